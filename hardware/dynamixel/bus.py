@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pupper_sysid.hardware.dynamixel import registers
 from pupper_sysid.hardware.dynamixel.line import DynamixelLine
-from pupper_sysid.hardware.serial_servos.bus import SerialBus, _Servo
+from pupper_sysid.hardware.serial_servos.bus import LineServo, SerialBus
 from pupper_sysid.hardware.serial_servos.line import Reply
 from pupper_sysid.hardware.serial_servos.series import Family
 from pupper_sysid.hardware.serial_servos.settings import read_register
@@ -65,7 +65,7 @@ class DynamixelBus(SerialBus):
         heat = self._servos[0].series.register("present_temperature").address
         self.line.sync_read([servo.id for servo in self._servos], heat, 1)
 
-    def _status(self, servo: _Servo, reply: Reply) -> int:
+    def _status(self, servo: LineServo, reply: Reply) -> int:
         if not reply.frame.code & registers.ALERT:
             return 0
         errors = read_register(self.line, servo.id, servo.series, "hardware_error_status")

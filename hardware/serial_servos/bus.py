@@ -1,4 +1,4 @@
-"""A `ServoBus` of servos on a serial line, whoever made them.
+"""A `ServoBus` of servos on a serial line, of any vendor.
 
     bus = FeetechBus("/dev/ttyUSB0", joint_map=load_joint_map("joints.yaml"))
 
@@ -66,7 +66,7 @@ _DOUBTS = 10  # exchanges from which the uncertainty of reading times is estimat
 
 
 @dataclass
-class _Servo:
+class LineServo:
     """State of one servo."""
 
     id: int
@@ -138,7 +138,7 @@ class SerialBus(HostClock):
             given = joints is not None
             names = answering_joints(self.family, wanted, series, given, self.line)
             self.joint_map = wanted.select(names)
-            self._servos = [_Servo(i, series[i]) for i in self.joint_map.ids]
+            self._servos = [LineServo(i, series[i]) for i in self.joint_map.ids]
             super().__init__()
             first = self._servos[0].series.register(self.family.present)
             self._first, self._turn = first.address, 0
@@ -316,7 +316,7 @@ class SerialBus(HostClock):
         """Release the port; the servos keep their last command."""
         self.line.close()
 
-    def _remember(self, servo: _Servo) -> None:
+    def _remember(self, servo: LineServo) -> None:
         """Read all registers of a servo."""
         memory = memory_of(self.line, servo.id, self.family.memory_pieces)
         servo.registers = None if memory is None else registers_of(servo.series, memory)
@@ -339,7 +339,7 @@ class SerialBus(HostClock):
             for (fault, name), names in joints.items()
         ]
 
-    def _other_offset(self, servo: _Servo, expected: int | None) -> list[RegisterFault]:
+    def _other_offset(self, servo: LineServo, expected: int | None) -> list[RegisterFault]:
         """Fault of a homing offset that is not that of the joint map."""
         name = servo.series.name_of("homing_offset")
         value = (servo.registers or {}).get(name)
@@ -352,22 +352,22 @@ class SerialBus(HostClock):
         )
         return [RegisterFault("homing_offset", value, meaning, cure)]
 
-    def _status(self, servo: _Servo, reply: Reply) -> int:
+    def _status(self, servo: LineServo, reply: Reply) -> int:
         """Error bits of a reply."""
         return reply.frame.code
 
-    def _holds(self, servo: _Servo, name: str, memory: bytes) -> bool:
+    def _holds(self, servo: LineServo, name: str, memory: bytes) -> bool:
         """Whether a reading is long enough for a register."""
         register = servo.series.register(name)
         return register.address + register.size <= self._first + len(memory)
 
-    def _servo(self, joint: str, register: str) -> _Servo:
+    def _servo(self, joint: str, register: str) -> LineServo:
         servo = self._servos[self.joint_names.index(joint)]
         if not servo.series.has(register):
             raise InputError(f"{joint}: a {servo.series.name} has no register {register}.")
         return servo
 
-    def _torque(self, servo: _Servo, on: bool) -> bool:
+    def _torque(self, servo: LineServo, on: bool) -> bool:
         """One try with one servo."""
         series = servo.series
         if on:
@@ -420,7 +420,7 @@ class SerialBus(HostClock):
         longer = max(sum(turns) - needed, 0.0) if needed else 0.0
         return 0.5 * (float(np.median(turns)) + longer)
 
-    def _plausible(self, servo: _Servo, index: int, at: float, count: int) -> bool:
+    def _plausible(self, servo: LineServo, index: int, at: float, count: int) -> bool:
         """Whether the servo can be there: 1 garbled frame in 256 has a correct checksum."""
         # outside the encoder's range by a homing offset, or turns: a value, too
         turns = self._turns * servo.series.counts

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -92,7 +93,7 @@ class Reply:
     after_s: float
 
 
-class SerialLine:
+class SerialLine(ABC):
     """An open serial line of one vendor's servos; see the module's docstring.
 
     Parameters
@@ -151,6 +152,7 @@ class SerialLine:
 
     # ----- what a vendor's line adds
 
+    @abstractmethod
     def _sdk(self) -> Any:
         """The vendor's SDK.
 
@@ -159,39 +161,38 @@ class SerialLine:
         BusError
             If it is not installed.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def _reader(self, accepted: Callable[[int, int], bool]) -> Reader:
         """A reader of replies; `accepted(id, data length)` says which can occur."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _request(self, frame: Frame) -> bytes:
         """Bytes that a request with the content of `frame` would have."""
-        raise NotImplementedError
 
+    @abstractmethod
     def ask_model(self, servo: int) -> int:
         """Send the request whose reply holds the model number; 0 if sent."""
-        raise NotImplementedError
 
+    @abstractmethod
     def echo_probe(self) -> bytes:
         """A request to which no servo answers."""
-        raise NotImplementedError
 
+    @abstractmethod
     def ping(self, servo: int) -> Frame | None:
         """Status frame of `servo`, or None if it does not answer."""
-        raise NotImplementedError
 
+    @abstractmethod
     def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
         """The same bytes of several servos with one request."""
-        raise NotImplementedError
 
+    @abstractmethod
     def sync_write(self, address: int, values: dict[int, bytes]) -> float:
         """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed."""
-        raise NotImplementedError
 
+    @abstractmethod
     def torque_off(self, servos: Sequence[int] | None = None) -> None:
         """Switch the torque of these (default: all) off at once; unacknowledged."""
-        raise NotImplementedError
 
     # ----- what all share
 

@@ -85,7 +85,7 @@ class DynamixelEmulator(LineEmulator):
         return Frame(servo_id, WRITE, address.to_bytes(2, "little") + data).encode()
 
     def receive(self, data: bytes, now: float, baud: int | None = None) -> Pieces:
-        """See `LineEmulator.receive`; time in which nobody spoke is looked at first."""
+        """See `LineEmulator.receive`; the pause since the last frame is counted first."""
         for servo_id in self.servos:
             self._watch(servo_id, max(now, self._free_at))
         pieces = super().receive(data, now, baud)

@@ -13,6 +13,7 @@ when its answer begins.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -49,7 +50,7 @@ class EmulatedMemory:
     state: dict[str, Any] = field(default_factory=dict)
 
 
-class LineEmulator:
+class LineEmulator(ABC):
     """A line of servos.
 
     Parameters
@@ -127,25 +128,25 @@ class LineEmulator:
 
     # ----- what a vendor's emulator adds
 
+    @abstractmethod
     def _new_reader(self) -> Any:
         """Reader of requests."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _baud_register(self, baud: int) -> dict[str, int]:
         """Register that holds the rate."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _execute(self, frame: Any, byte_s: float) -> Pieces:
         """Execute a request; what comes back."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _status(self, servo_id: int, error: int, data: bytes) -> bytes:
         """A reply on the wire."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _write_request(self, servo_id: int, address: int, data: bytes) -> bytes:
         """A write request on the wire."""
-        raise NotImplementedError
 
     def _error_byte(self, servo_id: int, bits: int) -> int:
         """Error byte of a reply of a servo with these faults."""
@@ -341,7 +342,8 @@ class LineEmulator:
         self._protect(servo_id, at)
 
     def _protect(self, servo_id: int, at: float) -> None:
-        """The servo's own overload protection."""
+        """The servo's own overload protection, where it has one."""
+        return
 
     def _set(self, servo_id: int, name: str, value: int) -> None:
         register = self.series.register(name)

@@ -3,8 +3,9 @@
     servo = foreign_servo("robot.xml", "LF_hip")    # for `servo_models.cards.compare`
 
 MuJoCo compiles the MJCF, so that class defaults and damping ratios are resolved; the inertia that
-the bodies put on the joint stands beside the armature. A Python file is read, not run: keyword
-arguments and dictionaries of literal numbers, such as Isaac Lab's and mjlab's actuators have.
+the bodies put on the joint is stated apart from the armature. A Python file is read, not run:
+keyword arguments and dictionaries of literal numbers, such as Isaac Lab's and mjlab's actuators
+have.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 `ExportedServos` is a calibration at one P gain, with or without the links that its armatures hold,
 for one physics step. Every export states in its head what the servos are, for which P gain,
 armature and physics step, in which units, from which calibration (by its hash), and what the
-target cannot carry. The feedback stands beside the actuator in every one; for simulators on torch
+target cannot carry. Each holds the feedback as well as the actuator; for simulators on torch
 with code that applies it (`sim.export.torch_servos`).
 """
 
