@@ -3,8 +3,10 @@
 `line_responses` fits the tones that a log names or that are found in its command, one after the
 other (`sysid.lag.tone`), and else the lines of a multisine (`multisine_responses`). Those lines are
 found in the command: the strongest is fitted and subtracted until next to nothing is left. A chirp,
-steps or a walk leave too much and are no multisine. All lines are then fitted to the fresh readings
-together, because sines at irregular times are not orthogonal.
+steps or a walk leave too much and are no multisine. Enough lines fit any motion within its own
+time, so those of a multisine must also predict each half of the command from the other half, and
+the motion of the joint must be at these frequencies. All lines are then fitted to the fresh
+readings together, because sines at irregular times are not orthogonal.
 """
 
 from __future__ import annotations
@@ -22,6 +24,9 @@ from pupper_sysid.sysid.recordings.recording import Trial
 _MOST_LINES = 24
 _LEFT_OVER = 0.005  # of the command's variance: quantisation, no signal
 _APART = 1.5  # periods over the trial: closer lines are what a random motion looks like
+_LEAST_PERIODS = 1.9  # of a line, over the trial
+_UNPREDICTED = 0.05  # of the command's variance, in one half from the other
+_INCOHERENT = 0.3  # of the readings' variance: motion at other frequencies
 _SETTLE_S = 0.5  # past the soft start: several times the servo's slowest pole
 _ROWS_PER_UNKNOWN = 3
 _BLOCK_S = 0.5
@@ -77,6 +82,8 @@ def multisine_responses(
     command_rows = _phasors(send[rows], trial.command_rad[rows], lines)
     raw = _draw(trial.read_time_s[rows], trial.position_rad[rows], lines, rng, draws)
     measured = _draw(reading.time_s[fresh], reading.position_rad[fresh], lines, rng, draws)
+    if measured[2] ** 2 > _INCOHERENT * float(np.var(reading.position_rad[fresh])):
+        return []
     shift = rng.normal(0.0, reading.time_sd_s, draws)
     return [
         ToneResponse(
@@ -105,7 +112,20 @@ def _lines(time: NDArray[np.float64], command: NDArray[np.float64]) -> NDArray[n
         lines, left = _sharpened(time, command, lines)
         if len(lines) > 1 and np.min(np.diff(np.sort(lines))) < _APART / span:
             return np.zeros(0)
+    if np.min(lines, initial=np.inf) < _LEAST_PERIODS / span or not _predicts(time, command, lines):
+        return np.zeros(0)
     return np.sort(lines)
+
+
+def _predicts(time: NDArray, command: NDArray, lines: NDArray) -> bool:
+    """Whether the lines as fitted to one half of the command go on in the other half."""
+    half = time < 0.5 * (time[0] + time[-1])
+    for known, other in ((half, ~half), (~half, half)):
+        solution = least_squares(_design(time[known], lines), command[known])
+        wrong = command[other] - _design(time[other], lines) @ solution
+        if np.mean(wrong**2) > _UNPREDICTED * np.var(command):
+            return False
+    return True
 
 
 def _sharpened(

@@ -30,7 +30,8 @@ _AWAY = 0.15  # of the tone's amplitude: where the command is, it has left the t
 _CLOSE = 0.03  # the same at its ends, where it must not lean on a row of what comes next
 _TIMES_LEFT = 3
 _CHIRP = 0.015  # of the frequency, by which the two halves of a tone may differ
-_COVERED = 0.6  # share of the moving time that tones must take
+_COVERED = 0.8  # share of the moving time that tones must take
+_SOFT = 0.4  # of a steady tone's time: the longest soft start before it
 _SAME_HZ = 0.02
 _RESTS_S = 0.15  # a servo has come to rest, or nearly so
 _LEAD_S, _LEAD = 0.5, 0.4  # rest kept in front of a tone, at most, and as a share of the tone
@@ -294,7 +295,10 @@ def _grown(time: NDArray, command: NDArray, first: int, last: int, end: int) -> 
         allowed = _CHIRP + 0.1 * _period_rows(clock, frequency)
         if abs(halves[0] - halves[1]) > allowed * frequency:
             return None
-    return Segment("tone", _soft_start(command, first, end), last + 1, frequency)
+    longest = max(_SOFT * float(clock[last] - clock[first]), 1.0 / frequency)
+    begin = _soft_start(command, first, end)
+    begin = begin if clock[first] - clock[begin] <= longest else first
+    return Segment("tone", begin, last + 1, frequency)
 
 
 def _period_rows(clock: NDArray, frequency: float) -> float:
