@@ -33,6 +33,7 @@ from pupper_sysid.sysid.feedback.quantisation import quantum
 from pupper_sysid.sysid.feedback.rows import fresh_rows
 from pupper_sysid.sysid.recordings.bad_readings import without_bad_readings
 from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.recordings.remembered import remembered
 
 LEAST_ROWS = 3
 """Rows of a trial; fewer have no rate of change."""
@@ -53,6 +54,7 @@ def long_enough(trials: Sequence[Trial]) -> list[Trial]:
     return [t for t in powered if len(t.send_time_s) >= LEAST_ROWS]
 
 
+@remembered(64)
 def findings(recorded: Sequence[Trial]) -> list[Finding]:
     """Find what is wrong with one joint's trials.
 

@@ -25,6 +25,7 @@ from scipy.signal import lfilter
 from pupper_sysid.sysid.feedback.rows import fresh_rows
 from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.recordings.remembered import remembered
 
 LATEST_S, EARLIEST_S = 0.8, -0.6
 
@@ -172,6 +173,7 @@ def servo_delay(number: int) -> float:
     return damping / (np.pi * hz) if hz else 0.0
 
 
+@remembered(8)
 def explain(trials: Sequence[Trial], step: float, exchanged: bool = False) -> Explanation | None:
     """Explain the position of one joint by its command.
 

@@ -95,7 +95,7 @@ def relations(trials: Sequence[Trial], step: float, base: Explanation) -> list[R
         early = base.total_s < -0.5 * base.grid_s
         ahead = base.best(1.0, early)
         found.append(Relation("position_early", "columns shifted in time", ahead))
-        other = explain(trials, step, exchanged=True)
+        other = explain(trials, step, True)
         if other is not None:
             other = replace(other, rows=base.rows)
             late = np.broadcast_to(other.lags_s >= -0.5 * other.grid_s, other.total_s.shape)
@@ -165,7 +165,7 @@ def stepwise_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
             return []
     if np.median(np.concatenate(holds)) < _HOLD_S or np.median(commands) > _STEPWISE - 0.2:
         return []
-    other, base = explain(trials, 0.0, exchanged=True), explain(trials, step)
+    other, base = explain(trials, 0.0, True), explain(trials, step)
     if other is None:
         return []
     late = np.broadcast_to(other.lags_s >= 0, other.total_s.shape) & (other.total_s > _FASTEST_S)

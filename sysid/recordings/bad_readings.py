@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.recordings.remembered import remembered
 
 _USUAL, _TIMES = 0.95, 8.0  # quantile of how far readings stand out, and times that
 _OF_RANGE = 0.03  # of the trial's motion; less does no harm
@@ -28,6 +29,7 @@ _PASSES = 4
 _LONGEST_S, _LIVE_ROWS = 0.12, 2  # a held bad reading
 
 
+@remembered(512)
 def bad_rows(trial: Trial) -> NDArray[np.int64]:
     """Rows of `trial` that hold a single bad reading.
 

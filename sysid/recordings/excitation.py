@@ -21,6 +21,7 @@ from scipy.stats import rankdata
 
 from pupper_sysid.common.tones import sine_design
 from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.recordings.remembered import remembered
 
 _SEED = 4  # half periods between turning points
 _LEAST_PERIODS = 1.9
@@ -61,6 +62,7 @@ class Segment:
     frequency_hz: float = float("nan")
 
 
+@remembered(512)
 def segments(trial: Trial) -> list[Segment]:
     """Cut the command of `trial` into tones, rests and other motion, in time order.
 

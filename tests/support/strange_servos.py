@@ -336,3 +336,18 @@ FAULTS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "force": (_rows(_force), ("not_a_position_servo", "unrelated", "loosely_related")),
     "friction": (_held, ("held_by_friction",)),
 }  # fmt: skip
+
+ACCUSING = sorted({code for _, codes in FAULTS.values() for code in codes})
+"""Codes that name a fault of the pair of columns: none may stand on a healthy recording."""
+
+NOISES_RAD = (0.0, 3e-4, 2e-3)
+
+
+def draw_recording(fault: str, number: int, seed: int) -> tuple[World, pd.DataFrame]:
+    """A recording of a fault: servo, motion and noise in turn, the rest by chance."""
+    rng = np.random.default_rng((seed, number, list(FAULTS).index(fault)))
+    world = draw_world(
+        rng, SERVOS[number % len(SERVOS)], MOTIONS[number % len(MOTIONS)],
+        NOISES_RAD[number % len(NOISES_RAD)],
+    )  # fmt: skip
+    return FAULTS[fault][0](world, rng)
