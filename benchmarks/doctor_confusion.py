@@ -5,9 +5,9 @@ classes, seven motions and many buses with no code of the package, and spoils th
 
     .venv/bin/python benchmarks/doctor_confusion.py --count 14 --seed 1 [--only clamp stop] [--each]
 
-Right: a finding of the fault's codes that asks for care or refuses. Undecided: another one, or none
-where the recording shows too little. Accused: a healthy recording with a finding that names a fault
-of the pair of columns (`ACCUSING`).
+Right: a finding of the fault's codes that asks for care or refuses, or a refusal to read it for its
+unit. Undecided: none, or one that names the fault as its runner-up. Accused: a finding that names
+another fault (`ACCUSING`), on a healthy recording any.
 """
 
 from __future__ import annotations
@@ -25,22 +25,23 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import numpy as np
-from support.strange_servos import ACCUSING, FAULTS, draw_recording
 
 import pupper_sysid as ps
 from pupper_sysid.sysid.doctor.checks import findings
 from pupper_sysid.sysid.doctor.findings import USE
+from support.strange_servos import ACCUSING, FAULTS, draw_recording
 
 
-def named(table) -> tuple[list[str], float]:
-    """Codes of the findings about one recording, and the processor time [s]."""
+def named(table) -> tuple[list[str], list[str], float]:
+    """Codes of the findings about one recording, of their runners-up, and processor time [s]."""
     recording = ps.Recording.from_arrays(
         table.send_time_s.to_numpy(), {"joint": table.command_rad.to_numpy()},
         {"joint": table.position_rad.to_numpy()}, read_time_s=table.read_time_s.to_numpy(),
     )  # fmt: skip
     began = time.process_time()
-    codes = [f.code for f in findings(recording.trials("joint")) if f.verdict != USE]
-    return codes, time.process_time() - began
+    found = [f for f in findings(recording.trials("joint")) if f.verdict != USE]
+    spent = time.process_time() - began
+    return [f.code for f in found], [f.values.get("rival", "") for f in found], spent
 
 
 def main() -> None:
@@ -58,29 +59,34 @@ def main() -> None:
         for number in range(options.count):
             world, table = draw_recording(fault, number, options.seed)
             try:
-                codes, spent = named(table)
+                codes, rivals, spent = named(table)
             except ps.InputError as error:
-                codes, spent = [f"not read: {error}"[:90]], 0.0
+                codes, rivals, spent = [str(error)[:90]], [], 0.0
+                codes += FAULTS[fault][1] if "Angles must be radians" in str(error) else []
             longest = max(longest, spent)
             right = set(FAULTS[fault][1]) & set(codes)
-            accused = set(ACCUSING) & set(codes)
+            # a gain that asks for care names no cause, and on a sound recording is an accusation
+            hedged = set() if fault == "healthy" else {"scale_asks_care"}
+            accused = set(ACCUSING) & set(codes) - hedged
             if fault == "healthy":
                 kind = "accused" if accused else "right"
             else:
-                kind = "right" if right else "accused" if accused else "undecided"
+                also = set(FAULTS[fault][1]) & set(rivals)
+                kind = "right" if right else "undecided" if also or not accused else "accused"
             told[kind] += 1
             if kind != "right":
                 for code in codes or ["nothing"]:
                     others[code] += 1
                 if options.each:
-                    print(fault, number, world.motion, f"{world.rate_hz:.0f} Hz", codes, flush=True)
+                    print(fault, number, world.motion, f"{world.rate_hz:.0f} Hz", codes, rivals)
         rest = ", ".join(f"{code} {n}" for code, n in sorted(others.items(), key=lambda o: -o[1]))
-        lines.append((fault, options.count, told["right"], told["undecided"], told["accused"], rest))
+        counts = [told[kind] for kind in ("right", "undecided", "accused")]
+        lines.append((fault, options.count, *counts, rest))
         print("| " + " | ".join(map(str, lines[-1])) + " |", flush=True)
     shares = np.array([line[1:5] for line in lines], float)
     total, right, undecided, wrong = shares.sum(axis=0)
-    print(f"\n{total:.0f} recordings: {right / total:.1%} right, {undecided / total:.1%} undecided, "
-          f"{wrong / total:.1%} another fault named; {longest:.1f} s at most")  # fmt: skip
+    print(f"\n{total:.0f} recordings: {right / total:.1%} right, {undecided / total:.1%} undecided,"
+          f" {wrong / total:.1%} another fault named; {longest:.1f} s at most")  # fmt: skip
 
 
 if __name__ == "__main__":

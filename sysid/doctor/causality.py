@@ -79,13 +79,16 @@ def echo(trials: Sequence[Trial], step: float) -> Finding | None:
     usual = float(np.median(moves[moves > 0])) if (moves > 0).any() else 0.0
     near = max(0.55 * step + 1e-5, _ECHO_OF_ROW * usual)  # the step may not have been found
     least = _ECHO_STEPS * near
-    moving = [np.flatnonzero(_recent_travel(t.command_rad) > least) for t in trials]
+    travels = [np.cumsum(np.abs(np.diff(t.command_rad, prepend=t.command_rad[0]))) for t in trials]
     if max(float(np.ptp(t.command_rad)) for t in trials) < _ECHO_TRAVEL * step:
         return None
     for shift in range(min(round(_LONGEST_ECHO_S / max(loop, 1e-4)), _MOST_SHIFTS) + 1):
         parts = []
-        for t, rows in zip(trials, moving, strict=True):
-            sent = rows[rows + shift < len(t.position_rad)]
+        for t, travel in zip(trials, travels, strict=True):
+            # a servo's way from one command to the next lies in the rows before and after a motion
+            row = np.arange(max(len(travel) - shift, 0))
+            moves = travel[row + shift] - travel[np.maximum(row - _ECHO_PAST_ROWS, 0)] > least
+            sent = row[moves]
             parts.append(t.position_rad[sent + shift] - t.command_rad[sent])
         left = np.concatenate([np.zeros(0), *parts])
         left = left[np.isfinite(left)]
@@ -98,15 +101,11 @@ def echo(trials: Sequence[Trial], step: float) -> Finding | None:
     return _delayed(trials, near, loop)
 
 
-def _recent_travel(command: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Range of the command over each row and those just before it [rad]."""
-    padded = np.concatenate([np.full(_ECHO_PAST_ROWS, command[0]), command])
-    return np.ptp(np.lib.stride_tricks.sliding_window_view(padded, _ECHO_PAST_ROWS + 1), axis=1)
-
-
 def _delayed(trials: Sequence[Trial], near: float, loop: float) -> Finding | None:
     """The position is the command at a constant time before, between rows as well."""
-    rows = [_rows_after_motion(t, _DELAYED_STEPS * near) for t in trials]
+    # as many as the longest lag takes: the way from one command to the next is among them
+    count = round(_LONGEST_ECHO_S / 2 / max(loop, 1e-4)) + _ECHO_PAST_ROWS
+    rows = [_rows_after_motion(t, _DELAYED_STEPS * near, count) for t in trials]
     if sum(map(len, rows)) < _ECHO_ROWS:
         return None
 
@@ -130,8 +129,9 @@ def _delayed(trials: Sequence[Trial], near: float, loop: float) -> Finding | Non
     return Finding("echo_between_rows", REFUSE, {"late_ms": 1e3 * late})
 
 
-def _rows_after_motion(trial: Trial, least: float) -> NDArray[np.int64]:
-    """Rows up to four after the command moved by more than `least`: no servo is there yet."""
+def _rows_after_motion(trial: Trial, least: float, count: int) -> NDArray[np.int64]:
+    """Rows up to `count` after the command moved by more than `least` in one."""
     moved = np.abs(np.diff(trial.command_rad, prepend=trial.command_rad[0])) > least
-    soon = np.convolve(moved, np.ones(5))[: len(moved)] > 0
-    return np.flatnonzero(np.isfinite(trial.position_rad) & soon)
+    total = np.cumsum(moved)
+    before = np.concatenate([np.zeros(min(count, len(total)), np.int64), total[:-count]])
+    return np.flatnonzero(np.isfinite(trial.position_rad) & (total > before[: len(total)]))

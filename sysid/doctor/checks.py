@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.doctor.bends import bend_findings
 from pupper_sysid.sysid.doctor.causality import crossed
 from pupper_sysid.sysid.doctor.clock import clock_findings, tone_findings
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, Finding
@@ -42,10 +43,11 @@ _FEW_MISSING, _MANY_MISSING = 0.02, 0.5
 _LEAST_FRESH = 16
 _MANY_BAD = 0.05  # share of the readings
 _CHECKS = (
-    motion_findings, tone_findings, encoder_findings, unit_findings, frozen_findings,
-    offset_findings, hypothesis_findings, start_findings, interpolation_findings,
+    motion_findings, tone_findings, encoder_findings, unit_findings, bend_findings,
+    frozen_findings, offset_findings, hypothesis_findings, start_findings, interpolation_findings,
     register_findings,
 )  # fmt: skip
+_SERVOS_ALONE = (frozen_findings, hypothesis_findings)  # a joint held by friction is explained
 
 
 def long_enough(trials: Sequence[Trial]) -> list[Trial]:
@@ -75,6 +77,8 @@ def findings(recorded: Sequence[Trial]) -> list[Finding]:
     for check in (*_CHECKS[:1], stepwise_findings, _few_fresh, *_CHECKS[1:]):
         if any(f.verdict == REFUSE for f in found):
             break
+        if check in _SERVOS_ALONE and any(f.code == "held_by_friction" for f in found):
+            continue
         step = quantum(trials) if step < 0 else step
         found += check(trials, step)
     return found

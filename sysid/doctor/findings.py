@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 USE, CARE, REFUSE = "use", "use with care", "do not use"
@@ -37,3 +37,8 @@ class Finding:
         from pupper_sysid.sysid.doctor.words import text
 
         return text(self)
+
+
+def rivalled(finding: Finding, rival: str) -> Finding:
+    """The finding with the code of an explanation that is nearly as good, empty where none is."""
+    return replace(finding, values={**finding.values, "rival": rival}) if rival else finding

@@ -4,10 +4,10 @@
 (`explanations`), and the one with the best score explains it. The position servo as it is needs no
 advantage; any other must beat it by `CLEAR_NATS`, and a runner-up within them is named.
 
-`CHANGES` are what may come on top of a servo that follows: a clipped or held motion, a second
-writer, a gain or a clock that changes. Each is fitted beside the servo alone and must explain a
-good part of what that leaves. A new hypothesis is one function and one entry; its simulator and its
-codes stand in the tests' own table.
+`CHANGES` are what may come on top of a servo that follows: a second writer, a gain or a clock that
+changes. What bends its path, a friction or a stop, is in `bends`. Each is fitted beside the servo
+alone and must explain a good part of what that leaves. A new hypothesis is one function and one
+entry; its simulator and its codes stand in the tests' own table.
 """
 
 from __future__ import annotations
@@ -21,22 +21,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import fit_sine, least_squares
+from pupper_sysid.sysid.doctor.bends import CLEAR_NATS, bend_findings
 from pupper_sysid.sysid.doctor.causality import echo
 from pupper_sysid.sysid.doctor.explanations import (
     Explanation,
     Samples,
     Servo,
     explain,
-    servo_delay,
 )
-from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding
+from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding, rivalled
 from pupper_sysid.sysid.recordings.excitation import named_tones, segments, split_tones
 from pupper_sysid.sysid.recordings.recording import Trial
 
-CLEAR_NATS = 6.0
-"""Advantage of a fault over the servo as it is: what is usual is 400 times as likely."""
-
-_UNRELATED, _LOOSE, _FOLLOWS = 0.25, 0.6, 0.75  # share of the position's variance
+_UNRELATED, _HALF, _LOOSE, _FOLLOWS = 0.25, 0.5, 0.6, 0.75  # share of the position's variance
 _NO_ONE_LAG = 0.3
 _TURNS, _TURN_SHARE = 4, 0.2
 _FAR_TOO_LARGE, _TOO_LARGE, _SMALL, _STILL = 2.0, 1.5, 0.4, 0.1
@@ -52,9 +49,6 @@ _AT_ONCE_S, _FASTEST_S, _LATE_S = 0.02, 0.001, 0.008
 _BEYOND, _SURELY = 4.0, 0.01
 _LONGEST_LAG_S = 0.5
 _FASTEST_RAD_S, _WRAP_RAD, _UNUSUAL = 60.0, 2.5, 8.0
-_PLATEAU_SHARE, _ENOUGH_PLATEAUS = 0.06, 3
-_SAME_LEVEL = 0.02  # of the motion's range
-_CLIP_BETTER = 0.6  # of what the servo alone leaves
 _JUMP = 0.3  # of the command's range, from one row to the next
 _BACK_OF_SPAN, _BACKS, _BACK_SHARE = 0.03, 3, 0.02
 _TWO_BETTER, _OTHER_GAIN, _PART_S = 0.3, 0.75, 1.5
@@ -62,7 +56,7 @@ _SAME_TONE_HZ = 0.02
 _DIFFERENT = 0.35  # of the gain
 _DRIFT_RAD, _DRIFT_SHARE = 0.1, 0.3
 _TWO_ZEROS = 0.5  # of the residuals' variance that two zeros may leave
-_SLOPE, _SLOPE_ERRORS, _LAG_DRIFT_S = 4e-4, 6.0, 0.005
+_SLOPE, _SLOPE_ERRORS, _LAG_DRIFT_S = 4e-4, 6.0, 0.008
 
 
 @dataclass(frozen=True)
@@ -73,13 +67,10 @@ class Relation:
     ----------
     code : str
         Of its finding; empty for the servo as it is.
-    words : str
-        As a runner-up.
     servo : Servo
     """
 
     code: str
-    words: str
     servo: Servo
 
 
@@ -88,19 +79,19 @@ def relations(trials: Sequence[Trial], step: float, base: Explanation) -> list[R
     causal = np.broadcast_to(base.lags_s >= -0.5 * base.grid_s, base.total_s.shape)
     causal = causal & (base.lags_s <= _LONGEST_LAG_S)
     found = [
-        Relation("", "a servo as it is", base.best(1.0, causal)),
-        Relation("sign_inverted", "an inverted sign", base.best(-1.0, causal)),
+        Relation("", base.best(1.0, causal)),
+        Relation("sign_inverted", base.best(-1.0, causal)),
     ]
     if _turns(trials) >= _TURNS:
         early = base.total_s < -0.5 * base.grid_s
         ahead = base.best(1.0, early)
-        found.append(Relation("position_early", "columns shifted in time", ahead))
+        found.append(Relation("position_early", ahead))
         other = explain(trials, step, True)
         if other is not None:
             other = replace(other, rows=base.rows)
             late = np.broadcast_to(other.lags_s >= -0.5 * other.grid_s, other.total_s.shape)
             late = late & (other.total_s > _FASTEST_S) & (other.lags_s <= _LONGEST_LAG_S)
-            found.append(Relation("columns_swapped", "swapped columns", other.best(1.0, late)))
+            found.append(Relation("columns_swapped", other.best(1.0, late)))
     return sorted(found, key=lambda r: r.servo.nats)
 
 
@@ -121,23 +112,21 @@ def relation_findings(
     if best.code == "position_early" and best.servo.total_s > -_CLEARLY_EARLY_S:
         # a little early is what another shape of the servo looks like
         hardly |= best.servo.unexplained > _MUCH_LESS * servo.unexplained
-    if best.code and hardly:
+    bent = bend_findings(trials, step)
+    if best.code and (hardly or (bent and best.code != "sign_inverted")):
         best = next(r for r in ranked if not r.code)
     share = 1 - best.servo.unexplained
-    if share < _FOLLOWS if best.code else (share < _LOOSE and _smooth_rest(base, best.servo)):
+    if share < _FOLLOWS if best.code else (share < _HALF and _smooth_rest(base, best.servo)):
         # a fault explains what is left of a servo, or smooth motion of another cause is left
-        verdict = REFUSE if share < 0.5 or best.code else CARE
-        values = {"percent": 100 * share}
-        return [Finding("not_a_position_servo", verdict, values)], base, None
+        return [Finding("not_a_position_servo", REFUSE, {"percent": 100 * share})], base, None
     if best.code != "columns_swapped" and (scaled := _scale(base, best.servo)):
         return [scaled], base, None
     if best.code:
         near = second.servo.nats < best.servo.nats + CLEAR_NATS
-        rival = f" As likely: {second.words}." if near and second.code else ""
-        return [_refusal(best, rival)], base, None
+        return [_refusal(best, second.code if near else "")], base, None
     if at_once := _at_once(base, best.servo):
         return [at_once], base, None
-    return _loose(trials, base, best.servo), base, best.servo
+    return [] if bent else _loose(trials, base, best.servo), base, best.servo
 
 
 def _smooth_rest(base: Explanation, servo: Servo) -> bool:
@@ -175,17 +164,17 @@ def stepwise_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
         plain = base.best(1.0, np.broadcast_to(base.lags_s >= 0, base.total_s.shape)).unexplained
     if 1 - servo.unexplained < _FOLLOWS or servo.unexplained > 0.5 * plain:
         return []
-    return [_refusal(Relation("columns_swapped", "", servo), "")]
+    return [_refusal(Relation("columns_swapped", servo), "")]
 
 
 def _refusal(relation: Relation, rival: str) -> Finding:
     servo = relation.servo
     if relation.code == "position_early":
-        return Finding(relation.code, REFUSE, {"early_ms": -1e3 * servo.total_s, "rival": rival})
-    values = {"lag_ms": 1e3 * servo.total_s, "rival": rival}
+        return rivalled(Finding(relation.code, REFUSE, {"early_ms": -1e3 * servo.total_s}), rival)
+    values = {"lag_ms": 1e3 * servo.total_s}
     if relation.code == "sign_inverted":
         values["gain"] = servo.gain
-    return Finding(relation.code, REFUSE, values)
+    return rivalled(Finding(relation.code, REFUSE, values), rival)
 
 
 def _scale(base: Explanation, servo: Servo) -> Finding | None:
@@ -365,21 +354,6 @@ class Followed:
         rest = np.concatenate([r for _, r in self.fits])
         return max(1.4826 * float(np.median(np.abs(rest))), 0.5 * self.step, 1e-5)
 
-    def unexplained(self, changed: Callable[[NDArray], NDArray]) -> float:
-        """Share that the servo leaves if `changed` becomes of its command, at the best lag."""
-        best = 1.0
-        for number in {self.servo.filter, 0, min(self.servo.filter + 2, 14)}:
-            servo = replace(self.servo, filter=number)
-            total = self.servo.total_s - (servo_delay(number) if number else 0.0)
-            for lag in np.linspace(max(total - 0.04, 0.0), total + 0.03, 8):
-                share = 0.0
-                paths = self.base.predicted(servo, changed, float(lag))
-                for weight, s, x in zip(self.base.weight, self.base.samples, paths, strict=True):
-                    rho = np.corrcoef(x, s.position_rad)[0, 1] if np.ptp(x) > 0 else 0.0
-                    share += weight * max(float(rho), 0.0) ** 2
-                best = min(best, 1 - share)
-        return best
-
 
 def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     """What explains the pair of columns, and what comes on top of it."""
@@ -395,79 +369,6 @@ def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     for change in CHANGES:
         findings = [*findings, *change(followed)]
     return findings
-
-
-def clipped(joint: Followed) -> list[Finding]:
-    """Readings that stay at one level while the command goes beyond: limits, a stop."""
-    if any(t.load is not None for t in joint.trials):
-        return []
-    plateaus = [p for t in named_tones(joint.trials) for p in _plateaus(t, joint.step)]
-    if not plateaus:
-        return []
-    found = []
-    for top in (True, False):
-        own = [p for p in plateaus if p.top == top]
-        if len(own) < _ENOUGH_PLATEAUS:
-            continue
-        levels = np.array([p.level_rad for p in own])
-        level = float(np.median(levels))
-        near = np.abs(levels - level) < max(1.5 * joint.step, _SAME_LEVEL * own[0].span_rad)
-        if near.sum() >= _ENOUGH_PLATEAUS:
-            found.append((top, level, [p for p, n in zip(own, near, strict=True) if n]))
-    if not found:
-        return []
-    # the command clipped where the motion is must explain it better than the whole command does
-    gain = float(np.average([g for g, _ in joint.fits], weights=joint.base.weight))
-    middle_c = np.mean([s.command_rad.mean() for s in joint.base.samples])
-    middle_p = np.mean([s.position_rad.mean() for s in joint.base.samples])
-    best = 1.0
-    for each in np.unique(np.clip([gain, 1.0, 0.85], 0.3, 1.3)):
-        limits = [-np.inf, np.inf]
-        for top, level, _ in found:
-            limits[top] = middle_c + (level - middle_p) / each
-        best = min(best, joint.unexplained(lambda c, e=tuple(limits): np.clip(c, *e)))
-    plain = joint.unexplained(lambda c: c)
-    floor = joint.base.floor
-    if best + floor > _CLIP_BETTER * (plain + floor):
-        return []
-    top, level, own = max(found, key=lambda f: len(f[2]))
-    share = max(p.share for p in own)
-    values = {"level_rad": level, "trials": sum(len(f[2]) for f in found), "percent": 100 * share}
-    return [Finding("clipped", CARE, values)]
-
-
-@dataclass(frozen=True)
-class _Plateau:
-    """A stretch of readings at a trial's extreme, longer than the command's own."""
-
-    top: bool
-    level_rad: float
-    span_rad: float
-    share: float
-
-
-def _plateaus(trial: Trial, step: float) -> list[_Plateau]:
-    seen = np.isfinite(trial.position_rad)
-    value, command = trial.position_rad[seen], trial.command_rad[seen]
-    if len(value) < 20 or np.ptp(value) < 10 * max(step, 1e-6):
-        return []
-    span = float(np.ptp(value))
-    near = max(1.5 * step, 0.015 * span)
-    found = []
-    for top in (True, False):
-        level = float(np.quantile(value, 0.995 if top else 0.005))
-        at = value > level - near if top else value < level + near
-        reach = float(np.ptp(command))
-        own = command > command.max() - 0.015 * reach if top else (
-            command < command.min() + 0.015 * reach)  # fmt: skip
-        share = float(np.mean(at) - np.mean(own))
-        if share < _PLATEAU_SHARE:
-            continue
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], at.astype(int), [0]])))
-        for first, stop in edges.reshape(-1, 2):
-            if stop - first >= 3:
-                found.append(_Plateau(top, float(np.median(value[first:stop])), span, share))
-    return found
 
 
 def second_writer(joint: Followed) -> list[Finding]:
@@ -661,5 +562,5 @@ def _alike(joint: Followed, samples: Samples) -> Iterator[tuple[float, float, fl
 
 
 CHANGES: tuple[Callable[[Followed], list[Finding]], ...] = (
-    clipped, second_writer, gain_changed, zero_moves, lag_drifts,
+    second_writer, gain_changed, zero_moves, lag_drifts,
 )  # fmt: skip

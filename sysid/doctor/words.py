@@ -29,10 +29,10 @@ WORDS: dict[str, str] = {
         "the bus. They are left out; check cable, baud rate and ids."
     ),
     "clipped": (
-        "readings stay at {level_rad:.3f} rad in {trials} stretches while the command goes "
-        "beyond, up to {percent:.0f} % of the time more than the command does: an angle limit "
-        "of the servo, a clamped goal or a mechanical stop clips the motion, and what looks "
-        "like a speed limit is none. Widen the limits, or record with a smaller amplitude."
+        "readings stay near {level_rad:.3f} rad for {percent:.0f} % of the time while the command "
+        "goes beyond: an angle limit of the servo, a clamped goal or a mechanical stop clips the "
+        "motion, and what looks like a speed limit is none. Widen the limits, or record with a "
+        "smaller amplitude."
     ),
     "clocks_apart": (
         "the time from a command to its reading varies by {drift_s:.3g} s: two clocks that "
@@ -40,7 +40,7 @@ WORDS: dict[str, str] = {
     ),
     "columns_swapped": (
         "the command follows the position by {lag_ms:.0f} ms, as a servo would: the columns "
-        "command_rad and position_rad look swapped. Swap them back.{rival}"
+        "command_rad and position_rad look swapped. Swap them back."
     ),
     "constant_command": (
         "the command never changes: {joint} was not swept. Record it with `pupper-sysid sweep`."
@@ -202,7 +202,7 @@ WORDS: dict[str, str] = {
     "position_early": (
         "the position moves {early_ms:.0f} ms before the command does: the columns command_rad "
         "and position_rad look swapped, or a row holds the command of another time. Swap them "
-        "back, or shift one.{rival}"
+        "back, or shift one."
     ),
     "read_early": (
         "readings are stamped {early_ms:.0f} ms before the commands of their rows, which is "
@@ -237,7 +237,7 @@ WORDS: dict[str, str] = {
     "sign_inverted": (
         "the position moves against the command: its sign is inverted (gain {gain:.2f}, "
         "{lag_ms:.0f} ms late). Change the direction in the joint map, or multiply one column "
-        "by -1.{rival}"
+        "by -1."
     ),
     "slow_commands": (
         "commands reach {speed_rad_s:.1f} of about {limit_rad_s:.1f} rad/s ({percent:.0f} %), "
@@ -301,6 +301,16 @@ WORDS: dict[str, str] = {
 }
 """Reason and cure, without the joint's name."""
 
+RIVALS = {
+    "clipped": "a clamped goal or a stop",
+    "columns_swapped": "swapped columns",
+    "held_by_friction": "friction",
+    "position_early": "columns shifted in time",
+    "second_writer": "a second program",
+    "sign_inverted": "an inverted sign",
+}
+"""What explains a recording nearly as well, by the code of its finding."""
+
 
 class _Ranges(Formatter):
     """Writes a pair of numbers as a range, once where both read alike."""
@@ -314,7 +324,12 @@ class _Ranges(Formatter):
 
 def text(finding: Finding) -> str:
     """The sentences of one finding, without the joint's name."""
-    return WORDS[finding.code].format(**finding.values)
+    return _template(finding).format(**finding.values)
+
+
+def _template(finding: Finding) -> str:
+    rival = finding.values.get("rival")
+    return WORDS[finding.code] + (f" Nearly as likely: {RIVALS[rival]}." if rival else "")
 
 
 def shared(by_joint: Mapping[str, Sequence[Finding]]) -> list[tuple[str, str]]:
@@ -350,7 +365,7 @@ def _ranged(findings: Mapping[str, Finding]) -> str:
         else _ends([f.values[name] for f in findings.values()])
         for name, value in first.values.items()
     }
-    return _Ranges().format(WORDS[first.code], **values)
+    return _Ranges().format(_template(first), **values)
 
 
 def _ends(numbers: Sequence[float]) -> tuple[float, float]:

@@ -245,13 +245,20 @@ def _wrapped(t, world, rng):
     return t.assign(position_rad=turned, command_rad=t.command_rad + shift)
 
 
+def _not_two_levels(world: World, rng) -> World:
+    """A random binary command that is clamped is another binary command: nothing shows it."""
+    return replace(world, motion="walk") if world.motion == "prbs" else world
+
+
 def _clamped(world: World, rng):
+    world = _not_two_levels(world, rng)
     reach = world.amplitude_rad * rng.uniform(0.35, 0.6)
     world = replace(world, clamp_rad=(-reach, reach))
     return world, simulated(world)
 
 
 def _stopped(world: World, rng):
+    world = _not_two_levels(world, rng)
     high = world.gain * world.amplitude_rad * rng.uniform(0.2, 0.5)
     world = replace(world, stop_rad=(-np.inf, high))
     return world, simulated(world)
@@ -324,7 +331,7 @@ FAULTS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "shift": (_rows(_early), ("position_early", "columns_swapped", "at_once")),
     "swapped": (_rows(_swapped), ("columns_swapped", "position_early")),
     "sign bit": (_rows(_sign_bit), ("sign_bit",)),
-    "overflow": (_rows(_overflow), ("encoder_overflow", "sign_bit")),
+    "overflow": (_rows(_overflow), ("encoder_overflow", "sign_bit", "angle_wrapped")),
     "wrap": (_rows(_wrapped), ("angle_wrapped",)),
     "clamp": (_clamped, ("clipped",)),
     "stop": (_stopped, ("clipped",)),

@@ -1,0 +1,406 @@
+"""What bends the path of a servo: friction, a clamped goal or a stop, a speed limit; compared.
+
+A linear servo (`explanations`) predicts a path. Operators on that path are fitted to the readings
+and compared by their scores: play, which holds the joint until the command has gone on by its
+width; saturation at one or two levels, of the goal or of the motion; a limit of the rate; a smooth
+cubic, as of gravity or of a bent potentiometer. A fault is found where its operator is clearly
+better than every other one, so that a saturation is not read into a slow servo.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pupper_sysid.sysid.doctor.explanations import Explanation, Servo, explain, servo_delay
+from pupper_sysid.sysid.doctor.findings import CARE, Finding, rivalled
+from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.recordings.remembered import remembered
+
+CLEAR_NATS = 6.0
+"""Advantage of a fault over what is usual: 400 times as likely."""
+
+_WIDTHS = (
+    0.02,
+    0.05,
+    0.1,
+    0.15,
+    0.2,
+    0.3,
+    0.4,
+    0.5,
+    0.6,
+    0.7,
+    0.8,
+    0.9,
+)  # of half the path's range
+_RATES = (0.15, 0.25, 0.4, 0.55, 0.7, 0.85)  # of the path's fastest rate
+_LEVELS = np.linspace(0.1, 0.96, 18)  # of the path's range
+_FILTERS_TRIED = (0, 6, 10)  # none, and critical ones of 4 and 10 Hz
+_TOTALS_S = (0.005, 0.02, 0.04, 0.07, 0.11)
+_MOST_READINGS = 4000
+_PARAMETER_NATS = 2.0
+_CRUDE = 0.01  # of the variance: what operators as simple as these leave of a sound servo
+_USUAL_LAG_S, _LAG_NATS = 0.08, 120.0  # delay with the low-pass: usual, and per second beyond
+_HELD_WIDTH, _RIVAL_WIDTH = 0.45, 0.25  # of half the command's range
+_EXPLAINED = 0.75  # of the position's variance
+_REST_TRAVEL = 0.15  # of the command's range, during one rest
+_FEWEST_RESTS = 2
+_ON_BY_FAR, _STAYS_S, _LATE_S = 0.12, 0.3, 0.15  # of the command's range; owed by a late servo
+_FEWEST_STOPS, _SAME_LEVEL = 3, 0.03  # of the command's range
+_DEEP, _BEYOND_SHARE, _FEWEST_BEYOND = 0.06, 0.03, 8  # of the path's range; of the readings
+_FLAT = 0.2  # slope beyond a level, of the slope within
+
+Paths = list[NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class Bend:
+    """One operator at its best.
+
+    Attributes
+    ----------
+    nats : float
+        Score, the less the better.
+    unexplained : float
+        Share of the position's variance.
+    values : tuple of float
+        Of play its half width [rad of command], of saturation two levels [rad of command].
+    servo : Servo
+        Whose path it bends.
+    """
+
+    nats: float
+    unexplained: float
+    values: tuple[float, ...]
+    servo: Servo
+
+
+@dataclass(frozen=True)
+class _Scan:
+    """Readings of all trials, thinned, and paths of servos."""
+
+    base: Explanation
+    servos: tuple[Servo, ...]
+    paths: tuple[Paths, ...]
+    position: Paths
+    time: Paths
+    every: int
+
+    def share(self, bent: Sequence[NDArray]) -> float:
+        """Share of the position's variance that bent paths leave."""
+        left = 0.0
+        for weight, x, y in zip(self.base.weight, bent, self.position, strict=True):
+            spread = float(np.std(x))
+            rho = 0.0
+            if spread > 1e-9:
+                rho = float(np.mean((x - x.mean()) * (y - y.mean()))) / spread / float(np.std(y))
+            left += weight * (1 - max(rho, 0.0) ** 2)
+        return left
+
+    def best(self, bend: Callable[..., NDArray], values: Sequence[tuple]) -> Bend:
+        """The best of one operator over its values and over all servos."""
+
+        def left(n: int, value: tuple) -> float:
+            pairs = zip(self.paths[n], self.time, strict=True)
+            return self.share([bend(x, t, *value) for x, t in pairs])
+
+        def tried(n: int, value: tuple) -> Bend:
+            return self.bend(left(n, value), value, self.servos[n])
+
+        starts = [0, *range(1, len(self.servos), 4)]
+        rough = min((tried(n, v) for n in starts for v in values), key=_by_nats)
+        servos = [tried(n, rough.values) for n in range(len(self.servos))]
+        at = int(np.argmin([b.nats for b in servos]))
+        return min((tried(at, v) for v in values), key=_by_nats)
+
+    def bend(self, unexplained: float, value: tuple, servo: Servo) -> Bend:
+        late = max(servo.total_s - _USUAL_LAG_S, 0.0) * _LAG_NATS
+        nats = self.base.nats(unexplained + _CRUDE) + _PARAMETER_NATS * len(value) + late
+        return Bend(nats, float(unexplained), tuple(map(float, value)), servo)
+
+
+def _by_nats(bend: Bend) -> float:
+    return bend.nats
+
+
+def bend_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
+    """Friction that holds the joint, or levels at which its motion saturates."""
+    if any(t.load is not None for t in trials):
+        return []  # a known load sags, and its friction is fitted
+    found = bends(trials, step)
+    if not found:
+        return []
+    friction = _held(trials, step, found, _RIVAL_WIDTH)
+    saturation = _saturated(trials, step, found)
+    play, level = found["play"].nats, found["saturation"].nats
+    near = abs(play - level) < 2 * CLEAR_NATS
+    if friction and (not saturation or play < level):
+        held = _held(trials, step, found, _HELD_WIDTH)
+        # less friction is usual, and no fault
+        return [rivalled(held, "clipped" if saturation and near else "")] if held else []
+    if not saturation:
+        return []
+    return [rivalled(saturation, "held_by_friction" if friction and near else "")]
+
+
+@remembered(8)
+def bends(trials: Sequence[Trial], step: float) -> dict[str, Bend]:
+    """Every operator at its best, by name; empty where too little moves."""
+    base = explain(trials, step)
+    if base is None:
+        return {}
+    causal = np.broadcast_to(base.lags_s >= -0.5 * base.grid_s, base.total_s.shape)
+    linear = base.best(1.0, causal & (base.lags_s < 0.5))
+    scan = _scan(base, linear)
+    ends = [(float(x.min()), float(x.max())) for x in scan.paths[0]]
+    low, high = min(e[0] for e in ends), max(e[1] for e in ends)
+    reach = high - low
+    if not reach > 1e-4:
+        return {}
+    rate = max(float(np.max(np.abs(np.gradient(x)))) for x in scan.paths[0]) + 1e-12
+    wide = scan.best(lambda x, t, w: _play(x, w), [(w * reach / 2,) for w in _WIDTHS])
+    widths = [(wide.values[0] * f,) for f in (0.8, 0.87, 0.93, 1.0, 1.07, 1.15)]
+    found = {
+        "linear": scan.best(lambda x, t: x, [()]),
+        "play": min(wide, scan.best(lambda x, t, w: _play(x, w), widths), key=_by_nats),
+        "rate": scan.best(lambda x, t, r: _limited(x, r), [(r * rate,) for r in _RATES]),
+        "cubic": _cubic(scan),
+    }
+    found["saturation"] = _saturation(scan, low, high)
+    return found
+
+
+def _scan(base: Explanation, linear: Servo) -> _Scan:
+    every = max(1, sum(len(s.time_s) for s in base.samples) // _MOST_READINGS)
+    servos = [linear]
+    for number in {linear.filter, min(linear.filter + 2, 14), *_FILTERS_TRIED}:
+        near = [linear.total_s + d for d in (-0.04, -0.025, -0.01, 0.0, 0.01, 0.025)]
+        for total in sorted({round(max(t, 0.0), 3) for t in (*near, *_TOTALS_S)}):
+            lag = total - servo_delay(number)
+            if lag >= -1e-3:
+                servos.append(Servo(0.0, 1.0, 1.0, max(lag, 0.0), total, number))
+    paths = [[x[::every] for x in base.predicted(servo)] for servo in servos]
+    return _Scan(
+        base, tuple(servos), tuple(paths), [s.position_rad[::every] for s in base.samples],
+        [s.time_s[::every] for s in base.samples], every,
+    )  # fmt: skip
+
+
+def _cubic(scan: _Scan) -> Bend:
+    """A smooth function of the path, another in each trial."""
+    best = None
+    for servo, paths in zip(scan.servos, scan.paths, strict=True):
+        bent = []
+        for x, y in zip(paths, scan.position, strict=True):
+            z = (x - x.mean()) / max(float(np.std(x)), 1e-9)
+            design = np.column_stack([np.ones_like(z), z, z**2, z**3])
+            gram = design.T @ design + 1e-9 * len(z) * np.eye(4)
+            bent.append(design @ np.linalg.solve(gram, design.T @ y))
+        tried = scan.bend(scan.share(bent), (0.0, 0.0), servo)
+        best = tried if best is None else min(best, tried, key=_by_nats)
+    assert best is not None
+    return best
+
+
+def _saturation(scan: _Scan, low: float, high: float) -> Bend:
+    """Levels of the motion, or of the goal before the servo."""
+
+    def of_motion(values: Sequence[tuple]) -> Bend:
+        return scan.best(lambda x, t, a, b: np.clip(x, a, b), values)
+
+    motion = _levels(of_motion, _LEVELS, low, high)
+    near = sorted(scan.servos[1:], key=lambda s: abs(s.total_s - motion.servo.total_s))
+    servos = [scan.servos[0], *near[:3]]
+
+    def of_goal(values: Sequence[tuple]) -> Bend:
+        tried = []
+        for servo in servos:
+            for value in values:
+                paths = scan.base.predicted(servo, lambda c, e=value: np.clip(c, *e))
+                left = scan.share([x[:: scan.every] for x in paths])
+                tried.append(scan.bend(left, value, servo))
+        return min(tried, key=_by_nats)
+
+    command = np.concatenate([s.command_rad for s in scan.base.samples])
+    goal = _levels(of_goal, _LEVELS[::3], float(command.min()), float(command.max()))
+    return min(motion, goal, key=_by_nats)
+
+
+def _levels(
+    fit: Callable[[Sequence[tuple]], Bend], levels: NDArray, low: float, high: float
+) -> Bend:
+    """One level after the other, above and below, then both beside where they are."""
+    reach = high - low
+    grid, under = low + reach * levels, high - reach * levels
+    best = min(
+        fit([(low - 1.0, float(b)) for b in grid]), fit([(float(a), high + 1.0) for a in under]),
+        key=_by_nats,
+    )  # fmt: skip
+    for _ in range(2):
+        a, b = best.values
+        pairs = [(float(each), b) for each in (low - 1.0, *under) if each < b - 0.1 * reach]
+        pairs += [(a, float(each)) for each in (high + 1.0, *grid) if each > a + 0.1 * reach]
+        again = fit(pairs)
+        if again.nats >= best.nats - 1e-9:
+            break
+        best = again
+    a, b = best.values
+    fine = 0.4 * reach * float(np.min(np.diff(levels)))
+    return min(best, fit([(a + x, b + y) for x in (-fine, 0, fine) for y in (-fine, 0, fine)]),
+               key=_by_nats)  # fmt: skip
+
+
+@njit(cache=True)
+def _play(path, width):
+    """Position of a joint that follows only at a distance of `width`."""
+    out = np.empty_like(path)
+    now = path[0]
+    for k in range(len(path)):
+        if path[k] > now + width:
+            now = path[k] - width
+        elif path[k] < now - width:
+            now = path[k] + width
+        out[k] = now
+    return out
+
+
+@njit(cache=True)
+def _limited(path, most):
+    """The path with a limited change from one reading to the next."""
+    out = np.empty_like(path)
+    now = path[0]
+    for k in range(len(path)):
+        now += min(max(path[k] - now, -most), most)
+        out[k] = now
+    return out
+
+
+def _held(
+    trials: Sequence[Trial], step: float, found: dict[str, Bend], width: float
+) -> Finding | None:
+    """A joint that rests while the command moves, and follows at the distance of its friction."""
+    play = found["play"]
+    reach = float(np.median([np.ptp(t.command_rad) for t in trials if np.ptp(t.command_rad) > 0]))
+    if not _explains(play, found) or play.values[0] < width * reach / 2:
+        return None
+    rests = [r for t in trials for r in _rests(t, step)]
+    if len(rests) < _FEWEST_RESTS:
+        return None
+    values = {"longest_s": max(r.lasts_s for r in rests), "travel_rad": 2 * play.values[0]}
+    return Finding("held_by_friction", CARE, values)
+
+
+def _explains(bend: Bend, found: dict[str, Bend]) -> bool:
+    """Whether a fault is clearly better than a servo and its speed limit, and a curve no better."""
+    usual = min(found["linear"].nats, found["rate"].nats) - CLEAR_NATS
+    curve = found["cubic"].nats + 2 * CLEAR_NATS
+    return bend.nats < min(usual, curve) and 1 - bend.unexplained > _EXPLAINED
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """A stretch in which the reading stays and the command moves on."""
+
+    lasts_s: float
+    level_rad: float
+    travel_rad: float
+    beyond_rad: float  # the command at its end, from where it was, on the side that it went to
+
+
+def _rests(trial: Trial, step: float) -> list[_Rest]:
+    seen = np.isfinite(trial.position_rad)
+    value, time = trial.position_rad[seen], trial.read_time_s[seen]
+    command, found, first = trial.command_rad[seen], [], 0
+    near = max(1.5 * step, 0.01 * float(np.ptp(value))) if len(value) else 0.0
+    for k in range(1, len(value) + 1):
+        if k < len(value) and abs(value[k] - value[first]) <= near:
+            continue
+        travel = float(np.ptp(command[first:k]))
+        if travel > _REST_TRAVEL * float(np.ptp(command)) and k - first > 3:
+            late = max(int(np.searchsorted(time, time[k - 1] - _LATE_S)), first + 1)
+            away = command[first:late] - command[first]
+            beyond = float(away[np.argmax(np.abs(away))])
+            found.append(
+                _Rest(float(time[k - 1] - time[first]), float(value[first]), travel, beyond)
+            )
+        first = k
+    return found
+
+
+def _stopped(trials: Sequence[Trial], step: float, width: float) -> Finding | None:
+    """A level at which the joint stays, several times, while the command goes on by far.
+
+    Something stands in its way, such as an object in a gripper, in parts of the recording.
+    """
+    reach = max(float(np.ptp(t.command_rad)) for t in trials)
+    least = 2 * width + _ON_BY_FAR * reach
+    rests = [r for t in trials for r in _rests(t, step)]
+    rests = [r for r in rests if abs(r.beyond_rad) > least and r.lasts_s > _STAYS_S]
+    if not rests:
+        return None
+    levels = np.array([r.level_rad for r in rests])
+    side = np.sign([r.beyond_rad for r in rests])
+    alike = [
+        (np.abs(levels - r.level_rad) < _SAME_LEVEL * reach) & (side == np.sign(r.beyond_rad))
+        for r in rests
+    ]
+    same = max(alike, key=np.sum)
+    if same.sum() < _FEWEST_STOPS:
+        return None
+    stays = sum(r.lasts_s for r, s in zip(rests, same, strict=True) if s)
+    recorded = sum(float(np.ptp(t.send_time_s)) for t in trials)
+    level = float(np.median(levels[same]))
+    return Finding("clipped", CARE, {"level_rad": level, "percent": 100 * stays / recorded})
+
+
+def _saturated(trials: Sequence[Trial], step: float, found: dict[str, Bend]) -> Finding | None:
+    """Readings that stay at a level while the command goes beyond."""
+    bend = found["saturation"]
+    if not _explains(bend, found):
+        return _stopped(trials, step, found["play"].values[0])
+    if found["play"].nats < bend.nats - 2 * CLEAR_NATS:
+        return None
+    surely = bend.nats < found["cubic"].nats - CLEAR_NATS
+    base = explain(trials, step)
+    assert base is not None
+    paths = base.predicted(bend.servo)
+    every = np.concatenate(paths)
+    low, high = float(every.min()), float(every.max())
+    inside = [(x > bend.values[0]) & (x < bend.values[1]) for x in paths]
+    best: tuple[float, float] | None = None
+    for top in (False, True):
+        level = bend.values[top]
+        depth = high - level if top else level - low
+        beyond = [x > level if top else x < level for x in paths]
+        share = float(np.mean(np.concatenate(beyond)))
+        if depth < _DEEP * (high - low) or share < _BEYOND_SHARE:
+            continue
+        slopes, stays = [], []
+        for x, s, out, within in zip(paths, base.samples, beyond, inside, strict=True):
+            if out.sum() < _FEWEST_BEYOND or within.sum() < _FEWEST_BEYOND:
+                continue
+            y = s.position_rad
+            slopes.append((_slope(x[out], y[out]), _slope(x[within], y[within]), out.sum()))
+            stays.append(y[out])
+        if not slopes:
+            continue
+        outer, inner, rows = np.transpose(slopes)
+        flat = np.average(outer, weights=rows) < _FLAT * np.average(inner, weights=rows)
+        if not (flat or surely):
+            continue
+        if best is None or share > best[0]:
+            best = share, float(np.median(np.concatenate(stays)))
+    if best is None:
+        return None
+    share, level = best
+    return Finding("clipped", CARE, {"level_rad": level, "percent": 100 * share})
+
+
+def _slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
+    spread = float(np.var(x))
+    return float(np.mean((x - x.mean()) * (y - y.mean()))) / spread if spread > 1e-12 else 0.0
