@@ -46,12 +46,12 @@ _MOST_READINGS = 4000
 _PARAMETER_NATS = 2.0
 _CRUDE = 0.01  # of the variance: what operators as simple as these leave of a sound servo
 _USUAL_LAG_S, _LAG_NATS = 0.08, 120.0  # delay with the low-pass: usual, and per second beyond
+_NEAR_NATS = 20.0  # a single sine shows little of where a joint rests: its lag decides
 _HELD_WIDTH, _RIVAL_WIDTH = 0.45, 0.25  # of half the command's range
 _EXPLAINED = 0.75  # of the position's variance
 _REST_TRAVEL = 0.15  # of the command's range, during one rest
 _FEWEST_RESTS = 2
-_ON_BY_FAR, _STAYS_S, _LATE_S = 0.12, 0.3, 0.15  # of the command's range; owed by a late servo
-_FEWEST_STOPS, _SAME_LEVEL = 3, 0.03  # of the command's range
+_PINNED, _ENOUGH_TRIALS = (0.10, 0.20), 3  # share of readings at an extreme, beyond the command's
 _DEEP, _BEYOND_SHARE, _FEWEST_BEYOND = 0.06, 0.03, 8  # of the path's range; of the readings
 _FLAT = 0.2  # slope beyond a level, of the slope within
 
@@ -138,14 +138,17 @@ def bend_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     friction = _held(trials, step, found, _RIVAL_WIDTH)
     saturation = _saturated(trials, step, found)
     play, level = found["play"].nats, found["saturation"].nats
-    near = abs(play - level) < 2 * CLEAR_NATS
+    near = abs(play - level) < _NEAR_NATS
     if friction and (not saturation or play < level):
         held = _held(trials, step, found, _HELD_WIDTH)
         # less friction is usual, and no fault
         return [rivalled(held, "clipped" if saturation and near else "")] if held else []
-    if not saturation:
-        return []
-    return [rivalled(saturation, "held_by_friction" if friction and near else "")]
+    # at a stop, play is no better than a servo as it is
+    rubs = play < min(found["linear"].nats, found["rate"].nats) - CLEAR_NATS
+    if saturation:
+        return [rivalled(saturation, "held_by_friction" if rubs else "")]
+    clearly = play < found["linear"].nats - 2 * CLEAR_NATS
+    return [] if clearly else _pinned(trials, step)
 
 
 @remembered(8)
@@ -288,17 +291,20 @@ def _held(
     reach = float(np.median([np.ptp(t.command_rad) for t in trials if np.ptp(t.command_rad) > 0]))
     if not _explains(play, found) or play.values[0] < width * reach / 2:
         return None
-    rests = [r for t in trials for r in _rests(t, step)]
+    rests = [r for t in trials for r in _rests(t, step, _REST_TRAVEL)]
     if len(rests) < _FEWEST_RESTS:
         return None
-    values = {"longest_s": max(r.lasts_s for r in rests), "travel_rad": 2 * play.values[0]}
+    values = {
+        "longest_s": max(r.end_s - r.start_s for r in rests),
+        "travel_rad": 2 * play.values[0],
+    }
     return Finding("held_by_friction", CARE, values)
 
 
 def _explains(bend: Bend, found: dict[str, Bend]) -> bool:
     """Whether a fault is clearly better than a servo and its speed limit, and a curve no better."""
     usual = min(found["linear"].nats, found["rate"].nats) - CLEAR_NATS
-    curve = found["cubic"].nats + 2 * CLEAR_NATS
+    curve = found["cubic"].nats + _NEAR_NATS
     return bend.nats < min(usual, curve) and 1 - bend.unexplained > _EXPLAINED
 
 
@@ -306,13 +312,13 @@ def _explains(bend: Bend, found: dict[str, Bend]) -> bool:
 class _Rest:
     """A stretch in which the reading stays and the command moves on."""
 
-    lasts_s: float
+    start_s: float
+    end_s: float
     level_rad: float
-    travel_rad: float
-    beyond_rad: float  # the command at its end, from where it was, on the side that it went to
 
 
-def _rests(trial: Trial, step: float) -> list[_Rest]:
+def _rests(trial: Trial, step: float, least: float) -> list[_Rest]:
+    """Stretches in which the reading stays and the command moves by `least` of its range."""
     seen = np.isfinite(trial.position_rad)
     value, time = trial.position_rad[seen], trial.read_time_s[seen]
     command, found, first = trial.command_rad[seen], [], 0
@@ -320,54 +326,50 @@ def _rests(trial: Trial, step: float) -> list[_Rest]:
     for k in range(1, len(value) + 1):
         if k < len(value) and abs(value[k] - value[first]) <= near:
             continue
-        travel = float(np.ptp(command[first:k]))
-        if travel > _REST_TRAVEL * float(np.ptp(command)) and k - first > 3:
-            late = max(int(np.searchsorted(time, time[k - 1] - _LATE_S)), first + 1)
-            away = command[first:late] - command[first]
-            beyond = float(away[np.argmax(np.abs(away))])
-            found.append(
-                _Rest(float(time[k - 1] - time[first]), float(value[first]), travel, beyond)
-            )
+        if k - first > 3 and first > 0:
+            if np.ptp(command[first:k]) > least * float(np.ptp(command)):
+                found.append(_Rest(float(time[first]), float(time[k - 1]), float(value[first])))
         first = k
     return found
 
 
-def _stopped(trials: Sequence[Trial], step: float, width: float) -> Finding | None:
-    """A level at which the joint stays, several times, while the command goes on by far.
+def _pinned(trials: Sequence[Trial], step: float) -> list[Finding]:
+    """Readings that stay at an extreme of their trial, in every trial or by much.
 
-    Something stands in its way, such as an object in a gripper, in parts of the recording.
+    Something stands in the way in a part of the recording, such as an object in a gripper, where
+    no level explains the whole.
     """
-    reach = max(float(np.ptp(t.command_rad)) for t in trials)
-    least = 2 * width + _ON_BY_FAR * reach
-    rests = [r for t in trials for r in _rests(t, step)]
-    rests = [r for r in rests if abs(r.beyond_rad) > least and r.lasts_s > _STAYS_S]
-    if not rests:
-        return None
-    levels = np.array([r.level_rad for r in rests])
-    side = np.sign([r.beyond_rad for r in rests])
-    alike = [
-        (np.abs(levels - r.level_rad) < _SAME_LEVEL * reach) & (side == np.sign(r.beyond_rad))
-        for r in rests
-    ]
-    same = max(alike, key=np.sum)
-    if same.sum() < _FEWEST_STOPS:
-        return None
-    stays = sum(r.lasts_s for r, s in zip(rests, same, strict=True) if s)
-    recorded = sum(float(np.ptp(t.send_time_s)) for t in trials)
-    level = float(np.median(levels[same]))
-    return Finding("clipped", CARE, {"level_rad": level, "percent": 100 * stays / recorded})
+    excess = [_dwell(t, step) for t in trials]
+    pinned = [e for e in excess if e > _PINNED[0]]
+    often = 2 * len(pinned) > len(excess) >= _ENOUGH_TRIALS
+    if not pinned or (max(excess) < _PINNED[1] and not often):
+        return []
+    values = {"trials": len(pinned), "of": len(trials), "percent": 100 * max(pinned)}
+    return [Finding("pinned", CARE, values)]
+
+
+def _dwell(trial: Trial, step: float) -> float:
+    """Share of readings at an extreme of the trial, beyond the share of the command at its own."""
+    position = trial.position_rad[np.isfinite(trial.position_rad)]
+    if len(position) < 20 or np.ptp(position) < 10 * max(step, 1e-6):
+        return 0.0
+    near = max(1.5 * step, 0.01 * float(np.ptp(position)))
+
+    def shares(value: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.array([np.mean(value < value.min() + near), np.mean(value > value.max() - near)])
+
+    return float(np.max(shares(position) - shares(trial.command_rad)))
 
 
 def _saturated(trials: Sequence[Trial], step: float, found: dict[str, Bend]) -> Finding | None:
     """Readings that stay at a level while the command goes beyond."""
-    bend = found["saturation"]
+    bend, base = found["saturation"], explain(trials, step)
+    assert base is not None
     if not _explains(bend, found):
-        return _stopped(trials, step, found["play"].values[0])
+        return None
     if found["play"].nats < bend.nats - 2 * CLEAR_NATS:
         return None
     surely = bend.nats < found["cubic"].nats - CLEAR_NATS
-    base = explain(trials, step)
-    assert base is not None
     paths = base.predicted(bend.servo)
     every = np.concatenate(paths)
     low, high = float(every.min()), float(every.max())

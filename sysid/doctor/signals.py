@@ -23,13 +23,9 @@ _FASTEST_RAD_S, _FAST_RAD_S = 60.0, 20.0  # three times and what a good servo of
 _LEVELS = 10  # values of a reading, from which on a coarse step is that of an encoder
 _ENCODER_BITS = range(10, 17)
 _SAME_STEP = 0.002
-_PINNED = (0.10, 0.20)  # share of readings at an extreme, beyond the command's own
 _NOTED_RAD, _FAR_RAD, _TURNED_RAD = 0.1, 1.3, 2.9  # of an offset; the last is nearly half a turn
-_ENOUGH_TRIALS = 3
-_WRAP_RAD, _UNUSUAL = 2.5, 8.0
 _FEW_STEPS = 8
 _FROZEN_S, _LATE_S, _FROZEN_SHARE = 1.0, 0.5, 0.5
-_SPIKES = 0.002  # share of readings
 _STRAIGHT, _SLOPES = 0.25, 0.3
 
 

@@ -176,6 +176,11 @@ WORDS: dict[str, str] = {
         "itself, and what is measured is this trajectory, not the servo. Write {cure} into "
         "{register} and record again."
     ),
+    "pinned": (
+        "readings stay at their highest or lowest value in {trials} of {of} trials, up to "
+        "{percent:.0f} % of the time more than the command does: a limit or a mechanical stop "
+        "clips the motion. Record with a smaller amplitude."
+    ),
     "poll_slipped": (
         "{where} the poll slipped by {jump_ms:.0f} ms at {time_s:.2f} s ({nats:.0f} nats); "
         "readings before and after it are dated apart."
