@@ -10,7 +10,7 @@ better than every other one, so that a saturation is not read into a slow servo.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -52,8 +52,8 @@ _EXPLAINED = 0.75  # of the position's variance
 _REST_TRAVEL = 0.15  # of the command's range, during one rest
 _FEWEST_RESTS = 2
 _PINNED, _ENOUGH_TRIALS = (0.10, 0.20), 3  # share of readings at an extreme, beyond the command's
-_DEEP, _BEYOND_SHARE, _FEWEST_BEYOND = 0.06, 0.03, 8  # of the path's range; of the readings
-_FLAT = 0.2  # slope beyond a level, of the slope within
+_DEEP, _BEYOND_SHARE = 0.06, 0.03  # of the path's range; of the readings
+_FLAT = 0.2  # gain of what the levels cut off, of the gain within them
 
 Paths = list[NDArray[np.float64]]
 
@@ -72,12 +72,15 @@ class Bend:
         Of play its half width [rad of command], of saturation two levels [rad of command].
     servo : Servo
         Whose path it bends.
+    of_goal : bool
+        Whether the command is bent before the servo's low-pass.
     """
 
     nats: float
     unexplained: float
     values: tuple[float, ...]
     servo: Servo
+    of_goal: bool = False
 
 
 @dataclass(frozen=True)
@@ -231,7 +234,7 @@ def _saturation(scan: _Scan, low: float, high: float) -> Bend:
 
     command = np.concatenate([s.command_rad for s in scan.base.samples])
     goal = _levels(of_goal, _LEVELS[::3], float(command.min()), float(command.max()))
-    return min(motion, goal, key=_by_nats)
+    return min(motion, replace(goal, of_goal=True), key=_by_nats)
 
 
 def _levels(
@@ -369,40 +372,27 @@ def _saturated(trials: Sequence[Trial], step: float, found: dict[str, Bend]) -> 
         return None
     if found["play"].nats < bend.nats - 2 * CLEAR_NATS:
         return None
-    surely = bend.nats < found["cubic"].nats - CLEAR_NATS
     paths = base.predicted(bend.servo)
+    levels = bend.values
+    bent = [np.clip(x, *levels) for x in paths]
+    if bend.of_goal:
+        bent = base.predicted(bend.servo, lambda c: np.clip(c, *levels))
+    # the readings follow the bent path, and what the levels cut off moves them no further
+    along = np.concatenate([x - x.mean() for x in bent])
+    cut = np.concatenate([x - y - np.mean(x - y) for x, y in zip(paths, bent, strict=True)])
+    position = np.concatenate([s.position_rad - s.position_rad.mean() for s in base.samples])
+    gram = np.array([[along @ along, along @ cut], [along @ cut, cut @ cut]])
+    gain, further = np.linalg.solve(gram + 1e-12 * np.eye(2), (along @ position, cut @ position))
     every = np.concatenate(paths)
     low, high = float(every.min()), float(every.max())
-    inside = [(x > bend.values[0]) & (x < bend.values[1]) for x in paths]
     best: tuple[float, float] | None = None
     for top in (False, True):
-        level = bend.values[top]
-        depth = high - level if top else level - low
-        beyond = [x > level if top else x < level for x in paths]
-        share = float(np.mean(np.concatenate(beyond)))
-        if depth < _DEEP * (high - low) or share < _BEYOND_SHARE:
-            continue
-        slopes, stays = [], []
-        for x, s, out, within in zip(paths, base.samples, beyond, inside, strict=True):
-            if out.sum() < _FEWEST_BEYOND or within.sum() < _FEWEST_BEYOND:
-                continue
-            y = s.position_rad
-            slopes.append((_slope(x[out], y[out]), _slope(x[within], y[within]), out.sum()))
-            stays.append(y[out])
-        if not slopes:
-            continue
-        outer, inner, rows = np.transpose(slopes)
-        flat = np.average(outer, weights=rows) < _FLAT * np.average(inner, weights=rows)
-        if not (flat or surely):
-            continue
-        if best is None or share > best[0]:
-            best = share, float(np.median(np.concatenate(stays)))
-    if best is None:
+        depth = high - levels[1] if top else levels[0] - low
+        beyond = every > levels[1] if top else every < levels[0]
+        share = float(np.mean(beyond))
+        if depth > _DEEP * (high - low) and share > max(_BEYOND_SHARE, best[0] if best else 0.0):
+            readings = np.concatenate([s.position_rad for s in base.samples])[beyond]
+            best = share, float(np.median(readings))
+    if best is None or not further < _FLAT * gain:
         return None
-    share, level = best
-    return Finding("clipped", CARE, {"level_rad": level, "percent": 100 * share})
-
-
-def _slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    spread = float(np.var(x))
-    return float(np.mean((x - x.mean()) * (y - y.mean()))) / spread if spread > 1e-12 else 0.0
+    return Finding("clipped", CARE, {"level_rad": best[1], "percent": 100 * best[0]})
