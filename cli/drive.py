@@ -20,13 +20,14 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.policies.deploy.deployment import Tick
+from pupper_sysid.policies.network.policy_file import CommandRanges
 
 STEP = np.array([0.05, 0.04, 0.1])
 """Increment of one key press [m/s, m/s, rad/s]."""
-LARGEST = np.array([0.2, 0.1, 0.5])
 KEYS = {
     "w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "q": (2, 1), "e": (2, -1),
 }  # fmt: skip
+CLIPPED = "   clipped to what it was trained for"
 _HELP = "w/s forward  a/d sideways  q/e turn  space stands  x ends"
 _SHOWN_EVERY_S = 0.2
 
@@ -35,9 +36,15 @@ class Driver:
     """Commands from the keyboard, and a live table of the ticks.
 
     Use it as a context; it is a `policies.deploy.commands.Commands`.
+
+    Parameters
+    ----------
+    trained : CommandRanges
+        Commands go no further than these.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, trained: CommandRanges) -> None:
+        self._trained, self._clipped = trained, False
         self._command = np.zeros(3)
         self._ended = False
         self._live = Live(console=terminal.err, auto_refresh=False)
@@ -61,12 +68,14 @@ class Driver:
         if key == "x":
             self._ended = True
         elif key == " ":
-            self._command[:] = 0.0
+            self._command, self._clipped = np.zeros(3), False
         elif key in KEYS:
             axis, sign = KEYS[key]
-            changed = self._command[axis] + sign * STEP[axis]
+            wanted = self._command.copy()
             # rounded: steps back to standing end at 0
-            self._command[axis] = np.clip(np.round(changed, 6), -LARGEST[axis], LARGEST[axis])
+            wanted[axis] = np.round(wanted[axis] + sign * STEP[axis], 6)
+            self._command = self._trained.clip(wanted)
+            self._clipped = bool((self._command != wanted).any())
 
     def watch(self, tick: Tick) -> None:
         """Show a tick, a few times a second."""
@@ -77,7 +86,8 @@ class Driver:
         if tick.elapsed_s - self._shown_s < _SHOWN_EVERY_S:
             return
         self._shown_s = tick.elapsed_s
-        self._live.update(_table(tick, self._age), refresh=True)
+        notice = CLIPPED if self._clipped else ""
+        self._live.update(_table(tick, self._age, notice), refresh=True)
 
     @contextmanager
     def driving(self) -> Iterator[Driver]:
@@ -94,11 +104,11 @@ class Driver:
             yield self
 
 
-def _table(tick: Tick, age_s: np.ndarray) -> Table:
+def _table(tick: Tick, age_s: np.ndarray, notice: str) -> Table:
     forward, left, turn = tick.senses.command
     shown = terminal.table(
         f"{tick.elapsed_s:6.1f} s   {forward:+.2f} m/s forward  {left:+.2f} left  "
-        f"{turn:+.2f} rad/s\n{_HELP}",
+        f"{turn:+.2f} rad/s{notice}\n{_HELP}",
         "joint", "sent rad", "read rad", "unchanged ms", "load N·m", "margin rad",
     )  # fmt: skip
     for i, joint in enumerate(JOINT_NAMES):

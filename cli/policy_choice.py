@@ -14,13 +14,14 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import resolved, sha256
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, is_shipped
+from pupper_sysid.sim.walking.config import PRESETS as WALKING
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import IDEAL, ServoRanges, check_actuator, servo_ranges
 
 if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.observer_match import Match
     from pupper_sysid.policies.deploy.servo_match import ServoMatch
-    from pupper_sysid.policies.network.policy_file import Policy
+    from pupper_sysid.policies.network.policy_file import CommandRanges, Policy
 
 _CONTRACT = "contract.json"
 
@@ -149,6 +150,30 @@ def simulator(
         if feedback not in ("held", "ideal"):
             feedback = str(next(iter(_near(feedback, path)), feedback))
     return task, servo_ranges(chosen, feedback)
+
+
+def trained_commands(policy: Policy, run: Run | None) -> CommandRanges:
+    """Commands that a policy was trained for: of its file, else of its run.
+
+    Where neither holds them, those of this version's presets are assumed, which is printed.
+    """
+    from pupper_sysid.policies.network.policy_file import CommandRanges
+
+    contract = policy.contract
+    if contract.commands is not None:
+        return contract.commands
+    if run is not None:
+        reached = run.task.curriculum.at(contract.training.get("samples", float("inf")))
+        return CommandRanges.of(run.task.commands, reached.commands)
+    # only the published presets let a policy see the trunk's speed
+    of = "release" if contract.base_velocity == "true" else "fast"
+    assumed = CommandRanges.of(WALKING[of].commands)
+    err.print(
+        "The policy's file does not say which commands it was trained for. Assumed are those of "
+        f"the preset {of}: {assumed}.",
+        soft_wrap=True,
+    )
+    return assumed
 
 
 def warn_of_fallbacks(servos: Iterable[ServoRanges]) -> None:

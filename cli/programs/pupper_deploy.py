@@ -26,6 +26,7 @@ from pupper_sysid.cli.policy_choice import (
     show_match,
     show_servos,
     trained_actuator,
+    trained_commands,
 )
 from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.cli.user_errors import end_politely, run_program
@@ -43,6 +44,9 @@ from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, Sta
 
 if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.assembly import Assembly
+    from pupper_sysid.policies.deploy.commands import Commands
+    from pupper_sysid.policies.network.policy_file import CommandRanges
+    from pupper_sysid.sim.emulator.robot import EmulatedRobot
 
 DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same bus.
 
@@ -74,8 +78,9 @@ class Deploy:
     servo: Path | None = None
     """Servo model's folder, for `lstm-servo`."""
     actuator: str | None = None
-    """Calibration of this robot, for `mlp-observer` and for a comparison with the policy's training
-    before the start; by default that of the training."""
+    """Calibration of this robot: an emulated one has its servos; on any, for `mlp-observer` and for
+    a comparison with the policy's training before the start. By default that of the training, and
+    for an emulated robot servos drawn from published measurements."""
     observer: ObserverKind | None = None
     """Instead of the stack's."""
     lowpass_hz: float | None = None
@@ -87,7 +92,8 @@ class Deploy:
     rate: float | None = None
     """Hz of the loop, instead of the policy's own; its time then runs faster or slower."""
     command: tuple[float, float, float] = (0.15, 0.0, 0.0)
-    """Forward and sideways speed [m/s], turn rate [rad/s]."""
+    """Forward and sideways speed [m/s], turn rate [rad/s]. Commands, also of --script and
+    --keyboard, are clipped to what the policy was trained for."""
     script: Path | None = None
     """CSV of commands with the columns seconds,forward_m_s,left_m_s,turn_rad_s, one after the
     other, instead of --command."""
@@ -165,13 +171,15 @@ def _run(options: Deploy) -> None:
     if options.replay:
         _replay(options.replay, policy)
         return
+    trained = trained_commands(policy, run)
+    commands = _commands(options, trained)
     folder = Path("walks") / (options.name or time.strftime(f"{options.policy.name}-%H%M%S"))
     with ExitStack() as open_things:
         bus, imu, joint_map, truth = _open(options, open_things)
         actuator = chosen_actuator(options.policy, policy, run, options.actuator)
-        trained, known = trained_actuator(options.policy, policy, run)
+        of_training, known = trained_actuator(options.policy, policy, run)
         parts = assemble(
-            policy, stack, joint_map, actuator, options.servo, trained if known else None
+            policy, stack, joint_map, actuator, options.servo, of_training if known else None
         )
         if stack.observer == "readings" and options.actuator is None:
             err.print(
@@ -192,9 +200,24 @@ def _run(options: Deploy) -> None:
             show_servos(match, policy.contract.servo is not None)
         header = parts.header | header_entries(bus) | {
             "policy": str(options.policy), "stack_name": name, "seed": options.seed,
-            "servo_match": match and match.to_dict(),
+            "servo_match": match and match.to_dict(), "commands": trained.model_dump(mode="json"),
         }  # fmt: skip
-        _walk(options, bus, imu, parts, header, folder, truth)
+        _walk(options, bus, imu, parts, commands, header, folder, truth)
+
+
+def _commands(options: Deploy, trained: CommandRanges) -> Commands:
+    """Commands within what the policy was trained for."""
+    from pupper_sysid.cli.drive import Driver
+    from pupper_sysid.policies.deploy.commands import constant, script
+
+    say = partial(err.print, soft_wrap=True)
+    if options.keyboard:
+        return Driver(trained)
+    return (
+        script(options.script, trained, say)
+        if options.script
+        else constant(options.command, trained, say)
+    )
 
 
 def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
@@ -227,11 +250,10 @@ def _changes(options: Deploy) -> dict[str, Any]:
 def _open(options: Deploy, open_things: ExitStack) -> tuple[GuardedBus, Imu, JointMap, Any]:
     """Bus, IMU, joint map, and the emulated robot if it is one."""
     if options.bus == EMULATED:
-        from pupper_sysid.sim.emulator.robot import draw_robot
         from pupper_sysid.sim.walking.bus import WalkingBus
 
         rng = np.random.default_rng(options.seed)
-        inner = WalkingBus(draw_robot(rng), rng, real_time=options.in_real_time)
+        inner = WalkingBus(_emulated(options, rng), rng, real_time=options.in_real_time)
         bus = open_things.enter_context(closing(GuardedBus(inner)))
         return bus, inner, load_joint_map("mini_pupper_2"), inner.robot
     address = parse_address(options.bus)
@@ -246,6 +268,26 @@ def _open(options: Deploy, open_things: ExitStack) -> tuple[GuardedBus, Imu, Joi
         return bus, bus.bus, joint_map, None
     other = open_things.enter_context(closing(Esp32Bus(options.imu or SOCKET)))
     return bus, other, joint_map, None
+
+
+def _emulated(options: Deploy, rng: np.random.Generator) -> EmulatedRobot:
+    """An emulated robot with the user's servos, else with published ones."""
+    from pupper_sysid.sim.emulator.robot import draw_robot
+    from pupper_sysid.sim.walking.bus import calibrated_robot
+    from pupper_sysid.sim.walking.servo_ranges import check_actuator, is_servo_model, servo_ranges
+
+    if options.actuator is None:
+        return draw_robot(rng)
+    check_actuator(options.actuator)
+    if is_servo_model(options.actuator):
+        err.print(
+            f"{options.actuator} is a learned model, which the emulated robot cannot have: its "
+            "servos are drawn from published measurements.",
+            soft_wrap=True,
+        )
+        return draw_robot(rng)
+    err.print(f"The emulated robot has the servos of {options.actuator}.", soft_wrap=True)
+    return calibrated_robot(servo_ranges(options.actuator), rng)
 
 
 def _replay(path: Path, policy: Any) -> None:
@@ -276,17 +318,15 @@ def _live(open_things: ExitStack, bus: GuardedBus) -> list[Any]:
 
 
 def _walk(
-    options: Deploy, bus: GuardedBus, imu: Imu, parts: Assembly, header: dict[str, Any],
-    folder: Path, truth: Any,
+    options: Deploy, bus: GuardedBus, imu: Imu, parts: Assembly, commands: Commands,
+    header: dict[str, Any], folder: Path, truth: Any,
 ) -> None:  # fmt: skip
     """Walk, log, and show the result."""
     from pupper_sysid.cli.drive import Driver
-    from pupper_sysid.policies.deploy.commands import constant, script
     from pupper_sysid.policies.deploy.deployment import deploy
     from pupper_sysid.policies.deploy.emulated_walk import ERRORS, WalkScore
     from pupper_sysid.sysid.recordings.files import RecordingWriter
 
-    commands = script(options.script) if options.script else constant(options.command)
     score = WalkScore(bus, truth) if truth else None
     log, table = folder / "walk.csv", folder / "recording.csv"
     about = {"bus": header["bus"] | {"coordinates": "servo"}, "policy": header["policy"]}
@@ -296,9 +336,9 @@ def _walk(
         if options.bus != EMULATED:
             err.print(f"Running with {priority}.")
         watchers: list[Any] = [parts.frozen_readings, *([score] if score else [])]
-        if options.keyboard:
-            driver = open_things.enter_context(Driver().driving())
-            commands, watchers = driver, [*watchers, driver.watch]
+        if isinstance(commands, Driver):
+            open_things.enter_context(commands.driving())
+            watchers.append(commands.watch)
         if options.live:
             watchers += _live(open_things, bus)
         if options.views:
@@ -338,13 +378,14 @@ def _walk(
         "guard": outcome.guard,
         "imu": {"clipped": outcome.clipped_imu_samples, "missing": outcome.missing_imu_samples},
         "servo_match": header["servo_match"],
+        "commands": header["commands"],
         "log": str(log),
     }  # fmt: skip
     if options.json:
         print_json(found)
         return
     shown = terminal.table(f"{outcome.seconds:.1f} s on {bus.name}", "", "")
-    del found["servo_match"]  # it was shown before the walk
+    del found["servo_match"], found["commands"]  # shown before the walk, where they matter
     for key, value in found.items():
         shown.add_row(key, terminal.cell(value, 3))
     out.print(shown)

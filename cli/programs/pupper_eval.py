@@ -30,11 +30,12 @@ if TYPE_CHECKING:
 _FULL, _QUICK = (100, 20.0), (30, 10.0)  # episodes, seconds each
 _FULL_BATTERY, _QUICK_BATTERY = (40, 20.0), (10, 8.0)
 
-DESCRIPTION = """Falls and tracking errors of a policy, beside an open-loop trot and standing.
+DESCRIPTION = """Falls, errors and effort of a policy, beside an open-loop trot and standing.
 
 By direction, ground and added dead time; with --battery under pushes, on slopes and stairs, with
 loads, weak legs, missed ticks, late and jittered servos. Errors are of the velocity at every
 instant and of its mean over a stride; a robot that fell counts as one that stands until the end.
+Beside them stand the clearance of the swings, and how near servos are to their torque limits.
 --quick answers within 20 s on two cores (the battery within 60 s), and less surely.
 
 Example: pupper-eval runs/<name> --extra-delay-ms 40 80 --report report
@@ -148,6 +149,7 @@ def _show(found: Evaluation, quick: bool) -> None:
     _show_errors(found, "every instant", "")
     _show_errors(found, "the mean over a stride", "stride_")
     _show_directions(found)
+    _show_effort(found)
 
 
 def _show_falls(found: Evaluation) -> None:
@@ -212,6 +214,27 @@ def _show_directions(found: Evaluation) -> None:
             *(_within(own.speed_share, 100) for own in each),
             *(_within(own.heading_drift_deg, 1) for own in each),
         )  # fmt: skip
+    out.print(shown)
+
+
+def _show_effort(found: Evaluation) -> None:
+    """Clearance of the swings and effort of the servos, of policy and trot."""
+    shown = terminal.table(
+        "Clearance of the swings (tenth percentile, median; share below 2 mm) and effort of the "
+        "servos: share of the time at the torque limit and rms torque over the limit, thigh and "
+        "calf; mechanical power; cost of transport", "", "walker", "p10 mm", "p50 mm", "low %",
+        "at limit %", "rms %", "W", "CoT",
+    )  # fmt: skip
+    for row in found.conditions:
+        for walker, own in (("policy", row.policy), ("trot", row.trot)):
+            pairs = (own.torque_saturated_share, own.rms_torque_share)
+            shown.add_row(
+                row.name if walker == "policy" else "", walker,
+                number(1e3 * own.clearance_p10_m, 1), number(1e3 * own.clearance_p50_m, 1),
+                number(100 * own.low_swing_share, 0),
+                *("/".join(number(100 * each[k], 0) for k in ("thigh", "calf")) for each in pairs),
+                number(own.mechanical_power_w, 1), number(own.cost_of_transport, 1),
+            )  # fmt: skip
     out.print(shown)
 
 

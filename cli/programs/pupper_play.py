@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +22,12 @@ import tyro
 from numpy.typing import NDArray
 
 from pupper_sysid.cli.live_views import refuse_file
-from pupper_sysid.cli.policy_choice import policy_at, simulator, warn_of_fallbacks
+from pupper_sysid.cli.policy_choice import (
+    policy_at,
+    simulator,
+    trained_commands,
+    warn_of_fallbacks,
+)
 from pupper_sysid.cli.terminal import err, need_positive, out, seconds_progress, warn
 from pupper_sysid.cli.user_errors import run_program
 from pupper_sysid.common.errors import InputError
@@ -41,7 +47,8 @@ class Play:
     policy: Annotated[Path, tyro.conf.Positional]
     """A run (`runs/<name>`) or a policy folder."""
     command: tuple[float, float, float] = (0.15, 0.0, 0.0)
-    """Forward and sideways speed [m/s], turn rate [rad/s]."""
+    """Forward and sideways speed [m/s], turn rate [rad/s], clipped to what the policy was trained
+    for."""
     seconds: float = 10.0
     """Duration."""
     video: Path | None = None
@@ -91,6 +98,8 @@ def _run(options: Play) -> None:
     policy, run = policy_at(options.policy)
     task, servos = simulator(options.policy, policy, run, options.actuator, options.feedback)
     warn_of_fallbacks([servos])
+    say = partial(err.print, soft_wrap=True)
+    command = trained_commands(policy, run).clipped(command[None], say)[0]
     task = replace(evaluation_task(task, options.seconds + 1.0), terrain=options.terrain)
     model = servo_model_of(servos.source, task.control_step_s)
     env = PupperEnv(task, servos, 1, options.seed, 1, model)
@@ -124,7 +133,7 @@ def _run(options: Play) -> None:
     if ended:
         out.print(ended)
     out.print(
-        "command {:.2f} m/s forward, {:.2f} m/s left, {:.2f} rad/s; mean ".format(*options.command)
+        "command {:.2f} m/s forward, {:.2f} m/s left, {:.2f} rad/s; mean ".format(*command)
         + "{:.2f}, {:.2f}, {:.2f}".format(*moved)
         + f"; {np.linalg.norm(away):.2f} m from the start"
     )

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import os
 import sys
+import time
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 # Physics threads and torch threads take turns, so waiting must not spin.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -21,14 +24,25 @@ import tyro
 import yaml
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from pupper_sysid.cli.terminal import err, out, print_json, warn
+from pupper_sysid.cli.terminal import err, out, print_json, share_progress, warn
 from pupper_sysid.cli.user_errors import begin_work, parse, user_errors
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import hold_output, refuse_path
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.network.hyperparameters import OWN, TROT, Kind
-from pupper_sysid.policies.train.run_file import Run, Start, check_teacher, preset
+from pupper_sysid.policies.train.run_file import (
+    Run,
+    Start,
+    check_teacher,
+    preset,
+    refuse_taken,
+)
+from pupper_sysid.sim.robot.trot import Trot
+from pupper_sysid.sim.walking.rewards.weights import Rewards
 from pupper_sysid.sim.walking.servo_ranges import check_actuator
+
+if TYPE_CHECKING:
+    from pupper_sysid.policies.train.ranks import Ranks
 
 DESCRIPTION = """Train a walking policy in a simulator that moves like the measured robot.
 
@@ -122,6 +136,7 @@ def _run(options: Options, given: list[str]) -> None:
                 text = f"{value:,.3g}" if isinstance(value, float) else str(value)
                 out.print(f"{name:28} {text}", soft_wrap=True)
         return
+    begun = time.monotonic()
     ranks = Ranks.join()
     folder = options.resume or Path("runs") / ranks.same(options.name or _name(options))
     if options.resume is not None and not options.resume.is_dir():
@@ -131,15 +146,17 @@ def _run(options: Options, given: list[str]) -> None:
         err.print(
             f"{'Going on with' if options.resume else 'Training into'} {folder}.", soft_wrap=True
         )
+    if options.resume is None:
+        refuse_taken(folder)
+        run = _with_first_gait(run, ranks)
     with _bar() as watch:
+        notice = (lambda text: warn([text])) if ranks.rank == 0 else (lambda text: None)
         stopping = (lambda text: err.print(text)) if ranks.rank == 0 else (lambda text: None)
         if options.resume:
-            learner = train(
-                folder, None, watch, *_extension(options, given), lambda text: warn([text]),
-                stopping,
-            )  # fmt: skip
+            learner = train(folder, None, watch, *_extension(options, given), notice, stopping)
         else:
-            learner = train(folder, run, watch, stopping=stopping)
+            spent_s = time.monotonic() - begun
+            learner = train(folder, run, watch, notice=notice, stopping=stopping, spent_s=spent_s)
     if ranks.rank > 0:
         return
     on = (
@@ -150,7 +167,25 @@ def _run(options: Options, given: list[str]) -> None:
         use = f"Learn from it: pupper-train --start scratch --imitation.teacher {folder}"
     else:
         use = f"Look at it: pupper-play {folder} --video walk.mp4; measure it: pupper-eval {folder}"
+    if not learner.iteration:
+        use = f"Its first gait is not complete, so it walks badly if at all. {use}"
     err.print(f"Saved. {use}; {on}")
+
+
+def _with_first_gait(run: Run, ranks: Ranks) -> Run:
+    """The run with a gait for its servos, which the first process searches for all."""
+    from pupper_sysid.policies.train.first_gait import fits_trots, with_first_gait
+
+    if not fits_trots(run):
+        return run
+    task = run.task
+    if ranks.rank == 0:
+        with share_progress("first gait") as advance:
+            say = partial(err.print, soft_wrap=True)
+            task = with_first_gait(run, say, partial(advance, "searching")).task
+    parts = json.loads(ranks.same(json.dumps(plain({"trot": task.trot, "rewards": task.rewards}))))
+    trot, rewards = Trot(**parts["trot"]), Rewards(**parts["rewards"])
+    return replace(run, task=replace(run.task, trot=trot, rewards=rewards))
 
 
 def _extension(options: Options, given: list[str]) -> tuple[int | None, float | None]:

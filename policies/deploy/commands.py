@@ -1,4 +1,8 @@
-"""Velocity commands over time: constant, or from a script."""
+"""Velocity commands over time: constant, or from a script, within what a policy was trained for.
+
+Beyond that a policy does not walk faster: at twice the training's speed the shipped ones stop or
+walk backwards.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.border import read_text
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.csv_table import column_names, read_table
+from pupper_sysid.policies.network.policy_file import CommandRanges
 
 Commands = Callable[[float], NDArray[np.float64] | None]
 """Forward and sideways speed [m/s] and turn rate [rad/s] by time since the first tick [s]; None to
@@ -20,15 +25,29 @@ COLUMNS = ("seconds", "forward_m_s", "left_m_s", "turn_rad_s")
 _LARGEST = 2.0
 
 
-def constant(command: tuple[float, float, float]) -> Commands:
+def constant(
+    command: tuple[float, float, float],
+    trained: CommandRanges | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Commands:
     """A constant command.
+
+    Parameters
+    ----------
+    command : (float, float, float)
+    trained : CommandRanges, optional
+        To clip it to.
+    say : callable
+        Called with a sentence if it is clipped.
 
     Raises
     ------
     InputError
-        If it is out of range.
+        If it is no command.
     """
     value = checked_command(command)
+    if trained is not None:
+        value = trained.clipped(value[None], say)[0]
     return lambda elapsed_s: value
 
 
@@ -49,8 +68,14 @@ def checked_command(command: tuple[float, float, float]) -> NDArray[np.float64]:
     return value
 
 
-def script(path: Path) -> Commands:
+def script(
+    path: Path,
+    trained: CommandRanges | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Commands:
     """Commands of a CSV file with `COLUMNS`, one row after another, then a stop.
+
+    `trained` and `say` as for `constant`.
 
     Raises
     ------
@@ -73,6 +98,8 @@ def script(path: Path) -> Commands:
             f"{path}, line {table.line[bad[0]]}: seconds must be positive and speeds within "
             f"±{_LARGEST:g}."
         )
+    if trained is not None:
+        rows[:, 1:] = trained.clipped(rows[:, 1:], say)
     ends = np.cumsum(rows[:, 0])
 
     def command(elapsed_s: float) -> NDArray[np.float64] | None:

@@ -1,9 +1,10 @@
-"""Figures of walks: falls, tracking errors, speed, drift of the heading, and what the feet do."""
+"""Figures of walks: falls, errors, speed, drift of the heading, feet, and effort of servos."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from pupper_sysid.common.results import Result
 from pupper_sysid.policies.analysis.rhythm import mean_of
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.conditions import Condition, Moment
+from pupper_sysid.policies.walks.effort import KINDS, LOW_SWING_M, EffortMeter
 from pupper_sysid.policies.walks.rollouts import heading
 from pupper_sysid.policies.walks.tracking import (
     ERRORS,
@@ -29,8 +31,6 @@ Array = NDArray[np.float64]
 
 START_S = 1.0
 """Time in which a robot starts to move, without which mean speeds are given [s]."""
-
-_SHORTEST_SWING_S = 0.04  # shorter ones are flickering contacts
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,16 @@ class Walk:
     """Length of the swings that ended, summed; shape (steps, episodes)."""
     swings: NDArray[np.int_]
     """How many ended; shape (steps, episodes)."""
+    clearance_m: NDArray[np.float32]
+    """Of the swings that ended, NaN of other feet; shape (steps, episodes, 4)."""
+    saturated: NDArray[np.float32]
+    """Share of the time at the torque limit by kind of joint; shape (steps, episodes, 3)."""
+    torque_square: NDArray[np.float32]
+    """Mean square of torque over limit by kind of joint; shape (steps, episodes, 3)."""
+    work_j: Array
+    """Positive work of all servos; shape (steps, episodes)."""
+    carried_j: Array
+    """Weight times distance; shape (steps, episodes)."""
 
     @property
     def error(self) -> Array:
@@ -155,6 +165,23 @@ class Figures(Result):
     """Mean length of a swing."""
     foot_slip_m_s: float
     """Mean speed of feet on the ground."""
+    clearance_p10_m: float
+    """Tenth percentile of the clearance over all swings: the largest height of the sole over the
+    ground in a swing (`policies.walks.effort`); NaN without a swing, as the next two."""
+    clearance_p50_m: float
+    """Its median."""
+    low_swing_share: float
+    """Share of the swings whose clearance is below 2 mm."""
+    torque_saturated_share: dict[str, float]
+    """Share of the time in which a servo is at its torque limit, by kind of joint (`hip`, `thigh`,
+    `calf`)."""
+    rms_torque_share: dict[str, float]
+    """Root mean square of torque over its limit, by kind of joint."""
+    mechanical_power_w: float
+    """Mean positive work of all servos over time."""
+    cost_of_transport: float
+    """Positive work over weight times distance, of the mean motion over a stride; NaN where the
+    command is to stay in place."""
     intervals: Intervals
 
 
@@ -165,6 +192,7 @@ class Recorder:
         self._env = env
         self._step_s = env.config.control_step_s
         self._fell = np.zeros(env.environments, bool)
+        self._effort = EffortMeter(env)
         self._steps: list[dict[str, NDArray]] = []
 
     def keep(self, now: Moment) -> None:
@@ -172,8 +200,8 @@ class Recorder:
         facts = now.facts
         self._fell |= now.fell
         standing = facts.contact & now.alive[:, None]
-        ended = standing & (facts.contact_s <= self._step_s + 1e-9)
-        ended &= facts.last_air_s > _SHORTEST_SWING_S - 1e-9
+        effort = self._effort.of(facts)
+        ended = effort.swing_ended & now.alive[:, None]
         # before the first step a foot may have been elsewhere: its speed is not known
         slip = facts.foot_speed_m_s * standing if self._steps else np.zeros(standing.shape)
         self._steps.append(
@@ -182,6 +210,10 @@ class Recorder:
                 "gravity": facts.gravity.astype(np.float32),
                 "heading": heading(self._env.robots.qpos), "slip_m_s": slip.sum(axis=1),
                 "swing_s": (facts.last_air_s * ended).sum(axis=1), "swings": ended.sum(axis=1),
+                "clearance_m": np.where(ended, effort.clearance_m, np.nan).astype(np.float32),
+                "saturated": effort.saturated.astype(np.float32),
+                "torque_square": effort.torque_square.astype(np.float32),
+                "work_j": effort.work_j, "carried_j": effort.carried_j,
             }
         )  # fmt: skip
 
@@ -218,10 +250,35 @@ def figures_of(found: Walk, command: tuple[float, float, float] | None = None) -
         stride_hz=float(found.stride_hz.mean()),
         swing_s=float(found.swing_s.sum() / swings) if swings else float("nan"),
         foot_slip_m_s=float(found.slip_m_s.sum() / max(standing, 1)),
+        **_effort(found, command is None or any(command[:2])),
         intervals=Intervals(
             fall_rate=share_interval(int(found.fell.sum()), len(found.fell)), **intervals
         ),
     )
+
+
+def _effort(found: Walk, travels: bool) -> dict[str, Any]:
+    """Clearance of the swings and effort of the servos, by the names of `Figures`."""
+    alive, nothing = found.alive, float("nan")
+    clearance = found.clearance_m[alive]
+    clearance = clearance[np.isfinite(clearance)]
+    low, middle = np.quantile(clearance, (0.1, 0.5)) if len(clearance) else (nothing, nothing)
+    up_s = found.step_s * alive.sum()
+    work, carried = found.work_j[alive].sum(), found.carried_j[alive].sum()
+
+    def by_kind(each: NDArray) -> dict[str, float]:
+        means = each[alive].mean(axis=0, dtype=float) if up_s else np.full(len(KINDS), nothing)
+        return dict(zip(KINDS, means.tolist(), strict=True))
+
+    return {
+        "clearance_p10_m": float(low),
+        "clearance_p50_m": float(middle),
+        "low_swing_share": float((clearance < LOW_SWING_M).mean()) if len(clearance) else nothing,
+        "torque_saturated_share": by_kind(found.saturated),
+        "rms_torque_share": {k: v**0.5 for k, v in by_kind(found.torque_square).items()},
+        "mechanical_power_w": float(work / up_s) if up_s else nothing,
+        "cost_of_transport": float(work / carried) if travels and carried else nothing,
+    }
 
 
 def _share(found: Walk, command: Array) -> Array:

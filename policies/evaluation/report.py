@@ -23,6 +23,7 @@ from pupper_sysid.policies.evaluation.figures import Figures
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.train.curves import LARGEST_BYTES, PROGRESS
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run
+from pupper_sysid.policies.walks.effort import KINDS
 from pupper_sysid.policies.walks.tracking import STRIDE_ERRORS
 
 ERRORS = {
@@ -80,13 +81,17 @@ def walking_sections(
             ],
             tables=[
                 Table("walks", "Errors, and what the feet do", _columns(), tuple(rows)),
+                _table_of_effort(found),
                 *_table_of_falls(found),
             ],
             notes=[
                 "Errors are of the mean velocity over a stride; of every instant they are in the "
                 "JSON result. A robot that fell counts as one that stands still until the "
                 "end. duty: share of time a foot is on the ground; slip: speed of feet on it; "
-                "speed: mean speed along the command over the commanded one."
+                "speed: mean speed along the command over the commanded one. clearance: largest "
+                "height of the sole over the ground in a swing; low: below 2 mm; at limit: share "
+                "of the time in which a servo gives all of its torque; power: positive work of "
+                "all servos over time; cost of transport: that over weight times distance."
             ],
         ),
     ]
@@ -180,6 +185,35 @@ def _columns() -> tuple[Column, ...]:
         Column("strides/s", lambda row: f"{row['stride_hz']:.1f}"),
         Column("slip, m/s", lambda row: f"{row['slip']:.3f}"),
     )
+
+
+def _table_of_effort(found: Evaluation) -> Table:
+    """Clearance of the swings and effort of the servos, of policy and trot."""
+
+    def column(title: str, key: str, scale: float, digits: int) -> Column:
+        def text(row: Mapping[str, Any]) -> str:
+            value = row[key]
+            return f"{scale * value:.{digits}f}" if value is not None else "–"
+
+        return Column(title, text)
+
+    rows = tuple(
+        {"walk": row.name, "walker": walker} | own.rows()[0]
+        for row in found.conditions
+        for walker, own in (("policy", row.policy), ("trot", row.trot))
+    )
+    columns = (
+        Column("", lambda row: row["walk"], "key"),
+        Column("walker", lambda row: row["walker"]),
+        column("clearance p10, mm", "clearance_p10_m", 1e3, 1),
+        column("p50, mm", "clearance_p50_m", 1e3, 1),
+        column("low swings, %", "low_swing_share", 100, 0),
+        *(column(f"{k} at limit, %", f"torque_saturated_share_{k}", 100, 0) for k in KINDS),
+        *(column(f"{k} rms, % of limit", f"rms_torque_share_{k}", 100, 0) for k in KINDS),
+        column("power, W", "mechanical_power_w", 1, 1),
+        column("cost of transport", "cost_of_transport", 1, 1),
+    )
+    return Table("effort", "Clearance of the swings, and effort of the servos", columns, rows)
 
 
 def _table_of_falls(found: Evaluation) -> list[Table]:

@@ -18,6 +18,7 @@ import torch
 from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.policies.network.policy_file import (
+    CommandRanges,
     ObservationPart,
     Policy,
     save_policy,
@@ -46,8 +47,11 @@ def write_policy(
     action_history: int,
     training: dict[str, Any],
     force: bool = True,
+    command_share: float = 1.0,
 ) -> None:
     """Write the policy folder of an rsl_rl actor's weights.
+
+    `command_share` is the share of the task's commands that the curriculum has come to.
 
     Raises
     ------
@@ -82,6 +86,7 @@ def write_policy(
         "feedback": servo.feedback,
         "dead_time_s": [float(delays.min()), float(delays.max())],
         "servo": servo.model_dump(mode="json", by_alias=True),
+        "commands": CommandRanges.of(task.commands, command_share).model_dump(mode="json"),
         "training": training,
     }
     save_policy(folder, network, about, force)

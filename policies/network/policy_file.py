@@ -1,10 +1,9 @@
 """Policy files: a folder with weights (safetensors) and a contract (JSON); nothing is unpickled.
 
 The contract defines a policy's inputs and outputs: names and order of the observation, scales,
-default pose, joint order, rates, and the servos and feedback of its training
-(`policies.network.trained_servo`). `load_policy`
-refuses other files. Every policy passes the gate `refuse_bad` before it is written: no NaN, right
-shapes, and actions that depend on the observation.
+default pose, joint order, rates, and the commands, servos (`policies.network.trained_servo`) and
+feedback of its training. `load_policy` refuses other files. Every policy passes the gate
+`refuse_bad` before it is written: no NaN, right shapes, and actions that depend on the observation.
 """
 
 from __future__ import annotations
@@ -37,9 +36,10 @@ from pupper_sysid.common.reading.tensors import refuse_large_header
 from pupper_sysid.policies.network.hyperparameters import Kind
 from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
 from pupper_sysid.policies.network.trained_servo import SERVO_VERSION, TrainedServo
+from pupper_sysid.sim.walking.config import Commands
 from pupper_sysid.sim.walking.observation import OBSERVATION, VELOCITY_STEPS
 
-SCHEMA, VERSION = "pupper-policy", 3
+SCHEMA, VERSION = "pupper-policy", 4
 CONTRACT, WEIGHTS = "contract.json", "weights.safetensors"
 _LARGEST_BYTES = 200_000_000
 _AGAIN = "Copy the whole folder again."
@@ -62,11 +62,68 @@ class ObservationPart(_Part):
     unit: str
 
 
+_Ends = Annotated[list[Annotated[float, Field(ge=-100, le=100)]], Field(min_length=2, max_length=2)]
+
+
+class CommandRanges(_Part):
+    """Commands of a training: lowest and highest of each part."""
+
+    forward_m_s: _Ends
+    sideways_m_s: _Ends
+    """To the left."""
+    yaw_rad_s: _Ends
+    """Turn rate to the left."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if not all(low <= high for low, high in self._ends):
+            raise ValueError("the lower end of a range must come first")
+        return self
+
+    @classmethod
+    def of(cls, commands: Commands, share: float = 1.0) -> Self:
+        """The ranges of a task, or a `share` of them."""
+        ends = {name: [share * end for end in getattr(commands, name)] for name in cls.model_fields}
+        return cls(**ends)
+
+    @property
+    def _ends(self) -> list[list[float]]:
+        return [self.forward_m_s, self.sideways_m_s, self.yaw_rad_s]
+
+    def clip(self, commands: np.ndarray) -> np.ndarray:
+        """The nearest commands within the ranges, each part by itself, shape (..., 3)."""
+        low, high = np.array(self._ends).T
+        return np.clip(commands, low, high)
+
+    def clipped(self, commands: np.ndarray, say: Callable[[str], None]) -> np.ndarray:
+        """`clip`, with one sentence if that changes anything.
+
+        Parameters
+        ----------
+        commands : ndarray, shape (k, 3)
+        say : callable
+            Called with the sentence.
+        """
+        within = self.clip(commands)
+        changed = np.flatnonzero((within != commands).any(axis=1))
+        if len(changed):
+            first = (" ".join(f"{v:g}" for v in x[changed[0]]) for x in (commands, within))
+            which = "command {} was clipped to {},".format(*first)
+            if len(commands) > 1:
+                which = f"{len(changed)} of {len(commands)} commands were clipped to"
+            say(f"The {which} what the policy was trained for ({self}).")
+        return within
+
+    def __str__(self) -> str:
+        parts = zip(("forward", "left", "turn"), self._ends, ("m/s", "m/s", "rad/s"), strict=True)
+        return ", ".join(f"{name} {low:g} to {high:g} {unit}" for name, (low, high), unit in parts)
+
+
 class Contract(_Part):
     """Inputs, outputs and training of a policy."""
 
     schema_name: Annotated[Literal["pupper-policy"], Field(alias="schema")]
-    schema_version: Literal[1, 2, 3]
+    schema_version: Literal[1, 2, 3, 4]
     kind: Kind
     hidden: Annotated[list[Annotated[int, Field(gt=0, le=8192)]], Field(max_length=16)]
     memory: Annotated[int, Field(gt=0, le=8192)]
@@ -94,6 +151,8 @@ class Contract(_Part):
     """Shortest and longest dead time it was trained with; `delay_s` in version 1."""
     servo: TrainedServo | None = None
     """The servos it was trained with, whole; null is no evidence of any. From version 3 on."""
+    commands: CommandRanges | None = None
+    """Commands it was trained for; null where the file does not say. From version 4 on."""
     training: dict[str, Any]
     versions: dict[str, str]
     weights_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]

@@ -119,6 +119,11 @@ class _Probe:
         return {"kl": float(kl.mean()), "clip_fraction": float(clipped.float().mean())}
 
 
+def _copied(state: dict[str, Any]) -> dict[str, Any]:
+    """A copy of an optimiser's state of one parameter."""
+    return {k: v.clone() if isinstance(v, torch.Tensor) else v for k, v in state.items()}
+
+
 class Learner:
     """An environment, a policy, a critic and PPO.
 
@@ -126,6 +131,8 @@ class Learner:
     ----------
     exact : bool
         Whether a loaded checkpoint goes on exactly; see `PupperEnv.restore`.
+    taken_back : bool
+        Whether the last update was undone, because it changed the actions too much.
 
     Raises
     ------
@@ -143,7 +150,7 @@ class Learner:
     ):
         self.env, self.architecture, self.hyper = env, architecture, hyper
         self.ranks = ranks or Ranks()
-        self.iteration, self.exact = 0, True
+        self.iteration, self.exact, self.taken_back = 0, True, False
         # the networks of all ranks start alike; their samples must differ
         torch.manual_seed(seed)
         # at different steps, so that not all episodes end in the same update
@@ -285,16 +292,22 @@ class Learner:
                 network.obs_normalizer.until = 0  # pyright: ignore[reportArgumentType]
         probe = _Probe.of(ppo)
         before = [parameter.detach().clone() for parameter in ppo.actor.parameters()]
+        moments = [_copied(ppo.optimizer.state.get(p, {})) for p in ppo.actor.parameters()]
         losses = ppo.update()
         self.iteration += 1
         found = {name: self.ranks.mean(value) for name, value in probe.compare(ppo).items()}
+        self.taken_back = actor_learns and found["kl"] > _LOST * self.hyper.desired_kl
         if actor_learns:
             self._adapt(found["kl"])
             # Adam's first steps are as long as its rate, whatever the gradient
-            if found["kl"] > _LOST * self.hyper.desired_kl:
+            if self.taken_back:
                 with torch.no_grad():
                     for parameter, value in zip(ppo.actor.parameters(), before, strict=True):
                         parameter.copy_(value)
+                # of its first update Adam keeps the moments: without them the next would be as long
+                for parameter, state in zip(ppo.actor.parameters(), moments, strict=True):
+                    if state:
+                        ppo.optimizer.state[parameter] = state
             self._average.update_parameters(ppo.actor)
         return losses | found
 

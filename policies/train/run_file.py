@@ -40,6 +40,7 @@ LearnerDevice = Literal["as-device", "cpu", "cuda"]
 RUN_SCHEMA = "pupper-run"
 RUN_VERSION = 2
 RUN_FILE = "run.yaml"
+_OF_TEACHER = (*CLOCK, "clock_duty", "crouch", "spread")  # parameters of its rewards
 _OF_ACTIONS = ("action_scale", "control_step_s", "knee")  # settings that say what actions mean
 _TEACHING = 0.6  # of a run's time: the most that its own teacher may take
 _DROPPED: dict[type, set[str]] = {
@@ -63,6 +64,10 @@ class Run:
     calibration whose feedback to take."""
     architecture: Architecture = field(default_factory=Architecture)
     task: Walking = field(default_factory=Walking)
+    first_gait: Literal["auto", "fit", "keep"] = "auto"
+    """`auto`: where the open-loop trot walks badly on the servos, one that suits them is searched
+    before the training (a minute on two cores), imitated, and written into `task.trot`; `fit`:
+    search in any case; `keep`: take `task.trot` as it is."""
     learner: Hyperparameters = field(default_factory=Hyperparameters)
     imitation: Imitation = field(default_factory=Imitation)
     environments: int = 512
@@ -70,7 +75,8 @@ class Run:
     iterations: int = 400
     """Updates of PPO, after imitation; training ends when they are done."""
     minutes: float = 120.0
-    """Training ends after this time, too."""
+    """Training ends after this time, too, of which the first gait and a teacher are parts; the
+    policy so far is saved and plays."""
     threads: int = 0
     """Of physics and of torch, each; 0 for all cores (one per process with torchrun)."""
     device: Device = "cpu"
@@ -169,7 +175,7 @@ def _teacher(kind: Kind) -> Run:
 def teacher_of(run: Run) -> Run:
     """Settings of the teacher that a run trains for itself: for the same robot and actions."""
     own = _teacher("mlp")
-    rewards = replace(own.task.rewards, **{n: getattr(run.task.rewards, n) for n in CLOCK})
+    rewards = replace(own.task.rewards, **{n: getattr(run.task.rewards, n) for n in _OF_TEACHER})
     steps = run.task.control_step_s / own.task.physics_step_s
     even = abs(steps - round(steps)) < 1e-6
     task = replace(

@@ -21,14 +21,15 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
 _SEED = 1_000_003
 _SECONDS, _IGNORED = 5.0, 0.2
-_COMMANDS = np.array(
+COMMANDS = np.array(
     [
         [0.15, 0, 0], [-0.15, 0, 0], [0, 0.08, 0], [0, -0.08, 0], [0, 0, 0.4], [0, 0, -0.4],
         [0.1, 0.05, 0], [0.1, 0, 0.3], [-0.1, 0, 0.3], [0.1, 0, -0.3], [0.05, 0, 0], [0, 0, 0],
     ]
 )  # fmt: skip
+"""Of the walks that are judged [m/s, m/s, rad/s]."""
 _EACH = 4
-_STANDING = np.abs(_COMMANDS).mean(axis=0)  # errors of a robot that stands [m/s, m/s, rad/s]
+_STANDING = np.abs(COMMANDS).mean(axis=0)  # errors of a robot that stands [m/s, m/s, rad/s]
 
 
 class Judge:
@@ -62,9 +63,9 @@ class Judge:
         seconds = min(_SECONDS, task.episode_s)
         task = evaluation_task(task, 2 * seconds)
         self._steps = round(seconds / task.control_step_s)
-        robots = _EACH * len(_COMMANDS)
+        robots = _EACH * len(COMMANDS)
         env = PupperEnv(task, servos, robots, seed + _SEED, threads, servo_model)
-        self._command = np.repeat(_COMMANDS, _EACH, axis=0)
+        self._command = np.repeat(COMMANDS, _EACH, axis=0)
         env.set_command(self._command)
         self._env = WalkingVecEnv(env, action_history, device)
         self._start = self._env.state
@@ -103,14 +104,25 @@ class Judge:
                 actor.reset(dones)
         actor.reset(hidden_state=kept)
         landed, duty = np.mean(feet[first:], axis=0)
-        found = _scored(np.array(velocity)[first:], np.array(up)[first:], self._command)
+        found = scored(np.array(velocity)[first:], np.array(up)[first:], self._command)
         rate = float(landed / env.env.config.control_step_s)
         return found | {"score_steps_hz": rate, "score_duty": float(duty)}
 
 
-def _scored(
+def scored(
     velocity: NDArray[np.float64], up: NDArray[np.bool_], command: NDArray[np.float64]
 ) -> dict[str, float]:
+    """Score of walks with its parts; see `Judge`.
+
+    Parameters
+    ----------
+    velocity : ndarray, shape (steps, n, 3)
+        Forward and sideways speed [m/s], turn rate [rad/s].
+    up : ndarray of bool, shape (steps, n)
+        Whether the robot has not fallen so far.
+    command : ndarray, shape (n, 3)
+        `COMMANDS`, or others.
+    """
     fell = ~up[-1]
     # a robot that fell has the errors of one that stands, from then on
     shown = np.where(up[..., None], velocity, 0.0)
@@ -125,5 +137,5 @@ def _scored(
         "score_vx_m_s": float(instant[0]),
         "score_vy_m_s": float(instant[1]),
         "score_yaw_rad_s": float(instant[2]),
-        "score_turn": float(turn.mean()),
+        "score_turn": float(turn.mean()) if len(turn) else float("nan"),
     }

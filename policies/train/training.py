@@ -5,8 +5,9 @@
 see `policies.train.learner`), and `policy_last/`, `policy_best/` (see
 `policies.network.policy_file`). The best has the highest score so far (`policies.train.selection`),
 imitation alone included; that is also kept as `policy_imitated/`, so that PPO's share can be
-measured. A run that learns from a teacher of its own has that teacher's run in `teacher/`, which
-has no policies: they would see what no robot can.
+measured. The last is written with every checkpoint and at every stop. A run that learns from a
+teacher of its own has that teacher's run in `teacher/`, which has no policies: they would see what
+no robot can.
 """
 
 from __future__ import annotations
@@ -46,8 +47,10 @@ from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 
 LAST, BEST = "last.pt", "best.pt"
-_TEACHER = "teacher"
+_TEACHER, _POLICY_LAST = "teacher", "policy_last"
 _SAVE_EVERY = 10
+_UNDONE_SAID, _UNDONE_END = 10, 50  # updates in a row that are taken back
+_IMITATING, _FEWEST_ROUNDS = 0.75, 3  # of the time after a first round; rounds of imitation
 _JUDGE_EVERY = 50
 
 
@@ -129,12 +132,15 @@ def train(
     minutes: float | None = None,
     notice: Callable[[str], None] = lambda text: None,
     stopping: Callable[[str], None] = lambda text: None,
+    spent_s: float = 0.0,
 ) -> Learner:
     """Begin a run in an empty folder, or (with `run` None) resume the one in it.
 
-    Ctrl-C ends it after the present update, with everything saved; a second one ends it at once
-    (KeyboardInterrupt). So does a termination signal if the update ends in time; else the process
-    ends within a second. The run can then be resumed from its last checkpoint.
+    Ctrl-C, and the end of the run's minutes, end it after the present update, with everything
+    saved; a second Ctrl-C ends it at once (KeyboardInterrupt). So does a termination signal if the
+    update ends in time; else the process ends within a second. A round of imitation is left at
+    once, and repeated when the run is resumed. The run can be resumed from its last checkpoint,
+    and its last policy can be played.
 
     Parameters
     ----------
@@ -145,9 +151,11 @@ def train(
     iterations, minutes : optional
         New end of a resumed run.
     notice : callable
-        Called with a sentence where a run does not go on exactly.
+        Called with a sentence where a run does not go on exactly, or its time is short.
     stopping : callable
         Called after the first Ctrl-C with what it does.
+    spent_s : float
+        Time that counts towards the minutes of a run that begins [s].
 
     Raises
     ------
@@ -159,7 +167,7 @@ def train(
     resumed = run is None
     settings = resume_run(folder, iterations, minutes) if run is None else run
     with finishing(stopping) as stop_requested:
-        session = _Session(folder, settings, resumed, watch)
+        session = _Session(folder, settings, resumed, watch, spent_s, notice)
         if not session.learner.exact and session.ranks.rank == 0:
             notice(
                 f"{folder} was begun with another model of the robot, by an older version: it goes "
@@ -179,7 +187,11 @@ class _Session:
         run: Run,
         resumed: bool,
         watch: Callable[[Progress], None] | None,
+        spent_s: float = 0.0,
+        notice: Callable[[str], None] = lambda text: None,
     ):
+        self.notice, self.undone = notice, 0  # updates in a row that were taken back
+        begun = time.monotonic()
         self.ranks = Ranks.join()
         self.folder, self.watch = folder, watch
         self.run = run
@@ -191,7 +203,7 @@ class _Session:
             self.learner.env.device,
         )  # fmt: skip
         self.counters: dict[str, Any] = {
-            "elapsed_s": 0.0, "imitated": 0, "best": None, "scores": {},
+            "elapsed_s": spent_s, "imitated": 0, "best": None, "scores": {},
         }  # fmt: skip
         if resumed:
             self.counters = self.learner.load(folder / _rank_file(LAST, self.ranks))
@@ -201,7 +213,7 @@ class _Session:
             "imitation": self.counters["imitated"], "ppo": self.learner.iteration,
         }  # fmt: skip
         self.writer = CurveWriter(folder, self.done_before) if self.ranks.rank == 0 else None
-        self.started = time.monotonic() - self.counters["elapsed_s"]
+        self.started = begun - self.counters["elapsed_s"]
         self.phase_began = self.started
 
     def _begin(self) -> None:
@@ -219,48 +231,89 @@ class _Session:
 
     def go(self, stop_requested: Callable[[], bool]) -> None:
         """All that remains of the run, until its end or a stop; then everything is saved."""
-        self.learn_first_gait(stop_requested)
-        self.improve(stop_requested)
-        self.save(LAST)
+
+        def ends() -> bool:
+            """Whether to stop; all processes agree."""
+            late = time.monotonic() - self.started >= 60 * self.run.minutes
+            return self.ranks.any(stop_requested() or late)
+
+        if self.learn_first_gait(ends):
+            self.improve(ends)
+            self.save(LAST)
         self.finish()
 
-    def learn_first_gait(self, stop_requested: Callable[[], bool]) -> None:
-        """The remaining rounds of imitation."""
-        learner, rounds = self.learner, self.run.imitation.iterations
-        if self.counters["imitated"] >= rounds:
-            return
-        teacher = self.teacher(stop_requested)
+    def learn_first_gait(self, ends: Callable[[], bool]) -> bool:
+        """The remaining rounds of imitation; whether all that was learned is in a checkpoint."""
+        learner = self.learner
+        if self.counters["imitated"] >= self.rounds or ends():
+            return True
+        teacher = self.teacher(ends)
         self.phase_began = time.monotonic()
-        while self.counters["imitated"] < rounds and not self.ranks.any(stop_requested()):
-            before = learner.networks()
-            error = imitate(learner, teacher, self.run.imitation, self.counters["imitated"])
+        while teacher and self.counters["imitated"] < self.rounds and not ends():
+            before, begun = learner.networks(), time.monotonic()
+            how = replace(self.run.imitation, iterations=self.rounds)
+            error = imitate(learner, teacher, how, self.counters["imitated"], ends)
+            if error is None:
+                self.refuse_nan(before, [])
+                return False
             self.refuse_nan(before, [error])
             self.counters["imitated"] += 1
             self.counters["teacher"] = teacher.state
-            self.report("imitation", self.counters["imitated"], rounds, {"difference": error})
+            if self.counters["imitated"] == 1:
+                self.plan_rounds(time.monotonic() - begun)
+            self.report("imitation", self.counters["imitated"], self.rounds, {"difference": error})
             self.save(LAST)
+            self.write_policy(_POLICY_LAST)
+        return True
 
-    def teacher(self, stop_requested: Callable[[], bool]) -> Teacher:
-        """Who shows the first gait; a teacher of the run's own is trained first, or to its end."""
+    @property
+    def rounds(self) -> int:
+        """Rounds of imitation; fewer than the run's where its minutes are too few for them."""
+        return self.counters.get("rounds", self.run.imitation.iterations)
+
+    def plan_rounds(self, round_s: float) -> None:
+        """After the first of its rounds, plan as many as most of the time is enough for.
+
+        The learning rate falls to 0 with the last round: one that was cut off would walk worse than
+        one of fewer rounds.
+        """
+        wanted = self.run.imitation.iterations
+        remaining_s = 60 * self.run.minutes - (time.monotonic() - self.started)
+        fit = 1 + int(_IMITATING * remaining_s / max(self.ranks.mean(round_s), 1e-9))
+        planned = int(self.ranks.mean(max(fit, _FEWEST_ROUNDS)))
+        if planned < wanted:
+            self.counters["rounds"] = planned
+            self.notice(
+                f"A round of the first gait takes {round_s:.0f} s, so that {planned} of {wanted} "
+                f"are made within --minutes {self.run.minutes:g}."
+            )
+
+    def teacher(self, ends: Callable[[], bool]) -> Teacher | None:
+        """What shows the first gait; a teacher of the run's own is trained first, or to its end.
+
+        None if a stop came first.
+        """
         learner, wanted = self.learner, self.run.imitation.teacher
         state = self.counters.get("teacher")
         if wanted == TROT:
             return TrotTeacher(learner.env, state)
         # a resumed run is to draw what it would have drawn
         with torch.random.fork_rng(devices=[]):
-            folder = Path(wanted) if wanted != OWN else self._train_teacher(stop_requested)
+            folder = Path(wanted) if wanted != OWN else self._train_teacher(ends)
+        if ends():
+            return None
         return LearnedTeacher(learner.env, self._network_of(folder), state)
 
     def _network_of(self, teacher: Path) -> MLPModel:
         with torch.random.fork_rng(devices=[]):
             return load_teacher(teacher, BEST, self.run, self.learner.observations)
 
-    def _train_teacher(self, stop_requested: Callable[[], bool]) -> Path:
+    def _train_teacher(self, ends: Callable[[], bool]) -> Path:
         folder = self.folder / _TEACHER
         begun = (folder / RUN_FILE).is_file()
         own = resume_run(folder, None, None) if begun else teacher_of(self.run)
         session = _Session(folder, own, begun, self._watch_teacher)
-        session.go(stop_requested)
+        session.go(ends)
         self.ranks.any(False)  # the first has written it
         # its time is this run's, also where that was killed meanwhile
         now = time.monotonic()
@@ -272,12 +325,12 @@ class _Session:
         if self.watch:
             self.watch(replace(progress, phase="teacher"))
 
-    def improve(self, stop_requested: Callable[[], bool]) -> None:
+    def improve(self, ends: Callable[[], bool]) -> None:
         """Updates of PPO, until they are done, time is up or a stop is requested."""
-        if self.counters["imitated"] < self.run.imitation.iterations:
+        if self.counters["imitated"] < self.rounds:
             return
         learner, episodes = self.learner, EpisodeMeans(self.learner.env.num_envs)
-        if self.ranks.any(stop_requested()):
+        if ends():
             return
         if not self.counters["scores"]:
             self.counters["scores"] = self.judge(learner.averaged)
@@ -285,9 +338,7 @@ class _Session:
             if self.run.imitation.iterations:
                 self.write_policy("policy_imitated")
         self.phase_began = time.monotonic()
-        while learner.iteration < self.run.iterations and not self.ranks.any(
-            stop_requested() or time.monotonic() - self.started >= 60 * self.run.minutes
-        ):
+        while learner.iteration < self.run.iterations and not ends():
             begun = time.perf_counter()
             learner.rollout(episodes)
             collected = time.perf_counter()
@@ -314,8 +365,30 @@ class _Session:
             )
             if judged:
                 self.keep_best()
+            if self.stuck():
+                return
             if learner.iteration % _SAVE_EVERY == 0:
                 self.save(LAST)  # after the best, or a resumed run would not know its best
+                self.write_policy(_POLICY_LAST)
+
+    def stuck(self) -> bool:
+        """Whether PPO's updates are taken back again and again, so that the policy stays as it is.
+
+        It is said when they repeat, and what helps when the run ends for it.
+        """
+        self.undone = self.undone + 1 if self.learner.taken_back else 0
+        if self.undone not in (_UNDONE_SAID, _UNDONE_END):
+            return False
+        ends = self.undone == _UNDONE_END
+        kl = self.run.learner.desired_kl
+        self.notice(
+            f"The last {self.undone} updates of PPO were taken back, because each changed the "
+            "actions too much: the policy stays as it is. "
+            + ("The run ends here. " if ends else f"The run ends after {_UNDONE_END} of them. ")
+            + f"Begin one with a larger step per update, --learner.desired-kl {2 * kl:g}, or with "
+            "more noise, --learner.exploration.std."
+        )
+        return ends
 
     def keep_best(self) -> None:
         """Save the policy if it walks better than those before."""
@@ -327,7 +400,7 @@ class _Session:
 
     def finish(self) -> None:
         """Write the last policy, and end the curves."""
-        self.write_policy("policy_last")
+        self.write_policy(_POLICY_LAST)
         if self.writer:
             self.writer.close()
 
@@ -345,10 +418,13 @@ class _Session:
             **self.counters["scores"], "seed": self.run.seed, "samples": self.learner.samples,
             "elapsed_s": self.counters["elapsed_s"],
         }  # fmt: skip
-        write_policy(
-            self.folder / name, self.learner.averaged.state_dict(), self.run, servos,
-            action_history(self.run, servos), about,
-        )  # fmt: skip
+        # new networks draw their weights, which must not change what the run draws
+        with torch.random.fork_rng(devices=[], enabled=name == _POLICY_LAST):
+            write_policy(
+                self.folder / name, self.learner.averaged.state_dict(), self.run, servos,
+                action_history(self.run, servos), about,
+                command_share=self.learner.env.env.level.commands,
+            )  # fmt: skip
 
     def report(
         self, phase: Literal["imitation", "ppo"], done: int, total: int, row: dict[str, float]
@@ -362,8 +438,7 @@ class _Session:
         if self.watch and self.ranks.rank == 0:
             steps = max(done - self.done_before[phase], 1)
             left = (total - done) * (now - self.phase_began) / steps
-            if phase == "ppo":
-                left = min(left, 60 * self.run.minutes - elapsed)
+            left = min(left, 60 * self.run.minutes - elapsed)
             self.watch(Progress(phase, done, total, elapsed, row, max(left, 0.0)))
 
     def refuse_nan(self, before: dict[str, Any], numbers: Iterable[float]) -> None:

@@ -37,8 +37,8 @@ RANDOM = Commands((-0.2, 0.2), (-0.1, 0.1), (-0.5, 0.5), standing=0.0, single=0.
 """Random commands: uniform in all three at once, new ones at exponential intervals."""
 
 Walker = Literal["policy", "trot", "standing"]
-"""By what a robot walks: the policy; the open-loop trot with a clock (`Trot()`), which sees nothing
-but its command; or set-points that stay."""
+"""By what a robot walks: the policy; an open-loop trot with a clock, which sees nothing but its
+command (`Trot()`, or the one that the training fitted to its servos); or set-points that stay."""
 
 Change = Callable[[int, NDArray[np.float32]], NDArray[np.floating]]
 """`change(step, observation)` returns the observation, shape (n, 60), for the policy; it may alter

@@ -33,6 +33,7 @@ from pupper_sysid.policies.walks.handicaps import (
     see_slope,
 )
 from pupper_sysid.sim.robot.trot import Trot
+from pupper_sysid.sim.walking.config import PRESETS, Walking
 from pupper_sysid.sim.walking.draws import at_rest
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
@@ -227,7 +228,7 @@ class _Group:
             np.flatnonzero(np.repeat([c.walker == w for c in conditions], np.diff(ends)))
             for w in ("policy", "trot")
         )
-        self.trot = Trot()
+        self.trot = _reference(task)
         self.last = np.zeros(len(conditions), int)  # steps until none of a condition was up
 
     def walk(self, advance: Callable[[float], bool]) -> bool:
@@ -294,6 +295,12 @@ class _Group:
         """What was kept, by condition."""
         given = zip(self.conditions, self.robots, self.last.tolist(), strict=True)
         return [self.recorder.of(c, robots, n, self.commands[:, robots]) for c, robots, n in given]
+
+
+def _reference(task: Walking) -> Trot:
+    """The trot beside a policy: the usual one, or that which was fitted to its servos."""
+    usual = [preset.trot for preset in PRESETS.values()]
+    return Trot() if task.trot in usual else task.trot
 
 
 def _numbers(robots: slice) -> NDArray[np.intp]:

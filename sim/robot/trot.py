@@ -48,6 +48,10 @@ class Trot:
     gain: float = 0.895
     """Speed of the feet over the commanded speed; this robot walks a little farther than its feet
     while it trots."""
+    back_gain: float = 1.0
+    """Factor on `gain` backward."""
+    side_gain: float = 1.0
+    """Factor on `gain` sideways."""
     turn_gain: float = 0.785
     """The same of turning: this robot turns farther than its feet while it trots."""
     turn_dead_band_rad_s: float = 0.087
@@ -138,7 +142,8 @@ class Trot:
     def _strokes(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
         """Half of each foot's stroke along x and y [m], shape (n, 4, 2)."""
         x, y = self._centre[:, 0], self._centre[:, 1]
-        forward, left = self.gain * command[:, :1], self.gain * command[:, 1:2]
+        ahead = self.gain * np.where(command[:, :1] < 0, self.back_gain, 1.0)
+        forward, left = ahead * command[:, :1], self.gain * self.side_gain * command[:, 1:2]
         turn = self._turn(command)[:, None]
         speed = np.stack([forward - turn * y, left + turn * x], axis=-1)
         # from +A to -A while it stands

@@ -10,7 +10,7 @@ machine can; `robot.trunk` gives the true motion.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -20,9 +20,59 @@ from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.imu import ImuSample
 from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.robot import EmulatedRobot
-from pupper_sysid.sim.walking.robot import WalkingRobot
+from pupper_sysid.sim.emulator.robot import (
+    SHORTEST_DELAY_S,
+    EmulatedRobot,
+    RobotSpec,
+    draw_robot,
+)
+from pupper_sysid.sim.walking.robot import PHYSICS_STEP_S, WalkingRobot
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+
+
+def calibrated_robot(servos: ServoRanges, rng: np.random.Generator) -> EmulatedRobot:
+    """An emulated Mini Pupper 2 with the servos of a calibration.
+
+    Its servos have the calibration's values and lag; the shortest dead time that can be emulated is
+    2 ms. The bus polls all of them with the median of their periods and losses. Counts, offsets of
+    the readings and the host's timing are those of `draw_robot`.
+
+    Parameters
+    ----------
+    servos : ServoRanges
+        Of a calibration or preset; a learned model has no such numbers.
+    rng : numpy.random.Generator
+        Draws offsets and phases.
+
+    Raises
+    ------
+    InputError
+        If a servo is not stable in the emulator's physics steps.
+    """
+    feedback = servos.feedback
+    spec = RobotSpec(
+        poll_period_s=float(np.median([own.poll_period_s for own in feedback])),
+        loss=float(np.median([own.loss for own in feedback])),
+        command_jitter_s=servos.command_jitter_s,
+    )
+    drawn = draw_robot(rng, spec)
+    own = servos.in_steps_of(PHYSICS_STEP_S).nominal()
+    return replace(
+        drawn,
+        servos=tuple(
+            replace(servo, actuator=_without_jitter(own[servo.joint], spec.command_jitter_s))
+            for servo in drawn.servos
+        ),
+    )
+
+
+def _without_jitter(own: DelayedPDParameters, jitter_s: float) -> DelayedPDParameters:
+    """A servo whose dead time is without the mean latency of commands."""
+    values = {name: float(np.asarray(value)) for name, value in asdict(own).items()}
+    dead_time_s = max(values["dead_time_s"] - jitter_s, SHORTEST_DELAY_S)
+    return DelayedPDParameters(**values | {"dead_time_s": dead_time_s})
 
 
 class WalkingBus:

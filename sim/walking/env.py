@@ -83,6 +83,9 @@ class PupperEnv:
         Forward and sideways speed [m/s] and turn rate [rad/s] that each robot is to follow.
     robots : RobotBatch
         The physics: positions, velocities, the servos that were drawn.
+    moved : list of Moved
+        What the physics did in the last control step, by parts of the robots, with the state after
+        each of its own steps; overwritten by the next.
     steps, nan_resets : int
         Control steps since the start; simulations that became NaN, and were drawn anew.
     processes : int
@@ -150,6 +153,7 @@ class PupperEnv:
         n = environments
         self._senses = Senses(config, servos, self.robots, n, generator([seed, 2], twins))
         self._strides = Strides(n, config.control_step_s, config.rewards)
+        self.moved: list[Moved] = []
         self.nan_resets = 0
         self.steps, self.processes = 0, 1
         self.level = config.curriculum.at(0)
@@ -200,7 +204,9 @@ class PupperEnv:
         moving = self.robots.step(self.set_points(self.action))
         # what does not need the new state is done while it is computed
         now = self._begin(before)
+        self.moved = []
         for moved in moving:
+            self.moved.append(moved)
             self._take(moved, now)
         broken = self.robots.broken()
         if broken.any():

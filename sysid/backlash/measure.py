@@ -40,7 +40,7 @@ from pupper_sysid.sysid.recordings.joints import (
     as_sequence,
     chosen_joints,
     joint_rng,
-    joint_trials,
+    recorded_trials,
 )
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -121,7 +121,7 @@ def backlash(recordings: Recordings, joints: Joints = None, seed: int = 0) -> Ba
     """
     given = as_sequence(recordings)
     found = {
-        joint: _measure(joint, joint_trials(given, joint), joint_rng(seed, joint))
+        joint: _measure(joint, recorded_trials(given, joint), joint_rng(seed, joint))
         for joint in chosen_joints(given, joints)
     }
     return Backlash(joints=found)

@@ -12,9 +12,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.doctor.causality import causality_findings, crossed
+from pupper_sysid.sysid.doctor.bends import bend_findings
+from pupper_sysid.sysid.doctor.causality import crossed
 from pupper_sysid.sysid.doctor.clock import clock_findings, tone_findings
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, Finding
+from pupper_sysid.sysid.doctor.hypotheses import (
+    encoder_findings,
+    hypothesis_findings,
+    stepwise_findings,
+)
 from pupper_sysid.sysid.doctor.servo_setup import register_findings
 from pupper_sysid.sysid.doctor.signals import (
     frozen_findings,
@@ -22,23 +28,26 @@ from pupper_sysid.sysid.doctor.signals import (
     motion_findings,
     offset_findings,
     start_findings,
-    stop_findings,
     unit_findings,
-    wrap_findings,
 )
 from pupper_sysid.sysid.feedback.quantisation import quantum
 from pupper_sysid.sysid.feedback.rows import fresh_rows
+from pupper_sysid.sysid.recordings.bad_readings import without_bad_readings
 from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.recordings.remembered import remembered
 
 LEAST_ROWS = 3
 """Rows of a trial; fewer have no rate of change."""
 
 _FEW_MISSING, _MANY_MISSING = 0.02, 0.5
 _LEAST_FRESH = 16
+_MANY_BAD = 0.05  # share of the readings
 _CHECKS = (
-    motion_findings, tone_findings, wrap_findings, unit_findings, frozen_findings, offset_findings,
-    causality_findings, start_findings, stop_findings, interpolation_findings, register_findings,
+    motion_findings, tone_findings, encoder_findings, unit_findings, bend_findings,
+    frozen_findings, offset_findings, hypothesis_findings, start_findings, interpolation_findings,
+    register_findings,
 )  # fmt: skip
+_SERVOS_ALONE = (frozen_findings, hypothesis_findings)  # a joint held by friction is explained
 
 
 def long_enough(trials: Sequence[Trial]) -> list[Trial]:
@@ -47,6 +56,7 @@ def long_enough(trials: Sequence[Trial]) -> list[Trial]:
     return [t for t in powered if len(t.send_time_s) >= LEAST_ROWS]
 
 
+@remembered(64)
 def findings(recorded: Sequence[Trial]) -> list[Finding]:
     """Find what is wrong with one joint's trials.
 
@@ -57,15 +67,18 @@ def findings(recorded: Sequence[Trial]) -> list[Finding]:
     recorded : sequence of Trial
         All of one joint.
     """
-    trials = long_enough(recorded)
+    cleaned = [without_bad_readings(t) for t in recorded]
+    trials = long_enough(cleaned)
     if not trials:
-        return [Finding(REFUSE, f"no trial has {LEAST_ROWS} rows: the recording was cut short. "
-                                "Record it again.")]  # fmt: skip
+        return [Finding("too_short", REFUSE, {"rows": LEAST_ROWS})]
     found = [*_missing(recorded, len(recorded) - len(trials)), *clock_findings(trials)]
+    found += _bad_readings(recorded, cleaned)
     step = -1.0
-    for check in (*_CHECKS[:1], _few_fresh, *_CHECKS[1:]):
+    for check in (*_CHECKS[:1], stepwise_findings, _few_fresh, *_CHECKS[1:]):
         if any(f.verdict == REFUSE for f in found):
             break
+        if check in _SERVOS_ALONE and any(f.code == "held_by_friction" for f in found):
+            continue
         step = quantum(trials) if step < 0 else step
         found += check(trials, step)
     return found
@@ -102,8 +115,7 @@ def _few_fresh(trials: Sequence[Trial], step: float) -> list[Finding]:
     fresh = sum(len(fresh_rows(t)) for t in trials)
     if fresh >= _LEAST_FRESH:
         return []
-    return [Finding(REFUSE, f"only {fresh} readings differ from the one before, too few to measure "
-                            "anything. Record for longer, with a larger amplitude.")]  # fmt: skip
+    return [Finding("few_fresh", REFUSE, {"readings": fresh})]
 
 
 def _missing(recorded: Sequence[Trial], short: int) -> list[Finding]:
@@ -111,12 +123,26 @@ def _missing(recorded: Sequence[Trial], short: int) -> list[Finding]:
     share = float(np.mean(~np.isfinite(position))) if len(position) else 1.0
     found = []
     if not len(position) or share > _MANY_MISSING:
-        found.append(Finding(REFUSE, f"{100 * share:.0f} % of the readings are missing: check "
-                                     "wiring and power, then record again."))  # fmt: skip
+        found.append(Finding("most_missing", REFUSE, {"percent": 100 * share}))
     elif share > _FEW_MISSING:
-        found.append(Finding(CARE, f"{100 * share:.0f} % of the readings are missing; the rest is "
-                                   "used. Check the plugs before the next recording."))  # fmt: skip
+        found.append(Finding("some_missing", CARE, {"percent": 100 * share}))
     if short:
-        found.append(Finding(CARE, f"{short} trials have fewer than {LEAST_ROWS} rows and are left "
-                                   "out. Record them again."))  # fmt: skip
+        found.append(Finding("short_trials", CARE, {"trials": short, "rows": LEAST_ROWS}))
     return found
+
+
+def _bad_readings(recorded: Sequence[Trial], cleaned: Sequence[Trial]) -> list[Finding]:
+    """Single readings that are left out, with the first of them."""
+    bad = [
+        (t.read_time_s[k] - recorded[0].send_time_s[0], t.position_rad[k])
+        for t, c in zip(recorded, cleaned, strict=True)
+        for k in np.flatnonzero(np.isfinite(t.position_rad) & ~np.isfinite(c.position_rad))
+    ]
+    if not bad:
+        return []
+    share = len(bad) / sum(int(np.isfinite(t.position_rad).sum()) for t in recorded)
+    many = share > _MANY_BAD
+    values = {"readings": len(bad), "percent": 100 * share, "time_s": bad[0][0],
+              "value_rad": bad[0][1]}  # fmt: skip
+    return [Finding("many_bad_readings" if many else "bad_readings", REFUSE if many else CARE,
+                    values)]  # fmt: skip

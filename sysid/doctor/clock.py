@@ -54,11 +54,9 @@ def _unit(loop: float) -> list[Finding]:
         )
         cure = (f"They look like {unit}: divide them by {scale:g}." if unit
                 else "Times must be seconds, with 10 rows or more per second.")  # fmt: skip
-        return [Finding(REFUSE, f"rows are {loop:.4g} s apart, too slow for a servo. {cure}")]
+        return [Finding("loop_too_slow", REFUSE, {"loop_s": loop, "cure": cure})]
     if 0 < loop < _FASTEST_LOOP_S:
-        return [Finding(REFUSE, f"rows are {1e6 * loop:.3g} µs apart, faster than any bus. Times "
-                                "must be seconds: multiply minutes by 60, hours by "
-                                "3600.")]  # fmt: skip
+        return [Finding("loop_too_fast", REFUSE, {"loop_us": 1000000.0 * loop})]
     return []
 
 
@@ -67,9 +65,7 @@ def _budget(spans: NDArray[np.float64]) -> list[Finding]:
     if not total <= LONGEST_S:
         where = "its longest trial spans" if longest > LONGEST_S else "its trials together span"
         span = longest if longest > LONGEST_S else total
-        return [Finding(REFUSE, f"{where} {span:.4g} s; at most {LONGEST_S:.0f} s can be computed. "
-                                "Check that times are seconds and come from one session, or cut "
-                                "the recording.")]  # fmt: skip
+        return [Finding("too_long", REFUSE, {"where": where, "span_s": span, "most_s": LONGEST_S})]
     return []
 
 
@@ -77,30 +73,21 @@ def _order(trials: Sequence[Trial], gaps: NDArray[np.float64]) -> list[Finding]:
     wrong = sum(disorder(t) for t in trials)
     if not wrong:
         return []
-    text = (f"{wrong} time stamps repeat or run backwards, so lags are uncertain there. Record "
-            "with a monotonic clock of 1 ms or finer, and give each pass its own trial "
-            "number.")  # fmt: skip
-    return [Finding(REFUSE if wrong > _DISORDER * len(gaps) else CARE, text)]
+    verdict = REFUSE if wrong > _DISORDER * len(gaps) else CARE
+    return [Finding("disordered_times", verdict, {"rows": wrong})]
 
 
 def _two_clocks(trials: Sequence[Trial], loop: float) -> list[Finding]:
     apart = np.concatenate([t.read_time_s - t.send_time_s for t in trials])
     middle = float(np.median(apart))
     if abs(middle) > max(_READ_APART_S, _READ_APART_LOOPS * loop):
-        return [Finding(REFUSE, f"readings are stamped {middle:.3g} s after the commands of their "
-                                "rows: `read_time_s` and `send_time_s` are of two clocks. Stamp "
-                                "both with one monotonic clock.")]  # fmt: skip
+        return [Finding("two_clocks", REFUSE, {"apart_s": middle})]
     early = -middle
     if early > max(_READ_EARLY_S, _READ_EARLY_LOOPS * loop):
-        return [Finding(CARE, f"readings are stamped {1e3 * early:.0f} ms before the commands of "
-                              f"their rows, which is {early / loop:.1f} turns of the loop: lag and "
-                              "dead time come out too short by as much, unless they were read "
-                              "then. Stamp each reading when it arrives.")]  # fmt: skip
+        return [Finding("read_early", CARE, {"early_ms": 1000.0 * early, "loops": early / loop})]
     drift = float(np.ptp(np.quantile(apart, (0.02, 0.98))))
     if drift > max(_READ_APART_S, _READ_APART_LOOPS * loop):
-        return [Finding(CARE, f"the time from a command to its reading varies by {drift:.3g} s: "
-                              "two clocks that drift apart, or reads that hang. Stamp both with "
-                              "one monotonic clock.")]  # fmt: skip
+        return [Finding("clocks_apart", CARE, {"drift_s": drift})]
     return []
 
 
@@ -109,19 +96,17 @@ def _gaps(gaps: NDArray[np.float64], loop: float) -> list[Finding]:
     late = gaps[gaps > _LONG_GAP * loop]
     lost = float(late.sum() / max(gaps.sum(), 1e-12))
     if lost > _LOST_TIME:
-        return [Finding(REFUSE, f"{100 * lost:.0f} % of the recorded time lies in gaps of up to "
-                                f"{late.max():.2g} s between rows, where the motion is unknown. "
-                                "Give each stretch its own trial number, or record "
-                                "again.")]  # fmt: skip
+        return [Finding("gaps", REFUSE, {"percent": 100 * lost, "longest_s": late.max()})]
     if np.std(gaps) > _UNEVEN * loop:
-        found.append(Finding(CARE, f"the loop is uneven ({1e3 * np.std(gaps):.1f} ms of jitter on "
-                                   f"{1e3 * loop:.1f} ms); time stamps are used as they are, but "
-                                   "record on an idle machine."))  # fmt: skip
+        found.append(
+            Finding(
+                "uneven_loop", CARE, {"jitter_ms": 1000.0 * np.std(gaps), "loop_ms": 1000.0 * loop}
+            )
+        )
     if len(late):
-        found.append(Finding(CARE, f"the loop stood still {len(late)} times for more than three "
-                                   f"periods, up to {late.max():.2g} s; commands are taken to "
-                                   "hold there. Record on an idle machine, or give each "
-                                   "stretch its own trial number."))  # fmt: skip
+        found.append(
+            Finding("loop_stood_still", CARE, {"times": len(late), "longest_s": late.max()})
+        )
     return found
 
 
@@ -134,17 +119,22 @@ def tone_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     found = []
     if wrong:
         first, own = wrong[0], _strongest_hz(wrong[0])
-        found.append(Finding(REFUSE if 2 * (len(wrong) + len(fast)) > len(tones) else CARE,
-                             f"trial {first.number} is called a tone of {first.frequency_hz:.3g} "
-                             f"Hz, and its command is none: it moves mostly at {own:.3g} Hz. Check "
-                             "the unit of the times and `frequency_hz`, or leave that "
-                             "empty."))  # fmt: skip
+        found.append(
+            Finding(
+                "not_its_tone",
+                REFUSE if 2 * (len(wrong) + len(fast)) > len(tones) else CARE,
+                {"trial": first.number, "called_hz": first.frequency_hz, "strongest_hz": own},
+            )
+        )
     if fast:
         highest = max(t.frequency_hz for t in fast)
-        found.append(Finding(REFUSE if len(fast) == len(tones) else CARE,
-                             f"the tone of {highest:.3g} Hz has "
-                             f"{1 / max(highest * loop, 1e-300):.2g} rows per period, too few to "
-                             "see it. Record with a faster loop, or slower tones."))  # fmt: skip
+        found.append(
+            Finding(
+                "too_few_rows_a_period",
+                REFUSE if len(fast) == len(tones) else CARE,
+                {"frequency_hz": highest, "rows": 1 / max(highest * loop, 1e-300)},
+            )
+        )
     return found
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -31,12 +31,14 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
 )
 from pupper_sysid.sysid.feedback.rows import moving_rows
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
+from pupper_sysid.sysid.recordings.bad_readings import without_bad_readings
+from pupper_sysid.sysid.recordings.excitation import describe, named_tones
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
     as_sequence,
     chosen_joints,
-    joint_trials,
+    recorded_trials,
 )
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -60,6 +62,8 @@ class JointExamination(Result):
     verdict : {"use", "use with care", "do not use"}
     reasons : tuple of str
         Sentences; each says what to do, or what to record instead.
+    findings : tuple of Finding
+        The same by code and numbers.
     loop_period_s, jitter_s : float
         Median time between commands, and standard deviation about their mean.
     fresh_fraction : float
@@ -85,6 +89,7 @@ class JointExamination(Result):
 
     verdict: str
     reasons: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
     loop_period_s: float = math.nan
     jitter_s: float = math.nan
     fresh_fraction: float = math.nan
@@ -173,7 +178,7 @@ def examine(
     rng = np.random.default_rng(seed)
     limits = [(r.metadata.get("bus") or {}).get("speed_limit_rad_s") for r in given]
     limit = max(float(each or _USUAL_SPEED_RAD_S) for each in limits)
-    recorded = {joint: joint_trials(given, joint) for joint in chosen_joints(given, joints)}
+    recorded = {joint: recorded_trials(given, joint) for joint in chosen_joints(given, joints)}
     mixed = crossed({joint: long_enough(trials) for joint, trials in recorded.items()})
     found = {
         joint: _examine_joint(joint, trials, mixed.get(joint), limit, rng, (lags or {}).get(joint))
@@ -209,26 +214,32 @@ def _examine_joint(
     lag: LagBudget | None,
 ) -> JointExamination:
     found = [*findings(recorded), *([mixed] if mixed else [])]
+    recorded = [without_bad_readings(t) for t in recorded]
     trials = long_enough(recorded)
     if not trials:
-        return JointExamination(verdict=REFUSE, reasons=tuple(f.text for f in found))
+        return JointExamination(
+            verdict=REFUSE, reasons=tuple(f.text for f in found), findings=tuple(found)
+        )
     gaps = np.concatenate([np.diff(t.send_time_s) for t in trials])
     seen = np.concatenate([np.isfinite(t.position_rad) for t in trials])
     fresh = sum(len(fresh_rows(t)) for t in trials)
     usable = all(f.verdict != REFUSE for f in found)
+    tones = [replace(t, number=n) for n, t in enumerate(named_tones(recorded))]
+    tones = long_enough(tones)
     lattice = PollLattice(kind="unresolved", fresh_fraction=fresh / len(seen))
     hold_share = math.nan
     speed = peak_speed(trials)
     if usable:
-        lattice = lag.feedback if lag else find_poll_lattice(trials, rng)
-        hold_share = _hold_share(joint, trials, lattice, rng, lag)
-        found += [*_held(lattice, hold_share), *_slips(trials, lattice)]
-        found += _coverage(trials, speed, limit_rad_s)
-    found = sorted(found, key=lambda f: VERDICTS.index(f.verdict))
+        lattice = lag.feedback if lag else find_poll_lattice(tones, rng)
+        hold_share = _hold_share(joint, tones, lattice, rng, lag)
+        found += [*_held(lattice, hold_share), *_slips(tones, lattice)]
+        found += [*_excitation(trials), *_coverage(tones, speed, limit_rad_s)]
+    found = [replace(f, joint=joint) for f in found]
+    found.sort(key=lambda f: VERDICTS.index(f.verdict))
     return JointExamination(
         verdict=found[0].verdict if found else USE,
-        reasons=tuple(f.text for f in found)
-        or ("nothing wrong was found: timing is even, readings are new, motion covers its range.",),
+        reasons=tuple(f.text for f in found) or (Finding("nothing_wrong", USE).text,),
+        findings=tuple(found),
         loop_period_s=float(np.median(gaps)),
         jitter_s=float(np.std(gaps)),
         fresh_fraction=lattice.fresh_fraction,
@@ -268,20 +279,24 @@ def _held(lattice: PollLattice, hold_share: float) -> list[Finding]:
     if lattice.kind == "every read":
         return []
     if lattice.kind == "unresolved":
-        return [Finding(CARE, f"{100 * lattice.fresh_fraction:.0f} % of the rows have a new "
-                              "reading, and no poll period explains when they were taken: times "
-                              f"are in doubt by {1e3 * lattice.time_doubt_s:.0f} ms, which widens "
-                              "lags and dead times. Record at least four tones of 3 s, with a "
-                              "loop faster than the poll.")]  # fmt: skip
-    text = f"the bus reads each servo every {1e3 * lattice.poll_period_s:.2f} ms"
+        return [
+            Finding(
+                "poll_unresolved",
+                CARE,
+                {
+                    "percent": 100 * lattice.fresh_fraction,
+                    "doubt_ms": 1000.0 * lattice.time_doubt_s,
+                },
+            )
+        ]
+    code, values = "polled", {"period_ms": 1e3 * lattice.poll_period_s}
     if math.isfinite(lattice.loss):
-        text += (
-            f" and {100 * lattice.loss:.0f} % of the reads fail silently, so a reading is "
-            f"{1e3 * lattice.mean_age_s:.0f} ms old on average"
-        )
+        code += "_loss"
+        values |= {"loss_percent": 100 * lattice.loss, "age_ms": 1e3 * lattice.mean_age_s}
     if math.isfinite(hold_share):
-        text += f", {100 * hold_share:.0f} % of the lag that all rows show"
-    return [Finding(USE, f"{text}.")]
+        code += "_share"
+        values["share_percent"] = 100 * hold_share
+    return [Finding(code, USE, values)]
 
 
 def _slips(trials: Sequence[Trial], lattice: PollLattice) -> list[Finding]:
@@ -290,10 +305,31 @@ def _slips(trials: Sequence[Trial], lattice: PollLattice) -> list[Finding]:
     for slip in lattice.slips:
         tone = next(t.frequency_hz for t in trials if t.number == slip.trial)
         where = f"at {tone:g} Hz" if tone > 0 else f"in trial {slip.trial}"
-        found.append(Finding(USE, f"{where} the poll slipped by {1e3 * slip.jump_s:.0f} ms at "
-                                  f"{slip.time_s:.2f} s ({slip.nats:.0f} nats); readings before "
-                                  "and after it are dated apart."))  # fmt: skip
+        found.append(
+            Finding(
+                "poll_slipped",
+                USE,
+                {
+                    "where": where,
+                    "jump_ms": 1000.0 * slip.jump_s,
+                    "time_s": slip.time_s,
+                    "nats": slip.nats,
+                },
+            )
+        )
     return found
+
+
+def _excitation(trials: Sequence[Trial]) -> list[Finding]:
+    """What was found in commands that the log does not name."""
+    if all(t.frequency_hz > 0 for t in trials):
+        return []
+    kinds = describe([t for t in trials if not t.frequency_hz > 0])
+    hz = sorted({float(f"{f:.3g}") for f in kinds.get("tone", ())})
+    if not hz:
+        return []
+    listed = ", ".join(f"{f:g}" for f in hz)
+    return [Finding("tones_found", USE, {"listed": listed})]
 
 
 def _coverage(trials: Sequence[Trial], speed: float, limit: float) -> list[Finding]:
@@ -301,17 +337,16 @@ def _coverage(trials: Sequence[Trial], speed: float, limit: float) -> list[Findi
     tones = [t for t in trials if t.frequency_hz > 0]
     frequencies = sorted({round(t.frequency_hz, 2) for t in tones})
     if len(frequencies) == 1 and len(tones) == len(trials):
-        found.append(Finding(CARE, f"one frequency only ({frequencies[0]:g} Hz): the lag is known "
-                                   "up to whole periods and no model can be tested. Record tones "
-                                   "of 1 to 10 Hz."))  # fmt: skip
+        found.append(Finding("one_frequency", CARE, {"frequency_hz": frequencies[0]}))
     short = [t for t in tones if (t.send_time_s[-1] - t.send_time_s[0]) * t.frequency_hz < 2]
     if short:
-        found.append(Finding(CARE, f"{len(short)} of {len(tones)} tones last less than two periods "
-                                   "and are left out of phases and gains. Record 3 s or more "
-                                   "each."))  # fmt: skip
+        found.append(Finding("short_tones", CARE, {"tones": len(short), "of": len(tones)}))
     if speed < 0.9 * limit:
-        found.append(Finding(USE, f"commands reach {speed:.1f} of about {limit:.1f} rad/s "
-                                  f"({100 * speed / limit:.0f} %), which may not show the servo's "
-                                  "speed limit: `calibrate` says whether it is identified. Steps "
-                                  "would show it."))  # fmt: skip
+        found.append(
+            Finding(
+                "slow_commands",
+                USE,
+                {"speed_rad_s": speed, "limit_rad_s": limit, "percent": 100 * speed / limit},
+            )
+        )
     return found

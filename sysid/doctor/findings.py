@@ -1,8 +1,10 @@
-"""A finding: a verdict on a joint's recording, and the sentence that says why and what to do."""
+"""A finding: what was found about one joint, by a code and numbers; `words` makes sentences."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 USE, CARE, REFUSE = "use", "use with care", "do not use"
 VERDICTS = (REFUSE, CARE, USE)
@@ -11,14 +13,32 @@ VERDICTS = (REFUSE, CARE, USE)
 
 @dataclass(frozen=True)
 class Finding:
-    """A verdict on a joint and the sentence that goes with it.
+    """What was found about a joint.
 
     Attributes
     ----------
+    code : str
+        A key of `words.WORDS`.
     verdict : {"use", "use with care", "do not use"}
-    text : str
-        Reason and cure, without the joint's name.
+    values : dict of str to number or str
+        What the sentence of this code holds.
+    joint : str
+        Empty where one joint is looked at.
     """
 
+    code: str
     verdict: str
-    text: str
+    values: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    joint: str = ""
+
+    @property
+    def text(self) -> str:
+        """Reason and cure, without the joint's name."""
+        from pupper_sysid.sysid.doctor.words import text
+
+        return text(self)
+
+
+def rivalled(finding: Finding, rival: str) -> Finding:
+    """The finding with the code of an explanation that is nearly as good, empty where none is."""
+    return replace(finding, values={**finding.values, "rival": rival}) if rival else finding

@@ -66,8 +66,5 @@ def _speed(trial: Trial) -> float:
 
 def _shaped(register: str, value: int, limit: str, cure: str) -> Finding:
     return Finding(
-        CARE,
-        f"the servo's register {register} is {value} ({limit}): it then moves its set-point by "
-        "itself, and what is measured is this trajectory, not the servo. Write "
-        f"{cure} into {register} and record again.",
+        "own_trajectory", CARE, {"register": register, "value": value, "limit": limit, "cure": cure}
     )

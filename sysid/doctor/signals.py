@@ -23,13 +23,9 @@ _FASTEST_RAD_S, _FAST_RAD_S = 60.0, 20.0  # three times and what a good servo of
 _LEVELS = 10  # values of a reading, from which on a coarse step is that of an encoder
 _ENCODER_BITS = range(10, 17)
 _SAME_STEP = 0.002
-_PINNED = (0.10, 0.20)  # share of readings at an extreme, beyond the command's own
 _NOTED_RAD, _FAR_RAD, _TURNED_RAD = 0.1, 1.3, 2.9  # of an offset; the last is nearly half a turn
-_ENOUGH_TRIALS = 3
-_WRAP_RAD, _UNUSUAL = 2.5, 8.0
 _FEW_STEPS = 8
 _FROZEN_S, _LATE_S, _FROZEN_SHARE = 1.0, 0.5, 0.5
-_SPIKES = 0.002  # share of readings
 _STRAIGHT, _SLOPES = 0.25, 0.3
 
 
@@ -39,20 +35,14 @@ def motion_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     position = np.concatenate([t.position_rad for t in trials])
     position = position[np.isfinite(position)]
     if not len(position):
-        text = ("there is no reading at all: check the servo's plug, id and power, then record "
-                "again.")  # fmt: skip
-    elif np.ptp(command) < 1e-3:
-        text = (f"the command never changes: {trials[0].joint} was not swept. Record it with "
-                "`pupper-sysid sweep`.")  # fmt: skip
-    elif np.ptp(position) < max(3 * min(step, _COARSEST_RAD), 5e-3):
-        text = ("the command moves and the reading does not: torque off, wrong servo id, or a "
-                "servo that no longer answers. Power it again and look at it move.")  # fmt: skip
-    else:
-        if np.ptp(position) >= _FEW_STEPS * step:
-            return []
-        return [Finding(CARE, f"the joint moves by {np.ptp(position) / step:.0f} quantisation "
-                              "steps only. Record with a larger amplitude.")]  # fmt: skip
-    return [Finding(REFUSE, text)]
+        return [Finding("no_readings", REFUSE)]
+    if np.ptp(command) < 1e-3:
+        return [Finding("constant_command", REFUSE, {"joint": trials[0].joint})]
+    if np.ptp(position) < max(3 * min(step, _COARSEST_RAD), 5e-3):
+        return [Finding("does_not_move", REFUSE)]
+    if np.ptp(position) < _FEW_STEPS * step:
+        return [Finding("few_steps", CARE, {"steps": np.ptp(position) / step})]
+    return []
 
 
 def unit_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
@@ -68,51 +58,12 @@ def unit_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     elif (speed := _speed(trials)) > _FASTEST_RAD_S:
         text = f"the joint moves at {speed:.0f} rad/s, faster than any servo: angles look"
     elif speed > _FAST_RAD_S:
-        return [Finding(CARE, f"the joint moves at {speed:.0f} rad/s, faster than servos of this "
-                              f"size do. {cure}")]  # fmt: skip
+        return [Finding("fast_joint", CARE, {"speed_rad_s": speed, "cure": cure})]
     elif bits := _degree_encoder(step):
-        return [Finding(CARE, f"readings come in steps of {step:.5g}, which is a turn of 360 over "
-                              f"2^{bits}: they look like degrees. {cure}")]  # fmt: skip
+        return [Finding("degrees_by_step", CARE, {"step": step, "bits": bits, "cure": cure})]
     else:
         return []
-    return [Finding(REFUSE, f"{text} like degrees. {cure}")]
-
-
-def wrap_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
-    """Jumps that no servo can make: a wrapped angle, or single wrong readings."""
-    turns = spikes = rows = 0
-    for t in trials:
-        seen = np.flatnonzero(np.isfinite(t.position_rad))
-        value, time = t.position_rad[seen], t.read_time_s[seen]
-        rows += len(seen)
-        new = np.concatenate([[0], np.flatnonzero(np.diff(value)) + 1]) if len(value) else []
-        if len(new) < 4:
-            continue
-        # a held value may be old: the jump took as long as nothing new was read
-        move = np.diff(value[new])
-        taken = np.maximum(np.diff(time[new]), 1e-6)
-        usual = _UNUSUAL * float(np.median(np.abs(move)))
-        far = np.abs(move) > np.maximum(_FASTEST_RAD_S * taken, max(5 * step + 0.2, usual))
-        returned = np.abs(move[:-1] + move[1:]) < 0.3 * np.abs(move[:-1])
-        back = far[:-1] & far[1:] & returned
-        spikes += int(back.sum())
-        lone = far.copy()
-        lone[:-1] &= ~back
-        lone[1:] &= ~back
-        turns += int(np.sum(lone & (np.abs(move) > _WRAP_RAD)))
-    found = []
-    if turns:
-        found.append(Finding(REFUSE, f"readings jump by about a turn {turns} times within a row, "
-                                     "which looks like an angle wrapped at ±π or at the encoder's "
-                                     "end. Unwrap it (numpy.unwrap), or mount the horn so that "
-                                     "the range is not crossed."))  # fmt: skip
-    if spikes:
-        share = spikes / max(rows, 1)
-        found.append(Finding(REFUSE if share > 10 * _SPIKES else CARE,
-                             f"{spikes} single readings lie farther away than a servo can move: "
-                             "wrong bytes from the bus. Leave them empty, and check cable and "
-                             "baud rate."))  # fmt: skip
-    return found
+    return [Finding("degrees", REFUSE, {"evidence": text, "cure": cure})]
 
 
 def frozen_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
@@ -120,18 +71,22 @@ def frozen_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     longest = [_frozen_s(t) for t in trials]
     found, frozen = [], sum(s > 0 for s in longest)
     if frozen:
-        found.append(Finding(REFUSE if 2 * frozen > len(trials) else CARE,
-                             f"in {frozen} of {len(trials)} trials the reading stays the same for "
-                             f"up to {max(longest):.1f} s while the command moves on: the servo no "
-                             "longer answered, or its torque was off. Record these trials "
-                             "again."))  # fmt: skip
+        found.append(
+            Finding(
+                "frozen",
+                REFUSE if 2 * frozen > len(trials) else CARE,
+                {"trials": frozen, "of": len(trials), "longest_s": max(longest)},
+            )
+        )
     still = _still(trials, step)
     if still:
-        found.append(Finding(REFUSE if 2 * len(still) > len(trials) else CARE,
-                             f"the reading does not move in trial{'s' if still[1:] else ''} "
-                             f"{', '.join(map(str, still[:5]))}, and does in others that are no "
-                             "slower: the servo no longer answered, or its torque was off. Record "
-                             "again."))  # fmt: skip
+        found.append(
+            Finding(
+                "still_trials",
+                REFUSE if 2 * len(still) > len(trials) else CARE,
+                {"plural": "s" if still[1:] else "", "trials": ", ".join(map(str, still[:5]))},
+            )
+        )
     return found
 
 
@@ -154,24 +109,7 @@ def interpolation_findings(trials: Sequence[Trial], step: float) -> list[Finding
     _, often = np.unique(np.concatenate(slopes), return_counts=True)
     if often.max() > _SLOPES * straight:
         return []  # a servo at its speed limit moves straight as well, always at one rate
-    return [Finding(CARE, f"{100 * straight / total:.0f} % of the positions lie on straight lines "
-                          "between others: the log was interpolated, and when its readings were "
-                          "taken is lost. Use the log as it was recorded.")]  # fmt: skip
-
-
-def stop_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
-    """Readings that stay at an extreme: a mechanical stop, a limit, a saturated encoder."""
-    # friction flattens the tops of a slow tone; a stop does it in every trial, or by more. A known
-    # load stands still where friction holds it
-    excess = [_pinned(t, step) for t in trials if t.load is None]
-    pinned = [e for e in excess if e > _PINNED[0]]
-    often = 2 * len(pinned) > len(excess) >= _ENOUGH_TRIALS
-    if not pinned or (max(excess) < _PINNED[1] and not often):
-        return []
-    return [Finding(CARE, f"readings stay at their highest or lowest value in {len(pinned)} of "
-                          f"{len(trials)} trials, up to {100 * max(pinned):.0f} % of the time more "
-                          "than the command does: a limit or a mechanical stop clips the motion. "
-                          "Record with a smaller amplitude.")]  # fmt: skip
+    return [Finding("interpolated", CARE, {"percent": 100 * straight / total})]
 
 
 def offset_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
@@ -180,12 +118,8 @@ def offset_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     if not abs(away) > _NOTED_RAD or any(t.load is not None for t in trials):
         return []  # a known load sags; the fit under load finds the zero
     if abs(away) > _TURNED_RAD:
-        return [Finding(REFUSE, f"readings are {away:.2f} rad away from the commands, half a turn "
-                                "or more: the encoder's zero or a multiple of 2π. Subtract it from "
-                                "`position_rad`, or calibrate the joint's zero.")]  # fmt: skip
-    return [Finding(CARE if abs(away) > _FAR_RAD else USE,
-                    f"readings are offset by {away:.3f} rad from the commands; the offset is "
-                    "fitted, but check the joint's zero.")]  # fmt: skip
+        return [Finding("turned", REFUSE, {"offset_rad": away})]
+    return [Finding("offset", CARE if abs(away) > _FAR_RAD else USE, {"offset_rad": away})]
 
 
 def start_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
@@ -199,9 +133,7 @@ def start_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     reach = max(float(np.ptp(first.command_rad)), _NOTED_RAD)
     if abs(rest - stands) < reach or abs(rest - began) < reach:
         return []
-    return [Finding(CARE, f"`start_pose_rad` is {rest:.2f}, and the joint stands at {stands:.2f} "
-                          "rad when the first trial begins. Correct the header, or leave the pose "
-                          "out.")]  # fmt: skip
+    return [Finding("start_pose", CARE, {"header_rad": rest, "stands_rad": stands})]
 
 
 def amplitude_ratio(trials: Sequence[Trial]) -> float:
@@ -310,19 +242,6 @@ def _frozen_s(trial: Trial) -> float:
         if np.ptp(command[first : max(owed, first + 1)]) > _FROZEN_SHARE * span:
             longest = lasts
     return longest
-
-
-def _pinned(trial: Trial, step: float) -> float:
-    """Share of readings at an extreme of the trial, beyond the share of the command at its own."""
-    position = trial.position_rad[np.isfinite(trial.position_rad)]
-    if len(position) < 20 or np.ptp(position) < 10 * max(step, 1e-6):
-        return 0.0
-    near = max(1.5 * step, 0.01 * float(np.ptp(position)))
-
-    def dwell(value: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.array([np.mean(value < value.min() + near), np.mean(value > value.max() - near)])
-
-    return float(np.max(dwell(position) - dwell(trial.command_rad)))
 
 
 def _tone_offset(trial: Trial) -> tuple[float, int] | None:

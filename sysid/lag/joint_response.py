@@ -19,10 +19,10 @@ from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, internal
 from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice, readings
-from pupper_sysid.sysid.lag.multisine import multisine_responses
+from pupper_sysid.sysid.lag.multisine import line_responses
 from pupper_sysid.sysid.lag.phase_slope import tone_lags
 from pupper_sysid.sysid.lag.ripple import without_ripple
-from pupper_sysid.sysid.lag.tone import ToneResponse, tone_response
+from pupper_sysid.sysid.lag.tone import ToneResponse
 from pupper_sysid.sysid.lag.transfer_function import TransferFunction, fit_transfer_functions
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -171,11 +171,7 @@ def joint_response(
     tones: list[ToneResponse] = []
     read = [readings(trial, lattice) for trial in trials]
     for trial, reading in zip(trials, read, strict=True):
-        if trial.frequency_hz > 0:
-            tone = tone_response(trial, reading, rng)
-            tones += [] if tone is None else [tone]
-        else:
-            tones += multisine_responses(trial, reading, rng)
+        tones += line_responses(trial, reading, rng)
     if not tones:
         raise InputError(
             f"{joint}: this recording has no tone of two periods or more, and no multisine, so "

@@ -7,9 +7,9 @@
 (`sysid.fit.joint_fit`). Only the dead time is the servo's own: the lag moves with gain,
 amplitude and load.
 
-* Tones (`sysid.lag.tone`): the phase slope of fresh rows at their measurement times, against the
-  zero-order-held command, without the staircase's ripple. Intervals are from a bootstrap over
-  periods.
+* Tones (`sysid.lag.tone`), named, found in the command, or the lines of a multisine: the phase
+  slope of fresh rows at their measurement times, against the zero-order-held command, without the
+  staircase's ripple. Intervals are from a bootstrap over periods.
 * Any other motion (`sysid.lag.time_shift`): the time shift of the held command that resembles the
   motion best, through an impulse response fitted to the readings.
 
@@ -38,6 +38,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     readings,
 )
 from pupper_sysid.sysid.lag.estimators import estimators
+from pupper_sysid.sysid.lag.multisine import line_responses
 from pupper_sysid.sysid.lag.phase_slope import lag_near, slope, tone_lags, tone_weights
 from pupper_sysid.sysid.lag.ripple import without_ripple
 from pupper_sysid.sysid.lag.step_response import (
@@ -48,7 +49,7 @@ from pupper_sysid.sysid.lag.step_response import (
     rough_lag,
 )
 from pupper_sysid.sysid.lag.time_shift import EARLIEST_S, command_hold, row_shift, shift_draws
-from pupper_sysid.sysid.lag.tone import ToneResponse, tone_response
+from pupper_sysid.sysid.lag.tone import ToneResponse
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _MOVES = 0.1  # gain below which a servo is stuck, and its readings are noise
@@ -110,7 +111,7 @@ class LagBudget(Result):
     offset_rad : float
         Reading minus position, from the fitted model.
     by_frequency : tuple of FrequencyLag
-        Empty if the recording has no tones.
+        By tone, whether named or found in the command; empty if the recording has none.
     estimators_s : dict of str to float
         Lag by every estimator; NaN where one does not apply.
     noise_rad : float
@@ -137,6 +138,20 @@ class LagBudget(Result):
     def dynamics_s(self) -> float:
         """Part of the servo's lag that is not dead time [s]."""
         return self.lag_s.value - (self.dead_time_s.value if self.dead_time_s else math.nan)
+
+    @derived
+    def lag_range(self) -> str:
+        """What the servo's lag is a mean over, in words; empty without tones.
+
+        The lag of a tone is what a motion at its frequency shows; the mean is of no motion.
+        """
+        if not self.by_frequency:
+            return ""
+        hz = sorted({float(f"{f.frequency_hz:.3g}") for f in self.by_frequency})
+        if len(hz) == 1:
+            return f"at {hz[0]:g} Hz"
+        lags = sorted(1e3 * f.lag_s.value for f in self.by_frequency)
+        return f"mean over {hz[0]:g}–{hz[-1]:g} Hz; {lags[0]:.0f}–{lags[-1]:.0f} ms by tone"
 
     def with_dead_time(self, dead_time_s: Interval, offset_rad: float) -> LagBudget:
         """The budget with a fitted model's dead time and offset.
@@ -173,7 +188,8 @@ class LagBudget(Result):
         return (
             f"raw lag {1e3 * self.raw_lag_s.value:.0f} ms = "
             f"{1e3 * self.stale_lag_s:.0f} ms stale readings + "
-            f"{1e3 * self.command_hold_s:.0f} ms command hold + {servo}."
+            f"{1e3 * self.command_hold_s:.0f} ms command hold + {servo}"
+            f"{f' ({self.lag_range})' if self.lag_range else ''}."
         )
 
 
@@ -287,9 +303,9 @@ def _seen(
     polled: bool,
 ) -> _Seen:  # fmt: skip
     """Measure the lag with readings dated as in `read`."""
-    frequency = [t.frequency_hz for t in trials if t.frequency_hz > 0]
-    tones = [tone_response(t, r, rng) for t, r in zip(trials, read, strict=True)]
-    tones = [t for t in tones if t is not None]
+    tones: list[ToneResponse] = []
+    for t, r in zip(trials, read, strict=True):
+        tones += line_responses(t, r, rng)
     if tones:
         moved = max(abs(t.response) for t in tones)
         if moved < _MOVES:
@@ -298,7 +314,7 @@ def _seen(
                 "lag to measure. Was its torque on, and does it turn freely?"
             )
         near = None
-        if min(frequency) > _ALONE_HZ:
+        if min(t.frequency_hz for t in tones) > _ALONE_HZ:
             near = rough_lag(joint_stretches(joint, trials, read))
         if not polled:  # polls meet all phases of the loop, so there is no ripple to take out
             tones = without_ripple(trials, read, tones, rng, near)

@@ -1,8 +1,12 @@
-"""Response at every line of a multisine, from one trial.
+"""Responses of one trial at every frequency of its command: tones in turn, or a multisine.
 
-The lines are found in the command: the strongest is fitted and subtracted until next to nothing is
-left. A chirp, steps or a walk leave too much and are no multisine. All lines are then fitted to the
-fresh readings together, because sines at irregular times are not orthogonal.
+`line_responses` fits the tones that a log names or that are found in its command, one after the
+other (`sysid.lag.tone`), and else the lines of a multisine (`multisine_responses`). Those lines are
+found in the command: the strongest is fitted and subtracted until next to nothing is left. A chirp,
+steps or a walk leave too much and are no multisine. Enough lines fit any motion within its own
+time, so those of a multisine must also predict each half of the command from the other half, and
+the motion of the joint must be at these frequencies. All lines are then fitted to the fresh
+readings together, because sines at irregular times are not orthogonal.
 """
 
 from __future__ import annotations
@@ -13,15 +17,38 @@ from numpy.typing import NDArray
 from pupper_sysid.common.tones import block_bootstrap, least_squares, phasors, sine_design
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
 from pupper_sysid.sysid.lag.held_command import HeldCommand
-from pupper_sysid.sysid.lag.tone import ToneResponse
+from pupper_sysid.sysid.lag.tone import ToneResponse, tone_response
+from pupper_sysid.sysid.recordings.excitation import split_tones
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _MOST_LINES = 24
 _LEFT_OVER = 0.005  # of the command's variance: quantisation, no signal
+_APART = 1.5  # periods over the trial: closer lines are what a random motion looks like
+_LEAST_PERIODS = 1.9  # of a line, over the trial
+_UNPREDICTED = 0.05  # of the command's variance, in one half from the other
+_INCOHERENT = 0.3  # of the readings' variance: motion at other frequencies
 _SETTLE_S = 0.5  # past the soft start: several times the servo's slowest pole
 _ROWS_PER_UNKNOWN = 3
 _BLOCK_S = 0.5
 _GRID_S = 1e-3
+
+
+def line_responses(trial: Trial, reading: Readings, rng: np.random.Generator) -> list[ToneResponse]:
+    """Response at every frequency that the command of `trial` is made of; empty if it is of none.
+
+    Parameters
+    ----------
+    trial : Trial
+    reading : Readings
+        Of the same trial: when its fresh rows were measured.
+    rng : numpy.random.Generator
+        Weights the periods.
+    """
+    parts = split_tones(trial)
+    if not parts[0].frequency_hz > 0:
+        return multisine_responses(trial, reading, rng)
+    tones = [tone_response(part, reading, rng) for part in parts]
+    return [tone for tone in tones if tone is not None]
 
 
 def multisine_responses(
@@ -55,6 +82,8 @@ def multisine_responses(
     command_rows = _phasors(send[rows], trial.command_rad[rows], lines)
     raw = _draw(trial.read_time_s[rows], trial.position_rad[rows], lines, rng, draws)
     measured = _draw(reading.time_s[fresh], reading.position_rad[fresh], lines, rng, draws)
+    if measured[2] ** 2 > _INCOHERENT * float(np.var(reading.position_rad[fresh])):
+        return []
     shift = rng.normal(0.0, reading.time_sd_s, draws)
     return [
         ToneResponse(
@@ -81,9 +110,22 @@ def _lines(time: NDArray[np.float64], command: NDArray[np.float64]) -> NDArray[n
         strength = np.abs(np.fft.rfft(np.interp(even, time, left), 8 * len(even)))
         lines = np.append(lines, spectrum_hz[int(np.argmax(strength * usable))])
         lines, left = _sharpened(time, command, lines)
-        if len(lines) > 1 and np.min(np.diff(np.sort(lines))) < 0.5 / span:
+        if len(lines) > 1 and np.min(np.diff(np.sort(lines))) < _APART / span:
             return np.zeros(0)
+    if np.min(lines, initial=np.inf) < _LEAST_PERIODS / span or not _predicts(time, command, lines):
+        return np.zeros(0)
     return np.sort(lines)
+
+
+def _predicts(time: NDArray, command: NDArray, lines: NDArray) -> bool:
+    """Whether the lines as fitted to one half of the command go on in the other half."""
+    half = time < 0.5 * (time[0] + time[-1])
+    for known, other in ((half, ~half), (~half, half)):
+        solution = least_squares(_design(time[known], lines), command[known])
+        wrong = command[other] - _design(time[other], lines) @ solution
+        if np.mean(wrong**2) > _UNPREDICTED * np.var(command):
+            return False
+    return True
 
 
 def _sharpened(

@@ -25,6 +25,7 @@ _IDENTITY = ["joint", "trial", "send_time_s", "read_time_s", "command_rad", "pos
 _MANY_REPEATED = 0.1  # of the rows
 _SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
 _LATEST_S = 1e11
+_MANY_ROWS = 5  # that lie apart from the others
 _FEW_TRIALS = 10  # that are named one by one
 
 
@@ -131,6 +132,10 @@ def _refuse_degrees(
     stated = "angle_unit" in metadata
     if largest <= (_FARTHEST_RAD if stated else LARGEST_RAD):
         return
+    known = table[column].to_numpy(float)
+    known = known[np.isfinite(known)]
+    if column == "position_rad" and _in_two_places(known):
+        return
     joint = str(table["joint"].iloc[farthest])
     names = metadata.get("columns") or {}
     kind = "position" if column == "position_rad" else "command"
@@ -141,8 +146,6 @@ def _refuse_degrees(
             f"{path}, column {place}: values reach {largest:.4g} rad, more than a hundred turns. "
             "Check the unit, or take the start's angle off."
         )
-    known = table[column].to_numpy(float)
-    known = known[np.isfinite(known)]
     turn = next((n for n in _COUNTS if known.max() < n), 0)
     if turn and largest > _FEWEST_COUNTS and (known >= 0).all() and (known % 1 == 0).all():
         unit = f"counts:{turn}"
@@ -155,6 +158,20 @@ def _refuse_degrees(
         f"{import_line(path, unit=unit)} (or deg, turns, counts:4096, scale:…; rad if the joint "
         "turns so far)."
     )
+
+
+def _in_two_places(values: NDArray[np.float64]) -> bool:
+    """Whether angles lie in two places that each could be a joint's: a number that overflows.
+
+    `doctor` says which number, and how to read it.
+    """
+    ordered = np.sort(values)
+    at = int(np.argmax(np.diff(ordered))) + 1 if len(ordered) > 1 else 0
+    parts = ordered[:at], ordered[at:]
+    return (
+        min(map(len, parts)) >= _MANY_ROWS and max(float(np.ptp(p)) for p in parts) < LARGEST_RAD
+        and min(float(np.abs(p).max()) for p in parts) < LARGEST_RAD
+    )  # fmt: skip
 
 
 def _refuse_disorder(path: Path | str, table: pd.DataFrame, own: NDArray[np.int64]) -> None:

@@ -14,6 +14,8 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, in_order, select_joints
 from pupper_sysid.common.processes.workers import Workers, prepare
 from pupper_sysid.sysid.doctor.checks import refuse_unusable
+from pupper_sysid.sysid.recordings.bad_readings import without_bad_readings
+from pupper_sysid.sysid.recordings.excitation import named_tones
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
 Recordings = Recording | Sequence[Recording]
@@ -70,9 +72,15 @@ def chosen_joints(recordings: Recordings, joints: Joints = None) -> list[str]:
     return select_joints(joints if isinstance(joints, str) else ",".join(joints), recorded)
 
 
-def joint_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
-    """All trials of `joint`, renumbered."""
+def recorded_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
+    """All trials of `joint` as they were recorded, renumbered."""
     trials = [trial for recording in as_sequence(recordings) for trial in recording.trials(joint)]
+    return tuple(replace(trial, number=n) for n, trial in enumerate(trials))
+
+
+def joint_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
+    """All trials of `joint` without bad readings, each tone of a command as its own, renumbered."""
+    trials = named_tones([without_bad_readings(t) for t in recorded_trials(recordings, joint)])
     return tuple(replace(trial, number=n) for n, trial in enumerate(trials))
 
 
@@ -90,9 +98,9 @@ def usable_trials(recordings: Recordings, joints: Joints = None) -> dict[str, tu
     InputError
         If a joint is not recorded, or the doctor's verdict on it is "do not use".
     """
-    trials = {j: joint_trials(recordings, j) for j in chosen_joints(recordings, joints)}
-    refuse_unusable(trials)
-    return trials
+    chosen = chosen_joints(recordings, joints)
+    refuse_unusable({j: recorded_trials(recordings, j) for j in chosen})
+    return {j: joint_trials(recordings, j) for j in chosen}
 
 
 def joint_rng(seed: int, joint: str) -> np.random.Generator:

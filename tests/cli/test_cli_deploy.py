@@ -7,6 +7,7 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -61,6 +62,25 @@ def test_the_shipped_policy_walks_on_the_emulated_robot_and_its_log_repeats(caps
     # the servos' side of it is a recording like any other
     recording = load(log.with_name("recording.csv"))
     assert len(recording.joints) == 12 and recording.loop_period_s == pytest.approx(0.02, abs=1e-3)
+
+
+def test_the_emulated_robot_has_the_servos_of_the_calibration_and_commands_are_clipped(
+    capsys, here
+):
+    moved = {}
+    for actuator in (CALIBRATION, "ideal"):
+        code, out, err = run_program(
+            capsys, pupper_deploy, POLICY, "--actuator", actuator, "--seconds", 1.5, "--name",
+            Path(actuator).stem, "--json", "--command", 0.4, 0, 0,
+        )  # fmt: skip
+        assert code == 0 and f"has the servos of {actuator}" in " ".join(err.split())
+        assert "0.4 0 0 was clipped to 0.2 0 0" in " ".join(err.split())
+        found = json.loads(out)
+        assert found["commands"]["forward_m_s"] == [-0.2, 0.2]
+        moved[actuator] = found["mean_motion"]
+        senses = read_walk(Path(found["log"])).senses
+        np.testing.assert_array_equal(senses[-1].command, [0.2, 0, 0])
+    assert moved[CALIBRATION] != moved["ideal"]
 
 
 def test_a_script_is_followed(capsys, here):

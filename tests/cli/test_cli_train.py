@@ -31,7 +31,7 @@ TINY = (
     "--actuator", CALIBRATION, "--environments", "4", "--threads", "1", "--iterations", "2",
     "--imitation.iterations", "2", "--imitation.epochs", "1", "--task.episode-s", "0.5",
     "--learner.steps-per-environment", "6", "--learner.minibatches", "2", "--learner.epochs", "1",
-    "--architecture.hidden", "16", "--architecture.critic-hidden", "16",
+    "--architecture.hidden", "16", "--architecture.critic-hidden", "16", "--first-gait", "keep",
 )  # fmt: skip
 
 

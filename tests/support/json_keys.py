@@ -15,7 +15,7 @@ DOCUMENTED = {command: keys for commands, keys in _ROWS for command in commands.
 # objects whose keys are names of the data
 _BY_NAME = frozenset(
     {"models", "gaits", "orbits", "ablations", "autonomy", "curves", "terrain", "compliance", "imu"}
-    | {"parameters", "choices", "transfer_functions", "estimators_s"}
+    | {"parameters", "choices", "transfer_functions", "estimators_s", "values"}
     | {"coefficients", "leave_one_out_ranges", "candidate_models", "presets", "undecided"}
 )
 # objects that another line, or a file, describes

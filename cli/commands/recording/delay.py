@@ -59,6 +59,11 @@ class Delay:
         terminal.out.print(
             "Only the dead time is the servo's own; the lag moves with gain, amplitude and load."
         )
+        ranges = {name: [f"servo lag is the {b.lag_range}; its table by frequency has the lag of "
+                         "a motion at each."] for name, b in found.items()
+                  if b.lag_range.startswith("mean")}  # fmt: skip
+        for names, text in share_sentences(ranges):
+            terminal.out.print(f"{names}: {text}", soft_wrap=True)
         self._print_frequencies(found)
         first = next(iter(found.values()))
         shown = terminal.table(f"Estimators on {first.joint}", "estimator", "lag ms")

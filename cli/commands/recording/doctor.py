@@ -9,7 +9,6 @@ import tyro
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.common.joints import share_sentences
 
 
 @dataclass(frozen=True)
@@ -29,6 +28,8 @@ class Doctor:
     def run(self) -> None:
         """Examine and print."""
         from pupper_sysid.sysid.doctor.examination import examine
+        from pupper_sysid.sysid.doctor.findings import USE, Finding
+        from pupper_sysid.sysid.doctor.words import shared
 
         recordings = terminal.load_all(self.recordings)
         found = examine(recordings, seed=self.seed)
@@ -49,7 +50,8 @@ class Doctor:
             )  # fmt: skip
         terminal.out.print(shown)
         terminal.out.print()
-        for joints, text in share_sentences({name: j.reasons for name, j in found.items()}):
+        nothing = (Finding("nothing_wrong", USE),)
+        for joints, text in shared({name: j.findings or nothing for name, j in found.items()}):
             terminal.out.print(Text.assemble((joints, "bold"), f": {text}"), soft_wrap=True)
         for text in found.advice:
             terminal.out.print(f"\n{text}", soft_wrap=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pupper_sysid.cli.drive import Driver
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import SyncedText
 from pupper_sysid.hardware.joint_map import load_joint_map
@@ -23,7 +25,7 @@ from pupper_sysid.policies.deploy.filters import Rest
 from pupper_sysid.policies.deploy.observers import ServoModelObserver
 from pupper_sysid.policies.deploy.stacks import STACKS, Stack, suited
 from pupper_sysid.policies.deploy.walk_log import read_walk, replay
-from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.network.policy_file import CommandRanges, Policy
 from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.robot.trot import Trot
@@ -324,6 +326,34 @@ def test_a_script_gives_one_command_after_the_other_and_then_stops(tmp_path):
     np.testing.assert_array_equal(told(1.99), [0.1, 0, 0])
     np.testing.assert_array_equal(told(2.0), [0, 0, 0.4])
     assert told(3.0) is None
+
+
+TRAINED = CommandRanges(forward_m_s=[-0.2, 0.2], sideways_m_s=[-0.1, 0.1], yaw_rad_s=[-0.5, 0.5])
+
+
+def test_commands_beyond_the_training_are_clipped_and_one_sentence_says_so(tmp_path):
+    path, said = tmp_path / "s.csv", []
+    path.write_text("seconds,forward_m_s,left_m_s,turn_rad_s\n2,0.4,0,0\n1,0,0,-2\n1,0.2,0.1,0\n")
+    command = script(path, TRAINED, said.append)
+    np.testing.assert_array_equal(command(0.0), [0.2, 0, 0])
+    np.testing.assert_array_equal(command(2.5), [0, 0, -0.5])
+    np.testing.assert_array_equal(command(3.5), [0.2, 0.1, 0])
+    np.testing.assert_array_equal(constant((-0.3, 0, 0), TRAINED, said.append)(9.0), [-0.2, 0, 0])
+    assert len(said) == 2 and "2 of 3 commands were clipped to what the policy was" in said[0]
+    assert "-0.3 0 0 was clipped to -0.2 0 0" in said[1] and "forward -0.2 to 0.2 m/s" in said[1]
+    constant((0.2, -0.1, 0.5), TRAINED, said.append)
+    assert len(said) == 2
+
+
+def test_keys_drive_no_further_than_the_training(monkeypatch):
+    read_end, write_end = os.pipe()
+    with os.fdopen(read_end) as keys:
+        monkeypatch.setattr("sys.stdin", keys)
+        driver = Driver(TRAINED)
+        for typed, expected in ((b"wwww", 0.2), (b"w", 0.2), (b"s", 0.15), (b" ssssss", -0.2)):
+            os.write(write_end, typed)
+            np.testing.assert_allclose(driver(0.0), [expected, 0, 0])
+    os.close(write_end)
 
 
 def test_a_script_that_is_none_is_refused(tmp_path):

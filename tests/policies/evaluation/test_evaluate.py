@@ -19,8 +19,15 @@ from pupper_sysid.policies.evaluation.evaluate import (
     walk,
 )  # fmt: skip
 from pupper_sysid.policies.evaluation.falls import in_short
-from pupper_sysid.policies.evaluation.figures import figures_of, share_interval
-from pupper_sysid.policies.walks.conditions import DIRECTIONS, RANDOM, evaluation_task
+from pupper_sysid.policies.evaluation.figures import Recorder, figures_of, share_interval
+from pupper_sysid.policies.walks.conditions import (
+    DIRECTIONS,
+    RANDOM,
+    Condition,
+    evaluation_task,
+)
+from pupper_sysid.policies.walks.together import walk_together
+from pupper_sysid.sim.robot.mini_pupper import MASS_KG
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Curriculum, Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
@@ -70,6 +77,26 @@ def test_a_fall_counts_once_and_its_error_is_that_of_standing_to_the_end_of_the_
             before = np.abs(walked.velocity[:up, i] - command).sum(axis=0)
             expected = (before + (60 - up) * np.abs(command)) / 60
             np.testing.assert_allclose(walked.error[i], expected)
+
+
+def test_a_trot_clears_the_ground_and_works_and_a_standing_robot_does_neither():
+    task, forward = evaluation_task(Walking(), 2.0), (0.15, 0.0, 0.0)
+    both = [Condition(task, 2, forward, walker=walker) for walker in ("trot", "standing")]
+    walks = walk_together(None, servo_ranges(CALIBRATION), both, 2.0, 3, 1, Recorder)
+    trot, still = (figures_of(walked, forward) for walked in walks)
+    # no foot rises above the lift of its set-points, but for what the trunk rocks
+    assert 0.0 < trot.clearance_p10_m < trot.clearance_p50_m < 1.5 * Trot().lift_m
+    assert 0.0 <= trot.low_swing_share < 0.5
+    # work goes into friction and impacts: more than that of lifting a leg at each step
+    assert trot.mechanical_power_w > 0.5 > 5 * still.mechanical_power_w
+    weight_n = 9.81 * MASS_KG
+    assert trot.cost_of_transport == pytest.approx(
+        trot.mechanical_power_w / (weight_n * trot.speed_share * 0.15), rel=0.25
+    )  # of the whole walk, its slow start and payloads included
+    for kind in ("hip", "thigh", "calf"):
+        share, rms = trot.torque_saturated_share[kind], trot.rms_torque_share[kind]
+        assert 0.0 <= share <= rms**2 <= 1.0 + 1e-9, "a saturated servo has a square of 1"
+    assert np.isnan(still.clearance_p50_m) or still.clearance_p50_m < trot.clearance_p50_m
 
 
 def test_policy_trot_and_standing_walk_as_the_same_robots_in_every_row():

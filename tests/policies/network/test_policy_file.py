@@ -15,13 +15,26 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from pupper_sysid.cli.policy_choice import chosen_actuator, policy_at, simulator, trained_actuator
+from pupper_sysid.cli.policy_choice import (
+    chosen_actuator,
+    policy_at,
+    simulator,
+    trained_actuator,
+    trained_commands,
+)
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.policies.network.policy_export import write_policy
-from pupper_sysid.policies.network.policy_file import CONTRACT, WEIGHTS, load_policy, refuse_bad
+from pupper_sysid.policies.network.policy_file import (
+    CONTRACT,
+    WEIGHTS,
+    Policy,
+    load_policy,
+    refuse_bad,
+)
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
+from pupper_sysid.sim.walking.config import Commands
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.refusals import assert_each_refused
 from support.tiny_training import ALL_KINDS, CALIBRATION, HISTORY, networks, tiny_run
@@ -37,6 +50,12 @@ def write(folder: Path, weights: dict[str, torch.Tensor], force: bool = True) ->
 def rewrite_contract(folder: Path, **changes) -> None:
     path = folder / CONTRACT
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def commands(**changes) -> dict[str, list[float]]:
+    """Command ranges of a contract."""
+    ranges = {"forward_m_s": [-0.2, 0.2], "sideways_m_s": [-0.1, 0.1], "yaw_rad_s": [-0.5, 0.5]}
+    return ranges | changes
 
 
 def rewrite_weights(folder: Path, data: bytes | None = None) -> None:
@@ -122,6 +141,40 @@ def test_a_contract_of_version_1_has_its_dead_time_under_the_old_name(copied):
     assert load_policy(folder).contract.model_dump(mode="json", by_alias=True) == written
 
 
+def test_a_policy_states_the_commands_that_its_training_had_come_to(tmp_path):
+    run = tiny_run()
+    run = replace(
+        run, architecture=replace(run.architecture, hidden=(32, 16)),
+        task=replace(run.task, commands=Commands(forward_m_s=(-0.1, 0.3))),
+    )  # fmt: skip
+    weights = networks("mlp")[0].state_dict()
+    servos = servo_ranges(CALIBRATION)
+    write_policy(tmp_path, weights, run, servos, 0, {"seed": 0}, command_share=0.5)
+    trained = load_policy(tmp_path).contract.commands
+    assert trained is not None
+    np.testing.assert_allclose(
+        trained.clip(np.array([[9.0, 9, 9], [-9, -9, -9], [0.1, 0, 0]])),
+        [[0.15, 0.05, 0.25], [-0.05, -0.05, -0.25], [0.1, 0, 0]],
+    )
+
+
+def test_an_older_policys_commands_are_those_of_its_run_or_else_a_stated_assumption(copied, capsys):
+    policy = load_policy(copied())
+    older = replace_contract(policy, commands=None)
+    run = replace(tiny_run(), task=replace(tiny_run().task, commands=Commands((-0.1, 0.3))))
+    assert trained_commands(policy, None).forward_m_s == [-0.2, 0.2]
+    assert trained_commands(older, run).forward_m_s == [-0.1, 0.3]
+    assert "Assumed" not in capsys.readouterr().err
+    assert trained_commands(older, None).forward_m_s == [-0.2, 0.2]
+    assert "Assumed are those of the preset fast" in " ".join(capsys.readouterr().err.split())
+    published = replace_contract(older, base_velocity="true")
+    assert trained_commands(published, None).forward_m_s == [-0.35, 0.35]
+
+
+def replace_contract(policy: Policy, **changes) -> Policy:
+    return Policy(policy.network, policy.contract.model_copy(update=changes))
+
+
 # ------------------------------------------------------------------------------ refused
 
 
@@ -135,7 +188,7 @@ def test_a_contract_that_was_tampered_with_is_refused(copied):
         load_policy(folder)
 
     cases = [
-        ({"schema": "pupper-servo"}, "schema"), ({"schema_version": 4}, "Upgrade pupper-sysid"),
+        ({"schema": "pupper-servo"}, "schema"), ({"schema_version": 5}, "Upgrade pupper-sysid"),
         ({"schema_version": 0}, "schema_version"), ({"kind": "perceptron"}, "kind"),
         ({"hidden": []}, "does not fit"), ({"hidden": [32, 17]}, "does not fit"),
         ({"hidden": [32, -1]}, "hidden"), ({"kind": "gru"}, "does not fit"),
@@ -147,6 +200,9 @@ def test_a_contract_that_was_tampered_with_is_refused(copied):
         ({"velocity_steps": 10**9}, "velocity_steps"), ({"dead_time_s": []}, "dead_time_s"),
         ({"dead_time_s": [0.01, float("nan")]}, "dead_time_s"),
         ({"weights_sha256": "0" * 63}, "weights_sha256"),
+        ({"commands": {"forward_m_s": [-0.2, 0.2]}}, "sideways_m_s"),
+        ({"commands": commands(forward_m_s=[0.2, -0.2])}, "lower end"),
+        ({"commands": commands(yaw_rad_s=[-0.5, float("inf")])}, "yaw_rad_s"),
         *((text, "") for text in ("", "{", "[]", "null", '{"schema": NaN}', "\x00\xff")),
     ]  # fmt: skip
     assert_each_refused(cases, load, names=folder)

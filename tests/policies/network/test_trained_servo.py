@@ -13,7 +13,7 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.policies.network.policy_file import CONTRACT, load_policy
+from pupper_sysid.policies.network.policy_file import CONTRACT, VERSION, load_policy
 from pupper_sysid.policies.network.trained_servo import trained_servo
 from pupper_sysid.sim.walking.config import Randomisation, Walking
 from pupper_sysid.sim.walking.differences import Differences
@@ -91,7 +91,7 @@ def test_an_absent_servo_is_no_evidence_and_older_files_are_read(folder):
             whole["delay_s"] = whole.pop("dead_time_s")
         path.write_text(json.dumps(whole))
         contract = load_policy(folder).contract
-        assert contract.servo is None and contract.schema_version == 3
+        assert contract.servo is None and contract.schema_version == VERSION
 
 
 def first(servo):

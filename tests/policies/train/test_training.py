@@ -14,18 +14,22 @@ import sys
 import time
 from dataclasses import replace
 from importlib.util import find_spec
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
+from pupper_sysid.cli.policy_choice import policy_at
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.policies.network.hyperparameters import Imitation
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.policies.train import training
 from pupper_sysid.policies.train.checkpoint import read_checkpoint
 from pupper_sysid.policies.train.curves import PROGRESS
+from pupper_sysid.policies.train.imitation import imitate
 from pupper_sysid.policies.train.learner import Learner
 from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.run_file import load_run
@@ -234,10 +238,92 @@ def test_a_termination_signal_ends_a_long_update_within_a_second(tmp_path):
     train(tmp_path / "run", None)
 
 
-def test_time_that_is_up_ends_a_run_with_everything_saved(tmp_path):
+def test_time_that_is_up_ends_a_run_within_its_first_gait_with_a_policy_that_plays(tmp_path):
     train(tmp_path, tiny_run(minutes=0.001))
     found = read_checkpoint(tmp_path / LAST)
-    assert found["iteration"] == 0 and found["more"]["imitated"] == 2
+    assert found["iteration"] == 0 and found["more"]["imitated"] < 2
+    policy, _ = policy_at(tmp_path)
+    policy.reset(np.zeros((1, 12)))
+    assert np.isfinite(policy.act(np.zeros((1, 60)))).all()
+
+
+def test_a_round_that_was_left_is_repeated_and_the_run_is_that_without_a_stop(
+    tmp_path, uninterrupted, monkeypatch
+):
+    def left_in_the_second_round(learner, teacher, how, round_, ends):
+        steps = count()
+        late = round_ == 1
+        return imitate(learner, teacher, how, round_, lambda: late and next(steps) > 6)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(training, "imitate", left_in_the_second_round)
+        train(tmp_path, tiny_run())
+    assert read_checkpoint(tmp_path / LAST)["more"]["imitated"] == 1
+    # seven steps: the rollout was whole, and one minibatch was learned from
+    weights = load_policy(tmp_path / "policy_last").network.state_dict()
+    kept = read_checkpoint(tmp_path / LAST)["actor_state_dict"]
+    assert not torch.equal(weights["mlp.0.weight"], kept["mlp.0.weight"])
+    train(tmp_path, None)
+    straight = read_checkpoint(uninterrupted() / LAST)
+    assert different(straight, read_checkpoint(tmp_path / LAST)) == []
+
+
+def test_the_last_policy_is_on_disk_after_each_round_of_imitation(tmp_path):
+    rounds = []
+
+    def watch(now):
+        if now.phase == "ppo":
+            rounds.append(load_policy(tmp_path / "policy_last").contract.training)
+
+    train(tmp_path, tiny_run(iterations=1), watch)
+    assert [r["imitation_rounds"] for r in rounds] == [2]
+
+
+def test_rounds_that_do_not_fit_the_time_are_left_out_and_the_rate_falls_to_zero_with_the_last(
+    tmp_path, monkeypatch
+):
+    rates, said, clock = [], [], SimpleNamespace(now_s=1000.0)
+
+    def slow(learner, teacher, how, round_, ends):
+        rates.append(how.iterations)
+        clock.now_s += 10.0
+        return imitate(learner, teacher, how, round_, ends)
+
+    monkeypatch.setattr(training, "imitate", slow)
+    ticking = SimpleNamespace(monotonic=lambda: clock.now_s, perf_counter=time.perf_counter)
+    monkeypatch.setattr(training, "time", ticking)
+    run = tiny_run(imitation=Imitation(40, rollouts=1, epochs=1, minibatches=2), minutes=1.0)
+    train(tmp_path, run, stop_after("imitation", 2), notice=said.append)
+    # of the 50 s after the first round three quarters are enough for three of 10 s
+    assert read_checkpoint(tmp_path / LAST)["more"]["rounds"] == 4 and rates == [40, 4]
+    assert len(said) == 1 and "4 of 40 are made within --minutes 1" in said[0]
+    train(tmp_path, None, stop_after("imitation", 4), minutes=60.0)
+    assert rates == [40, 4, 4, 4]
+
+
+def test_time_before_a_run_counts(tmp_path):
+    train(tmp_path, tiny_run(minutes=60.0), stop_after("imitation", 1), spent_s=100.0)
+    assert read_checkpoint(tmp_path / LAST)["more"]["elapsed_s"] > 100.0
+    train(tmp_path / "late", tiny_run(minutes=60.0), spent_s=3600.0)
+    assert read_checkpoint(tmp_path / "late" / LAST)["more"]["imitated"] == 0
+
+
+def test_updates_that_are_all_taken_back_are_said_and_end_the_run_with_what_helps(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(training, "_UNDONE_SAID", 2)
+    monkeypatch.setattr(training, "_UNDONE_END", 4)
+    hyper = replace(tiny_run().learner, desired_kl=1e-12, learning_rates=(1e-3, 1e-3))
+    said = []
+    run = tiny_run(learner=hyper, iterations=10, imitation=Imitation(iterations=0))
+    learner = train(tmp_path, run, notice=said.append)
+    assert learner.iteration == 4 and read_checkpoint(tmp_path / LAST)["iteration"] == 4
+    assert "The last 2 updates" in said[0] and "ends after 4" in said[0]
+    assert "The last 4 updates" in said[1] and "--learner.desired-kl 2e-12" in said[1]
+    # with the weights, Adam's memory goes back, but for that of its first update
+    steps = [s["step"] for s in learner.ppo.optimizer.state_dict()["state"].values()]
+    each = run.learner.epochs * run.learner.minibatches
+    assert min(steps) == each and max(steps) == 4 * each, "of the policy, and of the critic"
 
 
 def test_a_watcher_is_told_where_the_run_stands(tmp_path):

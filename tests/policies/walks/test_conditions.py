@@ -20,7 +20,7 @@ from pupper_sysid.policies.walks.conditions import (
 from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.config import PRESETS, Walking
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.refusals import assert_each_refused
@@ -155,6 +155,12 @@ def test_robots_and_terrain_are_others_than_those_of_a_training_with_the_seed():
     training = PupperEnv(ROUGH, SERVOS, 2, 3, 1)
     assert (seen[0][0] != training.ground.heights).any()
     assert (seen[0][1] != training.robots.friction).all()
+
+
+def test_the_trot_beside_a_policy_is_the_usual_one_or_that_fitted_to_its_servos():
+    fitted = replace(TASK, trot=Trot(frequency_hz=2.4, gain=1.3))
+    for task, expected in ((TASK, Trot()), (PRESETS["fast"], Trot()), (fitted, fitted.trot)):
+        assert module._reference(task) == expected
 
 
 def test_policy_trot_and_standing_robots_share_an_environment_and_differ_in_their_actions_only(

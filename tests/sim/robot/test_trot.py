@@ -52,6 +52,23 @@ def along(command, count: int) -> np.ndarray:
 NEUTRAL = feet(default_pose()[None])[0]
 
 
+def test_gains_of_their_own_lengthen_the_strokes_backward_and_sideways_alone():
+    phase = np.linspace(0, 2 * np.pi, 50)
+    own = replace(TROT, back_gain=1.5, side_gain=0.5)
+
+    def strokes(trot, command):
+        path = feet(trot.joints(phase, along(command, 50)))
+        return np.ptp(path, axis=0)[:, :2]
+
+    for command, factors in (
+        ((0.1, 0.0, 0.0), (1.0, 1.0)), ((-0.1, 0.0, 0.0), (1.5, 1.0)),
+        ((0.0, 0.06, 0.0), (1.0, 0.5)), ((-0.1, -0.06, 0.0), (1.5, 0.5)),
+        ((0.0, 0.0, 0.4), (1.0, 1.0)),
+    ):  # fmt: skip
+        expected = strokes(TROT, command) * factors
+        np.testing.assert_allclose(strokes(own, command), expected, atol=1e-9)
+
+
 def test_the_phase_is_read_back_from_the_joints():
     for command in COMMANDS:
         phase = np.linspace(-np.pi, np.pi, 41)[:-1] + 0.01

@@ -27,9 +27,11 @@ from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.bus import WalkingBus
+from pupper_sysid.sim.walking.bus import WalkingBus, calibrated_robot
 from pupper_sysid.sim.walking.robot import WalkingRobot
+from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.servo_servers import exact_spec, on_a_socket, wait_until
+from support.tiny_training import CALIBRATION
 
 POSE = np.array([DEFAULT_POSE[name] for name in JOINT_NAMES])
 HIP, THIGH, CALF = 0, 1, 2
@@ -361,3 +363,33 @@ def test_the_proxy_without_a_host_tells_of_a_standing_robot():
     raw = datagrams.parse_imu(proxy.answer(b"\x02\x04", b"", 1000.0))
     assert raw is not None
     np.testing.assert_allclose(raw[:3], [0.0, 0.0, -1.0], atol=0.012)
+
+
+def test_an_emulated_robot_has_the_servos_and_the_polls_of_a_calibration():
+    servos = servo_ranges(CALIBRATION)
+    robot = calibrated_robot(servos, np.random.default_rng(0))
+    at_1_ms = servos.in_steps_of(0.001)
+    assert robot.joint_names == JOINT_NAMES
+    for i, servo in enumerate(robot.servos):
+        for name in servos.value:
+            expected = (at_1_ms if name == "dead_time_s" else servos).value[name][i]
+            assert getattr(servo.actuator, name) == pytest.approx(expected), name
+    assert robot.spec.poll_period_s == pytest.approx(0.0268, abs=1e-4)
+    assert robot.spec.loss == pytest.approx(np.median([f.loss for f in servos.feedback]))
+
+
+def test_servos_without_a_delay_get_the_shortest_that_can_be_emulated_and_readings_are_live():
+    robot = calibrated_robot(servo_ranges("ideal", "ideal"), np.random.default_rng(0))
+    assert {s.actuator.dead_time_s for s in robot.servos} == {0.002}
+    assert robot.spec.poll_period_s == 0.0 and robot.spec.loss == 0.0
+    bus = WalkingBus(robot, np.random.default_rng(0))
+    bus.close()
+
+
+def test_the_jitter_of_commands_is_a_part_of_the_dead_time():
+    servos = replace(servo_ranges(CALIBRATION), command_jitter_s=0.004)
+    late = calibrated_robot(servos, np.random.default_rng(0))
+    steady = calibrated_robot(replace(servos, command_jitter_s=0.0), np.random.default_rng(0))
+    for a, b in zip(late.servos, steady.servos, strict=True):
+        assert a.actuator.dead_time_s == pytest.approx(b.actuator.dead_time_s - 0.004)
+    assert late.spec.command_jitter_s == 0.004

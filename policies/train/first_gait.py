@@ -1,0 +1,583 @@
+"""A first gait for the servos at hand: the open-loop trot judged on them, and fitted to them.
+
+What a policy imitates, and the rewards it then learns from, suit the servos for which they were
+found. So before a training the trot walks on the servos of the run for a few seconds. Where it is
+poor, its frequency, duty, lift, crouch, spread and gains are searched by the cross-entropy method
+(Rubinstein 1999): 64 candidates × 8 commands walk at once, the best of them give the next
+distribution. The gains of a candidate need no search: its speeds say by what they were wrong.
+
+The cost of a gait is the error of its speeds relative to standing, and falls, clearance of the
+feet, torque, saturation and sway. The best of each generation are judged again by the walks that
+`Judge` uses, in the physics of evaluation, and so is the trot before. Where even the fitted trot is
+poor, the same walk on servos without one of their limits says which of them it is.
+
+The fitted trot is what is imitated, and in whose poses episodes begin; its frequency, duty and
+stance are those of the clocked teacher's rewards, and its errors widen the rewards for speed, which
+have no slope at errors of several widths.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.results import Result
+from pupper_sysid.policies.network.hyperparameters import OWN, TROT
+from pupper_sysid.policies.train.run_file import Run
+from pupper_sysid.policies.train.selection import COMMANDS, scored
+from pupper_sysid.policies.walks.conditions import evaluation_task
+from pupper_sysid.policies.walks.effort import LOW_SWING_M, EffortMeter
+from pupper_sysid.policies.walks.tracking import planar_velocity
+from pupper_sysid.sim.robot.trot import Trot
+from pupper_sysid.sim.walking.config import PRESETS, Walking
+from pupper_sysid.sim.walking.env import PupperEnv
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
+from pupper_sysid.sim.walking.shared_draws import Twins
+
+Array = NDArray[np.float64]
+
+POOR_SCORE = 0.6
+"""Score below which a trot is fitted to the servos; on the shipped calibration it has 0.7."""
+FORWARD = (0.9, 1.1)
+"""Shares of the commanded forward speed within which a trot need not be fitted."""
+LOW_SWINGS = 0.25
+"""Share of low swings above which a trot is fitted."""
+
+_FORWARD_M_S, _TURN_RAD_S = 0.15, 0.4
+_LARGEST = np.array([0.2, 0.1, 0.5])
+"""Commands of a usual task, within which those of the walks are [m/s, m/s, rad/s]."""
+_SEED = 4_000_037  # of robots that neither trainings nor judges nor evaluations have
+_SECONDS, _IGNORED_S = 4.0, 1.0
+_EACH = 2  # robots per command of the judge
+_SEARCH_COMMANDS = np.array(
+    [
+        [0.15, 0, 0], [0.2, 0, 0], [-0.15, 0, 0], [0, 0.08, 0], [0, -0.08, 0], [0, 0, 0.4],
+        [0, 0, -0.4], [0.1, 0.05, 0.3],
+    ]
+)  # fmt: skip
+_CANDIDATES, _ELITE, _GENERATIONS = 64, 10, 5
+_SEARCH_S, _SEARCH_IGNORED_S = 2.4, 0.8
+_SEARCH_STEP_S = 0.004  # twice that of evaluation, in half of the time
+_FINALISTS = 4
+_MOST_CORRECTION = 1.6  # of a gain, in one generation
+
+_BOX = {
+    "frequency_hz": (1.8, 5.0), "duty": (0.5, 0.85), "lift_m": (0.009, 0.03),
+    "crouch_m": (0.0, 0.03), "spread_m": (0.0, 0.015), "gain": (0.5, 2.5), "back_gain": (0.5, 2.0),
+    "side_gain": (0.5, 2.0), "turn_gain": (0.4, 2.5),
+}  # fmt: skip
+_NAMES = tuple(_BOX)
+_LOW, _HIGH = np.array(list(_BOX.values())).T
+_FIRST_WIDTH, _NARROWEST = 0.2, 0.02  # standard deviations, in shares of the box
+
+_CLEARANCE_M = 0.006
+_WEIGHTS = {"clearance": 0.5, "torque": 0.2, "saturation": 0.2, "sway": 0.1}
+"""Of the parts of the cost beside errors relative to standing and falls, of order 1 each."""
+_SWAY_RAD_S = 1.0
+
+_LEAST_MINUTES = 5.0
+_USUAL = {
+    "linear_sigma": 0.017, "stride_linear_sigma": 0.005, "angular_sigma": 0.072,
+    "stride_angular_sigma": 0.027,
+}  # fmt: skip
+"""Errors of the trot on the shipped calibration, for which the widths of the rewards were found
+[m/s, rad/s]."""
+_WIDEST = 3.0
+
+_LIMITS: dict[str, dict[str, float]] = {
+    "torque": {"effort_limit": 2.0},
+    "friction": {"friction_loss": 0.25},
+    "speed": {"velocity_limit": 3.0, "back_emf": 0.2},
+    "stiffness": {"stiffness": 1.6, "damping": 1.3},
+    "dead time": {"dead_time_s": 0.3},
+}
+"""Factors on the servos' numbers that take away one of their limits."""
+_WORTH = 0.05  # of the merit: less is not what limits a gait
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaitScore(Result):
+    """How a trot walks on some servos."""
+
+    score: float
+    """That of `policies.train.selection.Judge`: 1 without errors, 0 for a robot that stands."""
+    falls: float
+    forward_share: float
+    """Mean forward speed over the commanded `forward_m_s`."""
+    turn_share: float
+    """Mean turn rate on the spot over the commanded `turn_rad_s`."""
+    forward_m_s: float = _FORWARD_M_S
+    """Or three quarters of the largest command of the task, where that is less."""
+    turn_rad_s: float = _TURN_RAD_S
+    """Or four fifths of the largest."""
+    speed_error_m_s: float
+    """Mean distance of the velocity from the commanded one of robots that are to move."""
+    mean_speed_error_m_s: float
+    """The same of the velocity averaged over a stride."""
+    turn_error_rad_s: float
+    mean_turn_error_rad_s: float
+    clearance_p10_m: float
+    """Tenth percentile of the clearance of the swings."""
+    low_swing_share: float
+    """Of swings that clear less than 2 mm."""
+    saturated_share: float
+    """Share of the time in which thighs and calves are at their torque limit."""
+
+    @property
+    def poor(self) -> bool:
+        """Whether a better gait is to be searched."""
+        fits = FORWARD[0] <= self.forward_share <= FORWARD[1]
+        return self.score < POOR_SCORE or not fits or self.low_swing_share > LOW_SWINGS
+
+    def __str__(self) -> str:
+        return (
+            f"score {self.score:.2f}, {100 * self.forward_share:.0f} % of {self.forward_m_s:g} m/s "
+            f"forward, {100 * self.turn_share:.0f} % of {self.turn_rad_s:g} rad/s on the spot, "
+            f"{100 * self.falls:.0f} % "
+            f"fell; clearance {1e3 * self.clearance_p10_m:.1f} mm (p10), "
+            f"{100 * self.low_swing_share:.0f} % of the swings low, thighs and calves at their "
+            f"torque limit {100 * self.saturated_share:.0f} % of the time"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstGait(Result):
+    """A trot before and after it was fitted to servos."""
+
+    before: GaitScore
+    trot: Trot
+    after: GaitScore
+    """The same as `before` where nothing better was found."""
+    limit: str | None
+    """What keeps the servos from walking better; None where the gait is not poor."""
+
+
+def fits_trots(run: Run) -> bool:
+    """Whether a run begins with a gait that may be fitted."""
+    taught = run.imitation.iterations and run.imitation.teacher in (TROT, OWN)
+    return bool(taught) and run.first_gait != "keep" and not run.architecture.privileged_actor
+
+
+def with_first_gait(
+    run: Run,
+    say: Callable[[str], None] = lambda text: None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Run:
+    """The run with a first gait for its servos: its own where that walks, else a fitted one.
+
+    Parameters
+    ----------
+    run : Run
+    say : callable
+        Called with sentences about the gait.
+    progress : callable
+        Called with the share of the search that is done.
+    """
+    servos, name = servo_ranges(run.actuator, run.feedback), Path(run.actuator).name
+    threads = run.threads or os.cpu_count() or 1
+    (own,) = judge_trots([run.task.trot], run.task, servos, run.seed, threads)
+    say(f"First gait, the open-loop trot on the servos of {name}: {own}.")
+    if run.first_gait == "auto":
+        if not own.poor:
+            return run
+        if run.minutes < _LEAST_MINUTES:
+            say(
+                f"That is poor, but a search for a better one takes a minute or two of --minutes "
+                f"{run.minutes:g}, and was left out. --first-gait fit searches anyway."
+            )
+            return run
+    say("Searching a better one for these servos takes about a minute on two cores.")
+    found = fit_trot(run.task, servos, run.seed, threads, progress)
+    if found.trot == run.task.trot:
+        say("Nothing better was found.")
+    else:
+        t = found.trot
+        say(
+            f"Fitted: {found.after}. It has {t.frequency_hz:.1f} Hz, duty {t.duty:.2f}, lift "
+            f"{1e3 * t.lift_m:.0f} mm, crouch {1e3 * t.crouch_m:.0f} mm, gain {t.gain:.2f}, "
+            f"turning {t.turn_gain:.2f}."
+        )
+    if found.after.poor:
+        say(_sentence(found))
+    return suited(run, found)
+
+
+def _sentence(found: FirstGait) -> str:
+    """What keeps servos from walking well."""
+    own, limit = found.after, found.limit
+    because = {
+        "torque": "their torque: thighs and calves are at its limit "
+        f"{100 * own.saturated_share:.0f} % of the time",
+        "friction": "their dry friction, in whose dead band small steps get lost",
+        "speed": "their speed",
+        "stiffness": "their stiffness: feet lag behind what they are commanded under load",
+        "dead time": "their dead time",
+    }
+    why = f" What limits it most is {because[limit]}." if limit else ""
+    return (
+        f"These servos carry no better open-loop trot than this.{why} Training begins with it; "
+        "commands of less speed (--task.commands.forward-m-s -0.1 0.1) are easier."
+    )
+
+
+def suited(run: Run, found: FirstGait) -> Run:
+    """The run with a fitted trot, and rewards that suit it."""
+    if found.trot == run.task.trot and not found.after.poor:
+        return run
+    trot, own, rewards = found.trot, found.after, run.task.rewards
+
+    def wider(name: str, error: float) -> float:
+        return getattr(rewards, name) * min(max(error / _USUAL[name], 1.0), _WIDEST)
+
+    changes = {
+        "linear_sigma": wider("linear_sigma", own.speed_error_m_s),
+        "stride_linear_sigma": wider("stride_linear_sigma", own.mean_speed_error_m_s),
+        "angular_sigma": wider("angular_sigma", own.turn_error_rad_s),
+        "stride_angular_sigma": wider("stride_angular_sigma", own.mean_turn_error_rad_s),
+    }
+    if run.imitation.teacher == OWN:
+        usual = PRESETS["fast"].trot
+        changes |= {
+            "clock_hz": rewards.clock_hz * trot.frequency_hz / usual.frequency_hz,
+            "clock_duty": min(max(rewards.clock_duty + trot.duty - usual.duty, 0.5), 0.85),
+            "crouch": trot.crouch_m, "spread": trot.spread_m,
+        }  # fmt: skip
+    return replace(run, task=replace(run.task, trot=trot, rewards=replace(rewards, **changes)))
+
+
+def judge_trots(
+    trots: Sequence[Trot],
+    task: Walking,
+    servos: ServoRanges,
+    seed: int,
+    threads: int,
+    changes: Sequence[dict[str, float]] = (),
+) -> list[GaitScore]:
+    """Let trots walk on the same robots under the judge's commands for 4 s.
+
+    Parameters
+    ----------
+    trots : sequence of Trot
+    task : Walking
+        Of the training.
+    servos : ServoRanges
+    seed, threads : int
+    changes : sequence of dict of str to float
+        For each trot, factors on numbers of its robots' servos, by field of
+        `DelayedPDParameters`; none by default.
+    """
+    return [_score(one) for one in _judged(trots, task, servos, seed, threads, changes)]
+
+
+def fit_trot(
+    task: Walking,
+    servos: ServoRanges,
+    seed: int,
+    threads: int = 0,
+    progress: Callable[[float], None] = lambda share: None,
+) -> FirstGait:
+    """Search a trot for some servos, beginning with that of a task.
+
+    Parameters
+    ----------
+    task : Walking
+    servos : ServoRanges
+    seed, threads : int
+    progress : callable
+        Called with the share of the work that is done.
+    """
+    rng = np.random.default_rng([seed, 6])
+    quick = _quick(task, servos)
+    mean = np.clip(_values(task.trot), _LOW, _HIGH)
+    width = _FIRST_WIDTH * (_HIGH - _LOW)
+    tried: list[tuple[float, Trot]] = []
+    for generation in range(_GENERATIONS):
+        drawn = np.clip(rng.normal(mean, width, (_CANDIDATES, len(_NAMES))), _LOW, _HIGH)
+        drawn[0] = mean
+        if not generation:  # half of them from the whole box, in strata of each number
+            half = _CANDIDATES // 2
+            strata = rng.permuted(np.tile(np.arange(half), (len(_NAMES), 1)), axis=1).T
+            drawn[half:] = _LOW + (strata + rng.random(strata.shape)) / half * (_HIGH - _LOW)
+        trots = [_trot(task.trot, values) for values in drawn]
+        walked = _walk(
+            trots,
+            quick,
+            servos,
+            _within(task, _SEARCH_COMMANDS),
+            _SEARCH_S,
+            _SEARCH_IGNORED_S,
+            seed,
+            threads,
+        )
+        costs = [_cost(one) for one in walked]
+        order = np.argsort(costs, kind="stable")[:_ELITE]
+        elite = [_corrected(trots[i], walked[i]) for i in order]
+        tried += [(costs[i], trot) for i, trot in zip(order, elite, strict=True)]
+        values = np.array([_values(trot) for trot in elite])
+        mean = values.mean(axis=0)
+        width = np.maximum(values.std(axis=0), _NARROWEST * (_HIGH - _LOW))
+        progress((generation + 1) / (_GENERATIONS + 1))
+    best = [trot for _, trot in sorted(tried, key=lambda one: one[0])[: _FINALISTS - 1]]
+    trots = [task.trot, _trot(task.trot, mean), *best]
+    walked = _judged(trots, task, servos, seed, threads)
+    before = _score(walked[0])
+    # in the physics of evaluation the speeds are a little others
+    more = [_corrected(trot, one) for trot, one in zip(trots, walked, strict=True)]
+    walked += _judged(more, task, servos, seed, threads)
+    trots += more
+    chosen = int(np.argmax([_merit(_score(one)) for one in walked]))
+    again = _corrected(trots[chosen], walked[chosen])
+    trots, walked = [trots[chosen], again], [walked[chosen]]
+    walked += _judged([again], task, servos, seed, threads)
+    scores = [_score(one) for one in walked]
+    chosen = int(np.argmax([_merit(score) for score in scores]))
+    trot, after = trots[chosen], scores[chosen]
+    limit = _limit(trot, after, task, servos, seed, threads) if after.poor else None
+    progress(1.0)
+    return FirstGait(before=before, trot=trot, after=after, limit=limit)
+
+
+def _judged(
+    trots: Sequence[Trot], task: Walking, servos: ServoRanges, seed: int, threads: int,
+    changes: Sequence[dict[str, float]] = (),
+) -> list[_Walked]:  # fmt: skip
+    command = _within(task, np.repeat(COMMANDS, _EACH, axis=0))
+    return _walk(
+        trots, _gentle(task, _SECONDS), servos, command, _SECONDS, _IGNORED_S, seed, threads,
+        changes,
+    )  # fmt: skip
+
+
+def _within(task: Walking, commands: Array) -> Array:
+    """Commands as far within the ranges of a task as they are within usual ones."""
+    return commands * _scale(task)
+
+
+def _scale(task: Walking) -> Array:
+    """Largest commands of a task over usual ones, at most 1, of each part."""
+    own = task.commands
+    ends = np.abs([own.forward_m_s, own.sideways_m_s, own.yaw_rad_s]).max(axis=1)
+    return np.minimum(ends / _LARGEST, 1.0)
+
+
+def _gentle(task: Walking, seconds: float) -> Walking:
+    """The task as it is evaluated, on the servos themselves: their scale is not drawn."""
+    found = evaluation_task(task, 2 * seconds)  # longer, so that no episode ends but by a fall
+    random = replace(found.randomisation, torque_scale=(1.0, 1.0))
+    return replace(found, commands=task.commands, randomisation=random)
+
+
+def _quick(task: Walking, servos: ServoRanges) -> Walking:
+    """The task of the search: as evaluated, but in the physics of training and in longer steps."""
+    found = replace(_gentle(task, _SEARCH_S), physics="training")
+    longer = replace(found, physics_step_s=_SEARCH_STEP_S) if _divides(task) else found
+    try:
+        servos.in_steps_of(longer.physics_step_s)
+    except InputError:  # too stiff for them
+        return found
+    return longer
+
+
+def _divides(task: Walking) -> bool:
+    steps = task.control_step_s / _SEARCH_STEP_S
+    return abs(steps - round(steps)) < 1e-6
+
+
+def _values(trot: Trot) -> Array:
+    return np.array([getattr(trot, name) for name in _NAMES])
+
+
+def _trot(begun: Trot, values: Array) -> Trot:
+    return replace(begun, **dict(zip(_NAMES, values.tolist(), strict=True)))
+
+
+@dataclass(frozen=True)
+class _Walked:
+    """Robots with one trot, those of `command`, without the start."""
+
+    scale: Array
+    """Of the commands, over usual ones; shape (3,)."""
+    command: Array
+    velocity: Array
+    """Shape (steps, n, 3)."""
+    stride_velocity: Array
+    up: NDArray[np.bool_]
+    """Shape (steps, n)."""
+    clearance_m: Array
+    """Of all swings of robots that are to move, shape (k,)."""
+    saturated: float
+    """Of thighs and calves."""
+    torque_square: float
+    sway_rad_s: float
+
+
+def _walk(
+    trots: Sequence[Trot], task: Walking, servos: ServoRanges, command: Array, seconds: float,
+    ignored_s: float, seed: int, threads: int, changes: Sequence[dict[str, float]] = (),
+) -> list[_Walked]:  # fmt: skip
+    """Walk with every trot on the same robots, one for each row of `command`."""
+    n, count, scale = len(command), len(trots), _scale(task)
+    step_s = task.control_step_s
+    steps, first = round(seconds / step_s), round(ignored_s / step_s)
+    number = np.tile(np.arange(n), count)
+    model = servo_model_of(servos.source, step_s)
+    env = PupperEnv(task, servos, n * count, _SEED + seed, threads, model, twins=Twins(number, n))
+    for k, factors in enumerate(changes):
+        ids = np.arange(k * n, (k + 1) * n)
+        for name, factor in factors.items():
+            env.robots.drawn[name][ids] *= factor
+        env.robots.write(ids)
+    env.set_command(np.tile(command, (count, 1)))
+    actions = _actions(trots, env, command, steps)
+    meter, alive = EffortMeter(env), np.ones(n * count, bool)
+    kept: dict[str, list[NDArray]] = {
+        name: []
+        for name in ("velocity", "stride", "up", "clearance", "saturated", "square", "sway")
+    }
+    for action in actions:
+        result = env.step(action)
+        facts, alive = result.facts, alive & ~result.done
+        effort = meter.of(facts)
+        for name, value in (
+            ("velocity", planar_velocity(facts)), ("stride", facts.stride_velocity),
+            ("up", alive), ("clearance", effort.clearance_m), ("saturated", effort.saturated),
+            ("square", effort.torque_square), ("sway", facts.angular_velocity[:, :2]),
+        ):  # fmt: skip
+            kept[name].append(value.copy())
+    whole = {name: np.stack(values)[first:] for name, values in kept.items()}
+    moves = command.any(axis=1)
+    found = []
+    for k in range(count):
+        own = {name: value[:, k * n : (k + 1) * n] for name, value in whole.items()}
+        walks = own["up"] & moves
+        clearance = own["clearance"][walks]
+        found.append(
+            _Walked(
+                scale, command, own["velocity"], own["stride"], own["up"],
+                clearance[np.isfinite(clearance)],
+                _mean(own["saturated"][walks][:, 1:]), _mean(own["square"][walks]),
+                _mean(own["sway"][walks] ** 2) ** 0.5,
+            )
+        )  # fmt: skip
+    return found
+
+
+def _mean(values: Array) -> float:
+    return float(values.mean()) if values.size else 1.0
+
+
+def _actions(trots: Sequence[Trot], env: PupperEnv, command: Array, steps: int) -> Array:
+    """Actions of all robots at every step, shape (steps, n, 12)."""
+    n, span = len(command), env.config.control_step_s
+    time_s: Array = np.repeat(span * np.arange(steps, dtype=float), n)
+    commands = np.tile(command, (steps, 1))
+    joints = [
+        trot.joints(time_s * (2 * np.pi * trot.frequency_hz), commands).reshape(steps, n, -1)
+        for trot in trots
+    ]
+    return (np.concatenate(joints, axis=1) - env.default) / env.config.action_scale
+
+
+def _shown(one: _Walked) -> tuple[Array, Array]:
+    """Velocities and those over a stride, with falls as standing."""
+    up = one.up[..., None]
+    return np.where(up, one.velocity, 0.0), np.where(up, one.stride_velocity, 0.0)
+
+
+def _share(one: _Walked, chosen: NDArray[np.bool_]) -> float:
+    """Mean motion of some robots along their commands, over these: least squares; 1 of none."""
+    mean, wanted = _shown(one)[0].mean(axis=0)[chosen], one.command[chosen]
+    size = float((wanted**2).sum())
+    return float((mean * wanted).sum()) / size if size else 1.0
+
+
+def _relative(one: _Walked) -> dict[str, float]:
+    """Score of walks as if their commands were usual ones, and their errors in proportion."""
+    scale = np.where(one.scale > 0, one.scale, 1.0)
+    return scored(one.velocity / scale, one.up, one.command / scale)
+
+
+def _score(one: _Walked) -> GaitScore:
+    command, found = one.command, _relative(one)
+    forward, _, turn = one.scale * [_FORWARD_M_S, 0.0, _TURN_RAD_S]
+    moves = command.any(axis=1)
+    ahead = np.asarray(moves & np.isclose(command, [forward, 0, 0]).all(axis=1))
+    turning = np.asarray(moves & ~command[:, :2].any(axis=1))
+    instant, stride = (np.abs(v - command)[:, moves] for v in _shown(one))
+    planar = [np.linalg.norm(e[..., :2], axis=-1).mean() for e in (instant, stride)]
+    clearance = one.clearance_m
+    return GaitScore(
+        score=found["score"], falls=found["score_falls"], forward_share=_share(one, ahead),
+        turn_share=_share(one, turning), forward_m_s=float(forward), turn_rad_s=float(turn),
+        speed_error_m_s=float(planar[0]), mean_speed_error_m_s=float(planar[1]),
+        turn_error_rad_s=float(instant[..., 2].mean()),
+        mean_turn_error_rad_s=float(stride[..., 2].mean()),
+        clearance_p10_m=float(np.quantile(clearance, 0.1)) if len(clearance) else 0.0,
+        low_swing_share=float((clearance < LOW_SWING_M).mean()) if len(clearance) else 1.0,
+        saturated_share=one.saturated,
+    )  # fmt: skip
+
+
+def _cost(one: _Walked) -> float:
+    """What is searched: 1 minus the judge's score, and what the gait asks of feet and servos."""
+    clearance = float(np.quantile(one.clearance_m, 0.1)) if len(one.clearance_m) else 0.0
+    parts = {
+        "clearance": _lacking(clearance), "torque": one.torque_square,
+        "saturation": one.saturated, "sway": one.sway_rad_s / _SWAY_RAD_S,
+    }  # fmt: skip
+    error = 1.0 - _relative(one)["score"]
+    return error + sum(_WEIGHTS[name] * value for name, value in parts.items())
+
+
+def _lacking(clearance_m: float) -> float:
+    """Share of a clearance of `_CLEARANCE_M` that is missing."""
+    return 1.0 - min(clearance_m / _CLEARANCE_M, 1.0)
+
+
+def _merit(own: GaitScore) -> float:
+    """By which the finalists are chosen: the same of the judge's walks."""
+    lacking = _lacking(own.clearance_p10_m)
+    short = max(FORWARD[0] - own.forward_share, own.forward_share - FORWARD[1], 0.0)
+    taken = _WEIGHTS["clearance"] * lacking + _WEIGHTS["saturation"] * own.saturated_share
+    return own.score - taken - 2.0 * short
+
+
+def _corrected(trot: Trot, one: _Walked) -> Trot:
+    """The trot with gains by which it would have walked at the commanded speeds."""
+    x, y, turn = one.command.T
+    alone = (one.command != 0).sum(axis=1) == 1
+
+    def wrong_by(chosen: Any) -> float:
+        share = _share(one, np.asarray(alone & chosen))
+        return 1.0 / min(max(share, 1.0 / _MOST_CORRECTION), _MOST_CORRECTION)
+
+    ahead, back, aside = wrong_by(x > 0), wrong_by(x < 0), wrong_by(y != 0)
+    values = {
+        "gain": trot.gain * ahead, "back_gain": trot.back_gain * back / ahead,
+        "side_gain": trot.side_gain * aside / ahead,
+        "turn_gain": trot.turn_gain * wrong_by(turn != 0),
+    }  # fmt: skip
+    return replace(trot, **{name: float(np.clip(v, *_BOX[name])) for name, v in values.items()})
+
+
+def _limit(
+    trot: Trot, own: GaitScore, task: Walking, servos: ServoRanges, seed: int, threads: int
+) -> str | None:
+    """Which of the servos' limits the trot would walk best without; None if that is of no use."""
+    if servo_model_of(servos.source, task.control_step_s) is not None:
+        return None  # a learned model has no numbers
+    names, changes = list(_LIMITS), list(_LIMITS.values())
+    walked = _judged([trot] * len(names), task, servos, seed, threads, changes)
+    # servos without a limit go farther than the gains expect, which says nothing against them
+    trots = [_corrected(trot, one) for one in walked]
+    walked = _judged(trots, task, servos, seed, threads, changes)
+    merits = [_merit(_score(one)) for one in walked]
+    best = int(np.argmax(merits))
+    return names[best] if merits[best] > _merit(own) + _WORTH else None

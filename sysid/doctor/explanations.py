@@ -1,0 +1,312 @@
+"""How well a position servo explains a joint's position by its command: fits for `hypotheses`.
+
+Each trial's position is regressed on its held command, passed through a second-order low-pass (or
+none) and shifted by every lag from early to late. `explain` pools the trials; `Explanation.best`
+is the best servo of a sign and a range of lags. Its score is in nats: half the effective readings
+times the logarithm of the unexplained share, a floor beneath it because no servo is linear, and
+what gains and lags that servos seldom have cost. A gain is that of the low-pass at rest, read from
+the response at the frequencies that the command has: a command without a constant part has no
+constant response.
+
+The model is a crude one on purpose: it takes milliseconds and knows nothing of poll, friction or
+limits. It judges a recording; it measures nothing that is printed as a servo's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from pupper_sysid.sysid.feedback.rows import fresh_rows
+from pupper_sysid.sysid.feedback.staleness import staleness
+from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.recordings.remembered import remembered
+
+LATEST_S, EARLIEST_S = 0.8, -0.6
+
+_FILTERS: tuple[tuple[float, float], ...] = ((0.0, 1.0), *(
+    (hz, damping) for hz in (1.5, 2.5, 4.0, 6.5, 10.0, 16.0, 25.0) for damping in (0.5, 1.0)
+))  # fmt: skip
+"""Natural frequency [Hz], 0 for none, and damping ratio."""
+_GRID_S, _FINEST_S = 0.005, 0.001
+_MOST_POINTS = 1 << 14
+_OVERLAP = 0.5  # of the readings must have a command at a lag
+_CORRELATED_ROWS = 4.0  # rows whose errors count as one
+_MOST_ROWS = 150.0  # the model's own errors do not shrink with more rows
+_NOT_LINEAR = 0.006  # of the variance
+_USUAL_LAG_S, _LAG_SCALE_S = 0.06, 0.05  # dead time with the age of a reading: usual, and beyond
+_USUAL_GAIN, _MOST_GAIN_NATS = 0.3, 12.0  # of the logarithm
+
+Filtered = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class Servo:
+    """The best servo of a region of gains and lags.
+
+    Attributes
+    ----------
+    nats : float
+        Its score, the less the better.
+    unexplained : float
+        Share of the position's variance that it leaves.
+    gain : float
+        Of its low-pass at rest, with its sign.
+    lag_s : float
+        Its delay beside the low-pass.
+    total_s : float
+        Delay and low-pass together.
+    filter : int
+        Number of its low-pass.
+    """
+
+    nats: float
+    unexplained: float
+    gain: float
+    lag_s: float
+    total_s: float
+    filter: int
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Readings of one trial, and the staircase of its command on a grid of time."""
+
+    time_s: NDArray[np.float64]
+    position_rad: NDArray[np.float64]
+    command_rad: NDArray[np.float64]
+    start_s: float
+    rest_rad: float
+    grid_s: float
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """All servos of the grid against the trials of one joint.
+
+    Attributes
+    ----------
+    samples : tuple of Samples
+        Of the trials that move.
+    weight : ndarray, shape (trials,)
+    rho, gains : ndarray, shape (trials, filters, lags)
+        Correlation with the filtered and shifted command, and position per command.
+    lags_s : ndarray, shape (lags,)
+    rows : float
+        Readings that count as independent.
+    floor : float
+        Unexplained share that any servo leaves.
+    """
+
+    samples: tuple[Samples, ...]
+    weight: NDArray[np.float64]
+    rho: NDArray[np.float64]
+    gains: NDArray[np.float64]
+    lags_s: NDArray[np.float64]
+    rows: float
+    floor: float
+    grid_s: float
+
+    @cached_property
+    def explained(self) -> float:
+        """Share that the command explains with a lag and a sign for each trial by itself."""
+        return float(self.weight @ (self.rho**2).max(axis=(1, 2)))
+
+    @cached_property
+    def total_s(self) -> NDArray[np.float64]:
+        """Delay of low-pass and lag together, shape (filters, lags)."""
+        delays = [servo_delay(k) for k in range(len(_FILTERS))]
+        return self.lags_s + np.array(delays)[:, None]
+
+    def best(self, sign: float, inside: NDArray[np.bool_]) -> Servo:
+        """The best servo of a sign, where `inside` of shape (filters, lags) allows it."""
+        share = np.tensordot(self.weight, np.maximum(sign * self.rho, 0.0) ** 2, axes=1)
+        gain = np.tensordot(self.weight, self.gains, axes=1)
+        with np.errstate(divide="ignore"):
+            odd = (np.log(np.maximum(np.abs(gain), 1e-9)) / _USUAL_GAIN) ** 2 / 2
+        late = np.maximum(np.abs(self.lags_s) - _USUAL_LAG_S, 0.0) / _LAG_SCALE_S
+        nats = 0.5 * self.rows * np.log(1 - share + self.floor)
+        nats = nats + np.minimum(odd, _MOST_GAIN_NATS) + late
+        f, at = np.unravel_index(int(np.argmin(np.where(inside, nats, np.inf))), nats.shape)
+        return Servo(
+            float(nats[f, at]), float(1 - share[f, at]), float(gain[f, at]),
+            float(self.lags_s[at]), float(self.total_s[f, at]), int(f),
+        )  # fmt: skip
+
+    def nats(self, unexplained: float) -> float:
+        """Score of an unexplained share alone."""
+        return 0.5 * self.rows * float(np.log(unexplained + self.floor))
+
+    def predicted(
+        self, servo: Servo, changed: Filtered | None = None, lag_s: float | None = None
+    ) -> list[NDArray[np.float64]]:
+        """The command of each trial as `servo` filters and delays it, at each reading.
+
+        Parameters
+        ----------
+        servo : Servo
+        changed : callable, optional
+            What becomes of the command before.
+        lag_s : float, optional
+            Instead of the servo's.
+        """
+        lag = servo.lag_s if lag_s is None else lag_s
+        found = []
+        for s in self.samples:
+            before = round(LATEST_S / self.grid_s)
+            command = np.concatenate([np.full(before, s.rest_rad), s.command_rad])
+            command = command if changed is None else changed(command)
+            time = s.start_s + self.grid_s * (np.arange(len(command)) - before)
+            moved = _low_pass(command, *_FILTERS[servo.filter], self.grid_s)
+            found.append(np.interp(s.time_s - lag, time, moved))
+        return found
+
+
+def servo_delay(number: int) -> float:
+    """Delay of slow motion by a low-pass [s]."""
+    hz, damping = _FILTERS[number]
+    return damping / (np.pi * hz) if hz else 0.0
+
+
+@remembered(8)
+def explain(trials: Sequence[Trial], step: float, exchanged: bool = False) -> Explanation | None:
+    """Explain the position of one joint by its command.
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+        All of this joint, three rows or more each, with sound time stamps.
+    step : float
+        Quantisation step [rad]: trials that move by little more weigh little.
+    exchanged : bool
+        Explain the command by the position.
+
+    Returns
+    -------
+    Explanation or None
+        None if no trial has enough motion of both.
+    """
+    if exchanged:
+        trials = [_exchanged(t) for t in trials if np.isfinite(t.position_rad).sum() > 8]
+        if not trials:
+            return None
+    loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
+    grid = max(min(loop / 4, _GRID_S), _FINEST_S)
+    lags = grid * np.arange(round(EARLIEST_S / grid), round(LATEST_S / grid) + 1)
+    live = exchanged or staleness(trials).kind == "live"
+    samples, maps, spread = [], [], []
+    for t in trials:
+        sample = _samples(t, live, grid)
+        found = _maps(sample, grid, len(lags))
+        if found is not None:
+            samples.append(sample)
+            maps.append(found)
+            spread.append(float(np.var(sample.position_rad)))
+    if not maps:
+        return None
+    variance = np.array(spread)
+    noise = max(step, 1e-5) ** 2 / 4
+    weight = variance * variance / (variance + noise)
+    if not weight.sum() > 0:
+        return None
+    rows = min(sum(len(s.time_s) for s in samples) / _CORRELATED_ROWS, _MOST_ROWS)
+    weight = weight / weight.sum()
+    floor = _NOT_LINEAR + max(step, 1e-5) ** 2 / 12 / float(weight @ variance)
+    return Explanation(
+        tuple(samples), weight, np.stack([m[0] for m in maps]), np.stack([m[1] for m in maps]),
+        lags, rows, floor, grid,
+    )  # fmt: skip
+
+
+def _exchanged(trial: Trial) -> Trial:
+    """The trial with its position for its command, and the other way round."""
+    seen = np.isfinite(trial.position_rad)
+    position = trial.position_rad[seen]
+    return replace(
+        trial, send_time_s=trial.read_time_s[seen], read_time_s=trial.send_time_s[seen],
+        command_rad=position, position_rad=trial.command_rad[seen], position_count=None,
+        initial_command_rad=float(position[0]), torque_enabled=None, voltage_v=None,
+    )  # fmt: skip
+
+
+def _samples(trial: Trial, live: bool, grid: float) -> Samples:
+    begin, end = trial.send_time_s[0], max(trial.send_time_s[-1], trial.read_time_s[-1])
+    points = min(int((end - begin) / grid) + 1, _MOST_POINTS)
+    row = np.searchsorted(trial.send_time_s, begin + grid * np.arange(points) + 1e-9, "right") - 1
+    command = trial.command_rad[np.maximum(row, 0)].astype(np.float64)
+    if live:
+        rows = np.flatnonzero(np.isfinite(trial.position_rad))
+        time = trial.read_time_s[rows]
+    else:
+        rows = fresh_rows(trial)
+        rows = rows[rows > 0]
+        time = 0.5 * (trial.read_time_s[rows] + trial.read_time_s[rows - 1])
+    inside = (time >= begin) & (time <= begin + grid * (points - 1))
+    rest, first = trial.initial_command_rad, float(trial.command_rad[0])
+    # a rest of the header far from the first command is another session's
+    rest = rest if abs(rest - first) <= np.ptp(trial.command_rad) + 0.1 else first
+    return Samples(time[inside], trial.position_rad[rows[inside]], command, begin, rest, grid)
+
+
+def _low_pass(command: NDArray, hz: float, damping: float, grid: float) -> NDArray[np.float64]:
+    """Command behind a second-order low-pass; before it, its first value."""
+    if hz <= 0:
+        return command
+    # bilinear, with the natural frequency in its place
+    k = np.tan(np.pi * min(hz * grid, 0.4))
+    scale = 1 + 2 * damping * k + k * k
+    top = k * k / scale
+    below = [1.0, 2 * (k * k - 1) / scale, (1 - 2 * damping * k + k * k) / scale]
+    return np.asarray(lfilter([top, 2 * top, top], below, command - command[0])) + command[0]
+
+
+def _maps(
+    samples: Samples, grid: float, count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Correlation and gain per filter and lag; None without motion."""
+    command, points = samples.command_rad, len(samples.command_rad)
+    place = np.round((samples.time_s - samples.start_s) / grid).astype(np.int64)
+    mask = np.bincount(place, minlength=points).astype(np.float64)
+    if mask.sum() < 8 or np.ptp(command) < 1e-6:
+        return None
+    value = samples.position_rad - samples.position_rad.mean()
+    y = np.bincount(place, value, points)
+    square = np.bincount(place, value**2, points)
+    if square.sum() < 1e-12:
+        return None
+    before = round(LATEST_S / grid)  # rows of rest that precede the command
+    ahead = count - 1 - before
+    size = 1 << int(np.ceil(np.log2(points + before + count)))
+    # lag m (from -ahead to before) looks at command row i - m, stored at i - m + before
+    shift = before - np.arange(-ahead, before + 1)
+
+    def transform(a: NDArray) -> NDArray[np.complex128]:
+        return np.fft.rfft(a, size)
+
+    def correlate(a: NDArray, b: NDArray) -> NDArray[np.float64]:
+        """Of transforms; the first is conjugate."""
+        return np.fft.irfft(a * b, size)[shift]
+
+    of_mask, of_y, of_square = (np.conj(transform(a)) for a in (mask, y, square))
+    of_there = transform(np.ones(before + points))
+    n, sy, syy = (correlate(a, of_there) for a in (of_mask, of_y, of_square))
+    n = np.maximum(n, 1e-9)
+    rho, gain = np.zeros((2, len(_FILTERS), count))
+    own = np.concatenate([np.full(before, samples.rest_rad), command])
+    enough = n >= _OVERLAP * mask.sum()
+    for k, (hz, damping) in enumerate(_FILTERS):
+        u = _low_pass(own, hz, damping, grid) - command.mean()
+        of_u = transform(u)
+        su, suy = correlate(of_mask, of_u), correlate(of_y, of_u)
+        suu = correlate(of_mask, transform(u * u))
+        covariance, inputs = suy - sy * su / n, suu - su**2 / n
+        outputs = syy - sy**2 / n
+        known = enough & (inputs > 1e-12 * len(u)) & (outputs > 0)
+        rho[k] = np.where(known, covariance / np.sqrt(np.maximum(inputs * outputs, 1e-300)), 0.0)
+        gain[k] = np.where(known, covariance / np.maximum(inputs, 1e-300), 0.0)
+    return np.clip(rho, -1.0, 1.0), gain

@@ -1,0 +1,566 @@
+"""What could explain a joint's command and position, compared: `relation_findings`.
+
+`RELATIONS` are servos of other signs, shifts and columns: each is fitted to the whole recording
+(`explanations`), and the one with the best score explains it. The position servo as it is needs no
+advantage; any other must beat it by `CLEAR_NATS`, and a runner-up within them is named.
+
+`CHANGES` are what may come on top of a servo that follows: a second writer, a gain or a clock that
+changes. What bends its path, a friction or a stop, is in `bends`. Each is fitted beside the servo
+alone and must explain a good part of what that leaves. A new hypothesis is one function and one
+entry; its simulator and its codes stand in the tests' own table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.tones import fit_sine, least_squares
+from pupper_sysid.sysid.doctor.bends import CLEAR_NATS, bend_findings
+from pupper_sysid.sysid.doctor.causality import echo
+from pupper_sysid.sysid.doctor.explanations import (
+    Explanation,
+    Samples,
+    Servo,
+    explain,
+)
+from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding, rivalled
+from pupper_sysid.sysid.recordings.excitation import named_tones, segments, split_tones
+from pupper_sysid.sysid.recordings.recording import Trial
+
+_UNRELATED, _HALF, _LOOSE, _FOLLOWS = 0.25, 0.5, 0.6, 0.75  # share of the position's variance
+_NO_ONE_LAG = 0.3
+_TURNS, _TURN_SHARE = 4, 0.2
+_FAR_TOO_LARGE, _TOO_LARGE, _SMALL, _STILL = 2.0, 1.5, 0.4, 0.1
+_UNITS = {
+    "degrees": 57.29578, "counts of 4,096 a turn": 651.8986, "counts of 1,024 a turn": 162.97466,
+    "milliradians": 1000.0,
+}  # fmt: skip
+_SAME_SCALE = 0.35  # of the logarithm
+_STEPWISE, _HOLD_S = 0.75, 0.1  # share of repeats, and how long a level lasts
+_CLEARLY_EARLY_S, _MUCH_LESS = 0.03, 0.3
+_SMOOTH = 0.6  # autocorrelation of what is left
+_AT_ONCE_S, _FASTEST_S, _LATE_S = 0.02, 0.001, 0.008
+_BEYOND, _SURELY = 4.0, 0.01
+_LONGEST_LAG_S = 0.5
+_FASTEST_RAD_S, _WRAP_RAD, _UNUSUAL = 60.0, 2.5, 8.0
+_JUMP = 0.3  # of the command's range, from one row to the next
+_BACK_OF_SPAN, _BACKS, _BACK_SHARE = 0.03, 3, 0.02
+_TWO_BETTER, _OTHER_GAIN, _PART_S = 0.3, 0.75, 1.5
+_SAME_TONE_HZ = 0.02
+_DIFFERENT = 0.35  # of the gain
+_DRIFT_RAD, _DRIFT_SHARE = 0.1, 0.3
+_TWO_ZEROS = 0.5  # of the residuals' variance that two zeros may leave
+_SLOPE, _SLOPE_ERRORS, _LAG_DRIFT_S = 4e-4, 6.0, 0.008
+
+
+@dataclass(frozen=True)
+class Relation:
+    """One explanation of the pair, fitted.
+
+    Attributes
+    ----------
+    code : str
+        Of its finding; empty for the servo as it is.
+    servo : Servo
+    """
+
+    code: str
+    servo: Servo
+
+
+def relations(trials: Sequence[Trial], step: float, base: Explanation) -> list[Relation]:
+    """All relations of one joint's command and position, the likeliest first."""
+    causal = np.broadcast_to(base.lags_s >= -0.5 * base.grid_s, base.total_s.shape)
+    causal = causal & (base.lags_s <= _LONGEST_LAG_S)
+    found = [
+        Relation("", base.best(1.0, causal)),
+        Relation("sign_inverted", base.best(-1.0, causal)),
+    ]
+    if _turns(trials) >= _TURNS:
+        early = base.total_s < -0.5 * base.grid_s
+        ahead = base.best(1.0, early)
+        found.append(Relation("position_early", ahead))
+        other = explain(trials, step, True)
+        if other is not None:
+            other = replace(other, rows=base.rows)
+            late = np.broadcast_to(other.lags_s >= -0.5 * other.grid_s, other.total_s.shape)
+            late = late & (other.total_s > _FASTEST_S) & (other.lags_s <= _LONGEST_LAG_S)
+            found.append(Relation("columns_swapped", other.best(1.0, late)))
+    return sorted(found, key=lambda r: r.servo.nats)
+
+
+def relation_findings(
+    trials: Sequence[Trial], step: float
+) -> tuple[list[Finding], Explanation | None, Servo | None]:
+    """Findings on the relation, and the servo that explains it where there is none to refuse."""
+    base = explain(trials, step)
+    if base is None:
+        return [], None, None
+    if base.explained < _UNRELATED:
+        values = {"percent": 100 * base.explained}
+        return [Finding("unrelated", REFUSE, values)], base, None
+    ranked = relations(trials, step, base)
+    servo = next(r.servo for r in ranked if not r.code)
+    best, second = ranked[0], ranked[1]
+    hardly = best.servo.nats > servo.nats - CLEAR_NATS
+    if best.code == "position_early" and best.servo.total_s > -_CLEARLY_EARLY_S:
+        # a little early is what another shape of the servo looks like
+        hardly |= best.servo.unexplained > _MUCH_LESS * servo.unexplained
+    bent = bend_findings(trials, step)
+    if best.code and (hardly or (bent and best.code != "sign_inverted")):
+        best = next(r for r in ranked if not r.code)
+    share = 1 - best.servo.unexplained
+    if share < _FOLLOWS if best.code else (share < _HALF and _smooth_rest(base, best.servo)):
+        # a fault explains what is left of a servo, or smooth motion of another cause is left
+        return [Finding("not_a_position_servo", REFUSE, {"percent": 100 * share})], base, None
+    if best.code != "columns_swapped" and (scaled := _scale(base, best.servo)):
+        return [scaled], base, None
+    if best.code:
+        near = second.servo.nats < best.servo.nats + CLEAR_NATS
+        return [_refusal(best, second.code if near else "")], base, None
+    if at_once := _at_once(base, best.servo):
+        return [at_once], base, None
+    return [] if bent else _loose(trials, base, best.servo), base, best.servo
+
+
+def _smooth_rest(base: Explanation, servo: Servo) -> bool:
+    """Whether the servo leaves motion rather than noise."""
+    along = across = 0.0
+    for s, x in zip(base.samples, base.predicted(servo), strict=True):
+        spread = float(np.var(x))
+        gain = float(np.mean((x - x.mean()) * s.position_rad) / spread) if spread > 0 else 0.0
+        rest = s.position_rad - s.position_rad.mean() - gain * (x - x.mean())
+        along += float(np.sum(rest[1:] * rest[:-1]))
+        across += float(np.sum(rest**2))
+    return along > _SMOOTH * across
+
+
+def stepwise_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
+    """A position that moves in steps, followed by the command: the columns are swapped."""
+    holds, commands = [], []
+    for t in trials:
+        seen = np.isfinite(t.position_rad)
+        value, time = t.position_rad[seen], t.read_time_s[seen]
+        jump = np.flatnonzero(np.abs(np.diff(value)) > max(5 * step, 1e-3))
+        holds.append(np.diff(time[jump]) if len(jump) > 4 else np.zeros(1))
+        commands.append(np.mean(np.diff(t.command_rad) == 0))
+        if len(value) < 8 or np.mean(np.diff(value) == 0) < _STEPWISE:
+            return []
+    if np.median(np.concatenate(holds)) < _HOLD_S or np.median(commands) > _STEPWISE - 0.2:
+        return []
+    other, base = explain(trials, 0.0, True), explain(trials, step)
+    if other is None:
+        return []
+    late = np.broadcast_to(other.lags_s >= 0, other.total_s.shape) & (other.total_s > _FASTEST_S)
+    servo = other.best(1.0, late)
+    plain = 1.0
+    if base is not None:
+        plain = base.best(1.0, np.broadcast_to(base.lags_s >= 0, base.total_s.shape)).unexplained
+    if 1 - servo.unexplained < _FOLLOWS or servo.unexplained > 0.5 * plain:
+        return []
+    return [_refusal(Relation("columns_swapped", servo), "")]
+
+
+def _refusal(relation: Relation, rival: str) -> Finding:
+    servo = relation.servo
+    if relation.code == "position_early":
+        return rivalled(Finding(relation.code, REFUSE, {"early_ms": -1e3 * servo.total_s}), rival)
+    values = {"lag_ms": 1e3 * servo.total_s}
+    if relation.code == "sign_inverted":
+        values["gain"] = servo.gain
+    return rivalled(Finding(relation.code, REFUSE, values), rival)
+
+
+def _scale(base: Explanation, servo: Servo) -> Finding | None:
+    """A position of another unit or scale than the command, whatever its sign."""
+    gain = abs(servo.gain)
+    if 1 - servo.unexplained < _LOOSE:
+        return None
+    for value, large, small in (
+        (gain, "positions", "commands"), (1 / max(gain, 1e-9), "commands", "positions"),
+    ):  # fmt: skip
+        unit = next((u for u, f in _UNITS.items() if abs(np.log(value / f)) < _SAME_SCALE), None)
+        if unit:
+            values = {"factor": value, "large": large, "small": small, "unit": unit}
+            return Finding("wrong_unit", REFUSE, values)
+    if gain > _FAR_TOO_LARGE:
+        return Finding("scale_too_large", REFUSE, {"gain": gain})
+    # where a servo cannot follow it moves less: the scale is what it shows at its best
+    best = float(np.abs(base.gains[:, servo.filter, _at(base, servo)]).max())
+    if best < _STILL:
+        return Finding("hardly_moves", REFUSE, {"percent": 100 * best})
+    return None
+
+
+def _at(base: Explanation, servo: Servo) -> int:
+    return int(np.argmin(np.abs(base.lags_s - servo.lag_s)))
+
+
+def _at_once(base: Explanation, servo: Servo) -> Finding | None:
+    """A position that goes with the command, beyond doubt: no servo is that fast."""
+    plain = np.tensordot(base.weight, np.maximum(base.rho[:, 0], 0.0) ** 2, axes=1)
+    at = int(np.argmax(plain))
+    lag = float(base.lags_s[at])
+    late = (base.lags_s >= -0.5 * base.grid_s) & (base.total_s >= _LATE_S)
+    rest = 1 - base.best(1.0, late).unexplained
+    noise = 2 * 10.0 * (1 - base.explained) / max(base.rows, 1.0)
+    away, beyond = base.explained - float(plain[at]), base.explained - rest
+    if lag >= _FASTEST_S or abs(lag) >= _AT_ONCE_S:
+        return None
+    if beyond <= max(_BEYOND * away + noise, _SURELY):
+        return None
+    return Finding("at_once", REFUSE, {"lag_ms": 1e3 * lag})
+
+
+def _loose(trials: Sequence[Trial], base: Explanation, servo: Servo) -> list[Finding]:
+    found, share = [], 1 - servo.unexplained
+    if base.explained < _LOOSE:
+        found.append(Finding("loosely_related", CARE, {"percent": 100 * base.explained}))
+    elif base.explained - share > _NO_ONE_LAG:
+        found.append(Finding("no_one_lag", CARE))
+    # a known load is held at a part of the command, the lower the P gain the less
+    if any(t.load is not None for t in trials):
+        return found
+    gains = np.abs(base.gains[:, servo.filter, _at(base, servo)])
+    middle, best = float(np.median(gains)), float(gains.max())
+    if middle > _TOO_LARGE or best < _SMALL:
+        shown = middle if middle > _TOO_LARGE else best
+        found.append(Finding("scale_asks_care", CARE, {"gain": shown}))
+    return found
+
+
+def _turns(trials: Sequence[Trial]) -> int:
+    """How often commands turn round, by a fifth of their range or more.
+
+    On a single way a bend, such as that of a load's sag, looks like a shift in time; on the way
+    back it does not.
+    """
+    count = 0
+    for t in trials:
+        least, extreme, way = _TURN_SHARE * float(np.ptp(t.command_rad)), t.command_rad[0], 0
+        for value in t.command_rad.tolist() if least > 0 else ():
+            if way >= 0 and value < extreme - least:
+                count, way, extreme = count + (way > 0), -1, value
+            elif way <= 0 and value > extreme + least:
+                count, way, extreme = count + (way < 0), 1, value
+            elif (value - extreme) * (way or 1) > 0:
+                extreme = value
+    return count
+
+
+# ----- how the encoder's number is read
+def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
+    """Readings that jump farther than a servo moves: a wrapped angle, an overflow, a sign bit.
+
+    The readings beyond the jump are put back, shifted or mirrored, whichever the command explains.
+    """
+    jumps = [_jumps(t, step) for t in trials]
+    sizes = np.concatenate([np.abs(size) for size, _ in jumps])
+    if not len(sizes):
+        return []
+    jump = float(np.median(sizes))
+    middle = _gap(np.concatenate([t.position_rad for t in trials]), jump)
+    shifted = [_beyond(t, middle, lambda v: v - jump) for t in trials]
+    edge = min(float(np.nanmin(np.where(t.position_rad > middle, t.position_rad, np.inf)))
+               for t in trials)  # fmt: skip
+    mirrored = [_beyond(t, middle, lambda v: edge - v) for t in trials]
+    when = min(float(time[0] - trials[0].send_time_s[0]) for size, time in jumps if len(size))
+    left = {name: _unexplained(put_back, step) for name, put_back in
+            (("", list(trials)), ("shifted", shifted), ("mirrored", mirrored))}  # fmt: skip
+    best = min(left, key=lambda name: left[name])
+    if not best or left[best] > 0.7 * left[""]:
+        best = "shifted"
+    values = {"times": len(sizes), "time_s": when}
+    bits = np.log2(max(edge if best == "mirrored" else jump, 1e-6) / step) if step > 0 else 0.0
+    if best == "mirrored":
+        values |= {"jump_rad": jump, "bit": round(bits)}
+        return [Finding("sign_bit", REFUSE, values)]
+    turn = 2 * np.pi
+    near = min(abs(jump - k * turn / 6) for k in (5, 6))  # servos of 300 and of 360 degrees
+    if bits > 8 and abs(jump - turn) > 0.15 * turn and near > 0.1 * turn:
+        exact = step * 2.0 ** round(bits)
+        if abs(exact - jump) < 0.1 * jump:
+            values |= {"jump_rad": exact, "bits": round(bits)}
+            return [Finding("encoder_overflow", REFUSE, values)]
+    return [Finding("angle_wrapped", REFUSE, values)]
+
+
+def _jumps(trial: Trial, step: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sizes and times of steps that no servo makes."""
+    seen = np.flatnonzero(np.isfinite(trial.position_rad))
+    value, time = trial.position_rad[seen], trial.read_time_s[seen]
+    new = np.concatenate([[0], np.flatnonzero(np.diff(value)) + 1]) if len(value) else []
+    if len(new) < 4:
+        return np.zeros(0), np.zeros(0)
+    # a held value may be old: the jump took as long as nothing new was read
+    move, taken = np.diff(value[new]), np.maximum(np.diff(time[new]), 1e-6)
+    usual = _UNUSUAL * float(np.median(np.abs(move)))
+    far = np.abs(move) > np.maximum(_FASTEST_RAD_S * taken, max(5 * step + 0.2, usual))
+    far &= np.abs(move) > _WRAP_RAD
+    return move[far], time[new][1:][far]
+
+
+def _gap(position: NDArray[np.float64], jump: float) -> float:
+    """Middle of the widest gap between readings."""
+    ordered = np.sort(position[np.isfinite(position)])
+    at = int(np.argmax(np.diff(ordered)))
+    return float(0.5 * (ordered[at] + ordered[at + 1]))
+
+
+def _beyond(trial: Trial, middle: float, put_back: Callable[[NDArray], NDArray]) -> Trial:
+    position = trial.position_rad
+    return replace(trial, position_rad=np.where(position > middle, put_back(position), position))
+
+
+def _unexplained(trials: Sequence[Trial], step: float) -> float:
+    base = explain(trials, step)
+    if base is None:
+        return 1.0
+    return base.best(1.0, np.broadcast_to(base.lags_s >= 0, base.total_s.shape)).unexplained
+
+
+# ----- what comes on top of a servo that follows
+@dataclass(frozen=True)
+class Followed:
+    """Readings of a joint that follows its command, trial by trial, and what the servo predicts."""
+
+    trials: tuple[Trial, ...]
+    step: float
+    base: Explanation
+    servo: Servo
+    predicted: tuple[NDArray[np.float64], ...]
+    start_s: float
+
+    @cached_property
+    def fits(self) -> list[tuple[float, NDArray[np.float64]]]:
+        """Gain and residuals of each trial."""
+        found = []
+        for s, x in zip(self.base.samples, self.predicted, strict=True):
+            spread = float(np.var(x))
+            gain = float(np.mean((x - x.mean()) * s.position_rad) / spread) if spread > 0 else 0.0
+            rest = s.position_rad - s.position_rad.mean() - gain * (x - x.mean())
+            found.append((gain, rest))
+        return found
+
+    @cached_property
+    def noise(self) -> float:
+        """Usual size of residuals [rad], at least half a quantisation step."""
+        rest = np.concatenate([r for _, r in self.fits])
+        return max(1.4826 * float(np.median(np.abs(rest))), 0.5 * self.step, 1e-5)
+
+
+def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
+    """What explains the pair of columns, and what comes on top of it."""
+    if found := echo(trials, step):
+        return [found]
+    findings, base, servo = relation_findings(trials, step)
+    if base is None or servo is None or 1 - servo.unexplained < _LOOSE:
+        return findings
+    followed = Followed(
+        tuple(trials), step, base, servo, tuple(base.predicted(servo)),
+        float(trials[0].send_time_s[0]),
+    )  # fmt: skip
+    for change in CHANGES:
+        findings = [*findings, *change(followed)]
+    return findings
+
+
+def second_writer(joint: Followed) -> list[Finding]:
+    """Motion that runs back while the command goes on."""
+    times, forward = [], 0
+    for s, x in zip(joint.base.samples, joint.predicted, strict=True):
+        new = np.concatenate([[0], np.flatnonzero(np.diff(s.position_rad)) + 1])
+        jump = float(np.abs(np.diff(s.command_rad)).max())
+        if len(new) < 8 or jump > _JUMP * float(np.ptp(s.command_rad)):
+            continue  # after a step a servo rings by itself
+        value, time, path = s.position_rad[new], s.time_s[new], x[new]
+        moved, wanted = np.diff(value), np.diff(path)
+        error = path - path.mean() - (value - value.mean())
+        scatter = 1.4826 * float(np.median(np.abs(np.diff(error))))
+        size = max(2.5 * joint.step, _BACK_OF_SPAN * float(np.ptp(value)), 5 * scatter)
+        # it is behind where it should be, and goes away from there, for one sample or more
+        back = (moved * np.sign(error[:-1]) < -size) & (moved * np.sign(wanted) < 0)
+        back &= np.abs(error[1:]) > 3 * joint.noise
+        times += list(time[1:][back])
+        forward += int(np.sum(moved * np.sign(error[:-1]) > size))
+    if len(times) < _BACKS or len(times) < _BACK_SHARE * (forward + len(times)):
+        return []
+    values = {"times": len(times), "time_s": float(times[0]) - joint.start_s}
+    return [Finding("second_writer", CARE, values)]
+
+
+def gain_changed(joint: Followed) -> list[Finding]:
+    """A gain that changes at a moment, with two fits in place of one."""
+    alike = _trials_differ(joint)
+    if alike:
+        return alike
+    best: tuple[float, float, float, float] | None = None
+    for s, x in zip(joint.base.samples, joint.predicted, strict=True):
+        found = _two_gains(s.time_s, s.position_rad, x)
+        if found and (best is None or found[0] < best[0]):
+            best = found
+    if best is None:
+        return []
+    share, at, before, after = best
+    low, high = sorted((abs(before), abs(after)))
+    if share > _TWO_BETTER or low > _OTHER_GAIN * high:
+        return []
+    values = {"time_s": at - joint.start_s, "before": before, "after": after}
+    return [Finding("gain_changed", CARE, values)]
+
+
+def _two_gains(
+    time: NDArray, position: NDArray, path: NDArray
+) -> tuple[float, float, float, float] | None:
+    """What two gains leave of the residual of one, when they change, and both."""
+    if len(time) < 60 or time[-1] - time[0] < 2 * _PART_S:
+        return None
+    rate = np.gradient(path, time) if (np.diff(time) > 0).all() else np.zeros_like(path)
+    design = np.column_stack([np.ones_like(path), path, rate])
+
+    def left(rows: slice) -> tuple[float, float]:
+        d, y = design[rows], position[rows]
+        gram = d.T @ d + 1e-12 * np.eye(3) * len(d)
+        solution = np.linalg.solve(gram, d.T @ y)
+        return float(np.sum((y - d @ solution) ** 2)), float(solution[1])
+
+    whole, _ = left(slice(None))
+    best = None
+    total = float(np.var(path))
+    for at in np.linspace(time[0] + _PART_S, time[-1] - _PART_S, 40):
+        k = int(np.searchsorted(time, at))
+        parts = slice(0, k), slice(k, None)
+        if min(k, len(time) - k) < 30 or min(np.var(path[p]) for p in parts) < 0.2 * total:
+            continue
+        (a, before), (b, after) = left(parts[0]), left(parts[1])
+        if best is None or a + b < best[0]:
+            best = a + b, float(at), before, after
+    if best is None or whole <= 0:
+        return None
+    floor = 1e-3 * float(np.var(position)) * len(position)
+    return (best[0] + floor) / (whole + floor), *best[1:]
+
+
+def _trials_differ(joint: Followed) -> list[Finding]:
+    """Trials of one tone and amplitude, named or found, that differ."""
+    tones = []
+    for trial in named_tones(joint.trials):
+        if not trial.frequency_hz > 0 or np.isfinite(trial.position_rad).sum() < 16:
+            continue
+        seen = np.isfinite(trial.position_rad)
+        half = trial.read_time_s > trial.read_time_s[0] + 0.4 * np.ptp(trial.read_time_s)
+        angle = 2 * np.pi * trial.frequency_hz * trial.read_time_s[seen & half]
+        if len(angle) < 8:
+            continue
+        moved = abs(fit_sine(angle, trial.position_rad[seen & half]).phasor)
+        sent = abs(fit_sine(angle, trial.command_rad[seen & half]).phasor)
+        tones.append((trial.frequency_hz, sent, moved / max(sent, 1e-9), trial.p_gain,
+                      float(trial.send_time_s[0])))  # fmt: skip
+    pairs = [
+        (abs(g - g2) / max(abs(g), abs(g2)), f, g2, g, at)
+        for n, (f, a, g, p, at) in enumerate(tones)
+        for f2, a2, g2, p2, _ in tones[:n]
+        if abs(f - f2) < _SAME_TONE_HZ
+        and abs(a - a2) < 0.05 * a
+        and (p == p2 or not np.isfinite(p + p2))  # another P gain moves differently
+    ]
+    if not pairs or max(pairs)[0] <= _DIFFERENT:
+        return []
+    _, f, before, after, _ = max(pairs)
+    # slow tones hardly show what fast ones do, and tell the moment
+    moment = min(at for share, *_, at in pairs if share > _DIFFERENT / 10)
+    values = {"frequency_hz": f, "gain": before, "other_gain": after,
+              "time_s": moment - joint.start_s}  # fmt: skip
+    return [Finding("trials_differ", CARE, values)]
+
+
+def zero_moves(joint: Followed) -> list[Finding]:
+    """A zero that moves during a trial; under a load that is known gravity moves it."""
+    if any(t.load is not None for t in joint.trials):
+        return []
+    for s, (_, rest) in zip(joint.base.samples, joint.fits, strict=True):
+        edge = len(rest) // 6
+        if edge < 7:
+            continue
+        sums = np.cumsum(rest - rest.mean())[edge:-edge]
+        at = int(np.argmax(np.abs(sums))) + edge + 1
+        parts = rest[:at], rest[at:]
+        moved = float(np.median(parts[1]) - np.median(parts[0]))
+        left = sum(float(np.sum((p - p.mean()) ** 2)) for p in parts)
+        if left > _TWO_ZEROS * float(np.sum((rest - rest.mean()) ** 2)):
+            continue
+        if abs(moved) > max(_DRIFT_RAD, _DRIFT_SHARE * float(np.ptp(s.command_rad))):
+            when = float(s.time_s[at]) - joint.start_s
+            return [Finding("zero_moves", CARE, {"offset_rad": abs(moved), "time_s": when})]
+    return []
+
+
+def lag_drifts(joint: Followed) -> list[Finding]:
+    """A lag that grows or shrinks steadily: clocks that drift apart.
+
+    Lags of windows of one motion are compared, of one tone or of free motion: another tone, and
+    the next part of a chirp, have another lag by themselves.
+    """
+    slopes, errors, span = [], [], 0.0
+    for s, x, (gain, rest) in zip(joint.base.samples, joint.predicted, joint.fits, strict=True):
+        if len(x) < 60 or not (np.diff(s.time_s) > 0).all():
+            continue
+        rate = gain * np.gradient(x, s.time_s)
+        for start, stop, period in _alike(joint, s):
+            inside = (s.time_s >= start) & (s.time_s <= stop)
+            count = int(min((stop - start) / max(period, 0.5), 8))
+            if count < 4 or inside.sum() < 8 * count:
+                continue
+            edges = np.linspace(start, stop, count + 1)
+            lags, times = [], []
+            for low, high in pairwise(edges):
+                rows = (s.time_s >= low) & (s.time_s < high)
+                design = np.column_stack([np.ones(rows.sum()), x[rows], rate[rows]])
+                if rows.sum() < 8 or np.std(rate[rows]) < 0.3 * np.std(rate[inside]):
+                    continue
+                lags.append(-float(least_squares(design, rest[rows])[2]))
+                times.append(0.5 * (low + high))
+            if len(lags) < 4:
+                continue
+            time = np.array(times) - np.mean(times)
+            slope = float(time @ np.array(lags) / (time @ time))
+            left = np.array(lags) - np.mean(lags) - slope * time
+            slopes.append(slope)
+            errors.append(np.sqrt(left @ left / (len(lags) - 2) / (time @ time)) + _SLOPE / 20)
+            span = max(span, float(np.ptp(s.time_s)))
+    if not slopes:
+        return []
+    weights = 1 / np.array(errors) ** 2
+    slope = float(np.average(slopes, weights=weights))
+    error = float(np.sum(weights)) ** -0.5
+    if len(slopes) > 1:
+        spread = np.average((np.array(slopes) - slope) ** 2, weights=weights)
+        error = max(error, float(np.sqrt(spread / (len(slopes) - 1))))
+    if abs(slope) < max(_SLOPE, _SLOPE_ERRORS * error) or abs(slope) * span < _LAG_DRIFT_S:
+        return []
+    return [Finding("lag_drifts", CARE, {"drift_ms": 1e3 * slope, "percent": 100 * slope})]
+
+
+def _alike(joint: Followed, samples: Samples) -> Iterator[tuple[float, float, float]]:
+    """Stretches of one motion: from, to, and the period of a tone."""
+    for trial in joint.trials:
+        if trial.send_time_s[0] != samples.start_s:
+            continue
+        for part in split_tones(trial):
+            start, stop = float(part.send_time_s[0]), float(part.send_time_s[-1])
+            if part.frequency_hz > 0:
+                settle = min(0.25 * (stop - start), 0.5)
+                yield start + settle, stop, 1 / part.frequency_hz
+            elif all(s.kind != "chirp" for s in segments(part)):
+                yield start + 0.3, stop, 1.0
+
+
+CHANGES: tuple[Callable[[Followed], list[Finding]], ...] = (
+    second_writer, gain_changed, zero_moves, lag_drifts,
+)  # fmt: skip

@@ -1,0 +1,398 @@
+"""What moves a joint: tones, a multisine, a chirp, steps or free motion, found in its command.
+
+A log need not say that its command is a tone, nor give each tone a trial. `segments` cuts a command
+where its kind changes; `split_at_rests` and `split_tones` make of one trial as many as it has
+tones, each with its frequency, as if the log had named them.
+
+A tone is grown from a seed of two periods between turning points: a sine is fitted, extended for as
+long as the command keeps to it, and fitted again. A chirp keeps to no sine for long; a square wave,
+a triangle or a gait keeps to none.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+
+from pupper_sysid.common.tones import sine_design
+from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.recordings.remembered import remembered
+
+_SEED = 4  # half periods between turning points
+_LEAST_PERIODS = 1.9
+_TURN = 0.02  # of the command's range; a smaller reversal is no turning point
+_IMPURE = 0.006  # of a tone's variance; quantisation to six counts leaves 0.005, a triangle 0.014
+_AWAY = 0.15  # of the tone's amplitude: where the command is, it has left the tone
+_CLOSE = 0.03  # the same at its ends, where it must not lean on a row of what comes next
+_TIMES_LEFT = 3
+_CHIRP = 0.015  # of the frequency, by which the two halves of a tone may differ
+_COVERED = 0.8  # share of the moving time that tones must take
+_SOFT = 0.4  # of a steady tone's time: the longest soft start before it
+_SAME_HZ = 0.02
+_RESTS_S = 0.15  # a servo has come to rest, or nearly so
+_LEAD_S, _LEAD = 0.5, 0.4  # rest kept in front of a tone, at most, and as a share of the tone
+_ONE_WAY = 0.8  # rank correlation of half periods with their number
+_STEPPED = 0.5  # share of rows without a change of command, from which on it moves in steps
+_SMALLEST_RAD = 1e-4
+_MOST_TURNS = 4000
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A stretch of a command of one kind.
+
+    Attributes
+    ----------
+    kind : {"tone", "rest", "steps", "chirp", "free"}
+        Steps include random binary ones; "free" is any other motion.
+    first, stop : int
+        Its rows, the last one excluded.
+    frequency_hz : float
+        Of a tone; NaN otherwise.
+    """
+
+    kind: str
+    first: int
+    stop: int
+    frequency_hz: float = float("nan")
+
+
+@remembered(512)
+def segments(trial: Trial) -> list[Segment]:
+    """Cut the command of `trial` into tones, rests and other motion, in time order.
+
+    Examples
+    --------
+    >>> time_s = 0.01 * np.arange(900)
+    >>> wave = np.where(time_s < 4, np.sin(2 * np.pi * time_s), np.sin(4 * np.pi * time_s))
+    >>> wave[time_s > 7] = 0.0
+    >>> trial = Trial("hip", 0, float("nan"), time_s, time_s, wave, wave, None, 0.0)
+    >>> [(s.kind, round(s.frequency_hz, 3)) for s in segments(trial)][:2]
+    [('tone', 1.0), ('tone', 2.0)]
+    """
+    time, command = trial.send_time_s, trial.command_rad
+    if len(time) < 8 or np.ptp(command) < _SMALLEST_RAD:
+        return [Segment("rest", 0, len(time))]
+    tones = _tones(time, command)
+    found, begin = [], 0
+    for tone in [*tones, Segment("", len(time), len(time))]:
+        if tone.first > begin:
+            found.append(_other(trial, begin, tone.first))
+        if tone.kind:
+            found.append(tone)
+        begin = tone.stop
+    return found
+
+
+def split_tones(trial: Trial, at_rests: bool = False) -> list[Trial]:
+    """Trials of one tone each, with their frequencies; `trial` itself if its command is none.
+
+    Rests and other motion between tones are left out, but for a rest in front of each.
+
+    Parameters
+    ----------
+    trial : Trial
+        One that a frequency is known of is left as it is.
+    at_rests : bool
+        Cut only where the joint can have come to rest, which a simulation must start from; tones
+        that follow one another directly stay together, without a frequency.
+    """
+    if trial.frequency_hz > 0:
+        return [trial]
+    found = segments(trial)
+    tones = [s for s in found if s.kind == "tone"]
+    moving = sum(s.stop - s.first for s in found if s.kind != "rest")
+    if not tones or sum(s.stop - s.first for s in tones) < _COVERED * moving:
+        return [trial]
+    if at_rests and len(tones) > 1:
+        tones = _grouped(trial, found)
+        if len(tones) == 1 and not tones[0].frequency_hz > 0:
+            return [trial]
+    if len(tones) == 1 and len(found) == 1:
+        return [replace(trial, frequency_hz=tones[0].frequency_hz)]
+    parts, end = [], 0
+    for tone in tones:
+        parts.append(_part(trial, tone, end))
+        end = tone.stop
+    return parts
+
+
+def named_tones(trials: Sequence[Trial]) -> list[Trial]:
+    """All trials, those of several tones cut at rests, each tone with its frequency."""
+    return [part for trial in trials for part in split_tones(trial, at_rests=True)]
+
+
+def describe(trials: Sequence[Trial]) -> dict[str, list[float]]:
+    """Kinds of motion in the commands of `trials`, with the frequencies of tones [Hz]."""
+    found: dict[str, list[float]] = {}
+    for trial in trials:
+        if trial.frequency_hz > 0:
+            found.setdefault("tone", []).append(trial.frequency_hz)
+            continue
+        parts = split_tones(trial)
+        if len(parts) > 1 or parts[0].frequency_hz > 0:
+            found.setdefault("tone", []).extend(p.frequency_hz for p in parts)
+            continue
+        for segment in segments(trial):
+            if segment.kind not in ("rest", "tone"):
+                found.setdefault(segment.kind, [])
+    return found
+
+
+def _grouped(trial: Trial, found: Sequence[Segment]) -> list[Segment]:
+    """Tones, those without a rest between them as one segment of several frequencies."""
+    groups: list[Segment] = []
+    rested = True
+    for s in found:
+        if s.kind == "tone":
+            if groups and not rested:
+                groups[-1] = Segment("tone", groups[-1].first, s.stop)
+            else:
+                groups.append(s)
+            rested = False
+        elif s.kind == "rest":
+            stop = min(s.stop, len(trial.send_time_s) - 1)
+            rested = trial.send_time_s[stop] - trial.send_time_s[s.first] >= _RESTS_S
+    return groups
+
+
+def _part(trial: Trial, tone: Segment, end: int) -> Trial:
+    """The rows of one tone and of the rest in front of it."""
+    time = trial.send_time_s
+    duration = time[tone.stop - 1] - time[tone.first]
+    lead = time[tone.first] - min(_LEAD_S, _LEAD * duration)
+    first = max(end, int(np.searchsorted(time, lead)))
+    still = np.flatnonzero(np.diff(trial.command_rad[first : tone.first + 1]) != 0)
+    if len(still) and first + still[0] + 1 < tone.first:
+        # motion between two tones is of neither: only the rest right before this one is kept
+        constant = np.flatnonzero(np.diff(trial.command_rad[first : tone.first]) != 0)
+        first = first + int(constant[-1]) + 1 if len(constant) else first
+    rows = slice(first, tone.stop)
+    return _rows(trial, rows, tone.frequency_hz)
+
+
+def _rows(trial: Trial, rows: slice, frequency_hz: float) -> Trial:
+    columns = {
+        name: value[rows]
+        for name in (
+            "send_time_s", "read_time_s", "command_rad", "position_rad", "position_count",
+            "torque_enabled", "voltage_v",
+        )
+        if (value := getattr(trial, name)) is not None
+    }  # fmt: skip
+    before = trial.initial_command_rad if rows.start == 0 else trial.command_rad[rows.start - 1]
+    return replace(
+        trial, **columns, initial_command_rad=float(before), frequency_hz=float(frequency_hz)
+    )
+
+
+def _other(trial: Trial, first: int, stop: int) -> Segment:
+    """A stretch that is no tone."""
+    command = trial.command_rad[first:stop]
+    moves = np.abs(np.diff(command))
+    if np.ptp(command) < max(0.01 * np.ptp(trial.command_rad), _SMALLEST_RAD):
+        return Segment("rest", first, stop)
+    if np.mean(moves < 1e-9) > _STEPPED and moves.max() > 0.1 * np.ptp(command):
+        return Segment("steps", first, stop)
+    turns = _turning_points(command, 0.1 * float(np.ptp(command)))
+    if len(turns) > 8:
+        half = np.diff(trial.send_time_s[first:stop][turns])
+        trend = np.corrcoef(np.arange(len(half)), rankdata(half))[0, 1]
+        ends = float(half[: len(half) // 4].mean()), float(half[-(len(half) // 4) :].mean())
+        if abs(trend) > _ONE_WAY and max(ends) > 1.5 * min(ends):
+            return Segment("chirp", first, stop)
+    return Segment("free", first, stop)
+
+
+def _turning_points(command: NDArray[np.float64], least: float) -> NDArray[np.int64]:
+    """Rows of extremes after which the command goes back by `least` or more."""
+    rows: list[int] = []
+    low = high = 0
+    way = 0
+    values = command.tolist()
+    for k, value in enumerate(values):
+        if value > values[high]:
+            high = k
+        if value < values[low]:
+            low = k
+        if way >= 0 and value < values[high] - least:
+            rows.append(high)
+            way, low = -1, k
+            high = k
+        elif way <= 0 and value > values[low] + least:
+            rows.append(low)
+            way, high = 1, k
+            low = k
+    return np.array(rows, np.int64)
+
+
+def _tones(time: NDArray[np.float64], command: NDArray[np.float64]) -> list[Segment]:
+    """Tones of a command, in time order and apart."""
+    turns = _turning_points(command, _TURN * float(np.ptp(command)))
+    if not _SEED < len(turns) + 1 <= _MOST_TURNS:
+        return []
+    found: list[Segment] = []
+    k, end = 0, 0
+    while k + _SEED < len(turns):
+        first, last = int(turns[k]), int(turns[k + _SEED])
+        half = np.diff(time[turns[k : k + _SEED + 1]])
+        loop = float(np.median(np.diff(time[first : last + 1])))
+        even = np.ptp(half) < 0.25 * half.mean() + 2.1 * loop
+        tone = _grown(time, command, first, last, end) if even and last - first >= 8 else None
+        if tone is None:
+            k += 1
+            continue
+        found.append(tone)
+        end = tone.stop
+        k = int(np.searchsorted(turns, tone.stop - 1))
+    found = _joined(found, time, command)
+    return [] if _is_chirp(found, time) else found
+
+
+def _grown(time: NDArray, command: NDArray, first: int, last: int, end: int) -> Segment | None:
+    """The tone that the rows from `first` to `last` are part of; None if they are of none."""
+    clock = time - time[first]
+    frequency = _SEED / 2 / float(clock[last])
+    fit = _sine(clock, command, first, last + 1, frequency)
+    if fit is None:
+        return None
+    left = 0  # how often the command left the sine: a frequency that is not exact yet, or its end
+    while left < _TIMES_LEFT:
+        frequency, solution, amplitude = fit
+        # as far as one doubles the stretch: there the frequency's error shows as a phase
+        reach = min(last + max(last - first, 8), len(time) - 1)
+        later = _keeps(clock, command, last + 1, reach + 1, frequency, solution, amplitude)
+        if later == last + 1:
+            break
+        longer = _sine(clock, command, first, later, frequency)
+        if longer is None:
+            break
+        left += later <= reach
+        last, fit = later - 1, longer
+    frequency, solution, amplitude = fit
+    while first > end:
+        reach = max(end, first - max(last - first, 8))
+        wrong = _away(clock, command, reach, first, frequency, solution, amplitude)
+        earlier = reach + int(np.flatnonzero(wrong)[-1]) + 1 if wrong.any() else reach
+        if earlier == first:
+            break
+        first = earlier
+    # the first rows of what follows may be close to the sine by chance
+    rest = np.abs(_residual(clock, command, first, last + 1, frequency, solution))
+    close = rest <= max(_CLOSE * amplitude, 4 * float(np.sqrt(np.mean(rest**2))))
+    first, last = first + int(np.argmax(close)), last - int(np.argmax(close[::-1]))
+    fit = _sine(clock, command, first, last + 1, frequency)
+    if fit is None or clock[last] - clock[first] < _LEAST_PERIODS / frequency:
+        return None
+    frequency = fit[0]
+    middle = (first + last) // 2
+    parts = [_sine(clock, command, a, b, frequency) for a, b in ((first, middle), (middle, last))]
+    if None not in parts:
+        halves = [part[0] for part in parts if part is not None]
+        allowed = _CHIRP + 0.1 * _period_rows(clock, frequency)
+        if abs(halves[0] - halves[1]) > allowed * frequency:
+            return None
+    longest = max(_SOFT * float(clock[last] - clock[first]), 1.0 / frequency)
+    begin = _soft_start(command, first, end)
+    begin = begin if clock[first] - clock[begin] <= longest else first
+    return Segment("tone", begin, last + 1, frequency)
+
+
+def _period_rows(clock: NDArray, frequency: float) -> float:
+    """Share of a tone's period that a row takes, squared: how coarsely it is sampled."""
+    return float(np.median(np.diff(clock)) * frequency) ** 2
+
+
+def _soft_start(command: NDArray, first: int, end: int) -> int:
+    """The row at which the motion before a steady tone began, after a rest or another tone."""
+    moved = np.flatnonzero(np.diff(command[end : first + 1]) == 0)
+    return end + int(moved[-1]) + 1 if len(moved) else first
+
+
+def _sine(
+    clock: NDArray, command: NDArray, first: int, stop: int, frequency: float
+) -> tuple[float, NDArray, float] | None:
+    """Frequency, coefficients and amplitude of a sine; None if the rows are no sine."""
+    t, value = clock[first:stop], command[first:stop]
+    if len(t) < 6:
+        return None
+    middle = t.mean()
+    for _ in range(4):
+        tone = sine_design(2 * np.pi * frequency * (t - middle))
+        solution = _solved(tone, value)
+        slope = 2 * np.pi * (t - middle) * (-solution[1] * tone[:, 2] + solution[2] * tone[:, 1])
+        step = _solved(np.column_stack([tone, slope]), value)[3]
+        frequency += float(np.clip(step, -0.1 * frequency, 0.1 * frequency))
+        if abs(step) < 1e-5 * frequency:
+            break
+    design = sine_design(2 * np.pi * frequency * t)
+    solution = _solved(design, value)
+    amplitude = float(np.hypot(solution[1], solution[2]))
+    impure = np.var(value - design @ solution)
+    if not amplitude > _SMALLEST_RAD or impure > _IMPURE * amplitude**2 / 2:
+        return None
+    return frequency, solution, amplitude
+
+
+def _solved(design: NDArray, value: NDArray) -> NDArray[np.float64]:
+    """Least squares by normal equations: of a few columns over a period or more, and many times."""
+    gram = design.T @ design
+    gram.flat[:: len(gram) + 1] *= 1 + 1e-12
+    return np.linalg.solve(gram, design.T @ value)
+
+
+def _away(
+    clock: NDArray, command: NDArray, first: int, stop: int, frequency: float, solution: NDArray,
+    amplitude: float,
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Rows at which the command is away from the sine."""
+    return np.abs(_residual(clock, command, first, stop, frequency, solution)) > _AWAY * amplitude
+
+
+def _residual(
+    clock: NDArray, command: NDArray, first: int, stop: int, frequency: float, solution: NDArray
+) -> NDArray[np.float64]:
+    """Command minus sine."""
+    return command[first:stop] - sine_design(2 * np.pi * frequency * clock[first:stop]) @ solution
+
+
+def _keeps(
+    clock: NDArray, command: NDArray, first: int, stop: int, frequency: float, solution: NDArray,
+    amplitude: float,
+) -> int:  # fmt: skip
+    """The first row from `first` on that is away from the sine; `stop` if none is."""
+    if first >= stop:
+        return first
+    wrong = np.flatnonzero(_away(clock, command, first, stop, frequency, solution, amplitude))
+    return first + int(wrong[0]) if len(wrong) else stop
+
+
+def _joined(found: list[Segment], time: NDArray, command: NDArray) -> list[Segment]:
+    """Neighbouring tones that are one sine, as one."""
+    kept: list[Segment] = []
+    for tone in found:
+        if kept and abs(tone.frequency_hz - kept[-1].frequency_hz) < _SAME_HZ:
+            fit = _sine(time - time[kept[-1].first], command, kept[-1].first, tone.stop,
+                        tone.frequency_hz)  # fmt: skip
+            if fit is not None:
+                kept[-1] = Segment("tone", kept[-1].first, tone.stop, fit[0])
+                continue
+        kept.append(tone)
+    return kept
+
+
+def _is_chirp(found: Sequence[Segment], time: NDArray) -> bool:
+    """Many short pieces whose frequency goes one way in small steps are of a chirp."""
+    if len(found) < 3:
+        return False
+    hz = np.array([s.frequency_hz for s in found])
+    periods = np.array([(time[s.stop - 1] - time[s.first]) * s.frequency_hz for s in found])
+    adjacent = np.array([b.first - a.stop for a, b in itertools.pairwise(found)]) <= 3
+    small = np.abs(np.diff(np.log(hz))) < 0.3
+    short = np.median(periods) < 4.5
+    return bool(short and np.mean(adjacent & small) > 0.6)

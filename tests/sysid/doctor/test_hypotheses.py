@@ -1,0 +1,128 @@
+"""The doctor names the fault of a recording, and nothing where there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import pupper_sysid as ps
+from pupper_sysid.sysid.doctor.checks import findings
+from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, Finding, rivalled
+from pupper_sysid.sysid.doctor.words import RIVALS, WORDS
+from support.real_recordings import case
+from support.strange_servos import ACCUSING, FAULTS, draw_recording
+
+
+def recorded(table) -> ps.Recording:
+    return ps.Recording.from_arrays(
+        table.send_time_s.to_numpy(), {"joint": table.command_rad.to_numpy()},
+        {"joint": table.position_rad.to_numpy()}, read_time_s=table.read_time_s.to_numpy(),
+    )  # fmt: skip
+
+
+def codes(recording, joint: str = "joint") -> dict[str, Finding]:
+    return {f.code: f for f in findings(recording.trials(joint)) if f.verdict != USE}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", [name for name in FAULTS if name not in (
+    "healthy", "scale", "second writer", "friction")])  # fmt: skip
+def test_a_fault_is_named_by_its_code(fault):
+    """Of four recordings (servos and motions in turn) three or more; none names another fault."""
+    told = [codes(recorded(draw_recording(fault, n, 5)[1])) for n in (0, 1, 2, 5)]
+    right = [bool(set(FAULTS[fault][1]) & set(one)) for one in told]
+    assert sum(right) >= 3, [list(one) for one in told]
+
+
+@pytest.mark.slow
+def test_sound_recordings_are_not_accused():
+    for number in range(14):
+        table = draw_recording("healthy", number, 6)[1]
+        assert set(codes(recorded(table))) & set(ACCUSING) == set(), number
+
+
+def test_a_joint_that_rests_in_slow_strokes_is_held_by_friction_and_not_dead():
+    """A backlash test: the joint follows a slow triangle at the distance of its friction."""
+    time = 0.02 * np.arange(2500)
+    command = 0.06 * (2 * np.abs((0.1 * time) % 2 - 1) - 1)
+    position, now = np.empty_like(command), command[0]
+    for k, goal in enumerate(command):
+        now = min(max(now, goal - 0.04), goal + 0.04)
+        position[k] = 0.0015 * np.round(now / 0.0015)
+    found = codes(ps.Recording.from_arrays(
+        time, {"joint": command}, {"joint": position}, read_time_s=time + 1e-3,
+    ))  # fmt: skip
+    assert set(found) == {"held_by_friction"}
+    assert found["held_by_friction"].values["travel_rad"] == pytest.approx(0.08, rel=0.1)
+    assert found["held_by_friction"].verdict == CARE
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 500.0])
+def test_a_servo_that_settles_after_each_step_is_no_echo(rate_hz):
+    """At rest the position is the command, a while late; on its way it is not."""
+    rng = np.random.default_rng(4)
+    time = np.arange(0.0, 25.0, 1 / rate_hz)
+    level = 0.4 * rng.uniform(-1, 1, 80)
+    late = time - 0.03
+    at = np.maximum((late / 0.8).astype(int), 0)
+    since = late - 0.8 * at
+    before = level[np.maximum(at - 1, 0)]
+    position = level[at] + (before - level[at]) * np.exp(-since / 0.04)
+    command = level[(time / 0.8).astype(int)]
+    recording = ps.Recording.from_arrays(
+        time, {"joint": command}, {"joint": np.round(position, 3)}, read_time_s=time + 1e-3
+    )
+    assert not {"echo", "echo_between_rows"} & set(codes(recording))
+    shift = round(0.3 * rate_hz)
+    echo = np.concatenate([np.full(shift, command[0]), command[:-shift]])
+    recording = ps.Recording.from_arrays(
+        time, {"joint": command}, {"joint": echo}, read_time_s=time + 1e-3
+    )
+    assert {"echo", "echo_between_rows"} & set(codes(recording))
+
+
+def test_a_runner_up_is_named_in_words_and_by_its_code():
+    best = Finding("clipped", CARE, {"level_rad": 0.2, "percent": 20.0})
+    near = rivalled(best, "held_by_friction")
+    assert near.values["rival"] == "held_by_friction" and near.text.startswith(best.text)
+    assert RIVALS["held_by_friction"] in near.text
+    assert set(RIVALS) <= set(WORDS) and {c for _, all_ in FAULTS.values() for c in all_} <= set(
+        WORDS
+    )
+
+
+CASES = {
+    "made/C6_sample_sweep_LF_hip_sign_flipped.csv": ("LF_hip", "sign_inverted", REFUSE),
+    "made/D1_goal_clamped_by_firmware.csv": ("hip", "clipped", CARE),
+    "made/F1_derated_halfway.csv": ("hip", "trials_differ", CARE),
+    "made/L4_failed_zero_0.005.csv": ("knee", "bad_readings", CARE),
+    "made/L4_foreign.csv": ("knee", "bad_readings", CARE),
+    "real/c06b_ankle_two_columns.csv": ("joint", "not_a_position_servo", REFUSE),
+}
+SOUND = {
+    "made/B4_14bit.csv": "hip",
+    "made/B6_trials_14bit.csv": "hip",
+    "made/L5_freq_no_trial.csv": "knee",
+    "real/c01_sine_5hz_said_inverted.csv": "joint",
+    "real/c02_mx106_four_sines_no_freq_column.csv": "servo",
+    "real/c03_mx106_steps_same_servo.csv": "servo",
+    "real/c05_mx106_2hz_quantised.csv": "joint",
+    "real/c07_mx106_telemetry_takes_ticks.csv": "joint",
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_fault_of_a_stranger_s_log_is_named(name):
+    joint, code, verdict = CASES[name]
+    found = codes(ps.load(case(name)), joint)
+    assert code in found and found[code].verdict == verdict
+
+
+@pytest.mark.parametrize("name", SOUND)
+def test_a_stranger_s_sound_log_is_not_accused(name):
+    assert set(codes(ps.load(case(name)), SOUND[name])) & set(ACCUSING) == set()
+
+
+def test_the_moment_and_the_level_of_a_fault_are_those_of_the_case():
+    clamped = codes(ps.load(case("made/D1_goal_clamped_by_firmware.csv")), "hip")["clipped"]
+    assert abs(clamped.values["level_rad"]) == pytest.approx(0.2, abs=0.01)
