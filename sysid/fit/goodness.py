@@ -6,7 +6,8 @@ its commands, so a weighted sum of a few consecutive readings and of earlier com
 zero, and what is left is noise. The weights of the readings with the smallest sum of squares are
 found on half of the readings and applied to the other half (Koopmans-Levin). Applied to the
 residuals of a model, the same finds what of them no smooth function explains, which is closer to
-the noise where readings are few.
+the noise where readings are few. A tone's motion is periodic as well: what a Fourier series leaves
+of its readings is noise, however irregular their dates are.
 
 References
 ----------
@@ -21,6 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.tones import least_squares
 from pupper_sysid.sysid.fit.run import Run, fresh_residuals
 from pupper_sysid.sysid.fit.structure import Structure
 
@@ -33,6 +35,9 @@ _REACH_S = 0.12  # of earlier commands: dead time and settling of a servo
 _ORDER = 4  # earlier readings of a sum
 _IRREGULAR = 0.35  # of the usual interval: a longer or shorter one spoils a sum
 _LEAST_ROWS = 4  # per weight
+_SETTLED_S = 0.5  # after which a tone's motion repeats, and not before its second period
+_MOST_HARMONICS = 7  # dry friction and a limited speed leave little beyond the seventh
+_LEAST_FREEDOM = 15  # readings more than coefficients: noise known to 18 %
 _OUTLIER_MAD = 4.0 * 1.4826
 
 
@@ -51,11 +56,36 @@ def reading_noise(runs: Sequence[Run], residuals: Sequence[NDArray[np.float64]])
     float
         NaN where there are too few readings.
     """
-    found = [
+    of_readings = [run.sample_rad for run in runs]
+    bounds = [
         _noise([_sums(run, values) for run, values in zip(runs, of_runs, strict=True)])
-        for of_runs in ([run.sample_rad for run in runs], residuals)
+        for of_runs in (of_readings, residuals)
     ]
-    return float(np.fmin(*found))
+    bounds += [_off_harmonics(runs, of_runs) for of_runs in (of_readings, residuals)]
+    return float(np.fmin.reduce(bounds))
+
+
+def _off_harmonics(runs: Sequence[Run], of_runs: Sequence[NDArray[np.float64]]) -> float:
+    """Root mean square of what a Fourier series leaves of a tone's settled readings [rad].
+
+    NaN where a run is no tone, or there are too few readings.
+    """
+    squares, freedom = 0.0, 0
+    for run, values in zip(runs, of_runs, strict=True):
+        if not run.tone > 0:
+            return float("nan")
+        time = run.sample_step * run.step_s
+        settled = time > max(_SETTLED_S, 1.0 / run.frequency_hz)
+        count = min(_MOST_HARMONICS, int(settled.sum()) // (2 * _LEAST_ROWS))
+        if count < 1:
+            continue
+        turn = 2 * np.pi * run.frequency_hz * time[settled]
+        orders = [n * turn for n in range(1, count + 1)]
+        design = np.column_stack([np.ones(len(turn)), *map(np.sin, orders), *map(np.cos, orders)])
+        rest = values[settled] - design @ least_squares(design, values[settled])
+        squares += len(turn) * _clipped_square(rest)
+        freedom += len(turn) - design.shape[1]
+    return float(np.sqrt(squares / freedom)) if freedom >= _LEAST_FREEDOM else float("nan")
 
 
 def _sums(run: Run, values: NDArray[np.float64]) -> tuple[NDArray, NDArray] | None:

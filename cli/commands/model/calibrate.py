@@ -133,8 +133,8 @@ class Calibrate:
     def _print(self, made: CalibrationResult) -> None:
         published = any("paper" in r.presets for r in made.values())
         shown = terminal.table(
-            "DelayedPD per joint", "joint", "dead time ms", "90 %", "Kp", "Kd", "fric. N·m",
-            "speed rad/s", "limit", "error mrad", "unseen mrad",
+            "DelayedPD per joint", "joint", "dead time ms", "90 %", "fit", "Kp", "Kd", "fric. N·m",
+            "speed limit", "error mrad", "unseen mrad",
             *(["paper mrad"] if published else []),
         )  # fmt: skip
         for name, r in made.items():
@@ -146,10 +146,10 @@ class Calibrate:
                 name,
                 _number(a.dead_time_s, 1, 1e3),
                 f"{1e3 * r.dead_time_s.low:.0f}–{1e3 * r.dead_time_s.high:.0f}",
+                terminal.number(made.calibration.joint(name).scores.residual_over_noise, 1),
                 _number(a.stiffness_nm_per_rad, 1), _number(a.damping_nm_s_per_rad, 3),
                 _number(a.friction_loss_nm, 3),
-                f"{terminal.number(a.top_speed_rad_s)}{_mark(limit)}",
-                "EMF" if brakes else "slew",
+                f"{terminal.number(a.top_speed_rad_s)}{_mark(limit)} {'EMF' if brakes else 'slew'}",
                 terminal.ms(s.rmse_fresh_rad), terminal.ms(s.rmse_unseen_rad),
                 *([terminal.ms(paper.rmse_fresh_rad if paper else None)] if published else []),
             )  # fmt: skip
@@ -163,8 +163,9 @@ class Calibrate:
                 "known load give only their ratios. "
             )
         terminal.out.print(
-            f"\n{torques}? is not identified; limit: what limits the speed, the set-point's slew "
-            "or back-EMF (EMF). Errors are free-run, on fresh readings.",
+            "\nfit: errors over the noise of readings, about 1 where the model describes the servo. "
+            f"{torques}? is not identified; speed limit in rad/s: of the set-point (slew) or by "
+            "back-EMF (EMF). Errors are free-run, on fresh readings.",
             soft_wrap=True,
         )
         for point, names in made.calibration.operating_points().items():
