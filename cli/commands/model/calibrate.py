@@ -131,15 +131,12 @@ class Calibrate:
         )
 
     def _print(self, made: CalibrationResult) -> None:
-        published = any("paper" in r.presets for r in made.values())
         shown = terminal.table(
             "DelayedPD per joint", "joint", "dead time ms", "90 %", "fit", "Kp", "Kd", "fric. N·m",
-            "speed limit", "error mrad", "unseen mrad",
-            *(["paper mrad"] if published else []),
+            "speed rad/s", "limit", "error mrad", "unseen mrad",
         )  # fmt: skip
         for name, r in made.items():
             a, s = made.calibration.joint(name).actuator, r.delayed_pd.scores
-            paper = r.presets.get("paper")
             brakes = a.back_emf_nm_s_per_rad.value > 0
             limit = a.back_emf_nm_s_per_rad if brakes else a.velocity_limit_rad_s
             shown.add_row(
@@ -149,9 +146,9 @@ class Calibrate:
                 terminal.number(made.calibration.joint(name).scores.residual_over_noise, 1),
                 _number(a.stiffness_nm_per_rad, 1), _number(a.damping_nm_s_per_rad, 3),
                 _number(a.friction_loss_nm, 3),
-                f"{terminal.number(a.top_speed_rad_s)}{_mark(limit)} {'EMF' if brakes else 'slew'}",
+                f"{terminal.number(a.top_speed_rad_s)}{_mark(limit)}",
+                "EMF" if brakes else "slew",
                 terminal.ms(s.rmse_fresh_rad), terminal.ms(s.rmse_unseen_rad),
-                *([terminal.ms(paper.rmse_fresh_rad if paper else None)] if published else []),
             )  # fmt: skip
         terminal.out.print(shown)
         scales = {name: made.calibration.joint(name).actuator.scale for name in made}
@@ -163,9 +160,9 @@ class Calibrate:
                 "known load give only their ratios. "
             )
         terminal.out.print(
-            "\nfit: errors over the noise of readings, about 1 where the model describes the servo. "
-            f"{torques}? is not identified; speed limit in rad/s: of the set-point (slew) or by "
-            "back-EMF (EMF). Errors are free-run, on fresh readings.",
+            "\nfit: errors over the noise of the readings; about 1 where the model describes the "
+            f"servo. {torques}? is not identified; limit: what limits the speed, the set-point's "
+            "slew or back-EMF (EMF). Errors are free-run, on fresh readings.",
             soft_wrap=True,
         )
         for point, names in made.calibration.operating_points().items():
