@@ -497,6 +497,10 @@ def _in_free_air(
     if why := _undescribed(goodness):
         results = {name: _doubted(fit, why) for name, fit in results.items()}
         lag = _with_misfit(ready, choice, goodness)
+        if _hardly_known(lag):
+            fit = results[carried.name]
+            undecided = {"dead_time_s": why} | fit.undecided
+            results[carried.name] = replace(fit, undecided=undecided)
     chosen = _best(results, carried.name)
     jitter = command_jitter(
         carried, choice.carried.values, ready.recorded, runs, ready.noise_rad,
@@ -584,6 +588,13 @@ def _with_misfit(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, f
         high = max(min(high, choice.lag.lag_s.high), own.high)
     wide = Interval(own.value, max(float(low), 0.0), float(high))
     return replace(choice.lag, dead_time_s=wide)
+
+
+def _hardly_known(lag: LagBudget) -> bool:
+    """Whether a dead time that was widened is not identified any more: see `_why_unidentified`."""
+    assert lag.dead_time_s is not None
+    low, high = lag.dead_time_s.low, lag.dead_time_s.high
+    return high - low >= _SHARP_DEAD_TIME_S and high > _WIDE * max(low, 0.0)
 
 
 def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) -> Iterator[str]:
@@ -802,6 +813,7 @@ def _under_load(
         doubted = {n: why for n in loaded.numbers if n not in ("offset_rad", "dead_time_s")}
         lag = _with_misfit(ready, choice, goodness)
         assert lag.dead_time_s is not None
+        doubted |= {"dead_time_s": why} if _hardly_known(lag) else {}
         loaded = replace(
             loaded, undecided=doubted | loaded.undecided,
             numbers=loaded.numbers | {"dead_time_s": lag.dead_time_s},
