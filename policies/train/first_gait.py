@@ -189,8 +189,9 @@ def with_first_gait(
             return run
         if run.minutes < _LEAST_MINUTES:
             say(
-                f"That is poor, but a search for a better one takes a minute or two of --minutes "
-                f"{run.minutes:g}, and was left out. --first-gait fit searches anyway."
+                f"That is poor, but a search for a better one takes a minute or two of the "
+                f"{run.minutes:g} that `minutes` allows, and was left out. `first_gait` fit "
+                "searches anyway."
             )
             return run
     say("Searching a better one for these servos takes about a minute on two cores.")
@@ -223,7 +224,7 @@ def _sentence(found: FirstGait) -> str:
     why = f" What limits it most is {because[limit]}." if limit else ""
     return (
         f"These servos carry no better open-loop trot than this.{why} Training begins with it; "
-        "commands of less speed (--task.commands.forward-m-s -0.1 0.1) are easier."
+        "commands of less speed (`task.commands.forward_m_s` of -0.1 to 0.1) are easier."
     )
 
 

@@ -285,7 +285,7 @@ class _Session:
             self.counters["rounds"] = planned
             self.notice(
                 f"A round of the first gait takes {round_s:.0f} s, so that {planned} of {wanted} "
-                f"are made within --minutes {self.run.minutes:g}."
+                f"are made within {self.run.minutes:g} minutes."
             )
 
     def teacher(self, ends: Callable[[], bool]) -> Teacher | None:
@@ -385,8 +385,8 @@ class _Session:
             f"The last {self.undone} updates of PPO were taken back, because each changed the "
             "actions too much: the policy stays as it is. "
             + ("The run ends here. " if ends else f"The run ends after {_UNDONE_END} of them. ")
-            + f"Begin one with a larger step per update, --learner.desired-kl {2 * kl:g}, or with "
-            "more noise, --learner.exploration.std."
+            + f"Begin one with a larger step per update, `learner.desired_kl` {2 * kl:g}, or with "
+            "more noise, `learner.exploration.std`."
         )
         return ends
 

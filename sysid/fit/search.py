@@ -196,7 +196,9 @@ def evolved(
     problem : Problem
     starts : ndarray, shape (starts, parameters)
         In fitted coordinates; those of simpler structures are kept as they are, too.
-    rng, short, crowd
+    rng : numpy.random.Generator
+    short : bool
+    crowd : ndarray, optional
         As for `evolve`.
     """
     best = evolve(problem.coarse, refined(problem.coarse, starts), rng, short, crowd)

@@ -296,7 +296,7 @@ def test_rounds_that_do_not_fit_the_time_are_left_out_and_the_rate_falls_to_zero
     train(tmp_path, run, stop_after("imitation", 2), notice=said.append)
     # of the 50 s after the first round three quarters are enough for three of 10 s
     assert read_checkpoint(tmp_path / LAST)["more"]["rounds"] == 4 and rates == [40, 4]
-    assert len(said) == 1 and "4 of 40 are made within --minutes 1" in said[0]
+    assert len(said) == 1 and "4 of 40 are made within 1 minutes" in said[0]
     train(tmp_path, None, stop_after("imitation", 4), minutes=60.0)
     assert rates == [40, 4, 4, 4]
 

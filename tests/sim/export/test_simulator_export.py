@@ -400,7 +400,10 @@ def test_the_json_export_holds_every_number_with_its_interval(calibration):
     found = json.loads(text_of(calibration, "json"))
     assert found["schema"] == "pupper-actuators" and found["physics_step_s"] == 0.005
     own = calibration.joint("LF_calf")
-    there, stiffness = found["joints"]["LF_calf"], own.actuator.stiffness_nm_per_rad
+    stepped = ExportedServos.of(calibration, 0.005).actuators()["LF_calf"]
+    there, stiffness = found["joints"]["LF_calf"], stepped.stiffness_nm_per_rad
+    dead_time = own.actuator.dead_time_s.model_dump(mode="json")
+    assert there["actuator"]["dead_time_s"] == dead_time
     assert there["actuator"]["stiffness_nm_per_rad"] == stiffness.model_dump(mode="json")
     assert there["feedback"]["loss"]["value"] == own.feedback.loss.value
     assert found["inputs"][0]["sha256"] == calibration.inputs[0].sha256
