@@ -110,11 +110,12 @@ def at_step(
 ) -> DelayedPDParameters:
     """Numbers with which servos in steps of `time_step_s` move as in those of `fitted_step_s`.
 
-    A damping d over the inertia slows a servo by exp(-h d) in a time h; a step of MuJoCo slows it
+    Back-EMF of d over the inertia slows a servo by exp(-h d) in a time h; a step of MuJoCo slows it
     by 1 / (1 + h d'), one with the torque from before by 1 - h d'. The drive of a step acts over
-    h / (1 + h d') or h instead of (1 - exp(-h d)) / d. Damping, stiffness and friction of steps
-    follow from these; while the torque is clipped, back-EMF is the only damping, so the same holds
-    of it and the effort limit. The dead time is that of `delay_at_step`.
+    h / (1 + h d') or h instead of (1 - exp(-h d)) / d. Back-EMF and all torques of steps follow
+    from these. The loop's damping does the same only while its torque is not clipped; no number
+    makes up for that in both states, and motions differ least without a change. The dead time is
+    that of `delay_at_step`.
 
     Parameters and errors as for `delay_at_step`.
 
@@ -141,26 +142,21 @@ def at_step(
 def _discrete(parameters: DelayedPDParameters, h: float, implicit: bool) -> DelayedPDParameters:
     v, sign = parameters.arrays(), 1.0 if implicit else -1.0
     brake = sign * h * v["back_emf"] / v["armature"]
-    total = sign * h * v["damping"] / v["armature"] + brake
-    drive, drive_clipped = _mean_exp(total), _mean_exp(brake)
-    return replace(
-        parameters, stiffness=v["stiffness"] * drive, friction_loss=v["friction_loss"] * drive,
-        effort_limit=v["effort_limit"] * drive_clipped,
-        back_emf=sign * np.expm1(brake) / h * v["armature"],
-        damping=sign * (np.exp(total) - np.exp(brake)) / h * v["armature"],
-    )  # fmt: skip
+    return _driven(parameters, _mean_exp(brake), sign * np.expm1(brake) / h * v["armature"])
 
 
 def _continuous(parameters: DelayedPDParameters, h: float) -> DelayedPDParameters:
     v = parameters.arrays()
     brake = np.log1p(h * v["back_emf"] / v["armature"])
-    total = np.log1p(h * (v["back_emf"] + v["damping"]) / v["armature"])
-    drive, drive_clipped = 1.0 / _mean_exp(total), 1.0 / _mean_exp(brake)
-    return replace(
-        parameters, stiffness=v["stiffness"] * drive, friction_loss=v["friction_loss"] * drive,
-        effort_limit=v["effort_limit"] * drive_clipped, back_emf=brake / h * v["armature"],
-        damping=(total - brake) / h * v["armature"],
-    )  # fmt: skip
+    return _driven(parameters, 1.0 / _mean_exp(brake), brake / h * v["armature"])
+
+
+def _driven(
+    parameters: DelayedPDParameters, factor: NDArray[np.float64], back_emf: NDArray[np.float64]
+) -> DelayedPDParameters:
+    names = ("stiffness", "damping", "friction_loss", "effort_limit")
+    torques = {name: getattr(parameters, name) * factor for name in names}
+    return replace(parameters, **torques, back_emf=back_emf)
 
 
 def _mean_exp(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -260,13 +260,13 @@ class ExportedServos:
         later = 1e3 * np.mean([new["dead_time_s"] - old["dead_time_s"] for old, new in pairs])
         gains = {
             name: np.mean([new[name] / old[name] for old, new in pairs if old[name] > 0] or [1.0])
-            for name in ("stiffness", "damping")
+            for name in ("stiffness", "back_emf")
         }
         if later or any(gain != 1.0 for gain in gains.values()):
-            changes = [f"{name} x {gain:.2f}" for name, gain in gains.items()]
+            changes = f"torques x {gains['stiffness']:.2f}, back-EMF x {gains['back_emf']:.2f}"
             yield (
                 f"Numbers below are those with which steps of {h:g} ms here move like the servo: "
-                f"{', '.join(changes)} and delays {later:+.1f} ms (means of the joints) of the "
+                f"{changes} and delays {later:+.1f} ms (means of the joints) of the "
                 "calibration's."
             )
 

@@ -319,7 +319,7 @@ def test_updates_that_are_all_taken_back_are_said_and_end_the_run_with_what_help
     learner = train(tmp_path, run, notice=said.append)
     assert learner.iteration == 4 and read_checkpoint(tmp_path / LAST)["iteration"] == 4
     assert "The last 2 updates" in said[0] and "ends after 4" in said[0]
-    assert "The last 4 updates" in said[1] and "--learner.desired-kl 2e-12" in said[1]
+    assert "The last 4 updates" in said[1] and "`learner.desired_kl` 2e-12" in said[1]
     # with the weights, Adam's memory goes back, but for that of its first update
     steps = [s["step"] for s in learner.ppo.optimizer.state_dict()["state"].values()]
     each = run.learner.epochs * run.learner.minibatches
