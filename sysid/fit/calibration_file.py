@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 
 from pupper_sysid.common.data_sheet import recorded_stall_torque
+from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import JOINT_NAMES, STALL_TORQUE_NM, STALL_TORQUE_SOURCE
@@ -279,9 +280,14 @@ def _loaded_actuator(
 
 
 def _delay_steps(servo: DelayedPDParameters, dead_time_s: Interval) -> tuple[int, int]:
-    """Dead times to train with, in whole physics steps, rounded outward."""
-    stepped = at_step(servo, TIME_STEP_S)
-    more = float(np.squeeze(stepped.dead_time_s)) - dead_time_s.value
+    """Dead times to train with, in whole physics steps, rounded outward.
+
+    Those of the servo itself where it is too stiff to be simulated in such steps.
+    """
+    try:
+        more = float(np.squeeze(at_step(servo, TIME_STEP_S).dead_time_s)) - dead_time_s.value
+    except InputError:
+        more = 0.0
     ends = (max(t + more, 0.0) for t in (dead_time_s.low, dead_time_s.high))
     return whole_steps(*ends, TIME_STEP_S)
 

@@ -31,6 +31,7 @@ from pupper_sysid.sysid.fit.noise import command_jitter, noise_by_run
 from pupper_sysid.sysid.fit.posterior import (
     EFFECTIVE,
     FEW_ROUNDS,
+    HARDLY_CONVERGED,
     LEAST_FOLDS,
     R_HAT,
     ROUNDS,
@@ -501,6 +502,10 @@ def _in_free_air(
             fit = results[carried.name]
             undecided = {"dead_time_s": why} | fit.undecided
             results[carried.name] = replace(fit, undecided=undecided)
+    elif why := _unconverged(choice.carried):
+        fit = _doubted(results[carried.name], why)
+        undecided = {"dead_time_s": why} | fit.undecided
+        results[carried.name] = replace(fit, undecided=undecided)
     chosen = _best(results, carried.name)
     jitter = command_jitter(
         carried, choice.carried.values, ready.recorded, runs, ready.noise_rad,
@@ -588,6 +593,14 @@ def _with_misfit(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, f
         high = max(min(high, choice.lag.lag_s.high), own.high)
     wide = Interval(own.value, max(float(low), 0.0), float(high))
     return replace(choice.lag, dead_time_s=wide)
+
+
+def _unconverged(carried: Fitted) -> str | None:
+    """Why intervals mean little though the model describes the servo; None if they can be used."""
+    most, least = HARDLY_CONVERGED
+    if carried.r_hat <= most and carried.effective >= least:
+        return None
+    return "its draws have not converged"
 
 
 def _hardly_known(lag: LagBudget) -> bool:
@@ -818,6 +831,9 @@ def _under_load(
             loaded, undecided=doubted | loaded.undecided,
             numbers=loaded.numbers | {"dead_time_s": lag.dead_time_s},
         )  # fmt: skip
+    elif why := _unconverged(choice.carried):
+        doubted = {n: why for n in loaded.numbers if n != "offset_rad"}
+        loaded = replace(loaded, undecided=doubted | loaded.undecided)
     pd = loaded.servo.delayed_pd(loaded.p_gain, 0.0, loaded.motor_torque_nm).arrays()
     inertia = float(np.asarray(loaded.servo.armature))
     inertia += max(i for i, _ in loaded.loads) if loaded.known_load else 0.0

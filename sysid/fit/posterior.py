@@ -43,6 +43,9 @@ however exactly its posterior is."""
 _POPULATION, _DRAWS = 384, 2000
 _CENTRES, _BY_WEIGHT, _WIDE_ONES, _FREEDOM, _GROUPS = 12, 4, 3, 5.0, 8
 _RISE = (0.5, 400.0)  # by which an axis is made longer or shorter, squared
+HARDLY_CONVERGED = 1.1, 100.0
+"""R̂ above, or effective draws below, which draws say little: the ends of an interval are off by a
+fifth of a standard deviation and more."""
 _BETTER = 4.0  # log-likelihood by which another optimum has to be better
 _STEP = 0.01
 PHASE_SD_S = 0.0003
@@ -250,6 +253,7 @@ def convergence(points: NDArray[np.float64], weight: NDArray[np.float64]) -> tup
     apart = points - middle
     variance = np.maximum(weight @ apart**2, 1e-300)
     effective = variance / np.maximum(weight**2 @ apart**2, 1e-300)
+    effective = np.minimum(effective, 1.0 / np.sum(weight**2))  # one heavy point has no variance
     means = []
     for part in range(_GROUPS):
         own = weight[part::_GROUPS]
