@@ -118,6 +118,7 @@ def sample(
     mixture = _Mixture.about(problem, best.point[None], temperature)
     mixtures: list[_Mixture] = []
     points, cost, density = np.empty((0, len(best.point))), np.empty(0), np.empty(0)
+    weight, r_hat, effective = np.empty(0), float("inf"), 1.0
     for turn in range(rounds):
         drawn = mixture.draw(_POPULATION, rng)
         own = _tempered(problem, drawn, temperature)
@@ -142,6 +143,8 @@ def sample(
         if r_hat <= R_HAT and effective >= EFFECTIVE:
             break
         mixture = _Mixture.of(problem, points, weight, temperature, rng)
+    if not len(points):
+        return Posterior(np.repeat(best.point[None], _DRAWS, axis=0), best, r_hat, effective)
     likeliest = points[int(np.argmin(cost))]
     whole = float(problem.costs(likeliest[None])[0])
     # truncated, so that few points do not stand for all where there was no convergence
