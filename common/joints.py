@@ -29,7 +29,7 @@ STALL_TORQUE_SOURCE = (
     "0.23 N·m at 6 V, so take torques as good to a factor of 1.5 at best"
 )
 NO_LOAD_SPEED_RAD_S = 7.5
-"""Speed of a Mini Pupper 2's servo without load, by its data sheet: 0.14 s for 60 degrees."""
+"""Speed of a Mini Pupper 2's servo without load, about; a vendor of its class states 10.5."""
 
 # names become names of files, of XML elements and of columns
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")

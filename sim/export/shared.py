@@ -26,7 +26,7 @@ from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, Actuator, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import MUJOCO, Engine, at_step
 
 FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age_s")
@@ -141,25 +141,18 @@ class ExportedServos:
         """
         if engine in self._actuators:
             return self._actuators[engine]
-        stepped = {}
-        for name, joint in self.moving.joints.items():
-            fitted = joint.actuator.parameters
-            moved = at_step(fitted, self.physics_step_s, joint.actuator.fitted_step_s, engine)
-            before, after = fitted.arrays(), moved.arrays()
-            actuator = self.calibration.joints[name].actuator
-            numbers = {}
-            for field_name in ("stiffness", "damping", "friction_loss", "effort_limit", "back_emf"):
-                old, new = float(before[field_name]), float(np.squeeze(after[field_name]))
-                key = PARAMETER_KEYS[field_name]
-                scale = new / old if old > 0 else 1.0
-                numbers[key] = getattr(actuator, key).scaled(scale)
-            later = float(np.squeeze(after["dead_time_s"])) - float(before["dead_time_s"])
-            ends = (actuator.dead_time_s.value, *actuator.dead_time_interval_s)
-            value, low, high = (max(end + later, 0.0) for end in ends)
-            numbers["dead_time_s"] = actuator.dead_time_s.model_copy(
-                update={"value": value, "low": low, "high": high}
-            )
-            stepped[name] = actuator.model_copy(update=numbers)
+        stepped: dict[str, Actuator] = {}
+        joints = {name: joint.actuator for name, joint in self.moving.joints.items()}
+        for fitted_s in {a.fitted_step_s for a in joints.values()}:
+            names = [name for name, a in joints.items() if a.fitted_step_s == fitted_s]
+            each = [joints[name].parameters.arrays() for name in names]
+            before = {key: np.array([float(numbers[key]) for numbers in each]) for key in each[0]}
+            servos = DelayedPDParameters(**before)
+            after = at_step(servos, self.physics_step_s, fitted_s, engine).arrays()
+            for n, name in enumerate(names):
+                old, new = ({key: float(x[n]) for key, x in y.items()} for y in (before, after))
+                stepped[name] = _changed(self.calibration.joints[name].actuator, old, new)
+        stepped = {name: stepped[name] for name in joints}
         self._actuators[engine] = stepped
         return stepped
 
@@ -269,6 +262,21 @@ class ExportedServos:
                 f"{changes} and delays {later:+.1f} ms (means of the joints) of the "
                 "calibration's."
             )
+
+
+def _changed(actuator: Actuator, old: Mapping[str, float], new: Mapping[str, float]) -> Actuator:
+    """An actuator whose torques are scaled as from `old` to `new`, and its dead time shifted."""
+    numbers = {}
+    for name in ("stiffness", "damping", "friction_loss", "effort_limit", "back_emf"):
+        key = PARAMETER_KEYS[name]
+        factor = new[name] / old[name] if old[name] > 0 else 1.0
+        numbers[key] = getattr(actuator, key).scaled(factor)
+    later = new["dead_time_s"] - old["dead_time_s"]
+    ends = (actuator.dead_time_s.value, *actuator.dead_time_interval_s)
+    value, low, high = (max(end + later, 0.0) for end in ends)
+    ends_of = {"value": value, "low": low, "high": high}
+    numbers["dead_time_s"] = actuator.dead_time_s.model_copy(update=ends_of)
+    return actuator.model_copy(update=numbers)
 
 
 def without_link(name: str, joint: JointCalibration, inertia_kg_m2: float) -> JointCalibration:

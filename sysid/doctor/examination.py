@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import NO_LOAD_SPEED_RAD_S
 from pupper_sysid.common.results import JointResults, Result, internal
 from pupper_sysid.sysid.doctor.causality import crossed
 from pupper_sysid.sysid.doctor.checks import findings, long_enough
@@ -45,7 +46,6 @@ from pupper_sysid.sysid.recordings.recording import Trial
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_USUAL_SPEED_RAD_S = 7.5  # a Mini Pupper 2's servo, unloaded
 _HELD = (
     "Feedback is held between polls, and the polls are known: `delay`, `bode` and `calibrate` date "
     "each new reading to the poll that measured it. Do not compute lag, gain or error from all "
@@ -177,7 +177,7 @@ def examine(
     given = as_sequence(recordings)
     rng = np.random.default_rng(seed)
     limits = [(r.metadata.get("bus") or {}).get("speed_limit_rad_s") for r in given]
-    limit = max(float(each or _USUAL_SPEED_RAD_S) for each in limits)
+    limit = max(float(each or NO_LOAD_SPEED_RAD_S) for each in limits)
     recorded = {joint: recorded_trials(given, joint) for joint in chosen_joints(given, joints)}
     mixed = crossed({joint: long_enough(trials) for joint, trials in recorded.items()})
     found = {
