@@ -21,7 +21,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 import torch
 
-from pupper_sysid.common.processes.memory import keep_freed_memory
+from pupper_sysid.common.processes.workers import keep_freed_memory
 from pupper_sysid.policies.network.hyperparameters import Kind
 from pupper_sysid.policies.train.run_file import preset
 from pupper_sysid.policies.train.speed import Paces, load, measure, ratios

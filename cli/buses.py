@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.numbers import whole
+from pupper_sysid.common.reading.dialect import whole
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.connect import open_guarded

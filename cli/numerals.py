@@ -1,6 +1,6 @@
 """Numbers of the command line: decimal numerals in ASCII, as in files.
 
-tyro's own rule takes `4_1` for 41 and the digits of every script (`common.reading.numbers`).
+tyro's own rule takes `4_1` for 41 and the digits of every script (`common.reading.dialect`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any
 
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from pupper_sysid.common.reading.numbers import decimal, whole
+from pupper_sysid.common.reading.dialect import decimal, whole
 
 NUMERALS = ConstructorRegistry()
 """Rules for `tyro.cli`."""

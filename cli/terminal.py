@@ -25,7 +25,7 @@ from rich.text import Text
 from pupper_sysid.cli.flags import spell
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.joints import select_joints, share_sentences
-from pupper_sysid.common.reading.numbers import whole
+from pupper_sysid.common.reading.dialect import whole
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.fleet.calibration import Fleet

@@ -29,8 +29,8 @@ from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import holding_outputs, versions
 from pupper_sysid.common.processes.stop import STOPPED, Stop, stoppable
 from pupper_sysid.common.processes.stop import end_politely as end_politely
-from pupper_sysid.common.reading.budget import reading_up_to
-from pupper_sysid.common.reading.numbers import decimal
+from pupper_sysid.common.reading.content import reading_up_to
+from pupper_sysid.common.reading.dialect import decimal
 
 _COMPLETIONS = {
     "bash": ".local/share/bash-completion/completions/{}",

@@ -21,8 +21,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.budget import allowed, refuse_more
-from pupper_sysid.common.reading.content import content
+from pupper_sysid.common.reading.content import allowed, content, refuse_more
 from pupper_sysid.common.strict_yaml import MAX_DEPTH, Place, load, place_text, printable
 
 LARGEST_BYTES = 2_000_000
@@ -74,7 +73,7 @@ def read_bytes(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "
     ----------
     path : Path
     largest_bytes : float
-        Larger files are refused without being read (`common.reading.budget` raises it).
+        Larger files are refused without being read (`common.reading.content` raises it).
     remedy : str
         What to do, as a sentence; by default, to check the file's name.
 

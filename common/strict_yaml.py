@@ -16,7 +16,7 @@ import yaml
 from yaml.composer import Composer
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.content import refuse_more
 
 MAX_DEPTH = 20
 MOST_NODES = 100_000

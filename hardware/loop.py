@@ -1,4 +1,4 @@
-"""A control loop at a fixed rate that does not drift, with statistics of its timing.
+"""A control loop at a fixed rate that does not drift, its clock, and gentle motions between poses.
 
     loop = FixedRateLoop(bus, period_s=0.02)
     for elapsed_s in loop.ticks(duration_s=5.0):
@@ -11,16 +11,86 @@ made it late. `real_time_priority` asks the system to run this process first.
 
 from __future__ import annotations
 
+import math
 import os
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pupper_sysid.common.durations import Durations
-from pupper_sysid.common.errors import InputError, SafetyStop
+from pupper_sysid.common.errors import BusError, InputError, SafetyStop
+from pupper_sysid.hardware.bus import ServoBus
+
+
+def lasting_s() -> float:
+    """Seconds that also pass while the machine is suspended, as `time.monotonic()`'s do not."""
+    if hasattr(time, "CLOCK_BOOTTIME"):  # Linux
+        return time.clock_gettime(time.CLOCK_BOOTTIME)
+    return time.monotonic()
+
+
+class HostClock:
+    """The host's monotonic clock, from 0 at construction, to the microsecond."""
+
+    def __init__(self):
+        self._start = time.monotonic()
+
+    def now(self) -> float:
+        """Time [s], from 0 at construction."""
+        return self.at(time.monotonic())
+
+    def at(self, monotonic_s: float) -> float:
+        """Time of this clock at a time of `time.monotonic()` [s]; NaN for NaN."""
+        return round(monotonic_s - self._start, 6)
+
+    def sleep_until(self, time_s: float) -> None:
+        """Sleep until `now()` has reached `time_s`."""
+        while (left := time_s - self.now()) > 0:
+            time.sleep(left)
+
+
+_SHORTEST_S, _LONGEST_S, _STEP = 1e-7, 1e3, 0.01
+_BINS = math.ceil(math.log(_LONGEST_S / _SHORTEST_S) / _STEP)
+
+
+class Durations:
+    """Count, mean, standard deviation, largest and quantiles of durations [s].
+
+    Mean and deviation are exact (Welford), quantiles within 1 %: they come from a histogram with
+    logarithmic bins from 0.1 µs to 1000 s.
+    """
+
+    def __init__(self):
+        self.count, self.mean_s, self.largest_s = 0, 0.0, 0.0
+        self._squares = 0.0
+        self._bins = np.zeros(_BINS, np.int64)
+
+    def add(self, seconds: float) -> None:
+        """Add one duration [s], ≥ 0."""
+        self.count += 1
+        away = seconds - self.mean_s
+        self.mean_s += away / self.count
+        self._squares += away * (seconds - self.mean_s)
+        self.largest_s = max(self.largest_s, seconds)
+        place = math.log(max(seconds, _SHORTEST_S) / _SHORTEST_S) / _STEP
+        self._bins[min(int(place), _BINS - 1)] += 1
+
+    @property
+    def sd_s(self) -> float:
+        """Standard deviation [s]; 0 for a single duration."""
+        return math.sqrt(self._squares / max(self.count, 1))
+
+    def quantile(self, share: float) -> float:
+        """Duration [s] that `share` of them stay below; NaN without any."""
+        if not self.count:
+            return math.nan
+        place = int(np.searchsorted(np.cumsum(self._bins), share * self.count))
+        return min(_SHORTEST_S * math.exp(_STEP * (place + 0.5)), self.largest_s)
+
 
 MOST_MISSES_IN_A_ROW = 10
 """So many missed deadlines in a row mean that the robot is out of control."""
@@ -227,3 +297,79 @@ def real_time_priority() -> Iterator[str]:
     finally:
         with suppress(OSError):  # an ordinary user may not take the flag back, which does no harm
             os.sched_setscheduler(0, *before)
+
+
+GENTLE_RAD_S = 1.0
+"""Highest speed of a joint in a gentle motion."""
+
+_FIRST_READING_S = 2.0
+
+
+def raised_cosine(share: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Ramp from 0 to 1 over `share` 0 to 1 of a motion's time, at rest at both ends."""
+    return 0.5 - 0.5 * np.cos(np.pi * np.clip(share, 0.0, 1.0))
+
+
+def minimum_jerk(share: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Quintic ramp from 0 to 1 over `share` 0 to 1: at rest, unaccelerated, at both ends.
+
+    Examples
+    --------
+    >>> minimum_jerk(np.array([0.0, 0.5, 2.0])).tolist()
+    [0.0, 0.5, 1.0]
+    """
+    s = np.clip(share, 0.0, 1.0)
+    return np.asarray(s**3 * (10.0 - 15.0 * s + 6.0 * s**2))
+
+
+def first_pose(bus: ServoBus, period_s: float) -> NDArray[np.float64]:
+    """Pose of the robot, shape (joints,) [rad]; waits up to 2 s for the first readings.
+
+    Raises
+    ------
+    BusError
+        If a joint returns no position.
+    """
+    until = bus.now() + _FIRST_READING_S
+    pose = np.full(len(bus.joint_names), np.nan)
+    while True:
+        reading = bus.read().position_rad
+        pose = np.where(np.isfinite(reading), reading, pose)
+        if np.isfinite(pose).all():
+            return pose
+        if bus.now() >= until:
+            silent = [n for n, x in zip(bus.joint_names, pose, strict=True) if np.isnan(x)]
+            raise BusError(
+                f"the bus {bus.name} gives no position of {', '.join(silent)}. Check that the "
+                "robot is on and its servos connected, then try again."
+            )
+        bus.sleep_until(bus.now() + period_s)
+
+
+def glide(
+    loop: FixedRateLoop,
+    send: Callable[[NDArray[np.float64]], object],
+    origin: NDArray[np.float64],
+    goal: NDArray[np.float64],
+    least_s: float,
+) -> None:
+    """Move from `origin` to `goal` [rad], shape (joints,), on a raised cosine.
+
+    Parameters
+    ----------
+    loop : FixedRateLoop
+    send : callable
+        Called with the pose of each tick.
+    origin, goal : ndarray, shape (joints,)
+    least_s : float
+        Shortest duration; longer if `GENTLE_RAD_S` asks for it.
+    """
+    way = goal - origin
+    farthest = float(np.max(np.abs(way)))
+    if farthest == 0:
+        return
+    # the fastest point of a raised cosine is π/2 times its mean speed
+    duration = max(least_s, 0.5 * np.pi * farthest / GENTLE_RAD_S)
+    for elapsed in loop.ticks(duration):
+        send(origin + raised_cosine(elapsed / duration) * way)
+    send(goal)

@@ -24,17 +24,137 @@ native `<pid delay nsample interp="linear" slewmax forcerange>` on a hinge with 
 
 Free-air positions cannot tell the torques from the inertia: scaling stiffness, damping,
 friction_loss, effort_limit, back_emf and armature together changes nothing (`per_inertia`).
+
+`DelayedServo` is the base of the models that integrate an equation of motion; its `DelayLine` holds
+the commands that have been sent and have not arrived yet.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.delay_line import DelayedServo
+
+
+class DelayedServo(ABC):
+    """A `ServoModel` that integrates an equation of motion under delayed commands.
+
+    Parameters
+    ----------
+    values : iterable of ndarray
+        All its numbers; their broadcast shape is the batch until `reset` widens it.
+    dead_time_s : ndarray
+        From a command's arrival to its first effect [s].
+    time_step_s : float
+        Time step [s]; commands and positions are at this step.
+
+    Raises
+    ------
+    InputError
+        If the time step is not positive.
+    """
+
+    def __init__(
+        self, values: Iterable[NDArray], dead_time_s: NDArray[np.float64], time_step_s: float
+    ):
+        refuse_time_step(type(self).__name__, time_step_s)
+        self.time_step_s = float(time_step_s)
+        self._own = np.broadcast_shapes(*(v.shape for v in values))
+        self._delay_line = DelayLine(dead_time_s, self.time_step_s)
+        self.reset(np.zeros(self._own))
+
+    def reset(self, position: ArrayLike) -> None:
+        """Rest at `position` [rad], which has been the command for as long as the dead time.
+
+        The batch becomes the shape to which `position` and the parameters broadcast.
+        """
+        position = np.asarray(position, float)
+        self.batch = np.broadcast_shapes(position.shape, self._own)
+        position = np.broadcast_to(position, self.batch)
+        self._rest(position)
+        self._delay_line.reset(position)
+
+    def step(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Advance one time step under `command` [rad]; returns the position after it."""
+        return self.rollout(np.broadcast_to(np.asarray(command, float), self.batch)[None])[0]
+
+    def rollout(self, commands: ArrayLike) -> NDArray[np.float64]:
+        """Positions [rad] after each command, shape (steps, *batch); continues from the state."""
+        commands = np.asarray(commands, float)
+        if commands.ndim == 1:  # one series for the whole batch
+            commands = commands.reshape(-1, *[1] * len(self.batch))
+        commands = np.broadcast_to(commands, (len(commands), *self.batch))
+        return self._integrate(self._delay_line.shift(commands))
+
+    @abstractmethod
+    def _rest(self, position: NDArray[np.float64]) -> None:
+        """Set the state to rest at `position`, of shape `batch`."""
+
+    @abstractmethod
+    def _integrate(self, delayed: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Positions after each delayed command; advances the state."""
+
+
+def refuse_time_step(model: str, time_step_s: float) -> None:
+    """Refuse a time step [s] that is not a positive number.
+
+    Raises
+    ------
+    InputError
+    """
+    if not (np.isfinite(time_step_s) and time_step_s > 0):
+        raise InputError(f"{model}: time_step_s is {time_step_s}; it must be positive.")
+
+
+class DelayLine:
+    """Commands on their way to the servos of a batch; starts when `reset` is called.
+
+    Parameters
+    ----------
+    delay_s : ndarray
+        Not negative, and finite [s].
+    time_step_s : float
+        Time between commands [s].
+
+    Examples
+    --------
+    >>> line = DelayLine(np.array(0.003), 0.002)
+    >>> line.reset(np.array(0.0))
+    >>> line.shift(np.array([1.0, 1.0, 1.0])).tolist()
+    [0.0, 0.5, 1.0]
+    """
+
+    def __init__(self, delay_s: NDArray[np.float64], time_step_s: float):
+        self._delay_steps = delay_s / time_step_s
+        self._rows = int(np.floor(np.max(delay_s) / time_step_s)) + 2
+
+    def reset(self, command: NDArray[np.float64]) -> None:
+        """Forget the past: `command` [rad] was given for as long as the delay.
+
+        Its shape, to which the delay must broadcast, becomes the batch.
+        """
+        self._past = np.broadcast_to(command, (self._rows, *command.shape)).copy()
+
+    def shift(self, commands: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What arrives while `commands` are given, both of shape (steps, *batch) [rad]."""
+        history = np.concatenate([self._past, commands])
+        self._past = history[len(history) - self._rows :].copy()
+        delay = np.broadcast_to(self._delay_steps, commands.shape[1:]).reshape(-1)
+        whole = np.floor(delay).astype(int)
+        # one row more than requested: each row's successor is the other end of its interpolation
+        row = np.arange(len(history) - len(commands) - 1, len(history))[:, None]
+        series = len(delay)
+        taken = np.take(history.reshape(-1), row * series + (np.arange(series) - whole * series))
+        arrived = np.subtract(taken[:-1], taken[1:])
+        arrived *= delay - whole
+        arrived += taken[1:]
+        return arrived.reshape(commands.shape)
+
 
 TIME_STEP_S = 0.002
 """Physics step of fitting and of training [s]: 500 Hz."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.delay_line import refuse_time_step
+from pupper_sysid.servo_models.delayed_pd import refuse_time_step
 
 _SAME_RATE = 0.02
 

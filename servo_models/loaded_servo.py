@@ -35,11 +35,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.delay_line import DelayedServo, DelayLine
 from pupper_sysid.servo_models.delayed_pd import (
     FRICTION_IMPEDANCE,
     TIME_STEP_S,
     DelayedPDParameters,
+    DelayedServo,
+    DelayLine,
 )
 
 START_ERROR_RAD = 0.0015

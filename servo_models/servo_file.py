@@ -33,12 +33,11 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, write_bytes, write_text
 from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.processes.stop import held
-from pupper_sysid.common.reading.tensors import refuse_large_header
-from pupper_sysid.servo_models.command_network import CommandNetwork
-from pupper_sysid.servo_models.control_rate import AtControlRate, substeps
+from pupper_sysid.common.reading.content import refuse_large_header
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+from pupper_sysid.servo_models.interface import AtControlRate, substeps
 from pupper_sysid.servo_models.joint_arrays import same_rate
-from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
+from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS, SparseEquation
 
 SCHEMA = "pupper-servo-model"

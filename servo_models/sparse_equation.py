@@ -31,8 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.delay_line import DelayedServo, refuse_time_step
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedServo, refuse_time_step
 
 
 class Coefficient(NamedTuple):

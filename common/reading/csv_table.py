@@ -5,7 +5,8 @@
 
 The first line that is no comment (`# …`) names the columns. Plain blocks are converted by pandas'
 parser, which rounds as Python does; a block in which it finds anything else is read again line by
-line, strictly, so that a fault is named with its place.
+line, strictly, so that a fault is named with its place. `distinct` refuses a name that stands
+twice, in a table of any format: a mapping from names to columns would keep only the last.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,75 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.budget import allowed, refuse_more
-from pupper_sysid.common.reading.names import distinct
-from pupper_sysid.common.reading.numbers import decimal
+from pupper_sysid.common.reading.content import allowed, refuse_more
+from pupper_sysid.common.reading.dialect import decimal
 from pupper_sysid.common.strict_yaml import printable
+
+
+def distinct(where: Path | str, names: Iterable[str], what: str = "columns") -> None:
+    """Refuse names of which two are the same.
+
+    Parameters
+    ----------
+    where : Path or str
+        File, and place in it, for messages.
+    names : iterable of str
+    what : str
+        Things that are named, in the plural.
+
+    Raises
+    ------
+    InputError
+        If one stands twice.
+
+    Examples
+    --------
+    >>> distinct("log.npz", ["knee", "ankle", "knee"], "joints")
+    Traceback (most recent call last):
+    ...
+    pupper_sysid.common.errors.InputError: log.npz: two joints would be called knee. Rename one of \
+them.
+    """
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            called = f"would be called {printable(name)[:60]}" if name else "have no name"
+            raise InputError(f"{where}: two {what} {called}. Rename one of them.")
+        seen.add(name)
+
+
+def one_each(where: Path | str, counts: Mapping[str, int], remedy: str = "Mend the log.") -> None:
+    """Refuse parts of a row that are not equally long: commands, positions, names of joints.
+
+    Parameters
+    ----------
+    where : Path or str
+        File, and place in it, for messages.
+    counts : mapping of str to int
+        How many values each part has.
+    remedy : str
+        What else to do, as a sentence.
+
+    Raises
+    ------
+    InputError
+        If two differ.
+
+    Examples
+    --------
+    >>> one_each("log.npz", {"command": 3, "joint_names": 2})
+    Traceback (most recent call last):
+    ...
+    pupper_sysid.common.errors.InputError: log.npz: command has 3 values and joint_names has 2; \
+each joint has one of each. Mend the log.
+    """
+    if len(set(counts.values())) > 1:
+        first, *others = counts.items()
+        listed = [f"{printable(first[0])[:60]} has {first[1]} values"]
+        listed += [f"{printable(what)[:60]} has {n}" for what, n in others]
+        text = f"{', '.join(listed[:-1])} and {listed[-1]}"
+        raise InputError(f"{where}: {text}; each joint has one of each. {remedy}")
+
 
 MOST_ROWS = 5_000_000
 MOST_COLUMNS = 2_000

@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import BusError, InputError, MissingDevice
 from pupper_sysid.hardware.address import SOCKET, BusAddress
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
-from pupper_sysid.hardware.clock import HostClock
 from pupper_sysid.hardware.esp32 import datagrams
 from pupper_sysid.hardware.imu import ImuSample, from_chip
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.lock import own
+from pupper_sysid.hardware.loop import HostClock
 
 TIMEOUT_S = 0.03
 VOLTAGE_BAND_V = (4.2, 8.7)

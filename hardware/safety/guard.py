@@ -24,8 +24,7 @@ import numpy as np
 
 from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
-from pupper_sysid.hardware.loop import BUS, GUARD, TimeSpent
-from pupper_sysid.hardware.moves import raised_cosine
+from pupper_sysid.hardware.loop import BUS, GUARD, TimeSpent, raised_cosine
 from pupper_sysid.hardware.safety.monitor import Angles, GuardLimits, Monitor
 from pupper_sysid.hardware.safety.rates import RateLimit
 from pupper_sysid.hardware.safety.registers import ChangedRegisters

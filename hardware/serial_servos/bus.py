@@ -27,8 +27,8 @@ from pupper_sysid.common.data_sheet import no_load_speed
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.address import BusAddress
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
-from pupper_sysid.hardware.clock import HostClock
 from pupper_sysid.hardware.joint_map import JointMap
+from pupper_sysid.hardware.loop import HostClock
 from pupper_sysid.hardware.serial_servos.line import Reply, slow_adapter
 from pupper_sysid.hardware.serial_servos.opening import (
     MINI_PUPPER_IDS,

@@ -17,13 +17,20 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.durations import Durations
 from pupper_sysid.common.errors import BusError, PupperError, SafetyStop
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.bus import BusSample, Sent
 from pupper_sysid.hardware.imu import Imu, ImuSample
-from pupper_sysid.hardware.loop import IMU, LOG, POLICY, VIEWS, FixedRateLoop
-from pupper_sysid.hardware.moves import first_pose, glide
+from pupper_sysid.hardware.loop import (
+    IMU,
+    LOG,
+    POLICY,
+    VIEWS,
+    Durations,
+    FixedRateLoop,
+    first_pose,
+    glide,
+)
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy.commands import Commands
 from pupper_sysid.policies.deploy.controller import Controller, Decision, Senses

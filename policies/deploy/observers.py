@@ -24,8 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.policies.deploy.stacks import ObserverKind
-from pupper_sysid.servo_models.control_rate import substeps as physics_substeps
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+from pupper_sysid.servo_models.interface import substeps as physics_substeps
 from pupper_sysid.servo_models.joint_arrays import JointArrays, same_rate
 
 Array = NDArray[np.float64]

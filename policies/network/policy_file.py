@@ -32,7 +32,7 @@ from pupper_sysid.common.border import (
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_bytes, write_text
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.common.reading.tensors import refuse_large_header
+from pupper_sysid.common.reading.content import refuse_large_header
 from pupper_sysid.policies.network.hyperparameters import Kind
 from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
 from pupper_sysid.policies.network.trained_servo import SERVO_VERSION, TrainedServo

@@ -13,7 +13,7 @@ import torch
 
 from pupper_sysid.common.border import read_bytes, refuse_other_version
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.tensors import LARGEST_CHECKPOINT, refuse_bomb
+from pupper_sysid.common.reading.content import LARGEST_CHECKPOINT, refuse_bomb
 
 CHECKPOINT_SCHEMA = "pupper-checkpoint"
 CHECKPOINT_VERSION = 4

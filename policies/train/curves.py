@@ -14,8 +14,8 @@ import torch
 from pupper_sysid.common.border import read_text
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
-from pupper_sysid.common.reading.budget import refuse_more
-from pupper_sysid.common.reading.numbers import whole
+from pupper_sysid.common.reading.content import refuse_more
+from pupper_sysid.common.reading.dialect import whole
 
 LARGEST_BYTES = 100e6
 """Of a table of curves."""

@@ -24,8 +24,8 @@ import torch
 from rsl_rl.models import MLPModel
 
 from pupper_sysid.common.errors import InputError, PupperError
-from pupper_sysid.common.processes.memory import keep_freed_memory
 from pupper_sysid.common.processes.stop import finishing
+from pupper_sysid.common.processes.workers import keep_freed_memory
 from pupper_sysid.policies.network.hyperparameters import OWN, TROT
 from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.train.curves import CurveWriter, EpisodeMeans

@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from pupper_sysid.hardware.clock import HostClock
+from pupper_sysid.hardware.loop import HostClock
 
 
 class VirtualClock:

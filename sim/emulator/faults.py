@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.numbers import decimal
+from pupper_sysid.common.reading.dialect import decimal
 
 ANSWER_KINDS = (
     "lost", "late", "truncated", "corrupted", "duplicated", "foreign", "wrong-length",

@@ -1,6 +1,6 @@
 """One step of a servo network as a PyTorch module without state, for ONNX and TorchScript.
 
-The arithmetic is that of `servo_models.command_network` and `servo_models.recurrent_network`.
+The arithmetic is that of `servo_models.networks` and `servo_models.networks`.
 """
 
 from __future__ import annotations
@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from pupper_sysid.servo_models.command_network import CommandNetwork
-from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
+from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
 
 
 class ServoStep(nn.Module):

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions, write_text
-from pupper_sysid.servo_models.command_network import CommandNetwork
-from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
+from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
 from pupper_sysid.servo_models.servo_file import Contract, SavedModel
 from pupper_sysid.sysid.recordings.table import comments
 

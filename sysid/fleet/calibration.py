@@ -32,7 +32,7 @@ from pupper_sysid.common.errors import InputError, PupperError, refuse_outside
 from pupper_sysid.common.files import hold_output, sha256, write_text
 from pupper_sysid.common.joints import STALL_TORQUES_NM
 from pupper_sysid.common.processes.workers import Workers
-from pupper_sysid.common.reading.budget import read_limit, reading_up_to
+from pupper_sysid.common.reading.content import read_limit, reading_up_to
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sysid.fit.calibrate import calibrate

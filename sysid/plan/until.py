@@ -16,7 +16,7 @@ from pathlib import Path
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
-from pupper_sysid.common.reading.numbers import decimal
+from pupper_sysid.common.reading.dialect import decimal
 from pupper_sysid.common.results import Result, derived
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.plan.candidates import trial_seconds

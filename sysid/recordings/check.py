@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import strange_joint
-from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
 from pupper_sysid.sysid.recordings.importers.tables import import_line

@@ -23,7 +23,7 @@ import pandas as pd
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
-from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
 from pupper_sysid.sysid.recordings.importers.options import LogOptions

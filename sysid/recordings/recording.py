@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions, write_text
 from pupper_sysid.common.joints import in_order
-from pupper_sysid.common.reading.names import distinct
+from pupper_sysid.common.reading.csv_table import distinct
 from pupper_sysid.sysid.recordings.check import check
 from pupper_sysid.sysid.recordings.coordinates import in_servo_coordinates
 from pupper_sysid.sysid.recordings.importers.options import LogOptions

@@ -121,7 +121,7 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
     ------
     InputError
         For ragged rows, text where a number belongs, a broken or newer header, or more than is
-        read (`common.reading.budget`).
+        read (`common.reading.content`).
     """
     options = options or LogOptions()
     text = one_line_end(text)

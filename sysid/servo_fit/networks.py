@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.servo_models.command_network import CommandNetwork
-from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
+from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
 from pupper_sysid.sysid.servo_fit.linear import RIDGES, LinearFits, fading, fit_linear, taps
 from pupper_sysid.sysid.servo_fit.training import LSTM, MLP, Checkpoint, train
 from pupper_sysid.sysid.servo_fit.windows import Samples, training_sets

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
-from pupper_sysid.common.processes.memory import keep_freed_memory
-from pupper_sysid.servo_models.command_network import CommandNetwork
-from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
+from pupper_sysid.common.processes.workers import keep_freed_memory
+from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
 from pupper_sysid.sysid.servo_fit.data import ServoData
 from pupper_sysid.sysid.servo_fit.windows import Part, chosen_rows
 

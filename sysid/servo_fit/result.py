@@ -15,9 +15,8 @@ from pupper_sysid.common.files import versions
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result, internal, plain
 from pupper_sysid.servo_models.calibration.calibration import utc_now
-from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.servo_models.interface import ServoModel
-from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
+from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
 from pupper_sysid.servo_models.servo_file import input_names, save_servo_model
 from pupper_sysid.sysid.servo_fit.data import ServoData
 from pupper_sysid.sysid.servo_fit.scores import ModelScores, Scores, Tracks

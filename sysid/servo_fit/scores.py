@@ -20,10 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import internal
-from pupper_sysid.servo_models.command_network import CommandNetwork
-from pupper_sysid.servo_models.control_rate import AtControlRate
-from pupper_sysid.servo_models.interface import ServoModel
-from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
+from pupper_sysid.servo_models.interface import AtControlRate, ServoModel
+from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
 from pupper_sysid.sysid.servo_fit.data import Run, ServoData, look_up
 from pupper_sysid.sysid.servo_fit.windows import Part, chosen, chosen_rows
 

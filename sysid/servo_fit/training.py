@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pupper_sysid.common.processes.memory import keep_freed_memory
+from pupper_sysid.common.processes.workers import keep_freed_memory
 from pupper_sysid.sysid.servo_fit.linear import LinearFits, fading, learns_from
 from pupper_sysid.sysid.servo_fit.lstm_kernel import Lstm
 from pupper_sysid.sysid.servo_fit.mlp_kernel import Mlp

@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.numbers import decimal
+from pupper_sysid.common.reading.dialect import decimal
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
 from pupper_sysid.sysid.sweep.excitation import (
     LEAD_IN_S,

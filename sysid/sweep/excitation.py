@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
-from pupper_sysid.common.reading.numbers import decimal
+from pupper_sysid.common.reading.dialect import decimal
 from pupper_sysid.sysid.sweep.waveforms import (
     Offset,
     after,

@@ -18,7 +18,7 @@ from pupper_sysid.common.border import read_text
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
-from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import read_table
 from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, MOST_LOOPS, Plan, TrialPlan
 

@@ -20,11 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError, InputError, SafetyStop
-from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_ROWS
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, header_entries
-from pupper_sysid.hardware.loop import LOG, VIEWS, FixedRateLoop
-from pupper_sysid.hardware.moves import first_pose, glide
+from pupper_sysid.hardware.loop import LOG, VIEWS, FixedRateLoop, first_pose, glide
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
 from pupper_sysid.sysid.recordings.files import RecordingWriter
 from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS

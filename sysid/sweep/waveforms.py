@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.hardware.moves import minimum_jerk, raised_cosine
+from pupper_sysid.hardware.loop import minimum_jerk, raised_cosine
 
 Offset = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 

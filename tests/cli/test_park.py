@@ -18,7 +18,7 @@ from pupper_sysid.cli.commands.robot import park
 from pupper_sysid.cli.commands.robot.park import Park
 from pupper_sysid.cli.programs.pupper_sysid import COMMANDS
 from pupper_sysid.common.errors import SafetyStop
-from pupper_sysid.hardware import clock
+from pupper_sysid.hardware import loop as clock
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.joint_map import load_joint_map

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pupper_sysid.common.durations import Durations
+from pupper_sysid.hardware.loop import Durations
 
 
 @pytest.mark.parametrize("size", [1, 10, 5000])

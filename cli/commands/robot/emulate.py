@@ -19,7 +19,7 @@ from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import parse_servo_registers
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
-from pupper_sysid.common.reading.numbers import whole
+from pupper_sysid.common.reading.dialect import whole
 from pupper_sysid.hardware.address import SOCKET
 from pupper_sysid.hardware.feetech.registers import BAUD_RATES, SCS0009, STS3215
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map

@@ -11,7 +11,7 @@ import tyro
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, resolved, sha256, write_text
-from pupper_sysid.common.reading.numbers import decimal
+from pupper_sysid.common.reading.dialect import decimal
 from pupper_sysid.servo_models.calibration.parts import P_GAINS
 
 if TYPE_CHECKING:

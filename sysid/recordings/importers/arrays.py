@@ -18,10 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.budget import refuse_more
-from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
-from pupper_sysid.common.reading.names import distinct
-from pupper_sysid.common.reading.tensors import refuse_bomb
+from pupper_sysid.common.reading.content import refuse_bomb, refuse_more
+from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS, distinct
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.log import LARGEST_BYTES, MOST_JOINTS, Log
 from pupper_sysid.sysid.recordings.importers.options import LogOptions

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
 from pupper_sysid.sysid.recordings.importers.log import (
     Log,

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.budget import refuse_more
-from pupper_sysid.common.reading.names import distinct
+from pupper_sysid.common.reading.content import refuse_more
+from pupper_sysid.common.reading.csv_table import distinct
 from pupper_sysid.common.strict_yaml import printable
 
 LARGEST_BYTES = 500e6

@@ -23,7 +23,7 @@ from pydantic import ConfigDict, create_model
 
 from pupper_sysid.common.border import read_yaml, validated
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.numbers import decimal
+from pupper_sysid.common.reading.dialect import decimal
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.units import Unit, unit
 

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import (
     LONGEST_CELL,
     MOST_CELLS,
     MOST_COLUMNS,
     MOST_ROWS,
+    distinct,
 )
-from pupper_sysid.common.reading.names import distinct
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.log import (
     LARGEST_BYTES,

@@ -12,7 +12,7 @@ from typing import Any
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import resolved
-from pupper_sysid.common.reading.budget import allowed, refuse_more
+from pupper_sysid.common.reading.content import allowed, refuse_more
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.log import LARGEST_BYTES
 from pupper_sysid.sysid.recordings.importers.ros_messages import KINDS, plain_type

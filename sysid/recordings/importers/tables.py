@@ -25,9 +25,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.budget import refuse_more
-from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
-from pupper_sysid.common.reading.names import distinct, one_each
+from pupper_sysid.common.reading.content import refuse_more
+from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS, distinct, one_each
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.columns import Column, column, time_columns
 from pupper_sysid.sysid.recordings.importers.log import (

@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.budget import refuse_more
+from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.dialect import is_clock
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.numbers import decimal
+from pupper_sysid.common.reading.dialect import decimal
 from pupper_sysid.common.strict_yaml import printable
 
 COUNT_RAD = 2 * np.pi / 4096

@@ -6,7 +6,7 @@ import pytest
 
 from pupper_sysid.common.border import MOST_VALUES, parse_json, read_text
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.budget import allowed, reading_up_to, refuse_more
+from pupper_sysid.common.reading.content import allowed, reading_up_to, refuse_more
 from pupper_sysid.common.strict_yaml import MAX_DEPTH, MOST_NODES, load
 from support.refusals import assert_each_refused
 

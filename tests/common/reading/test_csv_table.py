@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading import csv_table
-from pupper_sysid.common.reading.budget import reading_up_to
+from pupper_sysid.common.reading.content import reading_up_to
 from pupper_sysid.common.reading.csv_table import column_names, comments_of, read_table
-from pupper_sysid.common.reading.numbers import decimal, whole
+from pupper_sysid.common.reading.dialect import decimal, whole
 from support.refusals import assert_each_refused
 
 

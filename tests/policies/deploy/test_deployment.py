@@ -26,7 +26,7 @@ from pupper_sysid.policies.deploy.observers import ServoModelObserver
 from pupper_sysid.policies.deploy.stacks import STACKS, Stack, suited
 from pupper_sysid.policies.deploy.walk_log import read_walk, replay
 from pupper_sysid.policies.network.policy_file import CommandRanges, Policy
-from pupper_sysid.servo_models.command_network import CommandNetwork
+from pupper_sysid.servo_models.networks import CommandNetwork
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.bus import WalkingBus

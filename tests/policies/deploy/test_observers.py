@@ -18,8 +18,8 @@ from pupper_sysid.policies.deploy.observers import (
     SyntheticPD,
     Zero,
 )
-from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+from pupper_sysid.servo_models.networks import CommandNetwork
 from support.observer_response import response
 from support.refusals import assert_each_refused
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.delay_line import DelayLine
+from pupper_sysid.servo_models.delayed_pd import DelayLine
 from pupper_sysid.servo_models.held_feedback import HeldFeedback as Feedback
 from pupper_sysid.sim.export.torch_servos import HeldFeedback, ServoBank, SetPoint
 

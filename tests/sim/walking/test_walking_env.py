@@ -11,8 +11,8 @@ import pytest
 import pupper_sysid.sim.robot.robot_batch
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, LEGS
-from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.servo_models.networks import CommandNetwork
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import (
     STANDING_HEIGHT_M,

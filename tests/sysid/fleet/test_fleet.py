@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from pupper_sysid.cli.programs import pupper_sysid
-from pupper_sysid.common.reading.budget import reading_up_to
+from pupper_sysid.common.reading.content import reading_up_to
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.fleet import calibration as fleet

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.names import distinct
+from pupper_sysid.common.reading.csv_table import distinct
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.ros import _by_joint, _log, _Topic

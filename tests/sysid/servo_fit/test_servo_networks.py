@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from pupper_sysid.servo_models.command_network import CommandNetwork
-from pupper_sysid.servo_models.control_rate import AtControlRate, substeps
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
-from pupper_sysid.servo_models.recurrent_network import RecurrentNetwork
+from pupper_sysid.servo_models.interface import AtControlRate, substeps
+from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
 from pupper_sysid.sysid.servo_fit import networks as network_fit
 from pupper_sysid.sysid.servo_fit.data import ServoData, look_up, servo_data
 from pupper_sysid.sysid.servo_fit.linear import fit_linear

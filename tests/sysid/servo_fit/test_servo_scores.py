@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.interval import LEVEL
-from pupper_sysid.servo_models.command_network import CommandNetwork
+from pupper_sysid.servo_models.networks import CommandNetwork
 from pupper_sysid.sysid.servo_fit.data import servo_data
 from pupper_sysid.sysid.servo_fit.scores import (
     Errors,

@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.budget import reading_up_to
+from pupper_sysid.common.reading.content import reading_up_to
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.recording import Recording
