@@ -30,15 +30,14 @@ from pathlib import Path
 import numpy as np
 
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.hardware.feetech.registers import STS3215
+from pupper_sysid.hardware.feetech import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lock import lock_name, runtime_folder
-from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
-from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
+from pupper_sysid.sim.emulator.bench import ServoBench
+from pupper_sysid.sim.emulator.esp32 import ProxyEmulator, ProxySocket
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.serial_pty import SerialPty
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
+from pupper_sysid.sim.emulator.serial_line import SerialPty
 
 PARK = [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "park"]
 KINDS = ("feetech", "esp32")

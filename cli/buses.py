@@ -56,7 +56,7 @@ def parse_registers(text: str) -> dict[str, int]:
     InputError
         If it names one that does not act on the motion, or a value that it cannot have.
     """
-    from pupper_sysid.sim.emulator.servos.pendulum import REGISTERS
+    from pupper_sysid.sim.emulator.pendulum import REGISTERS
 
     return _registers(text, REGISTERS, "p=16")[None]
 

@@ -52,9 +52,9 @@ class BusKind:
 KINDS = {
     kind.name: kind
     for kind in (
-        BusKind("esp32", "Mini Pupper 2", "hardware.esp32.bus", "Esp32Bus", str(SOCKET)),
-        BusKind("feetech", "Feetech STS and SCS", "hardware.feetech.bus", "FeetechBus"),
-        BusKind("dynamixel", "Dynamixel X and MX", "hardware.dynamixel.bus", "DynamixelBus"),
+        BusKind("esp32", "Mini Pupper 2", "hardware.esp32", "Esp32Bus", str(SOCKET)),
+        BusKind("feetech", "Feetech STS and SCS", "hardware.feetech", "FeetechBus"),
+        BusKind("dynamixel", "Dynamixel X and MX", "hardware.dynamixel", "DynamixelBus"),
     )
 }
 """All buses outside this program, by name."""

@@ -29,8 +29,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pupper_sysid.common.errors import PupperError
-from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
-from pupper_sysid.hardware.feetech.registers import SERIES, Series
+from pupper_sysid.hardware.feetech import SERIES, Frame, FrameReader, Series
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.policies.deploy.commands import COLUMNS as SCRIPT_COLUMNS
 from pupper_sysid.policies.deploy.commands import script
@@ -42,10 +41,10 @@ from pupper_sysid.policies.train.run_file import load_run
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.servo_file import load_servo_model
+from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from pupper_sysid.sysid.plan.plan_file import load_plan, save_plan
 from pupper_sysid.sysid.plan.planner import PlannedTrial
 from pupper_sysid.sysid.plan.proposal import SweepPlan

@@ -35,7 +35,7 @@ from pupper_sysid.common.files import refuse_path
 from pupper_sysid.hardware.address import EMULATED, SOCKET, bus_name, parse_address
 from pupper_sysid.hardware.bus import header_entries
 from pupper_sysid.hardware.connect import open_guarded
-from pupper_sysid.hardware.esp32.bus import Esp32Bus
+from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.imu import Imu
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority

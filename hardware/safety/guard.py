@@ -17,19 +17,83 @@ to what was found, and the watchdog does if this process dies.
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
 from pupper_sysid.hardware.loop import BUS, GUARD, TimeSpent, raised_cosine
+from pupper_sysid.hardware.safety.limits import PositionLimits
 from pupper_sysid.hardware.safety.monitor import Angles, GuardLimits, Monitor
-from pupper_sysid.hardware.safety.rates import RateLimit
-from pupper_sysid.hardware.safety.registers import ChangedRegisters
 from pupper_sysid.hardware.safety.watchdog import Watchdog
 from pupper_sysid.hardware.serial_servos.series import ERROR_BITS
+
+_FIRST_TICK_S = 0.02  # until the driver's own rate is known
+_LATE = 1.5
+_SHORTEST_TICK_S, _LONGEST_TICK_S = 0.001, 0.06
+_REST_S = 0.1  # longer than any tick: the command has been at rest
+_RECENT_TICKS = 9
+
+
+class RateLimit:
+    """Speed and acceleration limits of the servo angles of a bus.
+
+    Parameters
+    ----------
+    limits : PositionLimits
+    speed_rad_s, acceleration_rad_s2 : float
+        Deceleration is free.
+    """
+
+    def __init__(self, limits: PositionLimits, speed_rad_s: float, acceleration_rad_s2: float):
+        self._limits = limits
+        self._speed, self._acceleration = speed_rad_s, acceleration_rad_s2
+        self._velocity = np.zeros(len(limits.low_rad))
+        self._ticks: deque[float] = deque(maxlen=_RECENT_TICKS)
+
+    def rest(self) -> None:
+        """Begin from rest."""
+        self._velocity[:] = 0.0
+
+    def limited(
+        self, command: NDArray[np.float64], sent: NDArray[np.float64], since_s: float
+    ) -> NDArray[np.float64]:
+        """`command`, or a point towards it that the limits allow; `command` itself if they do.
+
+        Parameters
+        ----------
+        command, sent : ndarray, shape (joints,)
+            The command, and the last one that was sent [rad].
+        since_s : float
+            Time since then.
+        """
+        limits = self._limits
+        wanted, here = limits.servo_angles(command), limits.servo_angles(sent)
+        tick = float(np.median(self._ticks)) if self._ticks else _FIRST_TICK_S
+        dt = max(min(since_s, _LATE * tick), 1e-4)
+        if since_s > _REST_S:
+            self.rest()
+            dt = min(tick, _FIRST_TICK_S)
+        else:
+            self._ticks.append(min(max(since_s, _SHORTEST_TICK_S), _LONGEST_TICK_S))
+        asked = (wanted - here) / dt
+        gain = self._acceleration * dt
+        low = np.maximum(np.minimum(self._velocity, 0.0) - gain, -self._speed)
+        high = np.minimum(np.maximum(self._velocity, 0.0) + gain, self._speed)
+        velocity = np.clip(asked, low, high)
+        exceeded = velocity != asked
+        # over all of a late tick the joint was slower than that
+        self._velocity = velocity * min(dt / min(max(since_s, 1e-4), _LONGEST_TICK_S), 1.0)
+        if not exceeded.any():
+            return command
+        slower = np.where(exceeded, here + velocity * dt, wanted)
+        return limits.clip(limits.from_servo_angles(slower))
+
 
 _HEARTBEAT_S = 0.1
 _MOST_EVENTS = 500  # that a report keeps; all are counted
@@ -408,3 +472,74 @@ class GuardedBus:
 def guarded(bus: ServoBus) -> GuardedBus:
     """`bus` behind a guard; as it is if it already is."""
     return bus if isinstance(bus, GuardedBus) else GuardedBus(bus)
+
+
+_TRIES, _PAUSE_S = 3, 0.02
+
+
+class ChangedRegisters:
+    """Registers of a bus's servos that differ from what was found.
+
+    Parameters
+    ----------
+    bus : ServoBus
+    watchdog : Watchdog, optional
+        Sets them back if this process dies.
+    found : mapping of joint to mapping of str to int, optional
+        Values before the change, by another driver.
+    """
+
+    def __init__(
+        self,
+        bus: ServoBus,
+        watchdog: Watchdog | None = None,
+        found: Mapping[str, Mapping[str, int]] | None = None,
+    ):
+        self._bus: Any = bus
+        self._watchdog = watchdog
+        self.found = {joint: dict(own) for joint, own in (found or {}).items()}
+        """Values to be set back, by joint and register."""
+
+    def set(self, joint: str, name: str, value: int) -> None:
+        """Set a register; the first time, keep what was found.
+
+        Raises
+        ------
+        BusError
+            If the bus has no registers, or the register does not take the value.
+        """
+        if not hasattr(self._bus, "set_register"):
+            raise BusError(
+                f"{self._bus.name}: registers of its servos cannot be set over this bus. Leave the "
+                "gains out, or connect the servos to a serial adapter (feetech:DEVICE)."
+            )
+        own = self.found.setdefault(joint, {})
+        if name not in own:
+            own[name] = self._bus.register(joint, name)
+            self._tell()
+        self._bus.set_register(joint, name, value)
+
+    def restore(self) -> bool:
+        """Set all back; whether every one is confirmed. What is not stays in `found`."""
+        if not self.found:
+            return True
+        for joint, own in self.found.items():
+            for name, value in list(own.items()):
+                if self._set_back(joint, name, value):
+                    del own[name]
+        self.found = {joint: own for joint, own in self.found.items() if own}
+        self._tell()
+        return not self.found
+
+    def _set_back(self, joint: str, name: str, value: int) -> bool:
+        for _ in range(_TRIES):
+            try:
+                self._bus.set_register(joint, name, value)
+                return True
+            except BusError:
+                self._bus.sleep_until(self._bus.now() + _PAUSE_S)
+        return False
+
+    def _tell(self) -> None:
+        if self._watchdog:
+            self._watchdog.restore(self.found)

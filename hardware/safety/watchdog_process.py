@@ -34,11 +34,10 @@ from pupper_sysid.hardware.address import BusAddress
 from pupper_sysid.hardware.connect import open_bus
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from
 from pupper_sysid.hardware.loop import lasting_s
-from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.guard import ChangedRegisters, GuardedBus
 from pupper_sysid.hardware.safety.limp import can_come_back, is_there, may_be_on, say, switch_off
 from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.hardware.safety.notes import remove_note
-from pupper_sysid.hardware.safety.registers import ChangedRegisters
 from pupper_sysid.hardware.safety.watchdog import HANG_S, SWITCH_ON_S
 
 PARK_WITHIN_S = 0.5

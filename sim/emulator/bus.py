@@ -5,13 +5,16 @@
 Commands are truncated to counts, as by the robot's own library. Readings are stale (polled in turn,
 polls fail silently), noisy, quantised and biased (`servo_models.held_feedback`). A host sees no
 more than on the real robot; `truth`, `truth_rows` and `write_truth` give the truth beside it.
-The robot starts at its default pose with the torque on.
+The robot starts at its default pose with the torque on. Its clock starts at 0 and counts seconds
+to the microsecond: virtual time, in which a sleep costs nothing and ends a little late, as on a
+real host, or the host's own.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,11 +27,46 @@ from pupper_sysid.common.data_sheet import no_load_speed
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.common.files import refuse_overwrite, write_text
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
-from pupper_sysid.sim.emulator.clocks import RealClock, VirtualClock
+from pupper_sysid.hardware.loop import HostClock
+from pupper_sysid.sim.emulator.bench import SUPPLY_V, FreeAirServos, ServoPlant
 from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
 from pupper_sysid.sim.emulator.robot import CENTRE_COUNT, RADIANS_PER_COUNT, EmulatedRobot
-from pupper_sysid.sim.emulator.servos.bench import SUPPLY_V
-from pupper_sysid.sim.emulator.servos.plant import FreeAirServos, ServoPlant
+
+
+class VirtualClock:
+    """Time that passes only in sleeps and exchanges with the bus.
+
+    Parameters
+    ----------
+    overshoot_s : float
+        Mean of the exponential time by which a sleep ends late [s].
+    rng : numpy.random.Generator
+    """
+
+    def __init__(self, overshoot_s: float, rng: np.random.Generator):
+        self._now, self._overshoot, self._rng = 0.0, overshoot_s, rng
+
+    def now(self) -> float:
+        """Time [s], to the microsecond."""
+        return round(self._now, 6)
+
+    def sleep_until(self, time_s: float) -> None:
+        """Jump to `time_s` and a little further."""
+        if time_s > self._now:
+            self._now = time_s + self._overshoot * self._rng.exponential()
+
+    def spend(self, duration_s: float) -> None:
+        """Let `duration_s` pass, give or take a fifth."""
+        self._now += duration_s * self._rng.uniform(0.8, 1.2)
+
+
+class RealClock(HostClock):
+    """The host's own clock; exchanges take real time."""
+
+    def spend(self, duration_s: float) -> None:
+        """Sleep for `duration_s`."""
+        time.sleep(duration_s)
+
 
 NOMINAL_SPEED_LIMIT_RAD_S = 7.5
 """Speed limit of the Mini Pupper's servos [rad/s], and of others whose data sheet has none."""

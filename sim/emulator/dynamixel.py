@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from pupper_sysid.hardware.dynamixel import registers as table
-from pupper_sysid.hardware.dynamixel.bus import FAMILY
-from pupper_sysid.hardware.dynamixel.frames import Frame, FrameReader
-from pupper_sysid.hardware.dynamixel.registers import (
+from pupper_sysid.hardware import dynamixel as table
+from pupper_sysid.hardware.dynamixel import (
     ACTION,
     ALERT,
     BAUD_RATES,
     BROADCAST_ID,
+    FAMILY,
     PING,
     READ,
     REBOOT,
@@ -27,9 +26,11 @@ from pupper_sysid.hardware.dynamixel.registers import (
     TRIGGERED,
     WATCHDOG_UNIT_S,
     WRITE,
+    Frame,
+    FrameReader,
 )
+from pupper_sysid.sim.emulator.pendulum import DYNAMIXEL_GAINS
 from pupper_sysid.sim.emulator.serial_line import LineEmulator, Pieces
-from pupper_sysid.sim.emulator.servos.loops import DYNAMIXEL_GAINS
 
 _COMMON = {
     "firmware": 46, "return_delay_time": 250, "drive_mode": 0, "operating_mode": 3,

@@ -1,26 +1,33 @@
 """The Mini Pupper 2's proxy and firmware, emulated: datagrams in, datagrams out.
 
 `ProxyEmulator` is the shared block, the firmware's loop behind it and the servos, without a socket;
-`sim.emulator.esp32_socket` serves it. It has the real one's quirks: no owner and no watchdog, an
-acknowledgement that does not depend on the servos, zeros until the first feedback, feedback polled
-one servo after the other with silent losses, an unknown request answered with the previous answer,
-the last request executed once more when a client leaves, and a torque byte that stores a
-calibration.
+`ProxySocket` serves it to any number of clients. It has the real one's quirks: no owner and no
+watchdog, an acknowledgement that does not depend on the servos, zeros until the first feedback,
+feedback polled one servo after the other with silent losses, an unknown request answered with the
+previous answer, the last request executed once more when a client leaves, and a torque byte that
+stores a calibration.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
+import select
+import socket
 import struct
+import threading
+import time
+from pathlib import Path
 
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.hardware.esp32 import datagrams
+from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.imu import to_chip
+from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
 
 TICK_S = 0.002
 """Period of the firmware's servo task [s], which writes goal positions."""
@@ -61,7 +68,7 @@ class ProxyEmulator:
         self._polls = PollSchedule(
             spec.poll_period_s, phase, spec.loss, spec.poll_jitter_s, spec.poll_drift, rng
         )
-        servos = datagrams.SERVOS
+        servos = esp32.SERVOS
         self._index = [bench.index_of_id[i] for i in range(1, servos + 1)]
         self._counts = np.zeros(servos, int)
         self._loads = np.zeros(servos, int)
@@ -80,19 +87,19 @@ class ProxyEmulator:
     def answer(self, request: bytes, previous: bytes, now: float) -> bytes:
         """The reply to one datagram at `now` (seconds, not going backwards)."""
         opcode = request[1] if len(request) > 1 and request[0] == len(request) else 0
-        if opcode == datagrams.SET_POSITION and len(request) == _SET.size:
+        if opcode == esp32.SET_POSITION and len(request) == _SET.size:
             values = _SET.unpack(request)[2:]
             self._execute(values[:12], values[12:], now)
-            return datagrams.ACKNOWLEDGED
-        if request == datagrams.request(datagrams.GET_IMU):
+            return esp32.ACKNOWLEDGED
+        if request == esp32.request(esp32.GET_IMU):
             return self._imu(now)
         self._refresh(now)
         if len(request) == 2:
-            if opcode == datagrams.GET_POSITION:
+            if opcode == esp32.GET_POSITION:
                 return struct.pack("<BB12H", 26, opcode, *self._counts)
-            if opcode == datagrams.GET_LOAD:
+            if opcode == esp32.GET_LOAD:
                 return struct.pack("<BB12h", 26, opcode, *self._loads)
-            if opcode == datagrams.GET_POWER:
+            if opcode == esp32.GET_POWER:
                 return struct.pack("<BB2f", 10, opcode, self.bench.supply_v, 0.4)
         return previous or self.rng.bytes(2)
 
@@ -104,7 +111,7 @@ class ProxyEmulator:
     def inject_fault(self, now: float) -> str | None:
         """Draw a fault for the next answer; start it if it lasts. Returns its kind."""
         kind = self.faults.draw()
-        servo = int(self.rng.integers(datagrams.SERVOS))
+        servo = int(self.rng.integers(esp32.SERVOS))
         # any status bit makes the firmware drop the answer: the servo's feedback freezes
         if kind in ("frozen", "error-bits"):
             self._refresh(now)
@@ -121,7 +128,7 @@ class ProxyEmulator:
             self.unplug_for_s = self.faults.lasts_s
         elif kind == "second-writer":
             self._refresh(now)
-            goal = np.clip(self._counts + self.rng.integers(-8, 9, 12), 1, datagrams.HIGHEST_COUNT)
+            goal = np.clip(self._counts + self.rng.integers(-8, 9, 12), 1, esp32.HIGHEST_COUNT)
             self._execute((1,) * 12, tuple(int(c) for c in goal), now)
         return kind
 
@@ -129,17 +136,17 @@ class ProxyEmulator:
         """What is sent instead of `reply`: pieces, each with its delay [s]."""
         if kind == "wrong-length":
             return [(0.0, reply + b"\0" if self.rng.random() < 0.5 else reply[:-1] or b"\0")]
-        other = struct.pack("<BB2f", 10, datagrams.GET_POWER, self.bench.supply_v, 0.4)
+        other = struct.pack("<BB2f", 10, esp32.GET_POWER, self.bench.supply_v, 0.4)
         return self.faults.apply(kind, reply, other)
 
     def _imu(self, now: float) -> bytes:
         sample = self.bench.imu(now)
         raw = np.zeros(6) if sample is None else to_chip(sample)
-        return struct.pack("<BB6f", 26, datagrams.GET_IMU, *raw)
+        return struct.pack("<BB6f", 26, esp32.GET_IMU, *raw)
 
     def _execute(self, torque: tuple[int, ...], counts: tuple[int, ...], now: float) -> None:
         """A command reaches the servos with the firmware's next tick."""
-        if torque[0] == datagrams.SAVE_CALIBRATION:
+        if torque[0] == esp32.SAVE_CALIBRATION:
             # the present goals become the new centre; then the firmware stands up anew
             shifted = self._calibration + _CENTRE - np.array(counts)
             self._calibration = np.clip(shifted, -_CENTRE, _CENTRE - 1)
@@ -152,12 +159,12 @@ class ProxyEmulator:
         if self._undone or self.bench.supply_v < LOW_VOLTAGE_V:
             return
         at = math.ceil(now / TICK_S) * TICK_S
-        raw = np.clip(np.array(counts) - self._calibration, 0, datagrams.HIGHEST_COUNT)
+        raw = np.clip(np.array(counts) - self._calibration, 0, esp32.HIGHEST_COUNT)
         for k, on, count in zip(self._index, torque, raw, strict=True):
-            if on == datagrams.TORQUE_ON:
+            if on == esp32.TORQUE_ON:
                 self.bench.torque(k, at, True)
                 self.bench.command(k, at, int(count))
-            elif on == datagrams.TORQUE_OFF:
+            elif on == esp32.TORQUE_OFF:
                 self.bench.torque(k, at, False)
 
     def _refresh(self, now: float) -> None:
@@ -168,7 +175,7 @@ class ProxyEmulator:
             at = measured[k]
             if at > self._measured[servo] and at >= 0 and at >= self._stuck_until[servo]:
                 calibrated = self.bench.count(k, at) + self._calibration[servo]
-                self._counts[servo] = min(max(calibrated, 1), datagrams.HIGHEST_COUNT)
+                self._counts[servo] = min(max(calibrated, 1), esp32.HIGHEST_COUNT)
                 self._loads[servo] = self.bench.load(k)
                 self._measured[servo] = at
         block = tuple(int(c) for c in self._counts)
@@ -181,6 +188,141 @@ class ImuProxy(ProxyEmulator):
 
     def answer(self, request: bytes, previous: bytes, now: float) -> bytes:
         """The reply to one datagram at `now`; all but GET_IMU are unknown."""
-        if request == datagrams.request(datagrams.GET_IMU):
+        if request == esp32.request(esp32.GET_IMU):
             return self._imu(now)
         return previous or self.rng.bytes(2)
+
+
+_BACKLOG, _BUFFER, _IDLE_S = 20, 38, 0.05
+_LONGEST_PATH = 107  # bytes, of a socket on Linux
+
+
+class ProxySocket:
+    """Serves a `ProxyEmulator` at a path.
+
+    Parameters
+    ----------
+    emulator : ProxyEmulator
+    path : Path
+        Of the socket; removed at the end.
+
+    Raises
+    ------
+    InputError
+        If something else is there.
+    """
+
+    def __init__(self, emulator: ProxyEmulator, path: Path):
+        self.emulator, self.path = emulator, path
+        self._stop = threading.Event()
+        self._start = time.monotonic()
+        self._previous: dict[socket.socket, bytes] = {}
+        self._last: dict[socket.socket, bytes] = {}
+        self._due: list[tuple[float, socket.socket, bytes]] = []
+        self._free(path)
+        self._listen()
+
+    def now(self) -> float:
+        """Seconds of the emulator's time."""
+        return time.monotonic() - self._start
+
+    def serve(self) -> None:
+        """Answer until `stop`."""
+        while not self._stop.is_set():
+            if self.emulator.unplug_for_s > 0:
+                self._unplug()
+            self._deliver()
+            self.emulator.resend(self.now())
+            wait = min((d[0] for d in self._due), default=self.now() + _IDLE_S) - self.now()
+            watched = [self._server, *self._previous]
+            ready, _, _ = select.select(watched, [], [], max(min(wait, _IDLE_S), 0))
+            for one in ready:
+                if one is self._server:
+                    client, _ = self._server.accept()
+                    self._previous[client] = b""
+                else:
+                    self._talk(one)
+
+    def stop(self) -> None:
+        """End `serve`; may be called from anywhere."""
+        self._stop.set()
+
+    def close(self) -> None:
+        """Remove the socket and all connections."""
+        for client in list(self._previous):
+            self._drop(client)
+        self._server.close()
+        self.path.unlink(missing_ok=True)
+
+    def _talk(self, client: socket.socket) -> None:
+        try:
+            request = client.recv(_BUFFER)
+        except OSError:
+            request = b""
+        now = self.now()
+        if not request:
+            # the real proxy's child executes the last request once more before it ends
+            if client in self._last:
+                self.emulator.answer(self._last[client], self._previous[client], now)
+            self._drop(client)
+            return
+        self._last[client] = request
+        kind = self.emulator.inject_fault(now)
+        reply = self.emulator.answer(request, self._previous[client], now)
+        self._previous[client] = reply
+        for delay, piece in self.emulator.apply_fault(kind, reply):
+            if delay > 0:
+                self._due.append((now + delay, client, piece))
+            else:
+                self._send(client, piece)
+
+    def _deliver(self) -> None:
+        now = self.now()
+        for item in [d for d in self._due if d[0] <= now]:
+            self._due.remove(item)
+            self._send(item[1], item[2])
+
+    def _send(self, client: socket.socket, piece: bytes) -> None:
+        with contextlib.suppress(OSError):
+            client.send(piece, socket.MSG_DONTWAIT)
+
+    def _drop(self, client: socket.socket) -> None:
+        self._previous.pop(client, None)
+        self._last.pop(client, None)
+        self._due = [d for d in self._due if d[1] is not client]
+        client.close()
+
+    def _unplug(self) -> None:
+        self.close()
+        time.sleep(self.emulator.unplug_for_s)
+        self.emulator.unplug_for_s = 0.0
+        self._listen()
+        self.emulator.faults.ended.append(("unplugged", self.now()))
+
+    def _listen(self) -> None:
+        self._server = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        if len(os.fsencode(self.path)) > _LONGEST_PATH:
+            raise InputError(
+                f"{str(self.path)[:40]}… is too long for a socket, whose path has at most "
+                f"{_LONGEST_PATH} bytes. Choose a shorter one."
+            )
+        self._server.bind(str(self.path))
+        self._server.listen(_BACKLOG)
+
+    def _free(self, path: Path) -> None:
+        """Remove the socket of a server that has ended; refuse if one is running."""
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            return
+        if not path.is_socket():
+            raise InputError(f"{path} exists and is no socket. Choose another path for the socket.")
+        probe = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with probe:
+            try:
+                probe.connect(str(path))
+            except OSError:
+                path.unlink()
+                return
+        raise InputError(
+            f"{path}: a proxy is already running there. Choose another path for the socket."
+        )

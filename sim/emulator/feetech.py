@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from pupper_sysid.hardware.feetech.bus import FAMILY
-from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
-from pupper_sysid.hardware.feetech.registers import (
+from pupper_sysid.hardware.feetech import (
     BAUD_RATES,
     BROADCAST_ID,
+    FAMILY,
     PING,
     READ,
     SYNC_READ,
     SYNC_WRITE,
     WRITE,
+    Frame,
+    FrameReader,
 )
 from pupper_sysid.sim.emulator.serial_line import LineEmulator, Pieces
 

@@ -1,6 +1,6 @@
 """One emulated Mini Pupper 2 that walks on flat ground, as a `ServoPlant` with an IMU.
 
-Its servos are those of `sim.emulator.servos`. MuJoCo steps it only as far as a call asks; a robot
+Its servos are those of `sim.emulator`. MuJoCo steps it only as far as a call asks; a robot
 at rest is not stepped until a command moves it. Commands come at any instant, not only on physics
 steps: each actuator gets the mean of its held command over the step before
 (`sim.robot.servo_mjcf.for_commands_between_steps`). The last two seconds are kept, because servos

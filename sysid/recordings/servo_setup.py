@@ -39,7 +39,7 @@ class ServoSetup(BaseModel):
     supply_voltage_v: _Positive | None = None
     """Nominal supply voltage [V]; the column `voltage_v` overrides it."""
     registers: dict[str, int] = {}
-    """Other registers by name (`hardware.feetech.registers`)."""
+    """Other registers by name (`hardware.feetech`)."""
 
     @property
     def set_point_acceleration_rad_s2(self) -> float | None:

@@ -9,11 +9,11 @@ import pytest
 import yaml
 
 from pupper_sysid.cli.programs import pupper_sysid
-from pupper_sysid.hardware.feetech.registers import STS3215
+from pupper_sysid.hardware.feetech import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
-from pupper_sysid.sim.emulator.servos.pendulum_bench import (
+from pupper_sysid.sim.emulator.pendulum_bench import (
     BENCH_MAP,
     Pendulum,
     PendulumBench,

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import yaml
 
-from pupper_sysid.hardware.esp32.bus import Esp32Bus
-from pupper_sysid.hardware.feetech.registers import SCS0009
+from pupper_sysid.hardware.esp32 import Esp32Bus
+from pupper_sysid.hardware.feetech import SCS0009
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
 from support.servo_servers import moving_servos, on_a_port, still_servos, wait_until

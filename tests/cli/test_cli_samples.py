@@ -11,11 +11,11 @@ import yaml
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.data_sheet import data_sheet
 from pupper_sysid.data import SAMPLES
-from pupper_sysid.hardware.feetech.registers import STS3215
+from pupper_sysid.hardware.feetech import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
-from pupper_sysid.sim.emulator.servos.pendulum_bench import draw_of_map
+from pupper_sysid.sim.emulator.pendulum_bench import draw_of_map
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run_program
 from support.servo_servers import on_a_port

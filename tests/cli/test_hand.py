@@ -14,8 +14,8 @@ import pytest
 
 from pupper_sysid.cli.commands.robot.hand import Hand
 from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.robot import draw_robot
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from support.servo_servers import wait_until
 
 PROGRAM = [

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from pupper_sysid.cli.commands.robot.monitor import Watched, _open
+from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.bus import BusSample
-from pupper_sysid.hardware.esp32 import datagrams
-from pupper_sysid.hardware.feetech.frames import FrameReader
-from pupper_sysid.hardware.feetech.registers import PING, SYNC_READ
+from pupper_sysid.hardware.feetech import PING, SYNC_READ, FrameReader
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from pupper_sysid.sim.emulator.faults import BusFaults
@@ -139,7 +138,7 @@ def test_monitoring_the_proxy_only_asks_and_says_what_it_cannot_tell(capsys, tmp
         code, out, err = run(capsys, "monitor", "--bus", f"esp32:{tmp_path / 's'}", "--once")
     assert code == 0, err
     assert {r[1] for r in proxy.requests} <= {
-        datagrams.GET_POSITION, datagrams.GET_LOAD, datagrams.GET_POWER
+        esp32.GET_POSITION, esp32.GET_LOAD, esp32.GET_POWER
     }  # fmt: skip
     words = " ".join(out.split())
     assert (

@@ -10,10 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.address import BusAddress, parse_address
-from pupper_sysid.hardware.esp32 import datagrams
-from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
-from pupper_sysid.hardware.feetech.registers import SERIES, Series
+from pupper_sysid.hardware.feetech import SERIES, Frame, FrameReader, Series
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
 
 SOME = settings(max_examples=80, deadline=None)
@@ -158,23 +157,23 @@ def test_a_register_keeps_its_value_or_refuses_it(series: Series, name, value):
     | st.binary(min_size=24, max_size=24).map(lambda b: b"\x1a\x02" + b)
 )
 def test_any_reply_is_counts_within_the_encoder_or_none(reply):
-    counts = datagrams.parse_counts(reply)
+    counts = esp32.parse_counts(reply)
     assert (counts is None) == (len(reply) != 26 or reply[:2] != b"\x1a\x02")
     if counts is not None:
         sent = np.frombuffer(reply[2:], "<u2")
-        assert ((counts == datagrams.NO_COUNT) | (counts == sent)).all()
-        assert (counts <= datagrams.HIGHEST_COUNT).all() and (counts != 0).all()
+        assert ((counts == esp32.NO_COUNT) | (counts == sent)).all()
+        assert (counts <= esp32.HIGHEST_COUNT).all() and (counts != 0).all()
 
 
 @SOME
 @given(words=st.binary(min_size=24, max_size=24), opcode=st.integers(0, 255))
 def test_loads_imu_and_power_of_any_bytes_are_possible_or_missing(words, opcode):
     reply = bytes([26, opcode]) + words
-    load, raw = datagrams.parse_load(reply), datagrams.parse_imu(reply)
-    assert (load is None) == (opcode != datagrams.GET_LOAD)
+    load, raw = esp32.parse_load(reply), esp32.parse_imu(reply)
+    assert (load is None) == (opcode != esp32.GET_LOAD)
     assert load is None or (np.isnan(load) | (np.abs(load) <= 1.03)).all()
     assert raw is None or (np.isfinite(raw).all() and np.abs(raw).max() <= 2048)
-    power = datagrams.parse_power(bytes([10, datagrams.GET_POWER]) + words[:8])
+    power = esp32.parse_power(bytes([10, esp32.GET_POWER]) + words[:8])
     assert power is None or (0 <= power.voltage_v <= 11 and -1 <= power.current_a <= 14)
 
 
@@ -185,14 +184,12 @@ def test_loads_imu_and_power_of_any_bytes_are_possible_or_missing(words, opcode)
 )
 def test_a_request_holds_what_was_asked_or_is_not_made(on, counts):
     try:
-        packed = datagrams.set_position(np.array(on), np.array(counts))
+        packed = esp32.set_position(np.array(on), np.array(counts))
     except ValueError:
-        assert min(counts) < 0 or max(counts) > datagrams.HIGHEST_COUNT
+        assert min(counts) < 0 or max(counts) > esp32.HIGHEST_COUNT
         return
     fields = struct.unpack("<BB12B12H", packed)
-    assert (
-        fields == (38, 1, *map(int, on), *counts) and datagrams.SAVE_CALIBRATION not in fields[2:14]
-    )
+    assert fields == (38, 1, *map(int, on), *counts) and esp32.SAVE_CALIBRATION not in fields[2:14]
 
 
 # ---- addresses ----

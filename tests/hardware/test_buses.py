@@ -13,12 +13,10 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import BusError, InputError
+from pupper_sysid.hardware import esp32 as esp32_proxy
 from pupper_sysid.hardware.bus import header_entries
-from pupper_sysid.hardware.esp32 import bus as esp32_bus
-from pupper_sysid.hardware.esp32 import datagrams
-from pupper_sysid.hardware.esp32.bus import Esp32Bus
-from pupper_sysid.hardware.feetech.bus import FeetechBus
-from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215, Series
+from pupper_sysid.hardware.esp32 import Esp32Bus
+from pupper_sysid.hardware.feetech import SCS0009, STS3215, FeetechBus, Series
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
@@ -86,7 +84,7 @@ class PartlyDeafProxy(ProxyEmulator):
 
     def answer(self, request: bytes, previous: bytes, now: float) -> bytes:
         reply = bytearray(super().answer(request, previous, now))
-        for servo in self.silent if request[1] == datagrams.GET_POSITION else ():
+        for servo in self.silent if request[1] == esp32_proxy.GET_POSITION else ():
             reply[2 * servo : 2 * servo + 2] = b"\0\0"
         return bytes(reply)
 
@@ -121,7 +119,7 @@ BUSES: dict[str, Callable[[], Any]] = {
 def line(request, monkeypatch) -> Iterator[Line]:
     # the servos share this process and a busy machine
     monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.4)
-    monkeypatch.setattr(esp32_bus, "TIMEOUT_S", 0.3)
+    monkeypatch.setattr(esp32_proxy, "TIMEOUT_S", 0.3)
     with BUSES[request.param]() as served:
         yield served
 

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.hardware.esp32 import bus as esp32_bus
-from pupper_sysid.hardware.esp32 import datagrams
-from pupper_sysid.hardware.esp32.bus import Esp32Bus
+from pupper_sysid.hardware import esp32
+from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.imu import ImuSample, as_words, from_chip, to_chip
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator
@@ -105,7 +104,7 @@ def imu_reply(*values: float) -> bytes:
 def test_the_reply_is_26_bytes_of_little_endian_floats():
     # 1.0, -2.0, 0.5 as IEEE 754 single, low byte first
     data = bytes.fromhex("1a04" + "0000803f" + "000000c0" + "0000003f" + "00000000" * 3)
-    raw = datagrams.parse_imu(data)
+    raw = esp32.parse_imu(data)
     assert raw is not None and raw.tolist() == [1.0, -2.0, 0.5, 0.0, 0.0, 0.0]
 
 
@@ -115,7 +114,7 @@ def test_a_reply_that_no_chip_could_have_given_is_none():
         imu_reply(float("nan"), 0, 0, 0, 0, 0), imu_reply(0, 0, float("inf"), 0, 0, 0),
         imu_reply(0, 2.1, 0, 0, 0, 0), imu_reply(0, 0, -1, 0, -2049, 0),
     ):  # fmt: skip
-        assert datagrams.parse_imu(wrong) is None, wrong
+        assert esp32.parse_imu(wrong) is None, wrong
 
 
 # ---- the bus ----
@@ -123,7 +122,7 @@ def test_a_reply_that_no_chip_could_have_given_is_none():
 
 @pytest.fixture
 def path(monkeypatch):
-    monkeypatch.setattr(esp32_bus, "TIMEOUT_S", 0.3)  # the proxy shares this process
+    monkeypatch.setattr(esp32, "TIMEOUT_S", 0.3)  # the proxy shares this process
     with tempfile.TemporaryDirectory(prefix="px", dir="/tmp") as folder:
         yield Path(folder) / "s"
 
@@ -158,14 +157,14 @@ def test_a_robot_on_a_stand_reports_gravity_and_nothing_else():
     still = StillBench("mini_pupper_2")
     for proxy in (ProxyEmulator, ImuProxy):
         emulator = proxy(still, np.random.default_rng(0))
-        reply = emulator.answer(datagrams.request(datagrams.GET_IMU), b"", 1.0)
+        reply = emulator.answer(esp32.request(esp32.GET_IMU), b"", 1.0)
         assert struct.unpack("<BB6f", reply) == (26, 4, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0)
 
 
 def test_a_proxy_for_the_imu_alone_does_not_move_the_servos_or_tell_of_them():
     still = StillBench("mini_pupper_2")
     proxy = ImuProxy(still, np.random.default_rng(0))
-    setpoint = datagrams.set_position(np.zeros(12, bool), np.full(12, 400))
-    for request in (setpoint, datagrams.request(datagrams.GET_POSITION)):
+    setpoint = esp32.set_position(np.zeros(12, bool), np.full(12, 400))
+    for request in (setpoint, esp32.request(esp32.GET_POSITION)):
         assert proxy.answer(request, b"before", 1.0) == b"before"
     assert still.goals == [] and still.torques == []

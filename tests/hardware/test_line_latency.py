@@ -13,10 +13,10 @@ import pytest
 from pupper_sysid.cli.commands.robot import scan as scan_command
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware.address import parse_address
-from pupper_sysid.hardware.feetech.bus import FAMILY, FeetechBus
+from pupper_sysid.hardware.feetech import FAMILY, FeetechBus
 from pupper_sysid.hardware.serial_servos.line import slow_adapter
 from pupper_sysid.hardware.serial_servos.scan import scan_line
-from pupper_sysid.sim.emulator.serial_pty import SerialPty
+from pupper_sysid.sim.emulator.serial_line import SerialPty
 from support.command_line import run
 from support.servo_servers import map_of, on_a_port, still_servos
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import BusError, InputError
-from pupper_sysid.hardware.dynamixel.bus import DynamixelBus
-from pupper_sysid.hardware.feetech.bus import FeetechBus
-from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
+from pupper_sysid.hardware.dynamixel import DynamixelBus
+from pupper_sysid.hardware.feetech import SCS0009, STS3215, FeetechBus
 from pupper_sysid.hardware.joint_map import joint_map_from
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.serial_servos import line as serial_line

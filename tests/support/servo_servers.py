@@ -11,26 +11,23 @@ from pathlib import Path
 
 import numpy as np
 
-from pupper_sysid.hardware.dynamixel.registers import SERIES as DYNAMIXELS
-from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
-from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215, Series
+from pupper_sysid.hardware.dynamixel import SERIES as DYNAMIXELS
+from pupper_sysid.hardware.feetech import SCS0009, STS3215, Frame, FrameReader, Series
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
+from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.dynamixel import DynamixelEmulator
-from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
-from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
+from pupper_sysid.sim.emulator.esp32 import ProxyEmulator, ProxySocket
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.serial_line import LineEmulator
-from pupper_sysid.sim.emulator.serial_pty import SerialPty
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
-from pupper_sysid.sim.emulator.servos.pendulum_bench import (
+from pupper_sysid.sim.emulator.pendulum_bench import (
     BENCH_MAP,
     Pendulum,
     PendulumBench,
     draw_bench,
     dynamixel_bench,
 )
+from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.serial_line import LineEmulator, SerialPty
 
 LAYOUTS = {STS3215.name: "sts3215", SCS0009.name: "mini_pupper_2_direct", "proxy": "mini_pupper_2"}
 

@@ -21,20 +21,16 @@ from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.reading.dialect import whole
 from pupper_sysid.hardware.address import SOCKET
-from pupper_sysid.hardware.feetech.registers import BAUD_RATES, SCS0009, STS3215
+from pupper_sysid.hardware.feetech import BAUD_RATES, SCS0009, STS3215
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.serial_servos.series import Series
-from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator
-from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
+from pupper_sysid.sim.emulator.bench import ServoBench
+from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator, ProxySocket
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.serial_line import LineEmulator
-from pupper_sysid.sim.emulator.serial_pty import SerialPty
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
-from pupper_sysid.sim.emulator.servos.pendulum import REGISTERS
-from pupper_sysid.sim.emulator.servos.pendulum_bench import (
+from pupper_sysid.sim.emulator.pendulum import REGISTERS
+from pupper_sysid.sim.emulator.pendulum_bench import (
     BENCH_MAP,
     BenchSpec,
     Pendulum,
@@ -43,6 +39,8 @@ from pupper_sysid.sim.emulator.servos.pendulum_bench import (
     dynamixel_bench,
     has_registers,
 )
+from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.serial_line import LineEmulator, SerialPty
 from pupper_sysid.sysid.sweep.bench import parse_load
 
 _MOST_BACKLASH_DEG = 20.0
@@ -235,7 +233,7 @@ class Dynamixel(SerialLine):
 
     def run(self) -> None:
         """Serve until Ctrl-C."""
-        from pupper_sysid.hardware.dynamixel import registers as table
+        from pupper_sysid.hardware import dynamixel as table
         from pupper_sysid.sim.emulator.dynamixel import DynamixelEmulator
 
         if self.walking:

@@ -11,7 +11,7 @@ from contextlib import contextmanager, nullcontext, suppress
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.keyboard import terminal_without
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
+from pupper_sysid.sim.emulator.bench import ServoBench
 
 HELP = (
     "Keys move limp joints, in this window: a and d by 0.05 rad, A and D by 0.4 rad, 0 back to "

@@ -9,7 +9,7 @@ from pathlib import Path
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.address import KINDS, SOCKET, BusAddress, parse_address
-from pupper_sysid.hardware.esp32.bus import Esp32Bus
+from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.serial_servos.scan import LineReport, ServoReport
 
 _USB_PORTS = ("ttyUSB", "ttyACM", "ttyAMA", "ttySC", "cu.usb", "COM")

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import BusError
-from pupper_sysid.hardware.dynamixel.bus import DynamixelBus
-from pupper_sysid.hardware.dynamixel.registers import TRIGGERED, WATCHDOG_UNITS
+from pupper_sysid.hardware.dynamixel import TRIGGERED, WATCHDOG_UNITS, DynamixelBus
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from support.servo_servers import (

@@ -8,9 +8,17 @@ import dynamixel_sdk
 import numpy as np
 import pytest
 
-from pupper_sysid.hardware.dynamixel.frames import Frame, FrameReader, crc16
-from pupper_sysid.hardware.dynamixel.line import DynamixelLine
-from pupper_sysid.hardware.dynamixel.registers import ACCESS, ALERT, CRC, DATA_LIMIT, INSTRUCTION
+from pupper_sysid.hardware.dynamixel import (
+    ACCESS,
+    ALERT,
+    CRC,
+    DATA_LIMIT,
+    INSTRUCTION,
+    DynamixelLine,
+    Frame,
+    FrameReader,
+    crc16,
+)
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from support.servo_servers import bench_of, on_a_port, still_dynamixels
 

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.hardware.esp32 import bus as esp32_bus
-from pupper_sysid.hardware.esp32 import datagrams
-from pupper_sysid.hardware.esp32.bus import Esp32Bus
-from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
-from pupper_sysid.sim.emulator.esp32_socket import ProxySocket
+from pupper_sysid.hardware import esp32
+from pupper_sysid.hardware.esp32 import Esp32Bus
+from pupper_sysid.sim.emulator.esp32 import ProxyEmulator, ProxySocket
 from pupper_sysid.sim.emulator.faults import BusFaults
 from support.servo_servers import ScriptedProxy, StillBench, bench_of, on_a_socket, wait_until
 
@@ -32,7 +30,7 @@ def path() -> Iterator[Path]:
 @pytest.fixture
 def patient(monkeypatch):
     """The proxy shares this process and a busy machine; tests of time do without."""
-    monkeypatch.setattr(esp32_bus, "TIMEOUT_S", 0.3)
+    monkeypatch.setattr(esp32, "TIMEOUT_S", 0.3)
 
 
 def still_proxy() -> ProxyEmulator:
@@ -62,33 +60,33 @@ def answers(request: bytes) -> bytes:
 
 def test_a_setpoint_is_38_bytes_torque_then_little_endian_counts_by_id_and_a_question_two():
     on = np.array([True, False] * 6)
-    packed = datagrams.set_position(on, np.arange(12) + 256)
+    packed = esp32.set_position(on, np.arange(12) + 256)
     assert packed[:2].hex() == "2601" and len(packed) == 38
     assert packed[2:14] == bytes([1, 0] * 6)
     assert packed[14:].hex() == "".join(f"{k:02x}01" for k in range(12))
-    assert [datagrams.request(op).hex() for op in (2, 3, 4, 5)] == ["0202", "0203", "0204", "0205"]
+    assert [esp32.request(op).hex() for op in (2, 3, 4, 5)] == ["0202", "0203", "0204", "0205"]
 
 
 def test_replies_have_26_26_and_10_bytes_and_are_little_endian():
-    counts = datagrams.parse_counts(bytes.fromhex("1a02" + "0102" * 12))
+    counts = esp32.parse_counts(bytes.fromhex("1a02" + "0102" * 12))
     assert counts is not None and counts.tolist() == [0x0201] * 12
-    load = datagrams.parse_load(bytes.fromhex("1a03" + "18fc" * 6 + "e803" * 6))
+    load = esp32.parse_load(bytes.fromhex("1a03" + "18fc" * 6 + "e803" * 6))
     assert load is not None and load.tolist() == [-1.0] * 6 + [1.0] * 6
     # 7.375 and 0.5 as IEEE 754 single, low byte first
-    power = datagrams.parse_power(bytes.fromhex("0a05" + "0000ec40" + "0000003f"))
-    assert power == datagrams.Power(7.375, 0.5)
+    power = esp32.parse_power(bytes.fromhex("0a05" + "0000ec40" + "0000003f"))
+    assert power == esp32.Power(7.375, 0.5)
 
 
 def test_zeros_and_counts_beyond_1023_are_missing():
     given = [0, 1, 512, 1023, 1024, 65_535, 0, 0, 2, 3, 4, 5]
-    counts = datagrams.parse_counts(counts_reply(given))
+    counts = esp32.parse_counts(counts_reply(given))
     assert counts is not None
     assert counts.tolist() == [-1, 1, 512, 1023, -1, -1, -1, -1, 2, 3, 4, 5]
 
 
 def test_an_impossible_load_is_missing():
     words = b"".join(x.to_bytes(2, "little", signed=True) for x in [1000, -1000, 1031, -32_768] * 3)
-    load = datagrams.parse_load(bytes([26, 3]) + words)
+    load = esp32.parse_load(bytes([26, 3]) + words)
     assert load is not None
     assert load[:2].tolist() == [1.0, -1.0] and np.isnan(load[2:4]).all()
 
@@ -96,7 +94,7 @@ def test_an_impossible_load_is_missing():
 def test_a_voltage_that_is_none_or_beyond_the_divider_is_missing():
     # NaN, infinity, 11.0 (the largest that passes), -1
     for volts in ("0000c07f", "0000807f", "00003041", "000080bf"):
-        power = datagrams.parse_power(bytes.fromhex("0a05" + volts + "0000003f"))
+        power = esp32.parse_power(bytes.fromhex("0a05" + volts + "0000003f"))
         assert (power is not None) == (volts == "00003041")
 
 
@@ -107,12 +105,12 @@ def test_the_byte_that_stores_a_calibration_is_never_packed_and_only_whole_count
     tries += [np.array(["99"] * 12), np.eye(12, dtype=int)[0] * 99]
     for count in (0, 99, 256 * 99 % 1024, 355, 1023):
         for on in tries:
-            packed = datagrams.set_position(on, np.full(12, count))
+            packed = esp32.set_position(on, np.full(12, count))
             assert len(packed) == 38 and set(packed[2:14]) <= {0, 1}
-    assert datagrams.SAVE_CALIBRATION == 99
+    assert esp32.SAVE_CALIBRATION == 99
     for counts in (np.full(12, -1), np.full(12, 1024), np.full(11, 512)):
         with pytest.raises(ValueError, match="set_position"):
-            datagrams.set_position(np.ones(12, bool), counts)
+            esp32.set_position(np.ones(12, bool), counts)
 
 
 # ---- the bus ----
@@ -205,12 +203,12 @@ def test_a_hung_server_costs_a_bounded_time_and_everything_is_missing(path):
         assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
         bus.close()
     # position, load, supply, goals: one time-out each
-    assert np.median(took) < 4 * esp32_bus.TIMEOUT_S + 0.05
+    assert np.median(took) < 4 * esp32.TIMEOUT_S + 0.05
 
 
 @pytest.mark.wall_clock
 def test_an_answer_that_belongs_to_an_earlier_question_is_not_taken(path, monkeypatch):
-    monkeypatch.setattr(esp32_bus, "TIMEOUT_S", 0.05)
+    monkeypatch.setattr(esp32, "TIMEOUT_S", 0.05)
 
     class Late(ScriptedProxy):
         slow = False

@@ -10,15 +10,12 @@ import serial
 from scservo_sdk import scservo_def
 
 from pupper_sysid.common.errors import BusError
-from pupper_sysid.hardware.feetech.bus import FAMILY, FeetechBus
-from pupper_sysid.hardware.feetech.frames import Frame
-from pupper_sysid.hardware.feetech.line import FeetechLine
-from pupper_sysid.hardware.feetech.registers import SCS0009, STS3215
+from pupper_sysid.hardware.feetech import FAMILY, SCS0009, STS3215, FeetechBus, FeetechLine, Frame
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.hardware.serial_servos import scan
 from pupper_sysid.hardware.serial_servos.settings import memory_of
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
+from pupper_sysid.sim.emulator.bench import ServoBench
 from support.servo_servers import (
     Scripted,
     StillBench,

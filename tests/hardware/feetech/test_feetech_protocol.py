@@ -7,10 +7,16 @@ import pytest
 import scservo_sdk
 from scservo_sdk import scservo_def
 
-from pupper_sysid.hardware.feetech.frames import Frame, FrameReader
-from pupper_sysid.hardware.feetech.line import FeetechLine
-from pupper_sysid.hardware.feetech.registers import SCS0009, SERIES, STS3215, Series
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
+from pupper_sysid.hardware.feetech import (
+    SCS0009,
+    SERIES,
+    STS3215,
+    FeetechLine,
+    Frame,
+    FrameReader,
+    Series,
+)
+from pupper_sysid.sim.emulator.bench import ServoBench
 from support.servo_servers import (
     Listening,
     bench_of,

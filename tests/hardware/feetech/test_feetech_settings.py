@@ -15,9 +15,7 @@ from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.bus import header_entries
 from pupper_sysid.hardware.connect import open_guarded
-from pupper_sysid.hardware.feetech.bus import FeetechBus
-from pupper_sysid.hardware.feetech.line import FeetechLine
-from pupper_sysid.hardware.feetech.registers import PROTECTIONS, SCS0009, STS3215
+from pupper_sysid.hardware.feetech import PROTECTIONS, SCS0009, STS3215, FeetechBus, FeetechLine
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sysid.recordings.servo_setup import ServoSetup

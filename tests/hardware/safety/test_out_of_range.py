@@ -11,11 +11,10 @@ import pytest
 
 from pupper_sysid.common.data_sheet import supply_range
 from pupper_sysid.common.errors import InputError, SafetyStop
+from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.bus import BusSample, Sent
-from pupper_sysid.hardware.esp32 import datagrams
-from pupper_sysid.hardware.esp32.bus import Esp32Bus
-from pupper_sysid.hardware.feetech.bus import FAMILY
-from pupper_sysid.hardware.feetech.registers import STS3215
+from pupper_sysid.hardware.esp32 import Esp32Bus
+from pupper_sysid.hardware.feetech import FAMILY, STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import HostClock
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
@@ -177,8 +176,8 @@ def test_the_band_of_a_servo_is_its_registers_within_its_data_sheet(model, regis
 def test_a_voltage_that_cannot_be_replaces_the_last_one_of_the_proxy(volts):
     """The proxy's divider ends at 10.3 V; what it held before must not hide what it says now."""
     answers = {
-        datagrams.GET_POSITION: struct.pack("<BB12H", 26, datagrams.GET_POSITION, *[512] * 12),
-        datagrams.GET_LOAD: struct.pack("<BB12h", 26, datagrams.GET_LOAD, *[0] * 12),
+        esp32.GET_POSITION: struct.pack("<BB12H", 26, esp32.GET_POSITION, *[512] * 12),
+        esp32.GET_LOAD: struct.pack("<BB12h", 26, esp32.GET_LOAD, *[0] * 12),
     }
     bus = Esp32Bus.__new__(Esp32Bus)
     HostClock.__init__(bus)
@@ -189,7 +188,7 @@ def test_a_voltage_that_cannot_be_replaces_the_last_one_of_the_proxy(volts):
 
     def voltage(present: float) -> np.ndarray:
         bus._power_s = -np.inf  # it is asked for twice a second
-        answers[datagrams.GET_POWER] = struct.pack("<BB2f", 10, datagrams.GET_POWER, present, 0.5)
+        answers[esp32.GET_POWER] = struct.pack("<BB2f", 10, esp32.GET_POWER, present, 0.5)
         return bus.read().voltage_v
 
     assert voltage(7.5) == pytest.approx(7.5)

@@ -45,7 +45,7 @@ pytestmark = pytest.mark.wall_clock  # what the watchdog does within a second
 ROOT = Path(__file__).resolve().parents[3]
 
 PATIENT = """
-from pupper_sysid.hardware.feetech import line
+from pupper_sysid.hardware.serial_servos import line
 line.REPLY_TIMEOUT_S = 0.1
 """
 """Servos that share a busy machine with their driver answer too late."""

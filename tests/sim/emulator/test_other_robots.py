@@ -13,14 +13,14 @@ import yaml
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.hardware.feetech.registers import STS3215
+from pupper_sysid.hardware.feetech import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.servo_file import load_servo_model
+from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from pupper_sysid.sim.robot import hinges, robot_map
 from pupper_sysid.sim.robot.mini_pupper import robot_xml
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 import yaml
 
-from pupper_sysid.hardware.feetech.bus import FeetechBus
-from pupper_sysid.hardware.feetech.registers import STS3215
+from pupper_sysid.hardware.feetech import STS3215, FeetechBus
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.serial_servos import line as serial_line
+from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
-from pupper_sysid.sim.emulator.servos.pendulum import PendulumServo, PendulumServoParameters
-from pupper_sysid.sim.emulator.servos.pendulum_bench import (
+from pupper_sysid.sim.emulator.pendulum import PendulumServo, PendulumServoParameters
+from pupper_sysid.sim.emulator.pendulum_bench import (
     BENCH_MAP,
     BenchSpec,
     Pendulum,

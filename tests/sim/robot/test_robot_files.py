@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import BusError, InputError
-from pupper_sysid.hardware.feetech.bus import FeetechBus
-from pupper_sysid.hardware.feetech.registers import STS3215
+from pupper_sysid.hardware.feetech import STS3215, FeetechBus
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lerobot_calibration import lerobot_calibration, read_lerobot
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.serial_servos import line as serial_line
+from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from pupper_sysid.sim.robot import hinges, robot_map
 from support.command_line import run
 from support.real_recordings import FOLDER

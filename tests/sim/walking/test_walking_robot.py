@@ -13,18 +13,16 @@ import pytest
 
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.bus import ServoBus
-from pupper_sysid.hardware.esp32 import bus as esp32_bus
-from pupper_sysid.hardware.esp32 import datagrams
-from pupper_sysid.hardware.esp32.bus import Esp32Bus
-from pupper_sysid.hardware.feetech.frames import Frame
-from pupper_sysid.hardware.feetech.registers import BROADCAST_ID, READ, STS3215, SYNC_WRITE
+from pupper_sysid.hardware.esp32 import Esp32Bus
+from pupper_sysid.hardware.feetech import BROADCAST_ID, READ, STS3215, SYNC_WRITE, Frame
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.servos.bench import ServoBench
 from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.bus import WalkingBus, calibrated_robot
@@ -298,7 +296,7 @@ def test_the_guard_lets_a_trotting_robot_walk():
 
 @pytest.fixture
 def path(monkeypatch) -> Iterator[Path]:
-    monkeypatch.setattr(esp32_bus, "TIMEOUT_S", 0.3)  # the proxy shares this process
+    monkeypatch.setattr(esp32, "TIMEOUT_S", 0.3)  # the proxy shares this process
     with tempfile.TemporaryDirectory(prefix="px", dir="/tmp") as folder:
         yield Path(folder) / "s"
 
@@ -358,9 +356,9 @@ def test_the_proxy_without_a_host_tells_of_a_standing_robot():
     truth = draw_robot(rng)
     bench = ServoBench(truth, load_joint_map("mini_pupper_2"), rng, plant=WalkingRobot(truth, rng))
     proxy = ProxyEmulator(bench, rng)
-    counts = datagrams.parse_counts(proxy.answer(b"\x02\x02", b"", 1000.0))
+    counts = esp32.parse_counts(proxy.answer(b"\x02\x02", b"", 1000.0))
     assert counts is not None and np.abs(counts - 512).max() <= 4
-    raw = datagrams.parse_imu(proxy.answer(b"\x02\x04", b"", 1000.0))
+    raw = esp32.parse_imu(proxy.answer(b"\x02\x04", b"", 1000.0))
     assert raw is not None
     np.testing.assert_allclose(raw[:3], [0.0, 0.0, -1.0], atol=0.012)
 

@@ -21,21 +21,19 @@ from pupper_sysid.common.data_sheet import no_load_speed, stall_torque
 from pupper_sysid.hardware.imu import GRAVITY_M_S2, ImuSample
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-from pupper_sysid.sim.emulator.robot import EmulatedRobot, EmulatedServo, directly_read, draw_robot
-from pupper_sysid.sim.emulator.servos.bench import AMBIENT_C, SUPPLY_V
-from pupper_sysid.sim.emulator.servos.loops import (
+from pupper_sysid.sim.emulator.bench import AMBIENT_C, SUPPLY_V
+from pupper_sysid.sim.emulator.pendulum import (
     DYNAMIXEL_GAINS,
     FEETECH_REGISTERS,
+    PHYSICS_STEP_S,
     Loop,
+    PendulumServo,
+    PendulumServoParameters,
     dynamixel_loop,
     dynamixel_registers,
     feetech_loop,
 )
-from pupper_sysid.sim.emulator.servos.pendulum import (
-    PHYSICS_STEP_S,
-    PendulumServo,
-    PendulumServoParameters,
-)
+from pupper_sysid.sim.emulator.robot import EmulatedRobot, EmulatedServo, directly_read, draw_robot
 
 BENCH_MAP = "bench_sts3215"
 """Joint map of one STS3215 on a bench: joint `bench`, id 1, 0 rad at its centre count."""

@@ -2,9 +2,12 @@
 
 The proxy shares one block of memory among all its clients: the last writer wins, a client that died
 goes unnoticed, and the feedback is 20 to 100 ms old without a time stamp. Hence one owner at a time
-(`hardware.lock`), a time-out on every exchange, a new connection after anything
-unexpected, and every position read twice, because the datagrams have no checksum. Stale readings
-are passed on as they come; `sysid` estimates their feedback age.
+(`hardware.lock`), a time-out on every exchange and a new connection after anything unexpected.
+Stale readings are passed on as they come; `sysid` estimates their feedback age.
+
+A datagram is one message, little endian, `length, opcode, payload`; layouts are those of the
+vendor's proxy, servos in the order of their ids, 1 to 12. `AF_UNIX` datagrams have no checksum:
+length, opcode and range are checked, and every position is read twice.
 
 Counts are those of the firmware's stored calibration, not raw ones.
 """
@@ -14,8 +17,10 @@ from __future__ import annotations
 import os
 import select
 import socket
+import struct
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -25,11 +30,113 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import BusError, InputError, MissingDevice
 from pupper_sysid.hardware.address import SOCKET, BusAddress
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
-from pupper_sysid.hardware.esp32 import datagrams
 from pupper_sysid.hardware.imu import ImuSample, from_chip
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.lock import own
 from pupper_sysid.hardware.loop import HostClock
+
+SERVOS = 12
+SET_POSITION, GET_POSITION, GET_LOAD, GET_IMU, GET_POWER = 1, 2, 3, 4, 5
+
+TORQUE_OFF, TORQUE_ON = 0, 1
+SAVE_CALIBRATION = 99
+"""As first torque byte it makes the proxy store a calibration: never sent from here."""
+
+NO_COUNT = -1
+HIGHEST_COUNT = 1023
+
+_SET = struct.Struct("<BB12B12H")
+_COUNTS = struct.Struct("<BB12H")
+_LOADS = struct.Struct("<BB12h")
+_IMU = struct.Struct("<BB6f")
+_POWER = struct.Struct("<BB2f")
+_IMU_FULL_SCALE = np.repeat([2.0, 2048.0], 3)  # g, °/s
+ACKNOWLEDGED = bytes([2, SET_POSITION])
+REPLY_SIZES = {SET_POSITION: 2, GET_POSITION: 26, GET_LOAD: 26, GET_IMU: 26, GET_POWER: 10}
+
+
+@dataclass(frozen=True)
+class Power:
+    """Supply of the servos."""
+
+    voltage_v: float
+    current_a: float
+
+
+def set_position(on: NDArray[np.bool_], counts: NDArray[np.int64]) -> bytes:
+    """Request to drive the servos, in order of id, to `counts`, or to switch their torque off.
+
+    Raises
+    ------
+    ValueError
+        If there are not twelve of each, or a count is outside 0..1023.
+
+    Examples
+    --------
+    >>> set_position(np.ones(12, bool), np.full(12, 512))[:4].hex(" ")
+    '26 01 01 01'
+    """
+    if len(on) != SERVOS or len(counts) != SERVOS:
+        raise ValueError(f"set_position: {len(on)} and {len(counts)} values instead of {SERVOS}.")
+    if np.min(counts) < 0 or np.max(counts) > HIGHEST_COUNT:
+        raise ValueError(f"set_position: counts {list(counts)} leave 0..{HIGHEST_COUNT}.")
+    # one of two constants, so never the byte that stores a calibration
+    torque = [TORQUE_ON if x else TORQUE_OFF for x in on]
+    return _SET.pack(_SET.size, SET_POSITION, *torque, *(int(c) for c in counts))
+
+
+def request(opcode: int) -> bytes:
+    """A request without payload."""
+    return bytes([2, opcode])
+
+
+def parse_counts(reply: bytes) -> NDArray[np.int64] | None:
+    """Counts by id, `NO_COUNT` where there is no reading; None if `reply` is another message.
+
+    The proxy starts with zeros and keeps a zero for a servo that never answers, so a zero is no
+    reading; neither is a count beyond the encoder.
+    """
+    if not _is(reply, GET_POSITION):
+        return None
+    counts = np.array(_COUNTS.unpack(reply)[2:], np.int64)
+    return np.where((counts > 0) & (counts <= HIGHEST_COUNT), counts, NO_COUNT)
+
+
+def parse_load(reply: bytes) -> NDArray[np.float64] | None:
+    """Signed fraction of full duty by id, NaN where impossible; None if another message."""
+    if not _is(reply, GET_LOAD):
+        return None
+    load = np.array(_LOADS.unpack(reply)[2:], float) / 1000.0
+    return np.where(np.abs(load) <= 1.03, load, np.nan)
+
+
+def parse_imu(reply: bytes) -> NDArray[np.float64] | None:
+    """Acceleration [g] and rate [°/s] along the chip's axes, shape (6,).
+
+    None if it is another message or a number is beyond the chip's range. Six zeros are a failed
+    read.
+    """
+    if not _is(reply, GET_IMU):
+        return None
+    raw = np.array(_IMU.unpack(reply)[2:], float)
+    return raw if np.all(np.abs(raw) <= _IMU_FULL_SCALE) else None  # refuses NaN, too
+
+
+def parse_power(reply: bytes) -> Power | None:
+    """Voltage and current; None if it is another message or a number is impossible."""
+    if not _is(reply, GET_POWER):
+        return None
+    volts, amperes = _POWER.unpack(reply)[2:]
+    # the divider's full scale is 10.3 V and 13.2 A
+    if not (0 <= volts <= 11 and -1 <= amperes <= 14):
+        return None
+    return Power(volts, amperes)
+
+
+def _is(reply: bytes, opcode: int) -> bool:
+    size = REPLY_SIZES[opcode]
+    return len(reply) == size and reply[0] == size and reply[1] == opcode
+
 
 TIMEOUT_S = 0.03
 VOLTAGE_BAND_V = (4.2, 8.7)
@@ -82,13 +189,13 @@ class Esp32Bus(HostClock):
                 f"the joint map {name} holds raw counts, and the proxy uses "
                 "calibrated ones. Make a map with `pupper-sysid calibrate-joints --bus esp32`."
             )
-        if self.joint_map.file.counts != datagrams.HIGHEST_COUNT + 1:
+        if self.joint_map.file.counts != HIGHEST_COUNT + 1:
             raise InputError(
                 f"the joint map {name} is for servos of {self.joint_map.file.counts} "
-                f"counts; the proxy's have {datagrams.HIGHEST_COUNT + 1}. Choose another map, such "
+                f"counts; the proxy's have {HIGHEST_COUNT + 1}. Choose another map, such "
                 "as mini_pupper_2."
             )
-        if sorted(self.joint_map.ids) != list(range(1, datagrams.SERVOS + 1)):
+        if sorted(self.joint_map.ids) != list(range(1, SERVOS + 1)):
             raise InputError(
                 f"the joint map {name} has the ids {sorted(self.joint_map.ids)}; the "
                 "proxy drives the servos 1 to 12 together, so the map must have them all."
@@ -99,10 +206,10 @@ class Esp32Bus(HostClock):
         self._owner = own(self.path) if exclusive else None
         self._socket: socket.socket | None = None
         self._retry_s = 0.0
-        self._power: datagrams.Power | None = None
+        self._power: Power | None = None
         self._power_s = -np.inf
-        self._on = np.ones(datagrams.SERVOS, bool)
-        self._command = np.full(datagrams.SERVOS, datagrams.NO_COUNT)  # which cannot be sent
+        self._on = np.ones(SERVOS, bool)
+        self._command = np.full(SERVOS, NO_COUNT)  # which cannot be sent
         self.joint_names = self.joint_map.joint_names
         self.limits = self.joint_map.position_limits()
         self.metadata: dict[str, Any] = {
@@ -137,7 +244,7 @@ class Esp32Bus(HostClock):
 
     def write(self, position_rad: NDArray[np.float64]) -> Sent:
         """Send commands; the proxy's acknowledgement does not mean that a servo has them."""
-        command = finite_angles(position_rad, datagrams.SERVOS, str(self.path))
+        command = finite_angles(position_rad, SERVOS, str(self.path))
         self._command[self._by_id] = self.joint_map.clip_counts(self.joint_map.to_counts(command))
         sent_s = self.now()
         return Sent(sent_s if self._send_command() else float("nan"), command)
@@ -148,10 +255,10 @@ class Esp32Bus(HostClock):
         by_id = self._settled_counts()
         at = round((before + self.now()) / 2, 6)
         count = by_id[self._by_id]
-        load = self._ask(datagrams.GET_LOAD, datagrams.parse_load)
+        load = self._ask(GET_LOAD, parse_load)
         if self.now() - self._power_s > _POWER_EVERY_S:
             # one that cannot be is none; an older one would hide that the supply has changed
-            self._power = self._ask(datagrams.GET_POWER, datagrams.parse_power)
+            self._power = self._ask(GET_POWER, parse_power)
             self._power_s = self.now() if self._power else self._power_s
         joints = len(self.joint_names)
         missing = np.full(joints, np.nan)
@@ -171,7 +278,7 @@ class Esp32Bus(HostClock):
         before = self.now()
         seen: list[list[float]] = []
         for _ in range(_SAME_READINGS):
-            raw = self._ask(datagrams.GET_IMU, datagrams.parse_imu)
+            raw = self._ask(GET_IMU, parse_imu)
             if raw is None:
                 return None
             if raw.tolist() in seen:
@@ -208,7 +315,7 @@ class Esp32Bus(HostClock):
 
     def _hold_present(self) -> bool:
         """Make the present counts the command; False if not all became known in time."""
-        present = np.full(datagrams.SERVOS, datagrams.NO_COUNT)
+        present = np.full(SERVOS, NO_COUNT)
         for _ in range(_TORQUE_TRIES):
             counts = self._settled_counts()
             present = np.where(counts > 0, counts, present)
@@ -221,9 +328,9 @@ class Esp32Bus(HostClock):
     def _settled_counts(self) -> NDArray[np.int64]:
         """Counts by id on which two successive answers agree."""
         last = None
-        settled = np.full(datagrams.SERVOS, datagrams.NO_COUNT)
+        settled = np.full(SERVOS, NO_COUNT)
         for _ in range(_SAME_READINGS):
-            counts = self._ask(datagrams.GET_POSITION, datagrams.parse_counts)
+            counts = self._ask(GET_POSITION, parse_counts)
             if counts is None:
                 break
             if last is not None:
@@ -237,14 +344,14 @@ class Esp32Bus(HostClock):
     def _send_command(self) -> bool:
         # with a torque byte of 0 the count is not used, but must be valid
         counts = np.where(self._on | (self._command > 0), self._command, _ANY_COUNT)
-        request = datagrams.set_position(self._on, counts)
-        acknowledged = self._exchange(request) == datagrams.ACKNOWLEDGED
+        request = set_position(self._on, counts)
+        acknowledged = self._exchange(request) == ACKNOWLEDGED
         if not acknowledged:
             self._disconnect()
         return acknowledged
 
     def _ask(self, opcode: int, parse: Callable[[bytes], Answer | None]) -> Answer | None:
-        reply = self._exchange(datagrams.request(opcode))
+        reply = self._exchange(request(opcode))
         parsed = None if reply is None else parse(reply)
         if parsed is None:
             # a further answer would belong to no request

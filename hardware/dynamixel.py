@@ -1,0 +1,466 @@
+"""Dynamixel servos with protocol 2.0 as a `ServoBus`: `--bus dynamixel:/dev/ttyUSB0`.
+
+One control table, by model number, serves the X series and MX(2.0): models differ in factory
+values, and XL430 and MX-28 report a load where the others report a current. Registers below 64 are
+EEPROM, which a servo writes with the torque off only.
+
+Frames are `FF FF FD 00 ID LEN_L LEN_H INST ... CRC_L CRC_H`. A status frame has the instruction 55
+and an error byte before its parameters. Bytes `FF FF FD` inside a frame are followed by a stuffed
+`FD`, so that a header cannot occur there; LEN counts what follows it, stuffing included. The CRC is
+CRC-16 with the polynomial 8005, from the header on.
+
+While the torque is on, each servo's own bus watchdog is set: it stops the servo if no program talks
+to it for 2 s, even if every process of the host is gone. `keep_alive` talks to the servos in
+pauses of a driver.
+
+Sources: Robotis e-Manual, protocol 2.0, and control tables of XL330-M288, XL430-W250, XM430-W350,
+XH430-W350 and MX-28(2.0), which agree on every address here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pupper_sysid.common.errors import BusError
+from pupper_sysid.hardware.serial_servos.bus import LineServo, SerialBus
+from pupper_sysid.hardware.serial_servos.line import Reply, SerialLine
+from pupper_sysid.hardware.serial_servos.series import Family, Profile, Register, Series
+from pupper_sysid.hardware.serial_servos.settings import RegisterFault, read_register
+
+PING, READ, WRITE, REG_WRITE, ACTION, REBOOT = 1, 2, 3, 4, 5, 8
+SYNC_READ, SYNC_WRITE = 0x82, 0x83
+BROADCAST_ID, HIGHEST_ID = 0xFE, 252
+
+ALERT = 0x80
+"""Bit of the error byte: `hardware_error_status` is not 0."""
+RESULT_FAIL, INSTRUCTION, CRC, DATA_RANGE, DATA_LENGTH, DATA_LIMIT, ACCESS = range(1, 8)
+"""Numbers of the error byte."""
+HARDWARE_ERRORS = {
+    1: "input voltage", 4: "overheating", 8: "encoder", 16: "electrical shock", 32: "overload",
+}  # fmt: skip
+"""Bits of the register hardware_error_status."""
+BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
+"""By the value of the servo's baud register."""
+
+POSITION_MODE, EXTENDED_POSITION_MODE, CURRENT_BASED_POSITION_MODE = 3, 4, 5
+MODES = {0: "current mode", 1: "velocity mode", 16: "PWM mode"}
+ACKNOWLEDGES = 2
+REVERSE, TIME_BASED = 1, 4
+"""Bits of the drive mode: counts fall with the angle; profiles are durations."""
+FULL_PWM = 885
+WATCHDOG_UNIT_S = 0.02
+WATCHDOG_UNITS = 100
+"""2 s: longer than the second after which the watchdog process takes over."""
+TRIGGERED = 255
+"""Value of the bus watchdog once it has stopped the servo."""
+
+_SPEED_RAD_S = 0.229 * math.tau / 60
+_ACCELERATION_RAD_S2 = 214.577 * math.tau / 3600
+_OVERLOAD_AND_HEAT = 36
+
+_TABLE = {
+    "model_number": Register(0, 2),
+    "firmware": Register(6),
+    "id": Register(7),
+    "baud_rate": Register(8),
+    "return_delay_time": Register(9),
+    "drive_mode": Register(10),
+    "operating_mode": Register(11),
+    "secondary_id": Register(12),
+    "homing_offset": Register(20, 4, signed=True),
+    "moving_threshold": Register(24, 4),
+    "temperature_limit": Register(31),
+    "max_voltage_limit": Register(32, 2),
+    "min_voltage_limit": Register(34, 2),
+    "pwm_limit": Register(36, 2),
+    "current_limit": Register(38, 2),
+    "velocity_limit": Register(44, 4),
+    "max_position_limit": Register(48, 4),
+    "min_position_limit": Register(52, 4),
+    "shutdown": Register(63),
+    "torque_enable": Register(64),
+    "status_return_level": Register(68),
+    "hardware_error_status": Register(70),
+    "position_d_gain": Register(80, 2),
+    "position_i_gain": Register(82, 2),
+    "position_p_gain": Register(84, 2),
+    "feedforward_2nd_gain": Register(88, 2),
+    "feedforward_1st_gain": Register(90, 2),
+    "bus_watchdog": Register(98),
+    "goal_pwm": Register(100, 2, signed=True),
+    "goal_current": Register(102, 2, signed=True),
+    "profile_acceleration": Register(108, 4),
+    "profile_velocity": Register(112, 4),
+    "goal_position": Register(116, 4, signed=True),
+    "moving": Register(122),
+    "present_pwm": Register(124, 2, signed=True),
+    "present_current": Register(126, 2, signed=True),
+    "present_velocity": Register(128, 4, signed=True),
+    "present_position": Register(132, 4, signed=True),
+    "present_input_voltage": Register(144, 2),
+    "present_temperature": Register(146),
+}
+_ALIASES = {
+    "model": "model_number", "p": "position_p_gain", "i": "position_i_gain",
+    "d": "position_d_gain", "mode": "operating_mode", "min_angle": "min_position_limit",
+    "max_angle": "max_position_limit", "response_level": "status_return_level",
+    "return_delay": "return_delay_time", "min_voltage": "min_voltage_limit",
+    "max_voltage": "max_voltage_limit", "present_load": "present_pwm",
+    "present_voltage": "present_input_voltage", "baud": "baud_rate",
+}  # fmt: skip
+MEMORY_BYTES = 147
+
+MODELS = {
+    1190: "XL330-M077", 1200: "XL330-M288", 1240: "XC330-M288", 1060: "XL430-W250",
+    1030: "XM430-W210", 1020: "XM430-W350", 1110: "XH430-W350", 1130: "XM540-W150",
+    1120: "XM540-W270", 30: "MX-28", 311: "MX-64", 321: "MX-106",
+}  # fmt: skip
+"""Names by model number; MX are those with the firmware for protocol 2.0."""
+
+
+def _series(name: str, model: int) -> Series:
+    return Series(
+        name, model, big_endian=False, counts=4096, has_sync_read=True, lock_address=None,
+        registers=_TABLE, aliases=_ALIASES, eeprom_end=64,
+        offset_sign=-1,  # present = encoder + homing offset
+    )  # fmt: skip
+
+
+SERIES = {model: _series(name, model) for model, name in MODELS.items()}
+
+SHAPING = (
+    "return_delay_time", "drive_mode", "operating_mode", "homing_offset", "pwm_limit",
+    "current_limit", "velocity_limit", "min_position_limit", "max_position_limit",
+    "temperature_limit", "min_voltage_limit", "max_voltage_limit", "shutdown",
+    "status_return_level", "feedforward_1st_gain", "feedforward_2nd_gain", "bus_watchdog",
+    "goal_pwm", "goal_current", "profile_acceleration", "profile_velocity",
+)  # fmt: skip
+"""Registers beside the gains that shape how a servo moves and answers."""
+
+
+def profile(series: Series, registers: Mapping[str, int]) -> Profile:
+    """Ramp of the set-point, whose units the drive mode sets.
+
+    By speed: 0.229 rev/min and 214.577 rev/min² per unit. By time: `profile_velocity` is the
+    duration of a motion in ms, and `profile_acceleration` that of its beginning.
+    """
+    speed, acceleration = registers["profile_velocity"], registers["profile_acceleration"]
+    named = {"profile_velocity": speed, "profile_acceleration": acceleration}
+    names = tuple(name for name, value in named.items() if value)
+    if registers["drive_mode"] & TIME_BASED:
+        return Profile(duration_s=speed / 1e3, registers=names)
+    return Profile(
+        speed * _SPEED_RAD_S if speed else math.inf,
+        acceleration * _ACCELERATION_RAD_S2 if speed and acceleration else math.inf,
+        registers=names,
+    )
+
+
+def own_faults(series: Series, registers: Mapping[str, int]) -> list[RegisterFault]:
+    """Faults of registers that only these servos have."""
+    faults = []
+    if errors := registers["hardware_error_status"]:
+        words = ", ".join(word for bit, word in HARDWARE_ERRORS.items() if errors & bit)
+        meaning = f"the servo has shut down ({words or 'unknown bits'}), and takes no torque"
+        cure = "Remove the cause, and switch its power off and on (or send a reboot)"
+        faults.append(RegisterFault("hardware_error_status", errors, meaning, cure))
+    if registers["bus_watchdog"] == TRIGGERED:
+        meaning = "its watchdog has stopped the servo, because an earlier program ended"
+        cure = "Nothing has to be done: it is cleared before the torque is switched on"
+        faults.append(RegisterFault("bus_watchdog", TRIGGERED, meaning, cure, False))
+    if registers["drive_mode"] & REVERSE:
+        meaning = "counts fall as the horn turns counter-clockwise"
+        cure = "The signs of the joint map must have been checked with it"
+        faults.append(RegisterFault("drive_mode", registers["drive_mode"], meaning, cure, False))
+    if registers["pwm_limit"] < FULL_PWM:
+        share = 100 * registers["pwm_limit"] / FULL_PWM
+        meaning = f"the servo uses {share:.0f} % of its duty at most, and so of its torque"
+        cure = f"Write {FULL_PWM} into it to measure the whole servo"
+        faults.append(RegisterFault("pwm_limit", registers["pwm_limit"], meaning, cure, False))
+    if registers["operating_mode"] == CURRENT_BASED_POSITION_MODE:
+        meaning = (
+            f"position mode with a limited current (goal_current {registers['goal_current']}, "
+            f"current_limit {registers['current_limit']})"
+        )
+        cure = "Write 3 into it to measure the servo without that limit"
+        faults.append(RegisterFault("operating_mode", 5, meaning, cure, False))
+    return faults
+
+
+def protections(series: Series, registers: Mapping[str, int]) -> dict[str, int]:
+    """Registers to set while the torque is on: shutdown by overload and heat, and the bus watchdog.
+
+    The bus watchdog stops the servo itself if no program talks to it for 2 s.
+
+    Examples
+    --------
+    >>> protections(SERIES[1200], {"shutdown": 52, "bus_watchdog": 0})
+    {'bus_watchdog': 100}
+    """
+    wanted = {
+        "shutdown": registers["shutdown"] | _OVERLOAD_AND_HEAT, "bus_watchdog": WATCHDOG_UNITS,
+    }  # fmt: skip
+    return {name: value for name, value in wanted.items() if value != registers[name]}
+
+
+HEADER = b"\xff\xff\xfd\x00"
+STATUS = 0x55
+_STUFFED, _STUFFING = b"\xff\xff\xfd", b"\xff\xff\xfd\xfd"
+_SHORTEST, _LONGEST = 10, 1024
+_POLYNOMIAL = 0x8005
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        crc = byte << 8
+        for _ in range(8):
+            crc = (crc << 1 ^ _POLYNOMIAL if crc & 0x8000 else crc << 1) & 0xFFFF
+        table.append(crc)
+    return tuple(table)
+
+
+_CRC_TABLE = _crc_table()
+
+
+def crc16(data: bytes | bytearray) -> int:
+    """CRC of a frame's bytes before it.
+
+    Examples
+    --------
+    >>> hex(crc16(bytes.fromhex("ff ff fd 00 01 03 00 01")))
+    '0x4e19'
+    """
+    crc = 0
+    for byte in data:
+        crc = (crc << 8 ^ _CRC_TABLE[crc >> 8 ^ byte]) & 0xFFFF
+    return crc
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame with a correct CRC."""
+
+    id: int
+    code: int
+    """Instruction of a request, error byte of a reply."""
+    data: bytes
+    """Parameters, without stuffing."""
+    is_status: bool = False
+
+    def encode(self) -> bytes:
+        """The frame on the wire.
+
+        Examples
+        --------
+        >>> Frame(1, 1, b"").encode().hex(" ")
+        'ff ff fd 00 01 03 00 01 19 4e'
+        """
+        body = (bytes([STATUS]) if self.is_status else b"") + bytes([self.code]) + self.data
+        body = body.replace(_STUFFED, _STUFFING)
+        head = HEADER + bytes([self.id]) + (len(body) + 2).to_bytes(2, "little")
+        return head + body + crc16(head + body).to_bytes(2, "little")
+
+
+class FrameReader:
+    """Finds frames in a stream that may hold anything.
+
+    Where a frame is incomplete behind a new header, or its CRC wrong, its first byte is dropped and
+    the search goes on, so garbage before, between or around frames is skipped.
+
+    Parameters
+    ----------
+    plausible : callable
+        `(id, parameter bytes) -> bool`: frames that can occur.
+    status : bool
+        Whether to take status frames, or requests.
+    """
+
+    def __init__(
+        self,
+        plausible: Callable[[int, int], bool] = lambda frame_id, size: True,
+        status: bool = False,
+    ):
+        self._plausible, self._status = plausible, status
+        self._buffer = bytearray()
+        self.rejected_bytes = 0
+        """Bytes outside valid frames."""
+        self.crc_errors: list[int] = []
+        """Ids of frames whose CRC was wrong."""
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """Frames completed by `data`."""
+        self._buffer += data
+        frames: list[Frame] = []
+        buffer = self._buffer
+        while len(buffer) >= _SHORTEST:
+            if not buffer.startswith(HEADER):
+                at = buffer.find(HEADER, 1)
+                self._drop(at if at >= 0 else len(buffer) - (len(HEADER) - 1))
+                continue
+            length = buffer[5] | buffer[6] << 8
+            whole = length + 7
+            if length < 3 or whole > _LONGEST:
+                self._drop(1)
+                continue
+            # stuffing keeps headers out of a frame: one inside starts the next
+            following = buffer.find(HEADER, 4, min(whole - 2, len(buffer)))
+            if following >= 0:
+                self._drop(following)
+                continue
+            if whole > len(buffer):
+                break
+            if crc16(buffer[: whole - 2]) != buffer[whole - 2] | buffer[whole - 1] << 8:
+                self.crc_errors.append(buffer[4])
+                self._drop(1)
+                continue
+            frame = self._frame(bytes(buffer[:whole]))
+            if frame is None:
+                self.rejected_bytes += whole
+            else:
+                frames.append(frame)
+            del buffer[:whole]
+        return frames
+
+    def _drop(self, count: int) -> None:
+        self.rejected_bytes += count
+        del self._buffer[:count]
+
+    def _frame(self, whole: bytes) -> Frame | None:
+        """A frame of the kind that is read; None for any other."""
+        body = whole[7:-2].replace(_STUFFING, _STUFFED)
+        is_status = body[0] == STATUS
+        if is_status != self._status or (is_status and len(body) < 2):
+            return None
+        code, data = (body[1], body[2:]) if is_status else (body[0], body[1:])
+        frame = Frame(whole[4], code, data, is_status)
+        return frame if self._plausible(frame.id, len(data)) else None
+
+
+_PROTOCOL = 2.0
+_TORQUE = SERIES[1200].register("torque_enable").address
+
+
+class DynamixelLine(SerialLine):
+    """An open serial line of Dynamixel servos; parameters and errors are those of `SerialLine`."""
+
+    reply_bytes = 11
+    longest_return_delay_s = 0.00051  # 254 units of 2 µs
+    model_bytes = 3  # model number and firmware, in the reply to a ping
+    rates_in_words = "57600, 115200, 1000000, 2000000, 3000000 or 4000000"
+
+    def __init__(self, device: str, baud: int, exclusive: bool = True):
+        super().__init__(device, baud, exclusive)
+        self._packets = self._sdk().PacketHandler(_PROTOCOL)
+
+    def ping(self, servo: int) -> Frame | None:
+        """Status frame of `servo`, or None if it does not answer."""
+        reply = self._exchange(lambda: self.ask_model(servo), [servo], self.model_bytes).get(servo)
+        return reply.frame if reply else None  # pyright: ignore[reportReturnType]
+
+    def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
+        """The same bytes of several servos with one request."""
+        ids = list(servos)
+        return self._exchange(
+            lambda: self._packets.syncReadTx(self._port, address, size, ids, len(ids), False),
+            ids, size,
+        )  # fmt: skip
+
+    def sync_write(self, address: int, values: dict[int, bytes]) -> float:
+        """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed."""
+        size = len(next(iter(values.values())))
+        params = [byte for servo, value in values.items() for byte in (servo, *value)]
+        return self._sync_written(
+            lambda: self._packets.syncWriteTxOnly(self._port, address, size, params, len(params))
+        )
+
+    def torque_off(self, servos: Sequence[int] | None = None) -> None:
+        """Switch the torque of these (default: all) off at once; unacknowledged."""
+        if servos is None:
+            off = Frame(BROADCAST_ID, WRITE, _TORQUE.to_bytes(2, "little") + b"\0").encode()
+            self._sync_written(lambda: self._send_raw(off))
+        else:
+            self.sync_write(_TORQUE, {servo: b"\0" for servo in servos})
+
+    def ask_model(self, servo: int) -> int:
+        """Send a ping, whose reply holds the model number; 0 if sent."""
+        request = [0, 0, 0, 0, servo, 3, 0, PING, 0, 0]
+        return self._packets.txPacket(self._port, request)
+
+    def echo_probe(self) -> bytes:
+        """A request to which no servo answers."""
+        return Frame(HIGHEST_ID, PING, b"").encode()
+
+    def _reader(self, accepted: Callable[[int, int], bool]) -> FrameReader:
+        return FrameReader(accepted, status=True)
+
+    def _request(self, frame: Any) -> bytes:
+        return b""  # an echo is no status frame
+
+    def _sdk(self) -> Any:
+        try:
+            import dynamixel_sdk
+        except ImportError as error:
+            raise BusError(
+                "the Dynamixel SDK is not installed. Run `pip install 'dynamixel-sdk>=3.8'`."
+            ) from error
+        return dynamixel_sdk
+
+
+FAMILY = Family(
+    name="dynamixel",
+    open_line=DynamixelLine,
+    rates=(1_000_000, 57_600, 2_000_000, 3_000_000, 4_000_000, 115_200),
+    highest_id=HIGHEST_ID,
+    series=SERIES,
+    profiles={},
+    presets={},
+    error_bits=HARDWARE_ERRORS | {ALERT: "hardware error"},
+    present="present_pwm",
+    reading_bytes=(12, 13, 14, 15, 16, 23),  # PWM, current, velocity, position; … voltage, heat
+    memory_pieces=(40, 38, 37, 32),
+    shaping=SHAPING,
+    modes=MODES,
+    position_mode=POSITION_MODE,
+    turns_freely=frozenset({EXTENDED_POSITION_MODE, CURRENT_BASED_POSITION_MODE}),
+    acknowledges=ACKNOWLEDGES,
+    profile=profile,
+    own_faults=own_faults,
+    protections=protections,
+    volt_scale=0.1,
+    load=("present_pwm", 1 / FULL_PWM),
+    return_delay_unit_s=2e-6,
+    tool="DYNAMIXEL Wizard",
+)
+
+
+class DynamixelBus(SerialBus):
+    """Dynamixel servos on a serial line; parameters and errors are those of `SerialBus`."""
+
+    family = FAMILY
+    _turns = 256  # of the extended position mode
+
+    def register(self, joint: str, name: str) -> int:
+        """Present value of a register; that of a bus watchdog that has acted is 0 (off)."""
+        value = super().register(joint, name)
+        return 0 if name == "bus_watchdog" and value == TRIGGERED else value
+
+    def set_register(self, joint: str, name: str, value: int) -> None:
+        """Set a register and read it back; a bus watchdog that has acted is cleared before."""
+        if name == "bus_watchdog" and value:
+            super().set_register(joint, name, 0)
+        super().set_register(joint, name, value)
+
+    def keep_alive(self) -> None:
+        """Talk to every servo, so that its bus watchdog does not act."""
+        heat = self._servos[0].series.register("present_temperature").address
+        self.line.sync_read([servo.id for servo in self._servos], heat, 1)
+
+    def _status(self, servo: LineServo, reply: Reply) -> int:
+        if not reply.frame.code & ALERT:
+            return 0
+        errors = read_register(self.line, servo.id, servo.series, "hardware_error_status")
+        return errors or ALERT

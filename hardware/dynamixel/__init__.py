@@ -1,1 +1,0 @@
-"""Dynamixel servos (protocol 2.0) on a serial line: frames, registers, and the bus made of them."""

@@ -1,0 +1,370 @@
+"""Feetech servos (STS, SCS and SMS series) as a `ServoBus`: `--bus feetech:/dev/ttyUSB0`.
+
+The series differ: address 48 locks the EEPROM of one and limits the torque of the other. So a
+servo's model number, at address 3 in both, is read before anything else.
+
+Frames are `FF FF ID LEN X ... CHK`, found in a stream that may hold anything: `X` is the
+instruction or the error byte, `LEN` counts it, the parameters and the checksum, which is the
+inverted sum of all bytes from ID on. `FrameReader` is the only parser: the bus reads replies with
+it, the emulator reads requests. Where a frame is incomplete or its checksum wrong, its first byte
+is dropped and the search goes on, so garbage before, between or around frames is skipped.
+
+Beside the faults that all SDKs share (`hardware.serial_servos.line`), version 1.0.0 of
+`scservo_sdk` keeps the byte order in a module global, does not check a reply's length, and loses
+the replies of a group read after one silent servo. All three are therefore handled here.
+
+Sources: the vendor's memory tables (wiki and ST3215 sheet), the Mini Pupper's firmware, LeRobot's
+tables; entries on which they disagree are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pupper_sysid.common.data_sheet import counts_of
+from pupper_sysid.common.errors import BusError
+from pupper_sysid.hardware.serial_servos.bus import SerialBus
+from pupper_sysid.hardware.serial_servos.line import Reply, SerialLine
+from pupper_sysid.hardware.serial_servos.series import ERROR_BITS, Family, Profile, Register, Series
+
+PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
+BROADCAST_ID = 0xFE
+HIGHEST_ID = 253
+
+BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
+"""By the value of the servo's baud register."""
+RETURN_DELAY_UNIT_S = 2e-6
+
+MODEL_ADDRESS, TORQUE_ADDRESS = 3, 40
+MULTI_TURN_FEEDBACK = 16
+_SPEED_SIGN, _LOAD_SIGN, _OFFSET_SIGN = 15, 10, 11
+
+
+_COMMON = {
+    "firmware_major": Register(0),
+    "firmware_minor": Register(1),
+    "model": Register(MODEL_ADDRESS, 2),
+    "id": Register(5),
+    "baud": Register(6),
+    "return_delay": Register(7),
+    "response_level": Register(8),
+    "min_angle": Register(9, 2),
+    "max_angle": Register(11, 2),
+    "max_temperature": Register(13),
+    "max_voltage": Register(14),
+    "min_voltage": Register(15),
+    "max_torque": Register(16, 2),
+    "phase": Register(18),
+    "unload_condition": Register(19),
+    "p": Register(21),
+    "d": Register(22),
+    "i": Register(23),
+    "min_start_force": Register(24, 2),
+    "dead_zone_cw": Register(26),
+    "dead_zone_ccw": Register(27),
+    "torque_enable": Register(TORQUE_ADDRESS),
+    "acceleration": Register(41),
+    "goal_time": Register(44, 2),
+    "goal_speed": Register(46, 2),
+    "present_speed": Register(58, 2, _SPEED_SIGN),
+    "present_load": Register(60, 2, _LOAD_SIGN),
+    "present_voltage": Register(62),
+    "present_temperature": Register(63),
+    "registered": Register(64),
+    "status": Register(65),
+    "moving": Register(66),
+}
+
+
+SCS0009 = Series(
+    "SCS0009", 1284, True, 1024, False, 48,
+    _COMMON | {"goal_position": Register(42, 2), "present_position": Register(56, 2)},
+)  # fmt: skip
+STS3215 = Series(
+    "STS3215", 777, False, 4096, True, 55,
+    _COMMON
+    | {
+        "homing_offset": Register(31, 2, _OFFSET_SIGN),
+        "mode": Register(33),
+        "protective_torque": Register(34),
+        "protection_time": Register(35),
+        "overload_torque": Register(36),
+        "goal_position": Register(42, 2, 15),
+        "torque_limit": Register(48, 2),
+        "present_position": Register(56, 2, 15),
+        "current": Register(69, 2, 15),
+    },
+    # several turns are reported, instead of one (LeRobot clears it)
+    multi_turn_bit=MULTI_TURN_FEEDBACK,
+)  # fmt: skip
+HD1910 = replace(
+    STS3215,
+    name="HD-1910",
+    model=0,
+    registers=STS3215.registers | {"p": Register(50), "d": Register(51)},
+    more_position_modes=frozenset({4}),  # as delivered, by a builder's notes on firmware 3.46
+)
+"""Microduck's Feetech servo: STS protocol, with the gains in use at 50 and 51. No source states its
+model number, so that a joint map has to name it."""
+SERIES = {int.from_bytes(s.word(s.model), "little"): s for s in (SCS0009, STS3215)}
+"""By model number, its bytes as little endian."""
+
+POSITION_MODE = 0
+MODES = {1: "wheel mode", 2: "PWM mode", 3: "step mode"}
+ACKNOWLEDGES = 1
+
+SHAPING = (
+    "return_delay", "response_level", "min_start_force", "dead_zone_cw", "dead_zone_ccw",
+    "max_torque", "torque_limit", "max_temperature", "max_voltage", "min_voltage", "min_angle",
+    "max_angle", "homing_offset", "phase", "mode", "acceleration", "goal_time", "goal_speed",
+)  # fmt: skip
+"""Registers beside the gains that shape how a servo moves and answers."""
+
+_ACCELERATION_COUNTS_S2 = 100
+_HEAT, _OVERLOAD = 4, 32  # of ERROR_BITS
+_MOST = {"protective_torque": 20, "protection_time": 200, "overload_torque": 80}
+"""Factory settings: share of the torque afterwards [%], duration [10 ms], share before [%]."""
+_OFF_AT_ZERO = ("protection_time", "overload_torque")
+
+PROTECTIONS = ("unload_condition", *_MOST)
+"""Registers of which a servo's protections consist, as far as its series has them."""
+
+
+def protections_to_set(series: Series, registers: Mapping[str, int]) -> dict[str, int]:
+    """Values that bring a servo's protections to at least the factory's; {} if they are.
+
+    If every process of the host is gone, only these act: above a temperature, or when a joint has
+    been blocked for some time, the servo reduces its torque by itself. No series has a
+    communication time-out: a servo that is free to move holds its last command for ever. Registers
+    37 to 39 of the SCS series are left alone: sources name them, the vendor's table does not.
+
+    Examples
+    --------
+    >>> protections_to_set(SCS0009, {"unload_condition": 1})
+    {'unload_condition': 37}
+    """
+    wanted = {"unload_condition": registers["unload_condition"] | _HEAT | _OVERLOAD}
+    for name, most in _MOST.items():
+        if name in series.registers:
+            off = registers[name] == 0 and name in _OFF_AT_ZERO
+            wanted[name] = most if off else min(registers[name], most)
+    return {name: value for name, value in wanted.items() if value != registers[name]}
+
+
+def profile(series: Series, registers: Mapping[str, int]) -> Profile:
+    """Ramp of the set-point: acceleration in 100 counts/s², speed in counts/s, time in ms.
+
+    A speed overrides the time.
+    """
+    count = math.tau / (counts_of(series.name) or series.counts)
+    acceleration, speed = registers.get("acceleration", 0), registers.get("goal_speed", 0)
+    duration = 0 if speed else registers.get("goal_time", 0)
+    named = {"acceleration": acceleration, "goal_speed": speed, "goal_time": duration}
+    return Profile(
+        speed * count if speed else math.inf,
+        _ACCELERATION_COUNTS_S2 * acceleration * count if acceleration else math.inf,
+        duration / 1e3,
+        tuple(name for name, value in named.items() if value),
+    )
+
+
+HEADER = b"\xff\xff"
+SHORTEST = 6
+_HIGHEST_LENGTH = 252
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame with a correct checksum."""
+
+    id: int
+    code: int
+    """Instruction of a request, error byte of a reply."""
+    data: bytes
+    """Parameters."""
+
+    def encode(self) -> bytes:
+        """The frame on the wire.
+
+        Examples
+        --------
+        >>> Frame(1, 2, bytes([56, 2])).encode().hex(" ")
+        'ff ff 01 04 02 38 02 be'
+        """
+        body = bytes([self.id, len(self.data) + 2, self.code]) + self.data
+        return HEADER + body + bytes([checksum(body)])
+
+
+def checksum(body: bytes | bytearray) -> int:
+    """Checksum of the bytes from ID to the last parameter."""
+    return ~sum(body) & 0xFF
+
+
+class FrameReader:
+    """Finds frames in a stream of bytes.
+
+    Parameters
+    ----------
+    plausible : callable
+        `(id, length byte) -> bool`: frames that can occur. Garbage that looks like the start of a
+        long frame would otherwise hide the true ones behind it.
+    """
+
+    def __init__(self, plausible: Callable[[int, int], bool] = lambda frame_id, length: True):
+        self._plausible = plausible
+        self._buffer = bytearray()
+        self.rejected_bytes = 0
+        """Bytes outside valid frames."""
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """Frames completed by `data`."""
+        self._buffer += data
+        found: list[Frame] = []
+        buffer, start, end = self._buffer, 0, len(self._buffer)
+        while end - start >= SHORTEST:
+            if buffer[start] != 0xFF or buffer[start + 1] != 0xFF:
+                at = buffer.find(HEADER, start)
+                # the last byte may be the first of a header
+                at = at if at >= 0 else end - (buffer[end - 1] == 0xFF)
+                self.rejected_bytes += at - start
+                start = at
+                continue
+            frame_id, length = buffer[start + 2], buffer[start + 3]
+            whole = start + length + 4
+            if (
+                frame_id == 0xFF
+                or not 2 <= length <= _HIGHEST_LENGTH
+                or not self._plausible(frame_id, length)
+            ):
+                start += 1
+                self.rejected_bytes += 1
+            elif whole > end:
+                break
+            elif checksum(buffer[start + 2 : whole - 1]) != buffer[whole - 1]:
+                start += 1
+                self.rejected_bytes += 1
+            else:
+                found.append(
+                    Frame(frame_id, buffer[start + 4], bytes(buffer[start + 5 : whole - 1]))
+                )
+                start = whole
+        del buffer[:start]
+        return found
+
+
+class FeetechLine(SerialLine):
+    """An open serial line of Feetech servos; parameters and errors are those of `SerialLine`."""
+
+    reply_bytes = 6
+    longest_return_delay_s = 0.00051  # 254 units of 2 µs
+    model_bytes = 2
+    rates_in_words = "1000000, 500000, 250000, 128000, 115200, 57600 or 38400"
+
+    def __init__(self, device: str, baud: int, exclusive: bool = True):
+        super().__init__(device, baud, exclusive)
+        self._packets = self._sdk().protocol_packet_handler()
+
+    def ping(self, servo: int) -> Frame | None:
+        """Status frame of `servo`, or None if it does not answer."""
+        reply = self._exchange(
+            lambda: self._packets.txPacket(self._port, [0, 0, servo, 2, PING, 0]), [servo], 0
+        ).get(servo)
+        return reply.frame if reply else None  # pyright: ignore[reportReturnType]
+
+    def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
+        """The same bytes of several servos with one request (not on the SCS series)."""
+        ids = list(servos)
+        return self._exchange(
+            lambda: self._packets.syncReadTx(self._port, address, size, ids, len(ids)), ids, size
+        )
+
+    def sync_write(self, address: int, values: dict[int, bytes]) -> float:
+        """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed.
+
+        Raises
+        ------
+        ValueError
+            If the values differ in length.
+        """
+        sizes = {len(v) for v in values.values()}
+        if len(sizes) != 1:
+            raise ValueError(f"sync_write: values of {sorted(sizes)} bytes; all must be as long.")
+        size = sizes.pop()
+        params = [byte for servo, value in values.items() for byte in (servo, *value)]
+        return self._sync_written(
+            lambda: self._packets.syncWriteTxOnly(self._port, address, size, params, len(params))
+        )
+
+    def torque_off(self, servos: Sequence[int] | None = None) -> None:
+        """Switch the torque of these (default: all) off at once; unacknowledged."""
+        if servos is None:
+            off = Frame(BROADCAST_ID, 3, bytes([TORQUE_ADDRESS, 0])).encode()
+            self._sync_written(lambda: self._send_raw(off))
+        else:
+            self.sync_write(TORQUE_ADDRESS, {servo: b"\0" for servo in servos})
+
+    def ask_model(self, servo: int) -> int:
+        """Send the request whose reply holds the model number; 0 if sent."""
+        return self._packets.readTx(self._port, servo, MODEL_ADDRESS, 2)
+
+    def echo_probe(self) -> bytes:
+        """A request to which no servo answers."""
+        return Frame(BROADCAST_ID - 1, PING, b"").encode()
+
+    def _reader(self, accepted: Callable[[int, int], bool]) -> FrameReader:
+        return FrameReader(lambda servo, length: accepted(servo, length - 2))
+
+    def _request(self, frame: Any) -> bytes:
+        return frame.encode()
+
+    def _sdk(self) -> Any:
+        """The vendor's SDK; refuses another package of the same module name."""
+        try:
+            import scservo_sdk
+        except ImportError as error:
+            raise BusError(
+                "the Feetech SDK is not installed. Run `pip install 'feetech-servo-sdk>=1.0,<2'`."
+            ) from error
+        if not hasattr(scservo_sdk, "PacketHandler"):
+            raise BusError(
+                "the package ftservo-python-sdk is installed, which puts another library under the "
+                "name scservo_sdk. Run `pip uninstall ftservo-python-sdk` and then "
+                "`pip install --force-reinstall 'feetech-servo-sdk>=1.0,<2'`."
+            )
+        return scservo_sdk
+
+
+FAMILY = Family(
+    name="feetech",
+    open_line=FeetechLine,
+    rates=(1_000_000, 500_000, 115_200, 250_000, 57_600, 38_400),
+    highest_id=HIGHEST_ID,
+    series=SERIES,
+    profiles={HD1910.name: HD1910},
+    presets={SCS0009.name: "mini_pupper_2_direct", STS3215.name: "sts3215"},
+    error_bits=ERROR_BITS,
+    present="present_position",
+    reading_bytes=(6, 7, 8, 9, 10, 11),  # position, speed, load; voltage; temperature; …
+    memory_pieces=(16, 15, 14, 13, 9),  # registers 0 to 66
+    shaping=SHAPING,
+    modes=MODES,
+    position_mode=POSITION_MODE,
+    turns_freely=frozenset(),
+    acknowledges=ACKNOWLEDGES,
+    profile=profile,
+    own_faults=lambda series, found: [],
+    protections=protections_to_set,
+    volt_scale=0.1,
+    load=("present_load", 1e-3),
+    return_delay_unit_s=RETURN_DELAY_UNIT_S,
+    tool="Feetech's FD program",
+)
+
+
+class FeetechBus(SerialBus):
+    """Feetech servos on a serial line; parameters and errors are those of `SerialBus`."""
+
+    family = FAMILY

@@ -1,1 +1,0 @@
-"""Emulated servos: in free air, with a pendulum, on a bench, or as the joints of a robot."""
