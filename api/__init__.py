@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.recordings.recording import Recording
     from pupper_sysid.sysid.report.report import write_report as report
     from pupper_sysid.sysid.servo_fit.fit import fit_servo
-    from pupper_sysid.sysid.sparse.equations import sparse_equations
+    from pupper_sysid.sysid.sparse import sparse_equations
 
 _MODULES = {
     "load": "sysid.recordings.files",
@@ -48,7 +48,7 @@ _MODULES = {
     "frequency_response": "sysid.lag.frequency_response",
     "backlash": "sysid.backlash.measure",
     "calibrate": "sysid.fit.calibrate",
-    "sparse_equations": "sysid.sparse.equations",
+    "sparse_equations": "sysid.sparse",
     "fit_servo": "sysid.servo_fit.fit",
     "compare": "sysid.compare.compare",
     "report": "sysid.report.report:write_report",

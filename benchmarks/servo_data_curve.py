@@ -33,13 +33,13 @@ from pupper_sysid.sysid.report.data_curve import FILE
 from pupper_sysid.sysid.report.data_curve import MODELS as CURVES
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
+from pupper_sysid.sysid.servo_fit.fit import delayed_pd_fits
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
-from pupper_sysid.sysid.servo_fit.physics import delayed_pd_fits
 from pupper_sysid.sysid.servo_fit.published import fit_published
 from pupper_sysid.sysid.servo_fit.windows import Part, grouped, merged_groups, samples
 from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S
-from pupper_sysid.sysid.sweep.playback import playback
 from pupper_sysid.sysid.sweep.recorder import record
+from pupper_sysid.sysid.sweep.resume import playback
 
 JOINTS = ("LF_hip", "LF_calf")
 CSV = f"sysid/report/data/{FILE}"

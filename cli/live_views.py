@@ -118,7 +118,7 @@ class LiveViews:
     """The loop's side; see `live_views`, which closes it."""
 
     def __init__(self, bus: ServoBus, wanted: Wanted, waits: bool):
-        from pupper_sysid.sysid.view.ticks import packed
+        from pupper_sysid.sysid.view.channels import packed
 
         self._packed = packed
         self._wanted, self._within_s = wanted, _WAIT_S if waits else 0.0

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pupper_sysid.common.interval import Interval
-from pupper_sysid.sysid.compare.comparison import Comparison
-from pupper_sysid.sysid.compare.four_way import FITTED, PUBLISHED, four_way
+from pupper_sysid.sysid.compare.comparison import FITTED, PUBLISHED, Comparison, four_way
 from pupper_sysid.sysid.doctor.examination import JointExamination, examine
 from pupper_sysid.sysid.fit.dead_time import lag
 from pupper_sysid.sysid.lag.lag_budget import LagBudget

@@ -50,7 +50,7 @@ from pupper_sysid.sysid.plan.planner import PlannedTrial
 from pupper_sysid.sysid.plan.proposal import SweepPlan
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.importers.options import LogOptions, read_mapping
-from pupper_sysid.sysid.sweep.playback import playback
+from pupper_sysid.sysid.sweep.resume import playback
 from support.saved_servo_models import saved
 
 SAMPLES = Path(__file__).parents[1] / "data" / "samples"

@@ -3,38 +3,42 @@
 `findings` has them all; `refuse_unusable` ends a computation with the sentence of what makes every
 number wrong, and `cautions` are the sentences that go with its result. The commands and functions
 that compute from recordings call these two, so that all of them judge as `doctor` does.
+
+`setup_findings` reads `ServoSetup` alone: with a finite acceleration or goal speed a Feetech servo
+ramps its set-point, so what is identified is the ramp, and no motor model explains it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.doctor.bends import bend_findings
-from pupper_sysid.sysid.doctor.causality import crossed
-from pupper_sysid.sysid.doctor.clock import clock_findings, tone_findings
+from pupper_sysid.sysid.doctor.explanations import crossed
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, Finding
 from pupper_sysid.sysid.doctor.hypotheses import (
     encoder_findings,
     hypothesis_findings,
     stepwise_findings,
 )
-from pupper_sysid.sysid.doctor.servo_setup import register_findings
 from pupper_sysid.sysid.doctor.signals import (
+    clock_findings,
     frozen_findings,
     interpolation_findings,
     motion_findings,
     offset_findings,
     start_findings,
+    tone_findings,
     unit_findings,
 )
-from pupper_sysid.sysid.feedback.quantisation import quantum
-from pupper_sysid.sysid.feedback.rows import fresh_rows
+from pupper_sysid.sysid.feedback.staleness import fresh_rows, quantum
 from pupper_sysid.sysid.recordings.bad_readings import without_bad_readings
 from pupper_sysid.sysid.recordings.recording import Trial
 from pupper_sysid.sysid.recordings.remembered import remembered
+from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
 
 LEAST_ROWS = 3
 """Rows of a trial; fewer have no rate of change."""
@@ -42,6 +46,61 @@ LEAST_ROWS = 3
 _FEW_MISSING, _MANY_MISSING = 0.02, 0.5
 _LEAST_FRESH = 16
 _MANY_BAD = 0.05  # share of the readings
+_COUNT_RAD = {"STS3215": math.tau / 4096, "SCS0009": math.radians(300) / 1024}
+_LEAST_LAG_S = 0.002
+_SERVO_RAD_S = 7.5  # no servo of this size follows a faster set-point
+_OVER_S = 0.1
+
+
+def setup_findings(setup: ServoSetup, speed_rad_s: float = _SERVO_RAD_S) -> list[Finding]:
+    """Registers of `setup` that shape the motion, each with its cure.
+
+    A set-point that must be able to stop on the command follows a speed v at a distance of v² over
+    twice its acceleration limit, which is a lag of v over twice the limit.
+
+    Parameters
+    ----------
+    setup : ServoSetup
+    speed_rad_s : float
+        Speed of the fast parts of the motion [rad/s].
+    """
+    found, registers = [], setup.registers
+    count_rad = _COUNT_RAD.get(setup.model or "", _COUNT_RAD["STS3215"])
+    limit = setup.set_point_acceleration_rad_s2
+    if limit is not None and (lag_s := speed_rad_s / (2 * limit)) > _LEAST_LAG_S:
+        said = f"{limit:.1f} rad/s², a lag of up to {1e3 * lag_s:.0f} ms at {speed_rad_s:.1f} rad/s"
+        found.append(_shaped("acceleration", registers["acceleration"], said, "0"))
+    speed = registers.get("goal_speed", 0)
+    if 0 < speed * count_rad < _SERVO_RAD_S:
+        found.append(_shaped("goal_speed", speed, f"{speed * count_rad:.2f} rad/s", "0"))
+    duration = registers.get("goal_time", 0)
+    if duration > 0 and speed == 0:
+        found.append(_shaped("goal_time", duration, f"{duration} ms for each command", "0"))
+    return found
+
+
+def register_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
+    """`setup_findings` of all trials, each once."""
+    speed = max((_speed(trial) for trial in trials), default=0.0)
+    return list(dict.fromkeys(f for trial in trials for f in setup_findings(trial.servo, speed)))
+
+
+def _speed(trial: Trial) -> float:
+    """Speed of the fast parts of a trial [rad/s], from readings a tenth of a second apart."""
+    read = np.isfinite(trial.position_rad) & np.isfinite(trial.read_time_s)
+    time, position = trial.read_time_s[read], trial.position_rad[read]
+    if len(time) < 2 or time[-1] - time[0] < _OVER_S:
+        return 0.0
+    grid = np.arange(time[0], time[-1], _OVER_S)
+    return float(np.percentile(np.abs(np.diff(np.interp(grid, time, position))), 95) / _OVER_S)
+
+
+def _shaped(register: str, value: int, limit: str, cure: str) -> Finding:
+    return Finding(
+        "own_trajectory", CARE, {"register": register, "value": value, "limit": limit, "cure": cure}
+    )
+
+
 _CHECKS = (
     motion_findings, tone_findings, encoder_findings, unit_findings, bend_findings,
     frozen_findings, offset_findings, hypothesis_findings, start_findings, interpolation_findings,

@@ -19,18 +19,17 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import NO_LOAD_SPEED_RAD_S
 from pupper_sysid.common.results import JointResults, Result, internal
-from pupper_sysid.sysid.doctor.causality import crossed
 from pupper_sysid.sysid.doctor.checks import findings, long_enough
-from pupper_sysid.sysid.doctor.clock import disorder
+from pupper_sysid.sysid.doctor.explanations import crossed
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, VERDICTS, Finding
-from pupper_sysid.sysid.doctor.signals import amplitude_ratio, offset, peak_speed
+from pupper_sysid.sysid.doctor.signals import amplitude_ratio, disorder, offset, peak_speed
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     find_poll_lattice,
     fresh_rows,
     quantum,
 )
-from pupper_sysid.sysid.feedback.rows import moving_rows
+from pupper_sysid.sysid.feedback.staleness import moving_rows
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.recordings.bad_readings import without_bad_readings
 from pupper_sysid.sysid.recordings.excitation import describe, named_tones
@@ -133,8 +132,7 @@ class Examination(JointResults[JointExamination]):
 
     def plot(self) -> Figure:
         """For how many rows each reading stayed the same; joints that can be used."""
-        from pupper_sysid.sysid.report.figure_data import hold_runs
-        from pupper_sysid.sysid.report.figures import hold_histogram_figure
+        from pupper_sysid.sysid.report.figures import hold_histogram_figure, hold_runs
 
         return hold_histogram_figure(
             {

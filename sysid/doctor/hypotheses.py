@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import fit_sine, least_squares
 from pupper_sysid.sysid.doctor.bends import CLEAR_NATS, bend_findings
-from pupper_sysid.sysid.doctor.causality import echo
 from pupper_sysid.sysid.doctor.explanations import (
     Explanation,
     Samples,
     Servo,
+    echo,
     explain,
 )
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding, rivalled

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from pupper_sysid.sysid.feedback.poll_search import OUTLIERS, Phase
-from pupper_sysid.sysid.feedback.quantisation import quantum
-from pupper_sysid.sysid.feedback.rows import fresh_rows, read_before
 from pupper_sysid.sysid.feedback.slips import Motion
+from pupper_sysid.sysid.feedback.staleness import fresh_rows, quantum, read_before
 from pupper_sysid.sysid.recordings.recording import Trial
 
 Sure = Callable[[NDArray[np.float64], float], NDArray[np.bool_]]

@@ -17,8 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.results import Result
-from pupper_sysid.sysid.feedback.poll_kernel import best_segments, summed_scores
-from pupper_sysid.sysid.feedback.poll_search import DRIFT, LOCK, OUTLIERS, Stretch
+from pupper_sysid.sysid.feedback.poll_search import (
+    DRIFT,
+    LOCK,
+    OUTLIERS,
+    Stretch,
+    best_segments,
+    summed_scores,
+)
 
 Motion = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Expected position [rad] of a joint at times [s] on the recording's clock."""

@@ -3,6 +3,9 @@
 A reading repeats for two reasons: the bus has no newer value, or the joint does not move. Only the
 first makes readings stale. A repeat in the midst of motion, where the values before and after it
 go on in one direction and the command leads, cannot be friction: `staleness` counts those.
+
+`quantum` is the quantisation step of a joint's readings, from the histogram of their differences;
+`fresh_rows` and `moving_rows` tell new readings from repeated ones.
 """
 
 from __future__ import annotations
@@ -10,14 +13,141 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from pupper_sysid.common.results import Result
-from pupper_sysid.sysid.feedback.quantisation import quantum
+from pupper_sysid.sysid.feedback.poll_search import Stretch
 from pupper_sysid.sysid.recordings.recording import Trial
+
+STRETCH_S = 4.0
+"""Longest stretch [s]; longer ones would need the poll to keep its phase to 1e-4."""
+
+_MOVING_QUANTA = 1.0  # a servo that moves by one count must change the reading
+
+
+def fresh_rows(trial: Trial) -> NDArray[np.int64]:
+    """Indices of the rows whose value differs from the last value before them.
+
+    Where readings are known to be live, every row is fresh.
+    """
+    valid = np.flatnonzero(np.isfinite(trial.position_rad))
+    if trial.readings == "live":
+        return valid
+    changed = np.flatnonzero(np.diff(trial.position_rad[valid]) != 0) + 1
+    return valid[changed]
+
+
+def read_before(trial: Trial) -> NDArray[np.float64]:
+    """For each row, when the last reading before it was read; NaN for the first one."""
+    here = np.isfinite(trial.position_rad)
+    at = np.where(here, np.arange(len(here)), -1)
+    last = np.concatenate([[-1], np.maximum.accumulate(at)[:-1]])
+    return np.where(last >= 0, trial.read_time_s[last], np.nan)
+
+
+def stretches_of(trial: Trial, step: float) -> list[Stretch]:
+    """Cut a trial into stretches short enough for one strict lattice each."""
+    read, rows, before = trial.read_time_s, fresh_rows(trial), read_before(trial)
+    moving = np.flatnonzero(moving_rows(trial, step))
+    known = np.isfinite(trial.position_rad) & np.isfinite(before)
+    same = np.setdiff1d(moving[known[moving]], rows)
+    parts = max(1, int(np.ceil((read[-1] - read[0]) / STRETCH_S)))
+    edges = np.linspace(read[0], read[-1], parts + 1)
+    found = []
+    for start, stop in pairwise(edges):
+        own, held = (r[(read[r] > start) & (read[r] <= stop)] for r in (rows, same))
+        if len(own) >= 8:
+            found.append(
+                Stretch(trial.number, start, stop, before[own], read[own], before[held], read[held])
+            )
+    return found
+
+
+def loop_period(trials: Sequence[Trial]) -> float:
+    """Median time between reads [s]; NaN without any."""
+    gaps = [np.diff(t.read_time_s) for t in trials if len(t.read_time_s) > 1]
+    return float(np.median(np.concatenate(gaps))) if gaps else float("nan")
+
+
+def moving_rows(trial: Trial, step: float) -> NDArray[np.bool_]:
+    """Rows by which the servo must have moved by a count of `step` [rad] since the row before."""
+    gap = float(np.median(np.diff(trial.read_time_s)))
+    return _speed(trial) * gap > _MOVING_QUANTA * step
+
+
+def _speed(trial: Trial) -> NDArray[np.float64]:
+    """|command rate| around each row [rad/s], the least over the past 0.1 s to allow for lag."""
+    rate = np.abs(np.gradient(trial.command_rad, trial.send_time_s))
+    loop = max(float(np.median(np.diff(trial.send_time_s))), 1e-4)
+    reach = max(1, round(0.1 / loop))
+    padded = np.concatenate([np.full(reach, rate[0]), rate])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, reach + 1)
+    # the slowest command in reach: the servo moves even if the lag is unknown
+    return windows.min(axis=1)
+
+
+_SMALLEST_RAD = 1e-4  # below it there is no telling a count from decimals
+_SAME_RAD = 2e-5  # differences of one number of counts, in a file with five decimals
+_NEAR = 0.2  # of a step: farther from a multiple a difference does not count
+_SURE = 0.98
+_FIRST_MULTIPLES = 4  # the smallest frequent difference may be several steps
+
+
+def quantum(trials: Sequence[Trial]) -> float:
+    """Find the quantisation step of readings.
+
+    Differences of quantised readings gather at multiples of the step. The smallest frequent one
+    gives a first guess, and least squares over all of them the step; a file's decimals only blur
+    it.
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+        All of one joint.
+
+    Returns
+    -------
+    float
+        The step [rad]; 0 if the differences are no multiples of one.
+    """
+    given = [t.position_rad for t in trials]
+    steps = np.concatenate([np.zeros(0), *(np.abs(np.diff(p)) for p in given)])
+    steps = np.sort(steps[np.isfinite(steps) & (steps > 1e-7)])
+    different = np.unique(np.round(steps, 9))
+    if len(steps) < 3:
+        return 0.0
+    clusters = np.split(steps, np.flatnonzero(np.diff(steps) > _SAME_RAD) + 1)
+    if len(clusters) > 0.3 * len(steps) + 3:
+        return 0.0  # as good as continuous
+    least = max(2, round(0.002 * len(steps)))
+    frequent = [c for c in clusters if len(c) >= least]
+    first = float(np.median((frequent or clusters)[0]))
+    for divisor in range(1, _FIRST_MULTIPLES + 1):
+        found = _multiples_of(different, first / divisor)
+        if found:
+            return found
+    return 0.0
+
+
+def _multiples_of(steps: NDArray[np.float64], guess: float) -> float:
+    """The step near `guess` [rad] of which all but a few of `steps` are multiples; 0 if none is."""
+    reach = 4.0
+    while guess >= 0.9 * _SMALLEST_RAD:
+        # small multiples first: the error of the guess grows with the multiple
+        counts = np.round(steps / guess)
+        near = (counts > 0) & (np.abs(steps - counts * guess) < _NEAR * guess)
+        used = near & (counts <= reach)
+        if used.any():
+            guess = float(np.sum(steps[used] * counts[used]) / np.sum(counts[used] ** 2))
+        if reach > steps[-1] / guess:
+            return guess if near.mean() >= _SURE else 0.0
+        reach *= 2
+    return 0.0
+
 
 # with these, 1 of 600 synthetic recordings (30–1,000 Hz) is decided wrong, and 29 % are left open
 _NEEDED = 30  # episodes

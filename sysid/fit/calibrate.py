@@ -76,7 +76,7 @@ class CalibrationResult(JointResults[JointCalibrationResult]):
 
     def plot(self) -> Figure:
         """Command, DelayedPD and readings of the first joint; `overlay_figure` draws the others."""
-        from pupper_sysid.sysid.report.free_run_figures import overlay_figure
+        from pupper_sysid.sysid.report.figures import overlay_figure
 
         return overlay_figure(next(iter(self.values())))
 

@@ -10,10 +10,25 @@ amplitude and load.
 * Tones (`sysid.lag.tone`), named, found in the command, or the lines of a multisine: the phase
   slope of fresh rows at their measurement times, against the zero-order-held command, without the
   staircase's ripple. Intervals are from a bootstrap over periods.
-* Any other motion (`sysid.lag.time_shift`): the time shift of the held command that resembles the
+* Any other motion : the time shift of the held command that resembles the
   motion best, through an impulse response fitted to the readings.
 
-`sysid.lag.estimators` has the usual ones, for comparison.
+The usual estimators stand beside it, for comparison:
+
+* integer cross-correlation, which resolves whole loop periods only;
+* sub-sample cross-correlation, bounded to one period of the tone;
+* sine phase per trial, and the phase slope over all tones, on all rows and on fresh rows.
+
+The lag of a motion of any kind is the shift τ at which the correlation of y(t) and c(t - τ) over
+continuous time is largest; y is the joint's motion, c the command as the bus holds it. For one tone
+that is its phase delay. For any other motion it is the phase delay of the cross-spectrum S between
+command and position, averaged over frequency f with the weight f² |S(f)|: over the band that was
+excited.
+
+A staircase read at one phase of the loop correlates alike for every shift within a loop, so
+readings and commands are not correlated here. An impulse response is fitted to them
+(`sysid.lag.step_response`), and its correlation with the command's own, in continuous time, has its
+largest value at the lag. That is as uncertain as the response between two readings.
 """
 
 from __future__ import annotations
@@ -24,9 +39,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, flat
 from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.feedback.poll_lattice import (
@@ -37,9 +54,8 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     quantum,
     readings,
 )
-from pupper_sysid.sysid.lag.estimators import estimators
 from pupper_sysid.sysid.lag.multisine import line_responses
-from pupper_sysid.sysid.lag.phase_slope import lag_near, slope, tone_lags, tone_weights
+from pupper_sysid.sysid.lag.phase_slope import lag_near, responses, slope, tone_lags, tone_weights
 from pupper_sysid.sysid.lag.ripple import without_ripple
 from pupper_sysid.sysid.lag.step_response import (
     LONGEST_S,
@@ -48,7 +64,6 @@ from pupper_sysid.sysid.lag.step_response import (
     joint_stretches,
     rough_lag,
 )
-from pupper_sysid.sysid.lag.time_shift import EARLIEST_S, command_hold, row_shift, shift_draws
 from pupper_sysid.sysid.lag.tone import ToneResponse
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -98,7 +113,7 @@ class LagBudget(Result):
         The same of fresh rows at their measurement times.
     lag_s : Interval
         From the held command to the motion: the servo's lag at the gain, amplitude and load of
-        this recording. Of tones the phase delay, of other motion as in `sysid.lag.time_shift`.
+        this recording. Of tones the phase delay, of other motion as in `sysid.lag.lag_budget`.
     stale_lag_s, command_hold_s : float
         What the bus adds: `raw_lag_s - fresh_lag_s` and `fresh_lag_s - lag_s`. Stale readings add
         less to the lag of a fast tone than their mean age (`feedback.mean_age_s`). The hold is
@@ -400,3 +415,173 @@ def _at_frequency(tone: ToneResponse, lag: float) -> FrequencyLag:
         raw_gain=abs(raw),
         trial=tone.trial,
     )
+
+
+def estimators(
+    trials: Sequence[Trial], read: Sequence[Readings], tones: Sequence[ToneResponse], lag_s: float
+) -> dict[str, float]:
+    """All estimators side by side, each the mean over trials [s].
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+    read : sequence of Readings
+        Of each trial.
+    tones : sequence of ToneResponse
+        Empty if there are none.
+    lag_s : float
+        The lag budget's own, to stand beside them.
+    """
+    pairs = list(zip(trials, read, strict=True))
+    found = {
+        "integer cross-correlation, all rows": [_integer(t, None) for t in trials],
+        "integer cross-correlation, fresh rows": [_integer(t, r.rows) for t, r in pairs],
+        "sub-sample cross-correlation, all rows": [
+            row_shift(t, t.read_time_s, t.position_rad, 0.0, _longest(t)) for t in trials
+        ],
+        "sub-sample cross-correlation, fresh rows": [
+            row_shift(t, r.time_s, r.position_rad, 0.0, _longest(t)) for t, r in pairs
+        ],
+    }
+    frequency = np.array([t.frequency_hz for t in tones])
+    for pair, name in (("raw_rows", "all rows"), ("fresh_rows", "fresh rows")):
+        lags = list(tone_lags(responses(tones, pair)[0], frequency)) if tones else []
+        found[f"sine phase, {name}"] = lags
+    result = {
+        k: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for k, v in found.items()
+    }
+    if tones:
+        result["phase slope, all rows"] = slope(tones, "raw_rows").value
+        result["phase slope, fresh rows"] = slope(tones, "fresh_rows").value
+        result["hold-aware (default)"] = lag_s
+    return result
+
+
+def _longest(trial: Trial) -> float:
+    return min(LONGEST_S, 1.0 / trial.frequency_hz if trial.frequency_hz > 0 else LONGEST_S)
+
+
+def _integer(trial: Trial, rows: NDArray | None) -> float:
+    """Lag in whole loop periods at which raw correlation peaks [s]."""
+    c = trial.command_rad - trial.command_rad.mean()
+    loop = float(np.median(np.diff(trial.send_time_s)))
+    shifts = np.arange(0, max(2, min(int(_longest(trial) / loop), len(c) // 2)))
+    rows = np.flatnonzero(np.isfinite(trial.position_rad)) if rows is None else rows
+    rows = rows[rows >= shifts[-1]]
+    if len(rows) < 8:
+        return float("nan")
+    y = trial.position_rad[rows] - trial.position_rad[rows].mean()
+    return float(shifts[int(np.argmax([np.sum(y * c[rows - s]) for s in shifts]))] * loop)
+
+
+EARLIEST_S = -0.05
+"""Search range of a lag: from here to `LONGEST_S`."""
+
+_STEP_S = 0.002
+_NEAR_S = 0.2
+_MOST_ROWS = 4000
+
+_Product = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def shift_draws(response: ImpulseResponse, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draws of the lag that impulse responses and the recording's own command give [s].
+
+    Parameters
+    ----------
+    response : ImpulseResponse
+    rng : numpy.random.Generator
+        Where the mass within a bin sits.
+
+    Returns
+    -------
+    ndarray, shape (draws,)
+    """
+    edges, masses = response.edges_s, response.masses
+    gain = -1.0 if response.gain < 0 else 1.0
+    products = [s.autocorrelation(LONGEST_S + edges[-1]) for s in response.stretches]
+    everywhere = np.arange(EARLIEST_S, LONGEST_S, 2.5 * _STEP_S)
+    # of the mean: draws differ in where they begin, and medians of single bins are no response
+    whole = masses.mean(axis=0) @ _correlation(products, edges, everywhere).sum(axis=0)
+    centre = everywhere[int(np.argmax(gain * whole))]
+    shift = np.arange(max(EARLIEST_S, centre - _NEAR_S), min(LONGEST_S, centre + _NEAR_S), _STEP_S)
+    command = _correlation(products, edges, shift)
+    draws, blocks = response.weights.shape
+    mixed = (response.weights @ command.reshape(blocks, -1)).reshape(draws, *command.shape[1:])
+    lag = _peaks(gain * np.einsum("dj,djt->dt", masses, mixed), shift)
+    # the response is constant within a bin; a jump may be anywhere in it
+    share = np.sqrt(np.sum((masses * np.diff(edges)) ** 2, axis=1) / 12)
+    share /= np.maximum(np.abs(masses.sum(axis=1)), 0.1)
+    lag = lag + share * rng.standard_normal(draws)
+    # few blocks: Student's quantile instead of the normal one
+    wider = stdtrit(max(blocks - 1, 1), (1 + LEVEL) / 2) / stdtrit(1e6, (1 + LEVEL) / 2)
+    return np.median(lag) + wider * (lag - np.median(lag))
+
+
+def _correlation(
+    products: Sequence[_Product], edges: NDArray, shift_s: NDArray
+) -> NDArray[np.float64]:
+    """Correlation of the command with its mean over each bin, shape (blocks, bins, shifts)."""
+    before = shift_s - edges[:, None]
+    parts = []
+    for time, product in products:
+        step = time[1] - time[0]
+        pieces = 0.5 * step * (product[:, 1:] + product[:, :-1])
+        area = np.concatenate([np.zeros((len(product), 1)), np.cumsum(pieces, axis=1)], axis=1)
+        at = (before - time[0]) / step
+        row = np.clip(at.astype(int), 0, len(time) - 2)
+        part = np.clip(at - row, 0.0, 1.0)
+        inside = area[:, row] + part * (area[:, row + 1] - area[:, row])
+        parts.append((inside[:, :-1] - inside[:, 1:]) / np.diff(edges)[:, None])
+    return np.concatenate(parts)
+
+
+def _peaks(score: NDArray, shift: NDArray) -> NDArray[np.float64]:
+    """Position of the maximum of each row, refined by the parabola through its top."""
+    k = np.clip(np.argmax(score, axis=1), 1, len(shift) - 2)
+    row = np.arange(len(score))
+    left, top, right = score[row, k - 1], score[row, k], score[row, k + 1]
+    bend = left - 2 * top + right
+    part = 0.5 * (left - right) / np.where(bend < 0, bend, -np.inf)
+    return shift[k] + np.clip(part, -1.0, 1.0) * (shift[1] - shift[0])
+
+
+def command_hold(trials: Sequence[Trial]) -> float:
+    """By how much the held command lags the line through its rows, weighted by its motion [s].
+
+    Half a loop where the loop is even.
+    """
+    gap = np.concatenate([np.diff(t.send_time_s) for t in trials])
+    moved = np.concatenate([np.diff(t.command_rad) for t in trials]) ** 2
+    moved = moved if moved.sum() > 0 else np.ones(len(gap))
+    return float(0.5 * moved.sum() / np.sum(moved / gap))
+
+
+def row_shift(
+    trial: Trial, time_s: NDArray, position_rad: NDArray, earliest_s: float, latest_s: float
+) -> float:
+    """Shift at which readings correlate best with the line through the rows' commands [s].
+
+    Parameters
+    ----------
+    trial : Trial
+    time_s, position_rad : ndarray, shape (readings,)
+        NaN where a reading is missing.
+    earliest_s, latest_s : float
+        Search range.
+
+    Returns
+    -------
+    float
+        NaN if there are fewer than 8 readings.
+    """
+    here = np.flatnonzero(np.isfinite(position_rad))
+    if len(here) < 8:
+        return float("nan")
+    here = here[:: len(here) // _MOST_ROWS + 1]  # bounded, however long the recording
+    shift = np.arange(earliest_s, max(latest_s, earliest_s + 4 * _STEP_S), _STEP_S)
+    past = np.interp(time_s[here, None] - shift, trial.send_time_s, trial.command_rad)
+    past -= past.mean(axis=0)
+    y = position_rad[here] - position_rad[here].mean()
+    scale = np.sqrt(np.maximum(np.sum(past**2, axis=0), 1e-18))
+    return float(_peaks((y @ past / scale)[None], shift)[0])

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
-from pupper_sysid.sysid.feedback.quantisation import quantum
+from pupper_sysid.sysid.feedback.staleness import quantum
 from pupper_sysid.sysid.lag.held_command import HeldCommand, Stretch, Sums
 from pupper_sysid.sysid.recordings.recording import Trial
 

@@ -1,12 +1,15 @@
 """The report's figures: each function takes results and returns a matplotlib `Figure`.
 
-They only draw: curves come from `sysid.report.figure_data`, the style from `common.figure_style`.
-Curves differ from each other in more than colour.
+Curves differ from each other in more than colour (`common.figure_style`); what can be hidden on a
+page has a `gid`. `tracks` is the free run of a fitted model beside commands and readings;
+`hold_runs` counts for how many rows readings stay the same, beside the prediction of the poll
+lattice.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,6 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
+from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from pupper_sysid.common.figure_style import (
     BLUE,
@@ -29,15 +34,15 @@ from pupper_sysid.common.figure_style import (
     axes_grid,
     styled,
 )
-from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
+from pupper_sysid.common.interval import LEVEL
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
+from pupper_sysid.sysid.fit.results import JointCalibrationResult
+from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
+from pupper_sysid.sysid.fit.structure import candidate
+from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Trial
-from pupper_sysid.sysid.report.figure_data import (
-    LONGEST_RUN,
-    HoldRuns,
-    response_errors,
-    within,
-)
 
 
 @styled
@@ -122,7 +127,7 @@ def hold_histogram_figure(found: Mapping[str, HoldRuns]) -> Figure:
     Parameters
     ----------
     found : dict of joint to HoldRuns
-        From `sysid.report.figure_data.hold_runs`.
+        From `sysid.report.figures.hold_runs`.
     """
     columns = 1 if len(found) <= _SINGLE else 3
     figure, grid = axes_grid(len(found), columns, 1.6)
@@ -240,3 +245,334 @@ def sweep_figure(trials: Sequence[Trial], periods: float = 3.0) -> Figure:
     panels[0].legend(fontsize=7.5, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     panels[-1].set_xlabel("time [s]")
     return figure
+
+
+LONGEST_RUN = 12
+"""Hold runs of this many rows and more share the last bar."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """One trial: command, model and readings; angles from rest [rad], times [s].
+
+    Attributes
+    ----------
+    frequency_hz : float
+        NaN if the trial is no tone.
+    time_s, command_rad, model_rad : ndarray, shape (steps,)
+        On the physics clock, from the trial's start.
+    fresh_time_s, fresh_rad : ndarray, shape (fresh,)
+        Fresh readings at the time they were measured.
+    row_time_s, row_rad : ndarray, shape (rows,)
+        Every reading at the time of its row; NaN where missing.
+    fresh_error_rad, row_error_rad : ndarray
+        Reading minus model at those times.
+    fresh_speed_rad_s, row_speed_rad_s : ndarray
+        Speed of the model at those times.
+    """
+
+    frequency_hz: float
+    time_s: NDArray[np.float64]
+    command_rad: NDArray[np.float64]
+    model_rad: NDArray[np.float64]
+    fresh_time_s: NDArray[np.float64]
+    fresh_rad: NDArray[np.float64]
+    row_time_s: NDArray[np.float64]
+    row_rad: NDArray[np.float64]
+    fresh_error_rad: NDArray[np.float64]
+    row_error_rad: NDArray[np.float64]
+    fresh_speed_rad_s: NDArray[np.float64]
+    row_speed_rad_s: NDArray[np.float64]
+
+
+def tracks(result: JointCalibrationResult, model: str | None = None) -> list[Track]:
+    """Free run of a fitted model on every trial of its joint.
+
+    Parameters
+    ----------
+    result : JointCalibrationResult
+    model : str, optional
+        Name of a candidate model; by default the one that simulators run.
+    """
+    if not result.runs:
+        return []
+    model = model or result.simulated_model
+    fitted = candidate(model)
+    values = np.array([result.candidate_models[model].values[name] for name in fitted.names])
+    simulated = free_run(fitted, values, result.runs)
+    return [_track(*pair) for pair in zip(result.runs, simulated, strict=True)]
+
+
+def _track(run: Run, simulated: NDArray) -> Track:
+    steps, rest = run.steps, run.rest_rad
+    # over a few steps: dry friction makes the speed of a single one jump
+    smooth = np.convolve(np.pad(simulated, 2, mode="edge"), np.ones(5) / 5, mode="valid")
+    speed = np.gradient(smooth, TIME_STEP_S)
+    return Track(
+        run.frequency_hz,
+        np.arange(steps) * np.float64(TIME_STEP_S), run.command - rest, simulated[:steps] - rest,
+        TIME_STEP_S * run.sample_step, run.sample_rad - rest,
+        TIME_STEP_S * run.row_step, run.row_rad - rest,
+        run.sample_rad - at_steps(simulated, run.sample_step),
+        run.row_rad - at_steps(simulated, run.row_step),
+        at_steps(speed, run.sample_step), at_steps(speed, run.row_step),
+    )  # fmt: skip
+
+
+def window(track: Track, periods: float = 2.5, longest_s: float = 3.0) -> tuple[float, float]:
+    """Start and end of the stretch of `track` to show [s]: steady tone, or largest motion."""
+    end = float(track.time_s[-1])
+    if track.frequency_hz > 0:
+        length = min(periods / track.frequency_hz, end)
+        start = min(0.5 * end, end - length)
+        return start, start + length
+    if end <= longest_s:
+        return 0.0, end
+    travel = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(track.command_rad)))])
+    width = int(longest_s / TIME_STEP_S)
+    start = float(track.time_s[int(np.argmax(travel[width:] - travel[:-width]))])
+    return start, start + longest_s
+
+
+def within(time: NDArray, start: float, stop: float) -> NDArray[np.bool_]:
+    """Which times lie within a stretch, its ends included."""
+    return (time >= start) & (time <= stop)
+
+
+def some_tracks(found: list[Track], count: int = 4) -> list[Track]:
+    """At most `count` tracks, spread over their frequencies, slowest first."""
+    order = sorted(found, key=lambda t: t.frequency_hz if t.frequency_hz > 0 else 0.0)
+    seen: dict[float, Track] = {}
+    for n, track in enumerate(order):
+        seen.setdefault(
+            round(track.frequency_hz, 2) if track.frequency_hz > 0 else -float(n), track
+        )
+    order = list(seen.values())
+    index = np.unique(np.round(np.linspace(0, len(order) - 1, min(count, len(order)))).astype(int))
+    return [order[i] for i in index]
+
+
+def response_errors(response: FrequencyResponse) -> tuple[NDArray, NDArray]:
+    """Half of the 90 % intervals of gain [dB] and phase [degrees], shape (tones,) each."""
+    along = response.response / np.abs(response.response)
+    sd = []
+    for direction in (along, 1j * along):
+        u = np.stack([direction.real, direction.imag], axis=-1)
+        sd.append(np.sqrt(np.einsum("ni,nij,nj->n", u, response.covariance, u)))
+    relative = ndtri((1 + LEVEL) / 2) * np.array(sd) / np.abs(response.response)
+    return 20 / np.log(10) * relative[0], np.degrees(relative[1])
+
+
+@dataclass(frozen=True)
+class HoldRuns:
+    """For how many rows a reading stays the same.
+
+    Attributes
+    ----------
+    lattice : PollLattice
+    count : ndarray of int, shape (LONGEST_RUN,)
+        Runs of 1, 2, … rows; the last holds all longer ones.
+    expected : ndarray, shape (LONGEST_RUN,), or None
+        Predicted by the poll period and the share of lost polls; None without a lattice.
+    """
+
+    lattice: PollLattice
+    count: NDArray[np.int64]
+    expected: NDArray[np.float64] | None
+
+
+def hold_runs(
+    histograms: Sequence[tuple[int, ...]], loop_periods_s: Sequence[float], lattice: PollLattice
+) -> HoldRuns:
+    """Hold runs of one joint, counted by the doctor and predicted by its poll lattice.
+
+    Parameters
+    ----------
+    histograms : sequence of tuple of int
+        Runs of 1, 2, … rows in each recording; they are added.
+    loop_periods_s : sequence of float
+        Of each recording.
+    lattice : PollLattice
+    """
+    count = np.zeros(LONGEST_RUN, dtype=np.int64)
+    for histogram in histograms:
+        length = np.clip(np.arange(len(histogram)), 0, LONGEST_RUN - 1)
+        np.add.at(count, length, np.array(histogram, dtype=np.int64))
+    if lattice.kind != "lattice" or not count.any() or not np.isfinite(lattice.loss):
+        return HoldRuns(lattice, count, None)
+    rows = lattice.poll_period_s / float(np.median(loop_periods_s))
+    return HoldRuns(lattice, count, count.sum() * _expected(rows, lattice.loss))
+
+
+def _expected(period_rows: float, loss: float) -> NDArray[np.float64]:
+    """Share of runs of 1, 2, … rows when each poll, `period_rows` apart, fails with `loss`.
+
+    Between two good polls lie k periods with probability (1 - loss) loss^(k-1). A gap of x rows,
+    at a random phase of the loop, is seen as floor(x) or ceil(x) rows, on average as x.
+    """
+    share = np.zeros(LONGEST_RUN + 1)
+    k = np.arange(1, 200)
+    weight = (1 - loss) * loss ** (k - 1)
+    gap = k * period_rows
+    for rows, chance in ((np.floor(gap), 1 - gap % 1), (np.floor(gap) + 1, gap % 1)):
+        np.add.at(share, np.clip(rows, 0, LONGEST_RUN).astype(int), weight * chance)
+    return share[1:] / max(share[1:].sum(), 1e-12)  # several polls within a row leave one run
+
+
+@styled
+def overlay_figure(
+    result: JointCalibrationResult, found: list[Track] | None = None, panels: int = 4
+) -> Figure:
+    """Command, model and readings, the fresh ones at the time they were measured.
+
+    Parameters
+    ----------
+    result : JointCalibrationResult
+    found : list of Track, optional
+        From `sysid.report.figures.tracks`, if they have been computed.
+    panels : int
+        At most so many frequencies.
+    """
+    shown = some_tracks(tracks(result) if found is None else found, panels)
+    figure, grid = axes_column(len(shown), 1.2 + 1.75 * len(shown))
+    for axes, track in zip(grid, shown, strict=True):
+        _overlay(axes, track, result.joint, 1.0)
+        axes.set_ylabel("from rest [rad]")
+    grid[-1].set_xlabel("time in the trial [s]")
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    return figure
+
+
+@styled
+def overlay_grid(found: Mapping[str, list[Track]]) -> Figure:
+    """The same of every joint beside the others, one frequency each.
+
+    Parameters
+    ----------
+    found : dict of joint to list of Track
+        From `sysid.report.figures.tracks`; none of them empty.
+    """
+    figure, grid = axes_grid(len(found), 3, 1.75)
+    for n, (axes, (joint, own)) in enumerate(zip(grid, found.items(), strict=True)):
+        spread = some_tracks(own, 3)
+        _overlay(axes, spread[len(spread) // 2], joint, 0.7)
+        if n % 3 == 0:
+            axes.set_ylabel("from rest [rad]")
+        if n >= len(grid) - 3:
+            axes.set_xlabel("time in the trial [s]")
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure
+
+
+def _overlay(axes: Axes, track: Track, joint: str, size: float) -> None:
+    """One trial; marks and lines are `size` times as large as usual."""
+    start, stop = window(track)
+    fine, row = within(track.time_s, start, stop), within(track.row_time_s, start, stop)
+    fresh = within(track.fresh_time_s, start, stop)
+    axes.plot(
+        track.time_s[fine], track.command_rad[fine], color=INK, lw=1, ls=(0, (4, 2)),
+        label="command (zero-order hold)", gid="part:command",
+    )  # fmt: skip
+    axes.plot(
+        track.row_time_s[row], track.row_rad[row], color=FAINT, lw=0.9, marker=".", ms=3.5 * size,
+        drawstyle="steps-post", label="raw readings", gid="part:raw",
+    )  # fmt: skip
+    axes.plot(
+        track.time_s[fine], track.model_rad[fine], color=BLUE, lw=2 * size, label="DelayedPD",
+        gid="part:model",
+    )  # fmt: skip
+    axes.plot(
+        track.fresh_time_s[fresh], track.fresh_rad[fresh], "o", color=RED, ms=5 * size,
+        mec="white", mew=0.6 * size, label="fresh readings, when measured", gid="part:fresh",
+    )  # fmt: skip
+    axes.set_title(_trial_name(track, joint))
+    axes.set_xlim(start, stop)
+
+
+OVERLAY_PARTS = {
+    "command": "command", "raw": "raw readings", "model": "model", "fresh": "fresh readings"
+}  # fmt: skip
+"""Parts of an overlay by the end of their `gid`, and what they are called."""
+
+
+@styled
+def residual_figure(result: JointCalibrationResult, found: list[Track] | None = None) -> Figure:
+    """Residuals of the model: over speed, fresh and raw; and over time.
+
+    Parameters
+    ----------
+    result : JointCalibrationResult
+    found : list of Track, optional
+        From `sysid.report.figures.tracks`, if they have been computed.
+    """
+    found = tracks(result) if found is None else found
+    figure, (over_speed, over_time) = axes_column(2, 6.0)
+    lattice = result.lag.feedback
+    age = 1e3 * (lattice.mean_age_s if np.isfinite(lattice.mean_age_s) else result.lag.stale_lag_s)
+    rows = f"all rows at their own time (dashed: speed × {age:.0f} ms)"
+    _residuals_over_speed(over_speed, found, 1.0, rows)
+    fastest = np.max([np.max(np.abs(t.row_speed_rad_s), initial=0.0) for t in found], initial=0.0)
+    reach = np.array([-1.0, 1.0]) * fastest
+    over_speed.plot(reach, -age * reach, color=INK, lw=1.2, ls=(0, (4, 2)))
+    over_speed.set_xlabel("speed of the model [rad/s]")
+    over_speed.set_ylabel("reading − model [mrad]")
+    start = 0.0
+    for n, track in enumerate(found):
+        over_time.plot(
+            start + track.fresh_time_s, 1e3 * track.fresh_error_rad, ".", color=RED, ms=4
+        )
+        if track.frequency_hz > 0 and len(found) <= 12:
+            over_time.text(
+                start + 0.5 * track.time_s[-1], 0.97, f"{track.frequency_hz:.3g} Hz",
+                transform=over_time.get_xaxis_transform(), ha="center", va="top",
+                fontsize=9,
+            )  # fmt: skip
+        start += float(track.time_s[-1])
+        if n < len(found) - 1:
+            over_time.axvline(start, color=FAINT, lw=0.8)
+    over_time.axhline(0, color=INK, lw=0.8)
+    over_time.margins(x=0.01, y=0.2)
+    over_time.set_xlabel("time, trials end to end [s]")
+    over_time.set_ylabel("fresh − model [mrad]")
+    figure.legend(*over_speed.get_legend_handles_labels(), loc="outside upper left", ncols=1)
+    return figure
+
+
+@styled
+def residual_grid(found: Mapping[str, list[Track]]) -> Figure:
+    """Fresh and raw residuals over speed, of every joint beside the others.
+
+    Parameters
+    ----------
+    found : dict of joint to list of Track
+        From `sysid.report.figures.tracks`.
+    """
+    figure, grid = axes_grid(len(found), 3, 1.75)
+    for n, (axes, (joint, own)) in enumerate(zip(grid, found.items(), strict=True)):
+        _residuals_over_speed(axes, own, 0.7, "all rows at their own time")
+        axes.set_title(joint)
+        if n % 3 == 0:
+            axes.set_ylabel("reading − model [mrad]")
+        if n >= len(grid) - 3:
+            axes.set_xlabel("speed of the model [rad/s]")
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    return figure
+
+
+def _residuals_over_speed(axes: Axes, found: list[Track], size: float, rows: str) -> None:
+    def gathered(name: str) -> NDArray:
+        return np.concatenate([getattr(t, name) for t in found])
+
+    axes.plot(
+        gathered("row_speed_rad_s"), 1e3 * gathered("row_error_rad"), ".", color=FAINT,
+        ms=3 * size, label=rows, rasterized=True, gid="part:raw",
+    )  # fmt: skip
+    axes.plot(
+        gathered("fresh_speed_rad_s"), 1e3 * gathered("fresh_error_rad"), "o", color=RED,
+        ms=3.5 * size, mec="white", mew=0.3, label="fresh rows when they were measured",
+        rasterized=True, gid="part:fresh",
+    )  # fmt: skip
+
+
+def _trial_name(track: Track, joint: str) -> str:
+    return f"{joint}, {track.frequency_hz:.3g} Hz" if track.frequency_hz > 0 else joint

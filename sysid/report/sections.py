@@ -13,15 +13,15 @@ from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.fit.structure import PREFERRED
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.report import figures, free_run_figures, tables
+from pupper_sysid.sysid.report import figures, tables
 from pupper_sysid.sysid.report.advice import advice
-from pupper_sysid.sysid.report.figure_data import Track, hold_runs, tracks
+from pupper_sysid.sysid.report.figures import Track, hold_runs, tracks
 from pupper_sysid.sysid.report.tables import MODEL_NAMES
 
 if TYPE_CHECKING:  # they bring libraries that a page does not need
     from pupper_sysid.sysid.compare.comparison import Comparison
     from pupper_sysid.sysid.doctor.examination import Examination
-    from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
+    from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,12 +144,12 @@ def _free_runs(
         pictures = [_overlay(results[joint], own), _residuals(results[joint], own)]
     elif runs:
         pictures = [
-            Picture("overlay", _OVERLAY, free_run_figures.overlay_grid(runs), wide=True),
-            Picture("residuals", _RESIDUALS, free_run_figures.residual_grid(runs), wide=True),
+            Picture("overlay", _OVERLAY, figures.overlay_grid(runs), wide=True),
+            Picture("residuals", _RESIDUALS, figures.residual_grid(runs), wide=True),
         ]
     return Section(
         "overlays", "Command, model, readings", text=[text] if pictures else [],
-        toggles=free_run_figures.OVERLAY_PARTS if pictures else {}, figures=pictures,
+        toggles=figures.OVERLAY_PARTS if pictures else {}, figures=pictures,
     )  # fmt: skip
 
 
@@ -164,13 +164,13 @@ _RESIDUALS = (
 
 
 def _overlay(result: JointCalibrationResult, runs: list[Track]) -> Picture:
-    drawn = free_run_figures.overlay_figure(result, runs)
+    drawn = figures.overlay_figure(result, runs)
     return Picture(f"overlay_{result.joint}", f"{result.joint}: {_OVERLAY}", drawn)
 
 
 def _residuals(result: JointCalibrationResult, runs: list[Track]) -> Picture:
     words = f"{result.joint}, above: {_RESIDUALS} Below, the residuals of fresh rows."
-    drawn = free_run_figures.residual_figure(result, runs)
+    drawn = figures.residual_figure(result, runs)
     return Picture(f"residuals_{result.joint}", words, drawn)
 
 

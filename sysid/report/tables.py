@@ -18,7 +18,7 @@ from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
-from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
+from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
 
 MODEL_NAMES = {
     "pure_delay": "pure delay",

@@ -15,9 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
-from pupper_sysid.sysid.servo_fit.linear import RIDGES, LinearFits, fading, fit_linear, taps
 from pupper_sysid.sysid.servo_fit.training import LSTM, MLP, Checkpoint, train
-from pupper_sysid.sysid.servo_fit.windows import Samples, training_sets
+from pupper_sysid.sysid.servo_fit.windows import (
+    RIDGES,
+    LinearFits,
+    Samples,
+    fading,
+    fit_linear,
+    taps,
+    training_sets,
+)
 
 Learned = CommandNetwork | RecurrentNetwork
 _LSTM_MEMORY_S = 1.5

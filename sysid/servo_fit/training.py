@@ -1,6 +1,6 @@
 """Train the networks of all joints, all held-out folds and all candidates in one computation.
 
-Every network corrects a linear filter (`sysid.servo_fit.linear`) fitted to the same readings, and
+Every network corrects a linear filter (`sysid.servo_fit.windows`) fitted to the same readings, and
 is scored at the readings' own times in free run. Its inputs are commands only, so its one-step and
 free-run errors are equal. Candidates differ in weight decay and in the length of training; the
 choice is made by held-out groups.
@@ -16,10 +16,9 @@ import torch
 from numpy.typing import NDArray
 
 from pupper_sysid.common.processes.workers import keep_freed_memory
-from pupper_sysid.sysid.servo_fit.linear import LinearFits, fading, learns_from
 from pupper_sysid.sysid.servo_fit.lstm_kernel import Lstm
 from pupper_sysid.sysid.servo_fit.mlp_kernel import Mlp
-from pupper_sysid.sysid.servo_fit.windows import WINDOW, Samples
+from pupper_sysid.sysid.servo_fit.windows import WINDOW, LinearFits, Samples, fading, learns_from
 
 _BEND = 3.0  # robust standard deviations beyond which a reading pulls with constant force
 _ROWS_PER_STEP = 4096

@@ -23,13 +23,16 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.dialect import decimal
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
 from pupper_sysid.sysid.sweep.excitation import (
+    FASTEST_OF_MINIMUM_JERK,
     LEAD_IN_S,
     Plan,
     TrialPlan,
+    after,
     check_amplitude,
+    lift,
     plan,
+    strokes,
 )
-from pupper_sysid.sysid.sweep.waveforms import FASTEST_OF_MINIMUM_JERK, after, lift, strokes
 
 BENCH, DROP, REVERSAL = "bench", "drop", "reversal"
 BENCH_KINDS = (BENCH, DROP, REVERSAL)

@@ -14,14 +14,14 @@ from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
 from pupper_sysid.sysid.fit.structure import candidate
 from pupper_sysid.sysid.plan.candidates import Setup, recorded
-from pupper_sysid.sysid.plan.information import (
+from pupper_sysid.sysid.plan.planner import (
     Hypothesis,
     Noise,
+    Servo,
     pooled,
     prior_information,
     respond,
 )
-from pupper_sysid.sysid.plan.planner import Servo
 from pupper_sysid.sysid.recordings.importers.times import READ_AFTER_SEND_S
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.sweep.excitation import plan

@@ -11,8 +11,7 @@ from pupper_sysid.sim.emulator.pendulum import PendulumServo, PendulumServoParam
 from pupper_sysid.sim.emulator.pendulum_bench import BenchSpec, Pendulum, draw_bench
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.sweep.bench import STROKE_RAD, STROKE_SPEEDS_RAD_S, STROKES
-from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S
-from pupper_sysid.sysid.sweep.waveforms import after, strokes
+from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, after, strokes
 
 PERIOD_S = 0.02
 

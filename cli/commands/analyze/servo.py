@@ -34,7 +34,7 @@ class Servo(Analysis):
         """Fit and compare the models."""
         import numpy as np
 
-        from pupper_sysid.sysid.compare.four_way import four_way
+        from pupper_sysid.sysid.compare.comparison import four_way
 
         need_positive("--seconds", self.seconds)
         if len(self.policies) != 1:

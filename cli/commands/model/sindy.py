@@ -13,7 +13,7 @@ from rich.text import Text
 from pupper_sysid.cli import terminal
 
 if TYPE_CHECKING:
-    from pupper_sysid.sysid.sparse.equations import Equations
+    from pupper_sysid.sysid.sparse import Equations
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Sindy:
 
     def run(self) -> None:
         """Find the equations and print them."""
-        from pupper_sysid.sysid.sparse.equations import sparse_equations
+        from pupper_sysid.sysid.sparse import sparse_equations
 
         started = time.perf_counter()
         recordings = terminal.load_all(self.recordings)

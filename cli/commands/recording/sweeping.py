@@ -89,7 +89,7 @@ def plan_of(request: dict[str, Any], bus: ServoBus) -> Plan:
     """The plan that a request describes, within the limits of the bus."""
     joints = request["joints"]
     if request["playback"]:
-        from pupper_sysid.sysid.sweep.playback import playback
+        from pupper_sysid.sysid.sweep.resume import playback
 
         chosen = playback(Path(request["playback"]), joints)
         return replace(chosen, trials=chosen.trials * request.get("loops", 1))

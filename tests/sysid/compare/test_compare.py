@@ -9,10 +9,9 @@ import pytest
 
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
-from pupper_sysid.sysid.compare import four_way as four_way_module
+from pupper_sysid.sysid.compare import comparison as four_way_module
 from pupper_sysid.sysid.compare.compare import LINEAR, compare
-from pupper_sysid.sysid.compare.comparison import Comparison
-from pupper_sysid.sysid.compare.four_way import calibrated_run
+from pupper_sysid.sysid.compare.comparison import Comparison, calibrated_run
 from pupper_sysid.sysid.fit.predict import ReadingRule, ages
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording

@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from pupper_sysid.sysid.doctor.servo_setup import register_findings, setup_findings
+from pupper_sysid.sysid.doctor.checks import register_findings, setup_findings
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
 

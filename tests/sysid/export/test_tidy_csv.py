@@ -15,7 +15,7 @@ from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.calibration.parts import Scores
 from pupper_sysid.servo_models.calibration.quantity import Quantity
-from pupper_sysid.sysid.export.tidy_csv import CALIBRATION_COLUMNS, to_csv
+from pupper_sysid.sysid.export.servo_card import CALIBRATION_COLUMNS, to_csv
 from pupper_sysid.sysid.recordings.files import load
 
 QUANTITIES_PER_JOINT = 9 + 5 + 5

@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 from scipy.stats import beta
 
-from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice, redate
+from pupper_sysid.sysid.feedback.poll_lattice import (
+    PollLattice,
+    common_period,
+    find_poll_lattice,
+    redate,
+)
 from pupper_sysid.sysid.feedback.poll_loss import count_loss, fast
-from pupper_sysid.sysid.feedback.poll_period import common_period
 from pupper_sysid.sysid.feedback.poll_search import Phase, Stretch
 from pupper_sysid.sysid.recordings.recording import Trial
 from support.synthetic import tone_trials

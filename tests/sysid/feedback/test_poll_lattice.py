@@ -8,14 +8,13 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from pupper_sysid.sysid.feedback.poll_kernel import log_likelihood, most_hits
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     find_poll_lattice,
     fresh_rows,
     readings,
 )
-from pupper_sysid.sysid.feedback.poll_search import Phase
+from pupper_sysid.sysid.feedback.poll_search import Phase, log_likelihood, most_hits
 from pupper_sysid.sysid.recordings.recording import Trial
 from support.synthetic import LOOP_S, tone_trials
 

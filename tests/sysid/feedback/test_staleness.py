@@ -10,8 +10,7 @@ import pytest
 
 from pupper_sysid.sysid.doctor.examination import examine
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
-from pupper_sysid.sysid.feedback.quantisation import quantum
-from pupper_sysid.sysid.feedback.staleness import episodes, staleness
+from pupper_sysid.sysid.feedback.staleness import episodes, quantum, staleness
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 from support.real_recordings import real_recording

@@ -23,9 +23,9 @@ from pupper_sysid.sysid.fit.scores import Scores
 from pupper_sysid.sysid.fit.structure import SIMULATED, candidate
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.plan.candidates import Setup
-from pupper_sysid.sysid.plan.servos import feedback_setup
+from pupper_sysid.sysid.plan.proposal import feedback_setup
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.report.figure_data import hold_runs
+from pupper_sysid.sysid.report.figures import hold_runs
 from support import made_recordings
 
 PERIOD_S, LOSS, QUANTUM_RAD = 0.02685, 0.42, 0.0057

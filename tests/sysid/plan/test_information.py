@@ -8,7 +8,7 @@ import pytest
 from pupper_sysid.sysid.fit.posterior import PHASE_SD_S
 from pupper_sysid.sysid.fit.run import at_steps, free_run
 from pupper_sysid.sysid.fit.structure import candidate
-from pupper_sysid.sysid.plan.information import (
+from pupper_sysid.sysid.plan.planner import (
     Hypothesis,
     Noise,
     fitted_noise,

@@ -7,8 +7,14 @@ import pytest
 
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.sysid.plan.candidates import Setup, candidates, recorded, trial_seconds
-from pupper_sysid.sysid.plan.information import Noise
-from pupper_sysid.sysid.plan.planner import CLEAR_NATS, LEAST_HALF_WIDTH_S, Servo, now, propose
+from pupper_sysid.sysid.plan.planner import (
+    CLEAR_NATS,
+    LEAST_HALF_WIDTH_S,
+    Noise,
+    Servo,
+    now,
+    propose,
+)
 from pupper_sysid.sysid.sweep.excitation import plan
 from support.planned_servos import NOISE, recorded_servo, tones
 

@@ -9,11 +9,13 @@ from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.sysid.plan.candidates import Setup
 from pupper_sysid.sysid.plan.planner import now, propose
-from pupper_sysid.sysid.plan.proposal import Source, plan_first_sweep, plan_from_calibration
-from pupper_sysid.sysid.plan.servos import (
+from pupper_sysid.sysid.plan.proposal import (
+    Source,
     calibrated_servo,
     feedback_setup,
     fitted_servo,
+    plan_first_sweep,
+    plan_from_calibration,
     unknown_servos,
 )
 from support.package import ROOT

@@ -19,8 +19,8 @@ from pupper_sysid.sysid.fit.dead_time import lag
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report import report
-from pupper_sysid.sysid.report.figure_data import tracks
-from pupper_sysid.sysid.report.recall import can_recall, recall
+from pupper_sysid.sysid.report.figures import tracks
+from pupper_sysid.sysid.report.report import can_recall, recall
 from pupper_sysid.sysid.sweep.excitation import plan
 from pupper_sysid.sysid.sweep.recorder import record
 

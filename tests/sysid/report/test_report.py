@@ -27,13 +27,12 @@ from pupper_sysid.sysid.fit.results import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
 from pupper_sysid.sysid.fit.scores import Scores
 from pupper_sysid.sysid.fit.structure import CANDIDATES, candidate
-from pupper_sysid.sysid.lag.joint_response import FrequencyResponse
+from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse, TransferFunction
 from pupper_sysid.sysid.lag.lag_budget import FrequencyLag, LagBudget
-from pupper_sysid.sysid.lag.transfer_function import TransferFunction
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.report import figures, free_run_figures, tables
+from pupper_sysid.sysid.report import figures, tables
 from pupper_sysid.sysid.report.advice import advice
-from pupper_sysid.sysid.report.figure_data import (
+from pupper_sysid.sysid.report.figures import (
     LONGEST_RUN,
     hold_runs,
     response_errors,
@@ -216,8 +215,8 @@ def test_ids_occur_once_and_every_reference_and_section_has_its_id(page, written
 def test_drawings_follow_the_colours_of_the_page_can_be_hidden_and_are_described(page, written):
     shown = {a["class"] for tag, a in page.tags if tag == "g" and "class" in a}
     boxes = {a["id"] for tag, a in page.tags if tag == "input"}
-    assert boxes == {f"show-{part}" for part in free_run_figures.OVERLAY_PARTS}
-    assert shown == {f"part-{part}" for part in free_run_figures.OVERLAY_PARTS}
+    assert boxes == {f"show-{part}" for part in figures.OVERLAY_PARTS}
+    assert shown == {f"part-{part}" for part in figures.OVERLAY_PARTS}
     html = written.path.read_text(encoding="utf-8")
     body = html[html.index("<main>") :]
     assert "var(--drawing-blue" in body and "var(--ink" in body
@@ -378,9 +377,9 @@ def test_predicted_hold_runs_follow_from_poll_and_loss():
 def test_letters_in_figures_are_nine_points_or_more():
     drawn = [
         figures.lag_budget_figure({"LF_thigh": result_of().lag}),
-        free_run_figures.overlay_figure(result_of()),
+        figures.overlay_figure(result_of()),
         figures.hold_histogram_figure({"LF_thigh": hold_runs([(50, 50)], [LOOP_S], LATTICE)}),
-        free_run_figures.residual_figure(result_of()),
+        figures.residual_figure(result_of()),
     ]
     for figure in drawn:
         sizes = [t.get_fontsize() for t in figure.findobj(Text) if t.get_text()]

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from pupper_sysid.sysid.servo_fit.data import ServoData, look_up, servo_data
-from pupper_sysid.sysid.servo_fit.linear import fit_linear, learns_from, taps
 from pupper_sysid.sysid.servo_fit.windows import (
     WINDOW,
     chosen,
+    fit_linear,
     grouped,
+    learns_from,
     merged_groups,
     samples,
+    taps,
     training_sets,
 )
 from support.refusals import assert_each_refused

@@ -14,11 +14,10 @@ from pupper_sysid.servo_models.interface import AtControlRate, substeps
 from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
 from pupper_sysid.sysid.servo_fit import networks as network_fit
 from pupper_sysid.sysid.servo_fit.data import ServoData, look_up, servo_data
-from pupper_sysid.sysid.servo_fit.linear import fit_linear
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
 from pupper_sysid.sysid.servo_fit.scores import tracks
 from pupper_sysid.sysid.servo_fit.training import Checkpoint, Recipe, train
-from pupper_sysid.sysid.servo_fit.windows import Samples, samples, training_sets
+from pupper_sysid.sysid.servo_fit.windows import Samples, fit_linear, samples, training_sets
 from support.refusals import assert_each_refused
 from support.servo_recordings import everything, recording, trial
 

@@ -20,9 +20,8 @@ from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
 from pupper_sysid.sysid.sweep import recorder
 from pupper_sysid.sysid.sweep.bench import LIFT_RAD, LIFT_RAD_S, bench_plan, parse_gains, parse_load
-from pupper_sysid.sysid.sweep.excitation import Plan
+from pupper_sysid.sysid.sweep.excitation import Plan, prbs, strokes
 from pupper_sysid.sysid.sweep.recorder import record
-from pupper_sysid.sysid.sweep.waveforms import prbs, strokes
 from support.refusals import assert_each_refused
 
 PERIOD = 0.01

@@ -21,8 +21,8 @@ from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, Plan, plan
-from pupper_sysid.sysid.sweep.playback import playback
 from pupper_sysid.sysid.sweep.recorder import REST_S, record
+from pupper_sysid.sysid.sweep.resume import playback
 
 PERIOD = 0.019
 
