@@ -110,11 +110,6 @@ def read_yaml(path: Path) -> tuple[Any, dict[Place, int]]:
     data : dict, list, str, int, float, bool or None
     lines : dict
         The line (from 1) of every place in the file.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is not YAML, or uses what is refused.
     """
     return load(read_text(path), str(path))
 
@@ -179,11 +174,6 @@ def refuse_other_version(path: Path | str, found: Any, known: int, oldest: int =
         `schema_version` as the file gives it.
     known, oldest : int
         The newest and the oldest version that are read.
-
-    Raises
-    ------
-    InputError
-        With the advice to upgrade if the file is newer.
     """
     if type(found) is int and found > known:
         raise InputError(

@@ -239,11 +239,6 @@ def counts_of(model: str | int) -> float | None:
 def stall_torque(model: str | int, supply_v: float | None = None) -> tuple[float, str]:
     """Stall torque [N·m] of a servo model at a supply voltage, and its source in words.
 
-    Raises
-    ------
-    InputError
-        If no data sheet of that model is known.
-
     Examples
     --------
     >>> torque, source = stall_torque("STS3215", 12.0)

@@ -146,26 +146,14 @@ def _variable(colour: str) -> str:
 
 
 def refuse_picture(path: Path, force: bool = False) -> None:
-    """Refuse a path to which no picture can be written.
-
-    Raises
-    ------
-    InputError
-        If `path` is neither PNG nor SVG, or exists and `force` is not given.
-    """
+    """Refuse a path to which no picture can be written."""
     if path.suffix.lower() not in (".png", ".svg"):
         raise InputError(f"{path}: pictures are written as .png or .svg; choose one of them.")
     refuse_overwrite(path, force)
 
 
 def save(figure: Figure, path: Path, force: bool = False) -> None:
-    """Write `figure` to `path`, as PNG or SVG by its ending.
-
-    Raises
-    ------
-    InputError
-        As `refuse_picture`, or if it cannot be written.
-    """
+    """Write `figure` to `path`, as PNG or SVG by its ending."""
     refuse_picture(path, force)
     draw = svg if path.suffix.lower() == ".svg" else png
     write_bytes(path, draw(figure), force)

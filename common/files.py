@@ -40,11 +40,6 @@ def refuse_overwrite(path: Path, force: bool = False) -> None:
     """Raise unless `path` is free, or a file and `force` was given; then hold it (`hold_output`).
 
     Devices, pipes and sockets are never replaced.
-
-    Raises
-    ------
-    InputError
-        Also if another program writes it at present.
     """
     _refuse_existing(path, force)
     hold_output(path)
@@ -75,11 +70,6 @@ def refuse_path(name: str, option: str) -> None:
     name : str
     option : str
         The option that gave it, for the message.
-
-    Raises
-    ------
-    InputError
-        If it is empty, too long, starts with a point, or has a separator or control character.
     """
     if not name.strip() or name[0] == "." or set(name) & set("/\\") or not name.isprintable():
         raise InputError(
@@ -155,11 +145,6 @@ class SyncedText:
         Go on writing an existing file from this byte on instead; what follows it is cut off.
     advice : str
         What to do when it can no longer be written, for the error's sentence.
-
-    Raises
-    ------
-    InputError
-        If the file exists, or cannot be written.
     """
 
     def __init__(
@@ -258,13 +243,7 @@ def holding_outputs() -> Iterator[None]:
 
 
 def hold_output(path: Path) -> None:
-    """Hold a file or folder against other programs; does nothing outside `holding_outputs`.
-
-    Raises
-    ------
-    InputError
-        If another process holds it, or its folder cannot be written.
-    """
+    """Hold a file or folder against other programs; does nothing outside `holding_outputs`."""
     locks, output = _held.get(), resolved(path)
     if locks is None:
         _refuse_held(path)
@@ -381,13 +360,7 @@ class _Lock:
 
 
 def sha256(path: Path) -> str:
-    """Hexadecimal SHA-256 of the file at `path`.
-
-    Raises
-    ------
-    InputError
-        If it is no regular file, or cannot be read.
-    """
+    """Hexadecimal SHA-256 of the file at `path`."""
     with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

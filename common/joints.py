@@ -131,11 +131,6 @@ def select_joints(text: str, available: Sequence[str] = JOINT_NAMES) -> list[str
     available : sequence of str
         The joints to choose from; the answer keeps their order.
 
-    Raises
-    ------
-    InputError
-        If a word names no joint; the message proposes the nearest name.
-
     Examples
     --------
     >>> select_joints("LF")

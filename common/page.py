@@ -183,12 +183,6 @@ def write_page(
     sections : sequence of Section
     force : bool
         Replace files that exist.
-
-    Raises
-    ------
-    InputError
-        If one of the files exists and `force` is not given (nothing has been written then), or if
-        one cannot be written.
     """
     html = render(title, subtitle, sections)
     drawn = [(path.parent / "figures" / p.name, p) for s in sections for p in s.pictures]

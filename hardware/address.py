@@ -86,11 +86,6 @@ class BusAddress:
 def parse_address(text: str) -> BusAddress:
     """Address of a bus outside this program.
 
-    Raises
-    ------
-    InputError
-        If `text` is no address.
-
     Examples
     --------
     >>> parse_address("feetech:/dev/ttyUSB0@500000")

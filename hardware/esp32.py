@@ -66,11 +66,6 @@ class Power:
 def set_position(on: NDArray[np.bool_], counts: NDArray[np.int64]) -> bytes:
     """Request to drive the servos, in order of id, to `counts`, or to switch their torque off.
 
-    Raises
-    ------
-    ValueError
-        If there are not twelve of each, or a count is outside 0..1023.
-
     Examples
     --------
     >>> set_position(np.ones(12, bool), np.full(12, 512))[:4].hex(" ")
@@ -166,13 +161,6 @@ class Esp32Bus(HostClock):
     exclusive : bool
         Whether to refuse a robot that another program drives. Only what switches the torque off
         goes without.
-
-    Raises
-    ------
-    BusError
-        If the socket is not there or another program owns it.
-    InputError
-        If the map is for raw counts or another encoder, or lacks a servo.
     """
 
     name = "esp32"

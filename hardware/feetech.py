@@ -282,13 +282,7 @@ class FeetechLine(SerialLine):
         )
 
     def sync_write(self, address: int, values: dict[int, bytes]) -> float:
-        """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed.
-
-        Raises
-        ------
-        ValueError
-            If the values differ in length.
-        """
+        """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed."""
         sizes = {len(v) for v in values.values()}
         if len(sizes) != 1:
             raise ValueError(f"sync_write: values of {sorted(sizes)} bytes; all must be as long.")

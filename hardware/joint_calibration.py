@@ -229,13 +229,7 @@ class Measured:
 
 
 def calibrated(start: JointMapFile, measured: Measured, date: str) -> JointMap:
-    """The starting map with the measured values; `limits_rad`, signs and ids stay.
-
-    Raises
-    ------
-    InputError
-        If the limits of a joint leave the encoder, or the map would not be valid.
-    """
+    """The starting map with the measured values; `limits_rad`, signs and ids stay."""
     data = start.model_dump(by_alias=True)
     data["name"] = f"{start.name.partition(', calibrated ')[0]}, calibrated {date}"
     data["source"] = f"{start.source.partition(_MARK)[0].rstrip('. ')}.{_MARK} {date}."

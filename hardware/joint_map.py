@@ -297,13 +297,7 @@ class JointMap:
         return {joint: {"model": model} for joint in self.joint_names} if model else {}
 
     def save(self, path: Path, force: bool = False) -> None:
-        """Write the map as YAML.
-
-        Raises
-        ------
-        FileExistsRefusal
-            If the file exists and `force` is not set.
-        """
+        """Write the map as YAML."""
         data = self.file.model_dump(by_alias=True)
         if self.file.servo is None:
             del data["servo"]
@@ -411,13 +405,7 @@ def load_joint_map(path_or_preset: Path | str) -> JointMap:
 
 
 def joint_map_from(data: dict[str, Any], name: str, lines: dict | None = None) -> JointMap:
-    """A joint map from plain data, as in the file.
-
-    Raises
-    ------
-    InputError
-        The sentence names the place and what is wrong with it.
-    """
+    """A joint map from plain data, as in the file."""
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise InputError(
             f"{name} is no joint map: it does not say `schema: {SCHEMA}` at the top. Make one with "

@@ -54,13 +54,7 @@ class LeRobotJoint(BaseModel):
 
 
 def read_lerobot(path: Path) -> dict[str, LeRobotJoint]:
-    """LeRobot's calibration by joint.
-
-    Raises
-    ------
-    InputError
-        If the file is not one, or a joint of it cannot be used.
-    """
+    """LeRobot's calibration by joint."""
     data = read_json(path)
     fields = set(LeRobotJoint.model_fields)
     if not isinstance(data, dict) or not data:
@@ -78,13 +72,7 @@ def read_lerobot(path: Path) -> dict[str, LeRobotJoint]:
 
 
 def apply_lerobot(data: dict[str, Any], joints: Mapping[str, LeRobotJoint], path: Path) -> None:
-    """Put ids, directions, homing offsets and ranges into the data of a joint map, in place.
-
-    Raises
-    ------
-    InputError
-        If the two name different joints, or a range leaves the encoder.
-    """
+    """Put ids, directions, homing offsets and ranges into the data of a joint map, in place."""
     entries, top = data["joints"], data["counts"] - 1
     missing = [name for name in entries if name not in joints]
     if missing:
@@ -142,12 +130,6 @@ def lerobot_calibration(
 def write_lerobot(
     path: Path, joint_map: JointMap, homing_offsets: Mapping[str, int], force: bool = False
 ) -> None:
-    """Write LeRobot's calibration of a joint map.
-
-    Raises
-    ------
-    FileExistsRefusal
-        If the file exists and `force` is not set.
-    """
+    """Write LeRobot's calibration of a joint map."""
     entries = lerobot_calibration(joint_map, homing_offsets)
     write_text(path, json.dumps(entries, indent=4) + "\n", force)

@@ -73,13 +73,7 @@ def lock_name(robot: Path) -> str:
 
 
 def own(robot: Path) -> int:
-    """Descriptor of the lock of a robot at this path, locked until it is closed.
-
-    Raises
-    ------
-    BusError
-        If another program holds it.
-    """
+    """Descriptor of the lock of a robot at this path, locked until it is closed."""
     descriptor = open_here(lock_name(robot), os.O_RDWR)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -217,13 +217,7 @@ class FixedRateLoop:
         self.spent: TimeSpent = getattr(self.timed, "spent", None) or TimeSpent(self.timed.now)
 
     def ticks(self, duration_s: float) -> Iterator[float]:
-        """Seconds since the first tick, at every tick for `duration_s`.
-
-        Raises
-        ------
-        SafetyStop
-            If the loop has missed `most_misses` deadlines in a row; names what took the time.
-        """
+        """Seconds since the first tick, at every tick for `duration_s`."""
         timed, start, tick, late = self.timed, self.timed.now(), 0, 0
         before, in_time_s, spent_s = None, start, {}
         while tick * self.period_s < duration_s:
@@ -323,13 +317,7 @@ def minimum_jerk(share: NDArray[np.float64] | float) -> NDArray[np.float64]:
 
 
 def first_pose(bus: ServoBus, period_s: float) -> NDArray[np.float64]:
-    """Pose of the robot, shape (joints,) [rad]; waits up to 2 s for the first readings.
-
-    Raises
-    ------
-    BusError
-        If a joint returns no position.
-    """
+    """Pose of the robot, shape (joints,) [rad]; waits up to 2 s for the first readings."""
     until = bus.now() + _FIRST_READING_S
     pose = np.full(len(bus.joint_names), np.nan)
     while True:

@@ -27,11 +27,6 @@ def differences(found: Sequence[Claim], beside: Path) -> list[dict[str, str]]:
     -------
     list of dict of str to str
         `id`, `claim`, `here`, `verdict`, `there` and `verdict_there` of each such claim.
-
-    Raises
-    ------
-    InputError
-        If the file is no such table.
     """
     text = read_text(beside)
     header = text.split("\n", 1)[0].strip().split(",")

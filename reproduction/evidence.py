@@ -153,13 +153,7 @@ def over(evidence: Sequence[PolicyEvidence], kind: str, value: Callable[[PolicyE
 def of_kinds(
     evidence: Sequence[PolicyEvidence], value: Callable[[PolicyEvidence], float], *needed: str
 ) -> dict[str, Interval]:
-    """`over` for each of `KINDS` of which there is a number.
-
-    Raises
-    ------
-    NotTestable
-        If there is no policy of one of the kinds `needed` (of any), or no number for it.
-    """
+    """`over` for each of `KINDS` of which there is a number."""
     given = [k for k in KINDS if any(e.kind == k for e in evidence)]
     if not given or not set(needed) <= set(given):
         wanted = " and of the ".join(KINDS[k] for k in needed or ("lstm",))
@@ -176,13 +170,7 @@ def of_kinds(
 
 
 def of_kind(evidence: Sequence[PolicyEvidence], kind: str) -> list[PolicyEvidence]:
-    """Those of one kind.
-
-    Raises
-    ------
-    NotTestable
-        If there is none.
-    """
+    """Those of one kind."""
     mine = [e for e in evidence if e.kind == kind]
     if not mine:
         raise NotTestable(f"Give a run of the {KINDS[kind]}.")

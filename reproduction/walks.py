@@ -41,13 +41,7 @@ class ImuWalk:
 
 
 def gather(given: Sequence[str]) -> list[ImuWalk]:
-    """Read logs given as `KIND=FILE`.
-
-    Raises
-    ------
-    InputError
-        If the kind is none of `KINDS`, or the file is no IMU log (see `policies.twin.gyro`).
-    """
+    """Read logs given as `KIND=FILE`."""
     found = []
     for text in given:
         kind, equals, name = text.partition("=")

@@ -52,11 +52,6 @@ class DelayedServo(ABC):
         From a command's arrival to its first effect [s].
     time_step_s : float
         Time step [s]; commands and positions are at this step.
-
-    Raises
-    ------
-    InputError
-        If the time step is not positive.
     """
 
     def __init__(
@@ -101,12 +96,7 @@ class DelayedServo(ABC):
 
 
 def refuse_time_step(model: str, time_step_s: float) -> None:
-    """Refuse a time step [s] that is not a positive number.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a time step [s] that is not a positive number."""
     if not (np.isfinite(time_step_s) and time_step_s > 0):
         raise InputError(f"{model}: time_step_s is {time_step_s}; it must be positive.")
 

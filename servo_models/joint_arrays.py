@@ -37,11 +37,6 @@ class JointArrays(ABC):
         taps), newest command first; and those of the subclass. All but `bound` are finite.
     feedback : bool
         Whether the network's last input is the position predicted last.
-
-    Raises
-    ------
-    InputError
-        If a shape does not fit the joints, a number is not finite, or a scale is not positive.
     """
 
     def __init__(

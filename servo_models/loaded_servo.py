@@ -196,11 +196,6 @@ class LoadedServo(DelayedServo):
     time_step_s : float
         Time step [s]; commands and positions are at this step.
 
-    Raises
-    ------
-    InputError
-        If a number is missing or negative, or the inertia or time step is zero.
-
     Examples
     --------
     >>> servo = LoadedServoParameters(

@@ -51,11 +51,6 @@ class CommandNetwork(JointArrays):
         (joints, units), `weight_1`, … to one output.
     feedback : bool
         Whether the network's last input is the position predicted last.
-
-    Raises
-    ------
-    InputError
-        If shapes do not fit each other, or a number is not finite.
     """
 
     def _prepare(self) -> None:
@@ -174,11 +169,6 @@ class RecurrentNetwork(JointArrays):
         Whether the network's last input is the position predicted last.
     warm_up : int
         Steps at rest that fill the memory after a reset.
-
-    Raises
-    ------
-    InputError
-        If shapes do not fit each other, or a number is not finite.
     """
 
     def __init__(

@@ -149,11 +149,6 @@ def save_servo_model(
         Fields of `Contract` without the weights' hash.
     force : bool
         Replace an existing model.
-
-    Raises
-    ------
-    InputError
-        If there is a model already, or if this one cannot be read back or written.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file; a servo model is a folder. Choose another name.")

@@ -185,11 +185,6 @@ def delay_at_step(
     -------
     ndarray, shape (servos,)
         May be negative, where the step alone is more than the whole lag.
-
-    Raises
-    ------
-    InputError
-        If the servo is not stable at this step.
     """
     delay = np.atleast_1d(parameters.dead_time_s)
     if time_step_s == fitted_step_s and engine == MUJOCO:

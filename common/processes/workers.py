@@ -107,11 +107,6 @@ class Workers:
         """Yield key and result of all that was submitted, in the order in which they are done.
 
         More can be submitted meanwhile. What `work` raises is raised here, and the rest is left.
-
-        Raises
-        ------
-        PupperError
-            If a process cannot be started, or was killed.
         """
         if min(self._count, len(self._tasks)) <= 1 and not self._streams:
             yield from self._here()

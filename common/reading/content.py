@@ -161,11 +161,6 @@ def content(path: Path | str, most_bytes: float, remedy: str = "") -> bytes:
         Larger files are refused without being read; `budget.reading_up_to` raises it.
     remedy : str
         What to do, as a sentence.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, no regular file, larger, or cannot be read.
     """
     try:
         with open_regular(path, remedy) as file:
@@ -203,12 +198,6 @@ def unpacked(path: Path | str, data: bytes, most_bytes: float) -> bytes:
         Content of the file: its first bytes tell the compression, not its name.
     most_bytes : float
         Content that is larger is refused; `budget.reading_up_to` raises it.
-
-    Raises
-    ------
-    InputError
-        If it is damaged, larger, packed twice, an archive of several files, or of a kind that is
-        not read.
     """
     kind = next((k for mark, k in _PACKED.items() if data.startswith(mark)), None)
     foreign = next((k for mark, k in _FOREIGN.items() if data.startswith(mark)), None)
@@ -292,10 +281,6 @@ def refuse_large_header(path: Path | str, data: bytes) -> None:
         For the message.
     data : bytes
         Content of the file.
-
-    Raises
-    ------
-    InputError
     """
     length = struct.unpack_from("<Q", data)[0] if len(data) >= 8 else 0
     if length > len(data):  # no such file, as its library will say
@@ -314,10 +299,6 @@ def refuse_bomb(path: Path | str, data: bytes, remedy: str) -> None:
         Content of the file.
     remedy : str
         What to do, as a sentence.
-
-    Raises
-    ------
-    InputError
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:

@@ -73,11 +73,6 @@ def one_each(where: Path | str, counts: Mapping[str, int], remedy: str = "Mend t
     remedy : str
         What else to do, as a sentence.
 
-    Raises
-    ------
-    InputError
-        If two differ.
-
     Examples
     --------
     >>> one_each("log.npz", {"command": 3, "joint_names": 2})
@@ -170,12 +165,6 @@ def read_table(
         Leave a last line out, too, that does not end.
     columns : sequence of str, optional
         Names of the columns where no line has them.
-
-    Raises
-    ------
-    InputError
-        If two columns have the same name, a row has another number of cells, a cell is no number,
-        or a limit of reading is passed.
     """
     text = one_line_end(text)
     refuse_more(path, text.count("\n"), MOST_ROWS + 2 * MOST_COMMENTS, "lines", _SPLIT)
@@ -203,24 +192,12 @@ def one_line_end(text: str) -> str:
 
 
 def column_names(path: Path | str, text: str) -> list[str]:
-    """Names of the columns of CSV text; empty if it has none.
-
-    Raises
-    ------
-    InputError
-        As `read_table`.
-    """
+    """Names of the columns of CSV text; empty if it has none."""
     return _opening(path, one_line_end(text))[0].columns
 
 
 def comments_of(path: Path | str, text: str) -> list[tuple[int, str]]:
-    """Comment lines of CSV text, numbered from 1.
-
-    Raises
-    ------
-    InputError
-        If there are too many, or one is too long.
-    """
+    """Comment lines of CSV text, numbered from 1."""
     return _comments(path, one_line_end(text), 1, [])
 
 

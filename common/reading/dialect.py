@@ -424,13 +424,7 @@ def _is_decimal(cell: str) -> bool:
 
 
 def decoded(path: object, data: bytes) -> str:
-    """Text in UTF-8 or UTF-16, with or without a byte order mark, else in Windows-1252.
-
-    Raises
-    ------
-    InputError
-        If it is not text.
-    """
+    """Text in UTF-8 or UTF-16, with or without a byte order mark, else in Windows-1252."""
     wide = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}.get(data[:2])
     if wide is None and b"\0" in data[:2]:
         wide = "utf-16-be" if data[:1] == b"\0" else "utf-16-le"

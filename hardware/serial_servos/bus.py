@@ -98,13 +98,6 @@ class SerialBus(HostClock):
         Only these, and all of them; by default those of the map that answer.
     exclusive : bool
         Whether to refuse a port that another program has open.
-
-    Raises
-    ------
-    BusError
-        If the port cannot be opened, a servo of `joints` does not answer, or two have one id.
-    InputError
-        If the map does not fit the servos, or there is none and they are not a Mini Pupper's.
     """
 
     family: ClassVar[Family]

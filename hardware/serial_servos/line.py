@@ -112,11 +112,6 @@ class SerialLine(ABC):
         has measured it.
     patience_s : float
         Time for which a reply is awaited beyond that.
-
-    Raises
-    ------
-    BusError
-        If the port cannot be opened or is in use, or the SDK is not installed.
     """
 
     reply_bytes: int
@@ -154,13 +149,7 @@ class SerialLine(ABC):
 
     @abstractmethod
     def _sdk(self) -> Any:
-        """The vendor's SDK.
-
-        Raises
-        ------
-        BusError
-            If it is not installed.
-        """
+        """The vendor's SDK."""
 
     @abstractmethod
     def _reader(self, accepted: Callable[[int, int], bool]) -> Reader:
@@ -459,13 +448,7 @@ class SerialLine(ABC):
             self.garbled[servo] += 1
 
     def _new_port(self, device: str, baud: int, exclusive: bool) -> Any:
-        """Port of the SDK, without busy waiting.
-
-        Raises
-        ------
-        BusError
-            If the SDK cannot set the rate.
-        """
+        """Port of the SDK, without busy waiting."""
 
         class Port(self._sdk().PortHandler):
             """Exclusive; sleeps while it waits; discards old bytes before it sends."""

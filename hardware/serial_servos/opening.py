@@ -32,11 +32,6 @@ def open_line(
     -------
     (SerialLine, dict of int to int)
         The line; those of `ids` that answer, and their model numbers.
-
-    Raises
-    ------
-    BusError
-        If the port cannot be opened, or no servo answers.
     """
     for rate in family.rates if baud is None else (baud,):
         line = family.open_line(device, rate, exclusive)

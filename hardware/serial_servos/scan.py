@@ -69,11 +69,6 @@ def scan_line(
 
     Every id is asked until a rate with servos is found; at the remaining rates the ids that robots
     use. Silent ids are asked again where servos answer, and gaps between ids a third time.
-
-    Raises
-    ------
-    BusError
-        If the port cannot be opened or no servo answers.
     """
     servos: list[ServoReport] = []
     remarks: list[str] = []

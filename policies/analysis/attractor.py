@@ -74,11 +74,6 @@ def principal_components(
         Actions or hidden states, for example (steps, robots, d).
     count : int
         How many axes to keep.
-
-    Raises
-    ------
-    InputError
-        If nothing varies, or there are fewer states than axes.
     """
     states = np.concatenate([np.asarray(c, float).reshape(-1, np.shape(c)[-1]) for c in conditions])
     if len(states) <= count or states.shape[1] < count:
@@ -112,11 +107,6 @@ def closure(orbit: NDArray[np.floating], step_s: float, frequency_hz: float) -> 
     step_s : float
     frequency_hz : float
         Of the gait.
-
-    Raises
-    ------
-    InputError
-        If it does not last two periods, or does not move.
     """
     orbit = np.asarray(orbit, float)
     time = step_s * np.arange(len(orbit))
@@ -157,11 +147,6 @@ def area_ratio(orbit: NDArray[np.floating], reference: NDArray[np.floating]) -> 
     Parameters
     ----------
     orbit, reference : ndarray, shape (steps, 2) or (steps, n, 2)
-
-    Raises
-    ------
-    InputError
-        If the reference encloses nothing.
     """
     before = area(reference)
     if not before > 0:

@@ -283,11 +283,6 @@ def correlation(actions_a: Signal, actions_b: Signal) -> float:
     ----------
     actions_a, actions_b : ndarray, shape (steps, 12) or (steps, n, 12)
         The gait to compare with, and the other.
-
-    Raises
-    ------
-    InputError
-        If the two are of different shapes, or nothing moves in the first.
     """
     a, b = (np.asarray(x, float).reshape(len(x), -1) for x in (actions_a, actions_b))
     if a.shape != b.shape:

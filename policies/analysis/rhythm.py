@@ -55,11 +55,6 @@ def frequency(signal: Signal, step_s: float) -> Interval:
     ----------
     signal : ndarray, shape (steps, channels)
     step_s : float
-
-    Raises
-    ------
-    InputError
-        If the signal is shorter than 5 s, or nothing moves.
     """
     best = sine_frequency(signal, step_s)
     y = standardised(signal)
@@ -92,11 +87,6 @@ def sine_frequency(signal: Signal, step_s: float) -> float:
     ----------
     signal : ndarray, shape (steps, channels)
     step_s : float
-
-    Raises
-    ------
-    InputError
-        If the signal is shorter than 5 s, or nothing moves.
     """
     y = standardised(signal)
     if len(y) * step_s < SHORTEST_S - 1e-9:

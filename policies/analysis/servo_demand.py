@@ -166,11 +166,6 @@ def servo_demand(
         Whether its dead time is a number rather than missing.
     extra_dead_times_s : sequence of float
         Dead times to add to those of the walk [s], beginning with 0.
-
-    Raises
-    ------
-    InputError
-        If no robot walked for long enough.
     """
     # a gait that drives strong servos into their limits would seem to need more than the servo has
     drawn = replace(trial.task.randomisation, torque_scale=(1.0, 1.0))

@@ -52,11 +52,6 @@ def walking_sections(
     folder : Path
         Of the run or policy; its curves are shown if they are there.
     found : Evaluation
-
-    Raises
-    ------
-    InputError
-        If the folder's curves cannot be read.
     """
     rows = [_cells(row) for row in found.conditions]
     sections = [

@@ -57,11 +57,6 @@ def actuator_of(name: str, robot: ServoRobot, recording: Recording) -> Actuator:
         A calibration file, a servo card, a preset, or `ideal`.
     robot : ServoRobot
     recording : Recording
-
-    Raises
-    ------
-    InputError
-        If there is no such thing, or it is a learned servo model.
     """
     check_actuator(name)
     if is_servo_model(name):
@@ -141,11 +136,6 @@ def robot_for(recording: Recording, model: Path | None = None) -> ServoRobot:
     recording : Recording
     model : Path, optional
         Its MJCF or URDF; by default the Mini Pupper, if the joints are its.
-
-    Raises
-    ------
-    InputError
-        If the joints are another robot's, and no model of it was given.
     """
     from pupper_sysid.sim.robot.servo_robot import mini_pupper_robot, robot_of
 

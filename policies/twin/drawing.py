@@ -53,11 +53,6 @@ def robot_over_time(recording: Recording, model: Path | None = None) -> tuple[Ar
         At most `POSES_PER_S` a second [s].
     bodies : list of Body
         Those that have a shape.
-
-    Raises
-    ------
-    InputError
-        If the robot cannot be read, or lacks a recorded joint.
     """
     robot = robot_for(recording, model)
     time_s, held = poses(recording, POSES_PER_S)

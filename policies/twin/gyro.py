@@ -77,11 +77,6 @@ def read_imu(path: Path) -> ImuLog:
     path : Path
         CSV file with the columns `timestamp` or `time_s` [s], `gx`, `gy`, `gz` [rad/s], and perhaps
         `ax`, `ay`, `az` [m/s²].
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, lacks a column, or is shorter than 7 s.
     """
     data = content(path, _MOST_BYTES, "Give a shorter log.")
     table = read_table(path, data.decode("utf-8", errors="replace"))

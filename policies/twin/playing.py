@@ -59,11 +59,6 @@ def sequences(data: ServoData, robot: ServoRobot) -> Sequences:
     data : ServoData
     robot : ServoRobot
         Has all joints of `data`.
-
-    Raises
-    ------
-    InputError
-        If they do not fit the memory.
     """
     found: dict[tuple, dict[str, int]] = {}
     for joint in data.joints:
@@ -147,11 +142,6 @@ def play(
     seed, threads : int
     progress : callable
         Called with the share that is done.
-
-    Raises
-    ------
-    InputError
-        If the motion does not fit the memory, or a servo is not stable.
     """
     count, rng = 1 if fixed else copies, np.random.default_rng(seed)
     friction = rng.uniform(*Randomisation().friction, count)

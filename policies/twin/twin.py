@@ -193,11 +193,6 @@ def twin(
     seed, threads : int
     progress : callable
         Called with the share that is done.
-
-    Raises
-    ------
-    InputError
-        If the robot lacks a joint, or cannot be simulated.
     """
     if copies < 1:
         raise InputError(f"{copies} robots; at least 1 is needed.")

@@ -113,13 +113,7 @@ class BamParameters(Part):
 
 
 def load_bam(path: Path) -> ServoCard:
-    """A card of a BAM parameter file, with the constants of its actuator class.
-
-    Raises
-    ------
-    InputError
-        If it is no such file, or of an actuator class whose constants are not known here.
-    """
+    """A card of a BAM parameter file, with the constants of its actuator class."""
     data = read_json(path)
     if not isinstance(data, dict) or not {"kt", "R", "model"} <= data.keys():
         raise InputError(
@@ -160,11 +154,6 @@ def from_bam(
     kind : Actuator
     name : Path or str
         Of their file, for messages.
-
-    Raises
-    ------
-    InputError
-        If a number is impossible.
     """
     p = parameters
     if p.R == 0 or p.kt == 0:
@@ -207,11 +196,6 @@ def to_bam(card: ServoCard, specimen: str | None = None) -> dict[str, Any]:
     card : ServoCard
     specimen : str, optional
         Which of its numbers; by default the card's default.
-
-    Raises
-    ------
-    InputError
-        If the card states no position loop and motor, or BAM has no class for that servo.
     """
     numbers = card.specimens.get(specimen or card.default)
     if numbers is None:
@@ -273,13 +257,7 @@ def not_in_bam(card: ServoCard) -> list[str]:
 
 
 def class_of(card: ServoCard) -> tuple[str, Actuator]:
-    """BAM's actuator class for the servo of a card.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
+    """BAM's actuator class for the servo of a card."""
     own = card.as_published.get("actuator")
     if isinstance(own, str) and own in ACTUATORS:
         return own, ACTUATORS[own]
@@ -319,11 +297,6 @@ def motor_of(servo: UnderLoad) -> tuple[dict[str, Any], tuple[str, ...]]:
     motor : dict
     lost : tuple of str
         What BAM's models do not have, in words.
-
-    Raises
-    ------
-    InputError
-        If there is no back-EMF, which gives kt.
     """
     value = {
         key: quantity.value if (quantity := getattr(servo, key)) is not None else 0.0

@@ -108,13 +108,7 @@ class Score(Part):
 
 
 class ServoCard(Part):
-    """Numbers of one servo type. Frozen; see the module's text.
-
-    Raises
-    ------
-    pydantic.ValidationError
-        If its parts do not fit each other; `load_card` raises `InputError`.
-    """
+    """Numbers of one servo type. Frozen; see the module's text."""
 
     schema_name: Annotated[Literal["pupper-servo-card"], Field(alias="schema")] = SCHEMA
     """Kind of the file."""
@@ -179,11 +173,6 @@ class ServoCard(Part):
             A specimen's name; that of any other joint means the default's.
         p_gain : float, optional
             Another P gain than the card's.
-
-        Raises
-        ------
-        InputError
-            If another gain is wanted of numbers that are torques already, or it is no gain.
         """
         numbers = self.specimens.get(joint or self.default, self.numbers)
         if not isinstance(numbers, TorquePD):
@@ -246,13 +235,7 @@ class ServoCard(Part):
         return f"{_HEADER}\n{dump(data)}"
 
     def save(self, path: Path | str, force: bool = False) -> None:
-        """Write this card to `path` as YAML, in one atomic step.
-
-        Raises
-        ------
-        InputError
-            If `path` exists and `force` is not set, or if it cannot be written.
-        """
+        """Write this card to `path` as YAML, in one atomic step."""
         write_text(Path(path), self.to_yaml(), force)
 
     def _in_default_order(self) -> list[str]:

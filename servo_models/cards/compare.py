@@ -131,11 +131,6 @@ def servo_of(path_or_name: str, part: str | None = None, p_gain: float | None = 
         of the other.
     p_gain : float, optional
         Another P gain than the numbers' own.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, has no such joint, or holds at its own P gain only.
     """
     name = Path(path_or_name).name
     if is_card(path_or_name):
@@ -189,11 +184,6 @@ def compared(
     p_gain : float, optional
     read : callable
         Reads a servo from its name or file; by default `servo_of`.
-
-    Raises
-    ------
-    InputError
-        As `servo_of`.
     """
     names, notes = (first, second), []
     servos = [read(name, part, None) for name in names]

@@ -57,12 +57,6 @@ def load_card(path_or_name: Path | str) -> ServoCard:
     -------
     ServoCard
 
-    Raises
-    ------
-    InputError
-        If there is no such file, or anything in it is not valid: one sentence with the file, the
-        place, the fault and what to do.
-
     Examples
     --------
     >>> card = load_card("sts3215-bam-m1-early")

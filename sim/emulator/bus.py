@@ -251,13 +251,7 @@ class EmulatedBus:
                 yield time_s, self.joint_names[i], float(true[i]), float(measured[i])
 
     def write_truth(self, stem: Path, force: bool = False) -> tuple[Path, Path]:
-        """Write `<stem>.truth.yaml` and `<stem>.truth.csv`; returns their paths.
-
-        Raises
-        ------
-        FileExistsRefusal
-            If one of them exists and `force` is not set.
-        """
+        """Write `<stem>.truth.yaml` and `<stem>.truth.csv`; returns their paths."""
         numbers, rows = (stem.with_name(f"{stem.name}.truth.{end}") for end in ("yaml", "csv"))
         for path in (numbers, rows):
             refuse_overwrite(path, force)

@@ -49,11 +49,6 @@ class ProxyEmulator:
     rng : numpy.random.Generator
         Lost polls, and the answers to unknown requests.
     faults : BusFaults, optional
-
-    Raises
-    ------
-    InputError
-        If the robot's readings are not polled.
     """
 
     def __init__(
@@ -205,11 +200,6 @@ class ProxySocket:
     emulator : ProxyEmulator
     path : Path
         Of the socket; removed at the end.
-
-    Raises
-    ------
-    InputError
-        If something else is there.
     """
 
     def __init__(self, emulator: ProxyEmulator, path: Path):

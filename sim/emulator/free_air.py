@@ -39,11 +39,6 @@ class FreeAirServo:
         Where it rests at the start, commanded there for long.
     time_step_s : float
         Physics step [s].
-
-    Raises
-    ------
-    InputError
-        If the dead time is shorter than two physics steps.
     """
 
     def __init__(

@@ -33,13 +33,7 @@ MJCF_STEP_S, TRAINING_STEP_S = 0.002, 0.005
 
 
 def to_json(servos: ExportedServos) -> str:
-    """All of it as JSON: every number with its interval, delays also in steps, the feedback.
-
-    Raises
-    ------
-    InputError
-        If the step is too long for the servos.
-    """
+    """All of it as JSON: every number with its interval, delays also in steps, the feedback."""
     calibration, stepped = servos.calibration, servos.actuators()
     joints = {}
     for name, joint in calibration.joints.items():
@@ -98,11 +92,6 @@ def exported_text(
     """Text of an export, and the servos that it holds.
 
     Parameters are those of `export` and `ExportedServos.of`.
-
-    Raises
-    ------
-    InputError
-        As `export`.
     """
     if to not in SIMULATORS:
         raise InputError(f"There is no export to {to}; there are {', '.join(SIMULATORS)}.")
@@ -155,12 +144,6 @@ def export(
     -------
     Path
         The file that was written.
-
-    Raises
-    ------
-    InputError
-        If there is no such target, the step is no physics step of these servos, the gain cannot be
-        predicted, a link cannot be taken off, the model cannot be edited, or the file exists.
     """
     path = Path(out)
     if not path.suffix or path.is_dir():

@@ -50,11 +50,6 @@ def foreign_servo(path: Path | str, joint: str | None = None) -> Servo:
     path : Path or str
     joint : str, optional
         By default the first that is driven.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or has no position actuator of that joint.
     """
     path = Path(path)
     if path.suffix == ".py":

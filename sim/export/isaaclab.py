@@ -94,13 +94,7 @@ ACTUATORS = {
 
 
 def to_isaaclab(servos: ExportedServos) -> str:
-    """A Python module with a class of servos, its configuration, and the feedback.
-
-    Raises
-    ------
-    InputError
-        If the step is too long for the servos.
-    """
+    """A Python module with a class of servos, its configuration, and the feedback."""
     step_s = servos.physics_step_s
     delays = servos.delays(EXPLICIT_PD)
     groups = []
@@ -167,13 +161,7 @@ def _servo(motor, **settings):
 
 
 def to_isaaclab_bam(servos: ExportedServos) -> str:
-    """A Python module with Isaac Lab's `BamActuatorCfg` per joint: motor, friction, delay.
-
-    Raises
-    ------
-    InputError
-        If a joint was not fitted under load, or the step is too long for the servos.
-    """
+    """A Python module with Isaac Lab's `BamActuatorCfg` per joint: motor, friction, delay."""
     step_s, delays, groups = servos.physics_step_s, servos.delays(), []
     lost: dict[str, list[str]] = {}
     for name, joint in servos.calibration.joints.items():

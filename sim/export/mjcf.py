@@ -63,13 +63,7 @@ _RESET = (
 
 
 def to_mjcf(servos: ExportedServos) -> str:
-    """Defaults, actuators and sensors to `<include>` in a model that has joints of these names.
-
-    Raises
-    ------
-    InputError
-        If the step is too long for the servos.
-    """
+    """Defaults, actuators and sensors to `<include>` in a model that has joints of these names."""
     names = {name: f"servo_{name}" for name in servos.calibration.joint_names}
     defaults, actuators, sensors = _parts(servos, names)
     for element, (name, joint) in zip(defaults, servos.calibration.joints.items(), strict=True):
@@ -169,14 +163,6 @@ def to_model(
     text : str
     servos : ExportedServos
         What it holds.
-
-    Raises
-    ------
-    InputError
-        If the model cannot be read, has none of the joints, or one of them in a place that cannot
-        be edited; or as `ExportedServos.of`.
-    PupperError
-        If the model does not compile to the servos' numbers.
     """
     from pupper_sysid.sim.robot.engine import mujoco
 

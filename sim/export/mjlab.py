@@ -82,13 +82,7 @@ ACTUATORS = (CalibratedServoCfg(),)
 
 
 def to_mjlab(servos: ExportedServos) -> str:
-    """A Python module with a class of servos, its configuration, and the feedback.
-
-    Raises
-    ------
-    InputError
-        If the step is too long for the servos.
-    """
+    """A Python module with a class of servos, its configuration, and the feedback."""
     step_s = servos.physics_step_s
     delays = servos.delays(BUILTIN_PD)
     groups, bounds = [], []

@@ -89,13 +89,7 @@ class Servos:
 
 
 def to_newton(servos: ExportedServos) -> str:
-    """A Python module that puts servos into a `newton.ModelBuilder`, feeds and reads them.
-
-    Raises
-    ------
-    InputError
-        If the step is too long for the servos.
-    """
+    """A Python module that puts servos into a `newton.ModelBuilder`, feeds and reads them."""
     notes = (
         "Take SolverMuJoCo with integrator='implicitfast' and steps of PHYSICS_DT. Delays are any "
         "fraction of a step, interpolated linearly, with a latency of its own for each command "

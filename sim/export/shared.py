@@ -133,11 +133,6 @@ class ExportedServos:
 
         Numbers and ends of intervals are changed by what `servo_models.step_size.at_step` changes
         for what the armatures held in the recordings; the dead time is shifted, the others scaled.
-
-        Raises
-        ------
-        InputError
-            If the step is too long for the servos.
         """
         if engine in self._actuators:
             return self._actuators[engine]
@@ -280,13 +275,7 @@ def _changed(actuator: Actuator, old: Mapping[str, float], new: Mapping[str, flo
 
 
 def without_link(name: str, joint: JointCalibration, inertia_kg_m2: float) -> JointCalibration:
-    """The servo of a joint alone: its armature less the inertia of what it moved.
-
-    Raises
-    ------
-    InputError
-        If the armature is the servo's own already, or not more than the link's inertia.
-    """
+    """The servo of a joint alone: its armature less the inertia of what it moved."""
     if inertia_kg_m2 == 0:
         return joint
     point, actuator = joint.holds_at, joint.actuator

@@ -217,13 +217,6 @@ def four_way(
     seed : int
     progress : callable, optional
         Called with what is being done and the share of it that is done.
-
-    Raises
-    ------
-    InputError
-        If the recording cannot support a fit.
-    KeyboardInterrupt
-        On Ctrl-C: of networks trained to different ends there is no comparison.
     """
     split = _split(recording)
     fits: dict[str, ServoFit] = {}

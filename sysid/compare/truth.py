@@ -192,11 +192,6 @@ def truth_table(
     Returns
     -------
     TruthTable
-
-    Raises
-    ------
-    InputError
-        If the two have no joint in common.
     """
     if isinstance(calibration, CalibrationResult):
         calibration = calibration.calibration
@@ -236,11 +231,6 @@ def read_truth(recording: Path) -> dict[str, Any]:
     ----------
     recording : Path
         The recording's `.csv`, or the `.truth.yaml` itself.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, or it is not valid.
     """
     path = recording
     if not recording.name.endswith(ENDING):

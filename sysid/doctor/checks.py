@@ -149,11 +149,6 @@ def refuse_unusable(trials_by_joint: Mapping[str, Sequence[Trial]]) -> None:
     Parameters
     ----------
     trials_by_joint : dict of joint to sequence of Trial
-
-    Raises
-    ------
-    InputError
-        With the joint, the reason and the cure.
     """
     others = " Or leave the joint out of `joints`." if len(trials_by_joint) > 1 else ""
     for joint, trials in trials_by_joint.items():

@@ -70,14 +70,6 @@ def export_module(
     -------
     float
         The largest difference.
-
-    Raises
-    ------
-    InputError
-        If `path` exists and `force` is not given, if it cannot be written, or if the package onnx
-        is not installed.
-    PupperError
-        If the difference is larger than `CLOSE`.
     """
     refuse_overwrite(path, force)
     module = module.eval()

@@ -75,11 +75,6 @@ def to_card(
         Specimen that stands for the servo type; by default the one nearest to the medians of all.
     notes : sequence of str
         Sentences for the reader.
-
-    Raises
-    ------
-    InputError
-        If there is no fit, no supply voltage, or no data sheet where the load is unknown.
     """
     first = _first(fits)
     volts = first.reference_voltage_v if supply_v is None else supply_v
@@ -137,11 +132,6 @@ def to_drive_card(
         What the drive moved, in words.
     notes : sequence of str
         Sentences for the reader.
-
-    Raises
-    ------
-    InputError
-        If there is no fit.
     """
     _first(fits)
     set_there = "set in the drive and stated by the recording; the scale of all torques"
@@ -284,11 +274,6 @@ def to_csv(source: Calibration | Recording, path: Path | None = None, force: boo
         Where to write; nothing is written without it.
     force : bool
         Replace `path` if it exists.
-
-    Raises
-    ------
-    InputError
-        If `path` exists and `force` is not given, or if it cannot be written.
     """
     text = _calibration(source) if isinstance(source, Calibration) else source.to_csv()
     if path is not None:

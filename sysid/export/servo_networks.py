@@ -46,14 +46,6 @@ def export_servo_model(
     path : Path
     force : bool
         Replace `path` if it exists.
-
-    Raises
-    ------
-    InputError
-        If `path` exists and `force` is not given, if it cannot be written, if a physical model is
-        to become a network, or if the package onnx is not installed.
-    PupperError
-        If the file does not compute what the model computes.
     """
     if to == "csv":
         write_text(path, parameter_table(saved), force)

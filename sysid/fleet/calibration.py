@@ -121,13 +121,7 @@ class Fleet:
 
 
 def robots_in(root: Path) -> dict[Path, str]:
-    """Recordings in a folder and the folders in it, and what their robots are called.
-
-    Raises
-    ------
-    InputError
-        If there is none, or two would have the same name.
-    """
+    """Recordings in a folder and the folders in it, and what their robots are called."""
     found = sorted(
         path
         for path in root.rglob("*.csv")
@@ -170,11 +164,6 @@ def calibrate_fleet(
         Make calibrations anew that another recording or other settings made.
     progress : callable, optional
         Called with each robot that is done.
-
-    Raises
-    ------
-    InputError
-        If there is no recording, or the cluster is no address or cannot be reached.
     """
     targets = {path: out / f"{name}.yaml" for path, name in robots_in(root).items()}
     return run_fleet(
@@ -218,12 +207,6 @@ def run_fleet(
     force : bool
     progress : callable, optional
         These four as for `calibrate_fleet`.
-
-    Raises
-    ------
-    InputError
-        If `jobs` is not positive, a target exists that is of something else, or the cluster cannot
-        be reached.
     """
     if jobs < 1:
         raise InputError(f"`jobs` is {jobs}; it must be at least 1.")
@@ -324,11 +307,6 @@ def trust(cluster: str) -> str:
     ----------
     cluster : str
         Address of a Dask scheduler.
-
-    Raises
-    ------
-    InputError
-        If it is not written out as `tls://HOST:PORT` or `tcp://HOST:PORT`.
     """
     found = _ADDRESS.fullmatch(cluster)
     if found is None:

@@ -332,11 +332,6 @@ def joint_response(
         For the bootstrap.
     lattice : PollLattice, optional
         If it has been found already.
-
-    Raises
-    ------
-    InputError
-        If the recording has neither tones nor a multisine.
     """
     lattice = lattice or find_poll_lattice(trials, rng.spawn(1)[0])
     tones: list[ToneResponse] = []

@@ -117,11 +117,6 @@ def joint_impulse_response(
     rng : numpy.random.Generator
     rough : bool
         As in `impulse_response`.
-
-    Raises
-    ------
-    InputError
-        If the command does not move, or nothing is read where it does.
     """
     loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
     return impulse_response(joint_stretches(joint, trials, read), loop, rng, rough=rough)
@@ -138,11 +133,6 @@ def joint_stretches(
     trials : sequence of Trial
     read : sequence of Readings
         Of each trial.
-
-    Raises
-    ------
-    InputError
-        If the command does not move, or nothing is read where it does.
     """
     parts, step = [], quantum(trials)
     for trial, reading in zip(trials, read, strict=True):

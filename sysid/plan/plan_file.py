@@ -128,13 +128,7 @@ class PlanFile(Part):
 
 
 def save_plan(proposal: SweepPlan, path: Path, force: bool = False) -> None:
-    """Write a plan file, in one atomic step.
-
-    Raises
-    ------
-    InputError
-        If the file exists and `force` is not given, or it cannot be written.
-    """
+    """Write a plan file, in one atomic step."""
     data = {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
@@ -147,13 +141,7 @@ def save_plan(proposal: SweepPlan, path: Path, force: bool = False) -> None:
 
 
 def load_plan(path: Path) -> SweepPlan:
-    """Read a plan file.
-
-    Raises
-    ------
-    InputError
-        If anything in it is not valid: one sentence with the file, the place and the fault.
-    """
+    """Read a plan file."""
     data, lines = read_yaml(path)
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise InputError(
@@ -196,11 +184,6 @@ def executable(
     start_pose_rad : mapping of joint to float
     speed_limit_rad_s : float
         Of the bus.
-
-    Raises
-    ------
-    InputError
-        If a tone cannot be commanded at the plan's rate, or a joint has no margin.
     """
     chosen = [t for t in proposal.trials if t.joint in joints]
     parts = [

@@ -129,11 +129,6 @@ def plan_from_recordings(
         Processes.
     progress : callable, optional
         Called with a joint's name when it is done.
-
-    Raises
-    ------
-    InputError
-        If a joint has too little motion, or `seconds` is out of range.
     """
     if seconds is not None:
         _checked(seconds)  # before the work, not after it
@@ -162,11 +157,6 @@ def plan_from_fits(
     margins : mapping of joint to float, optional
         Largest excursions [rad]; by default those of the recordings.
     seed : int
-
-    Raises
-    ------
-    InputError
-        If `seconds` is out of range.
     """
     base = Setup(
         loop_period_s=round(float(np.median([r.loop_period_s for r in recordings])), 6),
@@ -212,11 +202,6 @@ def plan_from_calibration(
     margins : mapping of joint to float, optional
         Largest excursions [rad].
     seed : int
-
-    Raises
-    ------
-    InputError
-        If it lacks a joint, or `seconds` is out of range.
     """
     base = Setup(loop_period_s=loop_period_s)
     plans, polls = [], []
@@ -251,11 +236,6 @@ def plan_first_sweep(
     margins : mapping of joint to float, optional
         Largest excursions [rad].
     seed : int
-
-    Raises
-    ------
-    InputError
-        If `seconds` is out of range.
     """
     servos, made, plans = unknown_servos(seed), dict[float, JointPlan](), []
     for joint in joints:

@@ -107,13 +107,7 @@ def plain_stem(path: Path) -> str:
 
 
 def newest_recording(folder: Path = FOLDER) -> Path:
-    """The newest recording in `folder`.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
+    """The newest recording in `folder`."""
     found = [p for p in folder.glob("*.csv") if not p.name.endswith(".truth.csv")]
     if not found:
         raise InputError(
@@ -177,11 +171,6 @@ class RecordingWriter:
         trial : int
             First trial to write. Its rows that are in the file stay and are cancelled by a comment
             line; an incomplete last line is removed.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be read or written.
         """
         text = as_text(path, read_bytes(path))
         whole = text[: text.rfind("\n") + 1]

@@ -28,13 +28,7 @@ Found = TypeVar("Found")
 
 
 def as_sequence(recordings: Recordings) -> Sequence[Recording]:
-    """The recordings as a sequence.
-
-    Raises
-    ------
-    InputError
-        If something else stands for a recording, such as the name of its file.
-    """
+    """The recordings as a sequence."""
     whole = isinstance(recordings, str | PurePath | Mapping) or not isinstance(recordings, Iterable)
     several = [recordings] if whole or _is_frame(recordings) else list(recordings)
     for one in several:
@@ -55,13 +49,7 @@ def _is_frame(value: object) -> bool:
 
 
 def chosen_joints(recordings: Recordings, joints: Joints = None) -> list[str]:
-    """The recorded joints that `joints` names, in joint order.
-
-    Raises
-    ------
-    InputError
-        If a name is not recorded.
-    """
+    """The recorded joints that `joints` names, in joint order."""
     recorded = in_order(joint for r in as_sequence(recordings) for joint in r.joints)
     if joints is None:
         return recorded
@@ -92,11 +80,6 @@ def usable_trials(recordings: Recordings, joints: Joints = None) -> dict[str, tu
     recordings : Recording or sequence of Recording
     joints : str or sequence of str, optional
         Which joints; by default all that were recorded.
-
-    Raises
-    ------
-    InputError
-        If a joint is not recorded, or the doctor's verdict on it is "do not use".
     """
     chosen = chosen_joints(recordings, joints)
     refuse_unusable({j: recorded_trials(recordings, j) for j in chosen})
@@ -129,11 +112,6 @@ def each_joint(
         Processes.
     progress : callable, optional
         Called with a joint's name when it is done.
-
-    Raises
-    ------
-    InputError
-        If a joint is not recorded, or the doctor's verdict on it is "do not use".
     """
     if workers > 1:  # imports what it needs beside the look at the recordings
         prepare(getattr(work, "func", work).__module__)

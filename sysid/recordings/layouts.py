@@ -44,13 +44,7 @@ PLAYBACK = ("time_s", "loop")
 def convert(
     path: Path | str, parsed: Parsed, options: LogOptions | None = None
 ) -> tuple[pd.DataFrame, dict[str, Any], list[str]]:
-    """Tidy table, metadata and warnings of a parsed file of any known layout.
-
-    Raises
-    ------
-    InputError
-        If the columns belong to no known layout.
-    """
+    """Tidy table, metadata and warnings of a parsed file of any known layout."""
     options = options or LogOptions()
     columns = {*parsed.table.columns, *parsed.faults}
     if {"send_time_s", "read_time_s"} & columns and not options.command:

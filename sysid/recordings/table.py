@@ -186,13 +186,7 @@ def require(path: Path | str, table: pd.DataFrame, columns: tuple[str, ...]) -> 
 
 
 def header(path: Path, text: str) -> dict[str, Any]:
-    """Validated entries of a file's comment lines.
-
-    Raises
-    ------
-    InputError
-        If a value is not JSON or not of its type, or a newer version wrote the file.
-    """
+    """Validated entries of a file's comment lines."""
     return _metadata(path, _entries(path, text, comments_of(path, text)))
 
 

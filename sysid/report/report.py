@@ -205,11 +205,6 @@ def recall(
         For which `can_recall` holds.
     progress : callable, optional
         Called with a joint's name when it is done.
-
-    Raises
-    ------
-    InputError
-        If a joint is not recorded.
     """
     found = {}
     for name, trials in usable_trials(recordings, joints).items():

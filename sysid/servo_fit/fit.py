@@ -80,11 +80,6 @@ class Split:
         ----------
         train_loops, test_loops : sequence of int
             Numbers of trials.
-
-        Raises
-        ------
-        InputError
-            If a trial is in both, or a number is none that a trial can have.
         """
         for name, numbers in (("train_loops", train_loops), ("test_loops", test_loops)):
             for number in numbers:
@@ -109,11 +104,6 @@ class Split:
         ----------
         train_before_s, test_after_s : float
             Since the start of the trial [s].
-
-        Raises
-        ------
-        InputError
-            If training does not end after 0 s and before testing begins.
         """
         if not 0 < train_before_s <= test_after_s < np.inf:
             raise InputError(
@@ -258,13 +248,7 @@ def fit_servo(
 
 
 def _with_two_groups(data: ServoData, part: Part) -> ServoData:
-    """The data without groups that have no readings, such as a tone cut short.
-
-    Raises
-    ------
-    InputError
-        If a joint has readings in one group only, so that nothing of it can be held out.
-    """
+    """The data without groups that have no readings, such as a tone cut short."""
     present = {
         j: {int(g) for r in data.runs[j] for g in r.group[r.readings.rows][chosen(r, part)]} - {-1}
         for j in data.joints

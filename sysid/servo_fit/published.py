@@ -37,13 +37,7 @@ def fit_published(
     seed: int,
     progress: Callable[[float], None] | None = None,
 ) -> CommandNetwork | RecurrentNetwork:
-    """Train the published MLP or LSTM of every joint on a part of the data.
-
-    Raises
-    ------
-    InputError
-        If the joints were not recorded together for the LSTM, or trials are too short.
-    """
+    """Train the published MLP or LSTM of every joint on a part of the data."""
     torch.set_num_threads(1)
     keep_freed_memory()
     generator = torch.Generator().manual_seed(seed)

@@ -151,11 +151,6 @@ class ServoFit(Result):
             Made if missing.
         force : bool
             Replace a model that is there.
-
-        Raises
-        ------
-        InputError
-            If the folder has a model and `force` is not given, or cannot be written.
         """
         feedback = isinstance(self.model, Learned) and self.model.feedback
         warm_up = self.model.warm_up if isinstance(self.model, RecurrentNetwork) else 0

@@ -172,13 +172,7 @@ def _sort_key(label: str) -> tuple[float, str]:
 
 
 def samples(data: ServoData, part: Part, past: int) -> Samples:
-    """Windows over all runs of all joints, with the readings of `part`.
-
-    Raises
-    ------
-    InputError
-        If a joint's commands do not move, or it has too few readings.
-    """
+    """Windows over all runs of all joints, with the readings of `part`."""
     parts = {
         j: [_windows(run, chosen(run, part), past) for run in data.runs[j]] for j in data.joints
     }

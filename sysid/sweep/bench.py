@@ -73,11 +73,6 @@ def parse_load(text: str) -> PendulumLoad | None:
         `pendulum:0.1kg@0.10m`, with `,arm=0.02kg` for the mass of the arm and `,hanging=0.1rad` if
         the mass does not hang straight down at 0.
 
-    Raises
-    ------
-    InputError
-        If it is no load.
-
     Examples
     --------
     >>> load = parse_load("pendulum:0.1kg@0.12m,arm=0.03kg")
@@ -116,13 +111,7 @@ def parse_load(text: str) -> PendulumLoad | None:
 
 
 def parse_gains(text: str) -> list[int]:
-    """P gains that `text` names, such as `8,16,32`.
-
-    Raises
-    ------
-    InputError
-        If one is no value of the register.
-    """
+    """P gains that `text` names, such as `8,16,32`."""
     words = [word.strip() for word in text.split(",")]
     gains = [int(word) if word.isascii() and word.isdecimal() else 0 for word in words]
     if any(not _GAINS[0] <= gain <= _GAINS[1] for gain in gains) or len(set(gains)) < len(gains):
@@ -168,11 +157,6 @@ def bench_plan(
         Where the mass hangs, or the joint's rest.
     margin_rad : float
         Travel to both sides of it.
-
-    Raises
-    ------
-    InputError
-        If the load is too heavy, or a value is out of range.
     """
     if amplitude_rad is not None:
         check_amplitude(amplitude_rad)

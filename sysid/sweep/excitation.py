@@ -287,11 +287,6 @@ def plan(
         Largest excursion of each joint to both sides of its start pose.
     start_pose_rad : mapping of joint to float, optional
         Default: the Mini Pupper's standing pose.
-
-    Raises
-    ------
-    InputError
-        If a value is out of range or the kind unknown.
     """
     if kind not in KINDS:
         raise InputError(f"excitation '{kind}' is unknown; choose from {', '.join(KINDS)}.")
@@ -362,13 +357,7 @@ def plan(
 
 
 def check_amplitude(amplitude_rad: float) -> None:
-    """Refuse an amplitude that is no excursion, or was meant in degrees.
-
-    Raises
-    ------
-    InputError
-        If it is not above 0, or above half a turn.
-    """
+    """Refuse an amplitude that is no excursion, or was meant in degrees."""
     allowed = f"it must be above 0 and at most {LARGEST_AMPLITUDE_RAD:.3g} rad"
     if not amplitude_rad > 0:
         raise InputError(f"`amplitude_rad` is {amplitude_rad:g} rad; {allowed}.")
@@ -382,11 +371,6 @@ def check_amplitude(amplitude_rad: float) -> None:
 
 def parse_frequencies(text: str, highest_hz: float = HIGHEST_HZ) -> list[float]:
     """Frequencies [Hz] that `text` names: `1-10`, `1-10:0.5`, `1,2,4,6.5`, or a mix.
-
-    Raises
-    ------
-    InputError
-        If a part is no number, not positive, reversed, or above `highest_hz`.
 
     Examples
     --------

@@ -109,14 +109,7 @@ class Resume:
 
 
 def header_of(path: Path) -> dict[str, Any]:
-    """Header of an unfinished recording, from which its plan can be made again.
-
-    Raises
-    ------
-    InputError
-        If it is not a recording of this project, was completed (and nothing follows it), or does
-        not hold its plan.
-    """
+    """Header of an unfinished recording, from which its plan can be made again."""
     text = as_text(path, read_bytes(path))
     if not text.startswith(TITLE):
         raise InputError(f"{path} is not a recording of pupper-sysid; only those can be continued.")
@@ -185,11 +178,6 @@ def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
     path : Path
     joints : sequence of str, optional
         Joints to move; by default all that the file commands.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, lacks a column, or has values that are not angles or times.
     """
     table = read_table(path, read_text(path, _LARGEST_BYTES), strict=False)
     named = [str(c).removesuffix(_ENDING) for c in table.columns if str(c).endswith(_ENDING)]

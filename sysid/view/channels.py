@@ -48,13 +48,7 @@ class Channel:
 
 
 def channels(recording: Recording) -> list[Channel]:
-    """All channels of a recording, joint by joint.
-
-    Raises
-    ------
-    InputError
-        If trials of a joint overlap in time: a viewer has one time axis.
-    """
+    """All channels of a recording, joint by joint."""
     found = []
     for joint in in_order(list(recording.table["joint"].unique())):
         rows = recording.table.loc[recording.table["joint"] == joint]

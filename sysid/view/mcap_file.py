@@ -48,11 +48,6 @@ def write_mcap(recording: Recording, path: Path, force: bool = False) -> None:
     path : Path
     force : bool
         Replace an existing file.
-
-    Raises
-    ------
-    InputError
-        If the library is not installed, the file exists, or trials overlap in time.
     """
     refuse_overwrite(path, force)
     file = io.BytesIO()
@@ -71,11 +66,6 @@ class McapStream:
     ----------
     file : binary file
         To write to; it stays open.
-
-    Raises
-    ------
-    InputError
-        If the library is not installed.
     """
 
     def __init__(self, file: IO[bytes]):

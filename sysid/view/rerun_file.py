@@ -67,12 +67,6 @@ def write_rerun(
         The robot; none leaves it out.
     force : bool
         Replace an existing file.
-
-    Raises
-    ------
-    InputError
-        If the library is not installed, the file exists or cannot be written, or trials overlap in
-        time.
     """
     refuse_overwrite(path, force)
     stream = RerunStream(recording.sha256)
@@ -93,11 +87,6 @@ class RerunStream:
     ----------
     name : str
         Different for every recording: a viewer joins those of one name.
-
-    Raises
-    ------
-    InputError
-        If the library is not installed.
     """
 
     def __init__(self, name: str):

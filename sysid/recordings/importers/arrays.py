@@ -37,13 +37,7 @@ _DEEPEST = 3  # of dictionaries in a torch file
 
 
 def read_arrays(path: Path, data: bytes, options: LogOptions) -> Log:
-    """The arrays of a file as rows.
-
-    Raises
-    ------
-    InputError
-        If it is damaged, unpacks to too much, holds objects, or lacks columns.
-    """
+    """The arrays of a file as rows."""
     if data.startswith(NPY):
         return _read_npy(path, data, options)
     if _is_torch(data):

@@ -65,13 +65,7 @@ def is_bam(data: Any) -> bool:
 
 
 def read_bam(path: Path, data: dict[str, Any]) -> Log:
-    """The log as rows; mass, length, gain and voltage go into the header.
-
-    Raises
-    ------
-    InputError
-        If entries are missing or are no numbers.
-    """
+    """The log as rows; mass, length, gain and voltage go into the header."""
     entries = data["entries"]
     if not entries:
         raise InputError(f"{path}: entries is empty, so nothing was recorded. Record it again.")
@@ -131,13 +125,7 @@ def is_ktune(data: Any) -> bool:
 
 
 def read_ktune(path: Path, data: dict[str, Any]) -> Log:
-    """The log as rows of the joint `actuator_<id>`.
-
-    Raises
-    ------
-    InputError
-        If rows are missing or are no numbers.
-    """
+    """The log as rows of the joint `actuator_<id>`."""
     entries, config = data["data"], data.get("config", {})
     if not entries:
         raise InputError(f"{path}: data is empty, so nothing was recorded. Record it again.")
@@ -162,13 +150,7 @@ def read_ktune(path: Path, data: dict[str, Any]) -> Log:
 
 
 def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
-    """The log in other JSON as a table; None if it has no columns of a command and a position.
-
-    Raises
-    ------
-    InputError
-        If there are too many columns, or as `tables.read_table`.
-    """
+    """The log in other JSON as a table; None if it has no columns of a command and a position."""
     lists: dict[str, list[Any]] = {}
     records = _records(data)
     if records is None and not isinstance(data, Mapping):

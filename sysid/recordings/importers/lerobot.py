@@ -53,13 +53,7 @@ def is_lerobot(folder: Path) -> bool:
 
 
 def read_lerobot(folder: Path, options: LogOptions) -> Log:
-    """The dataset's episodes as rows, a trial each.
-
-    Raises
-    ------
-    InputError
-        If `meta/info.json` or the data are not as described.
-    """
+    """The dataset's episodes as rows, a trial each."""
     info_path = folder / "meta" / "info.json"
     data_paths = sorted((folder / "data").rglob("*.parquet"))
     if not data_paths:

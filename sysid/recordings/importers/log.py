@@ -75,11 +75,6 @@ def rows(
 def joint_names(path: Path | str, given: Sequence[str]) -> list[str]:
     """Joints' names as this project can use them: letters, digits and `_`.
 
-    Raises
-    ------
-    InputError
-        If there are too many, or two would be called the same.
-
     Examples
     --------
     >>> joint_names("log", ["shoulder pan.pos", "2nd/wrist"])
@@ -102,13 +97,7 @@ def bare_name(name: str) -> str:
 def numbers(
     path: Path | str, entries: Sequence[Any], key: str, where: str, missing: bool = False
 ) -> NDArray[np.float64]:
-    """Numbers `entries[k][key]`; with `missing`, an absent or empty one is NaN.
-
-    Raises
-    ------
-    InputError
-        If one is no number; the message names its place.
-    """
+    """Numbers `entries[k][key]`; with `missing`, an absent or empty one is NaN."""
     found = np.full(len(entries), np.nan)
     for k, entry in enumerate(entries):
         value = entry.get(key) if isinstance(entry, Mapping) else None
@@ -119,13 +108,7 @@ def numbers(
 
 
 def number(path: Path | str, value: Any, place: str) -> float:
-    """`value` as a float.
-
-    Raises
-    ------
-    InputError
-        If it is none; the message names `place`.
-    """
+    """`value` as a float."""
     if isinstance(value, int | float):
         try:
             found = float(value)
@@ -138,13 +121,7 @@ def number(path: Path | str, value: Any, place: str) -> float:
 
 
 def read_files(root: Path, files: Iterable[Path]) -> tuple[dict[Path, bytes], str]:
-    """Content of a log's files within the budget of bytes, and the SHA-256 of names and content.
-
-    Raises
-    ------
-    InputError
-        If one cannot be read, or all together are too large.
-    """
+    """Content of a log's files within the budget of bytes, and the SHA-256 of names and content."""
     found: dict[Path, bytes] = {}
     total, digest = 0, hashlib.sha256()
     remedy = "Give a part of the log, or split it by joint or by episode."

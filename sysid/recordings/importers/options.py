@@ -130,13 +130,7 @@ class LogOptions:
         return seconds
 
     def refuse(self, layout: str, allowed: tuple[str, ...] = ("joints",)) -> None:
-        """Refuse options that a layout has no use for.
-
-        Raises
-        ------
-        InputError
-            If one other than `allowed` was given.
-        """
+        """Refuse options that a layout has no use for."""
         given = [f.name for f in fields(self) if getattr(self, f.name) not in (None, {})]
         useless = [name for name in given if name not in allowed]
         if useless:
@@ -161,13 +155,7 @@ _MappingFile = create_model(
 
 
 def read_mapping(path: Path) -> LogOptions:
-    """Options from a mapping file.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read or has unknown keys.
-    """
+    """Options from a mapping file."""
     data, lines = read_yaml(path)
     found = validated(_MappingFile, data, path, lines).model_dump()
     if isinstance(found["joints"], list):

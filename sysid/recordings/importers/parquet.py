@@ -36,13 +36,7 @@ MAGIC = b"PAR1"
 
 
 def read_parquet(path: Path, data: bytes, options: LogOptions) -> Log:
-    """A file's columns of numbers as rows.
-
-    Raises
-    ------
-    InputError
-        If it is no parquet file, is too large, or lacks columns.
-    """
+    """A file's columns of numbers as rows."""
     columns = columns_of(path, data)
     arrays = read_columns(path, data, [name for name, numeric in columns.items() if numeric])
     table = replace(expanded(path, arrays, list(options.joints)), texts=_texts(path, data))
@@ -60,13 +54,7 @@ def _library(path: Path) -> Any:
 
 
 def columns_of(path: Path, data: bytes) -> dict[str, bool]:
-    """Names of a file's columns, and whether each is of numbers (or lists of numbers).
-
-    Raises
-    ------
-    InputError
-        If it is no parquet file, or the library is not installed.
-    """
+    """Names of a file's columns, and whether each is of numbers (or lists of numbers)."""
     pa = _library(path)
     schema = _open(path, data).schema_arrow
     refuse_more(path, len(schema), MOST_COLUMNS, "columns", "Split the log.")
@@ -83,13 +71,7 @@ def columns_of(path: Path, data: bytes) -> dict[str, bool]:
 
 
 def read_columns(path: Path, data: bytes, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Columns of numbers, shape (rows,), or of equally long lists, shape (rows, length).
-
-    Raises
-    ------
-    InputError
-        If a column is missing, has no numbers, is ragged, or the table is too large.
-    """
+    """Columns of numbers, shape (rows,), or of equally long lists, shape (rows, length)."""
     pa = _library(path)
     file = _open(path, data)
     known = columns_of(path, data)

@@ -35,13 +35,7 @@ def is_log_folder(folder: Path) -> bool:
 
 
 def logs_in(path: Path) -> list[Path]:
-    """The logs that a path stands for: itself, or those in a folder that is none.
-
-    Raises
-    ------
-    InputError
-        If a folder holds none.
-    """
+    """The logs that a path stands for: itself, or those in a folder that is none."""
     if not path.is_dir() or is_log_folder(path):
         return [path]
     found = [p for p in sorted(path.iterdir()) if is_log_folder(p) or _may_be_log(p)]
@@ -68,13 +62,7 @@ def _may_be_log(path: Path) -> bool:
 
 
 def read_folder(folder: Path, options: LogOptions) -> Log:
-    """The log in a folder.
-
-    Raises
-    ------
-    InputError
-        If it holds none, or its rows cannot be used.
-    """
+    """The log in a folder."""
     if sage.is_sage(folder):
         options.refuse(sage.LAYOUT)
         return chosen(folder, sage.read_sage(folder), options)
@@ -91,13 +79,7 @@ def read_folder(folder: Path, options: LogOptions) -> Log:
 
 
 def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
-    """The log in a file's content; None if it is CSV text.
-
-    Raises
-    ------
-    InputError
-        If the layout is unknown, or its rows cannot be used.
-    """
+    """The log in a file's content; None if it is CSV text."""
     digest = hashlib.sha256(data).hexdigest()
     if data.startswith(ros_files.MAGIC):
         return replace(ros.read_mcap(path, data, options), sha256=digest)
@@ -133,13 +115,7 @@ def _whole_json(text: str) -> str:
 
 
 def chosen(path: Path, log: Log, options: LogOptions) -> Log:
-    """Only the joints that the options name, called as they say.
-
-    Raises
-    ------
-    InputError
-        If one is not in the log.
-    """
+    """Only the joints that the options name, called as they say."""
     if not options.joints:
         return log
     recorded = log.metadata["joints"]

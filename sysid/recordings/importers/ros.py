@@ -70,13 +70,7 @@ def is_bag(folder: Path) -> bool:
 
 
 def read_bag(folder: Path, options: LogOptions) -> Log:
-    """A bag's joints as rows.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be read, or positions or commands are missing.
-    """
+    """A bag's joints as rows."""
     files = _files(folder)
     contents, digest = read_files(folder, files)
     raw: list[Raw] = []
@@ -91,26 +85,14 @@ def read_bag(folder: Path, options: LogOptions) -> Log:
 
 
 def read_mcap(path: Path, data: bytes, options: LogOptions) -> Log:
-    """An MCAP file's joints as rows.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or positions or commands are missing.
-    """
+    """An MCAP file's joints as rows."""
     warnings: list[str] = []
     log = _log(path, bounded(path, mcap_messages(path, data, warnings)), options)
     return replace(log, warnings=[*warnings, *log.warnings])
 
 
 def read_sqlite(path: Path, options: LogOptions) -> Log:
-    """A `.db3` file's joints as rows.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or positions or commands are missing.
-    """
+    """A `.db3` file's joints as rows."""
     return _log(path, bounded(path, sqlite_messages(path)), options)
 
 

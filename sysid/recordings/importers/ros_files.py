@@ -30,13 +30,7 @@ _STEPS = 100_000  # between two looks at them
 
 
 def bounded(path: Path, messages: Iterator[Raw]) -> list[Raw]:
-    """All messages.
-
-    Raises
-    ------
-    InputError
-        If there are too many.
-    """
+    """All messages."""
     found: list[Raw] = []
     total = 0
     for message in messages:
@@ -58,11 +52,6 @@ def mcap_messages(path: Path, data: bytes, warnings: list[str]) -> Iterator[Raw]
     data : bytes
     warnings : list of str
         Gets a sentence if the file is cut off.
-
-    Raises
-    ------
-    InputError
-        If the library is not installed, or the file is damaged or too large.
     """
     try:
         from mcap.exceptions import EndOfFile, McapError
@@ -124,13 +113,7 @@ def _unpacked(path: Path, compression: str, data: bytes, most: int) -> bytes:
 
 
 def sqlite_messages(path: Path) -> Iterator[Raw]:
-    """Yield the messages of the known types in a bag's database, opened for reading only.
-
-    Raises
-    ------
-    InputError
-        If it is no such database.
-    """
+    """Yield the messages of the known types in a bag's database, opened for reading only."""
     address = f"{resolved(path).as_uri()}?mode=ro&immutable=1"
     steps = 0.0
 

@@ -54,13 +54,7 @@ def is_sage(folder: Path) -> bool:
 
 
 def read_sage(folder: Path) -> Log:
-    """The folder's motion as rows, one trial.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or a cell is not a list with a number per joint.
-    """
+    """The folder's motion as rows, one trial."""
     paths = [folder / name for name in (_CONTROL, _STATE, _JOINTS)]
     contents, digest = read_files(folder, paths)
     lines = decoded(paths[2], contents[paths[2]]).splitlines()

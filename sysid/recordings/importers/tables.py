@@ -106,13 +106,7 @@ class Table:
         return list(dict.fromkeys([*self.columns, *self.texts, *self.faults]))
 
     def numbers(self, path: Path | str, name: str) -> NDArray[np.float64]:
-        """Finite or missing numbers of a column.
-
-        Raises
-        ------
-        InputError
-            If it holds text or an infinite value.
-        """
+        """Finite or missing numbers of a column."""
         shown = printable(name)[:60]
         if name not in self.columns:
             fault = f"{path}, column {shown}: its values are not numbers."
@@ -128,13 +122,7 @@ class Table:
         return next((own[n] for n in names if n in own), None)
 
     def check_joints(self, path: Path | str, columns: Iterable[str]) -> None:
-        """Refuse arrays, of which these are columns, with other numbers of joints than names.
-
-        Raises
-        ------
-        InputError
-            If arrays and names are not equally many.
-        """
+        """Refuse arrays, of which these are columns, with other numbers of joints than names."""
         used = {key: n for key, n in self.widths.items()
                 if any(column.startswith(f"{key}.") for column in columns)}  # fmt: skip
         if used:
@@ -159,11 +147,6 @@ def expanded(
         Of the joints; arrays of another width get `joint_0`, `joint_1` and so on.
     named : str, optional
         What in the log holds these names; None if it does not name its joints.
-
-    Raises
-    ------
-    InputError
-        If a name stands twice.
     """
     distinct(path if named is None else f"{path}, {named}", names, "joints")
     lengths = [len(values) for values in arrays.values()]
@@ -186,14 +169,7 @@ def expanded(
 
 
 def read_table(path: Path | str, table: Table, options: LogOptions, layout: str = LAYOUT) -> Log:
-    """The rows of a table.
-
-    Raises
-    ------
-    InputError
-        If no time, or no joint with command and position, can be found; the message says what is
-        missing, or lists the choices.
-    """
+    """The rows of a table."""
     refuse_more(path, len(table.names), MOST_COLUMNS, "columns", "Split it by joint.")
     refuse_more(path, sum(map(len, table.columns.values())), MOST_CELLS, "cells", "Split it.")
     table = spread(path, table, options)

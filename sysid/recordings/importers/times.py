@@ -48,13 +48,7 @@ class Clock:
 
 
 def clock(name: str, values: NDArray[np.float64]) -> Clock:
-    """Unit of the times in the column `name`, by its ending, else by their distance.
-
-    Raises
-    ------
-    InputError
-        If they are no times of a servo's log in any unit.
-    """
+    """Unit of the times in the column `name`, by its ending, else by their distance."""
     shown = printable(name)[:60]
     if found := _UNIT.search(name):
         return Clock(_SCALES[found[1].lower()])
@@ -78,13 +72,7 @@ def clock(name: str, values: NDArray[np.float64]) -> Clock:
 
 
 def times_of_day(path: object, name: str, cells: Sequence[str]) -> NDArray[np.float64]:
-    """Seconds of cells such as `2026-05-04T12:30:01.25` or `12:30:01.25`; an empty one is NaN.
-
-    Raises
-    ------
-    InputError
-        If one is no time.
-    """
+    """Seconds of cells such as `2026-05-04T12:30:01.25` or `12:30:01.25`; an empty one is NaN."""
     bad = next((k for k, cell in enumerate(cells) if cell and not is_clock(cell)), None)
     texts = pd.Series([cell.replace(",", ".") or None for cell in cells], dtype=object)
     try:
@@ -170,11 +158,6 @@ def one_after_another(
     """Trial number of each row, and times with trials that start again put after one another.
 
     A trial is a run of rows of one number in `trial`; a step back in time starts one, too.
-
-    Raises
-    ------
-    InputError
-        If there are too many trials.
     """
     number = np.zeros(len(stamp)) if trial is None else trial
     with np.errstate(invalid="ignore"):

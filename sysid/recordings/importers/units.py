@@ -102,11 +102,6 @@ def unit(text: str, name: str = "`unit`") -> Unit:
     name : str
         Where it was given, for messages.
 
-    Raises
-    ------
-    InputError
-        If it is none of them.
-
     Examples
     --------
     >>> unit("deg").scale * 180 == np.pi, unit("counts:4096").zero, unit("percent:4").scale
