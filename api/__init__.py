@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pupper_sysid.servo_models.servo_file import load_servo_model
     from pupper_sysid.servo_models.sparse_equation import SparseEquation
     from pupper_sysid.sim.walking.env import PupperEnv
-    from pupper_sysid.sysid.backlash.measure import backlash
+    from pupper_sysid.sysid.backlash import backlash
     from pupper_sysid.sysid.compare.compare import compare
     from pupper_sysid.sysid.doctor.examination import examine
     from pupper_sysid.sysid.fit.calibrate import calibrate
@@ -46,7 +46,7 @@ _MODULES = {
     "examine": "sysid.doctor.examination",
     "lag": "sysid.fit.dead_time",
     "frequency_response": "sysid.lag.frequency_response",
-    "backlash": "sysid.backlash.measure",
+    "backlash": "sysid.backlash",
     "calibrate": "sysid.fit.calibrate",
     "sparse_equations": "sysid.sparse",
     "fit_servo": "sysid.servo_fit.fit",

@@ -18,8 +18,7 @@ import torch
 
 from pupper_sysid.cli.policy_choice import policy_at
 from pupper_sysid.common.interval import Interval
-from pupper_sysid.policies.evaluation.battery import BATTERY
-from pupper_sysid.policies.evaluation.evaluate import evaluate, table
+from pupper_sysid.policies.evaluation.evaluate import BATTERY, evaluate, table
 from pupper_sysid.policies.evaluation.figures import share_interval
 from pupper_sysid.policies.walks.conditions import Walker
 from pupper_sysid.sim.walking.config import Walking

@@ -40,7 +40,7 @@ from random_robots import SweptRobot, sweep_random_robot
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.sim.emulator.pendulum import PendulumServo, PendulumServoParameters
-from pupper_sysid.sysid.backlash.measure import backlash
+from pupper_sysid.sysid.backlash import backlash
 from pupper_sysid.sysid.compare.truth import truth_table
 from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.fit.calibrate import calibrate

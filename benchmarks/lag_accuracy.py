@@ -31,8 +31,7 @@ from random_robots import sweep_random_robot
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
 from pupper_sysid.sysid.lag.lag_budget import lag_budget
-from pupper_sysid.sysid.lag.phase_slope import tone_lags, tone_weights
-from pupper_sysid.sysid.lag.tone import tone_response
+from pupper_sysid.sysid.lag.tone import tone_lags, tone_response, tone_weights
 
 
 @dataclass(frozen=True)

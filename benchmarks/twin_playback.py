@@ -26,7 +26,7 @@ from real_recordings import REAL, SPLIT, SWEEPS, WALK
 
 from pupper_sysid.common.figure_style import ORANGE, PINK, save, styled
 from pupper_sysid.common.interval import Interval
-from pupper_sysid.policies.twin.actuators import Actuator, of_calibration, robot_for
+from pupper_sysid.policies.twin.drawing import Actuator, of_calibration, robot_for
 from pupper_sysid.policies.twin.figures import draw_bars, draw_joint
 from pupper_sysid.policies.twin.twin import ActuatorTwin, Condition, Twin, twin
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration

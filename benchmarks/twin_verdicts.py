@@ -29,8 +29,8 @@ from random_robots import random_spec
 
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
-from pupper_sysid.policies.twin.actuators import Actuator, robot_for
-from pupper_sysid.policies.twin.evidence import Evidence
+from pupper_sysid.policies.twin.drawing import Actuator, robot_for
+from pupper_sysid.policies.twin.playing import Evidence
 from pupper_sysid.policies.twin.twin import twin
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS

@@ -23,49 +23,32 @@ _KG_CM = 0.0980665
 
 @dataclass(frozen=True)
 class Rating:
-    """What a data sheet states at one supply voltage.
-
-    Attributes
-    ----------
-    supply_v : float
-        Supply voltage [V].
-    stall_torque_nm : float
-        Torque at standstill [N·m].
-    no_load_speed_rad_s : float or None
-        Speed without load [rad/s]; None where it is not stated.
-    source : str
-        Where it is stated.
-    """
+    """What a data sheet states at one supply voltage."""
 
     supply_v: float
+    """Supply voltage [V]."""
     stall_torque_nm: float
+    """Torque at standstill [N·m]."""
     no_load_speed_rad_s: float | None
+    """Speed without load [rad/s]; None where it is not stated."""
     source: str
+    """Where it is stated."""
 
 
 @dataclass(frozen=True)
 class DataSheet:
-    """One servo model; several ratings may be of several variants.
-
-    Attributes
-    ----------
-    name : str
-        Manufacturer's model name.
-    model_number : int
-        What its model register holds.
-    counts_per_turn : float
-        Readings per turn of the output.
-    ratings : tuple of Rating
-        By rising voltage.
-    supply_range_v : (float, float) or None
-        Lowest and highest supply of all variants [V]; None where it is not known.
-    """
+    """One servo model; several ratings may be of several variants."""
 
     name: str
+    """Manufacturer's model name."""
     model_number: int
+    """What its model register holds."""
     counts_per_turn: float
+    """Readings per turn of the output."""
     ratings: tuple[Rating, ...]
+    """By rising voltage."""
     supply_range_v: tuple[float, float] | None = None
+    """Lowest and highest supply of all variants [V]; None where it is not known."""
 
     def at(self, supply_v: float | None = None) -> Rating:
         """Rating at a supply voltage, in proportion to the nearest that is stated.

@@ -63,14 +63,7 @@ def _refuse_existing(path: Path, force: bool) -> None:
 
 
 def refuse_path(name: str, option: str) -> None:
-    """Refuse a name of a run or walk that would not be one folder: a path, or an odd name.
-
-    Parameters
-    ----------
-    name : str
-    option : str
-        The option that gave it, for the message.
-    """
+    """Refuse a name of a run or walk that would not be one folder: a path, or an odd name."""
     if not name.strip() or name[0] == "." or set(name) & set("/\\") or not name.isprintable():
         raise InputError(
             f"{option} {name!r} is not the name of one folder. Use letters, digits, '-' and '_'."

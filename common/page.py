@@ -41,26 +41,17 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the report.
-
-    Attributes
-    ----------
-    name : str
-        Name of its CSV file, without ending; a table without a name has no file.
-    title : str
-    columns : tuple of Column
-        On the page.
-    rows : tuple of dict
-        In the CSV file; all rows have the same keys.
-    marked : str
-        Rows in which this key is true are bold on the page.
-    """
+    """A table of the report."""
 
     name: str
+    """Name of its CSV file, without ending; a table without a name has no file."""
     title: str
     columns: tuple[Column, ...]
+    """On the page."""
     rows: tuple[Row, ...]
+    """In the CSV file; all rows have the same keys."""
     marked: str = ""
+    """Rows in which this key is true are bold on the page."""
 
     def where(self, key: str, value: object, title: str = "") -> Table:
         """The part of the rows whose `key` is `value`, without that column; it has no file."""
@@ -122,37 +113,24 @@ class Fold:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page.
-
-    Attributes
-    ----------
-    anchor, title : str
-    text : sequence of str
-        Paragraphs.
-    findings : sequence of (str, str)
-        Each with its name, which may be empty.
-    toggles : dict of str to str
-        Parts of the page's figures that the reader can hide, and what they are called; a part is
-        what was drawn under that `gid`.
-    figures : sequence of Picture
-    tables : sequence of Table
-    files : sequence of Table
-        Written as CSV, not shown.
-    folds : sequence of Fold
-    notes : sequence of str
-        In small print.
-    """
+    """A part of the page."""
 
     anchor: str
     title: str
     text: Sequence[str] = ()
+    """Paragraphs."""
     findings: Sequence[tuple[str, str]] = ()
+    """Each with its name, which may be empty."""
     toggles: Mapping[str, str] = field(default_factory=dict)
+    """Parts of the page's figures that the reader can hide, and what they are called; a part is
+    what was drawn under that `gid`."""
     figures: Sequence[Picture] = ()
     tables: Sequence[Table] = ()
     files: Sequence[Table] = ()
+    """Written as CSV, not shown."""
     folds: Sequence[Fold] = ()
     notes: Sequence[str] = ()
+    """In small print."""
 
     @property
     def pictures(self) -> list[Picture]:

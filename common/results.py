@@ -54,12 +54,7 @@ Each = TypeVar("Each", bound=Result)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JointResults(Result, Mapping[str, Each]):
-    """Results by joint: a mapping, and one table and one JSON object of all.
-
-    Attributes
-    ----------
-    joints : dict of str to Result
-    """
+    """Results by joint: a mapping, and one table and one JSON object of all."""
 
     joints: dict[str, Each]
 

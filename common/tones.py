@@ -75,20 +75,14 @@ def fit_sine(angle_rad: NDArray, value: NDArray) -> Sine:
 
 
 class BlockFit(NamedTuple):
-    """A least-squares fit with its bootstrap.
-
-    Attributes
-    ----------
-    solution : ndarray, shape (columns,)
-    drawn : ndarray, shape (draws, columns)
-        The same under random weights of the blocks.
-    blocks : int
-        How many blocks were weighted.
-    """
+    """A least-squares fit with its bootstrap."""
 
     solution: NDArray[np.float64]
+    """Shape (columns,)."""
     drawn: NDArray[np.float64]
+    """The same under random weights of the blocks, shape (draws, columns)."""
     blocks: int
+    """How many blocks were weighted."""
 
     def inflated(self, factor: float) -> NDArray[np.float64]:
         """The draws, their distance from the solution multiplied by `factor`."""

@@ -23,46 +23,33 @@ from pupper_sysid.hardware.serial_servos.series import ERROR_BITS, bits_in_words
 
 @dataclass(frozen=True)
 class BusSample:
-    """One reading of all joints, as the host received it; it may be stale.
-
-    Attributes
-    ----------
-    time_s : ndarray, shape (joints,)
-        Host time of each reading: the mean of the clock before and after its exchange.
-    position_rad : ndarray, shape (joints,)
-        Reported position; NaN where the bus has no reading.
-    position_count : ndarray of int, shape (joints,)
-        The raw count behind it, which a homing offset may move below 0 or over the encoder's range;
-        -1 where the bus has none: there the position is NaN.
-    voltage_v, temperature_c, load : ndarray, shape (joints,), or None
-        Where the bus has them; load is a fraction of full duty, signed.
-    status : ndarray of int, shape (joints,), or None
-        Error bits of the servo (`error_words`).
-    """
+    """One reading of all joints, as the host received it; it may be stale."""
 
     time_s: NDArray[np.float64]
+    """Host time of each reading: the mean of the clock before and after its exchange, shape
+    (joints,)."""
     position_rad: NDArray[np.float64]
+    """Shape (joints,). Reported position; NaN where the bus has no reading."""
     position_count: NDArray[np.int64]
+    """Shape (joints,). The raw count behind it, which a homing offset may move below 0 or over the
+    encoder's range; -1 where the bus has none: there the position is NaN."""
     voltage_v: NDArray[np.float64] | None = None
     temperature_c: NDArray[np.float64] | None = None
     load: NDArray[np.float64] | None = None
+    """Shape (joints,). `voltage_v`, `temperature_c` and `load`: where the bus has them; load is a
+    fraction of full duty, signed."""
     status: NDArray[np.int64] | None = None
+    """Error bits of the servo (`error_words`), shape (joints,)."""
 
 
 @dataclass(frozen=True)
 class Sent:
-    """What one `write` sent.
-
-    Attributes
-    ----------
-    time_s : float
-        Host time of sending [s]; NaN if it failed, and the servos keep the last command.
-    position_rad : ndarray, shape (joints,)
-        The commands after all limits, before the bus rounds them to counts.
-    """
+    """What one `write` sent."""
 
     time_s: float
+    """Host time of sending [s]; NaN if it failed, and the servos keep the last command."""
     position_rad: NDArray[np.float64]
+    """The commands after all limits, before the bus rounds them to counts, shape (joints,)."""
 
 
 class ServoBus(Protocol):

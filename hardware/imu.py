@@ -33,24 +33,17 @@ _TRUNK_FROM_CHIP = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
 
 @dataclass(frozen=True)
 class ImuSample:
-    """One reading of the IMU in the trunk's axes (x forward, y left, z up).
-
-    Attributes
-    ----------
-    time_s : float
-        Time of the read on the clock of the bus [s].
-    rate_rad_s : ndarray, shape (3,)
-        Angular velocity: rolling to the right, nose going down, turning to the left [rad/s].
-    acceleration_m_s2 : ndarray, shape (3,)
-        Specific force; (0, 0, 9.81) while standing level.
-    clipped : bool
-        Whether a value is at the end of its range and may be larger in truth.
-    """
+    """One reading of the IMU in the trunk's axes (x forward, y left, z up)."""
 
     time_s: float
+    """Time of the read on the clock of the bus [s]."""
     rate_rad_s: NDArray[np.float64]
+    """Angular velocity: rolling to the right, nose going down, turning to the left [rad/s], shape
+    (3,)."""
     acceleration_m_s2: NDArray[np.float64]
+    """Shape (3,). Specific force; (0, 0, 9.81) while standing level."""
     clipped: bool
+    """Whether a value is at the end of its range and may be larger in truth."""
 
 
 @runtime_checkable

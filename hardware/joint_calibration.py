@@ -54,12 +54,6 @@ class Travel:
     An extreme counts once two successive readings have been there: the checksum of a serial frame
     lets one garbled frame in 256 by, and a joint at the end of its travel stands still anyway.
 
-    Parameters
-    ----------
-    joints : int
-    counts : int
-        Of the encoder's whole range.
-
     Attributes
     ----------
     now, low, high : ndarray of int, shape (joints,)

@@ -187,29 +187,19 @@ class Timed(Protocol):
 
 @dataclass
 class FixedRateLoop:
-    """Ticks at a fixed rate.
-
-    Attributes
-    ----------
-    timed : Timed
-        Its `spent`, a `TimeSpent`, is used if it has one, as a `GuardedBus` has.
-    period_s : float
-    most_misses : int
-        Missed deadlines in a row after which the loop stops.
-    ticks_done : int
-    missed_deadlines : int
-        Ticks left out because the one before took too long.
-    periods, jitter : Durations
-        Time from one tick to the next, and its distance from `period_s`.
-    """
+    """Ticks at a fixed rate."""
 
     timed: Timed
+    """Its `spent`, a `TimeSpent`, is used if it has one, as a `GuardedBus` has."""
     period_s: float
     most_misses: int = MOST_MISSES_IN_A_ROW
+    """Missed deadlines in a row after which the loop stops."""
     ticks_done: int = 0
     missed_deadlines: int = 0
+    """Ticks left out because the one before took too long."""
     periods: Durations = field(default_factory=Durations)
     jitter: Durations = field(default_factory=Durations)
+    """`periods` and `jitter`: time from one tick to the next, and its distance from `period_s`."""
 
     def __post_init__(self):
         if not (np.isfinite(self.period_s) and self.period_s > 0):

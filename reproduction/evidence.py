@@ -15,13 +15,14 @@ from pupper_sysid.common.interval import Interval
 from pupper_sysid.policies.analysis.attractor import Orbits, orbits
 from pupper_sysid.policies.analysis.autonomy import Autonomy, autonomy
 from pupper_sysid.policies.analysis.gait import GaitReport, describe
-from pupper_sysid.policies.analysis.paths import DirectionWalk, compliance
 from pupper_sysid.policies.analysis.rhythm import mean_of
 from pupper_sysid.policies.analysis.robustness import (
     AblationPoint,
     DelayPoint,
+    DirectionWalk,
     GroundPoint,
     ablation,
+    compliance,
     delay_curve,
     terrain,
 )

@@ -43,7 +43,7 @@ def write_claims(options: Options, tries: Tries) -> None:
     from pupper_sysid.common.page import write_page
     from reproduction import servos as servo_claims
     from reproduction import walks as walk_claims
-    from reproduction.beside import differences
+    from reproduction.claims import differences
     from reproduction.evidence import KINDS, gather
     from reproduction.policies import judge
 
@@ -106,7 +106,7 @@ def _stacks(options: Options) -> list[dict[str, Any]]:
     if options.servo is None:
         return []
     from pupper_sysid.policies.deploy.stacks import STACKS
-    from reproduction.stacks import Walker, compare_stacks
+    from reproduction.walks import Walker, compare_stacks
 
     policy, run = policy_at(options.policies[0])
     actuator = chosen_actuator(options.policies[0], policy, run, options.actuator)

@@ -44,7 +44,7 @@ def judge(
     played : dict of str to (ndarray, ndarray, ndarray)
         Of a playback, per joint: times [s], commands and positions [rad]; may be empty.
     stacks : sequence of dict
-        Of `reproduction.stacks.compare_stacks`, closed loop first; may be empty.
+        Of `reproduction.walks.compare_stacks`, closed loop first; may be empty.
     """
     about_policies = (*training_claims.CLAIMS, *gait_claims.CLAIMS)
     return [

@@ -49,64 +49,45 @@ START_ERROR_RAD = 0.0015
 
 @dataclass(frozen=True)
 class LoadedServoParameters:
-    """Numbers of a servo; floats or arrays that broadcast against each other.
-
-    Parameters
-    ----------
-    duty_per_rad : array_like
-        Duty per position error and unit of the P gain [1/rad].
-    duty_s_per_rad : array_like
-        Duty per velocity, inside of the limit on the duty [s/rad].
-    stall_torque : array_like
-        Torque at full duty and standstill, at the reference voltage [N·m].
-    back_emf : array_like
-        Torque lost per velocity: back-EMF of the motor, viscous friction of the gears [N·m·s/rad].
-    armature : array_like
-        Reflected inertia of motor and gears [kg·m²].
-    friction_loss : array_like
-        Dry friction at speed without load [N·m].
-    dead_time_s : array_like
-        From a command's arrival to its first effect on the torque [s].
-    stribeck_friction : array_like
-        Dry friction at standstill beyond `friction_loss` [N·m].
-    stribeck_speed : array_like
-        Speed at which half of it is left [rad/s].
-    load_friction_motor, load_friction_load : array_like
-        Dry friction per torque of the motor, and of the load's weight.
-    load_friction_quadratic : array_like
-        Dry friction per squared torque of the motor [1/(N·m)].
-    load_friction_static : array_like
-        By what share friction per torque is larger at standstill.
-    torque_limit : array_like
-        Largest torque of the motor, a limit on its current [N·m].
-    off_brake : array_like
-        Share of `back_emf` that remains with the torque off.
-    dead_zone_rad : array_like
-        Half-width of the error that the loop ignores [rad].
-    start_duty : array_like
-        Duty added to overcome friction wherever there is an error.
-    acceleration_limit : array_like
-        Largest acceleration of the set-point [rad/s²]: the firmware's trajectory generator.
-    """
+    """Numbers of a servo; floats or arrays that broadcast against each other."""
 
     duty_per_rad: ArrayLike
+    """Duty per position error and unit of the P gain [1/rad]."""
     duty_s_per_rad: ArrayLike
+    """Duty per velocity, inside of the limit on the duty [s/rad]."""
     stall_torque: ArrayLike
+    """Torque at full duty and standstill, at the reference voltage [N·m]."""
     back_emf: ArrayLike
+    """Torque lost per velocity: back-EMF of the motor, viscous friction of the gears
+    [N·m·s/rad]."""
     armature: ArrayLike
+    """Reflected inertia of motor and gears [kg·m²]."""
     friction_loss: ArrayLike
+    """Dry friction at speed without load [N·m]."""
     dead_time_s: ArrayLike
+    """From a command's arrival to its first effect on the torque [s]."""
     stribeck_friction: ArrayLike = 0.0
+    """Dry friction at standstill beyond `friction_loss` [N·m]."""
     stribeck_speed: ArrayLike = 0.1
+    """Speed at which half of it is left [rad/s]."""
     load_friction_motor: ArrayLike = 0.0
     load_friction_load: ArrayLike = 0.0
+    """`load_friction_motor` and `load_friction_load`: dry friction per torque of the motor, and of
+    the load's weight."""
     load_friction_quadratic: ArrayLike = 0.0
+    """Dry friction per squared torque of the motor [1/(N·m)]."""
     load_friction_static: ArrayLike = 0.0
+    """By what share friction per torque is larger at standstill."""
     torque_limit: ArrayLike = np.inf
+    """Largest torque of the motor, a limit on its current [N·m]."""
     off_brake: ArrayLike = 0.0
+    """Share of `back_emf` that remains with the torque off."""
     dead_zone_rad: ArrayLike = 0.0
+    """Half-width of the error that the loop ignores [rad]."""
     start_duty: ArrayLike = 0.0
+    """Duty added to overcome friction wherever there is an error."""
     acceleration_limit: ArrayLike = np.inf
+    """Largest acceleration of the set-point [rad/s²]: the firmware's trajectory generator."""
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """The numbers as arrays, by name."""
@@ -167,21 +148,14 @@ _LIMITS_BEYOND = {
 
 @dataclass(frozen=True)
 class Load:
-    """What the servo turns; floats or arrays that broadcast with the servo's.
-
-    Parameters
-    ----------
-    inertia_kg_m2 : array_like
-        About the joint [kg·m²].
-    gravity_nm : array_like
-        Largest torque of gravity [N·m].
-    hanging_rad : array_like
-        Position at which the load hangs [rad].
-    """
+    """What the servo turns; floats or arrays that broadcast with the servo's."""
 
     inertia_kg_m2: ArrayLike = 0.0
+    """About the joint [kg·m²]."""
     gravity_nm: ArrayLike = 0.0
+    """Largest torque of gravity [N·m]."""
     hanging_rad: ArrayLike = 0.0
+    """Position at which the load hangs [rad]."""
 
 
 class LoadedServo(DelayedServo):

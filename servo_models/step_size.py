@@ -35,18 +35,13 @@ _UNSTABLE = 0.5  # random servos in steps of up to 10 ms are at most 0.4 from th
 
 @dataclass(frozen=True)
 class Engine:
-    """How a simulator integrates a PD servo.
-
-    Attributes
-    ----------
-    slews : bool
-        Whether it limits the speed of the set-point.
-    implicit : bool
-        Whether damping acts on the velocity at the step's end; otherwise the PD is computed before.
-    """
+    """How a simulator integrates a PD servo."""
 
     slews: bool = True
+    """Whether it limits the speed of the set-point."""
     implicit: bool = True
+    """Whether damping acts on the velocity at the step's end; otherwise the PD is computed
+    before."""
 
 
 MUJOCO = Engine()

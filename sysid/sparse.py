@@ -80,23 +80,16 @@ _PARAMETERS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """One candidate structure.
-
-    Attributes
-    ----------
-    terms : tuple of str
-        Its coefficients.
-    rmse_fresh_rad, rmse_leave_one_frequency_out_rad : float
-        Free run on fresh readings, of the fit to all, and on frequencies not fitted; the latter is
-        NaN with one frequency only.
-    bic : float
-        Bayesian information criterion of the fit to all: decides where there is one frequency.
-    """
+    """One candidate structure."""
 
     terms: Support
+    """Its coefficients."""
     rmse_fresh_rad: float
     rmse_leave_one_frequency_out_rad: float
+    """`rmse_fresh_rad` and `rmse_leave_one_frequency_out_rad`: free run on fresh readings, of the
+    fit to all, and on frequencies not fitted; the latter is NaN with one frequency only."""
     bic: float
+    """Bayesian information criterion of the fit to all: decides where there is one frequency."""
 
     def error(self) -> float:
         """The error on unseen frequencies, or without them the criterion."""
@@ -106,31 +99,21 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class EquationResult(Result):
-    """The equation of one joint, with its errors.
-
-    Attributes
-    ----------
-    coefficients : dict of str to float
-        Those present, by their names in `COEFFICIENTS`.
-    dead_time_s, offset_rad : float
-    leave_one_out_ranges : dict of str to (float, float)
-        Least and greatest value of each number (`dead_time_s` too) when each frequency is left out
-        in turn; empty with one frequency only. Wide where the data do not identify it.
-    scores : Scores
-    delayed_pd : Scores
-        `DelayedPD`, fitted and scored on the same readings.
-    candidates : tuple of Candidate
-        Every structure that was tried, best first.
-    """
+    """The equation of one joint, with its errors."""
 
     joint: str
     coefficients: dict[str, float]
+    """Those present, by their names in `COEFFICIENTS`."""
     dead_time_s: float
     offset_rad: float
     leave_one_out_ranges: dict[str, tuple[float, float]]
+    """Least and greatest value of each number (`dead_time_s` too) when each frequency is left out
+    in turn; empty with one frequency only. Wide where the data do not identify it."""
     scores: Scores
     delayed_pd: Scores
+    """`DelayedPD`, fitted and scored on the same readings."""
     candidates: tuple[Candidate, ...]
+    """Every structure that was tried, best first."""
     warnings: tuple[str, ...]
 
     @derived

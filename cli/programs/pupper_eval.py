@@ -104,8 +104,13 @@ def _run(options: Eval) -> None:
         refuse_overwrite(page, options.force)  # before the work
     import torch
 
-    from pupper_sysid.policies.evaluation.battery import BATTERY, battery_robots
-    from pupper_sysid.policies.evaluation.evaluate import evaluate, table, usual_robots
+    from pupper_sysid.policies.evaluation.evaluate import (
+        BATTERY,
+        battery_robots,
+        evaluate,
+        table,
+        usual_robots,
+    )
 
     torch.set_num_threads(1)
     policy, run = policy_at(options.policy)
@@ -168,7 +173,7 @@ def _show_falls(found: Evaluation) -> None:
     out.print(shown)
     if not found.falls:
         return
-    from pupper_sysid.policies.evaluation.falls import in_short
+    from pupper_sysid.policies.evaluation.figures import in_short
 
     shown = terminal.table(
         "Before falls: median time, median tilt 0.2 s before, usual side; pushed: a push in the "

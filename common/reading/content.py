@@ -273,15 +273,7 @@ LARGEST_CHECKPOINT = 2e9
 
 
 def refuse_large_header(path: Path | str, data: bytes) -> None:
-    """Refuse a safetensors file whose list of tensors is longer than a network's.
-
-    Parameters
-    ----------
-    path : Path or str
-        For the message.
-    data : bytes
-        Content of the file.
-    """
+    """Refuse a safetensors file whose list of tensors is longer than a network's."""
     length = struct.unpack_from("<Q", data)[0] if len(data) >= 8 else 0
     if length > len(data):  # no such file, as its library will say
         return

@@ -108,33 +108,22 @@ _QUOTED = re.compile(r'(?:^|(?<=[,\n]))"([^",\n]*)"(?=[,\n]|$)')
 
 @dataclass
 class CsvTable:
-    """Columns of a CSV text.
-
-    Attributes
-    ----------
-    columns : list of str
-        All names, in the order of the text.
-    numbers : dict of str to ndarray, shape (rows,)
-        Empty cells are NaN.
-    texts : dict of str to list of str
-        Columns that were asked for as text.
-    faults : dict of str to str
-        Other columns that hold text, and the sentence on the first such cell.
-    line : ndarray of int, shape (rows,)
-        Line of each row, from 1.
-    comments : list of (int, str)
-        Comment lines, numbered.
-    cut : bool
-        Whether the last row was incomplete and has been left out.
-    """
+    """Columns of a CSV text."""
 
     columns: list[str]
+    """All names, in the order of the text."""
     numbers: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    """Empty cells are NaN, shape (rows,)."""
     texts: dict[str, list[str]] = field(default_factory=dict)
+    """Columns that were asked for as text."""
     faults: dict[str, str] = field(default_factory=dict)
+    """Other columns that hold text, and the sentence on the first such cell."""
     line: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Line of each row, from 1, shape (rows,)."""
     comments: list[tuple[int, str]] = field(default_factory=list)
+    """Comment lines, numbered."""
     cut: bool = False
+    """Whether the last row was incomplete and has been left out."""
 
     def __len__(self) -> int:
         return len(self.line)

@@ -110,24 +110,16 @@ _LIST = re.compile(r'"?[\[(]\s*([-+.\d][-+.\deE,;\s]*?)\s*[\])]"?')
 
 @dataclass(frozen=True)
 class Plain:
-    """A table of text in the dialect of `csv_table`.
-
-    Attributes
-    ----------
-    text : str
-        With as many lines as before.
-    columns : list of str, or None
-        Names of the columns where no row of `text` has them.
-    numbered : bool
-        Whether the file names no columns, so that they are numbered from 0.
-    notes : list of str
-        What was assumed, as sentences.
-    """
+    """A table of text in the dialect of `csv_table`."""
 
     text: str
+    """With as many lines as before."""
     columns: list[str] | None = None
+    """Names of the columns where no row of `text` has them."""
     numbered: bool = False
+    """Whether the file names no columns, so that they are numbered from 0."""
     notes: list[str] = field(default_factory=list)
+    """What was assumed, as sentences."""
 
 
 @dataclass(frozen=True)

@@ -15,36 +15,25 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Coupling:
-    """Bounds of `q[calf] + sign * q[thigh]`.
-
-    Attributes
-    ----------
-    calf, thigh : ndarray of int, shape (legs,)
-        Indices of the legs' joints.
-    sign : {1, -1}
-    low_rad, high_rad : ndarray, shape (legs,)
-    """
+    """Bounds of `q[calf] + sign * q[thigh]`."""
 
     calf: NDArray[np.intp]
     thigh: NDArray[np.intp]
+    """`calf` and `thigh`: indices of the legs' joints, shape (legs,)."""
     sign: int
+    """1 or -1."""
     low_rad: NDArray[np.float64]
     high_rad: NDArray[np.float64]
+    """Shape (legs,)."""
 
 
 @dataclass(frozen=True)
 class PositionLimits:
-    """Bounds of the commands of a bus.
-
-    Attributes
-    ----------
-    low_rad, high_rad : ndarray, shape (joints,)
-        Infinite where there is none.
-    coupling : Coupling or None
-    """
+    """Bounds of the commands of a bus."""
 
     low_rad: NDArray[np.float64]
     high_rad: NDArray[np.float64]
+    """`low_rad` and `high_rad`: infinite where there is none, shape (joints,)."""
     coupling: Coupling | None = None
 
     def clip(self, position_rad: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -100,12 +100,6 @@ def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
 
     A robot that fell counts up to half a second before its fall, if enough is left.
 
-    Parameters
-    ----------
-    rollout : Rollout
-    rng : numpy.random.Generator
-        For the noise of `null_r2`.
-
     Raises
     ------
     InputError

@@ -10,6 +10,12 @@ sways; a robot that fell counts as one that stands still until the end of its ep
 Episodes under all conditions run together (`policies.walks.together`). Episode k of every condition
 has the same robot, so that rows differ by their conditions, not by their robots. Robots and terrain
 are others than those of a training with the same seed.
+
+The battery holds conditions that make walking robots fall. Usual conditions separate nothing: an
+open-loop trot falls under none of them. These go on until it does: pushes, slopes, stairs, loads
+off centre, a weak leg, missed control ticks, late and jittered servos, slippery ground, and all
+that typically differs between a robot and its model (`sim.walking.differences.TYPICAL`). All are
+walked under random commands.
 """
 
 from __future__ import annotations
@@ -19,8 +25,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from pupper_sysid.common.results import Result
-from pupper_sysid.policies.evaluation.falls import Fall, falls_of
-from pupper_sysid.policies.evaluation.figures import Figures, Recorder, Walk, figures_of
+from pupper_sysid.policies.evaluation.figures import (
+    Fall,
+    Figures,
+    Recorder,
+    Walk,
+    falls_of,
+    figures_of,
+)
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.conditions import (
     DIRECTIONS,
@@ -30,9 +42,9 @@ from pupper_sysid.policies.walks.conditions import (
 )
 from pupper_sysid.policies.walks.handicaps import Handicap
 from pupper_sysid.policies.walks.together import walk_together
-from pupper_sysid.sim.robot.terrain import Terrain
+from pupper_sysid.sim.robot.terrain import STAIRS_M, Terrain
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.differences import Differences
+from pupper_sysid.sim.walking.differences import TYPICAL, Differences
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
 Group = Literal[
@@ -181,7 +193,7 @@ def evaluate(
         Its ground is that of the cases.
     servos : ServoRanges
     cases : sequence of Case
-        After `RANDOM`; see `table` and `policies.evaluation.battery`.
+        After `RANDOM`; see `table` and `policies.evaluation.evaluate`.
     robots : callable
         Episodes of a case and a walker; see `usual_robots`.
     seed, threads : int
@@ -223,3 +235,54 @@ def usual_robots(episodes: int) -> Callable[[Case, Walker], int]:
         return {"policy": own, "trot": max(own // 2, 2), "standing": max(own // 6, 2)}[walker]
 
     return count
+
+
+BATTERY: tuple[Case, ...] = (
+    *(
+        Case("push", f"pushes of {speed:g} m/s", handicap=Handicap(push_m_s=speed))
+        for speed in (0.4, 0.8, 1.2)
+    ),
+    *(
+        Case("slope", f"slope of {slope:g}°", handicap=Handicap(slope_deg=slope))
+        for slope in (10.0, 15.0, 20.0)
+    ),
+    *(
+        Case(
+            "stairs", f"steps of {1e3 * riser:g} mm", terrain="stairs",
+            handicap=Handicap(riser_m=riser),
+        )
+        for riser in STAIRS_M
+    ),
+    Case(
+        "payload", "150 g, 4 cm left",
+        handicap=Handicap(payload_kg=0.15, payload_at_m=(0.0, 0.04)),
+    ),
+    Case(
+        "payload", "150 g, 8 cm behind",
+        handicap=Handicap(payload_kg=0.15, payload_at_m=(-0.08, 0.0)),
+    ),
+    *(
+        Case("leg", f"one leg at {100 * torque:g} %", handicap=Handicap(weak_leg=torque))
+        for torque in (0.5, 0.25)
+    ),
+    *(
+        Case("ticks", f"{100 * share:g} % ticks missed", handicap=Handicap(missed_ticks=share))
+        for share in (0.1, 0.3)
+    ),
+    *(
+        Case("dead time", f"dead time +{1e3 * extra:g} ms", extra_dead_time_s=extra)
+        for extra in (0.04, 0.08)
+    ),
+    *(
+        Case("jitter", f"jitter +{1e3 * jitter:g} ms", handicap=Handicap(extra_jitter_s=jitter))
+        for jitter in (0.01, 0.02)
+    ),
+    Case("friction", "friction of 0.15", handicap=Handicap(friction=0.15)),
+    Case("robot", "unlike its model", differences=TYPICAL),
+)  # fmt: skip
+"""Rows of the battery, after that of random commands."""
+
+
+def battery_robots(episodes: int) -> Callable[[Case, Walker], int]:
+    """Episodes of each case and walker: equally many."""
+    return lambda case, walker: episodes

@@ -18,8 +18,7 @@ from pupper_sysid.common.page import Column, Picture, Section, Table
 from pupper_sysid.common.reading.csv_table import read_table
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.evaluation.evaluate import Evaluation, Row
-from pupper_sysid.policies.evaluation.falls import in_short
-from pupper_sysid.policies.evaluation.figures import Figures
+from pupper_sysid.policies.evaluation.figures import Figures, in_short
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.train.curves import LARGEST_BYTES, PROGRESS
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run

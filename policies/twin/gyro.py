@@ -34,39 +34,26 @@ _PER_BIN = 8  # frequencies per 1 / duration
 
 @dataclass(frozen=True, kw_only=True)
 class Gyro(Result):
-    """Spectrum of a gyro; each number for x, y and z.
-
-    Attributes
-    ----------
-    deviation_rad_s : tuple of float
-        Standard deviation; of several robots their mean.
-    peak_hz : tuple of float
-        Frequency of 0.5 to 10 Hz whose sine explains most; NaN of an axis that does not turn.
-    peak_share : tuple of float
-        Share of the variance that this sine explains.
-    """
+    """Spectrum of a gyro; each number for x, y and z."""
 
     deviation_rad_s: tuple[float, ...]
+    """Standard deviation; of several robots their mean."""
     peak_hz: tuple[float, ...]
+    """Frequency of 0.5 to 10 Hz whose sine explains most; NaN of an axis that does not turn."""
     peak_share: tuple[float, ...]
+    """Share of the variance that this sine explains."""
 
 
 @dataclass(frozen=True)
 class ImuLog:
-    """Samples of an IMU.
-
-    Attributes
-    ----------
-    time_s : ndarray, shape (n,)
-        From the first sample on.
-    rate_rad_s : ndarray, shape (n, 3)
-    acceleration_m_s2 : ndarray, shape (n, 3)
-        NaN where none was logged.
-    """
+    """Samples of an IMU."""
 
     time_s: Array
+    """From the first sample on, shape (n,)."""
     rate_rad_s: Array
+    """Shape (n, 3)."""
     acceleration_m_s2: Array
+    """NaN where none was logged, shape (n, 3)."""
 
 
 def read_imu(path: Path) -> ImuLog:

@@ -4,7 +4,7 @@
 several actuators, in the air (its trunk fixed) and on the ground. Each predicts the readings that
 the recording's bus would have shown of it: their age, and an offset per joint
 (`sysid.servo_fit.readings`). Errors per joint stand beside the robot's repeatability
-and persistence, and readings say whether the robot was on the ground (`policies.twin.evidence`).
+and persistence, and readings say whether the robot was on the ground (`policies.twin.playing`).
 
 On the ground several copies move, which differ in friction and payload; the prediction is the mean
 of those that stay up. A robot on its back predicts what one in the air does.
@@ -22,10 +22,18 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import share_sentences
 from pupper_sysid.common.results import Result, internal
-from pupper_sysid.policies.twin.actuators import Actuator, stronger
-from pupper_sysid.policies.twin.evidence import STRONGER, Case, Evidence, Verdict, evidence
+from pupper_sysid.policies.twin.drawing import Actuator, stronger
 from pupper_sysid.policies.twin.gyro import STEP_S, Gyro, spectrum
-from pupper_sysid.policies.twin.playing import Played, play, sequences
+from pupper_sysid.policies.twin.playing import (
+    STRONGER,
+    Case,
+    Evidence,
+    Played,
+    Verdict,
+    evidence,
+    play,
+    sequences,
+)
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration
 from pupper_sysid.sysid.fit.predict import ReadingRule, in_words, rule_of
 from pupper_sysid.sysid.recordings.joints import chosen_joints
@@ -42,70 +50,47 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class TwinErrors(Result):
-    """Errors of the simulated robot on one joint, or their means over joints [rad].
-
-    Attributes
-    ----------
-    mae_rad, rmse_rad : float
-        Mean absolute and root mean square error of the readings that count: rows as logged against
-        predicted readings, or fresh ones where the recording dates them.
-    rmse_raw_rad : float
-        Of rows as logged.
-    offset_rad : float
-        Reading minus prediction, taken out of all.
-    """
+    """Errors of the simulated robot on one joint, or their means over joints [rad]."""
 
     mae_rad: float
     rmse_rad: float
+    """`mae_rad` and `rmse_rad`: mean absolute and root mean square error of the readings that
+    count: rows as logged against predicted readings, or fresh ones where the recording dates
+    them."""
     rmse_raw_rad: float
+    """Of rows as logged."""
     offset_rad: float
+    """Reading minus prediction, taken out of all."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Condition(Result):
-    """The simulated robot in the air or on the ground.
-
-    Attributes
-    ----------
-    joints : dict of str to TwinErrors
-    mean : TwinErrors
-        Over joints; of the offset, the mean of its size.
-    rmse_rad : Interval
-        Of the mean.
-    copies, upright : int
-        Simulated robots, and how many of them stayed up.
-    first_fall_s : float or None
-        When the first fell [s].
-    gyro : Gyro or None
-        Of those that stayed up; None in the air, or of less than seven seconds.
-    """
+    """The simulated robot in the air or on the ground."""
 
     joints: dict[str, TwinErrors]
     mean: TwinErrors
+    """Over joints; of the offset, the mean of its size."""
     rmse_rad: Interval
+    """Of the mean."""
     copies: int
     upright: int
+    """`copies` and `upright`: simulated robots, and how many of them stayed up."""
     first_fall_s: float | None
+    """When the first fell [s]."""
     gyro: Gyro | None
+    """Of those that stayed up; None in the air, or of less than seven seconds."""
     errors: dict[str, Errors] = internal()
     tracks: Tracks = internal()
 
 
 @dataclass(frozen=True, kw_only=True)
 class ActuatorTwin(Result):
-    """The simulated robot with one actuator.
-
-    Attributes
-    ----------
-    air : Condition
-    ground : Condition or None
-    evidence : Evidence or None
-        None of a robot that is fixed to the world.
-    """
+    """The simulated robot with one actuator."""
 
     air: Condition
     ground: Condition | None
     evidence: Evidence | None
+    """None of a robot that is fixed to the world."""
 
     @property
     def best_rad(self) -> float:
@@ -115,42 +100,27 @@ class ActuatorTwin(Result):
 
 @dataclass(frozen=True, kw_only=True)
 class Twin(Result):
-    """Twin test of a recording.
-
-    Attributes
-    ----------
-    robot : str
-    models : dict of str to ActuatorTwin
-        By actuator.
-    best : str
-        The actuator with the smallest error.
-    verdict : {"ground", "air", "cannot tell"}
-        Where the robot was.
-    judge : str or None
-        The actuator by which: the best of those that were not fitted to this recording, whose
-        numbers already hold what the ground did to it. None where all were.
-    scored : str
-        Which rows count.
-    readings : dict of str to ReadingRule
-        By joint, when its readings were measured.
-    persistence_rmse_rad, repeatability_rad : dict of str to float
-        By joint, on the same rows.
-    time_step_s : float
-        Time between commands.
-    notes : tuple of str
-    data : ServoData
-    """
+    """Twin test of a recording."""
 
     robot: str
     models: dict[str, ActuatorTwin]
+    """By actuator."""
     best: str
+    """The actuator with the smallest error."""
     verdict: Verdict
+    """Where the robot was."""
     judge: str | None
+    """The actuator by which: the best of those that were not fitted to this recording, whose
+    numbers already hold what the ground did to it. None where all were."""
     scored: str
+    """Which rows count."""
     readings: dict[str, ReadingRule]
+    """By joint, when its readings were measured."""
     persistence_rmse_rad: dict[str, float]
     repeatability_rad: dict[str, float]
+    """`persistence_rmse_rad` and `repeatability_rad`: by joint, on the same rows."""
     time_step_s: float
+    """Time between commands."""
     notes: tuple[str, ...]
     data: ServoData = internal()
 

@@ -146,15 +146,7 @@ def load_bam(path: Path) -> ServoCard:
 def from_bam(
     parameters: BamParameters, kind: Actuator, name: Path | str = "The parameters"
 ) -> PositionLoop:
-    """Numbers of a card from BAM's; see the module's text.
-
-    Parameters
-    ----------
-    parameters : BamParameters
-    kind : Actuator
-    name : Path or str
-        Of their file, for messages.
-    """
+    """Numbers of a card from BAM's; see the module's text."""
     p = parameters
     if p.R == 0 or p.kt == 0:
         raise InputError(f"{name}: kt and R must be above 0. Fit it again.")
@@ -287,10 +279,6 @@ def motor_of(servo: UnderLoad) -> tuple[dict[str, Any], tuple[str, ...]]:
 
     BAM's friction at standstill decays as exp(-(v / v0)^a), ours as 1 / (1 + (v / v1)^2); v0 is
     such that half of it is left at the same speed.
-
-    Parameters
-    ----------
-    servo : UnderLoad
 
     Returns
     -------

@@ -99,25 +99,16 @@ class Motion(Result):
 
 @dataclass(frozen=True)
 class Comparison(Result):
-    """Two servos at one P gain, as far as both know theirs.
-
-    Attributes
-    ----------
-    first, second : Servo
-    differences : tuple of Difference
-    p_gain : float or None
-        Of both; None where they could not be brought to one.
-    motion : Motion
-    notes : tuple of str
-        What is compared at which gain, and what is not comparable, in sentences.
-    """
+    """Two servos at one P gain, as far as both know theirs."""
 
     first: Servo
     second: Servo
     differences: tuple[Difference, ...]
     p_gain: float | None
+    """Of both; None where they could not be brought to one."""
     motion: Motion
     notes: tuple[str, ...]
+    """What is compared at which gain, and what is not comparable, in sentences."""
 
 
 def servo_of(path_or_name: str, part: str | None = None, p_gain: float | None = None) -> Servo:

@@ -193,14 +193,7 @@ _LONGEST_PATH = 107  # bytes, of a socket on Linux
 
 
 class ProxySocket:
-    """Serves a `ProxyEmulator` at a path.
-
-    Parameters
-    ----------
-    emulator : ProxyEmulator
-    path : Path
-        Of the socket; removed at the end.
-    """
+    """Serves a `ProxyEmulator` at a path."""
 
     def __init__(self, emulator: ProxyEmulator, path: Path):
         self.emulator, self.path = emulator, path

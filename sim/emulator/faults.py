@@ -28,26 +28,17 @@ _LATE_S = (0.004, 0.06)
 
 @dataclass
 class BusFaults:
-    """Faults drawn at given rates.
-
-    Attributes
-    ----------
-    rates : dict of str to float
-        Probability per answer, for each of `KINDS`.
-    rng : numpy.random.Generator
-    lasts_s : float
-        How long faults of servos and lines last.
-    counts : dict of str to int
-        How many were injected.
-    ended : list of (str, float)
-        Kind and end of faults that last, on the emulator's clock.
-    """
+    """Faults drawn at given rates."""
 
     rates: dict[str, float]
+    """Probability per answer, for each of `KINDS`."""
     rng: np.random.Generator
     lasts_s: float = 0.2
+    """How long faults of servos and lines last."""
     counts: dict[str, int] = field(default_factory=dict)
+    """How many were injected."""
     ended: list[tuple[str, float]] = field(default_factory=list)
+    """Kind and end of faults that last, on the emulator's clock."""
 
     def __post_init__(self):
         for kind, rate in self.rates.items():

@@ -88,28 +88,18 @@ class RobotSpec:
 
 @dataclass(frozen=True)
 class EmulatedServo:
-    """True parameters of one servo.
-
-    Attributes
-    ----------
-    joint : str
-    actuator : DelayedPDParameters
-        Scalars. Its dead time is without the latency of commands (`command_jitter_s`).
-    feedback : HeldFeedback
-    poll_phase_s : float
-        One poll instant of its lattice, before jitter and drift [s].
-    zero_rad : float
-        Angle of the centre count [rad].
-    count_sign : {1, -1}
-        Direction of the counts as the angle grows.
-    """
+    """True parameters of one servo."""
 
     joint: str
     actuator: DelayedPDParameters
+    """Scalars. Its dead time is without the latency of commands (`command_jitter_s`)."""
     feedback: HeldFeedback
     poll_phase_s: float
+    """One poll instant of its lattice, before jitter and drift [s]."""
     zero_rad: float
+    """Angle of the centre count [rad]."""
     count_sign: int
+    """Direction of the counts as the angle grows."""
 
     @property
     def command_rounding(self) -> str:
@@ -156,15 +146,7 @@ class EmulatedRobot:
 def draw_robot(
     rng: np.random.Generator, spec: RobotSpec | None = None, joint_map: JointMap | None = None
 ) -> EmulatedRobot:
-    """Draw one robot of `spec` (default: the published Mini Pupper 2).
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    spec : RobotSpec, optional
-    joint_map : JointMap, optional
-        Of another robot.
-    """
+    """Draw one robot of `spec` (default: the published Mini Pupper 2)."""
     spec = spec or RobotSpec()
     start = rng.uniform(0.0, spec.poll_period_s)
     layout = (joint_map or load_joint_map("mini_pupper_2")).per_servo()

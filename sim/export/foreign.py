@@ -43,14 +43,7 @@ _NAMES = ("joint_names_expr", "target_names_expr")
 
 
 def foreign_servo(path: Path | str, joint: str | None = None) -> Servo:
-    """One servo of an MJCF or of a Python configuration.
-
-    Parameters
-    ----------
-    path : Path or str
-    joint : str, optional
-        By default the first that is driven.
-    """
+    """One servo of an MJCF or of a Python configuration."""
     path = Path(path)
     if path.suffix == ".py":
         return _in_python(path, joint)

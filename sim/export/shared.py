@@ -56,27 +56,18 @@ _FASTEST_HZ, _AMPLITUDE_RAD = 4.0, 0.3  # the sweeps' fastest common tone
 
 @dataclass(frozen=True)
 class ExportedServos:
-    """Servos of a calibration, as an export states them.
-
-    Attributes
-    ----------
-    calibration : Calibration
-        At the exported P gain, its armatures without the links that were taken off.
-    physics_step_s : float
-        Of the simulator [s].
-    sha256 : str
-        Of the text of the calibration that all this was made from.
-    moving : Calibration
-        The same with all that its armatures hold, which is what moved in the recordings.
-    links : dict of str to float
-        By joint, the inertia that was taken off [kg·m²].
-    """
+    """Servos of a calibration, as an export states them."""
 
     calibration: Calibration
+    """At the exported P gain, its armatures without the links that were taken off."""
     physics_step_s: float
+    """Of the simulator [s]."""
     sha256: str
+    """Of the text of the calibration that all this was made from."""
     moving: Calibration
+    """The same with all that its armatures hold, which is what moved in the recordings."""
     links: Mapping[str, float] = field(default_factory=dict)
+    """By joint, the inertia that was taken off [kg·m²]."""
     _actuators: dict[Engine, dict[str, Actuator]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )

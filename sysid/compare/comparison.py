@@ -51,28 +51,19 @@ class ComparedScores(scores.Scores):
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedModel(ModelScores):
-    """Scores of one model on readings that it predicts.
-
-    Attributes
-    ----------
-    joints : dict of str to ComparedScores
-    mean : ComparedScores
-        Over joints.
-    offset_rad : dict of str to float
-        By joint, reading minus prediction of these recordings; empty for a model fitted here.
-    age_spread_rad : dict of str to float
-        By joint, the part of the raw error that the unknown age of readings makes: a perfect model
-        would have it. 0 where readings are dated.
-    readings : dict of str to ReadingRule
-        By joint, when a calibration says that readings were measured.
-    """
+    """Scores of one model on readings that it predicts."""
 
     # as for the errors, with more numbers
     joints: dict[str, ComparedScores]  # pyright: ignore[reportIncompatibleVariableOverride]
     mean: ComparedScores
+    """Over joints."""
     offset_rad: dict[str, float] = field(default_factory=dict)
+    """By joint, reading minus prediction of these recordings; empty for a model fitted here."""
     age_spread_rad: dict[str, float] = field(default_factory=dict)
+    """By joint, the part of the raw error that the unknown age of readings makes: a perfect model
+    would have it. 0 where readings are dated."""
     readings: dict[str, ReadingRule] = field(default_factory=dict)
+    """By joint, when a calibration says that readings were measured."""
 
     @classmethod
     def scored(
@@ -102,40 +93,26 @@ class ComparedModel(ModelScores):
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison(Result):
-    """Servo models on the same readings.
-
-    Attributes
-    ----------
-    models : dict of str to ComparedModel
-    readings : dict of str to ReadingRule
-        By joint, when its readings were measured.
-    persistence_rmse_rad, repeatability_rad : dict of str to float
-        Per joint.
-    time_step_s : float
-        Time between commands.
-    notes : tuple of str
-    data : ServoData
-    tracks : dict of str to Tracks
-        Readings of each model in free run.
-    bands : dict of str to (dict of str to Band)
-        By model, of those that have a predictive band, then joint.
-    runs : dict of str to list of ComparedRun
-        By joint.
-    run_tracks : dict of str to (dict of str to list of ndarray)
-        By calibration, then joint: predicted readings at the steps of each run.
-    """
+    """Servo models on the same readings."""
 
     models: dict[str, ComparedModel]
     readings: dict[str, ReadingRule]
+    """By joint, when its readings were measured."""
     persistence_rmse_rad: dict[str, float]
     repeatability_rad: dict[str, float]
+    """`persistence_rmse_rad` and `repeatability_rad`: per joint."""
     time_step_s: float
+    """Time between commands."""
     notes: tuple[str, ...]
     data: ServoData = internal()
     tracks: dict[str, scores.Tracks] = internal()
+    """Readings of each model in free run."""
     bands: dict[str, dict[str, scores.Band]] = internal()
+    """By model, of those that have a predictive band, then joint."""
     runs: dict[str, list[ComparedRun]] = internal(default_factory=dict)
+    """By joint."""
     run_tracks: dict[str, dict[str, list[NDArray[np.float64]]]] = internal(default_factory=dict)
+    """By calibration, then joint: predicted readings at the steps of each run."""
 
     def to_frame(self) -> pd.DataFrame:
         """Scores, one row per joint and model."""
@@ -170,13 +147,7 @@ class Comparison(Result):
         return list(dict.fromkeys([*said, *(text for own in rules for text in in_words(own))]))
 
     def plot(self, joints: Sequence[str] | None = None) -> Figure:
-        """Figure of the models in free run beside commands and readings, a panel per joint.
-
-        Parameters
-        ----------
-        joints : sequence of str, optional
-            By default all.
-        """
+        """Figure of the models in free run beside commands and readings, a panel per joint."""
         from pupper_sysid.sysid.servo_fit.figures import free_run_figure
 
         every = [own for runs in self.runs.values() for own in runs]

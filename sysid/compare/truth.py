@@ -37,8 +37,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice
 from pupper_sysid.sysid.fit.calibrate import CalibrationResult
 from pupper_sysid.sysid.fit.run import whole_counts
 from pupper_sysid.sysid.lag.lag_budget import lag_budget
-from pupper_sysid.sysid.lag.phase_slope import tone_lags, tone_weights
-from pupper_sysid.sysid.lag.tone import tone_response
+from pupper_sysid.sysid.lag.tone import tone_lags, tone_response, tone_weights
 from pupper_sysid.sysid.recordings.joints import (
     Recordings,
     as_sequence,
@@ -81,45 +80,29 @@ class _Truth(BaseModel):
 
 @dataclass(frozen=True, kw_only=True)
 class TruthRow(Result):
-    """One quantity of one joint: found and true.
-
-    Attributes
-    ----------
-    joint, quantity : str
-        `stiffness`, `damping`, `friction_loss`, `effort_limit` and `back_emf` are ratios to the
-        armature; the other names end in their unit.
-    found : Interval
-        With its 90 % interval; NaN at ends that the calibration does not give.
-    identified : {"yes", "ratio only", "no"}
-        Whether the calibration calls it determined.
-    truth : float
-    held : bool or None
-        Whether the interval holds the truth; None without an interval.
-    """
+    """One quantity of one joint: found and true."""
 
     joint: str
     quantity: str
+    """`joint` and `quantity`: `stiffness`, `damping`, `friction_loss`, `effort_limit` and
+    `back_emf` are ratios to the armature; the other names end in their unit."""
     found: Interval
+    """With its 90 % interval; NaN at ends that the calibration does not give."""
     identified: str
+    """Whether the calibration calls it determined."""
     truth: float
     held: bool | None
+    """Whether the interval holds the truth; None without an interval."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TruthTable(Result):
-    """A calibration beside the truth.
-
-    Attributes
-    ----------
-    quantities : tuple of TruthRow
-        By joint, in the order of the calibration.
-    definitions : tuple of str
-        P gain, armature and load that the numbers of both sides are for, a sentence per joint.
-    notes : tuple of str
-    """
+    """A calibration beside the truth."""
 
     quantities: tuple[TruthRow, ...]
+    """By joint, in the order of the calibration."""
     definitions: tuple[str, ...] = ()
+    """P gain, armature and load that the numbers of both sides are for, a sentence per joint."""
     notes: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[TruthRow]:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from pupper_sysid.sysid.doctor.explanations import Explanation, Servo, explain, servo_delay
 from pupper_sysid.sysid.doctor.findings import CARE, Finding, rivalled
+from pupper_sysid.sysid.recordings.excitation import remembered
 from pupper_sysid.sysid.recordings.recording import Trial
-from pupper_sysid.sysid.recordings.remembered import remembered
 
 CLEAR_NATS = 6.0
 """Advantage of a fault over what is usual: 400 times as likely."""
@@ -60,27 +60,18 @@ Paths = list[NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Bend:
-    """One operator at its best.
-
-    Attributes
-    ----------
-    nats : float
-        Score, the less the better.
-    unexplained : float
-        Share of the position's variance.
-    values : tuple of float
-        Of play its half width [rad of command], of saturation two levels [rad of command].
-    servo : Servo
-        Whose path it bends.
-    of_goal : bool
-        Whether the command is bent before the servo's low-pass.
-    """
+    """One operator at its best."""
 
     nats: float
+    """Score, the less the better."""
     unexplained: float
+    """Share of the position's variance."""
     values: tuple[float, ...]
+    """Of play its half width [rad of command], of saturation two levels [rad of command]."""
     servo: Servo
+    """Whose path it bends."""
     of_goal: bool = False
+    """Whether the command is bent before the servo's low-pass."""
 
 
 @dataclass(frozen=True)

@@ -35,9 +35,8 @@ from pupper_sysid.sysid.doctor.signals import (
     unit_findings,
 )
 from pupper_sysid.sysid.feedback.staleness import fresh_rows, quantum
-from pupper_sysid.sysid.recordings.bad_readings import without_bad_readings
+from pupper_sysid.sysid.recordings.excitation import remembered, without_bad_readings
 from pupper_sysid.sysid.recordings.recording import Trial
-from pupper_sysid.sysid.recordings.remembered import remembered
 from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
 
 LEAST_ROWS = 3
@@ -120,11 +119,6 @@ def findings(recorded: Sequence[Trial]) -> list[Finding]:
     """Find what is wrong with one joint's trials.
 
     All that asks for care, or the first fault that makes every number wrong.
-
-    Parameters
-    ----------
-    recorded : sequence of Trial
-        All of one joint.
     """
     cleaned = [without_bad_readings(t) for t in recorded]
     trials = long_enough(cleaned)
@@ -144,12 +138,7 @@ def findings(recorded: Sequence[Trial]) -> list[Finding]:
 
 
 def refuse_unusable(trials_by_joint: Mapping[str, Sequence[Trial]]) -> None:
-    """Refuse to compute from recordings whose verdict is "do not use".
-
-    Parameters
-    ----------
-    trials_by_joint : dict of joint to sequence of Trial
-    """
+    """Refuse to compute from recordings whose verdict is "do not use"."""
     others = " Or leave the joint out of `joints`." if len(trials_by_joint) > 1 else ""
     for joint, trials in trials_by_joint.items():
         for fault in findings(trials):

@@ -31,8 +31,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
 )
 from pupper_sysid.sysid.feedback.staleness import moving_rows
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
-from pupper_sysid.sysid.recordings.bad_readings import without_bad_readings
-from pupper_sysid.sysid.recordings.excitation import describe, named_tones
+from pupper_sysid.sysid.recordings.excitation import describe, named_tones, without_bad_readings
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
@@ -54,57 +53,43 @@ _HELD = (
 
 @dataclass(frozen=True, kw_only=True)
 class JointExamination(Result):
-    """Examination of one joint. Numbers that the recording does not give are NaN.
-
-    Attributes
-    ----------
-    verdict : {"use", "use with care", "do not use"}
-    reasons : tuple of str
-        Sentences; each says what to do, or what to record instead.
-    findings : tuple of Finding
-        The same by code and numbers.
-    loop_period_s, jitter_s : float
-        Median time between commands, and standard deviation about their mean.
-    fresh_fraction : float
-        Share of rows whose value differs from the one before.
-    poll_period_s, loss, z_score, hit_rate : float
-        See `sysid.feedback.poll_lattice.PollLattice`.
-    hold_share : float
-        Share of the raw lag that stale readings add.
-    quantum_rad : float
-        Quantisation step; 0 if there is none.
-    reading_minus_command_rad : float
-        Mean of the fresh readings minus mean of the command, over the tones if there are any.
-    missing_fraction : float
-    bad_time_stamps : int
-        Rows whose send or read time is not later than the row before.
-    amplitude_ratio : float
-        Range of the position over range of the command, median over trials.
-    peak_command_rad_s, speed_share : float
-        Fastest command, and the same as a share of the servo's speed limit.
-    hold_histogram : tuple of int
-        How many runs of 1, 2, 3, … equal readings there are while the joint must have moved.
-    """
+    """Examination of one joint. Numbers that the recording does not give are NaN."""
 
     verdict: str
+    """One of `findings.VERDICTS`: use, use with care, do not use."""
     reasons: tuple[str, ...]
+    """Sentences; each says what to do, or what to record instead."""
     findings: tuple[Finding, ...] = ()
+    """The same by code and numbers."""
     loop_period_s: float = math.nan
     jitter_s: float = math.nan
+    """`loop_period_s` and `jitter_s`: median time between commands, and standard deviation about
+    their mean."""
     fresh_fraction: float = math.nan
+    """Share of rows whose value differs from the one before."""
     poll_period_s: float = math.nan
     loss: float = math.nan
     z_score: float = math.nan
     hit_rate: float = math.nan
+    """`poll_period_s`, `loss`, `z_score` and `hit_rate`: see
+    `sysid.feedback.poll_lattice.PollLattice`."""
     hold_share: float = math.nan
+    """Share of the raw lag that stale readings add."""
     quantum_rad: float = math.nan
+    """Quantisation step; 0 if there is none."""
     reading_minus_command_rad: float = math.nan
+    """Mean of the fresh readings minus mean of the command, over the tones if there are any."""
     missing_fraction: float = math.nan
     bad_time_stamps: int = 0
+    """Rows whose send or read time is not later than the row before."""
     amplitude_ratio: float = math.nan
+    """Range of the position over range of the command, median over trials."""
     peak_command_rad_s: float = math.nan
     speed_share: float = math.nan
+    """`peak_command_rad_s` and `speed_share`: fastest command, and the same as a share of the
+    servo's speed limit."""
     hold_histogram: tuple[int, ...] = ()
+    """How many runs of 1, 2, 3, … equal readings there are while the joint must have moved."""
     feedback: PollLattice | None = internal(default=None)
 
     def __str__(self) -> str:

@@ -29,8 +29,8 @@ from scipy.signal import lfilter
 from pupper_sysid.sysid.doctor.findings import REFUSE, Finding
 from pupper_sysid.sysid.doctor.signals import clock_findings
 from pupper_sysid.sysid.feedback.staleness import fresh_rows, quantum, staleness
+from pupper_sysid.sysid.recordings.excitation import remembered
 from pupper_sysid.sysid.recordings.recording import Trial
-from pupper_sysid.sysid.recordings.remembered import remembered
 
 LATEST_S, EARLIEST_S = 0.8, -0.6
 
@@ -52,30 +52,20 @@ Filtered = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Servo:
-    """The best servo of a region of gains and lags.
-
-    Attributes
-    ----------
-    nats : float
-        Its score, the less the better.
-    unexplained : float
-        Share of the position's variance that it leaves.
-    gain : float
-        Of its low-pass at rest, with its sign.
-    lag_s : float
-        Its delay beside the low-pass.
-    total_s : float
-        Delay and low-pass together.
-    filter : int
-        Number of its low-pass.
-    """
+    """The best servo of a region of gains and lags."""
 
     nats: float
+    """Its score, the less the better."""
     unexplained: float
+    """Share of the position's variance that it leaves."""
     gain: float
+    """Of its low-pass at rest, with its sign."""
     lag_s: float
+    """Its delay beside the low-pass."""
     total_s: float
+    """Delay and low-pass together."""
     filter: int
+    """Number of its low-pass."""
 
 
 @dataclass(frozen=True)
@@ -92,29 +82,22 @@ class Samples:
 
 @dataclass(frozen=True)
 class Explanation:
-    """All servos of the grid against the trials of one joint.
-
-    Attributes
-    ----------
-    samples : tuple of Samples
-        Of the trials that move.
-    weight : ndarray, shape (trials,)
-    rho, gains : ndarray, shape (trials, filters, lags)
-        Correlation with the filtered and shifted command, and position per command.
-    lags_s : ndarray, shape (lags,)
-    rows : float
-        Readings that count as independent.
-    floor : float
-        Unexplained share that any servo leaves.
-    """
+    """All servos of the grid against the trials of one joint."""
 
     samples: tuple[Samples, ...]
+    """Of the trials that move."""
     weight: NDArray[np.float64]
+    """Shape (trials,)."""
     rho: NDArray[np.float64]
     gains: NDArray[np.float64]
+    """`rho` and `gains`: correlation with the filtered and shifted command, and position per
+    command, shape (trials, filters, lags)."""
     lags_s: NDArray[np.float64]
+    """Shape (lags,)."""
     rows: float
+    """Readings that count as independent."""
     floor: float
+    """Unexplained share that any servo leaves."""
     grid_s: float
 
     @cached_property

@@ -13,23 +13,16 @@ VERDICTS = (REFUSE, CARE, USE)
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found about a joint.
-
-    Attributes
-    ----------
-    code : str
-        A key of `words.WORDS`.
-    verdict : {"use", "use with care", "do not use"}
-    values : dict of str to number or str
-        What the sentence of this code holds.
-    joint : str
-        Empty where one joint is looked at.
-    """
+    """What was found about a joint."""
 
     code: str
+    """A key of `words.WORDS`."""
     verdict: str
+    """One of `VERDICTS`."""
     values: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """What the sentence of this code holds."""
     joint: str = ""
+    """Empty where one joint is looked at."""
 
     @property
     def text(self) -> str:

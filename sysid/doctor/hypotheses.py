@@ -61,16 +61,10 @@ _SLOPE, _SLOPE_ERRORS, _LAG_DRIFT_S = 4e-4, 6.0, 0.008
 
 @dataclass(frozen=True)
 class Relation:
-    """One explanation of the pair, fitted.
-
-    Attributes
-    ----------
-    code : str
-        Of its finding; empty for the servo as it is.
-    servo : Servo
-    """
+    """One explanation of the pair, fitted."""
 
     code: str
+    """Of its finding; empty for the servo as it is."""
     servo: Servo
 
 

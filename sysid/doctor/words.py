@@ -338,12 +338,7 @@ def _template(finding: Finding) -> str:
 
 
 def shared(by_joint: Mapping[str, Sequence[Finding]]) -> list[tuple[str, str]]:
-    """Joints and sentences: findings that differ in nothing but their numbers become one.
-
-    Parameters
-    ----------
-    by_joint : mapping of joint to sequence of Finding
-    """
+    """Joints and sentences: findings that differ in nothing but their numbers become one."""
     groups: dict[tuple, dict[str, Finding]] = {}
     for joint, findings in by_joint.items():
         kinds = [_kind(f) for f in findings]

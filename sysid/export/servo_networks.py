@@ -101,8 +101,7 @@ def _write_network(saved: SavedModel, to: Literal["onnx", "torchscript"], path: 
     """The model's step as a file, which must repeat a free run of the model."""
     import torch  # slow to import
 
-    from pupper_sysid.sysid.export.network import Run, export_module
-    from pupper_sysid.sysid.export.servo_module import ServoStep
+    from pupper_sysid.sysid.export.network import Run, ServoStep, export_module
 
     model = saved.model
     if not isinstance(model, CommandNetwork | RecurrentNetwork):

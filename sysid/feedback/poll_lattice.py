@@ -155,58 +155,41 @@ _FEWEST_SHUFFLES, _CLEAR = 4, 20.0
 
 @dataclass(frozen=True, kw_only=True)
 class PollLattice(Result):
-    """The poll of one joint's feedback, as far as its readings show it; NaN where unknown.
-
-    Attributes
-    ----------
-    kind : {"lattice", "unresolved", "every read"}
-        A lattice was found; none is significant; or readings are live, so each is dated to its
-        read, even where it repeats the one before because the joint stands still.
-    readings : {"live", "polled", "cannot tell"}
-        Whether the bus returns present positions or those of its last poll: by the recording's
-        header, else by the motion, else by a significant lattice.
-    time_doubt_s : float
-        By how much all readings may have been measured earlier or later than they are dated: half
-        a loop if the lattice is unresolved, else 0. Lag and dead time are in doubt by as much, and
-        neither is identified then.
-    poll_period_s, poll_period_sd_s : float
-        Time between polls and its standard error.
-    loss, loss_sd : float
-        Probability that a poll fails, and its standard error.
-    z_score : float
-        Score against shuffled rows, in their standard deviations.
-    hit_rate : float
-        Share of changed rows with a lattice instant between the previous read and this one.
-    fresh_fraction : float
-        Share of rows with a new value, among all rows.
-    slips : tuple of Slip
-        Jumps of the poll's phase within a trial.
-    polls : float
-        Independent polls from which the loss was counted.
-    rivals_s : tuple of float
-        Periods that explain the readings about as well [s]: reads meet their instants in the same
-        rows.
-    blur_s : float
-        Full width of the uncertainty of one poll instant.
-    phases : tuple of Phase
-        Lattice of each stretch, in time order within a trial.
-    """
+    """The poll of one joint's feedback, as far as its readings show it; NaN where unknown."""
 
     kind: str
+    """A lattice was found; none is significant; or readings are live, so each is dated to its read,
+    even where it repeats the one before because the joint stands still."""
     readings: str = "cannot tell"
+    """Whether the bus returns present positions or those of its last poll: by the recording's
+    header, else by the motion, else by a significant lattice."""
     time_doubt_s: float = 0.0
+    """By how much all readings may have been measured earlier or later than they are dated: half a
+    loop if the lattice is unresolved, else 0. Lag and dead time are in doubt by as much, and
+    neither is identified then."""
     poll_period_s: float = math.nan
     poll_period_sd_s: float = math.nan
+    """`poll_period_s` and `poll_period_sd_s`: time between polls and its standard error."""
     loss: float = math.nan
     loss_sd: float = math.nan
+    """`loss` and `loss_sd`: probability that a poll fails, and its standard error."""
     z_score: float = math.nan
+    """Score against shuffled rows, in their standard deviations."""
     hit_rate: float = math.nan
+    """Share of changed rows with a lattice instant between the previous read and this one."""
     fresh_fraction: float
+    """Share of rows with a new value, among all rows."""
     slips: tuple[Slip, ...] = ()
+    """Jumps of the poll's phase within a trial."""
     polls: float = internal(default=0.0)
+    """Independent polls from which the loss was counted."""
     rivals_s: tuple[float, ...] = internal(default=())
+    """Periods that explain the readings about as well [s]: reads meet their instants in the same
+    rows."""
     blur_s: float = internal(default=BLUR_S)
+    """Full width of the uncertainty of one poll instant."""
     phases: tuple[Phase, ...] = internal(default=())
+    """Lattice of each stretch, in time order within a trial."""
 
     @derived
     def mean_age_s(self) -> float:
@@ -265,27 +248,19 @@ class PollLattice(Result):
 
 @dataclass(frozen=True)
 class Readings:
-    """The fresh rows of a trial, each with the time at which it was measured.
-
-    Attributes
-    ----------
-    rows : ndarray of int, shape (fresh,)
-        Indices into the trial's rows.
-    time_s : ndarray, shape (fresh,)
-        When the position was measured.
-    position_rad : ndarray, shape (fresh,)
-    held_time_s : ndarray, shape (rows,)
-        For every row of the trial, when the value it shows was measured; NaN before the first
-        fresh row.
-    time_sd_s : float
-        Standard error of a shift common to all these times.
-    """
+    """The fresh rows of a trial, each with the time at which it was measured."""
 
     rows: NDArray[np.int64]
+    """Indices into the trial's rows, shape (fresh,)."""
     time_s: NDArray[np.float64]
+    """When the position was measured, shape (fresh,)."""
     position_rad: NDArray[np.float64]
+    """Shape (fresh,)."""
     held_time_s: NDArray[np.float64]
+    """Shape (rows,). For every row of the trial, when the value it shows was measured; NaN before
+    the first fresh row."""
     time_sd_s: float
+    """Standard error of a shift common to all these times."""
 
 
 def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> PollLattice:

@@ -228,26 +228,19 @@ _MOST_OUTLIERS = 0.4
 
 @dataclass(frozen=True)
 class Stretch:
-    """Evidence on the poll instants from one stretch of one trial.
-
-    Attributes
-    ----------
-    trial : int
-        Number of the trial.
-    start_s, stop_s : float
-    begin, end : ndarray, shape (changed,)
-        Previous read and read of each changed row [s].
-    same_begin, same_end : ndarray, shape (same,)
-        The same of each row whose value did not change although the servo must have moved [s].
-    """
+    """Evidence on the poll instants from one stretch of one trial."""
 
     trial: int
+    """Number of the trial."""
     start_s: float
     stop_s: float
     begin: NDArray[np.float64]
     end: NDArray[np.float64]
+    """`begin` and `end`: previous read and read of each changed row [s], shape (changed,)."""
     same_begin: NDArray[np.float64]
     same_end: NDArray[np.float64]
+    """`same_begin` and `same_end`: the same of each row whose value did not change although the
+    servo must have moved [s], shape (same,)."""
 
     def between(self, start_s: float, stop_s: float) -> Stretch:
         """Rows read within a part of the stretch."""
@@ -260,24 +253,18 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Phase:
-    """The lattice in one stretch of one trial: instants at `phase_s + n * period_s`.
-
-    Attributes
-    ----------
-    trial : int
-        Number of the trial.
-    start_s, stop_s : float
-        The stretch.
-    period_s, phase_s, phase_sd_s : float
-        Period, an instant near the stretch's middle, and the standard error of that.
-    """
+    """The lattice in one stretch of one trial: instants at `phase_s + n * period_s`."""
 
     trial: int
+    """Number of the trial."""
     start_s: float
     stop_s: float
+    """`start_s` and `stop_s`: the stretch."""
     period_s: float
     phase_s: float
     phase_sd_s: float
+    """`period_s`, `phase_s` and `phase_sd_s`: period, an instant near the stretch's middle, and the
+    standard error of that."""
 
 
 def best_periods(

@@ -51,24 +51,16 @@ _SCALES = (0.9, 0.7, 0.54)
 
 @dataclass(frozen=True, kw_only=True)
 class Slip(Result):
-    """Jump of the poll's phase within a trial.
-
-    Attributes
-    ----------
-    trial : int
-        Number of the trial.
-    time_s : float
-        When, from the trial's first read.
-    jump_s : float
-        By how much polls come later than before, within half a period.
-    nats : float
-        Log-likelihood that the jump gains.
-    """
+    """Jump of the poll's phase within a trial."""
 
     trial: int
+    """Number of the trial."""
     time_s: float
+    """When, from the trial's first read."""
     jump_s: float
+    """By how much polls come later than before, within half a period."""
     nats: float
+    """Log-likelihood that the jump gains."""
 
 
 @dataclass(frozen=True)

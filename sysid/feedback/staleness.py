@@ -104,11 +104,6 @@ def quantum(trials: Sequence[Trial]) -> float:
     gives a first guess, and least squares over all of them the step; a file's decimals only blur
     it.
 
-    Parameters
-    ----------
-    trials : sequence of Trial
-        All of one joint.
-
     Returns
     -------
     float
@@ -168,23 +163,15 @@ _HARMLESS_S = 0.004
 
 @dataclass(frozen=True, kw_only=True)
 class Staleness(Result):
-    """Whether readings are new at each read.
-
-    Attributes
-    ----------
-    kind : {"live", "stale", "cannot tell"}
-    episodes : int
-        Stretches from one new value to the next in the midst of motion.
-    episodes_with_repeat : int
-        Those in which the older value was read more than once.
-    repeat_share : float
-        Repeated readings among all readings of these episodes; NaN without one.
-    """
+    """Whether readings are new at each read."""
 
     kind: str
     episodes: int = 0
+    """Stretches from one new value to the next in the midst of motion."""
     episodes_with_repeat: int = 0
+    """Those in which the older value was read more than once."""
     repeat_share: float = math.nan
+    """Repeated readings among all readings of these episodes; NaN without one."""
 
 
 _Rows = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -196,11 +183,6 @@ def staleness(trials: Sequence[Trial]) -> Staleness:
     A joint that moves less than a count per row shows no episode at the rows' own rate, so the
     rule is tried on every second, third, fifth … row as well. There, a poll may hide between two
     rows: only changes in quick succession then prove readings live.
-
-    Parameters
-    ----------
-    trials : sequence of Trial
-        All of one joint.
 
     Returns
     -------

@@ -36,27 +36,18 @@ _MOST_UPSETS = 3  # of a trial: more are no upsets but a wrong model
 
 @dataclass(frozen=True, kw_only=True)
 class Upset(Result):
-    """Commands that never reached the servo.
-
-    Attributes
-    ----------
-    trial : int
-        Number of the trial.
-    time_s : float
-        When the first of them was sent, from the trial's first command.
-    commands : int
-        How many were lost.
-    nats : float
-        Log-likelihood that this gains.
-    readings : tuple of int
-        Fresh readings of the trial that it touches, counted from 0: to be left out of a fit.
-    """
+    """Commands that never reached the servo."""
 
     trial: int
+    """Number of the trial."""
     time_s: float
+    """When the first of them was sent, from the trial's first command."""
     commands: int
+    """How many were lost."""
     nats: float
+    """Log-likelihood that this gains."""
     readings: tuple[int, ...] = internal(default=())
+    """Fresh readings of the trial that it touches, counted from 0: to be left out of a fit."""
 
 
 def without_commands(trial: Trial, first: int, rows: int) -> NDArray[np.float64]:

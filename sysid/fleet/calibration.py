@@ -77,24 +77,18 @@ class Settings:
 
 @dataclass
 class Fleet:
-    """Results of a fleet.
-
-    Attributes
-    ----------
-    table : pandas.DataFrame
-        One row per robot and joint: `robot`, `joint`, `QUANTITIES`, `outliers` (names of
-        quantities, with semicolons), `problem` (a sentence; then the numbers are empty).
-    kept, made, failed : list of str
-        Robots whose calibration was there already, was made, could not be made.
-    problems : dict of str to str
-        Why, by robot.
-    """
+    """Results of a fleet."""
 
     table: pd.DataFrame = field(default_factory=pd.DataFrame)
+    """One row per robot and joint: `robot`, `joint`, `QUANTITIES`, `outliers` (names of quantities,
+    with semicolons), `problem` (a sentence; then the numbers are empty)."""
     kept: list[str] = field(default_factory=list)
     made: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
+    """`kept`, `made` and `failed`: robots whose calibration was there already, was made, could not
+    be made."""
     problems: dict[str, str] = field(default_factory=dict)
+    """Why, by robot."""
 
     def tabulate(
         self, rows: Sequence[dict[str, Any]], quantities: Sequence[str], out: Path

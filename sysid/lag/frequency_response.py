@@ -32,9 +32,7 @@ from pupper_sysid.common.results import JointResults, Result, derived, internal
 from pupper_sysid.sysid.doctor.checks import cautions
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice, readings
 from pupper_sysid.sysid.lag.multisine import line_responses
-from pupper_sysid.sysid.lag.phase_slope import tone_lags
-from pupper_sysid.sysid.lag.ripple import without_ripple
-from pupper_sysid.sysid.lag.tone import ToneResponse
+from pupper_sysid.sysid.lag.tone import ToneResponse, tone_lags, without_ripple
 from pupper_sysid.sysid.recordings.joints import Joints, Recordings, each_joint, joint_rng
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -49,23 +47,16 @@ _DELAY_MARGIN_S = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class TransferFunction(Result):
-    """A fitted transfer function with exact delay.
-
-    Attributes
-    ----------
-    name : {"FOPDT", "SOPDT"}
-    parameters : dict of str to Interval
-        By name, each name ending in its unit.
-    chi2_per_dof : float
-        Misfit in units of the tones' uncertainty; far above 1 means the servo is not linear.
-    at_bound : tuple of str
-        Parameters at the bound of their search, which the data do not identify.
-    """
+    """A fitted transfer function with exact delay."""
 
     name: str
+    """FOPDT or SOPDT."""
     parameters: dict[str, Interval]
+    """By name, each name ending in its unit."""
     chi2_per_dof: float
+    """Misfit in units of the tones' uncertainty; far above 1 means the servo is not linear."""
     at_bound: tuple[str, ...] = ()
+    """Parameters at the bound of their search, which the data do not identify."""
 
     @property
     def dead_time_s(self) -> float:
@@ -203,57 +194,41 @@ def _fit(name: str, tones: Sequence[ToneResponse], draws: NDArray) -> TransferFu
 
 @dataclass(frozen=True, kw_only=True)
 class FrequencyPoint(Result):
-    """Response to one tone.
-
-    Attributes
-    ----------
-    frequency_hz, amplitude_rad : float
-        Of the command.
-    gain, phase_deg : float
-        Describing gain, and phase unwrapped by the lag that all tones share.
-    raw_gain : float
-        Of all rows against their commands.
-    covariance : ndarray, shape (2, 2)
-        Of the response's real and imaginary parts.
-    """
+    """Response to one tone."""
 
     frequency_hz: float
     amplitude_rad: float
+    """`frequency_hz` and `amplitude_rad`: of the command."""
     gain: float
     phase_deg: float
+    """`gain` and `phase_deg`: describing gain, and phase unwrapped by the lag that all tones
+    share."""
     raw_gain: float
+    """Of all rows against their commands."""
     covariance: NDArray[np.float64]
+    """Of the response's real and imaginary parts, shape (2, 2)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrequencyResponse(Result):
-    """Measured response of one joint; arrays are over its tones, by frequency.
-
-    Attributes
-    ----------
-    frequency_hz, amplitude_rad : ndarray
-    response, raw_response : ndarray of complex
-        Of fresh readings against the held command; of all rows against their commands.
-    covariance : ndarray, shape (tones, 2, 2)
-        Of the response's real and imaginary parts.
-    bandwidth_hz : Interval or None
-        Where the gain falls below -3 dB of the lowest tone's; None if no tone reaches that. An
-        upper end of infinity lies above the highest tone.
-    transfer_functions : dict of str to TransferFunction
-        Those with fewer parameters than there are numbers measured.
-    warnings : tuple of str
-        What asks for care in these recordings.
-    """
+    """Measured response of one joint; arrays are over its tones, by frequency."""
 
     joint: str
     bandwidth_hz: Interval | None
+    """Where the gain falls below -3 dB of the lowest tone's; None if no tone reaches that. An upper
+    end of infinity lies above the highest tone."""
     transfer_functions: dict[str, TransferFunction]
+    """Those with fewer parameters than there are numbers measured."""
     warnings: tuple[str, ...] = ()
+    """What asks for care in these recordings."""
     frequency_hz: NDArray[np.float64] = internal()
     amplitude_rad: NDArray[np.float64] = internal()
     response: NDArray[np.complex128] = internal()
     raw_response: NDArray[np.complex128] = internal()
+    """`response` and `raw_response`: of fresh readings against the held command; of all rows
+    against their commands."""
     covariance: NDArray[np.float64] = internal()
+    """Of the response's real and imaginary parts, shape (tones, 2, 2)."""
 
     @property
     def gain(self) -> NDArray[np.float64]:

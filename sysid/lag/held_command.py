@@ -27,21 +27,14 @@ _MOST_POINTS = 2_000_000
 
 @dataclass(frozen=True)
 class HeldCommand:
-    """A trial's staircase, relative to the command in force before it.
-
-    Attributes
-    ----------
-    time_s : ndarray, shape (rows,)
-        When each command was sent.
-    command_rad : ndarray, shape (rows,)
-        Command minus the initial one.
-    area : ndarray, shape (rows,)
-        Integral of the staircase up to each time [rad s].
-    """
+    """A trial's staircase, relative to the command in force before it."""
 
     time_s: NDArray[np.float64]
+    """When each command was sent, shape (rows,)."""
     command_rad: NDArray[np.float64]
+    """Command minus the initial one, shape (rows,)."""
     area: NDArray[np.float64]
+    """Integral of the staircase up to each time [rad s], shape (rows,)."""
 
     @classmethod
     def of(cls, trial: Trial) -> HeldCommand:
@@ -109,38 +102,27 @@ def past_tones(
 
 @dataclass(frozen=True)
 class Sums:
-    """Normal equations of readings on bin means, one per block; offsets of trials are removed.
-
-    Attributes
-    ----------
-    gram : ndarray, shape (blocks, bins, bins)
-    moment : ndarray, shape (blocks, bins)
-    square : ndarray, shape (blocks,)
-    count : ndarray, shape (blocks,)
-        Readings.
-    """
+    """Normal equations of readings on bin means, one per block; offsets of trials are removed."""
 
     gram: NDArray[np.float64]
+    """Shape (blocks, bins, bins)."""
     moment: NDArray[np.float64]
+    """Shape (blocks, bins)."""
     square: NDArray[np.float64]
+    """Shape (blocks,)."""
     count: NDArray[np.float64]
+    """Readings, shape (blocks,)."""
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """A trial's staircase and the readings that answer it, cut into blocks of equal duration.
-
-    Attributes
-    ----------
-    held : HeldCommand
-    time_s, position_rad : ndarray, shape (readings,)
-        When each reading was measured, rising, and what it was.
-    blocks : int
-    """
+    """A trial's staircase and the readings that answer it, cut into blocks of equal duration."""
 
     held: HeldCommand
     time_s: NDArray[np.float64]
     position_rad: NDArray[np.float64]
+    """`time_s` and `position_rad`: when each reading was measured, rising, and what it was, shape
+    (readings,)."""
     blocks: int
 
     def edges_s(self) -> NDArray[np.float64]:
@@ -177,11 +159,6 @@ class Stretch:
 
     def autocorrelation(self, longest_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Products of the staircase with itself, shifted; the mean is removed.
-
-        Parameters
-        ----------
-        longest_s : float
-            Largest shift.
 
         Returns
         -------

@@ -55,8 +55,6 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     readings,
 )
 from pupper_sysid.sysid.lag.multisine import line_responses
-from pupper_sysid.sysid.lag.phase_slope import lag_near, responses, slope, tone_lags, tone_weights
-from pupper_sysid.sysid.lag.ripple import without_ripple
 from pupper_sysid.sysid.lag.step_response import (
     LONGEST_S,
     ImpulseResponse,
@@ -64,7 +62,15 @@ from pupper_sysid.sysid.lag.step_response import (
     joint_stretches,
     rough_lag,
 )
-from pupper_sysid.sysid.lag.tone import ToneResponse
+from pupper_sysid.sysid.lag.tone import (
+    ToneResponse,
+    lag_near,
+    responses,
+    slope,
+    tone_lags,
+    tone_weights,
+    without_ripple,
+)
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _MOVES = 0.1  # gain below which a servo is stuck, and its readings are noise
@@ -77,76 +83,51 @@ _USUAL_SHIFT_S = 0.15  # about the lag, where rows' own correlation is looked fo
 
 @dataclass(frozen=True, kw_only=True)
 class FrequencyLag:
-    """Response of the joint to one tone.
-
-    Attributes
-    ----------
-    frequency_hz : float
-    gain, phase_deg : float
-        Of fresh readings against the held command.
-    lag_s : Interval
-    raw_lag_s, raw_gain : float
-        Of all rows at their own times.
-    trial : int
-    """
+    """Response of the joint to one tone."""
 
     frequency_hz: float
     gain: float
     phase_deg: float
+    """`gain` and `phase_deg`: of fresh readings against the held command."""
     lag_s: Interval
     raw_lag_s: float
     raw_gain: float
+    """`raw_lag_s` and `raw_gain`: of all rows at their own times."""
     trial: int
 
 
 @dataclass(frozen=True, kw_only=True)
 class LagBudget(Result):
-    """Parts of one joint's lag.
-
-    Attributes
-    ----------
-    joint : str
-    raw_lag_s : Interval
-        From a command's row to the reading of a position, all rows; without tones, the sum of its
-        parts.
-    fresh_lag_s : Interval
-        The same of fresh rows at their measurement times.
-    lag_s : Interval
-        From the held command to the motion: the servo's lag at the gain, amplitude and load of
-        this recording. Of tones the phase delay, of other motion as in `sysid.lag.lag_budget`.
-    stale_lag_s, command_hold_s : float
-        What the bus adds: `raw_lag_s - fresh_lag_s` and `fresh_lag_s - lag_s`. Stale readings add
-        less to the lag of a fast tone than their mean age (`feedback.mean_age_s`). The hold is
-        half a loop, and with tones what readings at one phase of the loop see of the ripple.
-    dead_time_s : Interval or None
-        Part of `lag_s` before the servo moves; None if no model was fitted.
-    feedback : PollLattice
-    quantum_rad : float
-        Quantisation step of the readings; 0 if there is none.
-    offset_rad : float
-        Reading minus position, from the fitted model.
-    by_frequency : tuple of FrequencyLag
-        By tone, whether named or found in the command; empty if the recording has none.
-    estimators_s : dict of str to float
-        Lag by every estimator; NaN where one does not apply.
-    noise_rad : float
-        RMS of fresh readings about their tones; NaN if there are none.
-    warnings : tuple of str
-    """
+    """Parts of one joint's lag."""
 
     joint: str
     raw_lag_s: Interval
+    """From a command's row to the reading of a position, all rows; without tones, the sum of its
+    parts."""
     fresh_lag_s: Interval
+    """The same of fresh rows at their measurement times."""
     lag_s: Interval
+    """From the held command to the motion: the servo's lag at the gain, amplitude and load of this
+    recording. Of tones the phase delay, of other motion as in `sysid.lag.lag_budget`."""
     stale_lag_s: float
     command_hold_s: float
+    """`stale_lag_s` and `command_hold_s`: what the bus adds: `raw_lag_s - fresh_lag_s` and
+    `fresh_lag_s - lag_s`. Stale readings add less to the lag of a fast tone than their mean age
+    (`feedback.mean_age_s`). The hold is half a loop, and with tones what readings at one phase of
+    the loop see of the ripple."""
     dead_time_s: Interval | None = None
+    """Part of `lag_s` before the servo moves; None if no model was fitted."""
     feedback: PollLattice
     quantum_rad: float
+    """Quantisation step of the readings; 0 if there is none."""
     offset_rad: float = math.nan
+    """Reading minus position, from the fitted model."""
     by_frequency: tuple[FrequencyLag, ...]
+    """By tone, whether named or found in the command; empty if the recording has none."""
     estimators_s: dict[str, float]
+    """Lag by every estimator; NaN where one does not apply."""
     noise_rad: float
+    """RMS of fresh readings about their tones; NaN if there are none."""
     warnings: tuple[str, ...]
 
     @derived
@@ -172,11 +153,6 @@ class LagBudget(Result):
         """The budget with a fitted model's dead time and offset.
 
         A dead time longer than the lag leaves nothing for the dynamics: a warning says so.
-
-        Parameters
-        ----------
-        dead_time_s : Interval
-        offset_rad : float
         """
         warnings = self.warnings
         if dead_time_s.value > self.lag_s.value:

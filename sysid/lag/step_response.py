@@ -51,26 +51,18 @@ _STARTS_S, _LONG_ENOUGH_S = 0.3, 3.0  # what came before a motion's first comman
 
 @dataclass(frozen=True)
 class ImpulseResponse:
-    """Draws of an impulse response, each a mass per bin of past time.
-
-    Attributes
-    ----------
-    edges_s : ndarray, shape (bins + 1,)
-    masses : ndarray, shape (draws, bins)
-        They add up to the static gain.
-    weights : ndarray, shape (draws, blocks)
-        Of the blocks of time behind each draw.
-    stretches : tuple of Stretch
-        The readings it was found in.
-    explained : float
-        Share of the readings' variance that it explains.
-    """
+    """Draws of an impulse response, each a mass per bin of past time."""
 
     edges_s: NDArray[np.float64]
+    """Shape (bins + 1,)."""
     masses: NDArray[np.float64]
+    """They add up to the static gain, shape (draws, bins)."""
     weights: NDArray[np.float64]
+    """Of the blocks of time behind each draw, shape (draws, blocks)."""
     stretches: tuple[Stretch, ...]
+    """The readings it was found in."""
     explained: float
+    """Share of the readings' variance that it explains."""
 
     @property
     def gain(self) -> float:
@@ -125,15 +117,7 @@ def joint_impulse_response(
 def joint_stretches(
     joint: str, trials: Sequence[Trial], read: Sequence[Readings]
 ) -> tuple[Stretch, ...]:
-    """Staircases and readings of a joint, in blocks: some sixteen in all, at least one per trial.
-
-    Parameters
-    ----------
-    joint : str
-    trials : sequence of Trial
-    read : sequence of Readings
-        Of each trial.
-    """
+    """Staircases and readings of a joint, in blocks: about 16, at least one per trial."""
     parts, step = [], quantum(trials)
     for trial, reading in zip(trials, read, strict=True):
         send, order = trial.send_time_s, np.argsort(reading.time_s, kind="stable")

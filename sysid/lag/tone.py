@@ -3,18 +3,33 @@
 A tone `offset + Re(P exp(2πj f t))`, with a third harmonic for the flat tops that friction makes,
 is fitted by least squares to readings at irregular times; a bootstrap over its periods gives the
 uncertainty (`common.tones`).
+
+`ripple_draws` is the staircase's ripple in tones that are read at one phase of the loop. Between
+two commands a servo moves in ripples of the loop's rate. Readings at one phase of the loop see the
+ripple as part of the tone: the staircase's images at multiples of the loop rate f_s, plus and minus
+the tone f, are sampled down onto it, the strongest with an amplitude of f / (f_s - f) of the
+tone's, damped by the servo. At 30 Hz that is up to some milliseconds of lag.
+
+The ripple is computed from the recording's own staircase and read times for every servo of a grid
+of dead times, natural frequencies and damping ratios, each weighted by how well it predicts the
+tones as they were read, ripple included. What the tones leave open becomes the draws' spread.
+
+Lags follow from phases (`slope`): whole periods settled, tones weighted, one lag for a joint.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.tones import block_bootstrap, least_squares, phasors, sine_design
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
-from pupper_sysid.sysid.lag.held_command import HeldCommand
+from pupper_sysid.sysid.lag.held_command import HeldCommand, past_tones
+from pupper_sysid.sysid.lag.step_response import LONGEST_S
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _ALIASED = 30.0  # condition number beyond which a harmonic looks like the tone or the offset
@@ -24,51 +39,39 @@ _SETTLE_S = 0.2  # after the tone is at full amplitude: several times the servo'
 
 @dataclass(frozen=True)
 class ToneResponse:
-    """Phasors of one trial's tone, of `Re(P exp(2πj f t))`.
-
-    Attributes
-    ----------
-    trial : int
-    frequency_hz : float
-        Of the command as it was sent, fitted.
-    command_rows, command_held : complex
-        Command at the rows' send times, and as the bus holds it between them.
-    raw : complex
-        Position of all rows, each at its row's send time.
-    fresh : complex
-        Position of fresh rows at the times they were measured.
-    raw_draws, fresh_draws : ndarray of complex, shape (draws,)
-        The same under random weights of the periods.
-    fresh_count : int
-        Fresh rows in the window.
-    residual_rad : float
-        RMS of the fresh rows about the fitted tone.
-    time_sd_s : float
-        Standard error of a shift common to all times of measurement.
-    start_s, stop_s, steady_s : float
-        Window of the fit, and since when the command is this tone.
-    ripple : complex
-        Part of `fresh` that is ripple of the staircase (`sysid.lag.ripple`); 0 if it was not
-        computed.
-    ripple_draws : ndarray of complex, shape (draws,)
-    """
+    """Phasors of one trial's tone, of `Re(P exp(2πj f t))`."""
 
     trial: int
     frequency_hz: float
+    """Of the command as it was sent, fitted."""
     command_rows: complex
     command_held: complex
+    """`command_rows` and `command_held`: command at the rows' send times, and as the bus holds it
+    between them."""
     raw: complex
+    """Position of all rows, each at its row's send time."""
     fresh: complex
+    """Position of fresh rows at the times they were measured."""
     raw_draws: NDArray[np.complex128]
     fresh_draws: NDArray[np.complex128]
+    """`raw_draws` and `fresh_draws`: the same under random weights of the periods, shape
+    (draws,)."""
     fresh_count: int
+    """Fresh rows in the window."""
     residual_rad: float
+    """RMS of the fresh rows about the fitted tone."""
     time_sd_s: float
+    """Standard error of a shift common to all times of measurement."""
     start_s: float
     stop_s: float
     steady_s: float
+    """`start_s`, `stop_s` and `steady_s`: window of the fit, and since when the command is this
+    tone."""
     ripple: complex = 0j
+    """Part of `fresh` that is ripple of the staircase (`sysid.lag.tone`); 0 if it was not
+    computed."""
     ripple_draws: NDArray[np.complex128] | complex = 0j
+    """Shape (draws,)."""
 
     @property
     def response(self) -> complex:
@@ -194,3 +197,225 @@ def _steady_from(trial: Trial, frequency: float) -> float:
     wrong = np.abs(design @ solution - value) > 0.05 * np.hypot(solution[1], solution[2])
     last = np.flatnonzero(wrong[:half])
     return float(time[min(last[-1] + 1, len(time) - 1)]) if len(last) else float(time[0])
+
+
+_PER_LOOP = 10  # bins in a loop period
+_FINEST_S = 0.001
+_GROWTH = 1.1
+_BEYOND_S = 0.1
+_TIME_CONSTANTS_S = np.geomspace(0.001, 0.3, 16)
+_DAMPING = (0.3, 0.5, 0.7, 1.0, 1.5, 2.5)
+_DEAD_STEP_S, _DEAD_REACH_S = 0.002, 0.04
+_NOT_LINEAR = 0.01  # of a tone's response: no servo is nearer to a linear one
+_DRAWS = 400
+
+
+def without_ripple(
+    trials: Sequence[Trial],
+    read: Sequence[Readings],
+    tones: Sequence[ToneResponse],
+    rng: np.random.Generator,
+    near_s: float | None = None,
+) -> list[ToneResponse]:
+    """The tones with their ripple, which `ToneResponse.response` leaves out.
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+    read : sequence of Readings
+        Of each trial.
+    tones : sequence of ToneResponse
+        Found in these trials, at least one.
+    rng : numpy.random.Generator
+    near_s : float, optional
+        As in `phase_slope.tone_lags`.
+    """
+    loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
+    frequency = np.array([t.frequency_hz for t in tones])
+    lags = tone_lags(np.array([t.response for t in tones]), frequency, near_s)
+    edges = _edges(max(float(lags.max()), 0.0), loop)
+    masses = _servos(edges, frequency, lags)
+    by_number = {t.number: (t, r) for t, r in zip(trials, read, strict=True)}
+    turn = -2j * np.pi * np.outer(frequency, edges)
+    own = np.diff(np.exp(turn)) / np.diff(turn)
+    ripple = np.stack([_ripple_row(*by_number[t.trial], t, edges) for t in tones])
+    held = np.array([t.command_held for t in tones])
+    predicted = masses @ (ripple + held[:, None] * own).T
+    chance, gain = _chances(predicted, tones)
+    seen = gain[:, None] * (masses @ ripple.T)
+    drawn = seen[rng.choice(len(chance), _DRAWS, p=chance)]
+    picked = [rng.integers(_DRAWS, size=len(t.fresh_draws)) for t in tones]
+    return [
+        replace(t, ripple=complex(chance @ seen[:, k]), ripple_draws=drawn[picked[0], k])
+        for k, t in enumerate(tones)
+    ]
+
+
+def _edges(lag_s: float, loop_s: float) -> NDArray[np.float64]:
+    """Bins of past time: fine up to beyond the lag, then growing."""
+    width = max(loop_s / _PER_LOOP, _FINEST_S)
+    edges = list(np.arange(0.0, lag_s + _BEYOND_S, width))
+    while edges[-1] < LONGEST_S:
+        width *= _GROWTH
+        edges.append(edges[-1] + width)
+    return np.array(edges)
+
+
+def _servos(edges: NDArray, frequency: NDArray, lags: NDArray) -> NDArray[np.float64]:
+    """Masses per bin of second-order servos whose lag may be the one seen, shape (servos, bins)."""
+    found = []
+    for constant in _TIME_CONSTANTS_S:
+        for damping in _DAMPING:
+            s = 2j * np.pi * frequency * constant
+            dynamics = -np.angle(1 / (s * s + 2 * damping * s + 1)) / (2 * np.pi * frequency)
+            centre = float(np.mean(lags - dynamics))
+            reach = np.arange(-_DEAD_REACH_S, _DEAD_REACH_S, _DEAD_STEP_S)
+            dead_time = centre + reach
+            dead_time = dead_time[dead_time >= 0]
+            past = np.maximum(edges - dead_time[:, None], 0.0) / constant
+            found.append(np.diff(_second_order(past, damping), axis=1))
+    return np.concatenate(found)
+
+
+def _second_order(past: NDArray, damping: float) -> NDArray[np.float64]:
+    """Step response at times in units of 1 / (natural frequency)."""
+    if damping == 1.0:
+        return 1 - np.exp(-past) * (1 + past)
+    root = np.emath.sqrt(damping**2 - 1)
+    slow, fast = -damping + root, -damping - root
+    step = 1 + (fast * np.exp(slow * past) - slow * np.exp(fast * past)) / (slow - fast)
+    return np.real(step)
+
+
+def _ripple_row(
+    trial: Trial, reading: Readings, tone: ToneResponse, edges: NDArray
+) -> NDArray[np.complex128]:
+    """Phasor that the tone's fit finds in the images, per unit of mass in each bin."""
+    time = reading.time_s[(reading.time_s >= tone.start_s) & (reading.time_s <= tone.stop_s)]
+    images = HeldCommand.of(trial).means(time, edges)
+    one = np.array([tone.frequency_hz]), np.array([tone.command_held])
+    images -= past_tones(time, edges, *one)
+    # before the tone was steady the command was no tone
+    images = np.where(time[:, None] - edges[1:] >= tone.steady_s, images, 0.0)
+    return phasors(least_squares(tone_design(time, tone.frequency_hz), images).T)[:, 0]
+
+
+def _chances(
+    predicted: NDArray, tones: Sequence[ToneResponse]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Probability of each servo and its static gain, from the tones as they were read."""
+    seen = np.array([t.fresh for t in tones])
+    spread = np.array([np.std(t.fresh_draws) for t in tones])
+    weight = 1.0 / (spread**2 + (_NOT_LINEAR * np.abs(seen)) ** 2)
+    cross = np.sum(weight * np.real(np.conj(predicted) * seen), axis=1)
+    square = np.sum(weight * np.abs(predicted) ** 2, axis=1)
+    gain = np.maximum(cross / np.maximum(square, 1e-300), 0.0)
+    misfit = np.sum(weight * np.abs(seen - gain[:, None] * predicted) ** 2, axis=1)
+    freedom = max(2 * len(tones) - 4, 1)
+    scale = max(1.0, float(misfit.min()) / freedom)
+    chance = np.exp(-0.5 * (misfit - misfit.min()) / scale)
+    return chance / chance.sum(), gain
+
+
+_ONE_TONE_HZ = 0.05  # closer than that is one tone, twice
+_FOLLOWS = 0.5  # of the largest gain: below, a tone says nothing about the delay
+
+
+def slope(tones: Sequence[ToneResponse], pair: str, near_s: float | None = None) -> Interval:
+    """Lag common to all tones: the slope of the phase through the origin, with its interval.
+
+    Parameters
+    ----------
+    tones : sequence of ToneResponse
+    pair : {"raw_rows", "fresh_rows", "fresh_held"}
+        All rows or fresh readings against the rows' commands; fresh readings without the
+        staircase's ripple against the held command.
+    near_s : float, optional
+        As in `tone_lags`.
+    """
+    frequency = np.array([t.frequency_hz for t in tones])
+    response, draws = responses(tones, pair)
+    weight = tone_weights(tones)
+    lags = tone_lags(response, frequency, near_s)
+    drawn = lag_near(draws, frequency[:, None], lags[:, None])
+    return Interval.of_draws(float(weight @ lags), weight @ drawn)
+
+
+def responses(
+    tones: Sequence[ToneResponse], pair: str
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Responses of all tones and their draws, shapes (tones,) and (tones, draws)."""
+    if pair == "fresh_held":
+        value, drawn = [t.response for t in tones], [t.response_draws for t in tones]
+    elif pair == "fresh_rows":
+        value = [t.fresh / t.command_rows for t in tones]
+        drawn = [t.fresh_draws / t.command_rows for t in tones]
+    else:
+        value = [t.raw / t.command_rows for t in tones]
+        drawn = [t.raw_draws / t.command_rows for t in tones]
+    return np.array(value), np.array(drawn)
+
+
+def tone_weights(tones: Sequence[ToneResponse]) -> NDArray[np.float64]:
+    """Weight of each tone in the joint's lag: inverse variance, 0 where the servo cannot follow.
+
+    Below half of the largest gain the torque or speed limit clips the motion, and its phase is no
+    delay.
+    """
+    gain = np.array([abs(t.response) for t in tones])
+    weight = 1.0 / np.array([t.lag_variance_s2 for t in tones])
+    weight = np.where(gain >= _FOLLOWS * gain.max(), weight, 0.0)
+    return weight / weight.sum()
+
+
+def tone_lags(
+    response: NDArray, frequency_hz: NDArray, near_s: float | None = None
+) -> NDArray[np.float64]:
+    """Lag of every tone [s], the right whole period of each included.
+
+    A phase leaves the lag open to whole periods. The lowest tone has the longest period and
+    settles itself below 2 Hz; above, the lag on which all tones agree best settles it. From there
+    each tone takes the period nearest to the lag of the tone below it, for a servo's lag changes
+    by far less than half a period from one tone to the next.
+
+    Parameters
+    ----------
+    response : ndarray of complex, shape (tones,)
+    frequency_hz : ndarray, shape (tones,)
+    near_s : float, optional
+        The lag as other than phases show it, the start of the motion for one: it settles the
+        period of a lowest tone above 2 Hz, and of a lag that is longer than the lowest tone allows.
+    """
+    order = np.argsort(frequency_hz, kind="stable")
+    lowest = frequency_hz[order[0]]
+    if lowest > 2.0:
+        near = _common_lag(response, frequency_hz, near_s)
+    elif near_s is not None and near_s > 0.8 / lowest:
+        near = near_s
+    else:
+        near = 0.4 / lowest  # from a tenth of a period early to nine tenths late
+    lags = np.empty(len(order))
+    for i in order:
+        near = lags[i] = lag_near(response[i], frequency_hz[i], near)
+    return lags
+
+
+def _common_lag(response: NDArray, frequency: NDArray, near_s: float | None) -> float:
+    """The lag on which all phases agree best."""
+    spacing = np.diff(np.unique(frequency))
+    # two trials of one tone differ by the error of their fits only
+    spacing = spacing[spacing > _ONE_TONE_HZ]
+    # tones repeat their common phase pattern after 1 / (smallest spacing); one tone, after 1 / f
+    repeat = 0.95 / (spacing.min() if len(spacing) else frequency[0])
+    first, last = 0.0, min(LONGEST_S, repeat)
+    if near_s is not None and near_s > 0.8 * repeat:
+        first, last = near_s - repeat / 2, near_s + repeat / 2
+    lags = np.arange(first, last, 2e-4)
+    turned = np.angle(response)[:, None] + 2 * np.pi * frequency[:, None] * lags
+    return float(lags[int(np.argmax(np.cos(turned).sum(axis=0)))])
+
+
+def lag_near(response, frequency, centre):
+    """Lag of a phase, in the period around `centre` [s]; arrays broadcast."""
+    turned = np.angle(response * np.exp(2j * np.pi * frequency * centre))
+    return centre - turned / (2 * np.pi * frequency)

@@ -43,30 +43,20 @@ _POLL_PHASE = 0.3
 
 @dataclass(frozen=True)
 class Setup:
-    """What a joint is recorded with.
-
-    Attributes
-    ----------
-    loop_period_s : float
-        Time between commands.
-    poll_period_s : float
-        Time between two polls of the servo; 0 where readings are live.
-    loss : float
-        Share of the polls that fail.
-    quantum_rad : float
-        Quantisation step of a reading.
-    speed_limit_rad_s : float
-        Of the servo, by its data sheet.
-    margin_rad : float
-        Largest excursion to either side of the start pose.
-    """
+    """What a joint is recorded with."""
 
     loop_period_s: float = LOOP_PERIOD_S
+    """Time between commands."""
     poll_period_s: float = 1 / POLL_RATE_HZ
+    """Time between two polls of the servo; 0 where readings are live."""
     loss: float = 0.42
+    """Share of the polls that fail."""
     quantum_rad: float = 0.0057
+    """Quantisation step of a reading."""
     speed_limit_rad_s: float = 7.5
+    """Of the servo, by its data sheet."""
     margin_rad: float = LARGEST_RAD
+    """Largest excursion to either side of the start pose."""
 
     @property
     def poll_rate_hz(self) -> float:
@@ -89,23 +79,15 @@ class Setup:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A trial to choose.
-
-    Attributes
-    ----------
-    kind : {"sine", "square"}
-    frequency_hz, amplitude_rad : float
-    duration_s : float
-        Without the lead-in.
-    run : Run
-        Its command, and the times of its readings.
-    """
+    """A trial to choose."""
 
     kind: str
     frequency_hz: float
     amplitude_rad: float
     duration_s: float
+    """Without the lead-in."""
     run: Run
+    """Its command, and the times of its readings."""
 
 
 def candidates(setup: Setup, duration_s: float) -> list[Candidate]:

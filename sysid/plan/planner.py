@@ -67,83 +67,53 @@ _HELPS = 0.02  # a trial without which every interval stays within this share he
 
 @dataclass(frozen=True)
 class Servo:
-    """One servo as it may be: its hypotheses, the likeliest first, and its readings' noise.
-
-    Attributes
-    ----------
-    hypotheses : tuple of Hypothesis
-    noise : Noise
-    nats : tuple of float
-        By how much the log-likelihood of each is below that of the best.
-    inflation : float
-        Variance of the fit's own interval over that of the information; at least 1. New trials
-        are counted with it.
-    doubt_s : float
-        By how much all readings may be dated wrong: no trial reduces it.
-    """
+    """One servo as it may be: its hypotheses, the likeliest first, and its readings' noise."""
 
     hypotheses: tuple[Hypothesis, ...]
     noise: Noise
     nats: tuple[float, ...] = (0.0,)
+    """By how much the log-likelihood of each is below that of the best."""
     inflation: float = 1.0
+    """Variance of the fit's own interval over that of the information; at least 1. New trials are
+    counted with it."""
     doubt_s: float = 0.0
+    """By how much all readings may be dated wrong: no trial reduces it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedTrial(Result):
-    """One trial of a plan.
-
-    Attributes
-    ----------
-    joint, kind : str
-    frequency_hz, amplitude_rad : float
-    duration_s : float
-        Without the lead-in.
-    purpose : str
-        What it narrows most, or "structure" if it tells two candidate models apart.
-    """
+    """One trial of a plan."""
 
     joint: str
     kind: str
     frequency_hz: float
     amplitude_rad: float
     duration_s: float
+    """Without the lead-in."""
     purpose: str
+    """What it narrows most, or "structure" if it tells two candidate models apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction(Result):
-    """Interval of one quantity of a joint, now and after the planned sweep.
-
-    Attributes
-    ----------
-    joint, quantity : str
-    now, after : Interval
-        The value stays; the ends are the expected ones.
-    """
+    """Interval of one quantity of a joint, now and after the planned sweep."""
 
     joint: str
     quantity: str
     now: Interval
     after: Interval
+    """`now` and `after`: the value stays; the ends are the expected ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class JointPlan(Result):
-    """What to record of one joint.
-
-    Attributes
-    ----------
-    trials : tuple of PlannedTrial
-        Slowest first.
-    predictions : tuple of Prediction
-    notes : tuple of str
-        What no trial within the limits can show.
-    """
+    """What to record of one joint."""
 
     trials: tuple[PlannedTrial, ...]
+    """Slowest first."""
     predictions: tuple[Prediction, ...]
     notes: tuple[str, ...]
+    """What no trial within the limits can show."""
 
 
 def propose(joint: str, servos: Sequence[Servo], setup: Setup, seconds: float) -> JointPlan:
@@ -380,18 +350,12 @@ _LINEAR_STEP = 3e-4
 
 @dataclass(frozen=True)
 class Noise:
-    """Error of the readings of a trial.
-
-    Attributes
-    ----------
-    floor_rad : float
-        Standard deviation at rest: sensor noise and quantisation.
-    jitter_s : float
-        Standard deviation of the times of commands and readings.
-    """
+    """Error of the readings of a trial."""
 
     floor_rad: float
+    """Standard deviation at rest: sensor noise and quantisation."""
     jitter_s: float
+    """Standard deviation of the times of commands and readings."""
 
     def weights(self, speed_rad_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Inverse variances [1/rad²] of readings of a joint at these speeds."""
@@ -400,36 +364,27 @@ class Noise:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A servo model with the parameters that explain what is known.
-
-    Attributes
-    ----------
-    model : Structure
-    values : ndarray, shape (parameters,)
-    known : ndarray, shape (parameters, parameters)
-        Information about the fitted coordinates so far, the prior included.
-    """
+    """A servo model with the parameters that explain what is known."""
 
     model: Structure
     values: NDArray[np.float64]
+    """Shape (parameters,)."""
     known: NDArray[np.float64]
+    """Information about the fitted coordinates so far, the prior included, shape (parameters,
+    parameters)."""
 
 
 @dataclass(frozen=True)
 class Response:
-    """A trial as one hypothesis predicts it.
-
-    Attributes
-    ----------
-    position_rad, weights : ndarray, shape (samples,)
-        Readings, and their inverse variances [1/rad²].
-    sensitivity : ndarray, shape (samples, parameters + 1)
-        Of the readings to the fitted coordinates, and to the shift in time of the tone.
-    """
+    """A trial as one hypothesis predicts it."""
 
     position_rad: NDArray[np.float64]
     weights: NDArray[np.float64]
+    """`position_rad` and `weights`: readings, and their inverse variances [1/rad²], shape
+    (samples,)."""
     sensitivity: NDArray[np.float64]
+    """Of the readings to the fitted coordinates, and to the shift in time of the tone, shape
+    (samples, parameters + 1)."""
 
     def inner(self, a: NDArray, b: NDArray) -> NDArray[np.float64]:
         """Weighted inner product aᵀWb, shape (columns of a, columns of b)."""

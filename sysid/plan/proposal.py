@@ -58,12 +58,7 @@ Margins = Mapping[str, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Source(Result):
-    """A file that a plan was made from.
-
-    Attributes
-    ----------
-    name, sha256 : str
-    """
+    """A file that a plan was made from."""
 
     name: str
     sha256: str
@@ -71,31 +66,21 @@ class Source(Result):
 
 @dataclass(frozen=True, kw_only=True)
 class SweepPlan(Result):
-    """What to record next.
-
-    Attributes
-    ----------
-    made_from : tuple of Source
-        Empty for an unknown servo.
-    seed : int
-    loop_period_s, poll_rate_hz, speed_limit_rad_s : float
-        What the trials were chosen for.
-    trials : tuple of PlannedTrial
-        One joint after the other.
-    predictions : tuple of Prediction
-        Empty for an unknown servo.
-    notes : tuple of str
-        What no trial within the limits can show.
-    """
+    """What to record next."""
 
     made_from: tuple[Source, ...]
+    """Empty for an unknown servo."""
     seed: int
     loop_period_s: float
     poll_rate_hz: float
     speed_limit_rad_s: float
+    """`loop_period_s`, `poll_rate_hz` and `speed_limit_rad_s`: what the trials were chosen for."""
     trials: tuple[PlannedTrial, ...]
+    """One joint after the other."""
     predictions: tuple[Prediction, ...]
+    """Empty for an unknown servo."""
     notes: tuple[str, ...]
+    """What no trial within the limits can show."""
 
     @property
     def joints(self) -> list[str]:
@@ -309,13 +294,7 @@ _USUAL_NOISE = Noise(0.004, 0.001)
 
 
 def fitted_servo(result: JointCalibrationResult) -> Servo:
-    """The servo that the fits of a recording's joint describe, with their intervals.
-
-    Parameters
-    ----------
-    result : JointCalibrationResult
-        Of `sysid.fit.joint_fit.fit_joint`.
-    """
+    """The servo that the fits of a recording's joint describe, with their intervals."""
     trials, nats = result.runs, result.structure_nats
     best = result.candidate_models[min(nats, key=lambda name: nats[name])]
     least = max(result.lag.quantum_rad / math.sqrt(12), _LEAST_NOISE_RAD)
@@ -363,12 +342,7 @@ def _sd(parameter: Parameter, interval: Interval) -> float:
 
 
 def calibrated_servo(joint: JointCalibration) -> Servo:
-    """The servo that a calibration file describes, with intervals for want of readings.
-
-    Parameters
-    ----------
-    joint : JointCalibration
-    """
+    """The servo that a calibration file describes, with intervals for want of readings."""
     named = {c.model: c.parameters for c in joint.selection.candidate_models}
     floor = max(joint.feedback.quantum_rad.value / math.sqrt(12), _LEAST_NOISE_RAD)
     jitter = joint.actuator.command_jitter_s
@@ -397,12 +371,7 @@ def calibrated_servo(joint: JointCalibration) -> Servo:
 
 
 def unknown_servos(seed: int) -> list[Servo]:
-    """Servos drawn from the prior, with both structures each.
-
-    Parameters
-    ----------
-    seed : int
-    """
+    """Servos drawn from the prior, with both structures each."""
     rng = np.random.default_rng(seed)
     found: list[Servo] = []
     while len(found) < _DRAWS:

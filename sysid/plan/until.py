@@ -50,23 +50,15 @@ class Goal:
 
 @dataclass(frozen=True, kw_only=True)
 class JointOutcome(Result):
-    """How far a joint came.
-
-    Attributes
-    ----------
-    dead_time_s : Interval
-    recorded_s : float
-        Of all rounds.
-    rounds : int
-        Recordings with this joint.
-    why : str
-        Why its interval is not narrow enough; empty if it is.
-    """
+    """How far a joint came."""
 
     dead_time_s: Interval
     recorded_s: float
+    """Of all rounds."""
     rounds: int
+    """Recordings with this joint."""
     why: str = ""
+    """Why its interval is not narrow enough; empty if it is."""
 
     @derived
     def reached(self) -> bool:
@@ -76,13 +68,7 @@ class JointOutcome(Result):
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome(Result):
-    """All joints and recordings of `record_until`.
-
-    Attributes
-    ----------
-    joints : dict of str to JointOutcome
-    recordings : tuple of Path
-    """
+    """All joints and recordings of `record_until`."""
 
     joints: dict[str, JointOutcome]
     recordings: tuple[Path, ...]

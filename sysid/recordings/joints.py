@@ -14,8 +14,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, in_order, select_joints
 from pupper_sysid.common.processes.workers import Workers, prepare
 from pupper_sysid.sysid.doctor.checks import refuse_unusable
-from pupper_sysid.sysid.recordings.bad_readings import without_bad_readings
-from pupper_sysid.sysid.recordings.excitation import named_tones
+from pupper_sysid.sysid.recordings.excitation import named_tones, without_bad_readings
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
 Recordings = Recording | Sequence[Recording]

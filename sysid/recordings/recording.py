@@ -42,80 +42,54 @@ from pupper_sysid.sysid.recordings.table import (
 
 @dataclass(frozen=True)
 class Truncation:
-    """How a bus cuts commands to counts; the defaults leave them as they are.
-
-    Attributes
-    ----------
-    quantum_rad : float
-        Size of one count.
-    rounding : {"up", "down", "nearest"}, optional
-        Where making the count whole moves the angle.
-    zero_rad : float, optional
-        An angle that is a whole count; by default the rest position.
-    """
+    """How a bus cuts commands to counts; the defaults leave them as they are."""
 
     quantum_rad: float = 0.0
+    """Size of one count."""
     rounding: str | None = None
+    """Where making the count whole moves the angle."""
     zero_rad: float | None = None
+    """An angle that is a whole count; by default the rest position."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One joint over one stretch of time; arrays are over its rows, in time order.
-
-    Attributes
-    ----------
-    joint : str
-    number : int
-    frequency_hz : float
-        Of the commanded tone; NaN if it is none.
-    send_time_s, read_time_s : ndarray
-        When the command was sent and the position read, on the host's clock [s].
-    command_rad, position_rad : ndarray
-        Absolute angles [rad]; a missing reading is NaN.
-    position_count : ndarray of int, or None
-        Raw counts where the bus has them, -1 where missing.
-    initial_command_rad : float
-        Command in force before the first row.
-    readings : {"live", "polled"} or None
-        Whether each read returned the present position or that of the bus's last poll; None where
-        the recording's header does not say.
-    truncation : Truncation
-        How the bus cut the commands.
-    read_time_doubt_s : float
-        By how much all readings may have been taken earlier or later than `read_time_s`.
-    p_gain : float
-        P gain of the servo's position loop, the register's value; NaN where it is unknown.
-    torque_enabled : ndarray of bool, or None
-        Whether the servo's torque was on at each row; None where it always was.
-    voltage_v : ndarray, or None
-        Supply voltage at each row [V]; NaN where missing.
-    servo : ServoSetup
-        What the header says of the servo.
-    load : PendulumLoad or None
-        What the joint carried; None where the header does not say.
-    unit_stated : bool
-        Whether the unit of the angles was stated, so that they may be of several turns.
-    """
+    """One joint over one stretch of time; arrays are over its rows, in time order."""
 
     joint: str
     number: int
     frequency_hz: float
+    """Of the commanded tone; NaN if it is none."""
     send_time_s: NDArray[np.float64]
     read_time_s: NDArray[np.float64]
+    """`send_time_s` and `read_time_s`: when the command was sent and the position read, on the
+    host's clock [s]."""
     command_rad: NDArray[np.float64]
     position_rad: NDArray[np.float64]
+    """`command_rad` and `position_rad`: absolute angles [rad]; a missing reading is NaN."""
     position_count: NDArray[np.int64] | None
+    """Raw counts where the bus has them, -1 where missing."""
     initial_command_rad: float
+    """Command in force before the first row."""
     readings: Literal["live", "polled"] | None = None
+    """Whether each read returned the present position or that of the bus's last poll; None where
+    the recording's header does not say."""
     truncation: Truncation = Truncation()
+    """How the bus cut the commands."""
     read_time_doubt_s: float = 0.0
+    """By how much all readings may have been taken earlier or later than `read_time_s`."""
     p_gain: float = float("nan")
+    """P gain of the servo's position loop, the register's value; NaN where it is unknown."""
     torque_enabled: NDArray[np.bool_] | None = None
+    """Whether the servo's torque was on at each row; None where it always was."""
     voltage_v: NDArray[np.float64] | None = None
+    """Supply voltage at each row [V]; NaN where missing."""
     servo: ServoSetup = field(default_factory=ServoSetup)
+    """What the header says of the servo."""
     load: PendulumLoad | None = None
+    """What the joint carried; None where the header does not say."""
     unit_stated: bool = False
+    """Whether the unit of the angles was stated, so that they may be of several turns."""
 
     def powered(self) -> Trial:
         """Its longest stretch of rows with the torque on; all of it where it always was."""

@@ -92,26 +92,17 @@ class Header(BaseModel):
 
 @dataclass(frozen=True)
 class Parsed:
-    """Header and table of a file of yet unknown layout.
-
-    Attributes
-    ----------
-    metadata : dict
-    table : pandas.DataFrame
-        Numbers, but for the columns of text; empty cells are NaN.
-    warnings : list of str
-    faults : dict of str to str
-        Columns of other projects' logs that are not in the table, for they hold text, and the
-        sentence on the first such cell.
-    numbered : bool
-        Whether the file names no columns, so that they have their numbers as names.
-    """
+    """Header and table of a file of yet unknown layout."""
 
     metadata: dict[str, Any]
     table: pd.DataFrame
+    """Numbers, but for the columns of text; empty cells are NaN."""
     warnings: list[str] = field(default_factory=list)
     faults: dict[str, str] = field(default_factory=dict)
+    """Columns of other projects' logs that are not in the table, for they hold text, and the
+    sentence on the first such cell."""
     numbered: bool = False
+    """Whether the file names no columns, so that they have their numbers as names."""
 
 
 def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:

@@ -4,6 +4,8 @@ Curves differ from each other in more than colour (`common.figure_style`); what 
 page has a `gid`. `tracks` is the free run of a fitted model beside commands and readings;
 `hold_runs` counts for how many rows readings stay the same, beside the prediction of the poll
 lattice.
+
+Hysteresis of a servo over its P gain, with what explains it.
 """
 
 from __future__ import annotations
@@ -30,12 +32,14 @@ from pupper_sysid.common.figure_style import (
     ORANGE,
     RED,
     SKY,
+    WIDTH_IN,
     axes_column,
     axes_grid,
     styled,
 )
-from pupper_sysid.common.interval import LEVEL
+from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.sysid.backlash import JointBacklash
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
@@ -47,13 +51,7 @@ from pupper_sysid.sysid.recordings.recording import Trial
 
 @styled
 def lag_budget_figure(budgets: Mapping[str, LagBudget]) -> Figure:
-    """One stacked bar per joint: the parts of the time from a command's row to its position's row.
-
-    Parameters
-    ----------
-    budgets : dict of joint to LagBudget
-        With their dead times.
-    """
+    """One stacked bar per joint: parts of the time from a command's row to its position's row."""
     figure, (axes,) = axes_column(1, 1.9 + 0.52 * len(budgets))
     ends = [_lag_bar(axes, row, budget) for row, budget in enumerate(budgets.values())]
     axes.set_yticks(range(len(budgets)), list(budgets))
@@ -122,13 +120,7 @@ def _lag_bar(axes: Axes, row: int, part: LagBudget) -> float:
 
 @styled
 def hold_histogram_figure(found: Mapping[str, HoldRuns]) -> Figure:
-    """For how many rows each reading stayed the same, counted and predicted by poll and loss.
-
-    Parameters
-    ----------
-    found : dict of joint to HoldRuns
-        From `sysid.report.figures.hold_runs`.
-    """
+    """For how many rows each reading stayed the same, counted and predicted by poll and loss."""
     columns = 1 if len(found) <= _SINGLE else 3
     figure, grid = axes_grid(len(found), columns, 1.6)
     length = np.arange(1, LONGEST_RUN + 1)
@@ -174,12 +166,7 @@ _LATTICE_WORDS = {
 
 @styled
 def bode_figure(responses: Mapping[str, FrequencyResponse]) -> Figure:
-    """Gain and phase over frequency: measured, from all rows, and of the fitted transfer function.
-
-    Parameters
-    ----------
-    responses : dict of joint to FrequencyResponse
-    """
+    """Gain and phase over frequency: measured, of all rows, and of the fitted transfer function."""
     figure, (gain, phase) = axes_column(2, 6.4)
     for n, (joint, response) in enumerate(responses.items()):
         colour, mark = JOINT_COLOURS[n % len(JOINT_COLOURS)], MARKERS[n % len(MARKERS)]
@@ -253,36 +240,29 @@ LONGEST_RUN = 12
 
 @dataclass(frozen=True)
 class Track:
-    """One trial: command, model and readings; angles from rest [rad], times [s].
-
-    Attributes
-    ----------
-    frequency_hz : float
-        NaN if the trial is no tone.
-    time_s, command_rad, model_rad : ndarray, shape (steps,)
-        On the physics clock, from the trial's start.
-    fresh_time_s, fresh_rad : ndarray, shape (fresh,)
-        Fresh readings at the time they were measured.
-    row_time_s, row_rad : ndarray, shape (rows,)
-        Every reading at the time of its row; NaN where missing.
-    fresh_error_rad, row_error_rad : ndarray
-        Reading minus model at those times.
-    fresh_speed_rad_s, row_speed_rad_s : ndarray
-        Speed of the model at those times.
-    """
+    """One trial: command, model and readings; angles from rest [rad], times [s]."""
 
     frequency_hz: float
+    """NaN if the trial is no tone."""
     time_s: NDArray[np.float64]
     command_rad: NDArray[np.float64]
     model_rad: NDArray[np.float64]
+    """`time_s`, `command_rad` and `model_rad`: on the physics clock, from the trial's start, shape
+    (steps,)."""
     fresh_time_s: NDArray[np.float64]
     fresh_rad: NDArray[np.float64]
+    """`fresh_time_s` and `fresh_rad`: fresh readings at the time they were measured, shape
+    (fresh,)."""
     row_time_s: NDArray[np.float64]
     row_rad: NDArray[np.float64]
+    """Shape (rows,). `row_time_s` and `row_rad`: every reading at the time of its row; NaN where
+    missing."""
     fresh_error_rad: NDArray[np.float64]
     row_error_rad: NDArray[np.float64]
+    """`fresh_error_rad` and `row_error_rad`: reading minus model at those times."""
     fresh_speed_rad_s: NDArray[np.float64]
     row_speed_rad_s: NDArray[np.float64]
+    """`fresh_speed_rad_s` and `row_speed_rad_s`: speed of the model at those times."""
 
 
 def tracks(result: JointCalibrationResult, model: str | None = None) -> list[Track]:
@@ -365,20 +345,14 @@ def response_errors(response: FrequencyResponse) -> tuple[NDArray, NDArray]:
 
 @dataclass(frozen=True)
 class HoldRuns:
-    """For how many rows a reading stays the same.
-
-    Attributes
-    ----------
-    lattice : PollLattice
-    count : ndarray of int, shape (LONGEST_RUN,)
-        Runs of 1, 2, … rows; the last holds all longer ones.
-    expected : ndarray, shape (LONGEST_RUN,), or None
-        Predicted by the poll period and the share of lost polls; None without a lattice.
-    """
+    """For how many rows a reading stays the same."""
 
     lattice: PollLattice
     count: NDArray[np.int64]
+    """Shape (LONGEST_RUN,). Runs of 1, 2, … rows; the last holds all longer ones."""
     expected: NDArray[np.float64] | None
+    """Shape (LONGEST_RUN,). Predicted by the poll period and the share of lost polls; None without
+    a lattice."""
 
 
 def hold_runs(
@@ -540,13 +514,7 @@ def residual_figure(result: JointCalibrationResult, found: list[Track] | None = 
 
 @styled
 def residual_grid(found: Mapping[str, list[Track]]) -> Figure:
-    """Fresh and raw residuals over speed, of every joint beside the others.
-
-    Parameters
-    ----------
-    found : dict of joint to list of Track
-        From `sysid.report.figures.tracks`.
-    """
+    """Fresh and raw residuals over speed, of every joint beside the others."""
     figure, grid = axes_grid(len(found), 3, 1.75)
     for n, (axes, (joint, own)) in enumerate(zip(grid, found.items(), strict=True)):
         _residuals_over_speed(axes, own, 0.7, "all rows at their own time")
@@ -576,3 +544,50 @@ def _residuals_over_speed(axes: Axes, found: list[Track], size: float, rows: str
 
 def _trial_name(track: Track, joint: str) -> str:
     return f"{joint}, {track.frequency_hz:.3g} Hz" if track.frequency_hz > 0 else joint
+
+
+_PANEL_IN = 2.8
+
+
+@styled
+def hysteresis_figure(joints: Mapping[str, JointBacklash]) -> Figure:
+    """Hysteresis with its 90 % interval over the P gain, a panel per joint."""
+    drawn = Figure(figsize=(WIDTH_IN, _PANEL_IN * len(joints)), layout="constrained")
+    for axes, (joint, backlash) in zip(
+        drawn.subplots(len(joints), squeeze=False)[:, 0], joints.items(), strict=True
+    ):
+        gains = np.array([g.p_gain for g in backlash.gains])
+        known = np.isfinite(gains).all()
+        place = gains if known else np.arange(len(gains), dtype=float)
+        best, low, high = np.degrees([_ends(g.hysteresis_rad) for g in backlash.gains]).T
+        axes.errorbar(
+            place, best, [best - low, high - best], fmt="o", color=BLUE, capsize=3,
+            label="hysteresis, 90 %",
+        )  # fmt: skip
+        if known and len(gains) > 1:
+            lowest = int(np.argmin(gains))
+            line = np.linspace(gains.min(), gains.max(), 200)
+            axes.plot(
+                line, best[lowest] * gains[lowest] / line, "--", color=FAINT,
+                label="friction alone: as 1/P",
+            )  # fmt: skip
+        if (zone := backlash.dead_zone_rad) is not None:
+            ends = 2 * np.degrees([zone.low, zone.high])
+            axes.axhspan(*ends, color=ORANGE, alpha=0.3, lw=0, label="twice the dead zone, 90 %")
+        axes.set_ylim(bottom=0)
+        axes.set_xticks(place, [f"{g:g}" if known else "?" for g in gains])
+        axes.set_xlabel("P gain")
+        axes.set_ylabel("hysteresis [°]")
+        play = backlash.backlash_rad
+        verdict = (
+            "not determined"
+            if play is None
+            else "{:.2f}° [{:.2f}, {:.2f}]".format(*np.degrees(_ends(play)))
+        )
+        axes.set_title(f"{joint}: backlash {verdict}")
+        axes.legend()
+    return drawn
+
+
+def _ends(interval: Interval) -> tuple[float, float, float]:
+    return interval.value, interval.low, interval.high

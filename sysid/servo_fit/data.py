@@ -46,42 +46,32 @@ _SAME_RATE = 0.05
 
 @dataclass(frozen=True)
 class Run:
-    """Rows of one joint without a pause; arrays are over its rows unless a shape is given.
-
-    Attributes
-    ----------
-    trial : Trial
-        All rows, merged.
-    readings : Readings
-        Those that count, over `fresh` entries.
-    tick, position_rad : ndarray, shape (fresh,)
-        Their times, in ticks, and values [rad].
-    row_tick, held_tick : ndarray
-        When each row was read, and when its value was taken (NaN if before the run).
-    reading_tick : ndarray, shape (rows, instants)
-        Equally probable instants at which each row's reading was measured.
-    number, group : ndarray of int
-        Trial number in its recording; index into `ServoData.groups`, -1 for rows of no group.
-    elapsed_s : ndarray
-        Since the first command of the row's trial.
-    recording : int
-        Place of the recording that the run belongs to.
-    rest_known : bool
-        Whether the recording says where the run began; otherwise its first reading is taken.
-    """
+    """Rows of one joint without a pause; arrays are over its rows unless a shape is given."""
 
     trial: Trial
+    """All rows, merged."""
     readings: Readings
+    """Those that count, over `fresh` entries."""
     tick: NDArray[np.float64]
     position_rad: NDArray[np.float64]
+    """`tick` and `position_rad`: their times, in ticks, and values [rad], shape (fresh,)."""
     row_tick: NDArray[np.float64]
     held_tick: NDArray[np.float64]
+    """`row_tick` and `held_tick`: when each row was read, and when its value was taken (NaN if
+    before the run)."""
     reading_tick: NDArray[np.float64]
+    """Equally probable instants at which each row's reading was measured, shape (rows,
+    instants)."""
     number: NDArray[np.int64]
     group: NDArray[np.int64]
+    """`number` and `group`: trial number in its recording; index into `ServoData.groups`, -1 for
+    rows of no group."""
     elapsed_s: NDArray[np.float64]
+    """Since the first command of the row's trial."""
     recording: int
+    """Place of the recording that the run belongs to."""
     rest_known: bool
+    """Whether the recording says where the run began; otherwise its first reading is taken."""
 
     @property
     def command_rad(self) -> NDArray[np.float64]:
@@ -116,28 +106,18 @@ class Run:
 
 @dataclass(frozen=True)
 class ServoData:
-    """Runs of some joints, all at one rate.
-
-    Attributes
-    ----------
-    joints : tuple of str
-    period_s : float
-        Time between commands.
-    runs : dict of str to tuple of Run
-    groups : tuple of str
-        Groups to hold out: "loop 0", "3 Hz", …
-    modes : dict of str to str
-        "fresh" or "all": which readings of the joint count.
-    lattices : dict of str to PollLattice
-        Poll of each joint's readings, as far as these recordings show it.
-    """
+    """Runs of some joints, all at one rate."""
 
     joints: tuple[str, ...]
     period_s: float
+    """Time between commands."""
     runs: dict[str, tuple[Run, ...]]
     groups: tuple[str, ...]
+    """Groups to hold out: "loop 0", "3 Hz", …"""
     modes: dict[str, str]
+    """"fresh" or "all": which readings of the joint count."""
     lattices: dict[str, PollLattice]
+    """Poll of each joint's readings, as far as these recordings show it."""
 
 
 def servo_data(

@@ -59,16 +59,10 @@ from pupper_sysid.sysid.servo_fit.windows import (
 
 @dataclass(frozen=True)
 class Split:
-    """What is for training and what for testing; None: every group is left out in turn.
-
-    Attributes
-    ----------
-    name : str
-        In words.
-    train, test : Part or None
-    """
+    """What is for training and what for testing; None: every group is left out in turn."""
 
     name: str
+    """In words."""
     train: Part | None = None
     test: Part | None = None
 

@@ -33,24 +33,16 @@ _AS_GOOD = 0.01  # of the logarithm of the error: one percent
 
 @dataclass(frozen=True)
 class NetworkFit:
-    """Models of all joints.
-
-    Attributes
-    ----------
-    model : CommandNetwork or RecurrentNetwork
-        Fitted to the whole training part.
-    held_out : dict of int to model
-        Per group, the model fitted without it.
-    choices : dict of str to float
-        Hyper-parameters chosen by held-out groups.
-    interrupted : bool
-        Whether Ctrl-C ended the training; the best so far was kept.
-    """
+    """Models of all joints."""
 
     model: Learned
+    """Fitted to the whole training part."""
     held_out: dict[int, Learned]
+    """Per group, the model fitted without it."""
     choices: dict[str, float]
+    """Hyper-parameters chosen by held-out groups."""
     interrupted: bool
+    """Whether Ctrl-C ended the training; the best so far was kept."""
 
 
 def past_ticks(period_s: float) -> int:

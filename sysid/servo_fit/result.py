@@ -29,97 +29,67 @@ Learned = CommandNetwork | RecurrentNetwork
 
 @dataclass(frozen=True, kw_only=True)
 class FitScores(Scores):
-    """Scores of a fitted model on one joint, or their means, beside the baselines.
-
-    Attributes
-    ----------
-    linear_rmse_rad, delayed_pd_rmse_rad : float
-        Free run of a linear filter and of DelayedPD fitted to the same readings [rad].
-    persistence_rmse_rad : float
-        The last reading as the prediction of the next [rad].
-    repeatability_rad : float
-        RMS difference of repetitions over √2 [rad]; NaN if no command was repeated.
-    band_noise_rad, band_timing_s : float
-        Standard deviation of the error at speed v: sqrt(noise² + (timing · v)²).
-    """
+    """Scores of a fitted model on one joint, or their means, beside the baselines."""
 
     linear_rmse_rad: float
     delayed_pd_rmse_rad: float
+    """`linear_rmse_rad` and `delayed_pd_rmse_rad`: free run of a linear filter and of DelayedPD
+    fitted to the same readings [rad]."""
     persistence_rmse_rad: float
+    """The last reading as the prediction of the next [rad]."""
     repeatability_rad: float
+    """RMS difference of repetitions over √2 [rad]; NaN if no command was repeated."""
     band_noise_rad: float
     band_timing_s: float
+    """`band_noise_rad` and `band_timing_s`: standard deviation of the error at speed v: sqrt(noise²
+    + (timing · v)²)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ServoFit(Result):
-    """A fitted servo model and its scores on readings it was not fitted to.
-
-    Attributes
-    ----------
-    arch, preset : str
-    seed : int
-    split : str
-        What was for training and what for testing.
-    readings_counted : dict of str to str
-        Per joint, "fresh" or "all".
-    groups : tuple of str
-        What could be held out.
-    time_step_s : float
-        Time between commands.
-    choices : dict of str to float
-        Hyper-parameters chosen by held-out groups.
-    joints : dict of str to FitScores
-    mean : FitScores
-        Over joints.
-    rmse_free_run_rad, linear_rmse_rad, difference_to_linear_rad : Interval
-        Means over joints of the model, of the linear filter, and their difference.
-    coverage_of_90_percent_band : float
-        Share of the test readings inside the predictive band.
-    readings : dict of str to int
-        Per joint, that the model was fitted to.
-    recordings : tuple of dict
-        Name and SHA-256 of each.
-    verdict : str
-        Whether the model is better than the linear filter.
-    notes : tuple of str
-    interrupted : bool
-        Whether Ctrl-C ended the training; the best model so far was kept.
-    model : ServoModel
-        Fitted to the whole training part (to everything, where groups were left out in turn).
-    parameters : dict of str to ndarray
-        Its arrays, for a model file.
-    scored : dict of str to ModelScores
-        Under the name of the architecture, "linear" and "delayed-pd".
-    data : ServoData
-    tracks : Tracks
-        Free run of the model.
-    """
+    """A fitted servo model and its scores on readings it was not fitted to."""
 
     arch: str
     preset: str
     seed: int
     split: str
+    """What was for training and what for testing."""
     readings_counted: dict[str, str]
+    """Per joint, "fresh" or "all"."""
     groups: tuple[str, ...]
+    """What could be held out."""
     time_step_s: float
+    """Time between commands."""
     choices: dict[str, float]
+    """Hyper-parameters chosen by held-out groups."""
     joints: dict[str, FitScores]
     mean: FitScores
+    """Over joints."""
     rmse_free_run_rad: Interval
     linear_rmse_rad: Interval
     difference_to_linear_rad: Interval
+    """`rmse_free_run_rad`, `linear_rmse_rad` and `difference_to_linear_rad`: means over joints of
+    the model, of the linear filter, and their difference."""
     coverage_of_90_percent_band: float
+    """Share of the test readings inside the predictive band."""
     readings: dict[str, int]
+    """Per joint, that the model was fitted to."""
     recordings: tuple[dict[str, str], ...]
+    """Name and SHA-256 of each."""
     verdict: str
+    """Whether the model is better than the linear filter."""
     notes: tuple[str, ...]
     interrupted: bool
+    """Whether Ctrl-C ended the training; the best model so far was kept."""
     model: ServoModel = internal()
+    """Fitted to the whole training part (to everything, where groups were left out in turn)."""
     parameters: Mapping[str, NDArray[np.floating]] = internal()
+    """Its arrays, for a model file."""
     scored: dict[str, ModelScores] = internal()
+    """Under the name of the architecture, "linear" and "delayed-pd"."""
     data: ServoData = internal()
     tracks: Tracks = internal()
+    """Free run of the model."""
 
     def to_frame(self) -> pd.DataFrame:
         """Scores, one row per joint."""
@@ -127,13 +97,7 @@ class ServoFit(Result):
         return pd.DataFrame(rows).set_index("joint")
 
     def plot(self, joints: Sequence[str] | None = None) -> Figure:
-        """Figure of the model in free run beside commands and readings, a panel per joint.
-
-        Parameters
-        ----------
-        joints : sequence of str, optional
-            By default all.
-        """
+        """Figure of the model in free run beside commands and readings, a panel per joint."""
         from pupper_sysid.sysid.servo_fit.figures import free_run_figure
 
         bands = {j: (s.band_noise_rad, s.band_timing_s) for j, s in self.joints.items()}

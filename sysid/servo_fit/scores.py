@@ -34,26 +34,18 @@ _DRAWS = 1000
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of one model on one joint [rad], model minus reading, in order of time.
-
-    Attributes
-    ----------
-    free_run, one_step : ndarray
-        At the readings that count.
-    speed : ndarray
-        Of the model at those readings [rad/s].
-    block : list of tuple
-        Stretch of time each of those readings belongs to.
-    held, raw : ndarray
-        At rows.
-    """
+    """Errors of one model on one joint [rad], model minus reading, in order of time."""
 
     free_run: NDArray[np.float64]
     one_step: NDArray[np.float64]
+    """`free_run` and `one_step`: at the readings that count."""
     speed: NDArray[np.float64]
+    """Of the model at those readings [rad/s]."""
     block: list[tuple[str, int, int]]
+    """Stretch of time each of those readings belongs to."""
     held: NDArray[np.float64]
     raw: NDArray[np.float64]
+    """`held` and `raw`: at rows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,21 +60,13 @@ class Scores:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelScores:
-    """Scores of one model.
-
-    Attributes
-    ----------
-    joints : dict of str to Scores
-    mean : Scores
-        Over joints.
-    rmse_free_run_rad : Interval
-        Of the mean.
-    errors : dict of str to Errors
-    """
+    """Scores of one model."""
 
     joints: dict[str, Scores]
     mean: Scores
+    """Over joints."""
     rmse_free_run_rad: Interval
+    """Of the mean."""
     errors: dict[str, Errors] = internal()
 
     @classmethod

@@ -28,31 +28,22 @@ _LARGEST_GRADIENT = 10.0
 
 @dataclass(frozen=True)
 class Recipe:
-    """Hyper-parameters of a kind of network.
-
-    Attributes
-    ----------
-    units : int
-        Hidden units of one member.
-    members : int
-        Networks that are averaged.
-    decays : tuple of float
-        Weight decays to choose from, relative to the sum of squared errors: as in a posterior,
-        twice the data need half the decay per reading, so a choice made on folds fits the whole.
-    steps : int
-        Optimiser steps, with a learning rate that falls to zero as a cosine.
-    check_every, patience : int
-        Steps between comparisons of the candidates; training stops after `patience` comparisons
-        without improvement.
-    """
+    """Hyper-parameters of a kind of network."""
 
     units: int
+    """Hidden units of one member."""
     members: int
+    """Networks that are averaged."""
     decays: tuple[float, ...]
+    """Weight decays to choose from, relative to the sum of squared errors: as in a posterior, twice
+    the data need half the decay per reading, so a choice made on folds fits the whole."""
     steps: int
+    """Optimiser steps, with a learning rate that falls to zero as a cosine."""
     learning_rate: float
     check_every: int
     patience: int
+    """`check_every` and `patience`: steps between comparisons of the candidates; training stops
+    after `patience` comparisons without improvement."""
 
 
 MLP = Recipe(20, 4, (0.1, 0.3, 1.0, 3.0), 400, 5e-3, 100, 2)
@@ -61,20 +52,14 @@ LSTM = Recipe(16, 2, (0.1, 1.0), 200, 5e-3, 50, 3)
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """All networks at one step of training.
-
-    Attributes
-    ----------
-    step : int
-    error : ndarray, shape (joints, windows, readings, sets, decays)
-        Model minus reading of the averaged members, normalised.
-    weights : dict of str to ndarray
-        Each (joints, sets, decays, members, …).
-    """
+    """All networks at one step of training."""
 
     step: int
     error: NDArray[np.float32]
+    """Model minus reading of the averaged members, normalised, shape (joints, windows, readings,
+    sets, decays)."""
     weights: dict[str, NDArray[np.float32]]
+    """Each (joints, sets, decays, members, …)."""
 
 
 def train(

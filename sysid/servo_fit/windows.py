@@ -66,32 +66,24 @@ def chosen_rows(run: Run, part: Part) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Samples:
-    """Windows of all joints.
-
-    Attributes
-    ----------
-    command : ndarray, shape (joints, windows, past + WINDOW + 2)
-        Normalised, oldest first. Output `k` of a window is the position after command
-        `past - 1 + k`; a window has `WINDOW + 3` outputs.
-    index : ndarray of int, shape (joints, windows, readings)
-        First of the four outputs that a reading is looked up in.
-    weight : ndarray, shape (joints, windows, readings, 4)
-    target : ndarray, shape (joints, windows, readings)
-        Normalised position.
-    group : ndarray of int, shape (joints, windows, readings)
-    used : ndarray of bool, shape (joints, windows, readings)
-    normalisation : dict of str to ndarray
-        `command_center`, `command_scale`, `position_center`, `position_scale`, each (joints,).
-    past : int
-    """
+    """Windows of all joints."""
 
     command: NDArray[np.float32]
+    """Shape (joints, windows, past + WINDOW + 2). Normalised, oldest first. Output `k` of a window
+    is the position after command `past - 1 + k`; a window has `WINDOW + 3` outputs."""
     index: NDArray[np.int64]
+    """First of the four outputs that a reading is looked up in, shape (joints, windows,
+    readings)."""
     weight: NDArray[np.float32]
+    """Shape (joints, windows, readings, 4)."""
     target: NDArray[np.float32]
+    """Normalised position, shape (joints, windows, readings)."""
     group: NDArray[np.int64]
+    """Shape (joints, windows, readings)."""
     used: NDArray[np.bool_]
+    """Shape (joints, windows, readings)."""
     normalisation: dict[str, NDArray[np.float64]]
+    """`command_center`, `command_scale`, `position_center`, `position_scale`, each (joints,)."""
     past: int
 
     @property
@@ -269,25 +261,18 @@ _ITERATIONS = 8
 
 @dataclass(frozen=True)
 class LinearFits:
-    """Linear models of all joints, one per training set, in normalised units.
-
-    Attributes
-    ----------
-    fir : ndarray, shape (joints, sets, taps)
-    bias : ndarray, shape (joints, sets)
-    residual : ndarray, shape (joints, windows, readings, sets)
-        Reading minus model.
-    scale : ndarray, shape (joints, sets)
-        RMS of the residuals the model was fitted to.
-    spread : ndarray, shape (joints, sets)
-        The same, robust: 1.4826 times their median size.
-    """
+    """Linear models of all joints, one per training set, in normalised units."""
 
     fir: NDArray[np.float64]
+    """Shape (joints, sets, taps)."""
     bias: NDArray[np.float64]
+    """Shape (joints, sets)."""
     residual: NDArray[np.float64]
+    """Reading minus model, shape (joints, windows, readings, sets)."""
     scale: NDArray[np.float64]
+    """RMS of the residuals the model was fitted to, shape (joints, sets)."""
     spread: NDArray[np.float64]
+    """The same, robust: 1.4826 times their median size, shape (joints, sets)."""
 
 
 def taps(period_s: float) -> int:

@@ -187,31 +187,21 @@ _NUDGE_STEP_HZ = 0.01
 
 @dataclass(frozen=True)
 class TrialPlan:
-    """One trial: which joints move, for how long, and where to.
-
-    Attributes
-    ----------
-    joints : tuple of str
-        All others rest at the start pose.
-    frequency_hz : float
-        NaN if the motion is not a tone.
-    duration_s : float
-        With the lead-in.
-    offset : callable
-        Command minus start pose [rad] at times since the trial's start [s]: shape (n,) to shape
-        (n,), or (n, joints) where joints move differently.
-    p_gain : float
-        P gain of the moving servos, the register's value; NaN leaves it as it is.
-    release_s : float
-        Time since the trial's start from which the torque is off.
-    """
+    """One trial: which joints move, for how long, and where to."""
 
     joints: tuple[str, ...]
+    """All others rest at the start pose."""
     frequency_hz: float
+    """NaN if the motion is not a tone."""
     duration_s: float
+    """With the lead-in."""
     offset: Offset
+    """Command minus start pose [rad] at times since the trial's start [s]: shape (n,) to shape
+    (n,), or (n, joints) where joints move differently."""
     p_gain: float = float("nan")
+    """P gain of the moving servos, the register's value; NaN leaves it as it is."""
     release_s: float = float("inf")
+    """Time since the trial's start from which the torque is off."""
 
     def command(self, time_s: float, start_rad: NDArray[np.float64]) -> NDArray[np.float64]:
         """Commands [rad], shape (joints,), for joints that start at `start_rad`."""
@@ -220,26 +210,17 @@ class TrialPlan:
 
 @dataclass(frozen=True)
 class Plan:
-    """All trials of a recording, in order.
-
-    Attributes
-    ----------
-    trials : tuple of TrialPlan
-    start_pose_rad : dict of str to float
-        Every joint's pose before and between the trials, absolute [rad].
-    description : dict
-        Written into the recording's header.
-    warnings : tuple of str
-        Changes of the requested amplitudes and frequencies.
-    nearest_start_rad : float
-        Largest distance of a moving joint from its start pose at which the plan may begin.
-    """
+    """All trials of a recording, in order."""
 
     trials: tuple[TrialPlan, ...]
     start_pose_rad: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_POSE))
+    """Every joint's pose before and between the trials, absolute [rad]."""
     description: Mapping[str, Any] = field(default_factory=dict)
+    """Written into the recording's header."""
     warnings: tuple[str, ...] = ()
+    """Changes of the requested amplitudes and frequencies."""
     nearest_start_rad: float = float("inf")
+    """Largest distance of a moving joint from its start pose at which the plan may begin."""
 
     @property
     def duration_s(self) -> float:

@@ -83,24 +83,16 @@ class Request(BaseModel):
 
 @dataclass(frozen=True)
 class Resume:
-    """Where an unfinished recording continues.
-
-    Attributes
-    ----------
-    next_trial : int
-        Number of the first trial to record.
-    rows : int
-        Rows of the finished trials.
-    last_time_s : float
-        Of the file's last row, on the recording's clock.
-    written_at : float
-        `time.time()` of that row.
-    """
+    """Where an unfinished recording continues."""
 
     next_trial: int
+    """Number of the first trial to record."""
     rows: int
+    """Rows of the finished trials."""
     last_time_s: float
+    """Of the file's last row, on the recording's clock."""
     written_at: float
+    """`time.time()` of that row."""
 
     def now_s(self) -> float:
         """The present time on the recording's clock [s]."""

@@ -31,20 +31,14 @@ _GUARD = {"clipped": "held at the limits", "slowed": "delayed by the speed limit
 
 @dataclass(frozen=True)
 class Channel:
-    """One quantity of one joint.
-
-    Attributes
-    ----------
-    joint, name : str
-    time_s : ndarray, shape (n,)
-        Not decreasing [s].
-    values : ndarray, shape (n,)
-    """
+    """One quantity of one joint."""
 
     joint: str
     name: str
     time_s: Array
+    """Not decreasing [s], shape (n,)."""
     values: Array
+    """Shape (n,)."""
 
 
 def channels(recording: Recording) -> list[Channel]:
@@ -96,11 +90,6 @@ def guard_counts(counts: Mapping[str, int]) -> list[str]:
 
 def poses(recording: Recording, rate_hz: float) -> tuple[Array, dict[str, Array]]:
     """Latest reading of each joint, held, at most `rate_hz` times a second.
-
-    Parameters
-    ----------
-    recording : Recording
-    rate_hz : float
 
     Returns
     -------

@@ -40,15 +40,7 @@ _Message = tuple[int, str, str, dict[str, Any]]
 
 
 def write_mcap(recording: Recording, path: Path, force: bool = False) -> None:
-    """Write a recording as MCAP.
-
-    Parameters
-    ----------
-    recording : Recording
-    path : Path
-    force : bool
-        Replace an existing file.
-    """
+    """Write a recording as MCAP."""
     refuse_overwrite(path, force)
     file = io.BytesIO()
     stream = McapStream(file)
@@ -60,13 +52,7 @@ def write_mcap(recording: Recording, path: Path, force: bool = False) -> None:
 
 
 class McapStream:
-    """MCAP in ROS 2's messages that grows by channels.
-
-    Parameters
-    ----------
-    file : binary file
-        To write to; it stays open.
-    """
+    """MCAP in ROS 2's messages that grows by channels."""
 
     def __init__(self, file: IO[bytes]):
         try:

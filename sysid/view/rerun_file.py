@@ -26,26 +26,17 @@ _NO_TIMES: Array = np.empty(0)
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body over time.
-
-    Attributes
-    ----------
-    name : str
-    vertices : ndarray, shape (v, 3)
-        Of its surface, in its own frame [m].
-    triangles : ndarray of int, shape (t, 3)
-        Indices of vertices.
-    position : ndarray, shape (n, 3)
-        In the world [m].
-    quaternion : ndarray, shape (n, 4)
-        Attitude as x, y, z, w.
-    """
+    """A rigid body over time."""
 
     name: str
     vertices: Array
+    """Of its surface, in its own frame [m], shape (v, 3)."""
     triangles: NDArray[np.int64]
+    """Indices of vertices, shape (t, 3)."""
     position: Array
+    """In the world [m], shape (n, 3)."""
     quaternion: Array
+    """Attitude as x, y, z, w, shape (n, 4)."""
 
 
 def write_rerun(

@@ -16,7 +16,7 @@ import yaml
 
 from pupper_sysid.cli.programs import pupper_eval, pupper_play, pupper_train
 from pupper_sysid.common.results import plain
-from pupper_sysid.policies.evaluation.battery import BATTERY
+from pupper_sysid.policies.evaluation.evaluate import BATTERY
 from pupper_sysid.policies.train.checkpoint import read_checkpoint
 from pupper_sysid.policies.train.run_file import load_run, preset, save_run
 from pupper_sysid.policies.walks.film import SIZE

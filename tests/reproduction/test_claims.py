@@ -29,8 +29,12 @@ from pupper_sysid.policies.analysis.autonomy import (
     RatePoint,
     rate_exponent,
 )
-from pupper_sysid.policies.analysis.paths import DirectionWalk
-from pupper_sysid.policies.analysis.robustness import AblationPoint, DelayPoint, GroundPoint
+from pupper_sysid.policies.analysis.robustness import (
+    AblationPoint,
+    DelayPoint,
+    DirectionWalk,
+    GroundPoint,
+)
 from pupper_sysid.policies.network.hyperparameters import Imitation
 from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.sysid.compare.comparison import FITTED, PUBLISHED, four_way

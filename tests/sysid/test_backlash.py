@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pupper_sysid.sysid.backlash.measure import backlash
+from pupper_sysid.sysid.backlash import backlash
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
 from support.refusals import assert_each_refused

@@ -116,7 +116,7 @@ class Compliance(OfPolicies):
     def analyse(self) -> Found:
         """Walks of each policy in each direction."""
         from pupper_sysid.policies.analysis.figures import compliance_figure
-        from pupper_sysid.policies.analysis.paths import compliance
+        from pupper_sysid.policies.analysis.robustness import compliance
 
         found = self.each(compliance)
         table = terminal.table(

@@ -31,7 +31,7 @@ class ServoDemand(Commanded):
 
     def analyse(self) -> Found:
         """Walk, and compare."""
-        from pupper_sysid.policies.analysis.figures_of_servos import demand_figure
+        from pupper_sysid.policies.analysis.figures import demand_figure
         from pupper_sysid.policies.analysis.servo_demand import servo_demand
         from pupper_sysid.servo_models.cards.files import is_card, load_card
         from pupper_sysid.sim.walking.servo_ranges import check_actuator, servo_ranges

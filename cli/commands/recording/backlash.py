@@ -32,7 +32,7 @@ class Backlash:
 
     def run(self) -> None:
         """Measure and print."""
-        from pupper_sysid.sysid.backlash.measure import backlash
+        from pupper_sysid.sysid.backlash import backlash
 
         recordings = terminal.load_all(self.recordings)
         found = backlash(recordings, terminal.pick_joints(recordings, self.joints), self.seed)

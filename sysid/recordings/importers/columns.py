@@ -79,35 +79,23 @@ _LONGEST = 200
 
 @dataclass(frozen=True)
 class Column:
-    """What a name says of its column.
-
-    Attributes
-    ----------
-    name : str
-    kind : {"command", "position", "time", "unknown", ""}
-        Empty for another quantity, and unknown where no word of the name is known.
-    joint : str
-        The words that name a joint, as in the column's name, joined by `_`; empty for none.
-    key : str
-        The same without words such as `joint`, to be compared.
-    unit : str
-        "rad", "mrad", "deg", "turns", "counts", or empty.
-    rank : tuple of int
-        Smaller for the better of two columns for one purpose.
-    words : frozenset of str
-        Those that make it what it is.
-    template : str
-        The name with `{joint}` in place of the joint's name.
-    """
+    """What a name says of its column."""
 
     name: str
     kind: str
+    """Empty for another quantity, and unknown where no word of the name is known."""
     joint: str
+    """The words that name a joint, as in the column's name, joined by `_`; empty for none."""
     key: str
+    """The same without words such as `joint`, to be compared."""
     unit: str
+    """"rad", "mrad", "deg", "turns", "counts", or empty."""
     rank: tuple[int, ...]
+    """Smaller for the better of two columns for one purpose."""
     words: frozenset[str]
+    """Those that make it what it is."""
     template: str
+    """The name with `{joint}` in place of the joint's name."""
 
 
 def column(name: str) -> Column:

@@ -33,10 +33,9 @@ from pupper_sysid.sysid.recordings.importers.log import (
     read_files,
     rows,
 )
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.options import COUNT_RAD, LogOptions, smallest_step
 from pupper_sysid.sysid.recordings.importers.parquet import read_columns
 from pupper_sysid.sysid.recordings.importers.times import one_after_another
-from pupper_sysid.sysid.recordings.importers.units import COUNT_RAD, smallest_step
 
 LAYOUT = "LeRobot dataset"
 

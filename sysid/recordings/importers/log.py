@@ -30,24 +30,16 @@ _ENDINGS = re.compile(r"[._/](pos|position)$", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Log:
-    """A log of another project as the rows of a recording.
-
-    Attributes
-    ----------
-    table : pandas.DataFrame
-        Columns `sysid.recordings.table.REQUIRED_COLUMNS` and some of `OPTIONAL_COLUMNS`.
-    metadata : dict
-        Header entries; `imported_from` names the layout.
-    warnings : list of str
-        What the log does not say, and what was assumed instead.
-    sha256 : str
-        Of the bytes it was read from.
-    """
+    """A log of another project as the rows of a recording."""
 
     table: pd.DataFrame
+    """Columns `sysid.recordings.table.REQUIRED_COLUMNS` and some of `OPTIONAL_COLUMNS`."""
     metadata: dict[str, Any]
+    """Header entries; `imported_from` names the layout."""
     warnings: list[str] = field(default_factory=list)
+    """What the log does not say, and what was assumed instead."""
     sha256: str = ""
+    """Of the bytes it was read from."""
 
 
 def rows(

@@ -9,6 +9,10 @@ unit: deg
 units: {gripper: "percent:1.9"}
 read_before_send: true
 stamp: start
+
+Units of angles are factors to radians. Some logs hold shares of a joint's range (LeRobot's −100 …
+100) whose range is not in the log. The readings give it away: they are whole counts of an encoder
+apart, and hobby servos with a magnetic encoder have 4,096 a turn.
 """
 
 from __future__ import annotations
@@ -19,13 +23,122 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, get_type_hints
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict, create_model
 
 from pupper_sysid.common.border import read_yaml, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.dialect import decimal
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.units import Unit, unit
+
+COUNT_RAD = 2 * np.pi / 4096
+"""One count of an encoder with 4,096 a turn."""
+
+_ANGLE_SCALES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turns": 2 * np.pi}
+_NARROWEST_RAD, _WIDEST_RAD = 0.2, 2 * np.pi  # range of a joint
+
+
+def scale_by_step(positions: ArrayLike, nominal: float, span: float = 1.0) -> tuple[float, str]:
+    """Radians per unit of readings whose smallest step is one count of 4,096 a turn.
+
+    Parameters
+    ----------
+    positions : array_like
+    nominal : float
+        Range in rad to assume where the readings show no step.
+    span : float
+        Range in the log's unit: 1 for shares, 200 for −100 … 100.
+
+    Returns
+    -------
+    scale : float
+    text : str
+        What was assumed, for a warning.
+    """
+    step = smallest_step(np.asarray(positions, float))
+    found = span * COUNT_RAD / step if step > 0 else 0.0
+    if _NARROWEST_RAD <= found <= _WIDEST_RAD:
+        return found / span, (
+            f"its range was taken as {found:.3f} rad, since its readings are steps of 1/"
+            f"{span / step:.0f} of it apart and a step was taken for one count of 4096 a turn"
+        )
+    return nominal / span, f"its range was assumed to be {nominal:.3f} rad"
+
+
+def smallest_step(values: NDArray[np.float64]) -> float:
+    """Step of which all but a few differences of `values` are multiples; 0 if there is none.
+
+    Examples
+    --------
+    >>> round(smallest_step(0.25 * np.array([0, 2, 4, 7, 7, 9, 12, 15, 13, 11, 9, 6, 3])), 6)
+    0.25
+    """
+    known = values[np.isfinite(values)]
+    steps = np.abs(np.diff(known))
+    steps = np.sort(steps[steps > 1e-6 * np.ptp(known)]) if len(known) else steps
+    if len(steps) < 10:
+        return 0.0
+    least = float(np.median(steps[: len(steps) // 100 + 1]))
+    # the smallest difference may be several steps
+    found = (_refined(steps, least / divisor) for divisor in range(1, 7))
+    return next((step for step in found if step > 0), 0.0)
+
+
+def _refined(steps: NDArray[np.float64], guess: float) -> float:
+    """The step near `guess` of which `steps` are multiples; 0 if they are none."""
+    for reach in (5, 10, 20):  # small multiples first: the error of a guess grows with them
+        near = steps[steps < (reach + 0.5) * guess]
+        counts = np.round(near / guess)
+        used = (counts > 0) & (np.abs(near / guess - counts) < 0.2)
+        if used.any():
+            guess = float(np.sum(near[used] * counts[used]) / np.sum(counts[used] ** 2))
+    near = steps[steps < 20.5 * guess]
+    fits = np.abs(near / guess - np.round(near / guess)) < 0.1
+    return guess if len(near) >= 5 and fits.mean() > 0.97 else 0.0
+
+
+@dataclass(frozen=True)
+class Unit:
+    """How a log's numbers become radians: `(value - zero) * scale`."""
+
+    scale: float = 1.0
+    zero: float = 0.0
+    counts: bool = False
+
+
+def unit(text: str, name: str = "`unit`") -> Unit:
+    """The unit that `text` names.
+
+    Parameters
+    ----------
+    text : str
+        `rad`, `mrad`, `deg` or `turns`; `counts:4096` with the counts of a turn, half of which is
+        0 rad; `percent:RANGE_RAD` of −100 … 100 over a range; `scale:RAD_PER_UNIT`.
+    name : str
+        Where it was given, for messages.
+
+    Examples
+    --------
+    >>> unit("deg").scale * 180 == np.pi, unit("counts:4096").zero, unit("percent:4").scale
+    (True, 2048.0, 0.02)
+    """
+    word, _, value = text.strip().partition(":")
+    if word in _ANGLE_SCALES and not value:
+        return Unit(_ANGLE_SCALES[word])
+    try:
+        size = decimal(value)
+    except ValueError:
+        size = 0.0
+    if word == "counts" and 2 <= size <= 2**31:
+        return Unit(2 * np.pi / size, size / 2, counts=True)
+    if word in ("percent", "scale") and 1e-9 <= abs(size) <= 1e3:
+        return Unit(size / 200 if word == "percent" else size)
+    raise InputError(
+        f"{name} is {printable(text)[:40]}. Write rad, deg, turns, counts:4096 (counts of a turn), "
+        "percent:3.5 (rad that −100 … 100 span) or scale:0.01 (rad per unit of the log)."
+    )
+
 
 Stamp = Literal["start", "middle", "end"]
 Readings = Literal["live", "polled"]
@@ -38,50 +151,35 @@ _RATES_HZ = (0.1, 100_000.0)
 
 @dataclass(frozen=True)
 class LogOptions:
-    """Columns, units, names and order of a log. What is left out is found from the log.
-
-    Attributes
-    ----------
-    time : str, optional
-        Column of the time; of the reading's, where `command_time` is another.
-    command, position : str, optional
-        Columns, with `{joint}` where the joint's name stands: `action.{joint}`; or several, with
-        commas. A column of a file without names has its number, from 0. Of a ROS log the topics.
-    trial : str, optional
-        Column that numbers or names trials, episodes or loops.
-    joints : mapping of str to str
-        Joints to read, by the log's name, and what to call them; empty for all.
-    unit : str, optional
-        See `units.unit`.
-    units : mapping of str to str
-        The same for single joints, by the log's name or the new one.
-    read_before_send : bool, optional
-        Whether a turn reads the position before it sends the command.
-    stamp : {"start", "middle", "end"}, optional
-        Where in a turn its time stamp was taken.
-    command_time : str, optional
-        Column of the times at which the commands were sent.
-    send_after : str, optional
-        Time from the reading to the command, such as `3ms`; negative for a command before it.
-    rate : float, optional
-        Rows a second [Hz], instead of the log's times or in want of them.
-    readings : {"live", "polled"}, optional
-        Whether a reading is the present position or the bus's last poll.
-    """
+    """Columns, units, names and order of a log. What is left out is found from the log."""
 
     time: str | None = None
+    """Column of the time; of the reading's, where `command_time` is another."""
     command: str | None = None
     position: str | None = None
+    """`command` and `position`: columns, with `{joint}` where the joint's name stands:
+    `action.{joint}`; or several, with commas. A column of a file without names has its number, from
+    0. Of a ROS log the topics."""
     trial: str | None = None
+    """Column that numbers or names trials, episodes or loops."""
     joints: Mapping[str, str] = field(default_factory=dict)
+    """Joints to read, by the log's name, and what to call them; empty for all."""
     unit: str | None = None
+    """See `units.unit`."""
     units: Mapping[str, str] = field(default_factory=dict)
+    """The same for single joints, by the log's name or the new one."""
     read_before_send: bool | None = None
+    """Whether a turn reads the position before it sends the command."""
     stamp: Stamp | None = None
+    """Where in a turn its time stamp was taken."""
     command_time: str | None = None
+    """Column of the times at which the commands were sent."""
     send_after: str | None = None
+    """Time from the reading to the command, such as `3ms`; negative for a command before it."""
     rate: float | None = None
+    """Rows a second [Hz], instead of the log's times or in want of them."""
     readings: Readings | None = None
+    """Whether a reading is the present position or the bus's last poll."""
 
     def __post_init__(self) -> None:
         for text in [self.unit, *self.units.values()]:

@@ -16,7 +16,6 @@ from pupper_sysid.sysid.recordings.importers import (
     lerobot,
     parquet,
     ros,
-    ros_files,
     sage,
 )
 from pupper_sysid.sysid.recordings.importers.log import Log, joint_names
@@ -81,9 +80,9 @@ def read_folder(folder: Path, options: LogOptions) -> Log:
 def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
     """The log in a file's content; None if it is CSV text."""
     digest = hashlib.sha256(data).hexdigest()
-    if data.startswith(ros_files.MAGIC):
+    if data.startswith(ros.MAGIC):
         return replace(ros.read_mcap(path, data, options), sha256=digest)
-    if data.startswith(ros_files.SQLITE):
+    if data.startswith(ros.SQLITE):
         return replace(ros.read_sqlite(path, options), sha256=digest)
     if data.startswith((arrays.ZIP, arrays.NPY)):
         return replace(arrays.read_arrays(path, data, options), sha256=digest)

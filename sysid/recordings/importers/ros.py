@@ -6,24 +6,34 @@ Positions are a topic of `sensor_msgs/JointState`; commands are topics of
 
 A message has up to two times: its header's, by the program that made it, and the log's, when the
 recorder received it. The header's is used where there is one, for it is nearer to the servo.
+
+A bag in SQLite holds no definitions of its messages, so `decode` reads the three types from their
+bytes (CDR). No length in the bytes is believed beyond the bytes there are.
 """
 
 from __future__ import annotations
 
+import io
 import re
-from collections.abc import Mapping, Sequence
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.content import refuse_more
+from pupper_sysid.common.files import resolved
+from pupper_sysid.common.reading.content import allowed, refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS, distinct, one_each
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.log import (
+    LARGEST_BYTES,
     MOST_JOINTS,
     Log,
     held_commands,
@@ -32,20 +42,6 @@ from pupper_sysid.sysid.recordings.importers.log import (
     rows,
 )
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.ros_files import (
-    Raw,
-    bounded,
-    mcap_messages,
-    sqlite_messages,
-)
-from pupper_sysid.sysid.recordings.importers.ros_messages import (
-    JOINT_STATE,
-    KINDS,
-    MULTI_ARRAY,
-    TRAJECTORY,
-    Message,
-    decode,
-)
 
 LAYOUT = "ROS 2 log"
 
@@ -298,3 +294,263 @@ def _by_joint(place: str, topic: _Topic, names: Sequence[str]) -> dict[str, NDAr
                 found[joint] = np.full(len(topic.messages), np.nan)
             found[joint][k] = value
     return found
+
+
+MAGIC = b"\x89MCAP"
+SQLITE = b"SQLite format 3\0"
+
+Raw = tuple[str, str, int, bytes]
+"""Topic, type, log time [ns] and content of a message."""
+
+_MOST_MESSAGES = 1_000_000
+_MOST_TOPICS = 10_000
+_MOST_STEPS = 1e9  # of SQLite's machine; a message takes some twenty
+_STEPS = 100_000  # between two looks at them
+
+
+def bounded(path: Path, messages: Iterator[Raw]) -> list[Raw]:
+    """All messages."""
+    found: list[Raw] = []
+    total = 0
+    for message in messages:
+        found.append(message)
+        total += len(message[3])
+        # a database may say of one place that it is the content of many messages
+        refuse_more(path, total, LARGEST_BYTES, "bytes", "Split it.", exact=False)
+        refuse_more(path, len(found), _MOST_MESSAGES, "messages", "Split it.", exact=False)
+    return found
+
+
+def mcap_messages(path: Path, data: bytes, warnings: list[str]) -> Iterator[Raw]:
+    """Yield the messages of an MCAP file; one that is cut off gives what there is.
+
+    Parameters
+    ----------
+    path : Path
+        For messages to the user.
+    data : bytes
+    warnings : list of str
+        Gets a sentence if the file is cut off.
+    """
+    try:
+        from mcap.exceptions import EndOfFile, McapError
+        from mcap.records import Channel, Chunk, Schema
+        from mcap.records import Message as Record
+        from mcap.stream_reader import StreamReader, breakup_chunk
+    except ImportError:
+        raise InputError(
+            f"{path} is an MCAP file; reading it needs mcap. Install pupper-sysid[logs]."
+        ) from None
+    schemas: dict[int, str] = {}
+    channels: dict[int, tuple[str, str]] = {}
+    left = int(allowed(LARGEST_BYTES))
+    try:
+        stream = StreamReader(io.BytesIO(data), emit_chunks=True, record_size_limit=left)
+        for record in stream.records:
+            inside: Sequence[Any] = [record]
+            if isinstance(record, Chunk):
+                record.data = _unpacked(path, record.compression, record.data, left)
+                record.compression = ""
+                left -= len(record.data)
+                inside = breakup_chunk(record)
+            for one in inside:
+                if isinstance(one, Schema):
+                    schemas[one.id] = plain_type(one.name)
+                elif isinstance(one, Channel):
+                    channels[one.id] = one.topic, schemas.get(one.schema_id, "")
+                elif isinstance(one, Record) and one.channel_id in channels:
+                    topic, kind = channels[one.channel_id]
+                    yield topic, kind, one.log_time, one.data if kind in KINDS else b""
+    except (EndOfFile, struct.error):  # the library unpacks what is left of a record
+        warnings.append("it was cut short, or is damaged, and is used up to there.")
+    except (McapError, ValueError, RuntimeError, EOFError, OverflowError) as error:
+        said = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        raise InputError(
+            f"{path} is a damaged MCAP file: {printable(said)}. Try `mcap recover`."
+        ) from error
+
+
+def _unpacked(path: Path, compression: str, data: bytes, most: int) -> bytes:
+    """A chunk's content, at most `most` bytes of it."""
+    if compression == "zstd":
+        import zstandard
+
+        try:
+            found = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data)).read(most + 1)
+        except zstandard.ZstdError as error:
+            raise ValueError(str(error)) from error
+    elif compression == "lz4":
+        import lz4.frame
+
+        found = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most + 1)
+    else:
+        found = data
+    if len(found) > most:
+        refuse_more(f"{path}, unpacked,", allowed(LARGEST_BYTES) + 1, LARGEST_BYTES, "bytes",
+                    "Keep the topics of joints only (`mcap filter`).", exact=False)  # fmt: skip
+    return found
+
+
+def sqlite_messages(path: Path) -> Iterator[Raw]:
+    """Yield the messages of the known types in a bag's database, opened for reading only."""
+    address = f"{resolved(path).as_uri()}?mode=ro&immutable=1"
+    steps = 0.0
+
+    def enough() -> bool:
+        nonlocal steps
+        steps += _STEPS
+        return steps > allowed(_MOST_STEPS)
+
+    try:
+        with closing(sqlite3.connect(address, uri=True)) as database:
+            database.execute("PRAGMA trusted_schema = OFF")
+            database.set_progress_handler(enough, _STEPS)
+            _refuse_computed(database)
+            topics = {
+                int(n): (str(name)[:1000], plain_type(str(kind)[:1000]))
+                for n, name, kind in database.execute(
+                    f"SELECT id, name, type FROM topics LIMIT {_MOST_TOPICS}"
+                )
+            }
+            wanted = [n for n, (_, kind) in topics.items() if kind in KINDS]
+            marks = ",".join("?" * len(wanted[:500]))
+            for n, time_ns, data in database.execute(
+                f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks})",
+                wanted[:500],
+            ):
+                topic, kind = topics[n]
+                if type(time_ns) is not int or not isinstance(data, bytes):
+                    raise ValueError("a message is no bytes with a time")
+                yield topic, kind, time_ns, data
+    except (sqlite3.Error, TypeError, ValueError, OverflowError) as error:
+        raise InputError(
+            f"{path} is no readable rosbag2 database: {printable(str(error))[:120]}. Convert it "
+            "with `ros2 bag convert` to MCAP."
+        ) from error
+
+
+def _refuse_computed(database: sqlite3.Connection) -> None:
+    """Refuse tables that are views or programs: those may compute without end."""
+    for name in ("topics", "messages"):
+        found = database.execute(
+            "SELECT type, sql FROM sqlite_master WHERE name = ? COLLATE NOCASE", (name,)
+        ).fetchall()
+        hidden = database.execute(f"SELECT 1 FROM pragma_table_xinfo('{name}') WHERE hidden != 0")
+        tables = [kind == "table" and not str(sql).upper().startswith("CREATE VIRTUAL")
+                  for kind, sql in found]  # fmt: skip
+        if tables != [True] or hidden.fetchone():
+            raise ValueError(f"{name} is no plain table")
+
+
+JOINT_STATE = "sensor_msgs/JointState"
+TRAJECTORY = "trajectory_msgs/JointTrajectory"
+MULTI_ARRAY = "std_msgs/Float64MultiArray"
+KINDS = (JOINT_STATE, TRAJECTORY, MULTI_ARRAY)
+
+
+@dataclass(frozen=True)
+class Message:
+    """Positions of joints at a time."""
+
+    stamp_ns: int
+    """Of the header; 0 where there is none."""
+    names: tuple[str, ...]
+    """Empty where the message has none."""
+    positions: tuple[float, ...]
+    points: int = 1
+    """How many points a trajectory has; its first one is in `positions`."""
+
+
+def plain_type(name: str) -> str:
+    """A type's name without the `msg` between package and message.
+
+    Examples
+    --------
+    >>> plain_type("sensor_msgs/msg/JointState")
+    'sensor_msgs/JointState'
+    """
+    return name.replace("/msg/", "/")
+
+
+def decode(kind: str, data: bytes) -> Message:
+    """A message of type `kind`, one of this module's.
+
+    Raises
+    ------
+    ValueError
+        If the bytes are too short, or no such message.
+    """
+    return _DECODERS[kind](_Cdr(data))
+
+
+class _Cdr:
+    """Values one after another, aligned to their size (OMG CDR, with its four bytes of header)."""
+
+    def __init__(self, data: bytes):
+        if len(data) < 4 or data[0] != 0 or data[1] not in (0, 1):
+            raise ValueError("no CDR header")
+        self._data, self._at = memoryview(data)[4:], 0
+        self._order = "<" if data[1] == 1 else ">"
+
+    def values(self, code: str, size: int, count: int = 1) -> tuple[float, ...]:
+        """`count` numbers of `size` bytes each."""
+        if count == 0:
+            return ()
+        start = -(-self._at // size) * size
+        end = start + size * count
+        if end > len(self._data):
+            raise ValueError("message is cut short")
+        self._at = end
+        return struct.unpack(f"{self._order}{count}{code}", self._data[start:end])
+
+    def length(self) -> int:
+        """Length of the sequence that follows."""
+        count = int(self.values("I", 4)[0])
+        if count > len(self._data) - self._at:
+            raise ValueError("a length in the message is larger than the message")
+        return count
+
+    def text(self) -> str:
+        """Text that ends with a zero byte."""
+        count = self.length()
+        start, self._at = self._at, self._at + count
+        return bytes(self._data[start : self._at]).rstrip(b"\0").decode("utf-8", "replace")
+
+    def texts(self) -> tuple[str, ...]:
+        """A sequence of texts."""
+        return tuple(self.text() for _ in range(self.length()))
+
+    def doubles(self) -> tuple[float, ...]:
+        """A sequence of numbers."""
+        return self.values("d", 8, self.length())
+
+    def stamp_ns(self) -> int:
+        """Time of a header, whose frame is read over."""
+        seconds, rest = self.values("i", 4)[0], self.values("I", 4)[0]
+        self.text()
+        return int(seconds) * 10**9 + int(rest)
+
+
+def _joint_state(cdr: _Cdr) -> Message:
+    return Message(cdr.stamp_ns(), cdr.texts(), cdr.doubles())
+
+
+def _trajectory(cdr: _Cdr) -> Message:
+    stamp, names = cdr.stamp_ns(), cdr.texts()
+    points = cdr.length()
+    return Message(stamp, names, cdr.doubles() if points else (), points)
+
+
+def _multi_array(cdr: _Cdr) -> Message:
+    for _ in range(cdr.length()):
+        cdr.text()
+        cdr.values("I", 4, 2)
+    cdr.values("I", 4)
+    return Message(0, (), cdr.doubles())
+
+
+_DECODERS: dict[str, Callable[[_Cdr], Message]] = {
+    JOINT_STATE: _joint_state,
+    TRAJECTORY: _trajectory,
+    MULTI_ARRAY: _multi_array,
+}

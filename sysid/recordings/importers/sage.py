@@ -35,8 +35,8 @@ from pupper_sysid.sysid.recordings.importers.log import (
     read_files,
     rows,
 )
+from pupper_sysid.sysid.recordings.importers.options import scale_by_step
 from pupper_sysid.sysid.recordings.importers.times import doubt_of_a_turn
-from pupper_sysid.sysid.recordings.importers.units import scale_by_step
 
 LAYOUT = "SAGE folder"
 

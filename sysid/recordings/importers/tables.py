@@ -37,7 +37,7 @@ from pupper_sysid.sysid.recordings.importers.log import (
     joint_names,
     rows,
 )
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.options import LogOptions, Unit, unit
 from pupper_sysid.sysid.recordings.importers.times import (
     clock,
     doubt_of_a_turn,
@@ -46,7 +46,6 @@ from pupper_sysid.sysid.recordings.importers.times import (
     times_of_day,
     turns,
 )
-from pupper_sysid.sysid.recordings.importers.units import Unit, unit
 
 LAYOUT = "table"
 
@@ -72,33 +71,22 @@ _COMPARED = 8  # columns for one purpose
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of a log.
-
-    Attributes
-    ----------
-    columns : mapping of str to ndarray
-        Of numbers, equally long; shape (rows,).
-    texts : mapping of str to sequence of str
-        Columns that hold text.
-    faults : mapping of str to str
-        Why a column is no numbers, as a sentence.
-    widths : mapping of str to int
-        Arrays with a column per joint, and how many; their columns are `<array>.<joint>`.
-    joint_names : (str, int), optional
-        What names those joints, and how many.
-    numbered : bool
-        Whether the columns have no names but their numbers.
-    notes : tuple of str
-        What was assumed, in sentences.
-    """
+    """Columns of a log."""
 
     columns: Mapping[str, NDArray[np.float64]]
+    """Of numbers, equally long; shape (rows,)."""
     texts: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """Columns that hold text."""
     faults: Mapping[str, str] = field(default_factory=dict)
+    """Why a column is no numbers, as a sentence."""
     widths: Mapping[str, int] = field(default_factory=dict)
+    """Arrays with a column per joint, and how many; their columns are `<array>.<joint>`."""
     joint_names: tuple[str, int] | None = None
+    """What names those joints, and how many."""
     numbered: bool = False
+    """Whether the columns have no names but their numbers."""
     notes: tuple[str, ...] = ()
+    """What was assumed, in sentences."""
 
     @property
     def names(self) -> list[str]:

@@ -16,8 +16,7 @@ from pupper_sysid.policies.analysis.autonomy import (
     rate_exponent,
     rate_response,
 )
-from pupper_sysid.policies.analysis.paths import DirectionWalk, compliance
-from pupper_sysid.policies.analysis.robustness import terrain
+from pupper_sysid.policies.analysis.robustness import DirectionWalk, compliance, terrain
 from pupper_sysid.policies.walks.conditions import DIRECTIONS
 from pupper_sysid.policies.walks.rollouts import Rollout
 from reproduction.evidence import scales
@@ -117,7 +116,7 @@ def test_a_policy_walks_at_other_rates_with_other_scales_and_on_other_ground(wal
 def test_a_policy_goes_where_it_is_commanded(walker, monkeypatch):
     policy, trial = walker
     some = {k: DIRECTIONS[k] for k in ("forward", "turn left", "stand")}
-    monkeypatch.setattr("pupper_sysid.policies.analysis.paths.DIRECTIONS", some)
+    monkeypatch.setattr("pupper_sysid.policies.analysis.robustness.DIRECTIONS", some)
     forward, turn = compliance(policy, replace(trial, seconds=5.0))
     assert forward.direction == "forward" and forward.share.value > 0.7
     assert turn.share.value > 0.3 and np.isnan(turn.drift.value)

@@ -10,7 +10,7 @@ import pytest
 
 from pupper_sysid.cli.policy_choice import policy_at, simulator
 from pupper_sysid.common.results import plain
-from pupper_sysid.policies.analysis.figures_of_servos import demand_figure
+from pupper_sysid.policies.analysis.figures import demand_figure
 from pupper_sysid.policies.analysis.servo_demand import _load, _top_speed, servo_demand
 from pupper_sysid.policies.analysis.trial import Trial
 

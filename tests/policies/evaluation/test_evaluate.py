@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pupper_sysid.policies.evaluation.battery import BATTERY, battery_robots
-from pupper_sysid.policies.evaluation.evaluate import RANDOM as RANDOM_COMMANDS
 from pupper_sysid.policies.evaluation.evaluate import (
+    BATTERY,
     WALKERS,
     Case,
+    battery_robots,
     evaluate,
     summary,
     table,
     usual_robots,
     walk,
 )  # fmt: skip
-from pupper_sysid.policies.evaluation.falls import in_short
-from pupper_sysid.policies.evaluation.figures import Recorder, figures_of, share_interval
+from pupper_sysid.policies.evaluation.evaluate import RANDOM as RANDOM_COMMANDS
+from pupper_sysid.policies.evaluation.figures import Recorder, figures_of, in_short, share_interval
 from pupper_sysid.policies.walks.conditions import (
     DIRECTIONS,
     RANDOM,

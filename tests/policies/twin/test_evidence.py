@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.policies.twin.evidence import _load_share
 from pupper_sysid.policies.twin.gyro import read_imu, spectrum
+from pupper_sysid.policies.twin.playing import _load_share
 from support.refusals import assert_each_refused
 
 SAG = 1e-3 * np.array([3.0, 5, -12, -2, 7, -18, 9, 10, -8, -4, 4, -6])

@@ -7,7 +7,7 @@ import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.policies.twin.actuators import actuator_of, robot_for, spread_over, stronger
+from pupper_sysid.policies.twin.drawing import actuator_of, robot_for, spread_over, stronger
 from pupper_sysid.policies.twin.figures import twin_figure
 from pupper_sysid.policies.twin.twin import twin
 from pupper_sysid.servo_models.calibration.calibration import load_calibration

@@ -13,8 +13,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     readings,
 )
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
-from pupper_sysid.sysid.lag.phase_slope import tone_lags
-from pupper_sysid.sysid.lag.tone import tone_response
+from pupper_sysid.sysid.lag.tone import tone_lags, tone_response
 from pupper_sysid.sysid.recordings.recording import Trial
 from support.refusals import assert_each_refused
 from support.synthetic import LOOP_S, held_trial, tone_trials

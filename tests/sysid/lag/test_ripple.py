@@ -5,9 +5,13 @@ import pytest
 
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
 from pupper_sysid.sysid.lag.lag_budget import lag_budget
-from pupper_sysid.sysid.lag.phase_slope import slope, tone_lags, tone_weights
-from pupper_sysid.sysid.lag.ripple import without_ripple
-from pupper_sysid.sysid.lag.tone import tone_response
+from pupper_sysid.sysid.lag.tone import (
+    slope,
+    tone_lags,
+    tone_response,
+    tone_weights,
+    without_ripple,
+)
 from support.synthetic import first_order_trial, tone_trials
 
 TONES = (1.0, 2.0, 4.0, 6.0)

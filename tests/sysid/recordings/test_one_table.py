@@ -15,12 +15,14 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.csv_table import distinct
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.ros import _by_joint, _log, _Topic
-from pupper_sysid.sysid.recordings.importers.ros_messages import (
+from pupper_sysid.sysid.recordings.importers.ros import (
     JOINT_STATE,
     MULTI_ARRAY,
     TRAJECTORY,
     Message,
+    _by_joint,
+    _log,
+    _Topic,
 )
 from pupper_sysid.sysid.recordings.recording import Recording
 

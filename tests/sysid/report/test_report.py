@@ -31,7 +31,6 @@ from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse, Transfe
 from pupper_sysid.sysid.lag.lag_budget import FrequencyLag, LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report import figures, tables
-from pupper_sysid.sysid.report.advice import advice
 from pupper_sysid.sysid.report.figures import (
     LONGEST_RUN,
     hold_runs,
@@ -40,7 +39,7 @@ from pupper_sysid.sysid.report.figures import (
     window,
 )
 from pupper_sysid.sysid.report.report import write_findings
-from pupper_sysid.sysid.report.sections import Findings
+from pupper_sysid.sysid.report.sections import Findings, advice
 from support.browser import looks_right, needs_chromium
 from support.refusals import assert_each_refused
 from support.runs import run_of

@@ -11,7 +11,7 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.ros_messages import decode
+from pupper_sysid.sysid.recordings.importers.ros import decode
 from support.refusals import assert_each_refused
 
 writer = pytest.importorskip("mcap_ros2.writer")
@@ -297,7 +297,7 @@ def test_logs_that_are_damaged_too_large_or_without_joints_are_refused(tmp_path,
     ]  # fmt: skip
     monkeypatch.setattr("pupper_sysid.sysid.recordings.importers.ros.MOST_JOINTS", 50)
     assert_each_refused(cases, load)
-    monkeypatch.setattr("pupper_sysid.sysid.recordings.importers.ros_files.LARGEST_BYTES", 2e4)
+    monkeypatch.setattr("pupper_sysid.sysid.recordings.importers.ros.LARGEST_BYTES", 2e4)
     assert_each_refused([(whole, "unpacked, has more than 20,000 bytes")], load)
     monkeypatch.setitem(sys.modules, "mcap.stream_reader", None)
     assert_each_refused([(whole, "Install pupper-sysid[logs]")], load)
@@ -359,7 +359,7 @@ def test_a_database_that_takes_too_many_steps_is_given_up(tmp_path, monkeypatch)
         database.executemany(
             "INSERT INTO messages VALUES (7, ?, x'00')", ((k,) for k in range(9999))
         )
-    where = "pupper_sysid.sysid.recordings.importers.ros_files."
+    where = "pupper_sysid.sysid.recordings.importers.ros."
     monkeypatch.setattr(f"{where}_MOST_STEPS", 1000)
     monkeypatch.setattr(f"{where}_STEPS", 100)
     with pytest.raises(InputError, match="interrupted"):

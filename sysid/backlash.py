@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,7 @@ from scipy.stats import t as student
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import LEVEL, Interval
-from pupper_sysid.common.results import JointResults
-from pupper_sysid.sysid.backlash.results import GainHysteresis, JointBacklash
+from pupper_sysid.common.results import JointResults, Result, flat, plain
 from pupper_sysid.sysid.recordings.joints import (
     Joints,
     Recordings,
@@ -46,6 +45,53 @@ from pupper_sysid.sysid.recordings.recording import Trial
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, kw_only=True)
+class GainHysteresis(Result):
+    """Hysteresis at one P gain."""
+
+    p_gain: float
+    """NaN if the recording does not say it."""
+    hysteresis_rad: Interval
+    """Command difference between strokes up and down at the same reading and no speed."""
+    lag_s: Interval
+    """Lag behind a slow ramp: back-EMF over stiffness, and the dead time."""
+    strokes: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointBacklash(Result):
+    """Hysteresis, dead zone and backlash of one joint."""
+
+    gains: tuple[GainHysteresis, ...]
+    dead_zone_rad: Interval | None
+    """Half of the hysteresis that does not shrink with the gain. Its lower end is 0 where friction
+    explains all; None with a single gain."""
+    backlash_rad: Interval | None
+    """Play between motor and output; None without a load that reveals it."""
+    notes: tuple[str, ...] = ()
+    """What could not be told apart, and what would."""
+
+    def __str__(self) -> str:
+        parts = [f"hysteresis {_degrees(g.hysteresis_rad)} at P {g.p_gain:g}" for g in self.gains]
+        for name, value in (("dead zone", self.dead_zone_rad), ("backlash", self.backlash_rad)):
+            parts.append(f"{name} {'not determined' if value is None else _degrees(value)}")
+        return ", ".join(parts)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per P gain; dead zone and backlash, which have no gain, stand in each."""
+        return [
+            gain.rows()[0]
+            | flat(plain({"dead_zone_rad": self.dead_zone_rad, "backlash_rad": self.backlash_rad}))
+            for gain in self.gains
+        ]
+
+
+def _degrees(value: Interval) -> str:
+    best, low, high = np.degrees([value.value, value.low, value.high])
+    return f"{best:.2f}° [{low:.2f}, {high:.2f}]"
+
 
 FASTEST_RAD_S = 0.5
 """Faster strokes are no test of hysteresis: inertia counts."""
@@ -72,7 +118,7 @@ class Backlash(JointResults[JointBacklash]):
 
         The dashed line falls as 1/P from the lowest gain; the shaded band is twice the dead zone.
         """
-        from pupper_sysid.sysid.backlash.figure import hysteresis_figure
+        from pupper_sysid.sysid.report.figures import hysteresis_figure
 
         return hysteresis_figure(self)
 

@@ -1,1 +1,0 @@
-"""Hysteresis, dead zone and backlash of a servo from slow strokes."""
