@@ -33,7 +33,7 @@ from scipy.stats import t as student
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import JointResults, Result, flat, plain
-from pupper_sysid.sysid.recordings.joints import (
+from pupper_sysid.sysid.doctor.checks import (
     Joints,
     Recordings,
     as_sequence,

@@ -40,6 +40,13 @@ from pupper_sysid.servo_models.sparse_equation import (
     equation,
     explain,
 )
+from pupper_sysid.sysid.doctor.checks import (
+    Joints,
+    Recordings,
+    each_joint,
+    joint_rng,
+    map_joints,
+)
 from pupper_sysid.sysid.fit.kernel import SPARSE
 from pupper_sysid.sysid.fit.preparation import prepare_joint
 from pupper_sysid.sysid.fit.run import Run, free_run
@@ -47,13 +54,6 @@ from pupper_sysid.sysid.fit.scores import Scores, held_out_residuals, score
 from pupper_sysid.sysid.fit.search import Fit, Problem, fit_folds, folds_of, refined, search
 from pupper_sysid.sysid.fit.structure import PREFERRED, Parameter, Structure
 from pupper_sysid.sysid.fit.structure import candidate as structure_called
-from pupper_sysid.sysid.recordings.joints import (
-    Joints,
-    Recordings,
-    each_joint,
-    joint_rng,
-    map_joints,
-)
 
 PULLS = ("stiffness_per_s2", "saturated_stiffness_per_s2")
 """Terms that pull toward the command: without one of them it is no servo."""

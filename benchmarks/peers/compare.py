@@ -32,13 +32,13 @@ from numpy.typing import NDArray
 from random_robots import SweptRobot, sweep_random_robot
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.sysid.doctor.checks import joint_trials
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
 from pupper_sysid.sysid.fit.scores import rms, score
 from pupper_sysid.sysid.fit.search import folds_of
 from pupper_sysid.sysid.fit.structure import PREFERRED, candidate
 from pupper_sysid.sysid.recordings.files import load
-from pupper_sysid.sysid.recordings.joints import joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording
 
 HERE = Path(__file__).parent

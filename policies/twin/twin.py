@@ -35,8 +35,8 @@ from pupper_sysid.policies.twin.playing import (
     sequences,
 )
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration
+from pupper_sysid.sysid.doctor.checks import chosen_joints
 from pupper_sysid.sysid.fit.predict import ReadingRule, in_words, rule_of
-from pupper_sysid.sysid.recordings.joints import chosen_joints
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data

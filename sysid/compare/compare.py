@@ -29,7 +29,14 @@ from pupper_sysid.servo_models.cards.files import card_names
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model
 from pupper_sysid.sysid.compare.comparison import ComparedModel, Comparison
-from pupper_sysid.sysid.doctor.checks import cautions
+from pupper_sysid.sysid.doctor.checks import (
+    Joints,
+    Recordings,
+    as_sequence,
+    cautions,
+    chosen_joints,
+    usable_trials,
+)
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit.predict import (
     ComparedRun,
@@ -44,13 +51,6 @@ from pupper_sysid.sysid.fit.predict import (
     notes as run_notes,
 )
 from pupper_sysid.sysid.fit.run import at_steps
-from pupper_sysid.sysid.recordings.joints import (
-    Joints,
-    Recordings,
-    as_sequence,
-    chosen_joints,
-    usable_trials,
-)
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data

@@ -33,17 +33,17 @@ from pupper_sysid.servo_models.calibration.parts import JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import at_step
-from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice, readings
-from pupper_sysid.sysid.fit.calibrate import CalibrationResult
-from pupper_sysid.sysid.fit.run import whole_counts
-from pupper_sysid.sysid.lag.lag_budget import lag_budget
-from pupper_sysid.sysid.lag.tone import tone_lags, tone_response, tone_weights
-from pupper_sysid.sysid.recordings.joints import (
+from pupper_sysid.sysid.doctor.checks import (
     Recordings,
     as_sequence,
     joint_rng,
     joint_trials,
 )
+from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice, readings
+from pupper_sysid.sysid.fit.calibrate import CalibrationResult
+from pupper_sysid.sysid.fit.run import whole_counts
+from pupper_sysid.sysid.lag.lag_budget import lag_budget
+from pupper_sysid.sysid.lag.tone import tone_lags, tone_response, tone_weights
 from pupper_sysid.sysid.recordings.recording import Trial
 
 ENDING = ".truth.yaml"

@@ -19,7 +19,15 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import NO_LOAD_SPEED_RAD_S
 from pupper_sysid.common.results import JointResults, Result, internal
-from pupper_sysid.sysid.doctor.checks import findings, long_enough
+from pupper_sysid.sysid.doctor.checks import (
+    Joints,
+    Recordings,
+    as_sequence,
+    chosen_joints,
+    findings,
+    long_enough,
+    recorded_trials,
+)
 from pupper_sysid.sysid.doctor.explanations import crossed
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, VERDICTS, Finding
 from pupper_sysid.sysid.doctor.signals import amplitude_ratio, disorder, offset, peak_speed
@@ -32,13 +40,6 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
 from pupper_sysid.sysid.feedback.staleness import moving_rows
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.recordings.excitation import describe, named_tones, without_bad_readings
-from pupper_sysid.sysid.recordings.joints import (
-    Joints,
-    Recordings,
-    as_sequence,
-    chosen_joints,
-    recorded_trials,
-)
 from pupper_sysid.sysid.recordings.recording import Trial
 
 if TYPE_CHECKING:

@@ -19,6 +19,7 @@ from pupper_sysid.common.joints import STALL_TORQUES_NM
 from pupper_sysid.common.processes.workers import Workers, prepare
 from pupper_sysid.common.results import JointResults
 from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.sysid.doctor.checks import Joints, Recordings, as_sequence, usable_trials
 from pupper_sysid.sysid.fit.calibration_file import preset_parameters, to_calibration
 from pupper_sysid.sysid.fit.joint_fit import (
     Fitted,
@@ -32,7 +33,6 @@ from pupper_sysid.sysid.fit.operating_point import with_operating_points
 from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.fit.structure import SIMULATED
-from pupper_sysid.sysid.recordings.joints import Joints, Recordings, as_sequence, usable_trials
 from pupper_sysid.sysid.recordings.recording import Trial
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from pupper_sysid.common.results import JointResults
+from pupper_sysid.sysid.doctor.checks import Joints, Recordings, each_joint
 from pupper_sysid.sysid.fit.joint_fit import joint_lag
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
-from pupper_sysid.sysid.recordings.joints import Joints, Recordings, each_joint
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

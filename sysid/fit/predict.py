@@ -37,12 +37,12 @@ from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
+from pupper_sysid.sysid.doctor.checks import joint_rng
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
 from pupper_sysid.sysid.fit.kernel import COLUMNS
 from pupper_sysid.sysid.fit.run import Run, at_steps, prepare, simulate, with_voltage
 from pupper_sysid.sysid.fit.scores import known
 from pupper_sysid.sysid.fit.structure import loaded_columns
-from pupper_sysid.sysid.recordings.joints import joint_rng
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
 if TYPE_CHECKING:

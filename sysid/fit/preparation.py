@@ -18,6 +18,7 @@ from pupper_sysid.common.data_sheet import no_load_speed
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import JOINT_NAMES, NO_LOAD_SPEED_RAD_S
+from pupper_sysid.sysid.doctor.checks import joint_rng
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     find_poll_lattice,
@@ -41,7 +42,6 @@ from pupper_sysid.sysid.fit.structure import (
     servo_structure,
 )
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
-from pupper_sysid.sysid.recordings.joints import joint_rng
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _NOISE_RAD = 0.02  # of a first fit where no lag could be measured

@@ -21,6 +21,7 @@ from pupper_sysid.common.results import Result
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import Actuator, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
+from pupper_sysid.sysid.doctor.checks import each_joint, joint_trials
 from pupper_sysid.sysid.fit.joint_fit import fit_joint
 from pupper_sysid.sysid.fit.results import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.fit.run import Run
@@ -43,7 +44,6 @@ from pupper_sysid.sysid.plan.planner import (
     propose,
     respond,
 )
-from pupper_sysid.sysid.recordings.joints import each_joint, joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 from pupper_sysid.sysid.sweep.excitation import LEAST_MARGIN_RAD, LOOP_PERIOD_S, PLANS_S
 

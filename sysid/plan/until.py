@@ -18,12 +18,12 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.reading.dialect import decimal
 from pupper_sysid.common.results import Result, derived
+from pupper_sysid.sysid.doctor.checks import joint_trials
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.plan.candidates import trial_seconds
 from pupper_sysid.sysid.plan.planner import DEAD_TIME, LEAST_HALF_WIDTH_S, SHORTEST_S
 from pupper_sysid.sysid.plan.proposal import Margins, SweepPlan, plan_from_fits, recorded_s
 from pupper_sysid.sysid.recordings.files import load
-from pupper_sysid.sysid.recordings.joints import joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording
 
 ROUND_S = 20.0

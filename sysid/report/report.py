@@ -26,6 +26,15 @@ from pupper_sysid.common.page import WrittenPage, write_page
 from pupper_sysid.servo_models.calibration.calibration import Calibration, is_shipped
 from pupper_sysid.servo_models.calibration.parts import CandidateModel, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
+from pupper_sysid.sysid.doctor.checks import (
+    Joints,
+    Recordings,
+    as_sequence,
+    chosen_joints,
+    joint_rng,
+    joint_trials,
+    usable_trials,
+)
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.fit.calibration_file import preset_parameters
 from pupper_sysid.sysid.fit.joint_fit import score_preset
@@ -36,15 +45,6 @@ from pupper_sysid.sysid.fit.scores import Scores, score
 from pupper_sysid.sysid.fit.structure import SIMULATED
 from pupper_sysid.sysid.fit.structure import candidate as structure
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
-from pupper_sysid.sysid.recordings.joints import (
-    Joints,
-    Recordings,
-    as_sequence,
-    chosen_joints,
-    joint_rng,
-    joint_trials,
-    usable_trials,
-)
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 from pupper_sysid.sysid.report.sections import Findings, sections
 

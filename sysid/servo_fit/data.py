@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.doctor.checks import joint_rng, joint_trials
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     Readings,
@@ -35,7 +36,6 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
 )
 from pupper_sysid.sysid.fit.run import Run as PhysicsRun
 from pupper_sysid.sysid.fit.run import prepare, whole_counts
-from pupper_sysid.sysid.recordings.joints import joint_rng, joint_trials
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
 MODES = ("auto", "fresh", "all")

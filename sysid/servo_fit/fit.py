@@ -25,18 +25,18 @@ from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.servo_file import ARCHITECTURES, physical_model
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS
 from pupper_sysid.servo_models.step_size import at_step
-from pupper_sysid.sysid.doctor.checks import cautions
+from pupper_sysid.sysid.doctor.checks import (
+    Joints,
+    Recordings,
+    as_sequence,
+    cautions,
+    chosen_joints,
+    usable_trials,
+)
 from pupper_sysid.sysid.feedback.poll_lattice import quantum
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.search import Problem, search
 from pupper_sysid.sysid.fit.structure import PREFERRED, candidate
-from pupper_sysid.sysid.recordings.joints import (
-    Joints,
-    Recordings,
-    as_sequence,
-    chosen_joints,
-    usable_trials,
-)
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data

@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from pupper_sysid.cli.programs.pupper_sysid import main
+from pupper_sysid.sysid.doctor import checks as joints
 from pupper_sysid.sysid.plan.plan_file import load_plan
-from pupper_sysid.sysid.recordings import joints
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
 from support.json_keys import key_line

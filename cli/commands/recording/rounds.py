@@ -54,10 +54,10 @@ def run_rounds(
         Print one JSON object.
     """
     started = time.perf_counter()
+    from pupper_sysid.sysid.doctor.checks import each_joint
     from pupper_sysid.sysid.fit.joint_fit import fit_joint
     from pupper_sysid.sysid.plan.plan_file import save_plan
     from pupper_sysid.sysid.plan.until import parse_goal, record_until
-    from pupper_sysid.sysid.recordings.joints import each_joint
     from pupper_sysid.sysid.sweep.resume import footer, header_of
 
     series = request["until"]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import pupper_sysid as ps
+from pupper_sysid.sysid.doctor.checks import joint_trials
 from pupper_sysid.sysid.recordings.excitation import describe, named_tones, segments, split_tones
-from pupper_sysid.sysid.recordings.joints import joint_trials
 from pupper_sysid.sysid.recordings.recording import Trial
 from support.real_recordings import FOLDER
 from support.synthetic import LOOP_S, tone_trials
