@@ -29,8 +29,8 @@ from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.report.servo_section import FILE
-from pupper_sysid.sysid.report.servo_section import MODELS as CURVES
+from pupper_sysid.sysid.report.sections import FILE
+from pupper_sysid.sysid.report.sections import MODELS as CURVES
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.fit import delayed_pd_fits

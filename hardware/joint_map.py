@@ -37,7 +37,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, in_order, strange_joint
 from pupper_sysid.common.strict_yaml import dump
-from pupper_sysid.hardware.safety.limits import Coupling, PositionLimits
+from pupper_sysid.hardware.bus import Coupling, PositionLimits
 
 SCHEMA = "pupper-sysid joint map"
 SCHEMA_VERSION = 1

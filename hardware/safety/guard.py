@@ -26,9 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError, SafetyStop
-from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
+from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent, ServoBus
 from pupper_sysid.hardware.loop import BUS, GUARD, TimeSpent, raised_cosine
-from pupper_sysid.hardware.safety.limits import PositionLimits
 from pupper_sysid.hardware.safety.monitor import Angles, GuardLimits, Monitor
 from pupper_sysid.hardware.safety.watchdog import Watchdog
 from pupper_sysid.hardware.serial_servos.series import ERROR_BITS

@@ -71,7 +71,7 @@ def registers_of(series: Series, memory: bytes) -> dict[str, int]:
 def setup_of(
     servo: int, family: Family, series: Series, registers: Mapping[str, int] | None
 ) -> dict[str, Any]:
-    """Entry of a servo in a recording's header (`sysid.recordings.servo_setup.ServoSetup`).
+    """Entry of a servo in a recording's header (`sysid.recordings.table.ServoSetup`).
 
     Parameters
     ----------

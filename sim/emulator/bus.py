@@ -28,8 +28,7 @@ from pupper_sysid.common.errors import BusError
 from pupper_sysid.common.files import refuse_overwrite, write_text
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.loop import HostClock
-from pupper_sysid.sim.emulator.bench import SUPPLY_V, FreeAirServos, ServoPlant
-from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
+from pupper_sysid.sim.emulator.bench import SUPPLY_V, FreeAirServos, PollSchedule, ServoPlant
 from pupper_sysid.sim.emulator.robot import CENTRE_COUNT, RADIANS_PER_COUNT, EmulatedRobot
 
 

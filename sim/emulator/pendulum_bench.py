@@ -41,7 +41,7 @@ BENCH_MAP = "bench_sts3215"
 
 @dataclass(frozen=True)
 class Pendulum:
-    """A load, as `sysid.recordings.servo_setup.PendulumLoad` describes it in a recording."""
+    """A load, as `sysid.recordings.table.PendulumLoad` describes it in a recording."""
 
     mass_kg: float = 0.0
     length_m: float = 0.0

@@ -24,13 +24,6 @@ from scipy.special import betaincinv, ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, internal
-from pupper_sysid.sysid.feedback.poll_loss import (
-    Sure,
-    count_loss,
-    fast,
-    more_changes_than_polls,
-    moves,
-)
 from pupper_sysid.sysid.feedback.poll_search import (
     BLUR_S,
     BLURS_S,
@@ -48,8 +41,13 @@ from pupper_sysid.sysid.feedback.slips import (
     Motion,
     Segment,
     Slip,
+    Sure,
+    count_loss,
     evidence,
+    fast,
     find_segments,
+    more_changes_than_polls,
+    moves,
     robust_scale,
 )
 from pupper_sysid.sysid.feedback.staleness import (

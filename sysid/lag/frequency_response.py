@@ -31,8 +31,7 @@ from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import JointResults, Result, derived, internal
 from pupper_sysid.sysid.doctor.checks import Joints, Recordings, cautions, each_joint, joint_rng
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice, readings
-from pupper_sysid.sysid.lag.multisine import line_responses
-from pupper_sysid.sysid.lag.tone import ToneResponse, tone_lags, without_ripple
+from pupper_sysid.sysid.lag.tone import ToneResponse, line_responses, tone_lags, without_ripple
 from pupper_sysid.sysid.recordings.recording import Trial
 
 if TYPE_CHECKING:

@@ -54,7 +54,6 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     quantum,
     readings,
 )
-from pupper_sysid.sysid.lag.multisine import line_responses
 from pupper_sysid.sysid.lag.step_response import (
     LONGEST_S,
     ImpulseResponse,
@@ -65,6 +64,7 @@ from pupper_sysid.sysid.lag.step_response import (
 from pupper_sysid.sysid.lag.tone import (
     ToneResponse,
     lag_near,
+    line_responses,
     responses,
     slope,
     tone_lags,

@@ -16,8 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from pupper_sysid.common.processes.workers import keep_freed_memory
-from pupper_sysid.sysid.servo_fit.lstm_kernel import Lstm
-from pupper_sysid.sysid.servo_fit.mlp_kernel import Mlp
+from pupper_sysid.sysid.servo_fit.kernels import Lstm, Mlp
 from pupper_sysid.sysid.servo_fit.windows import WINDOW, LinearFits, Samples, fading, learns_from
 
 _BEND = 3.0  # robust standard deviations beyond which a reading pulls with constant force

@@ -15,11 +15,10 @@ import pytest
 
 from pupper_sysid.cli.user_errors import user_errors
 from pupper_sysid.common.errors import SafetyStop
-from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import BUS, GUARD, IMU, LOG, POLICY, VIEWS, FixedRateLoop
 from pupper_sysid.hardware.safety.guard import GuardedBus
-from pupper_sysid.hardware.safety.limits import PositionLimits
 from pupper_sysid.policies.deploy import deployment
 from pupper_sysid.policies.deploy.assembly import assemble
 from pupper_sysid.policies.deploy.commands import constant

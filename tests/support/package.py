@@ -32,7 +32,7 @@ def public_names(module: str) -> Iterator[str]:
             yield f"{module}.{name}"
         elif inspect.isclass(item):
             yield f"{module}.{name}"
-            for member, value in vars(item).items():
+            for member, value in list(vars(item).items()):
                 value = getattr(value, "__func__", value)  # class and static methods
                 if not member.startswith("_") and isinstance(value, (FunctionType, property)):
                     yield f"{module}.{name}.{member}"

@@ -28,8 +28,7 @@ class Doctor:
     def run(self) -> None:
         """Examine and print."""
         from pupper_sysid.sysid.doctor.examination import examine
-        from pupper_sysid.sysid.doctor.findings import USE, Finding
-        from pupper_sysid.sysid.doctor.words import shared
+        from pupper_sysid.sysid.doctor.findings import USE, Finding, shared
 
         recordings = terminal.load_all(self.recordings)
         found = examine(recordings, seed=self.seed)

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import BusError, SafetyStop
-from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.bus import BusSample, Coupling, PositionLimits, Sent
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits, guarded
-from pupper_sysid.hardware.safety.limits import Coupling, PositionLimits
 from pupper_sysid.hardware.safety.watchdog import Watchdog
 
 PERIOD = 0.02

@@ -8,10 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pupper_sysid.common.errors import BusError, SafetyStop
-from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.bus import BusSample, Coupling, PositionLimits, Sent
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
-from pupper_sysid.hardware.safety.limits import Coupling, PositionLimits
 
 FEW = settings(max_examples=60, deadline=None)
 MAPS = {

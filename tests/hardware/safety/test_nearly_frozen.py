@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import InputError, SafetyStop
-from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
-from pupper_sysid.hardware.safety.limits import PositionLimits
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.pendulum_bench import (
     BenchSpec,

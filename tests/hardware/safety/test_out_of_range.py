@@ -12,13 +12,12 @@ import pytest
 from pupper_sysid.common.data_sheet import supply_range
 from pupper_sysid.common.errors import InputError, SafetyStop
 from pupper_sysid.hardware import esp32
-from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.feetech import FAMILY, STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import HostClock
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
-from pupper_sysid.hardware.safety.limits import PositionLimits
 from pupper_sysid.hardware.serial_servos.settings import supply_band
 
 PERIOD_S = 0.02

@@ -13,9 +13,9 @@ import yaml
 from pupper_sysid.common.errors import BusError, FileExistsRefusal, InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
+from pupper_sysid.sim.emulator.bench import PollSchedule
 from pupper_sysid.sim.emulator.bus import TRUTH_COLUMNS, EmulatedBus
 from pupper_sysid.sim.emulator.free_air import FreeAirServo
-from pupper_sysid.sim.emulator.poll_schedule import PollSchedule
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from support.refusals import assert_each_refused
 from support.servo_parameters import MEASURED

@@ -7,8 +7,7 @@ import pytest
 
 import pupper_sysid as ps
 from pupper_sysid.sysid.doctor.checks import findings
-from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, Finding, rivalled
-from pupper_sysid.sysid.doctor.words import RIVALS, WORDS
+from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, RIVALS, USE, WORDS, Finding, rivalled
 from support.real_recordings import case
 from support.strange_servos import ACCUSING, FAULTS, draw_recording
 

@@ -16,8 +16,8 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     find_poll_lattice,
     redate,
 )
-from pupper_sysid.sysid.feedback.poll_loss import count_loss, fast
 from pupper_sysid.sysid.feedback.poll_search import Phase, Stretch
+from pupper_sysid.sysid.feedback.slips import count_loss, fast
 from pupper_sysid.sysid.recordings.recording import Trial
 from support.synthetic import tone_trials
 

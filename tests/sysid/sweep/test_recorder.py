@@ -14,9 +14,8 @@ import pytest
 
 from pupper_sysid.common.errors import BusError, FileExistsRefusal, InputError, SafetyStop
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
-from pupper_sysid.hardware.bus import BusSample, Sent
+from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent
 from pupper_sysid.hardware.loop import GENTLE_RAD_S
-from pupper_sysid.hardware.safety.limits import PositionLimits
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sysid.recordings.files import load
