@@ -52,11 +52,6 @@ def write_policy(
     """Write the policy folder of an rsl_rl actor's weights.
 
     `command_share` is the share of the task's commands that the curriculum has come to.
-
-    Raises
-    ------
-    InputError
-        If the gate refuses the policy; see `policies.network.policy_file.refuse_bad`.
     """
     shape, task = run.architecture, run.task
     size = OBSERVATION_SIZE + 12 * action_history
@@ -98,13 +93,6 @@ def export_policy(
     """Write a policy as one file for other runtimes, checked against the policy.
 
     Returns the largest difference of actions.
-
-    Raises
-    ------
-    InputError
-        If the file exists, or the `onnx` package is not installed.
-    PupperError
-        If the file's actions differ from the policy's by more than 1e-5.
     """
     network, names = policy.network, policy.network.state_names
     contract = policy.contract.model_dump(mode="json", by_alias=True)

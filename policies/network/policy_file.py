@@ -235,13 +235,7 @@ class Policy:
 def save_policy(
     folder: Path, network: PolicyNetwork, about: dict[str, Any], force: bool = False
 ) -> None:
-    """Write a policy; `about` is the contract without schema, versions and hash.
-
-    Raises
-    ------
-    InputError
-        If the gate refuses it, or the folder holds one and `force` is not given.
-    """
+    """Write a policy; `about` is the contract without schema, versions and hash."""
     refuse_bad(network, "this policy")
     refuse_overwrite(folder / CONTRACT, force)
     data = save_tensors({k: v.contiguous() for k, v in network.state_dict().items()})

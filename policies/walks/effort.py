@@ -35,30 +35,22 @@ _AT_LIMIT = 0.999
 
 @dataclass(frozen=True)
 class Effort:
-    """One control step of n robots.
-
-    Attributes
-    ----------
-    swing_ended : ndarray of bool, shape (n, 4)
-        Feet that came down after a swing.
-    clearance_m : ndarray, shape (n, 4)
-        Of the swings that ended; NaN of other feet.
-    saturated : ndarray, shape (n, 3)
-        By kind of joint, the share of the step's time in which its servos are at their limit.
-    torque_square : ndarray, shape (n, 3)
-        Mean square of torque over limit, by kind of joint.
-    work_j : ndarray, shape (n,)
-        Positive work of all servos.
-    carried_j : ndarray, shape (n,)
-        Weight times the distance travelled in the step, at the mean velocity over a stride.
-    """
+    """One control step of n robots."""
 
     swing_ended: NDArray[np.bool_]
+    """Feet that came down after a swing, shape (n, 4)."""
     clearance_m: Array
+    """Shape (n, 4). Of the swings that ended; NaN of other feet."""
     saturated: Array
+    """By kind of joint, the share of the step's time in which its servos are at their limit, shape
+    (n, 3)."""
     torque_square: Array
+    """Mean square of torque over limit, by kind of joint, shape (n, 3)."""
     work_j: Array
+    """Positive work of all servos, shape (n,)."""
     carried_j: Array
+    """Weight times the distance travelled in the step, at the mean velocity over a stride, shape
+    (n,)."""
 
 
 class EffortMeter:

@@ -109,11 +109,6 @@ def collect(
     lean : bool
         Whether to leave out observations and hidden states of altered walks: of 16 robots over
         10 s, 4 MB or more.
-
-    Raises
-    ------
-    InputError
-        If `seconds` is shorter than a step, or the environment cannot be made.
     """
     recorder = partial(_Recorder, lean=lean)
     return walk_together(policy, servos, conditions, seconds, seed, threads, recorder, progress)

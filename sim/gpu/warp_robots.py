@@ -45,11 +45,6 @@ class WarpRobots(RobotBatch):
     extra_dead_time_s : float or ndarray, shape (n,)
     extra_jitter_s : ndarray, shape (n,), optional
         As `RobotBatch`.
-
-    Raises
-    ------
-    InputError
-        As `RobotBatch`, or if there is no such device.
     """
 
     def __init__(
@@ -79,13 +74,7 @@ class WarpRobots(RobotBatch):
         self._broken = np.zeros(environments, bool)
 
     def field(self, name: str) -> Array:
-        """Live values of a model field that differs between robots, shape (n, …).
-
-        Raises
-        ------
-        InputError
-            If it is the same for all robots.
-        """
+        """Live values of a model field that differs between robots, shape (n, …)."""
         if name not in self._fields:
             raise InputError(
                 f"`{name}` is one value for all robots on a Warp device; those of each robot are "

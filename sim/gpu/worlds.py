@@ -87,13 +87,7 @@ def _kernels(wp: Any) -> dict[str, Any]:
 
 
 def device_of(name: str) -> Any:
-    """The Warp device of a name, `cpu`, `cuda` or `cuda:1`.
-
-    Raises
-    ------
-    InputError
-        If it is not there.
-    """
+    """The Warp device of a name, `cpu`, `cuda` or `cuda:1`."""
     wp = _engine().wp
     try:
         return wp.get_device(name)
@@ -118,11 +112,6 @@ class Worlds:
         How many robots, and physics steps in a call of `advance`.
     device : str
         Warp's name of it.
-
-    Raises
-    ------
-    InputError
-        If there is no such device.
     """
 
     def __init__(
