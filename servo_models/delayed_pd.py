@@ -253,10 +253,9 @@ def integrate(
     state: tuple[NDArray, NDArray, NDArray],
     values: dict[str, NDArray],
     time_step_s: float,
-    out: NDArray[np.float64] | None = None,
     implicit: bool = True,
 ) -> tuple[NDArray[np.float64], tuple[NDArray, NDArray, NDArray]]:
-    """Step the servo through commands that have already been delayed; the inner loop of fitting.
+    """Step the servo through commands that have already been delayed.
 
     Parameters
     ----------
@@ -266,8 +265,6 @@ def integrate(
     values : dict
         Fields of `DelayedPDParameters` but the dead time, each broadcastable to batch.
     time_step_s : float
-    out : ndarray, optional
-        Where the positions go; may be `delayed` itself.
     implicit : bool
         Brake with the velocity at the step's end, as MuJoCo does, instead of the present one.
 
@@ -282,7 +279,7 @@ def integrate(
         return np.ascontiguousarray(np.broadcast_to(value, batch), dtype=float).reshape(-1)
 
     kp, kd, friction, effort, brake = (flat(values[name] / values["armature"]) for name in _TORQUES)
-    positions = np.empty(delayed.shape) if out is None else out
+    positions = np.empty(delayed.shape)
     flat_positions = positions.reshape(len(delayed), -1)  # a view: splitting or merging one axis
     delayed = delayed.reshape(len(delayed), -1)
     low_effort, low_friction, stop = -effort, -friction, -FRICTION_IMPEDANCE

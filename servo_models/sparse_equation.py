@@ -137,7 +137,6 @@ def integrate(
     state: tuple[NDArray, NDArray],
     coefficients: Mapping[str, NDArray],
     time_step_s: float,
-    out: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float64], tuple[NDArray, NDArray]]:
     """Step the equation through commands that have already been delayed.
 
@@ -149,8 +148,6 @@ def integrate(
     coefficients : mapping of str to ndarray
         Names of `COEFFICIENTS`, each broadcastable to batch; those left out cost no time.
     time_step_s : float
-    out : ndarray, optional
-        Where the positions go; may be `delayed` itself.
 
     Returns
     -------
@@ -170,7 +167,7 @@ def integrate(
     limit = flat(coefficients.get("saturation_error_rad", np.inf))
     low_limit, low_friction = -limit, None if friction is None else -friction
     damping = 0.5 * h * flat(coefficients.get("damping_per_s", 0.0))
-    positions = np.empty(delayed.shape) if out is None else out
+    positions = np.empty(delayed.shape)
     flat_positions = positions.reshape(len(delayed), -1)
     delayed = delayed.reshape(len(delayed), -1)
     position, velocity = (flat(x).copy() for x in state)

@@ -39,7 +39,8 @@ _BLOCKS = 16
 _FEWEST_BLOCKS = 8
 _PER_LOOP = 8  # bins in a loop period
 _FINEST_S, _COARSEST_S = 0.001, 0.005
-_MOST_FINE, _ROUGHLY_FINE = 60, 40
+_MOST_FINE = 60  # bins up to beyond the lag
+_DRAWS = 300
 _GROWTH = 1.12  # of bins beyond the lag
 _BEYOND_S = 0.03
 _DECAYS_S = (0.0007, 0.0015, 0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2)
@@ -91,29 +92,6 @@ class _Prior:
         return -0.5 * (count * np.log(self.variance) + self.complexity)
 
 
-def joint_impulse_response(
-    joint: str,
-    trials: Sequence[Trial],
-    read: Sequence[Readings],
-    rng: np.random.Generator,
-    rough: bool = False,
-) -> ImpulseResponse:
-    """Impulse response of a joint, from all of its trials.
-
-    Parameters
-    ----------
-    joint : str
-    trials : sequence of Trial
-    read : sequence of Readings
-        Of each trial.
-    rng : numpy.random.Generator
-    rough : bool
-        As in `impulse_response`.
-    """
-    loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
-    return impulse_response(joint_stretches(joint, trials, read), loop, rng, rough=rough)
-
-
 def joint_stretches(
     joint: str, trials: Sequence[Trial], read: Sequence[Readings]
 ) -> tuple[Stretch, ...]:
@@ -160,35 +138,24 @@ def _inside_counts(trial: Trial, reading: Readings, step_rad: float) -> NDArray[
     return value - 0.5 * np.sign(moved) * (step_rad - between)
 
 
-def impulse_response(
-    parts: Sequence[Stretch],
-    loop_s: float,
-    rng: np.random.Generator,
-    draws: int = 300,
-    rough: bool = False,
+def joint_impulse_response(
+    joint: str, trials: Sequence[Trial], read: Sequence[Readings], rng: np.random.Generator
 ) -> ImpulseResponse:
-    """Draw impulse responses that the readings allow.
+    """Draw impulse responses of a joint that the readings of all of its trials allow.
 
-    Parameters
-    ----------
-    parts : sequence of Stretch
-        Of one joint; the command must move in at least one.
-    loop_s : float
-        Loop period.
-    rng : numpy.random.Generator
-    draws : int
-    rough : bool
-        Try few kernels: a fifth of the time.
+    The command must move in at least one of the trials.
     """
-    edges = _edges(rough_lag(parts), loop_s, rough)
+    parts = joint_stretches(joint, trials, read)
+    loop_s = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
+    edges = _edges(rough_lag(parts), loop_s)
     sums = _pooled([part.sums(edges) for part in parts])
     gram, moment = sums.gram.sum(axis=0), sums.moment.sum(axis=0)
     square, count = float(sums.square.sum()), float(sums.count.sum())
-    fine = np.flatnonzero(edges[1:] <= edges[1] * (_ROUGHLY_FINE if rough else _MOST_FINE) * 1.01)
-    dead_times, decays = edges[fine], _DECAYS_S[1::2] if rough else _DECAYS_S
+    fine = np.flatnonzero(edges[1:] <= edges[1] * _MOST_FINE * 1.01)
+    dead_times = edges[fine]
 
     def fit(chosen: NDArray) -> list[_Prior]:
-        kernels = [(d, decay, smooth) for d in chosen for decay in decays for smooth in (0, 1)]
+        kernels = [(d, decay, smooth) for d in chosen for decay in _DECAYS_S for smooth in (0, 1)]
         return [
             prior
             for kernel in kernels
@@ -198,7 +165,7 @@ def impulse_response(
     priors = fit(dead_times[::3])
     best = _best(priors, count)
     inflation = _inflation(sums, *best)
-    for _ in range(1 if rough else 2):
+    for _ in range(2):
         # dead times between the tried ones, where they are likely
         score = np.array([p.score(count / inflation).max() for p in priors])
         tried = np.array([p.dead_time_s for p in priors])
@@ -207,7 +174,7 @@ def impulse_response(
         priors += fit(dead_times[reach & ~np.isin(dead_times, tried)])
         best = _best(priors, count / inflation)
         inflation = _inflation(sums, *best)
-    masses, weights = _draw(priors, sums, inflation, len(edges) - 1, rng, draws)
+    masses, weights = _draw(priors, sums, inflation, len(edges) - 1, rng, _DRAWS)
     prior, k = best
     return ImpulseResponse(
         edges, masses, weights, tuple(parts), 1.0 - float(prior.variance[k]) * count / square
@@ -228,11 +195,11 @@ def rough_lag(parts: Sequence[Stretch]) -> float:
     return float(edges[int(np.argmax(np.abs(gram @ mean)))] + edges[1] / 2)
 
 
-def _edges(lag_s: float, loop_s: float, rough: bool) -> NDArray[np.float64]:
+def _edges(lag_s: float, loop_s: float) -> NDArray[np.float64]:
     """Bins: fine up to beyond the lag, then growing."""
     top = lag_s + loop_s + _BEYOND_S
     fine = np.clip(loop_s / _PER_LOOP, _FINEST_S, _COARSEST_S)
-    fine = max(fine, top / (_ROUGHLY_FINE if rough else _MOST_FINE))
+    fine = max(fine, top / _MOST_FINE)
     edges = list(np.arange(0.0, top, fine))
     width = fine
     while edges[-1] < LONGEST_S:
