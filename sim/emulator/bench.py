@@ -132,16 +132,16 @@ class ServoPlant(Protocol):
         ...
 
 
-class FreeAirServos:
-    """A `ServoPlant` on a stand: level and at rest, legs in free air."""
+class ServosOnStand:
+    """A `ServoPlant` whose trunk is level and at rest: each servo moves alone.
 
-    def __init__(self, robot: EmulatedRobot):
-        from pupper_sysid.sim.emulator.free_air import FreeAirServo  # imports MuJoCo
+    Parameters
+    ----------
+    servos : sequence of FreeAirServo or PendulumServo
+    """
 
-        pose = robot.joint_map.rest_pose().tolist()
-        self._servos = [
-            FreeAirServo(s.actuator, x) for s, x in zip(robot.servos, pose, strict=True)
-        ]
+    def __init__(self, servos: Sequence[Any]):
+        self._servos = servos
 
     def command(self, index: int, time_s: float, angle_rad: float) -> None:
         """Command one servo from `time_s` on; a limp one ignores it."""
@@ -162,6 +162,18 @@ class FreeAirServos:
     def imu(self, time_s: float) -> ImuSample:
         """Gravity alone."""
         return ImuSample(time_s, np.zeros(3), np.array([0.0, 0.0, GRAVITY_M_S2]), False)
+
+
+class FreeAirServos(ServosOnStand):
+    """A `ServoPlant` on a stand, legs in free air."""
+
+    def __init__(self, robot: EmulatedRobot):
+        from pupper_sysid.sim.emulator.free_air import FreeAirServo  # imports MuJoCo
+
+        pose = robot.joint_map.rest_pose().tolist()
+        super().__init__(
+            [FreeAirServo(s.actuator, x) for s, x in zip(robot.servos, pose, strict=True)]
+        )
 
 
 AMBIENT_C, SUPPLY_V = 27.0, 7.4

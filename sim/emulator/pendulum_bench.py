@@ -18,10 +18,9 @@ from typing import Any
 import numpy as np
 
 from pupper_sysid.common.data_sheet import no_load_speed, stall_torque
-from pupper_sysid.hardware.imu import GRAVITY_M_S2, ImuSample
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-from pupper_sysid.sim.emulator.bench import AMBIENT_C, SUPPLY_V
+from pupper_sysid.sim.emulator.bench import AMBIENT_C, SUPPLY_V, ServosOnStand
 from pupper_sysid.sim.emulator.pendulum import (
     DYNAMIXEL_GAINS,
     FEETECH_REGISTERS,
@@ -130,7 +129,7 @@ class BenchRobot(EmulatedRobot):
         return found
 
 
-class PendulumBench:
+class PendulumBench(ServosOnStand):
     """A `ServoPlant` of loaded servos, whose registers act."""
 
     def __init__(self, robot: BenchRobot):
@@ -138,30 +137,12 @@ class PendulumBench:
         spec = robot.bench
         self.acting_registers = tuple(spec.factory)
         self._model, self._supply_v = spec.model, spec.supply_v
-        self._servos = [
-            PendulumServo(p, x, robot.registers, spec.factory, spec.loop)
-            for p, x in zip(robot.loaded, pose, strict=True)
-        ]
-
-    def command(self, index: int, time_s: float, angle_rad: float) -> None:
-        """Command one servo from `time_s` on; a limp one ignores it."""
-        self._servos[index].command(time_s, angle_rad)
-
-    def torque(self, index: int, time_s: float, on: bool) -> None:
-        """Hold the present position, or go limp, from `time_s` on."""
-        self._servos[index].torque(time_s, on)
-
-    def angle(self, index: int, time_s: float) -> float:
-        """True angle of a servo [rad]."""
-        return self._servos[index].position_at(time_s)
-
-    def load(self, index: int) -> float:
-        """Signed duty of a servo at the time of the last `angle` call."""
-        return self._servos[index].load
-
-    def imu(self, time_s: float) -> ImuSample:
-        """Gravity alone."""
-        return ImuSample(time_s, np.zeros(3), np.array([0.0, 0.0, GRAVITY_M_S2]), False)
+        super().__init__(
+            [
+                PendulumServo(p, x, robot.registers, spec.factory, spec.loop)
+                for p, x in zip(robot.loaded, pose, strict=True)
+            ]
+        )
 
     def servo_setups(self, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
         """By joint, what a recording's header says of its servo."""

@@ -309,18 +309,7 @@ def map_joints(
     workers: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Found]:
-    """`work(joint, task)` of every joint, in the order of `tasks`; parameters as for `each_joint`.
-
-    Parameters
-    ----------
-    work : callable
-        Must be picklable if there are several workers.
-    tasks : dict of joint to what `work` takes
-    workers : int
-        Processes.
-    progress : callable, optional
-        Called with a joint's name when it is done.
-    """
+    """`work(joint, task)` of every joint, in the order of `tasks`; see `each_joint`."""
     results: dict[str, Found] = {}
     with Workers(workers) as pool:
         for joint, task in tasks.items():

@@ -1,4 +1,4 @@
-"""Impulse response of a servo from any recording, with its uncertainty: `impulse_response`.
+"""Impulse response of a servo from any recording, with its uncertainty: `joint_impulse_response`.
 
 Readings y at times t answer the held command c, known exactly as a function of time
 (`sysid.lag.held_command`): y(t) = offset + ∫ h(u) c(t - u) du + rest. The impulse response h is a
