@@ -46,7 +46,7 @@ from pupper_sysid.sysid.doctor.signals import (
 from pupper_sysid.sysid.feedback.staleness import fresh_rows, quantum
 from pupper_sysid.sysid.recordings.excitation import named_tones, remembered, without_bad_readings
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
-from pupper_sysid.sysid.recordings.table import ServoSetup
+from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
 
 LEAST_ROWS = 3
 """Rows of a trial; fewer have no rate of change."""

@@ -33,6 +33,7 @@ from pupper_sysid.sysid.recordings.check import check
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.times import READ_AFTER_SEND_S, doubt_of_a_turn
 from pupper_sysid.sysid.recordings.layouts import convert
+from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 from pupper_sysid.sysid.recordings.table import (
     OPTIONAL_COLUMNS,
     REQUIRED_COLUMNS,
@@ -40,8 +41,6 @@ from pupper_sysid.sysid.recordings.table import (
     TEXT_COLUMNS,
     TITLE,
     Parsed,
-    PendulumLoad,
-    ServoSetup,
     check_metadata,
     comment,
     comments,

@@ -1,18 +1,9 @@
-"""Recording files as tables of numbers and a header, or an error that names the place.
-
-The header also has what is known of a servo and its load: model, registers, pendulum.
-
-    # servos: {"knee": {"model": "STS3215", "p_gain": 16, "registers": {"acceleration": 254}}}
-    # loads: {"knee": {"mass_kg": 0.49, "length_m": 0.1}}
-
-Both are optional. With a known load the servo's torques can be identified in N·m.
-"""
+"""Recording files as tables of numbers and a header, or an error that names the place."""
 
 from __future__ import annotations
 
 import difflib
 import json
-import math
 import re
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -24,7 +15,6 @@ import pandas as pd
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from pupper_sysid.common.border import parse_json, refuse_other_version, validated
-from pupper_sysid.common.data_sheet import counts_of
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.csv_table import (
     CsvTable,
@@ -39,6 +29,7 @@ from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.columns import time_columns
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.tables import LABELS
+from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 
 SCHEMA_VERSION = 1
 TITLE = "# pupper-sysid recording"
@@ -271,70 +262,3 @@ def _numbered(path: Path, name: str, found: CsvTable) -> Any:
         with suppress(InputError):
             return numbers_of(path, name, cells, found.line)
     return cells
-
-
-_Positive = Annotated[float, Field(gt=0, le=1e6)]
-_NotNegative = Annotated[float, Field(ge=0, le=1e6)]
-
-GRAVITY_M_S2 = 9.81
-
-
-class ServoSetup(BaseModel):
-    """Servo of one joint as it was set; unknown keys are kept."""
-
-    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
-
-    model: str | None = None
-    """Manufacturer's model name, such as `STS3215`."""
-    firmware: str | None = None
-    """Version of its firmware."""
-    p_gain: _NotNegative | None = None
-    """P gain of its position loop, the register's value; the column `p_gain` overrides it."""
-    i_gain: _NotNegative | None = None
-    """I gain, the register's value."""
-    d_gain: _NotNegative | None = None
-    """D gain, the register's value."""
-    supply_voltage_v: _Positive | None = None
-    """Nominal supply voltage [V]; the column `voltage_v` overrides it."""
-    registers: dict[str, int] = {}
-    """Other registers by name (`hardware.feetech`)."""
-
-    @property
-    def set_point_acceleration_rad_s2(self) -> float | None:
-        """Largest acceleration of the set-point by the register `acceleration` [rad/s²].
-
-        None where it is not stated; infinite at 0. A unit is 100 counts/s².
-        """
-        units = self.registers.get("acceleration")
-        if units is None:
-            return None
-        counts = counts_of(self.model or "STS3215") or 4096.0
-        return 100 * units * math.tau / counts if units else math.inf
-
-
-class PendulumLoad(BaseModel):
-    """Point mass on an arm that the servo swings about a horizontal axis.
-
-    The gravity torque on the joint is `-gravity_nm * sin(position - hanging_rad)`.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    mass_kg: _NotNegative
-    """Mass at the end of the arm [kg]."""
-    length_m: _NotNegative
-    """From the axis to the mass [m]."""
-    arm_mass_kg: _NotNegative = 0.0
-    """Mass of the arm, a uniform rod [kg]."""
-    hanging_rad: Annotated[float, Field(ge=-10, le=10)] = 0.0
-    """Position at which the mass hangs straight down [rad]."""
-
-    @property
-    def inertia_kg_m2(self) -> float:
-        """Inertia about the axis [kg·m²]: `(mass + arm_mass / 3) * length**2`."""
-        return (self.mass_kg + self.arm_mass_kg / 3) * self.length_m**2
-
-    @property
-    def gravity_nm(self) -> float:
-        """Largest torque of gravity [N·m]: `(mass + arm_mass / 2) * g * length`."""
-        return (self.mass_kg + self.arm_mass_kg / 2) * GRAVITY_M_S2 * self.length_m

@@ -21,7 +21,7 @@ import numpy as np
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.dialect import decimal
-from pupper_sysid.sysid.recordings.table import PendulumLoad
+from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
 from pupper_sysid.sysid.sweep.excitation import (
     FASTEST_OF_MINIMUM_JERK,
     LEAD_IN_S,

@@ -16,7 +16,7 @@ from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.monitor import GuardLimits
-from pupper_sysid.sysid.recordings.table import PendulumLoad
+from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
 from pupper_sysid.sysid.sweep.bench import bench_plan, parse_load
 from pupper_sysid.sysid.sweep.excitation import Plan
 

@@ -18,7 +18,7 @@ from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.feetech import PROTECTIONS, SCS0009, STS3215, FeetechBus, FeetechLine
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.serial_servos import line as serial_line
-from pupper_sysid.sysid.recordings.table import ServoSetup
+from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
 from support.servo_servers import bench_of, map_of, on_a_port, still_servos, wait_until
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -5,7 +5,7 @@ import pandas as pd
 
 from pupper_sysid.sysid.doctor.checks import register_findings, setup_findings
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.recordings.table import ServoSetup
+from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
 
 
 def of(**registers: int) -> list[str]:

@@ -11,7 +11,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
 from pupper_sysid.sysid.fit.preparation import prepare_joint
 from pupper_sysid.sysid.recordings.recording import Trial
-from pupper_sysid.sysid.recordings.table import PendulumLoad, ServoSetup
+from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 from support.real_recordings import real_folder
 
 STS3215 = LoadedServoParameters(

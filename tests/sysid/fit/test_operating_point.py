@@ -17,7 +17,7 @@ from pupper_sysid.sysid.fit.operating_point import reference_gain, with_operatin
 from pupper_sysid.sysid.fit.preparation import scales_of
 from pupper_sysid.sysid.fit.run import prepare
 from pupper_sysid.sysid.recordings.recording import Trial
-from pupper_sysid.sysid.recordings.table import PendulumLoad, ServoSetup
+from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 
 NAN = float("nan")
 POINT = "P gain 32 (the servo's own by the recording's header)"

@@ -17,7 +17,7 @@ from pupper_sysid.sim.emulator.pendulum_bench import (
     draw_bench,
 )
 from pupper_sysid.sysid.recordings.files import load
-from pupper_sysid.sysid.recordings.table import PendulumLoad
+from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
 from pupper_sysid.sysid.sweep import recorder
 from pupper_sysid.sysid.sweep.bench import LIFT_RAD, LIFT_RAD_S, bench_plan, parse_gains, parse_load
 from pupper_sysid.sysid.sweep.excitation import Plan, prbs, strokes
