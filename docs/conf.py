@@ -58,10 +58,10 @@ _PROGRAMS = (
 
 
 def help_text(module: str, *words: str) -> str:
-    """What `--help` prints, without colours and without the lines' empty ends."""
+    """What `--help-all` prints, without colours and without the lines' empty ends."""
     said, plain = io.StringIO(), patch.dict(os.environ, _PLAIN)
     with plain, redirect_stdout(said), redirect_stderr(said), suppress(SystemExit):
-        import_module(f"pupper_sysid.cli.programs.{module}").main([*words, "--help"])
+        import_module(f"pupper_sysid.cli.programs.{module}").main([*words, "--help-all"])
     text = re.sub(r"\x1b\[[0-9;]*m", "", said.getvalue())
     return "\n".join(line.rstrip() for line in text.splitlines()).strip()
 
@@ -76,7 +76,7 @@ def reference() -> str:
     """The page of all commands, as Markdown."""
     lines = [
         "# Every command", "",
-        "Generated from the code: what `--help` prints. Every program also takes `--version`, "
+        "Generated from the code: what `--help-all` prints. Every program also takes `--version`, "
         "`--debug` (shows the traceback of an error), `--install-completion`, and "
         "`--read-limit N`, which reads files up to N times as large, long and wide as is usual "
         "(1 to 1000). Exit codes: 0, 2 for bad input (one sentence says what and where), 130 after "
