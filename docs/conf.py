@@ -50,6 +50,7 @@ html_theme = "furo"
 html_title = "pupper-sysid"
 html_static_path = ["style"]
 html_css_files = ["pages.css"]
+html_search_scorer = "style/scorer.js"
 # code that no highlighter knows is shown as it is
 highlight_language = "text"
 
@@ -171,7 +172,7 @@ def _front_door() -> str:
     """The page of the names of `pupper_sysid`."""
     front = import_module("pupper_sysid")
     assert sorted(name for names in _GROUPS.values() for name in names) == sorted(front.__all__)
-    lines = [*_titled("Python", "=")]
+    lines = [*_titled("Python: the public names", "=")]
     lines += [
         "``import pupper_sysid as ps`` has these names. Functions have the names of the commands; "
         "``examine``, ``lag``, ``frequency_response`` and ``sparse_equations`` are older names of "
