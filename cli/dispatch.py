@@ -34,7 +34,7 @@ class Command(NamedTuple):
     """`module:Class` below `pupper_sysid.cli.commands`: a dataclass with a method `run`, or a union
     of such dataclasses as subcommands."""
     holds_bus: bool = False
-    """Whether it must let go of a bus before it ends."""
+    """Whether it must release a bus before it ends."""
 
     def load(self) -> Any:
         """Import the class."""
