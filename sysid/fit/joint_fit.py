@@ -615,7 +615,7 @@ def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) ->
         worst = max((r, name) for name, r in goodness.items() if np.isfinite(r))
         yield f"{joint}: {why} ({worst[0]:.1f} at {worst[1]}). The lag holds; gains do not."
     elif not np.isfinite(overall(goodness)):
-        yield f"{joint}: too few readings to tell how well the model describes this servo."
+        yield f"{joint}: too few readings to say how well the model describes this servo."
     own = choice.carried
     if not (own.r_hat <= R_HAT and own.effective >= EFFECTIVE):
         yield (
@@ -742,7 +742,7 @@ def _why_unidentified(
     if p.name == "dead_time_s" and interval.high - interval.low < _SHARP_DEAD_TIME_S:
         return None  # a short one may well be close to none
     if interval.low <= 0 and p.logarithmic:
-        return "it cannot be told from none"
+        return "it cannot be distinguished from none"
     if p.logarithmic and interval.high > _WIDE * interval.low:
         return f"its interval is wider than a factor of {_WIDE:g}"
     return None
@@ -782,8 +782,9 @@ def _free_warnings(
         )
     if len(choice.likely) > 1 and not limits:
         yield (
-            f"{joint}: {UNTOLD} ({max(choice.nats.values()):.1f} nats); dead time and gains "
-            "cover both. Faster tones at a smaller amplitude would tell (`pupper-sysid plan`)."
+            f"{joint}: {UNTOLD} (log Bayes factor {max(choice.nats.values()):.1f}); dead "
+            "time and gains cover both. Faster tones at a smaller amplitude separate them "
+            "(`pupper-sysid plan`)."
         )
     for name in ("effort_rad_s2", "friction_rad_s2", "stiffness_per_s2", "damping_per_s"):
         if name in pd.undecided:
@@ -906,7 +907,7 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice) 
             wide = wide and interval.high > _WIDE * interval.low
             why = f"its interval is wider than a factor of {_WIDE:g}" if wide else None
         else:
-            why = "it cannot be told from none"
+            why = "it cannot be distinguished from none"
         if why:
             undecided[name] = why
     if why := _undated(ready.lag.feedback):
