@@ -104,6 +104,7 @@ _ACCELERATIONS_RAD_S2 = (6.0, 15.0, 40.0, 110.0)
 """Starts of a limit on the set-point's acceleration: its cost has many minima. A Feetech servo's
 register counts 0.153 rad/s² from 1 to 254, whose largest is 39."""
 _MOST_COMPARED = 3
+_NEAR = 64  # starts about a fit without draws, for its fits without a part
 _PREFERENCE = 1.02
 """Error on unseen motion, over the smallest, up to which a simpler structure is carried."""
 _REPORTED_PREFERENCE = 1.05
@@ -487,8 +488,12 @@ def _in_free_air(
         # a model that errs more on what it was fitted to cannot be better on unseen tones
         residuals = fresh_residuals(structure, fitted.values, runs)
         if rms(residuals) <= min(least):
-            own = [(f.structure, f.folds) for f in parents if f.folds]
-            fitted = replace(fitted, folds=fit_folds(problem, folds, rng, None, own))
+            near = fitted.fit.point + _spread(ready, fitted) * rng.standard_normal(
+                (_NEAR, len(structure.parameters))
+            )
+            near = np.clip(np.concatenate([fitted.fit.point[None], near]), *structure.box)
+            of_parents = [(f.structure, f.folds) for f in parents if f.folds]
+            fitted = replace(fitted, folds=fit_folds(problem, folds, rng, near, of_parents))
         by_name[structure.name] = fitted
         results[structure.name] = _candidate_fit(ready, fitted, folds)
     results = {name: results[name] for name in CANDIDATES}

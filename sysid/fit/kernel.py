@@ -429,7 +429,8 @@ def _evaluate(
     if task == _RESIDUALS or task == _COSTS:
         steps = min(int(np.ceil(np.max(step))) + 1, steps) if samples else 0
     who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
-    offset, cost = _lanes(), _lanes()
+    offset, cost, error_sum = _lanes(), _lanes(), _lanes()
+    per_noise = 1.0 / noise
     order = np.argsort(dead_time)  # those abreast meet a command in about the same step
     until = np.full(edges.shape[1], edges.shape[1] - 1)
     for k in range(edges.shape[1] - 2, -1, -1):
@@ -473,22 +474,25 @@ def _evaluate(
                 for i in range(LANES):
                     low = track[row, i]
                     position = low + part * (track[row + 1, i] - low)
-                    r = (position + offset[i] - read) / noise
+                    r = (position + offset[i] - read) * per_noise
                     cost[i] += np.sqrt(1.0 + r * r) - 1.0
             for i in range(used):
                 out[0, who[i]] = cost[i]
         else:
             for m in range(len(later)):
+                for i in range(LANES):
+                    error_sum[i], cost[i] = 0.0, 0.0
                 for n in range(samples):
                     moment = max(step[n] - later[m], 0.0)
                     row = min(int(moment), steps - 1)
-                    part = moment - row
-                    for i in range(used):
+                    part, read = moment - row, reading[n]
+                    for i in range(LANES):
                         low = track[row, i]
-                        position = low + part * (track[row + 1, i] - low)
-                        error = position + offset[i] - reading[n]
-                        out[m, who[i]] += error
-                        total[m, who[i]] += error * error
+                        error = low + part * (track[row + 1, i] - low) + offset[i] - read
+                        error_sum[i] += error
+                        cost[i] += error * error
+                for i in range(used):
+                    out[m, who[i]], total[m, who[i]] = error_sum[i], cost[i]
 
 
 Simulated = tuple[int, NDArray, NDArray, NDArray, NDArray, float, NDArray, float, int, float]
