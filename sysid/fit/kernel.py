@@ -12,10 +12,13 @@ stand beside the servo in tables. Compiled once per machine, on first use, and c
 
 from __future__ import annotations
 
+from math import prod
+
 import numpy as np
-from numba import carray, njit, types
+from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from numba.np import arrayobj
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.loaded_servo import START_ERROR_RAD
@@ -48,34 +51,35 @@ SPARSE = 4
 """Number of `servo_models.sparse_equation`; its columns are its coefficients, then the offset."""
 
 
-def _on_stack(count):
-    """Compiled function that returns a pointer to `count` uninitialised numbers on the stack.
+def _on_stack(*shape):
+    """Compiled function that returns an uninitialised array of a fixed shape on the stack.
 
-    Unlike arrays of the heap they are known not to overlap, without which the loops over candidates
-    are not vectorised.
+    Unlike arrays of the heap such arrays are known not to overlap, without which the loops over
+    candidates are not vectorised. They end with the function that makes them.
     """
+    kind = types.Array(types.float64, len(shape), "C")
 
     def codegen(context, builder, signature, args):
-        return cgutils.alloca_once(builder, context.get_data_type(types.float64), size=count)
+        double = context.get_data_type(types.float64)
+        sizes = [context.get_constant(types.intp, n) for n in shape]
+        steps = [
+            context.get_constant(types.intp, 8 * prod(shape[n + 1 :])) for n in range(len(shape))
+        ]
+        array = context.make_array(kind)(context, builder)
+        arrayobj.populate_array(
+            array, cgutils.alloca_once(builder, double, size=prod(shape)), sizes, steps,
+            context.get_constant(types.intp, 8), None,
+        )  # fmt: skip
+        return array._getvalue()
 
     @intrinsic
-    def pointer(typingctx):
-        return types.CPointer(types.float64)(), codegen
+    def array(typingctx):
+        return kind(), codegen
 
-    return pointer
-
-
-_row, _table = _on_stack(LANES), _on_stack(WIDTH * LANES)
+    return array
 
 
-@njit(inline="always")
-def _lanes():
-    """One number per candidate, 0."""
-    out = carray(_row(), (LANES,))
-    for i in range(LANES):
-        out[i] = 0.0
-    return out
-
+_lanes, _table = _on_stack(LANES), _on_stack(WIDTH, LANES)
 
 _PI, _PER_PI = 3.141592653589793, 0.3183098861837907
 
@@ -138,7 +142,7 @@ def _rubbed(v, force, limit, step):
 @njit(fastmath=SAFE, error_model="numpy")
 def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, shift, part, track):
     """Positions of the servos `who` after each step, into rows 1 … `steps` of `track`."""
-    p = carray(_table(), (WIDTH, LANES))
+    p = _table()
     y, v, s = _lanes(), _lanes(), _lanes()
     earlier, now, cut = _lanes(), _lanes(), _lanes()
     next_, next_cut_ = _lanes(), _lanes()
@@ -146,6 +150,7 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
     one, two, share = _lanes(), _lanes(), _lanes()
     on, rate, play = _lanes(), _lanes(), _lanes()
     braked, clipped, drive, free = _lanes(), _lanes(), _lanes(), _lanes()
+    begin, error, acting, pull, limit = _lanes(), _lanes(), _lanes(), _lanes(), _lanes()
     slew, friction, firmware, profile, gravity, backlash = (
         False,
         False,
@@ -172,9 +177,8 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
         braked[i] = _acting(h * (p[1, i] + p[3, i]), h)
         clipped[i] = _acting(h * p[3, i], h)
         y[i] = start - w[OFFSET]
-        s[i] = y[i]
-        play[i] = y[i]
-        on[i] = 1.0
+        s[i], play[i] = y[i], y[i]
+        v[i], rate[i], on[i] = 0.0, 0.0, 1.0
         track[0, i] = y[i]
         slew = slew or w[6] < np.inf
         profile = profile or w[7] < np.inf
@@ -272,17 +276,19 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
                 one[i] = before[i]
                 two[i] = after[i]
         for i in range(LANES):
-            drive[i], free[i] = 0.0, 0.0
+            drive[i], free[i], begin[i], error[i] = 0.0, 0.0, 0.0, 0.0
         for part_of in range(1 if steady else 0, 2):
             for i in range(LANES):
-                error = two[i] if part_of else one[i]
+                x = two[i] if part_of else one[i]
+                error[i] = x - (y[i] + v[i] * half)
+            if firmware:
+                for i in range(LANES):
+                    x = error[i] - clip(error[i], p[16, i])
+                    begin[i] = p[17, i] * clip(x * (1.0 / START_ERROR_RAD), 1.0)
+                    error[i] = x
+            for i in range(LANES):
                 weight = 1.0 - share[i] if part_of else share[i]
-                error -= y[i] + v[i] * half
-                begin = 0.0
-                if firmware:
-                    error -= clip(error, p[16, i])
-                    begin = p[17, i] * clip(error * (1.0 / START_ERROR_RAD), 1.0)
-                wanted = error * p[0, i] - p[1, i] * v[i] + begin
+                wanted = error[i] * p[0, i] - p[1, i] * v[i] + begin[i]
                 reached = clip(wanted, p[2, i])
                 drive[i] += reached * weight
                 free[i] += weight * (1.0 if reached == wanted else 0.0)
@@ -294,32 +300,35 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
                 y[i] = middle + v[i] * half
                 track[k + 1, i] = y[i]
         else:
-            volt = 1.0
             if supply:
                 _delayed(held, 1, k, shift, part, on)
                 volt = held[2, k + pad]
+                for i in range(LANES):
+                    given = volt * on[i]
+                    back = p[3, i] * (p[15, i] + (1.0 - p[15, i]) * on[i])
+                    acting[i] = _acting(h * (p[1, i] * given * free[i] + back), h)
+                    drive[i] = drive[i] * given - back * v[i]
+            else:
+                for i in range(LANES):
+                    acting[i] = clipped[i] + (braked[i] - clipped[i]) * free[i]
+                    drive[i] -= p[3, i] * v[i]
+            for i in range(LANES):
+                motor = clip(drive[i], p[14, i])
+                acting[i] = h + (acting[i] - h) * (1.0 if motor == drive[i] else 0.0)
+                drive[i], pull[i], limit[i] = motor, 0.0, p[5, i]
+            if gravity:
+                for i in range(LANES):
+                    pull[i] = -p[18, i] * _sin(y[i] + v[i] * half - p[19, i])
+            if friction:
+                for i in range(LANES):
+                    motor = drive[i]
+                    standing = 1.0 / (1.0 + v[i] * v[i] * p[9, i])
+                    of_load = p[10, i] * abs(motor) + p[11, i] * abs(pull[i])
+                    limit[i] += p[8, i] * standing + (1.0 + p[13, i] * standing) * of_load
+                    limit[i] += p[12, i] * motor * motor
             for i in range(LANES):
                 middle = y[i] + v[i] * half
-                back, given = p[3, i], 1.0
-                step = clipped[i] + (braked[i] - clipped[i]) * free[i]
-                if supply:
-                    given = volt * on[i]
-                    back *= p[15, i] + (1.0 - p[15, i]) * on[i]
-                    step = _acting(h * (p[1, i] * given * free[i] + back), h)
-                drawn = drive[i] * given - back * v[i]
-                motor = clip(drawn, p[14, i])
-                step = h + (step - h) * (1.0 if motor == drawn else 0.0)
-                force, limit = motor, p[5, i]
-                pull = 0.0
-                if gravity:
-                    pull = -p[18, i] * _sin(middle - p[19, i])
-                    force += pull
-                if friction:
-                    standing = 1.0 / (1.0 + v[i] * v[i] * p[9, i])
-                    of_load = p[10, i] * abs(motor) + p[11, i] * abs(pull)
-                    limit += p[8, i] * standing + (1.0 + p[13, i] * standing) * of_load
-                    limit += p[12, i] * motor * motor
-                v[i] = _rubbed(v[i], force, limit, step)
+                v[i] = _rubbed(v[i], drive[i] + pull[i], limit[i], acting[i])
                 y[i] = middle + v[i] * half
                 track[k + 1, i] = y[i]
         if backlash:
@@ -335,13 +344,13 @@ def _linear(kind, values, who, held, start, steps, h, shift, part, track):
     """As `_servo`, for the linear models: parameters, then the offset in the last column."""
     last = values.shape[1] - 1
     c, y, v, rest = _lanes(), _lanes(), _lanes(), _lanes()
-    p = carray(_table(), (WIDTH, LANES))
+    p = _table()
     for i in range(LANES):
         w = values[who[i]]
         rest[i] = start - w[last]
         track[0, i] = rest[i]
         p[0, i] = w[0]
-        p[1, i], p[2, i] = 0.0, 0.0
+        p[1, i], p[2, i], y[i], v[i] = 0.0, 0.0, 0.0, 0.0
         if kind == 2:
             p[1, i] = np.exp(-h / w[1])
         elif kind == 3:
@@ -366,10 +375,10 @@ def _sparse(values, who, held, start, steps, h, shift, part, track):
     """As `_servo`, for the equation of motion of `servo_models.sparse_equation`."""
     last = values.shape[1] - 1
     c, y, v = _lanes(), _lanes(), _lanes()
-    p = carray(_table(), (WIDTH, LANES))
+    p = _table()
     for i in range(LANES):
         w = values[who[i]]
-        y[i] = start - w[last]
+        y[i], v[i] = start - w[last], 0.0
         track[0, i] = y[i]
         p[0, i], p[1, i], p[2, i] = w[0] * h, w[1] * h, w[2]
         p[3, i], p[4, i], p[5, i] = 0.5 * h * w[3], 0.5 * h * w[4], w[5] * h
