@@ -134,7 +134,9 @@ def _rubbed(v, force, limit, step):
     forward = (v > 0.0) | ((v == 0.0) & (force > 0.0))
     slowed = v + (force - limit if forward else force + limit) * step
     goes_on = slowed > 0.0 if forward else slowed < 0.0
-    rest = -slowed / (v - slowed)  # of the step, after the standstill
+    apart = v - slowed
+    # share of the step after the standstill; a joint that creeps comes to stand still exactly
+    rest = -slowed / (apart if apart != 0.0 else 1.0)
     turned = (force - clip(force, limit)) * step * rest
     return slowed if goes_on else turned
 
