@@ -3,20 +3,23 @@
     import pupper_sysid as ps
 
     recording = ps.load("sweep.csv")
-    print(ps.lag(recording))
-    calibrated = ps.calibrate(recording)
-    calibrated.save("calibrated.yaml")
+    print(ps.delay(recording))
+    calibration = ps.calibrate(recording)
+    calibration.save("calibrated.yaml")
+    ps.export(calibration, "mjlab", "exported")
 
-Each name is the function or class that the commands use, imported when it is first looked up.
-Functions take one `Recording` or a sequence of them, whose trials are pooled per joint, and
-return frozen dataclasses with `to_dict` (the JSON of the command), `to_frame` and `plot`.
+Functions have the names of the commands, and are what the commands call; each is imported when it
+is first looked up. They take one `Recording` or a sequence of them, whose trials are pooled per
+joint, and return frozen dataclasses with `to_dict` (the JSON of the command), `to_frame` and
+`plot`. `examine`, `lag`, `frequency_response` and `sparse_equations` are older names of `doctor`,
+`delay`, `bode` and `sindy`.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from importlib import import_module as _import_module
 
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from pupper_sysid.common.errors import InputError, PupperError
     from pupper_sysid.common.interval import Interval
@@ -27,31 +30,37 @@ if TYPE_CHECKING:
     from pupper_sysid.servo_models.held_feedback import HeldFeedback
     from pupper_sysid.servo_models.servo_file import load_servo_model
     from pupper_sysid.servo_models.sparse_equation import SparseEquation
+    from pupper_sysid.sim.export.export import export
     from pupper_sysid.sim.walking.env import PupperEnv
     from pupper_sysid.sysid.backlash import backlash
     from pupper_sysid.sysid.compare.compare import compare
-    from pupper_sysid.sysid.doctor.examination import examine
+    from pupper_sysid.sysid.doctor.examination import examine as doctor
+    from pupper_sysid.sysid.doctor.examination import examine as examine
     from pupper_sysid.sysid.fit.calibrate import calibrate
-    from pupper_sysid.sysid.fit.dead_time import lag
-    from pupper_sysid.sysid.lag.frequency_response import frequency_response
+    from pupper_sysid.sysid.fit.dead_time import lag as delay
+    from pupper_sysid.sysid.fit.dead_time import lag as lag
+    from pupper_sysid.sysid.lag.frequency_response import frequency_response as bode
+    from pupper_sysid.sysid.lag.frequency_response import frequency_response as frequency_response
     from pupper_sysid.sysid.recordings.files import load
     from pupper_sysid.sysid.recordings.recording import Recording
     from pupper_sysid.sysid.report.report import write_report as report
     from pupper_sysid.sysid.servo_fit.fit import fit_servo
-    from pupper_sysid.sysid.sparse import sparse_equations
+    from pupper_sysid.sysid.sparse import sparse_equations as sindy
+    from pupper_sysid.sysid.sparse import sparse_equations as sparse_equations
 
 _MODULES = {
     "load": "sysid.recordings.files",
     "Recording": "sysid.recordings.recording",
-    "examine": "sysid.doctor.examination",
-    "lag": "sysid.fit.dead_time",
-    "frequency_response": "sysid.lag.frequency_response",
+    "doctor": "sysid.doctor.examination:examine",
+    "delay": "sysid.fit.dead_time:lag",
+    "bode": "sysid.lag.frequency_response:frequency_response",
     "backlash": "sysid.backlash",
     "calibrate": "sysid.fit.calibrate",
-    "sparse_equations": "sysid.sparse",
+    "sindy": "sysid.sparse:sparse_equations",
     "fit_servo": "sysid.servo_fit.fit",
     "compare": "sysid.compare.compare",
     "report": "sysid.report.report:write_report",
+    "export": "sim.export.export",
     "load_calibration": "servo_models.calibration.calibration",
     "Calibration": "servo_models.calibration.calibration",
     "load_servo_model": "servo_models.servo_file",
@@ -67,6 +76,9 @@ _MODULES = {
     "PupperError": "common.errors",
     "InputError": "common.errors",
 }
+_OLDER_NAMES = {
+    "examine": "doctor", "lag": "delay", "frequency_response": "bode", "sparse_equations": "sindy",
+}  # fmt: skip
 
 __all__ = [
     "JOINT_NAMES",
@@ -82,29 +94,35 @@ __all__ = [
     "Recording",
     "SparseEquation",
     "backlash",
+    "bode",
     "calibrate",
     "compare",
-    "examine",
+    "delay",
+    "doctor",
+    "export",
     "fit_servo",
-    "frequency_response",
-    "lag",
     "load",
     "load_calibration",
     "load_policy",
     "load_servo_model",
     "report",
-    "sparse_equations",
+    "sindy",
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
+def __getattr__(name: str) -> object:
+    if name == "__version__":
+        found: object = _import_module("importlib.metadata").version("pupper-sysid")
+    elif name in _OLDER_NAMES:
+        found = __getattr__(_OLDER_NAMES[name])
+    elif name in _MODULES:
+        module, _, attribute = _MODULES[name].partition(":")
+        found = getattr(_import_module(f"pupper_sysid.{module}"), attribute or name)
+    else:
         raise AttributeError(f"module 'pupper_sysid' has no attribute '{name}'")
-    module, _, own = _MODULES[name].partition(":")
-    found = getattr(import_module(f"pupper_sysid.{module}"), own or name)
     globals()[name] = found
     return found
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+    return [*__all__, "__version__"]

@@ -16,6 +16,7 @@ from typing import Annotated, Any, NamedTuple, get_args
 
 import tyro
 
+from pupper_sysid.cli.help_page import ALL, HELP
 from pupper_sysid.cli.user_errors import CONFIG, begin_work, end_politely, parse, user_errors
 from pupper_sysid.common.errors import InputError
 
@@ -33,7 +34,7 @@ class Command(NamedTuple):
     """`module:Class` below `pupper_sysid.cli.commands`: a dataclass with a method `run`, or a union
     of such dataclasses as subcommands."""
     holds_bus: bool = False
-    """Whether it must let go of a bus before it ends."""
+    """Whether it must release a bus before it ends."""
 
     def load(self) -> Any:
         """Import the class."""
@@ -63,7 +64,7 @@ def run_command(
     given = list(sys.argv[1:] if arguments is None else arguments)
     with user_errors(given, program) as left:
         first, rest = (left[0], left[1:]) if left else ("--help", [])
-        if first in ("-h", "--help"):
+        if first in (*HELP, ALL):
             print(overview(program, description, commands))
             return
         if first.startswith("--tyro-"):  # completion, of all words and their options

@@ -23,6 +23,7 @@ import tyro
 from rich.text import Text
 
 from pupper_sysid.cli.flags import forget, remember, spell
+from pupper_sysid.cli.help_page import ALL, HELP, help_page
 from pupper_sysid.cli.numerals import NUMERALS
 from pupper_sysid.cli.terminal import err, out
 from pupper_sysid.common.errors import InputError, PupperError
@@ -92,6 +93,10 @@ def parse(
     `keywords` are further ones of `tyro.cli`.
     """
     given = {"config": CONFIG, "description": description, "registry": NUMERALS} | keywords
+    if {*HELP, ALL} & {*arguments}:
+        known = {key: value for key, value in given.items() if key != "description"}
+        print(help_page(options, arguments, program, given["description"], **known))
+        sys.exit(0)
     parsed = tyro.cli(options, args=arguments, prog=program, **given)
     remember(parsed)
     seed = getattr(parsed, "seed", 0)

@@ -4,6 +4,8 @@ The command line prints the message and ends with `exit_code`, without a traceba
 not a `PupperError` is a defect of this project.
 """
 
+from typing import SupportsFloat
+
 
 class PupperError(Exception):
     """A fault that is reported to the user in one sentence."""
@@ -58,6 +60,8 @@ def refuse_outside(name: str, value: float, low: float, high: float, unit: str =
     ...
     pupper_sysid.common.errors.InputError: `seconds` is 1e+09 s; it must be from 0.1 to 600 s.
     """
+    if not isinstance(value, SupportsFloat):
+        raise InputError(f"{name} is a {type(value).__name__}; write a number.")
     if not low <= value <= high:
         unit = f" {unit}" if unit else ""
         raise InputError(f"{name} is {value:g}{unit}; it must be from {low:g} to {high:g}{unit}.")

@@ -62,6 +62,25 @@ def _refuse_existing(path: Path, force: bool) -> None:
         )
 
 
+def as_path(value: object, what: str) -> Path:
+    """`value` as a path.
+
+    Parameters
+    ----------
+    value : Path or str
+    what : str
+        What it leads to, for the message.
+
+    Raises
+    ------
+    InputError
+        If it is neither a path nor text.
+    """
+    if not isinstance(value, str | os.PathLike):
+        raise InputError(f"{what} is named by a path or a str, not by a {type(value).__name__}.")
+    return Path(os.fspath(value))
+
+
 def refuse_path(name: str, option: str) -> None:
     """Refuse a name of a run or walk that would not be one folder: a path, or an odd name."""
     if not name.strip() or name[0] == "." or set(name) & set("/\\") or not name.isprintable():

@@ -27,6 +27,9 @@ class Interval:
     low: float
     high: float
 
+    def __repr__(self) -> str:
+        return f"Interval({self.value:.4g}, {self.low:.4g}…{self.high:.4g})"
+
     @classmethod
     def of_draws(cls, value: float, draws: NDArray[np.float64]) -> Interval:
         """The interval that holds the middle 90 % of `draws`."""

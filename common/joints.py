@@ -145,7 +145,12 @@ def select_joints(text: str, available: Sequence[str] = JOINT_NAMES) -> list[str
         if not found:
             own = any(n in JOINT_NAMES for n in available)
             groups = [*LEGS, *KINDS] if own else []
-            near = difflib.get_close_matches(word, [*available, *groups, "all"], n=1, cutoff=0.4)
+            if word.lower() in {n.lower() for n in (*JOINT_NAMES, *groups)}:
+                raise InputError(
+                    f"`joints`: there is no {word} here; there is {', '.join(available)}."
+                )
+            there = [g for g in groups if any(g in n.split("_") for n in available)]
+            near = difflib.get_close_matches(word, [*available, *there, "all"], n=1, cutoff=0.4)
             hint = f" Did you mean {near[0]}?" if near else ""
             more = ", legs (LF, …), kinds (hip, …)" if own else ""
             raise InputError(

@@ -34,6 +34,19 @@ class derived(property):
 class Result:
     """Base of result dataclasses."""
 
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        if "__repr__" not in vars(cls):  # before `dataclass` writes one with every array in it
+            setattr(cls, "__repr__", cls.__repr__)  # noqa: B010
+
+    def __repr__(self) -> str:
+        name = type(self).__name__
+        if type(self).__str__ is not object.__str__:
+            first, *more = str(self).splitlines()
+            return f"{name}({first}{' …' if more else ''})"
+        shown = (f for f in fields(self) if not f.metadata.get("internal"))  # type: ignore[arg-type]
+        return f"{name}({', '.join(f'{f.name}={_short(getattr(self, f.name))}' for f in shown)})"
+
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain data: dicts, lists, text, finite numbers and None."""
         return plain(self)
@@ -47,6 +60,17 @@ class Result:
     def rows(self) -> list[dict[str, Any]]:
         """Rows of `to_frame`; by default a single one."""
         return [flat(self.to_dict())]
+
+
+def _short(value: Any) -> str:
+    """A value in a line: four digits, and how many where there are several."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, str):
+        return repr(value if len(value) <= 40 else f"{value[:39]}…")
+    if isinstance(value, dict | list | tuple | np.ndarray):
+        return f"{len(value)} of them" if len(value) else "none"
+    return f"{type(value).__name__}(…)" if isinstance(value, Result) else repr(value)
 
 
 Each = TypeVar("Each", bound=Result)
@@ -69,6 +93,10 @@ class JointResults(Result, Mapping[str, Each]):
 
     def __str__(self) -> str:
         return "\n".join(f"{joint}: {result}" for joint, result in self.joints.items())
+
+    def __repr__(self) -> str:
+        lines = (f"{joint}: {result!r}" for joint, result in self.joints.items())
+        return "\n  ".join([type(self).__name__, *lines])
 
     def rows(self) -> list[dict[str, Any]]:
         """Rows of all joints, with the joint's name in the first column."""

@@ -19,6 +19,7 @@ from jinja2 import Template
 from jinja2.sandbox import SandboxedEnvironment
 from numpydoc import docscrape_sphinx
 from sphinx.addnodes import pending_xref
+from sphinx.domains.python import PythonDomain
 
 from pupper_sysid.cli.dispatch import words
 
@@ -37,6 +38,7 @@ myst_heading_anchors = 3
 exclude_patterns = ["_build"]
 default_role = "code"  # docstrings write code in single back quotes
 add_module_names = False
+python_maximum_signature_line_length = 88
 autodoc_typehints = "signature"
 toc_object_entries = False
 autodoc_member_order = "bysource"
@@ -48,6 +50,7 @@ html_theme = "furo"
 html_title = "pupper-sysid"
 html_static_path = ["style"]
 html_css_files = ["pages.css"]
+html_search_scorer = "style/scorer.js"
 # code that no highlighter knows is shown as it is
 highlight_language = "text"
 
@@ -58,10 +61,10 @@ _PROGRAMS = (
 
 
 def help_text(module: str, *words: str) -> str:
-    """What `--help` prints, without colours and without the lines' empty ends."""
+    """What `--help-all` prints, without colours and without the lines' empty ends."""
     said, plain = io.StringIO(), patch.dict(os.environ, _PLAIN)
     with plain, redirect_stdout(said), redirect_stderr(said), suppress(SystemExit):
-        import_module(f"pupper_sysid.cli.programs.{module}").main([*words, "--help"])
+        import_module(f"pupper_sysid.cli.programs.{module}").main([*words, "--help-all"])
     text = re.sub(r"\x1b\[[0-9;]*m", "", said.getvalue())
     return "\n".join(line.rstrip() for line in text.splitlines()).strip()
 
@@ -76,7 +79,7 @@ def reference() -> str:
     """The page of all commands, as Markdown."""
     lines = [
         "# Every command", "",
-        "Generated from the code: what `--help` prints. Every program also takes `--version`, "
+        "Generated from the code: what `--help-all` prints. Every program also takes `--version`, "
         "`--debug` (shows the traceback of an error), `--install-completion`, and "
         "`--read-limit N`, which reads files up to N times as large, long and wide as is usual "
         "(1 to 1000). Exit codes: 0, 2 for bad input (one sentence says what and where), 130 after "
@@ -91,8 +94,47 @@ def reference() -> str:
     return "\n".join(lines)
 
 
+_GROUPS = {
+    "Read": ("load", "Recording"),
+    "Measure": ("doctor", "delay", "bode", "backlash"),
+    "Fit": ("calibrate", "fit_servo", "sindy", "compare"),
+    "Use": ("report", "export", "load_calibration", "Calibration", "load_servo_model"),
+    "Simulate": (
+        "DelayedPD", "DelayedPDParameters", "HeldFeedback", "SparseEquation", "PupperEnv",
+        "load_policy", "Policy",
+    ),
+    "Values and errors": ("Interval", "JOINT_NAMES", "InputError", "PupperError"),
+}  # fmt: skip
+_EXAMPLES = """
+
+A recording from a file, its lag, a calibration, and actuators for a simulator::
+
+    import pupper_sysid as ps
+
+    recording = ps.load("data/samples/sweep.csv")
+    lag = ps.delay(recording, "LF_hip")
+    print(lag)                                # one line a joint
+    lag["LF_hip"].dead_time_s                 # Interval(value, low … high), in seconds
+    lag.to_frame()                            # a table; to_dict() is the command's --json
+
+    calibration = ps.calibrate(recording, "LF_hip")
+    calibration.save("calibrated.yaml")
+    ps.export(calibration, "mjlab", "exported")
+
+Arrays in memory become a recording, too::
+
+    recording = ps.Recording.from_arrays(time_s, {"knee": command_rad}, {"knee": position_rad})
+
+A servo in your own loop::
+
+    servo = ps.load_calibration("calibrated.yaml").delayed_pd(["LF_hip"])
+    servo.reset([0.0])
+    position_rad = servo.step([0.1])          # 2 ms later
+"""
+
+
 def write_api_pages() -> None:
-    """A page of the Python reference per folder of the package, and their table of contents."""
+    """The page of the public names, and one of internals per folder of the package."""
     project = tomllib.loads((HERE.parent / "pyproject.toml").read_text())
     shutil.rmtree(REFERENCE, ignore_errors=True)
     REFERENCE.mkdir()
@@ -106,7 +148,8 @@ def write_api_pages() -> None:
             title = package.removeprefix("pupper_sysid.")
             (REFERENCE / f"{title}.rst").write_text(_api_page(package, modules))
             pages.append(title)
-    (REFERENCE / "index.rst").write_text(_front_door(pages))
+    (REFERENCE / "index.rst").write_text(_front_door())
+    (REFERENCE / "internals.rst").write_text(_internals(pages))
 
 
 def _titled(text: str, line: str) -> list[str]:
@@ -114,9 +157,9 @@ def _titled(text: str, line: str) -> list[str]:
 
 
 def _api_page(package: str, modules: list[str]) -> str:
-    """All modules of one folder."""
+    """All modules of one folder; no page of the search."""
     summary = (import_module(package).__doc__ or "").strip()
-    lines = [*_titled(f"``{package}``", "="), summary, ""]
+    lines = [":nosearch:", "", *_titled(f"``{package}``", "="), summary, ""]
     for name in modules:
         lines += [
             *_titled(f"``{name}``", "-"),
@@ -125,16 +168,51 @@ def _api_page(package: str, modules: list[str]) -> str:
     return "\n".join(lines)
 
 
-def _front_door(pages: list[str]) -> str:
-    """The names of `pupper_sysid` itself, and the pages of the folders."""
+def _front_door() -> str:
+    """The page of the names of `pupper_sysid`."""
     front = import_module("pupper_sysid")
-    lines = [*_titled("Python", "="), ".. automodule:: pupper_sysid", ""]
-    for name in getattr(front, "__all__", ()):
-        item = getattr(front, name)
-        kind = "class" if isinstance(item, type) else "function" if callable(item) else "data"
-        lines += [f".. auto{kind}:: pupper_sysid.{name}", "   :no-index:", ""]
-    lines += [*_titled("By folder", "-"), ".. toctree::", "   :maxdepth: 1", ""]
+    assert sorted(name for names in _GROUPS.values() for name in names) == sorted(front.__all__)
+    lines = [*_titled("Python: the public names", "=")]
+    lines += [
+        "``import pupper_sysid as ps`` has these names. Functions have the names of the commands; "
+        "``examine``, ``lag``, ``frequency_response`` and ``sparse_equations`` are older names of "
+        "``doctor``, ``delay``, ``bode`` and ``sindy``. Results are frozen dataclasses with units "
+        "in their field names, ``to_dict()``, ``to_frame()`` and ``plot()``." + _EXAMPLES
+    ]
+    for title, names in _GROUPS.items():
+        listed = ", ".join(f":py:obj:`~pupper_sysid.{name}`" for name in names)
+        lines += [*_titled(title, "-"), listed, ""]
+        for name in names:
+            item = getattr(front, name)
+            kind = "class" if isinstance(item, type) else "function" if callable(item) else "data"
+            kind = "exception" if kind == "class" and issubclass(item, Exception) else kind
+            lines += [f".. auto{kind}:: pupper_sysid.{name}"]
+            lines += ["   :members:"] * (kind == "class") + [""]
+    return "\n".join(lines)
+
+
+def _internals(pages: list[str]) -> str:
+    """Table of contents of everything else."""
+    lines = [
+        ":nosearch:", "", *_titled("Internals, by folder", "="),
+        "Every module of the package, for those who change it. Programs that use it need "
+        ":doc:`index` alone.", "", ".. toctree::", "   :maxdepth: 1", "",
+    ]  # fmt: skip
     return "\n".join([*lines, *(f"   {page}" for page in pages), ""])
+
+
+class _Names(PythonDomain):
+    """Python names, of which the search shows those of `pupper_sysid` itself."""
+
+    def get_objects(self):
+        for name, shown, kind, page, anchor, priority in super().get_objects():
+            inside = page.startswith("reference/") and page != "reference/index"
+            yield name, shown, kind, page, anchor, -1 if inside else priority
+
+
+def _short_signature(app, what, name, item, options, signature, returns):
+    """Without the fields of a file's classes, which their documentation lists."""
+    return ("", None) if what == "class" and hasattr(item, "model_fields") else None
 
 
 def _as_rst(app, what, name, item, options, lines: list[str]) -> None:
@@ -186,7 +264,9 @@ def setup(app) -> None:
     for script in sorted((HERE.parent / "examples").glob("*.py")):
         page = import_module("notebook").page(script, GALLERY / "figures")
         (GALLERY / f"{script.stem}.md").write_text(page)
+    app.add_domain(_Names, override=True)
     app.connect("autodoc-process-docstring", _as_rst, priority=100)  # before numpydoc
+    app.connect("autodoc-process-signature", _short_signature)
     app.connect("autodoc-skip-member", _skip_aliases)
     app.connect("doctree-read", _link_whole_names)
     docscrape_sphinx.SandboxedEnvironment = _CompiledOnce

@@ -18,7 +18,7 @@ print(recording.joints, f"at {1 / recording.loop_period_s:.1f} Hz")
 # %% [markdown]
 # ## Is it usable?
 # %%
-found = ps.examine(recording, "LF_thigh")["LF_thigh"]
+found = ps.doctor(recording, "LF_thigh")["LF_thigh"]
 print(found.verdict)
 for reason in found.reasons:
     print("-", reason)
@@ -29,7 +29,7 @@ for reason in found.reasons:
 # Functions take some of the joints, or by default all, and return results by joint. Times are in
 # seconds; a number with an interval has `value`, `low` and `high`.
 # %%
-lags = ps.lag(recording, "LF_thigh")
+lags = ps.delay(recording, "LF_thigh")
 print(lags)
 
 lag = lags["LF_thigh"]

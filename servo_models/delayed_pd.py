@@ -63,6 +63,10 @@ class DelayedServo(ABC):
         self._delay_line = DelayLine(dead_time_s, self.time_step_s)
         self.reset(np.zeros(self._own))
 
+    def __repr__(self) -> str:
+        of = f" of {self._own} servos" if self._own else ""
+        return f"{type(self).__name__}{of}, a step every {1e3 * self.time_step_s:g} ms"
+
     def reset(self, position: ArrayLike) -> None:
         """Rest at `position` [rad], which has been the command for as long as the dead time.
 

@@ -30,7 +30,7 @@ from pupper_sysid.common.border import (
     validated,
 )
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import refuse_overwrite, write_bytes, write_text
+from pupper_sysid.common.files import as_path, refuse_overwrite, write_bytes, write_text
 from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.processes.stop import held
 from pupper_sysid.common.reading.content import refuse_large_header
@@ -126,6 +126,11 @@ class SavedModel:
     parameters: dict[str, NDArray[np.floating]]
     path: Path
 
+    def __repr__(self) -> str:
+        step_ms = 1e3 * self.contract.time_step_s
+        joints = ", ".join(self.contract.joints)
+        return f"SavedModel {self.path.name}: {joints}; a command every {step_ms:g} ms"
+
 
 def input_names(parameters: Mapping[str, NDArray], feedback: bool) -> tuple[str, ...]:
     """Names of a model's inputs, in order: commands newest first, then a predicted position."""
@@ -165,13 +170,13 @@ def save_servo_model(
 
 
 def load_servo_model(
-    folder: Path, joints: Sequence[str] | None = None, time_step_s: float | None = None
+    folder: Path | str, joints: Sequence[str] | None = None, time_step_s: float | None = None
 ) -> SavedModel:
     """Read a model and build it.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or str
         Of the contract and the weights.
     joints : sequence of str, optional
         Joints of the model's batch, in this order; by default all that it has.
@@ -189,7 +194,7 @@ def load_servo_model(
         If the folder holds no model, or one that is damaged or changed, or is for another joint
         or rate.
     """
-    folder = Path(folder)
+    folder = as_path(folder, "The folder of a servo model")
     contract = _read_contract(folder)
     if time_step_s is not None and not same_rate(contract.time_step_s, time_step_s):
         raise InputError(

@@ -198,7 +198,7 @@ def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> J
     else:
         notes.append(
             "one P gain: friction and dead zone together make the hysteresis. Strokes at two or "
-            "more gains, such as 8 and 32, tell them apart."
+            "more gains, such as 8 and 32, separate them."
         )
     play = None
     if loaded:
@@ -208,7 +208,7 @@ def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> J
     else:
         notes.append(
             "no load: where the gears change sides is where the stroke reverses, and backlash "
-            "cannot be told from friction over stiffness. Hang a pendulum on it, such as "
+            "cannot be separated from friction over stiffness. Hang a pendulum on it, such as "
             "pendulum:0.1kg@0.10m."
         )
     return JointBacklash(
@@ -384,8 +384,8 @@ def _play(
     else:
         dead = np.r_[LONGEST_DEAD_TIME_S / 2, rng.uniform(0, LONGEST_DEAD_TIME_S, _DRAWS)]
         notes.append(
-            "one P gain: the dead time cannot be told from the motor's lag, and the interval of "
-            f"the backlash allows any up to {1e3 * LONGEST_DEAD_TIME_S:.0f} ms."
+            "one P gain: the dead time cannot be separated from the motor's lag, and the interval "
+            f"of the backlash allows any up to {1e3 * LONGEST_DEAD_TIME_S:.0f} ms."
         )
     values = np.array([f.play(f.best, np.ones(f.count), dead[0]) for f in own])
     draws = np.array(

@@ -2,14 +2,18 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import pupper_sysid as ps
+from pupper_sysid.cli.programs import pupper_sysid
 from support.command_line import run
 from support.json_keys import DOCUMENTED, key_line
 from support.strokes import stroked
@@ -38,11 +42,62 @@ def python(code: str, folder: Path) -> str:
 
 
 def test_every_name_is_there_and_no_other():
-    assert set(ps.__all__) == set(ps._MODULES) and set(ps.__all__) <= set(dir(ps))
+    assert set(ps.__all__) == set(ps._MODULES)
+    assert sorted(dir(ps)) == sorted([*ps.__all__, "__version__"])
     for name in ps.__all__:
         assert getattr(ps, name) is not None
     with pytest.raises(AttributeError, match="nonsense"):
         _ = ps.nonsense
+
+
+def test_names_are_those_of_the_commands_and_older_names_are_the_same_functions():
+    commands = {name.replace("-", "_") for name in pupper_sysid.COMMANDS}
+    functions = {n for n in ps.__all__ if n.islower() and not n.startswith("load")}
+    assert functions <= commands
+    assert ps.examine is ps.doctor and ps.lag is ps.delay
+    assert ps.frequency_response is ps.bode and ps.sparse_equations is ps.sindy
+    assert ps.__version__ == version("pupper-sysid")
+
+
+def test_representations_are_short_and_have_units(hip):
+    recording = ps.load(hip)
+    assert re.fullmatch(r"Recording \w+: LF_hip; \d trials, \d+ rows, \d+ s.*", repr(recording))
+    calibration = ps.load_calibration("data/samples/calibrated.yaml")
+    first, hip_line, *others = repr(calibration).splitlines()
+    assert first == "Calibration of Mini Pupper 2 (emulated)" and len(others) == 2
+    dead_time = calibration.joints["LF_hip"].actuator.dead_time_s
+    assert f"dead time {1e3 * dead_time.value:.1f} " in hip_line and " N·m/rad" in hip_line
+    assert repr(ps.Interval(0.041234567, 0.04, 0.0425)) == "Interval(0.04123, 0.04…0.0425)"
+    for shown in (calibration.delayed_pd(), ps.doctor(recording), ps.bode(recording)):
+        assert len(repr(shown)) < 400 and " object at 0x" not in repr(shown)
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: ps.load(3), "takes the path of one log, not a int"),
+        (lambda: ps.delay("sweep.csv"), r"pupper_sysid\.load\('sweep.csv'\)"),
+        (lambda: ps.load_calibration(3), "not by a int"),
+        (lambda: ps.load_policy(None), "not by a NoneType"),
+        (lambda: ps.load_servo_model(["a"]), "not by a list"),
+        (lambda: ps.export(3, "mjlab"), r"pupper_sysid\.load_calibration"),
+        (lambda: ps.export("paper", "gazebo"), "there are mjcf"),
+        (lambda: ps.calibrate(ps.load(SWEEP), stall_torque_nm="0.35"), "is a str; write a number"),
+    ],
+)  # fmt: skip
+def test_a_wrong_type_is_answered_in_a_sentence(call, says):
+    with pytest.raises(ps.InputError, match=says):
+        call()
+
+
+def test_export_takes_a_calibration_its_file_and_what_calibrate_returns(tmp_path):
+    calibration = ps.load_calibration("paper")
+    returned = SimpleNamespace(calibration=calibration)
+    texts = {
+        ps.export(each, "json", tmp_path / str(k)).read_text()
+        for k, each in enumerate((calibration, "paper", returned))
+    }
+    assert len(texts) == 1
 
 
 def test_importing_the_front_door_imports_nothing_else(tmp_path):
@@ -54,7 +109,7 @@ def test_importing_the_front_door_imports_nothing_else(tmp_path):
 
 def test_functions_of_a_calibration_need_neither_torch_nor_matplotlib(tmp_path):
     """As far as they are imported; the slow test beside this one runs them."""
-    python(WITHOUT + "import pupper_sysid as ps; ps.load, ps.lag, ps.calibrate", tmp_path)
+    python(WITHOUT + "import pupper_sysid as ps; ps.load, ps.delay, ps.calibrate", tmp_path)
 
 
 @pytest.mark.slow
@@ -64,7 +119,7 @@ def test_load_lag_calibrate_and_save_need_neither_torch_nor_matplotlib(hip, tmp_
         + f"""
 import pupper_sysid as ps
 recording = ps.load({str(hip)!r})
-lag = ps.lag(recording, "LF_hip")
+lag = ps.delay(recording, "LF_hip")
 print(lag)
 calibrated = ps.calibrate(recording, "LF_hip")
 assert lag["LF_hip"].dead_time_s == calibrated["LF_hip"].dead_time_s
@@ -96,30 +151,30 @@ def assert_is_the_result(printed: dict, result) -> None:
     assert result.plot().axes
 
 
-def test_delay_is_lag_and_its_parts_add_up_in_order(capsys, hip):
+def test_delay_is_its_command_and_its_parts_add_up_in_order(capsys, hip):
     printed = json_of(capsys, "delay", hip)
     joint = printed["joints"]["LF_hip"]
     lags = [joint[k]["value"] for k in ("raw_lag_s", "fresh_lag_s", "lag_s", "dead_time_s")]
     assert lags == sorted(lags, reverse=True)
-    assert_is_the_result(printed, ps.lag(ps.load(hip)))
+    assert_is_the_result(printed, ps.delay(ps.load(hip)))
 
 
-def test_doctor_is_examine_and_finds_the_polls(capsys, hip):
+def test_doctor_is_its_command_and_finds_the_polls(capsys, hip):
     printed = json_of(capsys, "doctor", hip)
     joint = printed["joints"]["LF_hip"]
     assert joint["verdict"] == "use"
     assert joint["poll_period_s"] == pytest.approx(0.02685, abs=1.5e-4)
     assert joint["quantum_rad"] == pytest.approx(np.pi / 550, rel=1e-4)
-    assert_is_the_result(printed, ps.examine(ps.load(hip)))
+    assert_is_the_result(printed, ps.doctor(ps.load(hip)))
 
 
-def test_bode_is_the_frequency_response_and_shows_that_the_servo_follows(capsys, hip, tmp_path):
+def test_bode_is_its_command_and_shows_that_the_servo_follows(capsys, hip, tmp_path):
     """Where raw rows say that it does not."""
     printed = json_of(capsys, "bode", hip, "--plot", tmp_path / "b.png")
     tones = printed["joints"]["LF_hip"]["by_frequency"]
     assert (tmp_path / "b.png").stat().st_size > 10_000
     assert all(t["gain"] > 0.9 for t in tones) and tones[-1]["raw_gain"] < 0.75
-    assert_is_the_result(printed, ps.frequency_response(ps.load(hip)))
+    assert_is_the_result(printed, ps.bode(ps.load(hip)))
 
 
 @pytest.mark.slow
@@ -141,4 +196,4 @@ def test_backlash_is_the_json_of_its_command_with_a_row_per_gain(capsys, tmp_pat
 
 def test_a_joint_that_was_not_recorded_is_refused():
     with pytest.raises(ps.InputError, match="RB_calf"):
-        ps.lag(ps.load(SWEEP), ["RB_calf"])
+        ps.delay(ps.load(SWEEP), ["RB_calf"])

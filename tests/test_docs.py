@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from support import docs_conf, docs_outputs
+from support import docs_conf, docs_outputs, golden
 from support.command_line import run_program
 from support.package import MODULES, ROOMS, ROOT, public_names
 
@@ -120,6 +120,24 @@ def test_the_readmes_example_runs_on_a_part_of_its_sample(hip, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     execute(ROOT / "README.md")
     assert (tmp_path / "calibrated.yaml").exists()
+
+
+def test_the_readme_is_short_and_its_lag_table_is_that_of_the_frozen_figures():
+    readme = (ROOT / "README.md").read_text()
+    assert len(readme.split()) <= 1000
+    figures = golden.read()
+    for joint in ("LF_hip", "LF_thigh"):
+        frozen = figures[f"mini_pupper_{joint[3:]}"]
+        lag, dead_time = frozen["lag"][joint], frozen["calibrate"][joint]["dead_time_ms"]
+        (row,) = re.findall(rf"^{joint} .*$", readme, re.MULTILINE)
+        raw, stale, hold, servo, low, high, *dead = map(float, re.findall(r"\d+\.\d", row))
+        frozen_servo = lag["lag_ms"]
+        assert [raw, servo, low, high] == pytest.approx(
+            [lag["raw_lag_ms"]["value"], *(frozen_servo[k] for k in ("value", "low", "high"))],
+            abs=0.06,
+        )
+        assert dead == pytest.approx([dead_time[k] for k in ("value", "low", "high")], abs=0.06)
+        assert raw == pytest.approx(stale + hold + servo, abs=0.15)
 
 
 def test_outputs_of_other_processors_are_the_same_and_others_are_not():

@@ -1,7 +1,7 @@
 """How a program answers Ctrl-C, SIGTERM and SIGHUP: one line, an exit code, nothing left behind.
 
 A program has one `Stop`, which `stop_process` installs in its first lines. What a signal does
-depends on the program's phase:
+depends on the program's phase::
 
     start    the libraries are being imported, or the program ends: nothing has to be undone, so the
              process ends at once

@@ -30,7 +30,14 @@ from pupper_sysid.common.border import (
     validated,
 )
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_bytes, write_text
+from pupper_sysid.common.files import (
+    as_path,
+    refuse_overwrite,
+    sha256,
+    versions,
+    write_bytes,
+    write_text,
+)
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.common.reading.content import refuse_large_header
 from pupper_sysid.policies.network.hyperparameters import Kind
@@ -193,6 +200,10 @@ class Policy:
         self._state: tuple[torch.Tensor, ...] = ()
         self._past = np.zeros((0, 0, ACTIONS), np.float32)
 
+    def __repr__(self) -> str:
+        seen, step_ms = self.contract.observation_size, 1e3 * self.contract.control_step_s
+        return f"Policy ({self.contract.kind}): {seen} numbers to {ACTIONS} joints, {step_ms:g} ms"
+
     def reset(self, action: np.ndarray) -> None:
         """Start an episode of all robots after their last `action`, shape (n, 12)."""
         self._state = self.network.initial_state(len(action))
@@ -251,12 +262,12 @@ def save_policy(
     write_text(folder / CONTRACT, text + "\n", force=True)
 
 
-def load_policy(folder: Path) -> Policy:
+def load_policy(folder: Path | str) -> Policy:
     """Read a policy.
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or str
         With `contract.json` and `weights.safetensors`.
 
     Returns
@@ -269,6 +280,7 @@ def load_policy(folder: Path) -> Policy:
     InputError
         If a file is missing, damaged, of another version, or fails the gate.
     """
+    folder = as_path(folder, "The folder of a policy")
     path, weights = folder / CONTRACT, folder / WEIGHTS
     for file in (path, weights):
         if not file.is_file():

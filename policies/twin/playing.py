@@ -243,7 +243,7 @@ _WHY: dict[Verdict, str] = {
         "The robot was in the air, unless its servos are more than "
         f"{STRONGER:g} times as strong as this actuator's: its joints show nothing of the load."
     ),
-    "cannot tell": "The motion of the joints does not tell the ground from the air.",
+    "cannot tell": "The motion of the joints does not separate the ground from the air.",
 }
 
 

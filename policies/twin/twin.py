@@ -292,8 +292,8 @@ def _notes(
         if ground and not ground.upright:
             notes.append(
                 f"{name}: no simulated robot stays up (the first falls after "
-                f"{ground.first_fall_s:.1f} s). On its back it moves as in the air, so there is "
-                "nothing to tell the ground from."
+                f"{ground.first_fall_s:.1f} s). On its back it moves as in the air, so air "
+                "and ground cannot be distinguished."
             )
     if presets := [name for name in actuators if name in PRESETS]:
         notes.append(

@@ -25,7 +25,7 @@ from pydantic import Field, field_validator
 
 from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import write_text
+from pupper_sysid.common.files import as_path, write_text
 from pupper_sysid.common.joints import in_order, strange_joint
 from pupper_sysid.common.strict_yaml import dump
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, JointCalibration
@@ -161,6 +161,10 @@ class Calibration(Part):
                 f"It has {', '.join(self.joints)}."
             )
         return self.joints[name]
+
+    def __repr__(self) -> str:
+        lines = (f"{name}: {joint!r}" for name, joint in self.joints.items())
+        return "\n  ".join([f"Calibration of {self.robot}", *lines])
 
     def operating_points(self) -> dict[str, list[str]]:
         """P gain, armature and load that the numbers hold for, in words, and the joints of each."""
@@ -326,6 +330,7 @@ def load_calibration(path_or_preset: Path | str) -> Calibration:
     >>> paper.delayed_pd().batch
     (12,)
     """
+    as_path(path_or_preset, "A calibration")
     if isinstance(path_or_preset, str) and path_or_preset in PRESETS:
         folder = resources.files("pupper_sysid.servo_models") / "presets"
         with resources.as_file(folder / f"{path_or_preset}.yaml") as file:

@@ -267,6 +267,19 @@ class JointCalibration(Part):
     warnings: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Reasons for distrust, in sentences."""
 
+    def __repr__(self) -> str:
+        servo, feedback = self.actuator, self.feedback
+        dead, interval = servo.dead_time_s, ""
+        if dead.low is not None and dead.high is not None:
+            interval = f" ({1e3 * dead.low:.1f}…{1e3 * dead.high:.1f})"
+        poll_s = feedback.poll_period_s.value
+        polls = f"polled every {1e3 * poll_s:.1f} ms" if poll_s else "readings not polled"
+        return (
+            f"dead time {1e3 * dead.value:.1f}{interval} ms, "
+            f"stiffness {servo.stiffness_nm_per_rad.value:.3g} N·m/rad, "
+            f"effort limit {servo.effort_limit_nm.value:.3g} N·m; {polls}"
+        )
+
     @property
     def holds_at(self) -> OperatingPoint:
         """What the numbers of `actuator` hold for; of an older file, as far as it says."""

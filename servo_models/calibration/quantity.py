@@ -94,6 +94,10 @@ class Quantity(Part):
             raise ValueError("identified is no, so `why` must give the reason")
         return self
 
+    def __repr__(self) -> str:
+        ends = "" if self.low is None or self.high is None else f", {self.low:.4g}…{self.high:.4g}"
+        return f"Quantity({self.value:.4g}{ends}, identified: {self.identified})"
+
     def scaled(self, factor: float) -> Quantity:
         """The number and its interval times a positive `factor`."""
         ends = (self.value, self.low, self.high)

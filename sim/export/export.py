@@ -11,10 +11,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions, write_text
-from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.delayed_pd import whole_steps
 from pupper_sysid.sim.export.isaaclab import to_isaaclab, to_isaaclab_bam
 from pupper_sysid.sim.export.mjcf import to_mjcf, to_model
@@ -110,7 +111,7 @@ def exported_text(
 
 
 def export(
-    calibration: Calibration,
+    calibration: Calibration | Any,
     to: str,
     out: Path | str = ".",
     *,
@@ -124,7 +125,8 @@ def export(
 
     Parameters
     ----------
-    calibration : Calibration
+    calibration : Calibration, Path or str
+        Also what `calibrate` returns, the name of a preset or servo card, or the file of one.
     to : {"mjcf", "isaaclab", "isaaclab-bam", "mjlab", "newton", "json"}
     out : Path or str
         File, or a folder, in which the file is called `servos` with the target's ending.
@@ -145,6 +147,14 @@ def export(
     Path
         The file that was written.
     """
+    if isinstance(calibration, Path | str):
+        calibration = load_calibration(calibration)
+    calibration = getattr(calibration, "calibration", calibration)  # of a result
+    if not isinstance(calibration, Calibration):
+        raise InputError(
+            f"A calibration is needed, not a {type(calibration).__name__}. Make one with "
+            "pupper_sysid.calibrate(recording) or pupper_sysid.load_calibration(path)."
+        )
     path = Path(out)
     if not path.suffix or path.is_dir():
         path = path / f"servos{ENDINGS.get(to, '')}"

@@ -131,7 +131,7 @@ def to_isaaclab(servos: ExportedServos) -> str:
         "friction is a torque from Isaac Sim 5.0 on; 4.5 takes a coefficient there, so leave the "
         "friction lines out with it. viscous_friction is the back-EMF, which brakes outside of the "
         "effort limit.",
-        "Not carried over: the PD is computed once per physics step, before it, so keep steps at "
+        "Not represented: the PD is computed once per physics step, before it, so keep steps at "
         "5 ms or less.",
         NOT_CARRIED,
     )
@@ -192,8 +192,8 @@ def to_isaaclab_bam(servos: ExportedServos) -> str:
         "the recording states none: only their ratio to it matters then).",
         "Delays are the nearest whole physics step: up to "
         f"{1e3 * servos.cost_of_whole_steps():.1f} mrad off (RMS) at 4 Hz, 0.3 rad.",
-        *(f"Not carried over: {words} ({', '.join(names)})." for words, names in lost.items()),
-        "Not carried over: backlash, which a calibration does not hold (`pupper-sysid backlash` "
+        *(f"Not represented: {words} ({', '.join(names)})." for words, names in lost.items()),
+        "Not represented: backlash, which a calibration does not hold (`pupper-sysid backlash` "
         "measures it; give it as a play hinge), and the readings: see FEEDBACK, and HeldFeedback "
         "of the export to isaaclab.",
     )

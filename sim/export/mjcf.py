@@ -50,9 +50,9 @@ NEUTRAL_ACTUATOR = {
 """The same of an actuator, as attributes of `<general>`: `<pid>` takes not all of them."""
 NEUTRAL_PID = {"ki": "0", "imax": "0", "inheritrange": "0", "slewmax": "0"}
 _CARRIED = (
-    "Carried over: delay (to fractions of a step), gains, limits of torque and of the set-point's "
+    "Represented: delay (to fractions of a step), gains, limits of torque and of the set-point's "
     "speed, dry friction, armature, back-EMF (as damping); of the feedback the poll period and, as "
-    "a delay, the mean age that lost polls add. Not carried over: which polls are lost (the age is "
+    "a delay, the mean age that lost polls add. Not represented: which polls are lost (the age is "
     "even here), the readings' counts and offset, that servos are polled one after the other, and "
     "the jitter of commands."
 )

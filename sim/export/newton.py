@@ -95,7 +95,7 @@ def to_newton(servos: ExportedServos) -> str:
         "fraction of a step, interpolated linearly, with a latency of its own for each command "
         "where its jitter is known; the set-point's speed is limited. The PD is computed once per "
         "physics step, before it, so keep steps at 5 ms or less.",
-        "Not carried over by other solvers: friction as hard as gears.",
+        "Not represented by other solvers: friction as hard as gears.",
         NOT_CARRIED,
     )
     friction = (

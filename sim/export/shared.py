@@ -224,7 +224,7 @@ class ExportedServos:
                     joints.setdefault(lost, []).append(name)
         for lost, names in joints.items():
             yield (
-                f"Fitted under load, but not carried over: {', '.join(lost)} ({', '.join(names)}). "
+                f"Fitted under load, but not represented: {', '.join(lost)} ({', '.join(names)}). "
                 "The friction here is that of one motor torque; `under_load` of the calibration "
                 "has the whole servo."
             )

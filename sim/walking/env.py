@@ -122,6 +122,10 @@ class PupperEnv:
     ((4, 60), (4,), False)
     """
 
+    def __repr__(self) -> str:
+        step_ms = 1e3 * self.config.control_step_s
+        return f"PupperEnv: {self.environments} robots, {step_ms:g} ms between actions"
+
     def __init__(
         self,
         config: Walking,

@@ -47,7 +47,7 @@ WORDS: dict[str, str] = {
         "(numpy.unwrap), or mount the horn so that the range is not crossed."
     ),
     "at_once": (
-        "the position goes with the command ({lag_ms:.1f} ms after it, as it was held): an echo"
+        "the position goes with the command ({lag_ms:.1f} ms after its zero-order hold): an echo"
         " with noise, or positions stamped too early. Read the servo's Present_Position, and "
         "stamp it when it is read."
     ),
@@ -210,7 +210,8 @@ WORDS: dict[str, str] = {
         "clips the motion. Record with a smaller amplitude."
     ),
     "poll_slipped": (
-        "{where} the poll slipped by {jump_ms:.0f} ms at {time_s:.2f} s ({nats:.0f} nats); "
+        "{where} the poll slipped by {jump_ms:.0f} ms at {time_s:.2f} s "
+        "(Δ log-likelihood {nats:.0f}); "
         "readings before and after it are dated apart."
     ),
     "poll_unresolved": (

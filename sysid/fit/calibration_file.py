@@ -414,7 +414,7 @@ def _jitter(result: JointCalibrationResult) -> Quantity:
         return Quantity(value=0.0, identified="no", why="it takes several tones to see it")
     why = "an upper bound: friction that the model lacks grows with the tone, too"
     if found.low <= 0:
-        why = "it cannot be told from none"
+        why = "it cannot be distinguished from none"
     if result.lag.feedback.kind == "unresolved":
         why = "readings are dated to half a loop only"
     return quantity_of(found, why=why)

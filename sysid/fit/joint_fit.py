@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
+from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
@@ -104,6 +105,7 @@ _ACCELERATIONS_RAD_S2 = (6.0, 15.0, 40.0, 110.0)
 """Starts of a limit on the set-point's acceleration: its cost has many minima. A Feetech servo's
 register counts 0.153 rad/s² from 1 to 254, whose largest is 39."""
 _MOST_COMPARED = 3
+_NEAR = 64  # starts about a fit without draws, for its fits without a part
 _PREFERENCE = 1.02
 """Error on unseen motion, over the smallest, up to which a simpler structure is carried."""
 _REPORTED_PREFERENCE = 1.05
@@ -237,10 +239,13 @@ def _ladder(
     rng: np.random.Generator,
     ladder: Sequence[tuple[str, ...]] = LADDER,
     most: float = float("inf"),
+    profiled: Fitted | None = None,
 ) -> list[Fitted]:
     """Structures of a motor, those with draws that the likelihood does not rule out.
 
-    None of them if the best one leaves more than `most` of residual over noise.
+    None of them if the best one leaves more than `most` of residual over noise. All have a limit on
+    the set-point's acceleration if there is a fit in free air that has one (`profiled`), or if that
+    is better.
     """
     scales = ready.scales
     stated: tuple[str, ...] = ("acceleration",) if np.isfinite(scales.acceleration_rad_s2) else ()
@@ -251,7 +256,14 @@ def _ladder(
         structure = servo_structure(("back-EMF", *features), scales)
         tried[structure.features] = _fitted(ready, structure, tried, rng, short=short)
 
-    if not stated:  # first, because friction that grows with the load imitates a profile
+    if profiled is not None:
+        features = [f for f in profiled.structure.features if f != "back-EMF"]
+        structure = servo_structure(("back-EMF", *features), scales)
+        near = structure.adopt(profiled.structure, profiled.fit.point)
+        fit = refine(ready.searched(structure), near[None])
+        tried[structure.features] = Fitted(structure, fit)
+        stated = ("acceleration",)
+    elif not stated:  # first, because friction that grows with the load imitates a profile
         try_out()
         try_out("acceleration")
         nats = _nats(ready, tried.values())
@@ -456,14 +468,34 @@ def conclude(
     if not ready.scales.free_air:
         return _under_load(ready, every, choice)
     result = _in_free_air(ready, every, choice, presets)
-    if not _undescribed(result.goodness):
+    misfit = overall(result.goodness)
+    profiled = _with_profile(ready, choice.carried)
+    if profiled is None and not _undescribed(result.goodness):
         return result
-    # DelayedPD does not describe it: one with a profile, gravity or other friction may
+    # one with a profile, gravity or other friction describes it, or may
+    most = np.inf if profiled is not None else _DESCRIBES_BETTER * misfit
     ready = ready.as_any_servo()
-    every = _ladder(
-        ready, ready.fit_rng(), SHORT_LADDER, _DESCRIBES_BETTER * overall(result.goodness)
-    )
+    every = _ladder(ready, ready.fit_rng(), SHORT_LADDER, most, profiled)
     return _under_load(ready, every, _choice(ready, every)) if every else result
+
+
+def _with_profile(ready: PreparedJoint, carried: Fitted) -> Fitted | None:
+    """The carried servo with a limit on its set-point's acceleration, if that describes it better.
+
+    Damping imitates such a profile within the noise, at a dead time that is wrong by tens of
+    milliseconds, so that goodness of fit does not show it. The limit is off in the Mini Pupper's
+    servos, which have none, and where the header says so.
+    """
+    unlimited = [t.servo.set_point_acceleration_rad_s2 == np.inf for t in ready.recorded]
+    unnamed = all(t.servo.model is None for t in ready.recorded)
+    if all(unlimited) or (unnamed and ready.joint in JOINT_NAMES):
+        return None
+    structure = servo_structure((*carried.structure.features, "acceleration"), ready.scales)
+    tried = {carried.structure.features: carried}
+    fitted = _fitted(ready, structure, tried, ready.fit_rng(), short=True)
+    nats = _nats(ready, (carried, fitted))
+    better = nats[carried.structure.name] - nats[structure.name] > _PROFILE_NATS
+    return fitted if better else None
 
 
 def _in_free_air(
@@ -487,8 +519,12 @@ def _in_free_air(
         # a model that errs more on what it was fitted to cannot be better on unseen tones
         residuals = fresh_residuals(structure, fitted.values, runs)
         if rms(residuals) <= min(least):
-            own = [(f.structure, f.folds) for f in parents if f.folds]
-            fitted = replace(fitted, folds=fit_folds(problem, folds, rng, None, own))
+            near = fitted.fit.point + _spread(ready, fitted) * rng.standard_normal(
+                (_NEAR, len(structure.parameters))
+            )
+            near = np.clip(np.concatenate([fitted.fit.point[None], near]), *structure.box)
+            of_parents = [(f.structure, f.folds) for f in parents if f.folds]
+            fitted = replace(fitted, folds=fit_folds(problem, folds, rng, near, of_parents))
         by_name[structure.name] = fitted
         results[structure.name] = _candidate_fit(ready, fitted, folds)
     results = {name: results[name] for name in CANDIDATES}
@@ -615,7 +651,7 @@ def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) ->
         worst = max((r, name) for name, r in goodness.items() if np.isfinite(r))
         yield f"{joint}: {why} ({worst[0]:.1f} at {worst[1]}). The lag holds; gains do not."
     elif not np.isfinite(overall(goodness)):
-        yield f"{joint}: too few readings to tell how well the model describes this servo."
+        yield f"{joint}: too few readings to say how well the model describes this servo."
     own = choice.carried
     if not (own.r_hat <= R_HAT and own.effective >= EFFECTIVE):
         yield (
@@ -742,7 +778,7 @@ def _why_unidentified(
     if p.name == "dead_time_s" and interval.high - interval.low < _SHARP_DEAD_TIME_S:
         return None  # a short one may well be close to none
     if interval.low <= 0 and p.logarithmic:
-        return "it cannot be told from none"
+        return "it cannot be distinguished from none"
     if p.logarithmic and interval.high > _WIDE * interval.low:
         return f"its interval is wider than a factor of {_WIDE:g}"
     return None
@@ -782,8 +818,9 @@ def _free_warnings(
         )
     if len(choice.likely) > 1 and not limits:
         yield (
-            f"{joint}: {UNTOLD} ({max(choice.nats.values()):.1f} nats); dead time and gains "
-            "cover both. Faster tones at a smaller amplitude would tell (`pupper-sysid plan`)."
+            f"{joint}: {UNTOLD} (log Bayes factor {max(choice.nats.values()):.1f}); dead "
+            "time and gains cover both. Faster tones at a smaller amplitude separate them "
+            "(`pupper-sysid plan`)."
         )
     for name in ("effort_rad_s2", "friction_rad_s2", "stiffness_per_s2", "damping_per_s"):
         if name in pd.undecided:
@@ -906,7 +943,7 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice) 
             wide = wide and interval.high > _WIDE * interval.low
             why = f"its interval is wider than a factor of {_WIDE:g}" if wide else None
         else:
-            why = "it cannot be told from none"
+            why = "it cannot be distinguished from none"
         if why:
             undecided[name] = why
     if why := _undated(ready.lag.feedback):

@@ -12,8 +12,13 @@ stand beside the servo in tables. Compiled once per machine, on first use, and c
 
 from __future__ import annotations
 
+from math import prod
+
 import numpy as np
-from numba import njit
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numba.np import arrayobj
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.loaded_servo import START_ERROR_RAD
@@ -44,6 +49,37 @@ LINEAR = {"pure_delay": 1, "fopdt": 2, "sopdt": 3}
 """Numbers of the linear models; their columns are their own parameters, the offset the last."""
 SPARSE = 4
 """Number of `servo_models.sparse_equation`; its columns are its coefficients, then the offset."""
+
+
+def _on_stack(*shape):
+    """Compiled function that returns an uninitialised array of a fixed shape on the stack.
+
+    Unlike arrays of the heap such arrays are known not to overlap, without which the loops over
+    candidates are not vectorised. They end with the function that makes them.
+    """
+    kind = types.Array(types.float64, len(shape), "C")
+
+    def codegen(context, builder, signature, args):
+        double = context.get_data_type(types.float64)
+        sizes = [context.get_constant(types.intp, n) for n in shape]
+        steps = [
+            context.get_constant(types.intp, 8 * prod(shape[n + 1 :])) for n in range(len(shape))
+        ]
+        array = context.make_array(kind)(context, builder)
+        arrayobj.populate_array(
+            array, cgutils.alloca_once(builder, double, size=prod(shape)), sizes, steps,
+            context.get_constant(types.intp, 8), None,
+        )  # fmt: skip
+        return array._getvalue()
+
+    @intrinsic
+    def array(typingctx):
+        return kind(), codegen
+
+    return array
+
+
+_lanes, _table = _on_stack(LANES), _on_stack(WIDTH, LANES)
 
 _PI, _PER_PI = 3.141592653589793, 0.3183098861837907
 
@@ -95,24 +131,28 @@ def _acting(x, h):
 @njit(fastmath=SAFE, error_model="numpy", inline="always")
 def _rubbed(v, force, limit, step):
     """Velocity after a step under a force and dry friction, which turns where the velocity does."""
-    forward = v > 0.0 or (v == 0.0 and force > 0.0)
+    forward = (v > 0.0) | ((v == 0.0) & (force > 0.0))
     slowed = v + (force - limit if forward else force + limit) * step
     goes_on = slowed > 0.0 if forward else slowed < 0.0
-    rest = -slowed / (v - slowed)  # of the step, after the standstill
+    apart = v - slowed
+    # share of the step after the standstill; a joint that creeps comes to stand still exactly
+    rest = -slowed / (apart if apart != 0.0 else 1.0)
     turned = (force - clip(force, limit)) * step * rest
     return slowed if goes_on else turned
 
 
 @njit(fastmath=SAFE, error_model="numpy")
-def _servo(values, who, held, edges, gain, load, start, steps, pad, h, shift, part, track):
+def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, shift, part, track):
     """Positions of the servos `who` after each step, into rows 1 … `steps` of `track`."""
-    p = np.zeros((WIDTH, LANES))
-    y, v, s = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
-    earlier, now, cut = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
-    before, after = np.zeros(LANES), np.zeros(LANES)
-    one, two, share = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
-    on, rate, play = np.ones(LANES), np.zeros(LANES), np.zeros(LANES)
-    braked, clipped = np.zeros(LANES), np.zeros(LANES)
+    p = _table()
+    y, v, s = _lanes(), _lanes(), _lanes()
+    earlier, now, cut = _lanes(), _lanes(), _lanes()
+    next_, next_cut_ = _lanes(), _lanes()
+    before, after = _lanes(), _lanes()
+    one, two, share = _lanes(), _lanes(), _lanes()
+    on, rate, play = _lanes(), _lanes(), _lanes()
+    braked, clipped, drive, free = _lanes(), _lanes(), _lanes(), _lanes()
+    begin, error, acting, pull, limit = _lanes(), _lanes(), _lanes(), _lanes(), _lanes()
     slew, friction, firmware, profile, gravity, backlash = (
         False,
         False,
@@ -139,8 +179,8 @@ def _servo(values, who, held, edges, gain, load, start, steps, pad, h, shift, pa
         braked[i] = _acting(h * (p[1, i] + p[3, i]), h)
         clipped[i] = _acting(h * p[3, i], h)
         y[i] = start - w[OFFSET]
-        s[i] = y[i]
-        play[i] = y[i]
+        s[i], play[i] = y[i], y[i]
+        v[i], rate[i], on[i] = 0.0, 0.0, 1.0
         track[0, i] = y[i]
         slew = slew or w[6] < np.inf
         profile = profile or w[7] < np.inf
@@ -152,34 +192,61 @@ def _servo(values, who, held, edges, gain, load, start, steps, pad, h, shift, pa
     plain = not (friction or firmware or gravity or supply)
     for i in range(LANES):
         plain = plain and not p[14, i] < np.inf
-    for i in range(LANES):
-        first = shift[i] - 1
-        earlier[i], now[i], cut[i] = edges[0, first - 1], edges[0, first], edges[1, first]
+    earliest, latest = shift.min(), shift.max()
+    direct = plain and not (slew or profile or backlash)
+    half = 0.5 * h
     for k in range(steps):
-        # the command's window of this step: the last `part` of one step, the first of the next
-        for i in range(LANES):
-            later, next_cut = edges[0, k + shift[i]], edges[1, k + shift[i]]
-            end = 1.0 - part[i]
-            inside = cut[i] > end
-            before[i] = earlier[i] if inside else now[i]
-            after[i] = later if next_cut < end else now[i]
-            old = (cut[i] - end) if inside else 0.0
-            kept = next_cut if next_cut < end else end
-            mean = earlier[i] * old + now[i] * (part[i] - old + kept) + later * (end - kept)
-            apart = before[i] - after[i]
-            apart = apart if abs(apart) > 1e-12 else 1.0
-            x = (mean - after[i]) / apart
-            x = x if x > 0.0 else 0.0
-            share[i] = x if x < 1.0 else 1.0
-            earlier[i], now[i], cut[i] = now[i], later, next_cut
+        # whether one command fills the windows of all candidates
+        steady = until[k + earliest - 2] >= k + latest
+        if steady and direct:
+            command = edges[0, k + earliest]
+            for i in range(LANES):
+                middle = y[i] + v[i] * half
+                wanted = (command - middle) * p[0, i] - p[1, i] * v[i]
+                force = clip(wanted, p[2, i])
+                unclipped = 1.0 if force == wanted else 0.0
+                step = clipped[i] + (braked[i] - clipped[i]) * unclipped
+                v[i] = _rubbed(v[i], force - p[3, i] * v[i], p[5, i], step)
+                y[i] = middle + v[i] * half
+                track[k + 1, i] = y[i]
+            continue
+        if steady:
+            for i in range(LANES):
+                share[i] = 0.0
+                before[i] = edges[0, k + earliest]
+                after[i] = edges[0, k + earliest]
+        else:
+            # the window of this step: the last `part` of one step, the first of the next
+            for i in range(LANES):
+                at = k + shift[i]
+                earlier[i], now[i], next_[i] = edges[0, at - 2], edges[0, at - 1], edges[0, at]
+                cut[i], next_cut_[i] = edges[1, at - 1], edges[1, at]
+            for i in range(LANES):
+                later, next_cut = next_[i], next_cut_[i]
+                first, end = now[i], 1.0 - part[i]
+                old = cut[i] - end
+                inside = 1.0 if old > 0.0 else 0.0
+                old = old if old > 0.0 else 0.0
+                changed = 1.0 if next_cut < end else 0.0
+                kept = next_cut if next_cut < end else end
+                b = first + (earlier[i] - first) * inside
+                a = first + (later - first) * changed
+                mean = earlier[i] * old + first * (part[i] - old + kept) + later * (end - kept)
+                apart = b - a
+                apart = apart if abs(apart) > 1e-12 else 1.0
+                x = (mean - a) / apart
+                before[i], after[i] = b, a
+                x = x if x > 0.0 else 0.0
+                share[i] = x if x < 1.0 else 1.0
         if profile:
             for i in range(LANES):
-                limited = p[7, i] < np.inf
-                most = p[7, i] if limited else 0.0
-                mean = 0.0
-                for half in range(2):
-                    weight = share[i] if half == 0 else 1.0 - share[i]
-                    way = (before[i] if half == 0 else after[i]) - s[i]
+                one[i] = 0.0
+            for part_of in range(1 if steady else 0, 2):
+                for i in range(LANES):
+                    limited = p[7, i] < np.inf
+                    most = p[7, i] if limited else 0.0
+                    weight = 1.0 - share[i] if part_of else share[i]
+                    way = (after[i] if part_of else before[i]) - s[i]
                     long = h * weight if weight > 1e-6 else 1e-6 * h
                     # from which the profile comes to rest at the command
                     brake = 0.5 * long * most
@@ -189,11 +256,13 @@ def _servo(values, who, held, edges, gain, load, start, steps, pad, h, shift, pa
                     rate[i] += change
                     move = (rate[i] - 0.5 * change) * long
                     move = move if limited else clip(way, p[6, i] * weight)
-                    mean += weight * (s[i] + 0.5 * move)
+                    one[i] += weight * (s[i] + 0.5 * move)
                     s[i] += move
-                straight = not (limited or p[6, i] < np.inf)
-                one[i] = before[i] if straight else mean
-                two[i] = after[i] if straight else mean
+            for i in range(LANES):
+                curved = 1.0 if p[7, i] < np.inf or p[6, i] < np.inf else 0.0
+                mean = one[i]
+                one[i] = before[i] + (mean - before[i]) * curved
+                two[i] = after[i] + (mean - after[i]) * curved
         elif slew:
             for i in range(LANES):
                 first = clip(before[i] - s[i], p[6, i] * share[i])
@@ -208,61 +277,61 @@ def _servo(values, who, held, edges, gain, load, start, steps, pad, h, shift, pa
             for i in range(LANES):
                 one[i] = before[i]
                 two[i] = after[i]
+        for i in range(LANES):
+            drive[i], free[i], begin[i], error[i] = 0.0, 0.0, 0.0, 0.0
+        for part_of in range(1 if steady else 0, 2):
+            for i in range(LANES):
+                x = two[i] if part_of else one[i]
+                error[i] = x - (y[i] + v[i] * half)
+            if firmware:
+                for i in range(LANES):
+                    x = error[i] - clip(error[i], p[16, i])
+                    begin[i] = p[17, i] * clip(x * (1.0 / START_ERROR_RAD), 1.0)
+                    error[i] = x
+            for i in range(LANES):
+                weight = 1.0 - share[i] if part_of else share[i]
+                wanted = error[i] * p[0, i] - p[1, i] * v[i] + begin[i]
+                reached = clip(wanted, p[2, i])
+                drive[i] += reached * weight
+                free[i] += weight * (1.0 if reached == wanted else 0.0)
         if plain:
             for i in range(LANES):
-                middle = y[i] + v[i] * (0.5 * h)
-                damped = p[1, i] * v[i]
-                wanted = (one[i] - middle) * p[0, i] - damped
-                drive = clip(wanted, p[2, i])
-                free = share[i] if drive == wanted else 0.0
-                force = drive * share[i]
-                wanted = (two[i] - middle) * p[0, i] - damped
-                drive = clip(wanted, p[2, i])
-                free += 1.0 - share[i] if drive == wanted else 0.0
-                force += drive * (1.0 - share[i])
-                step = clipped[i] + (braked[i] - clipped[i]) * free
-                v[i] = _rubbed(v[i], force - p[3, i] * v[i], p[5, i], step)
-                y[i] = middle + v[i] * (0.5 * h)
+                step = clipped[i] + (braked[i] - clipped[i]) * free[i]
+                middle = y[i] + v[i] * half
+                v[i] = _rubbed(v[i], drive[i] - p[3, i] * v[i], p[5, i], step)
+                y[i] = middle + v[i] * half
                 track[k + 1, i] = y[i]
         else:
-            volt = 1.0
             if supply:
                 _delayed(held, 1, k, shift, part, on)
                 volt = held[2, k + pad]
-            for i in range(LANES):
-                middle = y[i] + v[i] * (0.5 * h)
-                drive, free = 0.0, 0.0
-                for half in range(2):
-                    error = (one[i] if half == 0 else two[i]) - middle
-                    weight = share[i] if half == 0 else 1.0 - share[i]
-                    begin = 0.0
-                    if firmware:
-                        error -= clip(error, p[16, i])
-                        begin = p[17, i] * clip(error * (1.0 / START_ERROR_RAD), 1.0)
-                    wanted = error * p[0, i] - p[1, i] * v[i] + begin
-                    reached = clip(wanted, p[2, i])
-                    drive += reached * weight
-                    free += weight if reached == wanted else 0.0
-                back, step, given = p[3, i], clipped[i] + (braked[i] - clipped[i]) * free, 1.0
-                if supply:
+                for i in range(LANES):
                     given = volt * on[i]
-                    back *= p[15, i] + (1.0 - p[15, i]) * on[i]
-                    step = _acting(h * (p[1, i] * given * free + back), h)
-                drawn = drive * given - back * v[i]
-                motor = clip(drawn, p[14, i])
-                step = step if motor == drawn else h
-                force, limit = motor, p[5, i]
-                pull = 0.0
-                if gravity:
-                    pull = -p[18, i] * _sin(middle - p[19, i])
-                    force += pull
-                if friction:
+                    back = p[3, i] * (p[15, i] + (1.0 - p[15, i]) * on[i])
+                    acting[i] = _acting(h * (p[1, i] * given * free[i] + back), h)
+                    drive[i] = drive[i] * given - back * v[i]
+            else:
+                for i in range(LANES):
+                    acting[i] = clipped[i] + (braked[i] - clipped[i]) * free[i]
+                    drive[i] -= p[3, i] * v[i]
+            for i in range(LANES):
+                motor = clip(drive[i], p[14, i])
+                acting[i] = h + (acting[i] - h) * (1.0 if motor == drive[i] else 0.0)
+                drive[i], pull[i], limit[i] = motor, 0.0, p[5, i]
+            if gravity:
+                for i in range(LANES):
+                    pull[i] = -p[18, i] * _sin(y[i] + v[i] * half - p[19, i])
+            if friction:
+                for i in range(LANES):
+                    motor = drive[i]
                     standing = 1.0 / (1.0 + v[i] * v[i] * p[9, i])
-                    of_load = p[10, i] * abs(motor) + p[11, i] * abs(pull)
-                    limit += p[8, i] * standing + (1.0 + p[13, i] * standing) * of_load
-                    limit += p[12, i] * motor * motor
-                v[i] = _rubbed(v[i], force, limit, step)
-                y[i] = middle + v[i] * (0.5 * h)
+                    of_load = p[10, i] * abs(motor) + p[11, i] * abs(pull[i])
+                    limit[i] += p[8, i] * standing + (1.0 + p[13, i] * standing) * of_load
+                    limit[i] += p[12, i] * motor * motor
+            for i in range(LANES):
+                middle = y[i] + v[i] * half
+                v[i] = _rubbed(v[i], drive[i] + pull[i], limit[i], acting[i])
+                y[i] = middle + v[i] * half
                 track[k + 1, i] = y[i]
         if backlash:
             for i in range(LANES):
@@ -276,13 +345,14 @@ def _servo(values, who, held, edges, gain, load, start, steps, pad, h, shift, pa
 def _linear(kind, values, who, held, start, steps, h, shift, part, track):
     """As `_servo`, for the linear models: parameters, then the offset in the last column."""
     last = values.shape[1] - 1
-    c, y, v, rest = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
-    p = np.zeros((3, LANES))
+    c, y, v, rest = _lanes(), _lanes(), _lanes(), _lanes()
+    p = _table()
     for i in range(LANES):
         w = values[who[i]]
         rest[i] = start - w[last]
         track[0, i] = rest[i]
         p[0, i] = w[0]
+        p[1, i], p[2, i], y[i], v[i] = 0.0, 0.0, 0.0, 0.0
         if kind == 2:
             p[1, i] = np.exp(-h / w[1])
         elif kind == 3:
@@ -306,14 +376,14 @@ def _linear(kind, values, who, held, start, steps, h, shift, part, track):
 def _sparse(values, who, held, start, steps, h, shift, part, track):
     """As `_servo`, for the equation of motion of `servo_models.sparse_equation`."""
     last = values.shape[1] - 1
-    c, y, v = np.zeros(LANES), np.zeros(LANES), np.zeros(LANES)
-    p = np.zeros((6, LANES))
+    c, y, v = _lanes(), _lanes(), _lanes()
+    p = _table()
     for i in range(LANES):
         w = values[who[i]]
-        y[i] = start - w[last]
+        y[i], v[i] = start - w[last], 0.0
         track[0, i] = y[i]
         p[0, i], p[1, i], p[2, i] = w[0] * h, w[1] * h, w[2]
-        p[3, i], p[4, i], p[5, i] = 0.5 * h * w[3], w[4] * (0.5 * h), w[5] * h
+        p[3, i], p[4, i], p[5, i] = 0.5 * h * w[3], 0.5 * h * w[4], w[5] * h
     for k in range(steps):
         _delayed(held, 0, k, shift, part, c)
         for i in range(LANES):
@@ -329,13 +399,17 @@ def _sparse(values, who, held, start, steps, h, shift, part, track):
 
 
 @njit(fastmath=SAFE, error_model="numpy")
-def _simulate(kind, values, dead_time, who, held, edges, gain, load, start, steps, pad, h, track):
-    part, shift = np.zeros(LANES), np.zeros(LANES, np.int64)
+def _simulate(
+    kind, values, dead_time, who, held, edges, until, gain, load, start, steps, pad, h, track
+):  # fmt: skip
+    part, shift = _lanes(), np.zeros(LANES, np.int64)
     for i in range(LANES):
         whole = int(np.floor(dead_time[who[i]]))
         shift[i], part[i] = pad - whole, dead_time[who[i]] - whole
     if kind == SERVO:
-        _servo(values, who, held, edges, gain, load, start, steps, pad, h, shift, part, track)
+        _servo(
+            values, who, held, edges, until, gain, load, start, steps, pad, h, shift, part, track
+        )
     elif kind == SPARSE:
         _sparse(values, who, held, start, steps, h, shift, part, track)
     else:
@@ -343,11 +417,11 @@ def _simulate(kind, values, dead_time, who, held, edges, gain, load, start, step
 
 
 @njit(inline="always")
-def _fill_lanes(first, count, who):
+def _fill_lanes(first, order, who):
     """Fill `who` with candidates from `first` on, the first repeated where there are too few."""
-    used = min(LANES, count - first)
+    used = min(LANES, len(order) - first)
     for i in range(LANES):
-        who[i] = first + (i if i < used else 0)
+        who[i] = order[first + (i if i < used else 0)]
     return used
 
 
@@ -366,18 +440,36 @@ def _evaluate(
     if task == _RESIDUALS or task == _COSTS:
         steps = min(int(np.ceil(np.max(step))) + 1, steps) if samples else 0
     who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
-    offset, cost = np.zeros(LANES), np.zeros(LANES)
+    offset, cost, error_sum = _lanes(), _lanes(), _lanes()
+    per_noise = 1.0 / noise
+    order = np.argsort(dead_time)  # those abreast meet a command in about the same step
+    until = np.full(edges.shape[1], edges.shape[1] - 1)
+    for k in range(edges.shape[1] - 2, -1, -1):
+        until[k] = until[k + 1] if edges[0, k] == edges[0, k + 1] else k
     for first in range(0, count, LANES):
-        used = _fill_lanes(first, count, who)
+        used = _fill_lanes(first, order, who)
         _simulate(
-            kind, values, dead_time, who, held, edges, gain, load, start, steps, pad, h, track
+            kind,
+            values,
+            dead_time,
+            who,
+            held,
+            edges,
+            until,
+            gain,
+            load,
+            start,
+            steps,
+            pad,
+            h,
+            track,
         )
         for i in range(LANES):
             offset[i], cost[i] = values[who[i], last], 0.0
         if task == _POSITIONS:
             for k in range(steps + 1):
                 for i in range(used):
-                    out[k, first + i] = track[k, i] + offset[i]
+                    out[k, who[i]] = track[k, i] + offset[i]
         elif task == _RESIDUALS:
             for n in range(samples):
                 row = min(int(step[n]), steps - 1)
@@ -385,7 +477,7 @@ def _evaluate(
                 for i in range(used):
                     low = track[row, i]
                     position = low + part * (track[row + 1, i] - low)
-                    out[first + i, n] = position + offset[i] - reading[n]
+                    out[who[i], n] = position + offset[i] - reading[n]
         elif task == _COSTS:
             for n in range(samples):
                 row = min(int(step[n]), steps - 1)
@@ -393,22 +485,25 @@ def _evaluate(
                 for i in range(LANES):
                     low = track[row, i]
                     position = low + part * (track[row + 1, i] - low)
-                    r = (position + offset[i] - read) / noise
+                    r = (position + offset[i] - read) * per_noise
                     cost[i] += np.sqrt(1.0 + r * r) - 1.0
             for i in range(used):
-                out[0, first + i] = cost[i]
+                out[0, who[i]] = cost[i]
         else:
             for m in range(len(later)):
+                for i in range(LANES):
+                    error_sum[i], cost[i] = 0.0, 0.0
                 for n in range(samples):
                     moment = max(step[n] - later[m], 0.0)
                     row = min(int(moment), steps - 1)
-                    part = moment - row
-                    for i in range(used):
+                    part, read = moment - row, reading[n]
+                    for i in range(LANES):
                         low = track[row, i]
-                        position = low + part * (track[row + 1, i] - low)
-                        error = position + offset[i] - reading[n]
-                        out[m, first + i] += error
-                        total[m, first + i] += error * error
+                        error = low + part * (track[row + 1, i] - low) + offset[i] - read
+                        error_sum[i] += error
+                        cost[i] += error * error
+                for i in range(used):
+                    out[m, who[i]], total[m, who[i]] = error_sum[i], cost[i]
 
 
 Simulated = tuple[int, NDArray, NDArray, NDArray, NDArray, float, NDArray, float, int, float]

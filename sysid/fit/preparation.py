@@ -127,15 +127,15 @@ class PreparedJoint:
         for slip in self.lag.feedback.slips:
             yield (
                 f"{self.joint}: {tone.get(slip.trial, 'somewhere')} the poll slipped by "
-                f"{1e3 * slip.jump_s:.0f} ms at {slip.time_s:.2f} s ({slip.nats:.0f} nats); "
-                "readings behind it are dated anew."
+                f"{1e3 * slip.jump_s:.0f} ms at {slip.time_s:.2f} s "
+                f"(Δ log-likelihood {slip.nats:.0f}); readings behind it are dated anew."
             )
         for upset in self.upsets:
             lost = "1 command" if upset.commands == 1 else f"{upset.commands} commands"
             yield (
                 f"{self.joint}: {tone[upset.trial]}, {upset.time_s:.2f} s, {lost} never reached "
-                f"the servo ({upset.nats:.0f} nats); the {len(upset.readings)} readings that this "
-                "touches are left out."
+                f"the servo (Δ log-likelihood {upset.nats:.0f}); the {len(upset.readings)} "
+                "readings that this touches are left out."
             )
 
 

@@ -17,7 +17,7 @@ from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.scores import Scores
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 
-UNTOLD = "the data do not tell a set-point of limited rate from back-EMF"
+UNTOLD = "the data do not separate a set-point of limited rate from back-EMF"
 _TELLING_NATS = 5.0
 """Difference of the log-likelihoods of two structures that tells them apart."""
 

@@ -24,6 +24,7 @@ from pupper_sysid.sysid.fit.run import Run, costs, moments_if_later, residuals
 from pupper_sysid.sysid.fit.structure import Structure
 
 _CANDIDATES, _KEEP, _FINAL = 512, 12, 4
+_REFINED = 2  # of the fits in coarse steps, those that are fitted in fine ones
 _SHORT, _LONG = 8, 20  # iterations of the local fit
 _WIDE_STEP, _STEP = 0.05, 0.01
 """Steps of the Jacobian in fitted coordinates: a wide one looks past a rugged cost's dents, one
@@ -152,10 +153,12 @@ def search(
     final : int
         How many of those are fitted to the end.
     """
-    starts = Starts(problem, rng).best(np.ones(len(problem.runs), bool), keep)
+    starts = Starts(problem.coarse, rng).best(np.ones(len(problem.runs), bool), keep)
     if more is not None and len(more):
         starts = np.concatenate([starts, more])
-    return refined(problem, starts, final)
+    rough = refined(problem.coarse, starts, final)[:_REFINED]
+    fits = local(problem, np.array([f.point for f in rough]), _LONG, _STEP)
+    return sorted(fits, key=lambda f: f.cost)
 
 
 def search_widely(
@@ -203,7 +206,7 @@ def evolved(
     """
     best = evolve(problem.coarse, refined(problem.coarse, starts), rng, short, crowd)
     near = np.concatenate([best.point[None], starts[-_FINAL:]])
-    return refine(problem, near[np.argsort(problem.costs(near))[:2]])
+    return refine(problem, near[np.argsort(problem.costs(near))[:_REFINED]])
 
 
 def refined(problem: Problem, starts: NDArray[np.float64], final: int = _FINAL) -> list[Fit]:
@@ -525,5 +528,6 @@ def fit_folds(
             crowd = [draws[np.argsort(whole)[:_FOLD_STARTS]]]
         for parent, own in parents:
             crowd.append(problem.structure.adopt(parent, own[n].point[None]))
-        fits.append(refined(part, np.concatenate(crowd), 2)[0])
+        rough = refined(part.coarse, np.concatenate(crowd), _REFINED)[:_REFINED]
+        fits.append(refine(part, np.array([f.point for f in rough])))
     return fits

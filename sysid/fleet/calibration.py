@@ -309,13 +309,13 @@ def trust(cluster: str) -> str:
             "tls://host:8786. Schedulers are never searched for, since they execute code."
         )
     risk = (
-        f"{cluster} is trusted: it executes code, and its answers are unpickled here, so whoever "
-        "controls it can run programs on this computer."
+        f"{cluster} is trusted: it executes code, and its answers are unpickled here, so control "
+        "of it is enough to run programs on this computer."
     )
     if found[1] == "tls":
         return risk
     return (
-        f"{risk} tcp:// tells neither who answers nor who listens: use it within a network of your "
+        f"{risk} tcp:// neither authenticates nor encrypts: use it within a network of your "
         "own, else tls:// with certificates (docs/exports.md)."
     )
 

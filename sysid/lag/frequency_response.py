@@ -272,6 +272,13 @@ class FrequencyResponse(Result):
         """One row per tone."""
         return [row for point in self.by_frequency for row in point.rows()]
 
+    def __repr__(self) -> str:
+        f = self.frequency_hz
+        return (
+            f"FrequencyResponse({len(f)} tones, {f[0]:.3g}–{f[-1]:.3g} Hz; "
+            f"bandwidth {self.bandwidth_text})"
+        )
+
     def __str__(self) -> str:
         lines = ["    Hz  amplitude rad   gain      dB  phase °  raw gain"]
         for p in self.by_frequency:

@@ -325,7 +325,7 @@ def _notes(
             names = [world.servo.hypotheses[i].model.name for i in (0, which)]
             found.append(
                 f"{joint}: {names[0]} and {names[1]} would still explain the readings alike "
-                f"({nats:.1f} nats apart, {CLEAR_NATS:g} would tell): the dead time's interval "
+                f"(log Bayes factor {nats:.1f}, below {CLEAR_NATS:g}): the dead time's interval "
                 "covers both."
             )
     if world.servo.doubt_s > 0:

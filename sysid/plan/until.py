@@ -214,7 +214,7 @@ def _judged(
     (dead,) = (p for p in plan.predictions if p.quantity == DEAD_TIME)
     if half_width(dead.after) > _EXPECTED * half_width(dead.now):
         return state(notes.rstrip(".") or "no trial within the limits would narrow it"), None
-    return state("more is to be recorded"), plan
+    return state("more recordings are needed"), plan
 
 
 def _together(plans: Mapping[str, SweepPlan]) -> SweepPlan:

@@ -153,6 +153,15 @@ class Recording:
     sha256: str
     warnings: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        trials = [trial for several in self._trials.values() for trial in several]
+        moved_s = sum(float(np.ptp(t.send_time_s)) for t in trials)
+        warned = f", {len(self.warnings)} warnings" if self.warnings else ""
+        return (
+            f"Recording {self.name}: {', '.join(self.joints)}; {len(trials)} trials, "
+            f"{len(self.table)} rows, {moved_s:.0f} s{warned}"
+        )
+
     @classmethod
     def from_arrays(
         cls,

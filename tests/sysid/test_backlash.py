@@ -78,7 +78,7 @@ def test_without_a_load_backlash_is_not_given():
     recording, _ = stroked(5, 1.0, 1, gains=(32,), mass_kg=0.0)
     found = backlash(recording)["bench"]
     assert found.backlash_rad is None and found.gains[0].hysteresis_rad.value > 0
-    assert any("cannot be told from friction" in note for note in found.notes)
+    assert any("cannot be separated from friction" in note for note in found.notes)
 
 
 def test_other_recordings_are_refused(hip):

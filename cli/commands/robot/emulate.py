@@ -99,7 +99,7 @@ class SerialLine(Common):
     or bare (none)."""
     registers: str = ""
     """Registers that differ from the factory's, of all servos or of one id: p=16,5:mode=1. The
-    servos obey them; Feetech's gains, ramps and torque limits only STS3215 that do not walk."""
+    servos act on them; Feetech's gains, ramps and torque limits only STS3215 that do not walk."""
     joint_map: str | None = None
     """Joint map of another robot, such as `init-robot` writes; its joints are in free air."""
     ids: str = "all"

@@ -492,7 +492,7 @@ def test_what_a_target_cannot_carry_of_a_servo_under_load_is_said_in_it(
     for to in ("mjcf", "isaaclab", "mjlab", "newton"):
         run_program(capsys, pupper_sysid, "export", "xl330-m288", "--to", to, "--out", to)
         said = " ".join((tmp_path / to).read_text().split())
-        assert "not carried over: friction that grows with the motor's torque" in said, to
+        assert "not represented: friction that grows with the motor's torque" in said, to
 
 
 def test_an_export_in_the_steps_of_its_fit_moves_as_the_calibration_does(calibration):

@@ -38,7 +38,7 @@ def fit() -> LoadedFit:
         joint="j", structure="base", known_load=False, p_gain=16.0, p_gains=(16.0,),
         loads=((0.0, 0.0),), reference_voltage_v=float("nan"),
         numbers={n: Interval(v, 0.9 * v, 1.1 * v) for n, v in PER_INERTIA.items()},
-        undecided={"friction_loss": "it cannot be told from none"},
+        undecided={"friction_loss": "it cannot be distinguished from none"},
         structures=(StructureFit(
             name="base", parameters={}, mae_rad=0.002, rmse_rad=0.003,
             mae_unseen_rad=float("nan"), nats=0.0,
@@ -73,7 +73,7 @@ def test_gains_in_newton_metres_set_the_scale_of_a_drive(tmp_path):
     damping = numbers.damping_nm_s_per_rad
     assert damping is not None and damping.value == pytest.approx(25.0 * 150.0 / 320.0)
     assert damping.low == pytest.approx(0.9 * damping.value) and damping.identified == "yes"
-    assert numbers.friction_loss_nm.why == "it cannot be told from none"
+    assert numbers.friction_loss_nm.why == "it cannot be distinguished from none"
     assert numbers.effort_limit_nm.value == 60.0 and numbers.effort_limit_nm.identified == "no"
 
 

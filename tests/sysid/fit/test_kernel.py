@@ -187,3 +187,16 @@ def test_residuals_costs_and_moments_are_of_the_same_motion():
     moved = np.array([at(np.maximum(step - d, 0.0)) - reading for d in later])
     np.testing.assert_allclose(total, moved.sum(axis=-1), atol=1e-10)
     np.testing.assert_allclose(square, (moved**2).sum(axis=-1), atol=1e-10)
+
+
+def test_a_joint_whose_force_equals_its_friction_stands_still():
+    """Its velocity and the one after the step are both 0, of which a share cannot be taken."""
+    columns = np.tile(kernel.ABSENT, (1, 1))
+    for name, value in {"stiffness": 100.0, "friction_loss": 10.0, "effort_limit": 1e3}.items():
+        columns[0, kernel.COLUMNS.index(name)] = value
+    held = np.full((1, 60), 0.1)
+    still = kernel.positions(
+        kernel.SERVO, columns, np.zeros(1), held, kernel.edges_of(held[0]), 1.0, np.zeros(3), 0.2,
+        10, 0.002,
+    )  # fmt: skip
+    assert np.array_equal(still[:, 0], np.full(51, 0.2))

@@ -61,7 +61,7 @@ def test_only_joints_that_are_still_wide_are_recorded_again(tmp_path):
     hip, thigh = outcome.joints["LF_hip"], outcome.joints["LF_thigh"]
     assert (hip.rounds, thigh.rounds) == (3, 1)
     assert hip.recorded_s == pytest.approx(3 * SECONDS, abs=0.2)
-    assert reports[0]["LF_hip"].why == "more is to be recorded"
+    assert reports[0]["LF_hip"].why == "more recordings are needed"
 
 
 def test_the_limit_of_seconds_is_kept_and_named(tmp_path):

@@ -1,0 +1,202 @@
+"""Help of every command, on one screen: `--help`; all options in full: `--help-all`.
+
+tyro knows the options with their types, defaults and texts; this lays them out in two columns. A
+page that would be longer than a screen shows the first sentence of each option, and groups of
+settings (`--task.…`) only by name; its last line says that `--help-all` has the rest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shutil
+import textwrap
+import warnings
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import tyro
+
+HELP, ALL = ("-h", "--help"), "--help-all"
+SCREEN_LINES = 60
+"""Most lines of `--help`."""
+
+_WIDEST, _NARROWEST = 100, 40
+_COLUMN = 24  # at which texts begin
+_NOTHING = re.compile(r"\s*\(default: (None|False|''|\[\]|)\)$")
+_DEFAULT = re.compile(r"\s*(\(default: [^()]*(\([^()]*\)[^()]*)*\)|\(required\)|\(optional\))$")
+
+
+def help_page(
+    options: Any,
+    arguments: Sequence[str],
+    program: str,
+    description: str | None,
+    **keywords: Any,
+) -> str:
+    """Help of the command whose options are `options`, as wide as the terminal.
+
+    Parameters
+    ----------
+    options : type
+        Dataclass of the options, or a union of some as subcommands.
+    arguments : sequence of str
+        As typed: they name a subcommand, and hold `--help` or `--help-all`.
+    program : str
+        Its words, such as `pupper-sysid servo`.
+    description : str, optional
+        What it is for; by default the dataclass's docstring.
+    **keywords
+        Of `tyro.cli`.
+
+    Returns
+    -------
+    str
+        The page.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # since tyro 1.0, without a successor
+        parser = tyro.extras.get_parser(options, prog=program, description=description, **keywords)
+    for word in arguments:
+        if word not in _subcommands(parser):
+            break
+        parser = _subcommands(parser)[word]
+        program = f"{program} {word}"
+    width = max(_NARROWEST, min(_WIDEST, shutil.get_terminal_size().columns))
+    everything = "\n".join(_page(parser, program, width, whole=True, nested=True))
+    if ALL in arguments or everything.count("\n") < SCREEN_LINES:
+        return everything
+    for whole in (True, False):
+        lines = _page(parser, program, width, whole, nested=False)
+        rest = _left_out(parser)
+        lines += ["", *textwrap.wrap(f"{rest}{program} {ALL} shows every option in full.", width)]
+        if len(lines) <= SCREEN_LINES:
+            break
+    return "\n".join(lines)
+
+
+def _subcommands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    for action in parser._actions:
+        if isinstance(action.choices, dict):
+            return dict(action.choices)
+    return {}
+
+
+def _page(
+    parser: argparse.ArgumentParser, program: str, width: int, whole: bool, nested: bool
+) -> list[str]:
+    words = " ".join(_name(a) for a in parser._actions if _is_positional(a))
+    subcommands = _subcommands(parser)
+    usage = [program, "COMMAND" if subcommands else words, "[OPTIONS]"]
+    lines = [f"usage: {' '.join(part for part in usage if part)}"]
+    example = "Example: "
+    for paragraph in (parser.description or "").strip().split("\n\n"):
+        if not (paragraph.startswith(example) and lines[-1].startswith((example, " "))):
+            lines.append("")
+        lines += textwrap.wrap(
+            " ".join(paragraph.split()), width, break_on_hyphens=False,
+            subsequent_indent=" " * len(example) * paragraph.startswith(example),
+        )  # fmt: skip
+    if subcommands:
+        lines += ["", "commands:"]
+        for name, each in subcommands.items():
+            summary = (each.description or "").strip().split("\n\n")[0]
+            lines += _row(name, summary, width)
+    for title, actions in _groups(parser, nested):
+        lines += ["", *([f"{title}:"] if title else [])]
+        for action in actions:
+            text, end = _text(action)
+            text = text if whole else _first_sentence(text)
+            lines += _row(_name(action), text + end, width)
+    return lines
+
+
+def _groups(
+    parser: argparse.ArgumentParser, nested: bool
+) -> Iterable[tuple[str, list[argparse.Action]]]:
+    """Positional arguments, options, and groups of settings, in that order."""
+    for group in parser._action_groups:
+        own = [
+            action
+            for action in group._group_actions
+            if not isinstance(action.choices, dict) and (nested or not _is_nested(action))
+        ]
+        if own:
+            title = "" if group.title in ("options", "positional arguments") else group.title
+            yield (title or "").removesuffix(" options"), own
+
+
+def _is_nested(action: argparse.Action) -> bool:
+    return any("." in name for name in action.option_strings)
+
+
+def _is_positional(action: argparse.Action) -> bool:
+    return not (action.option_strings or isinstance(action.choices, dict))
+
+
+def _left_out(parser: argparse.ArgumentParser) -> str:
+    """Which groups of settings the short page leaves out."""
+    names = (name for a in parser._actions for name in a.option_strings if "." in name)
+    counts: dict[str, int] = {}
+    for name in names:
+        group = name.split(".")[0]
+        counts[group] = counts.get(group, 0) + 1
+    if not counts:
+        return ""
+    listed = ", ".join(f"{group}.* ({count})" for group, count in counts.items())
+    return f"Settings beside these: {listed}. "
+
+
+def _name(action: argparse.Action) -> str:
+    """An option and what it takes."""
+    metavar = action.metavar if isinstance(action.metavar, str) else ""
+    several = " ..." if "..." in metavar else ""
+    if not action.option_strings:
+        word = action.dest.split(".")[-1].split("(")[0].strip().replace("-", "_").upper()
+        return f"[{word}{several}]" if metavar[:1] == "[" else f"{word}{several}"
+    if several:
+        metavar = f"{metavar.strip('[]').split()[0]}{several}"
+    if action.choices is not None and len(metavar) > _COLUMN:
+        metavar = action.option_strings[0].split(".")[-1].lstrip("-").upper().replace("-", "_")
+    return f"{', '.join(action.option_strings)} {metavar}".strip()
+
+
+def _text(action: argparse.Action) -> tuple[str, str]:
+    """Text of an option, and its end: choices that its name does not hold, and its default."""
+    if "--help" in action.option_strings:
+        return f"Show this page ({ALL}: every option in full).", ""
+    text = _NOTHING.sub("", " ".join((action.help or "").replace("%%", "%").split()))
+    default = _DEFAULT.search(text)
+    end = default[0] if default else ""
+    text = text.removesuffix(end)
+    metavar = action.metavar if isinstance(action.metavar, str) else ""
+    if action.option_strings and action.choices is not None and len(metavar) > _COLUMN:
+        choices = metavar.strip("{}").replace(",", ", ")
+        end = f" One of {choices}.{end}"
+    return text, end
+
+
+def _row(name: str, text: str, width: int) -> list[str]:
+    """Lines of one option."""
+    wrapped = textwrap.wrap(text, width - _COLUMN, break_on_hyphens=False) or [""]
+    indent = " " * _COLUMN
+    left = f"  {name}"
+    if len(left) + 2 > _COLUMN:
+        rows = textwrap.wrap(
+            f"{left}  {text}", width, subsequent_indent=indent, break_on_hyphens=False,
+            drop_whitespace=True,
+        )  # fmt: skip
+        if len(left) + 2 + 16 <= width:
+            return rows
+        return [left, *(indent + line for line in wrapped)]
+    first, *rest = wrapped
+    return [f"{left:{_COLUMN}}{first}".rstrip(), *(indent + line for line in rest)]
+
+
+def _first_sentence(text: str) -> str:
+    """The text up to the first stop or semicolon outside of brackets."""
+    for match in re.finditer(r"[.;](?=\s|$)", text):
+        sentence = text[: match.start()]
+        if sentence.count("(") == sentence.count(")") and not sentence.endswith(("e.g", "i.e")):
+            return f"{sentence}."
+    return text
