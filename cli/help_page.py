@@ -56,7 +56,9 @@ def help_page(
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # since tyro 1.0, without a successor
-        parser = tyro.extras.get_parser(options, prog=program, description=description, **keywords)
+        parser: Any = tyro.extras.get_parser(
+            options, prog=program, description=description, **keywords
+        )
     for word in arguments:
         if word not in _subcommands(parser):
             break

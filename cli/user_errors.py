@@ -93,7 +93,7 @@ def parse(
     `keywords` are further ones of `tyro.cli`.
     """
     given = {"config": CONFIG, "description": description, "registry": NUMERALS} | keywords
-    if {*HELP, ALL} & {*arguments}:
+    if {*HELP, ALL} & {*arguments} and hasattr(tyro.extras, "get_parser"):
         known = {key: value for key, value in given.items() if key != "description"}
         print(help_page(options, arguments, program, given["description"], **known))
         sys.exit(0)

@@ -50,7 +50,7 @@ html_theme = "furo"
 html_title = "pupper-sysid"
 html_static_path = ["style"]
 html_css_files = ["pages.css"]
-html_search_scorer = "style/scorer.js"
+html_search_scorer = str(HERE / "style/scorer.js")
 # code that no highlighter knows is shown as it is
 highlight_language = "text"
 
