@@ -23,8 +23,8 @@ from pupper_sysid.policies.evaluation.figures import Figures
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.train.curves import LARGEST_BYTES, PROGRESS
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run
-from pupper_sysid.policies.walks.effort import KINDS
 from pupper_sysid.policies.walks.tracking import STRIDE_ERRORS
+from pupper_sysid.sim.walking.effort import KINDS
 
 ERRORS = {
     "mae_vx_m_s": ("forward", "m/s"),

@@ -33,10 +33,10 @@ from pupper_sysid.policies.network.hyperparameters import OWN, TROT
 from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.policies.train.selection import COMMANDS, scored
 from pupper_sysid.policies.walks.conditions import evaluation_task
-from pupper_sysid.policies.walks.effort import LOW_SWING_M, EffortMeter
 from pupper_sysid.policies.walks.tracking import planar_velocity
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.config import PRESETS, Walking
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.effort import LOW_SWING_M, by_kind
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 from pupper_sysid.sim.walking.shared_draws import Twins
@@ -77,8 +77,8 @@ _NAMES = tuple(_BOX)
 _LOW, _HIGH = np.array(list(_BOX.values())).T
 _FIRST_WIDTH, _NARROWEST = 0.2, 0.02  # standard deviations, in shares of the box
 
-_CLEARANCE_M = 0.006
-_WEIGHTS = {"clearance": 0.5, "torque": 0.2, "saturation": 0.2, "sway": 0.1}
+_CLEARANCE_M = 0.008  # `Rewards.least_clearance`
+_WEIGHTS = {"clearance": 0.2, "low": 0.4, "torque": 0.1, "saturation": 0.2, "sway": 0.1}
 """Of the parts of the cost beside errors relative to standing and falls, of order 1 each."""
 _SWAY_RAD_S = 1.0
 
@@ -244,7 +244,7 @@ def suited(run: Run, found: FirstGait) -> Run:
         "stride_angular_sigma": wider("stride_angular_sigma", own.mean_turn_error_rad_s),
     }
     if run.imitation.teacher == OWN:
-        usual = PRESETS["fast"].trot
+        usual = Trot()  # to which the clock of the rewards belongs
         changes |= {
             "clock_hz": rewards.clock_hz * trot.frequency_hz / usual.frequency_hz,
             "clock_duty": min(max(rewards.clock_duty + trot.duty - usual.duty, 0.5), 0.85),
@@ -437,7 +437,7 @@ def _walk(
         env.robots.write(ids)
     env.set_command(np.tile(command, (count, 1)))
     actions = _actions(trots, env, command, steps)
-    meter, alive = EffortMeter(env), np.ones(n * count, bool)
+    alive = np.ones(n * count, bool)
     kept: dict[str, list[NDArray]] = {
         name: []
         for name in ("velocity", "stride", "up", "clearance", "saturated", "square", "sway")
@@ -445,11 +445,11 @@ def _walk(
     for action in actions:
         result = env.step(action)
         facts, alive = result.facts, alive & ~result.done
-        effort = meter.of(facts)
         for name, value in (
             ("velocity", planar_velocity(facts)), ("stride", facts.stride_velocity),
-            ("up", alive), ("clearance", effort.clearance_m), ("saturated", effort.saturated),
-            ("square", effort.torque_square), ("sway", facts.angular_velocity[:, :2]),
+            ("up", alive), ("clearance", facts.clearance_m),
+            ("saturated", by_kind(facts.saturated)), ("square", facts.torque_square),
+            ("sway", facts.angular_velocity[:, :2]),
         ):  # fmt: skip
             kept[name].append(value.copy())
     whole = {name: np.stack(values)[first:] for name, values in kept.items()}
@@ -521,7 +521,7 @@ def _score(one: _Walked) -> GaitScore:
         turn_error_rad_s=float(instant[..., 2].mean()),
         mean_turn_error_rad_s=float(stride[..., 2].mean()),
         clearance_p10_m=float(np.quantile(clearance, 0.1)) if len(clearance) else 0.0,
-        low_swing_share=float((clearance < LOW_SWING_M).mean()) if len(clearance) else 1.0,
+        low_swing_share=_low(clearance),
         saturated_share=one.saturated,
     )  # fmt: skip
 
@@ -530,11 +530,16 @@ def _cost(one: _Walked) -> float:
     """What is searched: 1 minus the judge's score, and what the gait asks of feet and servos."""
     clearance = float(np.quantile(one.clearance_m, 0.1)) if len(one.clearance_m) else 0.0
     parts = {
-        "clearance": _lacking(clearance), "torque": one.torque_square,
+        "clearance": _lacking(clearance), "low": _low(one.clearance_m), "torque": one.torque_square,
         "saturation": one.saturated, "sway": one.sway_rad_s / _SWAY_RAD_S,
     }  # fmt: skip
     error = 1.0 - _relative(one)["score"]
     return error + sum(_WEIGHTS[name] * value for name, value in parts.items())
+
+
+def _low(clearance_m: Array) -> float:
+    """Share of low swings; 1 of a robot that does not step."""
+    return float((clearance_m < LOW_SWING_M).mean()) if len(clearance_m) else 1.0
 
 
 def _lacking(clearance_m: float) -> float:
@@ -546,7 +551,8 @@ def _merit(own: GaitScore) -> float:
     """By which the finalists are chosen: the same of the judge's walks."""
     lacking = _lacking(own.clearance_p10_m)
     short = max(FORWARD[0] - own.forward_share, own.forward_share - FORWARD[1], 0.0)
-    taken = _WEIGHTS["clearance"] * lacking + _WEIGHTS["saturation"] * own.saturated_share
+    taken = _WEIGHTS["clearance"] * lacking + _WEIGHTS["low"] * own.low_swing_share
+    taken += _WEIGHTS["saturation"] * own.saturated_share
     return own.score - taken - 2.0 * short
 
 

@@ -50,7 +50,7 @@ Array = NDArray[np.float64]
 
 FEET = len(LEGS)
 _TOUCH_S = 0.006  # a foot is down if it was so in the last milliseconds: contacts flicker
-_RECORD = ("qpos", "actuator_force", "sensordata")
+_RECORD = ("qpos", "actuator_force", "sensordata", "site_xpos")
 _MANY = 256  # robots from which parts are worth a second call of every NumPy function
 _LATEST = 4.0  # longest latency of a command, in means
 _FIRST_PART = 0.625  # while the rest moves, there is time for what follows on the first part
@@ -187,8 +187,11 @@ class RobotBatch:
     def feet(self, rows: slice | NDArray[np.intp] = slice(None)) -> tuple[Array, Array]:
         """Feet along the ground, (k, 4, 2), and heights of the soles, (k, 4) [m]; one step old."""
         at = self._site_position[rows][:, self._feet_sites]
-        height = at[..., 2] - FOOT_RADIUS_M - self.ground.height(at[..., 0], at[..., 1])
-        return at[..., :2], height
+        return at[..., :2], self.sole_heights(at)
+
+    def sole_heights(self, feet: Array) -> Array:
+        """Heights of the soles above the ground under them [m], (...), of feet at (..., 3)."""
+        return feet[..., 2] - FOOT_RADIUS_M - self.ground.height(feet[..., 0], feet[..., 1])
 
     def to_servo(self, joints: Array) -> Array:
         """Servo angles of joint angles (..., 12): servo 3 holds thigh + calf behind a linkage."""
@@ -250,7 +253,8 @@ class RobotBatch:
             self.config.substeps, own, record=_RECORD, ids=self._ids[part], out=records
         )
         touch = found["sensordata"][:, -self._touch_steps :, self._touch].max(axis=1)
-        return Moved(rows, start[rows], found["qpos"], found["actuator_force"], touch)
+        feet = found["site_xpos"][:, :, self._feet_sites]
+        return Moved(rows, start[rows], found["qpos"], found["actuator_force"], touch, feet)
 
     def _predicted(self, model: JointArrays, target: Array) -> Array:
         """Controls of each physics step, from the positions that a servo model predicts."""

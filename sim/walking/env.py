@@ -23,6 +23,7 @@ from pupper_sysid.sim.robot.robot_batch import FEET, RobotBatch
 from pupper_sysid.sim.robot.terrain import make_ground
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.draws import at_rest, draw_commands, draw_pose
+from pupper_sysid.sim.walking.effort import EffortMeter
 from pupper_sysid.sim.walking.observation import (
     FALLEN_TILT,
     OBSERVATION_SIZE,
@@ -83,9 +84,6 @@ class PupperEnv:
         Forward and sideways speed [m/s] and turn rate [rad/s] that each robot is to follow.
     robots : RobotBatch
         The physics: positions, velocities, the servos that were drawn.
-    moved : list of Moved
-        What the physics did in the last control step, by parts of the robots, with the state after
-        each of its own steps; overwritten by the next.
     steps, nan_resets : int
         Control steps since the start; simulations that became NaN, and were drawn anew.
     processes : int
@@ -153,7 +151,7 @@ class PupperEnv:
         n = environments
         self._senses = Senses(config, servos, self.robots, n, generator([seed, 2], twins))
         self._strides = Strides(n, config.control_step_s, config.rewards)
-        self.moved: list[Moved] = []
+        self._effort = EffortMeter(self.robots, config.control_step_s)
         self.nan_resets = 0
         self.steps, self.processes = 0, 1
         self.level = config.curriculum.at(0)
@@ -204,9 +202,7 @@ class PupperEnv:
         moving = self.robots.step(self.set_points(self.action))
         # what does not need the new state is done while it is computed
         now = self._begin(before)
-        self.moved = []
         for moved in moving:
-            self.moved.append(moved)
             self._take(moved, now)
         broken = self.robots.broken()
         if broken.any():
@@ -293,6 +289,7 @@ class PupperEnv:
         """All arrays that change, but for those of the physics."""
         senses = self._senses
         parts = {"readings": senses.readings, "imu": senses.imu, "strides": self._strides}
+        parts["effort"] = self._effort
         found = {f"{part}.{k}": v for part, its in parts.items() for k, v in its.state.items()}
         return found | {name: getattr(self, name) for name in _ARRAYS} | {"_seen": senses.kept}
 
@@ -349,6 +346,7 @@ class PupperEnv:
         now.fallen[rows] = fallen
         facts = {name: value[rows] for name, value in now.facts.items()}
         self._strides.advance(rows, moved.touch, robots.feet(rows), planar(velocity, qvel), facts)
+        self._effort.advance(moved, facts)
         facts["linear_velocity"][:], facts["gravity"][:] = velocity, gravity
         facts["angular_velocity"][:], facts["torque"][:] = qvel[:, 3:6], moved.load[:, -1]
         np.subtract(qpos[:, 7:], self.default, out=facts["position_relative"])
@@ -386,6 +384,7 @@ class PupperEnv:
         self._senses.reset(ids, angles, qvel[:, 3:6], gravity_direction(qpos), self.rng)
         velocity = planar(own_velocity(qpos, qvel), qvel)
         self._strides.reset(ids, self.robots.feet(ids)[0], velocity)
+        self._effort.reset(ids)
         self._until_push[ids] = self.rng.uniform(*self.config.randomisation.push_every_s, len(ids))
         self.episode_step[ids] = 0
         command = self.robots.from_servo(angles - self.robots.bodies.zero_rad[ids])

@@ -17,9 +17,10 @@ _COLUMNS = {
     "linear_velocity": 3, "angular_velocity": 3, "gravity": 3, "position_relative": 12,
     "velocity": 12, "acceleration": 12, "torque": 12, "air_s": FEET, "contact_s": FEET,
     "last_air_s": FEET, "last_contact_s": FEET, "foot_height_m": FEET, "foot_speed_m_s": FEET,
-    "stride_velocity": 3, "clock": 3,
+    "stride_velocity": 3, "clock": 3, "clearance_m": FEET, "saturated": 12, "torque_square": 12,
 }  # fmt: skip
-_FLAGS = ("contact", "landed", "lifted")
+_NUMBERS = ("power_w", "weight_n")
+_FLAGS = ("contact", "landed", "lifted", "swing_ended")
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,14 @@ class Step:
     clock : ndarray, shape (n, 3)
         Cosine and sine of a trot's clock that follows the feet, and how well they keep to it, -1
         to 1; see `Strides`.
+    swing_ended : ndarray of bool, shape (n, 4)
+        Feet that came down after a swing; see `sim.walking.effort`, as for all that follow.
+    clearance_m : ndarray, shape (n, 4)
+        Of the swings that ended; NaN of other feet.
+    saturated, torque_square : ndarray, shape (n, 12)
+        Share of the step in which a servo is at its torque limit; mean square of torque over limit.
+    power_w, weight_n : ndarray, shape (n,)
+        Positive mechanical power of all servos; weight of the robot.
     """
 
     command: Array
@@ -74,6 +83,12 @@ class Step:
     foot_speed_m_s: Array
     stride_velocity: Array
     clock: Array
+    swing_ended: NDArray[np.bool_]
+    clearance_m: Array
+    saturated: Array
+    torque_square: Array
+    power_w: Array
+    weight_n: Array
 
     def moving(self, threshold_m_s: float) -> NDArray[np.bool_]:
         """Whether a robot is commanded to move, or moves, shape (n,)."""
@@ -140,6 +155,7 @@ def empty_facts(
         "earlier_action": earlier_action.copy(),
     }  # fmt: skip
     found |= {name: np.empty((len(command), size)) for name, size in _COLUMNS.items()}
+    found |= {name: np.empty(len(command)) for name in _NUMBERS}
     return found | {name: np.empty((len(command), FEET), bool) for name in _FLAGS}
 
 

@@ -170,6 +170,27 @@ def swing_height(s: Step, p: Rewards) -> Array:
     return (short**2 * s.foot_speed_m_s).sum(axis=1)
 
 
+def low_swing(s: Step, p: Rewards) -> Array:
+    """Share of `least_clearance` that was missing, summed over feet whose swing has just ended."""
+    missing = np.maximum(1.0 - s.clearance_m / p.least_clearance, 0.0)
+    return np.where(s.swing_ended, missing, 0.0).sum(axis=1)
+
+
+def torque_saturation(s: Step, p: Rewards) -> Array:
+    """Share of the time at the torque limit, 0 to 1: the mean of all servos."""
+    return s.saturated.mean(axis=1)
+
+
+def torque_share(s: Step, p: Rewards) -> Array:
+    """Mean square of torque over its limit, 0 to 1, of all servos."""
+    return s.torque_square.mean(axis=1)
+
+
+def mechanical_power(s: Step, p: Rewards) -> Array:
+    """Positive mechanical power of all servos over the robot's weight [m/s]."""
+    return s.power_w / s.weight_n
+
+
 def action_smoothness(s: Step, p: Rewards) -> Array:
     """Norm of the change of the action."""
     return np.linalg.norm(s.action - s.last_action, axis=1)
@@ -244,6 +265,7 @@ TERMS = {
         base_linear_velocity, base_angular_velocity, stride_linear_velocity,
         stride_angular_velocity, progress, turn_progress, alive, unsupported, short_swing,
         short_stance, air_time, foot_paths, stance, gait, foot_clearance, swing_height,
+        low_swing, torque_saturation, torque_share, mechanical_power,
         action_smoothness, action_rate, action_jerk, air_time_variance, base_motion, bounce,
         base_orientation, foot_slip, joint_position, hip_abduction, joint_torques,
         joint_acceleration, joint_velocity,
