@@ -24,7 +24,7 @@ from pupper_sysid.policies.walks.tracking import (
     stride_errors,
     tracking_errors,
 )
-from pupper_sysid.sim.walking.effort import KINDS, LOW_SWING_M, by_kind
+from pupper_sysid.sim.walking.effort import LOW_SWING_M, by_kind
 from pupper_sysid.sim.walking.env import PupperEnv
 
 Array = NDArray[np.float64]
@@ -38,6 +38,8 @@ class Walk:
     """Episodes of one or more robots under one condition; zeros after a robot's last step."""
 
     step_s: float
+    kinds: tuple[str, ...]
+    """Of joints (`Body.kinds`)."""
     fell: NDArray[np.bool_]
     """Shape (episodes,)."""
     command: Array
@@ -110,9 +112,12 @@ class Walk:
 
     def first(self, episodes: int) -> Walk:
         """The same of the first episodes."""
-        given = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "step_s"}
+        given = {
+            f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("step_s", "kinds")
+        }
         return Walk(
             step_s=self.step_s,
+            kinds=self.kinds,
             **{k: v[:episodes] if k == "fell" else v[:, :episodes] for k, v in given.items()},
         )
 
@@ -211,8 +216,8 @@ class Recorder:
                 "heading": heading(self._env.robots.qpos), "slip_m_s": slip.sum(axis=1),
                 "swing_s": (facts.last_air_s * ended).sum(axis=1), "swings": ended.sum(axis=1),
                 "clearance_m": np.where(ended, facts.clearance_m, np.nan).astype(np.float32),
-                "saturated": by_kind(facts.saturated).astype(np.float32),
-                "torque_square": by_kind(facts.torque_square).astype(np.float32),
+                "saturated": by_kind(facts.body, facts.saturated).astype(np.float32),
+                "torque_square": by_kind(facts.body, facts.torque_square).astype(np.float32),
                 "work_j": self._step_s * facts.power_w, "carried_j": facts.weight_n * travelled,
             }
         )  # fmt: skip
@@ -227,7 +232,9 @@ class Recorder:
             name: np.concatenate([x, np.zeros((rest, *x.shape[1:]), x.dtype)])
             for name, x in arrays.items()
         }
-        return Walk(self._step_s, self._fell[robots], commands, **padded)
+        return Walk(
+            self._step_s, tuple(self._env.body.kinds), self._fell[robots], commands, **padded
+        )
 
 
 def figures_of(found: Walk, command: tuple[float, float, float] | None = None) -> Figures:
@@ -267,8 +274,10 @@ def _effort(found: Walk, travels: bool) -> dict[str, Any]:
     work, carried = found.work_j[alive].sum(), found.carried_j[alive].sum()
 
     def named(each: NDArray) -> dict[str, float]:
-        means = each[alive].mean(axis=0, dtype=float) if up_s else np.full(len(KINDS), nothing)
-        return dict(zip(KINDS, means.tolist(), strict=True))
+        means = (
+            each[alive].mean(axis=0, dtype=float) if up_s else np.full(len(found.kinds), nothing)
+        )
+        return dict(zip(found.kinds, means.tolist(), strict=True))
 
     return {
         "clearance_p10_m": float(low),

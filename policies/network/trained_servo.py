@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pupper_sysid.common.files import sha256
-from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.servo_file import WEIGHTS
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import IDEAL, ServoRanges, is_servo_model
@@ -113,8 +112,6 @@ class TrainedServo(_Part):
     def _whole(self) -> Self:
         if (self.joints is None) != (self.kind == "learned"):
             raise ValueError("joints must be null if, and only if, kind is learned")
-        if self.joints is not None and list(self.joints) != list(JOINT_NAMES):
-            raise ValueError("joints must name all joints in this project's order")
         return self
 
     @property
@@ -160,7 +157,7 @@ def trained_servo(actuator: str, feedback: str, task: Walking, servos: ServoRang
 
 def joints_of(servos: ServoRanges) -> dict[str, ServoNumbers]:
     """The numbers of each joint's servo."""
-    return {name: _numbers(servos, i) for i, name in enumerate(JOINT_NAMES)}
+    return {name: _numbers(servos, i) for i, name in enumerate(servos.joints)}
 
 
 def _numbers(servos: ServoRanges, joint: int) -> ServoNumbers:

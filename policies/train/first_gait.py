@@ -162,7 +162,10 @@ class FirstGait(Result):
 def fits_trots(run: Run) -> bool:
     """Whether a run begins with a gait that may be fitted."""
     taught = run.imitation.iterations and run.imitation.teacher in (TROT, OWN)
-    return bool(taught) and run.first_gait != "keep" and not run.architecture.privileged_actor
+    own = run.task.body.is_mini_pupper  # the trot is that of its legs
+    return (
+        own and bool(taught) and run.first_gait != "keep" and not run.architecture.privileged_actor
+    )
 
 
 def with_first_gait(
@@ -448,7 +451,7 @@ def _walk(
         for name, value in (
             ("velocity", planar_velocity(facts)), ("stride", facts.stride_velocity),
             ("up", alive), ("clearance", facts.clearance_m),
-            ("saturated", by_kind(facts.saturated)), ("square", facts.torque_square),
+            ("saturated", by_kind(facts.body, facts.saturated)), ("square", facts.torque_square),
             ("sway", facts.angular_velocity[:, :2]),
         ):  # fmt: skip
             kept[name].append(value.copy())

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.sim.robot.body import Body, body_of
 from pupper_sysid.sim.robot.mini_pupper import Knee, Physics
 from pupper_sysid.sim.robot.terrain import Terrain
 from pupper_sysid.sim.robot.trot import Trot
@@ -153,6 +154,11 @@ class Level:
 class Walking:
     """The walking task."""
 
+    robot: str = ""
+    """MJCF of the robot; empty for the Mini Pupper 2. `pupper-train --robot` sets it, and scales
+    the task."""
+    robot_config: str = ""
+    """YAML beside it (`sim.robot.robot_file`)."""
     episode_s: float = 20.0
     """Length of an episode."""
     physics_step_s: float = 0.002
@@ -199,6 +205,11 @@ class Walking:
         if step > EVALUATION_STEP_S:
             step = self.control_step_s / math.ceil(self.control_step_s / EVALUATION_STEP_S - 1e-6)
         return replace(self, physics="evaluation", physics_step_s=step, differences=Differences())
+
+    @property
+    def body(self) -> Body:
+        """The robot."""
+        return body_of(self.robot, self.robot_config, self.knee)
 
     @property
     def substeps(self) -> int:

@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.joints import JOINT_NAMES, LEGS
+from pupper_sysid.sim.robot.body import Body
 
 Array = NDArray[np.float64]
 
-_PER_LEG = len(JOINT_NAMES) // len(LEGS)
 _OF_VOLTAGE = ("stiffness", "effort_limit", "velocity_limit")
 _OF_MOTOR = ("stiffness", "damping", "effort_limit")
 
@@ -133,9 +132,9 @@ class Bodies:
         Robots without differences.
     """
 
-    def __init__(self, settings: Differences, robots: int):
-        self._settings = settings
-        self.zero_rad = np.zeros((robots, len(JOINT_NAMES)))
+    def __init__(self, settings: Differences, robots: int, body: Body):
+        self._settings, self._body = settings, body
+        self.zero_rad = np.zeros((robots, len(body.joints)))
         self.centre_m = np.zeros((robots, 3))
         self.jitter, self.poll, self.effort = np.ones(robots), np.ones(robots), np.ones(robots)
         self.as_calibrated = np.zeros(robots, bool)
@@ -166,7 +165,9 @@ class Bodies:
             differ = rng.random(n) >= own.as_calibrated
             self.as_calibrated[ids] = ~differ
         if own.joint_zero_rad:
-            error = rng.uniform(-own.joint_zero_rad, own.joint_zero_rad, (n, len(JOINT_NAMES)))
+            error = rng.uniform(
+                -own.joint_zero_rad, own.joint_zero_rad, (n, len(self._body.joints))
+            )
             self.zero_rad[ids] = error * differ[:, None]
         if any(own.centre_of_mass_m):
             shift = rng.uniform(-1, 1, (n, 3)) * own.centre_of_mass_m
@@ -183,8 +184,8 @@ class Bodies:
                 servos[name] *= voltage
         if own.weak_leg_share and own.weak_leg != (1.0, 1.0):
             weak = differ & (rng.random(n) < own.weak_leg_share)
-            leg, factor = rng.integers(0, len(LEGS), n), rng.uniform(*own.weak_leg, n)
-            strength = np.ones((n, len(LEGS)))
+            leg, factor = rng.integers(0, len(self._body.feet), n), rng.uniform(*own.weak_leg, n)
+            strength = np.ones((n, len(self._body.feet) + 1))  # the last of joints of no leg
             strength[weak, leg[weak]] = factor[weak]
             for name in _OF_MOTOR:
-                servos[name] *= np.repeat(strength, _PER_LEG, axis=1)
+                servos[name] *= strength[:, self._body.leg_of]

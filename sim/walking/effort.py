@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.hardware.imu import GRAVITY_M_S2
+from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.motion import Moved
-from pupper_sysid.sim.robot.robot_batch import FEET, RobotBatch
+from pupper_sysid.sim.robot.robot_batch import RobotBatch
 
 Array = NDArray[np.float64]
 
-KINDS = ("hip", "thigh", "calf")
-"""Kinds of joints, in their order on a leg."""
 SHORTEST_SWING_S = 0.04
 LOW_SWING_M = 0.002
 """Clearance below which a swing is low: the next pebble or seam ends it."""
@@ -42,7 +41,7 @@ class EffortMeter:
 
     def __init__(self, robots: RobotBatch, step_s: float):
         self._robots, self._step_s = robots, step_s
-        self._highest = np.full((robots.environments, FEET), -np.inf)
+        self._highest = np.full((robots.environments, len(robots.body.feet)), -np.inf)
 
     @property
     def state(self) -> dict[str, Any]:
@@ -76,6 +75,6 @@ class EffortMeter:
         facts["weight_n"][:] = GRAVITY_M_S2 * robots.field("body_mass")[rows].sum(axis=1)
 
 
-def by_kind(each: Array) -> Array:
-    """Means over the legs, shape (n, 3), of values of all servos, shape (n, 12)."""
-    return each.reshape(len(each), FEET, len(KINDS)).mean(axis=1)
+def by_kind(body: Body, each: Array) -> Array:
+    """Means over the joints of each of `Body.kinds`, shape (n, kinds), of values of all servos."""
+    return np.stack([each[:, joints].mean(axis=1) for joints in body.kinds.values()], axis=1)

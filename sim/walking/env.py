@@ -16,21 +16,19 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.joint_arrays import JointArrays
-from pupper_sysid.sim.robot.falls import touches_ground
-from pupper_sysid.sim.robot.mini_pupper import default_pose, limits
 from pupper_sysid.sim.robot.motion import Moved, gravity_direction, own_velocity, planar
-from pupper_sysid.sim.robot.robot_batch import FEET, RobotBatch
+from pupper_sysid.sim.robot.robot_batch import RobotBatch
 from pupper_sysid.sim.robot.terrain import make_ground
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.draws import at_rest, draw_commands, draw_pose
 from pupper_sysid.sim.walking.effort import EffortMeter
 from pupper_sysid.sim.walking.observation import (
     FALLEN_TILT,
-    OBSERVATION_SIZE,
-    PRIVILEGED_SIZE,
     noise_of,
+    observation_of,
     observed,
     privileged_of,
+    privileged_parts,
 )
 from pupper_sysid.sim.walking.rewards.strides import Strides
 from pupper_sysid.sim.walking.rewards.terms import weighted
@@ -50,7 +48,7 @@ _ARRAYS = (
 
 
 class PupperEnv:
-    """Vectorised walking environment of the Mini Pupper 2: a batch of actions in, a batch out.
+    """Vectorised walking environment of a legged robot: a batch of actions in, a batch out.
 
     Parameters
     ----------
@@ -146,11 +144,12 @@ class PupperEnv:
             from pupper_sysid.sim.gpu.warp_robots import WarpRobots
 
             self.robots = WarpRobots(config, servos, self.ground, environments, device, *late)
-        self.default, (self._low, self._high) = default_pose(), limits()
+        body = self.body = config.body
+        self.default = body.pose
         self.trot = config.trot
         n = environments
         self._senses = Senses(config, servos, self.robots, n, generator([seed, 2], twins))
-        self._strides = Strides(n, config.control_step_s, config.rewards)
+        self._strides = Strides(body, n, config.control_step_s, config.rewards)
         self._effort = EffortMeter(self.robots, config.control_step_s)
         self.nan_resets = 0
         self.steps, self.processes = 0, 1
@@ -162,7 +161,9 @@ class PupperEnv:
 
         self.command = zeros(3)
         self.episode_step = np.zeros(n, int)
-        self.action, self.last_action, self.earlier_action = zeros(12), zeros(12), zeros(12)
+        self.action, self.last_action, self.earlier_action = (
+            zeros(len(body.joints)) for _ in range(3)
+        )
         self._until_command, self._until_push = zeros(), zeros()
         self.reset()
 
@@ -179,7 +180,9 @@ class PupperEnv:
         Draws noise, but does not let time pass.
         """
         n = self.environments
-        return self._look(slice(None), noise_of(self.config.observation, n, self.rng))
+        return self._look(
+            slice(None), noise_of(self.config.observation, len(self.default), n, self.rng)
+        )
 
     def step(self, action: NDArray[np.floating]) -> StepResult:
         """Let every robot act for one control step.
@@ -227,7 +230,7 @@ class PupperEnv:
             self._restart(over)
             noise = None if now.noise is None else now.noise[over]
             now.observation[over], now.privileged[over] = self._look(over, noise)
-        facts = Step(**now.facts)
+        facts = Step(body=self.body, **now.facts)
         return StepResult(
             now.observation, now.privileged, reward, done, timed_out, now.terms, terminal,
             unforeseen, facts,
@@ -237,7 +240,7 @@ class PupperEnv:
         """Joint set-points [rad] of actions, shape (n, 12), within the joint limits."""
         target = action * self.config.action_scale
         target += self.default
-        return np.clip(target, self._low, self._high, out=target)
+        return np.clip(target, self.body.low, self.body.high, out=target)
 
     def set_command(self, command: NDArray[np.floating]) -> None:
         """Give all robots a command, shape (3,) or (n, 3), until the end of their episodes."""
@@ -314,7 +317,7 @@ class PupperEnv:
         n, config, span = self.environments, self.config, self.config.control_step_s
         chances = self._senses.readings.chances(config.substeps)
         actions = (self.action, self.last_action, self.earlier_action)
-        facts = empty_facts(self.command, *actions)
+        facts = empty_facts(self.body, self.command, *actions)
         self.episode_step += 1
         self._until_command -= span
         due = np.flatnonzero(self._until_command <= 0)
@@ -328,10 +331,12 @@ class PupperEnv:
             push = self.rng.uniform(-most, most, (len(pushed), 2))
             pause = self.rng.uniform(*config.randomisation.push_every_s, len(pushed))
             self._until_push[pushed] = pause
-        noise = noise_of(config.observation, n, self.rng)
+        joints, feet = len(self.body.joints), len(self.body.feet)
+        noise = noise_of(config.observation, joints, n, self.rng)
         return Unfinished(
             velocity_before, chances, noise, pushed if most > 0 else pushed[:0], push, facts, {},
-            np.empty((n, OBSERVATION_SIZE), np.float32), np.empty((n, PRIVILEGED_SIZE), np.float32),
+            np.empty((n, sum(size for _, size, _ in observation_of(joints))), np.float32),
+            np.empty((n, sum(size for _, size in privileged_parts(joints, feet))), np.float32),
             np.empty(n, bool),
         )  # fmt: skip
 
@@ -342,7 +347,7 @@ class PupperEnv:
         self._senses.advance(moved, now.chances, self.steps)
         gravity, velocity = gravity_direction(qpos), own_velocity(qpos, qvel)
         fallen = gravity[:, 2] > -FALLEN_TILT
-        fallen |= touches_ground(qpos, gravity, self.ground)
+        fallen |= self.body.touches_ground(qpos, gravity, self.ground)
         now.fallen[rows] = fallen
         facts = {name: value[rows] for name, value in now.facts.items()}
         self._strides.advance(rows, moved.touch, robots.feet(rows), planar(velocity, qvel), facts)
@@ -353,7 +358,7 @@ class PupperEnv:
         facts["velocity"][:] = qvel[:, 6:]
         np.subtract(qvel[:, 6:], now.velocity_before[rows], out=facts["acceleration"])
         facts["acceleration"] /= span
-        step = Step(**facts)
+        step = Step(body=self.body, **facts)
         level = self.level
         terms = weighted(step, self._rewards, level.penalties, level.guides, level.progress)
         for name, term in terms.items():
@@ -377,7 +382,9 @@ class PupperEnv:
     def _restart(self, ids: NDArray[np.intp]) -> None:
         self.robots.draw(ids, self.level.delay, self.rng)
         self._draw_commands(ids)
-        start, speed = draw_pose(self.config.randomisation, self.trot, self.command[ids], self.rng)
+        start, speed = draw_pose(
+            self.config.randomisation, self.body, self.trot, self.command[ids], self.rng
+        )  # fmt: skip
         self.robots.place(ids, start, speed, 2 * _EDGE_M, self.rng)
         angles = self.robots.to_servo(start)
         qpos, qvel = self.robots.qpos[ids], self.robots.qvel[ids]
@@ -446,7 +453,8 @@ class PupperEnv:
         speed = robots.drawn["velocity_limit"][rows] / self.servos.value["velocity_limit"]
         return [
             robots.payload_kg[rows, None], bodies.centre_m[rows],
-            stiffness.reshape(len(stiffness), FEET, -1).mean(axis=2),
+            np.stack([stiffness[:, self.body.leg_of == k].mean(axis=1)
+                      for k in range(len(self.body.feet))], axis=1),
             speed.mean(axis=1, keepdims=True), bodies.zero_rad[rows], imu.mounting_rad[rows],
             imu.bias_rad_s[rows],
             np.stack([imu.latency_s[rows], imu.period_s[rows]], axis=1),

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pupper_sysid.sim.robot.body import mini_pupper
 from pupper_sysid.sim.robot.mini_pupper import MASS_KG
 from pupper_sysid.sim.robot.motion import Moved
 from pupper_sysid.sim.walking.effort import EffortMeter, by_kind
@@ -23,7 +24,8 @@ class Made:
             "body_mass": np.full((1, 2), MASS_KG / 2),
         }
         robots: Any = SimpleNamespace(
-            environments=1, field=fields.__getitem__, to_servo=lambda joints: joints,
+            environments=1, body=mini_pupper(),
+            field=fields.__getitem__, to_servo=lambda joints: joints,
             sole_heights=lambda feet: feet[..., 2],
         )  # fmt: skip
         self._meter = EffortMeter(robots, STEP_S)
@@ -69,7 +71,7 @@ def test_only_positive_work_counts_and_saturation_is_by_kind_of_joint():
     torque[:, 2::3] = -0.25  # calves brake
     torque[:4, 1::3] = 0.5  # thighs drive, at their limit for 4 of 10 physics steps
     done = made.step(still, True, torque_nm=torque, turned_rad=0.1)
-    np.testing.assert_allclose(by_kind(done.saturated), [[0.0, 0.4, 0.0]])
-    np.testing.assert_allclose(by_kind(done.torque_square), [[0.0, 0.4, 0.25]])
+    np.testing.assert_allclose(by_kind(mini_pupper(), done.saturated), [[0.0, 0.4, 0.0]])
+    np.testing.assert_allclose(by_kind(mini_pupper(), done.torque_square), [[0.0, 0.4, 0.25]])
     np.testing.assert_allclose(done.power_w, 4 * 0.5 * 0.04 / STEP_S)
     np.testing.assert_allclose(done.weight_n, 9.80665 * MASS_KG)

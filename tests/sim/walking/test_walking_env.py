@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-import pupper_sysid.sim.robot.robot_batch
+import pupper_sysid.sim.walking.config
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, LEGS
 from pupper_sysid.servo_models.command_network import CommandNetwork
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.sim.robot.body import mini_pupper
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import (
     STANDING_HEIGHT_M,
@@ -20,7 +21,6 @@ from pupper_sysid.sim.robot.mini_pupper import (
     foot_position,
     joint_angles,
     limits,
-    robot_xml,
 )
 from pupper_sysid.sim.walking.config import (
     Commands,
@@ -457,9 +457,11 @@ def test_the_delay_buffers_hold_the_longest_delay_that_can_be_drawn():
 
 def test_a_delay_that_does_not_fit_its_buffer_is_refused(monkeypatch):
     def short(servos, *rest):
-        return robot_xml({k: replace(v, dead_time_s=0.01) for k, v in servos.items()}, *rest)
+        return own.xml({k: replace(v, dead_time_s=0.01) for k, v in servos.items()}, *rest)
 
-    monkeypatch.setattr(pupper_sysid.sim.robot.robot_batch, "robot_xml", short)
+    own = mini_pupper()
+    body = replace(own, xml=short)
+    monkeypatch.setattr(pupper_sysid.sim.walking.config, "body_of", lambda *names: body)
     with pytest.raises(InputError, match=r"does not fit the buffer of 0\.014 s"):
         make("paper")
 
