@@ -68,8 +68,8 @@ class Options:
     `teacher`: that teacher alone, for `--imitation.teacher runs/NAME`. The published presets always
     start from nothing."""
     robot: Path | None = None
-    """MJCF of another robot than the Mini Pupper 2: any with legs and position servos. It starts
-    from nothing; its task is scaled by its size."""
+    """MJCF of another robot than the Mini Pupper 2: any with legs and position servos. Its task is
+    scaled by its size; where no open-loop gait walks, as on two legs, give `--start scratch`."""
     robot_config: Path | None = None
     """YAML beside it: joints, feet, pose, servos, gait, commands (docs/own_robot.md)."""
     name: str | None = None
@@ -97,8 +97,6 @@ def _parse(given: list[str]) -> Options:
     """Options; --preset, --policy and --start set the defaults of the others."""
     start = _choice(given, "--start", Start)
     robot, config = (_path(given, name) for name in ("--robot", "--robot-config"))
-    if robot is not None and "--start" not in {a.split("=")[0] for a in given}:
-        start = "scratch"
     begun = preset(_choice(given, "--preset", Preset), _choice(given, "--policy", Kind), start)
     if config is not None and robot is None:
         raise InputError("--robot-config describes the robot of --robot; give that, too.")
@@ -135,11 +133,6 @@ def _run(options: Options, given: list[str]) -> None:
         refuse_path(options.name, "--name")
     if options.resume is None and not options.benchmark:
         check_actuator(run.actuator)
-        if run.imitation.iterations and run.imitation.teacher == TROT and run.task.robot:
-            raise InputError(
-                "The open-loop trot is one of the Mini Pupper's legs, so there is none to imitate "
-                "for --robot. Give --start scratch."
-            )
         if run.imitation.iterations and run.imitation.teacher not in (TROT, OWN):
             check_teacher(Path(run.imitation.teacher), run)
     # torch and rsl_rl take seconds to import: only after the settings were checked

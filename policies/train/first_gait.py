@@ -34,6 +34,7 @@ from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.policies.train.selection import COMMANDS, scored
 from pupper_sysid.policies.walks.conditions import evaluation_task
 from pupper_sysid.policies.walks.tracking import planar_velocity
+from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.effort import LOW_SWING_M, by_kind
@@ -74,7 +75,6 @@ _BOX = {
     "side_gain": (0.5, 2.0), "turn_gain": (0.4, 2.5),
 }  # fmt: skip
 _NAMES = tuple(_BOX)
-_LOW, _HIGH = np.array(list(_BOX.values())).T
 _FIRST_WIDTH, _NARROWEST = 0.2, 0.02  # standard deviations, in shares of the box
 
 _CLEARANCE_M = 0.008  # `Rewards.least_clearance`
@@ -126,9 +126,11 @@ class GaitScore(Result):
     clearance_p10_m: float
     """Tenth percentile of the clearance of the swings."""
     low_swing_share: float
-    """Of swings that clear less than 2 mm."""
+    """Of swings that clear less than 2 mm, on a robot of the Mini Pupper's height."""
     saturated_share: float
     """Share of the time in which thighs and calves are at their torque limit."""
+    length_scale: float = 1.0
+    """Standing height over the Mini Pupper's, by which clearances are judged."""
 
     @property
     def poor(self) -> bool:
@@ -162,10 +164,9 @@ class FirstGait(Result):
 def fits_trots(run: Run) -> bool:
     """Whether a run begins with a gait that may be fitted."""
     taught = run.imitation.iterations and run.imitation.teacher in (TROT, OWN)
-    own = run.task.body.is_mini_pupper  # the trot is that of its legs
-    return (
-        own and bool(taught) and run.first_gait != "keep" and not run.architecture.privileged_actor
-    )
+    if run.task.robot and run.imitation.teacher != TROT:
+        return False  # the teacher finds a gait for its robot
+    return bool(taught) and run.first_gait != "keep" and not run.architecture.privileged_actor
 
 
 def with_first_gait(
@@ -238,7 +239,8 @@ def suited(run: Run, found: FirstGait) -> Run:
     trot, own, rewards = found.trot, found.after, run.task.rewards
 
     def wider(name: str, error: float) -> float:
-        return getattr(rewards, name) * min(max(error / _USUAL[name], 1.0), _WIDEST)
+        usual = _USUAL[name] * run.task.body.command_scale[2 if "angular" in name else 0]
+        return getattr(rewards, name) * float(min(max(error / usual, 1.0), _WIDEST))
 
     changes = {
         "linear_sigma": wider("linear_sigma", own.speed_error_m_s),
@@ -299,16 +301,17 @@ def fit_trot(
     """
     rng = np.random.default_rng([seed, 6])
     quick = _quick(task, servos)
-    mean = np.clip(_values(task.trot), _LOW, _HIGH)
-    width = _FIRST_WIDTH * (_HIGH - _LOW)
+    low, high = _box(task.body)
+    mean = np.clip(_values(task.trot), low, high)
+    width = _FIRST_WIDTH * (high - low)
     tried: list[tuple[float, Trot]] = []
     for generation in range(_GENERATIONS):
-        drawn = np.clip(rng.normal(mean, width, (_CANDIDATES, len(_NAMES))), _LOW, _HIGH)
+        drawn = np.clip(rng.normal(mean, width, (_CANDIDATES, len(_NAMES))), low, high)
         drawn[0] = mean
         if not generation:  # half of them from the whole box, in strata of each number
             half = _CANDIDATES // 2
             strata = rng.permuted(np.tile(np.arange(half), (len(_NAMES), 1)), axis=1).T
-            drawn[half:] = _LOW + (strata + rng.random(strata.shape)) / half * (_HIGH - _LOW)
+            drawn[half:] = low + (strata + rng.random(strata.shape)) / half * (high - low)
         trots = [_trot(task.trot, values) for values in drawn]
         walked = _walk(
             trots,
@@ -326,7 +329,7 @@ def fit_trot(
         tried += [(costs[i], trot) for i, trot in zip(order, elite, strict=True)]
         values = np.array([_values(trot) for trot in elite])
         mean = values.mean(axis=0)
-        width = np.maximum(values.std(axis=0), _NARROWEST * (_HIGH - _LOW))
+        width = np.maximum(values.std(axis=0), _NARROWEST * (high - low))
         progress((generation + 1) / (_GENERATIONS + 1))
     best = [trot for _, trot in sorted(tried, key=lambda one: one[0])[: _FINALISTS - 1]]
     trots = [task.trot, _trot(task.trot, mean), *best]
@@ -368,7 +371,8 @@ def _scale(task: Walking) -> Array:
     """Largest commands of a task over usual ones, at most 1, of each part."""
     own = task.commands
     ends = np.abs([own.forward_m_s, own.sideways_m_s, own.yaw_rad_s]).max(axis=1)
-    return np.minimum(ends / _LARGEST, 1.0)
+    # those of another robot are its own, as large as they are
+    return ends / _LARGEST if task.robot else np.minimum(ends / _LARGEST, 1.0)
 
 
 def _gentle(task: Walking, seconds: float) -> Walking:
@@ -387,6 +391,16 @@ def _quick(task: Walking, servos: ServoRanges) -> Walking:
     except InputError:  # too stiff for them
         return found
     return longer
+
+
+def _box(body: Body) -> tuple[Array, Array]:
+    """Ends of what is searched, by Froude scaling of the Mini Pupper's."""
+    rate, length = float(body.command_scale[2]), body.scale
+    size = [
+        rate if name.endswith("_hz") else length if name.endswith("_m") else 1.0 for name in _NAMES
+    ]
+    low, high = np.array(list(_BOX.values())).T * size
+    return low, high
 
 
 def _divides(task: Walking) -> bool:
@@ -408,6 +422,8 @@ class _Walked:
 
     scale: Array
     """Of the commands, over usual ones; shape (3,)."""
+    length: float
+    """`Body.scale`."""
     command: Array
     velocity: Array
     """Shape (steps, n, 3)."""
@@ -464,7 +480,7 @@ def _walk(
         clearance = own["clearance"][walks]
         found.append(
             _Walked(
-                scale, command, own["velocity"], own["stride"], own["up"],
+                scale, env.body.scale, command, own["velocity"], own["stride"], own["up"],
                 clearance[np.isfinite(clearance)],
                 _mean(own["saturated"][walks][:, 1:]), _mean(own["square"][walks]),
                 _mean(own["sway"][walks] ** 2) ** 0.5,
@@ -483,7 +499,9 @@ def _actions(trots: Sequence[Trot], env: PupperEnv, command: Array, steps: int) 
     time_s: Array = np.repeat(span * np.arange(steps, dtype=float), n)
     commands = np.tile(command, (steps, 1))
     joints = [
-        trot.joints(time_s * (2 * np.pi * trot.frequency_hz), commands).reshape(steps, n, -1)
+        trot.joints(time_s * (2 * np.pi * trot.frequency_hz), commands, env.body).reshape(
+            steps, n, -1
+        )
         for trot in trots
     ]
     return (np.concatenate(joints, axis=1) - env.default) / env.config.action_scale
@@ -524,8 +542,8 @@ def _score(one: _Walked) -> GaitScore:
         turn_error_rad_s=float(instant[..., 2].mean()),
         mean_turn_error_rad_s=float(stride[..., 2].mean()),
         clearance_p10_m=float(np.quantile(clearance, 0.1)) if len(clearance) else 0.0,
-        low_swing_share=_low(clearance),
-        saturated_share=one.saturated,
+        low_swing_share=_low(clearance / one.length), saturated_share=one.saturated,
+        length_scale=one.length,
     )  # fmt: skip
 
 
@@ -533,7 +551,8 @@ def _cost(one: _Walked) -> float:
     """What is searched: 1 minus the judge's score, and what the gait asks of feet and servos."""
     clearance = float(np.quantile(one.clearance_m, 0.1)) if len(one.clearance_m) else 0.0
     parts = {
-        "clearance": _lacking(clearance), "low": _low(one.clearance_m), "torque": one.torque_square,
+        "clearance": _lacking(clearance / one.length),
+        "low": _low(one.clearance_m / one.length), "torque": one.torque_square,
         "saturation": one.saturated, "sway": one.sway_rad_s / _SWAY_RAD_S,
     }  # fmt: skip
     error = 1.0 - _relative(one)["score"]
@@ -552,7 +571,7 @@ def _lacking(clearance_m: float) -> float:
 
 def _merit(own: GaitScore) -> float:
     """By which the finalists are chosen: the same of the judge's walks."""
-    lacking = _lacking(own.clearance_p10_m)
+    lacking = _lacking(own.clearance_p10_m / own.length_scale)
     short = max(FORWARD[0] - own.forward_share, own.forward_share - FORWARD[1], 0.0)
     taken = _WEIGHTS["clearance"] * lacking + _WEIGHTS["low"] * own.low_swing_share
     taken += _WEIGHTS["saturation"] * own.saturated_share

@@ -158,8 +158,8 @@ class Learner:
         self.observations = env.get_observations()
         task = env.env.config
         first = None
-        if task.rewards.stance and task.body.is_mini_pupper:
-            wanted = stance(task.rewards.crouch, task.rewards.spread) - env.env.default
+        if task.rewards.stance:
+            wanted = stance(task.body, task.rewards.crouch, task.rewards.spread) - env.env.default
             first = torch.from_numpy(wanted / task.action_scale)
         actor, critic = build(architecture, self.observations, hyper, task.control_step_s, first)
         # a recurrent policy's minibatches are whole environments

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rsl_rl.models import MLPModel
 
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
-from pupper_sysid.policies.walks.conditions import evaluation_task
+from pupper_sysid.policies.walks.conditions import evaluation_task, share_of_usual
 from pupper_sysid.policies.walks.tracking import planar_velocity
 from pupper_sysid.servo_models.joint_arrays import JointArrays
 from pupper_sysid.sim.walking.config import Walking
@@ -65,7 +65,7 @@ class Judge:
         self._steps = round(seconds / task.control_step_s)
         robots = _EACH * len(COMMANDS)
         env = PupperEnv(task, servos, robots, seed + _SEED, threads, servo_model)
-        self._scale = task.body.command_scale
+        self._scale = share_of_usual(task) if task.robot else np.ones(3)
         self._command = np.repeat(COMMANDS, _EACH, axis=0) * self._scale
         env.set_command(self._command)
         self._env = WalkingVecEnv(env, action_history, device)

@@ -29,6 +29,7 @@ from pupper_sysid.policies.network.actor_critic import build
 from pupper_sysid.policies.train.checkpoint import judged_weights, read_checkpoint
 from pupper_sysid.policies.train.run_file import Run, check_teacher
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
+from pupper_sysid.policies.walks.conditions import share_of_usual
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.observation import CLOCK_SEEN, OBSERVATION_PARTS
 
@@ -66,7 +67,8 @@ class Teacher(ABC):
     def __init__(self, env: WalkingVecEnv, state: dict[str, torch.Tensor] | None = None):
         self._vec_env, self._env = env, env.env
         self._command = self._env.command.copy()
-        self._range = _RANGE * self._env.body.command_scale
+        task = self._env.config
+        self._range = _RANGE * (share_of_usual(task) if task.robot else 1.0)
         self.quiet = np.arange(env.num_envs) % _QUIET == 0
         self.correction, self._since = np.zeros((3, 6)), np.zeros(env.num_envs)
         if state:
@@ -125,8 +127,11 @@ class TrotTeacher(Teacher):
         trot, scale, span = env.trot, env.config.action_scale, env.config.control_step_s
         command = self.corrected(env.command)
         now, before = (env.default + scale * a for a in (env.action, env.last_action))
-        phase = trot.phase_of(now, before, span, command) + 2 * np.pi * trot.frequency_hz * span
-        shown = (trot.joints(phase, command) - env.default) / scale
+        phase = (
+            trot.phase_of(now, before, span, command, env.body)
+            + 2 * np.pi * trot.frequency_hz * span
+        )
+        shown = (trot.joints(phase, command, env.body) - env.default) / scale
         return self._vec_env.tensor(shown.astype(np.float32))
 
 

@@ -31,6 +31,7 @@ from pupper_sysid.sim.robot.mini_pupper import (
     Physics,
     default_pose,
     foot_position,
+    joint_angles,
     limits,
     robot_xml,
 )
@@ -75,6 +76,8 @@ class Body:
         `xml(servos, time_step_s, ground, physics)` gives the MJCF on a `Ground`.
     feet_in_trunk : callable
         Feet in the trunk's frame [m], shape (n, feet, 3), of joint angles (n, joints) [rad].
+    joints_at : callable
+        The inverse: joint angles (n, joints) that put the feet there, or near.
     touches_ground : callable
         `touches_ground(qpos, gravity, ground)`: whether more than feet do, shape (n,).
     foot_geoms, trunk : tuple of str, str
@@ -105,6 +108,7 @@ class Body:
     mass_kg: float
     xml: Callable[[dict[str, DelayedPDParameters], float, Ground, Physics], str]
     feet_in_trunk: Callable[[Array], Array]
+    joints_at: Callable[[Array], Array]
     touches_ground: Callable[[Array, Array, Ground], NDArray[np.bool_]]
     foot_geoms: tuple[str, ...]
     trunk: str = "trunk"
@@ -176,13 +180,17 @@ class Body:
 
     @property
     def is_mini_pupper(self) -> bool:
-        """Whether it is this project's own robot, which has an open-loop trot."""
+        """Whether it is this project's own robot, which can be deployed."""
         return self.name == MINI_PUPPER
 
 
-@cache
 def mini_pupper(knee: Knee = "linkage") -> Body:
     """The Mini Pupper 2, whose third servo of a leg holds thigh + calf behind a linkage."""
+    return _mini_pupper(knee)
+
+
+@cache
+def _mini_pupper(knee: Knee) -> Body:
 
     def xml(servos: dict[str, DelayedPDParameters], step_s: float, ground: Any, physics: Physics):
         return robot_xml(servos, step_s, knee, ground.xml, ground.assets, physics, False)
@@ -190,6 +198,9 @@ def mini_pupper(knee: Knee = "linkage") -> Body:
     def feet_in_trunk(joints: Array) -> Array:
         each = joints.reshape(-1, len(LEGS), 3)
         return np.stack([foot_position(leg, *each[:, i].T) for i, leg in enumerate(LEGS)], axis=1)
+
+    def joints_at(feet: Array) -> Array:
+        return np.concatenate([joint_angles(leg, feet[:, i]) for i, leg in enumerate(LEGS)], axis=1)
 
     pose, (low, high) = default_pose(), limits()
     other = [LEGS.index({"L": "R", "R": "L"}[leg[0]] + leg[1:]) for leg in LEGS]
@@ -204,7 +215,8 @@ def mini_pupper(knee: Knee = "linkage") -> Body:
         # hips turn about the forward axis, thighs and calves about the axis from side to side
         mirror_signs=np.array([-1.0 if name.endswith("hip") else 1.0 for name in JOINT_NAMES]),
         mirror_feet=np.array(other), standing_height_m=STANDING_HEIGHT_M, mass_kg=MASS_KG,
-        xml=xml, feet_in_trunk=feet_in_trunk, touches_ground=falls.touches_ground,
+        xml=xml, feet_in_trunk=feet_in_trunk, joints_at=joints_at,
+        touches_ground=falls.touches_ground,
         foot_geoms=tuple(f"{leg}_foot" for leg in LEGS),
     )  # fmt: skip
 

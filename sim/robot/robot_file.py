@@ -39,6 +39,7 @@ _SAME_HEIGHT = 0.1  # feet's lowest points differ by less, in shares of the stan
 _SAME_SOLE = 0.03  # of the geoms of one foot, likewise
 _SAME_PLACE = 0.06  # of a joint and its mirror image, likewise
 _TOUCH = 1.3  # radius of a touch sensor's site, in those of the geom
+_INVERSE_STEPS, _NUDGE_RAD, _DAMPING = 6, 1e-4, 0.02  # damping in standing heights per rad
 _FALLEN = 0.5  # share of the standing height below which the trunk has come down
 _WALK = (0.0, 0.5, 0.75, 0.25)  # left front, right front, left rear, right rear
 _TRAINING_ITERATIONS = 8  # of PGS, as of the Mini Pupper
@@ -428,7 +429,8 @@ class _Reader:
             feet_at=feet_at, sole_m=feet_at[:, 2] - soles, offsets=self._offsets(names, feet_at),
             mirror_joints=joints, mirror_signs=signs, mirror_feet=feet_image,
             standing_height_m=height, mass_kg=float(model.body_mass.sum()), xml=xml,
-            feet_in_trunk=kinematics, touches_ground=fallen,
+            feet_in_trunk=kinematics, joints_at=self._inverse(kinematics, chains, height),
+            touches_ground=fallen,
             foot_geoms=tuple(model.geom(g).name for own in self.feet.values() for g in own),
             trunk=self.root.name, servo_of=self._servo_of(),
             commands={name: (ends[0], ends[1]) for name, ends in commands.items()},
@@ -451,25 +453,64 @@ class _Reader:
         """Feet in the trunk's frame as a function of joint angles, without MuJoCo."""
         model, data = self.model, self.data
         self._place(np.zeros(len(self.joints)))
-        axes, anchors, feet = (x.copy() for x in (data.xaxis, data.xanchor, data.geom_xpos[geoms]))
-        chains = [self._chain(g) for g in geoms]
-        ids = [int(model.joint(name).id) for name in self.joints]
+        feet = data.geom_xpos[geoms].copy()
+        chains = [self._chain(g)[::-1] for g in geoms]  # the joint next to the foot turns it first
+        rounds = []
+        for k in range(max(len(chain) for chain in chains)):
+            legs = np.array([leg for leg, chain in enumerate(chains) if k < len(chain)])
+            joints = np.array([chains[leg][k] for leg in legs])
+            ids = [int(model.joint(self.joints[j]).id) for j in joints]
+            rounds.append((legs, joints, data.xaxis[ids].copy(), data.xanchor[ids].copy()))
         self._place(self.pose)
 
         def feet_in_trunk(joints: Array) -> Array:
-            found = np.empty((len(joints), len(geoms), 3))
-            for k, chain in enumerate(chains):
-                at = np.broadcast_to(feet[k], (len(joints), 3))
-                for j in reversed(chain):  # the joint next to the foot turns it first
-                    axis, anchor = axes[ids[j]], anchors[ids[j]]
-                    c, s = np.cos(joints[:, j, None]), np.sin(joints[:, j, None])
-                    arm = at - anchor
-                    at = anchor + c * arm + s * np.cross(axis, arm)
-                    at = at + (1 - c) * (arm @ axis)[:, None] * axis
-                found[:, k] = at
+            found = np.repeat(feet[None], len(joints), axis=0)
+            for legs, own, axes, anchors in rounds:
+                arm = found[:, legs] - anchors
+                c, s = np.cos(joints[:, own, None]), np.sin(joints[:, own, None])
+                along = (arm * axes).sum(axis=-1, keepdims=True) * axes
+                # Rodrigues; np.cross is slow for few robots
+                turned = np.stack(
+                    [
+                        axes[:, i - 2] * arm[..., i - 1] - axes[:, i - 1] * arm[..., i - 2]
+                        for i in range(3)
+                    ],
+                    axis=-1,
+                )
+                found[:, legs] = anchors + c * (arm - along) + s * turned + along
             return found
 
         return feet_in_trunk
+
+    def _inverse(self, kinematics: Any, chains: list[list[int]], height: float):
+        """Joint angles that put the feet somewhere: damped least squares from the default pose.
+
+        Out of reach, or where a leg has fewer than three joints, feet come as near as they can.
+        """
+        pose, low, high = self.pose, self.low, self.high
+        longest = max(len(chain) for chain in chains)
+
+        def joints_at(feet: Array) -> Array:
+            joints = np.repeat(pose[None], len(feet), axis=0)
+            for _ in range(_INVERSE_STEPS):
+                here = kinematics(joints)
+                slopes = np.zeros((*here.shape, longest))
+                for k in range(longest):  # one joint of every leg at a time
+                    moved = joints.copy()
+                    for chain in chains:
+                        if k < len(chain):
+                            moved[:, chain[k]] += _NUDGE_RAD
+                    slopes[..., k] = (kinematics(moved) - here) / _NUDGE_RAD
+                away = (feet - here)[..., None]
+                square = slopes.swapaxes(-1, -2) @ slopes
+                square = square + (_DAMPING * height) ** 2 * np.eye(longest)
+                turned = np.linalg.solve(square, slopes.swapaxes(-1, -2) @ away)[..., 0]
+                for leg, chain in enumerate(chains):
+                    joints[:, chain] += turned[:, leg, : len(chain)]
+                joints = np.clip(joints, low, high)
+            return joints
+
+        return joints_at
 
     def _mirror(self, height: float) -> tuple[NDArray[np.intp] | None, Array | None]:
         """Image of each joint, left for right, and its sign; None without."""
@@ -480,12 +521,14 @@ class _Reader:
         near = _SAME_PLACE * height
         found, signs = np.zeros(len(ids), int), np.zeros(len(ids))
         for k in range(len(ids)):
-            distance = np.linalg.norm(at - at[k] * [1, -1, 1], axis=1)
+            # where on its axis a joint is placed says nothing
+            apart = at - at[k] * [1, -1, 1]
+            beside = apart - (apart @ images[k])[:, None] * images[k]
             along = (axes * images[k]).sum(axis=1)
-            fits = np.flatnonzero((distance < near) & (np.abs(along) > 0.99))
+            fits = np.flatnonzero((np.linalg.norm(beside, axis=1) < near) & (np.abs(along) > 0.99))
             if not len(fits):
                 return None, None
-            found[k] = fits[np.argmin(distance[fits])]
+            found[k] = fits[np.argmin(np.linalg.norm(apart[fits], axis=1))]
             signs[k] = np.sign(along[found[k]])
         if (found[found] != np.arange(len(ids))).any():
             return None, None

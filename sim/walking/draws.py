@@ -40,5 +40,5 @@ def draw_pose(
     trotting = rng.random(n) < random.on_the_move
     phase = rng.uniform(0.0, 2 * np.pi, n)
     if trotting.any():
-        start[trotting] = trot.joints(phase, command)[trotting]
+        start[trotting] = trot.joints(phase, command, body)[trotting]
     return np.clip(start, body.low, body.high), speed * ~trotting[:, None]

@@ -55,6 +55,11 @@ def for_robot(task: Walking, robot: str | Path, robot_config: str | Path | None)
             base_rate_rad_s=times(random.base_rate_rad_s, rate),
             joint_rad_s=rate * random.joint_rad_s, on_the_move=0.0,
         ),
+        trot=replace(
+            task.trot, frequency_hz=rate * task.trot.frequency_hz, lift_m=length * task.trot.lift_m,
+            crouch_m=0.0, spread_m=0.0, gain=1.0, back_gain=1.0, side_gain=1.0, turn_gain=1.0,
+            turn_dead_band_rad_s=0.0,
+        ),
         differences=replace(differ, centre_of_mass_m=times(differ.centre_of_mass_m, length)),
     )  # fmt: skip
 
