@@ -9,6 +9,9 @@ The joint angles that a policy sees have passed through the measured feedback
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +22,7 @@ from pupper_sysid.servo_models.joint_arrays import JointArrays
 from pupper_sysid.sim.robot.motion import Moved, gravity_direction, own_velocity, planar
 from pupper_sysid.sim.robot.robot_batch import RobotBatch
 from pupper_sysid.sim.robot.terrain import make_ground
-from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.config import PRESETS, Walking
 from pupper_sysid.sim.walking.draws import at_rest, draw_commands, draw_pose
 from pupper_sysid.sim.walking.effort import EffortMeter
 from pupper_sysid.sim.walking.observation import (
@@ -31,14 +34,17 @@ from pupper_sysid.sim.walking.observation import (
     privileged_parts,
 )
 from pupper_sysid.sim.walking.rewards.strides import Strides
-from pupper_sysid.sim.walking.rewards.terms import weighted
+from pupper_sysid.sim.walking.rewards.terms import TERMS, weighted
 from pupper_sysid.sim.walking.rewards.weights import Rewards, narrowed
+from pupper_sysid.sim.walking.scaled import for_robot
 from pupper_sysid.sim.walking.senses import Rows, Senses
-from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 from pupper_sysid.sim.walking.shared_draws import Twins, generator
 from pupper_sysid.sim.walking.step import Step, StepResult, Unfinished, empty_facts, unforeseen_of
 
 Array = NDArray[np.float64]
+Term = Callable[[Step, Rewards], Array]
+Seen = Callable[["PupperEnv", Rows], Array]
 
 _EDGE_M = 0.5
 _ARRAYS = (
@@ -75,6 +81,12 @@ class PupperEnv:
         Of the physics by mujoco-warp (extra `gpu`): `cuda`, `cuda:1`, or `cpu` to try it; by
         default MuJoCo steps it on `threads`. Readings and rewards are NumPy either way, from the
         state that comes back after each control step.
+    terms : mapping of str to (float, callable), optional
+        Rewards of your own beside those of `config.rewards`: a weight per second, and a function of
+        a `Step` and the `Rewards` that gives one number per robot.
+    observations : mapping of str to callable, optional
+        Parts of an observation of your own, after the usual ones: `part(env, rows)` gives values of
+        shape (k, size) for some robots. Policy files hold the usual observation only.
 
     Attributes
     ----------
@@ -109,7 +121,7 @@ class PupperEnv:
 
     Examples
     --------
-    >>> from pupper_sysid.sim.walking.config import Walking
+    >>> from pupper_sysid.sim.walking.config import PRESETS, Walking
     >>> from pupper_sysid.sim.walking.servo_ranges import servo_ranges
     >>> env = PupperEnv(Walking(), servo_ranges("paper"), environments=4, threads=1)
     >>> observation, privileged = env.reset()
@@ -130,6 +142,8 @@ class PupperEnv:
         twins: Twins | None = None,
         extra_jitter_s: Array | None = None,
         device: str | None = None,
+        terms: Mapping[str, tuple[float, Term]] | None = None,
+        observations: Mapping[str, Seen] | None = None,
     ):
         if environments < 1:
             raise InputError(f"There are {environments} environments; at least 1 is needed.")
@@ -148,6 +162,11 @@ class PupperEnv:
         self.default = body.pose
         self.trot = config.trot
         n = environments
+        self._own_terms, self._own_seen = dict(terms or {}), dict(observations or {})
+        if known := sorted(self._own_terms.keys() & TERMS.keys()):
+            raise InputError(
+                f"A reward term is called {known[0]} already; give yours another name."
+            )
         self._senses = Senses(config, servos, self.robots, n, generator([seed, 2], twins))
         self._strides = Strides(body, n, config.control_step_s, config.rewards)
         self._effort = EffortMeter(self.robots, config.control_step_s)
@@ -165,6 +184,8 @@ class PupperEnv:
             zeros(len(body.joints)) for _ in range(3)
         )
         self._until_command, self._until_push = zeros(), zeros()
+        self._size = sum(size for _, size, _ in observation_of(len(body.joints)))
+        self._size += sum(x.shape[1] for x in self._seen(slice(None)))
         self.reset()
 
     # ------------------------------------------------------------------------- public
@@ -335,7 +356,7 @@ class PupperEnv:
         noise = noise_of(config.observation, joints, n, self.rng)
         return Unfinished(
             velocity_before, chances, noise, pushed if most > 0 else pushed[:0], push, facts, {},
-            np.empty((n, sum(size for _, size, _ in observation_of(joints))), np.float32),
+            np.empty((n, self._size), np.float32),
             np.empty((n, sum(size for _, size in privileged_parts(joints, feet))), np.float32),
             np.empty(n, bool),
         )  # fmt: skip
@@ -361,6 +382,8 @@ class PupperEnv:
         step = Step(body=self.body, **facts)
         level = self.level
         terms = weighted(step, self._rewards, level.penalties, level.guides, level.progress)
+        for name, (weight, term) in self._own_terms.items():
+            terms[name] = weight * term(step, self._rewards)
         for name, term in terms.items():
             whole = now.terms.setdefault(name, np.empty(self.environments))
             np.multiply(term, span, out=whole[rows])
@@ -429,6 +452,7 @@ class PupperEnv:
             [
                 velocity if true else np.zeros((len(qpos), 3)), rate, down,
                 self.command[rows], angle - self.default, moved, effort, self.action[rows],
+                *self._seen(rows),
             ],
             noise, observation,
         )  # fmt: skip
@@ -446,6 +470,10 @@ class PupperEnv:
         )  # fmt: skip
         return observation, privileged
 
+    def _seen(self, rows: Rows) -> list[Array]:
+        """What the user's own parts of an observation give for some robots."""
+        return [np.asarray(part(self, rows), float) for part in self._own_seen.values()]
+
     def _differing(self, rows: Rows) -> list[Array]:
         """What was drawn for robots, as the critic sees it."""
         robots, imu, bodies = self.robots, self._senses.imu, self.robots.bodies
@@ -460,3 +488,64 @@ class PupperEnv:
             np.stack([imu.latency_s[rows], imu.period_s[rows]], axis=1),
             np.stack([bodies.poll[rows], bodies.jitter[rows], bodies.effort[rows]], axis=1),
         ]  # fmt: skip
+
+
+def make_env(
+    actuator: str | Path = "calibrated.yaml",
+    *,
+    robot: str | Path | None = None,
+    robot_config: str | Path | None = None,
+    preset: str = "fast",
+    feedback: str | Path = "held",
+    environments: int = 64,
+    seed: int = 0,
+    threads: int = 0,
+    terms: Mapping[str, tuple[float, Term]] | None = None,
+    observations: Mapping[str, Seen] | None = None,
+    **task: Any,
+) -> PupperEnv:
+    """Many robots with measured servos on a walking task, for a learner of your own.
+
+    Parameters
+    ----------
+    actuator, feedback : str or Path
+        As for `pupper-train`: a calibration, a preset, `ideal`, …
+    robot, robot_config : str or Path, optional
+        MJCF and YAML of another robot than the Mini Pupper 2 (`sim.robot.robot_file`).
+    preset : {"fast", "scratch", "paper", "release"}
+        The task.
+    environments, seed, threads : int
+    terms, observations : mapping, optional
+        Of your own; see `PupperEnv`.
+    **task
+        Fields of `Walking` that differ from the preset's, such as `episode_s` or `rewards`.
+
+    Returns
+    -------
+    PupperEnv
+
+    Raises
+    ------
+    InputError
+        If the preset is unknown, or a file cannot be read or used.
+
+    Examples
+    --------
+    >>> def level(step, rewards):
+    ...     return step.gravity[:, 2] ** 2
+    >>> env = make_env("paper", environments=4, threads=1, terms={"level": (0.5, level)})
+    >>> result = env.step(np.zeros((4, 12)))
+    >>> result.terms["level"].shape
+    (4,)
+    """
+    if preset not in PRESETS:
+        raise InputError(f"There is no preset {preset}. Give one of {', '.join(PRESETS)}.")
+    config = PRESETS[preset]
+    if robot is not None:
+        config = for_robot(config, robot, robot_config)
+    config = replace(config, **task)
+    servos = servo_ranges(actuator, feedback, config.body)
+    model = servo_model_of(actuator, config.control_step_s)
+    return PupperEnv(
+        config, servos, environments, seed, threads, model, terms=terms, observations=observations
+    )

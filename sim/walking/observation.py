@@ -88,7 +88,7 @@ def observed(
         out = np.empty((len(parts[0]), sum(p.shape[1] for p in parts)), np.float32)
     whole = np.concatenate(parts, axis=1, out=out)
     if noise is not None:
-        whole += noise
+        whole[:, : noise.shape[1]] += noise  # none on a user's own parts, which come last
     return whole
 
 

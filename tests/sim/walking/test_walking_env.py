@@ -31,7 +31,7 @@ from pupper_sysid.sim.walking.config import (
     Randomisation,
     Walking,
 )
-from pupper_sysid.sim.walking.env import PupperEnv
+from pupper_sysid.sim.walking.env import PupperEnv, make_env
 from pupper_sysid.sim.walking.observation import OBSERVATION, OBSERVATION_SIZE
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 from pupper_sysid.sim.walking.rewards.terms import TERMS, progress
@@ -797,3 +797,28 @@ def test_commands_come_late_at_random_where_the_calibration_has_jitter():
     assert late.min() >= -0.003 - 1e-12
     assert late.mean() == pytest.approx(0.0, abs=3e-4)
     assert late.std() == pytest.approx(0.003, rel=0.15)
+
+
+def test_rewards_and_observations_of_a_users_own_come_beside_the_usual_ones():
+    def level(step, rewards):
+        return -step.gravity[:, 2]
+
+    def height(env, rows):
+        return env.robots.qpos[rows, 2:3]
+
+    env = make_env(
+        "paper", environments=3, seed=1, threads=1,
+        terms={"level": (2.0, level)}, observations={"height": height},
+    )  # fmt: skip
+    result = env.step(env.action)
+    np.testing.assert_allclose(
+        result.terms["level"], -2.0 * env.config.control_step_s * result.facts.gravity[:, 2]
+    )
+    assert result.observation.shape == (3, OBSERVATION_SIZE + 1)
+    np.testing.assert_allclose(result.observation[:, -1], env.robots.qpos[:, 2], rtol=1e-6)
+    plain = make_env("paper", environments=3, seed=1, threads=1)
+    usual = plain.step(plain.action)
+    np.testing.assert_array_equal(result.observation[:, :-1], usual.observation)
+    np.testing.assert_allclose(result.reward - result.terms["level"], usual.reward, atol=1e-12)
+    with pytest.raises(InputError, match="called alive already"):
+        make_env("paper", environments=1, terms={"alive": (1.0, level)})
