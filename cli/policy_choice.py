@@ -130,6 +130,22 @@ def _near(name: str, path: Path) -> list[Path]:
     return [p for p in (Path(name), *(f / name for f in (folder, *folder.parents))) if p.exists()]
 
 
+def refuse_other_robot(policy: Policy, program: str) -> None:
+    """Refuse a policy that walks another robot than the Mini Pupper 2.
+
+    Raises
+    ------
+    InputError
+        If it does.
+    """
+    if (own := policy.contract.robot) is not None:
+        raise InputError(
+            f"{program} knows the Mini Pupper 2 only, and this policy walks {own.name}. Look at it "
+            "with pupper-play, measure it with pupper-eval, and take it to its robot with "
+            "pupper-sysid export."
+        )
+
+
 def _of_robot(task: Walking, path: Path, policy: Policy, run: Run | None) -> Walking:
     """The task with the robot that the policy was trained on, whose files must be as they were."""
     own = policy.contract.robot

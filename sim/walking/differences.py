@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 _OF_VOLTAGE = ("stiffness", "effort_limit", "velocity_limit")
 _OF_MOTOR = ("stiffness", "damping", "effort_limit")
+OF_UNIT = ("stiffness", "damping", "friction_loss", "effort_limit", "velocity_limit")
+"""Numbers of a servo in which units of one type differ."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,9 @@ class Differences:
     Servos' own numbers vary within the calibration's intervals in any case.
     """
 
+    servo_spread: float = 0.0
+    """Largest share by which each of a joint's numbers (`OF_UNIT`) differs from the calibration's:
+    between units of one type, beyond what the calibration leaves open of its own."""
     joint_zero_rad: float = 0.0
     """Largest error of a servo's zero, the same in commands and readings."""
     command_jitter: tuple[float, float] = (1.0, 1.0)
@@ -59,7 +64,7 @@ class Differences:
     """Share of robots with none of these in body, servos and ticks."""
 
     def __post_init__(self):
-        for name in ("joint_zero_rad", "imu_mounting_rad", "gyro_bias_rad_s"):
+        for name in ("servo_spread", "joint_zero_rad", "imu_mounting_rad", "gyro_bias_rad_s"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"differences.{name} must be from 0 to below 1.")
         for name in ("weak_leg_share", "missed_ticks", "without_effort", "as_calibrated"):
@@ -88,6 +93,8 @@ class Differences:
 
 
 TYPICAL = Differences(
+    # servos of one type, bought together
+    servo_spread=0.1,
     # a tenth of the angle between two teeth of a horn (25 teeth); recordings show 6 mrad
     joint_zero_rad=0.025,
     # other hosts are busier, or idle
@@ -164,6 +171,10 @@ class Bodies:
         if own.as_calibrated:
             differ = rng.random(n) >= own.as_calibrated
             self.as_calibrated[ids] = ~differ
+        if own.servo_spread:
+            for name in OF_UNIT:
+                share = rng.uniform(-own.servo_spread, own.servo_spread, servos[name].shape)
+                servos[name] *= 1.0 + share * differ[:, None]
         if own.joint_zero_rad:
             error = rng.uniform(
                 -own.joint_zero_rad, own.joint_zero_rad, (n, len(self._body.joints))
