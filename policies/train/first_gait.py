@@ -140,8 +140,8 @@ class GaitScore(Result):
 
     def __str__(self) -> str:
         return (
-            f"score {self.score:.2f}, {100 * self.forward_share:.0f} % of {self.forward_m_s:g} m/s "
-            f"forward, {100 * self.turn_share:.0f} % of {self.turn_rad_s:g} rad/s on the spot, "
+            f"score {self.score:.2f}, {100 * self.forward_share:.0f} % of {self.forward_m_s:.3g} m/s "
+            f"forward, {100 * self.turn_share:.0f} % of {self.turn_rad_s:.3g} rad/s on the spot, "
             f"{100 * self.falls:.0f} % "
             f"fell; clearance {1e3 * self.clearance_p10_m:.1f} mm (p10), "
             f"{100 * self.low_swing_share:.0f} % of the swings low, thighs and calves at their "
@@ -184,7 +184,8 @@ def with_first_gait(
     progress : callable
         Called with the share of the search that is done.
     """
-    servos, name = servo_ranges(run.actuator, run.feedback), Path(run.actuator).name
+    servos = servo_ranges(run.actuator, run.feedback, run.task.body)
+    name = Path(run.actuator).name
     threads = run.threads or os.cpu_count() or 1
     (own,) = judge_trots([run.task.trot], run.task, servos, run.seed, threads)
     say(f"First gait, the open-loop trot on the servos of {name}: {own}.")

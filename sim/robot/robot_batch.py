@@ -100,6 +100,11 @@ class RobotBatch:
         self.config, self.servos, self.ground = config, servos, ground
         body = self.body = config.body
         joints = len(body.joints)
+        if servos.joints != body.joints:
+            raise InputError(
+                f"The servos are those of {len(servos.joints)} joints ({servos.joints[0]}, …), the "
+                f"robot is {body.name}. Give `servo_ranges` its body."
+            )
         self.servo_model, self.environments = servo_model, environments
         if servo_model is not None:
             self._check_servo_model(servo_model)
