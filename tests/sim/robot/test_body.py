@@ -83,16 +83,16 @@ def test_a_clocked_trot_carries_a_robot_that_no_one_has_seen_before(tmp_path):
     task = for_robot(PRESETS["fast"], tmp_path / "robot.xml", tmp_path / "robot.yaml")
     task = evaluation_task(task)
     assert task.body.commands == {} and task.commands.forward_m_s[1] > 0.2
-    env = PupperEnv(task, servo_ranges("ideal", "ideal", task.body), 2, seed=0, threads=1)
+    env = PupperEnv(task, servo_ranges("ideal", "ideal", task.body), 6, seed=0, threads=1)
     env.set_command(np.array([0.2, 0.0, 0.0]))
     speed = []
-    for k in range(120):
-        phase = np.full(2, 2 * np.pi * task.trot.frequency_hz * k * task.control_step_s)
+    for k in range(60):
+        phase = np.full(6, 2 * np.pi * task.trot.frequency_hz * k * task.control_step_s)
         joints = task.trot.joints(phase, env.command, env.body)
         found = env.step((joints - env.default) / task.action_scale)
         assert not found.done.any()
         speed.append(found.facts.stride_velocity[:, 0])
-    assert np.mean(speed[60:]) == pytest.approx(0.2, rel=0.4)
+    assert np.median(speed[30:]) == pytest.approx(0.2, rel=0.25)
 
 
 def test_the_feet_of_the_mini_pupper_and_its_gait_are_what_the_rule_for_others_gives():
