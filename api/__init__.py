@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pupper_sysid.servo_models.servo_file import load_servo_model
     from pupper_sysid.servo_models.sparse_equation import SparseEquation
     from pupper_sysid.sim.export.export import export
-    from pupper_sysid.sim.walking.env import PupperEnv
+    from pupper_sysid.sim.walking.env import PupperEnv, make_env
     from pupper_sysid.sysid.backlash import backlash
     from pupper_sysid.sysid.compare.compare import compare
     from pupper_sysid.sysid.doctor.examination import examine as doctor
@@ -69,6 +69,7 @@ _MODULES = {
     "HeldFeedback": "servo_models.held_feedback",
     "SparseEquation": "servo_models.sparse_equation",
     "PupperEnv": "sim.walking.env",
+    "make_env": "sim.walking.env",
     "Policy": "policies.network.policy_file",
     "load_policy": "policies.network.policy_file",
     "Interval": "common.interval",
@@ -105,6 +106,7 @@ __all__ = [
     "load_calibration",
     "load_policy",
     "load_servo_model",
+    "make_env",
     "report",
     "sindy",
 ]

@@ -16,6 +16,7 @@ from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, is_shipped
 from pupper_sysid.sim.walking.config import PRESETS as WALKING
 from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.scaled import for_robot
 from pupper_sysid.sim.walking.servo_ranges import IDEAL, ServoRanges, check_actuator, servo_ranges
 
 if TYPE_CHECKING:
@@ -129,6 +130,49 @@ def _near(name: str, path: Path) -> list[Path]:
     return [p for p in (Path(name), *(f / name for f in (folder, *folder.parents))) if p.exists()]
 
 
+def refuse_other_robot(policy: Policy, program: str) -> None:
+    """Refuse a policy that walks another robot than the Mini Pupper 2.
+
+    Raises
+    ------
+    InputError
+        If it does.
+    """
+    if (own := policy.contract.robot) is not None:
+        raise InputError(
+            f"{program} knows the Mini Pupper 2 only, and this policy walks {own.name}. Look at it "
+            "with pupper-play, measure it with pupper-eval, and take it to its robot with "
+            "pupper-sysid export."
+        )
+
+
+def _of_robot(task: Walking, path: Path, policy: Policy, run: Run | None) -> Walking:
+    """The task with the robot that the policy was trained on, whose files must be as they were."""
+    own = policy.contract.robot
+    if own is None:
+        return task
+    files = {}
+    for key, name, wanted in (
+        ("robot", own.mjcf, own.mjcf_sha256), ("robot_config", own.config, own.config_sha256),
+    ):  # fmt: skip
+        if name is None or wanted is None:
+            files[key] = ""
+            continue
+        # where it was, or of that name beside the policy
+        there = [f for f in (Path(name), *_near(Path(name).name, path)) if f.is_file()]
+        same = next((f for f in there if sha256(f) == wanted), None)
+        if same is None:
+            what = f"{there[0]} is not as it was" if there else "is not here"
+            raise InputError(
+                f"The policy at {path} walks {own.name}, of {name}, which {what}. Put the file of "
+                "its training there, or beside the policy."
+            )
+        files[key] = str(same)
+    if run is None:
+        return for_robot(task, files["robot"], files["robot_config"] or None)
+    return replace(task, **files)
+
+
 def simulator(
     path: Path, policy: Policy, run: Run | None, actuator: str | None, feedback: str | None
 ) -> tuple[Walking, ServoRanges]:
@@ -141,6 +185,7 @@ def simulator(
         physics_step_s=contract.physics_step_s, control_step_s=contract.control_step_s,
         action_scale=contract.action_scale_rad, knee=contract.knee,
     )  # fmt: skip
+    task = _of_robot(task, path, policy, run)
     task = replace(
         task, observation=replace(task.observation, base_velocity=contract.base_velocity)
     )
@@ -149,7 +194,7 @@ def simulator(
         feedback = run.feedback if run else contract.feedback
         if feedback not in ("held", "ideal"):
             feedback = str(next(iter(_near(feedback, path)), feedback))
-    return task, servo_ranges(chosen, feedback)
+    return task, servo_ranges(chosen, feedback, task.body)
 
 
 def trained_commands(policy: Policy, run: Run | None) -> CommandRanges:

@@ -23,6 +23,7 @@ from pupper_sysid.cli.live_views import Wanted, live_views
 from pupper_sysid.cli.policy_choice import (
     chosen_actuator,
     policy_at,
+    refuse_other_robot,
     show_match,
     show_servos,
     trained_actuator,
@@ -167,6 +168,7 @@ def _run(options: Deploy) -> None:
     from pupper_sysid.policies.deploy.assembly import assemble
 
     policy, run = policy_at(options.policy)
+    refuse_other_robot(policy, "pupper-deploy")
     name, stack = _stack(options, policy.contract)
     if options.replay:
         _replay(options.replay, policy)

@@ -224,11 +224,12 @@ def _show_directions(found: Evaluation) -> None:
 
 def _show_effort(found: Evaluation) -> None:
     """Clearance of the swings and effort of the servos, of policy and trot."""
+    kinds = [k for k in found.conditions[0].policy.torque_saturated_share if k != "hip"]
     shown = terminal.table(
         "Clearance of the swings (tenth percentile, median; share below 2 mm) and effort of the "
-        "servos: share of the time at the torque limit and rms torque over the limit, thigh and "
-        "calf; mechanical power; cost of transport", "", "walker", "p10 mm", "p50 mm", "low %",
-        "at limit %", "rms %", "W", "CoT",
+        "servos: share of the time at the torque limit and rms torque over the limit, "
+        f"{' and '.join(kinds)}; mechanical power; cost of transport",
+        "", "walker", "p10 mm", "p50 mm", "low %", "at limit %", "rms %", "W", "CoT",
     )  # fmt: skip
     for row in found.conditions:
         for walker, own in (("policy", row.policy), ("trot", row.trot)):
@@ -237,7 +238,7 @@ def _show_effort(found: Evaluation) -> None:
                 row.name if walker == "policy" else "", walker,
                 number(1e3 * own.clearance_p10_m, 1), number(1e3 * own.clearance_p50_m, 1),
                 number(100 * own.low_swing_share, 0),
-                *("/".join(number(100 * each[k], 0) for k in ("thigh", "calf")) for each in pairs),
+                *("/".join(number(100 * each[k], 0) for k in kinds) for each in pairs),
                 number(own.mechanical_power_w, 1), number(own.cost_of_transport, 1),
             )  # fmt: skip
     out.print(shown)

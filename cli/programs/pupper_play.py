@@ -158,18 +158,17 @@ class _Track:
         """Write what was asked for."""
         if not self._rows or (options.rerun is None and options.mcap is None):
             return
-        from pupper_sysid.common.joints import JOINT_NAMES
         from pupper_sysid.policies.twin.drawing import bodies_over_time
         from pupper_sysid.sysid.recordings.recording import Recording
         from pupper_sysid.sysid.view.mcap_file import write_mcap
         from pupper_sysid.sysid.view.rerun_file import write_rerun
 
-        time_s = np.array(self._time_s)
+        time_s, joints = np.array(self._time_s), self._env.body.joints
         sent, read, qpos = (np.array(part) for part in zip(*self._rows, strict=True))
         # a command holds for the step that ends with the reading
         recording = Recording.from_arrays(
-            time_s - self._env.config.control_step_s, dict(zip(JOINT_NAMES, sent.T, strict=True)),
-            dict(zip(JOINT_NAMES, read.T, strict=True)), read_time_s=time_s,
+            time_s - self._env.config.control_step_s, dict(zip(joints, sent.T, strict=True)),
+            dict(zip(joints, read.T, strict=True)), read_time_s=time_s,
             metadata={"bus": {"kind": "simulated", "coordinates": "joint"}}, name="walk",
         )  # fmt: skip
         if options.mcap is not None:

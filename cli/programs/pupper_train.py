@@ -36,6 +36,7 @@ from pupper_sysid.policies.train.run_file import (
     check_teacher,
     preset,
     refuse_taken,
+    with_robot,
 )
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.rewards.weights import Rewards
@@ -66,6 +67,11 @@ class Options:
     with a teacher that acts by a clock, then learn to walk like it from what the robot sees;
     `teacher`: that teacher alone, for `--imitation.teacher runs/NAME`. The published presets always
     start from nothing."""
+    robot: Path | None = None
+    """MJCF of another robot than the Mini Pupper 2: any with legs and position servos. Its task is
+    scaled by its size; where no open-loop gait walks, as on two legs, give `--start scratch`."""
+    robot_config: Path | None = None
+    """YAML beside it: joints, feet, pose, servos, gait, commands (docs/own_robot.md)."""
     name: str | None = None
     """Name of the run's folder in runs/; by default policy, date and time."""
     resume: Path | None = None
@@ -90,11 +96,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _parse(given: list[str]) -> Options:
     """Options; --preset, --policy and --start set the defaults of the others."""
     start = _choice(given, "--start", Start)
+    robot, config = (_path(given, name) for name in ("--robot", "--robot-config"))
     begun = preset(_choice(given, "--preset", Preset), _choice(given, "--policy", Kind), start)
+    if config is not None and robot is None:
+        raise InputError("--robot-config describes the robot of --robot; give that, too.")
+    if robot is not None:
+        begun = with_robot(begun, robot, config)
     return parse(
         Options, given, "pupper-train", DESCRIPTION,
-        default=Options(begun), config=(tyro.conf.FlagCreatePairsOff,),
+        default=Options(begun, start=start), config=(tyro.conf.FlagCreatePairsOff,),
     )  # fmt: skip
+
+
+def _path(given: list[str], flag: str) -> Path | None:
+    """Value of a flag that is a path; None without."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument(flag, nargs="?")
+    value = vars(parser.parse_known_args(given)[0]).popitem()[1]
+    return None if value is None else Path(value)
 
 
 def _choice(given: list[str], flag: str, kind: Any) -> Any:
@@ -148,6 +167,9 @@ def _run(options: Options, given: list[str]) -> None:
         )
     if options.resume is None:
         refuse_taken(folder)
+        if ranks.rank == 0:
+            for note in run.task.body.notes:
+                err.print(note, soft_wrap=True)
         run = _with_first_gait(run, ranks)
     with _bar() as watch:
         notice = (lambda text: warn([text])) if ranks.rank == 0 else (lambda text: None)

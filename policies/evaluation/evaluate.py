@@ -39,6 +39,7 @@ from pupper_sysid.policies.walks.conditions import (
     Condition,
     Walker,
     evaluation_task,
+    share_of_usual,
 )
 from pupper_sysid.policies.walks.handicaps import Handicap
 from pupper_sysid.policies.walks.together import walk_together
@@ -204,6 +205,12 @@ def evaluate(
     """
     plain = evaluation_task(task)
     cases = (RANDOM, *cases)
+    if task.robot:  # commands as far within its ranges as usual ones are within theirs
+        size = share_of_usual(plain)
+        cases = tuple(
+            c if c.command is None else replace(c, command=tuple((size * c.command).tolist()))
+            for c in cases
+        )
     conditions = [c.condition(plain, robots(c, w), w) for c in cases for w in WALKERS]
     walks = walk_together(
         policy, servos, conditions, plain.episode_s, seed, threads, Recorder, progress

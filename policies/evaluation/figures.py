@@ -15,7 +15,6 @@ from pupper_sysid.common.results import Result
 from pupper_sysid.policies.analysis.rhythm import mean_of
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.conditions import Condition, Moment, Walker
-from pupper_sysid.policies.walks.effort import KINDS, LOW_SWING_M, EffortMeter
 from pupper_sysid.policies.walks.rollouts import heading
 from pupper_sysid.policies.walks.tracking import (
     ERRORS,
@@ -25,6 +24,7 @@ from pupper_sysid.policies.walks.tracking import (
     stride_errors,
     tracking_errors,
 )
+from pupper_sysid.sim.walking.effort import LOW_SWING_M, by_kind
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.observation import FALLEN_TILT
 
@@ -39,6 +39,8 @@ class Walk:
     """Episodes of one or more robots under one condition; zeros after a robot's last step."""
 
     step_s: float
+    kinds: tuple[str, ...]
+    """Of joints (`Body.kinds`)."""
     fell: NDArray[np.bool_]
     """Shape (episodes,)."""
     command: Array
@@ -111,9 +113,12 @@ class Walk:
 
     def first(self, episodes: int) -> Walk:
         """The same of the first episodes."""
-        given = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "step_s"}
+        given = {
+            f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("step_s", "kinds")
+        }
         return Walk(
             step_s=self.step_s,
+            kinds=self.kinds,
             **{k: v[:episodes] if k == "fell" else v[:, :episodes] for k, v in given.items()},
         )
 
@@ -168,7 +173,7 @@ class Figures(Result):
     """Mean speed of feet on the ground."""
     clearance_p10_m: float
     """Tenth percentile of the clearance over all swings: the largest height of the sole over the
-    ground in a swing (`policies.walks.effort`); NaN without a swing, as the next two."""
+    ground in a swing (`sim.walking.effort`); NaN without a swing, as the next two."""
     clearance_p50_m: float
     """Its median."""
     low_swing_share: float
@@ -193,7 +198,6 @@ class Recorder:
         self._env = env
         self._step_s = env.config.control_step_s
         self._fell = np.zeros(env.environments, bool)
-        self._effort = EffortMeter(env)
         self._steps: list[dict[str, NDArray]] = []
 
     def keep(self, now: Moment) -> None:
@@ -201,8 +205,9 @@ class Recorder:
         facts = now.facts
         self._fell |= now.fell
         standing = facts.contact & now.alive[:, None]
-        effort = self._effort.of(facts)
-        ended = effort.swing_ended & now.alive[:, None]
+        ended = facts.swing_ended & now.alive[:, None]
+        # of the mean motion over a stride
+        travelled = self._step_s * np.linalg.norm(facts.stride_velocity[:, :2], axis=1)
         # before the first step a foot may have been elsewhere: its speed is not known
         slip = facts.foot_speed_m_s * standing if self._steps else np.zeros(standing.shape)
         self._steps.append(
@@ -211,10 +216,10 @@ class Recorder:
                 "gravity": facts.gravity.astype(np.float32),
                 "heading": heading(self._env.robots.qpos), "slip_m_s": slip.sum(axis=1),
                 "swing_s": (facts.last_air_s * ended).sum(axis=1), "swings": ended.sum(axis=1),
-                "clearance_m": np.where(ended, effort.clearance_m, np.nan).astype(np.float32),
-                "saturated": effort.saturated.astype(np.float32),
-                "torque_square": effort.torque_square.astype(np.float32),
-                "work_j": effort.work_j, "carried_j": effort.carried_j,
+                "clearance_m": np.where(ended, facts.clearance_m, np.nan).astype(np.float32),
+                "saturated": by_kind(facts.body, facts.saturated).astype(np.float32),
+                "torque_square": by_kind(facts.body, facts.torque_square).astype(np.float32),
+                "work_j": self._step_s * facts.power_w, "carried_j": facts.weight_n * travelled,
             }
         )  # fmt: skip
 
@@ -228,7 +233,9 @@ class Recorder:
             name: np.concatenate([x, np.zeros((rest, *x.shape[1:]), x.dtype)])
             for name, x in arrays.items()
         }
-        return Walk(self._step_s, self._fell[robots], commands, **padded)
+        return Walk(
+            self._step_s, tuple(self._env.body.kinds), self._fell[robots], commands, **padded
+        )
 
 
 def figures_of(found: Walk, command: tuple[float, float, float] | None = None) -> Figures:
@@ -267,16 +274,18 @@ def _effort(found: Walk, travels: bool) -> dict[str, Any]:
     up_s = found.step_s * alive.sum()
     work, carried = found.work_j[alive].sum(), found.carried_j[alive].sum()
 
-    def by_kind(each: NDArray) -> dict[str, float]:
-        means = each[alive].mean(axis=0, dtype=float) if up_s else np.full(len(KINDS), nothing)
-        return dict(zip(KINDS, means.tolist(), strict=True))
+    def named(each: NDArray) -> dict[str, float]:
+        means = (
+            each[alive].mean(axis=0, dtype=float) if up_s else np.full(len(found.kinds), nothing)
+        )
+        return dict(zip(found.kinds, means.tolist(), strict=True))
 
     return {
         "clearance_p10_m": float(low),
         "clearance_p50_m": float(middle),
         "low_swing_share": float((clearance < LOW_SWING_M).mean()) if len(clearance) else nothing,
-        "torque_saturated_share": by_kind(found.saturated),
-        "rms_torque_share": {k: v**0.5 for k, v in by_kind(found.torque_square).items()},
+        "torque_saturated_share": named(found.saturated),
+        "rms_torque_share": {k: v**0.5 for k, v in named(found.torque_square).items()},
         "mechanical_power_w": float(work / up_s) if up_s else nothing,
         "cost_of_transport": float(work / carried) if travels and carried else nothing,
     }

@@ -22,7 +22,6 @@ from pupper_sysid.policies.evaluation.figures import Figures, in_short
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.train.curves import LARGEST_BYTES, PROGRESS
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run
-from pupper_sysid.policies.walks.effort import KINDS
 from pupper_sysid.policies.walks.tracking import STRIDE_ERRORS
 
 ERRORS = {
@@ -196,14 +195,15 @@ def _table_of_effort(found: Evaluation) -> Table:
         for row in found.conditions
         for walker, own in (("policy", row.policy), ("trot", row.trot))
     )
+    kinds = found.conditions[0].policy.torque_saturated_share
     columns = (
         Column("", lambda row: row["walk"], "key"),
         Column("walker", lambda row: row["walker"]),
         column("clearance p10, mm", "clearance_p10_m", 1e3, 1),
         column("p50, mm", "clearance_p50_m", 1e3, 1),
         column("low swings, %", "low_swing_share", 100, 0),
-        *(column(f"{k} at limit, %", f"torque_saturated_share_{k}", 100, 0) for k in KINDS),
-        *(column(f"{k} rms, % of limit", f"rms_torque_share_{k}", 100, 0) for k in KINDS),
+        *(column(f"{k} at limit, %", f"torque_saturated_share_{k}", 100, 0) for k in kinds),
+        *(column(f"{k} rms, % of limit", f"rms_torque_share_{k}", 100, 0) for k in kinds),
         column("power, W", "mechanical_power_w", 1, 1),
         column("cost of transport", "cost_of_transport", 1, 1),
     )

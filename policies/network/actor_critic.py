@@ -60,7 +60,7 @@ def build(
         "correlation": explore.correlation(control_step_s),
     }  # fmt: skip
     own = common | {"hidden_dims": list(architecture.hidden), "distribution_cfg": gaussian}
-    actions = 12
+    actions = observations["noise"].shape[-1]
     if architecture.kind in ("lstm", "gru"):
         actor: MLPModel = RNNActor(
             observations, groups, "actor", actions, rnn_type=architecture.kind,

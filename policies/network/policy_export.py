@@ -16,7 +16,6 @@ import numpy as np
 import torch
 
 from pupper_sysid.common.files import sha256
-from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.policies.network.policy_file import (
     CommandRanges,
     ObservationPart,
@@ -26,7 +25,7 @@ from pupper_sysid.policies.network.policy_file import (
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
 from pupper_sysid.policies.network.trained_servo import trained_servo
 from pupper_sysid.policies.train.run_file import Run as TrainingRun
-from pupper_sysid.sim.walking.observation import OBSERVATION, OBSERVATION_SIZE, VELOCITY_STEPS
+from pupper_sysid.sim.walking.observation import VELOCITY_STEPS, observation_of
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sysid.export.network import Run, export_module
 
@@ -54,8 +53,12 @@ def write_policy(
     `command_share` is the share of the task's commands that the curriculum has come to.
     """
     shape, task = run.architecture, run.task
-    size = OBSERVATION_SIZE + 12 * action_history
-    network = PolicyNetwork(shape.kind, size, shape.hidden, shape.memory, run.learner.normalise)
+    body = task.body
+    joints, parts = len(body.joints), observation_of(len(body.joints))
+    size = sum(n for _, n, _ in parts) + joints * action_history
+    network = PolicyNetwork(
+        shape.kind, size, shape.hidden, shape.memory, run.learner.normalise, joints
+    )
     network.take(weights)
     servo = trained_servo(run.actuator, run.feedback, task, servos)
     source = Path(run.actuator)
@@ -66,13 +69,22 @@ def write_policy(
         "memory": shape.memory,
         "normalise": run.learner.normalise,
         "observation": [
-            ObservationPart(name=name, size=n, unit=_UNITS[name]) for name, n, _ in OBSERVATION
+            ObservationPart(name=name, size=n, unit=_UNITS[name]) for name, n, _ in parts
         ],
         "base_velocity": task.observation.base_velocity,
         "velocity_steps": VELOCITY_STEPS,
         "action_history": action_history,
         "action_scale_rad": task.action_scale,
-        "default_pose_rad": {name: DEFAULT_POSE[name] for name in JOINT_NAMES},
+        "default_pose_rad": dict(zip(body.joints, body.pose.tolist(), strict=True)),
+        "robot": None
+        if body.is_mini_pupper
+        else {
+            "name": body.name,
+            "mjcf": task.robot,
+            "mjcf_sha256": body.hashes["robot"],
+            "config": task.robot_config or None,
+            "config_sha256": body.hashes.get("robot_config"),
+        },
         "control_step_s": task.control_step_s,
         "physics_step_s": task.physics_step_s,
         "knee": task.knee,

@@ -41,10 +41,10 @@ from pupper_sysid.common.files import (
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.common.reading.content import refuse_large_header
 from pupper_sysid.policies.network.hyperparameters import Kind
-from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
+from pupper_sysid.policies.network.policy_network import PolicyNetwork
 from pupper_sysid.policies.network.trained_servo import SERVO_VERSION, TrainedServo
 from pupper_sysid.sim.walking.config import Commands
-from pupper_sysid.sim.walking.observation import OBSERVATION, VELOCITY_STEPS
+from pupper_sysid.sim.walking.observation import VELOCITY_STEPS, observation_of
 
 SCHEMA, VERSION = "pupper-policy", 4
 CONTRACT, WEIGHTS = "contract.json", "weights.safetensors"
@@ -126,6 +126,19 @@ class CommandRanges(_Part):
         return ", ".join(f"{name} {low:g} to {high:g} {unit}" for name, (low, high), unit in parts)
 
 
+_Sha = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class RobotReference(_Part):
+    """The robot of a training that is not the Mini Pupper 2: its files and their hashes."""
+
+    name: Annotated[str, Field(max_length=4096)]
+    mjcf: Annotated[str, Field(max_length=4096)]
+    mjcf_sha256: _Sha
+    config: Annotated[str, Field(max_length=4096)] | None
+    config_sha256: _Sha | None
+
+
 class Contract(_Part):
     """Inputs, outputs and training of a policy."""
 
@@ -145,6 +158,8 @@ class Contract(_Part):
     action_scale_rad: Annotated[float, Field(gt=0, le=10)]
     default_pose_rad: dict[str, _Angle]
     """Target = default pose + scale · action, in this order of joints."""
+    robot: RobotReference | None = None
+    """Null of the Mini Pupper 2."""
     control_step_s: Annotated[float, Field(ge=1e-3, le=1)]
     physics_step_s: Annotated[float, Field(ge=1e-5, le=1)]
     knee: Literal["linkage", "serial"]
@@ -171,6 +186,8 @@ class Contract(_Part):
             return self
         if own.dead_times_s is not None and own.dead_times_s != tuple(self.dead_time_s):
             raise ValueError("dead_time_s is not that of the servo")
+        if own.joints is not None and list(own.joints) != list(self.default_pose_rad):
+            raise ValueError("default_pose_rad must name the servo's joints, in their order")
         if own.actuator != self.actuator or own.feedback != self.feedback:
             raise ValueError("actuator and feedback are not those of the servo")
         if self.actuator_sha256 is not None and own.actuator_sha256 != self.actuator_sha256:
@@ -180,7 +197,12 @@ class Contract(_Part):
     @property
     def observation_size(self) -> int:
         """Length of the observation, past actions included."""
-        return sum(p.size for p in self.observation) + ACTIONS * self.action_history
+        return sum(p.size for p in self.observation) + self.actions * self.action_history
+
+    @property
+    def actions(self) -> int:
+        """Joints with a servo."""
+        return len(self.default_pose_rad)
 
 
 class Policy:
@@ -198,11 +220,14 @@ class Policy:
         self.network, self.contract = network, contract
         self._run: Callable[..., tuple[torch.Tensor, ...]] = network
         self._state: tuple[torch.Tensor, ...] = ()
-        self._past = np.zeros((0, 0, ACTIONS), np.float32)
+        self._past = np.zeros((0, 0, contract.actions), np.float32)
 
     def __repr__(self) -> str:
-        seen, step_ms = self.contract.observation_size, 1e3 * self.contract.control_step_s
-        return f"Policy ({self.contract.kind}): {seen} numbers to {ACTIONS} joints, {step_ms:g} ms"
+        c = self.contract
+        return (
+            f"Policy ({c.kind}): {c.observation_size} numbers to {c.actions} joints, "
+            f"{1e3 * c.control_step_s:g} ms"
+        )
 
     def reset(self, action: np.ndarray) -> None:
         """Start an episode of all robots after their last `action`, shape (n, 12)."""
@@ -292,14 +317,14 @@ def load_policy(folder: Path | str) -> Policy:
             refuse_other_version(f"{path}, servo", servo.get("schema_version"), SERVO_VERSION)
     contract = validated(Contract, found, path, remedy="copy the whole folder again")
     contract = contract.model_copy(update={"schema_version": VERSION})
-    if list(contract.default_pose_rad) != list(JOINT_NAMES):
+    if contract.robot is None and list(contract.default_pose_rad) != list(JOINT_NAMES):
         raise InputError(f"{path}: default_pose_rad must name the joints in this project's order.")
     data = read_bytes(weights, _LARGEST_BYTES, _AGAIN)
     if hashlib.sha256(data).hexdigest() != contract.weights_sha256:
         raise InputError(f"{weights} is not the file that {path.name} describes. Copy both again.")
     refuse_large_header(weights, data)
     about = (contract.kind, contract.observation_size, tuple(contract.hidden), contract.memory,
-             contract.normalise)  # fmt: skip
+             contract.normalise, contract.actions)  # fmt: skip
     with torch.device("meta"):  # shapes only: a contract may ask for any amount of memory
         shapes = {name: value.shape for name, value in PolicyNetwork(*about).state_dict().items()}
     try:
@@ -319,7 +344,7 @@ def load_policy(folder: Path | str) -> Policy:
 def refuse_other_observation(contract: Contract) -> None:
     """Refuse a policy of another observation, which would act wrongly without an error."""
     expected = [(p.name, p.size) for p in contract.observation]
-    given = [(name, size) for name, size, _ in OBSERVATION]
+    given = [(name, size) for name, size, _ in observation_of(contract.actions)]
     if expected != given or contract.velocity_steps != VELOCITY_STEPS:
         raise InputError(
             "The policy's observation is not the one this version gives "
@@ -336,8 +361,8 @@ def refuse_bad(network: PolicyNetwork, name: str) -> None:
     seen = torch.randn(64, network.observation_size, generator=generator)
     with torch.inference_mode():
         action = network(seen, *network.initial_state(64))[0]
-    if action.shape != (64, ACTIONS) or not torch.isfinite(action).all():
-        raise InputError(f"Actions of {name} are not 12 numbers. Train it again.")
+    if action.shape != (64, network.actions) or not torch.isfinite(action).all():
+        raise InputError(f"Actions of {name} are not {network.actions} numbers. Train it again.")
     if float(action.std(0).max()) < 1e-5:
         raise InputError(
             f"The output of {name} is constant (standard deviation below 1e-5 over 64 random "

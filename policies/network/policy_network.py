@@ -47,6 +47,8 @@ class PolicyNetwork(nn.Module):
     memory : int
         Units of an LSTM or GRU.
     normalise : bool
+    actions : int
+        Joints with a servo.
     """
 
     def __init__(
@@ -56,9 +58,11 @@ class PolicyNetwork(nn.Module):
         hidden: tuple[int, ...],
         memory: int,
         normalise: bool,
+        actions: int = ACTIONS,
     ):
         super().__init__()
         self.kind, self.observation_size, self.memory = kind, observation_size, memory
+        self.actions = actions
         self.obs_normalizer = Normaliser(observation_size) if normalise else nn.Identity()
         before = observation_size
         if kind in ("lstm", "gru"):
@@ -72,7 +76,7 @@ class PolicyNetwork(nn.Module):
         for units in hidden:
             layers += [nn.Linear(before, units), nn.ELU()]
             before = units
-        self.mlp = nn.Sequential(*layers, nn.Linear(before, ACTIONS))
+        self.mlp = nn.Sequential(*layers, nn.Linear(before, actions))
 
     @property
     def state_names(self) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDict
 
 from pupper_sysid.policies.network.exploration import MLPActor
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS, PRIVILEGED_PARTS
+from pupper_sysid.sim.walking.observation import CLOCK_SEEN, OBSERVATION_PARTS
 
 _SEEN = ("base_angular_velocity", "projected_gravity", "command")
 _HARMONICS = torch.tensor([1.0, 2.0, 3.0])
@@ -49,7 +49,7 @@ def inputs(obs: TensorDict) -> torch.Tensor:
     """What a teacher sees of the groups `policy` and `privileged`, shape (…, 34)."""
     policy, privileged = obs["policy"], obs["privileged"]
     seen = [policy[..., OBSERVATION_PARTS[name]] for name in _SEEN]
-    cos, sin, in_time = privileged[..., PRIVILEGED_PARTS["clock"]].split(1, -1)
+    cos, sin, in_time = privileged[..., CLOCK_SEEN].split(1, -1)
     angles = torch.atan2(sin, cos) * _HARMONICS.to(sin.device)
     waves = torch.cat([torch.cos(angles), torch.sin(angles)], dim=-1)
     # a foot's stroke is its speed times a function of the clock: Raibert's rule

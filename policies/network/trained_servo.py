@@ -15,9 +15,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pupper_sysid.common.files import sha256
-from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.servo_file import WEIGHTS
 from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.differences import OF_UNIT
 from pupper_sysid.sim.walking.servo_ranges import IDEAL, ServoRanges, is_servo_model
 
 SERVO_SCHEMA, SERVO_VERSION = "pupper-policy-servo", 1
@@ -113,8 +113,6 @@ class TrainedServo(_Part):
     def _whole(self) -> Self:
         if (self.joints is None) != (self.kind == "learned"):
             raise ValueError("joints must be null if, and only if, kind is learned")
-        if self.joints is not None and list(self.joints) != list(JOINT_NAMES):
-            raise ValueError("joints must name all joints in this project's order")
         return self
 
     @property
@@ -153,19 +151,23 @@ def trained_servo(actuator: str, feedback: str, task: Walking, servos: ServoRang
             "torque_scale": _scaled(1.0, torque),
             "voltage_scale": _scaled(1.0, differences.battery),
             "poll_scale": _scaled(1.0, differences.poll_period),
-            "joints": None if learned else joints_of(servos),
+            "joints": None if learned else joints_of(servos, differences.servo_spread),
         }
     )  # fmt: skip
 
 
-def joints_of(servos: ServoRanges) -> dict[str, ServoNumbers]:
-    """The numbers of each joint's servo."""
-    return {name: _numbers(servos, i) for i, name in enumerate(JOINT_NAMES)}
+def joints_of(servos: ServoRanges, spread: float = 0.0) -> dict[str, ServoNumbers]:
+    """The numbers of each joint's servo, wider by a share `spread` where units differ."""
+    return {name: _numbers(servos, i, spread) for i, name in enumerate(servos.joints)}
 
 
-def _numbers(servos: ServoRanges, joint: int) -> ServoNumbers:
+def _numbers(servos: ServoRanges, joint: int, spread: float) -> ServoNumbers:
+    factors = {"low": 1.0 - spread, "value": 1.0, "high": 1.0 + spread}
     ranges = {
-        field: {k: float(getattr(servos, k)[field][joint]) for k in ("low", "value", "high")}
+        field: {
+            k: float(getattr(servos, k)[field][joint] * (factor if field in OF_UNIT else 1.0))
+            for k, factor in factors.items()
+        }
         for field in servos.value
     }
     own = servos.feedback[joint]

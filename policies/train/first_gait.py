@@ -33,10 +33,11 @@ from pupper_sysid.policies.network.hyperparameters import OWN, TROT
 from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.policies.train.selection import COMMANDS, scored
 from pupper_sysid.policies.walks.conditions import evaluation_task
-from pupper_sysid.policies.walks.effort import LOW_SWING_M, EffortMeter
 from pupper_sysid.policies.walks.tracking import planar_velocity
+from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.config import PRESETS, Walking
+from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.effort import LOW_SWING_M, by_kind
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 from pupper_sysid.sim.walking.shared_draws import Twins
@@ -74,11 +75,10 @@ _BOX = {
     "side_gain": (0.5, 2.0), "turn_gain": (0.4, 2.5),
 }  # fmt: skip
 _NAMES = tuple(_BOX)
-_LOW, _HIGH = np.array(list(_BOX.values())).T
 _FIRST_WIDTH, _NARROWEST = 0.2, 0.02  # standard deviations, in shares of the box
 
-_CLEARANCE_M = 0.006
-_WEIGHTS = {"clearance": 0.5, "torque": 0.2, "saturation": 0.2, "sway": 0.1}
+_CLEARANCE_M = 0.008  # `Rewards.least_clearance`
+_WEIGHTS = {"clearance": 0.2, "low": 0.4, "torque": 0.1, "saturation": 0.2, "sway": 0.1}
 """Of the parts of the cost beside errors relative to standing and falls, of order 1 each."""
 _SWAY_RAD_S = 1.0
 
@@ -126,9 +126,11 @@ class GaitScore(Result):
     clearance_p10_m: float
     """Tenth percentile of the clearance of the swings."""
     low_swing_share: float
-    """Of swings that clear less than 2 mm."""
+    """Of swings that clear less than 2 mm, on a robot of the Mini Pupper's height."""
     saturated_share: float
     """Share of the time in which thighs and calves are at their torque limit."""
+    length_scale: float = 1.0
+    """Standing height over the Mini Pupper's, by which clearances are judged."""
 
     @property
     def poor(self) -> bool:
@@ -138,11 +140,10 @@ class GaitScore(Result):
 
     def __str__(self) -> str:
         return (
-            f"score {self.score:.2f}, {100 * self.forward_share:.0f} % of {self.forward_m_s:g} m/s "
-            f"forward, {100 * self.turn_share:.0f} % of {self.turn_rad_s:g} rad/s on the spot, "
-            f"{100 * self.falls:.0f} % "
-            f"fell; clearance {1e3 * self.clearance_p10_m:.1f} mm (p10), "
-            f"{100 * self.low_swing_share:.0f} % of the swings low, thighs and calves at their "
+            f"score {self.score:.2f}, {100 * self.forward_share:.0f} % of "
+            f"{self.forward_m_s:.3g} m/s forward, {100 * self.turn_share:.0f} % of "
+            f"{self.turn_rad_s:.3g} rad/s on the spot, {100 * self.falls:.0f} % fell; "
+            f"clearance {1e3 * self.clearance_p10_m:.1f} mm (p10), {100 * self.low_swing_share:.0f} % of the swings low, thighs and calves at their "
             f"torque limit {100 * self.saturated_share:.0f} % of the time"
         )
 
@@ -162,6 +163,8 @@ class FirstGait(Result):
 def fits_trots(run: Run) -> bool:
     """Whether a run begins with a gait that may be fitted."""
     taught = run.imitation.iterations and run.imitation.teacher in (TROT, OWN)
+    if run.task.robot and run.imitation.teacher != TROT:
+        return False  # the teacher finds a gait for its robot
     return bool(taught) and run.first_gait != "keep" and not run.architecture.privileged_actor
 
 
@@ -180,7 +183,8 @@ def with_first_gait(
     progress : callable
         Called with the share of the search that is done.
     """
-    servos, name = servo_ranges(run.actuator, run.feedback), Path(run.actuator).name
+    servos = servo_ranges(run.actuator, run.feedback, run.task.body)
+    name = Path(run.actuator).name
     threads = run.threads or os.cpu_count() or 1
     (own,) = judge_trots([run.task.trot], run.task, servos, run.seed, threads)
     say(f"First gait, the open-loop trot on the servos of {name}: {own}.")
@@ -235,7 +239,8 @@ def suited(run: Run, found: FirstGait) -> Run:
     trot, own, rewards = found.trot, found.after, run.task.rewards
 
     def wider(name: str, error: float) -> float:
-        return getattr(rewards, name) * min(max(error / _USUAL[name], 1.0), _WIDEST)
+        usual = _USUAL[name] * run.task.body.command_scale[2 if "angular" in name else 0]
+        return getattr(rewards, name) * float(min(max(error / usual, 1.0), _WIDEST))
 
     changes = {
         "linear_sigma": wider("linear_sigma", own.speed_error_m_s),
@@ -244,7 +249,7 @@ def suited(run: Run, found: FirstGait) -> Run:
         "stride_angular_sigma": wider("stride_angular_sigma", own.mean_turn_error_rad_s),
     }
     if run.imitation.teacher == OWN:
-        usual = PRESETS["fast"].trot
+        usual = Trot()  # to which the clock of the rewards belongs
         changes |= {
             "clock_hz": rewards.clock_hz * trot.frequency_hz / usual.frequency_hz,
             "clock_duty": min(max(rewards.clock_duty + trot.duty - usual.duty, 0.5), 0.85),
@@ -296,16 +301,17 @@ def fit_trot(
     """
     rng = np.random.default_rng([seed, 6])
     quick = _quick(task, servos)
-    mean = np.clip(_values(task.trot), _LOW, _HIGH)
-    width = _FIRST_WIDTH * (_HIGH - _LOW)
+    low, high = _box(task.body)
+    mean = np.clip(_values(task.trot), low, high)
+    width = _FIRST_WIDTH * (high - low)
     tried: list[tuple[float, Trot]] = []
     for generation in range(_GENERATIONS):
-        drawn = np.clip(rng.normal(mean, width, (_CANDIDATES, len(_NAMES))), _LOW, _HIGH)
+        drawn = np.clip(rng.normal(mean, width, (_CANDIDATES, len(_NAMES))), low, high)
         drawn[0] = mean
         if not generation:  # half of them from the whole box, in strata of each number
             half = _CANDIDATES // 2
             strata = rng.permuted(np.tile(np.arange(half), (len(_NAMES), 1)), axis=1).T
-            drawn[half:] = _LOW + (strata + rng.random(strata.shape)) / half * (_HIGH - _LOW)
+            drawn[half:] = low + (strata + rng.random(strata.shape)) / half * (high - low)
         trots = [_trot(task.trot, values) for values in drawn]
         walked = _walk(
             trots,
@@ -323,7 +329,7 @@ def fit_trot(
         tried += [(costs[i], trot) for i, trot in zip(order, elite, strict=True)]
         values = np.array([_values(trot) for trot in elite])
         mean = values.mean(axis=0)
-        width = np.maximum(values.std(axis=0), _NARROWEST * (_HIGH - _LOW))
+        width = np.maximum(values.std(axis=0), _NARROWEST * (high - low))
         progress((generation + 1) / (_GENERATIONS + 1))
     best = [trot for _, trot in sorted(tried, key=lambda one: one[0])[: _FINALISTS - 1]]
     trots = [task.trot, _trot(task.trot, mean), *best]
@@ -365,7 +371,8 @@ def _scale(task: Walking) -> Array:
     """Largest commands of a task over usual ones, at most 1, of each part."""
     own = task.commands
     ends = np.abs([own.forward_m_s, own.sideways_m_s, own.yaw_rad_s]).max(axis=1)
-    return np.minimum(ends / _LARGEST, 1.0)
+    # those of another robot are its own, as large as they are
+    return ends / _LARGEST if task.robot else np.minimum(ends / _LARGEST, 1.0)
 
 
 def _gentle(task: Walking, seconds: float) -> Walking:
@@ -384,6 +391,16 @@ def _quick(task: Walking, servos: ServoRanges) -> Walking:
     except InputError:  # too stiff for them
         return found
     return longer
+
+
+def _box(body: Body) -> tuple[Array, Array]:
+    """Ends of what is searched, by Froude scaling of the Mini Pupper's."""
+    rate, length = float(body.command_scale[2]), body.scale
+    size = [
+        rate if name.endswith("_hz") else length if name.endswith("_m") else 1.0 for name in _NAMES
+    ]
+    low, high = np.array(list(_BOX.values())).T * size
+    return low, high
 
 
 def _divides(task: Walking) -> bool:
@@ -405,6 +422,8 @@ class _Walked:
 
     scale: Array
     """Of the commands, over usual ones; shape (3,)."""
+    length: float
+    """`Body.scale`."""
     command: Array
     velocity: Array
     """Shape (steps, n, 3)."""
@@ -437,7 +456,7 @@ def _walk(
         env.robots.write(ids)
     env.set_command(np.tile(command, (count, 1)))
     actions = _actions(trots, env, command, steps)
-    meter, alive = EffortMeter(env), np.ones(n * count, bool)
+    alive = np.ones(n * count, bool)
     kept: dict[str, list[NDArray]] = {
         name: []
         for name in ("velocity", "stride", "up", "clearance", "saturated", "square", "sway")
@@ -445,11 +464,11 @@ def _walk(
     for action in actions:
         result = env.step(action)
         facts, alive = result.facts, alive & ~result.done
-        effort = meter.of(facts)
         for name, value in (
             ("velocity", planar_velocity(facts)), ("stride", facts.stride_velocity),
-            ("up", alive), ("clearance", effort.clearance_m), ("saturated", effort.saturated),
-            ("square", effort.torque_square), ("sway", facts.angular_velocity[:, :2]),
+            ("up", alive), ("clearance", facts.clearance_m),
+            ("saturated", by_kind(facts.body, facts.saturated)), ("square", facts.torque_square),
+            ("sway", facts.angular_velocity[:, :2]),
         ):  # fmt: skip
             kept[name].append(value.copy())
     whole = {name: np.stack(values)[first:] for name, values in kept.items()}
@@ -461,7 +480,7 @@ def _walk(
         clearance = own["clearance"][walks]
         found.append(
             _Walked(
-                scale, command, own["velocity"], own["stride"], own["up"],
+                scale, env.body.scale, command, own["velocity"], own["stride"], own["up"],
                 clearance[np.isfinite(clearance)],
                 _mean(own["saturated"][walks][:, 1:]), _mean(own["square"][walks]),
                 _mean(own["sway"][walks] ** 2) ** 0.5,
@@ -480,7 +499,9 @@ def _actions(trots: Sequence[Trot], env: PupperEnv, command: Array, steps: int) 
     time_s: Array = np.repeat(span * np.arange(steps, dtype=float), n)
     commands = np.tile(command, (steps, 1))
     joints = [
-        trot.joints(time_s * (2 * np.pi * trot.frequency_hz), commands).reshape(steps, n, -1)
+        trot.joints(time_s * (2 * np.pi * trot.frequency_hz), commands, env.body).reshape(
+            steps, n, -1
+        )
         for trot in trots
     ]
     return (np.concatenate(joints, axis=1) - env.default) / env.config.action_scale
@@ -521,8 +542,8 @@ def _score(one: _Walked) -> GaitScore:
         turn_error_rad_s=float(instant[..., 2].mean()),
         mean_turn_error_rad_s=float(stride[..., 2].mean()),
         clearance_p10_m=float(np.quantile(clearance, 0.1)) if len(clearance) else 0.0,
-        low_swing_share=float((clearance < LOW_SWING_M).mean()) if len(clearance) else 1.0,
-        saturated_share=one.saturated,
+        low_swing_share=_low(clearance / one.length), saturated_share=one.saturated,
+        length_scale=one.length,
     )  # fmt: skip
 
 
@@ -530,11 +551,17 @@ def _cost(one: _Walked) -> float:
     """What is searched: 1 minus the judge's score, and what the gait asks of feet and servos."""
     clearance = float(np.quantile(one.clearance_m, 0.1)) if len(one.clearance_m) else 0.0
     parts = {
-        "clearance": _lacking(clearance), "torque": one.torque_square,
+        "clearance": _lacking(clearance / one.length),
+        "low": _low(one.clearance_m / one.length), "torque": one.torque_square,
         "saturation": one.saturated, "sway": one.sway_rad_s / _SWAY_RAD_S,
     }  # fmt: skip
     error = 1.0 - _relative(one)["score"]
     return error + sum(_WEIGHTS[name] * value for name, value in parts.items())
+
+
+def _low(clearance_m: Array) -> float:
+    """Share of low swings; 1 of a robot that does not step."""
+    return float((clearance_m < LOW_SWING_M).mean()) if len(clearance_m) else 1.0
 
 
 def _lacking(clearance_m: float) -> float:
@@ -544,9 +571,10 @@ def _lacking(clearance_m: float) -> float:
 
 def _merit(own: GaitScore) -> float:
     """By which the finalists are chosen: the same of the judge's walks."""
-    lacking = _lacking(own.clearance_p10_m)
+    lacking = _lacking(own.clearance_p10_m / own.length_scale)
     short = max(FORWARD[0] - own.forward_share, own.forward_share - FORWARD[1], 0.0)
-    taken = _WEIGHTS["clearance"] * lacking + _WEIGHTS["saturation"] * own.saturated_share
+    taken = _WEIGHTS["clearance"] * lacking + _WEIGHTS["low"] * own.low_swing_share
+    taken += _WEIGHTS["saturation"] * own.saturated_share
     return own.score - taken - 2.0 * short
 
 

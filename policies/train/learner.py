@@ -159,7 +159,7 @@ class Learner:
         task = env.env.config
         first = None
         if task.rewards.stance:
-            wanted = stance(task.rewards.crouch, task.rewards.spread) - env.env.default
+            wanted = stance(task.body, task.rewards.crouch, task.rewards.spread) - env.env.default
             first = torch.from_numpy(wanted / task.action_scale)
         actor, critic = build(architecture, self.observations, hyper, task.control_step_s, first)
         # a recurrent policy's minibatches are whole environments
@@ -192,14 +192,14 @@ class Learner:
                     f"A policy of kind {architecture.kind} cannot learn from mirror images. Give "
                     "`learner.mirror` as False."
                 )
-            self.ppo.symmetry = MirrorImages()
+            self.ppo.symmetry = MirrorImages(env.env.body)
         self.fresh_optimiser()
         env.env.processes = self.ranks.size
         share = torch.ones(env.num_actions)
         if hyper.exploration.by_dead_band:
             share = torch.from_numpy(env.env.servos.dead_band_share).float()
         if hyper.mirror:  # or an image would have another likelihood than its original
-            share = 0.5 * (share + mirrored(share).abs())
+            share = 0.5 * (share + mirrored(share, "noise", env.env.body).abs())
         self._joint_share = share.to(env.device)
         self._explore()
         if group:

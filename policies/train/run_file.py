@@ -29,6 +29,7 @@ from pupper_sysid.policies.network.hyperparameters import (
 from pupper_sysid.policies.train.ranges import refuse_impossible
 from pupper_sysid.sim.walking.config import PRESETS, Curriculum, Observation, Walking
 from pupper_sysid.sim.walking.rewards.weights import CLOCK, Rewards
+from pupper_sysid.sim.walking.scaled import for_robot
 
 Start = Literal["imitation", "scratch", "teacher"]
 """How a policy comes to its first gait: by imitation of a trot, or of a teacher that was trained
@@ -41,7 +42,13 @@ RUN_SCHEMA = "pupper-run"
 RUN_VERSION = 2
 RUN_FILE = "run.yaml"
 _OF_TEACHER = (*CLOCK, "clock_duty", "crouch", "spread")  # parameters of its rewards
-_OF_ACTIONS = ("action_scale", "control_step_s", "knee")  # settings that say what actions mean
+_OF_ACTIONS = (
+    "action_scale",
+    "control_step_s",
+    "knee",
+    "robot",
+    "robot_config",
+)  # settings that say what actions mean
 _TEACHING = 0.6  # of a run's time: the most that its own teacher may take
 _DROPPED: dict[type, set[str]] = {
     Observation: {"privileged_critic"},
@@ -172,9 +179,24 @@ def _teacher(kind: Kind) -> Run:
     )  # fmt: skip
 
 
+def with_robot(run: Run, robot: str | Path, robot_config: str | Path | None) -> Run:
+    """The run for another robot than the Mini Pupper 2, its task scaled by that one's size.
+
+    Raises
+    ------
+    InputError
+        If the files do not describe a robot that can walk.
+    """
+    task = for_robot(run.task, robot, robot_config)
+    mirror = run.learner.mirror and task.body.mirror_joints is not None
+    return replace(run, task=task, learner=replace(run.learner, mirror=mirror))
+
+
 def teacher_of(run: Run) -> Run:
     """Settings of the teacher that a run trains for itself: for the same robot and actions."""
     own = _teacher("mlp")
+    if run.task.robot:
+        own = with_robot(own, run.task.robot, run.task.robot_config)
     rewards = replace(own.task.rewards, **{n: getattr(run.task.rewards, n) for n in _OF_TEACHER})
     steps = run.task.control_step_s / own.task.physics_step_s
     even = abs(steps - round(steps)) < 1e-6

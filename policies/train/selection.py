@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rsl_rl.models import MLPModel
 
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
-from pupper_sysid.policies.walks.conditions import evaluation_task
+from pupper_sysid.policies.walks.conditions import evaluation_task, share_of_usual
 from pupper_sysid.policies.walks.tracking import planar_velocity
 from pupper_sysid.servo_models.joint_arrays import JointArrays
 from pupper_sysid.sim.walking.config import Walking
@@ -65,7 +65,8 @@ class Judge:
         self._steps = round(seconds / task.control_step_s)
         robots = _EACH * len(COMMANDS)
         env = PupperEnv(task, servos, robots, seed + _SEED, threads, servo_model)
-        self._command = np.repeat(COMMANDS, _EACH, axis=0)
+        self._scale = share_of_usual(task) if task.robot else np.ones(3)
+        self._command = np.repeat(COMMANDS, _EACH, axis=0) * self._scale
         env.set_command(self._command)
         self._env = WalkingVecEnv(env, action_history, device)
         self._start = self._env.state
@@ -104,7 +105,12 @@ class Judge:
                 actor.reset(dones)
         actor.reset(hidden_state=kept)
         landed, duty = np.mean(feet[first:], axis=0)
-        found = scored(np.array(velocity)[first:], np.array(up)[first:], self._command)
+        scale = self._scale
+        found = scored(
+            np.array(velocity)[first:] / scale, np.array(up)[first:], self._command / scale
+        )
+        for name, size in zip(("vx_m_s", "vy_m_s", "yaw_rad_s"), scale, strict=True):
+            found[f"score_{name}"] *= float(size)
         rate = float(landed / env.env.config.control_step_s)
         return found | {"score_steps_hz": rate, "score_duty": float(duty)}
 

@@ -97,7 +97,7 @@ class Paces:
         env, found = self.env, []
         for _ in range(count):
             phase = np.full(env.environments, self._phases[self._at % _STRIDE])
-            target = env.trot.joints(phase, env.command)
+            target = env.trot.joints(phase, env.command, env.body)
             noise = self._noise[self._at % _STRIDE]
             found.append((target - env.default) / env.config.action_scale + noise)
             self._at += 1

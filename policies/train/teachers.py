@@ -29,8 +29,9 @@ from pupper_sysid.policies.network.actor_critic import build
 from pupper_sysid.policies.train.checkpoint import judged_weights, read_checkpoint
 from pupper_sysid.policies.train.run_file import Run, check_teacher
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
+from pupper_sysid.policies.walks.conditions import share_of_usual
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS, PRIVILEGED_PARTS
+from pupper_sysid.sim.walking.observation import CLOCK_SEEN, OBSERVATION_PARTS
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ _RIDGE = 0.02  # in shares of the data
 _FEWEST = 1000  # errors that are fitted
 _QUIET = 4  # every so many robots act without noise
 _COMMAND = OBSERVATION_PARTS["command"]
-_CLOCK = slice(PRIVILEGED_PARTS["clock"].start, PRIVILEGED_PARTS["clock"].start + 2)
+_CLOCK = slice(CLOCK_SEEN.start, CLOCK_SEEN.start + 2)  # cosine and sine
 _PER_STEP = 4  # phases of a learned gait that are compared, per control step
 
 
@@ -66,6 +67,8 @@ class Teacher(ABC):
     def __init__(self, env: WalkingVecEnv, state: dict[str, torch.Tensor] | None = None):
         self._vec_env, self._env = env, env.env
         self._command = self._env.command.copy()
+        task = self._env.config
+        self._range = _RANGE * (share_of_usual(task) if task.robot else 1.0)
         self.quiet = np.arange(env.num_envs) % _QUIET == 0
         self.correction, self._since = np.zeros((3, 6)), np.zeros(env.num_envs)
         if state:
@@ -87,8 +90,8 @@ class Teacher(ABC):
 
     def corrected(self, command: Array) -> Array:
         """Commands that the teacher follows where these are given, shape (n, 3)."""
-        more = np.einsum("nak,ak->na", _features(command), self.correction)
-        return command + _RANGE * more
+        more = np.einsum("nak,ak->na", _features(command / self._range), self.correction)
+        return command + self._range * more
 
     def watch(self) -> None:
         """Take the speeds of the present step."""
@@ -99,8 +102,8 @@ class Teacher(ABC):
         walks = self.quiet & (self._since > _SETTLED_S) & env.command.any(axis=1)
         if env.config.differences.as_calibrated:
             walks &= env.robots.bodies.as_calibrated
-        self._features.append(_features(env.command[walks]))
-        self._errors.append((env.command - env.stride_velocity)[walks] / _RANGE)
+        self._features.append(_features(env.command[walks] / self._range))
+        self._errors.append((env.command - env.stride_velocity)[walks] / self._range)
 
     def adapt(self, rate: float) -> None:
         """Add a share `rate` of the errors since the last time, fitted, to the correction."""
@@ -124,8 +127,11 @@ class TrotTeacher(Teacher):
         trot, scale, span = env.trot, env.config.action_scale, env.config.control_step_s
         command = self.corrected(env.command)
         now, before = (env.default + scale * a for a in (env.action, env.last_action))
-        phase = trot.phase_of(now, before, span, command) + 2 * np.pi * trot.frequency_hz * span
-        shown = (trot.joints(phase, command) - env.default) / scale
+        phase = (
+            trot.phase_of(now, before, span, command, env.body)
+            + 2 * np.pi * trot.frequency_hz * span
+        )
+        shown = (trot.joints(phase, command, env.body) - env.default) / scale
         return self._vec_env.tensor(shown.astype(np.float32))
 
 
@@ -230,13 +236,13 @@ def load_teacher(folder: Path, checkpoint: str, run: Run, seen: TensorDict) -> M
     return network.eval()
 
 
-def _features(command: Array) -> Array:
-    """Of each axis, what its speed may depend on, shape (n, 3, 6).
+def _features(share: Array) -> Array:
+    """Of each axis, what its speed may depend on, shape (n, 3, 6), of shares of the commands.
 
     Only what is odd under a mirror image where the axis is, and even where it is.
     """
-    x, y, turn = (command / _RANGE).T
-    alone = Trot.turning_in_place(command)
+    x, y, turn = share.T
+    alone = Trot.turning_in_place(share * _RANGE)
     return np.stack(
         [
             np.stack([np.maximum(x, 0), np.minimum(x, 0), x * abs(x), x * abs(y), x * abs(turn),

@@ -70,8 +70,8 @@ def make_env(run: Run, ranks: Ranks, servos: ServoRanges | None = None) -> Puppe
     """The environment of a run (of this process)."""
     threads = threads_of(run, ranks)
     return PupperEnv(
-        run.task, servos or servo_ranges(run.actuator, run.feedback), run.environments,
-        run.seed + 7919 * ranks.rank, threads,
+        run.task, servos or servo_ranges(run.actuator, run.feedback, run.task.body),
+        run.environments, run.seed + 7919 * ranks.rank, threads,
         servo_model_of(run.actuator, run.task.control_step_s),
         device={"cpu": None, "warp-cpu": "cpu"}.get(run.device, _local(run.device, ranks)),
     )  # fmt: skip

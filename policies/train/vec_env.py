@@ -35,11 +35,9 @@ class WalkingVecEnv:
         Of the last action; to be set before `step`. An episode begins with none.
     """
 
-    num_actions = 12
-
     def __init__(self, env: PupperEnv, action_history: int = 0, device: str = "cpu"):
         self.env, self.device = env, device
-        self.num_envs = env.environments
+        self.num_envs, self.num_actions = env.environments, len(env.default)
         self.max_episode_length = env.config.episode_steps
         self.cfg: dict[str, Any] = {}
         self._past = np.zeros((env.environments, action_history, self.num_actions))

@@ -109,19 +109,37 @@ def evaluation_task(task: Walking, seconds: float | None = None) -> Walking:
         task.randomisation, push_m_s=0.0, on_the_move=0.0, joint_rad=0.05, joint_rad_s=0.0,
         base_velocity_m_s=(0.0, 0.0, 0.0), base_rate_rad_s=(0.0, 0.0, 0.0),
     )  # fmt: skip
+    commands = RANDOM
+    if task.robot:  # as far within the robot's own ranges
+        own = task.commands
+        commands = replace(
+            RANDOM, forward_m_s=own.forward_m_s, sideways_m_s=own.sideways_m_s,
+            yaw_rad_s=own.yaw_rad_s, dead_band=own.dead_band,
+        )  # fmt: skip
     return replace(
-        task.evaluated(), commands=RANDOM, curriculum=Curriculum(), randomisation=gentle,
+        task.evaluated(), commands=commands, curriculum=Curriculum(), randomisation=gentle,
         episode_s=task.episode_s if seconds is None else seconds,
     )  # fmt: skip
 
 
-def random_commands(robots: int, steps: int, step_s: float, seed: int) -> Array:
-    """Commands of `RANDOM` for each robot and step, shape (steps, robots, 3)."""
+def share_of_usual(task: Walking) -> Array:
+    """Largest commands of a task over those of `RANDOM`, shape (3,)."""
+    own, usual = (
+        np.abs([c.forward_m_s, c.sideways_m_s, c.yaw_rad_s]).max(axis=1)
+        for c in (task.commands, RANDOM)
+    )
+    return own / usual
+
+
+def random_commands(
+    robots: int, steps: int, step_s: float, seed: int, commands: Commands = RANDOM
+) -> Array:
+    """Commands of `RANDOM`, or others, for each robot and step, shape (steps, robots, 3)."""
     rng = np.random.default_rng([seed, 3])
-    low, high = np.array([RANDOM.forward_m_s, RANDOM.sideways_m_s, RANDOM.yaw_rad_s]).T
+    low, high = np.array([commands.forward_m_s, commands.sideways_m_s, commands.yaw_rad_s]).T
     drawn = rng.uniform(low, high, (steps, robots, 3))
     # of exponential intervals, memoryless: in each step a new one comes with this chance
-    new = rng.random((steps, robots)) < 1 - np.exp(-step_s / RANDOM.every_s)
+    new = rng.random((steps, robots)) < 1 - np.exp(-step_s / commands.every_s)
     new[0] = True
     since = np.maximum.accumulate(np.where(new, np.arange(steps)[:, None], 0), axis=0)
     return np.take_along_axis(drawn, since[..., None], axis=0)

@@ -25,7 +25,13 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.walks.conditions import Condition, Moment, Recorder, random_commands
+from pupper_sysid.policies.walks.conditions import (
+    RANDOM,
+    Condition,
+    Moment,
+    Recorder,
+    random_commands,
+)
 from pupper_sysid.policies.walks.handicaps import (
     impose,
     missed_ticks,
@@ -211,7 +217,9 @@ class _Group:
             impose(self.env.robots, _numbers(robots), own.handicap)
         self.policy = deepcopy(policy)  # hooks of a recorder hear this environment only
         self.recorder = recorder(self.env, self.policy, conditions)
-        random = random_commands(shared.robots, self.steps, step_s, seed)
+        random = random_commands(
+            shared.robots, self.steps, step_s, seed, task.commands if task.robot else RANDOM
+        )
         commands = np.concatenate(
             [
                 random[:, : c.robots] if c.command is None
@@ -286,7 +294,7 @@ class _Group:
         if len(self.trotting):
             angle = 2 * np.pi * self.trot.frequency_hz * step * self.step_s
             phase = np.full(len(self.trotting), angle)
-            joints = self.trot.joints(phase, self.commands[step, self.trotting])
+            joints = self.trot.joints(phase, self.commands[step, self.trotting], env.body)
             action[self.trotting] = (joints - env.default) / env.config.action_scale
         action[missed] = env.action[missed]
         return action
@@ -300,7 +308,7 @@ class _Group:
 def _reference(task: Walking) -> Trot:
     """The trot beside a policy: the usual one, or that which was fitted to its servos."""
     usual = [preset.trot for preset in PRESETS.values()]
-    return Trot() if task.trot in usual else task.trot
+    return Trot() if task.trot in usual and task.body.is_mini_pupper else task.trot
 
 
 def _numbers(robots: slice) -> NDArray[np.intp]:

@@ -136,7 +136,8 @@ class WarpRobots(RobotBatch):
         self._activation[:], self._site_position[:] = found["act"], found["site_xpos"]
         self._mend(found)
         touch = found["sensordata"][:, -self._touch_steps :, self._touch].max(axis=1)
-        return Moved(self._parts[part], start, found["qpos"], found["actuator_force"], touch)
+        feet = self._site_position[:, None, self._feet_sites]
+        return Moved(self._parts[part], start, found["qpos"], found["actuator_force"], touch, feet)
 
     def _mend(self, found: dict[str, Array]) -> None:
         """Reset robots that became NaN, as MuJoCo does."""

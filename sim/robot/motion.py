@@ -26,6 +26,9 @@ class Moved:
         Servo torques in each physics step [N·m].
     touch : ndarray, shape (k, 4)
         Largest force on each foot in the last 6 ms [N].
+    feet : ndarray, shape (k, physics steps, 4, 3)
+        Places of the feet in the world before each physics step [m]; on a Warp device only the
+        last.
     """
 
     rows: slice
@@ -33,6 +36,7 @@ class Moved:
     qpos: Array
     load: Array
     touch: Array
+    feet: Array
 
 
 def gravity_direction(qpos: Array) -> Array:

@@ -1,7 +1,7 @@
-"""RobotBatch: many Mini Puppers in `mujoco.batch`, each with its own servos, friction and payload.
+"""RobotBatch: many robots in `mujoco.batch`, each with its own servos, friction and payload.
 
 The physics of `sim.walking.env` without its task: draw robots, place them, step them, read their
-state. Arrays are (environments, …) NumPy; joint angles are in the order of `JOINT_NAMES`, absolute.
+state. Arrays are (environments, …) NumPy; joint angles are in the order of `Body.joints`, absolute.
 Servo delay, gains, limits and friction are MuJoCo's own, so a control step of ten physics steps is
 one call (`Batch.rollout`) without Python inside.
 
@@ -23,16 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.joints import JOINT_NAMES, LEGS
 from pupper_sysid.servo_models.joint_arrays import JointArrays, same_rate
 from pupper_sysid.sim.robot.engine import mujoco
-from pupper_sysid.sim.robot.mini_pupper import (
-    FOOT_RADIUS_M,
-    STANDING_HEIGHT_M,
-    default_pose,
-    limits,
-    robot_xml,
-)
 from pupper_sysid.sim.robot.motion import Moved
 from pupper_sysid.sim.robot.servo_mjcf import (
     BATCH_FIELDS,
@@ -48,14 +40,11 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
 Array = NDArray[np.float64]
 
-FEET = len(LEGS)
 _TOUCH_S = 0.006  # a foot is down if it was so in the last milliseconds: contacts flicker
-_RECORD = ("qpos", "actuator_force", "sensordata")
+_RECORD = ("qpos", "actuator_force", "sensordata", "site_xpos")
 _MANY = 256  # robots from which parts are worth a second call of every NumPy function
 _LATEST = 4.0  # longest latency of a command, in means
 _FIRST_PART = 0.625  # while the rest moves, there is time for what follows on the first part
-
-_THIGHS, _CALVES = np.arange(1, 12, 3), np.arange(2, 12, 3)
 
 
 class RobotBatch:
@@ -109,10 +98,17 @@ class RobotBatch:
     ):
         servos = servos.in_steps_of(config.physics_step_s)
         self.config, self.servos, self.ground = config, servos, ground
+        body = self.body = config.body
+        joints = len(body.joints)
+        if servos.joints != body.joints:
+            raise InputError(
+                f"The servos are those of {len(servos.joints)} joints ({servos.joints[0]}, …), the "
+                f"robot is {body.name}. Give `servo_ranges` its body."
+            )
         self.servo_model, self.environments = servo_model, environments
         if servo_model is not None:
             self._check_servo_model(servo_model)
-            servo_model.reset(np.zeros((environments, len(JOINT_NAMES))))
+            servo_model.reset(np.zeros((environments, joints)))
         self._extra_s = np.broadcast_to(extra_dead_time_s, environments)
         # with an extra jitter of 0, too, robots draw what they draw beside others that have some
         self._added_jitter = extra_jitter_s is not None
@@ -126,8 +122,7 @@ class RobotBatch:
             name: replace(own, dead_time_s=np.array(longest_s))
             for name, own in servos.nominal().items()
         }
-        step_s, knee = config.physics_step_s, config.knee
-        xml = robot_xml(longest, step_s, knee, ground.xml, ground.assets, config.physics, False)
+        xml = body.xml(longest, config.physics_step_s, ground, config.physics)
         self.model = mujoco.MjModel.from_xml_string(xml)
         self._hash = hashlib.sha256(xml.encode()).hexdigest()
         ground.fill(self.model)
@@ -137,32 +132,29 @@ class RobotBatch:
         from mujoco.batch import Batch  # needs mujoco 4; its message names the module
 
         self.batch = Batch(self.model, environments, threads)
-        joints = range(len(JOINT_NAMES))
-        on_tendons = _CALVES.tolist() if config.knee == "linkage" else []
-        self._dof_of = {i: 6 + i for i in joints if i not in on_tendons}
-        self._tendon_of = {i: k for k, i in enumerate(on_tendons)}
+        self.linked = body.linked
+        self._dof_of = {i: 6 + i for i in range(joints) if i not in self.linked}
+        self._tendon_of = {i: k for k, i in enumerate(self.linked)}
+        self._after, self._before = np.array(self.linked, int), np.array(self.linked, int) - 1
         names = (*BATCH_FIELDS, "geom_friction", "body_mass", "body_ipos")
-        names += TENDON_FIELDS if on_tendons else ()
+        names += TENDON_FIELDS if self.linked else ()
         self._fields = {name: self.batch.expand(name) for name in names}
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._control, self._activation = self.batch.bind("ctrl"), self.batch.bind("act")
         self._history = self.batch.bind("history")
         self._site_position = self.batch.bind("site_xpos")
         self._empty_lines = empty_delay_lines(self.model)
-        self._feet_geoms = np.array([self.model.geom(f"{leg}_foot").id for leg in LEGS])
-        self._touch = np.array([self.model.sensor(f"{leg}_foot_touch").adr[0] for leg in LEGS])
+        self._feet_geoms = np.array([self.model.geom(name).id for name in body.foot_geoms])
+        self._touch = np.array([self.model.sensor(f"{foot}_touch").adr[0] for foot in body.feet])
         self._touch_steps = max(round(_TOUCH_S / config.physics_step_s), 1)
-        self._feet_sites = np.array([self.model.site(f"{leg}_foot").id for leg in LEGS])
-        self._trunk = self.model.body("trunk").id
-        self._low, self._high = limits()
+        self._feet_sites = np.array([self.model.site(foot).id for foot in body.feet])
+        self._trunk = self.model.body(body.trunk).id
         # a servo model is fitted in servo coordinates (`hardware.joint_map`): thighs at neutral
-        default = default_pose()
-        self._bend = self.to_servo(default) - default
+        self._bend = self.to_servo(body.pose) - body.pose
         self._warnings = self.batch.warning.copy()
-        self.drawn = {f: np.zeros((environments, len(JOINT_NAMES))) for f in servos.value}
+        self.drawn = {f: np.zeros((environments, joints)) for f in servos.value}
         self.friction, self.payload_kg = np.zeros(environments), np.zeros(environments)
-        self.bodies = Bodies(config.differences, environments)
-        self.linked: tuple[int, ...] = tuple(on_tendons)
+        self.bodies = Bodies(config.differences, environments, body)
         cut = round(_FIRST_PART * environments)
         whole = self.batch.nthread == 1 or environments < _MANY
         ends = (0, environments) if whole else (0, cut, environments)
@@ -187,23 +179,26 @@ class RobotBatch:
     def feet(self, rows: slice | NDArray[np.intp] = slice(None)) -> tuple[Array, Array]:
         """Feet along the ground, (k, 4, 2), and heights of the soles, (k, 4) [m]; one step old."""
         at = self._site_position[rows][:, self._feet_sites]
-        height = at[..., 2] - FOOT_RADIUS_M - self.ground.height(at[..., 0], at[..., 1])
-        return at[..., :2], height
+        return at[..., :2], self.sole_heights(at)
+
+    def sole_heights(self, feet: Array) -> Array:
+        """Heights of the soles above the ground under them [m], (...), of feet at (..., 3)."""
+        return feet[..., 2] - self.body.sole_m - self.ground.height(feet[..., 0], feet[..., 1])
 
     def to_servo(self, joints: Array) -> Array:
-        """Servo angles of joint angles (..., 12): servo 3 holds thigh + calf behind a linkage."""
-        if self.config.knee == "serial":
+        """Servo angles of joint angles (..., joints): some servos hold the sum of two."""
+        if not self.linked:
             return joints
         servo = joints.copy()
-        servo[..., _CALVES] += joints[..., _THIGHS]
+        servo[..., self._after] += joints[..., self._before]
         return servo
 
     def from_servo(self, servo: Array) -> Array:
         """Joint angles of servo angles; the inverse of `to_servo`."""
-        if self.config.knee == "serial":
+        if not self.linked:
             return servo
         joints = servo.copy()
-        joints[..., _CALVES] -= servo[..., _THIGHS]
+        joints[..., self._after] -= servo[..., self._before]
         return joints
 
     # ------------------------------------------------------------------------- stepping
@@ -250,7 +245,8 @@ class RobotBatch:
             self.config.substeps, own, record=_RECORD, ids=self._ids[part], out=records
         )
         touch = found["sensordata"][:, -self._touch_steps :, self._touch].max(axis=1)
-        return Moved(rows, start[rows], found["qpos"], found["actuator_force"], touch)
+        feet = found["site_xpos"][:, :, self._feet_sites]
+        return Moved(rows, start[rows], found["qpos"], found["actuator_force"], touch, feet)
 
     def _predicted(self, model: JointArrays, target: Array) -> Array:
         """Controls of each physics step, from the positions that a servo model predicts."""
@@ -258,7 +254,7 @@ class RobotBatch:
         servo = self.to_servo(target) + self.bodies.zero_rad
         predicted = np.asarray(model.step(servo - self._bend), float)
         joints = self.from_servo(predicted + self._bend)
-        after = self.to_servo(np.clip(joints, self._low, self._high))
+        after = self.to_servo(np.clip(joints, self.body.low, self.body.high))
         share = np.arange(1, steps + 1)[:, None] / steps
         return before[:, None] + share * (after - before)[:, None]
 
@@ -338,7 +334,7 @@ class RobotBatch:
         place = rng.uniform(-1, 1, (n, 2)) * (reach if np.isfinite(reach) else 0.5)
         yaw = rng.uniform(-np.pi, np.pi, n)
         self.qpos[ids, :2] = place
-        self.qpos[ids, 2] = self._highest_under(place) + STANDING_HEIGHT_M + 0.002
+        self.qpos[ids, 2] = self._highest_under(place) + self.body.standing_height_m + 0.002
         self.qpos[ids, 3:7] = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], axis=1)
         self.qpos[ids, 7:] = joints
         linear = rng.uniform(-1, 1, (n, 3)) * random.base_velocity_m_s
@@ -408,8 +404,10 @@ class RobotBatch:
         return state["robot"] == self._hash
 
     def _check_servo_model(self, model: JointArrays) -> None:
-        if model.joints != JOINT_NAMES:
-            raise InputError("The servo model must have all twelve joints, in order.")
+        if tuple(model.joints) != self.body.joints:
+            raise InputError(
+                f"The servo model must have all {len(self.body.joints)} joints, in order."
+            )
         span = self.config.control_step_s
         if not same_rate(model.time_step_s, span):
             raise InputError(

@@ -16,16 +16,13 @@ without a clock.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.joints import LEGS
-from pupper_sysid.sim.robot.mini_pupper import SIDE, default_pose, foot_position, joint_angles
+from pupper_sysid.sim.robot.body import Body, mini_pupper
 
-_BEHIND = np.array([0.0, 0.5, 0.5, 0.0])[:, None]  # LF, RF, LB, RB: share of a cycle
 _GRID = np.linspace(0.0, 2 * np.pi, 96, endpoint=False)
 
 
@@ -66,7 +63,10 @@ class Trot:
             )
 
     def joints(
-        self, phase: NDArray[np.float64], command: NDArray[np.float64]
+        self,
+        phase: NDArray[np.float64],
+        command: NDArray[np.float64],
+        body: Body | None = None,
     ) -> NDArray[np.float64]:
         """Joint set-points [rad], shape (n, 12).
 
@@ -76,15 +76,19 @@ class Trot:
             Of LF and RB [rad]; at 0 they touch down in front.
         command : ndarray, shape (n, 3)
             Forward and sideways speed [m/s], turn rate [rad/s]; 0, 0, 0 stands.
+        body : Body, optional
+            The Mini Pupper by default.
         """
-        along, up = self._cycle(phase)
-        stroke = self._strokes(command)
+        body = body or mini_pupper()
+        along, up = self._cycle(phase, body)
+        centre = feet_at(body, self.crouch_m, self.spread_m)
+        stroke = self._strokes(command, centre)
         moving = np.abs(command).max(axis=1) > 0
-        angles = []
-        for i, leg in enumerate(LEGS):
+        feet = np.empty((len(command), *centre.shape))
+        for i in range(len(centre)):
             path = np.concatenate([stroke[:, i] * along[i][:, None], up[i][:, None]], axis=1)
-            angles.append(joint_angles(leg, self._centre[i] + path))
-        return np.where(moving[:, None], np.concatenate(angles, axis=1), default_pose())
+            feet[:, i] = centre[i] + path
+        return np.where(moving[:, None], body.joints_at(feet), body.pose)
 
     def phase_of(
         self,
@@ -92,6 +96,7 @@ class Trot:
         earlier: NDArray[np.float64],
         between_s: float,
         command: NDArray[np.float64],
+        body: Body | None = None,
     ) -> NDArray[np.float64]:
         """Phase [rad], shape (n,), of the point of the trot nearest to joint set-points.
 
@@ -105,14 +110,19 @@ class Trot:
         between_s : float
         command : ndarray, shape (n, 3)
             Not all 0: a standing robot has no phase.
+        body : Body, optional
+            The Mini Pupper by default.
         """
-        stroke = self._strokes(command)
+        body = body or mini_pupper()
+        centre = feet_at(body, self.crouch_m, self.spread_m)
+        stroke = self._strokes(command, centre)
         step = 2 * np.pi * self.frequency_hz * between_s
         distance = np.zeros((len(joints), len(_GRID)))
         for targets, phase in ((joints, _GRID), (earlier, _GRID - step)):
-            along, up = self._cycle(phase)
-            for i, leg in enumerate(LEGS):
-                away = foot_position(leg, *targets[:, 3 * i : 3 * i + 3].T) - self._centre[i]
+            along, up = self._cycle(phase, body)
+            feet = body.feet_in_trunk(targets)
+            for i in range(len(centre)):
+                away = feet[:, i] - centre[i]
                 # |away - path|² without the part that is the same at every phase
                 distance -= 2 * (away[:, :2] * stroke[:, i]).sum(axis=1)[:, None] * along[i]
                 distance += (stroke[:, i] ** 2).sum(axis=1)[:, None] * along[i] ** 2
@@ -124,9 +134,9 @@ class Trot:
         bend = np.maximum(before - 2 * at + after, 1e-15)
         return _GRID[nearest] + _GRID[1] * np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
 
-    def _cycle(self, phase: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+    def _cycle(self, phase: NDArray[np.float64], body: Body) -> tuple[NDArray, NDArray]:
         """Where feet are in their strokes, 1 to -1, and how high [m], each shape (4, n)."""
-        own = (phase / (2 * np.pi) + _BEHIND) % 1.0
+        own = (phase / (2 * np.pi) + body.offsets[:, None]) % 1.0
         stands = own < self.duty
         swing = np.pi * (own - self.duty) / (1.0 - self.duty)
         even, round_ = 2.0 / np.pi * swing - 1.0, -np.cos(swing)
@@ -134,14 +144,11 @@ class Trot:
         along = np.where(stands, 1.0 - 2.0 * own / self.duty, back)
         return along, np.where(stands, 0.0, self.lift_m * np.sin(swing))
 
-    @cached_property
-    def _centre(self) -> NDArray[np.float64]:
-        """Middle of each foot's stroke in the trunk's frame [m], shape (4, 3)."""
-        return feet_at(self.crouch_m, self.spread_m)
-
-    def _strokes(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _strokes(
+        self, command: NDArray[np.float64], centre: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Half of each foot's stroke along x and y [m], shape (n, 4, 2)."""
-        x, y = self._centre[:, 0], self._centre[:, 1]
+        x, y = centre[:, 0], centre[:, 1]
         ahead = self.gain * np.where(command[:, :1] < 0, self.back_gain, 1.0)
         forward, left = ahead * command[:, :1], self.gain * self.side_gain * command[:, 1:2]
         turn = self._turn(command)[:, None]
@@ -165,19 +172,13 @@ class Trot:
 _BREAKS_LOOSE_M_S = 0.025  # speed sideways from which steps move the hips in any case
 _SOFT = 0.05  # rad/s over which the dead band is added
 
-FEET_AT = np.array(
-    [foot_position(leg, *default_pose()[3 * i : 3 * i + 3]) for i, leg in enumerate(LEGS)]
-)
-"""Where the feet are in the default pose, in the trunk's frame [m], shape (4, 3)."""
 
-
-def feet_at(crouch_m: float, spread_m: float) -> NDArray[np.float64]:
+def feet_at(body: Body, crouch_m: float, spread_m: float) -> NDArray[np.float64]:
     """Feet in the trunk's frame [m], shape (4, 3), of a trunk that is lower, and farther apart."""
-    side = np.array([SIDE[leg] for leg in LEGS])
-    return FEET_AT + np.column_stack([np.zeros(4), spread_m * side, np.full(4, crouch_m)])
+    none = np.zeros(len(body.feet))
+    return body.feet_at + np.column_stack([none, spread_m * body.sides, none + crouch_m])
 
 
-def stance(crouch_m: float, spread_m: float) -> NDArray[np.float64]:
+def stance(body: Body, crouch_m: float, spread_m: float) -> NDArray[np.float64]:
     """Joint angles [rad], shape (12,), of a robot that stands so low and wide."""
-    feet = feet_at(crouch_m, spread_m)
-    return np.concatenate([joint_angles(leg, foot) for leg, foot in zip(LEGS, feet, strict=True)])
+    return body.joints_at(feet_at(body, crouch_m, spread_m)[None])[0]

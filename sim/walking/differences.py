@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.joints import JOINT_NAMES, LEGS
+from pupper_sysid.sim.robot.body import Body
 
 Array = NDArray[np.float64]
 
-_PER_LEG = len(JOINT_NAMES) // len(LEGS)
 _OF_VOLTAGE = ("stiffness", "effort_limit", "velocity_limit")
 _OF_MOTOR = ("stiffness", "damping", "effort_limit")
+OF_UNIT = ("stiffness", "damping", "friction_loss", "effort_limit", "velocity_limit")
+"""Numbers of a servo in which units of one type differ."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,9 @@ class Differences:
     Servos' own numbers vary within the calibration's intervals in any case.
     """
 
+    servo_spread: float = 0.0
+    """Largest share by which each of a joint's numbers (`OF_UNIT`) differs from the calibration's:
+    between units of one type, beyond what the calibration leaves open of its own."""
     joint_zero_rad: float = 0.0
     """Largest error of a servo's zero, the same in commands and readings."""
     command_jitter: tuple[float, float] = (1.0, 1.0)
@@ -60,7 +64,7 @@ class Differences:
     """Share of robots with none of these in body, servos and ticks."""
 
     def __post_init__(self):
-        for name in ("joint_zero_rad", "imu_mounting_rad", "gyro_bias_rad_s"):
+        for name in ("servo_spread", "joint_zero_rad", "imu_mounting_rad", "gyro_bias_rad_s"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"differences.{name} must be from 0 to below 1.")
         for name in ("weak_leg_share", "missed_ticks", "without_effort", "as_calibrated"):
@@ -89,6 +93,8 @@ class Differences:
 
 
 TYPICAL = Differences(
+    # servos of one type, bought together
+    servo_spread=0.1,
     # a tenth of the angle between two teeth of a horn (25 teeth); recordings show 6 mrad
     joint_zero_rad=0.025,
     # other hosts are busier, or idle
@@ -133,9 +139,9 @@ class Bodies:
         Robots without differences.
     """
 
-    def __init__(self, settings: Differences, robots: int):
-        self._settings = settings
-        self.zero_rad = np.zeros((robots, len(JOINT_NAMES)))
+    def __init__(self, settings: Differences, robots: int, body: Body):
+        self._settings, self._body = settings, body
+        self.zero_rad = np.zeros((robots, len(body.joints)))
         self.centre_m = np.zeros((robots, 3))
         self.jitter, self.poll, self.effort = np.ones(robots), np.ones(robots), np.ones(robots)
         self.as_calibrated = np.zeros(robots, bool)
@@ -165,8 +171,14 @@ class Bodies:
         if own.as_calibrated:
             differ = rng.random(n) >= own.as_calibrated
             self.as_calibrated[ids] = ~differ
+        if own.servo_spread:
+            for name in OF_UNIT:
+                share = rng.uniform(-own.servo_spread, own.servo_spread, servos[name].shape)
+                servos[name] *= 1.0 + share * differ[:, None]
         if own.joint_zero_rad:
-            error = rng.uniform(-own.joint_zero_rad, own.joint_zero_rad, (n, len(JOINT_NAMES)))
+            error = rng.uniform(
+                -own.joint_zero_rad, own.joint_zero_rad, (n, len(self._body.joints))
+            )
             self.zero_rad[ids] = error * differ[:, None]
         if any(own.centre_of_mass_m):
             shift = rng.uniform(-1, 1, (n, 3)) * own.centre_of_mass_m
@@ -183,8 +195,8 @@ class Bodies:
                 servos[name] *= voltage
         if own.weak_leg_share and own.weak_leg != (1.0, 1.0):
             weak = differ & (rng.random(n) < own.weak_leg_share)
-            leg, factor = rng.integers(0, len(LEGS), n), rng.uniform(*own.weak_leg, n)
-            strength = np.ones((n, len(LEGS)))
+            leg, factor = rng.integers(0, len(self._body.feet), n), rng.uniform(*own.weak_leg, n)
+            strength = np.ones((n, len(self._body.feet) + 1))  # the last of joints of no leg
             strength[weak, leg[weak]] = factor[weak]
             for name in _OF_MOTOR:
-                servos[name] *= np.repeat(strength, _PER_LEG, axis=1)
+                servos[name] *= strength[:, self._body.leg_of]

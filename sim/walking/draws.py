@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.sim.robot.mini_pupper import default_pose, limits
+from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Commands, Randomisation
 
@@ -31,13 +31,14 @@ def at_rest(commands: Commands, command: Array) -> Array:
 
 
 def draw_pose(
-    random: Randomisation, trot: Trot, command: Array, rng: np.random.Generator
+    random: Randomisation, body: Body, trot: Trot, command: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Joint angles [rad] and velocities [rad/s] at the start, each (n, 12), of commands (n, 3)."""
-    n, default = len(command), default_pose()
-    start = default + rng.uniform(-random.joint_rad, random.joint_rad, (n, 12))
-    speed = rng.uniform(-random.joint_rad_s, random.joint_rad_s, (n, 12))
+    """Joint angles [rad] and velocities [rad/s] at the start, (n, joints), of commands (n, 3)."""
+    n, joints = len(command), len(body.joints)
+    start = body.pose + rng.uniform(-random.joint_rad, random.joint_rad, (n, joints))
+    speed = rng.uniform(-random.joint_rad_s, random.joint_rad_s, (n, joints))
     trotting = rng.random(n) < random.on_the_move
     phase = rng.uniform(0.0, 2 * np.pi, n)
-    start[trotting] = trot.joints(phase, command)[trotting]
-    return np.clip(start, *limits()), speed * ~trotting[:, None]
+    if trotting.any():
+        start[trotting] = trot.joints(phase, command, body)[trotting]
+    return np.clip(start, body.low, body.high), speed * ~trotting[:, None]

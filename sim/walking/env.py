@@ -9,6 +9,9 @@ The joint angles that a policy sees have passed through the measured feedback
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,30 +19,32 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.joint_arrays import JointArrays
-from pupper_sysid.sim.robot.falls import touches_ground
-from pupper_sysid.sim.robot.mini_pupper import default_pose, limits
 from pupper_sysid.sim.robot.motion import Moved, gravity_direction, own_velocity, planar
-from pupper_sysid.sim.robot.robot_batch import FEET, RobotBatch
+from pupper_sysid.sim.robot.robot_batch import RobotBatch
 from pupper_sysid.sim.robot.terrain import make_ground
-from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.config import PRESETS, Walking
 from pupper_sysid.sim.walking.draws import at_rest, draw_commands, draw_pose
+from pupper_sysid.sim.walking.effort import EffortMeter
 from pupper_sysid.sim.walking.observation import (
     FALLEN_TILT,
-    OBSERVATION_SIZE,
-    PRIVILEGED_SIZE,
     noise_of,
+    observation_of,
     observed,
     privileged_of,
+    privileged_parts,
 )
 from pupper_sysid.sim.walking.rewards.strides import Strides
-from pupper_sysid.sim.walking.rewards.terms import weighted
+from pupper_sysid.sim.walking.rewards.terms import TERMS, weighted
 from pupper_sysid.sim.walking.rewards.weights import Rewards, narrowed
+from pupper_sysid.sim.walking.scaled import for_robot
 from pupper_sysid.sim.walking.senses import Rows, Senses
-from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 from pupper_sysid.sim.walking.shared_draws import Twins, generator
 from pupper_sysid.sim.walking.step import Step, StepResult, Unfinished, empty_facts, unforeseen_of
 
 Array = NDArray[np.float64]
+Term = Callable[[Step, Rewards], Array]
+Seen = Callable[["PupperEnv", Rows], Array]
 
 _EDGE_M = 0.5
 _ARRAYS = (
@@ -49,7 +54,7 @@ _ARRAYS = (
 
 
 class PupperEnv:
-    """Vectorised walking environment of the Mini Pupper 2: a batch of actions in, a batch out.
+    """Vectorised walking environment of a legged robot: a batch of actions in, a batch out.
 
     Parameters
     ----------
@@ -76,6 +81,12 @@ class PupperEnv:
         Of the physics by mujoco-warp (extra `gpu`): `cuda`, `cuda:1`, or `cpu` to try it; by
         default MuJoCo steps it on `threads`. Readings and rewards are NumPy either way, from the
         state that comes back after each control step.
+    terms : mapping of str to (float, callable), optional
+        Rewards of your own beside those of `config.rewards`: a weight per second, and a function of
+        a `Step` and the `Rewards` that gives one number per robot.
+    observations : mapping of str to callable, optional
+        Parts of an observation of your own, after the usual ones: `part(env, rows)` gives values of
+        shape (k, size) for some robots. Policy files hold the usual observation only.
 
     Attributes
     ----------
@@ -83,9 +94,6 @@ class PupperEnv:
         Forward and sideways speed [m/s] and turn rate [rad/s] that each robot is to follow.
     robots : RobotBatch
         The physics: positions, velocities, the servos that were drawn.
-    moved : list of Moved
-        What the physics did in the last control step, by parts of the robots, with the state after
-        each of its own steps; overwritten by the next.
     steps, nan_resets : int
         Control steps since the start; simulations that became NaN, and were drawn anew.
     processes : int
@@ -113,7 +121,7 @@ class PupperEnv:
 
     Examples
     --------
-    >>> from pupper_sysid.sim.walking.config import Walking
+    >>> from pupper_sysid.sim.walking.config import PRESETS, Walking
     >>> from pupper_sysid.sim.walking.servo_ranges import servo_ranges
     >>> env = PupperEnv(Walking(), servo_ranges("paper"), environments=4, threads=1)
     >>> observation, privileged = env.reset()
@@ -138,6 +146,8 @@ class PupperEnv:
         twins: Twins | None = None,
         extra_jitter_s: Array | None = None,
         device: str | None = None,
+        terms: Mapping[str, tuple[float, Term]] | None = None,
+        observations: Mapping[str, Seen] | None = None,
     ):
         if environments < 1:
             raise InputError(f"There are {environments} environments; at least 1 is needed.")
@@ -152,12 +162,18 @@ class PupperEnv:
             from pupper_sysid.sim.gpu.warp_robots import WarpRobots
 
             self.robots = WarpRobots(config, servos, self.ground, environments, device, *late)
-        self.default, (self._low, self._high) = default_pose(), limits()
+        body = self.body = config.body
+        self.default = body.pose
         self.trot = config.trot
         n = environments
+        self._own_terms, self._own_seen = dict(terms or {}), dict(observations or {})
+        if known := sorted(self._own_terms.keys() & TERMS.keys()):
+            raise InputError(
+                f"A reward term is called {known[0]} already; give yours another name."
+            )
         self._senses = Senses(config, servos, self.robots, n, generator([seed, 2], twins))
-        self._strides = Strides(n, config.control_step_s, config.rewards)
-        self.moved: list[Moved] = []
+        self._strides = Strides(body, n, config.control_step_s, config.rewards)
+        self._effort = EffortMeter(self.robots, config.control_step_s)
         self.nan_resets = 0
         self.steps, self.processes = 0, 1
         self.level = config.curriculum.at(0)
@@ -168,8 +184,12 @@ class PupperEnv:
 
         self.command = zeros(3)
         self.episode_step = np.zeros(n, int)
-        self.action, self.last_action, self.earlier_action = zeros(12), zeros(12), zeros(12)
+        self.action, self.last_action, self.earlier_action = (
+            zeros(len(body.joints)) for _ in range(3)
+        )
         self._until_command, self._until_push = zeros(), zeros()
+        self._size = sum(size for _, size, _ in observation_of(len(body.joints)))
+        self._size += sum(x.shape[1] for x in self._seen(slice(None)))
         self.reset()
 
     # ------------------------------------------------------------------------- public
@@ -185,7 +205,9 @@ class PupperEnv:
         Draws noise, but does not let time pass.
         """
         n = self.environments
-        return self._look(slice(None), noise_of(self.config.observation, n, self.rng))
+        return self._look(
+            slice(None), noise_of(self.config.observation, len(self.default), n, self.rng)
+        )
 
     def step(self, action: NDArray[np.floating]) -> StepResult:
         """Let every robot act for one control step.
@@ -208,9 +230,7 @@ class PupperEnv:
         moving = self.robots.step(self.set_points(self.action))
         # what does not need the new state is done while it is computed
         now = self._begin(before)
-        self.moved = []
         for moved in moving:
-            self.moved.append(moved)
             self._take(moved, now)
         broken = self.robots.broken()
         if broken.any():
@@ -235,7 +255,7 @@ class PupperEnv:
             self._restart(over)
             noise = None if now.noise is None else now.noise[over]
             now.observation[over], now.privileged[over] = self._look(over, noise)
-        facts = Step(**now.facts)
+        facts = Step(body=self.body, **now.facts)
         return StepResult(
             now.observation, now.privileged, reward, done, timed_out, now.terms, terminal,
             unforeseen, facts,
@@ -245,7 +265,7 @@ class PupperEnv:
         """Joint set-points [rad] of actions, shape (n, 12), within the joint limits."""
         target = action * self.config.action_scale
         target += self.default
-        return np.clip(target, self._low, self._high, out=target)
+        return np.clip(target, self.body.low, self.body.high, out=target)
 
     def set_command(self, command: NDArray[np.floating]) -> None:
         """Give all robots a command, shape (3,) or (n, 3), until the end of their episodes."""
@@ -297,6 +317,7 @@ class PupperEnv:
         """All arrays that change, but for those of the physics."""
         senses = self._senses
         parts = {"readings": senses.readings, "imu": senses.imu, "strides": self._strides}
+        parts["effort"] = self._effort
         found = {f"{part}.{k}": v for part, its in parts.items() for k, v in its.state.items()}
         return found | {name: getattr(self, name) for name in _ARRAYS} | {"_seen": senses.kept}
 
@@ -321,7 +342,7 @@ class PupperEnv:
         n, config, span = self.environments, self.config, self.config.control_step_s
         chances = self._senses.readings.chances(config.substeps)
         actions = (self.action, self.last_action, self.earlier_action)
-        facts = empty_facts(self.command, *actions)
+        facts = empty_facts(self.body, self.command, *actions)
         self.episode_step += 1
         self._until_command -= span
         due = np.flatnonzero(self._until_command <= 0)
@@ -335,10 +356,12 @@ class PupperEnv:
             push = self.rng.uniform(-most, most, (len(pushed), 2))
             pause = self.rng.uniform(*config.randomisation.push_every_s, len(pushed))
             self._until_push[pushed] = pause
-        noise = noise_of(config.observation, n, self.rng)
+        joints, feet = len(self.body.joints), len(self.body.feet)
+        noise = noise_of(config.observation, joints, n, self.rng)
         return Unfinished(
             velocity_before, chances, noise, pushed if most > 0 else pushed[:0], push, facts, {},
-            np.empty((n, OBSERVATION_SIZE), np.float32), np.empty((n, PRIVILEGED_SIZE), np.float32),
+            np.empty((n, self._size), np.float32),
+            np.empty((n, sum(size for _, size in privileged_parts(joints, feet))), np.float32),
             np.empty(n, bool),
         )  # fmt: skip
 
@@ -349,19 +372,22 @@ class PupperEnv:
         self._senses.advance(moved, now.chances, self.steps)
         gravity, velocity = gravity_direction(qpos), own_velocity(qpos, qvel)
         fallen = gravity[:, 2] > -FALLEN_TILT
-        fallen |= touches_ground(qpos, gravity, self.ground)
+        fallen |= self.body.touches_ground(qpos, gravity, self.ground)
         now.fallen[rows] = fallen
         facts = {name: value[rows] for name, value in now.facts.items()}
         self._strides.advance(rows, moved.touch, robots.feet(rows), planar(velocity, qvel), facts)
+        self._effort.advance(moved, facts)
         facts["linear_velocity"][:], facts["gravity"][:] = velocity, gravity
         facts["angular_velocity"][:], facts["torque"][:] = qvel[:, 3:6], moved.load[:, -1]
         np.subtract(qpos[:, 7:], self.default, out=facts["position_relative"])
         facts["velocity"][:] = qvel[:, 6:]
         np.subtract(qvel[:, 6:], now.velocity_before[rows], out=facts["acceleration"])
         facts["acceleration"] /= span
-        step = Step(**facts)
+        step = Step(body=self.body, **facts)
         level = self.level
         terms = weighted(step, self._rewards, level.penalties, level.guides, level.progress)
+        for name, (weight, term) in self._own_terms.items():
+            terms[name] = weight * term(step, self._rewards)
         for name, term in terms.items():
             whole = now.terms.setdefault(name, np.empty(self.environments))
             np.multiply(term, span, out=whole[rows])
@@ -383,13 +409,16 @@ class PupperEnv:
     def _restart(self, ids: NDArray[np.intp]) -> None:
         self.robots.draw(ids, self.level.delay, self.rng)
         self._draw_commands(ids)
-        start, speed = draw_pose(self.config.randomisation, self.trot, self.command[ids], self.rng)
+        start, speed = draw_pose(
+            self.config.randomisation, self.body, self.trot, self.command[ids], self.rng
+        )  # fmt: skip
         self.robots.place(ids, start, speed, 2 * _EDGE_M, self.rng)
         angles = self.robots.to_servo(start)
         qpos, qvel = self.robots.qpos[ids], self.robots.qvel[ids]
         self._senses.reset(ids, angles, qvel[:, 3:6], gravity_direction(qpos), self.rng)
         velocity = planar(own_velocity(qpos, qvel), qvel)
         self._strides.reset(ids, self.robots.feet(ids)[0], velocity)
+        self._effort.reset(ids)
         self._until_push[ids] = self.rng.uniform(*self.config.randomisation.push_every_s, len(ids))
         self.episode_step[ids] = 0
         command = self.robots.from_servo(angles - self.robots.bodies.zero_rad[ids])
@@ -427,6 +456,7 @@ class PupperEnv:
             [
                 velocity if true else np.zeros((len(qpos), 3)), rate, down,
                 self.command[rows], angle - self.default, moved, effort, self.action[rows],
+                *self._seen(rows),
             ],
             noise, observation,
         )  # fmt: skip
@@ -444,6 +474,10 @@ class PupperEnv:
         )  # fmt: skip
         return observation, privileged
 
+    def _seen(self, rows: Rows) -> list[Array]:
+        """What the user's own parts of an observation give for some robots."""
+        return [np.asarray(part(self, rows), float) for part in self._own_seen.values()]
+
     def _differing(self, rows: Rows) -> list[Array]:
         """What was drawn for robots, as the critic sees it."""
         robots, imu, bodies = self.robots, self._senses.imu, self.robots.bodies
@@ -451,9 +485,71 @@ class PupperEnv:
         speed = robots.drawn["velocity_limit"][rows] / self.servos.value["velocity_limit"]
         return [
             robots.payload_kg[rows, None], bodies.centre_m[rows],
-            stiffness.reshape(len(stiffness), FEET, -1).mean(axis=2),
+            np.stack([stiffness[:, self.body.leg_of == k].mean(axis=1)
+                      for k in range(len(self.body.feet))], axis=1),
             speed.mean(axis=1, keepdims=True), bodies.zero_rad[rows], imu.mounting_rad[rows],
             imu.bias_rad_s[rows],
             np.stack([imu.latency_s[rows], imu.period_s[rows]], axis=1),
             np.stack([bodies.poll[rows], bodies.jitter[rows], bodies.effort[rows]], axis=1),
         ]  # fmt: skip
+
+
+def make_env(
+    actuator: str | Path = "calibrated.yaml",
+    *,
+    robot: str | Path | None = None,
+    robot_config: str | Path | None = None,
+    preset: str = "fast",
+    feedback: str | Path = "held",
+    environments: int = 64,
+    seed: int = 0,
+    threads: int = 0,
+    terms: Mapping[str, tuple[float, Term]] | None = None,
+    observations: Mapping[str, Seen] | None = None,
+    **task: Any,
+) -> PupperEnv:
+    """Many robots with measured servos on a walking task, for a learner of your own.
+
+    Parameters
+    ----------
+    actuator, feedback : str or Path
+        As for `pupper-train`: a calibration, a preset, `ideal`, …
+    robot, robot_config : str or Path, optional
+        MJCF and YAML of another robot than the Mini Pupper 2 (`sim.robot.robot_file`).
+    preset : {"fast", "scratch", "paper", "release"}
+        The task.
+    environments, seed, threads : int
+    terms, observations : mapping, optional
+        Of your own; see `PupperEnv`.
+    **task
+        Fields of `Walking` that differ from the preset's, such as `episode_s` or `rewards`.
+
+    Returns
+    -------
+    PupperEnv
+
+    Raises
+    ------
+    InputError
+        If the preset is unknown, or a file cannot be read or used.
+
+    Examples
+    --------
+    >>> def level(step, rewards):
+    ...     return step.gravity[:, 2] ** 2
+    >>> env = make_env("paper", environments=4, threads=1, terms={"level": (0.5, level)})
+    >>> result = env.step(np.zeros((4, 12)))
+    >>> result.terms["level"].shape
+    (4,)
+    """
+    if preset not in PRESETS:
+        raise InputError(f"There is no preset {preset}. Give one of {', '.join(PRESETS)}.")
+    config = PRESETS[preset]
+    if robot is not None:
+        config = for_robot(config, robot, robot_config)
+    config = replace(config, **task)
+    servos = servo_ranges(actuator, feedback, config.body)
+    model = servo_model_of(actuator, config.control_step_s)
+    return PupperEnv(
+        config, servos, environments, seed, threads, model, terms=terms, observations=observations
+    )

@@ -11,19 +11,22 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.joints import JOINT_NAMES, LEGS
 from pupper_sysid.sim.walking.config import Observation
 
-OBSERVATION = (
-    ("base_linear_velocity", 3, 0.1),
-    ("base_angular_velocity", 3, 0.2),
-    ("projected_gravity", 3, 0.05),
-    ("command", 3, 0.0),
-    ("joint_position_relative", 12, 0.01),
-    ("joint_velocity", 12, 1.5),
-    ("joint_effort", 12, 0.1),
-    ("last_action", 12, 0.0),
-)
-"""Name, size and half width of the published uniform noise of each part of an observation."""
+
+def observation_of(joints: int) -> tuple[tuple[str, int, float], ...]:
+    """Name, size and half width of the published uniform noise of each part of an observation."""
+    return (
+        ("base_linear_velocity", 3, 0.1), ("base_angular_velocity", 3, 0.2),
+        ("projected_gravity", 3, 0.05), ("command", 3, 0.0),
+        ("joint_position_relative", joints, 0.01), ("joint_velocity", joints, 1.5),
+        ("joint_effort", joints, 0.1), ("last_action", joints, 0.0),
+    )  # fmt: skip
+
+
+OBSERVATION = observation_of(len(JOINT_NAMES))
+"""That of the Mini Pupper."""
 OBSERVATION_SIZE = sum(size for _, size, _ in OBSERVATION)
 
 
@@ -38,9 +41,7 @@ def _places(parts: Iterable[tuple[str, int]]) -> dict[str, slice]:
 
 
 OBSERVATION_PARTS = _places((name, size) for name, size, _ in OBSERVATION)
-"""Where each part of an observation is."""
-_NOISE = np.concatenate([np.full(size, half, np.float32) for _, size, half in OBSERVATION])
-_NOISE_BLIND = np.where(np.arange(OBSERVATION_SIZE) < 3, np.float32(0), _NOISE)
+"""Where each part of an observation is; up to the command, of any robot's."""
 
 FALLEN_TILT = 0.6
 """Cosine of the tilt from which a robot has fallen: 53 degrees."""
@@ -51,15 +52,19 @@ for less."""
 
 
 def noise_of(
-    config: Observation, count: int, rng: np.random.Generator
+    config: Observation, joints: int, count: int, rng: np.random.Generator
 ) -> NDArray[np.float32] | None:
     """Draw the noise of `count` observations, shape (count, 60); None if it is off."""
     if not config.noise:
         return None
-    noise = rng.random((count, OBSERVATION_SIZE), np.float32)
+    parts = observation_of(joints)
+    half = np.concatenate([np.full(size, width, np.float32) for _, size, width in parts])
+    if config.base_velocity != "true":
+        half[OBSERVATION_PARTS["base_linear_velocity"]] = 0.0
+    noise = rng.random((count, len(half)), np.float32)
     noise *= 2
     noise -= 1
-    noise *= _NOISE if config.base_velocity == "true" else _NOISE_BLIND
+    noise *= half
     return noise
 
 
@@ -80,25 +85,33 @@ def observed(
         Where to write them.
     """
     if out is None:
-        out = np.empty((len(parts[0]), OBSERVATION_SIZE), np.float32)
+        out = np.empty((len(parts[0]), sum(p.shape[1] for p in parts)), np.float32)
     whole = np.concatenate(parts, axis=1, out=out)
     if noise is not None:
-        whole += noise
+        whole[:, : noise.shape[1]] += noise  # none on a user's own parts, which come last
     return whole
 
 
-PRIVILEGED = (
-    ("base_linear_velocity", 3), ("joint_position_relative", 12), ("joint_velocity", 12),
-    ("height", 1), ("air_s", 4), ("contact_s", 4), ("friction", 1), ("dead_time_s", 12),
-    ("added_mass", 1), ("centre_of_mass", 3), ("leg_strength", 4), ("battery", 1),
-    ("joint_zero", 12), ("imu_mounting", 3), ("gyro_bias", 3), ("imu_age", 2), ("readings", 3),
-    ("true_angular_velocity", 3), ("true_gravity", 3), ("stride_velocity", 3),
-    ("earlier_action", 12), ("clock", 3), ("time_left", 1),
-)  # fmt: skip
-"""Name and size of each part of what the critic sees."""
+def privileged_parts(joints: int, feet: int) -> tuple[tuple[str, int], ...]:
+    """Name and size of each part of what the critic sees."""
+    return (
+        ("base_linear_velocity", 3), ("joint_position_relative", joints),
+        ("joint_velocity", joints), ("height", 1), ("air_s", feet), ("contact_s", feet),
+        ("friction", 1), ("dead_time_s", joints), ("added_mass", 1), ("centre_of_mass", 3),
+        ("leg_strength", feet), ("battery", 1), ("joint_zero", joints), ("imu_mounting", 3),
+        ("gyro_bias", 3), ("imu_age", 2), ("readings", 3), ("true_angular_velocity", 3),
+        ("true_gravity", 3), ("stride_velocity", 3), ("earlier_action", joints), ("clock", 3),
+        ("time_left", 1),
+    )  # fmt: skip
+
+
+PRIVILEGED = privileged_parts(len(JOINT_NAMES), len(LEGS))
+"""That of the Mini Pupper."""
 PRIVILEGED_PARTS = _places(PRIVILEGED)
 """Where each of them is."""
 PRIVILEGED_SIZE = sum(size for _, size in PRIVILEGED)
+CLOCK_SEEN = slice(-4, -1)
+"""Where the clock is in what the critic sees, of any robot."""
 
 
 def privileged_of(
@@ -123,9 +136,9 @@ def privileged_of(
     """
     velocity, angle, speed, height, air, stance, friction, dead_time, *differs = parts
     mass, centre, legs, battery, zero, turn, bias, age, factors, *more = differs
-    if out is None:
-        out = np.empty((len(velocity), PRIVILEGED_SIZE), np.float32)
     scaled = [velocity, angle, 0.1 * speed, 10 * height, air, stance.clip(0, 1), friction]
     scaled += [10 * dead_time, 10 * mass, 100 * centre, legs, battery, 20 * zero, 20 * turn]
     scaled += [20 * bias, 50 * age, factors, *more]
+    if out is None:
+        out = np.empty((len(velocity), sum(p.shape[1] for p in scaled)), np.float32)
     return np.concatenate(scaled, axis=1, out=out)

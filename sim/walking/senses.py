@@ -58,7 +58,7 @@ class Senses:
             config.differences.poll_period[0],
         )  # fmt: skip
         self.imu = Imu(config.differences, environments, config.control_step_s)
-        self.kept = np.zeros((VELOCITY_STEPS + 1, environments, 12))
+        self.kept = np.zeros((VELOCITY_STEPS + 1, environments, len(robots.body.joints)))
 
     def reset(
         self,

@@ -9,7 +9,7 @@ environment. The feedback comes along, apart from the actuator.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,6 +35,7 @@ from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.joint_arrays import JointArrays
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.servo_models.step_size import at_step, delay_at_step
+from pupper_sysid.sim.robot.body import Body
 
 IDEAL = "ideal"
 _NO_LIMIT_NM = 1e3
@@ -57,6 +58,8 @@ class ServoRanges:
     command_jitter_s : float
         Standard deviation of the (exponential) latency of a robot's commands, whose mean is in the
         dead times [s]: the median of the joints that show one.
+    joints : tuple of str
+        Of the robot, the Mini Pupper's twelve by default.
     """
 
     source: str
@@ -66,6 +69,7 @@ class ServoRanges:
     feedback: tuple[HeldFeedback, ...]
     fallbacks: dict[str, str]
     command_jitter_s: float = 0.0
+    joints: tuple[str, ...] = JOINT_NAMES
 
     @property
     def longest_dead_time_s(self) -> float:
@@ -102,7 +106,7 @@ class ServoRanges:
         """The value of every number, by joint."""
         return {
             name: DelayedPDParameters(**{f: self.value[f][i] for f in PARAMETER_KEYS})
-            for i, name in enumerate(JOINT_NAMES)
+            for i, name in enumerate(self.joints)
         }
 
     def draw(
@@ -124,7 +128,7 @@ class ServoRanges:
             By field of `DelayedPDParameters`.
         """
         drawn = {
-            f: rng.uniform(self.low[f], self.high[f], (count, len(JOINT_NAMES)))
+            f: rng.uniform(self.low[f], self.high[f], (count, len(self.joints)))
             for f in PARAMETER_KEYS
         }
         scale = rng.uniform(*torque_scale, (count, 1))
@@ -133,7 +137,9 @@ class ServoRanges:
         return drawn
 
 
-def servo_ranges(actuator: str | Path, feedback: str | Path = "held") -> ServoRanges:
+def servo_ranges(
+    actuator: str | Path, feedback: str | Path = "held", body: Body | None = None
+) -> ServoRanges:
     """Ranges of the servos of an actuator, and its feedback or another.
 
     Parameters
@@ -144,31 +150,44 @@ def servo_ranges(actuator: str | Path, feedback: str | Path = "held") -> ServoRa
     feedback : str or Path
         `held`: the calibration's own; `ideal`: every reading fresh and exact; or another
         calibration, whose feedback is taken.
+    body : Body, optional
+        The robot; the Mini Pupper 2 by default.
 
     Raises
     ------
     InputError
         If a file cannot be read.
     """
+    joints = JOINT_NAMES if body is None else body.joints
+    servo_of = {} if body is None else body.servo_of
     if str(actuator) == IDEAL or is_servo_model(actuator):
-        found = _ideal(str(actuator))
+        found = _ideal(str(actuator), joints)
     else:
-        found = _from_calibration(load_calibration(actuator), str(actuator))
+        found = _from_calibration(load_calibration(actuator), str(actuator), joints, servo_of)
     if str(feedback) == "held":
         return found
     if str(feedback) == "ideal":
-        held = (HeldFeedback(),) * len(JOINT_NAMES)
+        held = (HeldFeedback(),) * len(joints)
     else:
-        held = _from_calibration(load_calibration(feedback), str(feedback)).feedback
+        other = load_calibration(feedback)
+        held = _from_calibration(other, str(feedback), joints, servo_of).feedback
     return replace(found, feedback=held)
 
 
-def _from_calibration(calibration: Calibration, source: str) -> ServoRanges:
+def _from_calibration(
+    calibration: Calibration, source: str, joints: tuple[str, ...], servo_of: Mapping[str, str]
+) -> ServoRanges:
     parts: list[JointCalibration] = []
     fallbacks = {}
-    for name in JOINT_NAMES:
-        nearest = nearest_joint(name, calibration.joint_names)
-        if nearest != name:
+    for name in joints:
+        wanted = servo_of.get(name)
+        if wanted is not None and wanted not in calibration.joint_names:
+            raise InputError(
+                f"Joint {name} is to have the servo of '{wanted}', but {source} has none. It has "
+                f"{', '.join(calibration.joint_names)}."
+            )
+        nearest = wanted or nearest_joint(name, calibration.joint_names)
+        if wanted is None and nearest != name:
             fallbacks[name] = nearest
         parts.append(calibration.joint(nearest))
     low, value, high = {}, {}, {}
@@ -194,11 +213,13 @@ def _from_calibration(calibration: Calibration, source: str) -> ServoRanges:
                     else ends[field] * longer
                 )
         value = {field: np.where(own, stepped[field], value[field]) for field in value}
-    feedback = tuple(calibration.held_feedback(fallbacks.get(n, n)) for n in JOINT_NAMES)
+    feedback = tuple(
+        calibration.held_feedback(servo_of.get(n) or fallbacks.get(n, n)) for n in joints
+    )
     jitters = [p.actuator.command_jitter_s for p in parts]
     known = [q.value for q in jitters if q.low]  # seen, if only as an upper bound
     jitter = float(np.median(known)) if known else 0.0
-    return ServoRanges(source, low, value, high, feedback, fallbacks, jitter)
+    return ServoRanges(source, low, value, high, feedback, fallbacks, jitter, joints)
 
 
 def nearest_joint(name: str, known: Sequence[str]) -> str:
@@ -215,15 +236,16 @@ def nearest_joint(name: str, known: Sequence[str]) -> str:
     )
 
 
-def _ideal(source: str) -> ServoRanges:
+def _ideal(source: str, joints: tuple[str, ...]) -> ServoRanges:
     """Servos that follow their command, as nearly as a 2 ms step can hold."""
     own = {
         "stiffness": 20.0, "damping": 0.25, "friction_loss": 0.0, "armature": 8e-4,
         "effort_limit": _NO_LIMIT_NM, "velocity_limit": NO_SPEED_LIMIT_RAD_S, "dead_time_s": 0.0,
         "back_emf": 0.0,
     }  # fmt: skip
-    value = {f: np.full(len(JOINT_NAMES), x) for f, x in own.items()}
-    return ServoRanges(source, value, value, value, (HeldFeedback(),) * len(JOINT_NAMES), {})
+    value = {f: np.full(len(joints), x) for f, x in own.items()}
+    held = (HeldFeedback(),) * len(joints)
+    return ServoRanges(source, value, value, value, held, {}, joints=joints)
 
 
 def is_servo_model(actuator: str | Path) -> bool:

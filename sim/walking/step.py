@@ -8,26 +8,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.sim.robot.robot_batch import FEET
+from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS, PRIVILEGED_PARTS
 
 Array = NDArray[np.float64]
 
-_COLUMNS = {
-    "linear_velocity": 3, "angular_velocity": 3, "gravity": 3, "position_relative": 12,
-    "velocity": 12, "acceleration": 12, "torque": 12, "air_s": FEET, "contact_s": FEET,
-    "last_air_s": FEET, "last_contact_s": FEET, "foot_height_m": FEET, "foot_speed_m_s": FEET,
-    "stride_velocity": 3, "clock": 3,
-}  # fmt: skip
-_FLAGS = ("contact", "landed", "lifted")
+_VECTORS = ("linear_velocity", "angular_velocity", "gravity", "stride_velocity", "clock")
+_OF_JOINTS = (
+    "position_relative", "velocity", "acceleration", "torque", "saturated", "torque_square",
+)  # fmt: skip
+_OF_FEET = (
+    "air_s", "contact_s", "last_air_s", "last_contact_s", "foot_height_m", "foot_speed_m_s",
+    "clearance_m",
+)  # fmt: skip
+_NUMBERS = ("power_w", "weight_n")
+_FLAGS = ("contact", "landed", "lifted", "swing_ended")
 
 
 @dataclass(frozen=True)
 class Step:
-    """What happened in one control step, for all environments.
+    """What happened in one control step, for all environments, whose robots have 12 joints, 4 feet.
 
     Attributes
     ----------
+    body : Body
+        The robot; of another one the numbers of joints and feet are its own.
     command : ndarray, shape (n, 3)
         Forward and sideways speed [m/s], turn rate [rad/s].
     linear_velocity, angular_velocity, gravity : ndarray, shape (n, 3)
@@ -50,8 +55,17 @@ class Step:
     clock : ndarray, shape (n, 3)
         Cosine and sine of a trot's clock that follows the feet, and how well they keep to it, -1
         to 1; see `Strides`.
+    swing_ended : ndarray of bool, shape (n, 4)
+        Feet that came down after a swing; see `sim.walking.effort`, as for all that follow.
+    clearance_m : ndarray, shape (n, 4)
+        Of the swings that ended; NaN of other feet.
+    saturated, torque_square : ndarray, shape (n, 12)
+        Share of the step in which a servo is at its torque limit; mean square of torque over limit.
+    power_w, weight_n : ndarray, shape (n,)
+        Positive mechanical power of all servos; weight of the robot.
     """
 
+    body: Body
     command: Array
     linear_velocity: Array
     angular_velocity: Array
@@ -74,6 +88,12 @@ class Step:
     foot_speed_m_s: Array
     stride_velocity: Array
     clock: Array
+    swing_ended: NDArray[np.bool_]
+    clearance_m: Array
+    saturated: Array
+    torque_square: Array
+    power_w: Array
+    weight_n: Array
 
     def moving(self, threshold_m_s: float) -> NDArray[np.bool_]:
         """Whether a robot is commanded to move, or moves, shape (n,)."""
@@ -132,15 +152,19 @@ class Unfinished:
 
 
 def empty_facts(
-    command: Array, action: Array, last_action: Array, earlier_action: Array
+    body: Body, command: Array, action: Array, last_action: Array, earlier_action: Array
 ) -> dict[str, Any]:
     """Arrays of a `Step` that are to be filled in; the given ones are copied."""
     found: dict[str, Any] = {
         "command": command.copy(), "action": action.copy(), "last_action": last_action.copy(),
         "earlier_action": earlier_action.copy(),
     }  # fmt: skip
-    found |= {name: np.empty((len(command), size)) for name, size in _COLUMNS.items()}
-    return found | {name: np.empty((len(command), FEET), bool) for name in _FLAGS}
+    for names, size in (
+        (_VECTORS, 3), (_OF_JOINTS, len(body.joints)), (_OF_FEET, len(body.feet)),
+    ):  # fmt: skip
+        found |= {name: np.empty((len(command), size)) for name in names}
+    found |= {name: np.empty(len(command)) for name in _NUMBERS}
+    return found | {name: np.empty((len(command), len(body.feet)), bool) for name in _FLAGS}
 
 
 def unforeseen_of(

@@ -10,10 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.terminal import err, need_positive, out, print_json
+from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite
 
@@ -184,7 +185,14 @@ def tries_of(
     InputError
         If two have the same name, or one cannot be read.
     """
-    from pupper_sysid.cli.policy_choice import policy_at, run_folder, simulator, warn_of_fallbacks
+    from pupper_sysid.cli.policy_choice import (
+        policy_at,
+        refuse_other_robot,
+        run_folder,
+        simulator,
+        trained_commands,
+        warn_of_fallbacks,
+    )
     from pupper_sysid.policies.analysis.trial import Trial
     from pupper_sysid.policies.deploy.commands import checked_command
 
@@ -202,8 +210,14 @@ def tries_of(
     tries: Tries = {}
     for name, path in zip(names, options.policies, strict=True):
         policy, run = policy_at(path)
+        refuse_other_robot(policy, "pupper-analyze")
         task, servos = simulator(path, policy, run, options.actuator, options.feedback)
-        tries[name] = policy, Trial(task, servos, command, robots, seconds, options.seed)
+        wanted = np.array([command], float)
+        within = trained_commands(policy, run).clipped(wanted, lambda text: warn([text]))[0]
+        tries[name] = (
+            policy,
+            Trial(task, servos, (within[0], within[1], within[2]), robots, seconds, options.seed),
+        )
     warn_of_fallbacks(trial.servos for _, trial in tries.values())
     return tries
 

@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.sim.robot.robot_batch import FEET
-from pupper_sysid.sim.walking.rewards.terms import DIAGONALS
+from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.walking.rewards.weights import Rewards
 
 Array = NDArray[np.float64]
 
-_TOUCH_N = 0.25  # a quarter of what a foot carries when this robot stands: 1.1 N
 _STRIDE_S = 0.2  # time constant of the average over a stride
 
 
@@ -25,6 +23,7 @@ class Strides:
 
     Parameters
     ----------
+    body : Body
     robots : int
     span_s : float
         Control step [s].
@@ -38,20 +37,23 @@ class Strides:
     velocity : ndarray, shape (n, 3)
         Forward and sideways speed and turn rate, averaged over about a stride [m/s, rad/s].
     phase : ndarray, shape (n,)
-        φ, of a trot's clock, from 0 to 1: left front and right rear are to be up in its first
-        half, the others in its second. A phase-locked loop: it runs at `clock_hz` and follows what
-        diagonal pairs do in turn, x, the difference of their heights as shares of `clock_height`
-        (-1 to 1), by 2·`clock_pull_hz`·x·cos 2πφ. Feet that step as x = sin 2πft draw it along for
+        φ, of the gait's clock, from 0 to 1: of a trot, left front and right rear are to be up in
+        its first half, the others in its second. A phase-locked loop: it runs at `clock_hz` and
+        follows what feet do in turn, x, the difference of the pairs' heights as shares of
+        `clock_height` (-1 to 1), by 2·`clock_pull_hz`·x·cos 2πφ.
+        Feet that step as x = sin 2πft draw it along for
         f within `clock_pull_hz` of `clock_hz`; at other rates it passes them by.
     in_time : ndarray, shape (n,)
         2x·sin 2πφ, averaged over about a stride: 1 for such feet.
     """
 
-    def __init__(self, robots: int, span_s: float, rewards: Rewards):
-        self._span, self._rewards = span_s, rewards
-        self.air_s, self.stance_s = np.zeros((2, robots, FEET))
-        self._last_air, self._last_stance = np.zeros((2, robots, FEET))
-        self._feet_at = np.zeros((robots, FEET, 2))
+    def __init__(self, body: Body, robots: int, span_s: float, rewards: Rewards):
+        self._span, self._rewards, feet = span_s, rewards, len(body.feet)
+        self._touch_n, self._signs = body.touch_n, body.swing_signs
+        self._in_turn = np.argsort(-self._signs, kind="stable")
+        self.air_s, self.stance_s = np.zeros((2, robots, feet))
+        self._last_air, self._last_stance = np.zeros((2, robots, feet))
+        self._feet_at = np.zeros((robots, feet, 2))
         self.velocity = np.zeros((robots, 3))
         self.phase, self.in_time = np.zeros((2, robots))
 
@@ -101,7 +103,7 @@ class Strides:
             Of a `Step`, for these robots.
         """
         span, (at, height) = self._span, feet
-        np.greater(touch, _TOUCH_N, out=facts["contact"])
+        np.greater(touch, self._touch_n, out=facts["contact"])
         np.logical_and(facts["contact"], self.air_s[rows] > 0, out=facts["landed"])
         np.logical_and(~facts["contact"], self.stance_s[rows] > 0, out=facts["lifted"])
         self._count(rows, facts["contact"])
@@ -132,8 +134,10 @@ class Strides:
     def _tick(self, rows: slice, height: Array) -> None:
         rewards = self._rewards
         share = np.clip(height / rewards.clock_height, 0.0, 1.0)
-        (a, b), (c, d) = DIAGONALS
-        swing = 0.5 * (share[:, a] + share[:, b] - share[:, c] - share[:, d])
+        swing = np.zeros(len(share))
+        for foot in self._in_turn:
+            swing += self._signs[foot] * share[:, foot]
+        swing *= 2.0 / len(self._signs)
         phase, in_time = self.phase[rows], self.in_time[rows]
         angle = 2 * np.pi * phase
         in_time += self._span / _STRIDE_S * (2 * swing * np.sin(angle) - in_time)

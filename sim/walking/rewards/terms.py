@@ -11,21 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.joints import LEGS
-from pupper_sysid.sim.robot.mini_pupper import default_pose, foot_position
-from pupper_sysid.sim.robot.trot import FEET_AT
 from pupper_sysid.sim.walking.rewards.weights import Rewards
 from pupper_sysid.sim.walking.step import Step
 
 Array = NDArray[np.float64]
-_HIPS = slice(0, 12, 3)
-# feet in the order LF, RF, LB, RB: diagonal pairs move together, sides and ends alternate
-DIAGONALS = ((0, 3), (1, 2))
-"""Feet that a trot moves together, by index."""
-_APART = ((0, 1), (3, 2), (0, 2), (1, 3))
-_BEHIND = np.array([0.0, 0.5, 0.5, 0.0])  # of the feet, in cycles of the clock
-_POSE = default_pose()
-_SIDES = np.sign(FEET_AT[:, 1])
 _SLOW = (0.05, 0.15)  # commands [m/s, rad/s] that are not much above the trunk's sway
 
 
@@ -55,12 +44,12 @@ def stride_angular_velocity(s: Step, p: Rewards) -> Array:
 
 def progress(s: Step, p: Rewards) -> Array:
     """Share of the commanded speed by which the mean over a stride is nearer than 0, -1 to 1."""
-    return _nearer(s.command[:, :2], s.stride_velocity[:, :2], _SLOW[0])
+    return _nearer(s.command[:, :2], s.stride_velocity[:, :2], _SLOW[0] * s.body.command_scale[0])
 
 
 def turn_progress(s: Step, p: Rewards) -> Array:
     """The same of the turn rate."""
-    return _nearer(s.command[:, 2:], s.stride_velocity[:, 2:], _SLOW[1])
+    return _nearer(s.command[:, 2:], s.stride_velocity[:, 2:], _SLOW[1] * s.body.command_scale[2])
 
 
 def _nearer(wanted: Array, velocity: Array, slow: float) -> Array:
@@ -71,8 +60,8 @@ def _nearer(wanted: Array, velocity: Array, slow: float) -> Array:
 
 
 def unsupported(s: Step, p: Rewards) -> Array:
-    """0 with two or more feet on the ground, a half with one, 1 in flight."""
-    return np.maximum(1.0 - 0.5 * s.contact.sum(axis=1), 0.0)
+    """0 with half of the feet or more on the ground, 1 in flight, evenly between."""
+    return np.maximum(1.0 - 2.0 / len(s.body.feet) * s.contact.sum(axis=1), 0.0)
 
 
 def short_swing(s: Step, p: Rewards) -> Array:
@@ -107,7 +96,9 @@ def gait(s: Step, p: Rewards) -> Array:
     most = p.gait_most**2
     product = np.ones(len(s.command))
     air, contact = s.air_s, s.contact_s
-    for pairs, first, second in ((DIAGONALS, air, contact), (_APART, contact, air)):
+    for pairs, first, second in (
+        (s.body.together, air, contact), (s.body.apart, contact, air),
+    ):  # fmt: skip
         for a, b in pairs:
             gap = np.minimum((air[:, a] - first[:, b]) ** 2, most)
             gap = gap + np.minimum((contact[:, a] - second[:, b]) ** 2, most)
@@ -127,17 +118,18 @@ def foot_paths(s: Step, p: Rewards) -> Array:
     """
     cycle = np.arctan2(s.clock[:, 1], s.clock[:, 0])[:, None] / (2 * np.pi)
     # since the middle of a foot's swing, -0.5 to 0.5 cycles
-    own = (cycle + _BEHIND + 0.25) % 1.0 - 0.5
+    own = (cycle + s.body.offsets + 0.25) % 1.0 - 0.5
     half = 0.5 * (1.0 - p.clock_duty)
     swings = np.abs(own) < half
     along = np.where(swings, own / half, np.sign(own) * (0.5 - np.abs(own)) / (0.5 - half))
     x, y, turn = s.command.T[:, :, None]
-    speed = np.stack([x - turn * FEET_AT[:, 1], y + turn * FEET_AT[:, 0]], axis=-1)
+    at, sides = s.body.feet_at, s.body.sides
+    speed = np.stack([x - turn * at[:, 1], y + turn * at[:, 0]], axis=-1)
     away = _feet_away(s)
     away[..., :2] -= along[..., None] * speed * p.clock_duty / (2 * p.clock_hz)
     away[..., 2] -= np.where(swings, p.clock_height * np.cos(0.5 * np.pi * own / half), 0.0)
     away[..., 0::2] -= away[..., 0::2].mean(axis=1, keepdims=True)
-    away[..., 1] -= _SIDES * (_SIDES * away[..., 1]).mean(axis=1, keepdims=True)
+    away[..., 1] -= sides * (sides * away[..., 1]).mean(axis=1, keepdims=True)
     missed = (away**2).sum(axis=(1, 2)) / p.foot_paths_sigma**2
     return np.where(np.abs(s.command).max(axis=1) > 0, np.maximum(1.0 - missed, -2.0), 0.0)
 
@@ -145,16 +137,14 @@ def foot_paths(s: Step, p: Rewards) -> Array:
 def stance(s: Step, p: Rewards) -> Array:
     """Distance of the feet, all together, from `crouch` and `spread` [m]; 0 while standing."""
     away = _feet_away(s)
-    lower, wider = away[..., 2].mean(axis=1), (_SIDES * away[..., 1]).mean(axis=1)
+    lower, wider = away[..., 2].mean(axis=1), (s.body.sides * away[..., 1]).mean(axis=1)
     missed = np.abs(lower - p.crouch) + np.abs(wider - p.spread)
     return np.where(np.abs(s.command).max(axis=1) > 0, missed, 0.0)
 
 
 def _feet_away(s: Step) -> Array:
     """Feet in the trunk's frame less where they are in the default pose [m], shape (n, 4, 3)."""
-    joints = (_POSE + s.position_relative).reshape(-1, len(LEGS), 3)
-    feet = [foot_position(leg, *joints[:, i].T) for i, leg in enumerate(LEGS)]
-    return np.stack(feet, axis=1) - FEET_AT
+    return s.body.feet_in_trunk(s.body.pose + s.position_relative) - s.body.feet_at
 
 
 def foot_clearance(s: Step, p: Rewards) -> Array:
@@ -168,6 +158,27 @@ def swing_height(s: Step, p: Rewards) -> Array:
     """Squared shortfall below `clearance_height` times the foot's speed, summed [m³/s]."""
     short = np.maximum(p.clearance_height - s.foot_height_m, 0.0)
     return (short**2 * s.foot_speed_m_s).sum(axis=1)
+
+
+def low_swing(s: Step, p: Rewards) -> Array:
+    """Share of `least_clearance` that was missing, summed over feet whose swing has just ended."""
+    missing = np.maximum(1.0 - s.clearance_m / p.least_clearance, 0.0)
+    return np.where(s.swing_ended, missing, 0.0).sum(axis=1)
+
+
+def torque_saturation(s: Step, p: Rewards) -> Array:
+    """Share of the time at the torque limit, 0 to 1: the mean of all servos."""
+    return s.saturated.mean(axis=1)
+
+
+def torque_share(s: Step, p: Rewards) -> Array:
+    """Mean square of torque over its limit, 0 to 1, of all servos."""
+    return s.torque_square.mean(axis=1)
+
+
+def mechanical_power(s: Step, p: Rewards) -> Array:
+    """Positive mechanical power of all servos over the robot's weight [m/s]."""
+    return s.power_w / s.weight_n
 
 
 def action_smoothness(s: Step, p: Rewards) -> Array:
@@ -220,7 +231,7 @@ def joint_position(s: Step, p: Rewards) -> Array:
 
 def hip_abduction(s: Step, p: Rewards) -> Array:
     """Norm of the hips' distance from the default pose [rad]."""
-    return np.linalg.norm(s.position_relative[:, _HIPS], axis=1)
+    return np.linalg.norm(s.position_relative[:, s.body.hips], axis=1)
 
 
 def joint_torques(s: Step, p: Rewards) -> Array:
@@ -244,6 +255,7 @@ TERMS = {
         base_linear_velocity, base_angular_velocity, stride_linear_velocity,
         stride_angular_velocity, progress, turn_progress, alive, unsupported, short_swing,
         short_stance, air_time, foot_paths, stance, gait, foot_clearance, swing_height,
+        low_swing, torque_saturation, torque_share, mechanical_power,
         action_smoothness, action_rate, action_jerk, air_time_variance, base_motion, bounce,
         base_orientation, foot_slip, joint_position, hip_abduction, joint_torques,
         joint_acceleration, joint_velocity,

@@ -98,6 +98,18 @@ class Rewards:
     """Inverse of the speed that counts as moving [s/m]."""
     swing_height: float = -400.0
     """Squared shortfall of a moving foot's height below `clearance_height`, by its speed [1/m³]."""
+    low_swing: float = 0.0
+    """Feet that come down after a swing whose highest point was below `least_clearance`, by the
+    share that was missing."""
+    least_clearance: float = 0.008
+    """For `low_swing`: about a tenth of the standing height [m]."""
+    torque_saturation: float = 0.0
+    """Share of the time in which servos are at their torque limit, the mean of all."""
+    torque_share: float = 0.0
+    """Square of torque over its limit, the mean of all servos."""
+    mechanical_power: float = 0.0
+    """Positive mechanical power over the robot's weight, a speed [m/s]: cost of transport times
+    speed."""
     action_smoothness: float = 0.0
     """Published: norm of the change of the action."""
     action_rate: float = -0.02
@@ -136,8 +148,12 @@ CLOCK = ("clock_hz", "clock_pull_hz", "clock_height")
 DEFAULT = Rewards(
     base_linear_velocity=3.0, tracking_shape="gaussian", linear_sigma=0.035,
     stride_linear_sigma=0.015, angular_sigma=0.16, stride_angular_sigma=0.06,
+    low_swing=-8.0, torque_saturation=-3.0, torque_share=-3.0, mechanical_power=-1.0,
 )  # fmt: skip
-"""With widths of about an imitated trot's errors, where the slope of a Gaussian is largest."""
+"""With widths of about an imitated trot's errors, where the slope of a Gaussian is largest. Each of
+the last four costs a trot that clears three quarters of `least_clearance`, with servos at their
+limit for a quarter of the time and a power of its weight times 1 m/s, about a tenth of what exact
+tracking pays: all are relative to limits and weight, so that they hold for other servos."""
 
 RELEASE = Rewards(
     base_linear_velocity=15.0, base_angular_velocity=10.0, tracking_shape="exponential",

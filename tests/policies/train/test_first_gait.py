@@ -39,7 +39,7 @@ def walked(command, shares) -> first_gait._Walked:
     velocity = np.tile(command * shares, (5, 1, 1))
     up = np.ones(velocity.shape[:2], bool)
     return first_gait._Walked(
-        np.ones(3), command, velocity, velocity, up, np.array([0.006]), 0.2, 0.3, 0.1
+        np.ones(3), 1.0, command, velocity, velocity, up, np.array([0.006]), 0.2, 0.3, 0.1
     )
 
 

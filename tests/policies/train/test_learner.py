@@ -24,8 +24,8 @@ from pupper_sysid.policies.train.learner import Learner
 from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.training import make_env, make_learner
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
+from pupper_sysid.sim.robot.body import mini_pupper
 from pupper_sysid.sim.robot.mini_pupper import SIDE, foot_position
-from pupper_sysid.sim.robot.trot import FEET_AT
 from pupper_sysid.sim.walking.config import Commands, Randomisation, Walking
 from pupper_sysid.sim.walking.rewards.weights import Rewards
 from support.refusals import assert_each_refused
@@ -115,7 +115,7 @@ def test_a_first_policy_stands_as_low_and_wide_as_its_rewards_want():
         action = learner.actor(learner.observations).numpy()
     joints = env.default + env.config.action_scale * action
     for i, leg in enumerate(LEGS):
-        away = foot_position(leg, *joints[:, 3 * i : 3 * i + 3].T) - FEET_AT[i]
+        away = foot_position(leg, *joints[:, 3 * i : 3 * i + 3].T) - mini_pupper().feet_at[i]
         # the rest of the network is small, not 0
         wanted = np.broadcast_to([0.0, 0.005 * SIDE[leg], 0.015], away.shape)
         np.testing.assert_allclose(away, wanted, atol=1.5e-3)

@@ -138,6 +138,18 @@ def test_a_low_battery_takes_stiffness_torque_and_speed_together():
         assert (env.robots.drawn[name] >= servos.low[name] * 0.9999).all()
 
 
+def test_servos_of_one_type_differ_between_joints_by_the_spread_and_not_where_as_calibrated():
+    env = make(servo_spread=0.1, as_calibrated=0.5, count=200, actuator="ideal")
+    value = env.servos.value["stiffness"]
+    share = env.robots.drawn["stiffness"] / value - 1.0
+    differ = ~env.robots.bodies.as_calibrated
+    np.testing.assert_array_equal(share[~differ], 0.0)
+    assert np.abs(share[differ]).max() <= 0.1 + 1e-12
+    assert share[differ].std() == pytest.approx(0.1 / np.sqrt(3), rel=0.1)
+    # each joint by itself
+    assert np.abs(np.corrcoef(share[differ].T) - np.eye(12)).max() < 0.5
+
+
 def test_one_leg_of_a_share_of_robots_is_weak():
     env = make("paper", 400, weak_leg_share=0.5, weak_leg=(0.3, 0.3))
     share = env.robots.drawn["effort_limit"] / env.servos.value["effort_limit"]

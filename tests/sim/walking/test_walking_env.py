@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-import pupper_sysid.sim.robot.robot_batch
+import pupper_sysid.sim.walking.config
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, LEGS
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.networks import CommandNetwork
+from pupper_sysid.sim.robot.body import mini_pupper
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import (
     STANDING_HEIGHT_M,
@@ -20,7 +21,6 @@ from pupper_sysid.sim.robot.mini_pupper import (
     foot_position,
     joint_angles,
     limits,
-    robot_xml,
 )
 from pupper_sysid.sim.walking.config import (
     Commands,
@@ -31,7 +31,7 @@ from pupper_sysid.sim.walking.config import (
     Randomisation,
     Walking,
 )
-from pupper_sysid.sim.walking.env import PupperEnv
+from pupper_sysid.sim.walking.env import PupperEnv, make_env
 from pupper_sysid.sim.walking.observation import OBSERVATION, OBSERVATION_SIZE
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 from pupper_sysid.sim.walking.rewards.terms import TERMS, progress
@@ -457,9 +457,11 @@ def test_the_delay_buffers_hold_the_longest_delay_that_can_be_drawn():
 
 def test_a_delay_that_does_not_fit_its_buffer_is_refused(monkeypatch):
     def short(servos, *rest):
-        return robot_xml({k: replace(v, dead_time_s=0.01) for k, v in servos.items()}, *rest)
+        return own.xml({k: replace(v, dead_time_s=0.01) for k, v in servos.items()}, *rest)
 
-    monkeypatch.setattr(pupper_sysid.sim.robot.robot_batch, "robot_xml", short)
+    own = mini_pupper()
+    body = replace(own, xml=short)
+    monkeypatch.setattr(pupper_sysid.sim.walking.config, "body_of", lambda *names: body)
     with pytest.raises(InputError, match=r"does not fit the buffer of 0\.014 s"):
         make("paper")
 
@@ -795,3 +797,28 @@ def test_commands_come_late_at_random_where_the_calibration_has_jitter():
     assert late.min() >= -0.003 - 1e-12
     assert late.mean() == pytest.approx(0.0, abs=3e-4)
     assert late.std() == pytest.approx(0.003, rel=0.15)
+
+
+def test_rewards_and_observations_of_a_users_own_come_beside_the_usual_ones():
+    def level(step, rewards):
+        return -step.gravity[:, 2]
+
+    def height(env, rows):
+        return env.robots.qpos[rows, 2:3]
+
+    env = make_env(
+        "paper", environments=3, seed=1, threads=1,
+        terms={"level": (2.0, level)}, observations={"height": height},
+    )  # fmt: skip
+    result = env.step(env.action)
+    np.testing.assert_allclose(
+        result.terms["level"], -2.0 * env.config.control_step_s * result.facts.gravity[:, 2]
+    )
+    assert result.observation.shape == (3, OBSERVATION_SIZE + 1)
+    np.testing.assert_allclose(result.observation[:, -1], env.robots.qpos[:, 2], rtol=1e-6)
+    plain = make_env("paper", environments=3, seed=1, threads=1)
+    usual = plain.step(plain.action)
+    np.testing.assert_array_equal(result.observation[:, :-1], usual.observation)
+    np.testing.assert_allclose(result.reward - result.terms["level"], usual.reward, atol=1e-12)
+    with pytest.raises(InputError, match="called alive already"):
+        make_env("paper", environments=1, terms={"alive": (1.0, level)})

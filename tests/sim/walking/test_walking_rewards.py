@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.joints import LEGS
+from pupper_sysid.sim.robot.body import mini_pupper
 from pupper_sysid.sim.robot.mini_pupper import SIDE, default_pose, foot_position, joint_angles
 from pupper_sysid.sim.walking.config import PRESETS
 from pupper_sysid.sim.walking.rewards import terms as wr
@@ -20,19 +21,22 @@ SIZES = dict.fromkeys(
     ["command", "linear_velocity", "angular_velocity", "gravity", "stride_velocity", "clock"], 3
 ) | dict.fromkeys(
     ["contact", "air_s", "contact_s", "last_air_s", "last_contact_s", "landed", "lifted",
-     "foot_height_m", "foot_speed_m_s"], 4
+     "foot_height_m", "foot_speed_m_s", "swing_ended", "clearance_m"], 4
 )  # fmt: skip
+ARRAYS = [f for f in fields(Step) if f.name != "body"]
 P = Rewards()
 E1 = np.exp(-1.0)
 
 
 def step(**known) -> Step:
     """One robot, all zeros but what is given."""
-    values: dict[str, Any] = {f.name: np.zeros((1, SIZES.get(f.name, 12))) for f in fields(Step)}
-    values |= {name: np.zeros((1, 4), bool) for name in ("contact", "landed", "lifted")}
+    values: dict[str, Any] = {f.name: np.zeros((1, SIZES.get(f.name, 12))) for f in ARRAYS}
+    flags = ("contact", "landed", "lifted", "swing_ended")
+    values |= {name: np.zeros((1, 4), bool) for name in flags}
+    values |= {"power_w": np.zeros(1), "weight_n": np.full(1, 5.0)}
     for name, value in known.items():
         values[name][:] = value
-    return Step(**values)
+    return Step(body=mini_pupper(), **values)
 
 
 def joints(**known: float) -> np.ndarray:
@@ -295,13 +299,26 @@ def test_effort_terms_are_norms_over_all_joints():
         assert TERMS[term](s, P)[0] == pytest.approx(10.0), term
 
 
+def test_a_swing_costs_what_its_highest_point_lacked_once_when_it_ends():
+    p = replace(P, least_clearance=0.008)
+    ended = np.array([True, True, True, False])
+    s = step(swing_ended=ended, clearance_m=(0.006, 0.020, -0.004, np.nan))
+    assert wr.low_swing(s, p)[0] == pytest.approx(0.25 + 0.0 + 1.5)
+    assert wr.low_swing(step(clearance_m=np.nan), p)[0] == 0.0
+
+
+def test_effort_relative_to_limits_is_a_mean_of_all_servos_and_power_is_over_the_weight():
+    s = step(saturated=joints(j2=0.6, j5=0.6), torque_square=joints(j2=1.0, j3=0.2))
+    assert wr.torque_saturation(s, P)[0] == pytest.approx(0.1)
+    assert wr.torque_share(s, P)[0] == pytest.approx(0.1)
+    assert wr.mechanical_power(step(power_w=4.0), P)[0] == pytest.approx(0.8)
+
+
 def test_every_robot_is_judged_by_its_own_numbers():
     one, other = step(command=FORWARD), step(foot_height_m=0.1, linear_velocity=(0.3, 0.0, 0.1))
     both = Step(
-        **{
-            f.name: np.concatenate([getattr(one, f.name), getattr(other, f.name)])
-            for f in fields(Step)
-        }
+        body=mini_pupper(),
+        **{f.name: np.concatenate([getattr(one, f.name), getattr(other, f.name)]) for f in ARRAYS},
     )
     for name, term in TERMS.items():
         np.testing.assert_allclose(

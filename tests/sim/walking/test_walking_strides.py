@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pupper_sysid.sim.robot.body import mini_pupper
 from pupper_sysid.sim.walking.rewards.strides import Strides
 from pupper_sysid.sim.walking.rewards.weights import Rewards
 from pupper_sysid.sim.walking.step import empty_facts
@@ -15,14 +16,14 @@ REWARDS = replace(Rewards(), clock_hz=3.6, clock_pull_hz=0.5, clock_height=0.012
 
 def steps_of(rates: np.ndarray, seconds: float, start: float = 0.0) -> tuple[Strides, np.ndarray]:
     """Feet that step as a trot at these rates; the strides, and `in_time` of the last 2 s."""
-    strides, n = Strides(len(rates), SPAN, REWARDS), len(rates)
+    strides, n = Strides(mini_pupper(), len(rates), SPAN, REWARDS), len(rates)
     none = np.zeros((n, 12))
     seen = []
     for k in range(round(seconds / SPAN)):
         x = np.sin(2 * np.pi * (rates * k * SPAN + start))
         first, second = 0.012 * np.maximum(x, 0), 0.012 * np.maximum(-x, 0)
         height = np.column_stack([first, second, second, first])
-        facts = empty_facts(np.zeros((n, 3)), none, none, none)
+        facts = empty_facts(mini_pupper(), np.zeros((n, 3)), none, none, none)
         touch = np.where(height > 0, 0.0, 1.0)
         strides.advance(WHOLE, touch, (np.zeros((n, 4, 2)), height), np.zeros((n, 3)), facts)
         seen.append(facts["clock"][:, 2].copy())

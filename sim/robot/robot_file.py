@@ -1,0 +1,658 @@
+"""A walking robot from its MJCF and a few lines of YAML, with measured servos on its joints.
+
+    joints: [FR_hip_joint, …]      # by default those that position actuators or motors drive
+    feet: [FR, FL, RR, RL]         # sites, geoms or bodies; by default the lowest geoms
+    pose: home                     # a keyframe, or angles by joint: {"*_thigh_joint": 0.9, …}
+    servos: LF_thigh               # one servo of the calibration for all, or {"*_hip_*": LF_hip, …}
+    gait: trot                     # or walk, or {FR: 0.5, …}: shares of a cycle behind the first
+    commands: {forward_m_s: [-0.6, 0.6], sideways_m_s: [-0.3, 0.3], yaw_rad_s: [-1, 1]}
+
+All lines may be left out; names may be patterns. x is forward, y to the left, z up in the trunk's
+frame. The robot's own actuators, sensors and ground are taken out, hinges without a servo fixed;
+visual meshes are not needed. What was assumed is said in `Body.notes`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from pupper_sysid.common.border import read_yaml, validated
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import sha256
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.sim.robot.body import Body, fixed_offsets
+from pupper_sysid.sim.robot.engine import mujoco
+from pupper_sysid.sim.robot.mini_pupper import EVALUATION_SOLVER, Physics
+from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
+from pupper_sysid.sim.robot.terrain import Ground
+
+Array = NDArray[np.float64]
+
+_SAME_HEIGHT = 0.1  # feet's lowest points differ by less, in shares of the standing height
+_SAME_SOLE = 0.03  # of the geoms of one foot, likewise
+_SAME_PLACE = 0.06  # of a joint and its mirror image, likewise
+_TOUCH = 1.3  # radius of a touch sensor's site, in those of the geom
+_INVERSE_STEPS, _NUDGE_RAD, _DAMPING = 6, 1e-4, 0.02  # damping in standing heights per rad
+_FALLEN = 0.5  # share of the standing height below which the trunk has come down
+_WALK = (0.0, 0.5, 0.75, 0.25)  # left front, right front, left rear, right rear
+_TRAINING_ITERATIONS = 8  # of PGS, as of the Mini Pupper
+
+_Ends = Annotated[list[Annotated[float, Field(ge=-100, le=100)]], Field(min_length=2, max_length=2)]
+
+
+class _Commands(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    forward_m_s: _Ends | None = None
+    sideways_m_s: _Ends | None = None
+    yaw_rad_s: _Ends | None = None
+
+
+class RobotFile(BaseModel):
+    """The YAML beside a MJCF."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    joints: list[str] | None = None
+    feet: list[str] | None = None
+    pose: str | dict[str, float] | None = None
+    servos: str | dict[str, str] | None = None
+    gait: str | dict[str, float] = "trot"
+    commands: _Commands = Field(default_factory=_Commands)
+
+
+def body_from_file(path: Path, config: Path | None) -> Body:
+    """The body of a robot's MJCF.
+
+    Parameters
+    ----------
+    path : Path
+    config : Path or None
+        Its YAML.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, a name in it is not there, or the robot is none that can walk.
+    """
+    if not path.is_file():
+        raise InputError(f"There is no {path}. Give the robot's MJCF as `robot`.")
+    own = RobotFile()
+    if config is not None:
+        if not config.is_file():
+            raise InputError(f"There is no {config}. Give the robot's YAML as `robot_config`.")
+        content, lines = read_yaml(config)
+        own = validated(RobotFile, content or {}, config, lines)
+    return _Reader(path, config, own).body()
+
+
+class _Reader:
+    """One robot's file on its way to a `Body`."""
+
+    def __init__(self, path: Path, config: Path | None, own: RobotFile):
+        self.path, self.config, self.own = path, config, own
+        self.where = str(config or path)
+        self.notes: list[str] = []
+        try:
+            self.spec = mujoco.MjSpec.from_file(str(path))
+        except ValueError as error:
+            raise InputError(f"{path} is no MJCF that MuJoCo reads: {_line(error)}.") from None
+        self._without_meshes()
+        free = [j for j in self.spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
+        if not free or free[0].parent.parent.name != self.spec.worldbody.name:
+            bodies = self.spec.worldbody.bodies
+            first = (bodies[0].name or "without a name") if len(bodies) else "none"
+            raise InputError(
+                f"{path} has no floating base: its first body ({first}) is fixed to the world, so "
+                "the robot cannot walk. Give that body a <freejoint/>."
+            )
+        if len(free) > 1:
+            raise InputError(
+                f"{path} has {len(free)} floating bodies ({', '.join(j.parent.name for j in free)})"
+                "; a robot has one. Take the others out."
+            )
+        self.root = free[0].parent
+        if not self.root.name:
+            self.root.name = "trunk"
+        self._of_keyframe = self._keyframe()
+        self.joints = self._servo_joints()
+        self._strip()
+        self.model = self._compiled()
+        self.pose, self.low, self.high = self._pose()
+        self.data = mujoco.MjData(self.model)
+        self._place(self.pose)
+        self.feet = self._feet()
+
+    # ------------------------------------------------------------------------- the MJCF
+
+    def _without_meshes(self) -> None:
+        """Take out meshes whose files are not there, and all that nothing collides with."""
+        spec, folder = self.spec, self.path.parent / (self.spec.meshdir or "")
+        missing = [
+            m.name or m.file for m in spec.meshes
+            if m.file and not (folder / m.file).is_file() and not Path(m.file).is_file()
+        ]  # fmt: skip
+        lost = []
+        for geom in list(spec.geoms):
+            if geom.type != mujoco.mjtGeom.mjGEOM_MESH:
+                continue
+            collides = bool(geom.contype or geom.conaffinity)
+            if collides and geom.meshname in missing:
+                lost.append(geom.meshname)
+            if not collides or geom.meshname in missing:
+                spec.delete(geom)
+        for mesh in list(spec.meshes):
+            if mesh.name in missing or (mesh.name or mesh.file) in missing:
+                spec.delete(mesh)
+        if lost:
+            self.notes.append(
+                f"Meshes of {self.path.name} that collide are not there ({', '.join(lost[:3])}"
+                f"{', …' if len(lost) > 3 else ''}); the robot was built without them."
+            )
+
+    def _keyframe(self) -> tuple[str, Array] | None:
+        """Name and positions of the keyframe that is the pose."""
+        keys = {key.name: np.array(key.qpos) for key in self.spec.keys}
+        wanted = self.own.pose
+        if isinstance(wanted, str):
+            if wanted not in keys:
+                raise InputError(
+                    f"{self.where}: {self.path.name} has no keyframe '{wanted}'; it has "
+                    f"{', '.join(keys) or 'none'}. Give angles by joint as `pose` instead."
+                )
+            return wanted, keys[wanted]
+        if wanted is None and keys:
+            name = next(iter(keys))
+            self.notes.append(f"The default pose is the keyframe '{name}' of {self.path.name}.")
+            return name, keys[name]
+        return None
+
+    def _servo_joints(self) -> tuple[str, ...]:
+        spec = self.spec
+        hinges = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE]
+        slides = [j.name for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_SLIDE]
+        if not hinges:
+            raise InputError(
+                f"{self.path} has no hinge joint: there is nothing for a servo to turn."
+            )
+        names = [j.name for j in hinges]
+        if "" in names:
+            raise InputError(f"{self.path} has a hinge without a name. Give every joint a name.")
+        if self.own.joints is not None:
+            chosen = {
+                n for w in self.own.joints for n in self._matching(w, names, "joints", "hinge")
+            }
+        else:
+            at = mujoco.mjtTrn.mjTRN_JOINT
+            chosen = {a.target for a in spec.actuators if a.trntype == at} & set(names)
+            if not chosen:
+                chosen = set(names)
+                self.notes.append(
+                    f"{self.path.name} has no actuators: each of its {len(names)} hinges gets "
+                    "a servo."
+                )
+        self._fixed = [n for n in names if n not in chosen] + slides
+        if self._fixed:
+            self.notes.append(
+                f"Joints without a servo are fixed: {', '.join(self._fixed[:6])}"
+                f"{', …' if len(self._fixed) > 6 else ''}."
+            )
+        return tuple(n for n in names if n in chosen)
+
+    def _matching(self, wanted: str, names: Sequence[str], key: str, kind: str) -> list[str]:
+        matching = [n for n in names if n == wanted or fnmatchcase(n, wanted)]
+        if not matching:
+            raise InputError(
+                f"{self.where}: {key} names '{wanted}', but {self.path.name} has no such {kind}. "
+                f"It has {', '.join(n for n in names if n)}."
+            )
+        return matching
+
+    def _strip(self) -> None:
+        """Take out actuators, sensors, keyframes, tendons, equalities, ground and fixed joints."""
+        spec = self.spec
+        order = self._order_of_keyframe()
+        for elements in (spec.actuators, spec.sensors, spec.keys, spec.tendons, spec.equalities,
+                         spec.excludes, spec.pairs):  # fmt: skip
+            for element in list(elements):
+                spec.delete(element)
+        plane, field = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD
+        for geom in list(spec.worldbody.geoms):
+            if geom.type in (plane, field):
+                spec.delete(geom)
+        for joint in list(spec.joints):
+            if joint.name in self._fixed and joint.type != mujoco.mjtJoint.mjJNT_FREE:
+                spec.delete(joint)
+        self._key_pose = order
+        for joint in spec.joints:
+            if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+                # the servo's friction, inertia and damping are all of the joint's
+                joint.damping, joint.stiffness = np.zeros(3), np.zeros(3)
+                joint.frictionloss = joint.armature = 0.0
+        for k, geom in enumerate(spec.geoms):
+            if not geom.name:
+                geom.name = f"geom_{k}"
+
+    def _order_of_keyframe(self) -> dict[str, float]:
+        """Angles by joint of the keyframe, which is in the order of the file as it is."""
+        if self._of_keyframe is None:
+            return {}
+        model = self._compiled()
+        name, qpos = self._of_keyframe
+        if len(qpos) != model.nq:
+            raise InputError(
+                f"{self.path}: keyframe '{name}' has {len(qpos)} positions, the robot {model.nq}."
+            )
+        return {n: float(qpos[model.joint(n).qposadr[0]]) for n in self.joints}
+
+    def _compiled(self) -> Any:
+        try:
+            return self.spec.copy().compile()
+        except ValueError as error:
+            raise InputError(
+                f"{self.path} cannot be simulated: {_line(error)}. If masses come from meshes that "
+                "are not there, give bodies an <inertial>."
+            ) from None
+
+    # ------------------------------------------------------------------------- pose
+
+    def _pose(self) -> tuple[Array, Array, Array]:
+        model = self.model
+        low, high = np.full((2, len(self.joints)), 0.0)
+        pose = np.zeros(len(self.joints))
+        for k, name in enumerate(self.joints):
+            joint = model.joint(name)
+            limited = bool(joint.limited[0])
+            low[k], high[k] = joint.range if limited else (-np.pi, np.pi)
+            pose[k] = self._key_pose.get(name, float(model.qpos0[joint.qposadr[0]]))
+        if isinstance(self.own.pose, dict):
+            for wanted, angle in self.own.pose.items():
+                for name in self._matching(wanted, self.joints, "pose", "joint with a servo"):
+                    pose[self.joints.index(name)] = angle
+        elif not self._key_pose:
+            self.notes.append(
+                f"{self.path.name} has no keyframe and there is no `pose`: the default pose is all "
+                "joints at 0, or at the limit next to it, with which few robots can stand."
+            )
+        outside = [
+            f"{n} ({p:g}, limits {a:g} to {b:g})"
+            for n, p, a, b in zip(self.joints, pose, low, high, strict=True)
+            if not a - 1e-6 <= p <= b + 1e-6
+        ]
+        if outside and isinstance(self.own.pose, dict):
+            raise InputError(f"{self.where}: pose is beyond the limits of {', '.join(outside)}.")
+        return np.clip(pose, low, high), low, high
+
+    def _place(self, pose: Array) -> None:
+        """Put the trunk upright at the origin, the joints in `pose`."""
+        self.data.qpos[:] = self.model.qpos0
+        self.data.qpos[:7] = [0, 0, 0, 1, 0, 0, 0]
+        self.data.qpos[7:] = pose
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def _lowest(self, geom: int) -> float:
+        """Height of the lowest point of a geom as it is placed."""
+        model, data = self.model, self.data
+        size, kind = model.geom_size[geom], mujoco.mjtGeom(model.geom_type[geom])
+        down = -data.geom_xmat[geom].reshape(3, 3)[2]  # in the geom's frame
+        types = mujoco.mjtGeom
+        if kind == types.mjGEOM_SPHERE:
+            reach = size[0]
+        elif kind == types.mjGEOM_CAPSULE:
+            reach = size[0] + size[1] * abs(down[2])
+        elif kind == types.mjGEOM_CYLINDER:
+            reach = size[0] * np.hypot(down[0], down[1]) + size[1] * abs(down[2])
+        elif kind == types.mjGEOM_ELLIPSOID:
+            reach = np.linalg.norm(size * down)
+        elif kind == types.mjGEOM_MESH:
+            mesh = model.geom_dataid[geom]
+            first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+            reach = (model.mesh_vert[first : first + count] @ down).max()
+        else:
+            reach = np.abs(size * down).sum()
+        return float(data.geom_xpos[geom][2] - reach)
+
+    # ------------------------------------------------------------------------- feet
+
+    def _feet(self) -> dict[str, list[int]]:
+        """Geoms of each foot, by its name, the lowest first."""
+        model = self.model
+        collides = np.flatnonzero((model.geom_contype | model.geom_conaffinity) > 0)
+        of_robot = [int(g) for g in collides if model.body_rootid[model.geom_bodyid[g]] != 0]
+        if not of_robot:
+            raise InputError(
+                f"{self.path}: no geom of the robot collides (contype and conaffinity are 0, or "
+                "meshes are not there). Give each foot a sphere, capsule or box that does."
+            )
+        by_body: dict[int, list[int]] = {}
+        for g in sorted(of_robot, key=self._lowest):
+            by_body.setdefault(int(model.geom_bodyid[g]), []).append(g)
+        if self.own.feet is None:
+            return self._lowest_bodies(by_body)
+        feet = {}
+        for name in self.own.feet:
+            body, geom = self._body_of(name)
+            if body not in by_body:
+                raise InputError(
+                    f"{self.where}: foot '{name}' has no geom that collides. Give its body a "
+                    "sphere, capsule or box with contype 1."
+                )
+            feet[name] = [geom] if geom in by_body[body] else self._soles(by_body[body])
+        return feet
+
+    def _soles(self, geoms: list[int]) -> list[int]:
+        """Those of a body's geoms, the lowest first, that are about as low."""
+        low = self._lowest(geoms[0])
+        return [g for g in geoms if self._lowest(g) - low < _SAME_SOLE * abs(low)]
+
+    def _body_of(self, name: str) -> tuple[int, int]:
+        """Body, and geom or -1, of a foot's name."""
+        model, kinds = self.model, mujoco.mjtObj
+        for kind, bodies in (
+            (kinds.mjOBJ_SITE, model.site_bodyid), (kinds.mjOBJ_GEOM, model.geom_bodyid),
+            (kinds.mjOBJ_BODY, range(model.nbody)),
+        ):  # fmt: skip
+            at = mujoco.mj_name2id(model, kind, name)
+            if at >= 0:
+                return int(bodies[at]), at if kind == kinds.mjOBJ_GEOM else -1
+        sites = [model.site(i).name for i in range(model.nsite)]
+        raise InputError(
+            f"{self.where}: {self.path.name} has no site, geom or body '{name}' for a foot. It has "
+            f"the sites {', '.join(n for n in sites if n) or 'none'}."
+        )
+
+    def _lowest_bodies(self, by_body: dict[int, list[int]]) -> dict[str, list[int]]:
+        model = self.model
+        low = {body: self._lowest(geoms[0]) for body, geoms in by_body.items()}
+        ground = min(low.values())
+        near = [b for b, z in low.items() if z - ground < _SAME_HEIGHT * abs(ground)]
+        moved = [b for b in near if b != self.model.body(self.root.name).id]
+        # of a chain of bodies, the last one that is so low
+        parents = {int(model.body_parentid[b]) for b in moved}
+        ends = sorted(b for b in moved if b not in parents)
+        if not ends:
+            raise InputError(
+                f"{self.path}: in the default pose its lowest geom is of the trunk, so no feet "
+                "were found. Give `feet` and `pose` in the YAML."
+            )
+        feet = {model.body(b).name: self._soles(by_body[b]) for b in ends}
+        self.notes.append(f"Feet, by the lowest geoms: {', '.join(feet)}.")
+        return feet
+
+    # ------------------------------------------------------------------------- the body
+
+    def body(self) -> Body:
+        """Everything together."""
+        model, data = self.model, self.data
+        names = tuple(self.feet)
+        if len(names) < 2:
+            raise InputError(
+                f"{self.where}: only one foot ({names[0]}) was found; a robot that walks has two "
+                "or more. Give `feet` in the YAML."
+            )
+        geoms = [g[0] for g in self.feet.values()]
+        feet_at = data.geom_xpos[geoms].copy()
+        soles = np.array([self._lowest(g) for g in geoms])
+        height = -float(soles.min())
+        if not height > 0:
+            raise InputError(f"{self.path}: the feet are not below the trunk in the default pose.")
+        chains = [self._chain(g) for g in geoms]
+        leg_of = np.full(len(self.joints), -1)
+        for leg, chain in enumerate(chains):
+            leg_of[chain] = leg
+        joints, signs = self._mirror(height)
+        feet_image = _images(feet_at, _SAME_PLACE * height)
+        if joints is None or feet_image is None:
+            joints = signs = feet_image = None
+            self.notes.append(
+                "The robot has no mirror image by its geometry: training does without images."
+            )
+        commands = self.own.commands.model_dump(exclude_none=True)
+        xml = self._xml_writer(names, geoms)
+        hashes = {"robot": sha256(self.path)}
+        if self.config is not None:
+            hashes["robot_config"] = sha256(self.config)
+        kinematics = self._kinematics(geoms)
+
+        def fallen(qpos: Array, gravity: Array, ground: Ground) -> NDArray[np.bool_]:
+            above = qpos[:, 2] - ground.height(qpos[:, 0], qpos[:, 1])
+            return above < _FALLEN * height
+
+        return Body(
+            name=self.path.stem, joints=self.joints, feet=tuple(f"foot_{n}" for n in names),
+            pose=self.pose, low=self.low, high=self.high, linked=(), leg_of=leg_of,
+            feet_at=feet_at, sole_m=feet_at[:, 2] - soles, offsets=self._offsets(names, feet_at),
+            mirror_joints=joints, mirror_signs=signs, mirror_feet=feet_image,
+            standing_height_m=height, mass_kg=float(model.body_mass.sum()), xml=xml,
+            feet_in_trunk=kinematics, joints_at=self._inverse(kinematics, chains, height),
+            touches_ground=fallen,
+            foot_geoms=tuple(model.geom(g).name for own in self.feet.values() for g in own),
+            trunk=self.root.name, servo_of=self._servo_of(),
+            commands={name: (ends[0], ends[1]) for name, ends in commands.items()},
+            notes=tuple(self.notes), hashes=hashes,
+        )  # fmt: skip
+
+    def _chain(self, geom: int) -> list[int]:
+        """Joints between trunk and a geom, from the trunk on."""
+        model, chain = self.model, []
+        body = int(model.geom_bodyid[geom])
+        while body:
+            for j in reversed(range(model.body_jntnum[body])):
+                name = model.joint(int(model.body_jntadr[body]) + j).name
+                if name in self.joints:
+                    chain.append(self.joints.index(name))
+            body = int(model.body_parentid[body])
+        return chain[::-1]
+
+    def _kinematics(self, geoms: list[int]):
+        """Feet in the trunk's frame as a function of joint angles, without MuJoCo."""
+        model, data = self.model, self.data
+        self._place(np.zeros(len(self.joints)))
+        feet = data.geom_xpos[geoms].copy()
+        chains = [self._chain(g)[::-1] for g in geoms]  # the joint next to the foot turns it first
+        rounds = []
+        for k in range(max(len(chain) for chain in chains)):
+            legs = np.array([leg for leg, chain in enumerate(chains) if k < len(chain)])
+            joints = np.array([chains[leg][k] for leg in legs])
+            ids = [int(model.joint(self.joints[j]).id) for j in joints]
+            rounds.append((legs, joints, data.xaxis[ids].copy(), data.xanchor[ids].copy()))
+        self._place(self.pose)
+
+        def feet_in_trunk(joints: Array) -> Array:
+            found = np.repeat(feet[None], len(joints), axis=0)
+            for legs, own, axes, anchors in rounds:
+                arm = found[:, legs] - anchors
+                c, s = np.cos(joints[:, own, None]), np.sin(joints[:, own, None])
+                along = (arm * axes).sum(axis=-1, keepdims=True) * axes
+                # Rodrigues; np.cross is slow for few robots
+                turned = np.stack(
+                    [
+                        axes[:, i - 2] * arm[..., i - 1] - axes[:, i - 1] * arm[..., i - 2]
+                        for i in range(3)
+                    ],
+                    axis=-1,
+                )
+                found[:, legs] = anchors + c * (arm - along) + s * turned + along
+            return found
+
+        return feet_in_trunk
+
+    def _inverse(self, kinematics: Any, chains: list[list[int]], height: float):
+        """Joint angles that put the feet somewhere: damped least squares from the default pose.
+
+        Out of reach, or where a leg has fewer than three joints, feet come as near as they can.
+        """
+        pose, low, high = self.pose, self.low, self.high
+        longest = max(len(chain) for chain in chains)
+
+        def joints_at(feet: Array) -> Array:
+            joints = np.repeat(pose[None], len(feet), axis=0)
+            for _ in range(_INVERSE_STEPS):
+                here = kinematics(joints)
+                slopes = np.zeros((*here.shape, longest))
+                for k in range(longest):  # one joint of every leg at a time
+                    moved = joints.copy()
+                    for chain in chains:
+                        if k < len(chain):
+                            moved[:, chain[k]] += _NUDGE_RAD
+                    slopes[..., k] = (kinematics(moved) - here) / _NUDGE_RAD
+                away = (feet - here)[..., None]
+                square = slopes.swapaxes(-1, -2) @ slopes
+                square = square + (_DAMPING * height) ** 2 * np.eye(longest)
+                turned = np.linalg.solve(square, slopes.swapaxes(-1, -2) @ away)[..., 0]
+                for leg, chain in enumerate(chains):
+                    joints[:, chain] += turned[:, leg, : len(chain)]
+                joints = np.clip(joints, low, high)
+            return joints
+
+        return joints_at
+
+    def _mirror(self, height: float) -> tuple[NDArray[np.intp] | None, Array | None]:
+        """Image of each joint, left for right, and its sign; None without."""
+        model, data = self.model, self.data
+        ids = [int(model.joint(name).id) for name in self.joints]
+        at, axes = data.xanchor[ids], data.xaxis[ids]
+        images = axes * [-1.0, 1.0, -1.0]  # an axis is axial: the plane turns it the other way
+        near = _SAME_PLACE * height
+        found, signs = np.zeros(len(ids), int), np.zeros(len(ids))
+        for k in range(len(ids)):
+            # where on its axis a joint is placed says nothing
+            apart = at - at[k] * [1, -1, 1]
+            beside = apart - (apart @ images[k])[:, None] * images[k]
+            along = (axes * images[k]).sum(axis=1)
+            fits = np.flatnonzero((np.linalg.norm(beside, axis=1) < near) & (np.abs(along) > 0.99))
+            if not len(fits):
+                return None, None
+            found[k] = fits[np.argmin(np.linalg.norm(apart[fits], axis=1))]
+            signs[k] = np.sign(along[found[k]])
+        if (found[found] != np.arange(len(ids))).any():
+            return None, None
+        return found, signs
+
+    def _offsets(self, names: tuple[str, ...], feet_at: Array) -> Array:
+        gait = self.own.gait
+        if isinstance(gait, dict):
+            missing = [n for n in names if n not in gait] or [n for n in gait if n not in names]
+            if missing:
+                raise InputError(
+                    f"{self.where}: gait and feet differ in '{missing[0]}'; the feet are "
+                    f"{', '.join(names)}."
+                )
+            return np.array([gait[n] % 1.0 for n in names])
+        if gait == "walk" and len(names) == 4:
+            right, rear = feet_at[:, 1] < 0, feet_at[:, 0] < feet_at[:, 0].mean()
+            return np.array(_WALK)[right + 2 * rear]
+        if gait not in ("trot", "walk", "biped"):
+            raise InputError(
+                f"{self.where}: gait '{gait}' is not known. Give trot, walk, biped, or the share "
+                "of a cycle by which each foot is behind."
+            )
+        return fixed_offsets(feet_at)
+
+    def _servo_of(self) -> dict[str, str]:
+        own = self.own.servos
+        if own is None:
+            return {}
+        if isinstance(own, str):
+            return dict.fromkeys(self.joints, own)
+        found = {}
+        for wanted, servo in own.items():
+            for name in self._matching(wanted, self.joints, "servos", "joint with a servo"):
+                found[name] = servo
+        return found
+
+    def _xml_writer(self, names: tuple[str, ...], geoms: list[int]):
+        """Function that writes the MJCF with servos on a ground."""
+        spec, model = self.spec, self.model
+        feet_geoms = {model.geom(g).name for own in self.feet.values() for g in own}
+        for name, g in zip(names, geoms, strict=True):
+            body = spec.body(model.body(int(model.geom_bodyid[g])).name)
+            sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+            at = spec.geom(model.geom(g).name)
+            place = model.geom_pos[g]
+            del at
+            body.add_site(
+                name=f"foot_{name}", pos=place, type=sphere, group=4,
+                size=[_TOUCH * float(model.geom_rbound[g]), 0, 0],
+            )  # fmt: skip
+            spec.add_sensor(
+                name=f"foot_{name}_touch", type=mujoco.mjtSensor.mjSENS_TOUCH,
+                objtype=mujoco.mjtObj.mjOBJ_SITE, objname=f"foot_{name}",
+            )  # fmt: skip
+
+        def xml(
+            servos: Mapping[str, DelayedPDParameters], step_s: float, ground: Ground,
+            physics: Physics,
+        ) -> str:  # fmt: skip
+            own = spec.copy()
+            for geom in own.geoms:
+                foot = geom.name in feet_geoms
+                collides = bool(geom.contype or geom.conaffinity)
+                on = foot or (collides and physics == "evaluation")
+                geom.contype, geom.conaffinity = int(on), 0
+                if foot:
+                    geom.priority = 1
+            option = own.option
+            option.timestep = step_s
+            option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+            option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+            if physics == "evaluation":
+                option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+                for name in ("iterations", "ls_iterations", "tolerance"):
+                    setattr(option, name, EVALUATION_SOLVER[name])
+            else:
+                option.solver = mujoco.mjtSolver.mjSOL_PGS
+                option.iterations = _TRAINING_ITERATIONS
+            for joint_name in self.joints:
+                servo, joint = servos[joint_name], own.joint(joint_name)
+                joint.armature = float(servo.armature)
+                joint.frictionloss = float(servo.friction_loss)
+                joint.damping = np.array([float(np.asarray(servo.back_emf)), 0.0, 0.0])
+                joint.solref_friction = list(friction_solref(step_s))
+                joint.solimp_friction = list(FRICTION_SOLIMP)
+                actuator = own.add_actuator(
+                    name=joint_name, target=joint_name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+                )
+                speed, effort = float(servo.velocity_limit), float(servo.effort_limit)
+                actuator.set_to_pid(
+                    float(servo.stiffness), float(servo.damping),
+                    slewmax=speed if np.isfinite(speed) else 0.0, ctrlspec=1,
+                )  # fmt: skip
+                actuator.interp = 1
+                # two more than whole steps: MuJoCo silently truncates a delay beyond its buffer
+                actuator.nsample = int(float(servo.dead_time_s) / step_s) + 2
+                actuator.delay = float(servo.dead_time_s)
+                if np.isfinite(effort):
+                    actuator.forcelimited, actuator.forcerange = 1, [-effort, effort]
+            own.compile()
+            text = own.to_xml()
+            at = text.index("<worldbody>") + len("<worldbody>")
+            text = text[:at] + ground.xml + text[at:]
+            return text.replace(
+                "<worldbody>", f"<asset>{_GRID}{ground.assets}</asset><worldbody>", 1
+            )
+
+        return xml
+
+
+_GRID = (
+    '<texture name="grid" type="2d" builtin="checker" rgb1="0.80 0.83 0.87" rgb2="0.68 0.72 0.77" '
+    'width="300" height="300"/><material name="grid" texture="grid" texrepeat="5 5" '
+    'texuniform="true"/>'
+)
+
+
+def _images(places: Array, near: float) -> NDArray[np.intp] | None:
+    """Which place each place is the mirror image of; None if one has none."""
+    distance = np.linalg.norm(places[:, None] * [1, -1, 1] - places[None], axis=-1)
+    found = distance.argmin(axis=1)
+    return found if (distance.min(axis=1) < near).all() else None
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split()).rstrip(".")
