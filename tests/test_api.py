@@ -52,7 +52,7 @@ def test_every_name_is_there_and_no_other():
 
 def test_names_are_those_of_the_commands_and_older_names_are_the_same_functions():
     commands = {name.replace("-", "_") for name in pupper_sysid.COMMANDS}
-    functions = {n for n in ps.__all__ if n.islower() and not n.startswith("load")}
+    functions = {n for n in ps.__all__ if n.islower() and not n.startswith(("load", "make"))}
     assert functions <= commands
     assert ps.examine is ps.doctor and ps.lag is ps.delay
     assert ps.frequency_response is ps.bode and ps.sparse_equations is ps.sindy
