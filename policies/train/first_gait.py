@@ -142,7 +142,8 @@ class GaitScore(Result):
         return (
             f"score {self.score:.2f}, {100 * self.forward_share:.0f} % of "
             f"{self.forward_m_s:.3g} m/s forward, {100 * self.turn_share:.0f} % of "
-            f"{self.turn_rad_s:.3g} rad/s on the spot, {100 * self.falls:.0f} % fell; clearance {1e3 * self.clearance_p10_m:.1f} mm (p10), "
+            f"{self.turn_rad_s:.3g} rad/s on the spot, {100 * self.falls:.0f} % fell; "
+            f"clearance {1e3 * self.clearance_p10_m:.1f} mm (p10), "
             f"{100 * self.low_swing_share:.0f} % of the swings low, thighs and calves at their "
             f"torque limit {100 * self.saturated_share:.0f} % of the time"
         )
