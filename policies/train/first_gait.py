@@ -77,8 +77,8 @@ _BOX = {
 _NAMES = tuple(_BOX)
 _FIRST_WIDTH, _NARROWEST = 0.2, 0.02  # standard deviations, in shares of the box
 
-_CLEARANCE_M = 0.008  # `Rewards.least_clearance`
-_WEIGHTS = {"clearance": 0.2, "low": 0.4, "torque": 0.1, "saturation": 0.2, "sway": 0.1}
+_CLEARANCE_M = 0.006
+_WEIGHTS = {"clearance": 0.5, "low": 0.2, "torque": 0.2, "saturation": 0.2, "sway": 0.1}
 """Of the parts of the cost beside errors relative to standing and falls, of order 1 each."""
 _SWAY_RAD_S = 1.0
 

@@ -508,25 +508,39 @@ def make_env(
     observations: Mapping[str, Seen] | None = None,
     **task: Any,
 ) -> PupperEnv:
-    """Many robots with measured servos on a walking task, for a learner of your own.
+    """Make many robots with measured servos on a walking task, for a learner of your own.
+
+    Episodes, physics and rewards are those of `pupper-train`.
 
     Parameters
     ----------
-    actuator, feedback : str or Path
-        As for `pupper-train`: a calibration, a preset, `ideal`, …
-    robot, robot_config : str or Path, optional
-        MJCF and YAML of another robot than the Mini Pupper 2 (`sim.robot.robot_file`).
+    actuator : str or Path
+        As for `pupper-train`: a calibration, a preset, a servo card, `ideal` or a servo model.
+    robot : str or Path, optional
+        MJCF of another robot than the Mini Pupper 2.
+    robot_config : str or Path, optional
+        YAML beside it (`sim.robot.robot_file`).
     preset : {"fast", "scratch", "paper", "release"}
         The task.
-    environments, seed, threads : int
-    terms, observations : mapping, optional
-        Of your own; see `PupperEnv`.
+    feedback : str or Path
+        As for `pupper-train`: `held`, `ideal` or another calibration.
+    environments : int
+        How many robots.
+    seed : int
+        Of everything random.
+    threads : int
+        Of the physics; 0 for all cores.
+    terms : mapping of str to (float, callable), optional
+        Rewards of your own; see `PupperEnv`.
+    observations : mapping of str to callable, optional
+        Parts of an observation of your own; see `PupperEnv`.
     **task
         Fields of `Walking` that differ from the preset's, such as `episode_s` or `rewards`.
 
     Returns
     -------
     PupperEnv
+        Reset, so that `observe` gives the first observations.
 
     Raises
     ------
