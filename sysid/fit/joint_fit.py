@@ -385,16 +385,7 @@ def _choice(ready: PreparedJoint, fitted: Sequence[Fitted]) -> _Choice:
     likely = [f for f in compared if f.structure.name in plausible(nats)]
     if not likely:
         likely = [min(compared, key=lambda f: nats[f.structure.name])]
-    lowest = min(unseen[f.structure.name] for f in likely)
-    # without folds by the likelihood alone
-    close = [
-        f for f in likely
-        if not np.isfinite(lowest) or unseen[f.structure.name] <= _PREFERENCE * lowest
-    ]  # fmt: skip
-    fewest = min(len(f.structure.parameters) for f in close)
-    if np.isfinite(lowest):
-        close = [f for f in close if len(f.structure.parameters) == fewest]
-    carried = min(close, key=lambda f: nats[f.structure.name])
+    carried = _simplest(likely, nats, unseen)
     noise = ready.noise_rad
     if not ready.scales.free_air:  # the noise of the first structure was that of a worse one
         for _ in range(2):
@@ -406,6 +397,26 @@ def _choice(ready: PreparedJoint, fitted: Sequence[Fitted]) -> _Choice:
     likely = [carried if f.structure.name == carried.structure.name else f for f in likely]
     lag = ready.lag.with_dead_time(_dead_time(ready, carried, likely), float(carried.values[-1]))
     return _Choice(carried, tuple(likely), nats, unseen, noise, lag)
+
+
+def _simplest(
+    likely: Sequence[Fitted], nats: Mapping[str, float], unseen_rad: Mapping[str, float]
+) -> Fitted:
+    """The structure of fewest parameters that predicts unseen motion about as well as any.
+
+    Structures of as many parameters cannot overfit one another: between them the likelihood
+    decides, whose scatter over searches is far below that of the fits without a part.
+    """
+    by_count: dict[int, Fitted] = {}
+    for f in sorted(likely, key=lambda f: nats[f.structure.name]):
+        by_count.setdefault(len(f.structure.parameters), f)
+    lowest = min(unseen_rad[f.structure.name] for f in by_count.values())
+    if not np.isfinite(lowest):  # no folds
+        return min(likely, key=lambda f: nats[f.structure.name])
+    return next(
+        f for _, f in sorted(by_count.items())
+        if unseen_rad[f.structure.name] <= _PREFERENCE * lowest
+    )  # fmt: skip
 
 
 def _unseen(ready: PreparedJoint, fitted: Fitted) -> float:
@@ -565,7 +576,7 @@ def _in_free_air(
         },
         warnings=(
             *lag.warnings, *ready.warnings(), *_fit_warnings(ready.joint, goodness, choice),
-            *_free_warnings(ready.joint, results, chosen, choice),
+            *_free_warnings(ready, results, chosen, choice),
         ),
         runs=runs,
     )  # fmt: skip
@@ -804,9 +815,9 @@ def _best(results: Mapping[str, CandidateFit], carried: str) -> str:
 
 
 def _free_warnings(
-    joint: str, results: Mapping[str, CandidateFit], chosen: str, choice: _Choice
+    ready: PreparedJoint, results: Mapping[str, CandidateFit], chosen: str, choice: _Choice
 ) -> Iterator[str]:
-    carried = choice.carried.structure.name
+    joint, carried = ready.joint, choice.carried.structure.name
     pd = results[carried]
     if why := pd.undecided.get("dead_time_s"):
         yield f"{joint}: the dead time is not identified: {why}."
@@ -834,7 +845,8 @@ def _free_warnings(
             f"{1e3 * own:.1f} mrad); simulators still get DelayedPD, the model they can run."
         )
     if not np.isfinite(own):
-        yield f"{joint}: one frequency only, so no model was tested on unseen motion."
+        only = "frequency" if any(run.tone > 0 for run in ready.runs) else "motion"
+        yield f"{joint}: one {only} only, so no model was tested on unseen motion."
 
 
 def _command_speed(run: Run) -> float:

@@ -184,7 +184,7 @@ def test_what_is_no_robot_is_refused_by_what_is_wrong(capsys, read_here):
     assert run(capsys, "init-robot", "arm.xml")[0] == 0
     assert "exists already" in refused(capsys, pupper_sysid, "init-robot", "arm.xml")
     unknown = ("sweep", "--joint-map", "arm.joints.yaml", "--joints", "LF_hip")
-    assert "no joint" in refused(capsys, pupper_sysid, *unknown)
+    assert "there is no LF_hip here" in refused(capsys, pupper_sysid, *unknown)
 
 
 BOMBS = (

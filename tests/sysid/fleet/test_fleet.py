@@ -142,7 +142,7 @@ def test_a_cluster_is_an_address_that_is_written_out_and_what_it_is_trusted_with
     )
     for address in ("tls://host:8786", "tcp://[::1]:8786"):
         said = fleet.trust(address)
-        assert "can run programs on this computer" in said
+        assert "is enough to run programs on this computer" in said
         assert ("within a network of your own" in said) == address.startswith("tcp")
 
 
