@@ -17,7 +17,7 @@ Transactions on Automatic Control 9: 229–235.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,7 +177,7 @@ def goodness_of_fit(
     return ratios
 
 
-def overall(ratios: dict[str, float]) -> float:
+def overall(ratios: Mapping[str, float]) -> float:
     """Root mean square over the motions; NaN where none is known."""
     known = np.array([r for r in ratios.values() if np.isfinite(r)])
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")

@@ -13,7 +13,7 @@ the same: `prepare_joint`, `fit_structures`, `conclude`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -329,11 +329,12 @@ def _temperature(problem: Problem, fit: Fit) -> float:
     return temperature_of(scaled, problem.runs, len(structure.parameters))
 
 
-def _nats(ready: PreparedJoint, fitted: Sequence[Fitted]) -> dict[str, float]:
+def _nats(ready: PreparedJoint, fitted: Iterable[Fitted]) -> dict[str, float]:
     """Log-likelihood below the best by name, one more per feature (Akaike's price of a number).
 
     All are counted at the temperature of the best one, or a worse fit would excuse itself.
     """
+    fitted = [*fitted]
     best = min(fitted, key=lambda f: f.fit.cost)
     temperature = _temperature(ready.searched(best.structure), best.fit)
     count = {f.structure.name: len(f.structure.parameters) for f in fitted}
@@ -491,7 +492,7 @@ def conclude(
 
 
 def _with_profile(ready: PreparedJoint, carried: Fitted) -> Fitted | None:
-    """The carried servo with a limit on its set-point's acceleration, if that describes it better.
+    """The carried servo with a limit on its set-point's acceleration, if that describes it.
 
     Damping imitates such a profile within the noise, at a dead time that is wrong by tens of
     milliseconds, so that goodness of fit does not show it. The limit is off in the Mini Pupper's
@@ -506,7 +507,8 @@ def _with_profile(ready: PreparedJoint, carried: Fitted) -> Fitted | None:
     fitted = _fitted(ready, structure, tried, ready.fit_rng(), short=True)
     nats = _nats(ready, (carried, fitted))
     better = nats[carried.structure.name] - nats[structure.name] > _PROFILE_NATS
-    return fitted if better else None
+    described = not _undescribed(_goodness(ready, fitted))
+    return fitted if better and described else None
 
 
 def _in_free_air(

@@ -13,6 +13,7 @@ stand beside the servo in tables. Compiled once per machine, on first use, and c
 from __future__ import annotations
 
 from math import prod
+from typing import Any
 
 import numpy as np
 from numba import njit, types
@@ -51,7 +52,7 @@ SPARSE = 4
 """Number of `servo_models.sparse_equation`; its columns are its coefficients, then the offset."""
 
 
-def _on_stack(*shape):
+def _on_stack(*shape: int) -> Any:
     """Compiled function that returns an uninitialised array of a fixed shape on the stack.
 
     Unlike arrays of the heap such arrays are known not to overlap, without which the loops over

@@ -524,6 +524,7 @@ def fit_folds(
         if starts is not None:
             crowd = [starts.best(~out, _KEEP)]
         else:
+            assert draws is not None and by_run is not None
             whole = by_run[~out].sum(axis=0) + problem.prior(draws)
             crowd = [draws[np.argsort(whole)[:_FOLD_STARTS]]]
         for parent, own in parents:

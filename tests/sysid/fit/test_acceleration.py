@@ -10,7 +10,12 @@ from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.cards.numbers import LoadedLoop, stated
 from pupper_sysid.servo_models.loaded_servo import LoadedServo, LoadedServoParameters
 from pupper_sysid.sysid.compare.compare import compare
+from pupper_sysid.sysid.doctor.checks import usable_trials
+from pupper_sysid.sysid.fit import joint_fit
 from pupper_sysid.sysid.fit.calibrate import calibrate
+from pupper_sysid.sysid.fit.joint_fit import Fitted
+from pupper_sysid.sysid.fit.search import Fit
+from pupper_sysid.sysid.fit.structure import servo_structure
 from pupper_sysid.sysid.recordings.recording import Recording
 
 LIMIT_RAD_S2, STEP_S, LOOP_S, ROWS = 40.0, 0.0004, 0.02, 450
@@ -96,3 +101,37 @@ def test_a_model_with_a_limit_predicts_with_it_unless_the_header_says_otherwise(
     free = recording(JUMPS, np.inf, 6)
     assert error(free) > 10e-3, "readings choose no limit for the model that they score"
     assert error(recording(JUMPS, np.inf, 6, {"acceleration": 0})) < 1.5e-3
+
+
+def a_fit(features: tuple[str, ...], cost: float) -> Fitted:
+    structure = servo_structure(features)
+    return Fitted(structure, Fit(structure.prior[0], cost))
+
+
+def test_the_likelihood_decides_between_structures_of_as_many_parameters():
+    """Errors on unseen motion scatter by more over searches; they decide on further parameters."""
+    slew, back_emf = a_fit(("slew",), 10.0), a_fit(("back-EMF",), 14.0)
+    more = a_fit(("slew", "backlash"), 9.0)
+    names = [f.structure.name for f in (slew, back_emf, more)]
+    nats = dict(zip(names, (0.0, 4.0, 0.5), strict=True))
+    for unseen, wanted in (
+        ((0.017, 0.016, 0.017), slew), ((0.017, 0.016, 0.010), more),
+        ((np.nan, np.nan, np.nan), slew),
+    ):  # fmt: skip
+        errors = dict(zip(names, unseen, strict=True))
+        assert joint_fit._simplest((more, back_emf, slew), nats, errors) is wanted
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit", [LIMIT_RAD_S2, np.inf])
+def test_a_profile_competes_in_free_air_before_a_misfit_asks_for_it(limit):
+    """Damping imitates a profile within the noise; the likelihood tells the two apart."""
+    trials = usable_trials([recording(JUMPS, limit, 5)])["j"]
+    ready = joint_fit.prepare_joint("j", trials, 0, free_air=True)
+    stages = {stage: joint_fit.fit_structures(ready, stage) for stage in joint_fit.stages(ready)}
+    carried = joint_fit._choice(ready, joint_fit._joined(stages)).carried
+    profiled = joint_fit._with_profile(ready, carried)
+    assert (profiled is not None) == np.isfinite(limit)
+    if profiled is not None:
+        place = profiled.structure.names.index("acceleration_limit")
+        assert profiled.values[place] == pytest.approx(limit, rel=0.1)
