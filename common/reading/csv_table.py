@@ -115,7 +115,7 @@ class CsvTable:
     numbers: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     """Empty cells are NaN, shape (rows,)."""
     texts: dict[str, list[str]] = field(default_factory=dict)
-    """Columns that were asked for as text."""
+    """Columns to read as text."""
     faults: dict[str, str] = field(default_factory=dict)
     """Other columns that hold text, and the sentence on the first such cell."""
     line: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))

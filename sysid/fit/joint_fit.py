@@ -185,7 +185,10 @@ def fit_joint(
 def joint_lag(joint: str, trials: Sequence[Trial], seed: int = 0) -> LagBudget:
     """Lag budget of one joint, its dead time that of `fit_joint`."""
     ready = prepare_joint(joint, trials, seed)
-    return _choice(ready, _joined({s: fit_structures(ready, s) for s in stages(ready)})).lag
+    fitted = {stage: fit_structures(ready, stage) for stage in stages(ready)}
+    ready, _, choice = _settled(ready, _joined(fitted))
+    goodness = _goodness(ready, choice.carried)
+    return _with_misfit(ready, choice, goodness) if _undescribed(goodness) else choice.lag
 
 
 def stages(ready: PreparedJoint) -> tuple[str, ...]:
@@ -475,20 +478,33 @@ def conclude(
     presets : dict, optional
         As for `fit_joint`.
     """
-    every = _joined(fitted)
-    choice = _choice(ready, every)
+    ready, every, choice = _settled(ready, _joined(fitted))
     if not ready.scales.free_air:
         return _under_load(ready, every, choice)
-    result = _in_free_air(ready, every, choice, presets)
-    misfit = overall(result.goodness)
+    return _in_free_air(ready, every, choice, presets)
+
+
+def _settled(
+    ready: PreparedJoint, every: list[Fitted]
+) -> tuple[PreparedJoint, list[Fitted], _Choice]:
+    """The joint, its fits and the choice among them.
+
+    A joint in free air is taken for any servo, with an unknown load, where a profile of the
+    set-point describes it better, or DelayedPD does not and such a servo may.
+    """
+    choice = _choice(ready, every)
+    if not ready.scales.free_air:
+        return ready, every, choice
+    goodness = _goodness(ready, choice.carried)
     profiled = _with_profile(ready, choice.carried)
-    if profiled is None and not _undescribed(result.goodness):
-        return result
-    # one with a profile, gravity or other friction describes it, or may
-    most = np.inf if profiled is not None else _DESCRIBES_BETTER * misfit
-    ready = ready.as_any_servo()
-    every = _ladder(ready, ready.fit_rng(), SHORT_LADDER, most, profiled)
-    return _under_load(ready, every, _choice(ready, every)) if every else result
+    if profiled is None and not _undescribed(goodness):
+        return ready, every, choice
+    most = np.inf if profiled is not None else _DESCRIBES_BETTER * overall(goodness)
+    any_servo = ready.as_any_servo()
+    ladder = _ladder(any_servo, any_servo.fit_rng(), SHORT_LADDER, most, profiled)
+    if not ladder:
+        return ready, every, choice
+    return any_servo, ladder, _choice(any_servo, ladder)
 
 
 def _with_profile(ready: PreparedJoint, carried: Fitted) -> Fitted | None:

@@ -134,7 +134,7 @@ def sample(
             continue
         density = np.logaddexp(density, mixture.log_density(points))
         mixtures.append(mixture)
-        of_drawn = np.logaddexp.reduce([m.log_density(drawn) for m in mixtures])
+        of_drawn = np.asarray(logsumexp([m.log_density(drawn) for m in mixtures], axis=0))
         points, cost = np.concatenate([points, drawn]), np.concatenate([cost, own])
         density = np.concatenate([density, of_drawn])
         weight = np.exp(-cost - density - np.max(-cost - density))

@@ -13,6 +13,7 @@ from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.doctor.checks import usable_trials
 from pupper_sysid.sysid.fit import joint_fit
 from pupper_sysid.sysid.fit.calibrate import calibrate
+from pupper_sysid.sysid.fit.dead_time import lag
 from pupper_sysid.sysid.fit.joint_fit import Fitted
 from pupper_sysid.sysid.fit.search import Fit
 from pupper_sysid.sysid.fit.structure import servo_structure
@@ -135,3 +136,10 @@ def test_a_profile_competes_in_free_air_before_a_misfit_asks_for_it(limit):
     if profiled is not None:
         place = profiled.structure.names.index("acceleration_limit")
         assert profiled.values[place] == pytest.approx(limit, rel=0.1)
+
+
+@pytest.mark.slow
+def test_delay_and_calibrate_have_one_dead_time_where_a_profile_is_found():
+    jumps = recording(JUMPS, LIMIT_RAD_S2, 5)
+    dead_time = lag(jumps)["j"].dead_time_s
+    assert dead_time == calibrate(jumps)["j"].lag.dead_time_s
