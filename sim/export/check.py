@@ -24,6 +24,7 @@ from pupper_sysid.servo_models.calibration.parts import JointCalibration
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.loaded_servo import LoadedServo
+from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sim.export.mjcf import to_mjcf
 from pupper_sysid.sim.export.shared import ExportedServos
 from pupper_sysid.sim.robot.servo_mjcf import hold
@@ -106,9 +107,11 @@ def check(servos: ExportedServos) -> Check:
         "cost at 4 Hz, 0.3 rad: simulators on torch get a class with delays of any fraction.",
     )
     if fitted != {servos.physics_step_s}:
+        continuous = min(fitted) <= CONTINUOUS_S
+        basis = "in continuous time" if continuous else f"for steps of {1e3 * min(fitted):g} ms"
         notes += (
-            f"The servos were fitted in steps of {1e3 * min(fitted):g} ms; another step moves them "
-            "otherwise by some mrad, since dry friction holds until the end of a step.",
+            f"The servos' numbers are {basis}; another step moves them otherwise by some mrad, "
+            "since dry friction holds until the end of a step.",
         )
     if loaded:
         notes += (
