@@ -9,7 +9,7 @@ into the `Calibration` that simulators read.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +18,7 @@ from pupper_sysid.common.errors import refuse_outside
 from pupper_sysid.common.joints import STALL_TORQUES_NM
 from pupper_sysid.common.processes.workers import Workers, prepare
 from pupper_sysid.common.results import JointResults
-from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.sysid.doctor.checks import Joints, Recordings, as_sequence, usable_trials
 from pupper_sysid.sysid.fit.calibration_file import preset_parameters, to_calibration
 from pupper_sysid.sysid.fit.joint_fit import (
@@ -29,9 +29,10 @@ from pupper_sysid.sysid.fit.joint_fit import (
     stages,
 )
 from pupper_sysid.sysid.fit.loads import loaded_joints
-from pupper_sysid.sysid.fit.operating_point import with_operating_points
+from pupper_sysid.sysid.fit.operating_point import reference_gain, with_operating_points
 from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
+from pupper_sysid.sysid.fit.servo_prior import ServoPrior, servo_prior
 from pupper_sysid.sysid.fit.structure import SIMULATED
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -89,6 +90,7 @@ def calibrate(
     workers: int = 1,
     progress: Callable[[str], None] | None = None,
     staged: Staged | None = None,
+    prior: Calibration | Path | str | None = None,
 ) -> CalibrationResult:
     """Calibrate every joint of the recordings.
 
@@ -109,6 +111,9 @@ def calibrate(
         Called with a joint's name when it is done.
     staged : callable, optional
         See `Staged`.
+    prior : Calibration, Path or str, optional
+        Another unit of the servo: a calibration or a servo card. Its numbers are the prior of each
+        joint's, so that a short recording is enough.
 
     Returns
     -------
@@ -127,17 +132,39 @@ def calibrate(
     every, presets = usable_trials(recordings, joints), preset_parameters()
     loaded = loaded_joints(every)
     free_air = {joint: joint not in loaded for joint in every}
+    priors, note = _priors(prior, every)
     if workers > 1 and len(every) > 1:  # of one joint, a second process costs what it saves
-        fits = side_by_side(every, free_air, seed, presets, workers, progress, staged)
+        fits = side_by_side(every, free_air, seed, presets, workers, progress, staged, priors)
     else:
         fits = {}
         for joint, trials in every.items():
-            fits[joint] = _one_by_one(joint, trials, free_air[joint], seed, presets, staged)
+            fits[joint] = _one_by_one(
+                joint, trials, free_air[joint], seed, presets, staged, priors.get(joint)
+            )
             if progress:
                 progress(joint)
     calibration = to_calibration(fits, as_sequence(recordings), seed, stall_torque_nm)
     calibration = with_operating_points(calibration, every)
+    if note:
+        calibration = calibration.model_copy(update={"notes": (*calibration.notes, note)})
     return CalibrationResult(joints=fits, calibration=calibration)
+
+
+def _priors(
+    prior: Calibration | Path | str | None, every: Mapping[str, Sequence[Trial]]
+) -> tuple[dict[str, ServoPrior], str]:
+    """The prior of each joint from another unit, and a note for the file."""
+    if prior is None:
+        return {}, ""
+    if isinstance(prior, Calibration):
+        other, source = prior, prior.robot
+    else:
+        other, source = load_calibration(prior), Path(prior).name
+    priors = {
+        joint: servo_prior(other, source, joint, reference_gain(trials).value)
+        for joint, trials in every.items()
+    }
+    return priors, f"Numbers of {source} ({other.robot}) are the prior of these."
 
 
 Staged = Callable[[str, str], None]
@@ -151,10 +178,11 @@ def _one_by_one(
     seed: int,
     presets: Presets,
     staged: Staged | None,
+    prior: ServoPrior | None,
 ) -> JointCalibrationResult:
     """`fit_joint`, telling of its stages."""
     done = staged or (lambda joint, stage: None)
-    ready, fitted = prepare_joint(joint, trials, seed, free_air), {}
+    ready, fitted = prepare_joint(joint, trials, seed, free_air, prior=prior), {}
     done(joint, PREPARATION)
     for stage in stages(ready):
         fitted[stage] = fit_structures(ready, stage)
@@ -172,6 +200,7 @@ def side_by_side(
     workers: int,
     progress: Callable[[str], None] | None,
     staged: Staged | None = None,
+    priors: Mapping[str, ServoPrior] | None = None,
 ) -> dict[str, JointCalibrationResult]:
     """`fit_joint` of every joint, its stages on several processes, so that none waits long.
 
@@ -190,6 +219,8 @@ def side_by_side(
         Called with a joint's name when it is done.
     staged : callable or None
         See `Staged`.
+    priors : mapping of joint to ServoPrior, optional
+        Numbers of another unit.
 
     Raises
     ------
@@ -201,7 +232,10 @@ def side_by_side(
     results: dict[str, JointCalibrationResult] = {}
     with Workers(workers, __name__) as pool:
         for joint, own in trials.items():
-            pool.submit((joint, PREPARATION), prepare_joint, joint, own, seed, free_air[joint])
+            prior = None if priors is None else priors.get(joint)
+            pool.submit(
+                (joint, PREPARATION), prepare_joint, joint, own, seed, free_air[joint], None, prior
+            )
         for (joint, stage), result in pool.results():
             if staged:  # before `progress`, which ends the joint
                 staged(joint, stage)

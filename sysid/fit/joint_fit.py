@@ -67,6 +67,7 @@ from pupper_sysid.sysid.fit.search import (
     search,
     search_widely,
 )
+from pupper_sysid.sysid.fit.servo_prior import ServoPrior
 from pupper_sysid.sysid.fit.structure import (
     CANDIDATES,
     PREFERRED,
@@ -157,6 +158,7 @@ def fit_joint(
     seed: int = 0,
     presets: Presets | None = None,
     free_air: bool | None = None,
+    prior: ServoPrior | None = None,
 ) -> JointCalibrationResult:
     """Fit the structures to one joint and choose.
 
@@ -171,13 +173,15 @@ def fit_joint(
         Published settings to score beside the fits.
     free_air : bool, optional
         Whether the joint carried no load; by default what its trials tell.
+    prior : ServoPrior, optional
+        Numbers of another unit of the servo.
 
     Raises
     ------
     InputError
         If there is too little motion.
     """
-    ready = prepare_joint(joint, trials, seed, free_air)
+    ready = prepare_joint(joint, trials, seed, free_air, prior=prior)
     fitted = {stage: fit_structures(ready, stage) for stage in stages(ready)}
     return conclude(ready, fitted, presets)
 
@@ -802,8 +806,9 @@ def _why_unidentified(
         on = float(abs(p.encode(end) - p.encode(bound))) < _AT_BOUND
         if on and (p.logarithmic or abs(value - bound) < _AT_BOUND):
             return f"on its bound, {bound:g}: the recording does not limit it on that side"
-    if sd > 0.7 * p.prior_sd:
-        return "these recordings do not excite it; the value is the prior's"
+    if sd > 0.7 * p.marginal_sd:
+        whose = f"that of {p.prior_source}" if p.prior_source else "the prior's"
+        return f"these recordings do not excite it; the value is {whose}"
     if p.name == "dead_time_s" and interval.high - interval.low < _SHARP_DEAD_TIME_S:
         return None  # a short one may well be close to none
     if interval.low <= 0 and p.logarithmic:

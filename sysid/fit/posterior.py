@@ -185,7 +185,7 @@ class _Mixture:
         A ridge bends, so a step of one standard deviation along an axis of the curvature often
         costs far more than half a unit of log-likelihood; the axis is made shorter then.
         """
-        precision, k = np.diag(problem.structure.prior[1]), centres.shape[1]
+        precision, k = problem.structure.prior_precision, centres.shape[1]
         bent = (curvatures(problem, centres, _STEP) - precision) / temperature + precision
         values, axes = np.linalg.eigh(bent)
         sizes = np.minimum(1.0 / np.sqrt(np.maximum(values, 1e-12)), _WIDEST)

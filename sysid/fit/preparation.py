@@ -34,6 +34,7 @@ from pupper_sysid.sysid.fit.noise import noise_by_run
 from pupper_sysid.sysid.fit.operating_point import reference_gain
 from pupper_sysid.sysid.fit.run import Run, free_run, fresh_residuals, prepare
 from pupper_sysid.sysid.fit.search import Fit, Problem, refine, search_widely
+from pupper_sysid.sysid.fit.servo_prior import ServoPrior
 from pupper_sysid.sysid.fit.structure import (
     SIMULATED,
     Scales,
@@ -103,7 +104,8 @@ class PreparedJoint:
 
         For a joint in free air that DelayedPD does not describe.
         """
-        scales = replace(scales_of(self.recorded, self.runs), known_load=False, p_gain=1.0)
+        scales = scales_of(self.recorded, self.runs)
+        scales = replace(scales, known_load=False, p_gain=1.0, prior=self.scales.prior)
         first = _first_fits(scales, self.runs, self.noise_rad, self.fit_rng())
         return replace(self, scales=scales, first=first, reference_voltage_v=float("nan"))
 
@@ -145,6 +147,7 @@ def prepare_joint(
     seed: int,
     free_air: bool | None = None,
     known: Mapping[str, NDArray[np.float64]] | None = None,
+    prior: ServoPrior | None = None,
 ) -> PreparedJoint:
     """Measure the lag of a joint, date its readings, and put its trials on the physics clock.
 
@@ -159,6 +162,8 @@ def prepare_joint(
     known : dict of str to ndarray, optional
         Values of candidates of free air by name, from an earlier fit to these trials; nothing is
         fitted then.
+    prior : ServoPrior, optional
+        Numbers of another unit of the servo.
 
     Raises
     ------
@@ -176,6 +181,7 @@ def prepare_joint(
     if not runs:
         raise InputError(f"{joint}: no readings; record again.")
     scales = _in_free_air(joint, recorded) if free_air else scales_of(recorded, runs)
+    scales = replace(scales, prior=prior)
     # fits of a noise-free servo still meet rounding: a third of a quantisation step
     least = max(quantum(trials) / 3, _LEAST_NOISE_RAD)
     scale = max(lag.noise_rad, least) if free_air and np.isfinite(lag.noise_rad) else _NOISE_RAD

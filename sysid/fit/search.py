@@ -69,8 +69,7 @@ class Problem:
 
     def prior(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Minus the logarithm of the prior."""
-        centre, precision = self.structure.prior
-        return 0.5 * np.sum(precision * (points - centre) ** 2, axis=-1)
+        return self.structure.prior_cost(points)
 
     def costs(
         self, points: NDArray[np.float64], ceiling: NDArray[np.float64] | float = np.inf
@@ -281,6 +280,8 @@ def _sobol(structure: Structure, rng: np.random.Generator, count: int) -> NDArra
     low, high = structure.box
     centre, precision = structure.prior
     reach = 2.0 / np.sqrt(np.maximum(precision, 1e-12))
+    if structure.shared is not None:
+        reach = np.hypot(reach, [2.0 * p.shared_sd for p in structure.parameters])
     reach = np.where(structure.logarithmic, reach, np.minimum(reach, _START_RAD))
     low, high = np.maximum(low, centre - reach), np.minimum(high, centre + reach)
     points = low + qmc.Sobol(len(low), rng=rng).random(count) * (high - low)
@@ -350,10 +351,9 @@ def _slopes(problem: Problem, points: NDArray, difference: float) -> tuple[NDArr
     """Cost, gradient and curvature at points (starts, parameters)."""
     structure, k = problem.structure, points.shape[1]
     _, high = structure.box
-    centre, precision = structure.prior
     step = difference * structure.scale
     away = np.where(points + step > high, -1.0, 1.0) * step
-    pull = precision * (points - centre)
+    pull = structure.prior_slope(points)
     cost, gradient = problem.prior(points), np.empty(points.shape)
     bent = np.empty((len(points), k, k))
     together = max(1, _LARGEST_BATCH // max(problem.samples * (k + 1), 1))
@@ -367,7 +367,7 @@ def _slopes(problem: Problem, points: NDArray, difference: float) -> tuple[NDArr
         weighted = jacobian / root[:, None]
         cost[at] += np.sum(root - 1.0, axis=-1)
         gradient[at] = (weighted @ r[:, 0, :, None])[..., 0] + pull[at]
-        bent[at] = weighted @ jacobian.mT + np.diag(precision)
+        bent[at] = weighted @ jacobian.mT + structure.prior_precision
     return cost, gradient, bent
 
 

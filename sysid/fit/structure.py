@@ -13,7 +13,7 @@ servo in tables.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 from pupper_sysid.sysid.fit import kernel
+from pupper_sysid.sysid.fit.servo_prior import PER_INERTIA, ServoPrior
 
 LONGEST_DEAD_TIME_S = 0.4
 
@@ -39,6 +40,10 @@ class Parameter:
         Standard deviation of a Gaussian prior about `nominal`, of the logarithm where that is
         what is fitted. Wide: it decides only what the data leave open, such as a speed limit
         that was never reached.
+    shared_sd : float
+        Standard deviation of what the numbers of one prior have in common besides.
+    prior_source : str
+        Calibration or card of another unit that the prior comes from; empty without one.
     """
 
     name: str
@@ -46,11 +51,18 @@ class Parameter:
     low: float
     high: float
     prior_sd: float = float("inf")
+    shared_sd: float = 0.0
+    prior_source: str = ""
 
     @property
     def logarithmic(self) -> bool:
         """Whether the logarithm is fitted."""
         return self.low > 0
+
+    @property
+    def marginal_sd(self) -> float:
+        """Standard deviation of the prior, with what is common to several numbers."""
+        return float(np.hypot(self.prior_sd, self.shared_sd))
 
     def encode(self, value):
         """Fitted coordinate of a value."""
@@ -83,6 +95,8 @@ class Scales:
         Limit on the set-point's acceleration that headers state; NaN if none.
     top_speed_rad_s : float
         Speed without load by the data sheet of the servo's model; NaN if that is not known.
+    prior : ServoPrior or None
+        Numbers of another unit of the servo.
     """
 
     torque: float = 1.0
@@ -93,6 +107,7 @@ class Scales:
     torque_off: bool = False
     acceleration_rad_s2: float = float("nan")
     top_speed_rad_s: float = float("nan")
+    prior: ServoPrior | None = None
 
     @property
     def gravity(self) -> bool:
@@ -260,6 +275,40 @@ class Structure:
         return centre, np.array([p.prior_sd**-2.0 for p in self.parameters])
 
     @cached_property
+    def shared(self) -> NDArray[np.float64] | None:
+        """Vector u of a prior in which numbers have a factor in common; None without one.
+
+        With variances D and the common one S², the precision is D⁻¹ − uuᵀ (Sherman and Morrison).
+        """
+        common = np.array([p.shared_sd for p in self.parameters])
+        if not common.any():
+            return None
+        weights = np.where(common > 0, self.prior[1], 0.0)
+        return weights / np.sqrt(common.max() ** -2 + weights.sum())
+
+    def prior_cost(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Minus the logarithm of the prior at points (..., parameters), but for a constant."""
+        centre, precision = self.prior
+        cost = 0.5 * np.sum(precision * (points - centre) ** 2, axis=-1)
+        if self.shared is not None:
+            cost = cost - 0.5 * ((points - centre) @ self.shared) ** 2
+        return cost
+
+    def prior_slope(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Gradient of `prior_cost` at points (..., parameters)."""
+        centre, precision = self.prior
+        slope = precision * (points - centre)
+        if self.shared is not None:
+            slope = slope - ((points - centre) @ self.shared)[..., None] * self.shared
+        return slope
+
+    @cached_property
+    def prior_precision(self) -> NDArray[np.float64]:
+        """Hessian of `prior_cost`, shape (parameters, parameters)."""
+        precision = np.diag(self.prior[1])
+        return precision if self.shared is None else precision - np.outer(self.shared, self.shared)
+
+    @cached_property
     def scale(self) -> NDArray[np.float64]:
         """Length of a usual move of each fitted coordinate: of logarithms 1, else by the prior."""
         return np.array([
@@ -367,7 +416,19 @@ def servo_structure(
 
 
 def _parameter(term: Term, scales: Scales) -> Parameter:
-    """The number of the table as it is fitted."""
+    """The number of the table as it is fitted, with the prior of another unit if there is one."""
+    plain = _plain_parameter(term, scales)
+    if scales.prior is None or plain.name not in scales.prior.logarithms:
+        return plain
+    mean, sd = scales.prior.logarithms[plain.name]
+    nominal = float(np.clip(np.exp(mean), plain.low, plain.high))
+    shared = scales.prior.shared_sd if plain.name in PER_INERTIA else 0.0
+    return replace(
+        plain, nominal=nominal, prior_sd=sd, shared_sd=shared, prior_source=scales.prior.source
+    )
+
+
+def _plain_parameter(term: Term, scales: Scales) -> Parameter:
     if scales.free_air and term.free is not None:
         nominal, low, high, sd = term.free
         if term.name in _SPEEDS and np.isfinite(scales.top_speed_rad_s):

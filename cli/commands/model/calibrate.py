@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -38,6 +38,8 @@ class Calibrate:
 
     Example: pupper-sysid calibrate recordings/sweep.csv --out calibrated.yaml
 
+    Example: pupper-sysid calibrate short.csv --from sts3215-12v --out mine.yaml
+
     Example: pupper-sysid calibrate robots/ --jobs 4
     """
 
@@ -52,6 +54,9 @@ class Calibrate:
     stall_torque: float | None = None
     """Torque the servo stalls at [N·m]: sets the scale of all torques and of the armature. By
     default of the recorded servo's data sheet; a recording with a known load needs none."""
+    prior: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """Calibration or servo card (`pupper-sysid servo list`) of another unit of the servo: its
+    numbers are the prior, so that 20 s in free air are enough."""
     jobs: int = 2
     """Robots of a fleet that are calibrated at the same time."""
     cluster: str | None = None
@@ -95,7 +100,7 @@ class Calibrate:
 
             made = calibrate(
                 recordings, joints, self.seed, self.stall_torque,
-                workers=2, progress=done, staged=staged,
+                workers=2, progress=done, staged=staged, prior=self.prior,
             )  # fmt: skip
         made.save(out, force=self.force)
         if self.json:
@@ -116,6 +121,8 @@ class Calibrate:
             trust,
         )
 
+        if self.prior is not None:
+            raise InputError("--from: a fleet is calibrated without a prior; leave it out.")
         if self.joints != "all":
             raise InputError("--joints: a fleet is calibrated with all its joints; leave it out.")
         out = self.out or resolved(root).with_name(f"{resolved(root).name}_calibrated")

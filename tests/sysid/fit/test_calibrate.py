@@ -205,3 +205,15 @@ def test_the_real_sweeps_reach_the_best_published_figures(real_sweeps):
     )
     assert paper / ours >= 10  # the paper's setting
     assert unseen <= 28e-3  # 4 Hz, by models fitted to 1, 2 and 3 Hz
+
+
+@pytest.mark.slow
+def test_a_short_recording_with_another_unit_as_the_prior_tells_the_effort_limit():
+    """Two tones alone leave it open; `test_servo_prior` has the parts."""
+    alone, adapted = (
+        calibrate(servo_recording(3, (2.0, 4.0)), prior=prior)
+        .calibration.joints[JOINT].actuator.ratios_to_armature.effort_limit
+        for prior in (None, "data/samples/calibrated.yaml")
+    )  # fmt: skip
+    assert adapted.high / adapted.low < 0.8 * alone.high / alone.low
+    assert adapted.low <= TRUE.effort_limit <= adapted.high
