@@ -264,6 +264,9 @@ class JointCalibration(Part):
     """Choice of the model."""
     scores: Scores = Scores()
     """Errors of the chosen model."""
+    between_recordings: dict[str, NotNegative] = Field(default_factory=dict)
+    """Of several recordings: standard deviation between them of the logarithm of a fitted number
+    (0.05 is 5 %), by its name. The intervals include it."""
     warnings: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """Reasons for distrust, in sentences."""
 

@@ -244,8 +244,21 @@ def chosen_joints(recordings: Recordings, joints: Joints = None) -> list[str]:
 
 def recorded_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
     """All trials of `joint` as they were recorded, renumbered."""
-    trials = [trial for recording in as_sequence(recordings) for trial in recording.trials(joint)]
+    several = as_sequence(recordings)
+    names = _told_apart([recording.name for recording in several])
+    trials = [
+        replace(trial, source=name)
+        for name, recording in zip(names, several, strict=True)
+        for trial in recording.trials(joint)
+    ]
     return tuple(replace(trial, number=n) for n, trial in enumerate(trials))
+
+
+def _told_apart(names: Sequence[str]) -> list[str]:
+    """Names of recordings, those that are alike with a number."""
+    places = [names[: k + 1].count(name) for k, name in enumerate(names)]
+    several = [names.count(name) > 1 for name in names]
+    return [f"{n} ({k})" if more else n for n, k, more in zip(names, places, several, strict=True)]
 
 
 def joint_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:

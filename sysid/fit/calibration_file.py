@@ -184,6 +184,7 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
             r_hat=_finite(result.r_hat),
             effective_draws=_finite(result.effective_draws),
         ),
+        between_recordings=result.between_recordings,
         warnings=result.warnings,
     )  # fmt: skip
 

@@ -43,6 +43,7 @@ from pupper_sysid.sysid.fit.posterior import (
     with_date_errors,
 )
 from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
+from pupper_sysid.sysid.fit.repeats import Repeats, by_number, compare_repeats
 from pupper_sysid.sysid.fit.results import (
     RATIO_SOURCES,
     UNTOLD,
@@ -375,6 +376,8 @@ class _Choice:
     noise_rad : tuple of float
     lag : LagBudget
         With dead time and offset.
+    repeats : Repeats or None
+        What several recordings in free air say of one another; the draws are widened by it.
     """
 
     carried: Fitted
@@ -383,6 +386,7 @@ class _Choice:
     unseen_rad: dict[str, float]
     noise_rad: tuple[float, ...]
     lag: LagBudget
+    repeats: Repeats | None = None
 
 
 def _choice(ready: PreparedJoint, fitted: Sequence[Fitted]) -> _Choice:
@@ -403,8 +407,29 @@ def _choice(ready: PreparedJoint, fitted: Sequence[Fitted]) -> _Choice:
             problem = replace(ready.problem(structure), noise_rad=noise)
             carried = replace(carried, fit=refine(problem, carried.fit.point[None]))
     likely = [carried if f.structure.name == carried.structure.name else f for f in likely]
+    repeats = None
+    if not ready.scales.known_load and len({r.p_gain for r in ready.runs}) == 1:
+        quantum_rad = ready.lag.quantum_rad
+        repeats = compare_repeats(
+            ready.problem(carried.structure), carried.fit, ready.least_rad,
+            quantum_rad if np.isfinite(quantum_rad) else 0.0,
+        )  # fmt: skip
+    if repeats is not None:
+        likely = [_as_repeats(f, repeats, ready.fit_rng()) for f in likely]
+        carried = next(f for f in likely if f.structure.name == carried.structure.name)
     lag = ready.lag.with_dead_time(_dead_time(ready, carried, likely), float(carried.values[-1]))
-    return _Choice(carried, tuple(likely), nats, unseen, noise, lag)
+    return _Choice(carried, tuple(likely), nats, unseen, noise, lag, repeats)
+
+
+def _as_repeats(fitted: Fitted, repeats: Repeats, rng: np.random.Generator) -> Fitted:
+    """The fit with draws as wide as recordings differ, in the numbers that it has, too."""
+    assert fitted.draws is not None
+    spread = dict(zip(repeats.names, repeats.for_the_next, strict=True))
+    sd = np.array([spread.get(name, 0.0) for name in fitted.structure.names])
+    if not sd.any():
+        return fitted
+    draws = fitted.draws + sd * rng.standard_normal(fitted.draws.shape)
+    return replace(fitted, draws=np.clip(draws, *fitted.structure.box))
 
 
 def _simplest(
@@ -535,7 +560,7 @@ def _in_free_air(
     ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice, presets: Presets | None
 ) -> JointCalibrationResult:
     runs, folds = ready.runs, folds_of(ready.runs)
-    by_name = {f.structure.name: f for f in every}
+    by_name = {f.structure.name: f for f in (*every, *choice.likely)}
     results = {name: _candidate_fit(ready, f, folds) for name, f in by_name.items()}
     least = [f.scores.rmse_unseen_rad for n, f in results.items() if n in SIMULATED]
     for structure in (candidate(name, ready.scales) for name in CANDIDATES):
@@ -591,6 +616,7 @@ def _in_free_air(
         goodness=goodness,
         r_hat=choice.carried.r_hat,
         effective_draws=choice.carried.effective,
+        between_recordings=by_number(choice.repeats),
         presets={
             name: score_preset(by_joint[ready.joint], runs)
             for name, by_joint in (presets or {}).items()
@@ -686,6 +712,8 @@ def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) ->
     elif not np.isfinite(overall(goodness)):
         yield f"{joint}: too few readings to say how well the model describes this servo."
     own = choice.carried
+    if choice.repeats is not None:
+        yield from (d.sentence(joint) for d in choice.repeats.differences)
     if not (own.r_hat <= R_HAT and own.effective >= EFFECTIVE):
         yield (
             f"{joint}: the draws have not converged (R̂ {own.r_hat:.2f}, {own.effective:.0f} "
@@ -934,6 +962,7 @@ def _under_load(
         goodness=goodness,
         r_hat=choice.carried.r_hat,
         effective_draws=choice.carried.effective,
+        between_recordings=by_number(choice.repeats),
         presets={},
         warnings=(
             *lag.warnings, *ready.warnings(), *_fit_warnings(ready.joint, goodness, choice),

@@ -168,6 +168,8 @@ class JointCalibrationResult(Result):
         Residual of the model over the noise of readings, by motion: 1 where it explains the servo.
     r_hat, effective_draws : float
         R̂ of the draws behind the intervals, and how many independent ones they are worth.
+    between_recordings : dict of str to float
+        Standard deviation between several recordings of the logarithm of a fitted number.
     loaded : LoadedFit or None
         The servo at any gain and load, where the recordings tell of a load or several gains.
     runs : tuple of Run
@@ -186,6 +188,7 @@ class JointCalibrationResult(Result):
     goodness: dict[str, float] = field(default_factory=dict)
     r_hat: float = float("nan")
     effective_draws: float = float("nan")
+    between_recordings: dict[str, float] = field(default_factory=dict)
     loaded: LoadedFit | None = None
     runs: tuple[Run, ...] = internal(default=())
 

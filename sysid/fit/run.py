@@ -63,6 +63,8 @@ class Run:
         1, or inf where it is not limited.
     ramp_known : bool
         Whether the header states it.
+    source : str
+        Name of its recording, where several are pooled.
     """
 
     label: str
@@ -81,6 +83,7 @@ class Run:
     step_s: float = TIME_STEP_S
     ramp_share: float = 1.0
     ramp_known: bool = False
+    source: str = ""
 
     @property
     def steps(self) -> int:
@@ -200,6 +203,7 @@ def prepare(
         row_rad=trial.position_rad,
         ramp_share=1.0 if ramp is None or np.isfinite(ramp) else float("inf"),
         ramp_known=ramp is not None,
+        source=trial.source,
     )  # fmt: skip
 
 

@@ -97,6 +97,8 @@ class Trial:
     """What the joint carried; None where the header does not say."""
     unit_stated: bool = False
     """Whether the unit of the angles was stated, so that they may be of several turns."""
+    source: str = ""
+    """Name of its recording, where several are pooled."""
 
     def powered(self) -> Trial:
         """Its longest stretch of rows with the torque on; all of it where it always was."""

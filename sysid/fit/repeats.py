@@ -1,0 +1,237 @@
+"""Repeats: do the recordings of a joint agree, which one differs in what, and how widely they vary.
+
+A servo is not the same on two days: its battery, temperature and grease are not, nor may be its
+gain. Each recording is fitted apart, from the fit to all of them, and compared with the others by
+normal approximations of their likelihoods. Where one differs, the one number that explains most of
+it is named, with the factor between it and the others. The variance of each number between
+recordings widens its interval, which then is for the next recording, too.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.common.interval import Interval
+from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
+from pupper_sysid.sysid.fit.noise import noise_by_run
+from pupper_sysid.sysid.fit.posterior import temperature_of
+from pupper_sysid.sysid.fit.run import fresh_residuals
+from pupper_sysid.sysid.fit.search import Fit, Problem, curvature, local, refine
+from pupper_sysid.sysid.fit.servo_prior import PER_INERTIA
+
+_ITERATIONS = 20  # from a fit to recordings that may differ much
+_STEP = 0.03  # of slopes and curvatures: over a likely error, not of one kink
+_LEAST_READINGS = 30
+"""Of a recording, below which it is not compared."""
+_NATS = 8.0
+"""Log-likelihood by which one number explains a difference that is named: four standard deviations,
+because recordings times numbers are tried."""
+_LEAST_CHANGE = 0.05
+"""Logarithm of the smallest factor that is named: servos of one batch differ by more."""
+_CHANGES = np.linspace(-1.2, 1.2, 121)
+"""Logarithms of factors that are tried, from 0.3 to 3.3."""
+_GRAIN = 0.006  # standard deviation of one of them about the true factor
+_MOST = 12  # recordings that are fitted apart
+_Z = 1.645
+GAINS = ("stiffness_per_s2", "damping_per_s")
+"""Numbers that the P gain and the supply voltage scale together."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One recording that differs from the others.
+
+    Attributes
+    ----------
+    recording : str
+    name : str
+        Of the fitted number that explains most of the difference.
+    factor : Interval
+        That number over the one of the other recordings.
+    nats : float
+        By how much the log-likelihood is better with a number of its own.
+    """
+
+    recording: str
+    name: str
+    factor: Interval
+    nats: float
+
+    def sentence(self, joint: str) -> str:
+        """The difference in words."""
+        quantity = re.sub("_(per_s2|per_s|rad_s2|rad_s|rad|s)$", "", self.name).replace("_", " ")
+        return (
+            f"{joint}: {self.recording} differs from the other recordings: {quantity} "
+            f"{self.factor.value:.2f} ({self.factor.low:.2f} to {self.factor.high:.2f}) of theirs "
+            f"(Δ log-likelihood {self.nats:.0f})."
+        )
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """What the recordings of a joint say of one another.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Fitted numbers.
+    between : ndarray, shape (parameters,)
+        Standard deviation between recordings, of fitted coordinates.
+    recordings : int
+    differences : tuple of Difference
+    """
+
+    names: tuple[str, ...]
+    between: NDArray[np.float64]
+    recordings: int
+    differences: tuple[Difference, ...]
+
+    @property
+    def for_the_next(self) -> NDArray[np.float64]:
+        """Standard deviation of the next recording about the mean of these, without its noise."""
+        return self.between * np.sqrt(1.0 + 1.0 / self.recordings)
+
+
+def compare_repeats(
+    problem: Problem, best: Fit, least_rad: float, quantum_rad: float
+) -> Repeats | None:
+    """Compare the recordings that a fit is of; None of one recording.
+
+    Parameters
+    ----------
+    problem : Problem
+        All runs.
+    best : Fit
+        To all of them.
+    least_rad : float
+        Least noise that a run may have [rad].
+    quantum_rad : float
+        Step of the readings [rad]; 0 if there is none.
+    """
+    structure, runs = problem.structure, problem.runs
+    sources = list(dict.fromkeys(r.source for r in runs))
+    parts = [problem.only([r.source == source for r in runs]) for source in sources]
+    rich = [len(sources) <= _MOST and part.samples >= _LEAST_READINGS for part in parts]
+    if sum(rich) < 2:
+        return None
+    sources = [s for s, enough in zip(sources, rich, strict=True) if enough]
+    own = [part for part, enough in zip(parts, rich, strict=True) if enough]
+    apart = [_apart(part, best.point, least_rad, quantum_rad) for part in own]
+    named = []
+    # of two, either differs from the other
+    for k in range(1 if len(own) == 2 else 0, len(own)):
+        others = [one for n, one in enumerate(apart) if n != k]
+        difference = _difference(sources[k], apart[k], others)
+        named += [difference] if difference is not None else []
+    named.sort(key=lambda d: -d.nats)
+    return Repeats(structure.names, _between(apart), len(sources), tuple(named))
+
+
+@dataclass(frozen=True)
+class _Apart:
+    """Fit to one recording alone.
+
+    Attributes
+    ----------
+    part : Problem
+        With the noise that is left without the other recordings.
+    point : ndarray, shape (parameters,)
+    precision : ndarray, shape (parameters, parameters)
+    temperature : float
+        How many readings count as one.
+    """
+
+    part: Problem
+    point: NDArray[np.float64]
+    precision: NDArray[np.float64]
+    temperature: float
+
+
+def _apart(part: Problem, point: NDArray, least_rad: float, quantum_rad: float) -> _Apart:
+    """Fit to one recording, from the fit to all of them."""
+    structure, runs = part.structure, part.runs
+    for _ in range(2):
+        point = refine(part, local(part, point[None], _ITERATIONS, _STEP)[0].point[None]).point
+        residuals = fresh_residuals(structure, structure.decode(point), runs)
+        part = replace(part, noise_rad=noise_by_run(residuals, runs, least_rad))
+    scaled = [r / n for r, n in zip(residuals, part.noise_rad, strict=True)]
+    temperature = temperature_of(scaled, runs, len(point))
+    misfit = overall(goodness_of_fit(structure, structure.decode(point), runs, quantum_rad))
+    if misfit > DESCRIBED:
+        temperature *= misfit**2
+    prior = structure.prior_precision
+    bent = (curvature(part, point, _STEP) - prior) / temperature
+    return _Apart(part, point, bent + prior + 1e-9 * np.eye(len(bent)), temperature)
+
+
+def _directions(names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """What one recording may differ in: a number, the position loop's gains, or the inertia."""
+    at = {name: np.array([n == name for n in names], float) for name in names[:-1]}
+    several = {"gains (stiffness and damping)": GAINS, "torques over inertia": PER_INERTIA}
+    for name, members in several.items():
+        own = [at[member] for member in members if member in at]
+        if len(own) > 1:
+            at[name] = np.sum(own, axis=0)
+    return at
+
+
+def _difference(source: str, one: _Apart, others: Sequence[_Apart]) -> Difference | None:
+    """In what a recording differs from all others; None if it does not.
+
+    Whether it does is asked of the difference of the two fits, in which direction of the run's own
+    readings: a large difference is beyond a parabola.
+    """
+    structure = one.part.structure
+    rest = sum(o.precision for o in others)
+    middle = np.linalg.solve(rest, sum(o.precision @ o.point for o in others))
+    weight = np.linalg.inv(np.linalg.inv(one.precision) + np.linalg.inv(rest))
+    pull = weight @ (one.point - middle)
+    directions = _directions(structure.names)
+    nats = {n: 0.5 * (v @ pull) ** 2 / (v @ weight @ v) for n, v in directions.items()}
+    if max(nats.values()) < _NATS:
+        return None
+    costs = {}
+    for name, direction in directions.items():
+        if nats[name] < _NATS:
+            continue
+        points = np.clip(middle + _CHANGES[:, None] * direction, *structure.box)
+        cost = one.part.costs(points)
+        costs[name] = float(cost.min()), float(_CHANGES[int(np.argmin(cost))])
+    name = min(costs, key=lambda n: costs[n][0])
+    change, sd = costs[name][1], (directions[name] @ weight @ directions[name]) ** -0.5
+    if abs(change) < _LEAST_CHANGE:
+        return None
+    factor = Interval(*(float(np.exp(change + z * np.hypot(sd, _GRAIN))) for z in (0.0, -_Z, _Z)))
+    return Difference(source, name, factor, float(nats[name]))
+
+
+def _between(apart: Sequence[_Apart]) -> NDArray[np.float64]:
+    """Standard deviation between recordings by the method of moments.
+
+    References
+    ----------
+    DerSimonian, R. and Laird, N. (1986). Meta-analysis in clinical trials. Controlled Clinical
+    Trials 7: 177–188.
+    """
+    values = np.array([one.point for one in apart])
+    weight = 1.0 / np.array([np.diag(np.linalg.inv(one.precision)) for one in apart])
+    total = weight.sum(axis=0)
+    mean = (weight * values).sum(axis=0) / total
+    spread = (weight * (values - mean) ** 2).sum(axis=0) - (len(values) - 1)
+    return np.sqrt(np.maximum(spread / (total - (weight**2).sum(axis=0) / total), 0.0))
+
+
+def by_number(repeats: Repeats | None) -> dict[str, float]:
+    """Standard deviations between recordings by the fitted number's name, if not 0."""
+    if repeats is None:
+        return {}
+    return {
+        name: float(sd)
+        for name, sd in zip(repeats.names, repeats.between, strict=True)
+        if sd > 0 and name != "offset_rad"
+    }

@@ -1,0 +1,86 @@
+"""Recordings of one joint: those that agree are left alone, one that differs is named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+from pupper_sysid.servo_models.step_size import CONTINUOUS_S
+from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
+from pupper_sysid.sysid.fit.repeats import Repeats, compare_repeats
+from pupper_sysid.sysid.fit.run import prepare
+from pupper_sysid.sysid.fit.search import Problem, refine
+from pupper_sysid.sysid.fit.structure import SIMULATED, candidate
+from support.synthetic import tone_trials
+
+SERVO = DelayedPDParameters(
+    stiffness=3000.0, damping=60.0, friction_loss=30.0, armature=1.0, effort_limit=300.0,
+    velocity_limit=6.0, dead_time_s=0.025,
+)  # fmt: skip
+NOISE_RAD = 1e-3
+
+
+def recorded(name: str, seed: int, **changes: float) -> list:
+    """Live, noisy tones of the servo, or of one that differs by factors."""
+    rng, runs = np.random.default_rng(seed), []
+    own = replace(SERVO, **{n: factor * getattr(SERVO, n) for n, factor in changes.items()})
+    tones = tone_trials(0.03, rng, (2.0, 4.0), duration_s=2.0, period_s=0.0)
+    lattice = find_poll_lattice([replace(t, readings="live") for t in tones], rng)
+    for trial in tones:
+        start = trial.send_time_s[0]
+        steps = np.arange(0.0, 2.1, CONTINUOUS_S)
+        row = np.clip(np.searchsorted(trial.send_time_s - start, steps, "right") - 1, 0, None)
+        motion = DelayedPD(own, CONTINUOUS_S).rollout(trial.command_rad[row])
+        seen = np.interp(trial.read_time_s - start, steps + CONTINUOUS_S, motion)
+        seen += NOISE_RAD * rng.standard_normal(len(seen))
+        made = replace(trial, position_rad=seen, readings="live", source=name)
+        runs.append(prepare(made, lattice).in_free_air())
+    return runs
+
+
+def compared(*recordings: list) -> Repeats | None:
+    structure = candidate(SIMULATED[0])
+    runs = tuple(run for several in recordings for run in several)
+    problem = Problem(structure, runs, (NOISE_RAD,) * len(runs))
+    by_name = {
+        "dead_time_s": 25e-3, "stiffness_per_s2": 3000.0, "damping_per_s": 60.0,
+        "friction_rad_s2": 30.0, "effort_rad_s2": 300.0, "velocity_limit_rad_s": 6.0,
+        "offset_rad": 0.0,
+    }  # fmt: skip
+    point = structure.encode(np.array([by_name[n] for n in structure.names]))
+    return compare_repeats(problem, refine(problem, point[None]), 3e-4, 0.0)
+
+
+def test_one_recording_has_nothing_to_be_compared_with():
+    assert compared(recorded("monday", 0)) is None
+
+
+def test_recordings_of_one_servo_agree():
+    repeats = compared(recorded("monday", 0), recorded("tuesday", 1), recorded("walk", 2))
+    assert repeats is not None and repeats.differences == ()
+    assert repeats.for_the_next[:-1].max() < 0.05  # a tenth would be seen
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"stiffness": 0.8, "damping": 0.8}, "gains (stiffness and damping)"),
+        ({"velocity_limit": 0.8}, "velocity_limit_rad_s"),
+        ({"dead_time_s": 0.8}, "dead_time_s"),
+    ],
+)
+def test_the_recording_that_differs_is_named_with_its_number_and_the_factor(changes, named):
+    repeats = compared(
+        recorded("monday", 0), recorded("tuesday", 1, **changes), recorded("walk", 2)
+    )
+    assert repeats is not None
+    worst = repeats.differences[0]
+    assert (worst.recording, worst.name) == ("tuesday", named)
+    assert worst.factor.low - 0.03 <= 0.8 <= worst.factor.high + 0.03
+    place = repeats.names.index("dead_time_s" if "dead" in named else
+                                "stiffness_per_s2" if "gains" in named else named)  # fmt: skip
+    assert repeats.for_the_next[place] > 0.05
+    assert "tuesday differs from the other recordings" in worst.sentence("knee")
