@@ -54,6 +54,9 @@ class RatiosToArmature(Part):
     """Effort limit over armature [rad/s²]: the servo's largest acceleration."""
     back_emf: Annotated[Quantity, RATIO] = _NO_BACK_EMF
     """Back-EMF over armature [1/s]."""
+    damping_and_back_emf: Annotated[Quantity | None, RATIO] = None
+    """Sum of the two over armature [1/s]: inside of the effort limit they brake alike, so it may be
+    known where they are not. Null in older files."""
 
 
 class Scale(Part):

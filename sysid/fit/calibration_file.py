@@ -205,6 +205,7 @@ def _free_actuator(result: JointCalibrationResult, stall: float, source: str) ->
     )  # fmt: skip
     low, high = _delay_steps(servo, result.dead_time_s)
     ratios = {ours: _ratio(pd, name, 1.0) for ours, name in _RATIOS.items()}
+    ratios["damping_and_back_emf"] = _ratio(pd, "braking_per_s", 1.0)
     torque = {ours: _ratio(pd, name, armature, "ratio only") for ours, name in _RATIOS.items()}
     return measured(
         Actuator,
@@ -258,6 +259,11 @@ def _loaded_actuator(
         scale = Scale(anchor="stall torque", value_nm=stall, source=source)
     numbers = {name: number(name, torque, known) for name in _RATIOS}
     ratios = {name: number(name, torque / armature, True) for name in _RATIOS}
+    braking = loaded.numbers["braking"]
+    ratios["damping_and_back_emf"] = quantity_of(
+        loaded.relative("braking", braking.value * torque / armature),
+        why=loaded.undecided.get("braking"),
+    )
     return measured(
         Actuator,
         model="delayed_pd",

@@ -486,6 +486,8 @@ def _intervals(fitted: Fitted, dead_time_s: float | None = None) -> dict[str, In
         value = float(values[at[0]] / values[at[1]])
         own = draws[:, at[0]] / draws[:, at[1]]
         found["back_emf_per_s"] = interval_of("back_emf_per_s", value, own)
+    if fitted.structure.scales.free_air and fitted.structure.kind == kernel.SERVO:
+        found["braking_per_s"] = _braking(fitted)
     return found
 
 
@@ -636,9 +638,11 @@ def _braking(fitted: Fitted) -> Interval:
 
     def total(values: NDArray) -> NDArray:
         effort, speed, damping = (
-            values[..., names.index(n)] if n in names else 0.0
-            for n in ("effort_rad_s2", "no_load_speed_rad_s", "damping_per_s")
-        )
+            values[..., names.index(n)] if n in names else absent
+            for n, absent in (
+                ("effort_rad_s2", 0.0), ("no_load_speed_rad_s", np.inf), ("damping_per_s", 0.0)
+            )
+        )  # fmt: skip
         return damping + effort / speed
 
     value = float(total(fitted.values))
@@ -739,13 +743,11 @@ def _candidate_fit(
         for p, v, s in zip(structure.parameters, values, sd, strict=True)
         if (why := _why_unidentified(p, float(v), float(s), parameters[p.name], speed))
     }
+    if "braking_per_s" in parameters:
+        undecided |= _vague("braking_per_s", parameters["braking_per_s"])
     if "back_emf_per_s" in parameters and "no_load_speed_rad_s" in undecided:
         # inside of the effort limit the two brake alike
-        total = _braking(fitted)
-        both = (
-            f"only the sum of damping and back-EMF is known, {total.value:.4g} "
-            f"({total.low:.4g}…{total.high:.4g}) 1/s"
-        )
+        both = _only_the_sum(parameters["braking_per_s"], "1/s")
         undecided |= {"back_emf_per_s": both, "damping_per_s": both}
     if why := _undated(ready.lag.feedback):
         undecided["dead_time_s"] = why
@@ -757,6 +759,21 @@ def _candidate_fit(
         parameters=parameters,
         undecided=undecided,
         scores=score(free_run(structure, values, ready.runs), ready.runs, left_out),
+    )
+
+
+def _vague(name: str, interval: Interval) -> dict[str, str]:
+    """Why a number that several fitted ones make is not known; empty if it is."""
+    if interval.low <= 0:
+        return {name: "it cannot be distinguished from none"}
+    wide = interval.high > _WIDE * interval.low
+    return {name: f"its interval is wider than a factor of {_WIDE:g}"} if wide else {}
+
+
+def _only_the_sum(total: Interval, unit: str) -> str:
+    return (
+        f"only the sum of damping and back-EMF is known, {total.value:.4g} "
+        f"({total.low:.4g}…{total.high:.4g}) {unit}"
     )
 
 
@@ -942,12 +959,16 @@ def _under_load(
         parameters[name] = loaded.relative(source, float(pd[field]) / inertia)
     for name in ("no_load_speed_rad_s", "offset_rad"):
         parameters[name] = loaded.numbers[name]
+    braking = loaded.numbers["braking"]
+    parameters["braking_per_s"] = loaded.relative("braking", braking.value / inertia)
     undecided = {
         name: loaded.undecided[source]
         for name, (source, _) in RATIO_SOURCES.items()
         if source in loaded.undecided
     }
     undecided |= {k: v for k, v in loaded.undecided.items() if k == "dead_time_s"}
+    if "braking" in loaded.undecided:
+        undecided["braking_per_s"] = loaded.undecided["braking"]
     nan = float("nan")
     return JointCalibrationResult(
         joint=ready.joint,
@@ -1010,6 +1031,10 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice) 
             why = "it cannot be distinguished from none"
         if why:
             undecided[name] = why
+    if "stall_torque" in undecided and "damping" not in structure.features:
+        # back-EMF stands for both: what tells them apart is a motor at its limit
+        both = _only_the_sum(numbers["braking"], "N·m·s/rad" if scales.known_load else "1/s")
+        undecided |= {"back_emf": both, "no_load_speed_rad_s": both}
     if why := _undated(ready.lag.feedback):
         undecided["dead_time_s"] = why
     labels = [r.label for r in runs]
@@ -1061,6 +1086,7 @@ def numbers_of(structure: Structure, values: NDArray[np.float64]) -> dict[str, N
     shown["no_load_speed_rad_s"] = stall / by_column["back_emf"]
     if scales.gravity:
         shown["gravity_nm"] = by_column["gravity_nm"]
+    shown["braking"] = by_column["damping"] + by_column["back_emf"]
     shown["hanging_rad"] = by_column["hanging_rad"]
     shown["offset_rad"] = by_column["offset_rad"]
     return shown

@@ -20,6 +20,7 @@ from pupper_sysid.common.joints import (
 )
 
 if TYPE_CHECKING:
+    from pupper_sysid.servo_models.calibration.parts import Actuator
     from pupper_sysid.servo_models.calibration.quantity import Quantity
     from pupper_sysid.sysid.fit.calibrate import CalibrationResult
 
@@ -151,7 +152,7 @@ class Calibrate:
                 _number(a.dead_time_s, 1, 1e3),
                 f"{1e3 * r.dead_time_s.low:.0f}–{1e3 * r.dead_time_s.high:.0f}",
                 terminal.number(made.calibration.joint(name).scores.residual_over_noise, 1),
-                _number(a.stiffness_nm_per_rad, 1), _number(a.damping_nm_s_per_rad, 3),
+                _number(a.stiffness_nm_per_rad, 1), _damping(a),
                 _number(a.friction_loss_nm, 3),
                 f"{terminal.number(a.top_speed_rad_s)}{_mark(limit)}",
                 "EMF" if brakes else "slew",
@@ -168,8 +169,9 @@ class Calibrate:
             )
         terminal.out.print(
             "\nfit: errors over the noise of the readings; about 1 where the model describes the "
-            f"servo. {torques}? is not identified; limit: what limits the speed, the set-point's "
-            "slew or back-EMF (EMF). Errors are free-run, on fresh readings.",
+            f"servo. {torques}? is not identified; Σ: damping and back-EMF together; "
+            "limit: what limits the speed, the set-point's slew or back-EMF (EMF). Errors are "
+            "free-run, on fresh readings.",
             soft_wrap=True,
         )
         for point, names in made.calibration.operating_points().items():
@@ -197,6 +199,14 @@ def _listed(torques: set[float]) -> str:
 
 def _mark(quantity: Quantity) -> str:
     return "?" if quantity.identified == "no" else ""
+
+
+def _damping(actuator: Actuator) -> str:
+    """The damping, or its sum with the back-EMF where only that is known."""
+    own, both = actuator.damping_nm_s_per_rad, actuator.ratios_to_armature.damping_and_back_emf
+    if own.identified == "no" and both is not None and both.identified != "no":
+        return f"{terminal.number(actuator.armature_kg_m2.value * both.value, 3)}Σ"
+    return _number(own, 3)
 
 
 def _number(quantity: Quantity, decimals: int, factor: float = 1.0) -> str:
