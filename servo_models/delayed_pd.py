@@ -247,9 +247,10 @@ class DelayedPD(DelayedServo):
 
     def _rest(self, position: NDArray[np.float64]) -> None:
         self._state = (position.copy(), np.zeros(self.batch), position.copy())
+        self._numbers = _per_step(self._values, self.batch, self.time_step_s)
 
     def _integrate(self, delayed: NDArray[np.float64]) -> NDArray[np.float64]:
-        positions, self._state = integrate(delayed, self._state, self._values, self.time_step_s)
+        positions, self._state = _moved(delayed, self._state, self._numbers, self.time_step_s)
         return positions
 
 
@@ -278,7 +279,14 @@ def integrate(
     positions : ndarray, shape (steps, *batch)
     state : the state after the last step
     """
-    h, batch = time_step_s, delayed.shape[1:]
+    numbers = _per_step(values, delayed.shape[1:], time_step_s, implicit)
+    return _moved(delayed, state, numbers, time_step_s)
+
+
+def _per_step(
+    values: dict[str, NDArray], batch: tuple[int, ...], h: float, implicit: bool = True
+) -> tuple[NDArray[np.float64], ...]:
+    """Numbers of `_steps`, each of shape (servos,)."""
 
     def flat(value):
         return np.array(np.broadcast_to(value, batch), dtype=float).reshape(-1)
@@ -288,14 +296,20 @@ def integrate(
     damped = h * (kd + brake) if implicit else np.zeros_like(kd)
     # explicit where the torque is clipped: MuJoCo drops the damping's derivative there
     braked = h * brake if implicit else np.zeros_like(kd)
-    position, velocity, setpoint = map(flat, state)
-    positions = np.empty(delayed.shape)
-    given, filled = (np.ascontiguousarray(x).reshape(len(x), -1) for x in (delayed, positions))
-    compiled(_steps)(
-        given, filled, position, velocity, setpoint, kp, kd, friction, effort, brake, slew,
-        h / (1.0 + damped), h / (1.0 + braked), h,
-    )  # fmt: skip
-    return positions, (position.reshape(batch), velocity.reshape(batch), setpoint.reshape(batch))
+    return kp, kd, friction, effort, brake, slew, h / (1.0 + damped), h / (1.0 + braked)
+
+
+def _moved(
+    delayed: NDArray[np.float64], state: tuple[NDArray, NDArray, NDArray],
+    numbers: tuple[NDArray[np.float64], ...], h: float,
+) -> tuple[NDArray[np.float64], tuple[NDArray, NDArray, NDArray]]:  # fmt: skip
+    steps, batch = len(delayed), delayed.shape[1:]
+    positions = np.empty((steps, len(numbers[0])))
+    position, velocity, setpoint = (np.array(x, dtype=float).reshape(-1) for x in state)
+    arrived = np.ascontiguousarray(delayed, dtype=float).reshape(steps, -1)
+    compiled(_steps)(arrived, positions, position, velocity, setpoint, *numbers, h)
+    after = (position.reshape(batch), velocity.reshape(batch), setpoint.reshape(batch))
+    return positions.reshape(delayed.shape), after
 
 
 @cache
