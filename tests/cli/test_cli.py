@@ -22,9 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SWEEP = ROOT / "data" / "samples" / "sweep.csv"
 
 
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def asked(capsys, *arguments) -> dict:

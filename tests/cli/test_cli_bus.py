@@ -22,9 +22,7 @@ from support.servo_servers import moving_servos, on_a_port, still_servos, wait_u
 SHORT = ("--freqs", "3", "--duration", "1")
 
 
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def test_scan_lists_the_servos_and_finds_their_rate(capsys):

@@ -21,12 +21,6 @@ POLICY = ROOT / "data/samples/policies/lstm"
 CALIBRATION = ROOT / "data/samples/calibrated.yaml"
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def deploy(capsys, *arguments) -> dict:
     code, out, err = run_program(
         capsys,

@@ -48,12 +48,6 @@ def trained(tmp_path_factory):
     return folder / "runs" / "tiny"
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 # ------------------------------------------------------------------------------ pupper-train
 
 
