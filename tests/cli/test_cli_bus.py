@@ -153,7 +153,7 @@ def test_a_map_of_the_other_frame_is_refused(capsys):
     assert code == 2 and "a direct bus uses raw ones" in err and "calibrate-joints" in err
 
 
-@pytest.mark.parametrize("kind", ["feetech", "esp32"])
+@pytest.mark.parametrize("kind", [pytest.param("feetech", marks=pytest.mark.slow), "esp32"])
 def test_an_emulator_prints_the_next_command_and_ends_on_request(tmp_path, kind):
     place = ("--link", "s") if kind == "feetech" else ("--socket", "s")
     process = subprocess.Popen(

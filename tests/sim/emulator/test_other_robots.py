@@ -131,6 +131,7 @@ def test_an_arm_goes_from_its_model_to_a_calibration_networks_and_exports(capsys
     assert arm.nu == 1 and arm.nsensor == 1
 
 
+@pytest.mark.slow
 @pytest.mark.wall_clock
 def test_one_servo_on_a_bench_is_swept_over_a_line_and_calibrated(capsys, read_here, monkeypatch):
     monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.04)  # they share this process
