@@ -15,6 +15,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from contextvars import ContextVar
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -379,10 +380,12 @@ def sha256(path: Path) -> str:
 
 def versions(*more: str) -> dict[str, str]:
     """Versions of this project and of the libraries that shape its numbers, `more` included."""
-    found = {}
-    for name in (PACKAGE, "numpy", "scipy", "mujoco", *more):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    return {name: _version(name) for name in (PACKAGE, "numpy", "scipy", "mujoco", *more)}
+
+
+@cache
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"

@@ -162,18 +162,20 @@ def write_page(
     force : bool
         Replace files that exist.
     """
-    html = render(title, subtitle, sections)
     drawn = [(path.parent / "figures" / p.name, p) for s in sections for p in s.pictures]
-    pngs = {file.with_name(f"{file.name}.png"): p.png for file, p in drawn}
-    svgs = {file.with_name(f"{file.name}.svg"): p.svg for file, p in drawn}
-    csvs = {
-        path.parent / "tables" / f"{t.name}.csv": t.to_csv()
+    tables = {
+        path.parent / "tables" / f"{t.name}.csv": t
         for s in sections
         for t in (*s.tables, *s.files)
         if t.rows and t.name
     }
-    for file in (path, *pngs, *svgs, *csvs):
+    endings = [file.with_name(f"{file.name}.{e}") for file, _ in drawn for e in ("png", "svg")]
+    for file in (path, *endings, *tables):  # before anything is drawn
         refuse_overwrite(file, force)
+    html = render(title, subtitle, sections)
+    pngs = {file.with_name(f"{file.name}.png"): p.png for file, p in drawn}
+    svgs = {file.with_name(f"{file.name}.svg"): p.svg for file, p in drawn}
+    csvs = {file: table.to_csv() for file, table in tables.items()}
     with held():  # a page without its pictures is none
         for file, image in (pngs | svgs).items():
             write_bytes(file, image, force)

@@ -13,7 +13,6 @@ import re
 from typing import TYPE_CHECKING, Any
 
 import yaml
-from yaml.composer import Composer
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
@@ -38,18 +37,13 @@ _WORDS: dict[str, bool | None] = {
 if TYPE_CHECKING or not hasattr(yaml, "CSafeLoader"):
     _Loader, _Dumper = yaml.SafeLoader, yaml.SafeDumper
 else:
-    _Dumper = yaml.CSafeDumper
-
-    class _Loader(Composer, yaml.CSafeLoader):
-        """libyaml's parser; nodes are composed in Python, where `StrictLoader` can refuse them."""
-
-        def __init__(self, text: str):
-            yaml.CSafeLoader.__init__(self, text)
-            Composer.__init__(self)
+    _Loader, _Dumper = yaml.CSafeLoader, yaml.CSafeDumper
 
 
 class StrictLoader(_Loader):
     """Loader of plain data: dict, list, str, int, float, bool and None.
+
+    Data are made of the parser's events, without nodes and tags between them.
 
     Parameters
     ----------
@@ -67,56 +61,72 @@ class StrictLoader(_Loader):
     def __init__(self, text: str, name: str = "the text"):
         super().__init__(text)
         self.name, self.lines = name, dict[Place, int]()
-        self._depth = self._nodes = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """The next node, unless it is of a kind that is refused."""
-        event: Any = self.peek_event()
-        where = f"{self.name}, line {event.start_mark.line + 1}"
-        marked = isinstance(event, yaml.AliasEvent) or event.anchor is not None
-        tag = getattr(event, "tag", None)
-        if isinstance(parent, yaml.MappingNode) and index is None:
-            if marked or tag is not None or not isinstance(event, yaml.ScalarEvent):
-                raise InputError(f"{where} has a key that is not a plain word. Use words as keys.")
-        elif marked:
-            raise InputError(
-                f"{where} uses a YAML alias or anchor (& or *), which is refused because a few of "
-                "them can unfold to gigabytes. Write the value out, or quote the text."
-            )
-        if tag is not None:
-            raise InputError(f"{where} uses a YAML tag ({printable(tag)}). Write the plain value.")
-        if self._depth > MAX_DEPTH:
-            refuse_more(where, self._depth, MAX_DEPTH, "levels of nesting", exact=False)
-        if self._nodes > MOST_NODES:
-            refuse_more(self.name, self._nodes, MOST_NODES, "values", exact=False)
-        self._depth, self._nodes = self._depth + 1, self._nodes + 1
-        node = super().compose_node(parent, index)  # pyright: ignore[reportArgumentType]
-        self._depth -= 1
-        return node
+        self._nodes = 0
 
     def get_single_data(self) -> Any:
         """The document's data."""
-        node = self.get_single_node()
-        if node is None:
+        self.get_event()
+        if self.check_event(yaml.StreamEndEvent):
             raise InputError(f"{self.name} is empty. Give a file with content.")
-        return self._value(node, ())
+        self.get_event()
+        data = self._value(self.get_event(), ())
+        self.get_event()
+        if not self.check_event(yaml.StreamEndEvent):
+            raise InputError(
+                f"{self.name} holds several YAML documents ('---'). Keep one per file."
+            )
+        return data
 
-    def _value(self, node: Any, place: Place) -> Any:
-        self.lines[place] = node.start_mark.line + 1
-        if isinstance(node, yaml.SequenceNode):
-            return [self._value(item, (*place, n)) for n, item in enumerate(node.value)]
-        if not isinstance(node, yaml.MappingNode):
-            return node.value if node.style else _plain(node.value)
+    def _value(self, event: Any, place: Place) -> Any:
+        if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
+            raise InputError(
+                f"{self._where(event)} uses a YAML alias or anchor (& or *), which is refused "
+                "because a few of them can unfold to gigabytes. Write the value out, or quote the "
+                "text."
+            )
+        self._admit(event, len(place))
+        self.lines[place] = event.start_mark.line + 1
+        if isinstance(event, yaml.ScalarEvent):
+            return event.value if event.style else _plain(event.value)
+        if isinstance(event, yaml.SequenceStartEvent):
+            items: list[Any] = []
+            while not isinstance(event := self.get_event(), yaml.SequenceEndEvent):
+                items.append(self._value(event, (*place, len(items))))
+            return items
         mapping: dict[str, Any] = {}
-        for key, value in node.value:
-            if key.value in mapping:
+        while not isinstance(event := self.get_event(), yaml.MappingEndEvent):
+            key = self._key(event, len(place) + 1)
+            if key in mapping:
                 raise InputError(
-                    f"{self.name}, line {key.start_mark.line + 1}, "
-                    f"{place_text((*place, key.value))} stands in the file twice. "
+                    f"{self._where(event)}, {place_text((*place, key))} stands in the file twice. "
                     "Remove one of the two."
                 )
-            mapping[key.value] = self._value(value, (*place, key.value))
+            mapping[key] = self._value(self.get_event(), (*place, key))
         return mapping
+
+    def _key(self, event: Any, depth: int) -> str:
+        plain = isinstance(event, yaml.ScalarEvent) and event.anchor is None and event.tag is None
+        if not plain:
+            raise InputError(
+                f"{self._where(event)} has a key that is not a plain word. Use words as keys."
+            )
+        self._admit(event, depth)
+        return event.value
+
+    def _admit(self, event: Any, depth: int) -> None:
+        if event.tag is not None:
+            raise InputError(
+                f"{self._where(event)} uses a YAML tag ({printable(event.tag)}). Write the plain "
+                "value."
+            )
+        if depth > MAX_DEPTH:
+            refuse_more(self._where(event), depth, MAX_DEPTH, "levels of nesting", exact=False)
+        if self._nodes > MOST_NODES:
+            refuse_more(self.name, self._nodes, MOST_NODES, "values", exact=False)
+        self._nodes += 1
+
+    def _where(self, event: Any) -> str:
+        return f"{self.name}, line {event.start_mark.line + 1}"
 
 
 def place_text(place: Place) -> str:
@@ -156,10 +166,6 @@ def load(text: str, name: str = "the text") -> tuple[Any, dict[Place, int]]:
         raise InputError(f"{name} is nested too deeply. Check the file.") from None
     except yaml.YAMLError as error:
         what = getattr(error, "problem", None) or getattr(error, "reason", None) or str(error)
-        if what == "but found another document":
-            raise InputError(
-                f"{name} holds several YAML documents ('---'). Keep one per file."
-            ) from error
         if "nesting depth" in what:
             refuse_more(name, _DEEPEST, MAX_DEPTH, "levels of nesting", exact=False)
             raise InputError(f"{name} is nested too deeply. Check the file.") from error

@@ -32,8 +32,9 @@ the commands that have been sent and have not arrived yet.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -246,9 +247,10 @@ class DelayedPD(DelayedServo):
 
     def _rest(self, position: NDArray[np.float64]) -> None:
         self._state = (position.copy(), np.zeros(self.batch), position.copy())
+        self._numbers = _per_step(self._values, self.batch, self.time_step_s)
 
     def _integrate(self, delayed: NDArray[np.float64]) -> NDArray[np.float64]:
-        positions, self._state = integrate(delayed, self._state, self._values, self.time_step_s)
+        positions, self._state = _moved(delayed, self._state, self._numbers, self.time_step_s)
         return positions
 
 
@@ -277,47 +279,62 @@ def integrate(
     positions : ndarray, shape (steps, *batch)
     state : the state after the last step
     """
-    h, batch = time_step_s, delayed.shape[1:]
+    numbers = _per_step(values, delayed.shape[1:], time_step_s, implicit)
+    return _moved(delayed, state, numbers, time_step_s)
 
-    def flat(value):  # one contiguous axis: the fastest shape for the small steps below
-        return np.ascontiguousarray(np.broadcast_to(value, batch), dtype=float).reshape(-1)
+
+def _per_step(
+    values: dict[str, NDArray], batch: tuple[int, ...], h: float, implicit: bool = True
+) -> tuple[NDArray[np.float64], ...]:
+    """Numbers of `_steps`, each of shape (servos,)."""
+
+    def flat(value):
+        return np.array(np.broadcast_to(value, batch), dtype=float).reshape(-1)
 
     kp, kd, friction, effort, brake = (flat(values[name] / values["armature"]) for name in _TORQUES)
-    positions = np.empty(delayed.shape)
-    flat_positions = positions.reshape(len(delayed), -1)  # a view: splitting or merging one axis
-    delayed = delayed.reshape(len(delayed), -1)
-    low_effort, low_friction, stop = -effort, -friction, -FRICTION_IMPEDANCE
     slew = flat(values["velocity_limit"] * h)
-    low_slew = -slew
-    inverse, clipped = (h / (1.0 + h * (kd + brake)), h / (1.0 + h * brake)) if implicit else (h, h)
-    brakes = bool(brake.any())
-    position, velocity, setpoint = (flat(x).copy() for x in state)
-    force, wanted, change = (np.empty_like(position) for _ in range(3))
-    # numpy.clip costs five times minimum + maximum on small arrays, hence the pairs below
-    for k in range(len(delayed)):
-        np.subtract(delayed[k], setpoint, out=change)
-        np.minimum(change, slew, out=change)
-        np.maximum(change, low_slew, out=change)
-        setpoint += change
-        np.subtract(setpoint, position, out=wanted)
-        wanted *= kp
-        np.multiply(kd, velocity, out=change)
-        wanted -= change
-        np.minimum(wanted, effort, out=force)
-        np.maximum(force, low_effort, out=force)
-        # explicit where the torque is clipped: MuJoCo drops the damping's derivative there
-        gain = np.where(force == wanted, inverse, clipped)
-        if brakes:
-            force -= brake * velocity
-        np.multiply(velocity, 1.0 / h, out=change)
-        change += force
-        change *= stop
-        np.minimum(change, friction, out=change)
-        np.maximum(change, low_friction, out=change)
-        force += change
-        force *= gain
-        velocity += force
-        np.multiply(velocity, h, out=change)
-        position += change
-        flat_positions[k] = position
-    return positions, (position.reshape(batch), velocity.reshape(batch), setpoint.reshape(batch))
+    damped = h * (kd + brake) if implicit else np.zeros_like(kd)
+    # explicit where the torque is clipped: MuJoCo drops the damping's derivative there
+    braked = h * brake if implicit else np.zeros_like(kd)
+    return kp, kd, friction, effort, brake, slew, h / (1.0 + damped), h / (1.0 + braked)
+
+
+def _moved(
+    delayed: NDArray[np.float64], state: tuple[NDArray, NDArray, NDArray],
+    numbers: tuple[NDArray[np.float64], ...], h: float,
+) -> tuple[NDArray[np.float64], tuple[NDArray, NDArray, NDArray]]:  # fmt: skip
+    steps, batch = len(delayed), delayed.shape[1:]
+    positions = np.empty((steps, len(numbers[0])))
+    position, velocity, setpoint = (np.array(x, dtype=float).reshape(-1) for x in state)
+    arrived = np.ascontiguousarray(delayed, dtype=float).reshape(steps, -1)
+    compiled(_steps)(arrived, positions, position, velocity, setpoint, *numbers, h)
+    after = (position.reshape(batch), velocity.reshape(batch), setpoint.reshape(batch))
+    return positions.reshape(delayed.shape), after
+
+
+@cache
+def compiled(loop: Callable) -> Callable:
+    """The loop compiled; numba is imported by the first model that moves."""
+    from numba import njit
+
+    return njit(cache=True, nogil=True, error_model="numpy")(loop)
+
+
+def _steps(
+    delayed, positions, position, velocity, setpoint, kp, kd, friction, effort, brake, slew,
+    inverse, clipped, h,
+):  # fmt: skip
+    """Fill `positions`, shape (steps, servos); position, velocity and set-point move in place."""
+    for k in range(delayed.shape[0]):
+        for n in range(delayed.shape[1]):
+            setpoint[n] += min(max(delayed[k, n] - setpoint[n], -slew[n]), slew[n])
+            wanted = (setpoint[n] - position[n]) * kp[n] - kd[n] * velocity[n]
+            force = min(max(wanted, -effort[n]), effort[n])
+            gain = inverse[n] if force == wanted else clipped[n]
+            if brake[n] != 0.0:
+                force -= brake[n] * velocity[n]
+            stop = (velocity[n] * (1.0 / h) + force) * -FRICTION_IMPEDANCE
+            force += min(max(stop, -friction[n]), friction[n])
+            velocity[n] += force * gain
+            position[n] += velocity[n] * h
+            positions[k, n] = position[n]

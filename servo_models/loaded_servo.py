@@ -29,6 +29,7 @@ stall_torque, and MuJoCo runs it natively (`delayed_pd`); tests hold the three t
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -41,6 +42,7 @@ from pupper_sysid.servo_models.delayed_pd import (
     DelayedPDParameters,
     DelayedServo,
     DelayLine,
+    compiled,
 )
 
 START_ERROR_RAD = 0.0015
@@ -234,43 +236,66 @@ class LoadedServo(DelayedServo):
         self._torque.reset(np.ones(self.batch))
 
     def _integrate(self, delayed: NDArray[np.float64]) -> NDArray[np.float64]:
-        w, h = self._values, self.time_step_s
         inertia, gravity, hanging = self._load
-        per = 1.0 / (w["armature"] + inertia)
-        stiffness = w["duty_per_rad"] * self._gain
-        y, v, target, rate = self._state
-        ramp = w["acceleration_limit"]
-        limited = np.isfinite(ramp)
-        out = np.empty(delayed.shape)
-        for k in range(len(delayed)):
-            way = delayed[k] - target
-            wanted_rate = np.sign(way) * np.sqrt(2.0 * np.where(limited, ramp, 1.0) * np.abs(way))
-            wanted_rate = np.clip(wanted_rate, -np.abs(way) / h, np.abs(way) / h)
-            rate = rate + np.clip(wanted_rate - rate, -ramp * h, ramp * h)
-            target = np.where(limited, target + rate * h, delayed[k])
-            error = target - y
-            error = error - np.clip(error, -w["dead_zone_rad"], w["dead_zone_rad"])
-            wanted = stiffness * error - w["duty_s_per_rad"] * v
-            wanted = wanted + w["start_duty"] * np.clip(error / START_ERROR_RAD, -1.0, 1.0)
-            duty = np.clip(wanted, -1.0, 1.0)
-            top = w["stall_torque"] * self._volts[k] * self._on[k]
-            share = w["off_brake"] + (1.0 - w["off_brake"]) * self._on[k]
-            back = w["back_emf"] * share
-            drawn = duty * top - back * v
-            motor = np.clip(drawn, -w["torque_limit"], w["torque_limit"])
-            damping = np.where(duty == wanted, w["duty_s_per_rad"] * top, 0.0) + back
-            damping = np.where(motor == drawn, damping, 0.0)
-            weight = -gravity * np.sin(y - hanging)
-            standing = 1.0 / (1.0 + (v / w["stribeck_speed"]) ** 2)
-            limit = w["friction_loss"] + w["stribeck_friction"] * standing
-            limit = limit + (1.0 + w["load_friction_static"] * standing) * (
-                w["load_friction_motor"] * np.abs(motor) + w["load_friction_load"] * np.abs(weight)
-            )
-            limit = (limit + w["load_friction_quadratic"] * motor**2) * per
-            force = (motor + weight) * per
-            force = force + np.clip(-FRICTION_IMPEDANCE * (v / h + force), -limit, limit)
-            v = v + force * h / (1.0 + h * damping * per)
-            y = y + v * h
-            out[k] = y
-        self._state = (y, v, target, rate)
+        values = self._values | {
+            "per_inertia": 1.0 / (self._values["armature"] + inertia), "gravity": gravity,
+            "hanging": hanging, "stiffness": self._values["duty_per_rad"] * self._gain,
+        }  # fmt: skip
+        table = np.stack([np.broadcast_to(values[n], self.batch).reshape(-1) for n in _ROWS])
+        state = [np.array(x).reshape(-1) for x in self._state]
+        steps, out = len(delayed), np.empty(delayed.shape)
+        delayed, on = (np.ascontiguousarray(x).reshape(steps, -1) for x in (delayed, self._on))
+        compiled(_steps)(
+            delayed, on, np.ascontiguousarray(self._volts), out.reshape(steps, -1), *state, table,
+            self.time_step_s,
+        )  # fmt: skip
+        self._state = tuple(x.reshape(self.batch) for x in state)
         return out
+
+
+_ROWS = (
+    "stiffness", "duty_s_per_rad", "stall_torque", "back_emf", "friction_loss", "torque_limit",
+    "dead_zone_rad", "start_duty", "off_brake", "acceleration_limit", "stribeck_friction",
+    "stribeck_speed", "load_friction_static", "load_friction_motor", "load_friction_load",
+    "load_friction_quadratic", "per_inertia", "gravity", "hanging",
+)  # fmt: skip
+"""Rows of the table of `_steps`."""
+
+
+def _steps(delayed, on, volts, positions, position, velocity, setpoint, rates, table, h):
+    """Fill `positions`, shape (steps, servos); the four of the state move in place."""
+    for k in range(delayed.shape[0]):
+        for n in range(delayed.shape[1]):
+            (stiffness, damper, stall, emf, loss, torque_limit, zone, start, off_brake, ramp,
+             stribeck, stribeck_speed, static, by_motor, by_load, quadratic, per, gravity,
+             hanging) = table[:, n]  # fmt: skip
+            y, v, target = position[n], velocity[n], setpoint[n]
+            way = delayed[k, n] - target
+            if np.isfinite(ramp):
+                rate = min(math.sqrt(2.0 * ramp * abs(way)), abs(way) / h) * np.sign(way)
+                rates[n] += min(max(rate - rates[n], -ramp * h), ramp * h)
+                target += rates[n] * h
+            else:
+                target = delayed[k, n]
+            error = target - y
+            error -= min(max(error, -zone), zone)
+            wanted = stiffness * error - damper * v
+            wanted += start * min(max(error / START_ERROR_RAD, -1.0), 1.0)
+            duty = min(max(wanted, -1.0), 1.0)
+            top = stall * volts[k] * on[k, n]
+            back = emf * (off_brake + (1.0 - off_brake) * on[k, n])
+            drawn = duty * top - back * v
+            motor = min(max(drawn, -torque_limit), torque_limit)
+            damping = (damper * top if duty == wanted else 0.0) + back
+            if motor != drawn:
+                damping = 0.0
+            weight = -gravity * math.sin(y - hanging)
+            standing = 1.0 / (1.0 + (v / stribeck_speed) ** 2)
+            limit = loss + stribeck * standing
+            limit += (1.0 + static * standing) * (by_motor * abs(motor) + by_load * abs(weight))
+            limit = (limit + quadratic * motor**2) * per
+            force = (motor + weight) * per
+            force += min(max(-FRICTION_IMPEDANCE * (v / h + force), -limit), limit)
+            v += force * h / (1.0 + h * damping * per)
+            y += v * h
+            position[n], velocity[n], setpoint[n], positions[k, n] = y, v, target, y

@@ -1,5 +1,6 @@
 """Fixtures: recordings of a real robot, where they are at hand, and a policy that walks."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -27,6 +28,12 @@ hypothesis.settings.load_profile("repeatable")
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The slowest file comes first: at the end one worker would wait for the other."""
     items.sort(key=lambda item: item.path.name != "test_docs.py")
+
+
+def pytest_collection_finish() -> None:
+    """What is imported by now stays: each full collection of garbage would search it in vain."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -1,10 +1,12 @@
 """The front door: names of functions that the commands call, imported when they are looked up."""
 
+import inspect
 import json
 import os
 import re
 import subprocess
 import sys
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
@@ -107,11 +109,6 @@ def test_importing_the_front_door_imports_nothing_else(tmp_path):
     assert [m for m in loaded if m.startswith("pupper_sysid.")] == []
 
 
-def test_functions_of_a_calibration_need_neither_torch_nor_matplotlib(tmp_path):
-    """As far as they are imported; the slow test beside this one runs them."""
-    python(WITHOUT + "import pupper_sysid as ps; ps.load, ps.delay, ps.calibrate", tmp_path)
-
-
 @pytest.mark.slow
 def test_load_lag_calibrate_and_save_need_neither_torch_nor_matplotlib(hip, tmp_path):
     text = python(
@@ -135,46 +132,56 @@ except ps.InputError as error:
     assert ps.load_calibration(tmp_path / "calibrated.yaml").joint_names == ("LF_hip",)
 
 
-def json_of(capsys, command: str, *words) -> dict:
-    """Object that a command prints, which has the documented keys."""
-    code, out, err = run(capsys, command, *words, "--json")
-    assert code == 0, err
-    printed = json.loads(out)
-    assert key_line(printed) == DOCUMENTED[command]
-    return printed
+@pytest.fixture
+def json_of(capsys, monkeypatch):
+    """Object that a command prints of one joint; it is that of the function of its name.
+
+    The function is called once, by the command, with the recording and its own defaults.
+    """
+
+    def printed_by(command: str, recording: Path, *words) -> dict:
+        function, calls = getattr(ps, command), []
+        signature = inspect.signature(function)
+
+        def called(*positional, **named):
+            result = function(*positional, **named)
+            calls.append((signature.bind(*positional, **named).arguments, result))
+            return result
+
+        monkeypatch.setattr(import_module(function.__module__), function.__name__, called)
+        code, out, err = run(capsys, command, recording, *words, "--json")
+        assert code == 0, err
+        printed, ((arguments, result),) = json.loads(out), calls
+        ((own,), known) = arguments.pop("recordings"), ps.load(recording)
+        assert own.sha256 == known.sha256 and own.joints == known.joints
+        assert arguments.get("seed", 0) == 0 == signature.parameters["seed"].default
+        assert key_line(printed) == DOCUMENTED[command]
+        assert result.to_dict() == printed
+        assert list(result.to_frame()["joint"].unique()) == ["LF_hip"]
+        assert result.plot().axes
+        return printed["joints"]["LF_hip"]
+
+    return printed_by
 
 
-def assert_is_the_result(printed: dict, result) -> None:
-    """The object of a command on one joint is the result of its function."""
-    assert result.to_dict() == printed
-    assert list(result.to_frame()["joint"].unique()) == ["LF_hip"]
-    assert result.plot().axes
-
-
-def test_delay_is_its_command_and_its_parts_add_up_in_order(capsys, hip):
-    printed = json_of(capsys, "delay", hip)
-    joint = printed["joints"]["LF_hip"]
+def test_delay_is_its_command_and_its_parts_add_up_in_order(json_of, hip):
+    joint = json_of("delay", hip)
     lags = [joint[k]["value"] for k in ("raw_lag_s", "fresh_lag_s", "lag_s", "dead_time_s")]
     assert lags == sorted(lags, reverse=True)
-    assert_is_the_result(printed, ps.delay(ps.load(hip)))
 
 
-def test_doctor_is_its_command_and_finds_the_polls(capsys, hip):
-    printed = json_of(capsys, "doctor", hip)
-    joint = printed["joints"]["LF_hip"]
+def test_doctor_is_its_command_and_finds_the_polls(json_of, hip):
+    joint = json_of("doctor", hip)
     assert joint["verdict"] == "use"
     assert joint["poll_period_s"] == pytest.approx(0.02685, abs=1.5e-4)
     assert joint["quantum_rad"] == pytest.approx(np.pi / 550, rel=1e-4)
-    assert_is_the_result(printed, ps.doctor(ps.load(hip)))
 
 
-def test_bode_is_its_command_and_shows_that_the_servo_follows(capsys, hip, tmp_path):
+def test_bode_is_its_command_and_shows_that_the_servo_follows(json_of, hip, tmp_path):
     """Where raw rows say that it does not."""
-    printed = json_of(capsys, "bode", hip, "--plot", tmp_path / "b.png")
-    tones = printed["joints"]["LF_hip"]["by_frequency"]
+    tones = json_of("bode", hip, "--plot", tmp_path / "b.png")["by_frequency"]
     assert (tmp_path / "b.png").stat().st_size > 10_000
     assert all(t["gain"] > 0.9 for t in tones) and tones[-1]["raw_gain"] < 0.75
-    assert_is_the_result(printed, ps.bode(ps.load(hip)))
 
 
 @pytest.mark.slow

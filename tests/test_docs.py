@@ -19,6 +19,7 @@ import pytest
 from support import docs_conf, docs_outputs, golden
 from support.command_line import run_program
 from support.package import MODULES, ROOMS, ROOT, public_names
+from support.undrawn import leave_undrawn
 
 DOCS = ROOT / "docs"
 WRITTEN = [  # pages written by hand
@@ -56,6 +57,7 @@ def test_every_example_of_a_page_runs_in_an_empty_folder(page, tmp_path, monkeyp
     if page.stem == "tutorial":  # what its network predicts is not on the page
         networks = importlib.import_module("pupper_sysid.sysid.servo_fit.networks")
         monkeypatch.setattr(networks, "MLP", replace(networks.MLP, steps=100, check_every=50))
+        leave_undrawn(monkeypatch)
     printed = {}
     for words in EXAMPLES[page]:
         module = importlib.import_module(f"pupper_sysid.cli.programs.{words[0].replace('-', '_')}")

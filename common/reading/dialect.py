@@ -415,6 +415,11 @@ def _is_decimal(cell: str) -> bool:
     return True
 
 
+def _usual(text: str) -> float:
+    """Share of printable ASCII characters and line ends."""
+    return sum(32 <= ord(c) < 127 or c in "\t\r\n" for c in text) / max(len(text), 1)
+
+
 def decoded(path: object, data: bytes) -> str:
     """Text in UTF-8 or UTF-16, with or without a byte order mark, else in Windows-1252."""
     wide = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}.get(data[:2])
@@ -425,8 +430,6 @@ def decoded(path: object, data: bytes) -> str:
             text = data.decode(coding)
         except ValueError:
             continue
-        head = text[:_SAMPLE]
-        usual = sum(32 <= ord(c) < 127 or c in "\t\r\n" for c in head)
-        if "\0" not in text and (coding == "utf-8-sig" or usual > _USUAL * len(head)):
+        if "\0" not in text and (coding == "utf-8-sig" or _usual(text[:_SAMPLE]) > _USUAL):
             return text
     raise InputError(f"{path} is not a text file. Give the log as it was written.")

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, is_dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_origin, get_type_hints
 
@@ -293,9 +294,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[Place, int]]:
     return found, lines
 
 
+@cache
 def _model_of(kind: type) -> type[BaseModel]:
     """Strict pydantic model with the fields of the dataclass `kind`, none of them required."""
-    kinds: dict[str, Any] = dict.fromkeys(_DROPPED.get(kind, ()), Any) | get_type_hints(kind)
+    kinds: dict[str, Any] = dict.fromkeys(_DROPPED.get(kind, ()), Any) | _kinds_of(kind)
     for name, wanted in kinds.items():
         if is_dataclass(wanted):
             kinds[name] = _model_of(cast("type", wanted))
@@ -306,9 +308,12 @@ def _model_of(kind: type) -> type[BaseModel]:
     return create_model(kind.__name__, __config__=config, **optional)
 
 
+_kinds_of = cache(get_type_hints)
+
+
 def _dataclass_of(kind: type, settings: Any) -> Any:
     """The dataclass `kind` with `settings`; the others have their defaults."""
-    kinds, given = get_type_hints(kind), {}
+    kinds, given = _kinds_of(kind), {}
     for name in settings.model_fields_set & set(kinds):
         value = getattr(settings, name)
         given[name] = _dataclass_of(kinds[name], value) if is_dataclass(kinds[name]) else value

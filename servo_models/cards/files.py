@@ -12,7 +12,13 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
-from pupper_sysid.common.border import read_json, read_yaml, refuse_other_version, validated
+from pupper_sysid.common.border import (
+    read_json,
+    read_text,
+    read_yaml,
+    refuse_other_version,
+    validated,
+)
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.cards.bam import load_bam
@@ -40,6 +46,8 @@ def is_card(path: Path | str) -> bool:
         data = read_json(file)
         return isinstance(data, dict) and {"kt", "R"} <= data.keys()
     if file.suffix.lower() not in (".yaml", ".yml"):
+        return False
+    if SCHEMA not in read_text(file):  # most files are calibrations, which are long
         return False
     data, _ = read_yaml(file)
     return isinstance(data, dict) and data.get("schema") == SCHEMA

@@ -26,9 +26,7 @@ from support.servo_servers import on_a_port
 LOAD = "pendulum:0.1kg@0.10m"
 
 
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def sweep(capsys, *more: str):

@@ -3,10 +3,6 @@
 import importlib
 import io
 import json
-import signal
-import subprocess
-import sys
-import time
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,9 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SWEEP = ROOT / "data" / "samples" / "sweep.csv"
 
 
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def asked(capsys, *arguments) -> dict:
@@ -141,26 +135,6 @@ def test_one_frequency_is_calibrated_with_a_warning(capsys, tmp_path):
     scores = joint["candidate_models"]["delayed_pd"]["scores"]
     assert code == 0 and scores["rmse_leave_one_frequency_out_rad"] is None
     assert any("one frequency only" in w for w in joint["warnings"])
-
-
-def test_a_sweep_killed_half_way_leaves_a_file_that_is_read(capsys, tmp_path):
-    path = tmp_path / "killed.csv"
-    sweep = subprocess.Popen(
-        [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid",
-            "sweep", "--freqs", "4,5", "--joints", "LF_hip",
-         "--duration", "2", "--real-time", "--out", str(path)],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-    stop = time.monotonic() + 40
-    while time.monotonic() < stop and not (path.exists() and path.read_text().count("\n") > 190):
-        time.sleep(0.05)
-    sweep.send_signal(signal.SIGKILL)
-    sweep.wait()
-    assert len(load(path).table) > 150
-    for command in ("doctor", "export"):
-        code, _, err = run(capsys, command, path)
-        assert code == 0, err
-    assert any("not recorded to its end" in w for w in load(path).warnings)
 
 
 def test_a_number_in_a_table_that_is_too_wide_is_folded_not_cut():

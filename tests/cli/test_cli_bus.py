@@ -22,9 +22,7 @@ from support.servo_servers import moving_servos, on_a_port, still_servos, wait_u
 SHORT = ("--freqs", "3", "--duration", "1")
 
 
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def test_scan_lists_the_servos_and_finds_their_rate(capsys):
@@ -155,7 +153,7 @@ def test_a_map_of_the_other_frame_is_refused(capsys):
     assert code == 2 and "a direct bus uses raw ones" in err and "calibrate-joints" in err
 
 
-@pytest.mark.parametrize("kind", ["feetech", "esp32"])
+@pytest.mark.parametrize("kind", [pytest.param("feetech", marks=pytest.mark.slow), "esp32"])
 def test_an_emulator_prints_the_next_command_and_ends_on_request(tmp_path, kind):
     place = ("--link", "s") if kind == "feetech" else ("--socket", "s")
     process = subprocess.Popen(

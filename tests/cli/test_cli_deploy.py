@@ -21,12 +21,6 @@ POLICY = ROOT / "data/samples/policies/lstm"
 CALIBRATION = ROOT / "data/samples/calibrated.yaml"
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def deploy(capsys, *arguments) -> dict:
     code, out, err = run_program(
         capsys,
@@ -42,7 +36,7 @@ def deploy(capsys, *arguments) -> dict:
 
 
 def test_the_shipped_policy_walks_on_the_emulated_robot_and_its_log_repeats(capsys, here):
-    found = deploy(capsys, "--seconds", 6, "--name", "walk", "--command", 0.15, 0, 0)
+    found = deploy(capsys, "--seconds", 4, "--name", "walk", "--command", 0.15, 0, 0)
     assert found["stop_reason"] == "time is up" and found["fell"] is False
     assert found["rate_hz"] == pytest.approx(50, rel=0.01) and found["deadline_misses"] == 0
     assert found["mae_vx_m_s"] < 0.06 and found["mae_vy_m_s"] < 0.035
@@ -57,8 +51,8 @@ def test_the_shipped_policy_walks_on_the_emulated_robot_and_its_log_repeats(caps
         "--actuator",
         CALIBRATION,
     )
-    assert code == 0 and "300 ticks repeated" in out
-    assert len(read_walk(log).senses) == 300
+    assert code == 0 and "200 ticks repeated" in out
+    assert len(read_walk(log).senses) == 200
     # the servos' side of it is a recording like any other
     recording = load(log.with_name("recording.csv"))
     assert len(recording.joints) == 12 and recording.loop_period_s == pytest.approx(0.02, abs=1e-3)
@@ -70,7 +64,7 @@ def test_the_emulated_robot_has_the_servos_of_the_calibration_and_commands_are_c
     moved = {}
     for actuator in (CALIBRATION, "ideal"):
         code, out, err = run_program(
-            capsys, pupper_deploy, POLICY, "--actuator", actuator, "--seconds", 1.5, "--name",
+            capsys, pupper_deploy, POLICY, "--actuator", actuator, "--seconds", 0.4, "--name",
             Path(actuator).stem, "--json", "--command", 0.4, 0, 0,
         )  # fmt: skip
         assert code == 0 and f"has the servos of {actuator}" in " ".join(err.split())
@@ -84,10 +78,10 @@ def test_the_emulated_robot_has_the_servos_of_the_calibration_and_commands_are_c
 
 
 def test_a_script_is_followed(capsys, here):
-    Path("s.csv").write_text("seconds,forward_m_s,left_m_s,turn_rad_s\n1,0.1,0,0\n0.5,0,0,0\n")
+    Path("s.csv").write_text("seconds,forward_m_s,left_m_s,turn_rad_s\n0.4,0.1,0,0\n0.2,0,0,0\n")
     found = deploy(capsys, "--script", "s.csv", "--name", "walk")
     assert found["stop_reason"] == "end of commands"
-    assert found["seconds"] == pytest.approx(1.5, abs=0.05)
+    assert found["seconds"] == pytest.approx(0.6, abs=0.05)
 
 
 def test_another_rate_is_said_to_change_the_policys_time(capsys, here):

@@ -18,9 +18,7 @@ from support.command_line import run
 SAMPLE = Path(__file__).parents[2] / "data" / "samples"
 
 
-@pytest.fixture(autouse=True)
-def _folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("here")
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ from support.tiny_training import CALIBRATION
 ROOT = Path(__file__).resolve().parents[2]
 TINY = (
     "--actuator", CALIBRATION, "--environments", "4", "--threads", "1", "--iterations", "2",
-    "--imitation.iterations", "2", "--imitation.epochs", "1", "--task.episode-s", "0.5",
+    "--imitation.iterations", "2", "--imitation.epochs", "1", "--task.episode-s", "0.2",
     "--learner.steps-per-environment", "6", "--learner.minibatches", "2", "--learner.epochs", "1",
     "--architecture.hidden", "16", "--architecture.critic-hidden", "16", "--first-gait", "keep",
 )  # fmt: skip
@@ -46,12 +46,6 @@ def trained(tmp_path_factory):
     finally:
         os.chdir(before)
     return folder / "runs" / "tiny"
-
-
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 # ------------------------------------------------------------------------------ pupper-train
@@ -137,13 +131,8 @@ def test_a_typo_is_refused_with_the_word_that_is_wrong(capsys, here):
 def test_sizes_that_cannot_be_are_refused(capsys, here):
     for arguments, words in (
         (("--environments", "0"), "environments is 0; it must be from 1 to"),
-        (("--learner.minibatches", "0"), "minibatches is 0"),
-        (("--architecture.hidden", "0"), "at least 1"),
-        (("--task.control-step-s", "0.003"), "whole multiple"),
         (("--policy", "lstm", "--environments", "1"), "1 environments cannot be split"),
-        (("--threads", "-1"), "threads is -1; it must be from 0 to"),
         (("--seed", "-1"), "seed is -1; it must be 0 or more"),
-        (("--imitation.minibatches", "0"), "imitation.minibatches is 0"),
         (("--architecture.hidden", "--seed", "1"), "architecture.hidden is empty"),
         (("--task.randomisation.friction", "1", "0.3"), "randomisation.friction is 1 to 0.3"),
         (("--task.randomisation.friction", "-1", "0.3"), "from 0 on"),
@@ -298,7 +287,7 @@ def test_an_evaluation_elsewhere_says_where(capsys, trained):
 def test_an_evaluation_is_a_table_and_a_page_with_every_direction(capsys, trained, tmp_path):
     arguments = (
         trained, "--episodes", "1", "--terrain", "rough", "--extra-delay-ms", "0", "--threads", "1",
-        "--seconds", "0.3", "--report", tmp_path / "report",
+        "--seconds", "0.1", "--report", tmp_path / "report",
     )  # fmt: skip
     code, out, err = run(capsys, pupper_eval, *arguments)
     assert code == 0, err

@@ -70,6 +70,9 @@ def test_without_a_command_a_message_stays_as_the_library_wrote_it():
     assert spell("`force=True`") == "`force=True`"
 
 
+OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
+
+
 def options_in_strings(path):
     """Options in the strings of a module, but for docstrings and whole lines to type."""
     tree = ast.parse(path.read_text())
@@ -78,7 +81,7 @@ def options_in_strings(path):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             command = re.search(r"pupper-|pip install", node.value)
             if id(node) not in docstrings and not command:
-                yield from re.findall(r"(?<![\w-])--[a-z][a-z-]+", node.value)
+                yield from OPTION.findall(node.value)
 
 
 def test_no_message_of_the_library_names_an_option():
@@ -87,7 +90,7 @@ def test_no_message_of_the_library_names_an_option():
         path.relative_to(ROOT).as_posix(): options
         for folder in library
         for path in folder.rglob("*.py")
-        if "--" in path.read_text() and (options := list(options_in_strings(path)))
+        if OPTION.search(path.read_text()) and (options := list(options_in_strings(path)))
     }
     assert found == {}
 

@@ -41,16 +41,11 @@ def options(page: str) -> set[str]:
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_help_is_one_screen_and_names_types_alone(command, capsys):
-    page = shown(capsys, command, "--help")
+def test_help_is_one_screen_and_leaves_out_only_groups_and_later_sentences(command, capsys):
+    page, everything = shown(capsys, command, "--help"), shown(capsys, command, "--help-all")
     assert len(page.splitlines()) <= SCREEN_LINES
     assert max(map(len, page.splitlines())) <= 80
     assert not re.search(r"None|%%|TYRO|\[\[|default: \)", page)
-
-
-@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_help_leaves_out_only_groups_and_later_sentences(command, capsys):
-    page, everything = shown(capsys, command, "--help"), shown(capsys, command, "--help-all")
     left_out = options(everything) - options(page)
     assert all("." in name for name in left_out)
     if page != everything:

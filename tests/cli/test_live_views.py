@@ -288,6 +288,7 @@ def test_a_viewer_gets_what_a_file_would_hold(tmp_path):
     assert len(time_s) == 100 and np.isfinite(np.ravel(values)).any()
 
 
+@pytest.mark.slow
 def test_monitor_writes_what_it_reads_and_sends_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ("monitor", "--bus", "emulated", "--seconds", "1", "--mcap", "m.mcap")

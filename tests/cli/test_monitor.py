@@ -28,9 +28,7 @@ def patience(monkeypatch):
     monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.02)
 
 
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("here")
 
 
 class Listener(ProxyEmulator):

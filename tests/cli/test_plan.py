@@ -22,9 +22,7 @@ from support.planned_servos import fit_of_half_width
 FORMATS = (ROOT / "docs/formats.md").read_text()
 
 
-@pytest.fixture(autouse=True)
-def in_an_empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("here")
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pandas as pd
 from pupper_sysid.sim.emulator.pendulum import PendulumServo, PendulumServoParameters
 from pupper_sysid.sim.emulator.pendulum_bench import BenchSpec, Pendulum, draw_bench
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.sweep.bench import STROKE_RAD, STROKE_SPEEDS_RAD_S, STROKES
+from pupper_sysid.sysid.sweep.bench import STROKE_RAD, STROKE_SPEEDS_RAD_S
 from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, after, strokes
 
 PERIOD_S = 0.02
@@ -23,13 +23,14 @@ def stroked(
     dead_zone: int,
     gains: tuple[int, ...] = (8, 32),
     mass_kg: float = 0.1,
+    count: int = 1,
 ) -> tuple[Recording, PendulumServoParameters]:
-    """Strokes at several gains of a servo that is drawn, and its true numbers."""
+    """Strokes at several gains of a servo that is drawn, `count` per speed; its true numbers."""
     rng = np.random.default_rng(seed)
     registers = {"dead_zone_cw": dead_zone, "dead_zone_ccw": dead_zone}
     spec = BenchSpec(backlash_rad=float(np.radians(backlash_deg)))
     true = draw_bench(rng, Pendulum(mass_kg, 0.1) if mass_kg else None, spec).loaded[0]
-    offset, duration = strokes(STROKE_RAD, STROKE_SPEEDS_RAD_S, STROKES)
+    offset, duration = strokes(STROKE_RAD, STROKE_SPEEDS_RAD_S, count)
     moved = after(LEAD_IN_S, offset)
     zero, tables, quantum = rng.normal(0, 0.002), [], true.count_rad
     for number, gain in enumerate(gains):

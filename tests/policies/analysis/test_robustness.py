@@ -65,7 +65,8 @@ def test_noise_has_the_size_that_was_asked_for_per_number():
 
 
 def test_a_delay_curve_has_its_three_modes_and_begins_with_the_plain_walk(walker):
-    rows = delay_curve(*walker, extra_ms=(0, 80))
+    policy, trial = walker
+    rows = delay_curve(policy, replace(trial, robots=1), extra_ms=(0, 80))
     assert [(r.extra_delay_ms, r.mode) for r in rows] == [
         (ms, mode) for ms in (0, 80) for mode in ("replay", "fixed", "jittered")
     ]

@@ -176,6 +176,7 @@ def test_acting_step_by_step_a_transformer_sees_sixteen_observations_as_in_a_seq
 # ------------------------------------------------------------------------------ other files
 
 
+@pytest.mark.slow
 def test_a_policy_is_loaded_without_its_trainer(saved_policies):
     code = (
         "import sys; from pathlib import Path\n"

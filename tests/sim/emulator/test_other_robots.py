@@ -57,13 +57,6 @@ def in_an_empty_folder(tmp_path, monkeypatch):
     Path("bench.xml").write_text(BENCH)
 
 
-@pytest.fixture
-def read_here(monkeypatch):
-    """Models are read in this process, without its limits of memory and time."""
-    monkeypatch.setattr(hinges, "_limit_this_process", lambda: None)
-    monkeypatch.setattr(robot_map, "hinges_of", lambda path: hinges._read(str(path)))
-
-
 def test_a_joint_map_has_the_model_s_joints_limits_and_the_servos_counts(capsys):
     code, out, err = run(capsys, "init-robot", "arm.xml", "--json")
     assert code == 0, err
@@ -138,6 +131,7 @@ def test_an_arm_goes_from_its_model_to_a_calibration_networks_and_exports(capsys
     assert arm.nu == 1 and arm.nsensor == 1
 
 
+@pytest.mark.slow
 @pytest.mark.wall_clock
 def test_one_servo_on_a_bench_is_swept_over_a_line_and_calibrated(capsys, read_here, monkeypatch):
     monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.04)  # they share this process

@@ -18,6 +18,8 @@ from pupper_sysid.sim.export.mjlab import BUILTIN_PD
 from pupper_sysid.sim.export.shared import EXPLICIT_PD, ExportedServos
 from support.command_line import refused, run_program
 
+pytestmark = pytest.mark.usefixtures("read_here")
+
 CALIBRATED = Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml"
 ROBOT = """<mujoco><compiler angle="radian"/><default><joint damping="0.3" frictionloss="0.02"/>
 <position kp="20" dampratio="1"/><default class="knee"><joint armature="0.01" axis="0 1 0"/>

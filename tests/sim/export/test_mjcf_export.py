@@ -18,6 +18,8 @@ from pupper_sysid.sim.robot.engine import mujoco
 from support.command_line import refused, run_program
 from support.real_recordings import real_recording
 
+pytestmark = pytest.mark.usefixtures("read_here")
+
 CALIBRATED = Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml"
 STEP_RAD = np.append(np.zeros(20), np.full(40, 0.3))  # a step after 0.4 s of a loop of 20 ms
 

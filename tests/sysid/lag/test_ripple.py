@@ -74,7 +74,7 @@ def test_the_lag_seen_otherwise_settles_the_period_of_fast_tones():
 
 def test_polled_tones_have_no_ripple_to_take_out():
     rng = np.random.default_rng(2)
-    trials = tone_trials(0.040, rng)
+    trials = tone_trials(0.040, rng, (1.0, 4.0))
     lattice = find_poll_lattice(trials, rng)
     read = [readings(t, lattice) for t in trials]
     found = [tone_response(t, r, rng) for t, r in zip(trials, read, strict=True)]

@@ -23,6 +23,7 @@ from pupper_sysid.sysid.report.figures import tracks
 from pupper_sysid.sysid.report.report import can_recall, recall
 from pupper_sysid.sysid.sweep.excitation import plan
 from pupper_sysid.sysid.sweep.recorder import record
+from support.undrawn import leave_undrawn
 
 JOINT = "LF_thigh"
 
@@ -47,6 +48,7 @@ def folder(swept, made, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("report")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "calibrate", never)
+        leave_undrawn(patch)
         report.write_report(
             swept, out, calibration=made.calibration, models=[made.calibration, "paper"]
         )

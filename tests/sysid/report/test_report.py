@@ -43,6 +43,7 @@ from pupper_sysid.sysid.report.sections import Findings, advice
 from support.browser import looks_right, needs_chromium
 from support.refusals import assert_each_refused
 from support.runs import run_of
+from support.undrawn import leave_undrawn
 
 HOSTILE = '<script>alert("x")</script>&lt;'
 POLL_S, LOOP_S, AGE_S = 0.030, 0.020, 0.025
@@ -180,6 +181,11 @@ def page(written):
     return Page(written.path.read_text(encoding="utf-8"))
 
 
+@pytest.fixture
+def undrawn(monkeypatch) -> None:
+    leave_undrawn(monkeypatch)
+
+
 def rows_of(written, name: str) -> list[dict[str, str]]:
     (path,) = [p for p in written.tables if p.stem == name]
     with path.open(encoding="utf-8", newline="") as file:
@@ -238,7 +244,7 @@ def test_what_the_page_says_is_what_was_found(page):
     assert "It prefers preset “paper” on LF_thigh." in page.text  # the raw score
 
 
-def test_a_page_of_several_joints_has_one_panel_each_and_one_column_each(tmp_path):
+def test_a_page_of_several_joints_has_one_panel_each_and_one_column_each(tmp_path, undrawn):
     names = ("LF_hip", "RF_calf")
     made = report_of({n: result_of(n) for n in names}, tmp_path)
     page = Page(made.path.read_text(encoding="utf-8"))
@@ -258,7 +264,9 @@ def test_a_bound_is_shown_as_one():
     assert value.show(limit | {"high": 1000.0}).endswith("… ∞)")
 
 
-def test_a_negative_age_is_explained_and_numbers_that_are_none_are_dashes_or_empty(tmp_path):
+def test_a_negative_age_is_explained_and_numbers_that_are_none_are_dashes_or_empty(
+    tmp_path, undrawn
+):
     unknown = replace(LATTICE, kind="unresolved", poll_period_s=np.nan, loss=np.nan)
     budget = replace(result_of().lag, feedback=unknown, stale_lag_s=-0.002)
     made = report_of({"LF_thigh": result_of(lag=budget)}, tmp_path)
@@ -308,7 +316,7 @@ def test_the_tables_have_the_numbers_of_the_result(written):
     assert parameters["actuator", "effort_limit_nm"]["identified"] == "no"
 
 
-def test_nothing_is_overwritten_without_force(written, tmp_path):
+def test_nothing_is_overwritten_without_force(written, tmp_path, undrawn):
     folder = tmp_path / "report"
     (folder / "tables").mkdir(parents=True)
     victim = Path(
@@ -442,7 +450,6 @@ def test_a_figure_is_written_as_its_ending_says(tmp_path):
 
 
 @needs_chromium
-@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-@pytest.mark.parametrize("width", [375, 1280])
+@pytest.mark.parametrize(("width", "dark"), [(375, True), (1280, False)])
 def test_in_a_browser_nothing_overflows_or_complains(written, tmp_path, width, dark):
     looks_right(written.path, tmp_path, width, dark)
