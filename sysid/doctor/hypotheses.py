@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import fit_sine, least_squares
-from pupper_sysid.sysid.doctor.bends import CLEAR_NATS, bend_findings
+from pupper_sysid.sysid.doctor.bends import CLEAR_NATS, bend_findings, bends
 from pupper_sysid.sysid.doctor.explanations import (
     Explanation,
     Samples,
@@ -43,6 +43,7 @@ _UNITS = {
 }  # fmt: skip
 _SAME_SCALE = 0.35  # of the logarithm
 _STEPWISE, _HOLD_S = 0.75, 0.1  # share of repeats, and how long a level lasts
+_LEVEL = 0.05  # of the range, between two levels
 _CLEARLY_EARLY_S, _MUCH_LESS = 0.03, 0.3
 _SMOOTH = 0.6  # autocorrelation of what is left
 _AT_ONCE_S, _FASTEST_S, _LATE_S = 0.02, 0.001, 0.008
@@ -107,7 +108,10 @@ def relation_findings(
         # a little early is what another shape of the servo looks like
         hardly |= best.servo.unexplained > _MUCH_LESS * servo.unexplained
     bent = bend_findings(trials, step)
-    if best.code and (hardly or (bent and best.code != "sign_inverted")):
+    if bent:  # a relation that leaves much less than the bend is no bend
+        left = min(b.unexplained for b in bends(trials, step).values())
+        hardly |= best.code != "sign_inverted" and best.servo.unexplained > _MUCH_LESS * left
+    if best.code and hardly:
         best = next(r for r in ranked if not r.code)
     share = 1 - best.servo.unexplained
     if share < _FOLLOWS if best.code else (share < _HALF and _smooth_rest(base, best.servo)):
@@ -141,7 +145,8 @@ def stepwise_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     for t in trials:
         seen = np.isfinite(t.position_rad)
         value, time = t.position_rad[seen], t.read_time_s[seen]
-        jump = np.flatnonzero(np.abs(np.diff(value)) > max(5 * step, 1e-3))
+        least = max(_LEVEL * float(np.ptp(value)) if len(value) else 0.0, 1e-3)
+        jump = np.flatnonzero(np.abs(np.diff(value)) > least)
         holds.append(np.diff(time[jump]) if len(jump) > 4 else np.zeros(1))
         commands.append(np.mean(np.diff(t.command_rad) == 0))
         if len(value) < 8 or np.mean(np.diff(value) == 0) < _STEPWISE:
@@ -263,7 +268,8 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     shifted = [_beyond(t, middle, lambda v: v - jump) for t in trials]
     edge = min(float(np.nanmin(np.where(t.position_rad > middle, t.position_rad, np.inf)))
                for t in trials)  # fmt: skip
-    mirrored = [_beyond(t, middle, lambda v: edge - v) for t in trials]
+    bottom = min(float(np.nanmin(t.position_rad)) for t in trials)  # count 0, or next to it
+    mirrored = [_beyond(t, middle, lambda v: bottom + edge - v) for t in trials]
     when = min(float(time[0] - trials[0].send_time_s[0]) for size, time in jumps if len(size))
     left = {name: _unexplained(put_back, step) for name, put_back in
             (("", list(trials)), ("shifted", shifted), ("mirrored", mirrored))}  # fmt: skip
@@ -271,7 +277,8 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     if not best or left[best] > 0.7 * left[""]:
         best = "shifted"
     values = {"times": len(sizes), "time_s": when}
-    bits = np.log2(max(edge if best == "mirrored" else jump, 1e-6) / step) if step > 0 else 0.0
+    reach = edge - bottom if best == "mirrored" else jump
+    bits = np.log2(max(reach, 1e-6) / step) if step > 0 else 0.0
     if best == "mirrored":
         values |= {"jump_rad": jump, "bit": round(bits)}
         return [Finding("sign_bit", REFUSE, values)]

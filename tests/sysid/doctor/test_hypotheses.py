@@ -8,6 +8,8 @@ import pytest
 import pupper_sysid as ps
 from pupper_sysid.sysid.doctor.checks import findings
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, RIVALS, USE, WORDS, Finding, rivalled
+from pupper_sysid.sysid.feedback.staleness import staleness
+from pupper_sysid.sysid.recordings.excitation import named_tones
 from support.real_recordings import case
 from support.strange_servos import ACCUSING, FAULTS, draw_recording
 
@@ -95,6 +97,7 @@ CASES = {
     "made/D1_goal_clamped_by_firmware.csv": ("hip", "clipped", CARE),
     "made/F1_derated_halfway.csv": ("hip", "trials_differ", CARE),
     "made/L4_failed_zero_0.005.csv": ("knee", "bad_readings", CARE),
+    "made/L2_sign_bit15.csv": ("knee", "sign_bit", REFUSE),
     "made/L4_foreign.csv": ("knee", "bad_readings", CARE),
     "real/c06b_ankle_two_columns.csv": ("joint", "not_a_position_servo", REFUSE),
 }
@@ -120,6 +123,37 @@ def test_the_fault_of_a_stranger_s_log_is_named(name):
 @pytest.mark.parametrize("name", SOUND)
 def test_a_stranger_s_sound_log_is_not_accused(name):
     assert set(codes(ps.load(case(name)), SOUND[name])) & set(ACCUSING) == set()
+
+
+def test_the_bit_of_the_sign_is_found_wherever_the_zero_is():
+    found = codes(ps.load(case("made/L2_sign_bit15.csv")), "knee")["sign_bit"]
+    assert found.values["bit"] == 15
+
+
+def polled_tone(rate_hz, period_rows, step, seed):
+    """Rows of a tone whose readings are those of a poll, or live for a period of 0."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0, 10, 1 / rate_hz)
+    period = period_rows / rate_hz
+    read = np.floor((time - rng.uniform(0, 1)) / period) * period if period_rows else time
+    hz, amplitude = rng.uniform(1, 3), rng.uniform(0.2, 0.6)
+    position = amplitude * np.sin(2 * np.pi * hz * (read - 0.03))
+    return ps.Recording.from_arrays(
+        time, {"joint": amplitude * np.sin(2 * np.pi * hz * time)},
+        {"joint": step * np.round(position / step)}, read_time_s=time,
+    ).trials("joint")  # fmt: skip
+
+
+def test_readings_that_are_new_wherever_the_joint_must_have_moved_are_live():
+    """A poll of 1.25 loops or longer repeats one reading in five; none is called live."""
+    kinds = {
+        period: [staleness(polled_tone(100, period, 0.0015, n)).kind for n in range(6)]
+        for period in (0, 1.3, 2.0, 3.4)
+    }
+    assert kinds.pop(0).count("live") >= 5
+    assert all("live" not in each for each in kinds.values()), kinds
+    measured = named_tones(ps.load(case("real/c05_mx106_2hz_quantised.csv")).trials("joint"))
+    assert staleness(measured).kind == "live"
 
 
 def test_the_moment_and_the_level_of_a_fault_are_those_of_the_case():
