@@ -3,7 +3,7 @@
 Each recording is drawn from `tests/support/strange_servos.py`, which simulates servos of four
 classes, nine motions and many buses with no code of the package, and spoils them with one fault.
 
-    .venv/bin/python benchmarks/doctor_confusion.py --count 14 --seed 1 [--only clamp stop] [--each] \
+    .venv/bin/python benchmarks/doctor_confusion.py --seed 1 [--count 14] [--only clamp] [--each]
         [--out FILE]
 
 Right: a finding of the fault's codes that asks for care or refuses, or a refusal to read it for its

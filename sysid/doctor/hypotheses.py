@@ -4,17 +4,16 @@
 (`explanations`), and the one with the best score explains it. The position servo as it is needs no
 advantage; any other must beat it by `CLEAR_NATS`, and a runner-up within them is named.
 
-`CHANGES` are what may come on top of a servo that follows: a second writer, a gain or a clock that
-changes. What bends its path, a friction or a stop, is in `bends`. Each is fitted beside the servo
-alone and must explain a good part of what that leaves. A new hypothesis is one function and one
-entry; its simulator and its codes stand in the tests' own table.
+`CHANGES` are what may come on top of a servo that follows: a second writer (`writers`), a gain or a
+clock that changes. What bends its path, a friction or a stop, is in `bends`. Each is fitted beside
+the servo alone and must explain a good part of what that leaves. A new hypothesis is one function
+and one entry; its simulator and its codes stand in the tests' own table.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -24,12 +23,14 @@ from pupper_sysid.common.tones import fit_sine, least_squares
 from pupper_sysid.sysid.doctor.bends import CLEAR_NATS, bend_findings, bends
 from pupper_sysid.sysid.doctor.explanations import (
     Explanation,
+    Followed,
     Samples,
     Servo,
     echo,
     explain,
 )
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding, rivalled
+from pupper_sysid.sysid.doctor.writers import second_writer
 from pupper_sysid.sysid.recordings.excitation import named_tones, segments, split_tones
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -50,8 +51,6 @@ _AT_ONCE_S, _FASTEST_S, _LATE_S = 0.02, 0.001, 0.008
 _BEYOND, _SURELY = 4.0, 0.01
 _LONGEST_LAG_S = 0.5
 _FASTEST_RAD_S, _WRAP_RAD, _UNUSUAL = 60.0, 2.5, 8.0
-_JUMP = 0.3  # of the command's range, from one row to the next
-_BACK_OF_SPAN, _BACKS, _BACK_SHARE = 0.03, 3, 0.02
 _TWO_BETTER, _OTHER_GAIN, _PART_S = 0.3, 0.75, 1.5
 _SAME_TONE_HZ = 0.02
 _DIFFERENT = 0.35  # of the gain
@@ -327,35 +326,6 @@ def _unexplained(trials: Sequence[Trial], step: float) -> float:
 
 
 # ----- what comes on top of a servo that follows
-@dataclass(frozen=True)
-class Followed:
-    """Readings of a joint that follows its command, trial by trial, and what the servo predicts."""
-
-    trials: tuple[Trial, ...]
-    step: float
-    base: Explanation
-    servo: Servo
-    predicted: tuple[NDArray[np.float64], ...]
-    start_s: float
-
-    @cached_property
-    def fits(self) -> list[tuple[float, NDArray[np.float64]]]:
-        """Gain and residuals of each trial."""
-        found = []
-        for s, x in zip(self.base.samples, self.predicted, strict=True):
-            spread = float(np.var(x))
-            gain = float(np.mean((x - x.mean()) * s.position_rad) / spread) if spread > 0 else 0.0
-            rest = s.position_rad - s.position_rad.mean() - gain * (x - x.mean())
-            found.append((gain, rest))
-        return found
-
-    @cached_property
-    def noise(self) -> float:
-        """Usual size of residuals [rad], at least half a quantisation step."""
-        rest = np.concatenate([r for _, r in self.fits])
-        return max(1.4826 * float(np.median(np.abs(rest))), 0.5 * self.step, 1e-5)
-
-
 def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     """What explains the pair of columns, and what comes on top of it."""
     if found := echo(trials, step):
@@ -370,30 +340,6 @@ def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     for change in CHANGES:
         findings = [*findings, *change(followed)]
     return findings
-
-
-def second_writer(joint: Followed) -> list[Finding]:
-    """Motion that runs back while the command goes on."""
-    times, forward = [], 0
-    for s, x in zip(joint.base.samples, joint.predicted, strict=True):
-        new = np.concatenate([[0], np.flatnonzero(np.diff(s.position_rad)) + 1])
-        jump = float(np.abs(np.diff(s.command_rad)).max())
-        if len(new) < 8 or jump > _JUMP * float(np.ptp(s.command_rad)):
-            continue  # after a step a servo rings by itself
-        value, time, path = s.position_rad[new], s.time_s[new], x[new]
-        moved, wanted = np.diff(value), np.diff(path)
-        error = path - path.mean() - (value - value.mean())
-        scatter = 1.4826 * float(np.median(np.abs(np.diff(error))))
-        size = max(2.5 * joint.step, _BACK_OF_SPAN * float(np.ptp(value)), 5 * scatter)
-        # it is behind where it should be, and goes away from there, for one sample or more
-        back = (moved * np.sign(error[:-1]) < -size) & (moved * np.sign(wanted) < 0)
-        back &= np.abs(error[1:]) > 3 * joint.noise
-        times += list(time[1:][back])
-        forward += int(np.sum(moved * np.sign(error[:-1]) > size))
-    if len(times) < _BACKS or len(times) < _BACK_SHARE * (forward + len(times)):
-        return []
-    values = {"times": len(times), "time_s": float(times[0]) - joint.start_s}
-    return [Finding("second_writer", CARE, values)]
 
 
 def gain_changed(joint: Followed) -> list[Finding]:
