@@ -131,10 +131,13 @@ def bend_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
         return [rivalled(held, "clipped" if saturation and near else "")] if held else []
     # at a stop, play is no better than a servo as it is
     rubs = play < min(found["linear"].nats, found["rate"].nats) - CLEAR_NATS
-    if saturation:
-        return [rivalled(saturation, "held_by_friction" if rubs else "")]
+    if saturation:  # less friction is usual, and may look like levels
+        usual = play < level - CLEAR_NATS
+        return [] if usual else [rivalled(saturation, "held_by_friction" if rubs else "")]
     clearly = play < found["linear"].nats - 2 * CLEAR_NATS
-    return [] if clearly else _pinned(trials, step)
+    rests = sum(len(_rests(t, step, _REST_TRAVEL)) for t in trials) >= _FEWEST_RESTS
+    rival = "held_by_friction" if near and rests else ""
+    return [] if clearly else [rivalled(f, rival) for f in _pinned(trials, step)]
 
 
 @remembered(8)
@@ -364,11 +367,17 @@ def _dwell(trial: Trial, step: float) -> float:
     return float(np.max(shares(position) - shares(trial.command_rad)))
 
 
+def _two_levels(command: NDArray[np.float64]) -> bool:
+    """Whether a command is a binary one, which at other levels is another binary one."""
+    near = 0.02 * float(np.ptp(command))
+    return bool(np.mean((command < command.min() + near) | (command > command.max() - near)) > 0.9)
+
+
 def _saturated(trials: Sequence[Trial], step: float, found: dict[str, Bend]) -> Finding | None:
     """Readings that stay at a level while the command goes beyond."""
     bend, base = found["saturation"], explain(trials, step)
     assert base is not None
-    if not _explains(bend, found):
+    if not _explains(bend, found) or all(_two_levels(s.command_rad) for s in base.samples):
         return None
     if found["play"].nats < bend.nats - 2 * CLEAR_NATS:
         return None

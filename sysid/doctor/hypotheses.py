@@ -35,6 +35,7 @@ from pupper_sysid.sysid.recordings.excitation import named_tones, segments, spli
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _UNRELATED, _HALF, _LOOSE, _FOLLOWS = 0.25, 0.5, 0.6, 0.75  # share of the position's variance
+_FOLLOWS_LATE, _LATEST_S = 0.9, 0.35  # what swings at a load's own frequency is late
 _NO_ONE_LAG = 0.3
 _TURNS, _TURN_SHARE = 4, 0.2
 _FAR_TOO_LARGE, _TOO_LARGE, _SMALL, _STILL = 2.0, 1.5, 0.4, 0.1
@@ -44,7 +45,7 @@ _UNITS = {
 }  # fmt: skip
 _SAME_SCALE = 0.35  # of the logarithm
 _STEPWISE, _HOLD_S = 0.75, 0.1  # share of repeats, and how long a level lasts
-_LEVEL = 0.05  # of the range, between two levels
+_LEVEL, _AT_LEAST = 0.05, 0.8  # of the range, between two levels; share of changes that are such
 _CLEARLY_EARLY_S, _MUCH_LESS = 0.03, 0.3
 _SMOOTH = 0.6  # autocorrelation of what is left
 _AT_ONCE_S, _FASTEST_S, _LATE_S = 0.02, 0.001, 0.008
@@ -107,13 +108,16 @@ def relation_findings(
         # a little early is what another shape of the servo looks like
         hardly |= best.servo.unexplained > _MUCH_LESS * servo.unexplained
     bent = bend_findings(trials, step)
-    if bent:  # a relation that leaves much less than the bend is no bend
-        left = min(b.unexplained for b in bends(trials, step).values())
-        hardly |= best.code != "sign_inverted" and best.servo.unexplained > _MUCH_LESS * left
+    if best.code and best.code != "sign_inverted":
+        # a relation that leaves more than a bend of the path does is no bend
+        left = min((b.unexplained for b in bends(trials, step).values()), default=1.0)
+        hardly |= left + base.floor < 0.5 * (best.servo.unexplained + base.floor)
+        hardly |= bool(bent) and best.servo.unexplained > _MUCH_LESS * left
     if best.code and hardly:
         best = next(r for r in ranked if not r.code)
     share = 1 - best.servo.unexplained
-    if share < _FOLLOWS if best.code else (share < _HALF and _smooth_rest(base, best.servo)):
+    least = _FOLLOWS_LATE if best.servo.total_s > _LATEST_S else _FOLLOWS
+    if share < least if best.code else (share < _HALF and _smooth_rest(base, best.servo)):
         # a fault explains what is left of a servo, or smooth motion of another cause is left
         return [Finding("not_a_position_servo", REFUSE, {"percent": 100 * share})], base, None
     if best.code != "columns_swapped" and (scaled := _scale(base, best.servo)):
@@ -145,7 +149,10 @@ def stepwise_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
         seen = np.isfinite(t.position_rad)
         value, time = t.position_rad[seen], t.read_time_s[seen]
         least = max(_LEVEL * float(np.ptp(value)) if len(value) else 0.0, 1e-3)
-        jump = np.flatnonzero(np.abs(np.diff(value)) > least)
+        moves = np.abs(np.diff(value))
+        jump = np.flatnonzero(moves > least)
+        if len(jump) < _AT_LEAST * np.count_nonzero(moves):
+            return []  # on its way from one level to the next
         holds.append(np.diff(time[jump]) if len(jump) > 4 else np.zeros(1))
         commands.append(np.mean(np.diff(t.command_rad) == 0))
         if len(value) < 8 or np.mean(np.diff(value) == 0) < _STEPWISE:
