@@ -37,13 +37,14 @@ from pupper_sysid.sysid.recordings.recording import Trial
 _UNRELATED, _HALF, _LOOSE, _FOLLOWS = 0.25, 0.5, 0.6, 0.75  # share of the position's variance
 _FOLLOWS_LATE, _LATEST_S = 0.9, 0.35  # what swings at a load's own frequency is late
 _NO_ONE_LAG = 0.3
+_FITS = 0.1  # of the position's variance left: nothing jumps
 _TURNS, _TURN_SHARE = 4, 0.2
 _FAR_TOO_LARGE, _TOO_LARGE, _SMALL, _STILL = 2.0, 1.5, 0.4, 0.1
 _UNITS = {
     "degrees": 57.29578, "counts of 4,096 a turn": 651.8986, "counts of 1,024 a turn": 162.97466,
     "milliradians": 1000.0,
 }  # fmt: skip
-_SAME_SCALE = 0.35  # of the logarithm
+_SAME_SCALE, _NO_SERVO = 0.35, 1.2  # of the logarithm
 _STEPWISE, _HOLD_S = 0.75, 0.1  # share of repeats, and how long a level lasts
 _LEVEL, _AT_LEAST = 0.05, 0.8  # of the range, between two levels; share of changes that are such
 _CLEARLY_EARLY_S, _MUCH_LESS = 0.03, 0.3
@@ -104,6 +105,8 @@ def relation_findings(
     servo = next(r.servo for r in ranked if not r.code)
     best, second = ranked[0], ranked[1]
     hardly = best.servo.nats > servo.nats - CLEAR_NATS
+    # swapped back, a position servo follows by about as much as commanded
+    hardly |= best.code == "columns_swapped" and abs(np.log(abs(best.servo.gain))) > _NO_SERVO
     if best.code == "position_early" and best.servo.total_s > -_CLEARLY_EARLY_S:
         # a little early is what another shape of the servo looks like
         hardly |= best.servo.unexplained > _MUCH_LESS * servo.unexplained
@@ -279,6 +282,8 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     when = min(float(time[0] - trials[0].send_time_s[0]) for size, time in jumps if len(size))
     left = {name: _unexplained(put_back, step) for name, put_back in
             (("", list(trials)), ("shifted", shifted), ("mirrored", mirrored))}  # fmt: skip
+    if left[""] < _FITS:
+        return []  # a fast joint, or one in another unit
     best = min(left, key=lambda name: left[name])
     if not best or left[best] > 0.7 * left[""]:
         best = "shifted"

@@ -32,7 +32,7 @@ _DATES_S = (0.0, 0.001, 0.004, 0.012)  # standard deviation of a reading's time
 _NOISES = (0.3, 1.0, 4.0)  # of a reading's variance, in those of its quantisation or scatter
 _FREEDOM = 4.0  # of Student's distribution: pushes do not set the noise
 _FAR = 5.0  # of the usual size of innovations
-_JUMP, _SETTLES_S = 0.3, 0.15  # of the command's range in a row; time beside a natural period
+_JUMP, _FEWEST_ROWS = 0.3, 40  # of the command's range in a row
 _FEWEST_PUSHES, _HEAVY, _ONE_WAY = 6, 12.0, 0.85
 _PLACES = np.linspace(-0.5, 1.5, 41)  # of the command's range
 _PARTS, _MOST_IN_PART = 6, 0.6
@@ -72,13 +72,16 @@ def _pushes(joint: Followed, number: int) -> tuple[NDArray[np.float64], ...]:
     sample, path = joint.base.samples[number], joint.predicted[number]
     hz, damping = FILTERS[joint.servo.filter]
     natural = 2 * np.pi * (hz or _UNFILTERED_HZ)
-    if len(path) < 40 or not (np.diff(sample.time_s) > 0).all():
+    if len(path) < _FEWEST_ROWS or not (np.diff(sample.time_s) > 0).all():
         return none
+    jump = float(np.max(np.abs(np.diff(sample.command_rad)), initial=0.0))
+    if jump > _JUMP * float(np.ptp(sample.command_rad)):
+        return none  # after a step friction stops a servo on its way, to a place between all
     spacing = 2 * np.pi / natural / _ROWS_OF_PERIOD
     slots = np.floor(sample.time_s / spacing)
     kept = np.concatenate([[0], np.flatnonzero(np.diff(slots)) + 1])
     time, position, path = sample.time_s[kept], sample.position_rad[kept], path[kept]
-    if len(time) < 40:
+    if len(time) < _FEWEST_ROWS:
         return none
     rate = np.gradient(path, time)
     design = np.column_stack([np.ones_like(path), path, rate, np.gradient(rate, time)])
@@ -102,27 +105,15 @@ def _pushes(joint: Followed, number: int) -> tuple[NDArray[np.float64], ...]:
                 if nats < best:
                     best, innovations = nats, scaled
     size = innovations / max(_usual(innovations), 1e-9)
-    calm = ~_after_jumps(sample.command_rad, sample.start_s, sample.grid_s, time, natural)
-    if calm.sum() < 40 or np.mean(size[calm] ** 4) < _HEAVY:
+    if np.mean(size**4) < _HEAVY:
         return none
-    far = calm & (np.abs(size) > _FAR)
+    far = np.abs(size) > _FAR
     far[1:] &= ~far[:-1]  # one push shows in the row after it, too
     return time[far], size[far], path[far]
 
 
 def _usual(values: NDArray[np.float64]) -> float:
     return 1.4826 * float(np.median(np.abs(values)))
-
-
-def _after_jumps(
-    command: NDArray[np.float64], start_s: float, grid_s: float, time: NDArray, natural: float
-) -> NDArray[np.bool_]:
-    """Whether the command jumped a short while before each time: a servo rings by itself."""
-    jumped = np.abs(np.diff(command, prepend=command[0])) > _JUMP * float(np.ptp(command))
-    count = np.concatenate([[0], np.cumsum(jumped)])
-    row = np.clip(((time - start_s) / grid_s).astype(int) + 1, 0, len(command))
-    earlier = np.clip(row - round((_SETTLES_S + 2 * np.pi / natural) / grid_s), 0, None)
-    return count[row] > count[earlier]
 
 
 @njit(cache=True)

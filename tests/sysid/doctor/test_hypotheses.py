@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, RIVALS, USE, WORDS,
 from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.excitation import named_tones
 from support.real_recordings import case
-from support.strange_servos import ACCUSING, FAULTS, draw_recording
+from support.strange_servos import ACCUSING, FAULTS, draw_recording, draw_world, simulated
 
 
 def recorded(table) -> ps.Recording:
@@ -128,6 +130,32 @@ def test_a_stranger_s_sound_log_is_not_accused(name):
 def test_the_bit_of_the_sign_is_found_wherever_the_zero_is():
     found = codes(ps.load(case("made/L2_sign_bit15.csv")), "knee")["sign_bit"]
     assert found.values["bit"] == 15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("motion", ["teleoperation", "multisine", "walk"])
+def test_pushes_to_one_place_are_a_second_writer(motion):
+    """Of servos whose commands another program replaces now and then, and of the same alone."""
+    named, accused = 0, 0
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        world = replace(
+            draw_world(rng, "hobby", motion, 3e-4), rate_hz=60.0, poll_s=0.0, friction_rad=0.0,
+            amplitude_rad=0.4, quantum_rad=0.0015, duration_s=15.0,
+        )  # fmt: skip
+        disturbed = replace(world, writer_share=0.05, values={"home": 0.2})
+        named += "second_writer" in codes(recorded(simulated(disturbed)))
+        accused += "second_writer" in codes(recorded(simulated(world)))
+    assert named >= 3 and accused == 0
+
+
+@pytest.mark.slow
+def test_tones_that_do_not_repeat_are_disturbed():
+    (found,) = ps.examine(ps.load(case("made/W3_esp32_second_writer_5pc.csv"))).values()
+    (uneven,) = (f for f in found.findings if f.code == "unrepeatable")
+    assert uneven.verdict == CARE and "second writer" in uneven.text
+    sound = ps.examine(ps.load(case("made/L5_freq_no_trial.csv")))
+    assert not any(f.code == "unrepeatable" for j in sound.values() for f in j.findings)
 
 
 def polled_tone(rate_hz, period_rows, step, seed):
