@@ -53,7 +53,7 @@ _AT_ONCE_S, _FASTEST_S, _LATE_S = 0.02, 0.001, 0.008
 _BEYOND, _SURELY = 4.0, 0.01
 _LONGEST_LAG_S = 0.5
 _FASTEST_RAD_S, _WRAP_RAD, _UNUSUAL = 60.0, 2.5, 8.0
-_TWO_BETTER, _OTHER_GAIN, _PART_S = 0.3, 0.75, 1.5
+_TWO_BETTER, _OTHER_GAIN, _PART_S, _RATE_BETTER = 0.3, 0.75, 1.5, 0.5
 _SAME_TONE_HZ = 0.02
 _DIFFERENT = 0.35  # of the gain
 _DRIFT_RAD, _DRIFT_SHARE = 0.1, 0.3
@@ -370,6 +370,9 @@ def gain_changed(joint: Followed) -> list[Finding]:
     low, high = sorted((abs(before), abs(after)))
     if share > _TWO_BETTER or low > _OTHER_GAIN * high:
         return []
+    bent = bends(joint.trials, joint.step)
+    if bent and bent["rate"].unexplained < _RATE_BETTER * bent["linear"].unexplained:
+        return []  # a later tone is faster than the servo
     values = {"time_s": at - joint.start_s, "before": before, "after": after}
     return [Finding("gain_changed", CARE, values)]
 

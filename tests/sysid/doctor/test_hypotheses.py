@@ -149,6 +149,16 @@ def test_pushes_to_one_place_are_a_second_writer(motion):
     assert named >= 3 and accused == 0
 
 
+def test_later_tones_beyond_the_speed_limit_are_no_change_of_gain():
+    """Of 0.5 rad at 8 Hz, 25 rad/s, a servo of 4 rad/s follows a sixth."""
+    world = draw_world(np.random.default_rng(1), "smart", "tones", 3e-4)
+    world = replace(
+        world, amplitude_rad=0.5, speed_rad_s=4.0, bandwidth_hz=10.0, rate_hz=80.0, poll_s=0.0,
+        friction_rad=0.0, gravity_rad=0.0, gain=0.9, duration_s=11.0, quantum_rad=0.0015,
+    )  # fmt: skip
+    assert "gain_changed" not in codes(recorded(simulated(world)))
+
+
 @pytest.mark.slow
 def test_tones_that_do_not_repeat_are_disturbed():
     (found,) = ps.examine(ps.load(case("made/W3_esp32_second_writer_5pc.csv"))).values()
