@@ -88,7 +88,14 @@ _USUAL = 0.9  # share of ASCII in tables of numbers that are not in UTF-8
 _SAME_SHAPE, _NUMERIC = 0.9, 0.9  # shares of rows, of cells
 _COMMENT = re.compile(r"[ \t]*(#|%|//|!)")
 _COMMA_NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:,[0-9]*)?|,[0-9]+)(?:[eE][+-]?[0-9]+)?")
-_CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?")
+_CLOCK = re.compile(
+    r"(\d{4}-\d\d-\d\d[T ]|\d{1,4}([-/.])\d{1,2}\2\d{1,4} )?"
+    r"\d{1,2}:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?"
+)
+_FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]\d{2,3}(?![\w.]))")
+_GROUPED = re.compile(r"(?<![\w.,'’])[+-]?\d{1,3}(?:['’]\d{3})+(?![\w'’])")
+_QUOTED_GROUPS = re.compile(r'"([+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?)"')
+_COMMA_GROUPS = re.compile(r"(?<![\w.,])[+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?(?![\w,])")
 _UNIT = re.compile(
     r"[(\[<{]?\s*(s|sec|seconds?|ms|us|µs|ns|rad|radians?|deg|degrees?|°|counts?|ticks?|raw|turns?|"
     r"rev|v|volts?|a|amps?|ma|mv|n\*?m|nm|%|°?c|hz|rad/s|deg/s|rpm|rad/s\^?2|m|mm|-|1|none)"
@@ -145,6 +152,8 @@ def plain(text: str) -> Plain:
     if len(bare) < 3:
         return Plain(text)
     rows = [lines[n] for n in bare[len(bare) // 2 :][:_ROWS]]
+    if (usual := _usual_numbers(text, rows)) != text:
+        return plain(usual)
     names = Counter(tuple(name for name, _ in _PAIR.findall(row)) for row in rows).most_common(1)[0]
     if len(set(names[0])) == len(names[0]) > 1 and names[1] >= _SAME_SHAPE * len(rows):
         return _labelled(text, list(names[0]))
@@ -160,8 +169,30 @@ def plain(text: str) -> Plain:
     return _rewritten(text, lines, bare, shape)
 
 
+def _usual_numbers(text: str, rows: Sequence[str]) -> str:
+    """The text without thousands separators, Fortran's exponents and typeset minus signs.
+
+    A comma groups thousands where it is quoted, or where cells are separated otherwise, every
+    comma stands before three digits, and other numbers have a decimal point.
+    """
+    sample = "\n".join(rows)
+    if "\u2212" in text:
+        text = text.replace("\u2212", "-")
+    if _FORTRAN.search(sample):
+        text = _FORTRAN.sub("E", text)
+    if _GROUPED.search(sample):
+        text = _GROUPED.sub(lambda m: re.sub("['’]", "", m[0]), text)
+    if _QUOTED_GROUPS.search(sample):
+        text = _QUOTED_GROUPS.sub(lambda m: m[1].replace(",", ""), text)
+    elif all(";" in row or "\t" in row for row in rows) and _COMMA_GROUPS.search(sample):
+        rest = _COMMA_GROUPS.sub("", sample)
+        if "," not in rest and re.search(r"\d\.\d", rest):
+            text = _COMMA_GROUPS.sub(lambda m: m[0].replace(",", ""), text)
+    return text
+
+
 def is_clock(cell: str) -> bool:
-    """Whether a cell is a time of day, with or without a date (ISO 8601)."""
+    """Whether a cell is a time of day, with or without a date."""
     return _CLOCK.fullmatch(cell.strip()) is not None
 
 
@@ -420,14 +451,30 @@ def _usual(text: str) -> float:
     return sum(32 <= ord(c) < 127 or c in "\t\r\n" for c in text) / max(len(text), 1)
 
 
+_BINARY = {
+    b"MATLAB 5.0": ("a MATLAB file", "writematrix or writetable writes it as text"),
+    b"\x89HDF\r\n": ("an HDF5 file", "pandas.read_hdf or h5py reads it; write it with to_csv"),
+    b"ARROW1": ("a feather file", "write it with pandas.read_feather(path).to_parquet"),
+    b"\xd0\xcf\x11\xe0": ("a spreadsheet", "save it as CSV"),
+    b"\x80\x04\x95": ("a pickle, which can hold programs", "write its arrays with numpy.savez"),
+}
+"""First bytes of files that are read by other programs, and what to do with them."""
+
+
 def decoded(path: object, data: bytes) -> str:
-    """Text in UTF-8 or UTF-16, with or without a byte order mark, else in Windows-1252."""
+    """Text in UTF-8 or UTF-16, with or without a byte order mark, else in Windows-1252.
+
+    Zeros at the end, where a file system lost the last rows, are left out.
+    """
+    for first, (kind, cure) in _BINARY.items():
+        if data.startswith(first):
+            raise InputError(f"{path} is {kind}, which is not read: {cure}, then give that file.")
     wide = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}.get(data[:2])
     if wide is None and b"\0" in data[:2]:
         wide = "utf-16-be" if data[:1] == b"\0" else "utf-16-le"
     for coding in (wide,) if wide else ("utf-8-sig", "cp1252"):
         try:
-            text = data.decode(coding)
+            text = data.decode(coding).rstrip("\0")
         except ValueError:
             continue
         if "\0" not in text and (coding == "utf-8-sig" or _usual(text[:_SAMPLE]) > _USUAL):

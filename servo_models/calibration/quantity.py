@@ -18,6 +18,7 @@ UNIT_OF_NAME = {
     "friction_loss": "rad/s²",
     "effort_limit": "rad/s²",
     "back_emf": "1/s",
+    "damping_and_back_emf": "1/s",
     "duty_per_rad": "1/rad",
     "duty_s_per_rad": "s/rad",
     "load_friction_quadratic_per_nm": "1/(N·m)",

@@ -55,7 +55,7 @@ _PINNED, _ENOUGH_TRIALS = (0.10, 0.20), 3  # share of readings at an extreme, be
 _DEEP, _BEYOND_SHARE = 0.06, 0.03  # of the path's range; of the readings
 _FLAT = 0.2  # gain of what the levels cut off, of the gain within them
 
-Paths = list[NDArray[np.float64]]
+_LINEAR, _PLAY, _RATE, _CLIP = range(4)
 
 
 @dataclass(frozen=True)
@@ -80,37 +80,29 @@ class _Scan:
 
     base: Explanation
     servos: tuple[Servo, ...]
-    paths: tuple[Paths, ...]
-    position: Paths
-    time: Paths
+    paths: NDArray[np.float64]
+    """Shape (servos, readings)."""
+    position: NDArray[np.float64]
+    """Readings of each trial, their mean 0 and their variance 1."""
+    starts: NDArray[np.int64]
+    """First reading of each trial, and the end."""
     every: int
 
-    def share(self, bent: Sequence[NDArray]) -> float:
-        """Share of the position's variance that bent paths leave."""
-        left = 0.0
-        for weight, x, y in zip(self.base.weight, bent, self.position, strict=True):
-            spread = float(np.std(x))
-            rho = 0.0
-            if spread > 1e-9:
-                rho = float(np.mean((x - x.mean()) * (y - y.mean()))) / spread / float(np.std(y))
-            left += weight * (1 - max(rho, 0.0) ** 2)
-        return left
+    def shares(self, operator: int, values: NDArray, paths: NDArray) -> NDArray[np.float64]:
+        """Shares of the position's variance that bent paths leave, shape (paths, values)."""
+        return _shares(operator, values, paths, self.position, self.starts, self.base.weight)
 
-    def best(self, bend: Callable[..., NDArray], values: Sequence[tuple]) -> Bend:
-        """The best of one operator over its values and over all servos."""
-
-        def left(n: int, value: tuple) -> float:
-            pairs = zip(self.paths[n], self.time, strict=True)
-            return self.share([bend(x, t, *value) for x, t in pairs])
-
-        def tried(n: int, value: tuple) -> Bend:
-            return self.bend(left(n, value), value, self.servos[n])
-
-        starts = [0, *range(1, len(self.servos), 4)]
-        rough = min((tried(n, v) for n in starts for v in values), key=_by_nats)
-        servos = [tried(n, rough.values) for n in range(len(self.servos))]
-        at = int(np.argmin([b.nats for b in servos]))
-        return min((tried(at, v) for v in values), key=_by_nats)
+    def best(self, operator: int, values: Sequence[tuple] = ((),)) -> Bend:
+        """The best of one operator over its values and all servos."""
+        pairs = np.zeros((len(values), 2))
+        if values[0]:
+            pairs[:, : len(values[0])] = values
+        shares = self.shares(operator, pairs, self.paths)
+        at = shares.argmin(axis=1)
+        return min(
+            (self.bend(shares[n, k], values[k], servo)
+             for n, (servo, k) in enumerate(zip(self.servos, at, strict=True))), key=_by_nats,
+        )  # fmt: skip
 
     def bend(self, unexplained: float, value: tuple, servo: Servo) -> Bend:
         late = max(servo.total_s - _USUAL_LAG_S, 0.0) * _LAG_NATS
@@ -139,10 +131,13 @@ def bend_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
         return [rivalled(held, "clipped" if saturation and near else "")] if held else []
     # at a stop, play is no better than a servo as it is
     rubs = play < min(found["linear"].nats, found["rate"].nats) - CLEAR_NATS
-    if saturation:
-        return [rivalled(saturation, "held_by_friction" if rubs else "")]
+    if saturation:  # less friction is usual, and may look like levels
+        usual = play < level - CLEAR_NATS
+        return [] if usual else [rivalled(saturation, "held_by_friction" if rubs else "")]
     clearly = play < found["linear"].nats - 2 * CLEAR_NATS
-    return [] if clearly else _pinned(trials, step)
+    rests = sum(len(_rests(t, step, _REST_TRAVEL)) for t in trials) >= _FEWEST_RESTS
+    rival = "held_by_friction" if near and rests else ""
+    return [] if clearly else [rivalled(f, rival) for f in _pinned(trials, step)]
 
 
 @remembered(8)
@@ -154,22 +149,22 @@ def bends(trials: Sequence[Trial], step: float) -> dict[str, Bend]:
     causal = np.broadcast_to(base.lags_s >= -0.5 * base.grid_s, base.total_s.shape)
     linear = base.best(1.0, causal & (base.lags_s < 0.5))
     scan = _scan(base, linear)
-    ends = [(float(x.min()), float(x.max())) for x in scan.paths[0]]
-    low, high = min(e[0] for e in ends), max(e[1] for e in ends)
+    low, high = float(scan.paths[0].min()), float(scan.paths[0].max())
     reach = high - low
     if not reach > 1e-4:
         return {}
-    rate = max(float(np.max(np.abs(np.gradient(x)))) for x in scan.paths[0]) + 1e-12
-    wide = scan.best(lambda x, t, w: _play(x, w), [(w * reach / 2,) for w in _WIDTHS])
-    widths = [(wide.values[0] * f,) for f in (0.8, 0.87, 0.93, 1.0, 1.07, 1.15)]
-    found = {
-        "linear": scan.best(lambda x, t: x, [()]),
-        "play": min(wide, scan.best(lambda x, t, w: _play(x, w), widths), key=_by_nats),
-        "rate": scan.best(lambda x, t, r: _limited(x, r), [(r * rate,) for r in _RATES]),
+    starts, ends = scan.starts[:-1], scan.starts[1:]
+    rate = max(float(np.max(np.abs(np.gradient(scan.paths[0, a:b]))))
+               for a, b in zip(starts, ends, strict=True)) + 1e-12  # fmt: skip
+    wide = scan.best(_PLAY, [(w * reach / 2,) for w in _WIDTHS])
+    widths = [(wide.values[0] * f,) for f in (0.8, 0.87, 0.93, 1.07, 1.15)]
+    return {
+        "linear": scan.best(_LINEAR),
+        "play": min(wide, scan.best(_PLAY, widths), key=_by_nats),
+        "rate": scan.best(_RATE, [(r * rate,) for r in _RATES]),
         "cubic": _cubic(scan),
+        "saturation": _saturation(scan, low, high),
     }
-    found["saturation"] = _saturation(scan, low, high)
-    return found
 
 
 def _scan(base: Explanation, linear: Servo) -> _Scan:
@@ -181,47 +176,49 @@ def _scan(base: Explanation, linear: Servo) -> _Scan:
             lag = total - servo_delay(number)
             if lag >= -1e-3:
                 servos.append(Servo(0.0, 1.0, 1.0, max(lag, 0.0), total, number))
-    paths = [[x[::every] for x in base.predicted(servo)] for servo in servos]
+    position = [s.position_rad[::every] for s in base.samples]
+    starts = np.cumsum([0, *(len(y) for y in position)])
+    paths = [_thinned(base.predicted(servo), every) for servo in servos]
+    scaled = [(y - y.mean()) / max(float(np.std(y)), 1e-12) for y in position]
     return _Scan(
-        base, tuple(servos), tuple(paths), [s.position_rad[::every] for s in base.samples],
-        [s.time_s[::every] for s in base.samples], every,
+        base, tuple(servos), np.array(paths), np.concatenate(scaled), starts, every
     )  # fmt: skip
+
+
+def _thinned(paths: Sequence[NDArray], every: int) -> NDArray[np.float64]:
+    return np.concatenate([x[::every] for x in paths])
 
 
 def _cubic(scan: _Scan) -> Bend:
     """A smooth function of the path, another in each trial."""
-    best = None
-    for servo, paths in zip(scan.servos, scan.paths, strict=True):
-        bent = []
-        for x, y in zip(paths, scan.position, strict=True):
-            z = (x - x.mean()) / max(float(np.std(x)), 1e-9)
-            design = np.column_stack([np.ones_like(z), z, z**2, z**3])
+    left = np.zeros(len(scan.servos))
+    for weight, a, b in zip(scan.base.weight, scan.starts[:-1], scan.starts[1:], strict=True):
+        y = scan.position[a:b]
+        for n, path in enumerate(scan.paths[:, a:b]):
+            z = (path - path.mean()) / max(float(np.std(path)), 1e-9)
+            design = np.column_stack([np.ones_like(z), z, z * z, z * z * z])
             gram = design.T @ design + 1e-9 * len(z) * np.eye(4)
-            bent.append(design @ np.linalg.solve(gram, design.T @ y))
-        tried = scan.bend(scan.share(bent), (0.0, 0.0), servo)
-        best = tried if best is None else min(best, tried, key=_by_nats)
-    assert best is not None
-    return best
+            right = design.T @ y
+            left[n] += weight * (1 - float(right @ np.linalg.solve(gram, right)) / len(y))
+    pairs = zip(left, scan.servos, strict=True)
+    return min((scan.bend(share, (0.0, 0.0), servo) for share, servo in pairs), key=_by_nats)
 
 
 def _saturation(scan: _Scan, low: float, high: float) -> Bend:
     """Levels of the motion, or of the goal before the servo."""
-
-    def of_motion(values: Sequence[tuple]) -> Bend:
-        return scan.best(lambda x, t, a, b: np.clip(x, a, b), values)
-
-    motion = _levels(of_motion, _LEVELS, low, high)
+    motion = _levels(lambda values: scan.best(_CLIP, values), _LEVELS, low, high)
     near = sorted(scan.servos[1:], key=lambda s: abs(s.total_s - motion.servo.total_s))
     servos = [scan.servos[0], *near[:3]]
 
     def of_goal(values: Sequence[tuple]) -> Bend:
-        tried = []
+        bends = []
         for servo in servos:
             for value in values:
                 paths = scan.base.predicted(servo, lambda c, e=value: np.clip(c, *e))
-                left = scan.share([x[:: scan.every] for x in paths])
-                tried.append(scan.bend(left, value, servo))
-        return min(tried, key=_by_nats)
+                path = _thinned(paths, scan.every)[None]
+                left = scan.shares(_LINEAR, np.zeros((1, 2)), path)[0, 0]
+                bends.append(scan.bend(left, value, servo))
+        return min(bends, key=_by_nats)
 
     command = np.concatenate([s.command_rad for s in scan.base.samples])
     goal = _levels(of_goal, _LEVELS[::3], float(command.min()), float(command.max()))
@@ -253,27 +250,42 @@ def _levels(
 
 
 @njit(cache=True)
-def _play(path, width):
-    """Position of a joint that follows only at a distance of `width`."""
-    out = np.empty_like(path)
-    now = path[0]
-    for k in range(len(path)):
-        if path[k] > now + width:
-            now = path[k] - width
-        elif path[k] < now - width:
-            now = path[k] + width
-        out[k] = now
-    return out
+def _shares(operator, values, paths, position, starts, weight):
+    """Share of the position's variance that each path leaves, bent with each pair of values.
 
-
-@njit(cache=True)
-def _limited(path, most):
-    """The path with a limited change from one reading to the next."""
-    out = np.empty_like(path)
-    now = path[0]
-    for k in range(len(path)):
-        now += min(max(path[k] - now, -most), most)
-        out[k] = now
+    Play follows only at a distance of its width, a limit of the rate changes by so much from one
+    reading to the next, and saturation stays between two levels.
+    """
+    out = np.zeros((len(paths), len(values)))
+    for n in range(len(paths)):
+        for v in range(len(values)):
+            first, second = values[v, 0], values[v, 1]
+            for trial in range(len(weight)):
+                start, stop = starts[trial], starts[trial + 1]
+                origin = now = paths[n, start]
+                if operator == 3:
+                    origin = min(max(now, first), second)
+                mean = square = product = 0.0
+                for k in range(start, stop):
+                    x = paths[n, k]
+                    if operator == 1:
+                        now = min(max(now, x - first), x + first)
+                    elif operator == 2:
+                        now += min(max(x - now, -first), first)
+                    elif operator == 3:
+                        now = min(max(x, first), second)
+                    else:
+                        now = x
+                    away = now - origin
+                    mean += away
+                    square += away * away
+                    product += away * position[k]
+                count = stop - start
+                variance = square / count - (mean / count) ** 2
+                rho = 0.0
+                if variance > 1e-18:
+                    rho = max(product / count / np.sqrt(variance), 0.0)
+                out[n, v] += weight[trial] * (1 - rho * rho)
     return out
 
 
@@ -355,11 +367,17 @@ def _dwell(trial: Trial, step: float) -> float:
     return float(np.max(shares(position) - shares(trial.command_rad)))
 
 
+def _two_levels(command: NDArray[np.float64]) -> bool:
+    """Whether a command is a binary one, which at other levels is another binary one."""
+    near = 0.02 * float(np.ptp(command))
+    return bool(np.mean((command < command.min() + near) | (command > command.max() - near)) > 0.9)
+
+
 def _saturated(trials: Sequence[Trial], step: float, found: dict[str, Bend]) -> Finding | None:
     """Readings that stay at a level while the command goes beyond."""
     bend, base = found["saturation"], explain(trials, step)
     assert base is not None
-    if not _explains(bend, found):
+    if not _explains(bend, found) or all(_two_levels(s.command_rad) for s in base.samples):
         return None
     if found["play"].nats < bend.nats - 2 * CLEAR_NATS:
         return None

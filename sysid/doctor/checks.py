@@ -136,7 +136,7 @@ def findings(recorded: Sequence[Trial]) -> list[Finding]:
     found = [*_missing(recorded, len(recorded) - len(trials)), *clock_findings(trials)]
     found += _bad_readings(recorded, cleaned)
     step = -1.0
-    for check in (*_CHECKS[:1], stepwise_findings, _few_fresh, *_CHECKS[1:]):
+    for check in (stepwise_findings, *_CHECKS[:1], _few_fresh, *_CHECKS[1:]):
         if any(f.verdict == REFUSE for f in found):
             break
         if check in _SERVOS_ALONE and any(f.code == "held_by_friction" for f in found):

@@ -31,6 +31,7 @@ from pupper_sysid.sysid.doctor.checks import (
 from pupper_sysid.sysid.doctor.explanations import crossed
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, VERDICTS, Finding
 from pupper_sysid.sysid.doctor.signals import amplitude_ratio, disorder, offset, peak_speed
+from pupper_sysid.sysid.doctor.writers import scatter_findings
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
     find_poll_lattice,
@@ -217,6 +218,7 @@ def _examine_joint(
         lattice = lag.feedback if lag else find_poll_lattice(tones, rng)
         hold_share = _hold_share(joint, tones, lattice, rng, lag)
         found += [*_held(lattice, hold_share), *_slips(tones, lattice)]
+        found += scatter_findings(tones, lattice)
         found += [*_excitation(trials), *_coverage(tones, speed, limit_rad_s)]
     found = [replace(f, joint=joint) for f in found]
     found.sort(key=lambda f: VERDICTS.index(f.verdict))

@@ -34,7 +34,7 @@ from pupper_sysid.sysid.recordings.recording import Trial
 
 LATEST_S, EARLIEST_S = 0.8, -0.6
 
-_FILTERS: tuple[tuple[float, float], ...] = ((0.0, 1.0), *(
+FILTERS: tuple[tuple[float, float], ...] = ((0.0, 1.0), *(
     (hz, damping) for hz in (1.5, 2.5, 4.0, 6.5, 10.0, 16.0, 25.0) for damping in (0.5, 1.0)
 ))  # fmt: skip
 """Natural frequency [Hz], 0 for none, and damping ratio."""
@@ -108,7 +108,7 @@ class Explanation:
     @cached_property
     def total_s(self) -> NDArray[np.float64]:
         """Delay of low-pass and lag together, shape (filters, lags)."""
-        delays = [servo_delay(k) for k in range(len(_FILTERS))]
+        delays = [servo_delay(k) for k in range(len(FILTERS))]
         return self.lags_s + np.array(delays)[:, None]
 
     def best(self, sign: float, inside: NDArray[np.bool_]) -> Servo:
@@ -150,14 +150,43 @@ class Explanation:
             command = np.concatenate([np.full(before, s.rest_rad), s.command_rad])
             command = command if changed is None else changed(command)
             time = s.start_s + self.grid_s * (np.arange(len(command)) - before)
-            moved = _low_pass(command, *_FILTERS[servo.filter], self.grid_s)
+            moved = _low_pass(command, *FILTERS[servo.filter], self.grid_s)
             found.append(np.interp(s.time_s - lag, time, moved))
         return found
 
 
+@dataclass(frozen=True)
+class Followed:
+    """Readings of a joint that follows its command, trial by trial, and what the servo predicts."""
+
+    trials: tuple[Trial, ...]
+    step: float
+    base: Explanation
+    servo: Servo
+    predicted: tuple[NDArray[np.float64], ...]
+    start_s: float
+
+    @cached_property
+    def fits(self) -> list[tuple[float, NDArray[np.float64]]]:
+        """Gain and residuals of each trial."""
+        found = []
+        for s, x in zip(self.base.samples, self.predicted, strict=True):
+            spread = float(np.var(x))
+            gain = float(np.mean((x - x.mean()) * s.position_rad) / spread) if spread > 0 else 0.0
+            rest = s.position_rad - s.position_rad.mean() - gain * (x - x.mean())
+            found.append((gain, rest))
+        return found
+
+    @cached_property
+    def noise(self) -> float:
+        """Usual size of residuals [rad], at least half a quantisation step."""
+        rest = np.concatenate([r for _, r in self.fits])
+        return max(1.4826 * float(np.median(np.abs(rest))), 0.5 * self.step, 1e-5)
+
+
 def servo_delay(number: int) -> float:
     """Delay of slow motion by a low-pass [s]."""
-    hz, damping = _FILTERS[number]
+    hz, damping = FILTERS[number]
     return damping / (np.pi * hz) if hz else 0.0
 
 
@@ -284,10 +313,10 @@ def _maps(
     of_there = transform(np.ones(before + points))
     n, sy, syy = (correlate(a, of_there) for a in (of_mask, of_y, of_square))
     n = np.maximum(n, 1e-9)
-    rho, gain = np.zeros((2, len(_FILTERS), count))
+    rho, gain = np.zeros((2, len(FILTERS), count))
     own = np.concatenate([np.full(before, samples.rest_rad), command])
     enough = n >= _OVERLAP * mask.sum()
-    for k, (hz, damping) in enumerate(_FILTERS):
+    for k, (hz, damping) in enumerate(FILTERS):
         u = _low_pass(own, hz, damping, grid) - command.mean()
         of_u = transform(u)
         su, suy = correlate(of_mask, of_u), correlate(of_y, of_u)

@@ -252,9 +252,9 @@ WORDS: dict[str, str] = {
         "check the scale (counts per radian, gear, joint map), then record again."
     ),
     "second_writer": (
-        "{times} times the motion runs back while the command goes on, the first time at "
-        "{time_s:.2f} s: another program commands this servo too (a second writer). Stop it and"
-        " record again; lags come out too long."
+        "{times} times the joint is pushed off its path while the command goes on, the first time "
+        "at {time_s:.2f} s: another program commands this servo too (a second writer). Stop it and"
+        " record again; lags come out wrong."
     ),
     "short_tones": (
         "{tones} of {of} tones last less than two periods and are left out of phases and gains."
@@ -319,6 +319,12 @@ WORDS: dict[str, str] = {
     "uneven_loop": (
         "the loop is uneven ({jitter_ms:.1f} ms of jitter on {loop_ms:.1f} ms); time stamps are"
         " used as they are, but record on an idle machine."
+    ),
+    "unrepeatable": (
+        "periods of one tone differ by {percent:.0f} % of its amplitude, which neither poll nor "
+        "quantisation explains: another program commands this servo too (a second writer), "
+        "commands are lost, or something touches the joint. Lags come out wrong; record again "
+        "with one program on the bus."
     ),
     "unrelated": (
         "the command explains {percent:.0f} % of the position's motion: the two have nothing to"

@@ -4,54 +4,56 @@
 (`explanations`), and the one with the best score explains it. The position servo as it is needs no
 advantage; any other must beat it by `CLEAR_NATS`, and a runner-up within them is named.
 
-`CHANGES` are what may come on top of a servo that follows: a second writer, a gain or a clock that
-changes. What bends its path, a friction or a stop, is in `bends`. Each is fitted beside the servo
-alone and must explain a good part of what that leaves. A new hypothesis is one function and one
-entry; its simulator and its codes stand in the tests' own table.
+`CHANGES` are what may come on top of a servo that follows: a second writer (`writers`), a gain or a
+clock that changes. What bends its path, a friction or a stop, is in `bends`. Each is fitted beside
+the servo alone and must explain a good part of what that leaves. A new hypothesis is one function
+and one entry; its simulator and its codes stand in the tests' own table.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import fit_sine, least_squares
-from pupper_sysid.sysid.doctor.bends import CLEAR_NATS, bend_findings
+from pupper_sysid.sysid.doctor.bends import CLEAR_NATS, bend_findings, bends
 from pupper_sysid.sysid.doctor.explanations import (
     Explanation,
+    Followed,
     Samples,
     Servo,
     echo,
     explain,
 )
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding, rivalled
+from pupper_sysid.sysid.doctor.writers import second_writer
 from pupper_sysid.sysid.recordings.excitation import named_tones, segments, split_tones
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _UNRELATED, _HALF, _LOOSE, _FOLLOWS = 0.25, 0.5, 0.6, 0.75  # share of the position's variance
+_FOLLOWS_LATE, _LATEST_S = 0.9, 0.35  # what swings at a load's own frequency is late
 _NO_ONE_LAG = 0.3
+_FITS = 0.1  # of the position's variance left: nothing jumps
 _TURNS, _TURN_SHARE = 4, 0.2
 _FAR_TOO_LARGE, _TOO_LARGE, _SMALL, _STILL = 2.0, 1.5, 0.4, 0.1
 _UNITS = {
     "degrees": 57.29578, "counts of 4,096 a turn": 651.8986, "counts of 1,024 a turn": 162.97466,
     "milliradians": 1000.0,
 }  # fmt: skip
-_SAME_SCALE = 0.35  # of the logarithm
+_SAME_SCALE, _NO_SERVO = 0.35, 1.2  # of the logarithm
 _STEPWISE, _HOLD_S = 0.75, 0.1  # share of repeats, and how long a level lasts
+_LEVEL, _AT_LEAST = 0.05, 0.8  # of the range, between two levels; share of changes that are such
 _CLEARLY_EARLY_S, _MUCH_LESS = 0.03, 0.3
 _SMOOTH = 0.6  # autocorrelation of what is left
 _AT_ONCE_S, _FASTEST_S, _LATE_S = 0.02, 0.001, 0.008
 _BEYOND, _SURELY = 4.0, 0.01
 _LONGEST_LAG_S = 0.5
 _FASTEST_RAD_S, _WRAP_RAD, _UNUSUAL = 60.0, 2.5, 8.0
-_JUMP = 0.3  # of the command's range, from one row to the next
-_BACK_OF_SPAN, _BACKS, _BACK_SHARE = 0.03, 3, 0.02
-_TWO_BETTER, _OTHER_GAIN, _PART_S = 0.3, 0.75, 1.5
+_TWO_BETTER, _OTHER_GAIN, _PART_S, _RATE_BETTER = 0.3, 0.75, 1.5, 0.5
 _SAME_TONE_HZ = 0.02
 _DIFFERENT = 0.35  # of the gain
 _DRIFT_RAD, _DRIFT_SHARE = 0.1, 0.3
@@ -103,14 +105,22 @@ def relation_findings(
     servo = next(r.servo for r in ranked if not r.code)
     best, second = ranked[0], ranked[1]
     hardly = best.servo.nats > servo.nats - CLEAR_NATS
+    # swapped back, a position servo follows by about as much as commanded
+    hardly |= best.code == "columns_swapped" and abs(np.log(abs(best.servo.gain))) > _NO_SERVO
     if best.code == "position_early" and best.servo.total_s > -_CLEARLY_EARLY_S:
         # a little early is what another shape of the servo looks like
         hardly |= best.servo.unexplained > _MUCH_LESS * servo.unexplained
     bent = bend_findings(trials, step)
-    if best.code and (hardly or (bent and best.code != "sign_inverted")):
+    if best.code and best.code != "sign_inverted":
+        # a relation that leaves more than a bend of the path does is no bend
+        left = min((b.unexplained for b in bends(trials, step).values()), default=1.0)
+        hardly |= left + base.floor < 0.5 * (best.servo.unexplained + base.floor)
+        hardly |= bool(bent) and best.servo.unexplained > _MUCH_LESS * left
+    if best.code and hardly:
         best = next(r for r in ranked if not r.code)
     share = 1 - best.servo.unexplained
-    if share < _FOLLOWS if best.code else (share < _HALF and _smooth_rest(base, best.servo)):
+    least = _FOLLOWS_LATE if best.servo.total_s > _LATEST_S else _FOLLOWS
+    if share < least if best.code else (share < _HALF and _smooth_rest(base, best.servo)):
         # a fault explains what is left of a servo, or smooth motion of another cause is left
         return [Finding("not_a_position_servo", REFUSE, {"percent": 100 * share})], base, None
     if best.code != "columns_swapped" and (scaled := _scale(base, best.servo)):
@@ -141,7 +151,11 @@ def stepwise_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     for t in trials:
         seen = np.isfinite(t.position_rad)
         value, time = t.position_rad[seen], t.read_time_s[seen]
-        jump = np.flatnonzero(np.abs(np.diff(value)) > max(5 * step, 1e-3))
+        least = max(_LEVEL * float(np.ptp(value)) if len(value) else 0.0, 1e-3)
+        moves = np.abs(np.diff(value))
+        jump = np.flatnonzero(moves > least)
+        if len(jump) < _AT_LEAST * np.count_nonzero(moves):
+            return []  # on its way from one level to the next
         holds.append(np.diff(time[jump]) if len(jump) > 4 else np.zeros(1))
         commands.append(np.mean(np.diff(t.command_rad) == 0))
         if len(value) < 8 or np.mean(np.diff(value) == 0) < _STEPWISE:
@@ -263,15 +277,19 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     shifted = [_beyond(t, middle, lambda v: v - jump) for t in trials]
     edge = min(float(np.nanmin(np.where(t.position_rad > middle, t.position_rad, np.inf)))
                for t in trials)  # fmt: skip
-    mirrored = [_beyond(t, middle, lambda v: edge - v) for t in trials]
+    bottom = min(float(np.nanmin(t.position_rad)) for t in trials)  # count 0, or next to it
+    mirrored = [_beyond(t, middle, lambda v: bottom + edge - v) for t in trials]
     when = min(float(time[0] - trials[0].send_time_s[0]) for size, time in jumps if len(size))
     left = {name: _unexplained(put_back, step) for name, put_back in
             (("", list(trials)), ("shifted", shifted), ("mirrored", mirrored))}  # fmt: skip
+    if left[""] < _FITS:
+        return []  # a fast joint, or one in another unit
     best = min(left, key=lambda name: left[name])
     if not best or left[best] > 0.7 * left[""]:
         best = "shifted"
     values = {"times": len(sizes), "time_s": when}
-    bits = np.log2(max(edge if best == "mirrored" else jump, 1e-6) / step) if step > 0 else 0.0
+    reach = edge - bottom if best == "mirrored" else jump
+    bits = np.log2(max(reach, 1e-6) / step) if step > 0 else 0.0
     if best == "mirrored":
         values |= {"jump_rad": jump, "bit": round(bits)}
         return [Finding("sign_bit", REFUSE, values)]
@@ -320,35 +338,6 @@ def _unexplained(trials: Sequence[Trial], step: float) -> float:
 
 
 # ----- what comes on top of a servo that follows
-@dataclass(frozen=True)
-class Followed:
-    """Readings of a joint that follows its command, trial by trial, and what the servo predicts."""
-
-    trials: tuple[Trial, ...]
-    step: float
-    base: Explanation
-    servo: Servo
-    predicted: tuple[NDArray[np.float64], ...]
-    start_s: float
-
-    @cached_property
-    def fits(self) -> list[tuple[float, NDArray[np.float64]]]:
-        """Gain and residuals of each trial."""
-        found = []
-        for s, x in zip(self.base.samples, self.predicted, strict=True):
-            spread = float(np.var(x))
-            gain = float(np.mean((x - x.mean()) * s.position_rad) / spread) if spread > 0 else 0.0
-            rest = s.position_rad - s.position_rad.mean() - gain * (x - x.mean())
-            found.append((gain, rest))
-        return found
-
-    @cached_property
-    def noise(self) -> float:
-        """Usual size of residuals [rad], at least half a quantisation step."""
-        rest = np.concatenate([r for _, r in self.fits])
-        return max(1.4826 * float(np.median(np.abs(rest))), 0.5 * self.step, 1e-5)
-
-
 def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     """What explains the pair of columns, and what comes on top of it."""
     if found := echo(trials, step):
@@ -363,30 +352,6 @@ def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     for change in CHANGES:
         findings = [*findings, *change(followed)]
     return findings
-
-
-def second_writer(joint: Followed) -> list[Finding]:
-    """Motion that runs back while the command goes on."""
-    times, forward = [], 0
-    for s, x in zip(joint.base.samples, joint.predicted, strict=True):
-        new = np.concatenate([[0], np.flatnonzero(np.diff(s.position_rad)) + 1])
-        jump = float(np.abs(np.diff(s.command_rad)).max())
-        if len(new) < 8 or jump > _JUMP * float(np.ptp(s.command_rad)):
-            continue  # after a step a servo rings by itself
-        value, time, path = s.position_rad[new], s.time_s[new], x[new]
-        moved, wanted = np.diff(value), np.diff(path)
-        error = path - path.mean() - (value - value.mean())
-        scatter = 1.4826 * float(np.median(np.abs(np.diff(error))))
-        size = max(2.5 * joint.step, _BACK_OF_SPAN * float(np.ptp(value)), 5 * scatter)
-        # it is behind where it should be, and goes away from there, for one sample or more
-        back = (moved * np.sign(error[:-1]) < -size) & (moved * np.sign(wanted) < 0)
-        back &= np.abs(error[1:]) > 3 * joint.noise
-        times += list(time[1:][back])
-        forward += int(np.sum(moved * np.sign(error[:-1]) > size))
-    if len(times) < _BACKS or len(times) < _BACK_SHARE * (forward + len(times)):
-        return []
-    values = {"times": len(times), "time_s": float(times[0]) - joint.start_s}
-    return [Finding("second_writer", CARE, values)]
 
 
 def gain_changed(joint: Followed) -> list[Finding]:
@@ -405,6 +370,9 @@ def gain_changed(joint: Followed) -> list[Finding]:
     low, high = sorted((abs(before), abs(after)))
     if share > _TWO_BETTER or low > _OTHER_GAIN * high:
         return []
+    bent = bends(joint.trials, joint.step)
+    if bent and bent["rate"].unexplained < _RATE_BETTER * bent["linear"].unexplained:
+        return []  # a later tone is faster than the servo
     values = {"time_s": at - joint.start_s, "before": before, "after": after}
     return [Finding("gain_changed", CARE, values)]
 

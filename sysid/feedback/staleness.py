@@ -17,7 +17,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtrc
+from scipy.special import bdtr, bdtrc
 
 from pupper_sysid.common.results import Result
 from pupper_sysid.sysid.feedback.poll_search import Stretch
@@ -159,6 +159,8 @@ _IN_A_ROW, _OFTEN = 5, 0.1
 _LEAD = 2.0
 _LONGEST_S = 0.06  # rows farther apart no longer follow the motion
 _HARMLESS_S = 0.004
+_WINDOW, _COUNTS_A_ROW = 7, 2.0
+_POLL_REPEATS = 0.2  # share of reads that a poll of 1.25 loops repeats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,12 +221,30 @@ def staleness(trials: Sequence[Trial]) -> Staleness:
     while len(found) < _NEEDED:
         every = math.ceil(1.5 * every)
         if not every * loop <= _LONGEST_S:
-            return _verdict("cannot tell", found)
+            return _verdict("live" if _new_in_motion(trials, step) else "cannot tell", found)
         found = _count(list(_thinned(rows, every)), offset, least)
     if _impossible(int(np.sum(found > 0)), len(found)):
         return _verdict("stale", found)
     shown = every == 1 or _follows_rows(values) or _shortest(values) * loop <= _HARMLESS_S
-    return _verdict("live" if shown else "cannot tell", found)
+    return _verdict("live" if shown or _new_in_motion(trials, step) else "cannot tell", found)
+
+
+def _new_in_motion(trials: Sequence[Trial], step: float) -> bool:
+    """Whether rows around which the joint must have moved are new, too often for a poll.
+
+    A joint that moves by two counts a row over seven rows changes its reading in each of them; a
+    poll of 1.25 loops or longer repeats one in five.
+    """
+    repeated = [np.zeros(0, bool)]
+    for trial in (t for t in trials if len(t.position_rad) > _WINDOW):
+        far = trial.position_rad[_WINDOW:] - trial.position_rad[:-_WINDOW]
+        same = np.diff(trial.position_rad)[_WINDOW // 2 :][: len(far)] == 0
+        repeated.append(same[np.abs(far) > _WINDOW * max(_COUNTS_A_ROW * step, 1e-6)])
+    rows = np.concatenate(repeated)
+    repeats = int(rows.sum())
+    if len(rows) < _NEEDED or _impossible(repeats, len(rows)):
+        return False
+    return float(bdtr(repeats, len(rows), _POLL_REPEATS)) < _IMPOSSIBLE
 
 
 def _verdict(kind: str, repeats: NDArray[np.int64]) -> Staleness:

@@ -46,6 +46,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, flat
 from pupper_sysid.sysid.doctor.checks import cautions
+from pupper_sysid.sysid.doctor.writers import scatter_findings
 from pupper_sysid.sysid.feedback.poll_lattice import (
     NO_LOSS,
     PollLattice,
@@ -229,7 +230,8 @@ def lag_budget(
         seen = other  # too few readings that changed, and nothing else is wrong with them
     tones, raw, fresh, lag = seen.tones, seen.raw, seen.fresh, seen.lag
     by_frequency = seen.by_frequency()
-    warnings = [*cautions(joint, trials), *_warnings(joint, seen)]
+    uneven = [f"{joint}: {f.text}" for f in scatter_findings(trials, lattice)]
+    warnings = [*cautions(joint, trials), *uneven, *_warnings(joint, seen)]
     doubt = max(t.read_time_doubt_s for t in trials)
     if lattice.kind == "unresolved":
         doubt += lattice.time_doubt_s

@@ -26,6 +26,7 @@ from hashlib import blake2b
 from typing import TypeVar
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
@@ -91,6 +92,7 @@ _ONE_WAY = 0.8  # rank correlation of half periods with their number
 _STEPPED = 0.5  # share of rows without a change of command, from which on it moves in steps
 _SMALLEST_RAD = 1e-4
 _MOST_TURNS = 4000
+_MOST_ROWS = 400  # of one sine: more do not change whether it is one
 
 
 @dataclass(frozen=True)
@@ -362,32 +364,55 @@ def _sine(
     clock: NDArray, command: NDArray, first: int, stop: int, frequency: float
 ) -> tuple[float, NDArray, float] | None:
     """Frequency, coefficients and amplitude of a sine; None if the rows are no sine."""
-    t, value = clock[first:stop], command[first:stop]
+    every = max(1, (stop - first) // _MOST_ROWS)
+    t, value = clock[first:stop:every], command[first:stop:every]
     if len(t) < 6:
         return None
-    middle = t.mean()
-    for _ in range(4):
-        tone = sine_design(2 * np.pi * frequency * (t - middle))
-        solution = _solved(tone, value)
-        slope = 2 * np.pi * (t - middle) * (-solution[1] * tone[:, 2] + solution[2] * tone[:, 1])
-        step = _solved(np.column_stack([tone, slope]), value)[3]
-        frequency += float(np.clip(step, -0.1 * frequency, 0.1 * frequency))
-        if abs(step) < 1e-5 * frequency:
-            break
-    design = sine_design(2 * np.pi * frequency * t)
-    solution = _solved(design, value)
+    frequency, solution, left = _sine_fit(t, value, frequency)
     amplitude = float(np.hypot(solution[1], solution[2]))
-    impure = np.var(value - design @ solution)
-    if not amplitude > _SMALLEST_RAD or impure > _IMPURE * amplitude**2 / 2:
+    if not amplitude > _SMALLEST_RAD or left > _IMPURE * amplitude**2 / 2:
         return None
     return frequency, solution, amplitude
 
 
-def _solved(design: NDArray, value: NDArray) -> NDArray[np.float64]:
-    """Least squares by normal equations: of a few columns over a period or more, and many times."""
-    gram = design.T @ design
-    gram.flat[:: len(gram) + 1] *= 1 + 1e-12
-    return np.linalg.solve(gram, design.T @ value)
+@njit(cache=True)
+def _sine_fit(time, value, frequency):
+    """Least-squares frequency near a first guess, coefficients as of `sine_design`, variance left.
+
+    Gauss-Newton steps by normal equations, which serve for a few columns over a period or more.
+    """
+    middle, solution = time.mean(), np.zeros(3)
+    for _ in range(4):
+        solution = _solved(time - middle, value, frequency, solution, 3)
+        step = _solved(time - middle, value, frequency, solution, 4)[3]
+        frequency += min(max(step, -0.1 * frequency), 0.1 * frequency)
+        if abs(step) < 1e-5 * frequency:
+            break
+    solution = _solved(time, value, frequency, solution, 3)
+    total = square = 0.0
+    for k in range(len(time)):
+        angle = 2 * np.pi * frequency * time[k]
+        rest = value[k] - solution[0] - solution[1] * np.cos(angle) - solution[2] * np.sin(angle)
+        total += rest
+        square += rest * rest
+    return frequency, solution, square / len(time) - (total / len(time)) ** 2
+
+
+@njit(cache=True)
+def _solved(time, value, frequency, sine, columns):
+    """Coefficients of one, cosine, sine and, as a fourth, the slope of `sine` by frequency."""
+    gram, right, row = np.zeros((columns, columns)), np.zeros(columns), np.ones(4)
+    for k in range(len(time)):
+        angle = 2 * np.pi * frequency * time[k]
+        row[1], row[2] = np.cos(angle), np.sin(angle)
+        row[3] = 2 * np.pi * time[k] * (sine[2] * row[1] - sine[1] * row[2])
+        for i in range(columns):
+            right[i] += row[i] * value[k]
+            for j in range(columns):
+                gram[i, j] += row[i] * row[j]
+    for i in range(columns):
+        gram[i, i] *= 1 + 1e-12
+    return np.linalg.solve(gram, right)
 
 
 def _away(

@@ -128,7 +128,7 @@ def test_presets_hold_the_published_numbers_for_all_joints_and_call_none_a_measu
         for ratio, quantity in zip(
             ("stiffness_nm_per_rad", "damping_nm_s_per_rad", "friction_loss_nm",
              "effort_limit_nm", "back_emf_nm_s_per_rad"),
-            dict(actuator.ratios_to_armature).values(),
+            (q for q in dict(actuator.ratios_to_armature).values() if q is not None),
             strict=True,
         ):  # fmt: skip
             assert quantity.value == pytest.approx(getattr(actuator, ratio).value / 0.005)

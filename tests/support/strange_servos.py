@@ -17,8 +17,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 STEP_S = 5e-4
-MOTIONS = ("sine", "tones", "chirp", "steps", "prbs", "teleoperation", "walk")
-SERVOS = ("hobby", "smart", "slow", "weak")
+MOTIONS = (
+    "sine", "tones", "chirp", "steps", "prbs", "teleoperation", "walk", "multisine", "triangle",
+)  # fmt: skip
+SERVOS = {"hobby": (4, 12), "smart": (8, 20), "slow": (1, 4), "weak": (3, 8)}
+"""Classes by their natural frequency [Hz]; a weak one follows a part of its command."""
 
 
 @dataclass(frozen=True)
@@ -57,23 +60,22 @@ def draw_world(rng: np.random.Generator, servo: str, motion: str, noise_rad: flo
     def between(low: float, high: float) -> float:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
-    bandwidth = {"hobby": between(4, 12), "smart": between(8, 30), "slow": between(2, 4),
-                 "weak": between(3, 8)}[servo]  # fmt: skip
-    amplitude = between(0.08, 0.6)
+    bandwidth, amplitude = between(*SERVOS[servo]), between(0.05, 1.0)
     rate = between(25, 1000) if motion != "prbs" else between(40, 1000)
-    polled = rng.random() < 0.25
-    quantum = float(rng.choice([0.0001, 0.00153, 0.00153, 0.006]))
+    polled, loaded = rng.random(2) < (0.4, 0.4)
+    gain = float(rng.uniform(0.5, 0.9) if servo == "weak" else rng.uniform(0.8, 1.1))
     return World(
         motion=motion, rate_hz=rate, duration_s=float(rng.uniform(8, 16)), amplitude_rad=amplitude,
-        offset_rad=float(rng.choice([0.0, rng.uniform(-0.7, 0.7)])),
-        gain=float(rng.uniform(0.8, 1.1) if servo != "weak" else rng.uniform(0.5, 0.9)),
+        offset_rad=float(rng.choice([0.0, rng.uniform(-0.7, 0.7)])), gain=gain,
         bandwidth_hz=bandwidth, damping=float(rng.uniform(0.5, 1.3)),
-        dead_time_s=float(rng.uniform(0.0, 0.06)),
+        dead_time_s=between(0.002, 0.08),
         friction_rad=float(amplitude * rng.choice([0.0, rng.uniform(0.0, 0.1)])),
-        speed_rad_s=between(4, 20), gravity_rad=float(rng.uniform(0, 0.1) * amplitude),
-        quantum_rad=quantum, noise_rad=noise_rad, jitter=float(rng.choice([0.0, 0.03])),
-        poll_s=float(max(rng.uniform(0.01, 0.03), 1.3 / rate)) if polled else 0.0,
-        loss=float(rng.uniform(0, 0.4)) if polled else 0.0, seed=int(rng.integers(1 << 30)),
+        speed_rad_s=between(4, 20),
+        gravity_rad=float(rng.uniform(0.02, 0.15) * amplitude) if loaded else 0.0,
+        quantum_rad=between(0.0001, 0.006), noise_rad=noise_rad,
+        jitter=float(rng.choice([0.0, 0.03])),
+        poll_s=between(0.002, 0.06) if polled else 0.0,
+        loss=float(rng.uniform(0, 0.6)) if polled else 0.0, seed=int(rng.integers(1 << 30)),
     )  # fmt: skip
 
 
@@ -98,6 +100,14 @@ def commanded(world: World, time: NDArray[np.float64], rng: np.random.Generator)
     elif world.motion == "prbs":
         hold = rng.uniform(0.12, 0.35)
         wave = rng.choice([-1.0, 1.0], 200)[(t / hold).astype(int)] * (time > 0.4)
+    elif world.motion == "multisine":
+        hz = np.geomspace(0.3, top, 8)
+        phase = rng.uniform(0, 2 * np.pi, 8)
+        wave = np.sin(2 * np.pi * np.outer(t, hz) + phase).sum(axis=1)
+        wave = (wave - wave[0]) / np.abs(wave - wave[0]).max() * np.minimum(t / 0.3, 1.0)
+    elif world.motion == "triangle":
+        wave = 2 * np.abs((2 * rng.uniform(0.1, 0.8) * t + 0.5) % 2 - 1) - 1
+        wave = wave - wave[0]
     elif world.motion == "walk":
         hz, phase = rng.uniform(0.8, 2.5), rng.uniform(0, 6)
         angle = 2 * np.pi * hz * t + phase
@@ -354,7 +364,7 @@ def draw_recording(fault: str, number: int, seed: int) -> tuple[World, pd.DataFr
     """A recording of a fault: servo, motion and noise in turn, the rest by chance."""
     rng = np.random.default_rng((seed, number, list(FAULTS).index(fault)))
     world = draw_world(
-        rng, SERVOS[number % len(SERVOS)], MOTIONS[number % len(MOTIONS)],
+        rng, list(SERVOS)[number % len(SERVOS)], MOTIONS[number % len(MOTIONS)],
         NOISES_RAD[number % len(NOISES_RAD)],
     )  # fmt: skip
     return FAULTS[fault][0](world, rng)

@@ -27,13 +27,14 @@ WORDS: dict[str, str] = {
     for kind, words in (
         (COMMAND, "command commands commanded cmd cmds goal goals target targets tgt desired des "
                   "setpoint setpoints sp reference references ref refs demand demanded requested "
-                  "action actions soll sollwert sv 目标 目標 指令"),
+                  "action actions soll sollwert sv consigne consigna riferimento referencia "
+                  "目标 目標 指令"),
         (MAYBE_COMMAND, "u r ctrl control input inputs send sent tx request planned plan "
                         "trajectory traj leader nominal wanted write written order"),
         (STATE, "actual act present measured measurement meas msr feedback fb fbk observed "
                 "observation observations obs state states estimate estimated est real encoder enc "
                 "reading readings sensed sensor response resp "
-                "potentiometer pot resolver pv ist istwert 实际 実測 反馈"),
+                "potentiometer pot resolver pv ist istwert mesure misura medida 实际 実測 反馈"),
         (MAYBE_STATE, "y output outputs read rx follower received"),
         (ANGLE, "position positions pos posn angle angles ang qpos q p theta θ winkel "
                 "角度 位置"),
@@ -49,9 +50,9 @@ WORDS: dict[str, str] = {
                 "strom spannung"),
         (TIME, "time times timestamp timestamps t stamp stamps clock elapsed seconds secs sec "
                "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
-               "nanosec nanosecs nsecs usec usecs zeit 时间 時間"),
+               "nanosec nanosecs nsecs usec usecs zeit temps tiempo tempo 时间 時間"),
         (UNIT, "rad rads radian radians deg degs degree degrees ° count counts tick ticks turn "
-               "turns rev revs revolution revolutions mrad"),
+               "turns rev revs revolution revolutions mrad percent pct"),
         (JOINT, "joint joints dof dofs motor motors servo servos actuator actuators axis axes dxl "
                 "group controller controllers data value values val field name names msg body "
                 "header array low"),
@@ -68,8 +69,9 @@ TIMES = ("time", "timestamp", "t", "stamp", "time_since_start", "elapsed", "seco
 UNITS = {"rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "mrad": "mrad",
          "deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "°": "deg",
          "turn": "turns", "turns": "turns", "rev": "turns", "revs": "turns",
-         "revolution": "turns", "revolutions": "turns"}  # fmt: skip
-_UNIT_RANK = {"rad": 0, "": 1, "mrad": 2, "deg": 3, "turns": 4, "counts": 5}
+         "revolution": "turns", "revolutions": "turns", "percent": "percent",
+         "pct": "percent"}  # fmt: skip
+_UNIT_RANK = {"rad": 0, "": 1, "mrad": 2, "deg": 3, "turns": 4, "counts": 5, "percent": 6}
 _SEPARATORS = re.compile(r"[\s_./:\\\[\](){}<>$%#*,;|='\"-]+")
 _CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-zµθ°]+|\d+|[^A-Za-z\d]+")
 _SOLE_LETTERS = frozenset("ury")  # that mean something where no other word does
@@ -89,7 +91,7 @@ class Column:
     key: str
     """The same without words such as `joint`, to be compared."""
     unit: str
-    """"rad", "mrad", "deg", "turns", "counts", or empty."""
+    """"rad", "mrad", "deg", "turns", "counts", "percent", or empty."""
     rank: tuple[int, ...]
     """Smaller for the better of two columns for one purpose."""
     words: frozenset[str]

@@ -633,7 +633,7 @@ def _joint(
     columns: dict[str, Any] = {}
     for key, source in (("command_rad", pair.command), ("position_rad", pair.position)):
         values = table.numbers(path, source.name)[own]
-        factor = stated or _of_name(source) or Unit()
+        factor = stated or _of_name(path, source) or Unit()
         columns[key] = (values - factor.zero) * factor.scale
         if factor.counts and stated is None:
             warnings.append(
@@ -695,8 +695,13 @@ def _trials(
     return trial, tone, notes
 
 
-def _of_name(source: Column) -> Unit | None:
+def _of_name(path: Path | str, source: Column) -> Unit | None:
     """The unit that a column's name ends in."""
     if source.unit in ("", "rad"):
         return None
+    if source.unit == "percent":
+        raise InputError(
+            f"{path}, column {printable(source.name)[:60]}: percent of a range of motion that the "
+            f"log does not say. Give it, as of 3.5 rad: {import_line(path, unit='percent:3.5')}."
+        )
     return unit("counts:4096" if source.unit == "counts" else source.unit)

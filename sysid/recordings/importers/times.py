@@ -32,6 +32,8 @@ _UNIT = re.compile(rf"(?:^|[_\s.(\[])({'|'.join(_SCALES)})[)\]]*$", re.IGNORECAS
 _LOOP_S = (2e-5, 0.5)  # fastest and slowest loop of a servo
 _GUESSED = (("s", 1.0), ("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
 _DAY_S = 86_400.0
+_OTHER_DATE = re.compile(r"^(?!\d{4}-)\d{1,4}([-/.])\d{1,2}\1\d{1,4} ")
+_NUMBER = re.compile(r"[-+]?[\d.]+(?:[eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -72,9 +74,16 @@ def clock(name: str, values: NDArray[np.float64]) -> Clock:
 
 
 def times_of_day(path: object, name: str, cells: Sequence[str]) -> NDArray[np.float64]:
-    """Seconds of cells such as `2026-05-04T12:30:01.25` or `12:30:01.25`; an empty one is NaN."""
-    bad = next((k for k, cell in enumerate(cells) if cell and not is_clock(cell)), None)
-    texts = pd.Series([cell.replace(",", ".") or None for cell in cells], dtype=object)
+    """Seconds of cells such as `2026-05-04T12:30:01.25` or `12:30:01.25`; an empty one is NaN.
+
+    A date in another order is left out: midnights are found in the times of day.
+    """
+    others = [k for k, cell in enumerate(cells) if cell and not is_clock(cell)]
+    bad = next(
+        (k for k in others if not _NUMBER.fullmatch(cells[k])), others[0] if others else None
+    )
+    bare = [_OTHER_DATE.sub("", cell.strip()) for cell in cells]
+    texts = pd.Series([cell.replace(",", ".") or None for cell in bare], dtype=object)
     try:
         if bad is not None:
             raise ValueError

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import pupper_sysid as ps
 from pupper_sysid.sysid.doctor.checks import findings
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, RIVALS, USE, WORDS, Finding, rivalled
+from pupper_sysid.sysid.feedback.staleness import staleness
+from pupper_sysid.sysid.recordings.excitation import named_tones
 from support.real_recordings import case
-from support.strange_servos import ACCUSING, FAULTS, draw_recording
+from support.strange_servos import ACCUSING, FAULTS, draw_recording, draw_world, simulated
 
 
 def recorded(table) -> ps.Recording:
@@ -95,6 +99,7 @@ CASES = {
     "made/D1_goal_clamped_by_firmware.csv": ("hip", "clipped", CARE),
     "made/F1_derated_halfway.csv": ("hip", "trials_differ", CARE),
     "made/L4_failed_zero_0.005.csv": ("knee", "bad_readings", CARE),
+    "made/L2_sign_bit15.csv": ("knee", "sign_bit", REFUSE),
     "made/L4_foreign.csv": ("knee", "bad_readings", CARE),
     "real/c06b_ankle_two_columns.csv": ("joint", "not_a_position_servo", REFUSE),
 }
@@ -120,6 +125,73 @@ def test_the_fault_of_a_stranger_s_log_is_named(name):
 @pytest.mark.parametrize("name", SOUND)
 def test_a_stranger_s_sound_log_is_not_accused(name):
     assert set(codes(ps.load(case(name)), SOUND[name])) & set(ACCUSING) == set()
+
+
+def test_the_bit_of_the_sign_is_found_wherever_the_zero_is():
+    found = codes(ps.load(case("made/L2_sign_bit15.csv")), "knee")["sign_bit"]
+    assert found.values["bit"] == 15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("motion", ["teleoperation", "multisine", "walk"])
+def test_pushes_to_one_place_are_a_second_writer(motion):
+    """Of servos whose commands another program replaces now and then, and of the same alone."""
+    named, accused = 0, 0
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        world = replace(
+            draw_world(rng, "hobby", motion, 3e-4), rate_hz=60.0, poll_s=0.0, friction_rad=0.0,
+            amplitude_rad=0.4, quantum_rad=0.0015, duration_s=15.0,
+        )  # fmt: skip
+        disturbed = replace(world, writer_share=0.05, values={"home": 0.2})
+        named += "second_writer" in codes(recorded(simulated(disturbed)))
+        accused += "second_writer" in codes(recorded(simulated(world)))
+    assert named >= 3 and accused == 0
+
+
+def test_later_tones_beyond_the_speed_limit_are_no_change_of_gain():
+    """Of 0.5 rad at 8 Hz, 25 rad/s, a servo of 4 rad/s follows a sixth."""
+    world = draw_world(np.random.default_rng(1), "smart", "tones", 3e-4)
+    world = replace(
+        world, amplitude_rad=0.5, speed_rad_s=4.0, bandwidth_hz=10.0, rate_hz=80.0, poll_s=0.0,
+        friction_rad=0.0, gravity_rad=0.0, gain=0.9, duration_s=11.0, quantum_rad=0.0015,
+    )  # fmt: skip
+    assert "gain_changed" not in codes(recorded(simulated(world)))
+
+
+@pytest.mark.slow
+def test_tones_that_do_not_repeat_are_disturbed():
+    (found,) = ps.examine(ps.load(case("made/W3_esp32_second_writer_5pc.csv"))).values()
+    (uneven,) = (f for f in found.findings if f.code == "unrepeatable")
+    assert uneven.verdict == CARE and "second writer" in uneven.text
+    sound = ps.examine(ps.load(case("made/L5_freq_no_trial.csv")))
+    assert not any(f.code == "unrepeatable" for j in sound.values() for f in j.findings)
+
+
+def polled_tone(rate_hz, period_rows, step, seed):
+    """Rows of a tone whose readings are those of a poll, or live for a period of 0."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0, 10, 1 / rate_hz)
+    period = period_rows / rate_hz
+    read = np.floor((time - rng.uniform(0, 1)) / period) * period if period_rows else time
+    hz, amplitude = rng.uniform(1, 3), rng.uniform(0.2, 0.6)
+    position = amplitude * np.sin(2 * np.pi * hz * (read - 0.03))
+    return ps.Recording.from_arrays(
+        time, {"joint": amplitude * np.sin(2 * np.pi * hz * time)},
+        {"joint": step * np.round(position / step)}, read_time_s=time,
+    ).trials("joint")  # fmt: skip
+
+
+def test_readings_that_are_new_wherever_the_joint_must_have_moved_are_live():
+    """A poll of 1.25 loops or longer repeats one reading in five; none is called live."""
+    kinds = {
+        period: [staleness(polled_tone(100, period, 0.0015, n)).kind for n in range(6)]
+        for period in (0, 1.3, 2.0, 3.4)
+    }
+    assert kinds.pop(0).count("live") >= 5
+    assert all("live" not in each for each in kinds.values()), kinds
+    measured = named_tones(ps.load(case("real/c05_mx106_2hz_quantised.csv")).trials("joint"))
+    assert staleness(measured).kind == "live"
 
 
 def test_the_moment_and_the_level_of_a_fault_are_those_of_the_case():

@@ -67,6 +67,14 @@ def labelled():
     return "\n".join(f"time:{t:.6f},cmd:{c:.6f},pos:{p:.6f}" for t, c, p in rows)
 
 
+def grouped(mark, quote="", separator=","):
+    """The log in microseconds, digits in groups of three."""
+    return "".join(
+        f"{quote}{1e6 * t:,.0f}{quote}".replace(",", mark) + f"{separator}{c}{separator}{p}\n"
+        for t, c, p in ROWS_OF
+    )
+
+
 def repeated():
     lines = joined(",").splitlines()
     return "\n".join([lines[0], *(line for line in lines[1:] for _ in range(4)), ""])
@@ -142,6 +150,16 @@ FORMS = {
     "JSON Lines": "\n".join(
         json.dumps({"t": t, "cmd": {"knee": c}, "pos": {"knee": p}}) for t, c, p in ROWS_OF),
     "each row four times": repeated(),
+    "Fortran's exponents": "time cmd pos\n" + "".join(
+        " ".join(f"{v:.12E}".replace("E", "D") for v in row) + "\n" for row in ROWS_OF),
+    "thousands in apostrophes": "time_us,cmd,pos\n" + grouped("'"),
+    "thousands in commas, quoted": "time_us,cmd,pos\n" + grouped(",", '"'),
+    "thousands in commas, tabs": "time_us\tcmd\tpos\n" + grouped(",", separator="\t"),
+    "dates with slashes": clock("%m/%d/%Y %H:%M:%S.%f"),
+    "dates with points": clock("%d.%m.%Y %H:%M:%S.%f"),
+    "French names": joined(";", ("temps", "consigne", "mesure"), comma=True),
+    "a typeset minus": joined(",").replace("-", "\u2212"),
+    "zeros after a power cut": joined(",").encode() + bytes(512),
     "missing in words": joined(",") + f"{TIME[-1] + 0.005:.6f},0.1,None\n",
 }  # fmt: skip
 
@@ -189,6 +207,19 @@ def test_what_was_assumed_of_the_form_is_said_in_one_sentence(tmp_path):
         )
         said = [w for w in load(tmp_path / "log.txt").warnings if "one time stamp" not in w]
         assert len(said) == bool(words) and all(word in said[0] for word in words), (form, said)
+
+
+def test_what_cannot_be_read_is_refused_with_the_cure(tmp_path):
+    (tmp_path / "log.csv").write_text(joined(",", ("time", "cmd_percent", "pos_percent")))
+    (tmp_path / "log.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
+    (tmp_path / "log.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(200))
+    (tmp_path / "log.xls").write_bytes(b"\xd0\xcf\x11\xe0" + bytes(200))
+    text = joined(",").replace(f"\n{TIME[3]:.6f},", "\nsoon,")
+    (tmp_path / "word.csv").write_text(text)
+    cases = [("log.csv", "import log.csv --unit percent:3.5 --out"), ("log.mat", "writematrix"),
+             ("log.h5", "h5py"), ("log.xls", "save it as CSV"),
+             ("word.csv", "'soon' is no")]  # fmt: skip
+    assert_each_refused(cases, lambda name: load(tmp_path / name), names=tmp_path)
 
 
 def test_what_is_packed_otherwise_is_refused_with_the_way_out(tmp_path):
