@@ -236,9 +236,10 @@ def _new_in_motion(trials: Sequence[Trial], step: float) -> bool:
     poll of 1.25 loops or longer repeats one in five.
     """
     repeated = [np.zeros(0, bool)]
-    for trial in (t for t in trials if len(t.position_rad) > _WINDOW):
-        far = trial.position_rad[_WINDOW:] - trial.position_rad[:-_WINDOW]
-        same = np.diff(trial.position_rad)[_WINDOW // 2 :][: len(far)] == 0
+    for trial in trials:
+        read = trial.position_rad[np.isfinite(trial.position_rad)]
+        far = read[_WINDOW:] - read[:-_WINDOW]
+        same = np.diff(read)[_WINDOW // 2 :][: len(far)] == 0
         repeated.append(same[np.abs(far) > _WINDOW * max(_COUNTS_A_ROW * step, 1e-6)])
     rows = np.concatenate(repeated)
     repeats = int(rows.sum())

@@ -178,7 +178,7 @@ def _one_by_one(
     seed: int,
     presets: Presets,
     staged: Staged | None,
-    prior: ServoPrior | None,
+    prior: ServoPrior | None = None,
 ) -> JointCalibrationResult:
     """`fit_joint`, telling of its stages."""
     done = staged or (lambda joint, stage: None)

@@ -205,7 +205,8 @@ def _free_actuator(result: JointCalibrationResult, stall: float, source: str) ->
     )  # fmt: skip
     low, high = _delay_steps(servo, result.dead_time_s)
     ratios = {ours: _ratio(pd, name, 1.0) for ours, name in _RATIOS.items()}
-    ratios["damping_and_back_emf"] = _ratio(pd, "braking_per_s", 1.0)
+    if "braking_per_s" in pd.parameters:  # a calibration that was read again has no draws for it
+        ratios["damping_and_back_emf"] = _ratio(pd, "braking_per_s", 1.0)
     torque = {ours: _ratio(pd, name, armature, "ratio only") for ours, name in _RATIOS.items()}
     return measured(
         Actuator,

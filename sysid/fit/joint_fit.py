@@ -28,6 +28,7 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
+from pupper_sysid.sysid.fit.misfit import Explanation, explained
 from pupper_sysid.sysid.fit.noise import command_jitter, noise_by_run
 from pupper_sysid.sysid.fit.posterior import (
     EFFECTIVE,
@@ -192,8 +193,7 @@ def joint_lag(joint: str, trials: Sequence[Trial], seed: int = 0) -> LagBudget:
     ready = prepare_joint(joint, trials, seed)
     fitted = {stage: fit_structures(ready, stage) for stage in stages(ready)}
     ready, _, choice = _settled(ready, _joined(fitted))
-    goodness = _goodness(ready, choice.carried)
-    return _with_misfit(ready, choice, goodness) if _undescribed(goodness) else choice.lag
+    return _lag(ready, choice, _goodness(ready, choice.carried))
 
 
 def stages(ready: PreparedJoint) -> tuple[str, ...]:
@@ -378,6 +378,8 @@ class _Choice:
         With dead time and offset.
     repeats : Repeats or None
         What several recordings in free air say of one another; the draws are widened by it.
+    misfit : Explanation or None
+        One thing more that describes the servo decidedly better.
     """
 
     carried: Fitted
@@ -387,6 +389,7 @@ class _Choice:
     noise_rad: tuple[float, ...]
     lag: LagBudget
     repeats: Repeats | None = None
+    misfit: Explanation | None = None
 
 
 def _choice(ready: PreparedJoint, fitted: Sequence[Fitted]) -> _Choice:
@@ -525,17 +528,26 @@ def _settled(
     """
     choice = _choice(ready, every)
     if not ready.scales.free_air:
-        return ready, every, choice
+        return ready, every, _explained(ready, choice)
     goodness = _goodness(ready, choice.carried)
     profiled = _with_profile(ready, choice.carried)
     if profiled is None and not _undescribed(goodness):
-        return ready, every, choice
+        return ready, every, _explained(ready, choice)
     most = np.inf if profiled is not None else _DESCRIBES_BETTER * overall(goodness)
     any_servo = ready.as_any_servo()
     ladder = _ladder(any_servo, any_servo.fit_rng(), SHORT_LADDER, most, profiled)
     if not ladder:
-        return ready, every, choice
-    return any_servo, ladder, _choice(any_servo, ladder)
+        return ready, every, _explained(ready, choice)
+    return any_servo, ladder, _explained(any_servo, _choice(any_servo, ladder))
+
+
+def _explained(ready: PreparedJoint, choice: _Choice) -> _Choice:
+    """The choice with what a misfit looks like."""
+    carried = choice.carried
+    undescribed = bool(_undescribed(_goodness(ready, carried)))
+    problem = ready.searched(carried.structure)
+    best = replace(carried.fit, cost=float(problem.costs(carried.fit.point[None])[0]))
+    return replace(choice, misfit=explained(problem, best, carried.temperature, undescribed))
 
 
 def _with_profile(ready: PreparedJoint, carried: Fitted) -> Fitted | None:
@@ -591,9 +603,9 @@ def _in_free_air(
     carried = choice.carried.structure
     goodness = _goodness(ready, choice.carried)
     lag = choice.lag
-    if why := _undescribed(goodness):
+    if why := _doubt(choice, goodness):
         results = {name: _doubted(fit, why) for name, fit in results.items()}
-        lag = _with_misfit(ready, choice, goodness)
+        lag = _lag(ready, choice, goodness)
         if _hardly_known(lag):
             fit = results[carried.name]
             undecided = {"dead_time_s": why} | fit.undecided
@@ -667,9 +679,30 @@ def _undescribed(goodness: Mapping[str, float]) -> str | None:
     return f"the model does not describe this servo: its errors are {ratio:.1f} times the noise"
 
 
+def _doubt(choice: _Choice, goodness: Mapping[str, float]) -> str | None:
+    """Why the gains mean little: errors above the noise, or an explanation that is better."""
+    if why := _undescribed(goodness):
+        return why
+    if choice.misfit is None:
+        return None
+    return f"the servo moves as if it had {choice.misfit.words}"
+
+
 def _doubted(fit: CandidateFit, why: str) -> CandidateFit:
     kept = ("offset_rad", "dead_time_s")
     return replace(fit, undecided={n: why for n in fit.parameters if n not in kept} | fit.undecided)
+
+
+def _lag(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, float]) -> LagBudget:
+    """The lag budget with the dead time of the choice, as wide as its misfit makes it."""
+    lag = _with_misfit(ready, choice, goodness) if _undescribed(goodness) else choice.lag
+    dead = lag.dead_time_s
+    if choice.misfit is None or dead is None:
+        return lag
+    other = choice.misfit.dead_time_s
+    low = min(dead.low, max(other - (dead.value - dead.low), 0.0))
+    high = max(dead.high, other + dead.high - dead.value)
+    return replace(lag, dead_time_s=replace(dead, low=low, high=high))
 
 
 def _with_misfit(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, float]) -> LagBudget:
@@ -715,6 +748,8 @@ def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) ->
         yield f"{joint}: {why} ({worst[0]:.1f} at {worst[1]}). The lag holds; gains do not."
     elif not np.isfinite(overall(goodness)):
         yield f"{joint}: too few readings to say how well the model describes this servo."
+    if choice.misfit is not None:
+        yield choice.misfit.sentence(joint)
     own = choice.carried
     if choice.repeats is not None:
         yield from (d.sentence(joint) for d in choice.repeats.differences)
@@ -939,9 +974,9 @@ def _under_load(
     left_out = held_out_residuals(structure, choice.carried.folds or [], folds, ready.runs)
     scores = score(free_run(structure, values, ready.runs), ready.runs, left_out)
     goodness, lag = _goodness(ready, choice.carried), choice.lag
-    if why := _undescribed(goodness):
+    if why := _doubt(choice, goodness):
         doubted = {n: why for n in loaded.numbers if n not in ("offset_rad", "dead_time_s")}
-        lag = _with_misfit(ready, choice, goodness)
+        lag = _lag(ready, choice, goodness)
         assert lag.dead_time_s is not None
         doubted |= {"dead_time_s": why} if _hardly_known(lag) else {}
         loaded = replace(

@@ -31,7 +31,9 @@ def test_without_a_terminal_there_is_a_line_each_ten_seconds(lines):
 
 
 def test_a_joint_is_done_after_all_its_stages(monkeypatch):
-    monkeypatch.setattr(module, "prepare_joint", lambda joint, trials, seed, free_air: "ready")
+    monkeypatch.setattr(
+        module, "prepare_joint", lambda joint, trials, seed, free_air, prior: "ready"
+    )
     monkeypatch.setattr(module, "stages", lambda ready: module.STAGES[1:-1])
     monkeypatch.setattr(module, "fit_structures", lambda ready, name: name)
     monkeypatch.setattr(module, "conclude", lambda ready, fitted, presets: list(fitted))

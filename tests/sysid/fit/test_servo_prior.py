@@ -41,7 +41,11 @@ def test_joints_on_links_of_their_own_differ_by_a_common_factor_not_number_by_nu
 
     def on_a_link(factor: float):
         ratios = joint.actuator.ratios_to_armature
-        heavier = {name: getattr(ratios, name).scaled(factor) for name in type(ratios).model_fields}
+        heavier = {
+            name: getattr(ratios, name).scaled(factor)
+            for name in type(ratios).model_fields
+            if getattr(ratios, name) is not None
+        }
         ratios = ratios.model_copy(update=heavier)
         actuator = joint.actuator.model_copy(update={"ratios_to_armature": ratios})
         return joint.model_copy(update={"actuator": actuator})

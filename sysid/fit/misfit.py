@@ -1,0 +1,148 @@
+"""What a servo that the model does not describe looks like: explanations, tried one by one.
+
+Each explanation is the carried fit with one thing more, fitted from there: a low-pass filter in
+front of the servo, play, a dead zone of the controller. The best is named where the likelihood is
+decidedly better with it. Simulators do not run these, so the numbers stay those of the carried fit;
+but a dead time that another explanation moves is not known better than the two are apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pupper_sysid.sysid.fit import kernel
+from pupper_sysid.sysid.fit.run import Run
+from pupper_sysid.sysid.fit.search import Fit, Problem, refine
+from pupper_sysid.sysid.fit.structure import Structure, servo_structure
+
+_LOW_PASS_S = (0.004, 0.008, 0.016, 0.032, 0.064)
+"""Time constants that are tried: below the first a filter is a delay, above the last a slow one."""
+_NATS = 10.0
+"""Log-likelihood by which an explanation is named."""
+_WORDS = {
+    "backlash": ("backlash_rad", "play of {:.1f} mrad between motor and link", 1e3),
+    "dead zone": ("dead_zone_rad", "a dead zone of {:.1f} mrad to either side in its controller",
+                  1e3),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """One thing more that describes a servo better.
+
+    Attributes
+    ----------
+    words : str
+    nats : float
+        By how much the log-likelihood is better.
+    dead_time_s : float
+        Of the fit with it.
+    """
+
+    words: str
+    nats: float
+    dead_time_s: float
+
+    def sentence(self, joint: str) -> str:
+        """The explanation in words."""
+        return (
+            f"{joint}: it moves as if it had {self.words} (Δ log-likelihood {self.nats:.0f}); its "
+            f"dead time would be {1e3 * self.dead_time_s:.1f} ms then."
+        )
+
+
+def explained(
+    problem: Problem, best: Fit, temperature: float, undescribed: bool
+) -> Explanation | None:
+    """The best explanation of a misfit; None if none is decidedly better than the fit alone.
+
+    Parameters
+    ----------
+    problem : Problem
+    best : Fit
+        Of the carried structure.
+    temperature : float
+        How many readings count as one.
+    undescribed : bool
+        Whether errors are larger than noise. Otherwise only a low-pass filter is looked for, which
+        a dead time imitates, and only where it is better before anything is fitted to it.
+    """
+    found = [_low_pass(problem, best, temperature, undescribed)]
+    if undescribed:
+        found += [_with_feature(problem, best, temperature, feature) for feature in _WORDS]
+    likely = [one for one in found if one is not None and one.nats > _NATS]
+    return max(likely, key=lambda one: one.nats, default=None)
+
+
+def filtered(run: Run, time_constant_s: float) -> Run:
+    """The run with its command behind a first-order low-pass filter, at rest before."""
+    from scipy.signal import lfilter  # a tenth of a second to import
+
+    ratio = time_constant_s / run.step_s
+    left = np.exp(-1.0 / ratio)
+    command = run.held[0]
+    rest = command[0]
+    end = rest + lfilter([1.0 - left], [1.0, -left], command - rest)
+    before = np.concatenate([[rest], end[:-1]])
+    mean = command + (before - command) * ratio * (1.0 - left)
+    held = np.concatenate([mean[None], run.held[1:]])
+    return replace(run, held=held, edges=kernel.edges_of(mean, end))
+
+
+def _low_pass(
+    problem: Problem, best: Fit, temperature: float, undescribed: bool
+) -> Explanation | None:
+    filters = {t: _behind(problem, t) for t in _LOW_PASS_S}
+    starts = {t: _earlier(problem.structure, best.point, t) for t in filters}
+    if not undescribed:
+        least = min(float(behind.costs(starts[t]).min()) for t, behind in filters.items())
+        if (best.cost - least) / temperature < _NATS:
+            return None
+    fits = {t: refine(behind, starts[t]) for t, behind in filters.items()}
+    middle = min(fits, key=lambda t: fits[t].cost)
+    for factor in (0.71, 1.41, 0.84, 1.19):  # between the constants that were tried
+        between = middle * factor
+        fits[between] = refine(_behind(problem, between), fits[middle].point[None])
+        middle = min(fits, key=lambda t: fits[t].cost)
+    fit = fits[middle]
+    delay = float(problem.structure.decode(fit.point)[0])
+    words = f"a low-pass filter of about {1e3 * middle:.0f} ms in front of it"
+    return Explanation(words, (best.cost - fit.cost) / temperature - 1.0, delay)
+
+
+def _behind(problem: Problem, time_constant_s: float) -> Problem:
+    """The same fit with the commands behind a filter."""
+    return replace(problem, runs=tuple(filtered(r, time_constant_s) for r in problem.runs))
+
+
+def _earlier(structure: Structure, point: NDArray, time_constant_s: float) -> NDArray[np.float64]:
+    """Points whose dead time is shorter by parts of a filter's lag, shape (starts, parameters)."""
+    first = structure.parameters[0]
+    delay = float(structure.decode(point)[0])
+    starts = np.repeat(point[None], 4, axis=0)
+    shorter = delay - time_constant_s * np.array([1.0, 0.75, 0.5, 0.0])
+    starts[:, 0] = first.encode(np.clip(shorter, first.low, first.high))
+    return starts
+
+
+def _with_feature(
+    problem: Problem, best: Fit, temperature: float, feature: str
+) -> Explanation | None:
+    structure = problem.structure
+    if feature in structure.features:
+        return None
+    wider = servo_structure((*structure.features, feature), structure.scales)
+    name, words, factor = _WORDS[feature]
+    starts = np.repeat(wider.adopt(structure, best.point)[None], 3, axis=0)
+    place = wider.names.index(name)
+    low, high = wider.box
+    starts[:, place] = np.clip(np.log([0.003, 0.01, 0.03]), low[place], high[place])
+    fit = refine(replace(problem, structure=wider), starts)
+    values = wider.decode(fit.point)
+    return Explanation(
+        words.format(factor * values[place]), (best.cost - fit.cost) / temperature - 1.0,
+        float(values[0]),
+    )  # fmt: skip
