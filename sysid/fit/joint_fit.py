@@ -547,7 +547,9 @@ def _explained(ready: PreparedJoint, choice: _Choice) -> _Choice:
     undescribed = bool(_undescribed(_goodness(ready, carried)))
     problem = ready.searched(carried.structure)
     best = replace(carried.fit, cost=float(problem.costs(carried.fit.point[None])[0]))
-    return replace(choice, misfit=explained(problem, best, carried.temperature, undescribed))
+    return replace(
+        choice, misfit=explained(problem, best, carried.temperature, undescribed, ready.fit_rng())
+    )
 
 
 def _with_profile(ready: PreparedJoint, carried: Fitted) -> Fitted | None:

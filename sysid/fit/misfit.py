@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.run import Run
-from pupper_sysid.sysid.fit.search import Fit, Problem, refine
+from pupper_sysid.sysid.fit.search import Fit, Problem, refine, search_widely
 from pupper_sysid.sysid.fit.structure import Structure, servo_structure
 
 _LOW_PASS_S = (0.004, 0.008, 0.016, 0.032, 0.064)
 """Time constants that are tried: below the first a filter is a delay, above the last a slow one."""
+_SEARCHED_S = 0.016
+"""Time constant from which a fit with a filter is searched for anew, where there is a misfit."""
 _NATS = 10.0
 """Log-likelihood by which an explanation is named."""
 _WORDS = {
@@ -55,7 +57,7 @@ class Explanation:
 
 
 def explained(
-    problem: Problem, best: Fit, temperature: float, undescribed: bool
+    problem: Problem, best: Fit, temperature: float, undescribed: bool, rng: np.random.Generator
 ) -> Explanation | None:
     """The best explanation of a misfit; None if none is decidedly better than the fit alone.
 
@@ -68,9 +70,10 @@ def explained(
         How many readings count as one.
     undescribed : bool
         Whether errors are larger than noise. Otherwise only a low-pass filter is looked for, which
-        a dead time imitates, and only where it is better before anything is fitted to it.
+        dead time and damping imitate within the noise.
+    rng : numpy.random.Generator
     """
-    found = [_low_pass(problem, best, temperature, undescribed)]
+    found: list[Explanation | None] = [_low_pass(problem, best, temperature, undescribed, rng)]
     if undescribed:
         found += [_with_feature(problem, best, temperature, feature) for feature in _WORDS]
     likely = [one for one in found if one is not None and one.nats > _NATS]
@@ -93,22 +96,24 @@ def filtered(run: Run, time_constant_s: float) -> Run:
 
 
 def _low_pass(
-    problem: Problem, best: Fit, temperature: float, undescribed: bool
-) -> Explanation | None:
-    filters = {t: _behind(problem, t) for t in _LOW_PASS_S}
-    starts = {t: _earlier(problem.structure, best.point, t) for t in filters}
-    if not undescribed:
-        least = min(float(behind.costs(starts[t]).min()) for t, behind in filters.items())
-        if (best.cost - least) / temperature < _NATS:
-            return None
-    fits = {t: refine(behind, starts[t]) for t, behind in filters.items()}
+    problem: Problem, best: Fit, temperature: float, undescribed: bool, rng: np.random.Generator
+) -> Explanation:
+    structure = problem.structure
+    fits = {}
+    for constant in _LOW_PASS_S:
+        behind, starts = _behind(problem, constant), _earlier(structure, best.point, constant)
+        fits[constant] = refine(behind, starts)
+        if undescribed and constant >= _SEARCHED_S:  # far from the fit without it
+            fits[constant] = min(
+                search_widely(behind, rng, starts, short=True), fits[constant], key=lambda f: f.cost
+            )
     middle = min(fits, key=lambda t: fits[t].cost)
     for factor in (0.71, 1.41, 0.84, 1.19):  # between the constants that were tried
         between = middle * factor
         fits[between] = refine(_behind(problem, between), fits[middle].point[None])
         middle = min(fits, key=lambda t: fits[t].cost)
     fit = fits[middle]
-    delay = float(problem.structure.decode(fit.point)[0])
+    delay = float(structure.decode(fit.point)[0])
     words = f"a low-pass filter of about {1e3 * middle:.0f} ms in front of it"
     return Explanation(words, (best.cost - fit.cost) / temperature - 1.0, delay)
 

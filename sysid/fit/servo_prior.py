@@ -30,6 +30,7 @@ _UNIT_SD = 0.15
 hobby servos (the default spread in training), more between batches."""
 _DEAD_TIME_SD = 0.3  # the bus and the host are a part of the dead time, and another robot's
 _GAIN_SD = 0.5  # of stiffness and damping where the P gain of one of the two is not known
+_DOUBTED_SD = 0.3  # of a number whose interval is not to be trusted: the model does not describe it
 _LINK_SD = 0.7  # a link of the armature's inertia halves all torques per inertia
 _WEIGHT = 4.0  # joints that each of these spreads counts as, beside those of the calibration
 _Z = NormalDist().inv_cdf((1 + LEVEL) / 2)
@@ -81,8 +82,8 @@ def servo_prior(
     rows = [row for row in rows if row]
     if not rows:
         raise InputError(
-            f"{source} has no number that is identified, so it says nothing of another unit. "
-            "Name a calibration or a servo card whose gains are identified."
+            f"{source} has no number with an interval, so it says nothing of another unit. "
+            "Name a calibration of measured servos or a servo card."
         )
     links = _links(rows)
     names = dict.fromkeys(name for row in rows for name in row)
@@ -135,14 +136,16 @@ def _logarithms(
 
 
 def _known(quantity: Quantity) -> bool:
-    """Whether a number says anything: measured, or cited without an interval."""
-    return quantity.identified != "no" or quantity.why == UNSTATED
+    """Whether a number says anything: measured with an interval, or cited without one."""
+    measured = quantity.low is not None and quantity.high is not None
+    return quantity.why == UNSTATED or (measured and quantity.high != quantity.low)
 
 
 def _sd(quantity: Quantity) -> float:
     if quantity.low is None or quantity.high is None or quantity.low <= 0:
         return 0.0
-    return math.log(quantity.high / quantity.low) / (2 * _Z)
+    sd = math.log(quantity.high / quantity.low) / (2 * _Z)
+    return math.hypot(sd, _DOUBTED_SD) if quantity.identified == "no" else sd
 
 
 def _links(rows: Sequence[Mapping[str, tuple[float, float]]]) -> list[float]:

@@ -37,7 +37,9 @@ def run_of(command: np.ndarray, time_s: np.ndarray) -> Run:
     )  # fmt: skip
 
 
-def explanation(structure: Structure, numbers: dict, filter_s: float = 0.0) -> Explanation | None:
+def explanation(
+    structure: Structure, numbers: dict, filter_s: float = 0.0, undescribed: bool = True
+) -> Explanation | None:
     """What is found of the motion of one servo, by a fit of the plain one."""
     rng = np.random.default_rng(0)
     time = CONTINUOUS_S * np.arange(int(4.0 / CONTINUOUS_S))
@@ -53,7 +55,7 @@ def explanation(structure: Structure, numbers: dict, filter_s: float = 0.0) -> E
     plain = candidate(SIMULATED[0])
     problem = Problem(plain, read, (NOISE_RAD,) * len(read))
     start = plain.encode(np.array([NUMBERS[n] for n in plain.names]))
-    return explained(problem, refine(problem, start[None]), 1.0, undescribed=True)
+    return explained(problem, refine(problem, start[None]), 1.0, undescribed, rng)
 
 
 def test_a_filter_of_a_step_command_rises_as_an_exponential():
@@ -69,7 +71,7 @@ def test_a_servo_without_anything_more_is_left_alone():
 
 
 def test_a_low_pass_filter_is_named_and_its_dead_time_is_the_true_one():
-    found = explanation(candidate(SIMULATED[0]), NUMBERS, filter_s=0.016)
+    found = explanation(candidate(SIMULATED[0]), NUMBERS, 0.016, undescribed=False)
     assert found is not None
     constant = re.fullmatch(r"a low-pass filter of about (\d+) ms in front of it", found.words)
     assert constant is not None and 13 <= int(constant[1]) <= 19

@@ -75,7 +75,7 @@ def test_a_calibration_that_knows_nothing_is_refused():
     empty = SAMPLE.model_copy(
         update={"joints": {"pan": joint.model_copy(update={"actuator": actuator})}}
     )
-    with pytest.raises(InputError, match="no number that is identified"):
+    with pytest.raises(InputError, match="no number with an interval"):
         prior_of(empty)
 
 
