@@ -60,7 +60,7 @@ def test_a_joint_that_rests_in_slow_strokes_is_held_by_friction_and_not_dead():
     assert found["held_by_friction"].verdict == CARE
 
 
-@pytest.mark.parametrize("rate_hz", [50.0, 500.0])
+@pytest.mark.parametrize("rate_hz", [50.0, pytest.param(500.0, marks=pytest.mark.slow)])
 def test_a_servo_that_settles_after_each_step_is_no_echo(rate_hz):
     """At rest the position is the command, a while late; on its way it is not."""
     rng = np.random.default_rng(4)
