@@ -545,6 +545,8 @@ def _explained(ready: PreparedJoint, choice: _Choice) -> _Choice:
     """The choice with what a misfit looks like."""
     carried = choice.carried
     undescribed = bool(_undescribed(_goodness(ready, carried)))
+    if not (undescribed or ready.scales.free_air):
+        return choice  # a motor under load has enough terms to imitate a filter
     problem = ready.searched(carried.structure)
     best = replace(carried.fit, cost=float(problem.costs(carried.fit.point[None])[0]))
     return replace(

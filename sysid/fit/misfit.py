@@ -99,11 +99,12 @@ def _low_pass(
     problem: Problem, best: Fit, temperature: float, undescribed: bool, rng: np.random.Generator
 ) -> Explanation:
     structure = problem.structure
+    anew = undescribed and structure.scales.free_air  # under load a search takes minutes
     fits = {}
     for constant in _LOW_PASS_S:
         behind, starts = _behind(problem, constant), _earlier(structure, best.point, constant)
         fits[constant] = refine(behind, starts)
-        if undescribed and constant >= _SEARCHED_S:  # far from the fit without it
+        if anew and constant >= _SEARCHED_S:  # far from the fit without it
             fits[constant] = min(
                 search_widely(behind, rng, starts, short=True), fits[constant], key=lambda f: f.cost
             )
