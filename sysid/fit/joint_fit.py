@@ -47,6 +47,7 @@ from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
 from pupper_sysid.sysid.fit.repeats import Repeats, by_number, compare_repeats
 from pupper_sysid.sysid.fit.results import (
     RATIO_SOURCES,
+    TELLING_NATS,
     UNTOLD,
     CandidateFit,
     JointCalibrationResult,
@@ -529,33 +530,52 @@ def _settled(
     choice = _choice(ready, every)
     if not ready.scales.free_air:
         return ready, every, _explained(ready, choice)
-    goodness = _goodness(ready, choice.carried)
-    profiled = _with_profile(ready, choice.carried)
+    goodness, plain = _goodness(ready, choice.carried), _explained(ready, choice)
+    profiled, gained = _with_profile(ready, choice.carried)
+    stated = bool(np.isfinite(ready.scales.acceleration_rad_s2))
+    enough = -TELLING_NATS if stated else _PROFILE_NATS  # a register is believed unless refuted
+    if gained > enough and not stated:  # it was searched for, so what else there may be is, too
+        plain = _explained(ready, choice, anew=True)
+    rival = -np.inf if plain.misfit is None else plain.misfit.nats
+    most = _DESCRIBES_BETTER * overall(goodness)
+    if gained < max(enough, rival):
+        plain, profiled = _perhaps_profiled(plain, profiled, gained), None
+    elif stated or not _undescribed(_goodness(ready, profiled)):
+        most = np.inf
+    else:  # a motor's friction beside it may describe it
+        most = DESCRIBED
     if profiled is None and not _undescribed(goodness):
-        return ready, every, _explained(ready, choice)
-    most = np.inf if profiled is not None else _DESCRIBES_BETTER * overall(goodness)
+        return ready, every, plain
     any_servo = ready.as_any_servo()
     ladder = _ladder(any_servo, any_servo.fit_rng(), SHORT_LADDER, most, profiled)
     if not ladder:
-        return ready, every, _explained(ready, choice)
-    return any_servo, ladder, _explained(any_servo, _choice(any_servo, ladder))
+        if profiled is not None:
+            plain = _perhaps_profiled(plain, profiled, gained)
+        return ready, every, plain
+    wider = _choice(any_servo, ladder)
+    better = (choice.carried.fit.cost - wider.carried.fit.cost) / choice.carried.temperature
+    if (
+        plain.misfit is not None and better < plain.misfit.nats
+    ):  # what explains the misfit best is no term of a servo
+        return ready, every, plain
+    return any_servo, ladder, _explained(any_servo, wider)
 
 
-def _explained(ready: PreparedJoint, choice: _Choice) -> _Choice:
-    """The choice with what a misfit looks like."""
+def _explained(ready: PreparedJoint, choice: _Choice, anew: bool = False) -> _Choice:
+    """The choice with what a misfit looks like; `anew` searches for it far from the fit."""
     carried = choice.carried
-    undescribed = bool(_undescribed(_goodness(ready, carried)))
-    if not (undescribed or ready.scales.free_air):
+    anew = anew or bool(_undescribed(_goodness(ready, carried)))
+    if not (anew or ready.scales.free_air):
         return choice  # a motor under load has enough terms to imitate a filter
     problem = ready.searched(carried.structure)
     best = replace(carried.fit, cost=float(problem.costs(carried.fit.point[None])[0]))
     return replace(
-        choice, misfit=explained(problem, best, carried.temperature, undescribed, ready.fit_rng())
+        choice, misfit=explained(problem, best, carried.temperature, anew, ready.fit_rng())
     )
 
 
-def _with_profile(ready: PreparedJoint, carried: Fitted) -> Fitted | None:
-    """The carried servo with a limit on its set-point's acceleration, if that describes it.
+def _with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]:
+    """The carried servo with a limit on its set-point's acceleration, and its gain in likelihood.
 
     Damping imitates such a profile within the noise, at a dead time that is wrong by tens of
     milliseconds, so that goodness of fit does not show it. The limit is off in the Mini Pupper's
@@ -564,14 +584,27 @@ def _with_profile(ready: PreparedJoint, carried: Fitted) -> Fitted | None:
     unlimited = [t.servo.set_point_acceleration_rad_s2 == np.inf for t in ready.recorded]
     unnamed = all(t.servo.model is None for t in ready.recorded)
     if all(unlimited) or (unnamed and ready.joint in JOINT_NAMES):
-        return None
+        return carried, -np.inf
     structure = servo_structure((*carried.structure.features, "acceleration"), ready.scales)
     tried = {carried.structure.features: carried}
     fitted = _fitted(ready, structure, tried, ready.fit_rng(), short=True)
     nats = _nats(ready, (carried, fitted))
-    better = nats[carried.structure.name] - nats[structure.name] > _PROFILE_NATS
-    described = not _undescribed(_goodness(ready, fitted))
-    return fitted if better and described else None
+    return fitted, nats[carried.structure.name] - nats[structure.name]
+
+
+def _perhaps_profiled(choice: _Choice, profiled: Fitted, gained: float) -> _Choice:
+    """The choice with a profile as its explanation, where the data allow one as well.
+
+    One that leaves the dead time where it is changes nothing.
+    """
+    dead = choice.lag.dead_time_s
+    assert dead is not None
+    delay = float(profiled.values[0])
+    if choice.misfit is not None or gained < -TELLING_NATS or dead.low <= delay <= dead.high:
+        return choice
+    limit = float(profiled.values[profiled.structure.names.index("acceleration_limit")])
+    words = f"a profile whose acceleration is limited to about {limit:.0f} rad/s²"
+    return replace(choice, misfit=Explanation(words, gained, delay))
 
 
 def _in_free_air(
@@ -689,7 +722,7 @@ def _doubt(choice: _Choice, goodness: Mapping[str, float]) -> str | None:
         return why
     if choice.misfit is None:
         return None
-    return f"the servo moves as if it had {choice.misfit.words}"
+    return choice.misfit.claim
 
 
 def _doubted(fit: CandidateFit, why: str) -> CandidateFit:

@@ -21,7 +21,7 @@ from pupper_sysid.sysid.fit.structure import Structure, servo_structure
 _LOW_PASS_S = (0.004, 0.008, 0.016, 0.032, 0.064)
 """Time constants that are tried: below the first a filter is a delay, above the last a slow one."""
 _SEARCHED_S = 0.016
-"""Time constant from which a fit with a filter is searched for anew, where there is a misfit."""
+"""Time constant from which a fit with a filter may lie far from the fit without it."""
 _NATS = 10.0
 """Log-likelihood by which an explanation is named."""
 _WORDS = {
@@ -39,7 +39,7 @@ class Explanation:
     ----------
     words : str
     nats : float
-        By how much the log-likelihood is better.
+        By how much the log-likelihood is better; about 0 where the data do not decide.
     dead_time_s : float
         Of the fit with it.
     """
@@ -48,16 +48,23 @@ class Explanation:
     nats: float
     dead_time_s: float
 
+    @property
+    def claim(self) -> str:
+        """What it says of the servo."""
+        if self.nats > _NATS:
+            return f"the servo moves as if it had {self.words}"
+        return f"the servo may as well have {self.words}"
+
     def sentence(self, joint: str) -> str:
         """The explanation in words."""
         return (
-            f"{joint}: it moves as if it had {self.words} (Δ log-likelihood {self.nats:.0f}); its "
-            f"dead time would be {1e3 * self.dead_time_s:.1f} ms then."
+            f"{joint}: {self.claim} (Δ log-likelihood {self.nats:.0f}); its dead time would be "
+            f"{1e3 * self.dead_time_s:.1f} ms then."
         )
 
 
 def explained(
-    problem: Problem, best: Fit, temperature: float, undescribed: bool, rng: np.random.Generator
+    problem: Problem, best: Fit, temperature: float, anew: bool, rng: np.random.Generator
 ) -> Explanation | None:
     """The best explanation of a misfit; None if none is decidedly better than the fit alone.
 
@@ -68,14 +75,13 @@ def explained(
         Of the carried structure.
     temperature : float
         How many readings count as one.
-    undescribed : bool
-        Whether errors are larger than noise. Otherwise only a low-pass filter is looked for, which
-        dead time and damping imitate within the noise.
+    anew : bool
+        Whether a filter is searched for far from the fit, too, as it is where errors are larger
+        than noise.
     rng : numpy.random.Generator
     """
-    found: list[Explanation | None] = [_low_pass(problem, best, temperature, undescribed, rng)]
-    if undescribed:
-        found += [_with_feature(problem, best, temperature, feature) for feature in _WORDS]
+    found: list[Explanation | None] = [_low_pass(problem, best, temperature, anew, rng)]
+    found += [_with_feature(problem, best, temperature, feature) for feature in _WORDS]
     likely = [one for one in found if one is not None and one.nats > _NATS]
     return max(likely, key=lambda one: one.nats, default=None)
 
@@ -96,10 +102,10 @@ def filtered(run: Run, time_constant_s: float) -> Run:
 
 
 def _low_pass(
-    problem: Problem, best: Fit, temperature: float, undescribed: bool, rng: np.random.Generator
+    problem: Problem, best: Fit, temperature: float, anew: bool, rng: np.random.Generator
 ) -> Explanation:
     structure = problem.structure
-    anew = undescribed and structure.scales.free_air  # under load a search takes minutes
+    anew = anew and structure.scales.free_air  # under load a search takes minutes
     fits = {}
     for constant in _LOW_PASS_S:
         behind, starts = _behind(problem, constant), _earlier(structure, best.point, constant)

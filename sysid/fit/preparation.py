@@ -250,21 +250,27 @@ def _in_free_air(joint: str, trials: Sequence[Trial]) -> Scales:
     speed = no_load_speed(model, supply) if model else None
     if model is None and joint in JOINT_NAMES:
         speed = NO_LOAD_SPEED_RAD_S
-    return Scales() if speed is None else Scales(top_speed_rad_s=speed)
+    scales = Scales(acceleration_rad_s2=_stated_acceleration(trials))
+    return scales if speed is None else replace(scales, top_speed_rad_s=speed)
+
+
+def _stated_acceleration(trials: Sequence[Trial]) -> float:
+    """Limit on the set-point's acceleration that headers state [rad/s²]; NaN if none."""
+    ramps = [t.servo.set_point_acceleration_rad_s2 for t in trials]
+    stated = [ramp for ramp in ramps if ramp is not None and np.isfinite(ramp)]
+    return float(np.median(stated)) if stated else float("nan")
 
 
 def scales_of(trials: Sequence[Trial], runs: Sequence[Run]) -> Scales:
     """Scales of the parameters under load: from the known load, or per inertia without one."""
     known = all(t.load is not None for t in trials) and any(r.load[0] > 0 for r in runs)
-    ramps = [t.servo.set_point_acceleration_rad_s2 for t in trials]
-    stated = [ramp for ramp in ramps if ramp is not None and np.isfinite(ramp)]
     inertia = max(float(r.load[0]) for r in runs) if known else 1.0
     # without gravity the scale is a torque that would reach 10 rad/s within 0.1 s
     torque = max(max(float(r.load[1]) for r in runs), 100.0 * inertia) if known else 1.0
     return Scales(
         torque=torque, inertia=inertia, p_gain=reference_gain(trials).value or 1.0, free_air=False,
         known_load=known, torque_off=any((r.torque_on < 0.5).any() for r in runs),
-        acceleration_rad_s2=float(np.median(stated)) if stated else float("nan"),
+        acceleration_rad_s2=_stated_acceleration(trials),
     )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from pupper_sysid.sysid.fit.scores import Scores
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 
 UNTOLD = "the data do not separate a set-point of limited rate from back-EMF"
-_TELLING_NATS = 5.0
+TELLING_NATS = 5.0
 """Difference of the log-likelihoods of two structures that tells them apart."""
 
 
@@ -233,4 +233,4 @@ class JointCalibrationResult(Result):
 
 def plausible(structure_nats: Mapping[str, float]) -> list[str]:
     """Structures that the data do not tell from the best."""
-    return [name for name, nats in structure_nats.items() if nats <= _TELLING_NATS]
+    return [name for name, nats in structure_nats.items() if nats <= TELLING_NATS]
