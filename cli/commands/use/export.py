@@ -206,7 +206,7 @@ class Export:
 
     def _check(self, calibration: Calibration, links: dict[str, float]) -> None:
         """Print how far the export is from the calibration."""
-        from pupper_sysid.sim.export.check import check
+        from pupper_sysid.sim.export.check import SWITCHED_OFF, WHOLE, check
         from pupper_sysid.sim.export.shared import ExportedServos
 
         step = 0.002 if self.physics_step is None else self.physics_step
@@ -218,14 +218,24 @@ class Export:
         n = terminal.number
         table = terminal.table(
             f"Export in MuJoCo, steps of {1e3 * step:g} ms, beside the calibration, RMS",
-            "joint", "tones mrad", "walk mrad", "readings counts", "whole steps mrad",
+            "joint", "tones mrad", "walk mrad", "same steps mrad", "readings counts",
+            "whole steps mrad",
         )  # fmt: skip
         for name, row in checked.joints.items():
             table.add_row(
                 name, n(1e3 * row.tones_rad, 2), n(1e3 * row.walk_rad, 2),
-                n(row.reading_counts, 2), n(1e3 * row.whole_steps_rad, 1),
+                n(1e3 * row.same_steps_rad, 2), n(row.reading_counts, 2),
+                n(1e3 * row.whole_steps_rad, 1),
             )  # fmt: skip
         terminal.out.print(table)
+        if any(row.step_rad[WHOLE] > 0 for row in checked.joints.values()):
+            parts = terminal.table(
+                f"What steps of {1e3 * step:g} ms cost, RMS on the tones [mrad]",
+                "joint", *SWITCHED_OFF,
+            )  # fmt: skip
+            for name, row in checked.joints.items():
+                parts.add_row(name, *(n(1e3 * cost, 2) for cost in row.step_rad.values()))
+            terminal.out.print(parts)
         for sentence in checked.notes:
             terminal.err.print(sentence, soft_wrap=True)
 

@@ -11,7 +11,8 @@ from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
-from pupper_sysid.sim.export.check import LOOP_S, compiled, held, moved_by
+from pupper_sysid.servo_models.step_size import CONTROL_S
+from pupper_sysid.sim.export.check import compiled, held, moved_by
 from pupper_sysid.sim.export.mjcf import compiled_numbers, link_inertias, to_mjcf, to_model
 from pupper_sysid.sim.export.shared import ExportedServos
 from pupper_sysid.sim.robot.engine import mujoco
@@ -69,7 +70,7 @@ def unlimited(calibration):
 
 def rise_s(positions: np.ndarray, step_s: float) -> np.ndarray:
     """Time from the step's edge to 63 % of it, between steps."""
-    at = step_s * np.arange(1, len(positions) + 1) - 20 * LOOP_S
+    at = step_s * np.arange(1, len(positions) + 1) - 20 * CONTROL_S
     wanted = 0.3 * (1 - np.exp(-1))
     return np.array([np.interp(wanted, np.maximum.accumulate(p), at) for p in positions.T])
 
