@@ -61,10 +61,14 @@ class Engine:
     implicit: bool = True
     """Whether damping acts on the velocity at the step's end; otherwise the PD is computed
     before."""
+    short_delays: bool = True
+    """Whether a delay may be a part of the first step; otherwise it becomes all of it."""
 
 
 MUJOCO = Engine()
-"""MuJoCo's `<pid>`, with which calibrations are found."""
+"""The arithmetic of MuJoCo's `<pid>`, with which calibrations are found."""
+MUJOCO_PID = Engine(short_delays=False)
+"""MuJoCo's `<pid>` itself, whose delay line has nothing between 0 and one step."""
 
 
 def tones_in_steps_of(
@@ -169,19 +173,21 @@ def nearest_in_loop(
 
     Parameters, returned value and errors as for `at_step`.
     """
-    if time_step_s == fitted_step_s and engine == MUJOCO:
-        return parameters
-    stepped = at_step(parameters, time_step_s, fitted_step_s, engine)
-    if not engine.slews:
+    stepped = at_step(parameters, time_step_s, fitted_step_s, replace(engine, short_delays=True))
+    usual = np.atleast_1d(stepped.dead_time_s)[:, None]
+    short = (usual > 0) & (usual < time_step_s) & (not engine.short_delays)
+    same = stepped is parameters
+    if not engine.slews or (same and not short.any()):
         return stepped
     stairs = _loop_tones()
     at, wanted = in_loop(parameters, fitted_step_s, stairs)
-    count = len(np.atleast_1d(stepped.dead_time_s))
-    usual = np.atleast_1d(stepped.dead_time_s)[:, None]
     delay, reach = usual, time_step_s
-    values = {k: np.broadcast_to(v, count)[:, None] for k, v in stepped.arrays().items()}
+    values = {k: np.broadcast_to(v, len(usual))[:, None] for k, v in stepped.arrays().items()}
     for _ in range(2):  # over a step either way, then between neighbours
         trials = np.maximum(delay + reach * np.linspace(-1.0, 1.0, _TRIALS), 0.0)
+        if not engine.short_delays:
+            whole = time_step_s * np.round(trials / time_step_s)
+            trials = np.where(trials < time_step_s, whole, trials)
         own = DelayedPDParameters(**values | {"dead_time_s": trials})
         times, moved = in_loop(own, time_step_s, stairs, engine)
         there = np.stack([np.interp(times, at, track) for track in wanted.T], axis=1)
@@ -190,6 +196,8 @@ def nearest_in_loop(
         errors *= 1.0 + _LIKE_USUAL * ((trials - usual) / time_step_s) ** 2
         delay = np.take_along_axis(trials, np.argmin(errors, axis=1)[:, None], axis=1)
         reach *= 2.0 / (_TRIALS - 1)
+    if same:
+        delay = np.where(short, delay, usual)
     return replace(stepped, dead_time_s=delay[:, 0])
 
 

@@ -28,7 +28,13 @@ from pupper_sysid.servo_models.calibration.parts import JointCalibration
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.loaded_servo import LoadedServo
-from pupper_sysid.servo_models.step_size import CONTINUOUS_S, CONTROL_S, in_loop, nearest_in_loop
+from pupper_sysid.servo_models.step_size import (
+    CONTINUOUS_S,
+    CONTROL_S,
+    MUJOCO_PID,
+    in_loop,
+    nearest_in_loop,
+)
 from pupper_sysid.sim.export.mjcf import to_mjcf
 from pupper_sysid.sim.export.shared import ExportedServos
 from pupper_sysid.sim.robot.servo_mjcf import hold
@@ -109,7 +115,7 @@ def check(servos: ExportedServos) -> Check:
         walk_at, walked = _own_motion(joint, walk)
         pd = joint.actuator
         pd_at, pd_moved = in_loop(pd.parameters, pd.fitted_step_s, tones)
-        stepped = servos.actuators()[name].parameters
+        stepped = servos.actuators(MUJOCO_PID)[name].parameters
         whole = replace(stepped, armature=pd.parameters.armature)
         _, same = in_loop(whole, servos.physics_step_s, tones)
         feedback = servos.calibration.held_feedback(name)
@@ -139,7 +145,9 @@ def step_costs(servos: ExportedServos, commands: NDArray) -> dict[str, list[floa
         for part, terms in SWITCHED_OFF.items():
             servo = replace(whole, **terms)
             at, moved = in_loop(servo, fitted_s, commands)
-            stepped_at, stepped = in_loop(nearest_in_loop(servo, h, fitted_s), h, commands)
+            stepped_at, stepped = in_loop(
+                nearest_in_loop(servo, h, fitted_s, MUJOCO_PID), h, commands
+            )
             costs[part].append(_apart(stepped_at, stepped[:, 0], at, moved[:, 0]))
     return costs
 
@@ -175,7 +183,7 @@ def _notes(servos: ExportedServos, joints: Mapping[str, JointCheck]) -> Iterator
         worst = max(joints, key=lambda name: joints[name].step_rad[WHOLE])
         far = 1e3 * joints[worst].step_of_full_torque_rad
         actuator = servos.moving.joint(worst).actuator
-        half = nearest_in_loop(actuator.parameters, h / 2, actuator.fitted_step_s)
+        half = nearest_in_loop(actuator.parameters, h / 2, actuator.fitted_step_s, MUJOCO_PID)
         own = in_loop(actuator.parameters, actuator.fitted_step_s, unseen_tones())
         at, moved = in_loop(half, h / 2, unseen_tones())
         there = 1e3 * _apart(at, moved[:, 0], own[0], own[1][:, 0])
@@ -186,6 +194,7 @@ def _notes(servos: ExportedServos, joints: Mapping[str, JointCheck]) -> Iterator
             f"and what it would cost without a term. Steps of {1e3 * h / 2:g} ms would leave "
             f"{there:.2g} mrad of {worst}'s {1e3 * joints[worst].step_rad[WHOLE]:.2g}."
         )
+    yield from servos.short_delays()
     loaded = [n for n in joints if servos.calibration.joint(n).under_load is not None]
     if loaded:
         most = 1e3 * max(joints[name].not_carried_rad for name in loaded)

@@ -27,7 +27,7 @@ from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, Actuator, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
-from pupper_sysid.servo_models.step_size import MUJOCO, Engine, nearest_in_loop
+from pupper_sysid.servo_models.step_size import MUJOCO, MUJOCO_PID, Engine, nearest_in_loop
 
 FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age_s")
 TORQUE_KEYS = (
@@ -206,6 +206,21 @@ class ExportedServos:
             shift = turn * (h * round(delay.value / h) - delay.value)
             costs[name] = float(2 * abs(np.sin(shift / 2)) * amplitude / np.sqrt(2))
         return costs
+
+    def short_delays(self) -> Iterator[str]:
+        """Which dead times MuJoCo's delay line cannot hold, in a sentence."""
+        wanted, written = self.actuators(), self.actuators(MUJOCO_PID)
+        texts = [
+            f"{name} {1e3 * a.dead_time_s.value:.2g} became "
+            f"{1e3 * written[name].dead_time_s.value:.2g} ms"
+            for name, a in wanted.items()
+            if 0 < a.dead_time_s.value < self.physics_step_s
+        ]
+        if texts:
+            yield (
+                f"MuJoCo has no delay between 0 and one step: {', '.join(texts)}. Take steps that "
+                "are shorter than the dead time."
+            )
 
     def _scales(self) -> Iterator[str]:
         scales = {

@@ -200,6 +200,28 @@ def test_own_actuators_are_replaced_under_their_names_and_keyframes_hold_the_pos
     assert "LF_hip (2)" in text
 
 
+def test_actuators_on_tendons_are_no_servos_whatever_their_ids(calibration, tmp_path):
+    tendon = (
+        '<tendon><fixed name="first"><joint joint="LF_hip" coef="1"/></fixed></tendon><actuator>'
+        '<position name="pull" tendon="first" kp="1000"/></actuator>'
+    )
+    model, servos = put_into(tmp_path, robot(LINKS, actuators=OWN + tendon), calibration)
+    assert model.actuator("pull").id == model.nu - 1  # behind the servos, on tendon 0
+    for name, (found, wanted) in compiled_numbers(model, servos).items():
+        np.testing.assert_array_equal(found, wanted, err_msg=name)
+    assert "and were left: pull" in " ".join((tmp_path / "out.xml").read_text().split())
+
+
+def test_a_card_is_refused_where_no_hinge_is_driven(tmp_path):
+    (tmp_path / "cart.xml").write_text(
+        '<mujoco><worldbody><body><joint name="slider" type="slide"/><geom size="0.1"/><body>'
+        '<joint name="pole"/><geom size="0.1"/></body></body></worldbody><actuator>'
+        '<motor joint="slider"/></actuator></mujoco>'
+    )
+    with pytest.raises(InputError, match=r"drives none of its hinges \(pole\)"):
+        to_model(load_calibration("sts3215-bam-m1"), tmp_path / "cart.xml", tmp_path / "out.xml")
+
+
 def test_the_links_inertia_is_that_of_the_bodies_whatever_else_the_model_adds():
     text = robot(LINKS, joint='armature="0.7"', actuators=OWN)
     model = mujoco.MjModel.from_xml_string(text)

@@ -26,12 +26,14 @@ from pupper_sysid.servo_models.step_size import (
     CONTINUOUS_S,
     CONTROL_S,
     MUJOCO,
+    MUJOCO_PID,
     at_step,
     in_loop,
     nearest_in_loop,
 )
 from pupper_sysid.sim.export.check import check, held, walk_commands
 from pupper_sysid.sim.export.export import SIMULATORS, exported_text
+from pupper_sysid.sim.export.mjcf import to_mjcf
 from pupper_sysid.sim.export.mjlab import BUILTIN_PD
 from pupper_sysid.sim.export.shared import CALIBRATED_PD, EXPLICIT_PD, ExportedServos
 from pupper_sysid.sim.robot.engine import mujoco
@@ -544,6 +546,19 @@ def test_the_dead_time_for_a_step_is_that_of_the_nearest_motion_on_other_command
     for later_s in (-0.0015, 0.0015):
         other = replace(nearest, dead_time_s=nearest.dead_time_s + later_s)
         assert (apart(nearest) < apart(other)).all()
+
+
+@pytest.mark.parametrize(
+    ("card", "step_s"), [("sts3215-open-duck", 0.005), ("sts3215-bam-m1", 0.002)]
+)
+def test_a_dead_time_below_one_step_is_written_as_mujoco_takes_it(card, step_s):
+    servos = ExportedServos.of(load_calibration(card), step_s)
+    (row,) = check(servos).joints.values()
+    assert row.same_steps_rad < 3e-5
+    (wanted,), (written,) = (servos.actuators(e).values() for e in (MUJOCO, MUJOCO_PID))
+    assert 0 < wanted.dead_time_s.value < step_s
+    assert written.dead_time_s.value in (0.0, step_s)
+    assert "no delay between 0 and one step" in " ".join(to_mjcf(servos).split())
 
 
 def test_whole_steps_cost_what_a_shift_of_the_tone_costs(calibration):
