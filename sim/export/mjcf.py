@@ -358,8 +358,14 @@ def _options(root: Element, servos: ExportedServos, theirs: Any) -> Iterator[str
         "actuation": bits.mjDSBL_ACTUATION,
     }  # fmt: skip
     off = [name for name, bit in flags.items() if theirs.opt.disableflags & bit]
+    settings = dict.fromkeys(off, "enable")
+    if theirs.opt.disableflags & bits.mjDSBL_CONSTRAINT:
+        # dry friction is a constraint; the others stay off
+        off.append("constraint")
+        settings |= dict.fromkeys(("contact", "limit", "equality"), "disable")
+        settings["constraint"] = "enable"
     if off:
-        ElementTree.SubElement(option, "flag", dict.fromkeys(off, "enable"))
+        ElementTree.SubElement(option, "flag", settings)
         yield f"Flags were disabled that the servos need: {', '.join(off)}."
 
 

@@ -212,6 +212,21 @@ def test_actuators_on_tendons_are_no_servos_whatever_their_ids(calibration, tmp_
     assert "and were left: pull" in " ".join((tmp_path / "out.xml").read_text().split())
 
 
+def test_dry_friction_acts_in_a_model_without_constraints_and_the_others_stay_off(
+    calibration, tmp_path
+):
+    settings = '<option><flag constraint="disable"/></option>'
+    model, _ = put_into(
+        tmp_path, robot(LINKS, settings, actuators=OWN), calibration, physics_step_s=TIME_STEP_S
+    )
+    bits = mujoco.mjtDisableBit
+    kept = bits.mjDSBL_CONTACT | bits.mjDSBL_LIMIT | bits.mjDSBL_EQUALITY
+    assert model.opt.disableflags == int(kept)
+    names = calibration.joint_names
+    there = moved_by(model, names, STEP_RAD, TIME_STEP_S)
+    np.testing.assert_allclose(there, own_step(calibration, names), atol=1e-3)
+
+
 def test_a_card_is_refused_where_no_hinge_is_driven(tmp_path):
     (tmp_path / "cart.xml").write_text(
         '<mujoco><worldbody><body><joint name="slider" type="slide"/><geom size="0.1"/><body>'
