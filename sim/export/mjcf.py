@@ -187,18 +187,30 @@ def to_model(
             f"({', '.join(calibration.joint_names)}); it has {', '.join(names) or 'none'}. Rename "
             "the joints of one of them."
         )
+    card = isinstance(calibration, CardCalibration)
+    absent = [] if card else [n for n in calibration.joint_names if n not in wanted]
     calibration = calibration.model_copy(
         update={"joints": {name: calibration.joint(name) for name in wanted}}
     )
+    if strangers := [name for name in link_inertia or {} if name not in wanted]:
+        raise InputError(
+            f"{', '.join(strangers)}: a link's inertia was stated, but no servo goes into such a "
+            f"joint of {model}; servos go into {', '.join(wanted)}. Leave it out, or correct the "
+            "name."
+        )
     bodies = link_inertias(theirs, wanted)
     held = [n for n in wanted if calibration.joint(n).holds_at.armature == "servo and load"]
     links = {name: bodies[name] for name in held if bodies[name] > 0}
-    links |= {n: v for n, v in (link_inertia or {}).items() if n in wanted}
+    links |= dict(link_inertia or {})
     step_s = float(theirs.opt.timestep) if physics_step_s is None else physics_step_s
     servos = ExportedServos.of(calibration, step_s, gain, links, sha256)
     before = _actuators(root)
     changes = list(_put_servos(root, servos, model, _free_group(theirs)))
     changes += _options(root, servos, theirs)
+    if absent:
+        changes.append(
+            f"Servos of joints that the model has not were left out: {', '.join(absent)}."
+        )
     _place_assets(root, model, out)
     _keyframes(root, servos, theirs, before)
     notes = servos.head(

@@ -241,6 +241,7 @@ class Export:
 
     def _simulator(self, path: Path, calibration: Calibration, links: dict[str, float]) -> Path:
         """The calibration for another simulator."""
+        from pupper_sysid.servo_models.cards.card import CardCalibration
         from pupper_sysid.sim.export.export import ENDINGS, exported_text
         from pupper_sysid.sim.export.shared import INCLUDES_LINK
 
@@ -257,6 +258,9 @@ class Export:
             f"For a physics step of {1e3 * servos.physics_step_s:g} ms (--physics-step).",
             *servos.operating_points(), sep="\n", soft_wrap=True,
         )  # fmt: skip
+        absent = [n for n in calibration.joint_names if n not in servos.calibration.joint_names]
+        if absent and not isinstance(calibration, CardCalibration):
+            terminal.warn([f"{self.model} has no joint {', '.join(absent)}; left out."])
         if servos.with_link:
             terminal.warn(
                 [

@@ -297,6 +297,17 @@ def test_a_model_that_cannot_take_the_servos_is_refused_with_the_way_out(
         calibration.export("mjlab", tmp_path, model="other.xml")
 
 
+def test_joints_that_a_model_lacks_are_named(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my.xml").write_text(robot({"LF_hip": 1e-4}, actuators=""))
+    words = ("export", CALIBRATED, "--to", "mjcf", "--model", "my.xml", "--out", "out.xml")
+    code, _, err = run_program(capsys, pupper_sysid, *words)
+    assert code == 0 and "my.xml has no joint LF_thigh, LF_calf" in " ".join(err.split())
+    assert "left out: LF_thigh, LF_calf" in " ".join((tmp_path / "out.xml").read_text().split())
+    said = refused(capsys, pupper_sysid, *words, "--force", "--link-inertia", "LF_calf=1e-4")
+    assert "servos go into LF_hip" in said
+
+
 def test_a_card_goes_into_every_driven_joint_of_a_published_robot(tmp_path):
     robots = Path(str(real_recording("playback_lstm_25hz.csv"))).parents[1] / "robots"
     source = robots / "open_duck_mini_v2.xml"
