@@ -6,13 +6,17 @@ model is the servo that was fitted, in its own steps: under load with all its fr
 export cannot carry. Both run freely on commands that no recording had: tones between the usual
 ones, and a walk.
 
-In steps of another length than those of the fit a servo moves otherwise by some mrad, whatever its
-numbers: dry friction holds it until the end of a step.
+The distance has three parts, which are simulated on their own: what MuJoCo makes of the written
+numbers (the same numbers in the same steps, in the arithmetic of the fit), what an actuator cannot
+carry of a servo fitted under load, and what the length of the physics step costs. For the last,
+terms of the servo are switched off one at a time, in the steps of the fit and in those of the
+export.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from importlib import resources
 from typing import Any
 
@@ -24,14 +28,29 @@ from pupper_sysid.servo_models.calibration.parts import JointCalibration
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.loaded_servo import LoadedServo
-from pupper_sysid.servo_models.step_size import CONTINUOUS_S
+from pupper_sysid.servo_models.step_size import (
+    CONTINUOUS_S,
+    CONTROL_S,
+    MUJOCO_PID,
+    in_loop,
+    nearest_in_loop,
+)
 from pupper_sysid.sim.export.mjcf import to_mjcf
 from pupper_sysid.sim.export.shared import ExportedServos
 from pupper_sysid.sim.robot.servo_mjcf import hold
 
 TONES_HZ, AMPLITUDE_RAD, TONE_S = (1.7, 2.7, 3.7), 0.25, 1.0
-WALK_S, LOOP_S = 2.0, 0.02
+WALK_S = 2.0
 _SETTLE_S = 0.5
+WHOLE = "whole servo"
+SWITCHED_OFF: dict[str, dict[str, float]] = {
+    WHOLE: {},
+    "no speed limit": {"velocity_limit": np.inf},
+    "no dry friction": {"friction_loss": 0.0},
+    "no torque limit": {"effort_limit": np.inf},
+    "PD loop alone": {"velocity_limit": np.inf, "friction_loss": 0.0, "effort_limit": np.inf},
+}
+"""Terms of a servo that are switched off to see what the physics step costs them."""
 _MODEL_DEFAULTS = '<joint damping="0.6" frictionloss="0.05"/><position kp="20"/>'
 
 
@@ -43,6 +62,15 @@ class JointCheck(Result):
     """RMS apart on tones [rad]."""
     walk_rad: float
     """RMS apart on a walk's commands [rad]."""
+    same_steps_rad: float
+    """What MuJoCo adds: RMS from the same numbers in the same steps, on the tones [rad]."""
+    not_carried_rad: float
+    """What of a servo under load an actuator does not carry, RMS on the tones [rad]."""
+    step_rad: dict[str, float]
+    """What the physics step costs, RMS on the tones [rad]: of the whole servo, without one of its
+    terms, and of the PD loop alone."""
+    step_of_full_torque_rad: float
+    """How far the largest torque moves the servo in one physics step from rest [rad]."""
     reading_counts: float
     """RMS apart of the readings on the walk, in counts of the servo."""
     whole_steps_rad: float
@@ -74,51 +102,106 @@ def check(servos: ExportedServos) -> Check:
         If the step is too long for the servos.
     """
     names = servos.calibration.joint_names
-    tones = unseen_tones()
-    walk = walk_commands()
+    tones, walk = unseen_tones(), walk_commands()
     model = compiled(servos)
-    ours = {name: own_model(servos.moving.joint(name)) for name in names}
-    apart: dict[str, dict[str, float]] = {name: {} for name in names}
-    counts = {}
-    for kind, commands in (("tones", tones), ("walk", walk)):
-        there = moved_by(model, names, commands, servos.physics_step_s)
-        at = servos.physics_step_s * np.arange(1, len(there) + 1)
-        for name, exported in zip(names, there.T, strict=True):
-            servo = ours[name]
-            servo.reset(commands[0])
-            own = servo.rollout(held(commands, servo.time_step_s))
-            own_at = servo.time_step_s * np.arange(1, len(own) + 1)
-            here = np.interp(at, np.append(0.0, own_at), np.append(commands[0], own))
-            late = at > _SETTLE_S
-            apart[name][kind] = float(np.sqrt(np.mean((exported - here)[late] ** 2)))
-            if kind == "walk":
-                feedback = servos.calibration.held_feedback(name)
-                counts[name] = _counts_apart(feedback, exported, at, own_at, own)
-    costs = servos.whole_step_costs()
-    joints = {
-        name: JointCheck(errors["tones"], errors["walk"], counts[name], costs[name])
-        for name, errors in apart.items()
-    }
-    fitted = {joint.actuator.fitted_step_s for joint in servos.calibration.joints.values()}
-    loaded = [n for n in names if servos.calibration.joint(n).under_load is not None]
-    notes = (
-        f"Free run on tones of {', '.join(f'{hz:g}' for hz in TONES_HZ)} Hz and a walk's "
-        "commands, in free air. The last column is what a delay of the nearest whole step would "
-        "cost at 4 Hz, 0.3 rad: simulators on torch get a class with delays of any fraction.",
+    costs, joints = servos.whole_step_costs(), {}
+    on_tones = moved_by(model, names, tones, servos.physics_step_s)
+    on_walk = moved_by(model, names, walk, servos.physics_step_s)
+    at = [servos.physics_step_s * np.arange(1, len(moved) + 1) for moved in (on_tones, on_walk)]
+    parts = step_costs(servos, tones)
+    for n, name in enumerate(names):
+        joint = servos.moving.joint(name)
+        own_at, own = _own_motion(joint, tones)
+        walk_at, walked = _own_motion(joint, walk)
+        pd = joint.actuator
+        pd_at, pd_moved = in_loop(pd.parameters, pd.fitted_step_s, tones)
+        stepped = servos.actuators(MUJOCO_PID)[name].parameters
+        whole = replace(stepped, armature=pd.parameters.armature)
+        _, same = in_loop(whole, servos.physics_step_s, tones)
+        feedback = servos.calibration.held_feedback(name)
+        torque = pd.effort_limit_nm.value / pd.armature_kg_m2.value
+        joints[name] = JointCheck(
+            tones_rad=_apart(at[0], on_tones[:, n], own_at, own),
+            walk_rad=_apart(at[1], on_walk[:, n], walk_at, walked),
+            same_steps_rad=_apart(at[0], on_tones[:, n], at[0], same[1:, 0]),
+            not_carried_rad=_apart(pd_at, pd_moved[:, 0], own_at, own),
+            step_rad={part: errors[n] for part, errors in parts.items()},
+            step_of_full_torque_rad=torque * servos.physics_step_s**2,
+            reading_counts=_counts_apart(feedback, on_walk[:, n], at[1], walk_at, walked),
+            whole_steps_rad=costs[name],
+        )
+    return Check(
+        joints=joints, physics_step_s=servos.physics_step_s, notes=tuple(_notes(servos, joints))
     )
-    if fitted != {servos.physics_step_s}:
+
+
+def step_costs(servos: ExportedServos, commands: NDArray) -> dict[str, list[float]]:
+    """What the physics step costs servos and servos without terms, RMS by joint [rad]."""
+    h = servos.physics_step_s
+    costs: dict[str, list[float]] = {part: [] for part in SWITCHED_OFF}
+    for joint in servos.moving.joints.values():
+        fitted_s = joint.actuator.fitted_step_s
+        whole = joint.actuator.parameters
+        for part, terms in SWITCHED_OFF.items():
+            servo = replace(whole, **terms)
+            at, moved = in_loop(servo, fitted_s, commands)
+            stepped_at, stepped = in_loop(
+                nearest_in_loop(servo, h, fitted_s, MUJOCO_PID), h, commands
+            )
+            costs[part].append(_apart(stepped_at, stepped[:, 0], at, moved[:, 0]))
+    return costs
+
+
+def _own_motion(
+    joint: JointCalibration, commands: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times and positions of the calibration's own model, in the steps of its fit."""
+    servo = own_model(joint)
+    servo.reset(commands[0])
+    moved = servo.rollout(held(commands, servo.time_step_s))
+    return servo.time_step_s * np.arange(len(moved) + 1), np.append(commands[0], moved)
+
+
+def _apart(at: NDArray, moved: NDArray, other_at: NDArray, other: NDArray) -> float:
+    """RMS difference of two motions, after they have settled [rad]."""
+    late = at > _SETTLE_S
+    return float(np.sqrt(np.mean((moved - np.interp(at, other_at, other))[late] ** 2)))
+
+
+def _notes(servos: ExportedServos, joints: Mapping[str, JointCheck]) -> Iterator[str]:
+    yield (
+        f"Free run on tones of {', '.join(f'{hz:g}' for hz in TONES_HZ)} Hz and a walk's "
+        "commands, in free air. 'Same steps' is what MuJoCo adds to the same numbers in the same "
+        "steps. 'Whole steps' is what a delay of the nearest whole step would cost at 4 Hz, "
+        "0.3 rad: simulators on torch get a class with delays of any fraction."
+    )
+    h = servos.physics_step_s
+    fitted = {joint.actuator.fitted_step_s for joint in servos.calibration.joints.values()}
+    if fitted != {h}:
         continuous = min(fitted) <= CONTINUOUS_S
         basis = "in continuous time" if continuous else f"for steps of {1e3 * min(fitted):g} ms"
-        notes += (
-            f"The servos' numbers are {basis}; another step moves them otherwise by some mrad, "
-            "since dry friction holds until the end of a step.",
+        worst = max(joints, key=lambda name: joints[name].step_rad[WHOLE])
+        far = 1e3 * joints[worst].step_of_full_torque_rad
+        actuator = servos.moving.joint(worst).actuator
+        half = nearest_in_loop(actuator.parameters, h / 2, actuator.fitted_step_s, MUJOCO_PID)
+        own = in_loop(actuator.parameters, actuator.fitted_step_s, unseen_tones())
+        at, moved = in_loop(half, h / 2, unseen_tones())
+        there = 1e3 * _apart(at, moved[:, 0], own[0], own[1][:, 0])
+        yield (
+            f"The servos' numbers are {basis}, and no numbers of an actuator make up for steps of "
+            f"{1e3 * h:g} ms: in one, the largest torque moves {worst} by {far:.2g} mrad, and "
+            "torque, friction and set-point change once. The second table says what that costs, "
+            f"and what it would cost without a term. Steps of {1e3 * h / 2:g} ms would leave "
+            f"{there:.2g} mrad of {worst}'s {1e3 * joints[worst].step_rad[WHOLE]:.2g}."
         )
+    yield from servos.short_delays()
+    loaded = [n for n in joints if servos.calibration.joint(n).under_load is not None]
     if loaded:
-        notes += (
+        most = 1e3 * max(joints[name].not_carried_rad for name in loaded)
+        yield (
             f"{', '.join(loaded)}: fitted under load, so the calibration's own model has frictions "
-            "that no simulator's actuator carries; the distance is mostly theirs.",
+            f"that no simulator's actuator carries; they cost up to {most:.2g} mrad."
         )
-    return Check(joints=joints, physics_step_s=servos.physics_step_s, notes=notes)
 
 
 def own_model(joint: JointCalibration) -> DelayedPD | LoadedServo:
@@ -172,8 +255,8 @@ def moved_by(
 
 def held(commands: NDArray, step_s: float) -> NDArray[np.float64]:
     """Mean of the held commands of a loop over each physics step."""
-    edges = LOOP_S * np.arange(len(commands) + 1)
-    area = np.append(0.0, np.cumsum(commands) * LOOP_S)
+    edges = CONTROL_S * np.arange(len(commands) + 1)
+    area = np.append(0.0, np.cumsum(commands) * CONTROL_S)
     steps = int(edges[-1] / step_s + 1e-9)
     return np.diff(np.interp(step_s * np.arange(steps + 1), edges, area)) / step_s
 
@@ -183,14 +266,14 @@ def walk_commands() -> NDArray[np.float64]:
     file = resources.files("pupper_sysid.data") / "samples" / "walk_commands.csv"
     with resources.as_file(file) as path:
         rows = np.genfromtxt(path, delimiter=",", names=True)
-    time = np.arange(0.0, min(WALK_S, rows["time_s"][-1]), LOOP_S)
+    time = np.arange(0.0, min(WALK_S, rows["time_s"][-1]), CONTROL_S)
     row = np.searchsorted(rows["time_s"], time + 1e-9, side="right") - 1
     return (rows["LF_thigh_command_rad"] - rows["LF_thigh_command_rad"][0])[row]
 
 
 def unseen_tones() -> NDArray[np.float64]:
     """Commands of the tones, one after the other [rad]."""
-    time = np.arange(0.0, TONE_S, LOOP_S)
+    time = np.arange(0.0, TONE_S, CONTROL_S)
     return AMPLITUDE_RAD * np.sin(2 * np.pi * np.outer(TONES_HZ, time)).ravel()
 
 

@@ -4,15 +4,17 @@
 
 MuJoCo compiles the MJCF, so that class defaults and damping ratios are resolved; the inertia that
 the bodies put on the joint is stated apart from the armature. A Python file is read, not run:
-keyword arguments and dictionaries of literal numbers, such as Isaac Lab's and mjlab's actuators
-have.
+keyword arguments and dictionaries of numbers, such as Isaac Lab's and mjlab's actuators have, and
+nested classes as of legged_gym; numbers may be arithmetic with constants at the top of the file.
 """
 
 from __future__ import annotations
 
 import ast
+import math
+import operator
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +41,10 @@ _WORDS = {
 }
 """Numbers of a PD by the names that configurations have for them."""
 _STEPS = ("max_delay", "delay_max_lag", "delay_steps")
+_ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul,
+    ast.Div: operator.truediv, ast.Pow: math.pow,
+}  # fmt: skip
 _NAMES = ("joint_names_expr", "target_names_expr")
 
 
@@ -118,8 +124,9 @@ def _in_python(path: Path, joint: str | None) -> Servo:
     if not fitting:
         raise InputError(
             f"{path}: no stiffness{f' of {joint}' if joint else ''} stands there as a number. "
-            "Gains must be literal keyword arguments or dictionary entries (stiffness, damping, "
-            "armature, friction, effort_limit)."
+            "Gains must be keyword arguments, dictionary entries or settings of a class "
+            "(stiffness, damping, armature, friction, effort_limit), as numbers or arithmetic with "
+            "constants at the top of the file."
         )
     group = fitting[0]
     numbers = {key: _first(group, words, joint) for key, words in _WORDS.items()}
@@ -160,28 +167,65 @@ def _pd(numbers: dict[str, Any]) -> TorquePD:
 
 
 def _literals(tree: ast.Module) -> dict[str, Any]:
-    """Names at the top of the file that stand for literals."""
-    found = {}
+    """Names at the top of the file that stand for literals, or for arithmetic with such names."""
+    literals: dict[str, Any] = {}
     for node in tree.body:
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            try:
-                found[node.targets[0].id] = ast.literal_eval(node.value)
-            except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-                continue
-    return found
+        name, value = _assigned(node)
+        if name and (number := _value(value, literals)) is not None:
+            literals[name] = number
+    return literals
+
+
+def _assigned(node: ast.stmt) -> tuple[str, ast.expr | None]:
+    """Name and value of an assignment, annotated or not; no name of anything else."""
+    if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+        return node.targets[0].id, node.value
+    if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+        return node.target.id, node.value
+    return "", None
+
+
+def _value(node: ast.expr | None, literals: Mapping[str, Any]) -> Any:
+    """A literal, a name of one, or arithmetic of such numbers; None for anything else."""
+    if node is None:
+        return None
+    if isinstance(node, ast.Name):
+        return literals.get(node.id)
+    if isinstance(node, ast.Attribute) and ast.unparse(node) in ("math.pi", "np.pi", "torch.pi"):
+        return np.pi
+    if isinstance(node, ast.Dict):
+        entries = zip(node.keys, node.values, strict=True)
+        return {_value(k, literals): _value(v, literals) for k, v in entries if k is not None}
+    if isinstance(node, ast.BinOp) and type(node.op) in _ARITHMETIC:
+        sides = [_value(side, literals) for side in (node.left, node.right)]
+        if not all(isinstance(side, int | float) for side in sides):
+            return None
+        try:
+            # as floats, which overflow where whole numbers would grow without end
+            return _ARITHMETIC[type(node.op)](*map(float, sides))
+        except (ArithmeticError, ValueError):
+            return None
+    try:
+        return ast.literal_eval(node)
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+        return None
 
 
 def _groups(tree: ast.Module, literals: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Keyword arguments of calls, and dictionaries with text as keys, as far as literal."""
+    """Keyword arguments, dictionaries with text as keys, bodies of classes, as far as literal."""
 
     def value_of(node: ast.expr) -> Any:
-        if isinstance(node, ast.Name):
-            return literals.get(node.id)
-        try:
-            return ast.literal_eval(node)
-        except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-            return None
+        return _value(node, literals)
 
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef):  # settings in nested classes, as of legged_gym
+            yield {
+                name: value_of(value)
+                for inner in ast.walk(node)
+                if isinstance(inner, ast.stmt)
+                for name, value in (_assigned(inner),)
+                if name and value is not None
+            }
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
             group = {k.arg: value_of(k.value) for k in node.keywords if k.arg}
@@ -212,6 +256,8 @@ def _first(group: dict[str, Any], words: tuple[str, ...], joint: str | None) -> 
         value = group.get(word)
         if isinstance(value, dict):
             fitting = [v for k, v in value.items() if joint is None or _matches(str(k), joint)]
+            # legged_gym's keys are parts of names
+            fitting += [v for k, v in value.items() if joint is not None and str(k) in joint]
             value = fitting[0] if fitting else None
         if isinstance(value, int | float) and not isinstance(value, bool):
             return float(value)

@@ -26,7 +26,7 @@ from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import JointCalibration
 from pupper_sysid.servo_models.cards.card import CardCalibration
-from pupper_sysid.servo_models.step_size import MUJOCO
+from pupper_sysid.servo_models.step_size import MUJOCO_PID
 from pupper_sysid.sim.export.shared import FEEDBACK_KEYS, TORQUE_KEYS, ExportedServos, known_text
 from pupper_sysid.sim.robot.hinges import hinges_of
 from pupper_sysid.sim.robot.servo_mjcf import (
@@ -70,7 +70,7 @@ def to_mjcf(servos: ExportedServos) -> str:
         element.insert(0, Element("joint", _joint(servos, name, joint)))
     first = servos.calibration.joint_names[0]
     notes = servos.head(
-        MUJOCO,
+        MUJOCO_PID,
         "Include this file in your model, and give each servo's joint its class, such as "
         f"class='servo_{first}'. Take off the joint what it states of armature, damping, "
         "stiffness, springref, springdamper, frictionloss, solreffriction, solimpfriction and "
@@ -81,6 +81,7 @@ def to_mjcf(servos: ExportedServos) -> str:
         "The time step, the integrator and flags of your <option> override those here.",
         _RESET,
         _CARRIED,
+        *servos.short_delays(),
     )
     option = f'  <option timestep="{servos.physics_step_s!r}" integrator="{INTEGRATOR}"/>'
     lines = [
@@ -98,7 +99,7 @@ def _parts(
     """Per joint: default class of its actuator, `<pid>` and sensor."""
     defaults, actuators, sensors = [], [], []
     for name, joint in servos.calibration.joints.items():
-        servo = servos.actuators()[name].parameters
+        servo = servos.actuators(MUJOCO_PID)[name].parameters
         pid = actuator_attributes(servo, servos.physics_step_s)
         neutral = dict(NEUTRAL_ACTUATOR)
         if "forcerange" in pid:
@@ -121,7 +122,7 @@ def _parts(
 
 def _joint(servos: ExportedServos, name: str, joint: JointCalibration) -> dict[str, str]:
     """Every attribute of a joint that the measurement covers."""
-    servo = servos.actuators()[name].parameters
+    servo = servos.actuators(MUJOCO_PID)[name].parameters
     damping = {"damping": f"{float(np.asarray(servo.back_emf))!r} 0 0"}
     return NEUTRAL_JOINT | joint_attributes(servo, servos.physics_step_s) | damping
 
@@ -174,28 +175,51 @@ def to_model(
         wanted = [h.name for h in hinges if h.name and h.driven]
     else:
         wanted = [name for name in calibration.joint_names if name in names]
+    if not wanted and isinstance(calibration, CardCalibration):
+        raise InputError(
+            f"{model} drives none of its hinges ({', '.join(names) or 'it has none'}), and a card "
+            "goes into every hinge that is driven. Give the servo's hinge an actuator, such as "
+            "<motor joint=...>."
+        )
     if not wanted:
         raise InputError(
             f"{model} has no hinge of the calibration's joints "
             f"({', '.join(calibration.joint_names)}); it has {', '.join(names) or 'none'}. Rename "
             "the joints of one of them."
         )
+    card = isinstance(calibration, CardCalibration)
+    absent = [] if card else [n for n in calibration.joint_names if n not in wanted]
     calibration = calibration.model_copy(
         update={"joints": {name: calibration.joint(name) for name in wanted}}
     )
+    if strangers := [name for name in link_inertia or {} if name not in wanted]:
+        raise InputError(
+            f"{', '.join(strangers)}: a link's inertia was stated, but no servo goes into such a "
+            f"joint of {model}; servos go into {', '.join(wanted)}. Leave it out, or correct the "
+            "name."
+        )
     bodies = link_inertias(theirs, wanted)
     held = [n for n in wanted if calibration.joint(n).holds_at.armature == "servo and load"]
     links = {name: bodies[name] for name in held if bodies[name] > 0}
-    links |= {n: v for n, v in (link_inertia or {}).items() if n in wanted}
+    links |= dict(link_inertia or {})
     step_s = float(theirs.opt.timestep) if physics_step_s is None else physics_step_s
     servos = ExportedServos.of(calibration, step_s, gain, links, sha256)
     before = _actuators(root)
     changes = list(_put_servos(root, servos, model, _free_group(theirs)))
     changes += _options(root, servos, theirs)
+    if absent:
+        changes.append(
+            f"Servos of joints that the model has not were left out: {', '.join(absent)}."
+        )
     _place_assets(root, model, out)
     _keyframes(root, servos, theirs, before)
     notes = servos.head(
-        MUJOCO, f"The model is {model.name}, with these changes:", *changes, _RESET, _CARRIED
+        MUJOCO_PID,
+        f"The model is {model.name}, with these changes:",
+        *changes,
+        _RESET,
+        _CARRIED,
+        *servos.short_delays(),
     )
     ElementTree.indent(root)
     text = ElementTree.tostring(root, encoding="unicode")
@@ -346,8 +370,14 @@ def _options(root: Element, servos: ExportedServos, theirs: Any) -> Iterator[str
         "actuation": bits.mjDSBL_ACTUATION,
     }  # fmt: skip
     off = [name for name, bit in flags.items() if theirs.opt.disableflags & bit]
+    settings = dict.fromkeys(off, "enable")
+    if theirs.opt.disableflags & bits.mjDSBL_CONSTRAINT:
+        # dry friction is a constraint; the others stay off
+        off.append("constraint")
+        settings |= dict.fromkeys(("contact", "limit", "equality"), "disable")
+        settings["constraint"] = "enable"
     if off:
-        ElementTree.SubElement(option, "flag", dict.fromkeys(off, "enable"))
+        ElementTree.SubElement(option, "flag", settings)
         yield f"Flags were disabled that the servos need: {', '.join(off)}."
 
 
@@ -432,9 +462,12 @@ def _compare(text: str, servos: ExportedServos, out: Path) -> None:
 
 def compiled_numbers(model: Any, servos: ExportedServos) -> dict[str, tuple[Any, Any]]:
     """Numbers of compiled joints and actuators, each beside the servo's: (compiled, wanted)."""
-    driven = {int(model.actuator_trnid[i, 0]): i for i in range(model.nu)}
+    from pupper_sysid.sim.robot.engine import mujoco
+
+    of_joints = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT  # ids of tendons count apart
+    driven = {int(model.actuator_trnid[i, 0]): i for i in np.flatnonzero(of_joints)}
     found: dict[str, tuple[Any, Any]] = {}
-    for name, actuator in servos.actuators().items():
+    for name, actuator in servos.actuators(MUJOCO_PID).items():
         servo = actuator.parameters
         j, dof = model.joint(name).id, int(model.joint(name).dofadr[0])
         i = driven[j]

@@ -27,7 +27,7 @@ from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, Actuator, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
-from pupper_sysid.servo_models.step_size import MUJOCO, Engine, at_step
+from pupper_sysid.servo_models.step_size import MUJOCO, MUJOCO_PID, Engine, nearest_in_loop
 
 FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age_s")
 TORQUE_KEYS = (
@@ -122,8 +122,8 @@ class ExportedServos:
     def actuators(self, engine: Engine = MUJOCO) -> dict[str, Actuator]:
         """Actuators with which joints in the simulator's steps and engine move like the servos.
 
-        Numbers and ends of intervals are changed by what `servo_models.step_size.at_step` changes
-        for what the armatures held in the recordings; the dead time is shifted, the others scaled.
+        Numbers and ends of intervals are changed by what `step_size.nearest_in_loop` changes for
+        what the armatures held in the recordings; the dead time is shifted, the others scaled.
         """
         if engine in self._actuators:
             return self._actuators[engine]
@@ -134,7 +134,7 @@ class ExportedServos:
             each = [joints[name].parameters.arrays() for name in names]
             before = {key: np.array([float(numbers[key]) for numbers in each]) for key in each[0]}
             servos = DelayedPDParameters(**before)
-            after = at_step(servos, self.physics_step_s, fitted_s, engine).arrays()
+            after = nearest_in_loop(servos, self.physics_step_s, fitted_s, engine).arrays()
             for n, name in enumerate(names):
                 old, new = ({key: float(x[n]) for key, x in y.items()} for y in (before, after))
                 stepped[name] = _changed(self.calibration.joints[name].actuator, old, new)
@@ -206,6 +206,21 @@ class ExportedServos:
             shift = turn * (h * round(delay.value / h) - delay.value)
             costs[name] = float(2 * abs(np.sin(shift / 2)) * amplitude / np.sqrt(2))
         return costs
+
+    def short_delays(self) -> Iterator[str]:
+        """Which dead times MuJoCo's delay line cannot hold, in a sentence."""
+        wanted, written = self.actuators(), self.actuators(MUJOCO_PID)
+        texts = [
+            f"{name} {1e3 * a.dead_time_s.value:.2g} became "
+            f"{1e3 * written[name].dead_time_s.value:.2g} ms"
+            for name, a in wanted.items()
+            if 0 < a.dead_time_s.value < self.physics_step_s
+        ]
+        if texts:
+            yield (
+                f"MuJoCo has no delay between 0 and one step: {', '.join(texts)}. Take steps that "
+                "are shorter than the dead time."
+            )
 
     def _scales(self) -> Iterator[str]:
         scales = {

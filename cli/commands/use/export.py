@@ -206,7 +206,7 @@ class Export:
 
     def _check(self, calibration: Calibration, links: dict[str, float]) -> None:
         """Print how far the export is from the calibration."""
-        from pupper_sysid.sim.export.check import check
+        from pupper_sysid.sim.export.check import SWITCHED_OFF, WHOLE, check
         from pupper_sysid.sim.export.shared import ExportedServos
 
         step = 0.002 if self.physics_step is None else self.physics_step
@@ -218,19 +218,30 @@ class Export:
         n = terminal.number
         table = terminal.table(
             f"Export in MuJoCo, steps of {1e3 * step:g} ms, beside the calibration, RMS",
-            "joint", "tones mrad", "walk mrad", "readings counts", "whole steps mrad",
+            "joint", "tones mrad", "walk mrad", "same steps mrad", "readings counts",
+            "whole steps mrad",
         )  # fmt: skip
         for name, row in checked.joints.items():
             table.add_row(
                 name, n(1e3 * row.tones_rad, 2), n(1e3 * row.walk_rad, 2),
-                n(row.reading_counts, 2), n(1e3 * row.whole_steps_rad, 1),
+                n(1e3 * row.same_steps_rad, 2), n(row.reading_counts, 2),
+                n(1e3 * row.whole_steps_rad, 1),
             )  # fmt: skip
         terminal.out.print(table)
+        if any(row.step_rad[WHOLE] > 0 for row in checked.joints.values()):
+            parts = terminal.table(
+                f"What steps of {1e3 * step:g} ms cost, RMS on the tones [mrad]",
+                "joint", *SWITCHED_OFF,
+            )  # fmt: skip
+            for name, row in checked.joints.items():
+                parts.add_row(name, *(n(1e3 * cost, 2) for cost in row.step_rad.values()))
+            terminal.out.print(parts)
         for sentence in checked.notes:
             terminal.err.print(sentence, soft_wrap=True)
 
     def _simulator(self, path: Path, calibration: Calibration, links: dict[str, float]) -> Path:
         """The calibration for another simulator."""
+        from pupper_sysid.servo_models.cards.card import CardCalibration
         from pupper_sysid.sim.export.export import ENDINGS, exported_text
         from pupper_sysid.sim.export.shared import INCLUDES_LINK
 
@@ -247,6 +258,9 @@ class Export:
             f"For a physics step of {1e3 * servos.physics_step_s:g} ms (--physics-step).",
             *servos.operating_points(), sep="\n", soft_wrap=True,
         )  # fmt: skip
+        absent = [n for n in calibration.joint_names if n not in servos.calibration.joint_names]
+        if absent and not isinstance(calibration, CardCalibration):
+            terminal.warn([f"{self.model} has no joint {', '.join(absent)}; left out."])
         if servos.with_link:
             terminal.warn(
                 [

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.cli.programs import pupper_sysid
+from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.cards.compare import implausible, motion_of, servo_of
 from pupper_sysid.servo_models.cards.files import load_card
@@ -62,6 +63,41 @@ def test_a_configuration_is_read_and_not_run(tmp_path):
     assert any("states no armature" in note for note in head.notes)
 
 
+STYLES = {
+    "isaaclab": (
+        "STIFF = 25.0\nROBOT = ArticulationCfg(actuators={'legs': DCMotorCfg(joint_names_expr="
+        "['.*_hip', '.*_thigh'], effort_limit=23.5, stiffness=STIFF, damping=0.5)})\n",
+        (25.0, 0.5, 23.5),
+    ),
+    "mjlab": (
+        "import math\nA: float = 0.001\nW = 10 * 2.0 * math.pi\nACT = BuiltinPositionActuatorCfg("
+        "target_names_expr=('.*_thigh',), stiffness=A * W**2, damping=2.0 * 2.0 * A * W, "
+        "effort_limit=0.35, armature=A)\n",
+        (0.001 * (20 * np.pi) ** 2, 0.004 * 20 * np.pi, 0.35),
+    ),
+    "legged_gym": (
+        "class Mine(LeggedRobotCfg):\n  class control(LeggedRobotCfg.control):\n"
+        "    stiffness = {'hip': 7.0, 'thigh': 9.0}\n    damping = {'hip': 0.2, 'thigh': 0.1}\n"
+        "  class asset:\n    armature = 0.001\n    effort_limit = 1.5\n",
+        (9.0, 0.1, 1.5),
+    ),
+}
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_the_common_styles_of_configurations_are_read(style, tmp_path):
+    text, wanted = STYLES[style]
+    (tmp_path / "cfg.py").write_text(text)
+    pd = foreign_servo(tmp_path / "cfg.py", "LF_thigh").pd.parameters
+    assert (pd.stiffness, pd.damping, pd.effort_limit) == pytest.approx(wanted)
+
+
+def test_arithmetic_that_grows_without_end_is_no_number(tmp_path):
+    (tmp_path / "cfg.py").write_text("A = 9 ** 9 ** 9 ** 9\nB = make(stiffness=A / 0)\n")
+    with pytest.raises(InputError, match="no stiffness"):
+        foreign_servo(tmp_path / "cfg.py")
+
+
 @pytest.mark.parametrize(("target", "engine"), [("isaaclab", EXPLICIT_PD), ("mjlab", BUILTIN_PD)])
 def test_our_own_exports_are_read_back_as_they_were_written(target, engine, tmp_path):
     calibration = load_calibration(CALIBRATED)
@@ -101,7 +137,8 @@ def test_files_without_a_servo_are_refused_with_the_way_out(tmp_path, capsys):
     (tmp_path / "cfg.py").write_text("A = make(stiffness=compute())\n")
     (tmp_path / "broken.py").write_text("def (\n")
     for name, cure in (
-        ("robot.xml", "they drive hip"), ("cfg.py", "literal keyword"), ("broken.py", "no Python"),
+        ("robot.xml", "they drive hip"), ("cfg.py", "keyword arguments"),
+        ("broken.py", "no Python"),
     ):  # fmt: skip
         words = ("servo", "diff", CALIBRATED, tmp_path / name, "--joint", "LF_hip")
         assert cure in refused(capsys, pupper_sysid, *words)

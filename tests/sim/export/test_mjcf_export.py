@@ -11,7 +11,8 @@ from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
-from pupper_sysid.sim.export.check import LOOP_S, compiled, held, moved_by
+from pupper_sysid.servo_models.step_size import CONTROL_S
+from pupper_sysid.sim.export.check import compiled, held, moved_by
 from pupper_sysid.sim.export.mjcf import compiled_numbers, link_inertias, to_mjcf, to_model
 from pupper_sysid.sim.export.shared import ExportedServos
 from pupper_sysid.sim.robot.engine import mujoco
@@ -69,7 +70,7 @@ def unlimited(calibration):
 
 def rise_s(positions: np.ndarray, step_s: float) -> np.ndarray:
     """Time from the step's edge to 63 % of it, between steps."""
-    at = step_s * np.arange(1, len(positions) + 1) - 20 * LOOP_S
+    at = step_s * np.arange(1, len(positions) + 1) - 20 * CONTROL_S
     wanted = 0.3 * (1 - np.exp(-1))
     return np.array([np.interp(wanted, np.maximum.accumulate(p), at) for p in positions.T])
 
@@ -199,6 +200,43 @@ def test_own_actuators_are_replaced_under_their_names_and_keyframes_hold_the_pos
     assert "LF_hip (2)" in text
 
 
+def test_actuators_on_tendons_are_no_servos_whatever_their_ids(calibration, tmp_path):
+    tendon = (
+        '<tendon><fixed name="first"><joint joint="LF_hip" coef="1"/></fixed></tendon><actuator>'
+        '<position name="pull" tendon="first" kp="1000"/></actuator>'
+    )
+    model, servos = put_into(tmp_path, robot(LINKS, actuators=OWN + tendon), calibration)
+    assert model.actuator("pull").id == model.nu - 1  # behind the servos, on tendon 0
+    for name, (found, wanted) in compiled_numbers(model, servos).items():
+        np.testing.assert_array_equal(found, wanted, err_msg=name)
+    assert "and were left: pull" in " ".join((tmp_path / "out.xml").read_text().split())
+
+
+def test_dry_friction_acts_in_a_model_without_constraints_and_the_others_stay_off(
+    calibration, tmp_path
+):
+    settings = '<option><flag constraint="disable"/></option>'
+    model, _ = put_into(
+        tmp_path, robot(LINKS, settings, actuators=OWN), calibration, physics_step_s=TIME_STEP_S
+    )
+    bits = mujoco.mjtDisableBit
+    kept = bits.mjDSBL_CONTACT | bits.mjDSBL_LIMIT | bits.mjDSBL_EQUALITY
+    assert model.opt.disableflags == int(kept)
+    names = calibration.joint_names
+    there = moved_by(model, names, STEP_RAD, TIME_STEP_S)
+    np.testing.assert_allclose(there, own_step(calibration, names), atol=1e-3)
+
+
+def test_a_card_is_refused_where_no_hinge_is_driven(tmp_path):
+    (tmp_path / "cart.xml").write_text(
+        '<mujoco><worldbody><body><joint name="slider" type="slide"/><geom size="0.1"/><body>'
+        '<joint name="pole"/><geom size="0.1"/></body></body></worldbody><actuator>'
+        '<motor joint="slider"/></actuator></mujoco>'
+    )
+    with pytest.raises(InputError, match=r"drives none of its hinges \(pole\)"):
+        to_model(load_calibration("sts3215-bam-m1"), tmp_path / "cart.xml", tmp_path / "out.xml")
+
+
 def test_the_links_inertia_is_that_of_the_bodies_whatever_else_the_model_adds():
     text = robot(LINKS, joint='armature="0.7"', actuators=OWN)
     model = mujoco.MjModel.from_xml_string(text)
@@ -257,6 +295,17 @@ def test_a_model_that_cannot_take_the_servos_is_refused_with_the_way_out(
         assert cure in refused(capsys, pupper_sysid, *words)
     with pytest.raises(InputError, match="model is of"):
         calibration.export("mjlab", tmp_path, model="other.xml")
+
+
+def test_joints_that_a_model_lacks_are_named(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my.xml").write_text(robot({"LF_hip": 1e-4}, actuators=""))
+    words = ("export", CALIBRATED, "--to", "mjcf", "--model", "my.xml", "--out", "out.xml")
+    code, _, err = run_program(capsys, pupper_sysid, *words)
+    assert code == 0 and "my.xml has no joint LF_thigh, LF_calf" in " ".join(err.split())
+    assert "left out: LF_thigh, LF_calf" in " ".join((tmp_path / "out.xml").read_text().split())
+    said = refused(capsys, pupper_sysid, *words, "--force", "--link-inertia", "LF_calf=1e-4")
+    assert "servos go into LF_hip" in said
 
 
 def test_a_card_goes_into_every_driven_joint_of_a_published_robot(tmp_path):

@@ -8,7 +8,7 @@ import re
 import sys
 import types
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,18 @@ from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
-from pupper_sysid.servo_models.step_size import MUJOCO
+from pupper_sysid.servo_models.step_size import (
+    CONTINUOUS_S,
+    CONTROL_S,
+    MUJOCO,
+    MUJOCO_PID,
+    at_step,
+    in_loop,
+    nearest_in_loop,
+)
 from pupper_sysid.sim.export.check import check, held, walk_commands
 from pupper_sysid.sim.export.export import SIMULATORS, exported_text
+from pupper_sysid.sim.export.mjcf import to_mjcf
 from pupper_sysid.sim.export.mjlab import BUILTIN_PD
 from pupper_sysid.sim.export.shared import CALIBRATED_PD, EXPLICIT_PD, ExportedServos
 from pupper_sysid.sim.robot.engine import mujoco
@@ -502,6 +511,54 @@ def test_an_export_in_the_steps_of_its_fit_moves_as_the_calibration_does(calibra
     links = {name: 1e-4 for name in calibration.joint_names}
     checked = check(ExportedServos.of(calibration, TIME_STEP_S, link_inertia=links))
     assert max(row.walk_rad for row in checked.joints.values()) < 3e-5
+
+
+def test_a_check_says_what_the_step_costs_apart_from_what_the_target_does(calibration):
+    checked = check(ExportedServos.of(calibration, 0.005))
+    for name, row in checked.joints.items():
+        assert row.same_steps_rad < 3e-5, name
+        assert row.not_carried_rad == 0.0, name
+        # all of the distance is the step's, and less than the largest torque moves in one
+        assert row.step_rad["whole servo"] == pytest.approx(row.tones_rad, abs=3e-5)
+        assert row.tones_rad < row.step_of_full_torque_rad
+    assert any("Steps of 2.5 ms would leave" in note for note in checked.notes)
+    loaded = check(ExportedServos.of(load_calibration("sts3215-bam-m6"), 0.005))
+    (row,) = loaded.joints.values()
+    assert row.not_carried_rad > 1e-4
+
+
+def test_the_dead_time_for_a_step_is_that_of_the_nearest_motion_on_other_commands(calibration):
+    time = np.arange(0.0, 1.0, CONTROL_S)
+    turn, amplitude, phase = np.random.default_rng(3).uniform((4, 0.1, 0), (25, 0.3, 6), (24, 3)).T
+    unseen = (amplitude * np.sin(turn * time[:, None] + phase)).T.ravel()
+    servos = calibration.delayed_pd().parameters
+    at, here = in_loop(servos, CONTINUOUS_S, unseen)
+
+    def apart(stepped):
+        times, there = in_loop(stepped, 0.005, unseen)
+        wanted = np.stack([np.interp(times, at, track) for track in here.T], axis=1)
+        return np.sqrt(np.mean((there - wanted) ** 2, axis=0))
+
+    nearest = nearest_in_loop(servos, 0.005)
+    by_lag = at_step(servos, 0.005)
+    np.testing.assert_array_equal(nearest.stiffness, by_lag.stiffness)  # a stance sags as much
+    assert np.mean(apart(nearest)) < 0.9 * np.mean(apart(by_lag))
+    for later_s in (-0.0015, 0.0015):
+        other = replace(nearest, dead_time_s=nearest.dead_time_s + later_s)
+        assert (apart(nearest) < apart(other)).all()
+
+
+@pytest.mark.parametrize(
+    ("card", "step_s"), [("sts3215-open-duck", 0.005), ("sts3215-bam-m1", 0.002)]
+)
+def test_a_dead_time_below_one_step_is_written_as_mujoco_takes_it(card, step_s):
+    servos = ExportedServos.of(load_calibration(card), step_s)
+    (row,) = check(servos).joints.values()
+    assert row.same_steps_rad < 3e-5
+    (wanted,), (written,) = (servos.actuators(e).values() for e in (MUJOCO, MUJOCO_PID))
+    assert 0 < wanted.dead_time_s.value < step_s
+    assert written.dead_time_s.value in (0.0, step_s)
+    assert "no delay between 0 and one step" in " ".join(to_mjcf(servos).split())
 
 
 def test_whole_steps_cost_what_a_shift_of_the_tone_costs(calibration):
