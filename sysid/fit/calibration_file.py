@@ -296,8 +296,8 @@ def _delay_steps(servo: DelayedPDParameters, dead_time_s: Interval) -> tuple[int
         more = float(np.squeeze(at_step(servo, TIME_STEP_S).dead_time_s)) - dead_time_s.value
     except InputError:
         more = 0.0
-    ends = (max(t + more, 0.0) for t in (dead_time_s.low, dead_time_s.high))
-    return whole_steps(*ends, TIME_STEP_S)
+    low, high = (max(t + more, 0.0) for t in (dead_time_s.low, dead_time_s.high))
+    return whole_steps(low, high, TIME_STEP_S)
 
 
 def _block(loaded: LoadedFit, torque: float) -> UnderLoad:

@@ -687,7 +687,7 @@ def _braking(fitted: Fitted) -> Interval:
 
     def total(values: NDArray) -> NDArray:
         effort, speed, damping = (
-            values[..., names.index(n)] if n in names else absent
+            values[..., names.index(n)] if n in names else np.asarray(absent)
             for n, absent in (
                 ("effort_rad_s2", 0.0), ("no_load_speed_rad_s", np.inf), ("damping_per_s", 0.0)
             )

@@ -155,6 +155,7 @@ class _Apart:
 def _apart(part: Problem, point: NDArray, least_rad: float, quantum_rad: float) -> _Apart:
     """Fit to one recording, from the fit to all of them."""
     structure, runs = part.structure, part.runs
+    residuals: list[NDArray[np.float64]] = []
     for _ in range(2):
         point = refine(part, local(part, point[None], _ITERATIONS, _STEP)[0].point[None]).point
         residuals = fresh_residuals(structure, structure.decode(point), runs)
