@@ -114,6 +114,8 @@ _PREFERENCE = 1.02
 """Error on unseen motion, over the smallest, up to which a simpler structure is carried."""
 _REPORTED_PREFERENCE = 1.05
 _WIDE = 4.0
+_FOREIGN = 3.0
+"""Standard deviations of a prior from another unit, beyond which it is of another servo."""
 _SHARP_DEAD_TIME_S = 0.015
 _POLL_SD_S = 1e-3
 """Standard deviation of a poll's instant about its lattice: jitter of the bus and drift."""
@@ -779,6 +781,18 @@ def _hardly_known(lag: LagBudget) -> bool:
     return high - low >= _SHARP_DEAD_TIME_S and high > _WIDE * max(low, 0.0)
 
 
+def _foreign(joint: str, carried: Fitted) -> Iterator[str]:
+    """Numbers that are far from those of the unit which was taken as the prior."""
+    for p, value in zip(carried.structure.parameters, carried.values, strict=True):
+        apart = float(p.encode(value) - p.encode(p.nominal))
+        if p.prior_source and abs(apart) > _FOREIGN * p.marginal_sd:
+            yield (
+                f"{joint}: {_shown(p.name)} is {np.exp(apart):.2g} times that of {p.prior_source}, "
+                "which units of one servo do not differ by. Is it the same servo at the same gain? "
+                "Calibrate without that prior if not."
+            )
+
+
 def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) -> Iterator[str]:
     if why := _undescribed(goodness):
         worst = max((r, name) for name, r in goodness.items() if np.isfinite(r))
@@ -788,6 +802,7 @@ def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) ->
     if choice.misfit is not None:
         yield choice.misfit.sentence(joint)
     own = choice.carried
+    yield from _foreign(joint, own)
     if choice.repeats is not None:
         yield from (d.sentence(joint) for d in choice.repeats.differences)
     if not (own.r_hat <= R_HAT and own.effective >= EFFECTIVE):

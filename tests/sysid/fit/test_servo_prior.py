@@ -8,6 +8,8 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
+from pupper_sysid.sysid.fit.joint_fit import Fitted, _foreign
+from pupper_sysid.sysid.fit.search import Fit
 from pupper_sysid.sysid.fit.servo_prior import PER_INERTIA, ServoPrior, servo_prior
 from pupper_sysid.sysid.fit.structure import SIMULATED, Scales, candidate
 
@@ -103,3 +105,13 @@ def test_a_heavier_link_costs_little_and_another_ratio_much():
     stronger = structure.prior[0] + np.log(2) * (np.array(structure.names) == "effort_rad_s2")
     assert structure.prior_cost(heavier[None])[0] < 1.0
     assert structure.prior_cost(stronger[None])[0] > 4.0
+
+
+def test_numbers_that_no_unit_of_the_servo_has_are_named():
+    structure = candidate(SIMULATED[0], Scales(prior=prior_of()))
+    usual = Fitted(structure, Fit(structure.prior[0], 0.0))
+    place = structure.names.index("velocity_limit_rad_s")
+    far = structure.prior[0] + np.log(5.0) * (np.arange(len(structure.names)) == place)
+    assert list(_foreign("pan", usual)) == []
+    (sentence,) = _foreign("pan", Fitted(structure, Fit(far, 0.0)))
+    assert "velocity_limit_rad_s is 5 times that of sample" in sentence
