@@ -114,6 +114,9 @@ _PREFERENCE = 1.02
 """Error on unseen motion, over the smallest, up to which a simpler structure is carried."""
 _REPORTED_PREFERENCE = 1.05
 _WIDE = 4.0
+_REACHED = 1.25
+"""Ends of the effort limit's interval, up to which a motion at that limit tells back-EMF from
+damping. Wider ones gave wrong parts of a right sum on twins (`benchmarks/wide_twins.py`)."""
 _FOREIGN = 3.0
 """Standard deviations of a prior from another unit, beyond which it is of another servo."""
 _SHARP_DEAD_TIME_S = 0.015
@@ -832,7 +835,8 @@ def _candidate_fit(
     }
     if "braking_per_s" in parameters:
         undecided |= _vague("braking_per_s", parameters["braking_per_s"])
-    if "back_emf_per_s" in parameters and "no_load_speed_rad_s" in undecided:
+    vague = "no_load_speed_rad_s" in undecided or _ratio_of(parameters, "effort_rad_s2") > _REACHED
+    if "back_emf_per_s" in parameters and vague:
         # inside of the effort limit the two brake alike
         both = _only_the_sum(parameters["braking_per_s"], "1/s")
         undecided |= {"back_emf_per_s": both, "damping_per_s": both}
@@ -847,6 +851,12 @@ def _candidate_fit(
         undecided=undecided,
         scores=score(free_run(structure, values, ready.runs), ready.runs, left_out),
     )
+
+
+def _ratio_of(parameters: Mapping[str, Interval], name: str) -> float:
+    """Upper over lower end of an interval; 1 without one."""
+    interval = parameters.get(name)
+    return 1.0 if interval is None else interval.high / max(interval.low, 1e-12)
 
 
 def _vague(name: str, interval: Interval) -> dict[str, str]:
