@@ -559,9 +559,7 @@ def _settled(
         return ready, every, plain
     wider = _choice(any_servo, ladder)
     better = (choice.carried.fit.cost - wider.carried.fit.cost) / choice.carried.temperature
-    if (
-        plain.misfit is not None and better < plain.misfit.nats
-    ):  # what explains the misfit best is no term of a servo
+    if plain.misfit is not None and better < plain.misfit.nats:  # that is no term of a servo
         return ready, every, plain
     return any_servo, ladder, _explained(any_servo, wider)
 

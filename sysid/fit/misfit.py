@@ -25,9 +25,8 @@ _SEARCHED_S = 0.016
 _NATS = 10.0
 """Log-likelihood by which an explanation is named."""
 _WORDS = {
-    "backlash": ("backlash_rad", "play of {:.1f} mrad between motor and link", 1e3),
-    "dead zone": ("dead_zone_rad", "a dead zone of {:.1f} mrad to either side in its controller",
-                  1e3),
+    "backlash": ("backlash_rad", "play of {:.1f} mrad between motor and link"),
+    "dead zone": ("dead_zone_rad", "a dead zone of {:.1f} mrad to either side in its controller"),
 }  # fmt: skip
 
 
@@ -147,7 +146,7 @@ def _with_feature(
     if feature in structure.features:
         return None
     wider = servo_structure((*structure.features, feature), structure.scales)
-    name, words, factor = _WORDS[feature]
+    name, words = _WORDS[feature]
     starts = np.repeat(wider.adopt(structure, best.point)[None], 3, axis=0)
     place = wider.names.index(name)
     low, high = wider.box
@@ -155,6 +154,6 @@ def _with_feature(
     fit = refine(replace(problem, structure=wider), starts)
     values = wider.decode(fit.point)
     return Explanation(
-        words.format(factor * values[place]), (best.cost - fit.cost) / temperature - 1.0,
+        words.format(1e3 * values[place]), (best.cost - fit.cost) / temperature - 1.0,
         float(values[0]),
     )  # fmt: skip

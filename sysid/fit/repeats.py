@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.noise import noise_by_run
 from pupper_sysid.sysid.fit.posterior import temperature_of
@@ -37,7 +37,6 @@ _CHANGES = np.linspace(-1.2, 1.2, 121)
 """Logarithms of factors that are tried, from 0.3 to 3.3."""
 _GRAIN = 0.006  # standard deviation of one of them about the true factor
 _MOST = 12  # recordings that are fitted apart
-_Z = 1.645
 GAINS = ("stiffness_per_s2", "damping_per_s")
 """Numbers that the P gain and the supply voltage scale together."""
 
@@ -207,7 +206,12 @@ def _difference(source: str, one: _Apart, others: Sequence[_Apart]) -> Differenc
     change, sd = costs[name][1], (directions[name] @ weight @ directions[name]) ** -0.5
     if abs(change) < _LEAST_CHANGE:
         return None
-    factor = Interval(*(float(np.exp(change + z * np.hypot(sd, _GRAIN))) for z in (0.0, -_Z, _Z)))
+    factor = Interval(
+        *(
+            float(np.exp(change + z * np.hypot(sd, _GRAIN)))
+            for z in (0.0, -HALF_WIDTH_SD, HALF_WIDTH_SD)
+        )
+    )
     return Difference(source, name, factor, float(nats[name]))
 
 

@@ -12,10 +12,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.interval import LEVEL
+from pupper_sysid.common.interval import HALF_WIDTH_SD
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
@@ -33,7 +32,6 @@ _GAIN_SD = 0.5  # of stiffness and damping where the P gain of one of the two is
 _DOUBTED_SD = 0.3  # of a number whose interval is not to be trusted: the model does not describe it
 _LINK_SD = 0.7  # a link of the armature's inertia halves all torques per inertia
 _WEIGHT = 4.0  # joints that each of these spreads counts as, beside those of the calibration
-_Z = NormalDist().inv_cdf((1 + LEVEL) / 2)
 
 
 @dataclass(frozen=True)
@@ -123,15 +121,16 @@ def _logarithms(
         speed = math.log(ratios.effort_limit.value / ratios.back_emf.value)
         yield "no_load_speed_rad_s", (speed, _sd(ratios.back_emf))
     gain = None if point is None else point.p_gain
-    both = gain is not None and p_gain is not None
+    scale = None if gain is None or p_gain is None else p_gain / gain
     for name, quantity in numbers.items():
         limitless = name == "velocity_limit_rad_s" and quantity.value >= NO_SPEED_LIMIT_RAD_S
         if not quantity.value > 0 or limitless or not _known(quantity):
             continue
         mean, sd = math.log(quantity.value), _sd(quantity)
         if name in _AT_GAIN:
-            mean += math.log(p_gain / gain) if both else 0.0  # type: ignore[operator]
-            sd = sd if both else math.hypot(sd, _GAIN_SD)
+            mean, sd = (
+                (mean, math.hypot(sd, _GAIN_SD)) if scale is None else (mean + math.log(scale), sd)
+            )
         yield name, (mean, sd)
 
 
@@ -144,7 +143,7 @@ def _known(quantity: Quantity) -> bool:
 def _sd(quantity: Quantity) -> float:
     if quantity.low is None or quantity.high is None or quantity.low <= 0:
         return 0.0
-    sd = math.log(quantity.high / quantity.low) / (2 * _Z)
+    sd = math.log(quantity.high / quantity.low) / (2 * HALF_WIDTH_SD)
     return math.hypot(sd, _DOUBTED_SD) if quantity.identified == "no" else sd
 
 
