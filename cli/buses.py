@@ -7,10 +7,11 @@ from pathlib import Path
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import JOINT_NAMES, select_joints
 from pupper_sysid.common.reading.dialect import whole
-from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.address import EMULATED, KINDS, bus_name, parse_address
 from pupper_sysid.hardware.bus import ServoBus
-from pupper_sysid.hardware.connect import open_guarded
+from pupper_sysid.hardware.connect import open_bus, open_guarded
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.monitor import GuardLimits
@@ -26,6 +27,27 @@ def chosen_map(text: str | None) -> JointMap | None:
         terminal.err.print(f"Taking the joint map {JOINTS_FILE}.", soft_wrap=True)
         return load_joint_map(JOINTS_FILE)
     return None if text is None else load_joint_map(text)
+
+
+def joints_on(bus: str, joint_map: JointMap | None, text: str) -> list[str]:
+    """Joints of a bus that `text` names, as `select_joints` reads it.
+
+    Raises
+    ------
+    InputError
+        If one is unknown. Without a joint map names are the Mini Pupper's: a serial line of other
+        servos is then refused for its missing map, not for the name.
+    BusError
+        If that line has no servos, or cannot be opened.
+    """
+    try:
+        return select_joints(text, joint_map.joint_names if joint_map else JOINT_NAMES)
+    except InputError:
+        if joint_map is None and bus_name(bus) != EMULATED:
+            address = parse_address(bus)
+            if KINDS[address.kind].is_serial:
+                open_bus(address).close()
+        raise
 
 
 def connect(

@@ -144,9 +144,11 @@ def default_map(family: Family, line: SerialLine, series: dict[int, Series]) -> 
     ids = ids_in_words([*series, *others])
     raise InputError(
         f"{line.device}: no joint map says which joint each servo moves, and these ({one.name}, "
-        f"ids {ids}) are not the Mini Pupper's twelve. Make a map from your robot's URDF or MJCF "
-        "with `pupper-sysid init-robot ROBOT.urdf` and name it as the joint map; `pupper-sysid "
-        f"scan --bus {family.name}:{line.device}` lists the servos."
+        f"{'ids' if len(series) + len(others) > 1 else 'id'} {ids}) are not the Mini Pupper's "
+        "twelve. Make a map from your robot's URDF or MJCF with `pupper-sysid init-robot "
+        f"ROBOT.urdf --servo {one.name.lower()}`, or without such a file with `pupper-sysid "
+        f"init-robot --servo {one.name.lower()} --joints pan={min(series)}`, and give it with "
+        f"--joint-map; `pupper-sysid scan --bus {family.name}:{line.device}` lists the servos."
         + (f" A part of a Mini Pupper needs its joint map ({preset}) named, too." if preset else "")
     )
 

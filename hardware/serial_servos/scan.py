@@ -187,7 +187,10 @@ def _slow_returns(servos: list[ServoReport]) -> list[str]:
     ]
     if not slow:
         return []
+    delays = sorted({s.return_delay_us for s in slow if s.return_delay_us is not None})
+    many = len(slow) > 1
     return [
-        f"Servos {', '.join(str(s.id) for s in slow)} have a return delay (servo {slow[0].id}: "
-        f"{slow[0].return_delay_us} µs); 0 would make reading faster."
+        f"{'Servos' if many else 'Servo'} {ids_in_words([s.id for s in slow])} "
+        f"{'have' if many else 'has'} a return delay of {' or '.join(map(str, delays))} µs; 0 "
+        "would make reading faster."
     ]

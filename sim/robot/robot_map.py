@@ -1,6 +1,7 @@
 """A joint map for any robot with hobby servos, from its MJCF (or URDF).
 
     robot = joint_map_of(Path("arm.xml"), "sts3215")      # robot.joint_map, robot.left_out
+    robot = joint_map_of_servos({"pan": 1, "tilt": 2}, "xl330-m288")       # without a model
 
 Each hinge that an actuator drives, by itself or through a tendon, becomes a joint with a servo;
 in a model without actuators, each hinge that does not follow another one (URDF `mimic`, MJCF
@@ -12,7 +13,7 @@ and signs are checked in `pupper-sysid monitor` while a joint is moved by hand.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,8 +27,12 @@ from pupper_sysid.sim.robot.hinges import Hinge, hinges_of
 
 _TURN = (4096, 2 * np.pi)
 SERVOS = {"sts3215": _TURN, "scs0009": (1024, np.radians(300))} | dict.fromkeys(
-    ("hd-1910", "xl330-m288", "xl430-w250", "xm430-w350", "xm430-w210", "mx-28"), _TURN
-)
+    (
+        "hd-1910", "xl330-m288", "xl330-m077", "xc330-m288", "xl430-w250", "xm430-w350",
+        "xm430-w210", "xh430-w350", "xm540-w150", "xm540-w270", "mx-28", "mx-64", "mx-106",
+    ),
+    _TURN,
+)  # fmt: skip
 """Counts of the encoder, and the angle that they span [rad]."""
 
 _MARGIN_COUNTS = 20  # servos clip goals near the ends of their range
@@ -59,7 +64,7 @@ def joint_map_of(
     ----------
     path : Path
         MJCF or URDF.
-    servo : {"sts3215", "scs0009"}
+    servo : str
         Type of all servos; one of `SERVOS`.
     lerobot : mapping of str to LeRobotJoint, optional
         LeRobot's calibration of the arm, whose ids, directions and ranges are then taken.
@@ -90,20 +95,53 @@ def joint_map_of(
     if strange := strange_joint(names):
         name = strange[0] or "without a name"
         raise InputError(f"{path}: a joint is called '{name}'; {strange[1]} Rename it there.")
-    counts, span = SERVOS[servo]
     joints, doubts = _with_sound_limits(joints)
-    data = {
-        "schema": SCHEMA, "schema_version": SCHEMA_VERSION, "name": path.stem, "frame": "raw",
-        "counts": counts, "servo": servo.upper(), "linkage": "none",
-        "source": f"made from {path.name} for {servo} servos; ids, centres and signs are guesses",
-        "joints": {
-            hinge.name: _entry(path, hinge, k + 1, counts, counts / span)
-            for k, hinge in enumerate(joints)
-        },
-    }  # fmt: skip
+    source = f"made from {path.name} for {servo} servos; ids, centres and signs are guesses"
+    ids = range(1, len(joints) + 1)
+    data = _map_data(path, joints, ids, servo, source, "limits of the model; the rest is a guess")
     if lerobot is not None:
         apply_lerobot(data, lerobot, path)
     return RobotMap(joint_map_from(data, str(path)), left_out, following, doubts)
+
+
+def joint_map_of_servos(ids: Mapping[str, int], servo: str) -> RobotMap:
+    """Joint map of servos without a model file: a bench, or a part of a robot.
+
+    Parameters
+    ----------
+    ids : mapping of str to int
+        Servo id of each joint.
+    servo : str
+        Type of all servos; one of `SERVOS`.
+
+    Raises
+    ------
+    InputError
+        If a name cannot be a joint's, or an id is no servo's or there twice.
+    """
+    hinges = [Hinge(name, True, -_UNKNOWN_RAD, _UNKNOWN_RAD, driven=True) for name in ids]
+    source = f"names and ids as stated, for {servo} servos; centres, signs and limits are guesses"
+    data = _map_data(Path("joints"), hinges, ids.values(), servo, source, "a guess")
+    doubt = (
+        f"no limits are known, so the map allows ±{_UNKNOWN_RAD:g} rad about each servo's middle "
+        "until `pupper-sysid calibrate-joints` has measured them. Turn the servos there by hand."
+    )
+    return RobotMap(joint_map_from(data, "--joints"), [], {}, [doubt])
+
+
+def _map_data(
+    path: Path, joints: list[Hinge], ids: Iterable[int], servo: str, source: str, of_joint: str
+) -> dict:
+    """A joint map's file; `of_joint` is the source of each joint's values."""
+    counts, span = SERVOS[servo]
+    return {
+        "schema": SCHEMA, "schema_version": SCHEMA_VERSION, "name": path.stem, "frame": "raw",
+        "counts": counts, "servo": servo.upper(), "linkage": "none", "source": source,
+        "joints": {
+            hinge.name: _entry(path, hinge, servo_id, counts, counts / span, of_joint)
+            for hinge, servo_id in zip(joints, ids, strict=True)
+        },
+    }  # fmt: skip
 
 
 def _with_sound_limits(joints: list[Hinge]) -> tuple[list[Hinge], list[str]]:
@@ -136,7 +174,9 @@ def _with_sound_limits(joints: list[Hinge]) -> tuple[list[Hinge], list[str]]:
     return sound, doubts
 
 
-def _entry(path: Path, hinge: Hinge, servo_id: int, counts: int, per_rad: float) -> dict:
+def _entry(
+    path: Path, hinge: Hinge, servo_id: int, counts: int, per_rad: float, source: str
+) -> dict:
     reach = (counts / 2 - _MARGIN_COUNTS) / per_rad
     low, high = hinge.low, hinge.high
     if low is None or high is None or (low >= high and (low, high) != (0.0, 0.0)):
@@ -156,5 +196,5 @@ def _entry(path: Path, hinge: Hinge, servo_id: int, counts: int, per_rad: float)
             int(np.floor(counts / 2 + per_rad * (high - neutral))),
         ],
         "limits_rad": [low, high],
-        "source": "limits of the model; the rest is a guess",
+        "source": source,
     }  # fmt: skip

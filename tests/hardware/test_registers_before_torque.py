@@ -15,6 +15,7 @@ from pupper_sysid.hardware.joint_map import joint_map_from
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.serial_line import LineEmulator
+from support.command_line import run
 from support.servo_servers import (
     bench_of,
     dynamixel_map,
@@ -216,3 +217,24 @@ def test_a_servo_without_a_published_model_number_is_driven_by_the_map_that_name
         setup = bus.servo_setups()["LF_hip"]
         bus.close()
     assert (setup["model"], setup["p_gain"], setup["d_gain"]) == ("HD-1910", 16, 8)
+
+
+@pytest.mark.parametrize("kind", ["feetech", "dynamixel"])
+@pytest.mark.parametrize("words", ["sweep --freqs 1-8 --joints", "calibrate-joints --joints"])
+def test_an_unknown_name_on_a_line_without_a_map_is_blamed_on_the_missing_map(
+    capsys, tmp_path, monkeypatch, kind, words
+):
+    monkeypatch.chdir(tmp_path)
+    servos = still_servos(STS3215, IDS) if kind == "feetech" else still_dynamixels(IDS)
+    with on_a_port(servos) as server:
+        bus = f"{kind}:{server.device}@1000000"
+        code, _, err = run(capsys, *words.split(), "pan", "--bus", bus)
+        model = servos.series.name.lower()
+        assert code and "no joint map says" in err and f"init-robot --servo {model}" in err
+        assert "--joint-map" in err and "pupper-sysid scan" in err and "'pan'" not in err
+        dynamixel_map(*IDS, model=servos.series.name).save(tmp_path / "map.yaml")
+        code, _, err = run(
+            capsys, *words.split(), "LF_tigh", "--bus", bus, "--joint-map", "map.yaml"
+        )
+        assert code and "Did you mean LF_thigh?" in err and "no joint map" not in err
+    assert bench_of(servos).goals == [] and not any(on for _, on in bench_of(servos).torques)

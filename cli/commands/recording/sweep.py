@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.buses import JOINTS_FILE, parse_registers
+from pupper_sysid.cli.buses import JOINTS_FILE, joints_on, parse_registers
 from pupper_sysid.cli.commands.recording.bench import BENCH_MAP, BENCH_RATE_HZ, loads_of
 from pupper_sysid.cli.commands.recording.sweeping import (
     guard_warnings,
@@ -23,9 +23,9 @@ from pupper_sysid.cli.commands.recording.sweeping import (
 from pupper_sysid.cli.live_views import Wanted
 from pupper_sysid.common.errors import BusError, InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite
-from pupper_sysid.common.joints import JOINT_NAMES, select_joints
+from pupper_sysid.common.joints import select_joints
 from pupper_sysid.hardware.address import EMULATED, bus_name
-from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.safety.guard import guarded
 from pupper_sysid.sysid.sweep.bench import (
     BENCH,
@@ -229,7 +229,7 @@ class Sweep:
         loop_period_s = 1.0 / rate
         self._refuse_bench_options()
         if self.plan is None:
-            joints = select_joints(self.joints, self._joints_there())
+            joints = joints_on(bus, self._map_there(), self.joints)
         else:
             from pupper_sysid.sysid.plan.plan_file import load_plan
 
@@ -319,11 +319,11 @@ class Sweep:
             "number": 1,
         }  # fmt: skip
 
-    def _joints_there(self) -> tuple[str, ...]:
-        """Joints to choose from: those of the joint map that is named or is in this folder."""
+    def _map_there(self) -> JointMap | None:
+        """The joint map that is named or is in this folder."""
         here = JOINTS_FILE if bus_name(self.bus) != EMULATED and JOINTS_FILE.exists() else None
         chosen = self._map() or here
-        return load_joint_map(chosen).joint_names if chosen else JOINT_NAMES
+        return load_joint_map(chosen) if chosen else None
 
     def _print(self, joints: list[str], chosen: Plan, written: list[Path], elapsed: float) -> None:
         path = written[0]

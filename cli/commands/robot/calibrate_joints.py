@@ -14,11 +14,10 @@ from rich.live import Live
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.buses import say_remarks
+from pupper_sysid.cli.buses import joints_on, say_remarks
 from pupper_sysid.cli.keyboard import Keyboard
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.common.files import refuse_overwrite
-from pupper_sysid.common.joints import JOINT_NAMES, select_joints
 from pupper_sysid.hardware import joint_calibration as jc
 from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
 from pupper_sysid.hardware.bus import ServoBus
@@ -78,7 +77,7 @@ class CalibrateJoints:
             )
         address = parse_address(self.bus)
         given = load_joint_map(self.joint_map) if self.joint_map else None
-        names = select_joints(self.joints, given.joint_names if given else JOINT_NAMES)
+        names = joints_on(self.bus, given, self.joints)
         if self.scale_joint and self.scale_joint not in names:
             raise InputError(
                 f"--scale-joint {self.scale_joint}: it is not among the joints that are "

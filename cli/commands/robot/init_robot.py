@@ -10,6 +10,9 @@ import numpy as np
 import tyro
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.cli.buses import JOINTS_FILE
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.dialect import whole
 
 _AMPLITUDE_RAD, _SMALLEST_RAD = 0.3, 0.05
 
@@ -19,20 +22,25 @@ class InitRobot:
     """Make a joint map of another robot with hobby servos, and plan its sweeps.
 
     Example: pupper-sysid init-robot my_robot.xml --servo sts3215
+    Without a model file: pupper-sysid init-robot --servo xl330-m288 --joints pan=1,tilt=2
     """
 
-    model: tyro.conf.Positional[Path]
+    model: tyro.conf.Positional[Path | None] = None
     """The robot's MJCF or URDF."""
+    joints: str | None = None
+    """Instead of a model file, names of joints and their servos' ids: pan=1,tilt=2."""
     servo: Literal[
-        "sts3215", "scs0009", "hd-1910", "xl330-m288", "xl430-w250", "xm430-w350",
-        "xm430-w210", "mx-28",
+        "sts3215", "scs0009", "hd-1910", "xl330-m288", "xl330-m077", "xc330-m288", "xl430-w250",
+        "xm430-w350", "xm430-w210", "xh430-w350", "xm540-w150", "xm540-w270", "mx-28", "mx-64",
+        "mx-106",
     ] = "sts3215"  # fmt: skip
     """Which servos it has."""
     lerobot_calibration: Path | None = None
     """LeRobot's calibration of this arm (.json): its ids, directions, homing offsets and ranges are
     taken instead of guesses."""
     out: Path | None = None
-    """Joint map to write; by default the model's name and .joints.yaml, in this folder."""
+    """Joint map to write; by default the model's name and .joints.yaml, in this folder; without a
+    model joints.yaml, which the other commands use by default."""
     force: bool = False
     """Replace the file if it exists."""
     json: bool = False
@@ -41,12 +49,21 @@ class InitRobot:
     def run(self) -> None:
         """Read the model, write the map, print the next commands."""
         from pupper_sysid.hardware.lerobot_calibration import read_lerobot
-        from pupper_sysid.sim.robot.robot_map import joint_map_of
+        from pupper_sysid.sim.robot.robot_map import joint_map_of, joint_map_of_servos
 
         lerobot = read_lerobot(self.lerobot_calibration) if self.lerobot_calibration else None
-        robot = joint_map_of(self.model, self.servo, lerobot)
+        if self.model is not None and self.joints is None:
+            robot = joint_map_of(self.model, self.servo, lerobot)
+            usual = Path(f"{self.model.stem}.joints.yaml")
+        elif self.model is None and self.joints is not None and lerobot is None:
+            robot, usual = joint_map_of_servos(_parse_ids(self.joints), self.servo), JOINTS_FILE
+        else:
+            raise InputError(
+                "init-robot needs the robot's MJCF or URDF; or, without one, --joints with the "
+                "servos' ids, such as pan=1,tilt=2 (--lerobot-calibration goes with a model)."
+            )
         found, left_out = robot.joint_map, robot.left_out
-        target = self.out or Path(f"{self.model.stem}.joints.yaml")
+        target = self.out or usual
         found.save(target, self.force)
         servos = found.per_servo()
         margin = servos.position_limits().margin(servos.rest_pose())
@@ -114,6 +131,22 @@ class InitRobot:
             + "Then doctor, delay, calibrate, fit-servo and export, as for any recording.",
             soft_wrap=True,
         )
+
+
+def _parse_ids(text: str) -> dict[str, int]:
+    """Servo id of each joint: pan=1,tilt=2."""
+    ids: dict[str, int] = {}
+    for part in (piece.strip() for piece in text.split(",")):
+        name, equals, number = (piece.strip() for piece in part.partition("="))
+        if not (name and equals and number.isascii() and number.isdecimal()):
+            raise InputError(
+                f"--joints: '{part}' is not NAME=ID; write pan=1,tilt=2. `pupper-sysid scan` lists "
+                "the ids."
+            )
+        if name in ids:
+            raise InputError(f"--joints: {name} is there twice.")
+        ids[name] = whole(number)
+    return ids
 
 
 def _plan(names: tuple[str, ...], margin: np.ndarray) -> list[tuple[float, list[str]]]:

@@ -49,8 +49,9 @@ class Scan:
 
     def _show(self, report: LineReport) -> None:
         servos = report.servos
+        number = f"{len(servos)} servo{'' if len(servos) == 1 else 's'}"
         table = terminal.table(
-            f"{len(servos)} servos at {report.family}:{report.device}, {report.baud} baud",
+            f"{number} at {report.family}:{report.device}, {report.baud} baud",
             "id", "model", "firmware", "volt", "°C", "count", "limits", "P D I", "errors",
         )  # fmt: skip
         for servo in servos:

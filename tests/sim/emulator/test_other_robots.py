@@ -98,6 +98,27 @@ def test_hinges_that_an_actuator_drives_by_any_way_are_taken_and_others_named(ca
     assert "left out" in err and "wrist_pitch, wrist_roll, gripper" in " ".join(err.split())
 
 
+def test_servos_without_a_model_file_get_a_map_from_their_names_and_ids(capsys, read_here):
+    code, out, err = run(
+        capsys, "init-robot", "--servo", "xm430-w350", "--joints", "pan=7,tilt=3", "--json"
+    )
+    assert code == 0, err
+    written = json.loads(out)
+    assert (written["joint_map"], written["ids"]) == ("joints.yaml", [7, 3])
+    assert "no limits are known" in err and "calibrate-joints" in err
+    layout = load_joint_map(Path("joints.yaml"))
+    assert layout.joint_names == ("pan", "tilt") and layout.file.servo == "XM430-W350"
+    assert layout.file.joints["pan"].limits_rad == (-0.5, 0.5)
+    for words, why in (
+        ("", "needs the robot's MJCF or URDF"),
+        ("arm.xml --joints pan=1", "needs the robot's MJCF or URDF"),
+        ("--joints pan", "'pan' is not NAME=ID"),
+        ("--joints pan=1,tilt=1", "have the same id 1"),
+        ("--joints pan=1,pan=2", "pan is there twice"),
+    ):
+        assert why in refused(capsys, pupper_sysid, "init-robot", *words.split(), "--force")
+
+
 def test_the_mini_pupper_s_own_model_has_its_twelve_joints(read_here):
     Path("pupper.xml").write_text(robot_xml(servo_ranges("paper").nominal(), 0.002, "linkage"))
     robot = robot_map.joint_map_of(Path("pupper.xml"), "scs0009")
