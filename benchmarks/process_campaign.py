@@ -1,13 +1,16 @@
-"""What happens to a robot when its driver, its watchdog or both are killed, stopped or starved?
+"""What happens to a robot when its driver, its watchdog or both are killed, stopped or starved, and
+when its line or a servo fails?
 
     .venv/bin/python benchmarks/process_campaign.py --repeats 3 --seed 0
+    .venv/bin/python benchmarks/process_campaign.py --bus xl330-m288      # one of its robots
 
 An emulated robot runs in this process behind each real protocol. A driver in a process of its own,
 with its watchdog, swings all joints; at a random moment something happens to one of the two or to
 both. Measured is the time until no servo has torque, from then (from the start of `park` where it
 is called by hand), and whether any gets it again. Scenarios in which neither of the two can do
 anything are those for which `pupper-sysid park` exists; a pause of less than the two tolerate must
-not end a drive. Exits with 1 if one did not end as it should.
+not end a drive. Afterwards every register of a servo must hold what it held before, but those of
+its state. Exits with 1 if one did not end as it should.
 """
 
 from __future__ import annotations
@@ -29,36 +32,51 @@ from pathlib import Path
 
 import numpy as np
 
-from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.address import KINDS as KINDS_OF_BUS
+from pupper_sysid.hardware.dynamixel import SERIES
 from pupper_sysid.hardware.feetech import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lock import lock_name, runtime_folder
 from pupper_sysid.sim.emulator.bench import ServoBench
+from pupper_sysid.sim.emulator.dynamixel import DynamixelEmulator
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator, ProxySocket
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sim.emulator.serial_line import SerialPty
+from pupper_sysid.sim.emulator.serial_line import LineEmulator, SerialPty
+from pupper_sysid.sim.robot.robot_map import joint_map_of_servos
 
 PARK = [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "park"]
-KINDS = ("feetech", "esp32")
+DYNAMIXELS = {"xl330-m288": 1200, "xm430-w350": 1020}
+"""Model numbers by name."""
+KINDS = ("feetech", "esp32", *DYNAMIXELS)
 PATIENCE_S, AFTER_S, SWINGS_S = 12.0, 0.7, (0.3, 1.0)
+RESTORED_WITHIN_S = 6.0
+STATE = {
+    "goal_position", "torque_enable", "moving", "hardware_error_status", "status", "lock",
+    "goal_time",
+}  # fmt: skip
+"""Registers, beside the present ones, that a drive leaves otherwise."""
+OVERLOAD = 32
 HEADROOM = 2 << 20
 """Memory that a starved process may still take [bytes]."""
 
 DRIVER = """
 import fcntl, os, signal, sys, termios, time
+from pathlib import Path
 import numpy as np
 from pupper_sysid.cli.user_errors import end_politely
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.connect import open_guarded
+from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.safety import watchdog
 
-address, says, tty = sys.argv[1:4]
+address, layout, says, tty = sys.argv[1:5]
 if tty:
     fcntl.ioctl(os.open(tty, os.O_RDWR), termios.TIOCSCTTY, 0)
-bus = open_guarded(parse_address(address))
+chosen = load_joint_map(Path(layout)).per_servo() if layout else None
+bus = open_guarded(parse_address(address), chosen)
 
 held = []
 
@@ -111,6 +129,7 @@ finally:
 class Drive:
     """A driven robot."""
 
+    server: SerialPty | ProxySocket
     where: str
     driver: subprocess.Popen
     watchdog: int
@@ -144,6 +163,8 @@ class Scenario:
     expected: str = LIMP
     supervised: bool = False
     terminal: bool = False
+    serial: bool = False
+    """Whether it is a fault of a serial line's emulator."""
 
 
 def send(drive: Drive, number: int, *processes: int) -> None:
@@ -187,7 +208,11 @@ def lock_wanted(then: Fault) -> Fault:
 
     def inject(drive: Drive) -> None:
         kind, _, where = drive.where.partition(":")
-        lock = where if kind == "feetech" else str(runtime_folder() / lock_name(Path(where)))
+        lock = (
+            where
+            if KINDS_OF_BUS[kind].is_serial
+            else str(runtime_folder() / lock_name(Path(where)))
+        )
         waiting = subprocess.Popen(["flock", "-x", lock, "sleep", "30"], start_new_session=True)
         drive.held.callback(lambda: os.killpg(waiting.pid, signal.SIGKILL))
         time.sleep(0.2)
@@ -230,7 +255,35 @@ def short(to: Callable[[int], Fault], seconds: float) -> Fault:
     return in_turn(to(STOP), seconds, to(GO_ON))
 
 
+def unplugged(seconds: float) -> Fault:
+    """The adapter is pulled, and comes back."""
+
+    def inject(drive: Drive) -> None:
+        drive.injected_s = time.monotonic()
+        drive.server.emulator.unplug_for_s = seconds
+
+    return inject
+
+
+def brown_out(drive: Drive) -> None:
+    """The supply is too low for a second."""
+    drive.injected_s = time.monotonic()
+    emulator = drive.server.emulator
+    assert isinstance(emulator, LineEmulator)
+    emulator.brown_out(drive.server.now(), 1.0)
+
+
+def overloaded(drive: Drive) -> None:
+    """A servo reports an overload until its power is switched off."""
+    drive.injected_s = time.monotonic()
+    emulator = drive.server.emulator
+    assert isinstance(emulator, LineEmulator)
+    emulator.fail(min(emulator.servos), drive.server.now(), OVERLOAD, 60.0)
+
+
 SCENARIOS = (
+    Scenario("driver", "SIGINT (Ctrl-C)", to_driver(signal.SIGINT)),
+    Scenario("driver", "SIGTERM", to_driver(signal.SIGTERM)),
     Scenario("driver", "SIGKILL", to_driver(KILL)),
     Scenario("driver", "SIGSTOP", to_driver(STOP)),
     Scenario("driver", "SIGSTOP, SIGCONT after 0.2 s", short(to_driver, 0.2), GOES_ON),
@@ -261,6 +314,9 @@ SCENARIOS = (
         "both", "SIGKILL, lock taken, supervised", lock_wanted(to_both(KILL)), supervised=True
     ),
     Scenario("both", "SIGKILL, then `park`", parked_by_hand),
+    Scenario("line", "cable pulled for 1.5 s", unplugged(1.5), serial=True),
+    Scenario("line", "brown-out of 1 s", brown_out, serial=True),
+    Scenario("servo", "overload, reported by one", overloaded, serial=True),
 )
 
 
@@ -270,13 +326,16 @@ class Tally:
 
     limp_s: list[float] = field(default_factory=list)
     on_again: int = 0
+    restored: int = 0
     as_expected: int = 0
     undriven: int = 0
     """Drives that the busy machine ended before anything happened, and that were repeated."""
 
 
 @contextmanager
-def driven(where: str, scenario: Scenario) -> Iterator[Drive | None]:
+def driven(
+    server: SerialPty | ProxySocket, where: str, layout: str, scenario: Scenario
+) -> Iterator[Drive | None]:
     """A driver and its watchdog, in the midst of a swing; None if it did not begin."""
     reads, writes = os.pipe()
     master, tty = os.openpty() if scenario.terminal else (-1, -1)
@@ -288,7 +347,8 @@ def driven(where: str, scenario: Scenario) -> Iterator[Drive | None]:
             held.callback(supervisor.wait)
             held.callback(supervisor.kill)
         driver = subprocess.Popen(
-            [sys.executable, "-c", DRIVER, where, str(writes), os.ttyname(tty) if tty >= 0 else ""],
+            [sys.executable, "-c", DRIVER, where, layout, str(writes),
+             os.ttyname(tty) if tty >= 0 else ""],
             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, pass_fds=[writes],
             start_new_session=True,
         )  # fmt: skip
@@ -297,7 +357,7 @@ def driven(where: str, scenario: Scenario) -> Iterator[Drive | None]:
             os.close(tty)
         with os.fdopen(reads, "rb") as pipe:
             line = pipe.readline()
-        drive = Drive(where, driver, int(line or 0), master, held)
+        drive = Drive(server, where, driver, int(line or 0), master, held)
         try:
             yield drive if line else None
         finally:
@@ -311,18 +371,32 @@ def driven(where: str, scenario: Scenario) -> Iterator[Drive | None]:
 
 
 @contextmanager
-def served(kind: str, seed: int) -> Iterator[tuple[SerialPty | ProxySocket, str]]:
-    """A running server of one emulated robot, and the address of its bus."""
+def served(kind: str, seed: int) -> Iterator[tuple[SerialPty | ProxySocket, str, str]]:
+    """A running server of one emulated robot, the address of its bus, and its joint map's file.
+
+    The file is empty where the map needs no name.
+    """
     rng = np.random.default_rng(seed)
     # read directly, a servo answers for the very moment: no polls in between, none lost
-    direct = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
-    robot = draw_robot(rng, RobotSpec() if kind == "esp32" else direct)
-    layout = load_joint_map("mini_pupper_2" if kind == "esp32" else "sts3215")
+    direct = RobotSpec(
+        poll_period_s=0.0, loss=0.0, quantum_rad=0.0, reading_noise_rad=float(np.pi / 4096)
+    )
+    model = DYNAMIXELS.get(kind)
+    if model:
+        ids = {f"joint_{k}": k for k in range(1, 7)}
+        layout = joint_map_of_servos(ids, kind).joint_map
+    else:
+        layout = load_joint_map("mini_pupper_2" if kind == "esp32" else "sts3215")
+    robot = draw_robot(rng, RobotSpec() if kind == "esp32" else direct, layout if model else None)
     bench = ServoBench(robot, layout, rng.spawn(1)[0])
     with tempfile.TemporaryDirectory(prefix="robot") as name:
-        path = Path(name) / "bus"
+        path, named = Path(name) / "bus", Path(name) / "map.yaml"
         if kind == "esp32":
             server = ProxySocket(ProxyEmulator(bench, rng), path)
+        elif model:
+            layout.save(named)
+            bench.supply_v = 5.0 if kind.startswith("xl330") else 12.0
+            server = SerialPty(DynamixelEmulator(bench, SERIES[model], rng), path)
         else:
             server = SerialPty(FeetechEmulator(bench, STS3215, rng), path)
         thread = threading.Thread(target=server.serve, daemon=True)
@@ -332,7 +406,8 @@ def served(kind: str, seed: int) -> Iterator[tuple[SerialPty | ProxySocket, str]
                 how = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
                 os.sched_setscheduler(thread.native_id, how, os.sched_param(10))
         try:
-            yield server, f"{kind}:{path}"
+            bus = "dynamixel" if model else kind
+            yield server, f"{bus}:{path}", str(named) if model else ""
         finally:
             server.stop()
             thread.join(5.0)
@@ -341,18 +416,52 @@ def served(kind: str, seed: int) -> Iterator[tuple[SerialPty | ProxySocket, str]
 
 def limp(server) -> bool:
     """Whether no servo has torque."""
-    return not any(server.emulator.bench.is_on(k) for k in range(len(JOINT_NAMES)))
+    bench = server.emulator.bench
+    return not any(bench.is_on(k) for k in bench.index_of_id.values())
 
 
-def once(server, where: str, scenario: Scenario, rng: np.random.Generator, tally: Tally) -> bool:
+def registers(server) -> dict[tuple[int, str], int]:
+    """Registers of all servos that a drive must leave as they were; none behind the proxy."""
+    emulator = server.emulator
+    if not isinstance(emulator, LineEmulator):
+        return {}
+    names = [n for n in emulator.series.registers if not n.startswith("present") and n not in STATE]
+    return {
+        (servo, name): emulator.series.decode(name, bytes(memory.memory))
+        for servo, memory in emulator.servos.items()
+        for name in names
+    }
+
+
+def repaired(server, found: dict[tuple[int, str], int]) -> None:
+    """Servos that are limp, without errors, and have these registers."""
+    emulator = server.emulator
+    for k in emulator.bench.index_of_id.values():
+        emulator.bench.torque(k, server.now(), False)
+    if isinstance(emulator, LineEmulator):
+        for (servo, name), value in found.items():
+            emulator._set(servo, name, value)
+        for servo, memory in emulator.servos.items():
+            memory.faulty_until, memory.overloaded, memory.stopped = -np.inf, False, False
+            emulator._set(servo, "torque_enable", 0)
+            if emulator.series.has("hardware_error_status"):
+                emulator._set(servo, "hardware_error_status", 0)
+
+
+def once(
+    server: SerialPty | ProxySocket, where: str, layout: str, scenario: Scenario,
+    rng: np.random.Generator, tally: Tally,
+) -> bool:  # fmt: skip
     """One repeat; False if it has to be repeated."""
-    for k in range(len(JOINT_NAMES)):
-        server.emulator.bench.torque(k, server.now(), False)
-    with driven(where, scenario) as drive:
+    found = registers(server)
+    repaired(server, found)
+    with driven(server, where, layout, scenario) as drive:
         if drive is None:
+            repaired(server, found)
             return False
         time.sleep(float(rng.uniform(*SWINGS_S)))
         if limp(server) or drive.driver.poll() is not None:
+            repaired(server, found)
             return False
         at = threading.Event()
         limp_s = [np.inf]
@@ -370,14 +479,21 @@ def once(server, where: str, scenario: Scenario, rng: np.random.Generator, tally
         watcher.join()
         time.sleep(AFTER_S)
         again = np.isfinite(limp_s[0]) and not limp(server)
-        tally.on_again += again
-        if np.isfinite(limp_s[0]):
-            tally.limp_s.append(limp_s[0] - drive.injected_s)
         outcome = LIMP if np.isfinite(limp_s[0]) else GOES_ON
         running = drive.driver.poll() is None
+        restored = True
+        if outcome == LIMP:
+            until = time.monotonic() + RESTORED_WITHIN_S
+            while not (restored := registers(server) == found) and time.monotonic() < until:
+                time.sleep(0.05)
+        tally.on_again += again
+        tally.restored += restored
+        if np.isfinite(limp_s[0]):
+            tally.limp_s.append(limp_s[0] - drive.injected_s)
         tally.as_expected += (
-            outcome == scenario.expected and not again and (outcome == LIMP or running)
+            outcome == scenario.expected and not again and restored and (outcome == LIMP or running)
         )
+    repaired(server, found)
     return True
 
 
@@ -386,24 +502,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Processes killed, stopped and starved.")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--bus", choices=KINDS, help="one of the robots")
     parser.add_argument("--only", default="", help="scenarios whose name contains this")
     options = parser.parse_args()
     print("| bus | process | what happens | repeats | limp after s: median | worst | on again "
-          "| as it should | drives ended before by the load |")  # fmt: skip
-    print("|" + "---|" * 9)
+          "| registers as before | as it should | drives ended before by the load |")  # fmt: skip
+    print("|" + "---|" * 10)
     rows = failed = 0
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under `nohup` drivers would ignore it, too
     with tempfile.TemporaryDirectory(prefix="runtime") as runtime:
         os.environ["XDG_RUNTIME_DIR"] = runtime
-        for kind in KINDS:
-            with served(kind, options.seed) as (server, where):
+        for kind in [options.bus] if options.bus else KINDS:
+            with served(kind, options.seed) as (server, where, layout):
                 for number, scenario in enumerate(SCENARIOS):
                     if options.only not in f"{scenario.process} {scenario.what}":
+                        continue
+                    if scenario.serial and kind == "esp32":
                         continue
                     rng = np.random.default_rng([options.seed, number])
                     tally, done = Tally(), 0
                     while done < options.repeats:
-                        if once(server, where, scenario, rng, tally):
+                        if once(server, where, layout, scenario, rng, tally):
                             done += 1
                         else:
                             tally.undriven += 1
@@ -417,7 +536,8 @@ def main() -> None:
                     failed += options.repeats - tally.as_expected
                     print(
                         f"| {kind} | {scenario.process} | {scenario.what} | {done} | {shown} "
-                        f"| {tally.on_again} | {tally.as_expected} of {done} | {tally.undriven} |",
+                        f"| {tally.on_again} | {tally.restored} of {done} "
+                        f"| {tally.as_expected} of {done} | {tally.undriven} |",
                         flush=True,
                     )
     load = " ".join(f"{x:.1f}" for x in os.getloadavg())

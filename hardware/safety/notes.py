@@ -37,6 +37,8 @@ class Note:
     """Process id."""
     processes: tuple[tuple[int, int], ...]
     """Ids of driver and watchdog, and when each was started [clock ticks since the system was]."""
+    registers: dict[str, dict[str, int]]
+    """Values that the driver had found in registers that it changed, by joint."""
 
     @property
     def robot(self) -> str:
@@ -59,7 +61,7 @@ def write_note(orders: dict[str, Any], joints: Sequence[str], watchdog: int) -> 
     Parameters
     ----------
     orders : dict
-        First message to the watchdog.
+        First message to the watchdog, and the registers to be set back.
     joints : sequence of str
     watchdog : int
         Its process id.
@@ -85,7 +87,9 @@ def notes() -> list[Note]:
     found = []
     for path in sorted(runtime_folder().glob(f"*{_END}")):
         # half of one, another version's, or removed meanwhile
-        with contextlib.suppress(PupperError, OSError, ValueError, KeyError, TypeError):
+        with contextlib.suppress(
+            PupperError, OSError, ValueError, KeyError, TypeError, AttributeError
+        ):
             found.append(_read(path.name))
     return found
 
@@ -103,6 +107,7 @@ def _read(name: str) -> Note:
         tuple(told["joints"]),
         int(told["driver"]),
         tuple((int(number), int(start)) for number, start in told["processes"]),
+        {j: {n: int(v) for n, v in own.items()} for j, own in told.get("registers", {}).items()},
     )
 
 

@@ -104,7 +104,7 @@ class Watchdog:
         self._due_s = lasting_s() + SWITCH_ON_S
 
     def _arm(self) -> None:
-        write_note(self._orders, list(self._pose), self._process.pid)
+        self._note()
         self._send({"arm": self._pose})
 
     def disarm(self) -> None:
@@ -154,8 +154,16 @@ class Watchdog:
 
     def restore(self, registers: Mapping[str, Mapping[str, int]]) -> None:
         """Set these registers back, by joint, if the driver ends without having done so."""
-        self._registers = registers
+        changed = registers != self._registers
+        self._registers = {joint: dict(own) for joint, own in registers.items()}
         self._send({"registers": registers})
+        if changed and self._pose:
+            self._note()
+
+    def _note(self) -> None:
+        """Note for `pupper-sysid park` what is on, and what is to be set back."""
+        orders = self._orders | {"registers": self._registers}
+        write_note(orders, list(self._pose), self._process.pid)
 
     def take_over(self) -> None:
         """Torque-off or a register was not confirmed and the bus is released: keep trying.

@@ -23,6 +23,7 @@ import select
 import signal
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -97,8 +98,7 @@ def main() -> None:
     if orders.pose_rad:
         park(orders)
         remove_note(orders.address.where)
-    if orders.registers:
-        restore(orders)
+    restore(orders.address, orders.joint_map, orders.registers)
 
 
 def first_orders(message: dict[str, Any]) -> _Orders:
@@ -182,13 +182,14 @@ def _go_home(orders: _Orders) -> list[str]:
     return [] if limp else joints
 
 
-def restore(orders: _Orders) -> None:
-    """Set the registers back; tries for some seconds. The torque is off."""
-    start, registers = time.monotonic(), orders.registers
-    joint_map = orders.joint_map.per_servo()
+def restore(
+    address: BusAddress, joint_map: JointMap, registers: Mapping[str, Mapping[str, int]]
+) -> None:
+    """Set registers back to these values, by joint; tries for some seconds. The torque is off."""
+    start = time.monotonic()
     while registers and time.monotonic() - start < _RESTORE_WITHIN_S:
         try:
-            bus = open_bus(orders.address, joint_map, list(registers), exclusive=False)
+            bus = open_bus(address, joint_map.per_servo(), list(registers), exclusive=False)
         except PupperError:
             time.sleep(0.02)
             continue

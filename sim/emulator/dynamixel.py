@@ -248,6 +248,9 @@ class DynamixelEmulator(LineEmulator):
         status = self._get(servo_id, "hardware_error_status") | known
         if known:
             self._set(servo_id, "hardware_error_status", status)
+        if status & self._get(servo_id, "shutdown") and self._get(servo_id, "torque_enable"):
+            self._set(servo_id, "torque_enable", 0)
+            self.bench.torque(self.bench.index_of_id[servo_id], self._free_at, False)
         return ALERT if status else 0
 
     def _protect(self, servo_id: int, at: float) -> None:

@@ -317,17 +317,26 @@ class LineEmulator(ABC):
             servo.frozen_until = at + self.faults.lasts_s
             servo.frozen_count = self._present(servo_id, at)
         elif kind == "error-bits":
-            servo.faulty_until = at + self.faults.lasts_s
-            servo.error = int(self._rng.choice([1, 2, 4, 8, 32, 33]))
+            bits = int(self._rng.choice([1, 2, 4, 8, 32, 33]))
+            self.fail(servo_id, at, bits, self.faults.lasts_s)
         elif kind == "brown-out":
-            self._brown_out_until = at + self.faults.lasts_s
-            for other in self.servos:
-                self._set(other, "torque_enable", 0)
-                self.bench.torque(self.bench.index_of_id[other], at, False)
-            self.faults.ended.append((kind, self._brown_out_until))
+            self.brown_out(at, self.faults.lasts_s)
         elif kind == "unplugged":
             self.unplug_for_s = self.faults.lasts_s
         return kind
+
+    def brown_out(self, at: float, seconds: float) -> None:
+        """Supply too low from `at` on: all servos are limp, and deaf for some seconds."""
+        self._brown_out_until = at + seconds
+        for servo_id in self.servos:
+            self._set(servo_id, "torque_enable", 0)
+            self.bench.torque(self.bench.index_of_id[servo_id], at, False)
+        self.faults.ended.append(("brown-out", self._brown_out_until))
+
+    def fail(self, servo_id: int, at: float, bits: int, seconds: float) -> None:
+        """Error bits of one servo from `at` on, for some seconds."""
+        self.servos[servo_id].faulty_until = at + seconds
+        self.servos[servo_id].error = bits
 
     def _second_writer(self, byte_s: float) -> Pieces:
         """Another host's request on the wire, which the first host receives, too."""

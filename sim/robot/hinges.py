@@ -8,6 +8,7 @@ JSON: `python -m pupper_sysid.sim.robot.hinges FILE`.
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import asdict, dataclass
@@ -98,7 +99,7 @@ def _read(path: str) -> list[Hinge]:
     from pupper_sysid.sim.robot.engine import mujoco
 
     _limit_this_process()
-    model = _without_meshes(mujoco, path)
+    model = _model(mujoco, path)
     hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
     leaders = _leaders(model, mujoco)
     driven = _driven(model, mujoco) if model.nu else set(hinges) - set(leaders)
@@ -113,23 +114,24 @@ def _read(path: str) -> list[Hinge]:
     return found
 
 
-def _without_meshes(mujoco, path: str):
-    """The compiled model; where files of meshes are missing, without them."""
+def _model(mujoco, path: str):
+    """The compiled model; where it does not compile as it is, without all but its joints."""
     try:
         return mujoco.MjModel.from_xml_path(path)
     except ValueError as error:
-        if not any(word in str(error).lower() for word in ("file", "mesh", "resource")):
-            raise
         reason = error
     try:
         spec = mujoco.MjSpec.from_file(path)
         for geom in list(spec.geoms):
-            if geom.meshname:
+            geom.material = ""
+            if geom.meshname or geom.hfieldname:
                 spec.delete(geom)
-        for mesh in list(spec.meshes):
-            spec.delete(mesh)
-        # a body whose mass came from its mesh
-        spec.compiler.boundmass, spec.compiler.boundinertia = 1e-6, 1e-9
+        for pieces in (spec.skins, spec.meshes, spec.hfields, spec.materials, spec.textures):
+            for piece in list(pieces):
+                spec.delete(piece)
+        for body in spec.bodies[1:]:  # no number of these is used
+            body.explicitinertial, body.mass, body.inertia = True, 1.0, [1.0, 1.0, 1.0]
+            body.fullinertia = [float("nan"), 0.0, 0.0, 0.0, 0.0, 0.0]
         return spec.compile()
     except ValueError:
         raise reason from None
@@ -150,8 +152,16 @@ def _zero_ranges(path: str) -> set[str]:
     """Joints for which the file itself states a range of 0 to 0."""
     import xml.etree.ElementTree as tree
 
+    text = Path(path).read_bytes()
+    try:
+        root = tree.fromstring(text)
+    except tree.ParseError:
+        try:
+            root = tree.fromstring(_bound(text))
+        except tree.ParseError:  # MuJoCo takes more than XML
+            return set()
     zero = set()
-    for joint in tree.parse(path).iter("joint"):
+    for joint in root.iter("joint"):
         limit = joint.find("limit")
         ends = joint.get("range", "").split()
         if limit is not None and joint.get("type") == "revolute":
@@ -162,6 +172,14 @@ def _zero_ranges(path: str) -> set[str]:
         except ValueError:
             continue
     return zero
+
+
+def _bound(text: bytes) -> bytes:
+    """XML whose prefixes are all declared: URDF of Drake and of ROS often has some that are not."""
+    used = set(re.findall(rb"[<\s/]([A-Za-z_][\w.-]*):[A-Za-z_][\w.-]*(?=[\s=>/])", text))
+    used -= {b"xml", b"xmlns", *re.findall(rb"xmlns:([\w.-]+)\s*=", text)}
+    declared = b"".join(b' xmlns:%s="%s"' % (prefix, prefix) for prefix in sorted(used))
+    return re.sub(rb"<(robot|mujoco)\b", lambda begin: begin[0] + declared, text, count=1)
 
 
 def _driven(model, mujoco) -> set[int]:

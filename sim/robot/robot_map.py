@@ -13,6 +13,7 @@ and signs are checked in `pupper-sysid monitor` while a joint is moved by hand.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -91,11 +92,13 @@ def joint_map_of(
         )
     if len(joints) > _MOST_SERVOS:
         raise InputError(f"{path} has {len(joints)} hinges; a bus has at most {_MOST_SERVOS} ids.")
+    joints, renamed = _with_sound_names(joints)
     names = [hinge.name for hinge in joints]
     if strange := strange_joint(names):
         name = strange[0] or "without a name"
         raise InputError(f"{path}: a joint is called '{name}'; {strange[1]} Rename it there.")
     joints, doubts = _with_sound_limits(joints)
+    doubts = renamed + doubts
     source = f"made from {path.name} for {servo} servos; ids, centres and signs are guesses"
     ids = range(1, len(joints) + 1)
     data = _map_data(path, joints, ids, servo, source, "limits of the model; the rest is a guess")
@@ -142,6 +145,26 @@ def _map_data(
             for hinge, servo_id in zip(joints, ids, strict=True)
         },
     }  # fmt: skip
+
+
+def _with_sound_names(joints: list[Hinge]) -> tuple[list[Hinge], list[str]]:
+    """Hinges whose names can be those of files and columns, and a sentence about those renamed."""
+    taken = {hinge.name for hinge in joints}
+    sound, renamed = [], []
+    for hinge in joints:
+        name = re.sub(r"[^A-Za-z0-9_]+", "_", hinge.name)
+        name = name if name[:1].isalpha() or not hinge.name else f"joint_{name.lstrip('_')}"
+        if name != hinge.name:
+            while name in taken:
+                name += "_"
+            taken.add(name)
+            renamed.append(f"{hinge.name} is {name}")
+        sound.append(replace(hinge, name=name))
+    if not renamed:
+        return sound, []
+    return sound, [
+        f"joints are called otherwise here, by letters, digits and _: {', '.join(renamed)}."
+    ]
 
 
 def _with_sound_limits(joints: list[Hinge]) -> tuple[list[Hinge], list[str]]:

@@ -14,6 +14,7 @@ from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.hardware.safety.limp import can_come_back, is_there, may_be_on, switch_off
 from pupper_sysid.hardware.safety.notes import Note, notes
 from pupper_sysid.hardware.safety.watchdog import HANG_S
+from pupper_sysid.hardware.safety.watchdog_process import restore
 
 _AGAIN_S, _LOOK_S = 0.1, 0.2
 _OTHERS_WAIT_S = 1.0
@@ -69,6 +70,7 @@ class Park:
                     f"process {note.driver} drives this robot and may switch the torque on again. "
                     f"Stop it: `kill {note.driver}`."
                 )
+            restore(note.address, note.joint_map, note.registers)
             note.remove()
 
     def _left_on(self) -> None:
@@ -96,7 +98,7 @@ class Park:
 
 def _take(note: Note, seconds: float, say: bool = True) -> bool:
     """Switch a robot off that was left on; whether that is settled."""
-    where = note.address.where
+    where, on = note.address.where, list(note.joints)
     try:
         on = _until_limp(note.address, note.joint_map, note.joints, seconds)
         told = may_be_on(on) if on else "its driver was gone; its torque was switched off."
@@ -107,6 +109,8 @@ def _take(note: Note, seconds: float, say: bool = True) -> bool:
         told, settled = f"gone for good; {may_be_on(note.joints)}", True
     if settled or say:
         terminal.err.print(f"{where}: {told}", soft_wrap=True)
+    if not on:
+        restore(note.address, note.joint_map, note.registers)
     if settled:  # last: what is interrupted here is said again, not lost
         note.remove()
     return settled

@@ -15,7 +15,10 @@ import pytest
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.dynamixel import TRIGGERED, WATCHDOG_UNITS, DynamixelBus
 from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.notes import notes, write_note
 from pupper_sysid.hardware.serial_servos import line as serial_line
+from pupper_sysid.sysid.recordings.files import load
+from support.command_line import run
 from support.servo_servers import (
     bench_of,
     dynamixel_map,
@@ -119,6 +122,46 @@ def test_a_servo_that_has_shut_down_is_refused_and_an_alert_is_named(line):
     assert sample.status is not None and sample.status.tolist() == [33, 0]
 
 
+def test_an_error_that_its_shutdown_register_names_switches_a_servo_off(line):
+    servos, device = line
+    bus = opened(device)
+    try:
+        for bits, shutdown, on in ((4, 52, 0), (8, 52, 1)):
+            servos._set(4, "shutdown", shutdown)
+            servos._set(4, "torque_enable", 1)
+            servos.fail(4, servos._free_at, bits, 0.3)
+            sample = bus.read()
+            assert sample.status is not None and sample.status[0] == bits
+            assert servos._get(4, "torque_enable") == on
+            servos.fail(4, servos._free_at, 0, 0.0)
+            servos._set(4, "hardware_error_status", 0)
+    finally:
+        servos._set(4, "torque_enable", 0)
+        bus.close()
+
+
+def test_park_sets_registers_back_of_a_robot_whose_driver_and_watchdog_are_gone(
+    line, capsys, tmp_path, monkeypatch
+):
+    servos, device = line
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    orders = {
+        "kind": "dynamixel", "where": device, "baud": 1_000_000, "driver": 2**22 - 2,
+        "coordinates": "servo",
+        "map": dynamixel_map(4, 5).file.model_dump(mode="json", by_alias=True),
+        "registers": {"LF_hip": {"bus_watchdog": 0, "position_p_gain": 400}},
+    }  # fmt: skip
+    for words in (("park",), ("park", "--bus", f"dynamixel:{device}@1000000")):
+        servos._set(4, "bus_watchdog", WATCHDOG_UNITS)
+        servos._set(4, "position_p_gain", 300)
+        servos._set(4, "torque_enable", 1)
+        write_note(orders, ["LF_hip"], 2**22 - 3)
+        code, _, err = run(capsys, *words)
+        assert code == 0, err
+        assert [servos._get(4, n) for n in ("torque_enable", "bus_watchdog")] == [0, 0]
+        assert servos._get(4, "position_p_gain") == 400 and notes() == []
+
+
 @pytest.mark.wall_clock
 def test_reading_times_are_those_of_the_measurement_within_0_3_ms():
     servos = still_dynamixels([4, 5])
@@ -170,3 +213,45 @@ def test_a_killed_driver_leaves_limp_servos_with_their_own_registers(line, tmp_p
         lambda: (servos._get(4, "bus_watchdog"), servos._get(4, "position_p_gain")) == (0, 400), 12
     )
     time.sleep(0.2)
+
+
+SWEEP = """
+from pupper_sysid.hardware.serial_servos import line
+line.REPLY_TIMEOUT_S = 0.1
+from pupper_sysid.cli.programs.pupper_sysid import main
+main()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.wall_clock
+@pytest.mark.parametrize(("model", "number"), [(1200, signal.SIGINT), (1020, signal.SIGTERM)])
+def test_a_sweep_that_is_cut_parks_sets_registers_back_and_is_resumed(
+    capsys, tmp_path, model, number
+):
+    servos = moving_dynamixel(model)
+    chosen, path = tmp_path / "map.yaml", tmp_path / "a.csv"
+    servos.bench.map.save(chosen)
+    servos._set(1, "torque_enable", 0)
+    servos.bench.torque(0, 0.0, False)
+    with on_a_port(servos) as server:
+        words = (
+            "sweep", "--freqs", "2,3", "--duration", "2", "--bus",
+            f"dynamixel:{server.device}@1000000", "--joint-map", str(chosen),
+        )  # fmt: skip
+        process = subprocess.Popen(
+            [sys.executable, "-c", SWEEP, *words, "--out", str(path)], cwd=ROOT,
+            stderr=subprocess.PIPE,
+        )  # fmt: skip
+        assert wait_until(lambda: path.exists() and path.read_text().count("bench,") > 25, 30.0)
+        assert servos._get(1, "bus_watchdog") == WATCHDOG_UNITS
+        process.send_signal(number)
+        said = process.communicate(timeout=10)[1].decode()
+        assert process.returncode == 128 + number and "Stopped." in said
+        for name, value in (("torque_enable", 0), ("bus_watchdog", 0), ("shutdown", 52)):
+            assert servos._get(1, name) == value, name
+        assert "completed" not in load(path).metadata
+        code, _, err = run(capsys, *words, "--resume", path)
+        assert code == 0, err
+        assert "completed" in load(path).metadata
+        assert servos._get(1, "torque_enable") == servos._get(1, "bus_watchdog") == 0

@@ -97,6 +97,37 @@ def test_meshes_need_not_be_there():
     assert robot.joint_map.joint_names == ("k",)
 
 
+def test_a_joint_map_needs_neither_sound_inertias_nor_declared_prefixes():
+    text = urdf(("pan", -1, 1, ""), ("tilt", -1, 1, ""))
+    for unsound in ('ixx="1e-4" iyy="1e-4" izz="9e-4"', 'ixx="1e-4" iyy="-1e-4" izz="1e-4"'):
+        robot = robot_of(text.replace('ixx="1e-4" iyy="1e-4" izz="1e-4"', unsound))
+        assert robot.joint_map.joint_names == ("pan", "tilt")
+    undeclared = text.replace("<limit", '<limit drake:acceleration="2.5"').replace(
+        "</robot>", '<drake:ignored name="a:b"/></robot>'
+    )
+    robot = robot_of(
+        undeclared.replace('lower="-1"', 'lower="0"').replace('upper="1"', 'upper="0"')
+    )
+    assert "limits of pan, tilt are 0 to 0" in robot.doubts[0]
+
+
+def test_an_mjcf_is_read_without_its_textures_and_height_fields():
+    robot = robot_of(
+        f"""<mujoco><asset><texture name="t" type="2d" file="absent.png"/>
+        <material name="m" texture="t"/><mesh name="s" file="absent.stl"/></asset><worldbody>
+        <body><joint name="k" range="-40 40"/>{GEOM.replace("/>", ' material="m"/>')}
+        <geom type="mesh" mesh="s"/></body></worldbody></mujoco>""",
+        "arm.xml",
+    )
+    assert robot.joint_map.joint_names == ("k",)
+
+
+def test_names_that_no_file_or_column_can_have_are_changed_and_said():
+    robot = robot_of(urdf(("left/waist", -1, 1, ""), ("8", -1, 1, ""), ("left_waist", -1, 1, "")))
+    assert robot.joint_map.joint_names == ("left_waist_", "joint_8", "left_waist")
+    assert "left/waist is left_waist_, 8 is joint_8" in robot.doubts[0]
+
+
 @pytest.mark.skipif(not CASES.exists(), reason="the shared cases are not here")
 @pytest.mark.parametrize(
     ("case", "words"),
