@@ -20,11 +20,13 @@ delivers them with the ticks of its latency timer.
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import heapq
 import math
 import os
 import pty
 import select
+import struct
 import termios
 import threading
 import time
@@ -399,6 +401,8 @@ _SPEEDS = {
     )
 }
 _IDLE_S = 0.05
+_TCGETS2, _TERMIOS2 = 0x802C542A, struct.Struct("=4IB19s2I")
+"""Linux: request of a terminal's settings with its rates as numbers, and their layout."""
 
 
 class SerialPty:
@@ -488,9 +492,12 @@ class SerialPty:
     def _baud(self) -> int | None:
         """Rate that the host has set; None if the terminal has none.
 
-        A terminal does not distinguish rates without a name: such a one counts as the servos' if
-        theirs has no name either, and else as 0, at which no servo listens.
+        Linux has every rate as a number. Elsewhere those without a name are not distinguished: such
+        a one counts as the servos' if theirs has no name either, and else as 0, at which no servo
+        listens.
         """
+        with contextlib.suppress(OSError):
+            return _TERMIOS2.unpack(fcntl.ioctl(self._host, _TCGETS2, bytes(_TERMIOS2.size)))[-1]
         with contextlib.suppress(termios.error):
             named = _SPEEDS.get(termios.tcgetattr(self._host)[4])
             if named is not None:

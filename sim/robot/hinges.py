@@ -122,8 +122,9 @@ def _model(mujoco, path: str):
         reason = error
     try:
         spec = mujoco.MjSpec.from_file(path)
+        for shown in (*spec.geoms, *spec.sites, *spec.tendons):
+            shown.material = ""
         for geom in list(spec.geoms):
-            geom.material = ""
             if geom.meshname or geom.hfieldname:
                 spec.delete(geom)
         for pieces in (spec.skins, spec.meshes, spec.hfields, spec.materials, spec.textures):

@@ -13,12 +13,13 @@ import pytest
 from pupper_sysid.cli.commands.robot import scan as scan_command
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware.address import parse_address
+from pupper_sysid.hardware.dynamixel import FAMILY as DYNAMIXEL_FAMILY
 from pupper_sysid.hardware.feetech import FAMILY, FeetechBus
 from pupper_sysid.hardware.serial_servos.line import slow_adapter
 from pupper_sysid.hardware.serial_servos.scan import scan_line
 from pupper_sysid.sim.emulator.serial_line import SerialPty
 from support.command_line import run
-from support.servo_servers import map_of, on_a_port, still_servos
+from support.servo_servers import map_of, on_a_port, still_dynamixels, still_servos
 
 
 @contextmanager
@@ -54,9 +55,11 @@ def test_a_fast_adapter_is_not_called_slow():
 @pytest.mark.slow
 @pytest.mark.wall_clock
 @pytest.mark.parametrize("latency_ms", [0.2, 1, 3, 6, 16])
-def test_no_servo_is_missed_in_20_scans_whatever_the_adapter(latency_ms):
-    family = replace(FAMILY, highest_id=40)
-    with behind_adapter(still_servos(), latency_ms / 1e3) as server:
+@pytest.mark.parametrize("known", [FAMILY, DYNAMIXEL_FAMILY], ids=lambda family: family.name)
+def test_no_servo_is_missed_in_20_scans_whatever_the_adapter(known, latency_ms):
+    family = replace(known, highest_id=40)
+    servos = still_servos() if known is FAMILY else still_dynamixels(range(1, 13))
+    with behind_adapter(servos, latency_ms / 1e3) as server:
         listed = [
             [servo.id for servo in scan_line(family, server.device, 1_000_000).servos]
             for _ in range(20)

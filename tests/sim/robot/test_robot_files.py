@@ -116,7 +116,7 @@ def test_an_mjcf_is_read_without_its_textures_and_height_fields():
         f"""<mujoco><asset><texture name="t" type="2d" file="absent.png"/>
         <material name="m" texture="t"/><mesh name="s" file="absent.stl"/></asset><worldbody>
         <body><joint name="k" range="-40 40"/>{GEOM.replace("/>", ' material="m"/>')}
-        <geom type="mesh" mesh="s"/></body></worldbody></mujoco>""",
+        <geom type="mesh" mesh="s"/><site material="m"/></body></worldbody></mujoco>""",
         "arm.xml",
     )
     assert robot.joint_map.joint_names == ("k",)
