@@ -36,7 +36,7 @@ def test_another_client_reads_writes_and_groups(kind, controller, unit, zero):
         client.write_torque_enable(1, True)
         assert np.ravel(client.read_torque_enable(1))[0] and servos._get(1, "torque_enable") == 1
         wanted = np.array([CENTRE + 300, CENTRE - 150])
-        client.sync_write_goal_position([1, 2], [float(x) for x in (wanted - zero) * unit])
+        client.sync_write_goal_position([1, 2], ((wanted - zero) * unit).tolist())
         # answered only after the goals, which are not acknowledged
         assert np.ravel(client.sync_read_present_position([1, 2])).size == 2
         goals = [servos._get(servo, "goal_position") for servo in (1, 2)]
