@@ -13,6 +13,12 @@ While the torque is on, each servo's own bus watchdog is set: it stops the servo
 to it for 2 s, even if every process of the host is gone. `keep_alive` talks to the servos in
 pauses of a driver.
 
+Servos are read by fast sync read where all of them support it. They answer with one status frame of
+the broadcast id, to which each adds error byte, id, data and the CRC of all bytes before it, right
+behind the servo before it. Nothing in that frame is stuffed. One return delay remains instead of
+one per servo. A servo that fails leaves those behind it without an answer, so after an incomplete
+one plain sync read is used until all have answered again.
+
 Sources: Robotis e-Manual, protocol 2.0, and control tables of XL330-M288, XL430-W250, XM430-W350,
 XH430-W350 and MX-28(2.0), which agree on every address here.
 """
@@ -20,18 +26,19 @@ XH430-W350 and MX-28(2.0), which agree on every address here.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.serial_servos.bus import LineServo, SerialBus
-from pupper_sysid.hardware.serial_servos.line import Reply, SerialLine
+from pupper_sysid.hardware.serial_servos.line import SLOWEST_ADAPTER_S, Reply, SerialLine
 from pupper_sysid.hardware.serial_servos.series import Family, Profile, Register, Series
 from pupper_sysid.hardware.serial_servos.settings import RegisterFault, read_register
 
 PING, READ, WRITE, REG_WRITE, ACTION, REBOOT = 1, 2, 3, 4, 5, 8
-SYNC_READ, SYNC_WRITE = 0x82, 0x83
+SYNC_READ, SYNC_WRITE, FAST_SYNC_READ = 0x82, 0x83, 0x8A
 BROADCAST_ID, HIGHEST_ID = 0xFE, 252
 
 ALERT = 0x80
@@ -131,6 +138,23 @@ def _series(name: str, model: int) -> Series:
 
 SERIES = {model: _series(name, model) for model, name in MODELS.items()}
 
+FAST_SINCE = {"X330": 46, "X430": 45, "X540": 45}
+"""First firmware with fast sync read, by the models' size: Robotis e-Manual, protocol 2.0, section
+Fast Sync Read. MX have none (Robotis' forum: "DYNAMIXEL X Series only"). Neither was tried."""
+
+
+def has_fast_sync_read(series: Series, firmware: int) -> bool:
+    """Whether a servo answers fast sync reads.
+
+    Examples
+    --------
+    >>> [has_fast_sync_read(SERIES[model], 45) for model in (1200, 1020, 30)]
+    [False, True, False]
+    """
+    size = "X" + series.name[2:5]  # XL330-M288: X330
+    return series.name.startswith("X") and firmware >= FAST_SINCE.get(size, 256)
+
+
 SHAPING = (
     "return_delay_time", "drive_mode", "operating_mode", "homing_offset", "pwm_limit",
     "current_limit", "velocity_limit", "min_position_limit", "max_position_limit",
@@ -226,15 +250,14 @@ def _crc_table() -> tuple[int, ...]:
 _CRC_TABLE = _crc_table()
 
 
-def crc16(data: bytes | bytearray) -> int:
-    """CRC of a frame's bytes before it.
+def crc16(data: bytes | bytearray, crc: int = 0) -> int:
+    """CRC of a frame's bytes before it; `crc` is that of the bytes before `data`.
 
     Examples
     --------
     >>> hex(crc16(bytes.fromhex("ff ff fd 00 01 03 00 01")))
     '0x4e19'
     """
-    crc = 0
     for byte in data:
         crc = (crc << 8 ^ _CRC_TABLE[crc >> 8 ^ byte]) & 0xFFFF
     return crc
@@ -263,6 +286,49 @@ class Frame:
         body = body.replace(_STUFFED, _STUFFING)
         head = HEADER + bytes([self.id]) + (len(body) + 2).to_bytes(2, "little")
         return head + body + crc16(head + body).to_bytes(2, "little")
+
+
+FAST_HEAD_BYTES, FAST_BLOCK_BYTES = 8, 4
+"""Of the answer to a fast sync read: before the first servo's block; of a block without data."""
+
+
+def fast_head(servos: int, size: int) -> bytes:
+    """First bytes of the answer of `servos` servos to a fast sync read of `size` bytes each.
+
+    Examples
+    --------
+    >>> fast_head(3, 4).hex(" ")
+    'ff ff fd 00 fe 19 00 55'
+    """
+    length = 1 + servos * (size + FAST_BLOCK_BYTES)
+    return HEADER + bytes([BROADCAST_ID]) + length.to_bytes(2, "little") + bytes([STATUS])
+
+
+def fast_replies(answer: bytes, servos: Sequence[int], size: int) -> list[Frame]:
+    """Status frames that the answer to a fast sync read stands for.
+
+    A block counts if all bytes up to its CRC are right, so those before a damaged byte are kept.
+
+    Parameters
+    ----------
+    answer : bytes
+        From its header on; may be incomplete.
+    servos : sequence of int
+        Ids in the order of the request.
+    size : int
+        Bytes read of each.
+    """
+    frames, at = [], FAST_HEAD_BYTES
+    crc = crc16(answer[:at])
+    for servo in servos:
+        end = at + size + FAST_BLOCK_BYTES
+        block = answer[at:end]
+        crc = crc16(block[:-2], crc)
+        if len(block) < end - at or block[1] != servo or crc != block[-2] | block[-1] << 8:
+            break
+        frames.append(Frame(servo, block[0], block[2:-2], is_status=True))
+        crc, at = crc16(block[-2:], crc), end
+    return frames
 
 
 class FrameReader:
@@ -355,6 +421,9 @@ class DynamixelLine(SerialLine):
     def __init__(self, device: str, baud: int, exclusive: bool = True):
         super().__init__(device, baud, exclusive)
         self._packets = self._sdk().PacketHandler(_PROTOCOL)
+        self.fast: frozenset[int] = frozenset()
+        """Ids of servos that answer fast sync reads."""
+        self._was_fast = self._incomplete = False
 
     def ping(self, servo: int) -> Frame | None:
         """Status frame of `servo`, or None if it does not answer."""
@@ -362,12 +431,71 @@ class DynamixelLine(SerialLine):
         return reply.frame if reply else None  # pyright: ignore[reportReturnType]
 
     def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
-        """The same bytes of several servos with one request."""
+        """The same bytes of several servos with one request; fast, if all of them can."""
         ids = list(servos)
-        return self._exchange(
-            lambda: self._packets.syncReadTx(self._port, address, size, ids, len(ids), False),
-            ids, size,
+        # one servo's plain answer is shorter
+        self._was_fast = len(ids) > 1 and self.fast.issuperset(ids) and not self._incomplete
+        if self._was_fast:
+            replies = self.fast_sync_read(ids, address, size)
+        else:
+            replies = self._exchange(
+                lambda: self._packets.syncReadTx(self._port, address, size, ids, len(ids), False),
+                ids, size,
+            )  # fmt: skip
+        self._incomplete = len(replies) < len(ids)
+        return replies
+
+    def fast_sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
+        """`sync_read` by the fast request, whether or not all servos support it."""
+        ids, arrived = list(servos), bytearray()
+        head, block = fast_head(len(ids), size), size + FAST_BLOCK_BYTES
+        whole, last_s = len(head) + len(ids) * block, 0.0
+        kind = FAST_SYNC_READ, len(ids), 0  # what precedes the blocks depends on no length
+
+        def take(data: bytes) -> bool:
+            nonlocal last_s
+            if data:
+                arrived.extend(data)
+                last_s = time.monotonic()
+            at = arrived.find(head)
+            return at >= 0 and len(arrived) - at >= whole
+
+        begin = self._listen(
+            lambda: self._packets.syncReadTx(self._port, address, size, ids, len(ids), True),
+            whole, 1, take,
         )  # fmt: skip
+        at = arrived.find(head)
+        if begin is None or at < 0:
+            return {}
+        frames = fast_replies(bytes(arrived[at : at + whole]), ids, size)
+        # the servos' blocks follow each other without a pause, so each ends at its own byte
+        turn_s = block * self._byte_s()
+        if len(frames) == len(ids):
+            waited_s = self._least_s(kind, max(last_s - begin - len(ids) * turn_s, 0.0), True)
+        else:
+            waited_s = self._fastest_s.get(kind, len(head) * self._byte_s())
+        first_s = begin + waited_s
+        return {
+            frame.id: Reply(
+                frame, first_s + k * turn_s, first_s + (k + 1) * turn_s, 0.0 if k else waited_s
+            )
+            for k, frame in enumerate(frames)
+        }
+
+    def try_fast(self, servos: Sequence[int], address: int, size: int) -> bool:
+        """Whether all of these servos answer one fast sync read; if so, it is used from then on."""
+        usual_s, self.patience_s = self.patience_s, max(self.patience_s, SLOWEST_ADAPTER_S)
+        replies = self.fast_sync_read(servos, address, size)
+        self.patience_s = usual_s
+        self.fast = frozenset(replies) if len(replies) == len(servos) else frozenset()
+        return bool(self.fast)
+
+    def sync_read_s(self, delays_s: Sequence[float], size: int) -> float:
+        """See `SerialLine.sync_read_s`; of a fast one, the first servo's return delay counts."""
+        if not self._was_fast:
+            return super().sync_read_s(delays_s, size)
+        whole = FAST_HEAD_BYTES + len(delays_s) * (size + FAST_BLOCK_BYTES)
+        return delays_s[0] + whole * self._byte_s()
 
     def sync_write(self, address: int, values: dict[int, bytes]) -> float:
         """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed."""
@@ -458,6 +586,19 @@ class DynamixelBus(SerialBus):
         """Talk to every servo, so that its bus watchdog does not act."""
         heat = self._servos[0].series.register("present_temperature").address
         self.line.sync_read([servo.id for servo in self._servos], heat, 1)
+
+    def _choose_reading(self) -> str:
+        """Fast sync read, if all servos support it by their firmware and answer to one trial."""
+        able = [
+            servo.id for servo in self._servos
+            if has_fast_sync_read(servo.series, (servo.registers or {}).get("firmware", 0))
+        ]  # fmt: skip
+        assert isinstance(self.line, DynamixelLine)
+        if len(able) > 1 and len(able) == len(self._servos):
+            where = self._servos[0].series.register("present_temperature").address
+            if self.line.try_fast(able, where, 1):
+                return "fast sync read"
+        return super()._choose_reading()
 
     def _status(self, servo: LineServo, reply: Reply) -> int:
         if not reply.frame.code & ALERT:

@@ -405,12 +405,13 @@ class SerialBus(HostClock):
         the time by which an exchange with several servos exceeded what the line needs.
         """
         turns = [reply.after_s - reply.before_s for reply in replies.values()]
-        needed = 0.0
-        for joint, servo in zip(self.joint_names, self._servos, strict=True):
-            if servo.id in replies and servo.series.has_sync_read:
-                wait_s = return_delay_s(self.family, self._setups[joint])
-                needed += wait_s + 10.0 / self.line.baud * (size + self.line.reply_bytes)
-        longer = max(sum(turns) - needed, 0.0) if needed else 0.0
+        delays = [
+            return_delay_s(self.family, self._setups[joint])
+            for joint, servo in zip(self.joint_names, self._servos, strict=True)
+            if servo.id in replies and servo.series.has_sync_read
+        ]
+        took = sum(turns) + sum(reply.waited_s for reply in replies.values())
+        longer = max(took - self.line.sync_read_s(delays, size), 0.0) if delays else 0.0
         return 0.5 * (float(np.median(turns)) + longer)
 
     def _plausible(self, servo: LineServo, index: int, at: float, count: int) -> bool:
@@ -444,6 +445,11 @@ class SerialBus(HostClock):
             for setup in self._setups.values()
         ]
 
+    def _choose_reading(self) -> str:
+        """Request with which the servos are read, for the header."""
+        together = all(servo.series.has_sync_read for servo in self._servos)
+        return "sync read" if together else "read"
+
     def _describe(self, device: str) -> dict[str, Any]:
         bands = (
             supply_band(self.family, servo.series, servo.registers or {}) for servo in self._servos
@@ -452,6 +458,7 @@ class SerialBus(HostClock):
         known: dict[str, Any] = {
             "kind": self.family.name,
             "readings": "live",
+            "read_by": self._choose_reading(),
             "device": device,
             "baud": self.line.baud,
             "echo": self.line.echoes,

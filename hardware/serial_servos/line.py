@@ -91,6 +91,8 @@ class Reply:
     frame: Frame
     before_s: float
     after_s: float
+    waited_s: float = 0.0
+    """Between the request and `before_s`, as far as it belongs to no servo's part."""
 
 
 class SerialLine(ABC):
@@ -134,7 +136,7 @@ class SerialLine(ABC):
         self.garbled: Counter[int] = Counter()
         """Exchanges with one servo that gave bytes and no frame, or two different ones."""
         self._port = self._new_port(device, baud, exclusive)
-        self._fastest_s: dict[tuple[int, int], float] = {}
+        self._fastest_s: dict[tuple[int, ...], float] = {}
         self._retry_s = self._busy_s = 0.0
         try:
             self._port.openPort()
@@ -178,6 +180,18 @@ class SerialLine(ABC):
     @abstractmethod
     def sync_write(self, address: int, values: dict[int, bytes]) -> float:
         """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed."""
+
+    def sync_read_s(self, delays_s: Sequence[float], size: int) -> float:
+        """Time that the replies to the last `sync_read` need on the wire [s].
+
+        Parameters
+        ----------
+        delays_s : sequence of float
+            Return delays of the servos that replied, in order [s].
+        size : int
+            Bytes read of each.
+        """
+        return sum(delays_s) + len(delays_s) * (size + self.reply_bytes) * self._byte_s()
 
     @abstractmethod
     def torque_off(self, servos: Sequence[int] | None = None) -> None:
@@ -395,48 +409,83 @@ class SerialLine(ABC):
         self, send: Callable[[], int], servos: Sequence[int], size: int
     ) -> dict[int, Reply]:
         """Send, and collect one reply of `size` parameter bytes from each of `servos`."""
-        before = time.monotonic()
-        if not self._sent(send):
-            return {}
-        asked = len(self._port.sent)
         wanted = set(servos)
         reader = self._reader(lambda servo, length: servo in wanted and length == size)
-        wire = (asked + len(servos) * (size + self.reply_bytes)) * self._byte_s()
-        deadline = max(before, self._busy_s) + wire + self.patience_s
-        deadline += len(servos) * self.longest_return_delay_s
-        owed = self._port.sent if self.echoes else b""
         replies: dict[int, tuple[Frame, float]] = {}
         contradicted: set[int] = set()
-        arrived = b""
-        try:
-            while len(replies) < len(wanted) and time.monotonic() < deadline:
-                data = self._port.read_some()
-                if owed:
-                    data, owed = _strip(data, owed)
-                arrived += data
-                for frame in reader.feed(data):
-                    first = replies.setdefault(frame.id, (frame, time.monotonic()))
-                    if first[0] != frame:
-                        contradicted.add(frame.id)
-        except PORT_ERRORS:
-            self._drop_port()
+        arrived = bytearray()
+
+        def take(data: bytes) -> bool:
+            arrived.extend(data)
+            for frame in reader.feed(data):
+                first = replies.setdefault(frame.id, (frame, time.monotonic()))
+                if first[0] != frame:
+                    contradicted.add(frame.id)
+            return len(replies) == len(wanted)
+
+        begin = self._listen(send, len(servos) * (size + self.reply_bytes), len(servos), take)
+        if begin is None:
+            return {}
         if len(servos) == 1 and arrived:
-            self._count(servos[0], arrived, bool(replies), bool(contradicted), reader)
+            self._count(servos[0], bytes(arrived), bool(replies), bool(contradicted), reader)
         # replies come evenly, in the order of the request; the host's buffers blur each arrival
-        begin = max(before, self._busy_s) + asked * self._byte_s()
         last = max((k for k, servo in enumerate(servos) if servo in replies), default=0)
         after = max((at for _, at in replies.values()), default=begin)
-        share = max(after - begin, 0.0) / (last + 1)
-        # what exceeds the fastest exchange of this kind was spent on the way back to this program
-        kind = size, len(servos)
-        if len(replies) == len(wanted):
-            self._fastest_s[kind] = min(share, self._fastest_s.get(kind, share))
-        share = min(share, self._fastest_s.get(kind, share))
+        share = self._least_s(
+            (size, len(servos)), max(after - begin, 0.0) / (last + 1), len(replies) == len(wanted)
+        )
         return {
             servo: Reply(replies[servo][0], begin + k * share, begin + (k + 1) * share)
             for k, servo in enumerate(servos)
             if servo in replies and servo not in contradicted
         }
+
+    def _listen(
+        self, send: Callable[[], int], size: int, delays: int, take: Callable[[bytes], bool]
+    ) -> float | None:
+        """Send, and hand what arrives to `take` until it has all, or the time is over.
+
+        Parameters
+        ----------
+        send : callable
+        size : int
+            Bytes that should come.
+        delays : int
+            Servos whose return delays add up.
+        take : callable
+            Takes bytes without echo; returns whether all has come.
+
+        Returns
+        -------
+        float or None
+            `time.monotonic()` when the request's last byte was on the wire; None if not sent.
+        """
+        before = time.monotonic()
+        if not self._sent(send):
+            return None
+        begin = max(before, self._busy_s) + len(self._port.sent) * self._byte_s()
+        deadline = begin + size * self._byte_s() + self.patience_s
+        deadline += delays * self.longest_return_delay_s
+        owed = self._port.sent if self.echoes else b""
+        complete = take(b"")
+        try:
+            while not complete and time.monotonic() < deadline:
+                data = self._port.read_some()
+                if owed:
+                    data, owed = _strip(data, owed)
+                complete = take(data)
+        except PORT_ERRORS:
+            self._drop_port()
+        return begin
+
+    def _least_s(self, kind: tuple[int, ...], took_s: float, complete: bool) -> float:
+        """Time of an exchange without what was spent on the way back to this program.
+
+        That is what exceeds the fastest complete exchange of this kind.
+        """
+        if complete:
+            self._fastest_s[kind] = min(took_s, self._fastest_s.get(kind, took_s))
+        return min(took_s, self._fastest_s.get(kind, took_s))
 
     def _count(
         self, servo: int, arrived: bytes, replied: bool, contradicted: bool, reader: Reader

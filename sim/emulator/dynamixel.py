@@ -17,6 +17,7 @@ from pupper_sysid.hardware.dynamixel import (
     BAUD_RATES,
     BROADCAST_ID,
     FAMILY,
+    FAST_SYNC_READ,
     PING,
     READ,
     REBOOT,
@@ -104,7 +105,7 @@ class DynamixelEmulator(LineEmulator):
         for servo_id in self.servos if frame.id == BROADCAST_ID else (frame.id,):
             if servo_id in self.servos:
                 self.servos[servo_id].heard_s = at
-        if frame.code in (SYNC_READ, SYNC_WRITE):
+        if frame.code in (SYNC_READ, SYNC_WRITE, FAST_SYNC_READ):
             return self._sync(frame, byte_s)
         if frame.id == BROADCAST_ID:
             pieces: Pieces = []
@@ -122,6 +123,8 @@ class DynamixelEmulator(LineEmulator):
             return []
         address, size = (int.from_bytes(params[k : k + 2], "little") for k in (0, 2))
         rest = params[4:]
+        if frame.code == FAST_SYNC_READ:
+            return self._fast(rest, address, size, byte_s)
         if frame.code == SYNC_READ:
             for servo_id in rest:
                 if servo_id in self.servos and self._level(servo_id) >= 1:
@@ -132,6 +135,36 @@ class DynamixelEmulator(LineEmulator):
             if rest[k] in self.servos:
                 self._try_store(rest[k], address, rest[k + 1 : k + 1 + size], self._free_at)
         return []
+
+    def _fast(self, ids: bytes, address: int, size: int, byte_s: float) -> Pieces:
+        """One frame from all servos: each adds its block when as many bytes as its turn needs are
+        on the line, so one that stays silent silences those behind it.
+        """
+        line, pieces = table.fast_head(len(ids), size), []
+
+        def block(servo_id: int, error: int, data: bytes) -> bytes:
+            own = bytes([error, servo_id]) + data
+            head = b"" if pieces else line
+            return head + own + table.crc16(own, table.crc16(line)).to_bytes(2, "little")
+
+        for servo_id in ids:
+            if (
+                servo_id not in self.servos
+                or not self._level(servo_id)
+                or not table.has_fast_sync_read(self.series, self._get(servo_id, "firmware"))
+                or address + size > self.memory_bytes
+            ):
+                break
+            added = self._answer(
+                servo_id, address, size, byte_s, encode=block, waits=not pieces
+            )  # fmt: skip
+            sent = b"".join(piece for _, piece in added)
+            expected = size + table.FAST_BLOCK_BYTES + (0 if pieces else len(line))
+            line = line + sent if pieces else sent
+            pieces += added
+            if len(sent) != expected:
+                break
+        return pieces
 
     def _instruct(self, servo_id: int, frame: Frame, at: float, byte_s: float) -> Pieces:
         """Execute an instruction of one servo; its reply."""

@@ -32,7 +32,7 @@ import threading
 import time
 import tty
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -263,13 +263,17 @@ class LineEmulator(ABC):
         self.bench.command(k, at, goal + self._offset(servo_id))
 
     def _answer(
-        self, servo_id: int, address: int, size: int, byte_s: float, error: int = 0
-    ) -> Pieces:
-        """The answer of one servo, after its return delay, as the line delivers it."""
-        servo = self.servos.get(servo_id)
+        self, servo_id: int, address: int, size: int, byte_s: float, error: int = 0,
+        encode: Callable[[int, int, bytes], bytes] | None = None, waits: bool = True,
+    ) -> Pieces:  # fmt: skip
+        """The answer of one servo, after its return delay, as the line delivers it.
+
+        `encode` makes another answer than a frame of the servo's own from id, error and data.
+        """
+        servo, encode = self.servos.get(servo_id), encode or self._status
         if servo is None or self._free_at < self._brown_out_until:
             return []
-        delay = self.family.return_delay_unit_s * self._get(servo_id, "return_delay")
+        delay = self.family.return_delay_unit_s * self._get(servo_id, "return_delay") * waits
         begin = self._free_at + delay
         kind = self._inject_fault(servo_id, begin)
         if begin < self._brown_out_until:
@@ -279,15 +283,15 @@ class LineEmulator(ABC):
         bits |= 32 * servo.overloaded  # overload, of every family
         error = self._error_byte(servo_id, bits) | error
         data = bytes(servo.memory[address : address + size])
-        answer = self._status(servo_id, error, data)
+        answer = encode(servo_id, error, data)
         # the answer of another servo to another request
         other = self._status((servo_id + 100) % 250, 0, bytes(len(data)))
         if kind == "wrong-length":
             shorter = len(data) and self._rng.random() < 0.5
             more = bytes([int(self._rng.integers(256))])
-            answer = self._status(servo_id, error, data[:-1] if shorter else data + more)
+            answer = encode(servo_id, error, data[:-1] if shorter else data + more)
         if servo_id in self._doubled:
-            answer = self._collided(servo_id, address, data, error)
+            answer = self._collided(servo_id, address, data, error, encode)
         arrived = []
         for late, piece in self.faults.apply(kind, answer, other):
             self._free_at = max(self._free_at, begin) + len(piece) * byte_s
@@ -296,7 +300,10 @@ class LineEmulator(ABC):
             arrived += self._second_writer(byte_s)
         return arrived
 
-    def _collided(self, servo_id: int, address: int, data: bytes, error: int) -> bytes:
+    def _collided(
+        self, servo_id: int, address: int, data: bytes, error: int,
+        encode: Callable[[int, int, bytes], bytes],
+    ) -> bytes:  # fmt: skip
         """Answers of two servos at once: the line is low where either pulls it."""
         twin = bytearray(data)
         where = self.series.register("present_position")
@@ -304,8 +311,8 @@ class LineEmulator(ABC):
         if 0 <= at and at + where.size <= len(data):
             count = self._get(servo_id, "present_position") + TWIN_COUNTS
             twin[at : at + where.size] = self.series.encode("present_position", count)
-        first = self._status(servo_id, error, data)
-        second = self._status(servo_id, error, bytes(twin))
+        first = encode(servo_id, error, data)
+        second = encode(servo_id, error, bytes(twin))
         late = int(self._rng.integers(0, 3))  # bytes by which one clock starts later
         longest = max(len(first), late + len(second))
         padded = first.ljust(longest, b"\xff"), (b"\xff" * late + second).ljust(longest, b"\xff")

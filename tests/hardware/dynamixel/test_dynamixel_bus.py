@@ -7,16 +7,22 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import BusError
+from pupper_sysid.hardware import dynamixel
 from pupper_sysid.hardware.dynamixel import TRIGGERED, WATCHDOG_UNITS, DynamixelBus
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.notes import notes, write_note
 from pupper_sysid.hardware.serial_servos import line as serial_line
+from pupper_sysid.sim.emulator.dynamixel import DynamixelEmulator
+from pupper_sysid.sim.emulator.serial_line import SerialPty
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
 from support.servo_servers import (
@@ -163,8 +169,9 @@ def test_park_sets_registers_back_of_a_robot_whose_driver_and_watchdog_are_gone(
 
 
 @pytest.mark.wall_clock
-def test_reading_times_are_those_of_the_measurement_within_0_3_ms():
-    servos = still_dynamixels([4, 5])
+@pytest.mark.parametrize(("firmware", "request_"), [(44, "sync read"), (46, "fast sync read")])
+def test_reading_times_are_those_of_the_measurement_within_0_3_ms(firmware, request_):
+    servos = still_dynamixels([4, 5], registers={None: {"firmware": firmware}})
     with on_a_port(servos) as server:
         bus = opened(server.device)
         servos.readings.clear()
@@ -172,6 +179,7 @@ def test_reading_times_are_those_of_the_measurement_within_0_3_ms():
         # both clocks are the host's, from different starts
         apart_s = bus._start - server._start
         bus.close()
+    assert bus.metadata["read_by"] == request_
     for k, servo in enumerate((4, 5)):
         measured = np.array([at for at, which, _ in servos.readings if which == servo])
         times = np.array([sample.time_s[k] for sample in samples]) + apart_s
@@ -193,6 +201,63 @@ bus.torque(True)
 print("on", flush=True)
 time.sleep(60)
 """
+
+
+@contextmanager
+def served(**registers: int) -> Iterator[tuple[DynamixelEmulator, SerialPty]]:
+    """Three servos; the last with these registers."""
+    servos = still_dynamixels([4, 5, 6], registers={6: registers})
+    with on_a_port(servos) as server:
+        yield servos, server
+
+
+def test_servos_are_read_by_one_answer_where_all_support_it_and_the_header_says_so():
+    with served() as (servos, server):
+        bus = opened(server.device, 4, 5, 6)
+        bench_of(servos).counts.update({4: 2000, 5: 2100, 6: 2200})
+        counts = bus.read().position_count
+        fast = bus.line.fast
+        bus.close()
+    assert bus.metadata["read_by"] == "fast sync read" and fast == {4, 5, 6}
+    assert counts.tolist() == [2000, 2100, 2200]
+
+
+@pytest.mark.parametrize(
+    ("claimed", "real"),
+    [(45, 45), (46, 45)],
+    ids=["its firmware is too old", "it does not answer though its firmware should"],
+)
+def test_a_servo_without_fast_sync_read_makes_all_be_read_by_sync_read(monkeypatch, claimed, real):
+    with served(firmware=real) as (servos, server):
+        if claimed != real:
+            monkeypatch.setattr(dynamixel, "has_fast_sync_read", lambda series, firmware: True)
+            monkeypatch.setattr(servos, "_fast", partial(silenced, servos))
+        bus = opened(server.device, 4, 5, 6)
+        reading = bus.read()
+        bus.close()
+    assert bus.metadata["read_by"] == "sync read"
+    assert reading.position_count.tolist() == [2048, 2048, 2048]
+
+
+def silenced(servos: DynamixelEmulator, ids: bytes, *request) -> list:
+    """The answer that breaks off before the last servo."""
+    return DynamixelEmulator._fast(servos, ids, *request)[: len(ids) - 1]
+
+
+def test_a_servo_that_falls_silent_costs_one_reading_of_those_behind_it_and_comes_back(monkeypatch):
+    with served() as (servos, server):
+        bus = opened(server.device, 4, 5, 6)
+        monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.02)
+        bus.line.patience_s = 0.02
+        servos._set(5, "status_return_level", 0)
+        silent = [np.isfinite(bus.read().position_rad).tolist() for _ in range(3)]
+        servos._set(5, "status_return_level", 2)
+        bus.read()
+        back = bus.read()
+        fast = bus.line._was_fast
+        bus.close()
+    assert silent == [[True, False, False], [True, False, True], [True, False, True]]
+    assert fast and np.isfinite(back.position_rad).all()
 
 
 @pytest.mark.wall_clock

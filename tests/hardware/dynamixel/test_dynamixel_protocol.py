@@ -18,6 +18,7 @@ from pupper_sysid.hardware.dynamixel import (
     Frame,
     FrameReader,
     crc16,
+    fast_replies,
 )
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from support.servo_servers import bench_of, on_a_port, still_dynamixels
@@ -50,6 +51,11 @@ EXAMPLES = {
     ),
     "reboot": ("FF FF FD 00 01 03 00 08 2F 4E", Frame(1, 8, b"")),
 }  # fmt: skip
+
+# the same: fast sync read of Present_Position from ids 3, 7 and 4
+FAST_ANSWER = bytes.fromhex(
+    "FF FF FD 00 FE 19 00 55 00 03 A6 00 00 00 84 08 00 07 1F 08 00 00 16 CA00 04 FF 03 00 00 D1 9E"
+)
 
 
 def wire(name: str) -> bytes:
@@ -92,6 +98,40 @@ def test_the_emulated_servo_answers_the_manuals_requests_as_the_manual_says():
     assert answer("sync read") == wire("read answer") + wire("sync read answer")
     assert answer("sync write") == b""
     assert (servos._get(1, "goal_position"), servos._get(2, "goal_position")) == (0x96, 0xAA)
+
+
+def test_servos_build_the_manuals_answer_to_a_fast_sync_read_and_it_is_read():
+    servos = still_dynamixels([3, 4, 7], model=1030)
+    bench_of(servos).counts.update({3: 0xA6, 7: 0x81F, 4: 0x3FF})
+    request = Frame(254, 0x8A, b"\x84\x00\x04\x00\x03\x07\x04").encode()
+    pieces = servos.receive(request, 0.0)
+    answer = b"".join(piece for _, piece in pieces)
+    assert answer == FAST_ANSWER
+    # one return delay of 500 µs, then 10 µs a byte without a pause
+    ends = [17 + 8 + 8, 17 + 8 + 16, 17 + 8 + 24]
+    np.testing.assert_allclose([at for at, _ in pieces], 5e-4 + 1e-5 * np.array(ends))
+    frames = fast_replies(answer, [3, 7, 4], 4)
+    assert [(f.id, int.from_bytes(f.data, "little")) for f in frames] == [
+        (3, 0xA6), (7, 0x81F), (4, 0x3FF)
+    ]  # fmt: skip
+    assert fast_replies(answer, [3, 4, 7], 4) == frames[:1]
+
+
+@pytest.mark.parametrize("bit", range(0, 8 * len(FAST_ANSWER), 5))
+def test_of_a_damaged_fast_answer_only_the_blocks_before_the_damage_are_taken(bit):
+    damaged = bytearray(FAST_ANSWER)
+    damaged[bit // 8] ^= 1 << bit % 8
+    frames = fast_replies(bytes(damaged), [3, 7, 4], 4)
+    assert len(frames) == max(bit // 8 - 8, 0) // 8
+    assert frames == fast_replies(FAST_ANSWER, [3, 7, 4], 4)[: len(frames)]
+
+
+@pytest.mark.parametrize("registers", [{4: {"firmware": 44}}, {4: {"status_return_level": 0}}])
+def test_a_servo_that_does_not_answer_a_fast_sync_read_silences_those_behind_it(registers):
+    servos = still_dynamixels([3, 4, 7], model=1030, registers=registers)
+    request = Frame(254, 0x8A, b"\x84\x00\x04\x00\x03\x04\x07").encode()
+    answer = b"".join(piece for _, piece in servos.receive(request, 0.0))
+    assert [frame.id for frame in fast_replies(answer, [3, 4, 7], 4)] == [3]
 
 
 def test_a_header_inside_the_data_is_stuffed_and_comes_out_again():
@@ -148,7 +188,9 @@ def test_100000_damaged_frames_raise_nothing():
     assert read_damaged(100_000) > 10_000
 
 
-def test_the_vendors_sdk_reads_writes_and_groups(served):
+def test_the_vendors_sdk_reads_writes_and_groups(served, monkeypatch):
+    # of its replies the SDK awaits two of these latencies [ms]; a busy host is later than 2 x 16
+    monkeypatch.setattr(dynamixel_sdk.port_handler, "LATENCY_TIMER", 500)
     servos, device = served
     port = dynamixel_sdk.PortHandler(device)
     packets = dynamixel_sdk.PacketHandler(2.0)
@@ -175,6 +217,9 @@ def test_the_vendors_sdk_reads_writes_and_groups(served):
         assert readings.addParam(1) and readings.addParam(2)
         assert readings.txRxPacket() == 0
         assert [readings.getData(i, 132, 4) for i in (1, 2)] == [1999, 2201]
+        bench_of(servos).counts.update({1: 1899, 2: 2301})
+        assert readings.fastSyncRead() == 0
+        assert [readings.getData(i, 132, 4) for i in (1, 2)] == [1899, 2301]
     finally:
         port.closePort()
     assert bench_of(servos).goals[-2:] == [(1, 2000), (2, 2200)]
