@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pupper_sysid.cli.programs import pupper_analyze, pupper_deploy, pupper_eval, pupper_play
+from pupper_sysid.cli.programs import pupper_analyze, pupper_deploy
 from pupper_sysid.policies.deploy.walk_log import read_walk
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run_program
@@ -153,25 +153,6 @@ def test_a_calibration_that_only_has_the_name_of_the_trained_one_is_told(capsys,
     assert "was not compared with it" in err and "moves like the trained" not in err
 
 
-def test_bad_input_is_answered_in_a_sentence(capsys, here):
-    known = (POLICY, "--actuator", CALIBRATION)
-    for arguments, says in (
-        ((), "No policy was named"),
-        (("nowhere",), "neither a run nor a policy"),
-        ((POLICY, "--actuator", "nowhere.yaml"), "no such file"),
-        ((*known, "--bus", "feetech:/dev/none"), "no IMU"),
-        ((*known, "--bus", "serial"), "bus serial"),
-        ((*known, "--stack", "lstm-servo"), "--servo"),
-        ((*known, "--command", "9", "0", "0"), "--command"),
-        ((*known, "--lowpass-hz", "40"), "half the rate"),
-        ((*known, "--keyboard"), "terminal"),
-        ((POLICY, "--replay", "nowhere.csv"), "does not exist"),
-        ((POLICY, "--seconds", "-1"), "--seconds"),
-        ((POLICY, "--seed", "-1"), "--seed is -1"),
-    ):
-        assert says in refused(capsys, pupper_deploy, *arguments), arguments
-
-
 # ------------------------------------------------------------------------------ pupper-analyze
 
 
@@ -208,63 +189,7 @@ def test_frozen_senses_leave_the_rhythm_and_a_frozen_last_action_stops_it(
 
 
 @pytest.mark.slow
-def test_orbits_close(capsys, here):
-    orbits = analyze(capsys, "attractor")["orbits"]["lstm"]
-    assert orbits["actions"]["explained_3"] > 0.9 and orbits["actions"]["closure"][0] < 0.2
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("what", "count"), [("terrain", 7), ("compliance", 6)])
 def test_where_it_walks_is_said_per_ground_and_direction(capsys, here, what, count):
     rows = analyze(capsys, what, "--seconds", 3, "--robots", 1)[what]["lstm"]
     assert len(rows) == count and all(0 <= r["survival"] <= 1 for r in rows)
-
-
-@pytest.mark.slow
-def test_a_quick_look_is_smaller_and_says_so(capsys, here, monkeypatch):
-    from pupper_sysid.cli.commands.analyze import common
-
-    assert common._QUICK[0] < common._FULL[0] and common._QUICK[1] < common._FULL[1]
-    monkeypatch.setattr(common, "_QUICK", (1, 0.5))
-    arguments = ("terrain", POLICY, "--actuator", CALIBRATION, "--quick")
-    code, out, _ = run_program(capsys, pupper_analyze, *arguments)
-    assert code == 0
-    assert "On other ground (1 robots, 0.5 s each; a quick look)" in " ".join(out.split())
-
-
-def test_two_policies_of_one_name_are_not_merged(capsys, here):
-    run = here / "runs/A"
-    for name in ("policy_best", "policy_last"):
-        shutil.copytree(POLICY, run / name)
-    both = (run / "policy_best", run / "policy_last")
-    said = refused(capsys, pupper_analyze, "gait", *both, "--actuator", CALIBRATION)
-    assert "Two policies are called A" in said
-
-
-def test_a_walk_too_short_for_a_gait_or_an_orbit_is_told_so(capsys, here):
-    for what, says in (("gait", "No robot walked for 7 s"), ("attractor", "there is no orbit")):
-        arguments = (what, POLICY, "--robots", 1, "--seconds", 1)
-        assert says in refused(capsys, pupper_analyze, *arguments)
-
-
-def test_help_shows_an_example(capsys):
-    for module in (pupper_deploy, pupper_analyze, pupper_eval, pupper_play):
-        code, out, _ = run_program(capsys, module, "--help")
-        program = module.__name__.split(".")[-1].replace("_", "-")
-        assert code == 0 and f"Example: {program} " in " ".join(out.split())
-
-
-def test_servo_models_are_compared_on_one_thing_at_a_time(capsys, here):
-    assert "one recording or policy" in refused(
-        capsys,
-        pupper_analyze,
-        "servo",
-        POLICY,
-        POLICY,
-        "--actuator",
-        CALIBRATION,
-    )
-
-
-def test_an_analysis_of_nothing_is_refused(capsys, here):
-    assert "nowhere" in refused(capsys, pupper_analyze, "gait", "nowhere")

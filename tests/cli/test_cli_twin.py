@@ -11,7 +11,7 @@ import pytest
 
 from pupper_sysid.cli.programs import pupper_analyze
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
-from support.command_line import refused, run_program
+from support.command_line import run_program
 from support.json_keys import DOCUMENTED, key_line
 from support.package import ROOT
 
@@ -56,19 +56,3 @@ def test_the_twin_of_a_walk_is_drawn_and_has_the_documented_keys(
     assert 0 < model["air"]["rmse_rad"]["value"] < still
     assert model["ground"]["copies"] == 1 and model["ground"]["gyro"]["peak_hz"][1] > 0
     assert Path(found["picture"]).stat().st_size > 20_000
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        ((WALK,), "No actuator was named"),
-        ((WALK, "--actuator", "papr"), "papr"),
-        ((WALK, "--actuator", "paper", "--test-loops", "a"), "write loop numbers with commas"),
-        ((WALK, "--actuator", "paper", "--robots", 0), "0 robots"),
-        ((WALK, WALK, "--actuator", "paper"), "One recording at a time"),
-        ((WALK, "--actuator", "paper", "--imu", CALIBRATION), "calibrated.yaml"),
-    ],
-)
-def test_input_that_cannot_be_used_is_refused(capsys, tmp_path, monkeypatch, arguments, says):
-    monkeypatch.chdir(tmp_path)
-    assert says in refused(capsys, pupper_analyze, "twin", *arguments)
