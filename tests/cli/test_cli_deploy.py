@@ -8,15 +8,18 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
 from pupper_sysid.cli.programs import pupper_analyze, pupper_deploy
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.policies.deploy.walk_log import read_walk
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run_program
+from support.json_keys import DOCUMENTED, key_line
+from support.package import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 POLICY = ROOT / "data/samples/policies/lstm"
 CALIBRATION = ROOT / "data/samples/calibrated.yaml"
 
@@ -193,3 +196,59 @@ def test_frozen_senses_leave_the_rhythm_and_a_frozen_last_action_stops_it(
 def test_where_it_walks_is_said_per_ground_and_direction(capsys, here, what, count):
     rows = analyze(capsys, what, "--seconds", 3, "--robots", 1)[what]["lstm"]
     assert len(rows) == count and all(0 <= r["survival"] <= 1 for r in rows)
+
+
+# ----- `pupper-analyze twin` as a user meets it
+
+SAMPLES = ROOT / "data/samples"
+WALK, CALIBRATION_TWIN = SAMPLES / "playback.csv", SAMPLES / "calibrated.yaml"
+
+
+@pytest.fixture
+def imu(tmp_path) -> Path:
+    path = tmp_path / "imu.csv"
+    rows = (f"{0.02 * k:.2f},{0.1 * (k % 5):.1f},0.2,0.{k % 3}" for k in range(400))
+    path.write_text("timestamp,gx,gy,gz\n" + "\n".join(rows) + "\n")
+    return path
+
+
+@pytest.fixture
+def walk(tmp_path) -> Path:
+    """Eight seconds of all joints, read two rows late."""
+    rows = np.arange(200)
+    swing = 0.15 * np.sin(0.5 * rows)[:, None] * np.tile([0.3, 1, -1], 4)
+    command = swing + [DEFAULT_POSE[joint] for joint in JOINT_NAMES]
+    columns: dict = {"time_s": 0.04 * rows, "loop": 0}
+    for n, joint in enumerate(JOINT_NAMES):
+        columns[f"{joint}_command_rad"] = command[:, n]
+        columns[f"{joint}_position_rad"] = command[np.maximum(rows - 2, 0), n]
+    path = tmp_path / "walk.csv"
+    pd.DataFrame(columns).to_csv(path, index=False)
+    return path
+
+
+def test_the_twin_of_a_walk_is_drawn_and_has_the_documented_keys(
+    capsys, tmp_path, monkeypatch, walk, imu
+):
+    monkeypatch.chdir(tmp_path)
+    given = (
+        "twin",
+        walk,
+        "--actuator",
+        CALIBRATION_TWIN,
+        "--robots",
+        1,
+        "--threads",
+        1,
+        "--imu",
+        imu,
+    )
+    code, out, err = run_program(capsys, pupper_analyze, *given, "--json")
+    assert code == 0, err
+    found = json.loads(out)
+    assert key_line(found) == DOCUMENTED["pupper-analyze twin"]
+    model = found["models"]["calibrated.yaml"]
+    still = sum(found["persistence_rmse_rad"].values()) / 12
+    assert 0 < model["air"]["rmse_rad"]["value"] < still
+    assert model["ground"]["copies"] == 1 and model["ground"]["gyro"]["peak_hz"][1] > 0
+    assert Path(found["picture"]).stat().st_size > 20_000
