@@ -79,6 +79,7 @@ def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     assert np.nanmax(abs(trial.position_rad - 0.785)) > 0.2
 
 
+@pytest.mark.slow
 def test_a_calf_can_be_swept_without_its_thigh(capsys):
     with on_a_port(moving_servos(ids=[6])) as port:
         code, _, err = run(

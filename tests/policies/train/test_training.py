@@ -97,6 +97,7 @@ def test_a_run_that_was_stopped_and_resumed_is_bit_for_bit_the_run_that_was_not(
         assert different(straight[part], checkpoint[part])
 
 
+@pytest.mark.slow
 def test_a_resumed_run_can_be_extended_and_remembers_it(tmp_path, uninterrupted):
     train(tmp_path, tiny_run(iterations=2))
     train(tmp_path, None, iterations=3)
@@ -246,6 +247,7 @@ def test_time_that_is_up_ends_a_run_within_its_first_gait_with_a_policy_that_pla
     assert np.isfinite(policy.act(np.zeros((1, 60)))).all()
 
 
+@pytest.mark.slow
 def test_a_round_that_was_left_is_repeated_and_the_run_is_that_without_a_stop(
     tmp_path, uninterrupted, monkeypatch
 ):

@@ -283,6 +283,7 @@ def path(monkeypatch) -> Iterator[Path]:
         yield Path(folder) / "s"
 
 
+@pytest.mark.wall_clock
 def test_it_walks_behind_the_robots_proxy_in_real_time(path):
     rng = np.random.default_rng(0)
     truth = draw_robot(rng)

@@ -296,6 +296,7 @@ def test_unknown_servos_move_and_depend_on_the_seed_alone():
         assert np.array_equal(slew.values[:5], back_emf.values[:5])
 
 
+@pytest.mark.slow
 def test_joints_with_the_same_margin_get_the_same_first_sweep():
     margins = {"LF_hip": 0.5, "RF_hip": 0.4, "LF_calf": 0.1}
     plan = plan_first_sweep(list(margins), setup=Setup(), margins=margins, seconds=10.0)
