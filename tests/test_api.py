@@ -143,7 +143,6 @@ def test_doctor_is_its_command_and_finds_the_polls(json_of, hip):
     assert joint["quantum_rad"] == pytest.approx(np.pi / 550, rel=1e-4)
 
 
-@pytest.mark.slow
 def test_bode_is_its_command_and_shows_that_the_servo_follows(json_of, hip, tmp_path):
     """Where raw rows say that it does not."""
     tones = json_of("bode", hip, "--plot", tmp_path / "b.png")["by_frequency"]

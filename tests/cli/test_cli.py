@@ -110,7 +110,6 @@ def test_constant_feedback_is_answered_in_a_sentence_by_every_command(capsys, tm
         assert code == 2 and "LF_hip" in err and "defect" not in err
 
 
-@pytest.mark.slow
 def test_one_frequency_is_calibrated_with_a_warning(capsys, tmp_path):
     path = table_with(tmp_path, lambda t: t[t.trial == 2])
     code, out, _ = run(capsys, "calibrate", path, "--json")

@@ -80,7 +80,6 @@ def test_the_emulated_robot_has_the_servos_of_the_calibration_and_commands_are_c
     assert moved[CALIBRATION] != moved["ideal"]
 
 
-@pytest.mark.slow
 def test_a_script_is_followed(capsys, here):
     Path("s.csv").write_text("seconds,forward_m_s,left_m_s,turn_rad_s\n0.4,0.1,0,0\n0.2,0,0,0\n")
     found = deploy(capsys, "--script", "s.csv", "--name", "walk")
@@ -88,7 +87,6 @@ def test_a_script_is_followed(capsys, here):
     assert found["seconds"] == pytest.approx(0.6, abs=0.05)
 
 
-@pytest.mark.slow
 def test_another_rate_is_said_to_change_the_policys_time(capsys, here):
     code, _, err = run_program(
         capsys, pupper_deploy, POLICY, "--actuator", CALIBRATION, "--rate", 25, "--seconds", 0.1,
@@ -229,7 +227,6 @@ def walk(tmp_path) -> Path:
     return path
 
 
-@pytest.mark.slow
 def test_the_twin_of_a_walk_is_drawn_and_has_the_documented_keys(
     capsys, tmp_path, monkeypatch, walk, imu
 ):

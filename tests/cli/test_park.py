@@ -173,7 +173,9 @@ def test_a_driver_that_was_stopped_with_its_watchdog_does_not_go_on(robot):
     bus.close()
 
 
-@on_esp32
+@pytest.mark.parametrize(
+    "robot", ["feetech", pytest.param("esp32", marks=pytest.mark.slow)], indirect=True
+)
 @pytest.mark.wall_clock
 def test_a_machine_that_was_suspended_during_a_walk_does_not_go_on(robot, monkeypatch):
     _, address = robot

@@ -199,6 +199,21 @@ def test_errors_on_unseen_runs_of_a_version_3_file_have_their_own_names(file, tm
     assert load_calibration(tmp_path / "new.yaml").joints == load_calibration(old).joints
 
 
+def test_a_damaged_version_3_file_is_refused_like_any_other(file):
+    text = file.read_text().replace("schema_version: 4", "schema_version: 3")
+    head = text[: text.index("\njoints:") + 1]
+
+    def read(damage):
+        file.write_text(head + damage + "\n")
+        load_calibration(file)
+
+    damages = (
+        "joints: 3", "joints: {LF_hip: 3}", "joints: {LF_hip: {under_load: 1, scores: 2}}",
+        "joints: {LF_hip: {under_load: 1, selection: {candidate_models: [3]}}}",
+    )  # fmt: skip
+    assert_each_refused([(damage, "joints") for damage in damages], read)
+
+
 # ----- calibration files that cannot be trusted are refused in one sentence that says what to do
 
 
@@ -366,6 +381,8 @@ def test_an_entry_of_the_wrong_kind_is_refused(file):
         (("actuator",), None, "mapping of keys is expected"),
         (("actuator", "scale", "source"), 0.35, "Write text"),
         (("feedback",), [1, 2], "mapping of keys is expected"),
+        (("feedback", "loss"), "much", "Write"),
+        (("feedback", "loss"), True, "Write"),
         (("scores", "rmse_free_run_held_rad"), -0.1, "greater than or equal to 0"),
         (("scores", "rmse_free_run_held_rad"), "13 mrad", "Write the number only, in rad"),
         (("warnings",), "one sentence", "Write a list"),

@@ -108,7 +108,10 @@ def test_weights_of_another_model_of_the_same_shape_are_refused(tmp_path: Path):
 
 @pytest.mark.parametrize(
     "kind",
-    [k if k in ("fir", "lstm") else pytest.param(k, marks=pytest.mark.slow) for k in KINDS],
+    [
+        k if k in ("fir", "lstm", "delayed-pd") else pytest.param(k, marks=pytest.mark.slow)
+        for k in KINDS
+    ],
 )
 def test_arrays_that_are_not_the_models_are_refused_by_name_even_with_a_matching_hash(
     tmp_path: Path, kind: str
@@ -259,3 +262,10 @@ def test_a_model_of_version_1_has_its_dead_time_under_the_old_name(tmp_path: Pat
         expected = parameters["dead_time_s"]
         np.testing.assert_array_equal(model.parameters["dead_time_s"], expected)
         assert "_s is missing" in refusal(crafted(tmp_path / f"{kind} new", kind, old))
+
+
+def test_a_file_where_the_folder_should_be_is_left_alone(tmp_path: Path):
+    (tmp_path / "a").write_text("mine")
+    with pytest.raises(InputError, match="is a file"):
+        save_servo_model(tmp_path / "a", arrays("fir"), contract("fir", arrays("fir")), force=True)
+    assert (tmp_path / "a").read_text() == "mine"

@@ -247,7 +247,6 @@ def test_time_that_is_up_ends_a_run_within_its_first_gait_with_a_policy_that_pla
     assert np.isfinite(policy.act(np.zeros((1, 60)))).all()
 
 
-@pytest.mark.slow
 def test_a_round_that_was_left_is_repeated_and_the_run_is_that_without_a_stop(
     tmp_path, uninterrupted, monkeypatch
 ):

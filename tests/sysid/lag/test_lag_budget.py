@@ -130,12 +130,6 @@ def test_quantum_is_the_greatest_common_divisor_of_the_changes_and_missing_readi
     assert not np.isin(fresh_rows(gap), np.arange(10, 20)).any()
 
 
-def test_one_frequency_is_said_to_leave_the_period_open():
-    rng = np.random.default_rng(9)
-    b = lag_budget("LF_hip", tone_trials(0.04, rng, (2.0,), duration_s=6.0), rng)
-    assert any("one frequency only" in w for w in b.warnings)
-
-
 def test_motion_without_tones_still_has_a_lag():
     rng = np.random.default_rng(10)
     knots = np.cumsum(rng.standard_normal(400)) * 0.05

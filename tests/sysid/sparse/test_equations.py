@@ -221,7 +221,6 @@ def test_one_frequency_is_judged_in_sample_and_says_so():
 # ------------------------------------------------------------------------------- recordings
 
 
-@pytest.mark.slow
 def test_the_command_prints_one_object(capsys, hip):
     code, out, said = run(capsys, "sindy", hip, "--json")
     assert code == 0, said
