@@ -28,13 +28,14 @@ WORDS: dict[str, str] = {
         (COMMAND, "command commands commanded cmd cmds goal goals target targets tgt desired des "
                   "setpoint setpoints sp reference references ref refs demand demanded requested "
                   "action actions soll sollwert sv consigne consigna riferimento referencia "
-                  "目标 目標 指令"),
+                  "börvärde 目标 目標 指令 给定 设定"),
         (MAYBE_COMMAND, "u r ctrl control input inputs send sent tx request planned plan "
                         "trajectory traj leader nominal wanted write written order"),
         (STATE, "actual act present measured measurement meas msr feedback fb fbk observed "
                 "observation observations obs state states estimate estimated est real encoder enc "
                 "reading readings sensed sensor response resp "
-                "potentiometer pot resolver pv ist istwert mesure misura medida 实际 実測 反馈"),
+                "potentiometer pot resolver pv ist istwert ärvärde mesure misura medida "
+                "实际 当前 実測 反馈"),
         (MAYBE_STATE, "y output outputs read rx follower received"),
         (ANGLE, "position positions pos posn angle angles ang qpos q p theta θ winkel "
                 "角度 位置"),
@@ -48,9 +49,9 @@ WORDS: dict[str, str] = {
                 "previous last offset home initial init delta diff frequency freq hz cov "
                 "covariance enable enabled reached done warning fault trial episode loop "
                 "strom spannung"),
-        (TIME, "time times timestamp timestamps t stamp stamps clock elapsed seconds secs sec "
+        (TIME, "time times timestamp timestamps t ts stamp stamps clock elapsed seconds secs sec "
                "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
-               "nanosec nanosecs nsecs usec usecs zeit temps tiempo tempo 时间 時間"),
+               "nanosec nanosecs nsecs usec usecs zeit temps tiempo tempo tid 时间 時間"),
         (UNIT, "rad rads radian radians deg degs degree degrees ° count counts tick ticks turn "
                "turns rev revs revolution revolutions mrad percent pct"),
         (JOINT, "joint joints dof dofs motor motors servo servos actuator actuators axis axes dxl "
@@ -63,7 +64,7 @@ WORDS: dict[str, str] = {
 }  # fmt: skip
 """What each word of a column's name stands for."""
 
-TIMES = ("time", "timestamp", "t", "stamp", "time_since_start", "elapsed", "seconds", "clock")
+TIMES = ("time", "timestamp", "t", "stamp", "time_since_start", "ts", "elapsed", "seconds", "clock")
 """Names of times, the likeliest first."""
 
 UNITS = {"rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "mrad": "mrad",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,9 @@ from pupper_sysid.sysid.recordings.importers.log import Log, joint_names
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.unknown import unknown_folder, unknown_json
 
-_ENDINGS = (".csv", ".tsv", ".json", ".jsonl", ".mcap", ".db3", ".npz", ".parquet", ".pt")
+_ENDINGS = (".csv", ".tsv", ".json", ".jsonl", ".mcap", ".db3", ".npz", ".parquet", ".pt", ".mat")
 _PACKED = (".gz", ".bz2", ".xz")
+_STAMP = re.compile(rb"\[[\d.:, TZ-]+\][ \t]*[A-Za-z(]")  # before a message: a line of text
 
 
 def is_log_folder(folder: Path) -> bool:
@@ -84,12 +86,12 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
         return replace(ros.read_mcap(path, data, options), sha256=digest)
     if data.startswith(ros.SQLITE):
         return replace(ros.read_sqlite(path, options), sha256=digest)
-    if data.startswith((arrays.ZIP, arrays.NPY)):
+    if data.startswith((arrays.ZIP, arrays.NPY, arrays.MAT)):
         return replace(arrays.read_arrays(path, data, options), sha256=digest)
     if data.startswith(parquet.MAGIC):
         return replace(parquet.read_parquet(path, data, options), sha256=digest)
     start = data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")
-    if start[:1] not in (b"{", b"["):
+    if start[:1] not in (b"{", b"[") or _STAMP.match(start):
         return None
     found = border.parse_json(_whole_json(decoded(path, data)), str(path), "Give it as written.")
     for layout, known, read in (
