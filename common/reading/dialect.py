@@ -117,6 +117,7 @@ _STAMPED = re.compile(
 _REMARK = re.compile(r"\W*\w+\W*:$")  # a first word such as WARN: or [INFO]:
 _NUMBERS = re.compile(r"[\s,;]+")
 _LONGEST_LIST = 1000
+_BRACKETED = re.compile(r"^[ \t]*[\[(]([^\[\]()\n]+)[\])][ \t]*[,;]?[ \t]*$", re.MULTILINE)
 _LIST = re.compile(r'"?[\[(]\s*([-+.\d][-+.\deE,;\s]*?)\s*[\])]"?')
 
 
@@ -168,6 +169,8 @@ def plain(text: str) -> Plain:
         inner = _shape([_STAMPED.sub("", row) for row in rows])
         separator = inner.separator if inner else ","
         return plain(_STAMPED.sub(lambda m: _stamp(m) + separator, text))
+    if all(_BRACKETED.match(row) for row in rows):
+        return plain(_BRACKETED.sub(r"\1", text))
     if all(_LIST.search(row) for row in rows) and (flat := _unlisted(text, lines, bare, rows)):
         return plain(flat)
     shape = _shape(rows)
@@ -462,6 +465,8 @@ def _names(line: str, shape: _Shape) -> list[str] | None:
     for cells in ways:
         if len(cells) == shape.columns - 1 and not shape.numeric[-1]:
             cells = [*cells, ""]
+        if len(cells) == shape.columns + 1 and cells[-1].lower() in ("comment", "remark", "note"):
+            cells = cells[:-1]
         if len(cells) == shape.columns - 1 and shape.counted:
             cells = ["row", *cells]
         if len(cells) == shape.columns and not any(_is_decimal(c) for c in cells if c):

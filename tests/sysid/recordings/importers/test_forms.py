@@ -201,6 +201,18 @@ FORMS = {
     "an archive with notes": zipped("log.csv", "notes.md"),
     "MATLAB": matlab({"t": TIME[:, None], "cmd": COMMAND[:, None], "pos": POSITION[:, None]}),
     "MATLAB's structure": matlab({"log": {"time": TIME, "cmd": COMMAND, "pos": POSITION}}),
+    "a comment's name without cells": joined("\t").replace("pos\n", "pos\tComment\n", 1),
+    "Python's tuples": "time, cmd, pos\n" + "".join(f"({t}, {c}, {p})\n" for t, c, p in ROWS_OF),
+    "Python's dictionaries": "".join(
+        f"{dict(t=t, goal=c, pos=p)}\n" for t, c, p in ROWS_OF),
+    "tenths of a degree": "time,cmd (0.1deg),pos (0.1deg)\n" + "".join(
+        f"{t!r},{1800 / np.pi * c!r},{1800 / np.pi * p!r}\n" for t, c, p in ROWS_OF),
+    "JSON of pandas": pd.DataFrame(
+        {"time": TIME, "cmd": COMMAND, "pos": POSITION}).to_json(double_precision=12),
+    "JSON of pandas, split": pd.DataFrame(
+        {"time": TIME, "cmd": COMMAND, "pos": POSITION}).to_json(orient="split"),
+    "names of a controller in ROS 1": joined(",", ("%time", "field.set_point",
+                                                   "field.process_value")),
     "missing in words": joined(",") + f"{TIME[-1] + 0.005:.6f},0.1,None\n",
 }  # fmt: skip
 
@@ -272,13 +284,14 @@ def test_what_was_assumed_of_the_form_is_said_in_one_sentence(tmp_path):
 def test_what_cannot_be_read_is_refused_with_the_cure(tmp_path):
     (tmp_path / "log.csv").write_text(joined(",", ("time", "cmd_percent", "pos_percent")))
     (tmp_path / "log.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
+    (tmp_path / "echo.txt").write_text("header:\n  stamp:\n    sec: 1\n---\n")
     (tmp_path / "log73.mat").write_bytes(b"MATLAB 7.3 MAT-file" + bytes(200))
     (tmp_path / "log.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(200))
     (tmp_path / "log.xls").write_bytes(b"\xd0\xcf\x11\xe0" + bytes(200))
     text = joined(",").replace(f"\n{TIME[3]:.6f},", "\nsoon,")
     (tmp_path / "word.csv").write_text(text)
     cases = [("log.csv", "import log.csv --unit percent:3.5 --out"), ("log.mat", "writematrix"),
-             ("log73.mat", "'-v7'"),
+             ("echo.txt", "ros2 topic echo --csv"), ("log73.mat", "'-v7'"),
              ("log.h5", "h5py"), ("log.xls", "save it as CSV"),
              ("word.csv", "'soon' is no")]  # fmt: skip
     assert_each_refused(cases, lambda name: load(tmp_path / name), names=tmp_path)
