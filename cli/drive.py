@@ -6,7 +6,7 @@ import os
 import select
 import sys
 import termios
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -17,7 +17,6 @@ from rich.text import Text
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.keyboard import terminal_without
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.policies.deploy.deployment import Tick
 from pupper_sysid.policies.network.policy_file import CommandRanges
@@ -49,7 +48,8 @@ class Driver:
         self._ended = False
         self._live = Live(console=terminal.err, auto_refresh=False)
         self._shown_s = -np.inf
-        self._age = np.zeros(len(JOINT_NAMES))
+        self._age = np.zeros(0)
+        self._joints: Sequence[str] = ()
         self._seen: BusSample | None = None
         self._seen_s = 0.0
 
@@ -77,6 +77,11 @@ class Driver:
             self._command = self._trained.clip(wanted)
             self._clipped = bool((self._command != wanted).any())
 
+    def watching(self, joints: Sequence[str]) -> Callable[[Tick], None]:
+        """Watcher of a walk of these joints, for the table."""
+        self._joints, self._age = joints, np.zeros(len(joints))
+        return self.watch
+
     def watch(self, tick: Tick) -> None:
         """Show a tick, a few times a second."""
         if self._seen is not None:
@@ -87,7 +92,7 @@ class Driver:
             return
         self._shown_s = tick.elapsed_s
         notice = CLIPPED if self._clipped else ""
-        self._live.update(_table(tick, self._age, notice), refresh=True)
+        self._live.update(_table(tick, self._joints, self._age, notice), refresh=True)
 
     @contextmanager
     def driving(self) -> Iterator[Driver]:
@@ -104,14 +109,14 @@ class Driver:
             yield self
 
 
-def _table(tick: Tick, age_s: np.ndarray, notice: str) -> Table:
+def _table(tick: Tick, joints: Sequence[str], age_s: np.ndarray, notice: str) -> Table:
     forward, left, turn = tick.senses.command
     shown = terminal.table(
         f"{tick.elapsed_s:6.1f} s   {forward:+.2f} m/s forward  {left:+.2f} left  "
         f"{turn:+.2f} rad/s{notice}\n{_HELP}",
         "joint", "sent rad", "read rad", "unchanged ms", "load N·m", "margin rad",
     )  # fmt: skip
-    for i, joint in enumerate(JOINT_NAMES):
+    for i, joint in enumerate(joints):
         room = tick.decision.margin[i]
         shown.add_row(
             joint, terminal.number(tick.sent[i], 3),

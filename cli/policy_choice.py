@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.observer_match import Match
     from pupper_sysid.policies.deploy.servo_match import ServoMatch
     from pupper_sysid.policies.network.policy_file import CommandRanges, Policy
+    from pupper_sysid.sim.robot.body import Body
 
 _CONTRACT = "contract.json"
 
@@ -141,9 +142,20 @@ def refuse_other_robot(policy: Policy, program: str) -> None:
     if (own := policy.contract.robot) is not None:
         raise InputError(
             f"{program} knows the Mini Pupper 2 only, and this policy walks {own.name}. Look at it "
-            "with pupper-play, measure it with pupper-eval, and take it to its robot with "
-            "pupper-sysid export."
+            "with pupper-play, measure it with pupper-eval, compare its servos with "
+            "pupper-analyze servo-demand, and walk it with pupper-deploy."
         )
+
+
+def body_at(path: Path, policy: Policy, run: Run | None) -> Body:
+    """The robot that the policy at `path` was trained on.
+
+    Raises
+    ------
+    InputError
+        If its MJCF or YAML is not here as it was.
+    """
+    return _of_robot(run.task if run else Walking(), path, policy, run).body
 
 
 def _of_robot(task: Walking, path: Path, policy: Policy, run: Run | None) -> Walking:

@@ -18,19 +18,8 @@ import pupper_sysid as ps
 from pupper_sysid.cli.programs import pupper_sysid
 from support.command_line import run
 from support.json_keys import DOCUMENTED, key_line
-from support.strokes import stroked
 
 SWEEP = Path("data/samples/sweep.csv")
-
-# imports of these fail as where they are not installed
-WITHOUT = """
-import sys
-class Absent:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in ("torch", "rsl_rl", "matplotlib"):
-            raise ModuleNotFoundError(name)
-sys.meta_path.insert(0, Absent())
-"""
 
 
 def python(code: str, folder: Path) -> str:
@@ -109,29 +98,6 @@ def test_importing_the_front_door_imports_nothing_else(tmp_path):
     assert [m for m in loaded if m.startswith("pupper_sysid.")] == []
 
 
-@pytest.mark.slow
-def test_load_lag_calibrate_and_save_need_neither_torch_nor_matplotlib(hip, tmp_path):
-    text = python(
-        WITHOUT
-        + f"""
-import pupper_sysid as ps
-recording = ps.load({str(hip)!r})
-lag = ps.delay(recording, "LF_hip")
-print(lag)
-calibrated = ps.calibrate(recording, "LF_hip")
-assert lag["LF_hip"].dead_time_s == calibrated["LF_hip"].dead_time_s
-calibrated.save("calibrated.yaml")
-try:
-    calibrated.save("calibrated.yaml")
-except ps.InputError as error:
-    print("refused")
-""",
-        tmp_path,
-    )
-    assert "dead time" in text and len(text) < 500 and text.endswith("refused\n")
-    assert ps.load_calibration(tmp_path / "calibrated.yaml").joint_names == ("LF_hip",)
-
-
 @pytest.fixture
 def json_of(capsys, monkeypatch):
     """Object that a command prints of one joint; it is that of the function of its name.
@@ -182,25 +148,3 @@ def test_bode_is_its_command_and_shows_that_the_servo_follows(json_of, hip, tmp_
     tones = json_of("bode", hip, "--plot", tmp_path / "b.png")["by_frequency"]
     assert (tmp_path / "b.png").stat().st_size > 10_000
     assert all(t["gain"] > 0.9 for t in tones) and tones[-1]["raw_gain"] < 0.75
-
-
-@pytest.mark.slow
-def test_backlash_is_the_json_of_its_command_with_a_row_per_gain(capsys, tmp_path):
-    strokes, _ = stroked(3, 2.0, 0)
-    strokes.save(tmp_path / "strokes.csv")
-    code, out, err = run(capsys, "backlash", tmp_path / "strokes.csv", "--json")
-    assert code == 0, err
-    found = ps.backlash(ps.load(tmp_path / "strokes.csv"))
-    assert found.to_dict() == json.loads(out)
-    table, own = found.to_frame(), found["bench"]
-    assert list(table["joint"]) == ["bench", "bench"] and list(table["p_gain"]) == [8, 32]
-    assert list(table["hysteresis_rad_low"]) == [g.hysteresis_rad.low for g in own.gains]
-    assert own.backlash_rad and set(table["backlash_rad"]) == {own.backlash_rad.value}
-    (axes,) = found.plot().axes
-    assert axes.get_xlabel() == "P gain" and "bench: backlash 1.9" in axes.get_title(loc="left")
-    assert str(found).startswith("bench: hysteresis ") and "at P 32" in str(found)
-
-
-def test_a_joint_that_was_not_recorded_is_refused():
-    with pytest.raises(ps.InputError, match="RB_calf"):
-        ps.delay(ps.load(SWEEP), ["RB_calf"])

@@ -21,13 +21,14 @@ from pupper_sysid.cli.buses import chosen_map
 from pupper_sysid.cli.commands.recording.sweep import Sweep
 from pupper_sysid.cli.live_views import Wanted, live_views
 from pupper_sysid.cli.policy_choice import (
+    body_at,
     chosen_actuator,
     policy_at,
-    refuse_other_robot,
     show_match,
     show_servos,
     trained_actuator,
     trained_commands,
+    warn_of_fallbacks,
 )
 from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.cli.user_errors import end_politely, run_program
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.commands import Commands
     from pupper_sysid.policies.network.policy_file import CommandRanges
     from pupper_sysid.sim.emulator.robot import EmulatedRobot
+    from pupper_sysid.sim.robot.body import Body
 
 DESCRIPTION = """Run a policy on a robot, or on an emulated one, behind the same bus.
 
@@ -168,20 +170,20 @@ def _run(options: Deploy) -> None:
     from pupper_sysid.policies.deploy.assembly import assemble
 
     policy, run = policy_at(options.policy)
-    refuse_other_robot(policy, "pupper-deploy")
+    body = body_at(options.policy, policy, run)
     name, stack = _stack(options, policy.contract)
     if options.replay:
-        _replay(options.replay, policy)
+        _replay(options.replay, policy, body)
         return
     trained = trained_commands(policy, run)
     commands = _commands(options, trained)
     folder = Path("walks") / (options.name or time.strftime(f"{options.policy.name}-%H%M%S"))
     with ExitStack() as open_things:
-        bus, imu, joint_map, truth = _open(options, open_things)
         actuator = chosen_actuator(options.policy, policy, run, options.actuator)
+        bus, imu, joint_map, truth = _open(options, open_things, body, actuator)
         of_training, known = trained_actuator(options.policy, policy, run)
         parts = assemble(
-            policy, stack, joint_map, actuator, options.servo, of_training if known else None
+            policy, stack, joint_map, actuator, options.servo, of_training if known else None, body
         )
         if stack.observer == "readings" and options.actuator is None:
             err.print(
@@ -249,18 +251,25 @@ def _changes(options: Deploy) -> dict[str, Any]:
     return {name: value for name, value in changes.items() if value is not None} | without
 
 
-def _open(options: Deploy, open_things: ExitStack) -> tuple[GuardedBus, Imu, JointMap, Any]:
+def _open(
+    options: Deploy, open_things: ExitStack, body: Body, actuator: str
+) -> tuple[GuardedBus, Imu, JointMap, Any]:
     """Bus, IMU, joint map, and the emulated robot if it is one."""
     if options.bus == EMULATED:
         from pupper_sysid.sim.walking.bus import WalkingBus
+        from pupper_sysid.sim.walking.robot import body_joint_map
 
         rng = np.random.default_rng(options.seed)
-        inner = WalkingBus(_emulated(options, rng), rng, real_time=options.in_real_time)
+        truth = _emulated(options, rng, body, actuator)
+        inner = WalkingBus(truth, rng, real_time=options.in_real_time, body=body)
         bus = open_things.enter_context(closing(GuardedBus(inner)))
-        return bus, inner, load_joint_map("mini_pupper_2"), inner.robot
+        return bus, inner, body_joint_map(body), inner.robot
     address = parse_address(options.bus)
-    preset = "mini_pupper_2" if address.kind == "esp32" else "sts3215"
-    joint_map = chosen_map(options.joint_map) or load_joint_map(preset)
+    if body.is_mini_pupper:
+        preset = "mini_pupper_2" if address.kind == "esp32" else "sts3215"
+        joint_map = chosen_map(options.joint_map) or load_joint_map(preset)
+    else:
+        joint_map = _map_of(options, body)
     if address.kind == "feetech" and options.imu is None:
         raise InputError(
             "A Feetech line has no IMU, and a policy needs one. Give the proxy's socket with --imu."
@@ -272,12 +281,59 @@ def _open(options: Deploy, open_things: ExitStack) -> tuple[GuardedBus, Imu, Joi
     return bus, other, joint_map, None
 
 
-def _emulated(options: Deploy, rng: np.random.Generator) -> EmulatedRobot:
-    """An emulated robot with the user's servos, else with published ones."""
+def _map_of(options: Deploy, body: Body) -> JointMap:
+    """The user's joint map of another robot, in the order of the policy's joints."""
+    joint_map = chosen_map(options.joint_map)
+    if joint_map is None:
+        raise InputError(
+            f"The policy walks {body.name}, and a real bus needs the joint map of that robot: the "
+            f"servo's id, direction and limits of {', '.join(body.joints[:3])}, … Begin one with "
+            "`pupper-sysid init-robot MJCF`, measure it with `pupper-sysid calibrate-joints`, and "
+            "give it with --joint-map. Without a robot: --bus emulated."
+        )
+    if missing := [j for j in body.joints if j not in joint_map.joint_names]:
+        raise InputError(
+            f"The joint map {joint_map.file.name} has no {missing[0]}, which the policy of "
+            f"{body.name} moves; it has {', '.join(joint_map.joint_names)}. Its joints must be "
+            "called as in the robot's MJCF."
+        )
+    warn(
+        [
+            f"the IMU's axes are taken for those of {body.name}'s trunk (x forward, y to the left, "
+            "z up), and the joint map's angles for those of its MJCF."
+        ]
+    )
+    return replace(joint_map, joint_names=body.joints)
+
+
+def _emulated(options: Deploy, rng: np.random.Generator, body: Body, trained: str) -> EmulatedRobot:
+    """An emulated robot with the user's servos.
+
+    Without a calibration, a Mini Pupper has published servos, another robot those of the training.
+    """
+    from pupper_sysid.servo_models.cards.files import is_card
     from pupper_sysid.sim.emulator.robot import draw_robot
     from pupper_sysid.sim.walking.bus import calibrated_robot
     from pupper_sysid.sim.walking.servo_ranges import check_actuator, is_servo_model, servo_ranges
 
+    if not body.is_mini_pupper:
+        if is_servo_model(trained):
+            raise InputError(
+                f"{trained} is a learned model, which an emulated {body.name} cannot have. Give a "
+                "calibration with --actuator."
+            )
+        if options.actuator is None:
+            err.print(
+                f"The emulated {body.name} has the servos of the training, {Path(trained).name}. "
+                "Give yours with --actuator.",
+                soft_wrap=True,
+            )
+        else:
+            err.print(f"The emulated {body.name} has the servos of {trained}.", soft_wrap=True)
+        servos = servo_ranges(trained, body=body)
+        if not is_card(trained):
+            warn_of_fallbacks([servos])
+        return calibrated_robot(servos, rng, body)
     if options.actuator is None:
         return draw_robot(rng)
     check_actuator(options.actuator)
@@ -292,13 +348,13 @@ def _emulated(options: Deploy, rng: np.random.Generator) -> EmulatedRobot:
     return calibrated_robot(servo_ranges(options.actuator), rng)
 
 
-def _replay(path: Path, policy: Any) -> None:
+def _replay(path: Path, policy: Any, body: Body) -> None:
     """Repeat a log and compare."""
     from pupper_sysid.policies.deploy.assembly import reassemble
     from pupper_sysid.policies.deploy.walk_log import read_walk, replay
 
     walk = read_walk(path)
-    differs = replay(walk, reassemble(policy, walk.header, path))
+    differs = replay(walk, reassemble(policy, walk.header, path, body))
     ended = walk.ended or "it was cut short"
     if differs is not None:
         raise InputError(
@@ -340,7 +396,7 @@ def _walk(
         watchers: list[Any] = [parts.frozen_readings, *([score] if score else [])]
         if isinstance(commands, Driver):
             open_things.enter_context(commands.driving())
-            watchers.append(commands.watch)
+            watchers.append(commands.watching(bus.joint_names))
         if options.live:
             watchers += _live(open_things, bus)
         if options.views:

@@ -180,6 +180,7 @@ def content(path: Path | str, most_bytes: float, remedy: str = "") -> bytes:
 
 _XZ_MEMORY = 256 << 20  # of `xz -9`: 65 MB
 _ZIP = b"PK\x03\x04"
+_LOGS = (".csv", ".tsv", ".json", ".jsonl", ".parquet", ".mcap", ".log", ".dat")
 _PACKED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ\0": "xz"}
 _FOREIGN = {b"\x28\xb5\x2f\xfd": "zstd", b"7z\xbc\xaf\x27\x1c": "7-Zip", b"Rar!": "RAR",
             b"\x04\x22\x4d\x18": "LZ4"}  # fmt: skip
@@ -212,6 +213,10 @@ def unpacked(path: Path | str, data: bytes, most_bytes: float) -> bytes:
                           and not m.filename.startswith("__MACOSX/")]  # fmt: skip
                 if any(m.filename.endswith((".npy", "/data.pkl")) for m in inside):
                     return data
+                if any(m.filename.startswith("xl/") for m in inside):
+                    raise InputError(f"{path} is a spreadsheet, which is not read: save it as CSV.")
+                if len(inside) != 1:  # beside notes and pictures
+                    inside = [m for m in inside if m.filename.lower().endswith(_LOGS)] or inside
                 if len(inside) != 1:
                     raise InputError(
                         f"{path} is an archive of {len(inside)} files. Unpack it, and give one of "

@@ -101,6 +101,7 @@ _OLD_PANDAS = tuple(map(int, pd.__version__.split(".")[:2])) < (3, 1)
 _EXACTLY: dict[str, Any] = {"float_precision": "round_trip"} if _OLD_PANDAS else {}
 _SPLIT = "Split it by joint or by time."
 _BLOCK = 4_000_000  # characters
+_FEW_BROKEN = 0.01  # of the lines: a serial line lost characters
 _NOTHING = frozenset({"none", "null", "n/a", "na", "#n/a", "-", "--", "<na>"})
 _COMMENT = re.compile(r"^#.*$", re.MULTILINE)
 _QUOTED = re.compile(r'(?:^|(?<=[,\n]))"([^",\n]*)"(?=[,\n]|$)')
@@ -122,6 +123,8 @@ class CsvTable:
     """Line of each row, from 1, shape (rows,)."""
     comments: list[tuple[int, str]] = field(default_factory=list)
     """Comment lines, numbered."""
+    broken: list[int] = field(default_factory=list)
+    """Lines with another number of cells, which have been left out; few, and not if strict."""
     cut: bool = False
     """Whether the last row was incomplete and has been left out."""
 
@@ -149,7 +152,8 @@ def read_table(
     texts : collection of str
         Columns that hold text.
     strict : bool
-        Refuse text in other columns, rather than name it in `faults`.
+        Refuse text in other columns, rather than name it in `faults`, and each line with another
+        number of cells, rather than leave a few out.
     whole_lines : bool
         Leave a last line out, too, that does not end.
     columns : sequence of str, optional
@@ -308,6 +312,11 @@ class _Blocks:
         if last and rows and len(rows[-1]) < len(found.columns):
             found.cut = True
             rows, lines = rows[:-1], lines[:-1]
+        whole = [len(row) == len(found.columns) for row in rows]
+        if not self._strict and 0 < whole.count(False) <= max(_FEW_BROKEN * len(rows), 1):
+            found.broken += [n for n, good in zip(lines, whole, strict=True) if not good]
+            rows = [row for row, good in zip(rows, whole, strict=True) if good]
+            lines = [n for n, good in zip(lines, whole, strict=True) if good]
         for n, row in zip(lines, rows, strict=True):
             if len(row) != len(found.columns):
                 raise InputError(

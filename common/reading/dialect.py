@@ -89,29 +89,35 @@ _SAME_SHAPE, _NUMERIC = 0.9, 0.9  # shares of rows, of cells
 _COMMENT = re.compile(r"[ \t]*(#|%|//|!)")
 _COMMA_NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:,[0-9]*)?|,[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _CLOCK = re.compile(
-    r"(\d{4}-\d\d-\d\d[T ]|\d{1,4}([-/.])\d{1,2}\2\d{1,4} )?"
-    r"\d{1,2}:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?"
+    r"(\d{4}-\d\d-\d\d[T ]|\d{1,4}([-/.])\d{1,2}\2\d{1,4} |\d+ days? )?"
+    r"(\d{1,2}:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?|\d{1,3}:\d\d[.,]\d+)"
 )
 _FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]\d{2,3}(?![\w.]))")
 _GROUPED = re.compile(r"(?<![\w.,'’])[+-]?\d{1,3}(?:['’]\d{3})+(?![\w'’])")
 _QUOTED_GROUPS = re.compile(r'"([+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?)"')
 _COMMA_GROUPS = re.compile(r"(?<![\w.,])[+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?(?![\w,])")
-_UNIT = re.compile(
-    r"[(\[<{]?\s*(s|sec|seconds?|ms|us|µs|ns|rad|radians?|deg|degrees?|°|counts?|ticks?|raw|turns?|"
-    r"rev|v|volts?|a|amps?|ma|mv|n\*?m|nm|%|°?c|hz|rad/s|deg/s|rpm|rad/s\^?2|m|mm|-|1|none)"
-    r"\s*[)\]>}]?",
+_POINT_GROUPS = re.compile(r"(?<![\w.,])[+-]?\d{1,3}(?:\.\d{3})+(?:,\d+)?(?![\w.])")
+_UNITS = (
+    r"s|sec|seconds?|ms|us|µs|ns|rad|radians?|deg|degrees?|°|counts?|ticks?|turns?|rev|v|volts?|a|"
+    r"amps?|ma|mv|n\*?m|nm|%|°?c|hz|rad/s|deg/s|rpm|rad/s\^?2|m|mm"
+)
+_UNIT = re.compile(rf"[(\[<{{]?\s*({_UNITS}|raw|-|1|none)\s*[)\]>}}]?", re.IGNORECASE)
+_WITH_UNIT = re.compile(rf"([-+]?[\d.]+(?:[eE][-+]?\d+)?) ?({_UNITS})", re.IGNORECASE)
+_PAIR = re.compile(
+    r"(?<![\w\"'])([A-Za-z_][\w./]*)\s*[:=]\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
+    rf"(?:{_UNITS})?(?![\w:])",
     re.IGNORECASE,
 )
-_PAIR = re.compile(
-    r"(?<![\w\"'])([A-Za-z_][\w./]*)\s*[:=]\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)(?![\w:])"
-)
 _STAMPED = re.compile(
-    r"^[ \t]*\[?((?:\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,]\d+)?)\]?"
+    r"^[ \t]*(?:\[?((?:\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,]\d+)?)\]?|"
+    r"[(\[][ \t]*(\d+\.\d+)[ \t]*[)\]])"
     r"[ \t]*(?:->|[|:])?[ \t]+(?=\S)",
     re.MULTILINE,
 )
+_REMARK = re.compile(r"\W*\w+\W*:$")  # a first word such as WARN: or [INFO]:
 _NUMBERS = re.compile(r"[\s,;]+")
 _LONGEST_LIST = 1000
+_BRACKETED = re.compile(r"^[ \t]*[\[(]([^\[\]()\n]+)[\])][ \t]*[,;]?[ \t]*$", re.MULTILINE)
 _LIST = re.compile(r'"?[\[(]\s*([-+.\d][-+.\deE,;\s]*?)\s*[\])]"?')
 
 
@@ -137,6 +143,8 @@ class _Shape:
     comma: bool  # in numbers
     columns: int
     numeric: tuple[bool, ...]  # by column
+    units: dict[int, str]  # of columns in whose cells one stands behind the number
+    counted: bool  # whether the first column counts the rows
 
 
 def plain(text: str) -> Plain:
@@ -152,7 +160,7 @@ def plain(text: str) -> Plain:
     if len(bare) < 3:
         return Plain(text)
     rows = [lines[n] for n in bare[len(bare) // 2 :][:_ROWS]]
-    if (usual := _usual_numbers(text, rows)) != text:
+    if (usual := _usual_numbers(text, [*rows, *text[-2000:].split("\n")[1:-1]])) != text:
         return plain(usual)
     names = Counter(tuple(name for name, _ in _PAIR.findall(row)) for row in rows).most_common(1)[0]
     if len(set(names[0])) == len(names[0]) > 1 and names[1] >= _SAME_SHAPE * len(rows):
@@ -160,7 +168,9 @@ def plain(text: str) -> Plain:
     if all(_STAMPED.match(row) for row in rows):  # of a serial monitor
         inner = _shape([_STAMPED.sub("", row) for row in rows])
         separator = inner.separator if inner else ","
-        return plain(_STAMPED.sub(lambda m: m[1].replace(" ", "T") + separator, text))
+        return plain(_STAMPED.sub(lambda m: _stamp(m) + separator, text))
+    if all(_BRACKETED.match(row) for row in rows):
+        return plain(_BRACKETED.sub(r"\1", text))
     if all(_LIST.search(row) for row in rows) and (flat := _unlisted(text, lines, bare, rows)):
         return plain(flat)
     shape = _shape(rows)
@@ -173,7 +183,8 @@ def _usual_numbers(text: str, rows: Sequence[str]) -> str:
     """The text without thousands separators, Fortran's exponents and typeset minus signs.
 
     A comma groups thousands where it is quoted, or where cells are separated otherwise, every
-    comma stands before three digits, and other numbers have a decimal point.
+    comma stands before three digits, and other numbers have a decimal point; a point where the
+    others have a decimal comma.
     """
     sample = "\n".join(rows)
     if "\u2212" in text:
@@ -184,11 +195,17 @@ def _usual_numbers(text: str, rows: Sequence[str]) -> str:
         text = _GROUPED.sub(lambda m: re.sub("['’]", "", m[0]), text)
     if _QUOTED_GROUPS.search(sample):
         text = _QUOTED_GROUPS.sub(lambda m: m[1].replace(",", ""), text)
-    elif all(";" in row or "\t" in row for row in rows) and _COMMA_GROUPS.search(sample):
-        rest = _COMMA_GROUPS.sub("", sample)
-        if "," not in rest and re.search(r"\d\.\d", rest):
-            text = _COMMA_GROUPS.sub(lambda m: m[0].replace(",", ""), text)
+    elif all(";" in row or "\t" in row for row in rows):
+        for groups, mark, point in ((_COMMA_GROUPS, ",", "."), (_POINT_GROUPS, ".", ",")):
+            rest = groups.sub("", sample)
+            if rest != sample and mark not in rest and re.search(rf"\d[{point}]\d", rest):
+                return groups.sub(lambda m, mark=mark: m[0].replace(mark, ""), text)
     return text
+
+
+def _stamp(match: re.Match[str]) -> str:
+    """The time at the start of a line as a cell."""
+    return match[2] or match[1].replace(" ", "T").replace(",", ".")
 
 
 def is_clock(cell: str) -> bool:
@@ -210,12 +227,34 @@ def _shape(rows: Sequence[str]) -> _Shape | None:
             shares = [
                 sum(_number(row[k], comma) for row in cells) / len(cells) for k in range(columns)
             ]
+            full = tuple(any(row[k] for row in cells) for k in range(columns))
+            units = {} if separator == " " else _units_of(cells, shares)
+            shares = [1.0 if k in units else share for k, share in enumerate(shares)]
             if sum(shares) > most * columns:
                 most = sum(shares) / columns
-                filled = [any(row[k] for row in cells) for k in range(columns)]
-                numeric = tuple(s >= _NUMERIC and f for s, f in zip(shares, filled, strict=True))
-                best = _Shape(separator, comma, columns, numeric)
+                numeric = tuple(s >= _NUMERIC and f for s, f in zip(shares, full, strict=True))
+                counted = _counted([row[0] for row in cells])
+                best = _Shape(separator, comma, columns, numeric, units, counted)
     return best if best is not None and any(best.numeric) else None
+
+
+def _units_of(cells: Sequence[Sequence[str]], shares: Sequence[float]) -> dict[int, str]:
+    """Columns, of such shares of numbers, in which one unit stands behind each; and the unit."""
+    units = {}
+    for k, share in enumerate(shares):
+        matches = (
+            [] if share >= _NUMERIC else [_WITH_UNIT.fullmatch(row[k]) for row in cells if row[k]]
+        )
+        words = {m[2] if m else "" for m in matches}
+        if len(words) == 1 and "" not in words:
+            units[k] = words.pop()
+    return units
+
+
+def _counted(cells: Sequence[str]) -> bool:
+    """Whether cells are whole numbers, each greater by one than the one before."""
+    numbers = [int(cell) for cell in cells if _WHOLE.fullmatch(cell)]
+    return len(numbers) == len(cells) and numbers == [*range(numbers[0], numbers[0] + len(cells))]
 
 
 def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> Plain:
@@ -231,9 +270,8 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
     if before:
         columns = _names(lines[before[-1]], shape)
         if columns is None or len(columns) != shape.columns:
-            if shape.separator == ",":  # its reader says which line has how many cells
+            if columns and shape.separator == ",":  # its reader says which line has how many cells
                 return Plain(text)
-            columns = columns or [lines[before[-1]].strip()]
     else:
         comments = [line for line in lines[:first] if _COMMENT.match(line)]
         columns = next((c for c in map(lambda x: _named_in(x, shape), comments[::-1]) if c), None)
@@ -247,7 +285,7 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
         lines[before.pop(-2)] = ""
     plain_names = (
         shape.separator == "," and len(before) == 1 and not units and not shape.comma
-        and columns == _split(lines[before[0]], ",")
+        and not shape.units and columns == _split(lines[before[0]], ",")
         and not any(_COMMENT.match(line) and line[:1] != "#" for line in lines)
     )  # fmt: skip
     if plain_names and columns and columns[-1]:
@@ -260,11 +298,13 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
     for k, word in enumerate(units):
         if word and word not in ("-", "1"):
             columns[k] = f"{columns[k]} [{word}]"
+    for k, word in shape.units.items():
+        columns[k : k + 1] = [f"{name} [{word}]" for name in columns[k : k + 1]]
     if units:
         notes.append("the row below the names was taken for their units")
-    if len(before) > 1:
-        lines_above = f"{len(before) - 1} line{'s' if len(before) > 2 else ''}"
-        notes.append(f"{lines_above} above the names of the columns left out")
+    if above := len(before) - (not numbered):
+        what = "the numbers" if numbered else "the names of the columns"
+        notes.append(f"{above} line{'s' if above > 1 else ''} above {what} left out")
     if shape.separator != ",":
         notes.append(f"cells are separated by {_NAMES_OF[shape.separator]}")
     if shape.comma:
@@ -290,7 +330,7 @@ def _cells(body: str, shape: _Shape, trailing: int) -> str:
     """Rows with commas between cells and points in numbers."""
     body = re.sub(r"^[ \t]*(?:%|//|!).*$", "", body, flags=re.MULTILINE)
     quoted = '"' in body and (shape.separator != "," or shape.comma)
-    if quoted or (shape.separator != "," and "," in body and not shape.comma):
+    if quoted or shape.units or (shape.separator != "," and "," in body and not shape.comma):
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         for line in body.split("\n"):
@@ -298,6 +338,9 @@ def _cells(body: str, shape: _Shape, trailing: int) -> str:
                 out.write(f"{line}\n")
                 continue
             cells = _split(line, shape.separator)
+            for k in shape.units:
+                if k < len(cells) and (found := _WITH_UNIT.fullmatch(cells[k])):
+                    cells[k] = found[1]
             writer.writerow([c.replace(",", ".") if _number(c, shape.comma) else c for c in cells])
         body = out.getvalue().removesuffix("\n")
     elif shape.separator != ",":
@@ -323,7 +366,8 @@ def _labelled(text: str, columns: list[str]) -> Plain:
         stamp = _STAMPED.match(line) if same else None
         stamped = stamped or (stamp is not None and not rows)
         cells = [value for _, value in pairs] if same else []
-        rows.append(",".join([stamp[1] if stamp else "", *cells] if stamped and same else cells))
+        cells = [_stamp(stamp) if stamp else "", *cells] if stamped and same else cells
+        rows.append(",".join(cells))
         others += not same and bool(line.strip())
     notes = ["its lines are pairs of name and number"]
     notes += [f"{others} other lines were left out"] if others else []
@@ -371,12 +415,13 @@ def _sentence(notes: Sequence[str]) -> list[str]:
 
 
 def _split(line: str, separator: str) -> list[str]:
-    if separator == " ":
+    if separator == " " and '"' not in line:
         return line.split()
     if '"' not in line:
         return [cell.strip() for cell in line.split(separator)]
     try:
-        return [c.strip() for c in next(csv.reader([line], delimiter=separator), [])]
+        reader = csv.reader([line], delimiter=separator, skipinitialspace=separator == " ")
+        return [c.strip() for c in next(reader, [])]
     except csv.Error:
         return [cell.strip() for cell in line.split(separator)]
 
@@ -397,8 +442,12 @@ def _is_row(line: str, shape: _Shape) -> bool:
     cells = _split(line, shape.separator)
     if len(cells) != shape.columns:
         return False
-    full = [c for c, numeric in zip(cells, shape.numeric, strict=True) if numeric and c]
-    return bool(full) and sum(_number(c, shape.comma) for c in full) > len(full) / 2
+    full = [(k, c) for k, c in enumerate(cells) if shape.numeric[k] and c]
+    numbers = [
+        c for k, c in full
+        if _number(c, shape.comma) or (k in shape.units and _WITH_UNIT.fullmatch(c))
+    ]  # fmt: skip
+    return len(numbers) > len(full) / 2
 
 
 def _names(line: str, shape: _Shape) -> list[str] | None:
@@ -411,9 +460,15 @@ def _names(line: str, shape: _Shape) -> list[str] | None:
         _split(line, ";"),
         tied.split(),
     ]
+    if _REMARK.match(line.split(maxsplit=1)[0]) and shape.separator != " ":
+        ways = ways[:2]
     for cells in ways:
         if len(cells) == shape.columns - 1 and not shape.numeric[-1]:
             cells = [*cells, ""]
+        if len(cells) == shape.columns + 1 and cells[-1].lower() in ("comment", "remark", "note"):
+            cells = cells[:-1]
+        if len(cells) == shape.columns - 1 and shape.counted:
+            cells = ["row", *cells]
         if len(cells) == shape.columns and not any(_is_decimal(c) for c in cells if c):
             return cells
     return ways[0] if len(ways[0]) > 1 else None
@@ -451,8 +506,10 @@ def _usual(text: str) -> float:
     return sum(32 <= ord(c) < 127 or c in "\t\r\n" for c in text) / max(len(text), 1)
 
 
+_HIGH = re.compile(rb"[\x80-\xff]+")
 _BINARY = {
-    b"MATLAB 5.0": ("a MATLAB file", "writematrix or writetable writes it as text"),
+    b"MATLAB 7.3": ("a MATLAB file of version 7.3", "save it again with save(name, '-v7')"),
+    b"MATLAB": ("a damaged MATLAB file", "save it again with save(name, '-v7')"),
     b"\x89HDF\r\n": ("an HDF5 file", "pandas.read_hdf or h5py reads it; write it with to_csv"),
     b"ARROW1": ("a feather file", "write it with pandas.read_feather(path).to_parquet"),
     b"\xd0\xcf\x11\xe0": ("a spreadsheet", "save it as CSV"),
@@ -462,7 +519,10 @@ _BINARY = {
 
 
 def decoded(path: object, data: bytes) -> str:
-    """Text in UTF-8 or UTF-16, with or without a byte order mark, else in Windows-1252.
+    """Text in UTF-8 or UTF-16, with or without a byte order mark, GB 18030, or Windows-1252.
+
+    Letters with accents stand alone in words of Windows-1252; where bytes above 127 stand side by
+    side throughout, they are Chinese characters.
 
     Zeros at the end, where a file system lost the last rows, are left out.
     """
@@ -472,7 +532,8 @@ def decoded(path: object, data: bytes) -> str:
     wide = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}.get(data[:2])
     if wide is None and b"\0" in data[:2]:
         wide = "utf-16-be" if data[:1] == b"\0" else "utf-16-le"
-    for coding in (wide,) if wide else ("utf-8-sig", "cp1252"):
+    chinese = all(len(run) % 2 == 0 for run in _HIGH.findall(data[:_SAMPLE]))
+    for coding in (wide,) if wide else ("utf-8-sig", *["gb18030"] * chinese, "cp1252"):
         try:
             text = data.decode(coding).rstrip("\0")
         except ValueError:

@@ -204,9 +204,8 @@ _SHOWN = 4000
 @styled
 def demand_figure(demand: ServoDemand) -> Figure:
     """Needed torque over speed, by kind of joint; the line is what the servo has."""
-    figure, axes = axes_column(len(KINDS), 2.3 * len(KINDS))
-    for kind, one in zip(KINDS, axes, strict=True):
-        names = [name for name in demand.joints if name.endswith(f"_{kind}")]
+    figure, axes = axes_column(len(demand.kinds), 2.3 * len(demand.kinds))
+    for (kind, names), one in zip(demand.kinds.items(), axes, strict=True):
         speed = np.concatenate([demand.samples[name][0] for name in names])
         torque = np.concatenate([demand.samples[name][1] for name in names])
         every = max(1, len(speed) // _SHOWN)
@@ -218,7 +217,7 @@ def demand_figure(demand: ServoDemand) -> Figure:
         at_last = stall if top is None else own.torque_at_top_nm
         # driving the torque left falls with speed, braking it rises by as much
         one.plot([0, last, last, 0], [stall, at_last, at_last - 2 * stall, -stall], color=RED)
-        one.set_title(kind)
+        one.set_title(kind if kind in KINDS else ", ".join(names))
         one.set_ylabel("N·m")
     axes[0].plot([], [], color=RED, label=demand.servo)
     axes[0].legend(loc="center right")

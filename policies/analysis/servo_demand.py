@@ -29,12 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.common.results import Result, internal
 from pupper_sysid.policies.analysis.gait import SETTLE_S
 from pupper_sysid.policies.analysis.trial import Trial
-from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.walks.conditions import Condition, Moment
+from pupper_sysid.policies.walks.conditions import Actor, Condition, Moment
 from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.policies.walks.tracking import planar_velocity
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
@@ -130,6 +128,8 @@ class ServoDemand(Result):
     """The result in a sentence or two."""
     samples: Mapping[str, tuple[Array, Array]] = internal()
     """Speed and needed torque in the direction of motion, by joint."""
+    kinds: Mapping[str, tuple[str, ...]] = internal()
+    """Joints by kind."""
 
     @property
     def walks_on_it(self) -> bool:
@@ -147,7 +147,7 @@ class ServoDemand(Result):
 
 
 def servo_demand(
-    policy: Policy,
+    policy: Actor,
     trial: Trial,
     candidate: ServoRanges,
     dead_time_known: bool = True,
@@ -157,11 +157,11 @@ def servo_demand(
 
     Parameters
     ----------
-    policy : Policy
+    policy : Policy or ForeignPolicy
     trial : Trial
         Its task, servos and command.
     candidate : ServoRanges
-        The servo in question, for all joints.
+        The servo in question, for all joints of the task's robot.
     dead_time_known : bool
         Whether its dead time is a number rather than missing.
     extra_dead_times_s : sequence of float
@@ -182,7 +182,7 @@ def servo_demand(
             f"No robot walked for {SETTLE_S:g} s, so there is no gait to measure. Give a policy "
             "that walks on these servos."
         )
-    own = candidate.value
+    own, body = candidate.value, trial.task.body
     speed, acceleration, force = plain.speed[now], plain.acceleration[now], plain.force[now]
     walked = {name: np.broadcast_to(x, plain.speed.shape)[now] for name, x in plain.servos.items()}
     direction = np.sign(speed)
@@ -206,7 +206,7 @@ def servo_demand(
             walked_short=float(walked_short[:, i].mean()),
             walked_nm=Spread.of(force[:, i]),
         )
-        for i, name in enumerate(JOINT_NAMES)
+        for i, name in enumerate(body.joints)
     }
     survived = [walk.survival for walk in walks]
     enough = [s >= STILL_UP * survived[0] for s in survived]
@@ -228,8 +228,9 @@ def servo_demand(
         verdict="",
         samples={
             name: (np.abs(speed[:, i]), need[:, i] * direction[:, i])
-            for i, name in enumerate(JOINT_NAMES)
+            for i, name in enumerate(body.joints)
         },
+        kinds={kind: tuple(body.joints[i] for i in at) for kind, at in body.kinds.items()},
     )
     return replace(found, verdict=_verdict(found))
 
@@ -241,7 +242,7 @@ def _load(need: Array, speed: Array, own: Mapping[str, Array]) -> tuple[Array, N
     return used, (used > _TOLERANCE) | (np.abs(speed) > _TOLERANCE * _top_speed(own))
 
 
-def _walk_on(policy: Policy, trial: Trial, candidate: ServoRanges) -> _Kept | None:
+def _walk_on(policy: Actor, trial: Trial, candidate: ServoRanges) -> _Kept | None:
     """The walk on the servo in question; None if it cannot be simulated."""
     try:
         (walk,) = walk_together(
@@ -254,7 +255,7 @@ def _walk_on(policy: Policy, trial: Trial, candidate: ServoRanges) -> _Kept | No
 
 
 def _top_speed(own: Mapping[str, Array]) -> Array:
-    """Speeds without load of twelve servos [rad/s]."""
+    """Speeds without load of all servos [rad/s]."""
     left = np.maximum(own["effort_limit"] - own["friction_loss"], 0.0)
     free = np.where(own["back_emf"] > 0, left / np.maximum(own["back_emf"], 1e-12), np.inf)
     return np.minimum(free, own["velocity_limit"])
@@ -299,7 +300,7 @@ def _verdict(found: ServoDemand) -> str:
 
 @dataclass(frozen=True)
 class _Kept:
-    """Servo motion and forces of the robots of a condition; shape (steps, n, 12)."""
+    """Servo motion and forces of the robots of a condition; shape (steps, n, joints)."""
 
     step_s: float
     force: Array
@@ -310,7 +311,7 @@ class _Kept:
     alive: NDArray[np.bool_]
     survival: float
     servos: dict[str, Array]
-    """Of each robot, by field of `DelayedPDParameters`; shape (n, 12)."""
+    """Of each robot, by field of `DelayedPDParameters`; shape (n, joints)."""
 
     def mean_speed(self, now: NDArray[np.bool_]) -> float:
         """Mean of `along` over some steps; 0 if there are none."""
@@ -326,7 +327,7 @@ class _Kept:
 class _Recorder:
     """Keeps `_Kept` of one environment."""
 
-    def __init__(self, env: PupperEnv, policy: Policy | None, conditions: Sequence[Condition]):
+    def __init__(self, env: PupperEnv, policy: Actor | None, conditions: Sequence[Condition]):
         self._env = env
         self._servos = {name: x.copy() for name, x in env.robots.drawn.items()}
         self._fell = np.zeros(env.environments, bool)

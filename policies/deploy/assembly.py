@@ -21,7 +21,9 @@ from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.network.trained_servo import trained_servo
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.servo_file import WEIGHTS
+from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.robot import body_joint_map
 from pupper_sysid.sim.walking.servo_ranges import (
     ServoRanges,
     is_servo_model,
@@ -52,6 +54,7 @@ def assemble(
     actuator: str,
     servo: Path | None,
     trained: str | None = None,
+    body: Body | None = None,
 ) -> Assembly:
     """Make a controller.
 
@@ -67,6 +70,8 @@ def assemble(
         A learned servo model's folder.
     trained : str, optional
         Calibration or preset with which the policy was trained, if not with `actuator`.
+    body : Body, optional
+        The robot; the Mini Pupper 2 by default.
 
     Raises
     ------
@@ -75,7 +80,8 @@ def assemble(
     """
     contract = policy.contract
     period = stack.period_s(contract)
-    servos = servo_ranges(actuator)
+    servos = servo_ranges(actuator, body=body)
+    pose = contract.default_pose_rad
     parameters = DelayedPDParameters(**servos.value)
     limits = joint_map.per_servo().position_limits()
     model = None
@@ -85,16 +91,17 @@ def assemble(
         model = servo_model_of(servo, period)
     observer = make_observer(
         stack.observer, period, contract.velocity_steps, parameters,
-        (limits.low_rad, limits.high_rad), model,
+        (limits.low_rad, limits.high_rad), model, len(pose),
     )  # fmt: skip
     if trained is None or trained == actuator:
-        match = compare(observer, parameters, period)
+        match = compare(observer, parameters, period, pose=pose)
     else:
-        of_training = DelayedPDParameters(**servo_ranges(trained).value)
-        match = compare(observer, of_training, period, parameters)
+        of_training = DelayedPDParameters(**servo_ranges(trained, body=body).value)
+        match = compare(observer, of_training, period, parameters, pose)
     controller = Controller(policy, stack, observer, joint_map, _stall_torque(servos))
-    moving = SyntheticPD(parameters, period, limits_rad=(limits.low_rad, limits.high_rad))
-    frozen = FrozenReadings(moving, controller.to_servo)
+    ends = (limits.low_rad, limits.high_rad)
+    moving = SyntheticPD(parameters, period, limits_rad=ends, joints=len(pose))
+    frozen = FrozenReadings(moving, controller.to_servo, controller.joints)
     header = {
         "policy_sha256": contract.weights_sha256, "stack": asdict(stack),
         "joint_map": joint_map.file.name, "actuator": actuator,
@@ -105,8 +112,10 @@ def assemble(
     return Assembly(controller, frozen, match, _servo_match(policy, servos, trained), header)
 
 
-def reassemble(policy: Policy, header: dict[str, Any], log: Path) -> Controller:
-    """The controller of a log, from its header.
+def reassemble(
+    policy: Policy, header: dict[str, Any], log: Path, body: Body | None = None
+) -> Controller:
+    """The controller of a log, from its header; `body` is another robot than the Mini Pupper 2.
 
     Raises
     ------
@@ -117,9 +126,13 @@ def reassemble(policy: Policy, header: dict[str, Any], log: Path) -> Controller:
         if header["policy_sha256"] != policy.contract.weights_sha256:
             raise InputError(f"{log} was made with another policy. Give that one.")
         stack = Stack(**header["stack"])
-        joint_map = load_joint_map(header["joint_map"])
+        joint_map = (
+            body_joint_map(body)
+            if body is not None and header["joint_map"] == body_joint_map(body).file.name
+            else load_joint_map(header["joint_map"])
+        )
         servo = Path(header["servo"]) if header["servo"] else None
-        found = assemble(policy, stack, joint_map, header["actuator"], servo)
+        found = assemble(policy, stack, joint_map, header["actuator"], servo, body=body)
         changed = [
             key for key in ("actuator_sha256", "servo_sha256") if header[key] != found.header[key]
         ]

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError, SafetyStop
-from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.policies.deploy.filters import ComplementaryFilter, LowPass, Rest
 from pupper_sysid.policies.deploy.observers import JointEstimate, Observer
@@ -90,24 +89,27 @@ class Controller:
     ):
         contract = policy.contract
         refuse_other_observation(contract)
-        if joint_map.joint_names != JOINT_NAMES or joint_map.coordinates != "joint":
-            raise InputError("A policy needs a bus of all twelve joints, in joint coordinates.")
+        self.joints = tuple(contract.default_pose_rad)
+        if joint_map.joint_names != self.joints or joint_map.coordinates != "joint":
+            raise InputError(
+                f"A policy needs a bus of all its {len(self.joints)} joints, in joint coordinates."
+            )
         self.policy, self.stack, self.observer = policy.for_one(), stack, observer
         self.stall_torque_nm = stall_torque_nm
         self.period_s = stack.period_s(contract)
         self._to_servo = _affine(joint_map, joint_map.per_servo())
         self._to_joint = _affine(joint_map.per_servo(), joint_map)
         self._limits = joint_map.position_limits()
-        self.default = np.array([contract.default_pose_rad[name] for name in JOINT_NAMES])
+        self.default = np.array([*contract.default_pose_rad.values()])
         self._scale = contract.action_scale_rad if stack.scale_rad is None else stack.scale_rad
         self._smooth = (
-            LowPass(stack.lowpass_hz, 1 / self.period_s, len(JOINT_NAMES))
+            LowPass(stack.lowpass_hz, 1 / self.period_s, len(self.joints))
             if stack.lowpass_hz is not None
             else None
         )
         self._attitude = ComplementaryFilter()
         self._target = self.default.copy()
-        self._action = np.zeros(len(JOINT_NAMES), np.float32)
+        self._action = np.zeros(len(self.joints), np.float32)
         self._last_s: float | None = None
         self._rate = np.zeros(3)
 
@@ -124,10 +126,10 @@ class Controller:
         self.observer.reset(self.to_servo(position))
         self._attitude.reset(rest)
         self._target = np.asarray(position, float).copy()
-        self._action = np.zeros(len(JOINT_NAMES), np.float32)
+        self._action = np.zeros(len(self.joints), np.float32)
         self.policy.reset(self._action[None])
         if self._smooth:
-            self._smooth.reset(np.zeros(len(JOINT_NAMES)))
+            self._smooth.reset(np.zeros(len(self.joints)))
         self._last_s = None
         self._rate = rest.bias_rad_s
 
@@ -195,8 +197,9 @@ class Controller:
 
 def _affine(source: JointMap, target: JointMap) -> tuple[Array, Array]:
     """Matrix and constant of the conversion between two maps of the same counts."""
-    constant = target.to_angles(source.to_counts(np.zeros(len(JOINT_NAMES))))
-    return target.to_angles(source.to_counts(np.eye(len(JOINT_NAMES)))) - constant, constant
+    count = len(source.joint_names)
+    constant = target.to_angles(source.to_counts(np.zeros(count)))
+    return target.to_angles(source.to_counts(np.eye(count))) - constant, constant
 
 
 def _apply(affine: tuple[Array, Array], angles: Array) -> Array:

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError, PupperError, SafetyStop
-from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.bus import BusSample, Sent
 from pupper_sysid.hardware.imu import Imu, ImuSample
 from pupper_sysid.hardware.loop import (
@@ -145,7 +144,8 @@ def deploy(
         glide(standing, lambda pose: _send(bus, pose), position, controller.default, STAND_S)
         rest = _rest(bus, imu, standing, controller.default)
         start = first_pose(bus, controller.period_s)
-        writer = WalkLog(log, header | start_header(start, rest), force)
+        about = header | start_header(start, rest)
+        writer = WalkLog(log, about, force, controller.joints)
         try:
             controller.reset(start, rest)
             _walk(bus, imu, controller, commands, seconds, writer, rows, watchers, outcome)
@@ -190,7 +190,7 @@ def _walk(
     gc.collect()
     gc.freeze()
     imu_s = bus.now()
-    load_nm = np.zeros(len(JOINT_NAMES))
+    load_nm = np.zeros(len(controller.joints))
     try:
         for elapsed in loop.ticks(seconds):
             command = commands(elapsed)
@@ -296,5 +296,5 @@ def _rows(controller: Controller, sent: Sent, reading: BusSample) -> list[dict[s
             "position_count": int(reading.position_count[i]),
         }
         | {name: float(values[i]) for name, values in optional.items()}
-        for i, joint in enumerate(JOINT_NAMES)
+        for i, joint in enumerate(controller.joints)
     ]  # fmt: skip

@@ -15,7 +15,7 @@ Where the model does not move either, nothing can be found, and the motion is to
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,9 +49,17 @@ class FrozenReadings:
         Model of the servos in free run at the loop's period, in servo coordinates.
     to_servo : callable
         Joint angles to servo coordinates [rad].
+    joints : sequence of str
+        Their names; the Mini Pupper's by default.
     """
 
-    def __init__(self, servos: Observer, to_servo: Callable[[Array], Array]):
+    def __init__(
+        self,
+        servos: Observer,
+        to_servo: Callable[[Array], Array],
+        joints: Sequence[str] = JOINT_NAMES,
+    ):
+        self._joints = joints
         self._servos, self._to_servo = servos, to_servo
         ticks = round(WINDOW_S / servos.period_s)
         self._moved: deque[Array] = deque(maxlen=ticks)
@@ -90,7 +98,7 @@ class FrozenReadings:
             if spread[k] >= _SAME_RAD:
                 same = f"positions within {spread[k]:.3f} rad"
             raise SafetyStop(
-                f"{JOINT_NAMES[k]} has reported {same} for {WINDOW_S:g} s, in which a "
+                f"{self._joints[k]} has reported {same} for {WINDOW_S:g} s, in which a "
                 f"servo under its commands moves by {moved[k]:.2f} rad. It is blocked, without "
                 "power, or has stopped answering; switch the servos' power off and on."
             )

@@ -8,6 +8,7 @@ its training has no resonance.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +52,7 @@ class Match:
     """Shape (frequencies,)."""
     observer: NDArray[np.complex128]
     actuator: NDArray[np.complex128]
+    joints: tuple[str, ...] = JOINT_NAMES
 
     @property
     def gain_ratio(self) -> Array:
@@ -114,10 +116,11 @@ class Match:
         )
 
     def table(self) -> list[dict[str, str | float]]:
-        """One row per kind of joint and frequency: gain and phase of both, averaged over legs."""
+        """One row per kind of joint, or joint of another robot, and frequency: gain and phase."""
         rows: list[dict[str, str | float]] = []
-        for kind in KINDS:
-            legs = [i for i, name in enumerate(JOINT_NAMES) if name.endswith(kind)]
+        kinds = KINDS if self.joints == JOINT_NAMES else self.joints
+        for kind in kinds:
+            legs = [i for i, name in enumerate(self.joints) if name.endswith(kind)]
             observer, actuator = (h[:, legs].mean(axis=1) for h in (self.observer, self.actuator))
             phases = [np.degrees(np.unwrap(np.angle(h))) for h in (observer, actuator)]
             rows += [
@@ -145,7 +148,7 @@ class Match:
     def _joints(self, i: int, j: int) -> str:
         """Joint `j`, or all joints if their responses at frequency `i` are alike."""
         alike = all(np.allclose(h[i], h[i, j], atol=0.01) for h in (self.observer, self.actuator))
-        return "all joints" if alike else JOINT_NAMES[j]
+        return "all joints" if alike else self.joints[j]
 
 
 _ADVICE = (
@@ -159,6 +162,7 @@ def compare(
     actuator: DelayedPDParameters,
     period_s: float,
     robot: DelayedPDParameters | None = None,
+    pose: Mapping[str, float] = DEFAULT_POSE,
 ) -> Match:
     """Compare an observer with the actuator a policy was trained with.
 
@@ -172,6 +176,8 @@ def compare(
         Control period of the controller [s].
     robot : DelayedPDParameters, optional
         Of the robot; by default that of the training.
+    pose : mapping of str to float
+        Default pose by joint [rad], about which they swing.
 
     Raises
     ------
@@ -186,21 +192,27 @@ def compare(
     >>> compare(SyntheticPD(trained, 0.02), trained, 0.02).fits
     True
     """
-    targets = _sines(FREQUENCIES_HZ, AMPLITUDE_RAD, period_s)
+    targets = _sines(FREQUENCIES_HZ, AMPLITUDE_RAD, period_s, pose)
+    count = len(pose)
     nothing = np.full_like(targets, np.nan)
-    moved = _drive(SyntheticPD(actuator, period_s), targets, nothing, period_s)
+    moved = _drive(SyntheticPD(actuator, period_s, joints=count), targets, nothing, period_s)
     readings = moved
     if robot is not None:
-        readings = _drive(SyntheticPD(robot, period_s), targets, nothing, period_s)
+        readings = _drive(SyntheticPD(robot, period_s, joints=count), targets, nothing, period_s)
     seen = _drive(observer, targets, readings, period_s)
     estimated, trained = (
         _phasors(x, FREQUENCIES_HZ, period_s) / AMPLITUDE_RAD for x in (seen, moved)
     )
-    return Match(FREQUENCIES_HZ.copy(), estimated, trained)
+    return Match(FREQUENCIES_HZ.copy(), estimated, trained, tuple(pose))
 
 
-def _sines(frequencies: Array, amplitude_rad: float, period_s: float) -> Array:
-    """Targets [rad], shape (steps, frequencies, 12), at the start of each control period."""
+def _sines(
+    frequencies: Array,
+    amplitude_rad: float,
+    period_s: float,
+    pose: Mapping[str, float] = DEFAULT_POSE,
+) -> Array:
+    """Targets [rad], shape (steps, frequencies, joints), at the start of each control period."""
     if not (np.all(frequencies > 0) and np.all(frequencies * period_s < 0.5)):
         raise InputError(
             f"The frequencies are {frequencies.min():g} … {frequencies.max():g} Hz; a controller "
@@ -209,7 +221,7 @@ def _sines(frequencies: Array, amplitude_rad: float, period_s: float) -> Array:
     span = _SETTLE_S + max(_WINDOW_S, 2 / frequencies.min())
     time = period_s * np.arange(int(np.ceil(span / period_s)))
     swing = amplitude_rad * np.sin(2 * np.pi * time[:, None] * frequencies)
-    return swing[..., None] + np.array([DEFAULT_POSE[name] for name in JOINT_NAMES])
+    return swing[..., None] + np.array([*pose.values()])
 
 
 def _drive(

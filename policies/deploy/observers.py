@@ -8,9 +8,10 @@ An observer steps at the end of each control period: `target` is the command of 
 `reading` the bus's report at its end, and the estimate is of that instant. A controller reads the
 bus, steps its observer with the target of the period that ended, and then the policy acts.
 
-Arrays are (..., 12) in the order of `common.joints.JOINT_NAMES`, with any leading axes
-(environments). Angles are radians in servo coordinates: one number per servo, as its `DelayedPD` or
-servo model was fitted (see `hardware.joint_map.JointMap.per_servo`); the caller converts.
+Arrays are (..., joints) in the order of the policy's joints, by default the twelve of
+`common.joints.JOINT_NAMES`, with any leading axes (environments). Angles are radians in servo
+coordinates: one number per servo, as its `DelayedPD` or servo model was fitted (see
+`hardware.joint_map.JointMap.per_servo`); the caller converts.
 """
 
 from __future__ import annotations
@@ -54,6 +55,8 @@ class Observer(ABC):
     ----------
     period_s : float
         Control period [s].
+    joints : int
+        Number of joints.
 
     Raises
     ------
@@ -63,9 +66,9 @@ class Observer(ABC):
 
     name: str
 
-    def __init__(self, period_s: float):
-        self.period_s = _positive(period_s)
-        self.reset(np.zeros(_JOINTS))
+    def __init__(self, period_s: float, joints: int = _JOINTS):
+        self.period_s, self.joints = _positive(period_s), joints
+        self.reset(np.zeros(joints))
 
     def reset(self, position: ArrayLike) -> None:
         """Rest at `position` [rad], shape (..., 12), its target and reading so far.
@@ -73,13 +76,13 @@ class Observer(ABC):
         Raises
         ------
         InputError
-            If it is not of twelve joints, or not finite.
+            If it is of another number of joints, or not finite.
         """
         position = np.array(position, float)
-        if position.shape[-1:] != (_JOINTS,):
+        if position.shape[-1:] != (self.joints,):
             raise InputError(
                 f"An observer was reset to positions of shape {position.shape}; the last axis must "
-                f"be the {_JOINTS} joints."
+                f"be the {self.joints} joints."
             )
         if not np.isfinite(position).all():
             raise InputError("An observer was reset to positions that are not finite.")
@@ -134,6 +137,8 @@ class SyntheticPD(Observer):
         Time steps per period; by default those of training, 2 ms each.
     limits_rad : (array_like, array_like)
         Lowest and highest position, scalars or arrays of 12 [rad]. A joint that reaches one stops.
+    joints : int
+        Number of joints, where they are not twelve.
 
     Raises
     ------
@@ -150,15 +155,16 @@ class SyntheticPD(Observer):
         period_s: float,
         substeps: int | None = None,
         limits_rad: tuple[ArrayLike, ArrayLike] = (-np.inf, np.inf),
+        joints: int = _JOINTS,
     ):
         substeps = physics_substeps(_positive(period_s)) if substeps is None else substeps
         if substeps < 1:
             raise InputError(f"SyntheticPD: {substeps} substeps; it must be at least 1.")
         for value in (*astuple(parameters), *limits_rad):
-            if np.shape(value) not in ((), (_JOINTS,)):
+            if np.shape(value) not in ((), (joints,)):
                 raise InputError(
                     f"SyntheticPD: a parameter has shape {np.shape(value)}; it must be one number "
-                    f"or {_JOINTS}, in the order of the joints."
+                    f"or {joints}, in the order of the joints."
                 )
         low, high = (np.asarray(limit, float) for limit in limits_rad)
         if not np.all(low < high):
@@ -171,7 +177,7 @@ class SyntheticPD(Observer):
                 f"SyntheticPD: {substeps} substeps of {1e3 * period_s / substeps:.3g} ms are too "
                 f"long for so stiff a servo; take {int(np.ceil(period_s / needed))} or more."
             )
-        super().__init__(period_s)
+        super().__init__(period_s, joints)
 
     @classmethod
     def paper(
@@ -321,11 +327,11 @@ class HeldEncoder(Observer):
 
     name = "encoder"
 
-    def __init__(self, period_s: float, velocity_steps: int):
+    def __init__(self, period_s: float, velocity_steps: int, joints: int = _JOINTS):
         if velocity_steps < 1:
             raise InputError(f"HeldEncoder: {velocity_steps} velocity steps; at least 1 is needed.")
         self._velocity_steps = velocity_steps
-        super().__init__(period_s)
+        super().__init__(period_s, joints)
 
     def reset(self, position: ArrayLike) -> None:
         """See `Observer`."""
@@ -366,6 +372,7 @@ def make_observer(
     actuator: DelayedPDParameters,
     limits_rad: tuple[ArrayLike, ArrayLike],
     servo_model: JointArrays | None,
+    joints: int = _JOINTS,
 ) -> Observer:
     """The observer of a stack.
 
@@ -383,6 +390,8 @@ def make_observer(
         Limits of the servos' angles, for a simulated servo.
     servo_model : JointArrays or None
         For `servo-model`.
+    joints : int
+        Number of joints.
 
     Raises
     ------
@@ -390,13 +399,13 @@ def make_observer(
         If a servo model is needed and none is given, or it does not fit.
     """
     if kind == "readings":
-        return HeldEncoder(period_s, velocity_steps)
+        return HeldEncoder(period_s, velocity_steps, joints)
     if kind == "synthetic-pd":
-        return SyntheticPD(actuator, period_s, limits_rad=limits_rad)
+        return SyntheticPD(actuator, period_s, limits_rad=limits_rad, joints=joints)
     if kind == "published-pd":
         return SyntheticPD.paper(period_s, limits_rad)
     if kind == "rest":
-        return Zero(period_s)
+        return Zero(period_s, joints)
     if servo_model is None:
         raise InputError(
             "This stack uses a servo model's prediction: give one with `servo` "

@@ -9,13 +9,14 @@ reason of the end; a log without it was cut short.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pupper_sysid.common.border import parse_json, read_text, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
@@ -29,7 +30,7 @@ from pupper_sysid.common.reading.csv_table import (
 )
 from pupper_sysid.policies.deploy.controller import Controller, Decision, Senses
 from pupper_sysid.policies.deploy.filters import Rest
-from pupper_sysid.sim.walking.observation import OBSERVATION_SIZE
+from pupper_sysid.sim.walking.observation import observation_of
 
 TITLE = "# pupper-sysid walk"
 SCHEMA_VERSION = 1
@@ -37,37 +38,53 @@ _LARGEST_BYTES = 1e9
 
 _AXES = ("x", "y", "z")
 _COMMAND = ("forward_m_s", "left_m_s", "turn_rad_s")
-_SENSES = (
-    ("command", tuple(f"command_{c}" for c in _COMMAND)),
-    ("position", tuple(f"{j}_position_rad" for j in JOINT_NAMES)),
-    ("load", tuple(f"{j}_load_nm" for j in JOINT_NAMES)),
-    ("rate", tuple(f"rate_{a}_rad_s" for a in _AXES)),
-    ("acceleration", tuple(f"acceleration_{a}_m_s2" for a in _AXES)),
-)
-_OBSERVATION = tuple(f"observation_{i}" for i in range(OBSERVATION_SIZE))
-_ACTION = tuple(f"{j}_action" for j in JOINT_NAMES)
-_TARGET = tuple(f"{j}_target_rad" for j in JOINT_NAMES)
-_SENT = tuple(f"{j}_sent_rad" for j in JOINT_NAMES)
-COLUMNS = (
-    "elapsed_s", *(name for _, names in _SENSES for name in names), *_OBSERVATION, *_ACTION,
-    *_TARGET, *_SENT,
-)  # fmt: skip
+_SENSES = ("command", "position", "load", "rate", "acceleration")
+
+
+def columns_of(joints: Sequence[str] = JOINT_NAMES) -> dict[str, tuple[str, ...]]:
+    """Names of a log's columns by part, in order, of a robot's joints."""
+    size = sum(size for _, size, _ in observation_of(len(joints)))
+    return {
+        "elapsed_s": ("elapsed_s",),
+        "command": tuple(f"command_{c}" for c in _COMMAND),
+        "position": tuple(f"{j}_position_rad" for j in joints),
+        "load": tuple(f"{j}_load_nm" for j in joints),
+        "rate": tuple(f"rate_{a}_rad_s" for a in _AXES),
+        "acceleration": tuple(f"acceleration_{a}_m_s2" for a in _AXES),
+        "observation": tuple(f"observation_{i}" for i in range(size)),
+        "action": tuple(f"{j}_action" for j in joints),
+        "target": tuple(f"{j}_target_rad" for j in joints),
+        "sent": tuple(f"{j}_sent_rad" for j in joints),
+    }
+
+
+COLUMNS = tuple(name for names in columns_of().values() for name in names)
+"""Columns of the Mini Pupper's logs."""
 
 
 class WalkLog:
     """Writer of a log; every value of `header` must be JSON."""
 
-    def __init__(self, path: Path, header: dict[str, Any], force: bool = False):
+    def __init__(
+        self,
+        path: Path,
+        header: dict[str, Any],
+        force: bool = False,
+        joints: Sequence[str] = JOINT_NAMES,
+    ):
         self._file = SyncedText(path, force)
+        if tuple(joints) != JOINT_NAMES:
+            header = {"joints": list(joints)} | header
+        columns = [name for names in columns_of(joints).values() for name in names]
         about = {"schema_version": SCHEMA_VERSION, "versions": versions("torch")} | header
         lines = [f"# {k}: {json.dumps(v, ensure_ascii=False)}" for k, v in about.items()]
-        self._file.write([TITLE, *lines, ",".join(COLUMNS)])
+        self._file.write([TITLE, *lines, ",".join(columns)])
 
     def append(self, senses: Senses, decision: Decision, sent: NDArray[np.float64]) -> None:
         """Write one tick: inputs, outputs, and the targets that passed the guard [rad]."""
         numbers = np.concatenate(
             [
-                [senses.elapsed_s], *(getattr(senses, name) for name, _ in _SENSES),
+                [senses.elapsed_s], *(getattr(senses, name) for name in _SENSES),
                 decision.observation, decision.action, decision.target, sent,
             ]
         )  # fmt: skip
@@ -115,9 +132,18 @@ class _Start(BaseModel):
     model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
 
     rest: _Rest
-    start_rad: Annotated[
-        list[float], Field(min_length=len(JOINT_NAMES), max_length=len(JOINT_NAMES))
-    ]
+    joints: Annotated[
+        list[Annotated[str, Field(min_length=1, max_length=200)]],
+        Field(min_length=1, max_length=500),
+    ] = list(JOINT_NAMES)
+    """Only in logs of other robots than the Mini Pupper 2."""
+    start_rad: list[float]
+
+    @model_validator(mode="after")
+    def _one_each(self) -> Self:
+        if len(self.start_rad) != len(self.joints):
+            raise ValueError(f"start_rad is not {len(self.joints)} numbers, one per joint")
+        return self
 
 
 def start_header(position: NDArray[np.float64], rest: Rest) -> dict[str, Any]:
@@ -151,26 +177,25 @@ def read_walk(path: Path) -> Walk:
             continue
         header[key] = parse_json(value, f"{path}: its header's {key}", "Was it edited?")
     refuse_other_version(path, header.get("schema_version"), SCHEMA_VERSION)
-    if tuple(column_names(path, text)) != COLUMNS:
-        raise InputError(f"{path}: its columns are not those of a walk. Was it edited?")
     known = validated(_Start, header, f"{path}, header")
+    parts_of = columns_of(known.joints)
+    every = [name for names in parts_of.values() for name in names]
+    if column_names(path, text) != every:
+        raise InputError(f"{path}: its columns are not those of a walk. Was it edited?")
     begin = Rest(np.array(known.rest.gravity), np.array(known.rest.bias_rad_s))
     start = np.array(known.start_rad)
     table = read_table(path, text)
-    numbers = np.stack([table.numbers[name] for name in COLUMNS], axis=-1)
-    place = {name: i for i, name in enumerate(COLUMNS)}
-
-    def columns(names: tuple[str, ...]) -> NDArray[np.float64]:
-        return numbers[:, place[names[0]] : place[names[0]] + len(names)]
-
-    parts = {name: columns(names) for name, names in _SENSES}
+    columns = {
+        part: np.stack([table.numbers[name] for name in names], axis=-1)
+        for part, names in parts_of.items()
+    }
     senses = [
-        Senses(float(numbers[i, 0]), **{name: part[i] for name, part in parts.items()})
-        for i in range(len(numbers))
+        Senses(float(elapsed_s), **{name: columns[name][i] for name in _SENSES})
+        for i, (elapsed_s,) in enumerate(columns["elapsed_s"])
     ]
     return Walk(
-        header, begin, start, senses, columns(_OBSERVATION).astype(np.float32),
-        columns(_ACTION).astype(np.float32), columns(_TARGET), columns(_SENT), ended,
+        header, begin, start, senses, columns["observation"].astype(np.float32),
+        columns["action"].astype(np.float32), columns["target"], columns["sent"], ended,
     )  # fmt: skip
 
 

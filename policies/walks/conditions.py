@@ -84,6 +84,21 @@ class Moment:
     """Robots that fell in this step."""
 
 
+class Actor(Protocol):
+    """Acts for many robots at once and keeps their states: a `Policy`, or one of another trainer.
+
+    Observations and actions are those of the walking task; see `Policy`.
+    """
+
+    def reset(self, action: np.ndarray) -> None:
+        """Start an episode of all robots after their last `action`."""
+        ...
+
+    def act(self, observation: np.ndarray, missed: np.ndarray | None = None) -> np.ndarray:
+        """Actions for observations; the states of robots in the mask `missed` stay."""
+        ...
+
+
 class Recorder(Protocol[Kept]):
     """Keeps what is wanted of the walks in an environment."""
 

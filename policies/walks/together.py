@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.conditions import (
     RANDOM,
+    Actor,
     Condition,
     Moment,
     Recorder,
@@ -48,6 +48,7 @@ from pupper_sysid.sim.walking.shared_draws import Twins
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
+PolicyT = TypeVar("PolicyT", bound=Actor)
 
 _SEED = 2_000_003  # added to a seed: a training with the same one has other robots
 _MOST_ROBOT_S = 1e6
@@ -57,20 +58,20 @@ _COMMAND = OBSERVATION_PARTS["command"]
 
 
 def walk_together(
-    policy: Policy | None,
+    policy: PolicyT | None,
     servos: ServoRanges,
     conditions: Sequence[Condition],
     seconds: float,
     seed: int,
     threads: int,
-    recorder: Callable[[PupperEnv, Policy | None, Sequence[Condition]], Recorder[T]],
+    recorder: Callable[[PupperEnv, PolicyT | None, Sequence[Condition]], Recorder[T]],
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[T]:
     """Walk from a gentle start under every condition.
 
     Parameters
     ----------
-    policy : Policy or None
+    policy : Policy, another Actor, or None
         Keeps its own state; None stands still.
     servos : ServoRanges
     conditions : sequence of Condition
@@ -193,9 +194,9 @@ class _Group:
     """An environment, and the conditions of its robots."""
 
     def __init__(
-        self, policy: Policy | None, servos: ServoRanges, conditions: Sequence[Condition],
+        self, policy: Actor | None, servos: ServoRanges, conditions: Sequence[Condition],
         seconds: float, seed: int, threads: int, shared: _Shared,
-        recorder: Callable[[PupperEnv, Policy | None, Sequence[Condition]], Recorder],
+        recorder: Callable[..., Recorder],
     ):  # fmt: skip
         step_s = conditions[0].task.control_step_s
         self.conditions, self.step_s, self.steps = conditions, step_s, round(seconds / step_s)

@@ -56,11 +56,40 @@ def foreign_servo(path: Path | str, joint: str | None = None) -> Servo:
     return _in_mjcf(path, joint)
 
 
+def position_servos(path: Path) -> dict[str, Servo]:
+    """Servos that the position actuators of an MJCF make of its joints, by joint; may be none.
+
+    Raises
+    ------
+    InputError
+        If MuJoCo cannot compile the file.
+    """
+    model, driven = _compiled(path)
+    return {name: _driven_servo(path, model, name, i) for name, i in driven.items()}
+
+
 def _in_mjcf(path: Path, joint: str | None) -> Servo:
+    model, driven = _compiled(path)
+    if not driven or (joint is not None and joint not in driven):
+        raise InputError(
+            f"{path}: no position actuator drives {joint or 'a joint'}"
+            + (f"; they drive {', '.join(driven)}." if driven else ".")
+        )
+    name = joint or next(iter(driven))
+    return _driven_servo(path, model, name, driven[name])
+
+
+def _compiled(path: Path) -> tuple[Any, dict[str, int]]:
+    """The model, and the position actuator of each joint that has one."""
     from pupper_sysid.sim.robot.engine import mujoco
 
     hinges_of(path)  # refuses what takes too much memory or time
-    model = mujoco.MjModel.from_xml_path(str(path))
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise InputError(
+            f"{path} cannot be compiled by MuJoCo: {' '.join(str(error).split())}."
+        ) from None
     driven: dict[str, int] = {}
     for i in range(model.nu):
         affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
@@ -68,13 +97,12 @@ def _in_mjcf(path: Path, joint: str | None) -> Servo:
         pid = model.actuator_dyntype[i] == getattr(mujoco.mjtDyn, "mjDYN_PID", -1)
         if on_joint and (affine or pid or model.actuator_biasprm[i, 1] < 0):
             driven.setdefault(model.joint(int(model.actuator_trnid[i, 0])).name, i)
-    if not driven or (joint is not None and joint not in driven):
-        raise InputError(
-            f"{path}: no position actuator drives {joint or 'a joint'}"
-            + (f"; they drive {', '.join(driven)}." if driven else ".")
-        )
-    name = joint or next(iter(driven))
-    i, dof, j = driven[name], int(model.joint(name).dofadr[0]), model.joint(name).id
+    return model, driven
+
+
+def _driven_servo(path: Path, model: Any, name: str, i: int) -> Servo:
+    """The servo that actuator `i` makes of a joint."""
+    dof, j = int(model.joint(name).dofadr[0]), model.joint(name).id
     gear = float(model.actuator_gear[i, 0])
     efforts = [_NO_LIMIT_NM]
     if model.actuator_forcelimited[i]:

@@ -180,7 +180,7 @@ class Body:
 
     @property
     def is_mini_pupper(self) -> bool:
-        """Whether it is this project's own robot, which can be deployed."""
+        """Whether it is this project's own robot."""
         return self.name == MINI_PUPPER
 
 

@@ -16,10 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.imu import ImuSample
-from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import (
@@ -28,12 +26,15 @@ from pupper_sysid.sim.emulator.robot import (
     RobotSpec,
     draw_robot,
 )
-from pupper_sysid.sim.walking.robot import PHYSICS_STEP_S, WalkingRobot
+from pupper_sysid.sim.robot.body import Body
+from pupper_sysid.sim.walking.robot import PHYSICS_STEP_S, WalkingRobot, body_joint_map
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
 
-def calibrated_robot(servos: ServoRanges, rng: np.random.Generator) -> EmulatedRobot:
-    """An emulated Mini Pupper 2 with the servos of a calibration.
+def calibrated_robot(
+    servos: ServoRanges, rng: np.random.Generator, body: Body | None = None
+) -> EmulatedRobot:
+    """An emulated robot with the servos of a calibration.
 
     Its servos have the calibration's values and lag; the shortest dead time that can be emulated is
     2 ms. The bus polls all of them with the median of their periods and losses. Counts, offsets of
@@ -45,6 +46,9 @@ def calibrated_robot(servos: ServoRanges, rng: np.random.Generator) -> EmulatedR
         Of a calibration or preset; a learned model has no such numbers.
     rng : numpy.random.Generator
         Draws offsets and phases.
+    body : Body, optional
+        The robot, of which the servos are; the Mini Pupper 2 by default. Others read as fine as the
+        calibration's servos.
 
     Raises
     ------
@@ -57,7 +61,12 @@ def calibrated_robot(servos: ServoRanges, rng: np.random.Generator) -> EmulatedR
         loss=float(np.median([own.loss for own in feedback])),
         command_jitter_s=servos.command_jitter_s,
     )
-    drawn = draw_robot(rng, spec)
+    layout = None
+    if body is not None and not body.is_mini_pupper:
+        layout = body_joint_map(body)
+        quantum = float(np.median([own.quantum_rad for own in feedback]))
+        spec = replace(spec, quantum_rad=quantum, reading_noise_rad=quantum / 2)
+    drawn = draw_robot(rng, spec, layout)
     own = servos.in_steps_of(PHYSICS_STEP_S).nominal()
     return replace(
         drawn,
@@ -86,6 +95,8 @@ class WalkingBus:
         Decides lost polls, noise and timing.
     real_time : bool
         Use the host's clock instead of virtual time.
+    body : Body, optional
+        The robot; the Mini Pupper 2 by default.
 
     Attributes
     ----------
@@ -99,12 +110,18 @@ class WalkingBus:
     """
 
     name = "emulated"
-    joint_names: tuple[str, ...] = JOINT_NAMES
 
-    def __init__(self, truth: EmulatedRobot, rng: np.random.Generator, real_time: bool = False):
-        self.robot = WalkingRobot(truth, rng.spawn(1)[0])
+    def __init__(
+        self,
+        truth: EmulatedRobot,
+        rng: np.random.Generator,
+        real_time: bool = False,
+        body: Body | None = None,
+    ):
+        self.joint_names: tuple[str, ...] = truth.joint_names
+        self.robot = WalkingRobot(truth, rng.spawn(1)[0], body=body)
         self._bus = EmulatedBus(truth, rng, real_time, self.robot, keep_log=False)
-        self._map = load_joint_map("mini_pupper_2")
+        self._map = body_joint_map(self.robot.body)
         self._servo_map = self._map.per_servo()
         self.limits = self._map.position_limits()
         self.metadata: dict[str, Any] = self._bus.metadata | {
@@ -128,7 +145,7 @@ class WalkingBus:
         BusError
             If the bus is closed or a command is not a number.
         """
-        goal = finite_angles(position_rad, len(JOINT_NAMES), self.name)
+        goal = finite_angles(position_rad, len(self.joint_names), self.name)
         sent = self._bus.write(self._servo_map.to_angles(self._map.to_counts(goal)))
         return Sent(sent.time_s, goal)
 

@@ -1,4 +1,4 @@
-"""One emulated Mini Pupper 2 that walks on flat ground, as a `ServoPlant` with an IMU.
+"""One emulated robot that walks on flat ground, as a `ServoPlant` with an IMU.
 
 Its servos are those of `sim.emulator`. MuJoCo steps it only as far as a call asks; a robot
 at rest is not stepped until a command moves it. Commands come at any instant, not only on physics
@@ -13,17 +13,27 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 from threading import RLock
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.imu import GRAVITY_M_S2, SAMPLE_RATE_HZ, ImuSample, as_words, from_chip
-from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.hardware.joint_map import (
+    SCHEMA,
+    SCHEMA_VERSION,
+    JointEntry,
+    JointMap,
+    JointMapFile,
+    load_joint_map,
+)
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.emulator.robot import EmulatedRobot
+from pupper_sysid.sim.robot.body import Body, mini_pupper
 from pupper_sysid.sim.robot.engine import mujoco
-from pupper_sysid.sim.robot.mini_pupper import default_pose, robot_xml
+from pupper_sysid.sim.robot.mini_pupper import robot_xml
 from pupper_sysid.sim.robot.servo_mjcf import for_commands_between_steps, hold, switch_torque
+from pupper_sysid.sim.robot.terrain import make_ground
 
 PHYSICS_STEP_S = 0.001
 """Half the step of training, so that a policy is not scored in the simulator it learnt in."""
@@ -32,10 +42,10 @@ ACCELERATION_NOISE_G, RATE_NOISE_DEG_S = 0.002, 0.15
 """Standard deviations of a chip of this class over its whole bandwidth, not measured on this one;
 white, without bias."""
 
+_IMU = "emulated_imu"
 _MEMORY_STEPS = 2048
 _SETTLING_S = 1.0
 _STILL_RAD_S, _STILL_RAD_S2 = 1e-3, 1e-2  # of the trunk m/s and m/s²; settled, 1e-5 are left
-_SERVOS = len(JOINT_NAMES)
 _CHIP_UNITS = np.repeat([GRAVITY_M_S2, np.pi / 180], 3)
 _NOISE = np.repeat([ACCELERATION_NOISE_G, RATE_NOISE_DEG_S], 3)
 
@@ -78,6 +88,8 @@ class WalkingRobot:
         The IMU's noise.
     time_step_s : float
         Physics step [s].
+    body : Body, optional
+        The Mini Pupper 2 by default; the servos are in the order of its joints.
 
     Raises
     ------
@@ -90,13 +102,15 @@ class WalkingRobot:
         robot: EmulatedRobot,
         rng: np.random.Generator,
         time_step_s: float = PHYSICS_STEP_S,
+        body: Body | None = None,
     ):
+        self.body = body = body or mini_pupper()
         self._rng, self._dt, self._lock = rng, time_step_s, RLock()
         native = {
             s.joint: for_commands_between_steps(s.actuator, time_step_s, s.joint)
             for s in robot.servos
         }
-        self._model = mujoco.MjModel.from_xml_string(robot_xml(native, time_step_s))
+        self._model = _model(body, native, time_step_s)
         self._data = mujoco.MjData(self._model)
         self._gains = self._model.actuator_biasprm.copy()
         self._effort = np.array([s.actuator.effort_limit for s in robot.servos], float)
@@ -104,18 +118,18 @@ class WalkingRobot:
         self._acceleration, self._rate = (
             self._data.sensor(name).data for name in ("accelerometer", "gyro")
         )
-        layout = load_joint_map("mini_pupper_2")
+        layout, joints = body_joint_map(body), len(body.joints)
         # servo coordinates of absolute angles: a calf's is that with its thigh at neutral
-        self._shift = layout.per_servo().to_angles(layout.to_counts(np.zeros(_SERVOS)))
+        self._shift = layout.per_servo().to_angles(layout.to_counts(np.zeros(joints)))
         delays = [float(np.asarray(s.actuator.dead_time_s)) for s in robot.servos]
         self._settled_after = int(max(delays) / time_step_s) + 3
-        self._goal = default_pose()
-        self._goal[2::3] += self._goal[1::3]  # a calf's servo holds thigh + calf
+        self._linked = np.array(body.linked, int)
+        self._goal = self._absolute(body.pose)
         self._queue: deque[tuple[float, int, float]] = deque()
-        self._angles = np.zeros((_MEMORY_STEPS, _SERVOS))  # absolute
-        self._forces = np.zeros((_MEMORY_STEPS, _SERVOS))
+        self._angles = np.zeros((_MEMORY_STEPS, joints))  # absolute
+        self._forces = np.zeros((_MEMORY_STEPS, joints))
         self._chip = np.zeros((_MEMORY_STEPS, 6))  # m/s², rad/s, along the chip's axes
-        self._asked = np.zeros(_SERVOS, int)
+        self._asked = np.zeros(joints, int)
         self._conversion = -1
         self._sample: ImuSample | None = None
         self._step = self._changed = 0
@@ -197,7 +211,9 @@ class WalkingRobot:
 
     def _stand(self) -> None:
         """Stand at the origin in the default pose, settled, with full delay lines."""
-        self._data.qpos[7:] = default_pose()
+        if not self.body.is_mini_pupper:  # others stand where their file puts them
+            self._data.qpos[:7] = [0, 0, self.body.standing_height_m, 1, 0, 0, 0]
+        self._data.qpos[7:] = self.body.pose
         for index, held in enumerate(self._goal.copy()):
             self._hold(index, held)
         for _ in range(round(_SETTLING_S / self._dt)):
@@ -210,6 +226,12 @@ class WalkingRobot:
         mujoco.mj_forward(self._model, self._data)
         self._changed = -self._settled_after - 1
         self._remember()
+
+    def _absolute(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the servos hold: thigh + calf at a calf behind a linkage."""
+        held = np.array(joints)
+        held[self._linked] += held[self._linked - 1]
+        return held
 
     def _hold(self, index: int, held: float) -> None:
         """Set a servo as if commanded to `held` [rad, absolute] for long."""
@@ -253,8 +275,7 @@ class WalkingRobot:
         """Write the present state into the memory; forces and sensors are one step old."""
         row = self._step % _MEMORY_STEPS
         angles, chip = self._angles[row], self._chip[row]
-        angles[:] = self._data.qpos[7:]
-        angles[2::3] += angles[1::3]
+        angles[:] = self._absolute(self._data.qpos[7:])
         self._forces[row] = self._force
         chip[:3], chip[3:] = self._acceleration, self._rate
 
@@ -287,3 +308,45 @@ class WalkingRobot:
             and np.abs(self._data.qvel).max() < _STILL_RAD_S
             and np.abs(self._data.qacc).max() < _STILL_RAD_S2
         )
+
+
+def body_joint_map(body: Body) -> JointMap:
+    """Joint map of an emulated robot: one direct servo of 4,096 counts a turn on each joint.
+
+    Counts are in the middle between a joint's limits; the Mini Pupper's map is that of its robot.
+    """
+    if body.is_mini_pupper:
+        return load_joint_map("mini_pupper_2")
+    counts, source = 4096, f"emulated {body.name}"
+    entries = {
+        name: JointEntry(
+            id=i, sign=1, neutral_rad=float(low + high) / 2, counts_per_rad=counts / (2 * np.pi),
+            offset_counts=0, limits_counts=(0, counts - 1),
+            limits_rad=(float(low), float(high)), source=source,
+        )
+        for i, (name, low, high) in enumerate(
+            zip(body.joints, body.low, body.high, strict=True)
+        )
+    }  # fmt: skip
+    # not validated: names of joints are those of the MJCF, and none of its servos is a real one
+    file = JointMapFile.model_construct(
+        schema_=SCHEMA, schema_version=SCHEMA_VERSION, name=source, frame="raw", counts=counts,
+        servo=None, linkage="none", source=source, joints=entries,
+    )  # fmt: skip
+    return JointMap(file, body.joints)
+
+
+def _model(body: Body, servos: dict[str, DelayedPDParameters], step_s: float) -> Any:
+    """The robot on flat ground, compiled, with an IMU."""
+    if body.is_mini_pupper:
+        return mujoco.MjModel.from_xml_string(robot_xml(servos, step_s))
+    ground = make_ground("flat", np.random.default_rng(0))
+    spec = mujoco.MjSpec.from_string(body.xml(servos, step_s, ground, "evaluation"))
+    # mounted as the Mini Pupper's chip (`hardware.imu`): x and y exchanged, z down
+    spec.body(body.trunk).add_site(name=_IMU, xyaxes=[0, 1, 0, 1, 0, 0])
+    for name, kind in (
+        ("gyro", mujoco.mjtSensor.mjSENS_GYRO),
+        ("accelerometer", mujoco.mjtSensor.mjSENS_ACCELEROMETER),
+    ):
+        spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=_IMU)
+    return spec.compile()

@@ -24,20 +24,8 @@ from pupper_sysid.sysid.recordings.recording import Trial
 CLEAR_NATS = 6.0
 """Advantage of a fault over what is usual: 400 times as likely."""
 
-_WIDTHS = (
-    0.02,
-    0.05,
-    0.1,
-    0.15,
-    0.2,
-    0.3,
-    0.4,
-    0.5,
-    0.6,
-    0.7,
-    0.8,
-    0.9,
-)  # of half the path's range
+_WIDTHS = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)  # fmt: skip
+"""Of half the path's range."""
 _RATES = (0.15, 0.25, 0.4, 0.55, 0.7, 0.85)  # of the path's fastest rate
 _LEVELS = np.linspace(0.1, 0.96, 18)  # of the path's range
 _FILTERS_TRIED = (0, 6, 10)  # none, and critical ones of 4 and 10 Hz

@@ -31,6 +31,7 @@ from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, Finding
 from pupper_sysid.sysid.doctor.hypotheses import (
     encoder_findings,
     hypothesis_findings,
+    speed_findings,
     stepwise_findings,
 )
 from pupper_sysid.sysid.doctor.signals import (
@@ -110,7 +111,7 @@ def _shaped(register: str, value: int, limit: str, cure: str) -> Finding:
 
 
 _CHECKS = (
-    motion_findings, tone_findings, encoder_findings, unit_findings, bend_findings,
+    motion_findings, tone_findings, speed_findings, encoder_findings, unit_findings, bend_findings,
     frozen_findings, offset_findings, hypothesis_findings, start_findings, interpolation_findings,
     register_findings,
 )  # fmt: skip

@@ -120,6 +120,11 @@ WORDS: dict[str, str] = {
         "{after:.2f} times after it: settings, supply, torque limit or load changed. Use the "
         "two parts apart."
     ),
+    "gain_drifts": (
+        "the joint moves {percent:+.0f} % farther at the end than at the beginning, by the same "
+        "commands: a servo that heats, a supply that sinks, or a load that grows. Use a part, or "
+        "record again when it has cooled."
+    ),
     "gaps": (
         "{percent:.0f} % of the recorded time lies in gaps of up to {longest_s:.2g} s between "
         "rows, where the motion is unknown. Give each stretch its own trial number, or record "
@@ -281,6 +286,10 @@ WORDS: dict[str, str] = {
     "some_missing": (
         "{percent:.0f} % of the readings are missing; the rest is used. Check the plugs before "
         "the next recording."
+    ),
+    "speed_for_position": (
+        "the position moves as the joint's speed does: its integral follows the command "
+        "({percent:.0f} %), and it does not. The column holds a velocity; take that of the angle."
     ),
     "start_pose": (
         "`start_pose_rad` is {header_rad:.2f}, and the joint stands at {stands_rad:.2f} rad "

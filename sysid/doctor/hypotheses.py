@@ -46,19 +46,24 @@ _UNITS = {
 }  # fmt: skip
 _SAME_SCALE, _NO_SERVO = 0.35, 1.2  # of the logarithm
 _STEPWISE, _HOLD_S = 0.75, 0.1  # share of repeats, and how long a level lasts
+_MOVES_MORE = 0.2  # share of repeats that what follows a stepwise command lacks
 _LEVEL, _AT_LEAST = 0.05, 0.8  # of the range, between two levels; share of changes that are such
 _CLEARLY_EARLY_S, _MUCH_LESS = 0.03, 0.3
 _SMOOTH = 0.6  # autocorrelation of what is left
 _AT_ONCE_S, _FASTEST_S, _LATE_S = 0.02, 0.001, 0.008
 _BEYOND, _SURELY = 4.0, 0.01
 _LONGEST_LAG_S = 0.5
-_FASTEST_RAD_S, _WRAP_RAD, _UNUSUAL = 60.0, 2.5, 8.0
+_FASTEST_RAD_S, _WRAP_RAD, _UNUSUAL = 60.0, 1.0, 8.0
 _TWO_BETTER, _OTHER_GAIN, _PART_S, _RATE_BETTER = 0.3, 0.75, 1.5, 0.5
 _SAME_TONE_HZ = 0.02
 _DIFFERENT = 0.35  # of the gain
 _DRIFT_RAD, _DRIFT_SHARE = 0.1, 0.3
 _TWO_ZEROS = 0.5  # of the residuals' variance that two zeros may leave
-_SLOPE, _SLOPE_ERRORS, _LAG_DRIFT_S = 4e-4, 6.0, 0.008
+_SLOPE, _SLOPE_ERRORS, _LAG_DRIFT_S, _GAIN_DRIFT = 4e-4, 6.0, 0.008, 0.2
+_QUICKER, _STEADILY = 1.7, 0.7
+_STOOD_S, _STOOD_SHARE, _SETTLED_S = 0.5, 0.25, 0.15  # the share of the path's range
+_SURELY_TWO, _SURELY_MOVED = 0.35, (0.03, 0.08)  # rad; of the command's range
+_SPEED_LEFT, _SPEED_BETTER, _SPEED_GAIN = 0.12, 0.35, 0.55  # the last of the logarithm
 
 
 @dataclass(frozen=True)
@@ -120,7 +125,8 @@ def relation_findings(
         best = next(r for r in ranked if not r.code)
     share = 1 - best.servo.unexplained
     least = _FOLLOWS_LATE if best.servo.total_s > _LATEST_S else _FOLLOWS
-    if share < least if best.code else (share < _HALF and _smooth_rest(base, best.servo)):
+    strange = share < _HALF and not bent and not best.code and _smooth_rest(base, best.servo)
+    if strange or (best.code and share < least):
         # a fault explains what is left of a servo, or smooth motion of another cause is left
         return [Finding("not_a_position_servo", REFUSE, {"percent": 100 * share})], base, None
     if best.code != "columns_swapped" and (scaled := _scale(base, best.servo)):
@@ -147,7 +153,7 @@ def _smooth_rest(base: Explanation, servo: Servo) -> bool:
 
 def stepwise_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     """A position that moves in steps, followed by the command: the columns are swapped."""
-    holds, commands = [], []
+    holds, commands, repeats = [], [], []
     for t in trials:
         seen = np.isfinite(t.position_rad)
         value, time = t.position_rad[seen], t.read_time_s[seen]
@@ -158,9 +164,12 @@ def stepwise_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
             return []  # on its way from one level to the next
         holds.append(np.diff(time[jump]) if len(jump) > 4 else np.zeros(1))
         commands.append(np.mean(np.diff(t.command_rad) == 0))
-        if len(value) < 8 or np.mean(np.diff(value) == 0) < _STEPWISE:
+        repeats.append(np.mean(np.diff(value) == 0))
+        if len(value) < 8 or repeats[-1] < _STEPWISE:
             return []
-    if np.median(np.concatenate(holds)) < _HOLD_S or np.median(commands) > _STEPWISE - 0.2:
+    if np.median(np.concatenate(holds)) < _HOLD_S:
+        return []
+    if np.median(commands) > np.median(repeats) - _MOVES_MORE:
         return []
     other, base = explain(trials, 0.0, True), explain(trials, step)
     if other is None:
@@ -337,6 +346,36 @@ def _unexplained(trials: Sequence[Trial], step: float) -> float:
     return base.best(1.0, np.broadcast_to(base.lags_s >= 0, base.total_s.shape)).unexplained
 
 
+def speed_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
+    """A column that holds the joint's speed: its integral follows the command, and it does not."""
+    base = explain(trials, step)
+    if base is None:
+        return []
+    causal = np.broadcast_to(base.lags_s >= -0.5 * base.grid_s, base.total_s.shape)
+    plain = base.best(1.0, causal).unexplained
+    summed = [_summed(t) for t in trials if np.isfinite(t.position_rad).sum() > 8]
+    other = explain(summed, 0.0) if plain > _SPEED_LEFT and summed else None
+    if other is None:
+        return []
+    servo = other.best(1.0, np.broadcast_to(other.lags_s >= 0, other.total_s.shape))
+    if servo.unexplained > min(_SPEED_LEFT, _SPEED_BETTER * plain):
+        return []
+    if abs(np.log(max(servo.gain, 1e-9))) > _SPEED_GAIN:
+        return []
+    return [Finding("speed_for_position", REFUSE, {"percent": 100 * (1 - servo.unexplained)})]
+
+
+def _summed(trial: Trial) -> Trial:
+    """The trial with the integral of its position, without the line that a constant leaves."""
+    seen = np.isfinite(trial.position_rad)
+    time, value = trial.read_time_s[seen], trial.position_rad[seen]
+    total = np.concatenate([[0.0], np.cumsum(np.diff(time) * 0.5 * (value[1:] + value[:-1]))])
+    line = np.column_stack([np.ones_like(time), time - time[0]])
+    position = np.full(len(seen), np.nan)
+    position[seen] = total - line @ least_squares(line, total)
+    return replace(trial, position_rad=position, position_count=None)
+
+
 # ----- what comes on top of a servo that follows
 def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     """What explains the pair of columns, and what comes on top of it."""
@@ -446,7 +485,7 @@ def zero_moves(joint: Followed) -> list[Finding]:
     """A zero that moves during a trial; under a load that is known gravity moves it."""
     if any(t.load is not None for t in joint.trials):
         return []
-    for s, (_, rest) in zip(joint.base.samples, joint.fits, strict=True):
+    for s, x, (_, rest) in zip(joint.base.samples, joint.predicted, joint.fits, strict=True):
         edge = len(rest) // 6
         if edge < 7:
             continue
@@ -455,23 +494,25 @@ def zero_moves(joint: Followed) -> list[Finding]:
         parts = rest[:at], rest[at:]
         moved = float(np.median(parts[1]) - np.median(parts[0]))
         left = sum(float(np.sum((p - p.mean()) ** 2)) for p in parts)
-        if left > _TWO_ZEROS * float(np.sum((rest - rest.mean()) ** 2)):
-            continue
-        if abs(moved) > max(_DRIFT_RAD, _DRIFT_SHARE * float(np.ptp(s.command_rad))):
+        left /= max(float(np.sum((rest - rest.mean()) ** 2)), 1e-12)
+        reach = float(np.ptp(s.command_rad))
+        sure = left < _SURELY_TWO and all(np.ptp(p) > 0.5 * np.ptp(x) for p in (x[:at], x[at:]))
+        least, share = _SURELY_MOVED if sure else (_DRIFT_RAD, _DRIFT_SHARE)
+        if left < _TWO_ZEROS and abs(moved) > max(least, share * reach):
             when = float(s.time_s[at]) - joint.start_s
             return [Finding("zero_moves", CARE, {"offset_rad": abs(moved), "time_s": when})]
     return []
 
 
-def lag_drifts(joint: Followed) -> list[Finding]:
-    """A lag that grows or shrinks steadily: clocks that drift apart.
+def drifts(joint: Followed) -> list[Finding]:
+    """A lag or a gain that grows or shrinks steadily: clocks that drift apart, a servo that heats.
 
-    Lags of windows of one motion are compared, of one tone or of free motion: another tone, and
-    the next part of a chirp, have another lag by themselves.
+    Windows of one motion are compared, of one tone or of free motion: another tone, and the next
+    part of a chirp, have another lag and gain by themselves.
     """
-    slopes, errors, span = [], [], 0.0
+    stretches, span = [], 0.0
     for s, x, (gain, rest) in zip(joint.base.samples, joint.predicted, joint.fits, strict=True):
-        if len(x) < 60 or not (np.diff(s.time_s) > 0).all():
+        if len(x) < 60 or not (np.diff(s.time_s) > 0).all() or not gain > 0:
             continue
         rate = gain * np.gradient(x, s.time_s)
         for start, stop, period in _alike(joint, s):
@@ -479,34 +520,86 @@ def lag_drifts(joint: Followed) -> list[Finding]:
             count = int(min((stop - start) / max(period, 0.5), 8))
             if count < 4 or inside.sum() < 8 * count:
                 continue
-            edges = np.linspace(start, stop, count + 1)
-            lags, times = [], []
-            for low, high in pairwise(edges):
+            found = []
+            for low, high in pairwise(np.linspace(start, stop, count + 1)):
                 rows = (s.time_s >= low) & (s.time_s < high)
                 design = np.column_stack([np.ones(rows.sum()), x[rows], rate[rows]])
                 if rows.sum() < 8 or np.std(rate[rows]) < 0.3 * np.std(rate[inside]):
                     continue
-                lags.append(-float(least_squares(design, rest[rows])[2]))
-                times.append(0.5 * (low + high))
-            if len(lags) < 4:
-                continue
-            time = np.array(times) - np.mean(times)
-            slope = float(time @ np.array(lags) / (time @ time))
-            left = np.array(lags) - np.mean(lags) - slope * time
-            slopes.append(slope)
-            errors.append(np.sqrt(left @ left / (len(lags) - 2) / (time @ time)) + _SLOPE / 20)
-            span = max(span, float(np.ptp(s.time_s)))
-    if not slopes:
+                _, more, early = least_squares(design, rest[rows])
+                pace = float(np.std(rate[rows]) / max(np.std(x[rows]), 1e-9))
+                found.append((0.5 * (low + high), -float(early), float(more) / gain, np.log(pace)))
+            if len(found) >= 4 and not _quickens(np.array(found)):
+                stretches.append(np.array(found))
+                span = max(span, float(np.ptp(s.time_s)))
+    if not stretches:
         return []
+    lag, gain = (_slope([(f[:, 0], f[:, k]) for f in stretches], least)
+                 for k, least in ((1, _SLOPE), (2, _GAIN_DRIFT / span)))  # fmt: skip
+    found = []
+    if abs(lag) > _SLOPE and abs(lag) * span > _LAG_DRIFT_S:
+        found.append(Finding("lag_drifts", CARE, {"drift_ms": 1e3 * lag, "percent": 100 * lag}))
+    if abs(gain) * span > _GAIN_DRIFT:
+        found.append(Finding("gain_drifts", CARE, {"percent": 100 * gain * span}))
+    return found
+
+
+def _quickens(windows: NDArray[np.float64]) -> bool:
+    """Whether the motion itself becomes faster or slower, shape (windows, 4) with the pace last."""
+    time, pace = windows[:, 0], windows[:, 3]
+    if np.ptp(pace) < np.log(_QUICKER):
+        return False
+    return abs(float(np.corrcoef(time, pace)[0, 1])) > _STEADILY
+
+
+def _slope(lines: Sequence[tuple[NDArray, NDArray]], least: float) -> float:
+    """Common slope of several lines of points; 0 where it is less than six times its error."""
+    slopes, errors = [], []
+    for time, value in lines:
+        t, v = time - time.mean(), value - value.mean()
+        slopes.append(float(t @ v / (t @ t)))
+        away = v - slopes[-1] * t
+        errors.append(np.sqrt(away @ away / (len(t) - 2) / (t @ t)) + least / 20)
     weights = 1 / np.array(errors) ** 2
     slope = float(np.average(slopes, weights=weights))
     error = float(np.sum(weights)) ** -0.5
     if len(slopes) > 1:
         spread = np.average((np.array(slopes) - slope) ** 2, weights=weights)
         error = max(error, float(np.sqrt(spread / (len(slopes) - 1))))
-    if abs(slope) < max(_SLOPE, _SLOPE_ERRORS * error) or abs(slope) * span < _LAG_DRIFT_S:
+    return slope if abs(slope) > _SLOPE_ERRORS * error else 0.0
+
+
+def stood_still(joint: Followed) -> list[Finding]:
+    """Readings that stay while the servo's path goes on by more than its friction holds."""
+    bent = bends(joint.trials, joint.step)
+    held = 2 * bent["play"].values[0] if bent else 0.0
+    longest, stood = 0.0, 0
+    for t in joint.trials:
+        rows = np.flatnonzero(np.isfinite(t.position_rad))
+        mine = [s for s in joint.base.samples if s.start_s == t.send_time_s[0]]
+        if len(rows) < 20 or not mine:
+            continue
+        value, time = t.position_rad[rows], t.read_time_s[rows]
+        every = replace(joint.base, samples=(replace(mine[0], time_s=time),))
+        (path,) = every.predicted(joint.servo)
+        near = max(1.5 * joint.step, 0.01 * float(np.ptp(value)))
+        least = max(_STOOD_SHARE * float(np.ptp(path)), 1.5 * held, 8 * joint.noise)
+        first, longest_s = 0, 0.0
+        for k in range(1, len(value) + 1):
+            if k < len(value) and abs(value[k] - value[first]) <= near:
+                continue
+            lasts = float(time[k - 1] - time[first])
+            middle = (time > time[first] + _SETTLED_S) & (time < time[k - 1] - _SETTLED_S)
+            away = np.ptp(path[middle]) if middle.any() else 0.0
+            inside = value.min() + 2 * near < value[first] < value.max() - 2 * near
+            if inside and lasts > max(_STOOD_S, longest_s) and away > least:
+                longest_s = lasts
+            first = k
+        longest, stood = max(longest, longest_s), stood + (longest_s > 0)
+    if not stood:
         return []
-    return [Finding("lag_drifts", CARE, {"drift_ms": 1e3 * slope, "percent": 100 * slope})]
+    values = {"trials": stood, "of": len(joint.trials), "longest_s": longest}
+    return [Finding("frozen", CARE, values)]
 
 
 def _alike(joint: Followed, samples: Samples) -> Iterator[tuple[float, float, float]]:
@@ -524,5 +617,5 @@ def _alike(joint: Followed, samples: Samples) -> Iterator[tuple[float, float, fl
 
 
 CHANGES: tuple[Callable[[Followed], list[Finding]], ...] = (
-    second_writer, gain_changed, zero_moves, lag_drifts,
+    second_writer, gain_changed, zero_moves, drifts, stood_still,
 )  # fmt: skip

@@ -15,11 +15,13 @@ from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.tables import import_line
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT, LARGEST_RAD
 
 _LEAST_ROWS = 20
 _COUNTS, _FEWEST_COUNTS = (1024, 4096, 16384, 65536), 100  # a turn
+_MOST_DEGREES = 360.0  # of whole numbers that may be degrees
 _FARTHEST_RAD = 200 * np.pi  # of angles whose unit was stated
 _IDENTITY = ["joint", "trial", "send_time_s", "read_time_s", "command_rad", "position_rad"]
 _MANY_REPEATED = 0.1  # of the rows
@@ -30,7 +32,10 @@ _FEW_TRIALS = 10  # that are named one by one
 
 
 def check(
-    path: Path | str, table: pd.DataFrame, metadata: Mapping[str, Any]
+    path: Path | str,
+    table: pd.DataFrame,
+    metadata: Mapping[str, Any],
+    options: LogOptions | None = None,
 ) -> tuple[pd.DataFrame, list[str]]:
     """Refuse or repair a tidy table.
 
@@ -41,6 +46,8 @@ def check(
     table : pandas.DataFrame
     metadata : mapping
         Header entries: angles whose unit was stated may be of several turns.
+    options : LogOptions, optional
+        What was stated of the log.
 
     Returns
     -------
@@ -72,7 +79,7 @@ def check(
     if missing > 0:
         warnings.append(f"{100 * missing:.1f} % of the positions are missing.")
     for column in ("command_rad", "position_rad"):
-        _refuse_degrees(path, column, table, metadata)
+        _refuse_degrees(path, column, table, metadata, options or LogOptions())
     same = table.duplicated(_IDENTITY).to_numpy()
     if same.any():
         warnings.append(
@@ -123,7 +130,11 @@ def _refuse_odd_numbers(path: Path | str, table: pd.DataFrame) -> None:
 
 
 def _refuse_degrees(
-    path: Path | str, column: str, table: pd.DataFrame, metadata: Mapping[str, Any]
+    path: Path | str,
+    column: str,
+    table: pd.DataFrame,
+    metadata: Mapping[str, Any],
+    options: LogOptions,
 ) -> None:
     """Refuse angles beyond a turn, or beyond a hundred where their unit was stated."""
     values = np.nan_to_num(np.abs(table[column].to_numpy(float)))
@@ -146,17 +157,19 @@ def _refuse_degrees(
             f"{path}, column {place}: values reach {largest:.4g} rad, more than a hundred turns. "
             "Check the unit, or take the start's angle off."
         )
-    turn = next((n for n in _COUNTS if known.max() < n), 0)
-    if turn and largest > _FEWEST_COUNTS and (known >= 0).all() and (known % 1 == 0).all():
-        unit = f"counts:{turn}"
-        kind = f"counts of an encoder with {turn} a turn"
-    else:
-        unit, kind = "deg", "degrees"
+    both = table[["command_rad", "position_rad"]].to_numpy(float)
+    both = both[np.isfinite(both)]
+    units = ["deg"]
+    if (both >= 0).all() and (both % 1 == 0).all() and largest > _FEWEST_COUNTS:
+        turns = [f"counts:{n}" for n in _COUNTS if known.max() < n][:2]
+        units = turns if turns and largest > _MOST_DEGREES else units + turns[:1]
+    kind = units[0].replace("deg", "degrees").replace(":", " of an encoder with ")
+    kind += " a turn" if kind != "degrees" else ""
+    lines = "; or ".join(import_line(path, **(options.words | {"unit": u})) for u in units)
     raise InputError(
         f"{path}, column {place}: values reach {largest:.4g}, more than a turn, which looks like "
         f"{kind}. Angles must be radians: multiply degrees by 0.0174533, or convert the log with "
-        f"{import_line(path, unit=unit)} (or deg, turns, counts:4096, scale:…; rad if the joint "
-        "turns so far)."
+        f"{lines} (or turns, counts:4096, scale:…; rad if the joint turns so far)."
     )
 
 

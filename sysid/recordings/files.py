@@ -71,7 +71,7 @@ def load(path: Path | str, options: LogOptions | None = None) -> Recording:
         )
     path, options = Path(path), options or LogOptions()
     if path.is_dir():
-        return _imported(path, read_folder(path, options))
+        return _imported(path, read_folder(path, options), options)
     if path.name.endswith(".truth.csv"):
         raise InputError(
             f"{path} holds the true values of {path.name.removesuffix('.truth.csv')}.csv, "
@@ -81,20 +81,20 @@ def load(path: Path | str, options: LogOptions | None = None) -> Recording:
     content = unpacked(path, data, LARGEST_BYTES)
     log = read_content(path, content, options)
     if log is not None:
-        return _imported(path, log)
+        return _imported(path, log, options)
     parsed = parse(path, decoded(path, content), options)
     table, metadata, warnings = convert(path, parsed, options)
     check_metadata(path, metadata)
-    table, more = check(path, table, metadata)
+    table, more = check(path, table, metadata, options)
     digest = hashlib.sha256(data).hexdigest()
     found = [*parsed.warnings, *warnings, *more]
     return Recording(table, metadata, plain_stem(path), path, digest, tuple(found))
 
 
-def _imported(path: Path, log: Log) -> Recording:
+def _imported(path: Path, log: Log, options: LogOptions) -> Recording:
     """The recording of another project's log, checked like any other."""
     check_metadata(path, log.metadata)
-    table, more = check(path, log.table, log.metadata)
+    table, more = check(path, log.table, log.metadata, options)
     return Recording(
         table, log.metadata, plain_stem(path), path, log.sha256, tuple([*log.warnings, *more])
     )

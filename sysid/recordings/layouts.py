@@ -64,7 +64,8 @@ def convert(
     if not options.command:
         if parsed.numbered:
             raise InputError(f"{path}: {unknown_numbers(path, table)}")
-        if text := unknown_columns(path, table.names, bool(options.time or options.rate)):
+        timed = bool(options.time or options.rate)
+        if text := unknown_columns(path, table.names, timed, table.increasing):
             raise InputError(f"{path}: {text}")
     log = read_table(path, table, options)
     # what the log's own header says of its robot counts

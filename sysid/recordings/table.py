@@ -139,6 +139,11 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
         keep[rows] = False
     if found.cut:
         warnings.append("its last line was cut short and has been left out.")
+    if found.broken:
+        warnings.append(
+            f"{len(found.broken)} lines with another number of cells were left out, the first of "
+            f"them line {found.broken[0]}."
+        )
     if text.startswith(TITLE) and "completed" not in metadata:
         warnings.append("it was not recorded to its end; what is there is used.")
     if not len(found):

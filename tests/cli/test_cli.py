@@ -78,24 +78,6 @@ def test_export_of_presets_calibrations_and_recordings(capsys):
     assert code == 2 and "--force" in err
 
 
-def test_bad_input_ends_with_2_and_names_what_is_wrong(capsys):
-    for arguments, expected in (
-        (("delay", "nothing.csv"), "does not exist"),
-        (("delay",), "No recording was named"),
-        (("delay", SWEEP, "--joints", "LF_hipp"), "Did you mean LF_hip"),
-        (("sweep", "--freqs", "10-1"), "10-1"),
-        (("sweep", "--freqs", "abc"), "abc"),
-        (("sweep", "--freqs", "0"), "0"),
-        (("sweep", "--amplitude", "-1"), "amplitude"),
-        (("sweep", "--out", "x.txt"), ".csv"),
-        (("calibrate", SWEEP, "--stall-torque", "0"), "--stall-torque"),
-        (("export", "x.docx"), "neither"),
-        (("export", "missing.yaml"), "missing.yaml"),
-        (("nonsense",), "nonsense"),
-    ):
-        assert expected in refused(capsys, pupper_sysid, *arguments), arguments
-
-
 def table_with(tmp_path, change):
     """The sample's LF_hip rows, changed, as a file."""
     table = load(SWEEP).table.query("joint == 'LF_hip' and trial < 3").copy()
@@ -145,12 +127,6 @@ def test_a_number_in_a_table_that_is_too_wide_is_folded_not_cut():
     shown = written.getvalue()
     assert "…" not in shown
     assert sorted(c for c in shown if c.isdigit()) == sorted("327326328" + "0641234567890")
-
-
-def test_help_of_every_command_has_an_example(capsys):
-    for command in ("sweep", "doctor", "delay", "bode", "calibrate", "export", "report"):
-        code, out, _ = run(capsys, command, "--help")
-        assert code == 0 and f"Example: pupper-sysid {command}" in " ".join(out.split())
 
 
 PROGRAMS = ("pupper_sysid", "pupper_train", "pupper_play", "pupper_eval", "pupper_deploy",

@@ -79,6 +79,7 @@ def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     assert np.nanmax(abs(trial.position_rad - 0.785)) > 0.2
 
 
+@pytest.mark.slow
 def test_a_calf_can_be_swept_without_its_thigh(capsys):
     with on_a_port(moving_servos(ids=[6])) as port:
         code, _, err = run(
@@ -106,42 +107,6 @@ def test_a_joint_whose_servo_is_not_there_is_named_with_its_id(capsys):
         )
     assert code == 1 and "LF_thigh (id 5), LF_calf (id 6) does not answer" in err
     assert not list(Path().glob("recordings/*"))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (("sweep", "--bus", "usb"), "write emulated, esp32"),
-        (("sweep", "--bus", "feetech:/dev/ttyUSB0@fast"), "'fast' is no baud rate"),
-        (("sweep", "--bus", "esp32", "--truth"), "only a new recording of the emulated robot"),
-        (("sweep", "--bus", "esp32", "--real-time"), "always runs in real time"),
-        (("sweep", "--joint-map", "nowhere.yaml"), "does not exist"),
-        (("emulate", "feetech", "--joint-map", "sts3215", "--walking"), "only the Mini Pupper"),
-        (("sweep", "--resume", "nothing.csv"), "does not exist"),
-        (("emulate", "feetech", "--ids", "1-20"), "has the ids 1 to 12"),
-        (("emulate", "feetech", "--baud", "7"), "choose 1000000"),
-        (("emulate", "esp32", "--walking", "--by-hand"), "leave out --walking"),
-        (("emulate", "esp32", "--faults", "gremlins=1"), "'gremlins' is not known"),
-        (("emulate", "esp32", "--faults", "lost=2"), "is not a probability"),
-        (("emulate", "esp32", "--faults", "lost"), "is not kind=probability"),
-    ],
-)
-def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, arguments, expected):
-    code, out, err = run(capsys, *arguments)
-    assert code == 2 and expected in err and out == ""
-
-
-@pytest.mark.parametrize(
-    ("bus", "expected"),
-    [
-        ("feetech:/dev/no-such-port", "There is no such device"),
-        ("esp32:/tmp/no-such-folder-here/socket", "no answer. On the robot"),
-        ("esp32:nobody.socket", "no answer. On the robot"),
-    ],
-)
-def test_a_missing_bus_is_refused_with_what_to_check(capsys, bus, expected):
-    code, _, err = run(capsys, "sweep", *SHORT, "--bus", bus)
-    assert code == 2 and expected in err
 
 
 def test_a_map_of_the_other_frame_is_refused(capsys):
@@ -210,11 +175,3 @@ def test_a_walking_robot_on_a_serial_line_has_its_imu_on_a_socket(tmp_path):
     assert "IMU at i." in out and "monitor --bus feetech:s" in out and "Ctrl-C" in out
     assert "sweep" not in out, "a sweep is for legs in free air"
     assert "Traceback" not in err and not list(tmp_path.glob("[is]"))
-
-
-def test_a_sweep_of_the_older_word_for_the_emulated_bus_is_recorded_under_the_new_one(capsys):
-    code, _, err = run(
-        capsys, "sweep", *SHORT, "--joints", "LF_hip", "--bus", "sim", "--out", "a.csv", "--truth"
-    )
-    assert code == 0, err
-    assert load(Path("a.csv")).metadata["sweep"]["bus"] == "emulated"

@@ -8,15 +8,18 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
-from pupper_sysid.cli.programs import pupper_analyze, pupper_deploy, pupper_eval, pupper_play
+from pupper_sysid.cli.programs import pupper_analyze, pupper_deploy
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.policies.deploy.walk_log import read_walk
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run_program
+from support.json_keys import DOCUMENTED, key_line
+from support.package import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 POLICY = ROOT / "data/samples/policies/lstm"
 CALIBRATION = ROOT / "data/samples/calibrated.yaml"
 
@@ -153,25 +156,6 @@ def test_a_calibration_that_only_has_the_name_of_the_trained_one_is_told(capsys,
     assert "was not compared with it" in err and "moves like the trained" not in err
 
 
-def test_bad_input_is_answered_in_a_sentence(capsys, here):
-    known = (POLICY, "--actuator", CALIBRATION)
-    for arguments, says in (
-        ((), "No policy was named"),
-        (("nowhere",), "neither a run nor a policy"),
-        ((POLICY, "--actuator", "nowhere.yaml"), "no such file"),
-        ((*known, "--bus", "feetech:/dev/none"), "no IMU"),
-        ((*known, "--bus", "serial"), "bus serial"),
-        ((*known, "--stack", "lstm-servo"), "--servo"),
-        ((*known, "--command", "9", "0", "0"), "--command"),
-        ((*known, "--lowpass-hz", "40"), "half the rate"),
-        ((*known, "--keyboard"), "terminal"),
-        ((POLICY, "--replay", "nowhere.csv"), "does not exist"),
-        ((POLICY, "--seconds", "-1"), "--seconds"),
-        ((POLICY, "--seed", "-1"), "--seed is -1"),
-    ):
-        assert says in refused(capsys, pupper_deploy, *arguments), arguments
-
-
 # ------------------------------------------------------------------------------ pupper-analyze
 
 
@@ -208,63 +192,63 @@ def test_frozen_senses_leave_the_rhythm_and_a_frozen_last_action_stops_it(
 
 
 @pytest.mark.slow
-def test_orbits_close(capsys, here):
-    orbits = analyze(capsys, "attractor")["orbits"]["lstm"]
-    assert orbits["actions"]["explained_3"] > 0.9 and orbits["actions"]["closure"][0] < 0.2
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("what", "count"), [("terrain", 7), ("compliance", 6)])
 def test_where_it_walks_is_said_per_ground_and_direction(capsys, here, what, count):
     rows = analyze(capsys, what, "--seconds", 3, "--robots", 1)[what]["lstm"]
     assert len(rows) == count and all(0 <= r["survival"] <= 1 for r in rows)
 
 
-@pytest.mark.slow
-def test_a_quick_look_is_smaller_and_says_so(capsys, here, monkeypatch):
-    from pupper_sysid.cli.commands.analyze import common
+# ----- `pupper-analyze twin` as a user meets it
 
-    assert common._QUICK[0] < common._FULL[0] and common._QUICK[1] < common._FULL[1]
-    monkeypatch.setattr(common, "_QUICK", (1, 0.5))
-    arguments = ("terrain", POLICY, "--actuator", CALIBRATION, "--quick")
-    code, out, _ = run_program(capsys, pupper_analyze, *arguments)
-    assert code == 0
-    assert "On other ground (1 robots, 0.5 s each; a quick look)" in " ".join(out.split())
+SAMPLES = ROOT / "data/samples"
+WALK, CALIBRATION_TWIN = SAMPLES / "playback.csv", SAMPLES / "calibrated.yaml"
 
 
-def test_two_policies_of_one_name_are_not_merged(capsys, here):
-    run = here / "runs/A"
-    for name in ("policy_best", "policy_last"):
-        shutil.copytree(POLICY, run / name)
-    both = (run / "policy_best", run / "policy_last")
-    said = refused(capsys, pupper_analyze, "gait", *both, "--actuator", CALIBRATION)
-    assert "Two policies are called A" in said
+@pytest.fixture
+def imu(tmp_path) -> Path:
+    path = tmp_path / "imu.csv"
+    rows = (f"{0.02 * k:.2f},{0.1 * (k % 5):.1f},0.2,0.{k % 3}" for k in range(400))
+    path.write_text("timestamp,gx,gy,gz\n" + "\n".join(rows) + "\n")
+    return path
 
 
-def test_a_walk_too_short_for_a_gait_or_an_orbit_is_told_so(capsys, here):
-    for what, says in (("gait", "No robot walked for 7 s"), ("attractor", "there is no orbit")):
-        arguments = (what, POLICY, "--robots", 1, "--seconds", 1)
-        assert says in refused(capsys, pupper_analyze, *arguments)
+@pytest.fixture
+def walk(tmp_path) -> Path:
+    """Eight seconds of all joints, read two rows late."""
+    rows = np.arange(200)
+    swing = 0.15 * np.sin(0.5 * rows)[:, None] * np.tile([0.3, 1, -1], 4)
+    command = swing + [DEFAULT_POSE[joint] for joint in JOINT_NAMES]
+    columns: dict = {"time_s": 0.04 * rows, "loop": 0}
+    for n, joint in enumerate(JOINT_NAMES):
+        columns[f"{joint}_command_rad"] = command[:, n]
+        columns[f"{joint}_position_rad"] = command[np.maximum(rows - 2, 0), n]
+    path = tmp_path / "walk.csv"
+    pd.DataFrame(columns).to_csv(path, index=False)
+    return path
 
 
-def test_help_shows_an_example(capsys):
-    for module in (pupper_deploy, pupper_analyze, pupper_eval, pupper_play):
-        code, out, _ = run_program(capsys, module, "--help")
-        program = module.__name__.split(".")[-1].replace("_", "-")
-        assert code == 0 and f"Example: {program} " in " ".join(out.split())
-
-
-def test_servo_models_are_compared_on_one_thing_at_a_time(capsys, here):
-    assert "one recording or policy" in refused(
-        capsys,
-        pupper_analyze,
-        "servo",
-        POLICY,
-        POLICY,
+def test_the_twin_of_a_walk_is_drawn_and_has_the_documented_keys(
+    capsys, tmp_path, monkeypatch, walk, imu
+):
+    monkeypatch.chdir(tmp_path)
+    given = (
+        "twin",
+        walk,
         "--actuator",
-        CALIBRATION,
+        CALIBRATION_TWIN,
+        "--robots",
+        1,
+        "--threads",
+        1,
+        "--imu",
+        imu,
     )
-
-
-def test_an_analysis_of_nothing_is_refused(capsys, here):
-    assert "nowhere" in refused(capsys, pupper_analyze, "gait", "nowhere")
+    code, out, err = run_program(capsys, pupper_analyze, *given, "--json")
+    assert code == 0, err
+    found = json.loads(out)
+    assert key_line(found) == DOCUMENTED["pupper-analyze twin"]
+    model = found["models"]["calibrated.yaml"]
+    still = sum(found["persistence_rmse_rad"].values()) / 12
+    assert 0 < model["air"]["rmse_rad"]["value"] < still
+    assert model["ground"]["copies"] == 1 and model["ground"]["gyro"]["peak_hz"][1] > 0
+    assert Path(found["picture"]).stat().st_size > 20_000

@@ -63,11 +63,7 @@ def test_a_mapping_file_stands_for_the_options(capsys, arm):
     assert load("arm.csv").joints == ["shoulder"]
 
 
-def test_half_a_choice_of_columns_and_useless_options_are_refused(capsys, arm, tmp_path):
-    assert "belong together" in refused(
-        capsys, pupper_sysid, "import", arm, "--command", "u {joint}"
-    )
-    assert "Write rad, deg" in refused(capsys, pupper_sysid, "import", arm, "--unit", "furlong")
+def test_options_that_a_format_does_not_need_are_refused(capsys, tmp_path):
     entries = [{"timestamp": 0.1, "position": 0, "goal_position": 0}]
     (tmp_path / "bam.json").write_text(json.dumps({"entries": entries}))
     said = refused(capsys, pupper_sysid, "import", tmp_path / "bam.json", "--unit", "deg")
@@ -132,15 +128,3 @@ def test_a_column_that_does_not_exist_is_named(capsys, arm):
     )
     other = [c.replace("y {joint}", "y pa{joint}") for c in COLUMNS]
     assert "no joint has both" in refused(capsys, pupper_sysid, "import", arm, *other)
-
-
-@pytest.mark.parametrize(
-    "words",
-    [("import", "loop.csv"), ("doctor", "loop.csv"), ("calibrate", "loop.csv"),
-     ("fit-servo", "loop.csv"), ("export", "loop.csv", "--to", "json")],
-    ids=lambda words: words[0],
-)  # fmt: skip
-def test_a_link_to_itself_is_answered_in_a_sentence(capsys, tmp_path, monkeypatch, words):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "loop.csv").symlink_to("loop.csv")
-    assert "loop.csv" in refused(capsys, pupper_sysid, *words)

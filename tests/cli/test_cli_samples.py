@@ -59,6 +59,8 @@ def test_an_arm_of_sts3215_is_emulated_by_its_servos_data_sheet_and_registers(ar
         "--truth", "--out", "sweep.csv",
     )  # fmt: skip
     assert code == 0, err
+    wrong = refused(capsys, pupper_sysid, "sweep", "--joint-map", arm, "--registers", "q=16")
+    assert "'q=16' sets no register" in wrong
     recording = load("sweep.csv")
     servo = recording.trials("wrist_roll")[0].servo
     assert (servo.model, servo.p_gain, servo.d_gain, servo.supply_voltage_v) == (
@@ -74,22 +76,6 @@ def test_an_arm_of_sts3215_is_emulated_by_its_servos_data_sheet_and_registers(ar
     loaded = truth["loaded_servo"]
     assert truth["actuator"]["stiffness"] == pytest.approx(
         16 * loaded["duty_per_rad"] * loaded["torque_nm"]
-    )
-
-
-def test_registers_are_of_emulated_servos_that_have_them(arm, capsys):
-    assert "on a bench --gains" in refused(
-        capsys, pupper_sysid, "sweep", "--load", "none", "--registers", "p=16"
-    )
-    assert "A real one's are recorded" in refused(
-        capsys, pupper_sysid, "sweep", "--bus", "feetech:nowhere", "--registers", "p=16"
-    )
-    assert "have none that act" in refused(capsys, pupper_sysid, "sweep", "--registers", "p=16")
-    assert "'q=16' sets no register" in refused(
-        capsys, pupper_sysid, "sweep", "--joint-map", arm, "--registers", "q=16"
-    )
-    assert "do not act" in refused(
-        capsys, pupper_sysid, "emulate", "feetech", "--model", "scs0009", "--registers", "p=16"
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ import pandas as pd
 import pytest
 
 from pupper_sysid.servo_models.servo_file import load_servo_model
-from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.servo_fit import networks
 from pupper_sysid.sysid.servo_fit.training import Recipe
 from support.command_line import run
@@ -124,21 +124,6 @@ def test_a_fit_repeats_under_its_seed_and_sees_nothing_of_the_test_loop(capsys, 
         assert np.array_equal(a[name], b[name]) and np.array_equal(a[name], c[name])
 
 
-def test_a_split_that_makes_no_sense_is_answered_in_a_sentence(capsys):
-    for arguments, said in (
-        (("--train-loops", "0,1"), "go together"),
-        (("--train-loops", "0,1", "--test-loops", "1"), "Loop 1 is in"),
-        (("--train-loops", "zero", "--test-loops", "1"), "'zero'"),
-        (("--train-loops", "0", "--test-loops", "7"), "nothing to test on"),
-        (("--train-before", "2", "--test-after", "1"), "before testing begins"),
-        (("--train-before", "1", "--test-after", "1", "--leave-one-frequency-out"), "one way"),
-        (("--train-before", "0.2", "--test-after", "1", "--train-loops", "0"), "one way"),
-        (("--preset", "paper", "--arch", "fir"), "no published fir"),
-    ):
-        code, _, err = run(capsys, "fit-servo", playback("log.csv"), *arguments)
-        assert code == 2 and said in err, (arguments, err)
-
-
 def test_data_that_cannot_teach_is_answered_in_a_sentence(capsys, quick):
     code, _, err = run(capsys, "fit-servo", playback("still.csv", still=True))
     assert code == 2 and "the command never changes" in err
@@ -160,36 +145,43 @@ def test_a_model_for_another_rate_or_joint_is_refused_where_it_would_be_used(cap
     other = (SAMPLE / "playback.csv", "--joints", "LF_calf")
     code, _, err = run(capsys, "compare", *other, "--models", "servo")
     assert code == 2
-    code, _, err = run(capsys, "compare", "log.csv", "--models", "log.csv")
-    assert code == 2 and "neither a servo model" in err
-    code, _, err = run(capsys, "compare", "log.csv", "--models", "sts3215-bam")
-    assert code == 2 and "Did you mean sts3215-bam-m" in err
     code, _, err = run(
         capsys, "compare", SAMPLE / "playback.csv", "--models", SAMPLE / "calibrated.yaml"
     )
     assert code == 2 and "only (--joints)" in err and "has no joint" in err
-    code, _, err = run(capsys, "compare", "log.csv")
-    assert code == 2 and "--models" in err
 
 
-def cut_sweep(path: Path, trial: int, rows: int) -> Path:
-    """The sample sweep as it is if it was interrupted so many rows into a trial."""
-    lines = (SAMPLE / "sweep.csv").read_text().splitlines()
-    first = next(n for n, line in enumerate(lines) if f",{trial},LF_" in line)
-    path.write_text("\n".join([*lines[: first + rows], ""]))
-    return path
+# ----- a fleet's results go beside its folder, by whatever name the folder is given
 
 
-@pytest.mark.slow
-def test_a_sweep_that_was_interrupted_is_used_up_to_there(capsys, tmp_path):
-    tones = {int(n) for n in load(SAMPLE / "sweep.csv").table.query("joint == 'LF_hip'")["trial"]}
-    torn = cut_sweep(tmp_path / "torn.csv", max(tones), 8)
-    code, _, err = run(capsys, "fit-servo", torn, "--arch", "fir")
-    assert code == 0, err
-    assert load_servo_model(tmp_path / "servo").contract.split == "each group left out in turn"
-    # of the next joint there is one tone: nothing to test on
-    torn = cut_sweep(tmp_path / "later.csv", max(tones) + 2, 1)
-    code, _, err = run(capsys, "fit-servo", torn, "--arch", "fir")
-    assert code == 2 and "LF_thigh" in err and "--joints" in err
-    code, _, err = run(capsys, "delay", torn, "--joints", "LF_thigh")
-    assert code == 0, err
+@dataclass
+class Reached(Exception):
+    """Where the results were about to be written."""
+
+    out: Path
+
+
+@pytest.mark.parametrize(
+    ("command", "worker", "ending"),
+    [
+        ("calibrate", "pupper_sysid.sysid.fleet.calibration.calibrate_fleet", "calibrated"),
+        ("fit-servo", "pupper_sysid.sysid.fleet.servo_model.fit_servo_fleet", "servos"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("here", "given"), [("robots", "."), ("robots/one", ".."), (".", "robots")]
+)
+def test_results_are_beside_the_folder(
+    capsys, tmp_path, monkeypatch, command, worker, ending, here, given
+):
+    (tmp_path / "robots/one").mkdir(parents=True)
+    (tmp_path / "robots/one/sweep.csv").touch()
+
+    def reach(root, out, *_):
+        raise Reached(out)
+
+    monkeypatch.setattr(worker, reach)
+    monkeypatch.chdir(tmp_path / here)
+    with pytest.raises(Reached) as reached:
+        run(capsys, command, given, "--debug")
+    assert reached.value.out.resolve() == tmp_path / f"robots_{ending}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import multiprocessing.synchronize
 import os
+import subprocess
 import sys
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.cli.user_errors import user_errors
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent
@@ -24,11 +26,9 @@ from pupper_sysid.policies.deploy.assembly import assemble
 from pupper_sysid.policies.deploy.commands import constant
 from pupper_sysid.policies.deploy.stacks import STACKS, suited
 from pupper_sysid.policies.network.policy_file import load_policy
-from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
+from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.walking.bus import WalkingBus
-from pupper_sysid.sysid.sweep.excitation import plan
-from pupper_sysid.sysid.sweep.recorder import record
+from support.command_line import refused
 
 SAMPLES = Path(__file__).parents[2] / "data/samples"
 PERIOD_S, LATE_S = 0.02, 0.055
@@ -190,14 +190,6 @@ def test_ticks_in_time_before_do_not_count_towards_the_culprit():
     assert shares in str(stop.value)
 
 
-def test_a_sweep_whose_bus_answers_late_says_so(tmp_path):
-    rng = np.random.default_rng(0)
-    bus = EmulatedBus(draw_robot(rng, RobotSpec(read_duration_s=LATE_S)), rng, keep_log=False)
-    chosen = plan("sine", ["LF_hip"], [1.0])
-    with pytest.raises(SafetyStop, match="the bus answers late"):
-        record(bus, chosen, tmp_path / "sweep.csv")
-
-
 class _Faulty(WalkingBus):
     """A walking robot, part of which is late, or broken, from the first tick of the walk on."""
 
@@ -244,10 +236,46 @@ def stop_reason(monkeypatch, folder: Path, fault: str) -> str:
         ).stop_reason  # fmt: skip
 
 
-@pytest.mark.parametrize("culprit", [BUS, POLICY])
+@pytest.mark.parametrize("culprit", [BUS, pytest.param(POLICY, marks=pytest.mark.slow)])
 def test_a_walk_that_is_late_blames_what_it_waited_for(monkeypatch, tmp_path, culprit):
     assert CULPRITS[culprit] in stop_reason(monkeypatch, tmp_path, culprit)
 
 
 def test_an_imu_that_returns_no_numbers_is_silent(monkeypatch, tmp_path):
     assert "the IMU has not answered" in stop_reason(monkeypatch, tmp_path, "rate_rad_s")
+
+
+# ----- what the system refuses is the user's to mend: one sentence, exit code 2
+
+
+def command(words, **how):
+    program = "from pupper_sysid.cli.programs.pupper_sysid import main; main()"
+    return subprocess.run([sys.executable, "-c", program, *words], check=False, **how)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_a_full_disk_behind_the_output_is_said_in_a_sentence():
+    with open("/dev/full", "w") as full:
+        ended = command(["servo", "list"], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert ended.returncode == 2
+    assert ended.stderr.startswith("error: standard output: No space left on device.")
+    assert ended.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="streams are closed by a shell")
+def test_a_program_whose_streams_are_closed_ends_as_ever(tmp_path):
+    for words, closed, expected in ((["sweep", "--help"], (0, 1, 2), 0), (["nonsense"], (2,), 2)):
+
+        def close(streams=closed) -> None:
+            for stream in streams:
+                os.close(stream)
+
+        ended = command(words, cwd=tmp_path, preexec_fn=close)
+        assert ended.returncode == expected, (words, closed)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc"), reason="needs a folder that cannot be written")
+def test_a_home_that_cannot_be_written_is_said_in_a_sentence(capsys, monkeypatch):
+    monkeypatch.setenv("HOME", "/proc")
+    monkeypatch.setenv("SHELL", "/bin/bash")
+    assert "cannot be made" in refused(capsys, pupper_sysid, "--install-completion")

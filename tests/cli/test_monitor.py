@@ -169,21 +169,6 @@ def test_a_monitored_emulated_robot_does_not_remember_its_readings():
     assert watched.bus._log == []  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("--bus", "emulated", "--joint-map", "sts3215"), "has its own"),
-        (("--bus", "emulated", "--rate", "0"), "--rate is 0"),
-        (("--bus", "emulated", "--rate", "1e9"), "it must be from 0.1 to 1000 Hz"),
-        (("--bus", "emulated", "--seconds", "-1"), "--seconds is -1"),
-        (("--bus", "usb"), "write emulated, esp32"),
-    ],
-)
-def test_what_cannot_be_done_is_refused_in_a_sentence(capsys, arguments, says):
-    code, out, err = run(capsys, "monitor", *arguments)
-    assert code == 2 and says in err and out == ""
-
-
 def test_the_older_word_for_the_emulated_bus_is_taken_and_answered_with_the_new_one(capsys):
     code, out, err = run(capsys, "monitor", "--bus", "sim", "--json")
     assert code == 0, err

@@ -132,9 +132,7 @@ def test_park_without_a_bus_switches_off_what_was_left_on_and_nothing_else(robot
     ("robot", "number"),
     [
         ("feetech", signal.SIGSTOP),
-        ("esp32", signal.SIGKILL),
-        pytest.param("feetech", signal.SIGKILL, marks=pytest.mark.slow),
-        pytest.param("esp32", signal.SIGSTOP, marks=pytest.mark.slow),
+        pytest.param("esp32", signal.SIGKILL, marks=pytest.mark.slow),
     ],
     indirect=["robot"],
 )
@@ -158,6 +156,7 @@ def test_a_supervisor_switches_off_what_driver_and_watchdog_have_left_on(robot, 
     assert "its driver was gone" in said and supervisor.returncode == 143
 
 
+@on_esp32
 @pytest.mark.wall_clock
 def test_a_driver_that_was_stopped_with_its_watchdog_does_not_go_on(robot):
     _, address = robot
@@ -174,6 +173,9 @@ def test_a_driver_that_was_stopped_with_its_watchdog_does_not_go_on(robot):
     bus.close()
 
 
+@pytest.mark.parametrize(
+    "robot", ["feetech", pytest.param("esp32", marks=pytest.mark.slow)], indirect=True
+)
 @pytest.mark.wall_clock
 def test_a_machine_that_was_suspended_during_a_walk_does_not_go_on(robot, monkeypatch):
     _, address = robot

@@ -293,6 +293,7 @@ def test_four_ways_on_the_sample_playback_score_unseen_readings_only(monkeypatch
         assert c.id != "S4" or c.verdict == "not testable here"
 
 
+@pytest.mark.slow
 def test_a_sweep_says_how_much_of_the_lag_is_stale_feedback(tmp_path):
     path = tmp_path / "sweep.csv"
     Sweep(joints="LF_thigh", freqs="2,4", duration=2.0, out=path, seed=3, json=True).run()

@@ -333,6 +333,37 @@ def _held(world: World, rng):
     return world, simulated(world)
 
 
+def _part(t, low: float, high: float, rng) -> float:
+    """A time within a part of the recording [s]."""
+    time = t.read_time_s.to_numpy()
+    return float(time[0] + np.ptp(time) * rng.uniform(low, high))
+
+
+def _zero_jumps(t, world, rng):
+    step = rng.choice([-1, 1]) * rng.uniform(0.3, 0.6) * world.amplitude_rad
+    late = t.read_time_s > _part(t, 0.35, 0.65, rng)
+    return t.assign(position_rad=t.position_rad + step * late)
+
+
+def _heats(t, world, rng):
+    time = t.read_time_s.to_numpy()
+    gain = 1 - rng.uniform(0.35, 0.6) * (time - time[0]) / np.ptp(time)
+    about = world.offset_rad
+    return t.assign(position_rad=about + gain * (t.position_rad - about))
+
+
+def _loses_power(t, world, rng):
+    begin = _part(t, 0.3, 0.5, rng)
+    out = ((t.read_time_s > begin) & (t.read_time_s < begin + 2.5)).to_numpy()
+    first = max(int(np.argmax(out)) - 1, 0)
+    return t.assign(position_rad=np.where(out, t.position_rad.iloc[first], t.position_rad))
+
+
+def _speed(t, world, rng):
+    time = t.read_time_s.to_numpy()
+    return t.assign(position_rad=np.gradient(t.position_rad.to_numpy(), time))
+
+
 FAULTS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "healthy": (healthy, ()),
     "sign": (_rows(_inverted), ("sign_inverted",)),
@@ -352,6 +383,11 @@ FAULTS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
                                       "no_one_lag")),
     "force": (_rows(_force), ("not_a_position_servo", "unrelated", "loosely_related")),
     "friction": (_held, ("held_by_friction",)),
+    "zero jumps": (_rows(_zero_jumps), ("zero_moves",)),
+    "heats": (_rows(_heats), ("gain_drifts", "gain_changed")),
+    "loses power": (_rows(_loses_power), ("frozen",)),
+    "speed": (_rows(_speed), ("speed_for_position", "fast_joint", "degrees", "unrelated",
+                              "not_a_position_servo")),
 }  # fmt: skip
 
 ACCUSING = sorted({code for _, codes in FAULTS.values() for code in codes})

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pupper_sysid.policies.analysis.trial import Trial
     from pupper_sysid.policies.network.policy_file import Policy
 
-    Tries = dict[str, tuple[Policy, Trial]]
+    Tries = Mapping[str, tuple[Any, Trial]]
     """Policy and trial by the policy's name."""
     Found = tuple[Mapping[str, Any], Figure, Table]
     """Results for --json, figure, and table."""
@@ -126,8 +126,7 @@ class OfPolicies(Analysis):
         command: tuple[float, float, float] = (0.15, 0.0, 0.0),
     ) -> dict[str, Any]:
         """An analysis of every policy, by its short name, with a progress bar over all of them."""
-        robots, seconds = self.size
-        tries = tries_of(self, command, robots, seconds)
+        tries = self.tries(command)
         found = {}
         with terminal.share_progress("walking") as advance:
             for name, (policy, trial) in tries.items():
@@ -135,6 +134,10 @@ class OfPolicies(Analysis):
                 threads = self.threads
                 found[name] = analyse(policy, replace(trial, threads=threads, progress=watch))
         return found
+
+    def tries(self, command: tuple[float, float, float]) -> Tries:
+        """Policies by their short names, and how each is tried."""
+        return tries_of(self, command, *self.size)
 
     @property
     def size(self) -> tuple[int, float]:
@@ -176,9 +179,15 @@ def _share_of_all(advance: Any, name: str, before: int, count: int, share: float
 
 
 def tries_of(
-    options: Any, command: tuple[float, float, float], robots: int, seconds: float
+    options: Any,
+    command: tuple[float, float, float],
+    robots: int,
+    seconds: float,
+    other_robots: bool = False,
 ) -> Tries:
     """Policies by the names of their runs, and how each is tried.
+
+    `other_robots` is whether the analysis is one for any robot's policy.
 
     Raises
     ------
@@ -207,10 +216,11 @@ def tries_of(
             f"Two policies are called {twice}, after their run's folder, and results go by these "
             "names: give one of them, or rename a folder."
         )
-    tries: Tries = {}
+    tries: dict[str, tuple[Policy, Trial]] = {}
     for name, path in zip(names, options.policies, strict=True):
         policy, run = policy_at(path)
-        refuse_other_robot(policy, "pupper-analyze")
+        if not other_robots:
+            refuse_other_robot(policy, "pupper-analyze")
         task, servos = simulator(path, policy, run, options.actuator, options.feedback)
         wanted = np.array([command], float)
         within = trained_commands(policy, run).clipped(wanted, lambda text: warn([text]))[0]

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.analyze.common import Commanded
-from pupper_sysid.cli.terminal import number
+from pupper_sysid.cli.commands.analyze.common import Commanded, tries_of
+from pupper_sysid.cli.terminal import err, need_positive, number
 from pupper_sysid.common.errors import InputError
 
 if TYPE_CHECKING:
-    from pupper_sysid.cli.commands.analyze.common import Found
+    from pupper_sysid.cli.commands.analyze.common import Found, Tries
     from pupper_sysid.policies.analysis.servo_demand import ServoDemand as Demand
+    from pupper_sysid.policies.analysis.trial import Trial
+    from pupper_sysid.policies.walks.conditions import Actor
+    from pupper_sysid.sim.robot.body import Body
+    from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+
+_ONNX = ".onnx"
+_STROLL = 0.5  # of the commanded speed; slower, it is probably not the gait that was trained
 
 _WIDTH = 78
 
@@ -23,11 +32,21 @@ _WIDTH = 78
 class ServoDemand(Commanded):
     """Compare what a gait needs of its servos with what a servo has: speed, torque, dead time.
 
-    Example: pupper-analyze servo-demand runs/<name> --servo sts3215-bam-m1
+    The policy is a run, or the ONNX file of any trainer with its robot's MJCF. What its metadata
+    lack stands in a YAML beside it (docs: Understanding a walk).
+
+    Example: pupper-analyze servo-demand walk.onnx --robot duck.xml --servo sts3215-bam-m1
     """
 
     servo: str | None = None
     """The servo in question: a servo card, its file, a calibration or a preset."""
+    robot: Path | None = None
+    """MJCF of an ONNX file's robot; without it, it walks the Mini Pupper 2."""
+    robot_config: Path | None = None
+    """YAML of that robot, as for pupper-train."""
+    policy_config: Path | None = None
+    """YAML of an ONNX file: joints, default pose, action scale, time step, observation. By default
+    the one beside it."""
 
     def analyse(self) -> Found:
         """Walk, and compare."""
@@ -44,12 +63,27 @@ class ServoDemand(Commanded):
         if len(self.policies) != 1:
             raise InputError("One gait at a time: name one policy.")
         check_actuator(self.servo)
-        known = not is_card(self.servo) or load_card(self.servo).pd().dead_time_s is not None
-        candidate = servo_ranges(self.servo)
-        found: dict[str, Demand] = self.each(
-            lambda policy, trial: servo_demand(policy, trial, candidate, known), self.command
-        )
+        card = is_card(self.servo)
+        known = not card or load_card(self.servo).pd().dead_time_s is not None
+
+        def candidate(body: Body) -> ServoRanges:
+            # a card is of one servo, whichever joints of a calibration the robot's YAML names
+            return servo_ranges(self.servo or "", body=replace(body, servo_of={}) if card else body)
+
+        def demand_of(policy: Actor, trial: Trial) -> Demand:
+            return servo_demand(policy, trial, candidate(trial.task.body), known)
+
+        found: dict[str, Demand] = self.each(demand_of, self.command)
         (name, demand), *_ = found.items()
+        wanted = float(np.hypot(*self.command[:2]))
+        if path_is_onnx(self.policies[0]) and demand.speed_m_s < _STROLL * wanted:
+            terminal.warn(
+                [
+                    f"{name} walks at {demand.speed_m_s:.2f} m/s where {wanted:g} are commanded, "
+                    "so this may not be its gait: check the order, signs and scales of "
+                    "`observation`, the pose, and the command (--command)."
+                ]
+            )
         table = terminal.table(
             self.title(f"{name} on {Path(self.servo).name}"), "servo", "rad/s 99 %", "peak", "has",
             "N·m 99 %", "has", "used", "short", "(walked)",
@@ -65,3 +99,68 @@ class ServoDemand(Commanded):
             for line in wrap(demand.verdict, _WIDTH):
                 terminal.out.print(line)
         return {"demand": found, "verdict": demand.verdict}, demand_figure(demand), table
+
+    def tries(self, command: tuple[float, float, float]) -> Tries:
+        """The policy of a run or of an ONNX file, and how it is tried."""
+        path = self.policies[0]
+        if not path_is_onnx(path):
+            if other := next((n for n in _OF_ONNX if getattr(self, n) is not None), None):
+                raise InputError(
+                    f"--{other.replace('_', '-')} is for a policy in an ONNX file; {path} is a run "
+                    "or a policy of pupper-train, which knows its robot."
+                )
+            return tries_of(self, command, *self.size, other_robots=True)
+        from pupper_sysid.cli.policy_choice import warn_of_fallbacks
+        from pupper_sysid.policies.analysis.trial import Trial
+        from pupper_sysid.policies.deploy.commands import checked_command
+
+        robots, seconds = self.size
+        if robots < 1:
+            raise InputError(f"--robots is {robots}; it must be at least 1.")
+        need_positive("--seconds", seconds)
+        checked_command(command)
+        policy, task, servos = self._of_onnx(path)
+        warn_of_fallbacks([servos])
+        return {path.stem: (policy, Trial(task, servos, command, robots, seconds, self.seed))}
+
+    def _of_onnx(self, path: Path) -> tuple[Any, Any, ServoRanges]:
+        """Policy, task and servos of the walk."""
+        from pupper_sysid.cli.policy_choice import simulator
+        from pupper_sysid.policies.analysis.foreign_policy import (
+            ForeignPolicy,
+            exported_policy,
+            servos_of_training,
+        )
+        from pupper_sysid.policies.network.onnx_network import OnnxNetwork
+        from pupper_sysid.sim.walking.servo_ranges import check_actuator, servo_ranges
+
+        for file, what in (
+            (path, "a policy's ONNX file"), (self.robot, "the robot's MJCF as --robot"),
+            (self.robot_config, "its YAML as --robot-config"),
+            (self.policy_config, "the policy's YAML as --policy-config"),
+        ):  # fmt: skip
+            if file is not None and not file.is_file():
+                raise InputError(f"There is no {file}. Give {what}.")
+        network = OnnxNetwork(path)
+        own = exported_policy(network)
+        if own is not None and self.policy_config is None:
+            return own, *simulator(path, own, None, self.actuator, self.feedback)
+        policy = ForeignPolicy.of(network, self.policy_config)
+        task = policy.task(self.robot, self.robot_config)
+        policy.fit(task)
+        if self.actuator is not None:
+            check_actuator(self.actuator)
+            servos = servo_ranges(self.actuator, self.feedback or "held", task.body)
+        else:
+            servos = servos_of_training(policy, task, self.robot)
+        for note in policy.notes:
+            err.print(note, soft_wrap=True)
+        return policy, task, servos
+
+
+def path_is_onnx(path: Path) -> bool:
+    """Whether a policy is named by its ONNX file."""
+    return path.suffix.lower() == _ONNX
+
+
+_OF_ONNX = ("robot", "robot_config", "policy_config")

@@ -1,7 +1,8 @@
-"""Arrays by name, of shape (rows,) or (rows, joints): NumPy's `.npz` and `.npy`, and torch's `.pt`.
+"""Arrays by name, of shape (rows,) or (rows, joints): NumPy's, torch's `.pt` and MATLAB's `.mat`.
 
     np.savez("log.npz", time=t, command=commands, position=positions, joint_names=["knee", "ankle"])
     torch.save({"time": t, "dof_pos": positions, "des_dof_pos": commands}, "run.pt")     # PACE
+    save("run.mat", "t", "cmd", "pos", "-v7")
 
 An array of a `.npy` file has columns without names. Objects (pickles) are never loaded.
 """
@@ -9,7 +10,9 @@ An array of a `.npy` file has columns without names. Objects (pickles) are never
 from __future__ import annotations
 
 import io
+import struct
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -30,17 +33,19 @@ from pupper_sysid.sysid.recordings.importers.tables import (
     unknown_numbers,
 )
 
-ZIP, NPY = b"PK\x03\x04", b"\x93NUMPY"
+ZIP, NPY, MAT = b"PK\x03\x04", b"\x93NUMPY", b"MATLAB 5.0"
 
 _NAMES = ("joint_names", "joints", "names", "motor_names", "dof_names")
-_DEEPEST = 3  # of dictionaries in a torch file
+_DEEPEST = 3  # of dictionaries in a torch file, of structures in MATLAB's
 
 
 def read_arrays(path: Path, data: bytes, options: LogOptions) -> Log:
     """The arrays of a file as rows."""
     if data.startswith(NPY):
         return _read_npy(path, data, options)
-    if _is_torch(data):
+    if data.startswith(MAT):
+        arrays, layout = _mat_arrays(path, data), "MATLAB file"
+    elif _is_torch(data):
         arrays, layout = _torch_arrays(path, data), "torch file"
     else:
         arrays, layout = _npz_arrays(path, data), "NumPy archive"
@@ -111,6 +116,41 @@ def _loaded(path: Path, data: bytes) -> Any:
             if pickled
             else _damaged(path)
         ) from error
+
+
+_MAT_HEADER, _MAT_COMPRESSED, _PIECE = 128, 15, 1 << 20  # of MATLAB 5 MAT-files
+
+
+def _mat_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
+    """The arrays of a MATLAB 5 file, those in structures as `structure.field`."""
+    order, at, total = ">" if data[126:128] == b"MI" else "<", _MAT_HEADER, 0
+    remedy = "Save it again with save(name, '-v7'), or writematrix."
+    from scipy.io import loadmat
+
+    try:
+        while at + 8 <= len(data):
+            kind, size = struct.unpack_from(f"{order}II", data, at)
+            rest, unpacker = data[at + 8 : at + 8 + size], zlib.decompressobj()
+            while kind == _MAT_COMPRESSED and rest and not unpacker.eof:
+                total += len(unpacker.decompress(rest, _PIECE))
+                rest = unpacker.unconsumed_tail
+                refuse_more(f"{path}, unpacked,", total, LARGEST_BYTES, "bytes", exact=False)
+            at += 8 + size
+        loaded = loadmat(io.BytesIO(data), simplify_cells=True)
+    except InputError:
+        raise
+    except Exception as error:  # damaged ones raise whatever zlib and scipy do
+        raise InputError(f"{path} is a damaged MATLAB file. {remedy}") from error
+    arrays: dict[str, NDArray[Any]] = {}
+    pending = [(name, value, 0) for name, value in loaded.items() if name[:2] != "__"]
+    while pending:
+        name, value, depth = pending.pop(0)
+        refuse_more(path, len(arrays) + len(pending), MOST_COLUMNS, "arrays", exact=False)
+        if isinstance(value, Mapping) and depth < _DEEPEST:
+            pending += [(f"{name}.{key}"[:200], inside, depth + 1) for key, inside in value.items()]
+        elif isinstance(value, np.ndarray) and value.dtype.kind in "biufUS":
+            arrays[name] = value
+    return arrays
 
 
 def _damaged(path: Path) -> str:

@@ -15,8 +15,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+
+import numpy as np
 
 COMMAND, STATE, ANGLE, OTHER = "command", "state", "angle", "other"
 MAYBE_COMMAND, MAYBE_STATE = "command, perhaps", "state, perhaps"
@@ -26,16 +28,17 @@ WORDS: dict[str, str] = {
     word: kind
     for kind, words in (
         (COMMAND, "command commands commanded cmd cmds goal goals target targets tgt desired des "
-                  "setpoint setpoints sp reference references ref refs demand demanded requested "
-                  "action actions soll sollwert sv consigne consigna riferimento referencia "
-                  "目标 目標 指令"),
+                  "setpoint setpoints set sp reference references ref refs demand demanded "
+                  "requested action actions soll sollwert sv consigne consigna riferimento "
+                  "referencia börvärde 目标 目標 指令 给定 设定"),
         (MAYBE_COMMAND, "u r ctrl control input inputs send sent tx request planned plan "
                         "trajectory traj leader nominal wanted write written order"),
         (STATE, "actual act present measured measurement meas msr feedback fb fbk observed "
                 "observation observations obs state states estimate estimated est real encoder enc "
                 "reading readings sensed sensor response resp "
-                "potentiometer pot resolver pv ist istwert mesure misura medida 实际 実測 反馈"),
-        (MAYBE_STATE, "y output outputs read rx follower received"),
+                "potentiometer pot resolver pv ist istwert ärvärde mesure misura medida "
+                "实际 当前 実測 反馈"),
+        (MAYBE_STATE, "y output outputs read rx follower received process"),
         (ANGLE, "position positions pos posn angle angles ang qpos q p theta θ winkel "
                 "角度 位置"),
         (OTHER, "v w velocity velocities vel vels speed speeds omega qd dq qdot qvel rate accel "
@@ -47,15 +50,15 @@ WORDS: dict[str, str] = {
                 "frame iteration iter step overrun moving force feedforward ff tff integral prev "
                 "previous last offset home initial init delta diff frequency freq hz cov "
                 "covariance enable enabled reached done warning fault trial episode loop "
-                "strom spannung"),
-        (TIME, "time times timestamp timestamps t stamp stamps clock elapsed seconds secs sec "
+                "strom spannung dot"),
+        (TIME, "time times timestamp timestamps t ts stamp stamps clock elapsed seconds secs sec "
                "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
-               "nanosec nanosecs nsecs usec usecs zeit temps tiempo tempo 时间 時間"),
+               "nanosec nanosecs nsecs usec usecs zeit temps tiempo tempo tid 时间 時間"),
         (UNIT, "rad rads radian radians deg degs degree degrees ° count counts tick ticks turn "
                "turns rev revs revolution revolutions mrad percent pct"),
         (JOINT, "joint joints dof dofs motor motors servo servos actuator actuators axis axes dxl "
                 "group controller controllers data value values val field name names msg body "
-                "header array low"),
+                "header array low point"),
         (DERIVED, "filtered filt filter smoothed smooth sim simulated simulation model modeled "
                   "modelled predicted prediction pred mean avg relative rel next raw"),
     )
@@ -63,7 +66,7 @@ WORDS: dict[str, str] = {
 }  # fmt: skip
 """What each word of a column's name stands for."""
 
-TIMES = ("time", "timestamp", "t", "stamp", "time_since_start", "elapsed", "seconds", "clock")
+TIMES = ("time", "timestamp", "t", "stamp", "time_since_start", "ts", "elapsed", "seconds", "clock")
 """Names of times, the likeliest first."""
 
 UNITS = {"rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "mrad": "mrad",
@@ -77,6 +80,8 @@ _CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-zµθ°]+|\d+|[^A-Za-z\d]+")
 _SOLE_LETTERS = frozenset("ury")  # that mean something where no other word does
 _LETTERS = frozenset("qput")  # that begin a word such as qdes or tcmd
 _LONGEST = 200
+_PARTS_OF = re.compile(r"(?<![\w.])(\d*\.\d+)\s*\*?\s*(deg|rad|°)(?![a-z])")  # 0.1deg
+_RAD = {"deg": np.pi / 180, "°": np.pi / 180, "rad": 1.0}
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,7 @@ class Column:
     key: str
     """The same without words such as `joint`, to be compared."""
     unit: str
-    """"rad", "mrad", "deg", "turns", "counts", "percent", or empty."""
+    """"rad", "mrad", "deg", "turns", "counts", "percent", "scale:0.01" (rad), or empty."""
     rank: tuple[int, ...]
     """Smaller for the better of two columns for one purpose."""
     words: frozenset[str]
@@ -102,7 +107,13 @@ class Column:
 
 def column(name: str) -> Column:
     """What the name of a column says."""
-    return _column(str(name)[:_LONGEST])
+    name = str(name)[:_LONGEST]
+    if not (part := _PARTS_OF.search(name)) or not float(part[1]) > 0:
+        return _column(name)
+    found = _column(name.replace(part[0], part[2]))
+    return replace(
+        found, name=name, template=name, unit=f"scale:{float(part[1]) * _RAD[part[2]]:.9g}"
+    )
 
 
 @lru_cache(4096)

@@ -56,7 +56,7 @@ def _rows_have(found: Any, *names: str) -> bool:
     """Whether this is a list of records, the first of which has one of these names, or none."""
     if not isinstance(found, list):
         return False
-    return not found or not isinstance(found[0], Mapping) or any(n in found[0] for n in names)
+    return not found or (isinstance(found[0], Mapping) and any(n in found[0] for n in names))
 
 
 def is_bam(data: Any) -> bool:
@@ -152,6 +152,7 @@ def read_ktune(path: Path, data: dict[str, Any]) -> Log:
 def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     """The log in other JSON as a table; None if it has no columns of a command and a position."""
     lists: dict[str, list[Any]] = {}
+    data = _of_frame(data)
     records = _records(data)
     if records is None and not isinstance(data, Mapping):
         return None
@@ -178,6 +179,19 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     if not arrays or (missing(table.names) and not options.command):
         return None
     return read_table(path, table, options, "JSON table")
+
+
+def _of_frame(data: Any) -> Any:
+    """The columns of a frame that pandas wrote as JSON, `split` or by row numbers; else `data`."""
+    if not isinstance(data, Mapping):
+        return data
+    names, rows = data.get("columns"), data.get("data")
+    if isinstance(names, list) and isinstance(rows, list) and rows and all(
+        isinstance(row, list) and len(row) == len(names) for row in rows
+    ):  # fmt: skip
+        return {str(n): list(v) for n, v in zip(names, zip(*rows, strict=True), strict=True)}
+    numbered = data and all(isinstance(v, Mapping) and "0" in v and "1" in v for v in data.values())
+    return {n: list(v.values()) for n, v in data.items()} if numbered else data
 
 
 def _records(data: Any) -> list[Any] | None:

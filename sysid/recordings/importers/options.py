@@ -227,6 +227,14 @@ class LogOptions:
             )
         return seconds
 
+    @property
+    def words(self) -> dict[str, str]:
+        """What was stated, as options of a command line take it."""
+        known = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "units"}
+        known |= {"joints": ",".join(self.joints)}
+        return {k: f"{v:g}" if isinstance(v, float) else "" if v is True else str(v)
+                for k, v in known.items() if v}  # fmt: skip
+
     def refuse(self, layout: str, allowed: tuple[str, ...] = ("joints",)) -> None:
         """Refuse options that a layout has no use for."""
         given = [f.name for f in fields(self) if getattr(self, f.name) not in (None, {})]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,11 @@ from pupper_sysid.sysid.recordings.importers.log import Log, joint_names
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.unknown import unknown_folder, unknown_json
 
-_ENDINGS = (".csv", ".tsv", ".json", ".jsonl", ".mcap", ".db3", ".npz", ".parquet", ".pt")
+_ENDINGS = (".csv", ".tsv", ".json", ".jsonl", ".mcap", ".db3", ".npz", ".parquet", ".pt", ".mat")
 _PACKED = (".gz", ".bz2", ".xz")
+_STAMP = re.compile(rb"\[[\d.:, TZ-]+\][ \t]*[A-Za-z(]")  # before a message: a line of text
+_YAML = re.compile(rb"(?:---\s*\n)?(?:- \w+:|\w+:[ \t]*\r?\n[ \t]+\w+:)")
+_ROW = re.compile(rb"\[[-+\d.eE, \t]+\][ \t]*\r?\n")  # a list of numbers that is a whole line
 
 
 def is_log_folder(folder: Path) -> bool:
@@ -84,12 +88,17 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
         return replace(ros.read_mcap(path, data, options), sha256=digest)
     if data.startswith(ros.SQLITE):
         return replace(ros.read_sqlite(path, options), sha256=digest)
-    if data.startswith((arrays.ZIP, arrays.NPY)):
+    if data.startswith((arrays.ZIP, arrays.NPY, arrays.MAT)):
         return replace(arrays.read_arrays(path, data, options), sha256=digest)
     if data.startswith(parquet.MAGIC):
         return replace(parquet.read_parquet(path, data, options), sha256=digest)
     start = data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")
-    if start[:1] not in (b"{", b"["):
+    if _YAML.match(start):
+        raise InputError(
+            f"{path} is YAML, which is not read: write rows as CSV, or record messages with "
+            "`ros2 bag record` or `ros2 topic echo --csv`."
+        )
+    if start[:1] not in (b"{", b"[") or _STAMP.match(start) or _ROW.match(data):
         return None
     found = border.parse_json(_whole_json(decoded(path, data)), str(path), "Give it as written.")
     for layout, known, read in (
@@ -106,7 +115,9 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
 
 
 def _whole_json(text: str) -> str:
-    """JSON Lines as one list; other JSON as it is."""
+    """JSON Lines as one list, in Python's quotes, too; other JSON as it is."""
+    if text.lstrip()[:2] == "{'":
+        text = text.replace("'", '"').replace(": None", ": null")
     lines = text.strip().split("\n")
     if len(lines) > 1 and all(line.strip()[:1] + line.strip()[-1:] == "{}" for line in lines[:2]):
         return f"[{','.join(line for line in lines if line.strip())}]"

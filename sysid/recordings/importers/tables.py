@@ -51,8 +51,8 @@ LAYOUT = "table"
 
 _TRIALS = ("trial", "episode_index", "episode", "loop", "run", "segment")
 _TONES = ("frequency_hz", "freq_hz", "frequency", "freq")
-_SERIES = ("name", "signal", "variable", "topic", "field", "series", "metric", "key", "channel",
-           "_field", "_measurement")  # fmt: skip
+_SERIES = ("name", "signal", "event", "type", "kind", "variable", "topic", "field", "series",
+           "metric", "key", "channel", "_field", "_measurement")  # fmt: skip
 _GROUPS = ("leg", "limb", "arm", "side", "joint", "joint_name", "motor", "motor_name", "servo",
            "servo_name", "actuator", "name", "axis", "dof", "motor_idx", "motor_id", "motor_index",
            "joint_idx", "joint_id", "joint_index", "servo_id", "actuator_id", "dxl_id", "can_id",
@@ -63,10 +63,19 @@ _SUBSECONDS = ("nanosec", "nanosecs", "nsec", "nsecs", "usec", "usecs")
 _KEPT = ("p_gain", "torque_enabled", "voltage_v", "temperature_c", "load")
 _SOLE = "joint"  # of a log that names none
 _MOST_GROUPS = 1000
+_TOGETHER = 0.2  # share of the rows with a command or position that have both
 _FEWEST_ROWS = 3  # of a joint in a table with a row per joint
 _SHORTEST_TONE = 20  # rows of one frequency; a chirp changes it sooner
 _MOST_CHOICES = 4  # that a message lists
 _COMPARED = 8  # columns for one purpose
+_WIDEST_ANGLE = 1e6  # of a joint, in any unit
+_ORDERED = 100_000  # rows
+_OF_TURNS = {
+    "ODrive": (("setpoint", "estimate"), "pos_setpoint and pos_estimate"),
+    "moteus": (("servo_stats.position",), "servo_stats.position"),
+    "moteus's decoder": (("command_position", "q_current"), "command_position and q_current"),
+}
+"""Programs that count turns and do not say so, and what gives their logs away."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +117,12 @@ class Table:
         """The first of these names, in any case, that a column of numbers has."""
         own = {n.lower(): n for n in self.columns}
         return next((own[n] for n in names if n in own), None)
+
+    @property
+    def increasing(self) -> list[str]:
+        """Columns whose numbers never decrease, and are not all the same."""
+        steps = {n: np.diff(v[np.isfinite(v)]) for n, v in self.columns.items()}
+        return [n for n, s in steps.items() if (s >= 0).all() and (s > 0).any()]
 
     def check_joints(self, path: Path | str, columns: Iterable[str]) -> None:
         """Refuse arrays, of which these are columns, with other numbers of joints than names."""
@@ -258,13 +273,14 @@ def _pairs_by_words(
             )
         pairs[key] = pair
         names.append(_joint_name(pair))
-        odd = {"setpoint", "estimate"} <= pair.command.words | pair.position.words
-        if odd and not pair.command.unit + pair.position.unit and not options.unit:
-            notes.append(
-                "pos_setpoint and pos_estimate are names of ODrive, which counts turns; the values "
-                "were taken as rad. If they are turns, give `unit='turns'`; lag and dead time "
-                "are the same."
-            )
+        signs = {*table.names, *pair.command.words, *pair.position.words}
+        for program, (marks, shown) in _OF_TURNS.items():
+            unnamed = not pair.command.unit + pair.position.unit and not options.unit
+            if unnamed and signs.issuperset(marks):
+                notes.append(
+                    f"{shown} are names of {program}, which counts turns; the values were taken as "
+                    "rad. If they are turns, give `unit='turns'`; lag and dead time are the same."
+                )
     distinct(path, names, "joints")
     kinds = dict(zip((note[:12] for note in reversed(notes)), reversed(notes), strict=True))
     return dict(zip(names, pairs.values(), strict=True)), [*kinds.values()][::-1]
@@ -353,8 +369,8 @@ def import_line(path: Path | str, **options: str) -> str:
     """The command that imports a log with these options."""
     words = [f"pupper-sysid import {shlex.quote(Path(path).name)}"]
     for name, value in (options | {"out": "rec.csv"}).items():
-        words.append(f"--{name.replace('_', '-')} {shlex.quote(printable(value))}")
-    return f"`{' '.join(words)}`"
+        words.append(f"--{name.replace('_', '-')} {shlex.quote(printable(value)) if value else ''}")
+    return f"`{' '.join(map(str.rstrip, words))}`"
 
 
 def _stated_pairs(path: Path | str, table: Table, options: LogOptions) -> dict[str, _Pair]:
@@ -417,24 +433,38 @@ def unknown_numbers(path: Path | str, table: Table) -> str:
     for name, values in list(table.columns.items())[:12]:
         known = values[np.isfinite(values)]
         if len(known):
-            steps = np.diff(known)
-            up = ", increasing" if (steps >= 0).all() and (steps > 0).any() else ""
+            up = ", increasing" if name in table.increasing else ""
             shown.append(f"{name} ({known.min():.4g} … {known.max():.4g}{up})")
-    increasing = [text.split(" ")[0] for text in shown if "increasing" in text]
-    time = (increasing or ["0"])[0]
+    time = (table.increasing or ["0"])[0]
     others: list[str] = []  # that move, each once
     for name, values in table.columns.items():
         known = values[np.isfinite(values)]
         same = (np.array_equal(values, table.columns[o], equal_nan=True) for o in others)
-        if name != time and len(known) and np.ptp(known) > 0 and not any(same):
+        if name == time or not len(known) or np.ptp(known) == 0 or any(same):
+            continue
+        if np.ptp(known) < _WIDEST_ANGLE:
             others.append(name)
-    first, second = [*others, "1", "2"][:2]
+        elif (known % 1 == 0).all() and known.min() >= 0 and known.max() < 1e9 and "," not in time:
+            time = f"{time},{name}"  # nanoseconds
+    first, second = _in_order(table, [*others, "1", "2"][:2])
     choices = dict.fromkeys([(first, second), (second, first), (first, (others or [second])[-1])])
     lines = [import_line(path, time=time, command=c, position=p) for c, p in choices]
     return (
         f"its columns have no names. By their numbers, from 0, they are {'; '.join(shown)}. Say "
         f"which is which: {', '.join(lines)}, or others."
     )
+
+
+def _in_order(table: Table, pair: Sequence[str]) -> list[str]:
+    """Two columns, first the one that the other follows."""
+    known = [table.columns.get(name) for name in pair]
+    if any(v is None or not np.isfinite(v).all() for v in known):
+        return [*pair]
+    first, second = (np.asarray(v[:_ORDERED]) - np.mean(v[:_ORDERED]) for v in known)
+    product_at = np.fft.irfft(np.fft.rfft(second, 2 * len(second)).conj()
+                              * np.fft.rfft(first, 2 * len(first)))  # fmt: skip
+    best = int(np.argmax(np.abs(product_at)))
+    return [*pair][::-1] if 0 < best < len(first) else [*pair]
 
 
 def has_time(names: Sequence[str]) -> bool:
@@ -473,6 +503,9 @@ def _times(
     sent = [n for n in names if (c := column(n)).kind == "time" and c.words & _SENT]
     read = [n for n in names if (c := column(n)).kind == "time" and c.words and n not in sent]
     time, command_time, notes = options.time, options.command_time, []
+    if time is not None and time not in table.names and time.count(",") == 1:
+        whole, below = (_column_named(path, table, "time", n.strip()) for n in time.split(","))
+        return _of_two(path, table, whole, below)[0], None, []
     if time is not None:
         time = _column_named(path, table, "time", time)
     elif not found and len(sent) == 1 and len(read) == 1:
@@ -516,12 +549,19 @@ def _seconds(
     lower = {n.lower(): n for n in table.columns}
     whole = re.fullmatch(r"(.*?)secs?", name.lower())
     rest = [lower[n] for end in _SUBSECONDS if whole and (n := whole[1] + end) in lower]
-    if rest:  # seconds and what is below one in a column of its own, as stamps of ROS have them
-        zero = float(np.nanmin(values))
-        below = table.numbers(path, rest[0])
-        return values - zero + clock(rest[0], below).scale * below, zero, []
+    if rest:
+        return *_of_two(path, table, name, rest[0]), []
     found = clock(name, values)
     return found.seconds(values), found.zero * found.scale, found.notes
+
+
+def _of_two(
+    path: Path | str, table: Table, name: str, rest: str
+) -> tuple[NDArray[np.float64], float]:
+    """Times in seconds and what is below one in a column of its own, as stamps of ROS have them."""
+    values, below = table.numbers(path, name), table.numbers(path, rest)
+    zero = float(np.nanmin(values))
+    return values - zero + (1e-6 if np.nanmax(below) < 1e6 else 1e-9) * below, zero
 
 
 # ---------------------------------------------------------------------------------------- rows
@@ -608,10 +648,18 @@ def _joint(
     metadata: dict[str, Any],
 ) -> tuple[pd.DataFrame, list[str]]:
     """Rows of one joint; its doubt goes into the header."""
+    own, held = _apart(path, table, times_s, pair, own)
     stamp, sent = times_s[0][own], None if times_s[1] is None else times_s[1][own]
+    if held is not None:
+        sent = held[0]
     if options.rate:
         stamp = np.arange(len(stamp)) / options.rate
     trial, tone, warnings = _trials(path, table, options, own)
+    if held is not None:
+        warnings.append(
+            "commands and positions stand in rows of their own: each row's time is that of what "
+            "it holds, and a command was taken as in force until the next one."
+        )
     number, shifted = one_after_another(stamp, trial)
     if sent is not None:
         send, read, doubt = sent_at(sent, stamp) + (shifted - stamp), shifted, 0.0
@@ -631,9 +679,12 @@ def _joint(
     metadata.setdefault("columns", {})[names[1]] = used
     stated = options.unit_of(*names)
     columns: dict[str, Any] = {}
+    measured = table.numbers(path, pair.position.name)[own]
     for key, source in (("command_rad", pair.command), ("position_rad", pair.position)):
         values = table.numbers(path, source.name)[own]
-        factor = stated or _of_name(path, source) or Unit()
+        if held is not None and key == "command_rad":
+            values = held[1]
+        factor = stated or _of_name(path, source, measured) or Unit()
         columns[key] = (values - factor.zero) * factor.scale
         if factor.counts and stated is None:
             warnings.append(
@@ -656,6 +707,31 @@ def _joint(
         several = part.groupby("trial")["frequency_hz"].transform("nunique").to_numpy() > 1
         part.loc[several, "frequency_hz"] = np.nan  # a chirp is no tone
     return part, warnings
+
+
+def _apart(
+    path: Path | str,
+    table: Table,
+    times_s: tuple[NDArray[np.float64], NDArray[np.float64] | None],
+    pair: _Pair,
+    own: NDArray[np.bool_],
+) -> tuple[NDArray[np.bool_], tuple[NDArray[np.float64], NDArray[np.float64]] | None]:
+    """Rows of a joint's positions, and its commands at them, where no row has both.
+
+    As PlotJuggler and outer joins write signals of several clocks.
+    """
+    command, position = (table.numbers(path, c.name) for c in (pair.command, pair.position))
+    sent, read = own & np.isfinite(command), own & np.isfinite(position)
+    apart = (sent & read).sum() < _TOGETHER * min(sent.sum(), read.sum())
+    if not apart or times_s[1] is not None:
+        return own, None
+    at = times_s[0] if times_s[1] is None else times_s[1]
+    order = np.argsort(at[sent], kind="stable")
+    send, held, kept = held_commands(at[sent][order], command[sent][order], times_s[0][read])
+    rows_of = np.flatnonzero(read)[kept]
+    chosen = np.zeros(len(own), bool)
+    chosen[rows_of] = True
+    return chosen, (send, held)
 
 
 def _trials(
@@ -695,8 +771,8 @@ def _trials(
     return trial, tone, notes
 
 
-def _of_name(path: Path | str, source: Column) -> Unit | None:
-    """The unit that a column's name ends in."""
+def _of_name(path: Path | str, source: Column, positions: NDArray[np.float64]) -> Unit | None:
+    """The unit that a column's name ends in; counts are of a usual turn that holds `positions`."""
     if source.unit in ("", "rad"):
         return None
     if source.unit == "percent":
@@ -704,4 +780,8 @@ def _of_name(path: Path | str, source: Column) -> Unit | None:
             f"{path}, column {printable(source.name)[:60]}: percent of a range of motion that the "
             f"log does not say. Give it, as of 3.5 rad: {import_line(path, unit='percent:3.5')}."
         )
-    return unit("counts:4096" if source.unit == "counts" else source.unit)
+    if source.unit == "counts":
+        known = positions[np.isfinite(positions)]
+        fine = len(known) > 0 and float(np.median(known)) > 4096 and known.max() < 16384
+        return unit(f"counts:{16384 if fine else 4096}")
+    return unit(source.unit)

@@ -83,6 +83,7 @@ def times_of_day(path: object, name: str, cells: Sequence[str]) -> NDArray[np.fl
         (k for k in others if not _NUMBER.fullmatch(cells[k])), others[0] if others else None
     )
     bare = [_OTHER_DATE.sub("", cell.strip()) for cell in cells]
+    bare = [f"00:{cell}" if cell.count(":") == 1 else cell for cell in bare]  # minutes and seconds
     texts = pd.Series([cell.replace(",", ".") or None for cell in bare], dtype=object)
     try:
         if bad is not None:

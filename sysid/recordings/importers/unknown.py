@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.columns import column
+from pupper_sysid.sysid.recordings.importers.columns import column, time_columns
 from pupper_sysid.sysid.recordings.importers.tables import has_time, import_line, missing
 
 OURS = (
@@ -30,11 +30,13 @@ FILES = (
 """Layouts other than tables of text."""
 
 
-def unknown_columns(path: Path | str, names: Sequence[str], timed: bool = False) -> str:
+def unknown_columns(
+    path: Path | str, names: Sequence[str], timed: bool = False, increasing: Sequence[str] = ()
+) -> str:
     """Why a table has no known layout; empty where it may have one.
 
-    Every tabular layout is listed with the columns that it lacks here. `timed` tables have their
-    times from elsewhere.
+    Tabular layouts that share columns with it are listed with those that it lacks. `timed` tables
+    have their times from elsewhere; columns that are `increasing` may be times.
     """
     own = set(names)
     lacks_pair = missing(names)
@@ -57,27 +59,36 @@ def unknown_columns(path: Path | str, names: Sequence[str], timed: bool = False)
                 ("Mini Pupper sweep", SWEEP),
                 ("Mini Pupper playback", PLAYBACK),
             )
+            if own & {*columns}
         ),
     ]
     return (
         f"its columns ({_listed(names)}) belong to no known layout. {'; '.join(parts)}. "
-        f"{_hint(names)}Name the columns{_examples(path, names)} with `pupper-sysid import` --time "
-        f"(or --rate), --command and --position. Other layouts: {'; '.join(FILES)}."
+        f"{_hint(names)}Name the columns{_examples(path, names, timed, increasing)} with "
+        "`pupper-sysid import` --time (or --rate, the rows a second), --command and --position. "
+        f"Other layouts: {'; '.join(FILES)}."
     )
 
 
-def _examples(path: Path | str, names: Sequence[str]) -> str:
+def _examples(
+    path: Path | str, names: Sequence[str], timed: bool, increasing: Sequence[str]
+) -> str:
     """Command lines that take columns whose names say nothing for what is missing."""
     columns = [column(name) for name in names]
-    by_kind = {
-        kind: [c.template for c in columns if c.kind == kind]
-        or [c.template for c in columns if c.kind == "unknown"]
-        for kind in ("time", "command", "position")
-    }
+    times = time_columns(names)[:1] or [n for n in increasing if column(n).kind != "position"][:1]
+    if not times and (len(columns) > 2 or timed):  # of another event
+        times = [c.name for c in columns if c.kind in ("time", "unknown")][:1]
+    when = {"time": times[0]} if times else {"rate": "50"}
+    by_kind = {}
+    for kind in ("command", "position"):
+        ranked = ((kind,), ("unknown",), ("time",))
+        chosen = ([c.template for c in columns if c.kind in kinds and c.name not in times]
+                  for kinds in ranked)  # fmt: skip
+        by_kind[kind] = next(filter(None, chosen), [])
     lines = [
-        import_line(path, time=by_kind["time"][0], command=c, position=p)
+        import_line(path, **when, command=c, position=p)
         for c, p in product(by_kind["command"], by_kind["position"])
-        if by_kind["time"] and len({c, p, by_kind["time"][0]}) == 3
+        if c != p
     ]
     return f" ({'; or '.join(list(dict.fromkeys(lines))[:3])})" if lines else ""
 

@@ -166,7 +166,7 @@ class TrotActor:
 
 
 def test_the_judge_counts_the_steps_of_a_trot():
-    task = Walking(episode_s=2.0)
+    task = Walking(episode_s=1.2)
     judge = Judge(task, servo_ranges("paper", "ideal"), 0, 1)
     found = judge(TrotActor(judge, task))  # type: ignore[arg-type]
     assert found["score_falls"] == 0

@@ -85,7 +85,7 @@ def test_the_teachers_commands_are_corrected_until_the_policy_walks_at_the_given
         return np.abs(walked(command) - command).mean(axis=0)
 
     before = error()
-    for _ in range(60):
+    for _ in range(40):
         env.command[:], env.episode_step[:] = draw(), 1
         for _ in range(80):
             env._strides.velocity[:] = walked(env.command) + rng.normal(

@@ -61,11 +61,18 @@ def finished(uninterrupted, tmp_path) -> Path:
     return Path(shutil.copytree(uninterrupted(), tmp_path / "run"))
 
 
+@pytest.fixture(scope="module")
+def stopped_once(tmp_path_factory) -> Path:
+    """A run that was stopped after its first update; not to be changed."""
+    folder = tmp_path_factory.mktemp("stopped") / "run"
+    train(folder, tiny_run(), stop_after("ppo", 1))
+    return folder
+
+
 @pytest.fixture
-def stopped(tmp_path) -> Path:
-    """A run that was stopped after its first update."""
-    train(tmp_path / "run", tiny_run(), stop_after("ppo", 1))
-    return tmp_path / "run"
+def stopped(stopped_once, tmp_path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(stopped_once, tmp_path / "run"))
 
 
 @pytest.mark.parametrize(
@@ -90,6 +97,7 @@ def test_a_run_that_was_stopped_and_resumed_is_bit_for_bit_the_run_that_was_not(
         assert different(straight[part], checkpoint[part])
 
 
+@pytest.mark.slow
 def test_a_resumed_run_can_be_extended_and_remembers_it(tmp_path, uninterrupted):
     train(tmp_path, tiny_run(iterations=2))
     train(tmp_path, None, iterations=3)
@@ -108,14 +116,6 @@ def test_a_run_is_not_resumed_with_another_actuator_file(tmp_path):
     actuator.unlink()
     with pytest.raises(InputError, match="is not there"):
         train(tmp_path / "run", None, iterations=2)
-
-
-def test_another_seed_is_another_run(tmp_path, uninterrupted):
-    train(tmp_path, tiny_run(seed=1))
-    straight = read_checkpoint(uninterrupted() / LAST)
-    other = different(straight, read_checkpoint(tmp_path / LAST))
-    assert any(d.startswith(".actor_state_dict") for d in other)
-    assert any(d.startswith(".environment.batch.state") for d in other)
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -268,17 +268,6 @@ def test_a_round_that_was_left_is_repeated_and_the_run_is_that_without_a_stop(
     assert different(straight, read_checkpoint(tmp_path / LAST)) == []
 
 
-def test_the_last_policy_is_on_disk_after_each_round_of_imitation(tmp_path):
-    rounds = []
-
-    def watch(now):
-        if now.phase == "ppo":
-            rounds.append(load_policy(tmp_path / "policy_last").contract.training)
-
-    train(tmp_path, tiny_run(iterations=1), watch)
-    assert [r["imitation_rounds"] for r in rounds] == [2]
-
-
 def test_rounds_that_do_not_fit_the_time_are_left_out_and_the_rate_falls_to_zero_with_the_last(
     tmp_path, monkeypatch
 ):
@@ -363,7 +352,9 @@ def spoil(monkeypatch, when: int, where: str):
     return began
 
 
-@pytest.mark.parametrize(("when", "where"), [(0, "loss"), (1, "critic")])
+@pytest.mark.parametrize(
+    ("when", "where"), [pytest.param(0, "loss", marks=pytest.mark.slow), (1, "critic")]
+)
 def test_when_numbers_stop_being_numbers_the_networks_before_are_saved_and_go_on(
     tmp_path, monkeypatch, when, where
 ):

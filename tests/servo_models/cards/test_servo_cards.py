@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +16,10 @@ from pupper_sysid.common.data_sheet import (
     stall_torque,
 )
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.cards.bam import ACTUATORS, BamParameters, from_bam, to_bam
 from pupper_sysid.servo_models.cards.card import ServoCard
+from pupper_sysid.servo_models.cards.compare import Comparison, compared, servo_of
 from pupper_sysid.servo_models.cards.files import card_names, load_card
 from pupper_sysid.servo_models.cards.numbers import PositionLoop, TorquePD, stated
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
@@ -259,3 +263,102 @@ def test_a_card_of_a_position_loop_is_a_calibration_at_any_gain_and_load(name):
     stiffness = twice.actuator.stiffness_nm_per_rad.value
     assert stiffness == pytest.approx(card.pd(p_gain=2 * gain).parameters.stiffness)
     assert load_card("sts3215-open-duck").calibration().joint("any").under_load is None
+
+
+# ----- two servos are compared at one P gain and by one definition of the armature
+
+LOOP, FIXED_16, NO_GAIN = "sts3215-bam-m6", "sts3215-soarm100", "sts3215-open-duck"
+
+
+def difference(found: Comparison, quantity: str):
+    return next(d for d in found.differences if d.quantity == quantity)
+
+
+def saved(path: Path, p_gain: float | None = None) -> str:
+    """The card `LOOP` as a calibration file, at another gain."""
+    made = load_card(LOOP).calibration()
+    if p_gain is not None:
+        made = made.at_p_gain(p_gain)
+    Calibration(**{name: getattr(made, name) for name in ("robot", "created")},
+                joints=made.joints).save(path)  # fmt: skip
+    return str(path)
+
+
+def test_a_servo_equals_itself_whatever_gain_its_file_was_written_at(tmp_path):
+    at_16 = saved(tmp_path / "a.yaml", 16.0)
+    found = compared(at_16, LOOP)
+    assert found.p_gain == 16.0 == found.second.p_gain
+    assert difference(found, "stiffness").ratio == pytest.approx(1.0)
+    assert any("P gain 16" in note for note in found.notes)
+    assert difference(compared(LOOP, at_16), "stiffness").ratio == pytest.approx(1.0)
+
+
+def test_the_gain_is_that_of_the_servo_whose_numbers_hold_at_no_other():
+    for pair in ((LOOP, FIXED_16), (FIXED_16, LOOP)):
+        found = compared(*pair)
+        assert found.p_gain == 16.0 and {found.first.p_gain, found.second.p_gain} == {16.0}
+
+
+def test_a_wanted_gain_is_that_of_both_or_refused(tmp_path):
+    found = compared(LOOP, saved(tmp_path / "a.yaml"), p_gain=8)
+    assert found.p_gain == 8.0 == found.first.p_gain == found.second.p_gain
+    with pytest.raises(InputError, match="p_gain"):
+        compared(LOOP, FIXED_16, p_gain=32)
+
+
+def test_without_a_gain_on_one_side_the_stiffness_is_not_compared_and_the_rest_is():
+    found = compared(LOOP, "paper", "LF_thigh")
+    assert found.p_gain is None and "not stated" in found.notes[0]
+    stiffness = difference(found, "stiffness")
+    assert stiffness.ratio is None and stiffness.second is not None
+    assert difference(found, "effort limit").ratio == pytest.approx(
+        5.0 / load_card(LOOP).pd().effort_limit_nm.value
+    )
+
+
+def test_armatures_with_and_without_the_link_are_not_compared():
+    found = compared(LOOP, "sts3215-12v")
+    assert difference(found, "armature").ratio is None
+    assert any("armatures differ" in note for note in found.notes)
+    assert difference(compared(LOOP, "sts3215-bam-m1"), "armature").ratio is not None
+
+
+def test_a_calibration_of_one_gain_refuses_another():
+    with pytest.raises(InputError, match="holds at P gain not stated only"):
+        servo_of("paper", "LF_hip", 16.0)
+    assert load_calibration("paper").joint("LF_hip").holds_at.armature == "servo"
+
+
+# ----- the page on STS3215 models shows what its benchmark printed, of the cards as they are
+
+ROOT = Path(__file__).resolve().parents[3]
+FOUND = json.loads((ROOT / "benchmarks" / "which_sts3215.json").read_text())
+PAGE = (ROOT / "docs" / "which_sts3215.md").read_text()
+
+
+def test_the_tables_of_the_page_are_those_that_the_benchmark_printed():
+    for name, lines in FOUND["tables"].items():
+        block = PAGE.split(f"<!-- table {name} -->")[1].split("<!-- end -->")[0]
+        assert block.strip().splitlines() == lines, name
+
+
+def test_the_mean_of_joints_in_the_table_follows_from_the_joints():
+    rows = [line.strip("| ").split(" | ") for line in FOUND["tables"]["errors"]]
+    row = next(r for r in rows if r[0] == "pupper-sysid")
+    sweep = [
+        j["models"]["pupper-sysid"]["errors"]["frequency_sweep"] for j in FOUND["joints"].values()
+    ]
+    assert float(row[1]) == pytest.approx(np.mean(sweep), abs=0.051)
+
+
+def test_the_cards_are_those_that_were_scored():
+    for name, expected in FOUND["cards"].items():
+        numbers = load_card(name).model_dump(mode="json")["specimens"]
+        found = hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()
+        assert found == expected, f"{name}: run benchmarks/which_sts3215.py again"
+
+
+def test_our_card_was_not_fitted_to_the_motion_that_is_scored():
+    ours = {f.sha256 for f in load_card("sts3215-12v").data}
+    assert FOUND["recordings"]["frequency_sweep"] not in ours
+    assert FOUND["recordings"]["chirp_sweep"] in ours

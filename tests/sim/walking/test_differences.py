@@ -7,7 +7,14 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from pupper_sysid.sim.walking.config import PRESETS, Commands, Observation, Randomisation, Walking
+from pupper_sysid.sim.walking.config import (
+    PRESETS,
+    Commands,
+    Curriculum,
+    Observation,
+    Randomisation,
+    Walking,
+)
 from pupper_sysid.sim.walking.differences import TYPICAL, Differences
 from pupper_sysid.sim.walking.draws import at_rest
 from pupper_sysid.sim.walking.env import PupperEnv
@@ -15,6 +22,7 @@ from pupper_sysid.sim.walking.held_readings import HeldReadings
 from pupper_sysid.sim.walking.imu import Imu
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from pupper_sysid.sim.walking.shared_draws import Twins, generator
 from support.refusals import assert_each_refused
 
 MEASURED = "data/samples/calibrated.yaml"
@@ -260,13 +268,47 @@ def test_robots_with_all_differences_go_on_exactly_from_a_saved_state():
         np.testing.assert_array_equal(a.privileged, b.privileged)
 
 
-def test_evaluated_robots_are_as_their_model():
-    assert replace(Walking(), differences=TYPICAL).evaluated().differences == Differences()
-
-
 def test_ranges_that_cannot_be_drawn_from_are_refused():
     wrong = ({"missed_ticks": 1.5}, {"battery": (1.2, 0.8)}, {"joint_zero_rad": -0.1})
     assert_each_refused(
         [(settings, "differences") for settings in wrong],
         lambda settings: Differences(**settings),
     )
+
+
+# ----- twins: one robot under several conditions
+
+
+def test_twins_have_the_same_numbers_and_others_have_their_own():
+    rng = generator(3, Twins(np.array([0, 1, 2, 0, 1]), 3))
+    plain = np.random.default_rng(3)
+    for draw in (
+        lambda r, n: r.uniform(-1.0, np.arange(1.0, 5.0), (n, 4)), lambda r, n: r.random(n),
+        lambda r, n: r.integers(0, 9, n), lambda r, n: r.exponential(5.0, n),
+        lambda r, n: r.standard_normal((n, 1)),
+    ):  # fmt: skip
+        np.testing.assert_array_equal(draw(rng, 5), draw(plain, 3)[[0, 1, 2, 0, 1]])
+        draw(rng, 2)  # of some robots only: leaves the others' numbers alone
+
+
+def test_twins_walk_alike_until_their_conditions_differ():
+    """The third robot equals the first but for 40 ms of dead time."""
+    servos = servo_ranges("data/samples/calibrated.yaml")
+    task = Walking(curriculum=Curriculum())
+    task = replace(task, randomisation=replace(task.randomisation, push_m_s=0.0))
+    alike, later = (
+        PupperEnv(task, servos, 3, 0, 1, None, extra, Twins(np.array([0, 1, 0]), 2))
+        for extra in (0.0, np.array([0.0, 0.0, 0.04]))
+    )
+    late_s = later.robots.drawn["dead_time_s"]
+    np.testing.assert_allclose(late_s[2], late_s[0] + 0.04)
+    assert (late_s[1] != late_s[0]).all()
+    for env in (alike, later):
+        env.set_command(np.zeros(3))
+    wave = 0.3 * np.sin(np.arange(40)[:, None] * 0.4 + np.arange(12))
+    for action in wave:
+        same, late = (env.step(np.repeat(action[None], 3, axis=0)) for env in (alike, later))
+    np.testing.assert_array_equal(same.observation[2], same.observation[0])
+    np.testing.assert_array_equal(late.observation[:2], same.observation[:2])
+    assert not np.allclose(same.observation[1], same.observation[0])
+    assert not np.allclose(late.observation[2], late.observation[0])

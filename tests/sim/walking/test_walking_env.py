@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-import pupper_sysid.sim.walking.config
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, LEGS
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.networks import CommandNetwork
-from pupper_sysid.sim.robot.body import mini_pupper
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import (
     STANDING_HEIGHT_M,
@@ -42,7 +40,7 @@ from support.refusals import assert_each_refused
 from support.robot_in_air import error_in_air, lags_in_air
 
 MEASURED = "data/samples/calibrated.yaml"
-ACTUATORS = (MEASURED, "paper", "release", "ideal")
+ACTUATORS = (MEASURED, "ideal")
 H, SPAN = 0.002, 0.02
 STILL = Randomisation(
     friction=(0.8, 0.8), payload_kg=(0.0, 0.0), torque_scale=(1.0, 1.0), joint_rad=0.0,
@@ -175,15 +173,6 @@ def proportional(gain: float | np.ndarray) -> CommandNetwork:
     )  # fmt: skip
 
 
-def test_a_servo_model_decides_where_the_joints_go():
-    env = make("ideal", QUIET, 2, servo_model=proportional(0.5))
-    action = np.tile([0.0, 0.2, -0.2], (2, 4))
-    for _ in range(40):
-        env.step(action)
-    moved = env.robots.joints - default_pose()
-    np.testing.assert_allclose(moved, 0.5 * 0.5 * action, atol=0.01)
-
-
 def test_a_servo_model_speaks_of_servos_not_of_joints():
     """The third servo of a leg sets thigh + calf; it was fitted while the thigh stood still."""
     env = make("ideal", QUIET, 1, servo_model=proportional(np.tile([1.0, 0.0, 1.0], 4)))
@@ -289,17 +278,6 @@ def test_with_the_measured_feedback_joints_are_seen_late_coarse_and_off():
     quantum = servo_ranges(MEASURED).feedback[0].quantum_rad
     hip = result.observation[:, PARTS["joint_position_relative"]][:, 0::3] / quantum
     np.testing.assert_allclose(hip, np.round(hip), atol=1e-3)
-
-
-def test_observing_lets_no_time_pass():
-    env = make(MEASURED, Walking())
-    walk_about(env, 3)
-    before = env.state
-    for _ in range(3):
-        env.observe()
-    after = env.state
-    for name in before.keys() - {"rng"}:
-        np.testing.assert_array_equal(after[name], before[name], err_msg=name)
 
 
 # --------------------------------------------------------------------------------- reproducibility
@@ -455,17 +433,6 @@ def test_the_delay_buffers_hold_the_longest_delay_that_can_be_drawn():
         assert model.actuator_history[:, 0].min() * H > servos.longest_dead_time_s, actuator
 
 
-def test_a_delay_that_does_not_fit_its_buffer_is_refused(monkeypatch):
-    def short(servos, *rest):
-        return own.xml({k: replace(v, dead_time_s=0.01) for k, v in servos.items()}, *rest)
-
-    own = mini_pupper()
-    body = replace(own, xml=short)
-    monkeypatch.setattr(pupper_sysid.sim.walking.config, "body_of", lambda *names: body)
-    with pytest.raises(InputError, match=r"does not fit the buffer of 0\.014 s"):
-        make("paper")
-
-
 def test_an_action_moves_the_target_by_its_scale_within_the_joint_limits():
     env = make()
     low, high = limits()
@@ -598,16 +565,6 @@ def test_the_stride_average_forgets_with_its_time_constant_and_at_the_end_of_an_
     throw(env, slice(None))
     env.step(still(env))
     assert np.abs(env.step(still(env)).facts.stride_velocity).max() < 0.01
-
-
-def test_a_standing_robot_has_its_feet_on_the_ground_and_does_not_slip():
-    env = make()
-    facts = [env.step(still(env)).facts for _ in range(20)][-1]
-    assert facts.contact.all()
-    assert np.abs(facts.foot_height_m).max() < 0.001
-    assert facts.foot_speed_m_s.max() < 0.01
-    assert (facts.contact_s > 0.3).all() and not facts.air_s.any()
-    np.testing.assert_allclose(env.robots.qpos[:, 2], STANDING_HEIGHT_M, atol=0.003)
 
 
 def test_the_reward_is_the_sum_of_its_terms_times_the_control_period():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,21 @@ import pytest
 
 from pupper_sysid.common.joints import LEGS
 from pupper_sysid.sim.robot.body import mini_pupper
-from pupper_sysid.sim.robot.mini_pupper import SIDE, default_pose, foot_position, joint_angles
+from pupper_sysid.sim.robot.mini_pupper import (
+    MASS_KG,
+    SIDE,
+    default_pose,
+    foot_position,
+    joint_angles,
+)
+from pupper_sysid.sim.robot.motion import Moved
 from pupper_sysid.sim.walking.config import PRESETS
+from pupper_sysid.sim.walking.effort import EffortMeter, by_kind
 from pupper_sysid.sim.walking.rewards import terms as wr
+from pupper_sysid.sim.walking.rewards.strides import Strides
 from pupper_sysid.sim.walking.rewards.terms import TERMS, weighted
 from pupper_sysid.sim.walking.rewards.weights import DEFAULT, PAPER, RELEASE, Rewards, narrowed
-from pupper_sysid.sim.walking.step import Step
+from pupper_sysid.sim.walking.step import Step, empty_facts
 
 SIZES = dict.fromkeys(
     ["command", "linear_velocity", "angular_velocity", "gravity", "stride_velocity", "clock"], 3
@@ -375,3 +385,121 @@ def test_presets_have_the_released_weights_but_those_of_the_paper_where_it_state
     assert PRESETS["paper"].rewards == PAPER
     assert PRESETS["release"].rewards == RELEASE
     assert PRESETS["fast"].rewards == DEFAULT
+
+
+# ----- clearance of swings and effort of servos, from made-up motion whose answer is known
+
+STEP_S, SUBSTEPS = 0.02, 10
+
+
+class Made:
+    """One robot whose feet rise and sink together, whose servos turn and push as commanded."""
+
+    def __init__(self, limit_nm: float = 0.5):
+        fields = {
+            "actuator_forcerange": np.tile([-limit_nm, limit_nm], (1, 12, 1)),
+            "body_mass": np.full((1, 2), MASS_KG / 2),
+        }
+        robots: Any = SimpleNamespace(
+            environments=1, body=mini_pupper(),
+            field=fields.__getitem__, to_servo=lambda joints: joints,
+            sole_heights=lambda feet: feet[..., 2],
+        )  # fmt: skip
+        self._meter = EffortMeter(robots, STEP_S)
+
+    def step(self, heights_m, contact, contact_s=0.0, last_air_s=0.0, torque_nm=0.0,
+             turned_rad=0.0):  # fmt: skip
+        """One control step; `heights_m` are those of the soles at each physics step."""
+        feet = np.zeros((1, SUBSTEPS, 4, 3))
+        feet[0, :, :, 2] = np.asarray(heights_m)[:, None]
+        qpos = np.zeros((1, SUBSTEPS, 19))
+        qpos[0, :, 7:] = np.linspace(0, turned_rad, SUBSTEPS + 1)[1:, None]
+        load = np.broadcast_to(torque_nm, (1, SUBSTEPS, 12))
+        moved = Moved(slice(0, 1), np.zeros((1, 12)), qpos, load, np.zeros((1, 4)), feet)
+        four = np.ones((1, 4))
+        facts = {
+            "contact": four * contact > 0, "contact_s": four * contact_s,
+            "last_air_s": four * last_air_s, "swing_ended": np.zeros((1, 4), bool),
+            "clearance_m": np.empty((1, 4)), "saturated": np.empty((1, 12)),
+            "torque_square": np.empty((1, 12)), "power_w": np.empty(1), "weight_n": np.empty(1),
+        }  # fmt: skip
+        self._meter.advance(moved, facts)
+        return SimpleNamespace(**facts)
+
+
+def test_the_clearance_of_a_swing_is_its_highest_point_between_two_control_steps():
+    made = Made()
+    made.step(np.full(SUBSTEPS, 0.05), contact=True, contact_s=0.2)  # carried: no swing
+    arc = 0.006 * np.sin(np.pi * np.arange(1, 31) / 31)
+    for part in np.split(arc, 3)[:2]:
+        assert np.isnan(made.step(part, contact=False).clearance_m).all()
+    landed = made.step(np.split(arc, 3)[2], True, contact_s=STEP_S, last_air_s=0.04)
+    assert landed.swing_ended.all()
+    np.testing.assert_allclose(landed.clearance_m, arc.max(), atol=1e-9)
+    # what was before is forgotten, and a flicker of one step is no swing
+    made.step(np.full(SUBSTEPS, 0.001), contact=False)
+    flicker = made.step(np.zeros(SUBSTEPS), True, contact_s=STEP_S, last_air_s=0.02)
+    assert not flicker.swing_ended.any() and np.isnan(flicker.clearance_m).all()
+
+
+def test_only_positive_work_counts_and_saturation_is_by_kind_of_joint():
+    made, still = Made(limit_nm=0.5), np.zeros(SUBSTEPS)
+    torque = np.zeros((SUBSTEPS, 12))
+    torque[:, 2::3] = -0.25  # calves brake
+    torque[:4, 1::3] = 0.5  # thighs drive, at their limit for 4 of 10 physics steps
+    done = made.step(still, True, torque_nm=torque, turned_rad=0.1)
+    np.testing.assert_allclose(by_kind(mini_pupper(), done.saturated), [[0.0, 0.4, 0.0]])
+    np.testing.assert_allclose(by_kind(mini_pupper(), done.torque_square), [[0.0, 0.4, 0.25]])
+    np.testing.assert_allclose(done.power_w, 4 * 0.5 * 0.04 / STEP_S)
+    np.testing.assert_allclose(done.weight_n, 9.80665 * MASS_KG)
+
+
+# ----- strides: times of swings and stances, mean velocities, and the clock that follows the feet
+
+SPAN = 0.02
+WHOLE = slice(None)
+REWARDS = replace(Rewards(), clock_hz=3.6, clock_pull_hz=0.5, clock_height=0.012)
+
+
+def steps_of(rates: np.ndarray, seconds: float, start: float = 0.0) -> tuple[Strides, np.ndarray]:
+    """Feet that step as a trot at these rates; the strides, and `in_time` of the last 2 s."""
+    strides, n = Strides(mini_pupper(), len(rates), SPAN, REWARDS), len(rates)
+    none = np.zeros((n, 12))
+    seen = []
+    for k in range(round(seconds / SPAN)):
+        x = np.sin(2 * np.pi * (rates * k * SPAN + start))
+        first, second = 0.012 * np.maximum(x, 0), 0.012 * np.maximum(-x, 0)
+        height = np.column_stack([first, second, second, first])
+        facts = empty_facts(mini_pupper(), np.zeros((n, 3)), none, none, none)
+        touch = np.where(height > 0, 0.0, 1.0)
+        strides.advance(WHOLE, touch, (np.zeros((n, 4, 2)), height), np.zeros((n, 3)), facts)
+        seen.append(facts["clock"][:, 2].copy())
+    return strides, np.array(seen[-100:])
+
+
+def test_the_clock_falls_into_step_with_a_trot_of_its_rate():
+    for start in (0.0, 0.2, 0.4, 0.7):
+        _, in_time = steps_of(np.array([3.6, 3.4, 3.8]), 8.0, start)
+        assert (in_time.mean(axis=0) > [0.95, 0.7, 0.7]).all()
+
+
+def test_feet_of_other_rates_are_not_in_time():
+    _, in_time = steps_of(np.array([0.0, 1.8, 2.5, 4.7, 6.0, 8.0]), 20.0)
+    assert (in_time.mean(axis=0) < 0.45).all()
+
+
+def test_a_mirrored_trot_keeps_the_mirrored_clock():
+    plain, _ = steps_of(np.array([3.6]), 8.0)
+    image, _ = steps_of(np.array([3.6]), 8.0, 0.5)
+    np.testing.assert_allclose(plain.clock(WHOLE) * [-1, -1, 1], image.clock(WHOLE), atol=0.05)
+
+
+def test_swings_and_stances_are_counted_and_begin_anew_with_an_episode():
+    strides, _ = steps_of(np.array([2.5, 2.5]), 1.0)
+    assert strides.air_s.max() <= 0.2 and strides.stance_s.max() <= 0.22
+    assert ((strides.air_s > 0) != (strides.stance_s > 0)).all()
+    velocity = np.array([[0.1, 0.2, 0.3]])
+    strides.reset(np.array([1]), np.zeros((1, 4, 2)), velocity)
+    assert not strides.air_s[1].any() and strides.air_s[0].any()
+    assert strides.phase[1] == strides.in_time[1] == 0.0
+    np.testing.assert_array_equal(strides.velocity[1:], velocity)

@@ -29,7 +29,7 @@ def codes(recording, joint: str = "joint") -> dict[str, Finding]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", [name for name in FAULTS if name not in (
-    "healthy", "scale", "second writer", "friction")])  # fmt: skip
+    "healthy", "scale", "second writer", "friction", "heats", "speed")])  # fmt: skip
 def test_a_fault_is_named_by_its_code(fault):
     """Of four recordings (servos and motions in turn) three or more; none names another fault."""
     told = [codes(recorded(draw_recording(fault, n, 5)[1])) for n in (0, 1, 2, 5)]
@@ -92,6 +92,19 @@ def test_a_runner_up_is_named_in_words_and_by_its_code():
     assert set(RIVALS) <= set(WORDS) and {c for _, all_ in FAULTS.values() for c in all_} <= set(
         WORDS
     )
+
+
+@pytest.mark.parametrize(("fault", "code"), [("heats", "gain_drifts"), ("zero jumps", "zero_moves"),
+                                             ("loses power", "frozen"),
+                                             ("speed", "speed_for_position")])  # fmt: skip
+def test_free_motion_shows_what_happened_within_a_trial(fault, code):
+    rng = np.random.default_rng(3)
+    world = replace(
+        draw_world(rng, "smart", "teleoperation", 3e-4), amplitude_rad=0.3, rate_hz=80.0,
+        poll_s=0.0, friction_rad=0.0, gravity_rad=0.0, duration_s=24.0, quantum_rad=0.0015,
+    )  # fmt: skip
+    assert code not in codes(recorded(simulated(world)))
+    assert code in codes(recorded(FAULTS[fault][0](world, rng)[1]))
 
 
 CASES = {

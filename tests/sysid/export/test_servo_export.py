@@ -96,7 +96,10 @@ def read_torchscript(path: Path) -> tuple[Any, dict, dict]:
     return module, json.loads(extra["contract.json"]), json.loads(extra["metadata.json"])
 
 
-@pytest.mark.parametrize("kind", LEARNED)
+@pytest.mark.parametrize(
+    "kind",
+    [k if k in ("mlp", LEARNED[-1]) else pytest.param(k, marks=pytest.mark.slow) for k in LEARNED],
+)
 def test_onnx_and_torchscript_compute_what_the_model_computes(tmp_path: Path, kind: str):
     model = saved(tmp_path / "a", kind)
     expected = own(model)

@@ -6,17 +6,45 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.interval import Interval
+from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.servo_models.calibration.quantity import Quantity
+from pupper_sysid.sysid.fit.posterior import PHASE_SD_S
+from pupper_sysid.sysid.fit.run import at_steps, free_run
+from pupper_sysid.sysid.fit.structure import candidate
 from pupper_sysid.sysid.plan.candidates import Setup, candidates, recorded, trial_seconds
 from pupper_sysid.sysid.plan.planner import (
     CLEAR_NATS,
     LEAST_HALF_WIDTH_S,
+    Hypothesis,
     Noise,
     Servo,
+    fitted_noise,
     now,
+    prior_information,
     propose,
+    respond,
+    separation,
+    without_shift,
+)
+from pupper_sysid.sysid.plan.proposal import (
+    Source,
+    calibrated_servo,
+    feedback_setup,
+    fitted_servo,
+    plan_first_sweep,
+    plan_from_calibration,
+    unknown_servos,
 )
 from pupper_sysid.sysid.sweep.excitation import plan
-from support.planned_servos import NOISE, recorded_servo, tones
+from support.package import ROOT
+from support.planned_servos import (
+    NOISE,
+    fit_of_half_width,
+    hypothesis,
+    recorded_servo,
+    tones,
+    with_readings,
+)
 
 SECONDS = 20.8
 """Of the standard sweep in `tones`."""
@@ -131,3 +159,150 @@ def test_live_readings_come_with_every_tick_and_polled_ones_with_every_poll():
     # two polls between two reads: one of them succeeds
     assert Setup(loop_period_s=0.02, poll_period_s=0.01, loss=0.5).seen == pytest.approx(0.75)
     assert NOISE.floor_rad > 0
+
+
+# ----- information of simulated trials, against formulas
+
+
+def test_a_delay_is_as_uncertain_as_the_bound_of_a_tone_says():
+    """sd(τ) = sqrt(2 / N) s / (A 2π f), the Cramér-Rao bound of a tone's time shift."""
+    model, delay, floor = candidate("pure_delay"), 0.025, 0.01
+    (trial,) = tones((2.0,), loop_period_s=0.002)  # else a delay shifts stairs, not a tone
+    found = respond(
+        Hypothesis(model, np.array([delay, 1.0, 0.0]), prior_information(model)), trial,
+        Noise(floor, 0.0),
+    )  # fmt: skip
+    bound = np.sqrt(2 / len(trial.sample_step)) * floor / (0.3 * 2 * np.pi * 2.0)
+    # about the logarithm of the delay; the rest at the head and the rise say nothing
+    sd = delay / np.sqrt(found.information[0, 0])
+    assert sd == pytest.approx(bound, rel=0.1)
+
+
+def test_a_longer_dead_time_shows_where_the_joint_moves():
+    own, (trial,) = hypothesis(), tones((2.0,), loop_period_s=0.002)
+    found = respond(own, trial, NOISE)
+    (track,) = free_run(own.model, own.values, [trial])
+    expected = -own.values[0] * at_steps(np.gradient(track) / trial.step_s, trial.sample_step)
+    off = found.sensitivity[:, 0] - expected
+    assert np.sqrt(np.mean(off**2)) < 0.1 * np.sqrt(np.mean(expected**2))
+
+
+def test_however_long_a_tone_is_its_own_shift_in_time_stays_in_doubt():
+    own = hypothesis()
+    information = respond(own, tones((3.0,))[0], NOISE).information
+    for repeats in (1e3, 1e6):
+        left = without_shift(repeats * information)
+        assert own.values[0] / np.sqrt(left[0, 0]) == pytest.approx(PHASE_SD_S, rel=0.01)
+
+
+def test_readings_that_do_not_arrive_say_nothing():
+    trial = tones((2.0,))[0]
+    whole, half = (respond(hypothesis(), trial, NOISE, seen).information for seen in (1.0, 0.5))
+    assert half == pytest.approx(0.5 * whole)
+
+
+def test_jitter_makes_fast_readings_uncertain():
+    weights = Noise(0.003, 0.002).weights(np.array([0.0, 2.0]))
+    assert weights == pytest.approx([1 / 0.003**2, 1 / (0.003**2 + 0.004**2)])
+
+
+def test_noise_of_a_fit_is_told_apart_into_floor_and_jitter():
+    own, rng, truth = hypothesis(), np.random.default_rng(5), Noise(0.003, 0.003)
+    trials = [with_readings(own, t, truth, rng) for t in tones() for _ in range(4)]
+    found = fitted_noise(own.model, own.values, trials, 1e-4)
+    assert found.floor_rad == pytest.approx(truth.floor_rad, rel=0.15)
+    assert found.jitter_s == pytest.approx(truth.jitter_s, rel=0.15)
+
+
+def test_noise_is_never_smaller_than_the_quantisation_allows():
+    own = hypothesis()
+    rng = np.random.default_rng(0)
+    exact = [with_readings(own, t, Noise(1e-9, 0.0), rng) for t in tones()]
+    assert fitted_noise(own.model, own.values, exact, 0.0017).floor_rad == 0.0017
+
+
+def test_a_model_is_not_told_apart_from_itself():
+    own = hypothesis()
+    responses = [respond(own, t, NOISE) for t in tones()]
+    assert separation(responses, responses, own.known) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_models_are_told_apart_by_what_remains_after_the_rival_is_fitted_again():
+    slew, back_emf = recorded_servo([], structures=2).hypotheses
+    pair = [[respond(h, t, NOISE) for t in tones((4.0, 8.0))] for h in (slew, back_emf)]
+    free = separation(*pair, known=back_emf.known)
+    frozen = separation(*pair, known=1e12 * np.eye(len(back_emf.known)))
+    assert 0 < free < frozen
+    # a parameter that may take any value explains more still
+    loose = replace(back_emf, known=1e-3 * back_emf.known)
+    assert separation(*pair, known=loose.known) <= free
+
+
+# ----- what a plan knows of a servo: the fit's own intervals, a calibration's, or the prior
+
+SAMPLE = ROOT / "data/samples/calibrated.yaml"
+
+
+@pytest.mark.parametrize("half_width_ms", [2.0, 6.0])
+def test_a_plan_starts_from_the_interval_that_the_fit_reports(half_width_ms):
+    fit = fit_of_half_width("LF_hip", half_width_ms)
+    interval = now(fitted_servo(fit))
+    assert (interval.high - interval.low) / 2 == pytest.approx(1e-3 * half_width_ms, rel=0.02)
+
+
+def test_a_doubt_about_the_dates_of_all_readings_stays():
+    fit = fit_of_half_width("LF_hip", 3.0)
+    doubted = replace(fitted_servo(fit), doubt_s=0.009)
+    plan = propose("LF_hip", [doubted], Setup(), 20.0)
+    (dead, *_) = plan.predictions
+    assert (dead.after.high - dead.after.low) / 2 > 0.009
+    assert any("in doubt by ± 9.0 ms" in note for note in plan.notes)
+
+
+def test_live_readings_are_planned_as_live():
+    setup = feedback_setup(fit_of_half_width("LF_hip", 3.0).lag, Setup())
+    assert setup.poll_period_s == 0.0 and setup.seen == 1.0
+
+
+def test_a_calibration_is_planned_from_its_intervals():
+    calibration = load_calibration(SAMPLE)
+    joint = calibration.joint("LF_hip")
+    for half in (0.003, 0.006):
+        own = joint.actuator.dead_time_s.value
+        wide = Quantity(value=own, low=own - half, high=own + half, identified="yes")
+        actuator = joint.actuator.model_copy(update={"dead_time_s": wide})
+        servo = calibrated_servo(joint.model_copy(update={"actuator": actuator}))
+        interval = now(replace(servo, hypotheses=servo.hypotheses[:1], nats=(0.0,)))
+        # the prior adds a little to what the interval says
+        assert (interval.high - interval.low) / 2 == pytest.approx(half, rel=0.05)
+    plan = plan_from_calibration(calibration, Source(name="c.yaml", sha256="0" * 64), ["LF_hip"])
+    assert plan.joints == ["LF_hip"] and plan.predictions
+
+
+def test_a_preset_is_planned_as_a_servo_of_the_usual_uncertainty():
+    servo = calibrated_servo(load_calibration("paper").joint("LF_hip"))
+    assert [h.model.name for h in servo.hypotheses] == ["delayed_pd"]
+    interval = now(servo)
+    assert interval.high - interval.low > 0.01
+
+
+def test_unknown_servos_move_and_depend_on_the_seed_alone():
+    servos, again, other = unknown_servos(0), unknown_servos(0), unknown_servos(1)
+    values = [[s.hypotheses[0].values for s in drawn] for drawn in (servos, again, other)]
+    assert np.array_equal(values[0], values[1]) and not np.array_equal(values[0], values[2])
+    for servo in servos:
+        slew, back_emf = servo.hypotheses
+        assert slew.values[3] < slew.values[4]  # friction below effort
+        assert np.array_equal(slew.values[:5], back_emf.values[:5])
+
+
+@pytest.mark.slow
+def test_joints_with_the_same_margin_get_the_same_first_sweep():
+    margins = {"LF_hip": 0.5, "RF_hip": 0.4, "LF_calf": 0.1}
+    plan = plan_first_sweep(list(margins), setup=Setup(), margins=margins, seconds=10.0)
+    tones = {
+        joint: [(t.kind, t.frequency_hz, t.amplitude_rad) for t in plan.trials if t.joint == joint]
+        for joint in margins
+    }
+    assert tones["LF_hip"] == tones["RF_hip"] != tones["LF_calf"]
+    assert max(amplitude for *_, amplitude in tones["LF_calf"]) <= 0.1

@@ -450,6 +450,8 @@ def test_a_figure_is_written_as_its_ending_says(tmp_path):
 
 
 @needs_chromium
-@pytest.mark.parametrize(("width", "dark"), [(375, True), (1280, False)])
+@pytest.mark.parametrize(
+    ("width", "dark"), [(375, True), pytest.param(1280, False, marks=pytest.mark.slow)]
+)
 def test_in_a_browser_nothing_overflows_or_complains(written, tmp_path, width, dark):
     looks_right(written.path, tmp_path, width, dark)

