@@ -315,7 +315,7 @@ class ForeignPolicy:
             observation=replace(base.observation, noise=False, base_velocity=self._velocity),
         )  # fmt: skip
         if robot is None:
-            self._refuse_unknown(base.body, "the Mini Pupper 2, which walks without --robot,")
+            self._refuse_unknown(base.body, "the Mini Pupper 2, which walks without `robot`,")
             return base
         return self._on(base, robot, robot_config)
 
@@ -349,7 +349,7 @@ class ForeignPolicy:
             raise InputError(
                 f"{self.network.path} moves the joints {', '.join(map(printable, lost[:6]))}"
                 f"{', …' if len(lost) > 6 else ''}, but {name} has no such joint with a servo. It "
-                f"has {', '.join(body.joints)}. Give the robot's MJCF with --robot, or the names "
+                f"has {', '.join(body.joints)}. Give the robot's MJCF as `robot`, or the names "
                 "in it as `joints` in the policy's YAML."
             )
 
@@ -511,8 +511,8 @@ def servos_of_training(policy: ForeignPolicy, task: Walking, robot: Path | None)
         raise InputError(
             f"{policy.network.path} does not say with which servos it was trained, and "
             f"{robot.name if robot else 'the Mini Pupper 2'} has no position actuator on "
-            f"{', '.join(lacking[:4])}{', …' if len(lacking) > 4 else ''}. Give them with "
-            "--actuator: a calibration, a servo card, or `ideal`."
+            f"{', '.join(lacking[:4])}{', …' if len(lacking) > 4 else ''}. Give them as "
+            "`actuator`: a calibration, a servo card, or `ideal`."
         )
     numbers = {
         field: np.array([float(np.asarray(getattr(servos[j].pd.parameters, field)))

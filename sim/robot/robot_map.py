@@ -129,7 +129,7 @@ def joint_map_of_servos(ids: Mapping[str, int], servo: str) -> RobotMap:
         f"no limits are known, so the map allows ±{_UNKNOWN_RAD:g} rad about each servo's middle "
         "until `pupper-sysid calibrate-joints` has measured them. Turn the servos there by hand."
     )
-    return RobotMap(joint_map_from(data, "--joints"), [], {}, [doubt])
+    return RobotMap(joint_map_from(data, "`joints`"), [], {}, [doubt])
 
 
 def _map_data(

@@ -96,7 +96,7 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
     if _YAML.match(start):
         raise InputError(
             f"{path} is YAML, which is not read: write rows as CSV, or record messages with "
-            "`ros2 bag record` or `ros2 topic echo --csv`."
+            "`ros2 bag record`."
         )
     if start[:1] not in (b"{", b"[") or _STAMP.match(start) or _ROW.match(data):
         return None

@@ -464,5 +464,5 @@ def test_joints_that_the_model_lacks_and_servos_that_no_file_states_are_named(tm
     )
     own = rows_of(tmp_path, 3, "observation: [command]")
     assert_each_refused(
-        [(None, "--actuator")], lambda robot: servos_of_training(own, own.task(None), robot)
+        [(None, "`actuator`")], lambda robot: servos_of_training(own, own.task(None), robot)
     )

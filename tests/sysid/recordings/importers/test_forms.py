@@ -291,7 +291,7 @@ def test_what_cannot_be_read_is_refused_with_the_cure(tmp_path):
     text = joined(",").replace(f"\n{TIME[3]:.6f},", "\nsoon,")
     (tmp_path / "word.csv").write_text(text)
     cases = [("log.csv", "import log.csv --unit percent:3.5 --out"), ("log.mat", "writematrix"),
-             ("echo.txt", "ros2 topic echo --csv"), ("log73.mat", "'-v7'"),
+             ("echo.txt", "ros2 bag record"), ("log73.mat", "'-v7'"),
              ("log.h5", "h5py"), ("log.xls", "save it as CSV"),
              ("word.csv", "'soon' is no")]  # fmt: skip
     assert_each_refused(cases, lambda name: load(tmp_path / name), names=tmp_path)
