@@ -240,7 +240,7 @@ class Starts:
     ) -> None:
         self._problem = problem
         structure = problem.structure
-        values = structure.decode(_sobol(structure, rng, count))
+        values = structure.decode(_spread(structure, rng, count))
         first = structure.parameters[0]
         values[:, 0], values[:, -1] = first.low, 0.0
         longest = (first.high - first.low) / TIME_STEP_S
@@ -273,10 +273,8 @@ class Starts:
         return points[np.argsort(problem.costs(points) - problem.prior(points))[:keep]]
 
 
-def _sobol(structure: Structure, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-    """Points that fill the prior's middle, shape (count, parameters)."""
-    from scipy.stats import qmc  # half a second to import
-
+def _spread(structure: Structure, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    """Latin hypercube over the prior's middle, shape (count, parameters)."""
     low, high = structure.box
     centre, precision = structure.prior
     reach = 2.0 / np.sqrt(np.maximum(precision, 1e-12))
@@ -284,7 +282,9 @@ def _sobol(structure: Structure, rng: np.random.Generator, count: int) -> NDArra
         reach = np.hypot(reach, [2.0 * p.shared_sd for p in structure.parameters])
     reach = np.where(structure.logarithmic, reach, np.minimum(reach, _START_RAD))
     low, high = np.maximum(low, centre - reach), np.minimum(high, centre + reach)
-    points = low + qmc.Sobol(len(low), rng=rng).random(count) * (high - low)
+    rows = np.tile(np.arange(count), (len(low), 1))
+    share = (rng.permuted(rows, axis=1).T + rng.random((count, len(low)))) / count
+    points = low + share * (high - low)
     points[0] = centre
     return points
 
