@@ -28,7 +28,7 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
-from pupper_sysid.sysid.fit.misfit import Explanation, explained
+from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations
 from pupper_sysid.sysid.fit.noise import command_jitter, noise_by_run
 from pupper_sysid.sysid.fit.posterior import (
     EFFECTIVE,
@@ -224,7 +224,6 @@ def _fitted(
     tried: Mapping[tuple[str, ...], Fitted],
     rng: np.random.Generator,
     first: Fit | None = None,
-    short: bool = False,
 ) -> Fitted:
     """The best fit to all runs; structures that this one contains are among its starts."""
     problem = ready.searched(structure)
@@ -242,9 +241,9 @@ def _fitted(
             for limit in _ACCELERATIONS_RAD_S2:
                 more.append(np.where(np.arange(len(start)) == place, np.log(limit), start))
     if ready.scales.free_air:
-        best = search_widely(problem, rng, np.array(more), short)
+        best = search_widely(problem, rng, np.array(more))
     else:  # the first structure was searched for
-        best = evolved(problem, np.array(more), rng, short)
+        best = evolved(problem, np.array(more), rng)
     return Fitted(structure, best)
 
 
@@ -266,9 +265,9 @@ def _ladder(
     plain, first = next(iter(ready.first.values()))
     tried = {plain.features: Fitted(plain, first)}
 
-    def try_out(*features: str, short: bool = False) -> None:
+    def try_out(*features: str) -> None:
         structure = servo_structure(("back-EMF", *features), scales)
-        tried[structure.features] = _fitted(ready, structure, tried, rng, short=short)
+        tried[structure.features] = _fitted(ready, structure, tried, rng)
 
     if profiled is not None:
         features = [f for f in profiled.structure.features if f != "back-EMF"]
@@ -289,7 +288,7 @@ def _ladder(
     for addition in ADDITIONS:
         best = min(tried.values(), key=lambda f: f.fit.cost).structure.features[1:]
         if addition not in best:
-            try_out(*best, addition, short=True)
+            try_out(*best, addition)
     best = min(tried.values(), key=lambda f: f.fit.cost)
     if overall(_goodness(ready, best)) > most:
         return []
@@ -572,9 +571,28 @@ def _explained(ready: PreparedJoint, choice: _Choice, anew: bool = False) -> _Ch
         return choice  # a motor under load has enough terms to imitate a filter
     problem = ready.searched(carried.structure)
     best = replace(carried.fit, cost=float(problem.costs(carried.fit.point[None])[0]))
-    return replace(
-        choice, misfit=explained(problem, best, carried.temperature, anew, ready.fit_rng())
-    )
+    likely = explanations(problem, best, carried.temperature, anew, ready.fit_rng())
+    named = decided(likely)
+    if named is None and likely and carried.draws is not None:
+        choice = _stacked(ready, choice, likely)
+    return replace(choice, misfit=named)
+
+
+def _stacked(ready: PreparedJoint, choice: _Choice, rivals: Sequence[Explanation]) -> _Choice:
+    """The choice with draws of the carried servo about what its numbers are in each rival, too.
+
+    The data do not tell the servo from its rivals, so none has more draws than another.
+    """
+    carried = choice.carried
+    assert carried.draws is not None
+    apart = [np.zeros_like(carried.fit.point)]
+    apart += [one.point - carried.fit.point for one in rivals if one.point is not None]
+    turn = np.arange(len(carried.draws)) % len(apart)
+    draws = np.clip(carried.draws + np.array(apart)[turn], *carried.structure.box)
+    wider = replace(carried, draws=draws)
+    likely = tuple(wider if f is carried else f for f in choice.likely)
+    lag = replace(choice.lag, dead_time_s=_dead_time(ready, wider, likely))
+    return replace(choice, carried=wider, likely=likely, lag=lag)
 
 
 def _with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]:
@@ -590,7 +608,7 @@ def _with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]
         return carried, -np.inf
     structure = servo_structure((*carried.structure.features, "acceleration"), ready.scales)
     tried = {carried.structure.features: carried}
-    fitted = _fitted(ready, structure, tried, ready.fit_rng(), short=True)
+    fitted = _fitted(ready, structure, tried, ready.fit_rng())
     nats = _nats(ready, (carried, fitted))
     return fitted, nats[carried.structure.name] - nats[structure.name]
 

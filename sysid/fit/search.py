@@ -4,10 +4,11 @@ One cost serves the search, the local fit, the folds and the posterior: free run
 readings that count, under a soft-L1 loss in units of each run's noise (a late poll must not steer
 the fit), plus wide priors. All candidates are simulated abreast.
 
-The cost of a servo with dry friction has many local optima (delay trades against damping, friction
-against effort). So many seeded starts are simulated once, the best are improved a little, the best
-of those are fitted to convergence, and a population evolves around them. A structure that contains
-another one starts from its fit, too, so that it never costs more.
+The cost of a servo with dry friction has many local optima along ridges (delay trades against
+damping, friction against effort). So many seeded starts are simulated once, the best are improved a
+little, the best of those are fitted to convergence, a population evolves around them, and local
+fits from points about the best go on until none is better. A structure that contains another one
+starts from its fit, too, so that it never costs more.
 """
 
 from __future__ import annotations
@@ -29,7 +30,11 @@ _SHORT, _LONG = 8, 20  # iterations of the local fit
 _WIDE_STEP, _STEP = 0.05, 0.01
 """Steps of the Jacobian in fitted coordinates: a wide one looks past a rugged cost's dents, one
 smaller than the second drowns in friction's stick-slip."""
-_POPULATION, _GENERATIONS, _SHORT_GENERATIONS = 48, 60, 20
+_POPULATION, _GENERATIONS = 48, 20
+_NEAR, _NEAR_ROUNDS, _NEAR_ITERATIONS = 12, 12, 12
+_NEAR_SD, _NEAR_STEP = (0.02, 0.5), 0.02
+"""Of the local fits about the best one: how many in a round, rounds at most, iterations, standard
+deviation of their starts and step of the Jacobian in fitted coordinates."""
 _LARGEST_BATCH = 4_000_000  # residuals at once
 _LEAST_GAIN = 0.05  # of log-likelihood: far below anything that an interval would notice
 _DELAY_GRID = 2.0  # steps between the delays tried for a start
@@ -164,7 +169,6 @@ def search_widely(
     problem: Problem,
     rng: np.random.Generator,
     more: NDArray[np.float64] | None = None,
-    short: bool = False,
 ) -> Fit:
     """The best fit of `search`, then of a population of its starts that evolves.
 
@@ -174,21 +178,18 @@ def search_widely(
     rng : numpy.random.Generator
     more : ndarray, shape (starts, parameters), optional
         Further starts, in fitted coordinates.
-    short : bool
-        Fewer generations.
     """
     crowd = Starts(problem.coarse, rng).best(np.ones(len(problem.runs), bool), _POPULATION)
     starts = crowd[:_KEEP]
     if more is not None and len(more):
         starts = np.concatenate([starts, more])
-    return evolved(problem, starts, rng, short, crowd)
+    return evolved(problem, starts, rng, crowd)
 
 
 def evolved(
     problem: Problem,
     starts: NDArray[np.float64],
     rng: np.random.Generator,
-    short: bool = False,
     crowd: NDArray[np.float64] | None = None,
 ) -> Fit:
     """The best fit from starts, searched in coarse steps and fitted to the end in fine ones.
@@ -199,13 +200,30 @@ def evolved(
     starts : ndarray, shape (starts, parameters)
         In fitted coordinates; those of simpler structures are kept as they are, too.
     rng : numpy.random.Generator
-    short : bool
     crowd : ndarray, optional
         As for `evolve`.
     """
-    best = evolve(problem.coarse, refined(problem.coarse, starts), rng, short, crowd)
+    best = evolve(problem.coarse, refined(problem.coarse, starts), rng, crowd)
     near = np.concatenate([best.point[None], starts[-_FINAL:]])
-    return refine(problem, near[np.argsort(problem.costs(near))[:_REFINED]])
+    best = refine(problem, near[np.argsort(problem.costs(near))[:_REFINED]])
+    return from_about(problem, best, rng)
+
+
+def from_about(problem: Problem, best: Fit, rng: np.random.Generator) -> Fit:
+    """The best of local fits from points about the best one, until a round finds none better.
+
+    A ridge has dents in which a local fit ends; in coarse steps they lie elsewhere.
+    """
+    low, high = problem.structure.box
+    shape = (_NEAR, len(best.point))
+    for _ in range(_NEAR_ROUNDS):
+        sd = np.exp(rng.uniform(*np.log(_NEAR_SD), (_NEAR, 1))) * problem.structure.scale
+        near = np.clip(best.point + sd * rng.standard_normal(shape), low, high)
+        fits = local(problem, near, _NEAR_ITERATIONS, _NEAR_STEP)
+        before, best = best.cost, min(best, *fits, key=lambda f: f.cost)
+        if before - best.cost < 1.0:  # one more number's worth
+            break
+    return best
 
 
 def refined(problem: Problem, starts: NDArray[np.float64], final: int = _FINAL) -> list[Fit]:
@@ -375,7 +393,6 @@ def evolve(
     problem: Problem,
     fits: Sequence[Fit],
     rng: np.random.Generator,
-    short: bool = False,
     crowd: NDArray[np.float64] | None = None,
 ) -> Fit:
     """The best of a population that evolves around fits, fitted to the end.
@@ -388,8 +405,6 @@ def evolve(
     problem : Problem
     fits : sequence of Fit
     rng : numpy.random.Generator
-    short : bool
-        Fewer generations.
     crowd : ndarray, shape (places, parameters), optional
         Further members, in fitted coordinates.
     """
@@ -404,7 +419,7 @@ def evolve(
     z[: len(seeds)] = seeds
     cost = problem.costs(z)
     everyone = np.arange(len(z))
-    for _ in range(_SHORT_GENERATIONS if short else _GENERATIONS):
+    for _ in range(_GENERATIONS):
         one, two = (rng.permutation(everyone) for _ in range(2))
         toward = z[np.argsort(cost)[rng.integers(0, 6, len(z))]]
         factor = rng.uniform(0.4, 0.9, (len(z), 1))
