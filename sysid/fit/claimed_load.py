@@ -124,7 +124,7 @@ def check_claimed_load(
 def _found(problem: Problem, starts: NDArray[np.float64], rng: np.random.Generator) -> Fit:
     """The best fit from some starts."""
     near = search.refine(problem, np.clip(starts, *problem.structure.box))
-    return search.evolve(problem, [near], rng)
+    return search.evolve(problem, [near], rng, short=True)
 
 
 def _size_notes(

@@ -224,6 +224,7 @@ def _fitted(
     tried: Mapping[tuple[str, ...], Fitted],
     rng: np.random.Generator,
     first: Fit | None = None,
+    short: bool = False,
 ) -> Fitted:
     """The best fit to all runs; structures that this one contains are among its starts."""
     problem = ready.searched(structure)
@@ -241,9 +242,9 @@ def _fitted(
             for limit in _ACCELERATIONS_RAD_S2:
                 more.append(np.where(np.arange(len(start)) == place, np.log(limit), start))
     if ready.scales.free_air:
-        best = search_widely(problem, rng, np.array(more))
+        best = search_widely(problem, rng, np.array(more), short)
     else:  # the first structure was searched for
-        best = evolved(problem, np.array(more), rng)
+        best = evolved(problem, np.array(more), rng, short)
     return Fitted(structure, best)
 
 
@@ -265,9 +266,9 @@ def _ladder(
     plain, first = next(iter(ready.first.values()))
     tried = {plain.features: Fitted(plain, first)}
 
-    def try_out(*features: str) -> None:
+    def try_out(*features: str, short: bool = False) -> None:
         structure = servo_structure(("back-EMF", *features), scales)
-        tried[structure.features] = _fitted(ready, structure, tried, rng)
+        tried[structure.features] = _fitted(ready, structure, tried, rng, short=short)
 
     if profiled is not None:
         features = [f for f in profiled.structure.features if f != "back-EMF"]
@@ -288,7 +289,7 @@ def _ladder(
     for addition in ADDITIONS:
         best = min(tried.values(), key=lambda f: f.fit.cost).structure.features[1:]
         if addition not in best:
-            try_out(*best, addition)
+            try_out(*best, addition, short=True)
     best = min(tried.values(), key=lambda f: f.fit.cost)
     if overall(_goodness(ready, best)) > most:
         return []
@@ -573,7 +574,7 @@ def _explained(ready: PreparedJoint, choice: _Choice, anew: bool = False) -> _Ch
     best = replace(carried.fit, cost=float(problem.costs(carried.fit.point[None])[0]))
     likely = explanations(problem, best, carried.temperature, anew, ready.fit_rng())
     named = decided(likely)
-    if named is None and likely and carried.draws is not None:
+    if named is None and likely and carried.draws is not None and ready.scales.free_air:
         choice = _stacked(ready, choice, likely)
     return replace(choice, misfit=named)
 
@@ -608,7 +609,7 @@ def _with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]
         return carried, -np.inf
     structure = servo_structure((*carried.structure.features, "acceleration"), ready.scales)
     tried = {carried.structure.features: carried}
-    fitted = _fitted(ready, structure, tried, ready.fit_rng())
+    fitted = _fitted(ready, structure, tried, ready.fit_rng(), short=True)
     nats = _nats(ready, (carried, fitted))
     return fitted, nats[carried.structure.name] - nats[structure.name]
 
@@ -672,7 +673,8 @@ def _in_free_air(
         fit = _doubted(results[carried.name], why)
         undecided = {"dead_time_s": why} | fit.undecided
         results[carried.name] = replace(fit, undecided=undecided)
-    chosen = _best(results, carried.name)
+    # where the carried one errs no more than the noise, differences between models are chance
+    chosen = _best(results, carried.name) if _doubt(choice, goodness) else carried.name
     jitter = command_jitter(
         carried, choice.carried.values, ready.recorded, runs, ready.noise_rad,
         _date_sd_s(ready.lag.feedback), ready.fit_rng(),

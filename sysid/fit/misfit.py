@@ -127,7 +127,7 @@ def _low_pass(
         fits[constant] = refine(behind, starts)
         if anew and constant >= _SEARCHED_S:  # far from the fit without it
             fits[constant] = min(
-                search_widely(behind, rng, starts), fits[constant], key=lambda f: f.cost
+                search_widely(behind, rng, starts, short=True), fits[constant], key=lambda f: f.cost
             )
     middle = min(fits, key=lambda t: fits[t].cost)
     for factor in (0.71, 1.41, 0.84, 1.19):  # between the constants that were tried
@@ -178,7 +178,9 @@ def _with_feature(
         friction *= 1.0 - _SHARES
     starts = np.clip(wider.encode(values), *wider.box)
     behind = replace(problem, structure=wider)
-    fit = from_about(behind, refine(behind, starts), rng)
+    fit = refine(behind, starts)
+    if structure.scales.free_air:
+        fit = from_about(behind, fit, rng)
     values = wider.decode(fit.point)
     shared = [wider.names.index(name) for name in structure.names]
     return [

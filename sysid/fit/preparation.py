@@ -366,7 +366,7 @@ def _first_fits(
         problem, own = Problem(s, runs, noise), deepcopy(rng)
         near = [s.adopt(t, fit.point) for t, fit in first.values() if s.contains(t)]
         # the noise follows from this fit, and with it which fits count as equally good
-        first[s.name] = s, search_widely(problem, own, np.array(near))
+        first[s.name] = s, search_widely(problem, own, np.array(near), short=True)
     return first
 
 

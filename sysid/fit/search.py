@@ -30,7 +30,7 @@ _SHORT, _LONG = 8, 20  # iterations of the local fit
 _WIDE_STEP, _STEP = 0.05, 0.01
 """Steps of the Jacobian in fitted coordinates: a wide one looks past a rugged cost's dents, one
 smaller than the second drowns in friction's stick-slip."""
-_POPULATION, _GENERATIONS = 48, 20
+_POPULATION, _GENERATIONS, _SHORT_GENERATIONS = 48, 60, 20
 _NEAR, _NEAR_ROUNDS, _NEAR_ITERATIONS = 12, 12, 12
 _NEAR_SD, _NEAR_STEP = (0.02, 0.5), 0.02
 """Of the local fits about the best one: how many in a round, rounds at most, iterations, standard
@@ -169,6 +169,7 @@ def search_widely(
     problem: Problem,
     rng: np.random.Generator,
     more: NDArray[np.float64] | None = None,
+    short: bool = False,
 ) -> Fit:
     """The best fit of `search`, then of a population of its starts that evolves.
 
@@ -178,18 +179,21 @@ def search_widely(
     rng : numpy.random.Generator
     more : ndarray, shape (starts, parameters), optional
         Further starts, in fitted coordinates.
+    short : bool
+        Fewer generations.
     """
     crowd = Starts(problem.coarse, rng).best(np.ones(len(problem.runs), bool), _POPULATION)
     starts = crowd[:_KEEP]
     if more is not None and len(more):
         starts = np.concatenate([starts, more])
-    return evolved(problem, starts, rng, crowd)
+    return evolved(problem, starts, rng, short, crowd)
 
 
 def evolved(
     problem: Problem,
     starts: NDArray[np.float64],
     rng: np.random.Generator,
+    short: bool = False,
     crowd: NDArray[np.float64] | None = None,
 ) -> Fit:
     """The best fit from starts, searched in coarse steps and fitted to the end in fine ones.
@@ -200,19 +204,27 @@ def evolved(
     starts : ndarray, shape (starts, parameters)
         In fitted coordinates; those of simpler structures are kept as they are, too.
     rng : numpy.random.Generator
+    short : bool
     crowd : ndarray, optional
         As for `evolve`.
     """
-    best = evolve(problem.coarse, refined(problem.coarse, starts), rng, crowd)
+    best = evolve(problem.coarse, refined(problem.coarse, starts), rng, short, crowd)
     near = np.concatenate([best.point[None], starts[-_FINAL:]])
     best = refine(problem, near[np.argsort(problem.costs(near))[:_REFINED]])
-    return from_about(problem, best, rng)
+    # the ladders under load have so many numbers that a better optimum predicts worse
+    return from_about(problem, best, rng) if problem.structure.scales.free_air else best
 
 
 def from_about(problem: Problem, best: Fit, rng: np.random.Generator) -> Fit:
     """The best of local fits from points about the best one, until a round finds none better.
 
     A ridge has dents in which a local fit ends; in coarse steps they lie elsewhere.
+
+    Parameters
+    ----------
+    problem : Problem
+    best : Fit
+    rng : numpy.random.Generator
     """
     low, high = problem.structure.box
     shape = (_NEAR, len(best.point))
@@ -292,7 +304,11 @@ class Starts:
 
 
 def _spread(structure: Structure, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-    """Latin hypercube over the prior's middle, shape (count, parameters)."""
+    """Points that fill the prior's middle, shape (count, parameters).
+
+    A Latin hypercube; under load, where many structures are compared, the more even sequence of
+    Sobol, whose import takes half a second.
+    """
     low, high = structure.box
     centre, precision = structure.prior
     reach = 2.0 / np.sqrt(np.maximum(precision, 1e-12))
@@ -300,8 +316,13 @@ def _spread(structure: Structure, rng: np.random.Generator, count: int) -> NDArr
         reach = np.hypot(reach, [2.0 * p.shared_sd for p in structure.parameters])
     reach = np.where(structure.logarithmic, reach, np.minimum(reach, _START_RAD))
     low, high = np.maximum(low, centre - reach), np.minimum(high, centre + reach)
-    rows = np.tile(np.arange(count), (len(low), 1))
-    share = (rng.permuted(rows, axis=1).T + rng.random((count, len(low)))) / count
+    if structure.scales.free_air:
+        rows = np.tile(np.arange(count), (len(low), 1))
+        share = (rng.permuted(rows, axis=1).T + rng.random((count, len(low)))) / count
+    else:
+        from scipy.stats import qmc
+
+        share = qmc.Sobol(len(low), rng=rng).random(count)
     points = low + share * (high - low)
     points[0] = centre
     return points
@@ -393,6 +414,7 @@ def evolve(
     problem: Problem,
     fits: Sequence[Fit],
     rng: np.random.Generator,
+    short: bool = False,
     crowd: NDArray[np.float64] | None = None,
 ) -> Fit:
     """The best of a population that evolves around fits, fitted to the end.
@@ -405,6 +427,8 @@ def evolve(
     problem : Problem
     fits : sequence of Fit
     rng : numpy.random.Generator
+    short : bool
+        Fewer generations.
     crowd : ndarray, shape (places, parameters), optional
         Further members, in fitted coordinates.
     """
@@ -419,7 +443,7 @@ def evolve(
     z[: len(seeds)] = seeds
     cost = problem.costs(z)
     everyone = np.arange(len(z))
-    for _ in range(_GENERATIONS):
+    for _ in range(_SHORT_GENERATIONS if short else _GENERATIONS):
         one, two = (rng.permutation(everyone) for _ in range(2))
         toward = z[np.argsort(cost)[rng.integers(0, 6, len(z))]]
         factor = rng.uniform(0.4, 0.9, (len(z), 1))
