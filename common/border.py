@@ -7,11 +7,17 @@ its schema version; `validated` turns the data into a pydantic model. Whatever i
 
 from __future__ import annotations
 
+import ast
 import difflib
+import inspect
 import json
 import math
 import re
+import textwrap
 from collections.abc import Mapping
+from copy import copy
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin
@@ -370,7 +376,7 @@ def _fields(top: type[BaseModel], place: Place) -> dict[str, FieldInfo]:
     for step in place:
         model = _part(annotation)
         if model is not None:
-            field = _named(model).get(str(step))
+            field = described_fields(model).get(str(step))
             if field is None:
                 return {}
             annotation = field.annotation
@@ -380,11 +386,35 @@ def _fields(top: type[BaseModel], place: Place) -> dict[str, FieldInfo]:
                 return {}
             annotation = inner[-1]
     model = _part(annotation)
-    return _named(model) if model is not None else {}
+    return described_fields(model) if model is not None else {}
 
 
-def _named(model: type[BaseModel]) -> dict[str, FieldInfo]:
-    return {field.alias or name: field for name, field in model.model_fields.items()}
+@cache
+def described_fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """Fields by their keys in the file, each described by the string that follows it in the class.
+
+    pydantic would read every class's source for that at each start.
+    """
+    meanings: dict[str, str] = {}
+    for base in reversed(model.__mro__):
+        if not issubclass(base, BaseModel) or base is BaseModel:
+            continue
+        try:
+            (part,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        except (OSError, TypeError):  # made at run time, or shipped without its source
+            continue
+        assert isinstance(part, ast.ClassDef)
+        for line, after in pairwise(part.body):
+            if not (isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name)):
+                continue
+            if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+                meanings[line.target.id] = inspect.cleandoc(str(after.value.value))
+    fields = {}
+    for name, field in model.model_fields.items():
+        described = copy(field)
+        described.description = field.description or meanings.get(name)
+        fields[field.alias or name] = described
+    return fields
 
 
 def _part(annotation: Any) -> type[BaseModel] | None:

@@ -51,7 +51,7 @@ Frame = Literal["proxy", "raw"]
 Linkage = Literal["parallel knee", "none"]
 
 _FILE = ConfigDict(
-    extra="forbid", strict=True, frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
+    extra="forbid", strict=True, frozen=True, allow_inf_nan=False
 )
 
 

@@ -59,7 +59,7 @@ Model = CommandNetwork | RecurrentNetwork | AtControlRate
 
 class _Strict(BaseModel):
     model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False
     )
 
 

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import LEVEL, Interval
@@ -341,7 +341,7 @@ def _interval(value: float, draws: _Array, count: int) -> Interval:
     """Bootstrap interval, widened for the few strokes that it is drawn from."""
     centre, spread = float(value), float(np.std(draws))
     freedom = max(count // 2 - 4, 2)
-    half = float(student.ppf((1 + LEVEL) / 2, freedom)) * spread * np.sqrt(count / (count - 6))
+    half = float(stdtrit(freedom, (1 + LEVEL) / 2)) * spread * np.sqrt(count / (count - 6))
     return Interval(centre, centre - half, centre + half)
 
 

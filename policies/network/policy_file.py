@@ -54,7 +54,7 @@ _AGAIN = "Copy the whole folder again."
 
 class _Part(BaseModel):
     model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True, allow_inf_nan=False
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False
     )
 
 

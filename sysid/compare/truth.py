@@ -57,7 +57,7 @@ _ROUNDING = 1e-6  # of files: a quantisation step has an interval of no width
 class _Joint(BaseModel):
     """True parameters of one joint."""
 
-    model_config = ConfigDict(extra="ignore", use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="ignore")
 
     actuator: dict[str, float]
     """Numbers of the servo: stiffness, damping, friction_loss, armature, dead_time_s, …"""
@@ -72,7 +72,7 @@ class _Joint(BaseModel):
 class _Truth(BaseModel):
     """A file of true parameters."""
 
-    model_config = ConfigDict(extra="ignore", use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="ignore")
 
     joints: Annotated[dict[str, _Joint], Field(min_length=1)]
     """Joints by name."""

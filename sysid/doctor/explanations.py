@@ -24,8 +24,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, minimize_scalar
-from scipy.signal import lfilter
 
+from pupper_sysid.common.filters import filtered
 from pupper_sysid.sysid.doctor.findings import REFUSE, Finding
 from pupper_sysid.sysid.doctor.signals import clock_findings
 from pupper_sysid.sysid.feedback.staleness import fresh_rows, quantum, staleness
@@ -278,8 +278,8 @@ def _low_pass(command: NDArray, hz: float, damping: float, grid: float) -> NDArr
     k = np.tan(np.pi * min(hz * grid, 0.4))
     scale = 1 + 2 * damping * k + k * k
     top = k * k / scale
-    below = [1.0, 2 * (k * k - 1) / scale, (1 - 2 * damping * k + k * k) / scale]
-    return np.asarray(lfilter([top, 2 * top, top], below, command - command[0])) + command[0]
+    below = np.array([1.0, 2 * (k * k - 1) / scale, (1 - 2 * damping * k + k * k) / scale])
+    return filtered(np.array([top, 2 * top, top]), below, command - command[0]) + command[0]
 
 
 def _maps(

@@ -22,7 +22,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from pupper_sysid.common.results import Result
 from pupper_sysid.sysid.feedback.poll_search import (
@@ -375,7 +374,11 @@ def _expected_speed(
     sent = trial.send_time_s
     grid = np.arange(sent[0], max(sent[-1], trial.read_time_s[-1]) + _GRID_S, _GRID_S)
     row = np.maximum(np.searchsorted(sent, grid, side="right") - 1, 0)
-    smooth = gaussian_filter1d(trial.command_rad[row], _SMOOTHING_S / _GRID_S, mode="nearest")
+    reach = round(4 * _SMOOTHING_S / _GRID_S)
+    bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) * (_GRID_S / _SMOOTHING_S)) ** 2)
+    smooth = np.convolve(
+        np.pad(trial.command_rad[row], reach, mode="edge"), bell / bell.sum(), mode="valid"
+    )
     none = np.zeros(len(trial.read_time_s))
     if len(time) < 8 or np.ptp(smooth) == 0:
         return none

@@ -28,7 +28,7 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
-from pupper_sysid.sysid.fit.misfit import Explanation, explained
+from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations
 from pupper_sysid.sysid.fit.noise import command_jitter, noise_by_run
 from pupper_sysid.sysid.fit.posterior import (
     EFFECTIVE,
@@ -572,9 +572,28 @@ def _explained(ready: PreparedJoint, choice: _Choice, anew: bool = False) -> _Ch
         return choice  # a motor under load has enough terms to imitate a filter
     problem = ready.searched(carried.structure)
     best = replace(carried.fit, cost=float(problem.costs(carried.fit.point[None])[0]))
-    return replace(
-        choice, misfit=explained(problem, best, carried.temperature, anew, ready.fit_rng())
-    )
+    likely = explanations(problem, best, carried.temperature, anew, ready.fit_rng())
+    named = decided(likely)
+    if named is None and likely and carried.draws is not None and ready.scales.free_air:
+        choice = _stacked(ready, choice, likely)
+    return replace(choice, misfit=named)
+
+
+def _stacked(ready: PreparedJoint, choice: _Choice, rivals: Sequence[Explanation]) -> _Choice:
+    """The choice with draws of the carried servo about what its numbers are in each rival, too.
+
+    The data do not tell the servo from its rivals, so none has more draws than another.
+    """
+    carried = choice.carried
+    assert carried.draws is not None
+    apart = [np.zeros_like(carried.fit.point)]
+    apart += [one.point - carried.fit.point for one in rivals if one.point is not None]
+    turn = np.arange(len(carried.draws)) % len(apart)
+    draws = np.clip(carried.draws + np.array(apart)[turn], *carried.structure.box)
+    wider = replace(carried, draws=draws)
+    likely = tuple(wider if f is carried else f for f in choice.likely)
+    lag = replace(choice.lag, dead_time_s=_dead_time(ready, wider, likely))
+    return replace(choice, carried=wider, likely=likely, lag=lag)
 
 
 def _with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]:
@@ -654,7 +673,8 @@ def _in_free_air(
         fit = _doubted(results[carried.name], why)
         undecided = {"dead_time_s": why} | fit.undecided
         results[carried.name] = replace(fit, undecided=undecided)
-    chosen = _best(results, carried.name)
+    # where the carried one errs no more than the noise, differences between models are chance
+    chosen = _best(results, carried.name) if _doubt(choice, goodness) else carried.name
     jitter = command_jitter(
         carried, choice.carried.values, ready.recorded, runs, ready.noise_rad,
         _date_sd_s(ready.lag.feedback), ready.fit_rng(),

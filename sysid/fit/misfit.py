@@ -3,19 +3,21 @@
 Each explanation is the carried fit with one thing more, fitted from there: a low-pass filter in
 front of the servo, play, a dead zone of the controller. The best is named where the likelihood is
 decidedly better with it. Simulators do not run these, so the numbers stay those of the carried fit;
-but a dead time that another explanation moves is not known better than the two are apart.
+but a number that another explanation moves is not known better than the two are apart.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common import filters
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.run import Run
-from pupper_sysid.sysid.fit.search import Fit, Problem, refine, search_widely
+from pupper_sysid.sysid.fit.search import Fit, Problem, from_about, refine, search_widely
 from pupper_sysid.sysid.fit.structure import Structure, servo_structure
 
 _LOW_PASS_S = (0.004, 0.008, 0.016, 0.032, 0.064)
@@ -24,6 +26,11 @@ _SEARCHED_S = 0.016
 """Time constant from which a fit with a filter may lie far from the fit without it."""
 _NATS = 10.0
 """Log-likelihood by which an explanation is named."""
+_AS_LIKELY_NATS = -1.0
+"""Log-likelihood from which the servo may as well be like that: a number that changes nothing has
+it, by its own price of 1."""
+_SHARES = np.array([0.4, 0.7, 0.95])
+"""Of what friction holds back: parts that a dead zone or play is given at the start."""
 _WORDS = {
     "backlash": ("backlash_rad", "play of {:.1f} mrad between motor and link"),
     "dead zone": ("dead_zone_rad", "a dead zone of {:.1f} mrad to either side in its controller"),
@@ -41,11 +48,14 @@ class Explanation:
         By how much the log-likelihood is better; about 0 where the data do not decide.
     dead_time_s : float
         Of the fit with it.
+    point : ndarray, shape (parameters,), optional
+        The carried structure's numbers in the fit with it, in fitted coordinates.
     """
 
     words: str
     nats: float
     dead_time_s: float
+    point: NDArray[np.float64] | None = None
 
     @property
     def claim(self) -> str:
@@ -62,10 +72,10 @@ class Explanation:
         )
 
 
-def explained(
+def explanations(
     problem: Problem, best: Fit, temperature: float, anew: bool, rng: np.random.Generator
-) -> Explanation | None:
-    """The best explanation of a misfit; None if none is decidedly better than the fit alone.
+) -> list[Explanation]:
+    """What describes the servo at least as well as the fit alone, best first.
 
     Parameters
     ----------
@@ -79,21 +89,26 @@ def explained(
         than noise.
     rng : numpy.random.Generator
     """
-    found: list[Explanation | None] = [_low_pass(problem, best, temperature, anew, rng)]
-    found += [_with_feature(problem, best, temperature, feature) for feature in _WORDS]
-    likely = [one for one in found if one is not None and one.nats > _NATS]
-    return max(likely, key=lambda one: one.nats, default=None)
+    tried = _low_pass(problem, best, temperature, anew, rng)
+    for feature in _WORDS:
+        tried += _with_feature(problem, best, temperature, feature, rng)
+    return sorted((x for x in tried if x.nats >= _AS_LIKELY_NATS), key=lambda x: -x.nats)
+
+
+def decided(likely: Sequence[Explanation]) -> Explanation | None:
+    """The best explanation if it is decidedly better than the fit alone."""
+    return next((one for one in likely if one.nats > _NATS), None)
 
 
 def filtered(run: Run, time_constant_s: float) -> Run:
     """The run with its command behind a first-order low-pass filter, at rest before."""
-    from scipy.signal import lfilter  # a tenth of a second to import
-
     ratio = time_constant_s / run.step_s
     left = np.exp(-1.0 / ratio)
     command = run.held[0]
     rest = command[0]
-    end = rest + lfilter([1.0 - left], [1.0, -left], command - rest)
+    end = rest + filters.filtered(
+        np.array([1.0 - left, 0.0]), np.array([1.0, -left]), command - rest
+    )
     before = np.concatenate([[rest], end[:-1]])
     mean = command + (before - command) * ratio * (1.0 - left)
     held = np.concatenate([mean[None], run.held[1:]])
@@ -102,7 +117,8 @@ def filtered(run: Run, time_constant_s: float) -> Run:
 
 def _low_pass(
     problem: Problem, best: Fit, temperature: float, anew: bool, rng: np.random.Generator
-) -> Explanation:
+) -> list[Explanation]:
+    """The likeliest filter, and the slowest that is as likely as none."""
     structure = problem.structure
     anew = anew and structure.scales.free_air  # under load a search takes minutes
     fits = {}
@@ -118,10 +134,15 @@ def _low_pass(
         between = middle * factor
         fits[between] = refine(_behind(problem, between), fits[middle].point[None])
         middle = min(fits, key=lambda t: fits[t].cost)
-    fit = fits[middle]
-    delay = float(structure.decode(fit.point)[0])
-    words = f"a low-pass filter of about {1e3 * middle:.0f} ms in front of it"
-    return Explanation(words, (best.cost - fit.cost) / temperature - 1.0, delay)
+    nats = {t: (best.cost - fit.cost) / temperature - 1.0 for t, fit in fits.items()}
+    slowest = max((t for t in fits if nats[t] >= _AS_LIKELY_NATS), default=middle)
+    return [
+        Explanation(
+            f"a low-pass filter of about {1e3 * t:.0f} ms in front of it", nats[t],
+            float(structure.decode(fits[t].point)[0]), fits[t].point,
+        )
+        for t in dict.fromkeys((middle, slowest))
+    ]  # fmt: skip
 
 
 def _behind(problem: Problem, time_constant_s: float) -> Problem:
@@ -140,20 +161,31 @@ def _earlier(structure: Structure, point: NDArray, time_constant_s: float) -> ND
 
 
 def _with_feature(
-    problem: Problem, best: Fit, temperature: float, feature: str
-) -> Explanation | None:
+    problem: Problem, best: Fit, temperature: float, feature: str, rng: np.random.Generator
+) -> list[Explanation]:
     structure = problem.structure
     if feature in structure.features:
-        return None
+        return []
     wider = servo_structure((*structure.features, feature), structure.scales)
     name, words = _WORDS[feature]
-    starts = np.repeat(wider.adopt(structure, best.point)[None], 3, axis=0)
+    values = np.repeat(wider.decode(wider.adopt(structure, best.point))[None], 6, axis=0)
     place = wider.names.index(name)
-    low, high = wider.box
-    starts[:, place] = np.clip(np.log([0.003, 0.01, 0.03]), low[place], high[place])
-    fit = refine(replace(problem, structure=wider), starts)
+    values[:3, place] = 0.003, 0.01, 0.03
+    if {"friction_rad_s2", "stiffness_per_s2"} <= {*wider.names}:
+        # what friction holds back at the carried stiffness may be this in its place
+        friction = values[3:, wider.names.index("friction_rad_s2")]
+        values[3:, place] = _SHARES * friction / values[3:, wider.names.index("stiffness_per_s2")]
+        friction *= 1.0 - _SHARES
+    starts = np.clip(wider.encode(values), *wider.box)
+    behind = replace(problem, structure=wider)
+    fit = refine(behind, starts)
+    if structure.scales.free_air:
+        fit = from_about(behind, fit, rng)
     values = wider.decode(fit.point)
-    return Explanation(
-        words.format(1e3 * values[place]), (best.cost - fit.cost) / temperature - 1.0,
-        float(values[0]),
-    )  # fmt: skip
+    shared = [wider.names.index(name) for name in structure.names]
+    return [
+        Explanation(
+            words.format(1e3 * values[place]), (best.cost - fit.cost) / temperature - 1.0,
+            float(values[0]), fit.point[shared],
+        )
+    ]  # fmt: skip

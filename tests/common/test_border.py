@@ -103,9 +103,7 @@ def test_only_the_versions_that_are_known_pass():
 
 
 class Leg(BaseModel):
-    model_config = ConfigDict(
-        extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
     length_m: Annotated[float, Field(gt=0)]
     lag_s: float | dict[str, float] | None = None

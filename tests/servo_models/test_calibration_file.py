@@ -13,6 +13,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pupper_sysid.common.border import described_fields
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.common.strict_yaml import dump
@@ -138,7 +139,7 @@ def test_presets_hold_the_published_numbers_for_all_joints_and_call_none_a_measu
 
 def test_every_quantity_of_a_calibration_has_a_unit_and_a_description():
     for part in (Actuator, Feedback, Lag, Scores, RatiosToArmature, Scale, CandidateModel):
-        for name, field in part.model_fields.items():
+        for name, field in described_fields(part).items():
             assert field.description, f"{part.__name__}.{name} is not documented"
             if "Quantity" in str(field.annotation) or "float" in str(field.annotation):
                 assert unit_of(name) or name == "parameters", f"{part.__name__}.{name}: no unit"

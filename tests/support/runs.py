@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.fit.kernel import edges_of
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.structure import LONGEST_DEAD_TIME_S
@@ -33,4 +34,17 @@ def run_of(
         sample_step=sample_step, sample_rad=sample_rad, row_step=row_step,
         held_step=row_step if held_step is None else held_step,
         row_rad=sample_rad if row_rad is None else row_rad,
+    )  # fmt: skip
+
+
+def fine_run(command: NDArray[np.float64], every_s: float = 0.01) -> Run:
+    """A run under `command` [rad], one a `CONTINUOUS_S`, with readings of zero from 0.1 s on."""
+    rest = np.full(int(LONGEST_DEAD_TIME_S / CONTINUOUS_S) + 25, command[0])
+    held = np.concatenate([rest, command])
+    step = np.arange(0.1 / CONTINUOUS_S, len(command) - 1, every_s / CONTINUOUS_S)
+    return Run(
+        label="", frequency_hz=float("nan"), p_gain=1.0, load=np.zeros(3), held=held[None],
+        edges=edges_of(held), pad=len(rest), start_rad=0.0, sample_step=step,
+        sample_rad=np.zeros(len(step)), row_step=step, held_step=step,
+        row_rad=np.full(len(step), np.nan), step_s=CONTINUOUS_S,
     )  # fmt: skip

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
-from pupper_sysid.sysid.fit.kernel import edges_of
-from pupper_sysid.sysid.fit.misfit import Explanation, explained, filtered
-from pupper_sysid.sysid.fit.run import Run, free_run
+from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, filtered
+from pupper_sysid.sysid.fit.run import free_run
 from pupper_sysid.sysid.fit.search import Problem, refine
 from pupper_sysid.sysid.fit.structure import SIMULATED, Structure, candidate, servo_structure
+from support.runs import fine_run
 
 NOISE_RAD = 5e-4
 NUMBERS = {
@@ -23,20 +23,6 @@ NUMBERS = {
 }  # fmt: skip
 
 
-def run_of(command: np.ndarray, time_s: np.ndarray) -> Run:
-    """A run under a command of each step, with readings every 10 ms from 0.1 s on."""
-    rest = np.full(int(0.45 / CONTINUOUS_S), command[0])
-    held = np.concatenate([rest, command])[None]
-    step = np.arange(0.1, time_s[-1], 0.01) / CONTINUOUS_S
-    nothing = np.full(len(step), np.nan)
-    return Run(
-        label="", frequency_hz=float("nan"), p_gain=1.0, load=np.zeros(3), held=held,
-        edges=edges_of(held[0]), pad=len(rest), start_rad=0.0, sample_step=step,
-        sample_rad=np.zeros(len(step)), row_step=step, held_step=step, row_rad=nothing,
-        step_s=CONTINUOUS_S,
-    )  # fmt: skip
-
-
 def explanation(
     structure: Structure, numbers: dict, filter_s: float = 0.0, undescribed: bool = True
 ) -> Explanation | None:
@@ -44,7 +30,7 @@ def explanation(
     rng = np.random.default_rng(0)
     time = CONTINUOUS_S * np.arange(int(4.0 / CONTINUOUS_S))
     levels = np.repeat(0.3 * rng.standard_normal(16), len(time) // 16)
-    runs = (run_of(levels, time), run_of(0.3 * np.sin(2 * np.pi * 2.0 * time), time))
+    runs = (fine_run(levels), fine_run(0.3 * np.sin(2 * np.pi * 2.0 * time)))
     moved = tuple(filtered(r, filter_s) for r in runs) if filter_s else runs
     tracks = free_run(structure, np.array([numbers[n] for n in structure.names]), moved)
     read = tuple(
@@ -55,12 +41,12 @@ def explanation(
     plain = candidate(SIMULATED[0])
     problem = Problem(plain, read, (NOISE_RAD,) * len(read))
     start = plain.encode(np.array([NUMBERS[n] for n in plain.names]))
-    return explained(problem, refine(problem, start[None]), 1.0, undescribed, rng)
+    return decided(explanations(problem, refine(problem, start[None]), 1.0, undescribed, rng))
 
 
 def test_a_filter_of_a_step_command_rises_as_an_exponential():
     time = CONTINUOUS_S * np.arange(2000)
-    run = filtered(run_of(np.where(time < 0.1, 0.0, 1.0), time), 0.02)
+    run = filtered(fine_run(np.where(time < 0.1, 0.0, 1.0)), 0.02)
     end = run.edges[0][run.pad :]
     expected = np.where(time < 0.1, 0.0, 1.0 - np.exp(-(time + CONTINUOUS_S - 0.1) / 0.02))
     np.testing.assert_allclose(end, expected, atol=1e-6)

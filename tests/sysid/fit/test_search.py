@@ -1,0 +1,48 @@
+"""Search: local fits from points about a fit leave the dents of a ridge."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pupper_sysid.servo_models.step_size import CONTINUOUS_S
+from pupper_sysid.sysid.fit.run import free_run
+from pupper_sysid.sysid.fit.search import Problem, from_about, refine
+from pupper_sysid.sysid.fit.structure import candidate
+from support.runs import fine_run
+
+NOISE_RAD = 4e-4
+NUMBERS = {
+    "dead_time_s": 0.0219, "stiffness_per_s2": 10_670.0, "damping_per_s": 140.0,
+    "friction_rad_s2": 7.15, "effort_rad_s2": 144.0, "no_load_speed_rad_s": 400.0,
+    "offset_rad": 0.0,
+}  # fmt: skip
+ALONG_THE_RIDGE = NUMBERS | {
+    "dead_time_s": 0.0255, "stiffness_per_s2": 19_800.0, "damping_per_s": 168.0,
+    "friction_rad_s2": 16.8, "effort_rad_s2": 216.0, "no_load_speed_rad_s": 13.3,
+}  # fmt: skip
+
+
+def test_local_fits_from_points_about_a_fit_find_the_way_along_a_ridge():
+    time = CONTINUOUS_S * np.arange(int(4.0 / CONTINUOUS_S))
+    sent = np.floor(time / 0.02) * 0.02
+    chirp = 0.12 * np.sin(2 * np.pi * (0.5 * sent + 0.5 * (6.0 - 0.5) / 4.0 * sent**2))
+    structure = candidate("delayed_pd_back_emf")
+    truth, far = (
+        structure.encode(np.array([numbers[name] for name in structure.names]))
+        for numbers in (NUMBERS, ALONG_THE_RIDGE)
+    )
+    run = fine_run(chirp, 0.005)
+    (track,) = free_run(structure, structure.decode(truth), (run,))
+    clean = np.interp(run.sample_step, np.arange(len(track)), track)
+    stuck = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        read = clean + NOISE_RAD * rng.standard_normal(len(clean))
+        problem = Problem(structure, (replace(run, sample_rad=read),), (NOISE_RAD,))
+        best = refine(problem, truth[None]).cost
+        near = refine(problem, far[None])
+        stuck.append(near.cost > best + 100)
+        assert from_about(problem, near, rng).cost < best + 1
+    assert any(stuck), "the ridge has no dent, so this proves nothing"
