@@ -50,9 +50,7 @@ PRESETS = (
 Frame = Literal["proxy", "raw"]
 Linkage = Literal["parallel knee", "none"]
 
-_FILE = ConfigDict(
-    extra="forbid", strict=True, frozen=True, allow_inf_nan=False
-)
+_FILE = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
 _SCALE_FACTOR, _KNOWN_FACTOR = 2.5, 1.3

@@ -58,9 +58,7 @@ Model = CommandNetwork | RecurrentNetwork | AtControlRate
 
 
 class _Strict(BaseModel):
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class JointContract(_Strict):

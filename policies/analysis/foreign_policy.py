@@ -106,7 +106,7 @@ _LONGEST_HISTORY = 200
 class Term(BaseModel):
     """One term of an observation."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
     term: _Name
     """Name of the term."""
     scale: _Number | list[_Number] = 1.0
@@ -166,7 +166,7 @@ class Term(BaseModel):
 class PolicyYaml(BaseModel):
     """What the YAML beside a policy can say; see the module."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
     joints: Annotated[list[_Name], Field(min_length=1, max_length=500)] | None = None
     """Joints, in the order of the actions."""
     default_pose_rad: list[_Number] | dict[str, _Number] | None = None

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.border import read_bytes
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.export.network import onnx_library
 
 SUFFIX = ".onnx"
 _LARGEST_BYTES = 200_000_000
@@ -65,7 +66,7 @@ class OnnxNetwork:
     """
 
     def __init__(self, path: Path):
-        onnx = _library()
+        onnx = onnx_library()
         self.path = path
         data = read_bytes(path, _LARGEST_BYTES, "Export the policy again.")
         try:
@@ -248,7 +249,7 @@ class OnnxNetwork:
                 (_PROBES, self.actions), *((a, _PROBES, b) for a, b in self._states)
             ] and np.allclose(several[0][:1], single[0], atol=1e-4, equal_nan=True)  # fmt: skip
             self._one_by_one = not same
-        except Exception:
+        except Exception:  # the evaluator passes on whatever NumPy raises at a batch
             self._one_by_one = True
         actions = self.run(inputs)[0]
         if not np.isfinite(actions).all():
@@ -258,19 +259,6 @@ class OnnxNetwork:
                 f"The output of {self.path} is constant (standard deviation below 1e-5 over "
                 f"{_PROBES} random observations). It is no trained policy."
             )
-
-
-def _library() -> Any:
-    try:
-        import onnx
-        import onnx.checker
-        import onnx.shape_inference
-    except ImportError as error:
-        raise InputError(
-            "ONNX files need the package onnx, which is not installed: "
-            "`pip install 'pupper-sysid[onnx]'`."
-        ) from error
-    return onnx
 
 
 def _dims(port: Any) -> tuple[int, ...]:

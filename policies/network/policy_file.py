@@ -53,9 +53,7 @@ _AGAIN = "Copy the whole folder again."
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 _Angle = Annotated[float, Field(ge=-2 * np.pi, le=2 * np.pi)]

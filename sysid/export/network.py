@@ -113,15 +113,23 @@ def _torchscript(module, given, names, metadata, batch, opset) -> tuple[bytes, R
     return buffer.getvalue(), run
 
 
-def _onnx(module, given, names, metadata, batch, opset) -> tuple[bytes, Run]:
+def onnx_library() -> Any:
+    """The package onnx, an optional one."""
     try:
         import onnx
-        from onnx.reference import ReferenceEvaluator
+        import onnx.checker
+        import onnx.reference
+        import onnx.shape_inference
     except ImportError as error:
         raise InputError(
             "ONNX files need the package onnx, which is not installed: "
             "`pip install 'pupper-sysid[onnx]'`."
         ) from error
+    return onnx
+
+
+def _onnx(module, given, names, metadata, batch, opset) -> tuple[bytes, Run]:
+    onnx = onnx_library()
     ins, outs = names
     buffer = io.BytesIO()
     export: Any = torch.onnx.export  # its annotations lack buffers
@@ -138,7 +146,7 @@ def _onnx(module, given, names, metadata, batch, opset) -> tuple[bytes, Run]:
             axis.dim_value = size  # the exporter forgets them where the first axis is free
     onnx.helper.set_model_props(made, metadata)
     onnx.checker.check_model(made, full_check=True)
-    evaluator = ReferenceEvaluator(made)
+    evaluator = onnx.reference.ReferenceEvaluator(made)
 
     def run(*inputs: Tensor) -> Sequence[Tensor]:
         found = evaluator.run(None, {n: v.numpy() for n, v in zip(ins, inputs, strict=True)})

@@ -178,9 +178,7 @@ def _with_feature(
         friction *= 1.0 - _SHARES
     starts = np.clip(wider.encode(values), *wider.box)
     behind = replace(problem, structure=wider)
-    fit = refine(behind, starts)
-    if structure.scales.free_air:
-        fit = from_about(behind, fit, rng)
+    fit = from_about(behind, refine(behind, starts), rng)
     values = wider.decode(fit.point)
     shared = [wider.names.index(name) for name in structure.names]
     return [

@@ -211,14 +211,14 @@ def evolved(
     best = evolve(problem.coarse, refined(problem.coarse, starts), rng, short, crowd)
     near = np.concatenate([best.point[None], starts[-_FINAL:]])
     best = refine(problem, near[np.argsort(problem.costs(near))[:_REFINED]])
-    # the ladders under load have so many numbers that a better optimum predicts worse
-    return from_about(problem, best, rng) if problem.structure.scales.free_air else best
+    return from_about(problem, best, rng)
 
 
 def from_about(problem: Problem, best: Fit, rng: np.random.Generator) -> Fit:
     """The best of local fits from points about the best one, until a round finds none better.
 
-    A ridge has dents in which a local fit ends; in coarse steps they lie elsewhere.
+    A ridge has dents in which a local fit ends; in coarse steps they lie elsewhere. In free air
+    only: the structures under load have so many numbers that a better optimum predicts worse.
 
     Parameters
     ----------
@@ -226,6 +226,8 @@ def from_about(problem: Problem, best: Fit, rng: np.random.Generator) -> Fit:
     best : Fit
     rng : numpy.random.Generator
     """
+    if not problem.structure.scales.free_air:
+        return best
     low, high = problem.structure.box
     shape = (_NEAR, len(best.point))
     for _ in range(_NEAR_ROUNDS):

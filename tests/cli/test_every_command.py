@@ -160,7 +160,7 @@ def test_what_was_typed_is_never_proposed():
         select_joints("LF_hop", ["LF_hip"])
 
 
-# ----- progress of long commands: it knows its end, and is told where there is no terminal
+# ----- progress of long commands: it ends, and is written as lines where there is no terminal
 
 
 @pytest.fixture

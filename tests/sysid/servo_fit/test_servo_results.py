@@ -194,7 +194,7 @@ def test_one_step_of_a_model_with_feedback_starts_from_the_readings():
     model = follower(0.0, feedback=0.5)
     found = errors(model, tracks(model, data), data, everything)[JOINT]
     np.testing.assert_allclose(found.one_step[1:], 0.5 * position[:-1] - position[1:], atol=1e-6)
-    np.testing.assert_allclose(found.free_run, -position, atol=1e-6)  # it was told nothing
+    np.testing.assert_allclose(found.free_run, -position, atol=1e-6)
 
 
 def test_runs_of_different_lengths_are_run_as_if_alone():
