@@ -19,9 +19,15 @@ from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run_program
 from support.json_keys import DOCUMENTED, key_line
 from support.package import ROOT
+from support.undrawn import stand_soon
 
 POLICY = ROOT / "data/samples/policies/lstm"
 CALIBRATION = ROOT / "data/samples/calibrated.yaml"
+
+
+@pytest.fixture(autouse=True)
+def standing(monkeypatch):
+    stand_soon(monkeypatch)
 
 
 def deploy(capsys, *arguments) -> dict:
@@ -171,7 +177,7 @@ def analyze(capsys, what, *arguments) -> dict:
 
 
 def test_the_gait_of_the_shipped_policy_is_a_trot_and_its_picture_is_not_written_over(capsys, here):
-    gait = analyze(capsys, "gait")["gaits"]["lstm"]
+    gait = analyze(capsys, "gait", "--robots", 1)["gaits"]["lstm"]
     assert gait["frequency_hz"]["value"] == pytest.approx(3.6, abs=0.15)
     assert gait["diagonal"]["value"] > 0.6 and gait["rhythmic"] == 1.0
     again = refused(capsys, pupper_analyze, "gait", POLICY, "--actuator", CALIBRATION)
@@ -207,15 +213,15 @@ WALK, CALIBRATION_TWIN = SAMPLES / "playback.csv", SAMPLES / "calibrated.yaml"
 @pytest.fixture
 def imu(tmp_path) -> Path:
     path = tmp_path / "imu.csv"
-    rows = (f"{0.02 * k:.2f},{0.1 * (k % 5):.1f},0.2,0.{k % 3}" for k in range(400))
+    rows = (f"{0.02 * k:.2f},{0.1 * (k % 5):.1f},0.2,0.{k % 3}" for k in range(200))
     path.write_text("timestamp,gx,gy,gz\n" + "\n".join(rows) + "\n")
     return path
 
 
 @pytest.fixture
 def walk(tmp_path) -> Path:
-    """Eight seconds of all joints, read two rows late."""
-    rows = np.arange(200)
+    """Four seconds of all joints, read two rows late."""
+    rows = np.arange(100)
     swing = 0.15 * np.sin(0.5 * rows)[:, None] * np.tile([0.3, 1, -1], 4)
     command = swing + [DEFAULT_POSE[joint] for joint in JOINT_NAMES]
     columns: dict = {"time_s": 0.04 * rows, "loop": 0}
