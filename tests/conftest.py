@@ -40,6 +40,7 @@ def pytest_collection_finish() -> None:
     """What is imported by now stays: each full collection of garbage would search it in vain."""
     gc.collect()
     gc.freeze()
+    gc.unfreeze = lambda: None  # the end of a walk would undo it
 
 
 @pytest.fixture(scope="session")

@@ -213,15 +213,15 @@ WALK, CALIBRATION_TWIN = SAMPLES / "playback.csv", SAMPLES / "calibrated.yaml"
 @pytest.fixture
 def imu(tmp_path) -> Path:
     path = tmp_path / "imu.csv"
-    rows = (f"{0.02 * k:.2f},{0.1 * (k % 5):.1f},0.2,0.{k % 3}" for k in range(200))
+    rows = (f"{0.02 * k:.2f},{0.1 * (k % 5):.1f},0.2,0.{k % 3}" for k in range(400))
     path.write_text("timestamp,gx,gy,gz\n" + "\n".join(rows) + "\n")
     return path
 
 
 @pytest.fixture
 def walk(tmp_path) -> Path:
-    """Four seconds of all joints, read two rows late."""
-    rows = np.arange(100)
+    """Eight seconds of all joints, read two rows late: a rhythm needs seven."""
+    rows = np.arange(200)
     swing = 0.15 * np.sin(0.5 * rows)[:, None] * np.tile([0.3, 1, -1], 4)
     command = swing + [DEFAULT_POSE[joint] for joint in JOINT_NAMES]
     columns: dict = {"time_s": 0.04 * rows, "loop": 0}

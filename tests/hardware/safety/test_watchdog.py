@@ -391,12 +391,13 @@ SWEEP = f"{PATIENT}\nfrom pupper_sysid.cli.programs.pupper_sysid import main\nma
 def test_a_terminated_sweep_parks_the_robot_itself_and_can_be_resumed(robot, tmp_path, capsys):
     server, address = robot
     path = tmp_path / "a.csv"
-    words = ("sweep", "--joints", "LF_hip", "--freqs", "3", "--duration", "1")
+    # at 20 Hz a busy machine keeps up
+    words = ("sweep", "--joints", "LF_hip", "--freqs", "3", "--duration", "2", "--rate", "20")
     process = subprocess.Popen(
         [sys.executable, "-c", SWEEP, *words, "--bus", address, "--out", str(path)],
         cwd=ROOT, stderr=subprocess.PIPE,
     )  # fmt: skip
-    wait_for(lambda: path.exists() and path.read_text().count("LF_hip,") > 25)
+    wait_for(lambda: path.exists() and path.read_text().count("LF_hip,") > 15)
     process.terminate()
     said = process.communicate(timeout=60)[1].decode()
     assert process.returncode == 143 and "Stopped." in said and "Traceback" not in said
