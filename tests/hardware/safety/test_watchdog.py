@@ -397,7 +397,7 @@ def test_a_terminated_sweep_parks_the_robot_itself_and_can_be_resumed(robot, tmp
         [sys.executable, "-c", SWEEP, *words, "--bus", address, "--out", str(path)],
         cwd=ROOT, stderr=subprocess.PIPE,
     )  # fmt: skip
-    wait_for(lambda: path.exists() and path.read_text().count("LF_hip,") > 15)
+    wait_for(lambda: path.exists() and path.read_text().count("LF_hip,") > 25)
     process.terminate()
     said = process.communicate(timeout=60)[1].decode()
     assert process.returncode == 143 and "Stopped." in said and "Traceback" not in said
