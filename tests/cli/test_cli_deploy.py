@@ -32,13 +32,7 @@ def standing(monkeypatch):
 
 def deploy(capsys, *arguments) -> dict:
     code, out, err = run_program(
-        capsys,
-        pupper_deploy,
-        POLICY,
-        "--actuator",
-        CALIBRATION,
-        "--json",
-        *arguments,
+        capsys, pupper_deploy, POLICY, "--actuator", CALIBRATION, "--json", *arguments
     )
     assert code == 0, err
     return json.loads(out)
@@ -52,13 +46,7 @@ def test_the_shipped_policy_walks_on_the_emulated_robot_and_its_log_repeats(caps
     assert found["mae_yaw_rad_s"] < 0.15 and set(found["step_ms"]) == {"p50", "p99", "max"}
     log = Path(found["log"])
     code, out, _ = run_program(
-        capsys,
-        pupper_deploy,
-        POLICY,
-        "--replay",
-        log,
-        "--actuator",
-        CALIBRATION,
+        capsys, pupper_deploy, POLICY, "--replay", log, "--actuator", CALIBRATION
     )
     assert code == 0 and "200 ticks repeated" in out
     assert len(read_walk(log).senses) == 200

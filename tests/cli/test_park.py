@@ -130,10 +130,7 @@ def test_park_without_a_bus_switches_off_what_was_left_on_and_nothing_else(robot
 @pytest.mark.wall_clock
 @pytest.mark.parametrize(
     ("robot", "number"),
-    [
-        ("feetech", signal.SIGSTOP),
-        pytest.param("esp32", signal.SIGKILL, marks=pytest.mark.slow),
-    ],
+    [("feetech", signal.SIGSTOP), pytest.param("esp32", signal.SIGKILL, marks=pytest.mark.slow)],
     indirect=["robot"],
 )
 def test_a_supervisor_switches_off_what_driver_and_watchdog_have_left_on(robot, number):
