@@ -1,10 +1,18 @@
-"""Fixture: commands run in an empty folder."""
+"""Fixtures: commands run in an empty folder, and drive robots in the process of the tests."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+
+from support.servo_servers import spare_this_process
+
+
+@pytest.fixture(autouse=True)
+def spared(monkeypatch) -> None:
+    """No watchdog ends the tests."""
+    spare_this_process(monkeypatch)
 
 
 @pytest.fixture

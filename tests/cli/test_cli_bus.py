@@ -130,7 +130,7 @@ def test_an_emulator_prints_the_next_command_and_ends_on_request(tmp_path, kind)
     out = "".join(process.stdout.readline() for _ in range(5))
     assert (tmp_path / "s").exists()
     process.send_signal(signal.SIGTERM)
-    _, err = process.communicate(timeout=10)
+    _, err = process.communicate(timeout=60)
     assert "pupper-sysid sweep --freqs 1-10 --joints LF --bus" in out and "Ctrl-C" in out
     assert process.returncode == 143 and "Stopped." in err and "Traceback" not in err
     assert not (tmp_path / "s").exists(), "it leaves nothing behind"
@@ -171,7 +171,7 @@ def test_a_walking_robot_on_a_serial_line_has_its_imu_on_a_socket(tmp_path):
         np.testing.assert_allclose(samples[-1].acceleration_m_s2, [0, 0, 9.81], atol=0.15)
     finally:
         process.send_signal(signal.SIGTERM)
-        _, err = process.communicate(timeout=10)
+        _, err = process.communicate(timeout=60)
     assert "IMU at i." in out and "monitor --bus feetech:s" in out and "Ctrl-C" in out
     assert "sweep" not in out, "a sweep is for legs in free air"
     assert "Traceback" not in err and not list(tmp_path.glob("[is]"))

@@ -82,8 +82,7 @@ def test_hold_aware_scores_on_the_real_sweeps_keep_what_was_reached(capsys, real
 
 
 @pytest.mark.parametrize(
-    "kinds",
-    [("fir",), pytest.param(("mlp", "lstm", "delayed-pd"), marks=pytest.mark.slow)],
+    "kinds", [("fir",), pytest.param(("mlp", "lstm", "delayed-pd"), marks=pytest.mark.slow)]
 )
 def test_what_was_fitted_is_saved_and_compared_with_a_calibration(capsys, quick, kinds):
     sample = (SAMPLE / "playback.csv", "--joints", "LF_calf")

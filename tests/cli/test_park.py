@@ -130,10 +130,7 @@ def test_park_without_a_bus_switches_off_what_was_left_on_and_nothing_else(robot
 @pytest.mark.wall_clock
 @pytest.mark.parametrize(
     ("robot", "number"),
-    [
-        ("feetech", signal.SIGSTOP),
-        pytest.param("esp32", signal.SIGKILL, marks=pytest.mark.slow),
-    ],
+    [("feetech", signal.SIGSTOP), pytest.param("esp32", signal.SIGKILL, marks=pytest.mark.slow)],
     indirect=["robot"],
 )
 def test_a_supervisor_switches_off_what_driver_and_watchdog_have_left_on(robot, number):
@@ -147,12 +144,12 @@ def test_a_supervisor_switches_off_what_driver_and_watchdog_have_left_on(robot, 
         for each in (signal.SIGSTOP, number):  # neither has time to notice that the other is gone
             for one in processes[::-1]:
                 os.kill(one, each)
-        assert wait_until(lambda: limp(server), 15.0)
-        assert wait_until(lambda: notes() == [], 15.0)
+        assert wait_until(lambda: limp(server))
+        assert wait_until(lambda: notes() == [])
     finally:
         end(processes)
         supervisor.send_signal(signal.SIGTERM)
-        said = supervisor.communicate(timeout=20)[1].decode()
+        said = supervisor.communicate(timeout=60)[1].decode()
     assert "its driver was gone" in said and supervisor.returncode == 143
 
 
@@ -161,7 +158,7 @@ def test_a_supervisor_switches_off_what_driver_and_watchdog_have_left_on(robot, 
 def test_a_driver_that_was_stopped_with_its_watchdog_does_not_go_on(robot):
     _, address = robot
     bus = open_guarded(parse_address(address))
-    assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()), 10.0)
+    assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
     bus.torque(True)
     assert bus._watchdog is not None
     watchdog = bus._watchdog._process.pid
@@ -180,7 +177,7 @@ def test_a_driver_that_was_stopped_with_its_watchdog_does_not_go_on(robot):
 def test_a_machine_that_was_suspended_during_a_walk_does_not_go_on(robot, monkeypatch):
     _, address = robot
     bus = open_guarded(parse_address(address))
-    assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()), 10.0)
+    assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
     bus.torque(True)
     # an hour passes at once, and monotonic clocks stood still
     monkeypatch.setattr(watchdog, "lasting_s", lambda: clock.lasting_s() + 3600)

@@ -161,8 +161,8 @@ def begun(process: subprocess.Popen[bytes]) -> None:
 
 def ended(process: subprocess.Popen[bytes]) -> tuple[int, str]:
     """Exit code and stderr of a program that has ended with all its processes."""
-    _, err = process.communicate(timeout=10)
-    assert until(lambda: session(process.pid) == [], 5.0)
+    _, err = process.communicate(timeout=60)
+    assert until(lambda: session(process.pid) == [], 30.0)
     return process.returncode, err.decode()
 
 
@@ -250,7 +250,7 @@ def test_ctrl_c_stops_a_robot_that_a_script_started_in_the_background(tmp_path):
     try:
         assert process.stdout is not None and process.stdout.readline()  # it reads servos
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=10)
+        process.communicate(timeout=60)
         assert process.returncode == 130
     finally:
         process.kill()

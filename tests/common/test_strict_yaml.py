@@ -85,10 +85,7 @@ def test_each_place_has_its_line():
 
 
 def test_the_loader_serves_pyyaml_s_own_functions():
-    assert yaml.load("{legs: 4, names: [yes]}", StrictLoader) == {
-        "legs": 4,
-        "names": ["yes"],
-    }
+    assert yaml.load("{legs: 4, names: [yes]}", StrictLoader) == {"legs": 4, "names": ["yes"]}
     with pytest.raises(InputError, match="line 2, legs stands in the file twice"):
         yaml.load("legs: 4\nlegs: 6", StrictLoader)
 

@@ -20,7 +20,7 @@ from support.package import ROOT
 linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 
 
-def until(true: Callable[[], bool], seconds: float = 10.0) -> bool:
+def until(true: Callable[[], bool], seconds: float = 60.0) -> bool:
     end = time.monotonic() + seconds
     while not true():
         if time.monotonic() > end:

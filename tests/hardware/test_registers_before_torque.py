@@ -31,7 +31,7 @@ JOINTS = {4: "LF_hip", 5: "LF_thigh"}
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch):
-    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.1)
 
 
 @pytest.fixture(scope="module")

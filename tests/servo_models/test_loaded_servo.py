@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
-from pupper_sysid.servo_models.loaded_servo import (
-    Load,
-    LoadedServo,
-    LoadedServoParameters,
-)
+from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
 from pupper_sysid.sim.robot.servo_mjcf import pendulum_xml, rest_at
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.structure import loaded_columns

@@ -34,12 +34,7 @@ import yaml
 
 import pupper_sysid as ps
 from pupper_sysid.common.results import plain
-from pupper_sysid.sysid.doctor.checks import (
-    Recordings,
-    chosen_joints,
-    joint_rng,
-    usable_trials,
-)
+from pupper_sysid.sysid.doctor.checks import Recordings, chosen_joints, joint_rng, usable_trials
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from support.golden_recordings import EMULATED, REAL
 

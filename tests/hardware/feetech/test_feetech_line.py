@@ -76,7 +76,7 @@ def test_b5_2_a_missing_servo_costs_less_than_10_ms(monkeypatch):
             start = time.perf_counter()
             assert line.read(2, POSITION, 2) is None
             took.append(time.perf_counter() - start)
-        return float(np.median(took))
+        return min(took)  # a busy machine makes some last longer, none shorter
 
     with on_a_port(still_servos(ids=[1])) as server:
         line = FeetechLine(server.device, 1_000_000)
@@ -98,8 +98,9 @@ def test_b5_3_a_late_reply_is_not_the_answer_to_the_next_read():
         line = FeetechLine(server.device, 1_000_000)
         line.patience_s = 0.02
         assert position(line, 1) is None
-        time.sleep(0.25)
-        line.patience_s = PATIENT_S
+        reply = raw(1, STS3215.word(900))
+        assert wait_until(lambda: line._port.ser.in_waiting == len(reply))
+        line.patience_s = 5.0
         assert position(line, 1) == 123
         line.close()
 
@@ -115,7 +116,7 @@ def test_b5_3_a_late_reply_that_comes_during_the_next_read_has_another_length():
         line = FeetechLine(server.device, 1_000_000)
         line.patience_s = 0.02
         assert line.read(1, POSITION, 8) is None
-        line.patience_s = 0.5
+        line.patience_s = 5.0
         reply = line.read(1, POSITION, 9)
         assert reply and STS3215.decode("present_position", reply.frame.data, POSITION) == 123
         line.close()
@@ -160,7 +161,7 @@ def test_b5_3_late_replies_do_not_shift_the_registers_that_a_recording_keeps():
         line.patience_s = 0.08
         for _ in range(3):
             assert memory_of(line, 1) in (None, memory)
-        line.patience_s = PATIENT_S
+        line.patience_s = 5.0
         assert memory_of(line, 1) == memory
         line.close()
 

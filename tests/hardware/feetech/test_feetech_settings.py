@@ -19,7 +19,14 @@ from pupper_sysid.hardware.feetech import PROTECTIONS, SCS0009, STS3215, Feetech
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
-from support.servo_servers import bench_of, map_of, on_a_port, still_servos, wait_until
+from support.servo_servers import (
+    bench_of,
+    map_of,
+    on_a_port,
+    spare_this_process,
+    still_servos,
+    wait_until,
+)
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -89,13 +96,14 @@ def test_the_other_series_keeps_its_lock_elsewhere(monkeypatch):
 
 
 @pytest.mark.wall_clock
-def test_registers_of_servos_that_were_unplugged_are_set_back_once_they_return(sts):
+def test_registers_of_servos_that_were_unplugged_are_set_back_once_they_return(sts, monkeypatch):
+    spare_this_process(monkeypatch)
     guard = open_guarded(parse_address(f"feetech:{sts.device}"), map_of(1))
     guard.set_register("RF_hip", "p", 8)
     sts.emulator.unplug_for_s = 1.0
     time.sleep(0.1)
     guard.close()
-    assert wait_until(lambda: p_of(sts) == 32, 8.0)
+    assert wait_until(lambda: p_of(sts) == 32)
 
 
 def set_protection(server, **values: int) -> None:
@@ -182,7 +190,7 @@ def test_the_watchdog_sets_registers_and_protections_back_if_the_driver_is_kille
     assert p_of(sts) == 8 and protection(sts) == FACTORY
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    assert wait_until(lambda: protection(sts) == OFF and p_of(sts) == 32, 12.0)
+    assert wait_until(lambda: protection(sts) == OFF and p_of(sts) == 32)
 
 
 def test_an_emulated_servo_that_is_blocked_reports_overload_after_its_protection_time(sts):
@@ -191,6 +199,6 @@ def test_an_emulated_servo_that_is_blocked_reports_overload_after_its_protection
     set_protection(sts, protection_time=20)
     began = time.monotonic()
     while not (reply := line.read(1, 56, 6)) or not reply.frame.code & 32:
-        assert time.monotonic() - began < 5.0
+        assert time.monotonic() - began < 30.0
     assert time.monotonic() - began > 0.19
     line.close()

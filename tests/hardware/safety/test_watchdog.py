@@ -37,8 +37,10 @@ from support.servo_servers import (
     moving_servos,
     on_a_port,
     robot_behind,
+    spare_this_process,
     still_servos,
 )
+from support.stopwatch import Stopwatch
 
 pytestmark = pytest.mark.wall_clock  # what the watchdog does within a second
 
@@ -60,7 +62,7 @@ while not np.isfinite(pose).all():
     pose = bus.read().position_rad
 bus.torque(True)
 start = bus.now()
-print("driving", flush=True)
+print("driving", bus._watchdog._process.pid, flush=True)
 while True:
     goal = pose + 0.3 * np.sin(2 * np.pi * 0.5 * (bus.now() - start))
     bus.write(goal)
@@ -77,6 +79,7 @@ def runtime(monkeypatch, tmp_path):
     """A runtime folder of the test: what the watchdogs say of vanished robots stays there."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.1)
+    spare_this_process(monkeypatch)
 
 
 @pytest.fixture(params=["feetech", "esp32"])
@@ -109,21 +112,26 @@ def angles(server) -> np.ndarray:
     return np.array([bench.angle(k, now) for k in range(len(JOINT_NAMES))])
 
 
-def wait_for(condition, seconds: float) -> float:
-    """How long it took until `condition()` held."""
-    start = time.monotonic()
+def wait_for(condition, *processes: int) -> float:
+    """Seconds these processes and this one took until `condition()` held; a minute at most."""
+    watch, end = Stopwatch(*processes), time.monotonic() + 60.0
+    took = 0.0
     while not condition():
-        assert time.monotonic() - start < seconds, "it never happened"
+        assert time.monotonic() < end, "it never happened"
         time.sleep(0.005)
-    return time.monotonic() - start
+        took = watch.seconds()
+    return took
 
 
-def drive(address: str, *hang: str) -> subprocess.Popen:
+def drive(address: str, *hang: str) -> tuple[subprocess.Popen, int]:
+    """A driver that moves the robot, and the process id of its watchdog."""
     process = subprocess.Popen(
         [sys.executable, "-c", DRIVER, address, *hang], stdout=subprocess.PIPE, cwd=ROOT
     )
-    assert process.stdout is not None and process.stdout.readline() == b"driving\n"
-    return process
+    assert process.stdout is not None
+    word, watchdog = process.stdout.readline().split()
+    assert word == b"driving"
+    return process, int(watchdog)
 
 
 def switched_on(address: str) -> GuardedBus:
@@ -138,12 +146,11 @@ def switched_on(address: str) -> GuardedBus:
 def test_a_killed_driver_s_robot_is_back_where_it_was_found_and_limp_within_a_second(robot):
     server, address = robot
     found = angles(server)
-    process = drive(address)
+    process, watchdog = drive(address)
     time.sleep(0.5)  # a quarter of its swing: farthest out
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    took = wait_for(lambda: limp(server), 5.0)
-    assert took < 1.5  # a second on an idle machine; tests share theirs
+    assert wait_for(lambda: limp(server), watchdog) < 1.5
     np.testing.assert_allclose(angles(server), found, atol=0.06)
 
 
@@ -155,27 +162,28 @@ def test_a_robot_that_was_unplugged_when_it_should_go_limp_does_so_once_it_is_ba
     time.sleep(0.1)
     bus.limp()
     bus.close()
-    wait_for(lambda: limp(server), 8.0)
+    wait_for(lambda: limp(server))
 
 
 @on_bus("esp32")
 def test_a_hung_driver_is_ended_and_its_robot_parked(robot):
     server, address = robot
-    process = drive(address)
+    process, watchdog = drive(address)
     os.kill(process.pid, signal.SIGSTOP)
-    took = wait_for(lambda: limp(server), 6.0)
-    assert 0.9 < took < 3.5
-    assert process.wait(2.0) == -signal.SIGKILL
+    stopped = time.monotonic()
+    assert wait_for(lambda: limp(server), watchdog) < 3.5
+    assert time.monotonic() - stopped > 0.9
+    assert process.wait(20.0) == -signal.SIGKILL
 
 
 @on_bus("feetech")
 def test_a_driver_that_hangs_after_a_stop_for_safety_leaves_its_robot_limp_where_it_is(robot):
     server, address = robot
     found = angles(server)
-    process = drive(address, "hang when it should go limp")
-    wait_for(lambda: limp(server), 6.0)
+    process, _ = drive(address, "hang when it should go limp")
+    wait_for(lambda: limp(server))
     assert np.abs(angles(server) - found).max() > 0.15
-    assert process.wait(2.0) == -signal.SIGKILL
+    assert process.wait(20.0) == -signal.SIGKILL
 
 
 @on_bus("feetech")
@@ -200,10 +208,10 @@ def test_a_dead_thigh_servo_does_not_keep_the_others_of_a_walking_robot_on(monke
         orders = orders_for("feetech", server.device, "sts3215")
         parking = threading.Thread(target=watchdog_process.park, args=(orders,))
         parking.start()
-        wait_for(lambda: (tmp_path / "pupper-sysid" / LOG).exists(), 10.0)
+        wait_for(lambda: (tmp_path / "pupper-sysid" / LOG).exists())
     assert dict(bench_of(servos).torques) == dict.fromkeys(there, False)
     assert bench_of(servos).goals == []
-    parking.join(10.0)
+    parking.join(60.0)
     assert not parking.is_alive(), "its folder is gone: it cannot come back"
     said = (tmp_path / "pupper-sysid" / LOG).read_text()
     assert "the torque of LF_thigh could not be switched off and may be on" in said
@@ -217,12 +225,12 @@ def test_servos_that_hear_but_do_not_answer_go_limp():
         orders = orders_for("feetech", server.device, "sts3215")
         parking = threading.Thread(target=watchdog_process.park, args=(orders,), daemon=True)
         parking.start()
-        wait_for(lambda: limp(server), 10.0)
+        wait_for(lambda: limp(server))
 
 
 def test_a_program_that_waits_for_the_lock_does_not_keep_the_robot_on(robot):
     server, address = robot
-    process = drive(address)
+    process, watchdog = drive(address)
     waiting = subprocess.Popen(
         [sys.executable, "-c", WAITS_FOR_LOCK, address.split(":", 1)[1]],
         cwd=ROOT, stdout=subprocess.PIPE,
@@ -231,7 +239,7 @@ def test_a_program_that_waits_for_the_lock_does_not_keep_the_robot_on(robot):
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     try:
-        assert wait_for(lambda: limp(server), 8.0) < 4.0
+        assert wait_for(lambda: limp(server), watchdog) < 4.0
         assert waiting.stdout is not None and waiting.stdout.readline() == b"held\n"
     finally:
         waiting.kill()
@@ -258,14 +266,14 @@ def test_a_watchdog_that_was_stopped_is_noticed_within_a_second(robot):
     assert bus._watchdog is not None
     stopped = bus._watchdog._process.pid
     os.kill(stopped, signal.SIGSTOP)
-    began = time.monotonic()
+    watch = Stopwatch()
     try:
         pose = bus.read().position_rad
         with pytest.raises(SafetyStop, match="has not answered for 0.5 s"):
-            while time.monotonic() - began < 5.0:
+            while watch.seconds() < 5.0:
                 bus.write(np.where(np.isfinite(pose), pose, bus.sent))
                 bus.sleep_until(bus.now() + 0.02)
-        assert time.monotonic() - began < 3.0  # half a second on an idle machine
+        assert watch.seconds() < 3.0
         bus.close()
         assert limp(server)
     finally:
@@ -291,7 +299,7 @@ def test_a_robot_that_does_not_confirm_is_left_to_a_new_watchdog_if_the_old_one_
     bus.close()
     try:
         assert bus._watchdog._process.pid != gone
-        wait_for(lambda: limp(server), 8.0)
+        wait_for(lambda: limp(server))
     finally:
         with suppress(ProcessLookupError):
             os.kill(gone, signal.SIGCONT)
@@ -301,10 +309,10 @@ def test_beats_to_a_watchdog_that_reads_nothing_never_wait():
     lost = Watchdog(BusAddress("esp32", "/tmp/none"), load_joint_map("mini_pupper_2"))
     os.kill(lost._process.pid, signal.SIGSTOP)
     try:
-        began = time.monotonic()
+        watch = Stopwatch()
         for _ in range(2000):
             lost._send({"registers": {"LF_hip": dict.fromkeys(map(str, range(20)), 1)}})
-        assert time.monotonic() - began < 2.0
+        assert watch.seconds() < 2.0
     finally:
         lost._process.kill()
         lost._process.wait()
@@ -383,14 +391,15 @@ SWEEP = f"{PATIENT}\nfrom pupper_sysid.cli.programs.pupper_sysid import main\nma
 def test_a_terminated_sweep_parks_the_robot_itself_and_can_be_resumed(robot, tmp_path, capsys):
     server, address = robot
     path = tmp_path / "a.csv"
-    words = ("sweep", "--joints", "LF_hip", "--freqs", "3", "--duration", "1")
+    # at 20 Hz a busy machine keeps up
+    words = ("sweep", "--joints", "LF_hip", "--freqs", "3", "--duration", "2", "--rate", "20")
     process = subprocess.Popen(
         [sys.executable, "-c", SWEEP, *words, "--bus", address, "--out", str(path)],
         cwd=ROOT, stderr=subprocess.PIPE,
     )  # fmt: skip
-    wait_for(lambda: path.exists() and path.read_text().count("LF_hip,") > 25, 30.0)
+    wait_for(lambda: path.exists() and path.read_text().count("LF_hip,") > 25)
     process.terminate()
-    said = process.communicate(timeout=10)[1].decode()
+    said = process.communicate(timeout=60)[1].decode()
     assert process.returncode == 143 and "Stopped." in said and "Traceback" not in said
     # on a serial line only the named joint is driven, and so only it is let go
     assert not server.emulator.bench.is_on(JOINT_NAMES.index("LF_hip"))

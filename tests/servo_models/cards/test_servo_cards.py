@@ -10,11 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pupper_sysid.common.data_sheet import (
-    data_sheet,
-    recorded_stall_torque,
-    stall_torque,
-)
+from pupper_sysid.common.data_sheet import data_sheet, recorded_stall_torque, stall_torque
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.cards.bam import ACTUATORS, BamParameters, from_bam, to_bam

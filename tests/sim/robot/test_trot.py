@@ -17,13 +17,7 @@ TROT = Trot(
     turn_gain=1.0, turn_dead_band_rad_s=0.0,
 )  # fmt: skip
 STEP_S = 0.02
-COMMANDS = (
-    (0.2, 0.0, 0.0),
-    (-0.2, 0.0, 0.0),
-    (0.0, 0.1, 0.0),
-    (0.0, 0.0, 0.5),
-    (0.15, -0.05, 0.3),
-)
+COMMANDS = ((0.2, 0.0, 0.0), (-0.2, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.5), (0.15, -0.05, 0.3))
 """Forward, backward, sideways, turning, all at once."""
 
 

@@ -271,8 +271,7 @@ def test_robots_with_all_differences_go_on_exactly_from_a_saved_state():
 def test_ranges_that_cannot_be_drawn_from_are_refused():
     wrong = ({"missed_ticks": 1.5}, {"battery": (1.2, 0.8)}, {"joint_zero_rad": -0.1})
     assert_each_refused(
-        [(settings, "differences") for settings in wrong],
-        lambda settings: Differences(**settings),
+        [(settings, "differences") for settings in wrong], lambda settings: Differences(**settings)
     )
 
 

@@ -25,14 +25,14 @@ PENDULUM = PendulumLoad(mass_kg=0.2, length_m=0.12)
 
 def trials(
     servo: LoadedServoParameters, there: PendulumLoad | None, claimed: PendulumLoad,
-    motion: str = "steps", **setup,
+    motion: str = "steps", rows: int = 400, **setup,
 ) -> tuple[Trial, ...]:  # fmt: skip
     """Runs at P 16 and 32 of a servo with one load, whose header claims another."""
     made = []
     for number, gain in enumerate((16.0, 32.0)):
         rng = np.random.default_rng(number)
-        time = LOOP_S * np.arange(400)
-        command = np.repeat(rng.uniform(-1, 1, 10), 40)
+        time = LOOP_S * np.arange(rows)
+        command = np.repeat(rng.uniform(-1, 1, rows // 40), 40)
         if motion == "chirp":
             command = 0.9 * np.sin(1.2 * time**2)
         load = Load(there.inertia_kg_m2, there.gravity_nm, 0.0) if there else Load()
@@ -68,7 +68,7 @@ def servos_and_motions(quick: tuple[str, str]):
 @servos_and_motions(("STS3215", "steps"))
 def test_a_pendulum_that_is_not_there_is_refused_in_a_sentence(servo, motion):
     with pytest.raises(InputError) as refused:
-        notes_of(trials(SERVOS[servo], None, PENDULUM, motion))
+        notes_of(trials(SERVOS[servo], None, PENDULUM, motion, rows=200))
     for words in ("knee", "0.2 kg at 0.12 m", "shows none", "Take `loads` out"):
         assert words in str(refused.value)
 

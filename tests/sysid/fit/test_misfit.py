@@ -28,8 +28,8 @@ def explanation(
 ) -> Explanation | None:
     """What is found of the motion of one servo, by a fit of the plain one."""
     rng = np.random.default_rng(0)
-    time = CONTINUOUS_S * np.arange(int(4.0 / CONTINUOUS_S))
-    levels = np.repeat(0.3 * rng.standard_normal(16), len(time) // 16)
+    time = CONTINUOUS_S * np.arange(int(2.0 / CONTINUOUS_S))
+    levels = np.repeat(0.3 * rng.standard_normal(8), len(time) // 8)
     runs = (fine_run(levels), fine_run(0.3 * np.sin(2 * np.pi * 2.0 * time)))
     moved = tuple(filtered(r, filter_s) for r in runs) if filter_s else runs
     tracks = free_run(structure, np.array([numbers[n] for n in structure.names]), moved)

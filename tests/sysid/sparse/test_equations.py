@@ -15,13 +15,7 @@ from pupper_sysid.servo_models.sparse_equation import (
 )
 from pupper_sysid.sysid.fit.run import free_run
 from pupper_sysid.sysid.recordings.files import load
-from pupper_sysid.sysid.sparse import (
-    LINEAR,
-    PULLS,
-    equation_model,
-    fit_equations,
-    sparse_equations,
-)
+from pupper_sysid.sysid.sparse import LINEAR, PULLS, equation_model, fit_equations, sparse_equations
 from support.command_line import run
 from support.refusals import assert_each_refused
 from support.runs import run_of

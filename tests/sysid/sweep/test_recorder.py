@@ -241,7 +241,9 @@ from pupper_sysid.sysid.sweep.excitation import plan
 from pupper_sysid.sysid.sweep.recorder import record
 rng = np.random.default_rng(1)
 bus = EmulatedBus(draw_robot(rng), rng, real_time=True)
-record(bus, plan("sine", ["LF_hip"], [2.0], duration_s=60.0), Path(sys.argv[1]))
+slow = {"loop_period_s": 0.05}  # a busy machine keeps up
+made = plan("sine", ["LF_hip"], [2.0], duration_s=60.0, **slow)
+record(bus, made, Path(sys.argv[1]), **slow)
 """
 
 
@@ -249,9 +251,8 @@ def test_a_process_killed_in_mid_sweep_leaves_a_recording(tmp_path):
     path = tmp_path / "killed.csv"
     process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)])
     try:
-        until = time.monotonic() + 60
-        while not (path.exists() and path.read_text().count("LF_hip,") > 60):
-            assert time.monotonic() < until and process.poll() is None
+        while not (path.exists() and path.read_text().count("LF_hip,") > 30):
+            assert process.poll() is None
             time.sleep(0.05)
     finally:
         os.kill(process.pid, signal.SIGKILL)
@@ -259,10 +260,10 @@ def test_a_process_killed_in_mid_sweep_leaves_a_recording(tmp_path):
     recording = load(path)
     assert "completed" not in recording.metadata
     trial = recording.trials("LF_hip")[0]
-    assert len(trial.send_time_s) >= 60
-    assert recording.loop_period_s == pytest.approx(PERIOD, rel=0.1)
+    assert len(trial.send_time_s) >= 30
+    assert recording.loop_period_s == pytest.approx(0.05, rel=0.1)
     # real time passed as the recording says
-    assert np.ptp(trial.send_time_s) > 0.9 * PERIOD * len(trial.send_time_s)
+    assert np.ptp(trial.send_time_s) > 0.9 * 0.05 * len(trial.send_time_s)
     assert any("not recorded to its end" in warning for warning in recording.warnings)
 
 
