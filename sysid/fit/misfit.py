@@ -1,14 +1,14 @@
 """What a servo that the model does not describe looks like: explanations, tried one by one.
 
 Each explanation is the carried fit with one thing more, fitted from there: a low-pass filter in
-front of the servo, play, a dead zone of the controller. The best is named where the likelihood is
+front of the servo, or one of `_FEATURES`. The best is named where the likelihood is
 decidedly better with it. Simulators do not run these, so the numbers stay those of the carried fit;
 but a number that another explanation moves is not known better than the two are apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,9 +31,44 @@ _AS_LIKELY_NATS = -1.0
 it, by its own price of 1."""
 _SHARES = np.array([0.4, 0.7, 0.95])
 """Of what friction holds back: parts that a dead zone or play is given at the start."""
-_WORDS = {
-    "backlash": ("backlash_rad", "play of {:.1f} mrad between motor and link"),
-    "dead zone": ("dead_zone_rad", "a dead zone of {:.1f} mrad to either side in its controller"),
+_TRADED = ("backlash", "dead zone")  # with friction
+
+
+@dataclass(frozen=True)
+class _Feature:
+    """One thing more: its words, its numbers at the starts, and the unit of the first in words."""
+
+    words: str
+    starts: Mapping[str, tuple[float, ...]]
+    unit: float = 1.0
+    of: str = ""
+    """What the starts are shares of."""
+    free_air_only: bool = False
+    """Whether a servo under load has this, or something alike, among its own terms."""
+
+
+_FEATURES = {
+    "backlash": _Feature(
+        "play of {:.1f} mrad between motor and link", {"backlash_rad": (0.003, 0.01, 0.03)}, 1e-3
+    ),
+    "dead zone": _Feature(
+        "a dead zone of {:.1f} mrad to either side in its controller",
+        {"dead_zone_rad": (0.003, 0.01, 0.03)}, 1e-3,
+    ),
+    "integral": _Feature(
+        "an integral term in its controller, of {:.2g}/s times the proportional one",
+        {"integral_per_s": (0.5, 2.0, 8.0)},
+    ),
+    "stribeck": _Feature(
+        "more friction at rest than in motion",
+        {"stribeck_friction": (0.3, 1.0, 2.0), "stribeck_speed_rad_s": (0.3, 0.1, 0.5)},
+        of="friction_rad_s2", free_air_only=True,
+    ),
+    "gravity": _Feature(
+        "a load whose weight pulls at it",
+        {"gravity_sin": (0.1, -0.1, 0.0), "gravity_cos": (0.0, 0.0, 0.1)},
+        of="effort_rad_s2", free_air_only=True,
+    ),
 }  # fmt: skip
 
 
@@ -90,7 +125,7 @@ def explanations(
     rng : numpy.random.Generator
     """
     tried = _low_pass(problem, best, temperature, anew, rng)
-    for feature in _WORDS:
+    for feature in _FEATURES:
         tried += _with_feature(problem, best, temperature, feature, rng)
     return sorted((x for x in tried if x.nats >= _AS_LIKELY_NATS), key=lambda x: -x.nats)
 
@@ -161,29 +196,38 @@ def _earlier(structure: Structure, point: NDArray, time_constant_s: float) -> ND
 
 
 def _with_feature(
-    problem: Problem, best: Fit, temperature: float, feature: str, rng: np.random.Generator
+    problem: Problem, best: Fit, temperature: float, name: str, rng: np.random.Generator
 ) -> list[Explanation]:
-    structure = problem.structure
-    if feature in structure.features:
+    structure, feature = problem.structure, _FEATURES[name]
+    if name in structure.features or (feature.free_air_only and not structure.scales.free_air):
         return []
-    wider = servo_structure((*structure.features, feature), structure.scales)
-    name, words = _WORDS[feature]
-    values = np.repeat(wider.decode(wider.adopt(structure, best.point))[None], 6, axis=0)
-    place = wider.names.index(name)
-    values[:3, place] = 0.003, 0.01, 0.03
-    if {"friction_rad_s2", "stiffness_per_s2"} <= {*wider.names}:
+    wider = servo_structure((*structure.features, name), structure.scales)
+    if feature.of and feature.of not in wider.names:
+        return []
+    carried = wider.decode(wider.adopt(structure, best.point))
+    values = np.repeat(carried[None], 3, axis=0)
+    for number, starts in feature.starts.items():
+        whole = 1.0
+        if feature.of and not number.endswith("_rad_s"):
+            whole = carried[wider.names.index(feature.of)]
+        values[:, wider.names.index(number)] = whole * np.array(starts)
+    place = wider.names.index(next(iter(feature.starts)))
+    if name in _TRADED and {"friction_rad_s2", "stiffness_per_s2"} <= {*wider.names}:
         # what friction holds back at the carried stiffness may be this in its place
-        friction = values[3:, wider.names.index("friction_rad_s2")]
-        values[3:, place] = _SHARES * friction / values[3:, wider.names.index("stiffness_per_s2")]
+        traded = values.copy()
+        friction = traded[:, wider.names.index("friction_rad_s2")]
+        traded[:, place] = _SHARES * friction / traded[:, wider.names.index("stiffness_per_s2")]
         friction *= 1.0 - _SHARES
+        values = np.concatenate([values, traded])
     starts = np.clip(wider.encode(values), *wider.box)
     behind = replace(problem, structure=wider)
     fit = from_about(behind, refine(behind, starts), rng)
     values = wider.decode(fit.point)
+    price = len(wider.names) - len(structure.names)
     shared = [wider.names.index(name) for name in structure.names]
     return [
         Explanation(
-            words.format(1e3 * values[place]), (best.cost - fit.cost) / temperature - 1.0,
-            float(values[0]), fit.point[shared],
+            feature.words.format(values[place] / feature.unit),
+            (best.cost - fit.cost) / temperature - price, float(values[0]), fit.point[shared],
         )
     ]  # fmt: skip

@@ -28,7 +28,7 @@ from pupper_sysid.sysid.fit.structure import Structure
 STEPPING_SD_S = 0.1 * TIME_STEP_S
 """Error of a dead time [s] that no number of readings reduces, because the model moves in steps:
 the shift that suits random servos simulated in steps of 0.1 ms best is 0 to 0.25 ms."""
-_STEPPING_SHARE = 0.006
+STEPPING_SHARE = 0.006
 """Relative error of torques that physics steps leave, whatever the number of readings: standard
 deviation over random emulated pendulums that move in other steps."""
 _PROFILE_SHARE = 0.02
@@ -426,7 +426,7 @@ def interval_of(name: str, value: float, draws: NDArray) -> Interval:
     elif name.endswith(("hanging_rad", "offset_rad")) or value <= 0:
         return Interval(value, low, high)
     else:
-        share = _PROFILE_SHARE if name == "acceleration_limit" else _STEPPING_SHARE
+        share = _PROFILE_SHARE if name == "acceleration_limit" else STEPPING_SHARE
         grain = _Z * share * value
     low, high = value - float(np.hypot(value - low, grain)), value + np.hypot(high - value, grain)
     return Interval(value, max(low, 0.0), float(high))
