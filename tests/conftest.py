@@ -12,10 +12,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # frozen figures are those of AVX2: wider registers round sums in another order, and a search turns
 # on the last bit. NumPy and OpenBLAS read this when they are imported, here and in the workers.
-_CPU = Path("/proc/cpuinfo")
-if _CPU.exists() and " avx512f " in _CPU.read_text():
-    os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
-    os.environ.setdefault("NPY_DISABLE_CPU_FEATURES", "X86_V4 AVX512_ICL AVX512_SPR")
+os.environ.update(
+    {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR"}
+    if os.path.exists("/proc/cpuinfo") and " avx512f " in Path("/proc/cpuinfo").read_text()
+    else {}
+)
 
 import hypothesis
 import pytest

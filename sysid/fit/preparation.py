@@ -55,7 +55,7 @@ _RIPPLE = 0.7  # autocorrelation below which a logged voltage is ripple, not the
 _STEPS_S = (TIME_STEP_S, TIME_STEP_S / 2, TIME_STEP_S / 4)
 """Physics steps of a fit, from the usual one to the shortest."""
 _MOST_SHIFT = 0.5
-"""Of a number's standard deviation: what an error of the step may be, which adds an eighth to it."""
+"""Of a number's standard deviation: what an error of the step may be; it adds an eighth to it."""
 _JACOBIAN_STEP = 0.01
 _SEARCHED_S = 250.0
 """Duration of all runs together that a search uses; the final fit uses all."""

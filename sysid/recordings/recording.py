@@ -96,8 +96,8 @@ class Trial:
     """By how much the clock of the readings ran faster than that of the commands, a share of the
     time; `read_time_s` is by the commands' clock, whatever it is."""
     falls_behind_s: float = 0.0
-    """By how much readings come later behind their commands at the recording's end than at its
-    beginning, where that may be clocks that drift apart or two loops of slightly different rates."""
+    """By how much later behind their commands readings come at the recording's end than at its
+    beginning, where that may be clocks that drift apart or two loops of slightly other rates."""
     p_gain: float = float("nan")
     """P gain of the servo's position loop, the register's value; NaN where it is unknown."""
     torque_enabled: NDArray[np.bool_] | None = None

@@ -70,7 +70,7 @@ def exact_recording(noise_rad: float, effort: float) -> Recording:
     rng, step_s = np.random.default_rng(2), CONTINUOUS_S
     time = step_s * np.arange(int(6.0 / step_s))
     sent = np.arange(0.0, 6.0, 0.005)
-    command = 0.5 * np.sin(2 * np.pi * (0.5 * sent + 0.4 * sent**2))
+    command = 0.5 * np.sin(2 * np.pi * (0.5 * sent + 0.15 * sent**2))
     servo = replace(TRUE, effort_limit=effort, velocity_limit=np.inf)
     motion = DelayedPD(servo, step_s).rollout(command[(time / 0.005 + 1e-9).astype(int)])
     position = np.interp(sent + 0.002, time + step_s, motion)
@@ -84,7 +84,7 @@ def exact_recording(noise_rad: float, effort: float) -> Recording:
 def test_exact_readings_of_a_servo_at_its_limit_are_fitted_in_shorter_steps():
     exact, coarse = (
         prepare_joint(JOINT, exact_recording(noise, effort).trials(JOINT), 0)
-        for noise, effort in ((1e-4, 60.0), (0.02, 5000.0))
+        for noise, effort in ((5e-5, 300.0), (0.02, 5000.0))
     )
     assert {run.step_s for run in exact.runs} <= {0.001, 0.0005}
     assert {run.step_s for run in coarse.runs} == {TIME_STEP_S}

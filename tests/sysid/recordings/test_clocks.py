@@ -1,4 +1,4 @@
-"""Clocks of commands and readings that drift apart: seen in the stamps, and taken out of the dates."""
+"""Clocks of commands and readings that drift apart: seen in the stamps, taken out of the dates."""
 
 from __future__ import annotations
 
