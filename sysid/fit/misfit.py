@@ -13,8 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from pupper_sysid.common import filters
+from pupper_sysid.common.interval import LEVEL
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.search import Fit, Problem, from_about, refine, search_widely
@@ -29,8 +31,12 @@ _NATS = 10.0
 _AS_LIKELY_NATS = -1.0
 """Log-likelihood from which the servo may as well be like that: a number that changes nothing has
 it, by its own price of 1."""
+_WITHIN_NATS = float(ndtri(0.5 + LEVEL / 2)) ** 2 / 2
+"""Log-likelihood that a number at the end of its interval costs."""
 _SHARES = np.array([0.4, 0.7, 0.95])
 """Of what friction holds back: parts that a dead zone or play is given at the start."""
+_LEFT = (0.3, 0.05)
+"""Shares of the friction that may be left then."""
 _TRADED = ("backlash", "dead zone")  # with friction
 
 
@@ -127,7 +133,7 @@ def explanations(
     tried = _low_pass(problem, best, temperature, anew, rng)
     for feature in _FEATURES:
         tried += _with_feature(problem, best, temperature, feature, rng)
-    return sorted((x for x in tried if x.nats >= _AS_LIKELY_NATS), key=lambda x: -x.nats)
+    return sorted(tried, key=lambda x: -x.nats)
 
 
 def decided(likely: Sequence[Explanation]) -> Explanation | None:
@@ -176,7 +182,7 @@ def _low_pass(
             f"a low-pass filter of about {1e3 * t:.0f} ms in front of it", nats[t],
             float(structure.decode(fits[t].point)[0]), fits[t].point,
         )
-        for t in dict.fromkeys((middle, slowest))
+        for t in dict.fromkeys((middle, slowest)) if nats[t] >= _AS_LIKELY_NATS
     ]  # fmt: skip
 
 
@@ -221,13 +227,37 @@ def _with_feature(
         values = np.concatenate([values, traded])
     starts = np.clip(wider.encode(values), *wider.box)
     behind = replace(problem, structure=wider)
-    fit = from_about(behind, refine(behind, starts), rng)
-    values = wider.decode(fit.point)
+    best_with = from_about(behind, refine(behind, starts), rng)
     price = len(wider.names) - len(structure.names)
+
+    def nats(fit: Fit) -> float:
+        return (best.cost - fit.cost) / temperature - price
+
+    if nats(best_with) < _AS_LIKELY_NATS:
+        return []
+    fits = [best_with]
+    if name in _TRADED and "friction_rad_s2" in wider.names:
+        # what the two hold back together may be all that the data tell: the least likely friction
+        less = [_with_less_friction(behind, starts, share) for share in _LEFT]
+        fits += [fit for fit in less if nats(fit) >= nats(best_with) - _WITHIN_NATS][-1:]
     shared = [wider.names.index(name) for name in structure.names]
     return [
         Explanation(
-            feature.words.format(values[place] / feature.unit),
-            (best.cost - fit.cost) / temperature - price, float(values[0]), fit.point[shared],
+            feature.words.format(float(wider.decode(fit.point)[place]) / feature.unit), nats(fit),
+            float(wider.decode(fit.point)[0]), fit.point[shared],
         )
+        for fit in fits
     ]  # fmt: skip
+
+
+def _with_less_friction(behind: Problem, starts: NDArray[np.float64], share: float) -> Fit:
+    """The fit from starts with no more friction than a share of the most that they have."""
+    wider = behind.structure
+    place = wider.names.index("friction_rad_s2")
+    friction = wider.parameters[place]
+    most = max(share * float(np.exp(starts[:, place].max())), 1.01 * friction.low)
+    bounded = list(wider.parameters)
+    bounded[place] = replace(friction, high=most)
+    structure = replace(wider, parameters=tuple(bounded))
+    fit = refine(replace(behind, structure=structure), np.clip(starts, *structure.box))
+    return replace(fit, point=np.clip(fit.point, *wider.box))
