@@ -10,17 +10,10 @@ os.environ["PYTHONDONTWRITEBYTECODE"] = ""
 # the workers share the cores; networks this small only wait for other threads
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# frozen figures are those of AVX2: wider registers round sums in another order, and a search turns
-# on the last bit. NumPy and OpenBLAS read this when they are imported, here and in the workers.
-os.environ.update(
-    {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR"}
-    if os.path.exists("/proc/cpuinfo") and " avx512f " in Path("/proc/cpuinfo").read_text()
-    else {}
-)
-
 import hypothesis
 import pytest
 
+import support.avx2  # noqa: F401
 from support.package import ROOT
 from support.real_recordings import real_recording
 
