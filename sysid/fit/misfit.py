@@ -175,7 +175,8 @@ def _low_pass(
         between = middle * factor
         fits[between] = refine(_behind(problem, between), fits[middle].point[None])
         middle = min(fits, key=lambda t: fits[t].cost)
-    nats = {t: (best.cost - fit.cost) / temperature - 1.0 for t, fit in fits.items()}
+    least = _tempered(problem, best, temperature)
+    nats = {t: least - _tempered(problem, fit, temperature) - 1.0 for t, fit in fits.items()}
     slowest = max((t for t in fits if nats[t] >= _AS_LIKELY_NATS), default=middle)
     return [
         Explanation(
@@ -184,6 +185,12 @@ def _low_pass(
         )
         for t in dict.fromkeys((middle, slowest)) if nats[t] >= _AS_LIKELY_NATS
     ]  # fmt: skip
+
+
+def _tempered(problem: Problem, fit: Fit, temperature: float) -> float:
+    """Minus the logarithm of the posterior's density at a fit."""
+    prior = float(problem.prior(fit.point[None])[0])
+    return (fit.cost - prior) / temperature + prior
 
 
 def _behind(problem: Problem, time_constant_s: float) -> Problem:
@@ -230,8 +237,10 @@ def _with_feature(
     best_with = from_about(behind, refine(behind, starts), rng)
     price = len(wider.names) - len(structure.names)
 
+    least = _tempered(problem, best, temperature)
+
     def nats(fit: Fit) -> float:
-        return (best.cost - fit.cost) / temperature - price
+        return least - _tempered(behind, fit, temperature) - price
 
     if nats(best_with) < _AS_LIKELY_NATS:
         return []

@@ -48,7 +48,7 @@ from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _NOISE_RAD = 0.02  # of a first fit where no lag could be measured
-_LEAST_NOISE_RAD = 3e-4
+_LEAST_NOISE_RAD = 1e-4
 _ROUNDS = 3
 _LEAST_READINGS = 20  # of a run under load: fewer tell nothing that the others do not
 _RIPPLE = 0.7  # autocorrelation below which a logged voltage is ripple, not the supply
