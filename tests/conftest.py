@@ -5,23 +5,18 @@ import os
 import sys
 from pathlib import Path
 
-import hypothesis
-import pytest
-
-from support.package import ROOT
-from support.real_recordings import real_recording
-
 # modules are compiled once, not by every worker and every program that a test starts
 os.environ["PYTHONDONTWRITEBYTECODE"] = ""
 # the workers share the cores; networks this small only wait for other threads
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# frozen figures are those of AVX2: wider registers round sums in another order, and a search turns
-# on the last bit. NumPy and OpenBLAS read this when they are imported, which no import above does.
-_CPU = Path("/proc/cpuinfo")
-if _CPU.exists() and " avx512f " in _CPU.read_text():
-    os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
-    os.environ.setdefault("NPY_DISABLE_CPU_FEATURES", "X86_V4 AVX512_ICL AVX512_SPR")
+
+import hypothesis
+import pytest
+
+import support.avx2  # noqa: F401
+from support.package import ROOT
+from support.real_recordings import real_recording
 
 sys.dont_write_bytecode = False
 

@@ -120,6 +120,16 @@ WORDS: dict[str, str] = {
         "{after:.2f} times after it: settings, supply, torque limit or load changed. Use the "
         "two parts apart."
     ),
+    "clocks_drift": (
+        "the clock of the readings drifts from that of the commands by {percent:+.3f} %; readings "
+        "are dated by the commands' clock, in doubt by {doubt_ms:.1f} ms. Stamp both with one "
+        "monotonic clock."
+    ),
+    "falls_behind": (
+        "the time from a command to its reading grows by {growth_ms:+.1f} ms over the recording: "
+        "clocks that drift apart, or two loops whose rates differ a little. Dates are in doubt by "
+        "{doubt_ms:.1f} ms; stamp commands and readings with one monotonic clock."
+    ),
     "gain_drifts": (
         "the joint moves {percent:+.0f} % farther at the end than at the beginning, by the same "
         "commands: a servo that heats, a supply that sinks, or a load that grows. Use a part, or "

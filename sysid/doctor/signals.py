@@ -334,6 +334,11 @@ def _two_clocks(trials: Sequence[Trial], loop: float) -> list[Finding]:
     early = -middle
     if early > max(_READ_EARLY_S, _READ_EARLY_LOOPS * loop):
         return [Finding("read_early", CARE, {"early_ms": 1000.0 * early, "loops": early / loop})]
+    doubt_ms = 1e3 * max(t.read_time_doubt_s for t in trials)
+    if rate := max((t.clock_drift for t in trials), key=abs):
+        return [Finding("clocks_drift", CARE, {"percent": 100 * rate, "doubt_ms": doubt_ms})]
+    if growth := max((t.falls_behind_s for t in trials), key=abs):
+        return [Finding("falls_behind", CARE, {"growth_ms": 1e3 * growth, "doubt_ms": doubt_ms})]
     drift = float(np.ptp(np.quantile(apart, (0.02, 0.98))))
     if drift > max(_READ_APART_S, _READ_APART_LOOPS * loop):
         return [Finding("clocks_apart", CARE, {"drift_s": drift})]

@@ -124,6 +124,7 @@ _POLL_SD_S = 1e-3
 """Standard deviation of a poll's instant about its lattice: jitter of the bus and drift."""
 _AT_BOUND = 0.03
 """Distance from a bound, in fitted coordinates, that counts as on it."""
+_COMMAND_WINDOW_S = 0.05
 _COVARIANCE_STEP = 0.03  # the slope over a likely error, not of one kink
 
 
@@ -1034,12 +1035,12 @@ def _free_warnings(
 
 def _command_speed(run: Run) -> float:
     """Peak rate of the command [rad/s], over windows longer than a control loop."""
-    window = 25
+    window = round(_COMMAND_WINDOW_S / run.step_s)
     command = run.command
     if len(command) <= window:
         return 0.0
     moved = command[window:] - command[:-window]
-    return float(np.max(np.abs(moved)) / (window * TIME_STEP_S))
+    return float(np.max(np.abs(moved)) / (window * run.step_s))
 
 
 # ------------------------------------------------------------------------------- under load

@@ -32,10 +32,11 @@ COLUMNS = (
     "velocity_limit", "acceleration_limit", "stribeck_friction", "stribeck_speed",
     "load_friction_motor", "load_friction_load", "load_friction_quadratic",
     "load_friction_static", "torque_limit", "off_brake", "dead_zone_rad", "start_duty",
-    "gravity_nm", "hanging_rad", "backlash_rad", "offset_rad",
+    "gravity_nm", "hanging_rad", "backlash_rad", "integral_per_s", "offset_rad",
 )  # fmt: skip
 """A candidate's numbers, in order: those of the servo without its dead time, then the gravity [N·m]
-and hanging position [rad] that are added to the load's, and the offset of readings [rad]."""
+and hanging position [rad] that are added to the load's, play, the integral gain over the
+proportional one [1/s], and the offset of readings [rad]."""
 OFFSET, WIDTH = len(COLUMNS) - 1, len(COLUMNS)
 
 _LIMITS = ("velocity_limit", "acceleration_limit", "torque_limit", "effort_limit")
@@ -152,6 +153,7 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
     before, after = _lanes(), _lanes()
     one, two, share = _lanes(), _lanes(), _lanes()
     on, rate, play = _lanes(), _lanes(), _lanes()
+    summed, most_summed, mean_error = _lanes(), _lanes(), _lanes()
     braked, clipped, drive, free = _lanes(), _lanes(), _lanes(), _lanes()
     begin, error, acting, pull, limit = _lanes(), _lanes(), _lanes(), _lanes(), _lanes()
     slew, friction, firmware, profile, gravity, backlash = (
@@ -182,11 +184,13 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
         y[i] = start - w[OFFSET]
         s[i], play[i] = y[i], y[i]
         v[i], rate[i], on[i] = 0.0, 0.0, 1.0
+        summed[i], most_summed[i] = 0.0, p[2, i] / max(p[0, i], 1e-12)
+        p[21, i] = h * w[21]
         track[0, i] = y[i]
         slew = slew or w[6] < np.inf
         profile = profile or w[7] < np.inf
         friction = friction or w[8] + w[10] + w[11] + w[12] > 0.0
-        firmware = firmware or w[16] + w[17] > 0.0
+        firmware = firmware or w[16] + w[17] + w[21] > 0.0
         gravity = gravity or p[18, i] != 0.0
         backlash = backlash or w[20] > 0.0
     supply = held.shape[0] > 1
@@ -279,7 +283,7 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
                 one[i] = before[i]
                 two[i] = after[i]
         for i in range(LANES):
-            drive[i], free[i], begin[i], error[i] = 0.0, 0.0, 0.0, 0.0
+            drive[i], free[i], begin[i], error[i], mean_error[i] = 0.0, 0.0, 0.0, 0.0, 0.0
         for part_of in range(1 if steady else 0, 2):
             for i in range(LANES):
                 x = two[i] if part_of else one[i]
@@ -288,13 +292,17 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
                 for i in range(LANES):
                     x = error[i] - clip(error[i], p[16, i])
                     begin[i] = p[17, i] * clip(x * (1.0 / START_ERROR_RAD), 1.0)
-                    error[i] = x
+                    error[i] = x + summed[i]
+                    mean_error[i] += (1.0 - share[i] if part_of else share[i]) * x
             for i in range(LANES):
                 weight = 1.0 - share[i] if part_of else share[i]
                 wanted = error[i] * p[0, i] - p[1, i] * v[i] + begin[i]
                 reached = clip(wanted, p[2, i])
                 drive[i] += reached * weight
                 free[i] += weight * (1.0 if reached == wanted else 0.0)
+        if firmware:  # its integral alone commands no more than the effort limit
+            for i in range(LANES):
+                summed[i] = clip(summed[i] + p[21, i] * mean_error[i], most_summed[i])
         if plain:
             for i in range(LANES):
                 step = clipped[i] + (braked[i] - clipped[i]) * free[i]

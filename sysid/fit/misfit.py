@@ -1,20 +1,22 @@
 """What a servo that the model does not describe looks like: explanations, tried one by one.
 
 Each explanation is the carried fit with one thing more, fitted from there: a low-pass filter in
-front of the servo, play, a dead zone of the controller. The best is named where the likelihood is
+front of the servo, or one of `_FEATURES`. The best is named where the likelihood is
 decidedly better with it. Simulators do not run these, so the numbers stay those of the carried fit;
 but a number that another explanation moves is not known better than the two are apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from pupper_sysid.common import filters
+from pupper_sysid.common.interval import LEVEL
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.search import Fit, Problem, from_about, refine, search_widely
@@ -29,11 +31,50 @@ _NATS = 10.0
 _AS_LIKELY_NATS = -1.0
 """Log-likelihood from which the servo may as well be like that: a number that changes nothing has
 it, by its own price of 1."""
+_WITHIN_NATS = float(ndtri(0.5 + LEVEL / 2)) ** 2 / 2
+"""Log-likelihood that a number at the end of its interval costs."""
 _SHARES = np.array([0.4, 0.7, 0.95])
 """Of what friction holds back: parts that a dead zone or play is given at the start."""
-_WORDS = {
-    "backlash": ("backlash_rad", "play of {:.1f} mrad between motor and link"),
-    "dead zone": ("dead_zone_rad", "a dead zone of {:.1f} mrad to either side in its controller"),
+_LEFT = (0.3, 0.05)
+"""Shares of the friction that may be left then."""
+_TRADED = ("backlash", "dead zone")  # with friction
+
+
+@dataclass(frozen=True)
+class _Feature:
+    """One thing more: its words, its numbers at the starts, and the unit of the first in words."""
+
+    words: str
+    starts: Mapping[str, tuple[float, ...]]
+    unit: float = 1.0
+    of: str = ""
+    """What the starts are shares of."""
+    free_air_only: bool = False
+    """Whether a servo under load has this, or something alike, among its own terms."""
+
+
+_FEATURES = {
+    "backlash": _Feature(
+        "play of {:.1f} mrad between motor and link", {"backlash_rad": (0.003, 0.01, 0.03)}, 1e-3
+    ),
+    "dead zone": _Feature(
+        "a dead zone of {:.1f} mrad to either side in its controller",
+        {"dead_zone_rad": (0.003, 0.01, 0.03)}, 1e-3,
+    ),
+    "integral": _Feature(
+        "an integral term in its controller, of {:.2g}/s times the proportional one",
+        {"integral_per_s": (0.5, 2.0, 8.0)},
+    ),
+    "stribeck": _Feature(
+        "more friction at rest than in motion",
+        {"stribeck_friction": (0.3, 1.0, 2.0), "stribeck_speed_rad_s": (0.3, 0.1, 0.5)},
+        of="friction_rad_s2", free_air_only=True,
+    ),
+    "gravity": _Feature(
+        "a load whose weight pulls at it",
+        {"gravity_sin": (0.1, -0.1, 0.0), "gravity_cos": (0.0, 0.0, 0.1)},
+        of="effort_rad_s2", free_air_only=True,
+    ),
 }  # fmt: skip
 
 
@@ -90,9 +131,9 @@ def explanations(
     rng : numpy.random.Generator
     """
     tried = _low_pass(problem, best, temperature, anew, rng)
-    for feature in _WORDS:
+    for feature in _FEATURES:
         tried += _with_feature(problem, best, temperature, feature, rng)
-    return sorted((x for x in tried if x.nats >= _AS_LIKELY_NATS), key=lambda x: -x.nats)
+    return sorted(tried, key=lambda x: -x.nats)
 
 
 def decided(likely: Sequence[Explanation]) -> Explanation | None:
@@ -134,15 +175,22 @@ def _low_pass(
         between = middle * factor
         fits[between] = refine(_behind(problem, between), fits[middle].point[None])
         middle = min(fits, key=lambda t: fits[t].cost)
-    nats = {t: (best.cost - fit.cost) / temperature - 1.0 for t, fit in fits.items()}
+    least = _tempered(problem, best, temperature)
+    nats = {t: least - _tempered(problem, fit, temperature) - 1.0 for t, fit in fits.items()}
     slowest = max((t for t in fits if nats[t] >= _AS_LIKELY_NATS), default=middle)
     return [
         Explanation(
             f"a low-pass filter of about {1e3 * t:.0f} ms in front of it", nats[t],
             float(structure.decode(fits[t].point)[0]), fits[t].point,
         )
-        for t in dict.fromkeys((middle, slowest))
+        for t in dict.fromkeys((middle, slowest)) if nats[t] >= _AS_LIKELY_NATS
     ]  # fmt: skip
+
+
+def _tempered(problem: Problem, fit: Fit, temperature: float) -> float:
+    """Minus the logarithm of the posterior's density at a fit."""
+    prior = float(problem.prior(fit.point[None])[0])
+    return (fit.cost - prior) / temperature + prior
 
 
 def _behind(problem: Problem, time_constant_s: float) -> Problem:
@@ -161,29 +209,64 @@ def _earlier(structure: Structure, point: NDArray, time_constant_s: float) -> ND
 
 
 def _with_feature(
-    problem: Problem, best: Fit, temperature: float, feature: str, rng: np.random.Generator
+    problem: Problem, best: Fit, temperature: float, name: str, rng: np.random.Generator
 ) -> list[Explanation]:
-    structure = problem.structure
-    if feature in structure.features:
+    structure, feature = problem.structure, _FEATURES[name]
+    if name in structure.features or (feature.free_air_only and not structure.scales.free_air):
         return []
-    wider = servo_structure((*structure.features, feature), structure.scales)
-    name, words = _WORDS[feature]
-    values = np.repeat(wider.decode(wider.adopt(structure, best.point))[None], 6, axis=0)
-    place = wider.names.index(name)
-    values[:3, place] = 0.003, 0.01, 0.03
-    if {"friction_rad_s2", "stiffness_per_s2"} <= {*wider.names}:
+    wider = servo_structure((*structure.features, name), structure.scales)
+    if feature.of and feature.of not in wider.names:
+        return []
+    carried = wider.decode(wider.adopt(structure, best.point))
+    values = np.repeat(carried[None], 3, axis=0)
+    for number, starts in feature.starts.items():
+        whole = 1.0
+        if feature.of and not number.endswith("_rad_s"):
+            whole = carried[wider.names.index(feature.of)]
+        values[:, wider.names.index(number)] = whole * np.array(starts)
+    place = wider.names.index(next(iter(feature.starts)))
+    if name in _TRADED and {"friction_rad_s2", "stiffness_per_s2"} <= {*wider.names}:
         # what friction holds back at the carried stiffness may be this in its place
-        friction = values[3:, wider.names.index("friction_rad_s2")]
-        values[3:, place] = _SHARES * friction / values[3:, wider.names.index("stiffness_per_s2")]
+        traded = values.copy()
+        friction = traded[:, wider.names.index("friction_rad_s2")]
+        traded[:, place] = _SHARES * friction / traded[:, wider.names.index("stiffness_per_s2")]
         friction *= 1.0 - _SHARES
+        values = np.concatenate([values, traded])
     starts = np.clip(wider.encode(values), *wider.box)
     behind = replace(problem, structure=wider)
-    fit = from_about(behind, refine(behind, starts), rng)
-    values = wider.decode(fit.point)
+    best_with = from_about(behind, refine(behind, starts), rng)
+    price = len(wider.names) - len(structure.names)
+
+    least = _tempered(problem, best, temperature)
+
+    def nats(fit: Fit) -> float:
+        return least - _tempered(behind, fit, temperature) - price
+
+    if nats(best_with) < _AS_LIKELY_NATS:
+        return []
+    fits = [best_with]
+    if name in _TRADED and "friction_rad_s2" in wider.names:
+        # what the two hold back together may be all that the data tell: the least likely friction
+        less = [_with_less_friction(behind, starts, share) for share in _LEFT]
+        fits += [fit for fit in less if nats(fit) >= nats(best_with) - _WITHIN_NATS][-1:]
     shared = [wider.names.index(name) for name in structure.names]
     return [
         Explanation(
-            words.format(1e3 * values[place]), (best.cost - fit.cost) / temperature - 1.0,
-            float(values[0]), fit.point[shared],
+            feature.words.format(float(wider.decode(fit.point)[place]) / feature.unit), nats(fit),
+            float(wider.decode(fit.point)[0]), fit.point[shared],
         )
+        for fit in fits
     ]  # fmt: skip
+
+
+def _with_less_friction(behind: Problem, starts: NDArray[np.float64], share: float) -> Fit:
+    """The fit from starts with no more friction than a share of the most that they have."""
+    wider = behind.structure
+    place = wider.names.index("friction_rad_s2")
+    friction = wider.parameters[place]
+    most = max(share * float(np.exp(starts[:, place].max())), 1.01 * friction.low)
+    bounded = list(wider.parameters)
+    bounded[place] = replace(friction, high=most)
+    structure = replace(wider, parameters=tuple(bounded))
+    fit = refine(replace(behind, structure=structure), np.clip(starts, *structure.box))
+    return replace(fit, point=np.clip(fit.point, *wider.box))

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,7 @@ from pupper_sysid.sysid.fit.structure import Structure
 STEPPING_SD_S = 0.1 * TIME_STEP_S
 """Error of a dead time [s] that no number of readings reduces, because the model moves in steps:
 the shift that suits random servos simulated in steps of 0.1 ms best is 0 to 0.25 ms."""
-_STEPPING_SHARE = 0.006
+STEPPING_SHARE = 0.006
 """Relative error of torques that physics steps leave, whatever the number of readings: standard
 deviation over random emulated pendulums that move in other steps."""
 _PROFILE_SHARE = 0.02
@@ -114,22 +115,26 @@ def sample(
     Ionides, E. L. (2008). Truncated importance sampling. Journal of Computational and Graphical
     Statistics 17: 295–311.
     """
-    least = float(_tempered(problem, best.point[None], temperature)[0])
-    mixture = _Mixture.about(problem, best.point[None], temperature)
+    target = _Target(problem, temperature)
+    begin = target.straight(best.point[None])
+    least = float(target.cost(begin)[0])
+    mixture = _Mixture.about(target, begin)
     mixtures: list[_Mixture] = []
-    points, cost, density = np.empty((0, len(best.point))), np.empty(0), np.empty(0)
+    points, cost, density = np.empty((0, begin.shape[1])), np.empty(0), np.empty(0)
     weight, r_hat, effective = np.empty(0), float("inf"), 1.0
     for turn in range(rounds):
         drawn = mixture.draw(_POPULATION, rng)
-        own = _tempered(problem, drawn, temperature)
+        own = target.cost(drawn)
         first = int(np.argmin(own))
         if not np.isfinite(own[first]):  # all beyond the bounds
             mixture = replace(mixture, roots=0.5 * mixture.roots)
             continue
         if own[first] < least - _BETTER and turn < rounds // 2:  # an optimum beside: begin there
-            fit = local(problem, drawn[first : first + 1], _DATE_ITERATIONS, _CURVATURE_STEP)[0]
-            least = float(_tempered(problem, fit.point[None], temperature)[0])
-            mixture, mixtures = _Mixture.about(problem, fit.point[None], temperature), []
+            start = target.fitted(drawn[first : first + 1])
+            fit = local(problem, start, _DATE_ITERATIONS, _CURVATURE_STEP)[0]
+            begin = target.straight(fit.point[None])
+            least = float(target.cost(begin)[0])
+            mixture, mixtures = _Mixture.about(target, begin), []
             points, cost, density = points[:0], cost[:0], density[:0]
             continue
         density = np.logaddexp(density, mixture.log_density(points))
@@ -142,26 +147,95 @@ def sample(
         r_hat, effective = convergence(points, weight)
         if r_hat <= R_HAT and effective >= EFFECTIVE:
             break
-        mixture = _Mixture.of(problem, points, weight, temperature, rng)
+        mixture = _Mixture.of(target, points, weight, rng)
     if not len(points):
         return Posterior(np.repeat(best.point[None], _DRAWS, axis=0), best, r_hat, effective)
-    likeliest = points[int(np.argmin(cost))]
+    likeliest = target.fitted(points[int(np.argmin(cost))])
     whole = float(problem.costs(likeliest[None])[0])
     # truncated, so that few points do not stand for all where there was no convergence
     weight = np.minimum(weight, 1.0 / np.sqrt(len(weight)))
-    draws = points[rng.choice(len(points), _DRAWS, p=weight / weight.sum())]
+    draws = target.fitted(points[rng.choice(len(points), _DRAWS, p=weight / weight.sum())])
     return Posterior(draws, Fit(likeliest, whole), r_hat, effective)
 
 
-def _tempered(problem: Problem, points: NDArray, temperature: float) -> NDArray[np.float64]:
-    """Minus the logarithm of the posterior's density; infinite outside of the box."""
-    low, high = problem.structure.box
-    inside = ((points >= low) & (points <= high)).all(axis=1)
-    cost = np.full(len(points), np.inf)
-    if inside.any():
-        prior = problem.prior(points[inside])
-        cost[inside] = (problem.costs(points[inside]) - prior) / temperature + prior
-    return np.where(np.isfinite(cost), cost, np.inf)
+@dataclass(frozen=True)
+class _Target:
+    """The tempered posterior of a problem, in coordinates in which its ridge is straight.
+
+    Of damping and back-EMF a motion inside of the effort limit tells the sum only, so that in the
+    logarithms of damping, effort and speed the posterior is a thin bent shell, of which a mixture
+    covers a part. Here the logarithms of the sum and of back-EMF over damping stand for those of
+    damping and speed; the determinant of the change is 1.
+    """
+
+    problem: Problem
+    temperature: float
+
+    @cached_property
+    def _places(self) -> tuple[int, int, int] | None:
+        """Of damping, speed and effort in the coordinates; None where they are not all fitted."""
+        names = self.problem.structure.names
+        for three in (
+            ("damping_per_s", "no_load_speed_rad_s", "effort_rad_s2"),
+            ("damping", "no_load_speed_rad_s", "stall_torque"),
+        ):
+            if {*three} <= {*names}:
+                damping, speed, effort = (names.index(name) for name in three)
+                return damping, speed, effort
+        return None
+
+    def straight(self, fitted: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (..., parameters) of fitted coordinates in these."""
+        if self._places is None:
+            return fitted
+        damping, speed, effort = self._places
+        points = fitted.copy()
+        back_emf = fitted[..., effort] - fitted[..., speed]
+        points[..., damping] = np.logaddexp(fitted[..., damping], back_emf)
+        points[..., speed] = back_emf - fitted[..., damping]
+        return points
+
+    def fitted(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The inverse of `straight`."""
+        if self._places is None:
+            return points
+        damping, speed, effort = self._places
+        fitted = points.copy()
+        fitted[..., damping] = points[..., damping] - np.logaddexp(0.0, points[..., speed])
+        fitted[..., speed] = points[..., effort] - fitted[..., damping] - points[..., speed]
+        return fitted
+
+    def cost(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Minus the logarithm of the density; infinite outside of the box."""
+        low, high = self.problem.structure.box
+        fitted = self.fitted(points)
+        inside = ((fitted >= low) & (fitted <= high)).all(axis=1)
+        cost = np.full(len(points), np.inf)
+        if inside.any():
+            prior = self.problem.prior(fitted[inside])
+            readings = self.problem.costs(fitted[inside]) - prior
+            cost[inside] = readings / self.temperature + prior
+        return np.where(np.isfinite(cost), cost, np.inf)
+
+    def curvature(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Hessian of `cost` at points (n, parameters), Gauss-Newton's."""
+        precision, fitted = self.problem.structure.prior_precision, self.fitted(points)
+        bent = curvatures(self.problem, fitted, _STEP) - precision
+        bent = bent / self.temperature + precision
+        if self._places is None:
+            return bent
+        damping, speed, effort = self._places
+        share = 1.0 / (1.0 + np.exp(-points[:, speed]))  # of back-EMF in the sum
+        slope = np.tile(np.eye(points.shape[1]), (len(points), 1, 1))
+        slope[:, damping, speed] = -share
+        slope[:, speed, damping] = -1.0
+        slope[:, speed, speed] = share - 1.0
+        slope[:, speed, effort] = 1.0
+        return slope.mT @ bent @ slope
+
+    def inside(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points moved into the box."""
+        return self.straight(np.clip(self.fitted(points), *self.problem.structure.box))
 
 
 @dataclass(frozen=True)
@@ -179,20 +253,19 @@ class _Mixture:
     roots: NDArray[np.float64]
 
     @classmethod
-    def about(cls, problem: Problem, centres: NDArray, temperature: float) -> _Mixture:
-        """As wide at each centre as the tempered cost says: by its curvature, then along the axes.
+    def about(cls, target: _Target, centres: NDArray[np.float64]) -> _Mixture:
+        """As wide at each centre as the cost says: by its curvature, then along the axes.
 
         A ridge bends, so a step of one standard deviation along an axis of the curvature often
         costs far more than half a unit of log-likelihood; the axis is made shorter then.
         """
-        precision, k = problem.structure.prior_precision, centres.shape[1]
-        bent = (curvatures(problem, centres, _STEP) - precision) / temperature + precision
-        values, axes = np.linalg.eigh(bent)
+        k = centres.shape[1]
+        values, axes = np.linalg.eigh(target.curvature(centres))
         sizes = np.minimum(1.0 / np.sqrt(np.maximum(values, 1e-12)), _WIDEST)
         steps = np.swapaxes(axes * sizes[:, None, :], 1, 2)
         ends = np.concatenate([centres[:, None] + steps, centres[:, None] - steps], axis=1)
-        ends = np.clip(ends, *problem.structure.box).reshape(-1, k)
-        cost = _tempered(problem, np.concatenate([centres, ends]), temperature)
+        ends = target.inside(ends.reshape(-1, k))
+        cost = target.cost(np.concatenate([centres, ends]))
         middle, ends = cost[: len(centres)], cost[len(centres) :].reshape(-1, 2, k)
         rise = ends.sum(axis=1) - 2.0 * middle[:, None]  # 1 of a normal distribution
         rise = np.where(np.isfinite(rise), rise, _RISE[1])
@@ -201,9 +274,8 @@ class _Mixture:
 
     @classmethod
     def of(
-        cls, problem: Problem, points: NDArray, weight: NDArray, temperature: float,
-        rng: np.random.Generator,
-    ) -> _Mixture:  # fmt: skip
+        cls, target: _Target, points: NDArray, weight: NDArray, rng: np.random.Generator
+    ) -> _Mixture:
         """About points drawn by weight, the heaviest points, and as wide as all of them.
 
         A heavy point is one where the mixtures so far have too few.
@@ -212,7 +284,7 @@ class _Mixture:
         flat = flat / flat.sum()
         heaviest = np.argsort(-weight)[: _CENTRES - _BY_WEIGHT]
         centres = points[np.append(rng.choice(len(points), _BY_WEIGHT, p=flat), heaviest)]
-        narrow = cls.about(problem, centres, temperature)
+        narrow = cls.about(target, centres)
         middle = flat @ points
         apart = points - middle
         covariance = (flat * apart.T) @ apart + 1e-12 * np.eye(len(middle))
@@ -426,7 +498,7 @@ def interval_of(name: str, value: float, draws: NDArray) -> Interval:
     elif name.endswith(("hanging_rad", "offset_rad")) or value <= 0:
         return Interval(value, low, high)
     else:
-        share = _PROFILE_SHARE if name == "acceleration_limit" else _STEPPING_SHARE
+        share = _PROFILE_SHARE if name == "acceleration_limit" else STEPPING_SHARE
         grain = _Z * share * value
     low, high = value - float(np.hypot(value - low, grain)), value + np.hypot(high - value, grain)
     return Interval(value, max(low, 0.0), float(high))

@@ -18,6 +18,7 @@ from pupper_sysid.common.data_sheet import no_load_speed
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import JOINT_NAMES, NO_LOAD_SPEED_RAD_S
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.doctor.checks import joint_rng
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
@@ -32,6 +33,7 @@ from pupper_sysid.sysid.fit.claimed_load import check_claimed_load
 from pupper_sysid.sysid.fit.loads import loaded_joints
 from pupper_sysid.sysid.fit.noise import noise_by_run
 from pupper_sysid.sysid.fit.operating_point import reference_gain
+from pupper_sysid.sysid.fit.posterior import STEPPING_SD_S, STEPPING_SHARE
 from pupper_sysid.sysid.fit.run import Run, free_run, fresh_residuals, prepare
 from pupper_sysid.sysid.fit.search import Fit, Problem, refine, search_widely
 from pupper_sysid.sysid.fit.servo_prior import ServoPrior
@@ -46,10 +48,15 @@ from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _NOISE_RAD = 0.02  # of a first fit where no lag could be measured
-_LEAST_NOISE_RAD = 3e-4
+_LEAST_NOISE_RAD = 1e-4
 _ROUNDS = 3
 _LEAST_READINGS = 20  # of a run under load: fewer tell nothing that the others do not
 _RIPPLE = 0.7  # autocorrelation below which a logged voltage is ripple, not the supply
+_STEPS_S = (TIME_STEP_S, TIME_STEP_S / 2, TIME_STEP_S / 4)
+"""Physics steps of a fit, from the usual one to the shortest."""
+_MOST_SHIFT = 0.5
+"""Of a number's standard deviation: what an error of the step may be; it adds an eighth to it."""
+_JACOBIAN_STEP = 0.01
 _SEARCHED_S = 250.0
 """Duration of all runs together that a search uses; the final fit uses all."""
 
@@ -192,19 +199,25 @@ def prepare_joint(
         models = {name: candidate(name, scales) for name in known}
         first = {n: (models[n], Fit(models[n].encode(v), 0.0)) for n, v in known.items()}
     upsets: tuple[Upset, ...] = ()
-    for _ in range(_ROUNDS):
+    step_s = TIME_STEP_S
+    for turn in range(_ROUNDS):
         structure, best = min(first.values(), key=lambda pair: pair[1].cost)
         values = structure.decode(best.point)
+        if free_air and known is None and not turn:
+            noise = noise_by_run(fresh_residuals(structure, values, runs), runs, least)
+            step_s = _step_for(Problem(structure, runs, noise), best, recorded, lattice, volts)
+            if step_s < TIME_STEP_S:
+                recorded, runs = _dated(trials, lattice, volts, free_air, step_s)
         motions = _motions(recorded, runs, free_run(structure, values, runs))
         dated = redate(recorded, lattice, motions)
         if dated is not lattice and dated.phases != lattice.phases:
             lattice = dated
-            recorded, runs = _dated(trials, lattice, volts, free_air)
+            recorded, runs = _dated(trials, lattice, volts, free_air, step_s)
         noise = noise_by_run(fresh_residuals(structure, values, runs), runs, least)
         if not upsets and free_air:  # under load, friction that the model lacks looks the same
-            upsets = _upsets(recorded, lattice, noise, structure, values)
+            upsets = _upsets(recorded, lattice, noise, structure, values, step_s)
         if upsets:
-            recorded, runs = _dated(trials, lattice, volts, free_air, upsets)
+            recorded, runs = _dated(trials, lattice, volts, free_air, step_s, upsets)
             noise = noise_by_run(fresh_residuals(structure, values, runs), runs, least)
         if known is None:
             first = {
@@ -307,6 +320,7 @@ def _upsets(
     noise: Sequence[float],
     structure: Structure,
     values: NDArray[np.float64],
+    step_s: float,
 ) -> tuple[Upset, ...]:
     """Commands that never arrived, in all trials."""
 
@@ -315,7 +329,7 @@ def _upsets(
         time = read.time_s[read.time_s >= trial.send_time_s[0]]
 
         def simulate(command: NDArray[np.float64]) -> NDArray[np.float64]:
-            run = prepare(replace(trial, command_rad=command), read).in_free_air()
+            run = prepare(replace(trial, command_rad=command), read, step_s=step_s).in_free_air()
             return fresh_residuals(structure, values, [run])[0]
 
         return find_upsets(trial, time, scale, simulate)
@@ -326,18 +340,50 @@ def _upsets(
 
 def _dated(
     trials: Sequence[Trial], lattice: PollLattice, volts: float, free_air: bool,
-    upsets: Sequence[Upset] = (),
+    step_s: float = TIME_STEP_S, upsets: Sequence[Upset] = (),
 ) -> tuple[tuple[Trial, ...], tuple[Run, ...]]:  # fmt: skip
     """The trials that have readings that count, as recorded and on the physics clock."""
     touched = {
         t.number: [k for u in upsets if u.trial == t.number for k in u.readings] for t in trials
     }
     least = 1 if free_air else _LEAST_READINGS + 1
-    pairs = [(t, _without(prepare(t, lattice, volts), touched[t.number])) for t in trials]
+    pairs = [(t, _without(prepare(t, lattice, volts, step_s), touched[t.number])) for t in trials]
     if free_air:
         pairs = [(t, run.in_free_air()) for t, run in pairs]
     used = [(t, r) for t, r in pairs if len(r.sample_step) >= least]
     return tuple(t for t, _ in used), tuple(r for _, r in used)
+
+
+def _step_for(
+    problem: Problem, fit: Fit, recorded: Sequence[Trial], lattice: PollLattice, volts: float
+) -> float:
+    """The longest physics step that moves no number by much of what is uncertain about it [s].
+
+    A step in which a torque reaches its limit is simulated with an error of its square; where
+    readings are exact and the motion is at its limits, that is many times the noise. The shift of
+    the numbers that it makes is that of the linearised fit, from the motion in much shorter steps.
+    """
+    structure = problem.structure
+
+    def shorter(step_s: float) -> Problem:
+        runs = tuple(prepare(t, lattice, volts, step_s).in_free_air() for t in recorded)
+        return replace(problem, runs=runs)
+
+    low, high = structure.box
+    away = np.where(fit.point + _JACOBIAN_STEP * structure.scale > high, -1.0, 1.0)
+    away = away * _JACOBIAN_STEP * structure.scale
+    cloud = np.concatenate([fit.point[None], fit.point + np.diag(away)])
+    tracks = shorter(_STEPS_S[-1] / 2).scaled(np.clip(cloud, low, high))
+    jacobian = (tracks[1:] - tracks[0]) / away[:, None]
+    covariance = np.linalg.pinv(jacobian @ jacobian.T + structure.prior_precision)
+    floor = np.where(structure.logarithmic, STEPPING_SHARE, 0.0)
+    floor[0] = STEPPING_SD_S / float(structure.decode(fit.point)[0])
+    most = _MOST_SHIFT * np.hypot(np.sqrt(np.diag(covariance)), floor)
+    for step_s in _STEPS_S[:-1]:
+        error = shorter(step_s).scaled(fit.point[None])[0] - tracks[0]
+        if (np.abs(covariance @ (jacobian @ error)) <= most).all():
+            return step_s
+    return _STEPS_S[-1]
 
 
 def _without(run: Run, touched: Sequence[int]) -> Run:

@@ -150,7 +150,10 @@ def whole_counts(trial: Trial) -> NDArray[np.float64]:
 
 
 def prepare(
-    trial: Trial, reading: Readings | PollLattice, reference_voltage_v: float = float("nan")
+    trial: Trial,
+    reading: Readings | PollLattice,
+    reference_voltage_v: float = float("nan"),
+    step_s: float = TIME_STEP_S,
 ) -> Run:
     """Put one trial on the physics clock.
 
@@ -161,26 +164,28 @@ def prepare(
         Which readings are fresh, and when they were measured.
     reference_voltage_v : float
         The voltage at which the stall torque is defined; NaN where torques do not depend on it.
+    step_s : float
+        Length of a physics step [s].
     """
     if isinstance(reading, PollLattice):
         reading = readings(trial, reading)
     start = float(trial.send_time_s[0])
     stop = max(trial.read_time_s[-1], trial.send_time_s[-1]) - start
-    steps, pad = int(np.ceil(stop / TIME_STEP_S)) + 2, int(LONGEST_DEAD_TIME_S / TIME_STEP_S) + 4
+    steps, pad = int(np.ceil(stop / step_s)) + 2, int(LONGEST_DEAD_TIME_S / step_s) + 4
     sent = trial.send_time_s - start
     held = np.ones((3, pad + steps))
     held[0, :pad] = trial.initial_command_rad
-    edges, held[0, pad:] = _commanded(sent, whole_counts(trial), held[0], pad)
+    edges, held[0, pad:] = _commanded(sent, whole_counts(trial), held[0], pad, step_s)
     if trial.torque_enabled is not None:
         on = trial.torque_enabled.astype(float)
         held[1, :pad] = on[0]
-        held[1, pad:] = averaged(sent, on, steps)
-    held[2] = _voltage(trial, reference_voltage_v, start, pad, steps)
+        held[1, pad:] = averaged(sent, on, steps, step_s)
+    held[2] = _voltage(trial, reference_voltage_v, start, pad, steps, step_s)
     if (held[1:] == 1.0).all():
         held = held[:1]
 
     def to_step(time: NDArray) -> NDArray[np.float64]:
-        return np.clip((time - start) / TIME_STEP_S, 0.0, steps)
+        return np.clip((time - start) / step_s, 0.0, steps)
 
     inside = (reading.time_s >= start) & np.isfinite(reading.position_rad)
     known = trial.position_rad[np.isfinite(trial.position_rad)]
@@ -201,6 +206,7 @@ def prepare(
         row_step=to_step(trial.read_time_s),
         held_step=to_step(np.where(reading.held_time_s >= start, reading.held_time_s, np.nan)),
         row_rad=trial.position_rad,
+        step_s=step_s,
         ramp_share=1.0 if ramp is None or np.isfinite(ramp) else float("inf"),
         ramp_known=ramp is not None,
         source=trial.source,
@@ -234,7 +240,7 @@ def with_voltage(run: Run, trial: Trial, reference_voltage_v: float) -> Run:
     held = np.ones((3, run.held.shape[1]))
     held[: len(run.held)] = run.held
     start = float(trial.send_time_s[0])
-    held[2] = _voltage(trial, reference_voltage_v, start, run.pad, run.steps)
+    held[2] = _voltage(trial, reference_voltage_v, start, run.pad, run.steps, run.step_s)
     return replace(run, held=held)
 
 
@@ -262,7 +268,7 @@ def with_late_commands(run: Run, trial: Trial, jitter_s: float, rng: np.random.G
 
 
 def _voltage(
-    trial: Trial, reference_v: float, start: float, pad: int, steps: int
+    trial: Trial, reference_v: float, start: float, pad: int, steps: int, step_s: float
 ) -> NDArray[np.float64] | float:
     """Supply voltage over the reference, per step; the nominal one where none was logged."""
     if not np.isfinite(reference_v):
@@ -272,9 +278,9 @@ def _voltage(
         nominal = trial.servo.supply_voltage_v
         return 1.0 if nominal is None else nominal / reference_v
     known = np.isfinite(logged)
-    time = TIME_STEP_S * (np.arange(pad + steps) - pad)
+    time = step_s * (np.arange(pad + steps) - pad)
     volts = np.interp(time, trial.read_time_s[known] - start, logged[known])
-    width = int(_VOLTAGE_WINDOW_S / TIME_STEP_S) // 2 * 2 + 1
+    width = int(_VOLTAGE_WINDOW_S / step_s) // 2 * 2 + 1
     padded = np.pad(volts, width // 2, mode="edge")
     return np.convolve(padded, np.full(width, 1.0 / width), "valid") / reference_v
 

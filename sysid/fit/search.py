@@ -109,8 +109,8 @@ class Problem:
 
     @cached_property
     def coarse(self) -> Problem:
-        """The same fit in steps of twice the length (`Run.coarser`)."""
-        return replace(self, runs=tuple(run.coarser() for run in self.runs))
+        """The same fit in longer steps (`Run.coarser`): twice the length, no shorter than usual."""
+        return replace(self, runs=tuple(_coarse(run) for run in self.runs))
 
     def only(self, use: Sequence[bool] | NDArray[np.bool_]) -> Problem:
         """The same fit to some of the runs."""
@@ -119,6 +119,11 @@ class Problem:
             self, runs=tuple(self.runs[i] for i in kept),
             noise_rad=tuple(self.noise_rad[i] for i in kept),
         )  # fmt: skip
+
+
+def _coarse(run: Run) -> Run:
+    longer = run.coarser()
+    return longer if longer.step_s > (1.0 - 1e-9) * TIME_STEP_S else _coarse(longer)
 
 
 @dataclass(frozen=True)

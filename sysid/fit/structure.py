@@ -130,6 +130,8 @@ FEATURES: dict[str, tuple[str, ...]] = {
     "acceleration": ("acceleration_limit",),
     "dead zone": ("dead_zone_rad",),
     "start duty": ("start_duty",),
+    "integral": ("integral_per_s",),
+    "gravity": ("gravity_sin", "gravity_cos"),
 }
 """Terms beside stiffness, effort limit and dry friction, and their parameters."""
 
@@ -206,6 +208,7 @@ SERVO_TERMS = {t.name: t for t in (
          60.0, 1.0, 3000.0, 1.2),
     Term("dead_zone_rad", "dead_zone_rad", "dead_zone_rad", "", 0.003, 1e-4, 0.05, 1.0),
     Term("start_duty", "start_duty", "start_duty", "", 0.01, 1e-4, 0.2, 1.5),
+    Term("integral_per_s", "integral_per_s", "integral_per_s", "", 2.0, 0.02, 100.0, 1.5),
     Term("offset_rad", "offset_rad", "offset_rad", "", 0.0, -0.3, 0.3, 0.02,
          (0.0, -2.0, 2.0, np.inf)),
 )}  # fmt: skip

@@ -59,6 +59,13 @@ class Truncation:
     """An angle that is a whole count; by default the rest position."""
 
 
+_DRIFT_PARTS, _LEAST_OF_A_PART = 12, 10
+_LEAST_DRIFT_S = 1e-3  # below it matters less than a count of most servos
+_DRIFT_OVER_SCATTER = 10.0
+"""Total drift over the scatter of the parts about the line: of twelve that lie about a level, or go
+up once, it is below 5."""
+
+
 @dataclass(frozen=True)
 class Trial:
     """One joint over one stretch of time; arrays are over its rows, in time order."""
@@ -85,6 +92,12 @@ class Trial:
     """How the bus cut the commands."""
     read_time_doubt_s: float = 0.0
     """By how much all readings may have been taken earlier or later than `read_time_s`."""
+    clock_drift: float = 0.0
+    """By how much the clock of the readings ran faster than that of the commands, a share of the
+    time; `read_time_s` is by the commands' clock, whatever it is."""
+    falls_behind_s: float = 0.0
+    """By how much later behind their commands readings come at the recording's end than at its
+    beginning, where that may be clocks that drift apart or two loops of slightly other rates."""
     p_gain: float = float("nan")
     """P gain of the servo's position loop, the register's value; NaN where it is unknown."""
     torque_enabled: NDArray[np.bool_] | None = None
@@ -411,6 +424,8 @@ class Recording:
                         (bus.get("count_zero_rad") or {}).get(joint),
                     ),
                     bus.get("read_time_doubt_s") or 0.0,
+                    0.0,
+                    0.0,
                     float(gain if np.isfinite(gain) or servo.p_gain is None else servo.p_gain),
                     None if torque is None else torque != 0,
                     columns.get("voltage_v"),
@@ -419,7 +434,57 @@ class Recording:
                     self.metadata.get("angle_unit") == "stated",
                 )
             )
-        return in_servo_coordinates(found, bus)
+        return in_servo_coordinates(on_one_clock(found), bus)
+
+
+def on_one_clock(trials: Mapping[str, list[Trial]]) -> dict[str, list[Trial]]:
+    """Trials by joint, their readings dated by the commands' clock where two clocks drift apart.
+
+    The time from a command to its reading is that of a transaction, which does not grow steadily:
+    a line through its medians over parts of the recording is a drift where they lie on it. The
+    clocks agree at the end of the recording at which readings follow commands within a turn of
+    the loop, to about a turn. Where they do so at both ends, commands and readings may as well be
+    of two loops at slightly different rates: nothing is changed, but the growth is in doubt.
+
+    Parameters
+    ----------
+    trials : mapping of joint to list of Trial
+    """
+    every = [t for of_joint in trials.values() for t in of_joint]
+    time = np.concatenate([np.empty(0), *(t.send_time_s for t in every)])
+    apart = np.concatenate([np.empty(0), *(t.read_time_s - t.send_time_s for t in every)])
+    known = np.isfinite(time) & np.isfinite(apart)
+    time, apart = time[known], apart[known]
+    if len(time) < _DRIFT_PARTS * _LEAST_OF_A_PART:
+        return dict(trials)
+    order = np.argsort(time, kind="stable")
+    parts = [
+        np.median(x, axis=1)
+        for x in np.array_split(np.stack([time, apart])[:, order], _DRIFT_PARTS, axis=1)
+    ]
+    middle, median = np.transpose(parts)
+    span = float(middle[-1] - middle[0])
+    if not span > 0:
+        return dict(trials)
+    slope, level = np.polyfit(middle - middle[0], median, 1)
+    scatter = float(np.std(median - level - slope * (middle - middle[0]), ddof=2))
+    total = float(slope * span)
+    if not _LEAST_DRIFT_S < abs(total) or not _DRIFT_OVER_SCATTER * scatter < abs(total):
+        return dict(trials)
+    turn = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in every])))
+    ends = {float(time.min()): level, float(time.max()): level + total}
+    agreed = [when for when, after in ends.items() if -turn / 2 <= after <= turn]
+    doubt = abs(total) if len(agreed) == 2 else turn if agreed else turn + abs(total) / 2
+    reference = float(np.mean(agreed or list(ends)))
+
+    def redated(trial: Trial) -> Trial:
+        doubtful = replace(trial, read_time_doubt_s=trial.read_time_doubt_s + doubt)
+        if len(agreed) == 2:
+            return replace(doubtful, falls_behind_s=total)
+        late = slope * (trial.send_time_s - reference)
+        return replace(doubtful, read_time_s=trial.read_time_s - late, clock_drift=float(slope))
+
+    return {joint: [redated(t) for t in of_joint] for joint, of_joint in trials.items()}
 
 
 def _numbers(place: str, key: str, values: ArrayLike) -> NDArray[np.float64]:

@@ -61,7 +61,7 @@ def servo(
     on = delayed(held[1], dead_time, pad) if len(held) > 1 else np.ones(held.shape[1] - pad)
     volts = held[2, pad:] if len(held) > 1 else np.ones(len(on))
     y = setpoint = shown = start - w["offset_rad"]
-    v = rate = 0.0
+    v = rate = summed = 0.0
     out = [shown]
     for k in range(len(on)):
         commands = window(edges, pad + k - dead_time)
@@ -92,14 +92,17 @@ def servo(
         targets = [moved, moved] if limited else [first, last]
         middle = y + v * h / 2
         effort = w["effort_limit"]
-        drive = free = 0.0
+        drive = free = mean_error = 0.0
         for target, part in zip(targets, (share, 1 - share), strict=True):
             error = target - middle
             error -= np.clip(error, -w["dead_zone_rad"], w["dead_zone_rad"])
             begin = w["start_duty"] * np.clip(error / START_ERROR_RAD, -1, 1) * effort
-            wanted = w["stiffness"] * gain * error - w["damping"] * v + begin
+            mean_error += part * error
+            wanted = w["stiffness"] * gain * (error + summed) - w["damping"] * v + begin
             drive += part * np.clip(wanted, -effort, effort)
             free += part * (abs(wanted) <= effort)
+        most = effort / (w["stiffness"] * gain)
+        summed = np.clip(summed + h * w["integral_per_s"] * mean_error, -most, most)
         back = w["back_emf"] * (w["off_brake"] + (1 - w["off_brake"]) * on[k])
         supply = volts[k] * on[k]
         drawn = drive * supply - back * v

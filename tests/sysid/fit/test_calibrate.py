@@ -16,6 +16,7 @@ from pupper_sysid.sysid.fit.calibrate import STAGES, calibrate
 from pupper_sysid.sysid.fit.calibration_file import GIVEN_TORQUE, to_calibration, torque_anchors
 from pupper_sysid.sysid.fit.dead_time import lag
 from pupper_sysid.sysid.fit.posterior import EFFECTIVE, R_HAT
+from pupper_sysid.sysid.fit.preparation import prepare_joint
 from pupper_sysid.sysid.fit.results import plausible
 from pupper_sysid.sysid.fit.run import prepare
 from pupper_sysid.sysid.recordings.files import load
@@ -58,6 +59,31 @@ def servo_recording(seed: int, frequencies=(1.0, 2.0, 3.0, 4.0)) -> Recording:
         position = np.interp(seen, steps + CONTINUOUS_S, motion, left=0.0)
         trials.append(replace(trial, position_rad=np.round(position / 0.0057) * 0.0057))
     return recorded(trials)
+
+
+def exact_recording(noise_rad: float, effort: float) -> Recording:
+    """Live readings at 200 Hz of a servo that chirps at its torque limit."""
+    rng, step_s = np.random.default_rng(2), CONTINUOUS_S
+    time = step_s * np.arange(int(6.0 / step_s))
+    sent = np.arange(0.0, 6.0, 0.005)
+    command = 0.5 * np.sin(2 * np.pi * (0.5 * sent + 0.15 * sent**2))
+    servo = replace(TRUE, effort_limit=effort, velocity_limit=np.inf)
+    motion = DelayedPD(servo, step_s).rollout(command[(time / 0.005 + 1e-9).astype(int)])
+    position = np.interp(sent + 0.002, time + step_s, motion)
+    position += noise_rad * rng.standard_normal(len(sent))
+    return Recording.from_arrays(
+        sent, {JOINT: command}, {JOINT: position}, read_time_s=sent + 0.002,
+        metadata={"readings": "live", "start_pose_rad": {JOINT: 0.0}},
+    )  # fmt: skip
+
+
+def test_exact_readings_of_a_servo_at_its_limit_are_fitted_in_shorter_steps():
+    exact, coarse = (
+        prepare_joint(JOINT, exact_recording(noise, effort).trials(JOINT), 0)
+        for noise, effort in ((5e-5, 300.0), (0.02, 5000.0))
+    )
+    assert {run.step_s for run in exact.runs} <= {0.001, 0.0005}
+    assert {run.step_s for run in coarse.runs} == {TIME_STEP_S}
 
 
 @pytest.fixture(scope="module")

@@ -30,6 +30,7 @@ TERMS = {
     },
     "torque limit": {"torque_limit": 250.0},
     "backlash": {"backlash_rad": 0.01},
+    "integral": {"integral_per_s": 3.0},
     "another inertia": {"armature": 2.5},
 }  # fmt: skip
 

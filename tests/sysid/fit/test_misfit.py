@@ -65,12 +65,21 @@ def test_a_low_pass_filter_is_named_and_its_dead_time_is_the_true_one():
 
 
 @pytest.mark.parametrize(
-    ("feature", "name", "words"),
-    [("backlash", "backlash_rad", "play of"), ("dead zone", "dead_zone_rad", "a dead zone of")],
-)
-def test_play_and_dead_zones_are_named_with_their_size(feature, name, words):
+    ("feature", "numbers", "words", "size"),
+    [
+        ("backlash", {"backlash_rad": 0.02}, "play of ([0-9.]+) mrad", 20.0),
+        ("dead zone", {"dead_zone_rad": 0.02}, "a dead zone of ([0-9.]+) mrad", 20.0),
+        ("integral", {"integral_per_s": 4.0}, "an integral term .* of ([0-9.]+)/s", 4.0),
+        ("stribeck", {"stribeck_friction": 90.0, "stribeck_speed_rad_s": 0.5},
+         "more friction at rest than in motion()", 0.0),
+        ("gravity", {"gravity_sin": 150.0, "gravity_cos": 0.0}, "a load whose weight pulls()", 0.0),
+    ],
+)  # fmt: skip
+def test_what_a_servo_has_besides_is_named_with_its_size(feature, numbers, words, size):
     wider = servo_structure((*candidate(SIMULATED[0]).features, feature))
-    found = explanation(wider, NUMBERS | {name: 0.02})
-    assert found is not None and found.words.startswith(words)
-    size = float(found.words.removeprefix(words).split()[0])
-    assert size == pytest.approx(20.0, rel=0.15)
+    named = explanation(wider, NUMBERS | numbers)
+    assert named is not None
+    match = re.match(words, named.words)
+    assert match is not None, named.words
+    assert float(match[1] or 0.0) == pytest.approx(size, rel=0.15)
+    assert named.dead_time_s == pytest.approx(NUMBERS["dead_time_s"], abs=1e-3)
