@@ -40,7 +40,14 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
 from pupper_sysid.sysid.doctor.checks import joint_rng
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
 from pupper_sysid.sysid.fit.kernel import COLUMNS
-from pupper_sysid.sysid.fit.run import Run, at_steps, prepare, simulate, with_voltage
+from pupper_sysid.sysid.fit.run import (
+    SHORTEST_STEP_S,
+    Run,
+    at_steps,
+    prepare,
+    simulate,
+    with_voltage,
+)
 from pupper_sysid.sysid.fit.scores import known
 from pupper_sysid.sysid.fit.structure import loaded_columns
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
@@ -204,7 +211,7 @@ def compared_runs(
         ComparedRun(trial, run, place, trial.load is not None)
         for place, recording in enumerate(recordings)
         for trial in recording.trials(joint)
-        if np.isfinite((run := prepare(trial, lattice)).row_rad).any()
+        if np.isfinite((run := prepare(trial, lattice, step_s=SHORTEST_STEP_S)).row_rad).any()
     ]
     if not runs:
         raise InputError(f"{joint}: no readings to compare with. Record it again.")

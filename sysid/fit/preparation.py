@@ -34,7 +34,13 @@ from pupper_sysid.sysid.fit.loads import loaded_joints
 from pupper_sysid.sysid.fit.noise import noise_by_run
 from pupper_sysid.sysid.fit.operating_point import reference_gain
 from pupper_sysid.sysid.fit.posterior import STEPPING_SD_S, STEPPING_SHARE
-from pupper_sysid.sysid.fit.run import Run, free_run, fresh_residuals, prepare
+from pupper_sysid.sysid.fit.run import (
+    SHORTEST_STEP_S,
+    Run,
+    free_run,
+    fresh_residuals,
+    prepare,
+)
 from pupper_sysid.sysid.fit.search import Fit, Problem, refine, search_widely
 from pupper_sysid.sysid.fit.servo_prior import ServoPrior
 from pupper_sysid.sysid.fit.structure import (
@@ -52,7 +58,7 @@ _LEAST_NOISE_RAD = 1e-4
 _ROUNDS = 3
 _LEAST_READINGS = 20  # of a run under load: fewer tell nothing that the others do not
 _RIPPLE = 0.7  # autocorrelation below which a logged voltage is ripple, not the supply
-_STEPS_S = (TIME_STEP_S, TIME_STEP_S / 2, TIME_STEP_S / 4)
+_STEPS_S = (TIME_STEP_S, 2 * SHORTEST_STEP_S, SHORTEST_STEP_S)
 """Physics steps of a fit, from the usual one to the shortest."""
 _MOST_SHIFT = 0.5
 """Of a number's standard deviation: what an error of the step may be; it adds an eighth to it."""

@@ -22,6 +22,9 @@ from pupper_sysid.sysid.fit.structure import LONGEST_DEAD_TIME_S, Structure
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _ACCELERATION = kernel.COLUMNS.index("acceleration_limit")
+SHORTEST_STEP_S = TIME_STEP_S / 4
+"""Physics step in which servos are nearly those of continuous time [s]: predictions take it, and
+fits where longer ones would move a number."""
 _VOLTAGE_WINDOW_S = 0.1
 """Length of the mean of logged voltages: single ones catch the ripple of the pulse width."""
 

@@ -377,6 +377,8 @@ class Structure:
         for j, p in enumerate(self.parameters):
             if p.name in other.names:
                 adopted[..., j] = points[..., other.names.index(p.name)]
+            elif p.name in _SPEEDS:
+                adopted[..., j] = high[j]
             elif p.name in _NEUTRAL or not p.logarithmic:
                 adopted[..., j] = float(p.encode(_NEUTRAL.get(p.name, p.nominal)))
             else:
