@@ -30,16 +30,7 @@ def chosen_map(text: str | None) -> JointMap | None:
 
 
 def joints_on(bus: str, joint_map: JointMap | None, text: str) -> list[str]:
-    """Joints of a bus that `text` names, as `select_joints` reads it.
-
-    Raises
-    ------
-    InputError
-        If one is unknown. Without a joint map names are the Mini Pupper's: a serial line of other
-        servos is then refused for its missing map, not for the name.
-    BusError
-        If that line has no servos, or cannot be opened.
-    """
+    """Joints of a bus that `text` names, as `select_joints` reads it."""
     try:
         return select_joints(text, joint_map.joint_names if joint_map else JOINT_NAMES)
     except InputError:
@@ -71,26 +62,14 @@ def say_remarks(bus: ServoBus) -> None:
 
 
 def parse_registers(text: str) -> dict[str, int]:
-    """Registers of emulated servos that `text` sets: p=16,goal_speed=400.
-
-    Raises
-    ------
-    InputError
-        If it names one that does not act on the motion, or a value that it cannot have.
-    """
+    """Registers of emulated servos that `text` sets: p=16,goal_speed=400."""
     from pupper_sysid.sim.emulator.pendulum import REGISTERS
 
     return _registers(text, REGISTERS, "p=16")[None]
 
 
 def parse_servo_registers(text: str, series: Series) -> dict[int | None, dict[str, int]]:
-    """Registers of emulated servos by id, of all servos under None: p=16,5:mode=1.
-
-    Raises
-    ------
-    InputError
-        If the series has no such register, or a value does not fit into it.
-    """
+    """Registers of emulated servos by id, of all servos under None: p=16,5:mode=1."""
     chosen = _registers(text, sorted([*series.registers, *series.aliases]), "p=16 or 5:mode=1")
     for own in chosen.values():
         for name, value in own.items():

@@ -47,11 +47,6 @@ class Writer:
     ----------
     every_s : float
         Time between two parts [s].
-
-    Raises
-    ------
-    InputError
-        If a library is not installed, a file is there or cannot be written, or no viewer answers.
     """
 
     def __init__(self, about: dict[str, Any]):

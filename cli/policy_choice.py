@@ -45,13 +45,7 @@ def run_folder(path: Path) -> Path:
 
 
 def policy_at(path: Path) -> tuple[Policy, Run | None]:
-    """The policy in a policy folder, or the best (else the last) of a run, and the run.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
+    """The policy in a policy folder, or the best (else the last) of a run, and the run."""
     from pupper_sysid.policies.network.policy_file import (  # torch takes seconds to import
         CONTRACT,
         load_policy,
@@ -98,13 +92,7 @@ def trained_actuator(path: Path, policy: Policy, run: Run | None) -> tuple[str |
 
 
 def chosen_actuator(path: Path, policy: Policy, run: Run | None, given: str | None) -> str:
-    """The actuator for the policy at `path`: the `given` one, else that of its training.
-
-    Raises
-    ------
-    InputError
-        If it is not here.
-    """
+    """The actuator for the policy at `path`: the `given` one, else that of its training."""
     if given is not None:
         check_actuator(given)
         return given
@@ -132,13 +120,7 @@ def _near(name: str, path: Path) -> list[Path]:
 
 
 def refuse_other_robot(policy: Policy, program: str) -> None:
-    """Refuse a policy that walks another robot than the Mini Pupper 2.
-
-    Raises
-    ------
-    InputError
-        If it does.
-    """
+    """Refuse a policy that walks another robot than the Mini Pupper 2."""
     if (own := policy.contract.robot) is not None:
         raise InputError(
             f"{program} knows the Mini Pupper 2 only, and this policy walks {own.name}. Look at it "
@@ -148,13 +130,7 @@ def refuse_other_robot(policy: Policy, program: str) -> None:
 
 
 def body_at(path: Path, policy: Policy, run: Run | None) -> Body:
-    """The robot that the policy at `path` was trained on.
-
-    Raises
-    ------
-    InputError
-        If its MJCF or YAML is not here as it was.
-    """
+    """The robot that the policy at `path` was trained on."""
     return _of_robot(run.task if run else Walking(), path, policy, run).body
 
 

@@ -82,23 +82,12 @@ def read_bytes(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "
         Larger files are refused without being read (`common.reading.content` raises it).
     remedy : str
         What to do, as a sentence; by default, to check the file's name.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, no regular file, larger, or cannot be read.
     """
     return content(path, largest_bytes, remedy)
 
 
 def read_text(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> str:
-    """Text of a UTF-8 file of limited size, without a byte order mark.
-
-    Raises
-    ------
-    InputError
-        As `read_bytes`, and if the file is not text.
-    """
+    """Text of a UTF-8 file of limited size, without a byte order mark."""
     try:
         return read_bytes(path, largest_bytes, remedy).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -121,24 +110,12 @@ def read_yaml(path: Path) -> tuple[Any, dict[Place, int]]:
 
 
 def read_json(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> Any:
-    """Data of a JSON file of limited size.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or is not JSON.
-    """
+    """Data of a JSON file of limited size."""
     return parse_json(read_text(path, largest_bytes, remedy), str(path), remedy)
 
 
 def parse_json(text: str, name: str, remedy: str = "") -> Any:
-    """Data of JSON `text`; `name` says in messages what it is, `remedy` what to do.
-
-    Raises
-    ------
-    InputError
-        If it is not JSON, has too many values, or is nested too deeply.
-    """
+    """Data of JSON `text`; `name` says in messages what it is, `remedy` what to do."""
     refuse_more(name, sum(map(text.count, ",:[{")), MOST_VALUES, "values", remedy)
     refuse_more(name, _depth(text), MAX_DEPTH, "levels of nesting", remedy)
     try:
@@ -216,11 +193,6 @@ def validated(
         The line of every place of the file, from `read_yaml`.
     remedy : str
         What to do instead of editing the file, such as "fit the model again".
-
-    Raises
-    ------
-    InputError
-        On the fault that most likely caused the others.
 
     Examples
     --------

@@ -232,14 +232,7 @@ def load_servo_model(
 
 
 def build(contract: Contract, parameters: Mapping[str, NDArray]) -> Model:
-    """The model of a contract and its arrays.
-
-    Raises
-    ------
-    InputError
-        If the arrays do not fit the contract's architecture, joints and inputs, or hold impossible
-        numbers.
-    """
+    """The model of a contract and its arrays."""
     joints, step = tuple(contract.joints), contract.time_step_s
     _check_names(contract.arch, set(parameters))
     for name, value in parameters.items():

@@ -293,13 +293,7 @@ class GuardedBus:
         return getattr(self.bus, "servo_setups", dict)()
 
     def set_register(self, joint: str, name: str, value: int) -> None:
-        """Set a register of a servo, until `close` sets it back.
-
-        Raises
-        ------
-        BusError
-            If the bus has no registers, or the register does not take the value.
-        """
+        """Set a register of a servo, until `close` sets it back."""
         self._beat()
         self.registers.set(joint, name, value)
         self._beat()
@@ -309,11 +303,6 @@ class GuardedBus:
 
         Like `torque(True)`, but a servo that does not confirm does not prevent the way back of the
         others.
-
-        Raises
-        ------
-        BusError
-            If a joint returns no position.
         """
         self._on = True
         self._locate()
@@ -500,13 +489,7 @@ class ChangedRegisters:
         """Values to be set back, by joint and register."""
 
     def set(self, joint: str, name: str, value: int) -> None:
-        """Set a register; the first time, keep what was found.
-
-        Raises
-        ------
-        BusError
-            If the bus has no registers, or the register does not take the value.
-        """
+        """Set a register; the first time, keep what was found."""
         if not hasattr(self._bus, "set_register"):
             raise BusError(
                 f"{self._bus.name}: registers of its servos cannot be set over this bus. Leave the "

@@ -56,13 +56,7 @@ def rates_in_words(family: Family, baud: int | None) -> str:
 def known_series(
     family: Family, models: dict[int, int], device: str, named: str | None = None
 ) -> dict[int, Series]:
-    """Series of the servos that answered; `named` is the servo of the joint map.
-
-    Raises
-    ------
-    BusError
-        If a model is unknown.
-    """
+    """Series of the servos that answered; `named` is the servo of the joint map."""
     profile = family.profiles.get(named or "")
     for servo, model in models.items():
         if model not in family.series and profile is None:
@@ -85,13 +79,7 @@ def answering_joints(
     all_of_them: bool,
     line: SerialLine,
 ) -> list[str]:
-    """Joints of `wanted` whose servos answer.
-
-    Raises
-    ------
-    BusError
-        If none does, or not `all_of_them`.
-    """
+    """Joints of `wanted` whose servos answer."""
     servos = dict(zip(wanted.joint_names, wanted.ids, strict=True))
     answering = [j for j, i in servos.items() if i in series]
     silent = [f"{j} (id {i})" for j, i in servos.items() if i not in series]
@@ -105,13 +93,7 @@ def answering_joints(
 
 
 def one_series(series: dict[int, Series], device: str) -> Series:
-    """The series of all servos.
-
-    Raises
-    ------
-    BusError
-        If servos whose counts differ share the line.
-    """
+    """The series of all servos."""
     kinds = {s.name: s for s in series.values()}
     if (
         len({s.counts for s in kinds.values()}) != 1
@@ -125,14 +107,7 @@ def one_series(series: dict[int, Series], device: str) -> Series:
 
 
 def default_map(family: Family, line: SerialLine, series: dict[int, Series]) -> JointMap:
-    """Joint map of a line without one: that of the Mini Pupper's layout, if its servos are there.
-
-    Raises
-    ------
-    InputError
-        If the servos are not those of a Mini Pupper: names of another robot's joints would move
-        the wrong ones.
-    """
+    """Joint map of a line without one: the Mini Pupper layout, if its servos are there."""
     one = one_series(series, line.device)
     preset = family.presets.get(one.name)
     silent = [i for i in MINI_PUPPER_IDS if i not in series]
@@ -154,13 +129,7 @@ def default_map(family: Family, line: SerialLine, series: dict[int, Series]) -> 
 
 
 def refuse_other_servos(joint_map: JointMap, family: Family, one: Series, device: str) -> None:
-    """Refuse a joint map that is not of these servos.
-
-    Raises
-    ------
-    InputError
-        If its counts or its servo are others.
-    """
+    """Refuse a joint map that is not of these servos."""
     name = joint_map.file.name
     if joint_map.frame != "raw":
         raise InputError(

@@ -306,12 +306,6 @@ class JointCalibration(Part):
         ----------
         p_gain : float
             The register's value, > 0.
-
-        Raises
-        ------
-        InputError
-            If the calibration is of one gain (the file has no `under_load`), or the gain is not
-            that of a position loop.
         """
         if self.under_load is None:
             raise InputError(

@@ -94,11 +94,6 @@ def half_width(interval: Interval) -> float:
 def parse_goal(text: str) -> Goal:
     """Goal that `text` names: quantity, colon, half width with its unit.
 
-    Raises
-    ------
-    InputError
-        If it is not of that form, or narrower than any recording can make it.
-
     Examples
     --------
     >>> parse_goal("dead_time:2ms")
@@ -154,11 +149,6 @@ def record_until(
         For the plans' record.
     report : callable, optional
         Called with the joints' state after every round of fits.
-
-    Raises
-    ------
-    InputError
-        If a joint has too little motion.
     """
     files, found, widths = list(paths), dict[str, JointOutcome](), dict[str, list[float]]()
     left = list(joints)

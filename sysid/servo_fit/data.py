@@ -139,11 +139,6 @@ def servo_data(
         Of the search for the poll.
     lattices : mapping of joint to PollLattice, optional
         Of the joints whose poll has been found already.
-
-    Raises
-    ------
-    InputError
-        If recordings differ in rate, or a joint has no readings.
     """
     period = _common_period(recordings)
     labels: dict[str, int] = {}

@@ -95,13 +95,7 @@ class RerunStream:
         self._stream.save(path)
 
     def connect(self, url: str) -> None:
-        """Send everything to a viewer, such as `rerun+http://127.0.0.1:9876/proxy`.
-
-        Raises
-        ------
-        InputError
-            If it is no such address.
-        """
+        """Send everything to a viewer, such as `rerun+http://127.0.0.1:9876/proxy`."""
         try:
             self._stream.connect_grpc(url)
         except (RuntimeError, ValueError) as error:
@@ -141,11 +135,6 @@ class RerunStream:
         ----------
         within_s : float, optional
             Longest wait for a viewer [s].
-
-        Raises
-        ------
-        InputError
-            If not everything could be sent.
         """
         try:
             self._stream.flush(**({} if within_s is None else {"timeout_sec": within_s}))

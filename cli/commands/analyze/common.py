@@ -188,11 +188,6 @@ def tries_of(
     """Policies by the names of their runs, and how each is tried.
 
     `other_robots` is whether the analysis is one for any robot's policy.
-
-    Raises
-    ------
-    InputError
-        If two have the same name, or one cannot be read.
     """
     from pupper_sysid.cli.policy_choice import (
         policy_at,
