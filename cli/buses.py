@@ -11,9 +11,8 @@ from pupper_sysid.common.joints import JOINT_NAMES, select_joints
 from pupper_sysid.common.reading.dialect import whole
 from pupper_sysid.hardware.address import EMULATED, KINDS, bus_name, parse_address
 from pupper_sysid.hardware.bus import ServoBus
-from pupper_sysid.hardware.connect import open_bus, open_guarded
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
-from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.guard import GuardedBus, open_bus, open_guarded
 from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.hardware.serial_servos.series import Series
 
@@ -24,7 +23,7 @@ _LARGEST_REGISTER = 1 << 20  # of a Dynamixel in its extended position mode
 def chosen_map(text: str | None) -> JointMap | None:
     """The joint map `text` (a file or a preset), else `joints.yaml` if it is in this folder."""
     if text is None and JOINTS_FILE.exists():
-        terminal.err.print(f"Taking the joint map {JOINTS_FILE}.", soft_wrap=True)
+        terminal.err.print(f"Taking the joint map {JOINTS_FILE}.")
         return load_joint_map(JOINTS_FILE)
     return None if text is None else load_joint_map(text)
 
@@ -58,7 +57,7 @@ def connect(
 def say_remarks(bus: ServoBus) -> None:
     """Print what a bus found out about its line and its servos' registers."""
     if remarks := getattr(bus, "remarks", None):
-        terminal.warn(remarks())
+        terminal.warn(*remarks())
 
 
 def parse_registers(text: str) -> dict[str, int]:

@@ -62,7 +62,7 @@ def policy_at(path: Path) -> tuple[Policy, Run | None]:
         )
     for name in ("policy_best", "policy_last"):
         if (path / name / CONTRACT).is_file():
-            err.print(f"Taking {path / name}.", soft_wrap=True)
+            err.print(f"Taking {path / name}.")
             return load_policy(path / name), load_run(path)
     run = load_run(path)
     if run.architecture.privileged_actor:
@@ -105,10 +105,8 @@ def chosen_actuator(path: Path, policy: Policy, run: Run | None, given: str | No
         )
     if not same:
         warn(
-            [
-                f"{found} is not the file with which {path} was trained: it was changed, or only "
-                "has the same name. Give the right one, or this one, with --actuator."
-            ]
+            f"{found} is not the file with which {path} was trained: it was changed, or only "
+            "has the same name. Give the right one, or this one, with --actuator."
         )
     return found
 
@@ -203,8 +201,7 @@ def trained_commands(policy: Policy, run: Run | None) -> CommandRanges:
     assumed = CommandRanges.of(WALKING[of].commands)
     err.print(
         "The policy's file does not say which commands it was trained for. Assumed are those of "
-        f"the preset {of}: {assumed}.",
-        soft_wrap=True,
+        f"the preset {of}: {assumed}."
     )
     return assumed
 
@@ -212,7 +209,7 @@ def trained_commands(policy: Policy, run: Run | None) -> CommandRanges:
 def warn_of_fallbacks(servos: Iterable[ServoRanges]) -> None:
     """Which joints go by another's numbers, once per calibration."""
     warn(
-        dict.fromkeys(
+        *dict.fromkeys(
             f"{s.source} has no {', '.join(s.fallbacks)}: they take the numbers of "
             f"{', '.join(sorted(set(s.fallbacks.values())))}. Calibrate them to know."
             for s in servos
@@ -226,7 +223,7 @@ def show_match(match: Match) -> None:
     if match.fits:
         err.print(match.sentence())
         return
-    warn([match.sentence()])
+    warn(match.sentence())
     rows = [row for row in match.table() if row["frequency_hz"] % 1 == 0]
     titles = (name.replace("_", " ") for name in rows[0])
     shown = table("Swing over command, and phase", *titles)
@@ -240,10 +237,9 @@ def show_servos(match: ServoMatch | None, carried: bool) -> None:
     if match is None:
         err.print(
             "The robot's servos were not compared with those of the training: "
-            + ("a learned model has no numbers." if carried else "the policy's file has none."),
-            soft_wrap=True,
+            + ("a learned model has no numbers." if carried else "the policy's file has none.")
         )
     elif match.outside:
-        warn([f"{match.here} is not what the policy was trained for:", *match.sentences()])
+        warn(f"{match.here} is not what the policy was trained for:", *match.sentences())
     else:
-        err.print(*match.sentences(), soft_wrap=True)
+        err.print(*match.sentences())

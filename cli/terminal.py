@@ -42,14 +42,16 @@ _CONTROL = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u20
 class _PlainConsole(Console):
     """Console on which text from files cannot move the cursor, set colours or reverse lines.
 
-    Sentences that are one line for other programs (`soft_wrap`) are broken between words on a
-    terminal, unless they hold a command, which would then be copied in parts.
+    Sentences are one line for other programs. On a terminal they are broken between words, unless
+    they hold a command, which would then be copied in parts.
     """
 
     def print(self, *objects: Any, soft_wrap: bool | None = None, **how: Any) -> None:
         """As rich's."""
-        if soft_wrap and self.is_terminal and not _COMMAND.search(" ".join(map(str, objects))):
-            soft_wrap = False
+        if soft_wrap is None:
+            words = all(isinstance(one, str | Text) for one in objects)
+            command = _COMMAND.search(" ".join(map(str, objects)))
+            soft_wrap = words and (command is not None or not self.is_terminal)
         super().print(*objects, soft_wrap=soft_wrap, **how)
 
     def render(
@@ -79,13 +81,13 @@ def load_all(paths: Sequence[Path]) -> list[Recording]:
     chosen = list(paths)
     if not chosen:
         chosen = [newest_recording()]
-        err.print(f"Taking the newest recording, {chosen[0]}.", soft_wrap=True)
+        err.print(f"Taking the newest recording, {chosen[0]}.")
     recordings = [load(log) for path in chosen for log in logs_in(path)]
     by_name: dict[str, tuple[str, ...]] = {}
     for recording in recordings:
         by_name[recording.name] = (*by_name.get(recording.name, ()), *recording.warnings)
     for names, text in share_sentences(by_name):
-        warn([f"{'all logs' if names == 'All joints' else names}: {text}"])
+        warn(f"{'all logs' if names == 'All joints' else names}: {text}")
     return recordings
 
 
@@ -103,7 +105,7 @@ def print_json(value: Any) -> None:
     print(_CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text))
 
 
-def warn(sentences: Iterable[str]) -> None:
+def warn(*sentences: str) -> None:
     """Print warnings on stderr, one per line."""
     for sentence in sentences:
         err.print(Text.assemble(("warning: ", "yellow"), spell(sentence)))
@@ -211,15 +213,13 @@ def _print_fleet_table(
     for _, row in known.query("outliers != ''").iterrows():
         out.print(
             f"{row['robot']} {row['joint']} is an outlier: "
-            f"{', '.join(str(row['outliers']).split(';'))}.",
-            soft_wrap=True,
+            f"{', '.join(str(row['outliers']).split(';'))}."
         )
     for name, problem in sorted(fleet.problems.items()):
-        warn([f"{name} was left out: {problem}"])
+        warn(f"{name} was left out: {problem}")
     err.print(
         f"{len(fleet.made)} made, {len(fleet.kept)} kept, {len(fleet.failed)} failed in "
-        f"{elapsed_s:.0f} s. Wrote {folder / TABLE} and {what} per robot beside it.",
-        soft_wrap=True,
+        f"{elapsed_s:.0f} s. Wrote {folder / TABLE} and {what} per robot beside it."
     )
 
 
@@ -289,6 +289,6 @@ def _bar(label: str, total: float, count: str) -> Iterator[Any]:
                 said = time.monotonic()
                 shown = bar.tasks[0]
                 err.print(f"{shown.description}: {shown.percentage:.0f} %, "
-                          f"{said - started:.0f} s", soft_wrap=True)  # fmt: skip
+                          f"{said - started:.0f} s")  # fmt: skip
 
         yield update

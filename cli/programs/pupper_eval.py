@@ -139,7 +139,7 @@ def _run(options: Eval) -> None:
         return
     _show(found, options.quick)
     if page:
-        err.print(f"Wrote {page}.", soft_wrap=True)
+        err.print(f"Wrote {page}.")
 
 
 def _show(found: Evaluation, quick: bool) -> None:
@@ -147,8 +147,7 @@ def _show(found: Evaluation, quick: bool) -> None:
     err.print(
         f"{'Quick look: ' if quick else ''}{first.episodes} episodes of {found.episode_s:g} s, "
         f"actuator {found.actuator}, feedback {found.feedback}. The trot is open-loop: it has a "
-        "clock and sees nothing. Episode k has the same robot in every row; intervals are of 90 %.",
-        soft_wrap=True,
+        "clock and sees nothing. Episode k has the same robot in every row; intervals are of 90 %."
     )
     _show_falls(found)
     _show_errors(found, "every instant", "")

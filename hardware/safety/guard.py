@@ -18,15 +18,17 @@ to what was found, and the watchdog does if this process dies.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError, SafetyStop
+from pupper_sysid.hardware.address import KINDS, BusAddress
 from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent, ServoBus
+from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.hardware.loop import BUS, GUARD, TimeSpent, raised_cosine
 from pupper_sysid.hardware.safety.monitor import Angles, GuardLimits, Monitor
 from pupper_sysid.hardware.safety.watchdog import Watchdog
@@ -525,3 +527,33 @@ class ChangedRegisters:
     def _tell(self) -> None:
         if self._watchdog:
             self._watchdog.restore(self.found)
+
+
+def open_bus(
+    address: BusAddress,
+    joint_map: JointMap | None = None,
+    joints: Sequence[str] | None = None,
+    exclusive: bool = True,
+) -> Any:
+    """The bus itself, unguarded; see its class for parameters and errors."""
+    cls = KINDS[address.kind].bus_class()
+    return cls.open_address(address, joint_map, joints, exclusive)
+
+
+def open_guarded(
+    address: BusAddress,
+    joint_map: JointMap | None = None,
+    joints: Sequence[str] | None = None,
+    limits: GuardLimits | None = None,
+) -> GuardedBus:
+    """The bus behind its guard, with a watchdog that parks the robot if this process dies."""
+    bus = open_bus(address, joint_map, joints)
+    try:
+        if hasattr(bus, "refuse_unfit"):
+            bus.refuse_unfit()
+        # rate and map as found: nothing is to be detected when it is urgent
+        watchdog = Watchdog(replace(address, baud=bus.metadata.get("baud")), bus.joint_map)
+    except BaseException:
+        bus.close()
+        raise
+    return GuardedBus(bus, limits, watchdog)

@@ -30,16 +30,18 @@ from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.hardware.loop import HostClock
 from pupper_sysid.hardware.serial_servos.line import Reply, slow_adapter
-from pupper_sysid.hardware.serial_servos.opening import (
+from pupper_sysid.hardware.serial_servos.scan import (
     MINI_PUPPER_IDS,
+    LineReport,
     answering_joints,
     default_map,
     known_series,
     one_series,
     open_line,
     refuse_other_servos,
+    scan_line,
+    two_of_one_id,
 )
-from pupper_sysid.hardware.serial_servos.scan import LineReport, scan_line, two_of_one_id
 from pupper_sysid.hardware.serial_servos.series import Family, Series
 from pupper_sysid.hardware.serial_servos.settings import (
     RegisterFault,

@@ -23,17 +23,15 @@ from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.strict_yaml import dump
 from pupper_sysid.servo_models.calibration.calibration import Calibration, InputFile
-from pupper_sysid.servo_models.calibration.operating_point import (
-    NOT_STATED,
-    Armature,
-    OperatingPoint,
-)
 from pupper_sysid.servo_models.calibration.parts import (
     NO_SPEED_LIMIT_RAD_S,
+    NOT_STATED,
     P_GAINS,
     Actuator,
+    Armature,
     Feedback,
     JointCalibration,
+    OperatingPoint,
     RatiosToArmature,
     Scale,
     Selection,

@@ -55,9 +55,14 @@ from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
-from pupper_sysid.sysid.servo_fit.readings import as_rows, learned_run, run_with_offset
 from pupper_sysid.sysid.servo_fit.result import ServoFit
-from pupper_sysid.sysid.servo_fit.scores import LINEAR, ModelScores
+from pupper_sysid.sysid.servo_fit.scores import (
+    LINEAR,
+    ModelScores,
+    as_rows,
+    learned_run,
+    run_with_offset,
+)
 from pupper_sysid.sysid.servo_fit.windows import everything, grouped, merged_groups, only, samples
 
 

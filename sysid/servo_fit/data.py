@@ -9,7 +9,7 @@ Where the feedback is held (more than a fifth of the rows repeat the one before 
 moves), only fresh readings count, each at its own time; otherwise every row as logged.
 
 Every row has the instants at which its reading may have been measured (`Run.reading_tick`): the
-one found, where the poll lattice is known, else that of the read. `sysid.servo_fit.readings` puts
+one found, where the poll lattice is known, else that of the read. `sysid.servo_fit.scores` puts
 the instants of a known bus in their place; a predicted reading is the mean of a model over them.
 
 Trials that follow each other without a pause, like the loops of a playback, are one run. Nothing is

@@ -61,7 +61,7 @@ class Drawn(ABC):
             print_json({**self.about(), **found, "picture": picture})
             return
         out.print(table)
-        err.print(f"Picture: {picture}", soft_wrap=True)
+        err.print(f"Picture: {picture}")
 
     def caption(self, title: str) -> str:
         """Title of the picture of a table with a title; none if it has its own."""
@@ -218,7 +218,7 @@ def tries_of(
             refuse_other_robot(policy, "pupper-analyze")
         task, servos = simulator(path, policy, run, options.actuator, options.feedback)
         wanted = np.array([command], float)
-        within = trained_commands(policy, run).clipped(wanted, lambda text: warn([text]))[0]
+        within = trained_commands(policy, run).clipped(wanted, warn)[0]
         tries[name] = (
             policy,
             Trial(task, servos, (within[0], within[1], within[2]), robots, seconds, options.seed),

@@ -19,7 +19,7 @@ from pupper_sysid.cli.live_views import LiveViews, Wanted, live_views
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, error_words
-from pupper_sysid.hardware.connect import open_bus
+from pupper_sysid.hardware.safety.guard import open_bus
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
 
