@@ -117,12 +117,12 @@ def _near(name: str, path: Path) -> list[Path]:
     return [p for p in (Path(name), *(f / name for f in (folder, *folder.parents))) if p.exists()]
 
 
-def refuse_other_robot(policy: Policy, program: str) -> None:
+def refuse_other_robot(policy: Policy) -> None:
     """Refuse a policy that walks another robot than the Mini Pupper 2."""
     if (own := policy.contract.robot) is not None:
         raise InputError(
-            f"{program} knows the Mini Pupper 2 only, and this policy walks {own.name}. Look at it "
-            "with pupper-play, measure it with pupper-eval, compare its servos with "
+            f"pupper-analyze knows the Mini Pupper 2 only, and this policy walks {own.name}. Look "
+            "at it with pupper-play, measure it with pupper-eval, compare its servos with "
             "pupper-analyze servo-demand, and walk it with pupper-deploy."
         )
 

@@ -291,7 +291,7 @@ class SerialBus(HostClock):
         return {joint: own for joint, own in weak.items() if own}
 
     def register(self, joint: str, name: str) -> int:
-        """Present value of a register; see `hardware.bus.RegisterBus`."""
+        """Present value of a register; `BusError` if it cannot be read."""
         servo = self._servo(joint, name)
         value = read_register(self.line, servo.id, servo.series, name)
         if value is None:
@@ -299,7 +299,7 @@ class SerialBus(HostClock):
         return value
 
     def set_register(self, joint: str, name: str, value: int) -> None:
-        """Set a register and read it back; see `hardware.bus.RegisterBus`."""
+        """Set a register; `BusError` if it is not read back with this value."""
         servo = self._servo(joint, name)
         if not write_register(self.line, servo.id, servo.series, name, value):
             raise BusError(

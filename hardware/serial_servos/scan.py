@@ -69,7 +69,6 @@ def scan_line(
     device: str,
     baud: int | None,
     advance: Callable[[str], None] = lambda what: None,
-    every_id: bool = True,
 ) -> LineReport:
     """Servos of a line, at all rates; `advance` is called with each rate tried, in words.
 
@@ -84,8 +83,8 @@ def scan_line(
         line = family.open_line(device, rate, True)
         try:
             line.detect_echo()
-            whole = every_id and not servos
-            answering = _answering(line, range(family.highest_id + 1) if whole else _USUAL_IDS)
+            ids = _USUAL_IDS if servos else range(family.highest_id + 1)
+            answering = _answering(line, ids)
             if not answering:
                 continue
             first = first or rate

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Annotated
 
 from pydantic import AfterValidator, Field
@@ -123,23 +124,9 @@ class UnderLoad(Part):
         )
 
 
+_ENDINGS = ("", "_nm", "_nm_s_per_rad", "_kg_m2", "_rad_s", "_rad_s2", "_per_nm")
 LOADED_KEYS = {
-    "duty_per_rad": "duty_per_rad",
-    "duty_s_per_rad": "duty_s_per_rad",
-    "stall_torque": "stall_torque_nm",
-    "back_emf": "back_emf_nm_s_per_rad",
-    "armature": "armature_kg_m2",
-    "friction_loss": "friction_loss_nm",
-    "stribeck_friction": "stribeck_friction_nm",
-    "stribeck_speed": "stribeck_speed_rad_s",
-    "load_friction_motor": "load_friction_motor",
-    "load_friction_load": "load_friction_load",
-    "load_friction_quadratic": "load_friction_quadratic_per_nm",
-    "load_friction_static": "load_friction_static",
-    "torque_limit": "torque_limit_nm",
-    "off_brake": "off_brake",
-    "dead_zone_rad": "dead_zone_rad",
-    "start_duty": "start_duty",
-    "acceleration_limit": "acceleration_limit_rad_s2",
+    name: next(name + end for end in _ENDINGS if name + end in UnderLoad.model_fields)
+    for name in (f.name for f in fields(LoadedServoParameters) if f.name != "dead_time_s")
 }
 """Fields of `LoadedServoParameters` and their names in `UnderLoad`."""

@@ -224,7 +224,11 @@ class ServoCard(Part):
             created=f"{self.date}T00:00:00+00:00",
             inputs=self.data,
             notes=tuple(self._notes()),
-            joints={name: self._joint(name) for name in self._in_default_order()},
+            # the default first: it is what other joints fall back on
+            joints={
+                name: self._joint(name)
+                for name in sorted(self.specimens, key=lambda name: name != self.default)
+            },
         )
 
     def to_yaml(self) -> str:
@@ -235,10 +239,6 @@ class ServoCard(Part):
     def save(self, path: Path | str, force: bool = False) -> None:
         """Write this card to `path` as YAML, in one atomic step."""
         write_text(Path(path), self.to_yaml(), force)
-
-    def _in_default_order(self) -> list[str]:
-        """Specimens, the default first: it is what other joints fall back on."""
-        return sorted(self.specimens, key=lambda name: name != self.default)
 
     def _notes(self) -> list[str]:
         kind = "cited from" if self.published else "fitted here to recordings of"

@@ -58,7 +58,7 @@ class TransferFunction(Result):
 
     @property
     def dead_time_s(self) -> float:
-        """The delay beside `rational()`; exact in `evaluate`, `control.pade` may approximate it."""
+        """The delay of the form; exact in `evaluate`, `control.pade` may approximate it."""
         return self.parameters["dead_time_s"].value
 
     def values(self) -> NDArray[np.float64]:
@@ -68,15 +68,6 @@ class TransferFunction(Result):
     def evaluate(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Response at `frequency_hz`, delay included."""
         return _MODELS[self.name].response(self.values(), np.asarray(frequency_hz, float))
-
-    def rational(self) -> control.TransferFunction:
-        """The part without the delay, for python-control."""
-        import control
-
-        v = self.values()
-        if self.name == "FOPDT":
-            return control.TransferFunction([v[0]], [v[2], 1.0])
-        return control.TransferFunction([v[0] * v[2] ** 2], [1.0, 2 * v[3] * v[2], v[2] ** 2])
 
     @derived
     def text(self) -> str:

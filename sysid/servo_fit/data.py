@@ -231,7 +231,11 @@ def _joint_runs(
             tone = np.isfinite(trial.frequency_hz) and trial.frequency_hz > 0
             name = f"{trial.frequency_hz:g} Hz" if tone else f"{prefix}loop {trial.number}"
             group = labels.setdefault(name, len(labels))
-            counted = next(timed) if mode == "fresh" else _all_rows(trial, next(timed))
+            counted = next(timed)
+            if mode == "all":
+                rows = np.flatnonzero(np.isfinite(trial.position_rad))
+                time_s, position = trial.read_time_s[rows], trial.position_rad[rows]
+                counted = replace(counted, rows=rows, time_s=time_s, position_rad=position)
             if not known:
                 first = trial.position_rad[np.isfinite(trial.position_rad)][:1]
                 rest = float(first[0]) if len(first) else trial.initial_command_rad
@@ -251,13 +255,6 @@ def _fresh_while_moving(trials: Sequence[Trial]) -> float:
         move &= np.isfinite(t.position_rad)
         changed, moving = changed + int(move[fresh_rows(t)].sum()), moving + int(move.sum())
     return changed / max(moving, 1)
-
-
-def _all_rows(trial: Trial, timed: Readings) -> Readings:
-    rows = np.flatnonzero(np.isfinite(trial.position_rad))
-    return replace(
-        timed, rows=rows, time_s=trial.read_time_s[rows], position_rad=trial.position_rad[rows]
-    )
 
 
 _ROWS = ("send_time_s", "read_time_s", "command_rad", "position_rad")

@@ -215,7 +215,7 @@ def tries_of(
     for name, path in zip(names, options.policies, strict=True):
         policy, run = policy_at(path)
         if not other_robots:
-            refuse_other_robot(policy, "pupper-analyze")
+            refuse_other_robot(policy)
         task, servos = simulator(path, policy, run, options.actuator, options.feedback)
         wanted = np.array([command], float)
         within = trained_commands(policy, run).clipped(wanted, warn)[0]

@@ -135,7 +135,7 @@ class Export:
             load_calibration,
         )
         from pupper_sysid.servo_models.cards.files import is_card
-        from pupper_sysid.sysid.export.servo_card import to_csv
+        from pupper_sysid.sysid.export.tidy_table import to_csv
         from pupper_sysid.sysid.recordings.files import load
 
         if path.name in ("contract.json", "weights.safetensors"):
