@@ -266,7 +266,8 @@ def _fault(fault: ErrorDetails, top: type[BaseModel], place: Place) -> str:
     if kind == "extra_forbidden":
         return _unknown_key(name, siblings)
     field = siblings.get(name)
-    meaning = _meaning(field)
+    text = (field.description or "").strip().rstrip(".") if field else ""
+    meaning = f": {text[:1].lower()}{text[1:]}" if text else ""
     if kind == "missing":
         return f"is missing. Add it{meaning}."
     if kind in _NOT_A_MAPPING:
@@ -319,11 +320,6 @@ def _not_a_mapping(given: Any, field: FieldInfo | None, meaning: str) -> str:
     checks = (getattr(getattr(entry, "func", None), "problem", None) for entry in field.metadata)
     problem = next((said for check in checks if check and (said := check(given))), "")
     return f"is a bare number{f' ({problem})' if problem else ''}. Write {example}{meaning}."
-
-
-def _meaning(field: FieldInfo | None) -> str:
-    text = (field.description or "").strip().rstrip(".") if field else ""
-    return f": {text[:1].lower()}{text[1:]}" if text else ""
 
 
 def _unit_in_words(place: Place) -> str:

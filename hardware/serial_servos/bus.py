@@ -440,13 +440,6 @@ class SerialBus(HostClock):
             servo.doubtful_s = -np.inf
         return good
 
-    def _speeds_rad_s(self) -> list[float]:
-        """Speed of each servo by its data sheet, at its supply voltage."""
-        return [
-            no_load_speed(setup["model"], setup.get("supply_voltage_v")) or SPEED_LIMIT_RAD_S
-            for setup in self._setups.values()
-        ]
-
     def _choose_reading(self) -> str:
         """Request with which the servos are read, for the header."""
         together = all(servo.series.has_sync_read for servo in self._servos)
@@ -457,6 +450,10 @@ class SerialBus(HostClock):
             supply_band(self.family, servo.series, servo.registers or {}) for servo in self._servos
         )
         supply = [band for band in bands if band]
+        speeds = [  # by their data sheets, at their supply voltage
+            no_load_speed(setup["model"], setup.get("supply_voltage_v")) or SPEED_LIMIT_RAD_S
+            for setup in self._setups.values()
+        ]
         known: dict[str, Any] = {
             "kind": self.family.name,
             "readings": "live",
@@ -465,7 +462,7 @@ class SerialBus(HostClock):
             "baud": self.line.baud,
             "echo": self.line.echoes,
             "latency_s": round(self.line.latency_s, 6),
-            "speed_limit_rad_s": min(self._speeds_rad_s(), default=SPEED_LIMIT_RAD_S),
+            "speed_limit_rad_s": min(speeds, default=SPEED_LIMIT_RAD_S),
             "poll_rate_hz": 0.0,
             "real_time": True,
         }

@@ -42,7 +42,6 @@ from pupper_sysid.common.border import (
 )
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number, Part
 from pupper_sysid.servo_models.calibration.under_load import LOADED_KEYS, UnderLoad
 from pupper_sysid.servo_models.cards.card import SCHEMA, SCHEMA_VERSION, Gains, ServoCard, Source
@@ -453,8 +452,3 @@ def _load(path: Path) -> ServoCard:
         )
     refuse_other_version(path, data.get("schema_version"), SCHEMA_VERSION)
     return validated(ServoCard, data, path, lines)
-
-
-def card_calibration(path_or_name: Path | str) -> Calibration:
-    """A card as a calibration; what `load_calibration` does with the name or file of one."""
-    return load_card(path_or_name).calibration()

@@ -116,21 +116,6 @@ _MODELS = {
 }  # fmt: skip
 
 
-def fit_transfer_functions(
-    tones: Sequence[ToneResponse], draws: NDArray
-) -> dict[str, TransferFunction]:
-    """FOPDT and SOPDT, unless there are too few frequencies for their parameters.
-
-    Parameters
-    ----------
-    tones : sequence of ToneResponse
-    draws : ndarray of complex, shape (tones, draws)
-        Bootstrap of the tones' responses.
-    """
-    numbers = 2 * len({round(t.frequency_hz, 2) for t in tones})
-    return {n: _fit(n, tones, draws) for n, model in _MODELS.items() if numbers > len(model.names)}
-
-
 def _fit(name: str, tones: Sequence[ToneResponse], draws: NDArray) -> TransferFunction:
     """Weighted least squares from the best points of a grid, refitted to the bootstrap's draws."""
     model = _MODELS[name]
@@ -322,7 +307,12 @@ def joint_response(
     return FrequencyResponse(
         joint=joint,
         bandwidth_hz=_bandwidth(tones, draws),
-        transfer_functions=fit_transfer_functions(tones, draws),
+        # not where there are too few frequencies for their parameters
+        transfer_functions={
+            n: _fit(n, tones, draws)
+            for n, model in _MODELS.items()
+            if 2 * len({round(t.frequency_hz, 2) for t in tones}) > len(model.names)
+        },
         warnings=cautions(joint, trials),
         frequency_hz=np.array([t.frequency_hz for t in tones]),
         amplitude_rad=np.array([abs(t.command_held) for t in tones]),

@@ -140,7 +140,14 @@ def servo_data(
     lattices : mapping of joint to PollLattice, optional
         Of the joints whose poll has been found already.
     """
-    period = _common_period(recordings)
+    periods = sorted((r.loop_period_s, r.name) for r in recordings)
+    (shortest, fast), (longest, slow) = periods[0], periods[-1]
+    if not longest / shortest - 1 < _SAME_RATE:
+        raise InputError(
+            f"Recordings of different rates cannot be pooled: {fast} has a command every "
+            f"{1e3 * shortest:.1f} ms, {slow} every {1e3 * longest:.1f} ms. Fit them one by one."
+        )
+    period = float(np.median([p for p, _ in periods]))
     labels: dict[str, int] = {}
     runs: dict[str, tuple[Run, ...]] = {}
     modes: dict[str, str] = {}
@@ -191,17 +198,6 @@ def look_up(track: NDArray[np.floating], tick: NDArray[np.float64]) -> NDArray[n
 
 
 # ------------------------------------------------------------------------------- runs
-
-
-def _common_period(recordings: Sequence[Recording]) -> float:
-    periods = sorted((r.loop_period_s, r.name) for r in recordings)
-    (shortest, fast), (longest, slow) = periods[0], periods[-1]
-    if not longest / shortest - 1 < _SAME_RATE:
-        raise InputError(
-            f"Recordings of different rates cannot be pooled: {fast} has a command every "
-            f"{1e3 * shortest:.1f} ms, {slow} every {1e3 * longest:.1f} ms. Fit them one by one."
-        )
-    return float(np.median([p for p, _ in periods]))
 
 
 def _joint_runs(

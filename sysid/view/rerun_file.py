@@ -151,12 +151,10 @@ class RerunStream:
             self._stream.disconnect()
 
     def _send(self, place: str, time_s: Array, columns: Any) -> None:
-        index = self._rr.TimeColumn("time", duration=_nanoseconds(time_s))
+        index = self._rr.TimeColumn(
+            "time", duration=np.rint(time_s * 1e9).astype("timedelta64[ns]")
+        )
         self._rr.send_columns(place, indexes=[index], columns=columns, recording=self._stream)
-
-
-def _nanoseconds(time_s: Array) -> NDArray[np.timedelta64]:
-    return np.rint(time_s * 1e9).astype("timedelta64[ns]")
 
 
 _RULE = "=" * 80
