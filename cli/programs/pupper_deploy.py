@@ -211,7 +211,7 @@ def _commands(options: Deploy, trained: CommandRanges) -> Commands:
     from pupper_sysid.cli.drive import Driver
     from pupper_sysid.policies.deploy.commands import constant, script
 
-    say = partial(err.print, soft_wrap=True)
+    say = err.print
     if options.keyboard:
         return Driver(trained)
     return (

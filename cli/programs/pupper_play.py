@@ -9,7 +9,6 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -98,7 +97,7 @@ def _run(options: Play) -> None:
     policy, run = policy_at(options.policy)
     task, servos = simulator(options.policy, policy, run, options.actuator, options.feedback)
     warn_of_fallbacks([servos])
-    say = partial(err.print, soft_wrap=True)
+    say = err.print
     command = trained_commands(policy, run).clipped(command[None], say)[0]
     task = replace(evaluation_task(task, options.seconds + 1.0), terrain=options.terrain)
     model = servo_model_of(servos.source, task.control_step_s)

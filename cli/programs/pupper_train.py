@@ -201,7 +201,7 @@ def _with_first_gait(run: Run, ranks: Ranks) -> Run:
     task = run.task
     if ranks.rank == 0:
         with share_progress("first gait") as advance:
-            say = partial(err.print, soft_wrap=True)
+            say = err.print
             task = with_first_gait(run, say, partial(advance, "searching")).task
     parts = json.loads(ranks.same(json.dumps(plain({"trot": task.trot, "rewards": task.rewards}))))
     trot, rewards = Trot(**parts["trot"]), Rewards(**parts["rewards"])
