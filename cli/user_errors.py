@@ -24,9 +24,8 @@ import tyro
 from rich.text import Text
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from pupper_sysid.cli.flags import forget, remember, spell
 from pupper_sysid.cli.help_page import ALL, HELP, help_page
-from pupper_sysid.cli.terminal import err, out
+from pupper_sysid.cli.terminal import err, forget, out, remember, spell
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import holding_outputs, versions
 from pupper_sysid.common.processes.stop import STOPPED, Stop, stoppable

@@ -20,10 +20,9 @@ short-term memory networks (Hochreiter and Schmidhuber 1997, with forget gates):
 
 Its memory starts empty and is filled by `warm_up` steps at the position of rest.
 
-Base of the learned servo models: parameters per joint, normalisation, layout of arrays.
-
-Inside, arrays are (joints, environments, …), so that one matrix product per joint serves all
-environments; outside they are (*environments, joints), as everywhere in this project.
+`JointArrays`, the base of both, has parameters per joint, normalisation and the layout of arrays:
+inside they are (joints, environments, …), so that one matrix product per joint serves all
+environments; outside (*environments, joints), as everywhere in this project.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Scan of a serial line: ask every id and read the servos that answer.
-
-Open a serial line at the right rate, and find out which servos are on it.
+"""Which servos are on a serial line: open it at the right rate, or scan every id at every rate.
 
 Refusals name the servo, its model, the rates that were tried, and what to check.
 """

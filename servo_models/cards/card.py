@@ -35,6 +35,7 @@ from pupper_sysid.servo_models.calibration.parts import (
     RatiosToArmature,
     Scale,
     Selection,
+    UnderLoad,
 )
 from pupper_sysid.servo_models.calibration.quantity import (
     NotNegative,
@@ -42,7 +43,6 @@ from pupper_sysid.servo_models.calibration.quantity import (
     Part,
     Quantity,
 )
-from pupper_sysid.servo_models.calibration.under_load import UnderLoad
 from pupper_sysid.servo_models.cards.numbers import (
     LOADED_KEYS,
     LoadedLoop,

@@ -1,12 +1,10 @@
-"""Read servo cards: files, the ones that are shipped, and parameter files of BAM.
+"""Servo cards from files and back: our YAML, those that are shipped, parameter files of BAM.
 
 card = load_card("sts3215-bam-m1")         # shipped, see `card_names`
 card = load_card("my_servo.yaml")
 card = load_card("params/m6.json")         # as BAM's fit writes it
 
-Parameter files of "Better actuator models" (Rhoban/bam) as servo cards.
-
-BAM identifies servos on a pendulum and writes one JSON file per friction model, M1 to M6. The file
+"Better actuator models" (BAM, Rhoban/bam) identifies servos on a pendulum and writes one JSON file per friction model, M1 to M6. The file
 has the motor as torque constant kt [N·m/A = V·s/rad] and resistance R [Ω]; supply voltage, P gain,
 duty per error and largest duty are constants of BAM's class for that actuator (`ACTUATORS`). Ours
 follow as::
@@ -42,8 +40,8 @@ from pupper_sysid.common.border import (
 )
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.servo_models.calibration.parts import LOADED_KEYS, UnderLoad
 from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number, Part
-from pupper_sysid.servo_models.calibration.under_load import LOADED_KEYS, UnderLoad
 from pupper_sysid.servo_models.cards.card import SCHEMA, SCHEMA_VERSION, Gains, ServoCard, Source
 from pupper_sysid.servo_models.cards.numbers import PositionLoop, stated
 

@@ -1,15 +1,14 @@
-"""ONNX and TorchScript files of a PyTorch module, checked before they are written.
+"""Networks as ONNX and TorchScript files, checked before they are written.
 
 `export_module` is used for servo models and for policies. The file is loaded again, and the caller
 compares what it computes with the model it came from; a file that differs is not written.
 
 `ServoStep` is one step of a servo network (`servo_models.networks`) as such a module.
 
-Export of servo models: a learned model as ONNX or TorchScript, the numbers of any as CSV.
-
-A simulator or a robot that has no pupper-sysid can then run the model. The exported network holds
-no state: it maps one step's inputs to its outputs, all joints and any number N of environments at
-once, in radians, with the normalisation inside:
+`export_servo_model` writes a learned servo model so, and the numbers of any as CSV. A simulator or a
+robot that has no pupper-sysid can then run the model. The exported network holds no state:
+it maps one step's inputs to its outputs, all joints and any number N of environments at once, in
+radians, with the normalisation inside:
 
     command_history_rad (N, joints, taps), newest first     -> position_rad_next (N, joints)
     position_rad (N, joints), predicted last, if `feedback`

@@ -8,10 +8,9 @@ predicted readings, too. `one_step` is the error when the model may start from t
 persistence scores well there, so it says little. Repeatability, where a command was repeated, is
 the least error that a model can reach. Intervals resample stretches of time.
 
-Readings that a model predicts on the clock of ticks: their age, rows, and their offset.
-
-The offset is a property of the recording (its zero, or its joint map's), not of the servo: for
-every model alike it is the median of reading minus predicted reading.
+Readings that a model predicts on the clock of ticks have an age and an offset. The offset is a
+property of the recording (its zero, or its joint map's), not of the servo: for every model alike it
+is the median of reading minus predicted reading.
 """
 
 from __future__ import annotations

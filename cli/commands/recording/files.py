@@ -152,7 +152,7 @@ class View:
 
     def run(self) -> None:
         """Read and write."""
-        from pupper_sysid.sysid.view.rerun_file import write_mcap, write_rerun
+        from pupper_sysid.sysid.view.files import write_mcap, write_rerun
 
         wanted = {"rerun": self.rerun, "mcap": self.mcap}
         if self.rerun is None and self.mcap is None:

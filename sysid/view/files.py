@@ -1,11 +1,9 @@
-"""A recording as a Rerun file: each channel over time, and the robot in three dimensions.
+"""A recording as a file for Rerun, or as MCAP for Foxglove and rosbag2: each channel over time.
 
-Channels are scalars under `joints/<joint>/<channel>` on the timeline `time`. The robot is what the
+For Rerun channels are scalars under `joints/<joint>/<channel>` on the timeline `time`. The robot is what the
 caller gives as `Body`: shapes that do not change, and where each body is over time.
 
-A recording as MCAP in ROS 2's messages, for Foxglove and rosbag2.
-
-`/joint_states` and `/joint_commands` are `sensor_msgs/JointState`, so that `pupper-sysid import`
+In MCAP `/joint_states` and `/joint_commands` are `sensor_msgs/JointState`, so that `pupper-sysid import`
 reads the file back; every other channel is a topic of `std_msgs/Float64` of its own
 (`/LF_hip/reading_age_s`), and sentences on the guard are `rcl_interfaces/Log` on `/rosout`.
 """
