@@ -9,10 +9,11 @@ less the centre of the encoder), the *limits* (ends of a joint's travel, less a 
 sources disagree on the scale, so limits stay in counts whatever it is.
 
 LeRobot's calibration of an arm, `{"shoulder_pan": {"id": 1, "drive_mode": 0, …}}`, is read and
-written, too. LeRobot homes an arm in the middle of its range: it writes into each servo's register homing_offset
-what makes the position there the encoder's centre, and keeps offset, range and direction in a JSON
-file. The counts of its ranges are therefore those that a servo reports with that offset, and a
-joint map made from it holds only while the register has it; a bus with another value is refused.
+written, too. LeRobot homes an arm in the middle of its range: it writes into each servo's register
+homing_offset what makes the position there the encoder's centre, and keeps offset, range and
+direction in a JSON file. The counts of its ranges are therefore those that a servo reports with
+that offset, and a joint map made from it holds only while the register has it; a bus with another
+value is refused.
 
 A `drive_mode` of 1 turns the direction around. With Feetech servos LeRobot does that itself; with
 Dynamixel the servo does, by its own register, so that counts keep their direction.

@@ -4,10 +4,10 @@ card = load_card("sts3215-bam-m1")         # shipped, see `card_names`
 card = load_card("my_servo.yaml")
 card = load_card("params/m6.json")         # as BAM's fit writes it
 
-"Better actuator models" (BAM, Rhoban/bam) identifies servos on a pendulum and writes one JSON file per friction model, M1 to M6. The file
-has the motor as torque constant kt [N·m/A = V·s/rad] and resistance R [Ω]; supply voltage, P gain,
-duty per error and largest duty are constants of BAM's class for that actuator (`ACTUATORS`). Ours
-follow as::
+"Better actuator models" (BAM, Rhoban/bam) identifies servos on a pendulum and writes one JSON file
+per friction model, M1 to M6. The file has the motor as torque constant kt [N·m/A = V·s/rad] and
+resistance R [Ω]; supply voltage, P gain, duty per error and largest duty are constants of BAM's
+class for that actuator (`ACTUATORS`). Ours follow as::
 
     stall torque = kt / R * supply voltage        at full duty, standstill
     back-EMF     = kt^2 / R

@@ -5,9 +5,9 @@ compares what it computes with the model it came from; a file that differs is no
 
 `ServoStep` is one step of a servo network (`servo_models.networks`) as such a module.
 
-`export_servo_model` writes a learned servo model so, and the numbers of any as CSV. A simulator or a
-robot that has no pupper-sysid can then run the model. The exported network holds no state:
-it maps one step's inputs to its outputs, all joints and any number N of environments at once, in
+`export_servo_model` writes a learned servo model so, and the numbers of any as CSV. A simulator or
+a robot that has no pupper-sysid can then run the model. The exported network holds no state: it
+maps one step's inputs to its outputs, all joints and any number N of environments at once, in
 radians, with the normalisation inside:
 
     command_history_rad (N, joints, taps), newest first     -> position_rad_next (N, joints)

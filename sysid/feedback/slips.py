@@ -13,11 +13,11 @@ polls count whose position must differ from that of the poll before; without one
 which a joint that follows its command is fast. Friction that holds the joint meanwhile is then
 taken for failed polls, here and there.
 
-Upsets are a few commands that never reached the servo. A line that loses a frame, or a host that stalls, leaves the servo with the command before. Readings
-behind it then disagree with any model of the servo for as long as it takes to catch up.
-`find_upsets` looks for readings far outside of their tone's noise, one after the other, and asks
-whether 1 to 3 lost commands shortly before explain them. A fit leaves out the readings that an
-upset touches.
+Upsets are a few commands that never reached the servo. A line that loses a frame, or a host that
+stalls, leaves the servo with the command before. Readings behind it then disagree with any model of
+the servo for as long as it takes to catch up. `find_upsets` looks for readings far outside of their
+tone's noise, one after the other, and asks whether 1 to 3 lost commands shortly before explain
+them. A fit leaves out the readings that an upset touches.
 """
 
 from __future__ import annotations

@@ -5,10 +5,11 @@ is scored at the readings' own times in free run. Its inputs are commands only, 
 free-run errors are equal. Candidates differ in weight decay and in the length of training; the
 choice is made by held-out groups.
 
-Products of many small LSTMs and MLPs, and their gradients, are compiled (numba). One LSTM's states fit into the fastest cache, so each window of each network is run to its end,
-and in the gradient back to its beginning, before the next one: PyTorch spends its time on starting
-small products and on arrays of all networks. Hyperbolic tangents are a quotient of polynomials, as
-in Eigen (`generic_fast_tanh_float`), correct to a few units of the last of 24 bits.
+Products of many small LSTMs and MLPs, and their gradients, are compiled (numba). One LSTM's states
+fit into the fastest cache, so each window of each network is run to its end, and in the gradient
+back to its beginning, before the next one: PyTorch spends its time on starting small products and
+on arrays of all networks. Hyperbolic tangents are a quotient of polynomials, as in Eigen
+(`generic_fast_tanh_float`), correct to a few units of the last of 24 bits.
 
 The MLPs have one hidden layer. All networks of a joint have the same inputs and few weights. The
 activations of one network fit into the fastest cache, so each network is finished before the next

@@ -1,10 +1,10 @@
 """A recording as a file for Rerun, or as MCAP for Foxglove and rosbag2: each channel over time.
 
-For Rerun channels are scalars under `joints/<joint>/<channel>` on the timeline `time`. The robot is what the
-caller gives as `Body`: shapes that do not change, and where each body is over time.
+For Rerun channels are scalars under `joints/<joint>/<channel>` on the timeline `time`. The robot is
+what the caller gives as `Body`: shapes that do not change, and where each body is over time.
 
-In MCAP `/joint_states` and `/joint_commands` are `sensor_msgs/JointState`, so that `pupper-sysid import`
-reads the file back; every other channel is a topic of `std_msgs/Float64` of its own
+In MCAP `/joint_states` and `/joint_commands` are `sensor_msgs/JointState`, so that `pupper-sysid
+import` reads the file back; every other channel is a topic of `std_msgs/Float64` of its own
 (`/LF_hip/reading_age_s`), and sentences on the guard are `rcl_interfaces/Log` on `/rosout`.
 """
 
