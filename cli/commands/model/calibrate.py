@@ -93,15 +93,15 @@ class Calibrate(OfRecordings):
                 for _ in range(left.pop(joint)):
                     advance(joint)
 
-            made = calibrate(
+            result = calibrate(
                 recordings, joints, self.seed, self.stall_torque,
                 workers=2, progress=done, staged=staged, prior=self.prior,
             )  # fmt: skip
-        made.save(out, force=self.force)
+        result.save(out, force=self.force)
         if self.json:
-            terminal.print_json(made)
+            terminal.print_json(result)
         else:
-            self._print(made)
+            self._print(result)
             terminal.err.print(
                 f"Wrote {out} in {time.perf_counter() - started:.1f} s. Next: pupper-sysid report"
             )
@@ -131,28 +131,28 @@ class Calibrate(OfRecordings):
             fleet, out, time.perf_counter() - started, self.json, "a calibration", _SHOWN
         )
 
-    def _print(self, made: CalibrationResult) -> None:
-        shown = terminal.table(
+    def _print(self, result: CalibrationResult) -> None:
+        table = terminal.table(
             "DelayedPD per joint", "joint", "dead time ms", "90 %", "fit", "Kp", "Kd", "fric. N·m",
             "speed rad/s", "limit", "error mrad", "unseen mrad",
         )  # fmt: skip
-        for name, r in made.items():
-            a, s = made.calibration.joint(name).actuator, r.delayed_pd.scores
+        for name, r in result.items():
+            a, s = result.calibration.joint(name).actuator, r.delayed_pd.scores
             brakes = a.back_emf_nm_s_per_rad.value > 0
             limit = a.back_emf_nm_s_per_rad if brakes else a.velocity_limit_rad_s
-            shown.add_row(
+            table.add_row(
                 name,
                 _number(a.dead_time_s, 1, 1e3),
                 f"{1e3 * r.dead_time_s.low:.0f}–{1e3 * r.dead_time_s.high:.0f}",
-                terminal.number(made.calibration.joint(name).scores.residual_over_noise, 1),
+                terminal.number(result.calibration.joint(name).scores.residual_over_noise, 1),
                 _number(a.stiffness_nm_per_rad, 1), _damping(a),
                 _number(a.friction_loss_nm, 3),
                 f"{terminal.number(a.top_speed_rad_s)}{_mark(limit)}",
                 "EMF" if brakes else "slew",
                 terminal.ms(s.rmse_fresh_rad), terminal.ms(s.rmse_unseen_rad),
             )  # fmt: skip
-        terminal.out.print(shown)
-        scales = {name: made.calibration.joint(name).actuator.scale for name in made}
+        terminal.out.print(table)
+        scales = {name: result.calibration.joint(name).actuator.scale for name in result}
         assumed = {s.value_nm for s in scales.values() if s.anchor == "stall torque"}
         torques = "Torques are in N·m by the known load. "
         if assumed:
@@ -167,9 +167,9 @@ class Calibrate(OfRecordings):
             "limit: what limits the speed, the set-point's slew or back-EMF (EMF). Errors are "
             "free-run, on fresh readings."
         )
-        for point, names in made.calibration.operating_points().items():
+        for point, names in result.calibration.operating_points().items():
             terminal.out.print(f"{', '.join(names)}: {point}.")
-        for r in made.values():
+        for r in result.values():
             terminal.warn(*r.warnings)
         of_pupper = [n for n, scale in scales.items() if scale.source == STALL_TORQUE_SOURCE]
         if strangers := [name for name in of_pupper if name not in JOINT_NAMES]:

@@ -48,35 +48,35 @@ class Compare(OfRecordings):
             )
         refuse_picture(self.plot, self.force)
         recordings, joints = self.load()
-        found = compare(recordings, self.models, joints, self.readings, self.seed)
-        save(found.plot(), self.plot, self.force)
+        result = compare(recordings, self.models, joints, self.readings, self.seed)
+        save(result.plot(), self.plot, self.force)
         if self.json:
-            terminal.print_json(found.to_dict() | {"written": str(self.plot)})
+            terminal.print_json(result.to_dict() | {"written": str(self.plot)})
             return
-        shown = terminal.table(
-            "RMS error in free run, mrad", "joint", *found.models, "persistence", "repeatability"
+        table = terminal.table(
+            "RMS error in free run, mrad", "joint", *result.models, "persistence", "repeatability"
         )
         for joint in joints:
-            errors = [m.joints[joint].rmse_free_run_rad for m in found.models.values()]
-            errors += [found.persistence_rmse_rad[joint], found.repeatability_rad[joint]]
-            shown.add_row(joint, *map(terminal.ms, errors))
+            errors = [m.joints[joint].rmse_free_run_rad for m in result.models.values()]
+            errors += [result.persistence_rmse_rad[joint], result.repeatability_rad[joint]]
+            table.add_row(joint, *map(terminal.ms, errors))
         if len(joints) > 1:
-            means = (terminal.ms(m.mean.rmse_free_run_rad) for m in found.models.values())
-            shown.add_row("mean", *means, style="bold")
-        terminal.out.print(shown)
+            means = (terminal.ms(m.mean.rmse_free_run_rad) for m in result.models.values())
+            table.add_row("mean", *means, style="bold")
+        terminal.out.print(table)
         for title in ("held", "raw", "one_step"):
-            means = {n: getattr(m.mean, f"rmse_{title}_rad") for n, m in found.models.items()}
+            means = {n: getattr(m.mean, f"rmse_{title}_rad") for n, m in result.models.items()}
             text = ", ".join(f"{name} {terminal.ms(value)}" for name, value in means.items())
             terminal.out.print(f"Mean, {title.replace('_', ' ')}: {text}")
-        shifted = {name: m.offset_rad for name, m in found.models.items() if m.offset_rad}
+        shifted = {name: m.offset_rad for name, m in result.models.items() if m.offset_rad}
         offsets = terminal.table("Offset of this recording, mrad", "joint", *shifted)
         for joint in joints:
             offsets.add_row(joint, *(terminal.ms(own[joint]) for own in shifted.values()))
         terminal.out.print()
         terminal.out.print(offsets)
-        for sentence in found.reading_notes():
+        for sentence in result.reading_notes():
             terminal.out.print(sentence)
-        terminal.warn(*found.notes)
+        terminal.warn(*result.notes)
         terminal.err.print(f"Wrote {self.plot}.")
 
 
@@ -112,21 +112,21 @@ class CompareTruth:
         (recording,) = terminal.load_all([self.recording])
         joints = terminal.pick_joints([recording], self.joints)
         if self.calibration:
-            known = load_calibration(self.calibration)
+            fitted = load_calibration(self.calibration)
         else:
             with terminal.progress("calibrating", len(joints)) as advance:
-                known = calibrate(
+                fitted = calibrate(
                     recording, joints, self.seed, workers=2, progress=advance
                 ).calibration
-        found = compared_with_truth(recording, truth, known, joints)
+        rows = compared_with_truth(recording, truth, fitted, joints)
         if self.json:
-            terminal.print_json(found)
+            terminal.print_json(rows)
             return
-        shown = terminal.table(
+        table = terminal.table(
             "Found and true", "joint", "quantity", "found", "90 % interval", "truth", "identified",
             "held",
         )  # fmt: skip
-        for row in found:
+        for row in rows:
             end = next((end for end in _UNITS if row.quantity.endswith(end)), "")
             plain_unit = (unit_of(row.quantity), 1.0, 3 if abs(row.truth) < 1 else 0)
             unit, factor, digits = _UNITS.get(end, plain_unit)
@@ -134,20 +134,20 @@ class CompareTruth:
             low, high = (
                 terminal.number(factor * x, digits) for x in (row.found.low, row.found.high)
             )
-            shown.add_row(
+            table.add_row(
                 row.joint, f"{name}, {unit}".removesuffix(", 1"),
                 terminal.number(factor * row.found.value, digits), f"{low}…{high}",
                 terminal.number(factor * row.truth, digits), row.identified,
                 {True: "yes", False: "no", None: "–"}[row.held],
             )  # fmt: skip
-        terminal.out.print(shown)
-        known_rows = [row for row in found if row.held is not None and row.identified != "no"]
+        terminal.out.print(table)
+        known_rows = [row for row in rows if row.held is not None and row.identified != "no"]
         held = sum(bool(row.held) for row in known_rows)
         terminal.out.print(
             f"\n{held} of {len(known_rows)} intervals of identified numbers hold the truth. "
             "stiffness, damping, friction loss, effort limit and back EMF are ratios to the "
             "armature."
         )
-        for definition in found.definitions:
+        for definition in rows.definitions:
             terminal.out.print(f"Both sides of {definition}")
-        terminal.warn(*found.notes)
+        terminal.warn(*rows.notes)

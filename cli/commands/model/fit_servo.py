@@ -163,15 +163,15 @@ class FitServo(OfRecordings):
         return Split.by_time(self.train_before, self.test_after)
 
     def _print(self, fit: ServoFit) -> None:
-        shown = terminal.table(
+        table = terminal.table(
             f"{fit.arch}, {fit.split}; RMS error in mrad", "joint", *(title for _, title in _SCORES)
         )
         for name, one in fit.joints.items():
-            shown.add_row(name, *(terminal.ms(getattr(one, key)) for key, _ in _SCORES))
+            table.add_row(name, *(terminal.ms(getattr(one, key)) for key, _ in _SCORES))
         if len(fit.joints) > 1:
             means = (terminal.ms(getattr(fit.mean, key)) for key, _ in _SCORES)
-            shown.add_row("mean", *means, style="bold")
-        terminal.out.print(shown)
+            table.add_row("mean", *means, style="bold")
+        terminal.out.print(table)
         terminal.out.print(
             "\nFree run: commands only, from the start of each run. DelayedPD (PD), the linear "
             "filter and the model were fitted to the same readings and scored on the same unseen "
@@ -217,18 +217,18 @@ class Sindy(OfRecordings):
             for line in r.explanation():
                 terminal.out.print(f"  - {line}")
             terminal.out.print()
-        shown = terminal.table(
+        table = terminal.table(
             "Free-run error, mrad", "joint", "equation, fresh", "all rows", "unseen Hz",
             "DelayedPD, fresh", "unseen Hz", "structures tried",
         )  # fmt: skip
         for name, r in results.items():
-            shown.add_row(
+            table.add_row(
                 name, terminal.ms(r.scores.rmse_fresh_rad), terminal.ms(r.scores.rmse_held_rad),
                 terminal.ms(r.scores.rmse_unseen_rad),
                 terminal.ms(r.delayed_pd.rmse_fresh_rad),
                 terminal.ms(r.delayed_pd.rmse_unseen_rad), str(len(r.candidates)),
             )  # fmt: skip
-        terminal.out.print(shown)
+        terminal.out.print(table)
         terminal.out.print(
             "\nq: joint angle, u: command, e: error. Per unit of inertia; each reading is compared "
             "with the motion at the time it was measured, none is fed back."

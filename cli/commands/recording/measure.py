@@ -39,28 +39,28 @@ class Doctor:
         from pupper_sysid.sysid.doctor.findings import USE, Finding, shared
 
         recordings = terminal.load_all(self.recordings)
-        found = examine(recordings, seed=self.seed)
+        result = examine(recordings, seed=self.seed)
         if self.json:
-            terminal.print_json(found)
+            terminal.print_json(result)
             return
-        title = found.recording if len(recordings) < 4 else f"{len(recordings)} recordings"
-        shown = terminal.table(
+        title = result.recording if len(recordings) < 4 else f"{len(recordings)} recordings"
+        table = terminal.table(
             title, "joint", "verdict", "loop ms", "jitter ms", "fresh %", "poll ms",
             "loss", "step mrad", "offset mrad",
         )  # fmt: skip
-        for name, j in found.items():
-            shown.add_row(
+        for name, j in result.items():
+            table.add_row(
                 name, j.verdict, terminal.ms(j.loop_period_s, 2), terminal.ms(j.jitter_s, 2),
                 terminal.number(100 * j.fresh_fraction, 0), terminal.ms(j.poll_period_s, 2),
                 terminal.number(j.loss), terminal.ms(j.quantum_rad, 3),
                 terminal.ms(j.reading_minus_command_rad),
             )  # fmt: skip
-        terminal.out.print(shown)
+        terminal.out.print(table)
         terminal.out.print()
         nothing = (Finding("nothing_wrong", USE),)
-        for joints, text in shared({name: j.findings or nothing for name, j in found.items()}):
+        for joints, text in shared({name: j.findings or nothing for name, j in result.items()}):
             terminal.out.print(Text.assemble((joints, "bold"), f": {text}"))
-        for text in found.advice:
+        for text in result.advice:
             terminal.out.print(f"\n{text}")
 
 
@@ -77,15 +77,15 @@ class Delay(OfRecordings):
 
         recordings, joints = self.load()
         with terminal.progress("measuring", len(joints)) as advance:
-            found = lag(recordings, joints, self.seed, workers=2, progress=advance)
+            budgets = lag(recordings, joints, self.seed, workers=2, progress=advance)
         if self.json:
-            terminal.print_json(found)
+            terminal.print_json(budgets)
             return
         budget = terminal.table(
             "Lag budget, ms: raw = stale readings + command hold + servo lag", "joint", "raw",
             "stale", "hold", "servo", "90 %", "of it dead time", "90 %",
         )  # fmt: skip
-        for name, b in found.items():
+        for name, b in budgets.items():
             dead = b.dead_time_s
             assert dead is not None
             budget.add_row(
@@ -98,26 +98,26 @@ class Delay(OfRecordings):
             "Only the dead time is the servo's own; the lag moves with gain, amplitude and load."
         )
         ranges = {name: [f"servo lag is the {b.lag_range}; its table by frequency has the lag of "
-                         "a motion at each."] for name, b in found.items()
+                         "a motion at each."] for name, b in budgets.items()
                   if b.lag_range.startswith("mean")}  # fmt: skip
         for names, text in share_sentences(ranges):
             terminal.out.print(f"{names}: {text}")
-        self._print_frequencies(found)
-        first = next(iter(found.values()))
+        self._print_frequencies(budgets)
+        first = next(iter(budgets.values()))
         shown = terminal.table(f"Estimators on {first.joint}", "estimator", "lag ms")
         for name, value in first.estimators_s.items():
             shown.add_row(name, terminal.ms(value))
         terminal.out.print()
         terminal.out.print(shown)
-        by_joint = {n: [w.removeprefix(f"{n}: ") for w in b.warnings] for n, b in found.items()}
+        by_joint = {n: [w.removeprefix(f"{n}: ") for w in b.warnings] for n, b in budgets.items()}
         terminal.warn(*(f"{names}: {text}" for names, text in share_sentences(by_joint)))
 
-    def _print_frequencies(self, found: LagBudgets) -> None:
+    def _print_frequencies(self, budgets: LagBudgets) -> None:
         shown = terminal.table(
             "Per frequency, fresh readings", "joint", "Hz", "gain", "phase °", "lag ms",
             "90 %", "raw lag ms", "raw gain",
         )  # fmt: skip
-        for name, b in found.items():
+        for name, b in budgets.items():
             for f in b.by_frequency:
                 shown.add_row(
                     name, terminal.number(f.frequency_hz), terminal.number(f.gain),
@@ -155,15 +155,15 @@ class Bode(OfRecordings):
 
             refuse_picture(self.plot, self.force)
         recordings, joints = self.load()
-        found = frequency_response(recordings, joints, self.seed)
+        responses = frequency_response(recordings, joints, self.seed)
         if self.plot:
             from pupper_sysid.common.figure_style import save
 
-            save(found.plot(), self.plot, self.force)
+            save(responses.plot(), self.plot, self.force)
         if self.json:
-            terminal.print_json(found)
+            terminal.print_json(responses)
             return
-        for joint, response in found.items():
+        for joint, response in responses.items():
             terminal.out.print(Text(joint, "bold"))
             terminal.out.print(str(response))
             terminal.warn(*response.warnings)
@@ -184,25 +184,25 @@ class Backlash(OfRecordings):
         """Measure and print."""
         from pupper_sysid.sysid.backlash import backlash
 
-        found = backlash(*self.load(), self.seed)
+        results = backlash(*self.load(), self.seed)
         if self.json:
-            terminal.print_json(found)
+            terminal.print_json(results)
             return
-        shown = terminal.table(
+        table = terminal.table(
             "Width between strokes up and down, 90 % intervals",
             "joint", "P gain", "hysteresis °", "lag ms", "strokes",
         )  # fmt: skip
-        for joint, one in found.items():
+        for joint, one in results.items():
             for row in one.gains:
-                shown.add_row(
+                table.add_row(
                     joint, terminal.number(row.p_gain, 0), _degrees(row.hysteresis_rad),
                     terminal.ms(row.lag_s.value, 0), str(row.strokes),
                 )  # fmt: skip
-        terminal.out.print(shown)
-        for joint, one in found.items():
+        terminal.out.print(table)
+        for joint, one in results.items():
             for name, value in (("dead zone", one.dead_zone_rad), ("backlash", one.backlash_rad)):
-                said = "not determined" if value is None else f"{_degrees(value)}°"
-                terminal.out.print(f"{joint}: {name} {said}")
+                text = "not determined" if value is None else f"{_degrees(value)}°"
+                terminal.out.print(f"{joint}: {name} {text}")
             for note in one.notes:
                 terminal.out.print(f"  {note}")
 
