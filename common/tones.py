@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 
@@ -134,29 +133,3 @@ def _normal_equations(design: NDArray, value: NDArray, block: NDArray) -> tuple[
     np.add.at(gram, block, design[:, :, None] * design[:, None, :])
     np.add.at(moment, block, design * value[:, None])
     return gram, moment
-
-
-@njit(cache=True)
-def filtered(
-    numerator: NDArray[np.float64], denominator: NDArray[np.float64], signal: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """A signal behind a filter at rest, as `scipy.signal.lfilter` (direct form II, transposed).
-
-    Parameters
-    ----------
-    numerator, denominator : ndarray, shape (order + 1,)
-        In rising powers of the delay, `denominator[0] == 1`.
-    signal : ndarray, shape (samples,)
-
-    Returns
-    -------
-    ndarray, shape (samples,)
-    """
-    order = len(denominator) - 1
-    state = np.zeros(order + 1)
-    out = np.empty_like(signal)
-    for n in range(len(signal)):
-        out[n] = numerator[0] * signal[n] + state[0]
-        for k in range(order):
-            state[k] = state[k + 1] + numerator[k + 1] * signal[n] - denominator[k + 1] * out[n]
-    return out

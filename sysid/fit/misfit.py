@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common import tones
+from pupper_sysid.common import filters
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.search import Fit, Problem, from_about, refine, search_widely
@@ -106,7 +106,9 @@ def filtered(run: Run, time_constant_s: float) -> Run:
     left = np.exp(-1.0 / ratio)
     command = run.held[0]
     rest = command[0]
-    end = rest + tones.filtered(np.array([1.0 - left, 0.0]), np.array([1.0, -left]), command - rest)
+    end = rest + filters.filtered(
+        np.array([1.0 - left, 0.0]), np.array([1.0, -left]), command - rest
+    )
     before = np.concatenate([[rest], end[:-1]])
     mean = command + (before - command) * ratio * (1.0 - left)
     held = np.concatenate([mean[None], run.held[1:]])
