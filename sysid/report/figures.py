@@ -291,11 +291,11 @@ def _track(run: Run, simulated: NDArray) -> Track:
     )  # fmt: skip
 
 
-def window(track: Track, longest_s: float = 3.0) -> tuple[float, float]:
+def window(track: Track, periods: float = 2.5, longest_s: float = 3.0) -> tuple[float, float]:
     """Start and end of the stretch of `track` to show [s]: steady tone, or largest motion."""
     end = float(track.time_s[-1])
     if track.frequency_hz > 0:
-        length = min(2.5 / track.frequency_hz, end)
+        length = min(periods / track.frequency_hz, end)
         start = min(0.5 * end, end - length)
         return start, start + length
     if end <= longest_s:
