@@ -67,7 +67,7 @@ import numpy as np
 from pupper_sysid.cli.user_errors import end_politely
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.address import parse_address
-from pupper_sysid.hardware.connect import open_guarded
+from pupper_sysid.hardware.safety.guard import open_guarded
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.safety import watchdog

@@ -43,8 +43,17 @@ from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Trial
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
-from pupper_sysid.sysid.servo_fit.readings import FreeRun, as_rows, run_with_offset, with_ages
-from pupper_sysid.sysid.servo_fit.scores import LINEAR, Tracks, errors, rms, stacked
+from pupper_sysid.sysid.servo_fit.scores import (
+    LINEAR,
+    FreeRun,
+    Tracks,
+    as_rows,
+    errors,
+    rms,
+    run_with_offset,
+    stacked,
+    with_ages,
+)
 from pupper_sysid.sysid.servo_fit.windows import everything
 
 HERE = Path(__file__).resolve().parent

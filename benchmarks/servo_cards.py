@@ -27,10 +27,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from card_of_fits import to_card, to_drive_card
 from real_recordings import FITTED_S, JOINTS, MOTIONS, REAL, first, loaded_fit, track
 
 from pupper_sysid.servo_models.cards.card import Gains, ServoCard, Source
-from pupper_sysid.sysid.export.servo_card import to_card, to_drive_card
 from pupper_sysid.sysid.fit.results import LoadedFit
 from pupper_sysid.sysid.fit.run import at_steps
 from pupper_sysid.sysid.recordings.files import load

@@ -11,9 +11,8 @@ from pupper_sysid.common.joints import JOINT_NAMES, select_joints
 from pupper_sysid.common.reading.dialect import whole
 from pupper_sysid.hardware.address import EMULATED, KINDS, bus_name, parse_address
 from pupper_sysid.hardware.bus import ServoBus
-from pupper_sysid.hardware.connect import open_bus, open_guarded
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
-from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.guard import GuardedBus, open_bus, open_guarded
 from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.hardware.serial_servos.series import Series
 
@@ -24,22 +23,13 @@ _LARGEST_REGISTER = 1 << 20  # of a Dynamixel in its extended position mode
 def chosen_map(text: str | None) -> JointMap | None:
     """The joint map `text` (a file or a preset), else `joints.yaml` if it is in this folder."""
     if text is None and JOINTS_FILE.exists():
-        terminal.err.print(f"Taking the joint map {JOINTS_FILE}.", soft_wrap=True)
+        terminal.err.print(f"Taking the joint map {JOINTS_FILE}.")
         return load_joint_map(JOINTS_FILE)
     return None if text is None else load_joint_map(text)
 
 
 def joints_on(bus: str, joint_map: JointMap | None, text: str) -> list[str]:
-    """Joints of a bus that `text` names, as `select_joints` reads it.
-
-    Raises
-    ------
-    InputError
-        If one is unknown. Without a joint map names are the Mini Pupper's: a serial line of other
-        servos is then refused for its missing map, not for the name.
-    BusError
-        If that line has no servos, or cannot be opened.
-    """
+    """Joints of a bus that `text` names, as `select_joints` reads it."""
     try:
         return select_joints(text, joint_map.joint_names if joint_map else JOINT_NAMES)
     except InputError:
@@ -67,30 +57,18 @@ def connect(
 def say_remarks(bus: ServoBus) -> None:
     """Print what a bus found out about its line and its servos' registers."""
     if remarks := getattr(bus, "remarks", None):
-        terminal.warn(remarks())
+        terminal.warn(*remarks())
 
 
 def parse_registers(text: str) -> dict[str, int]:
-    """Registers of emulated servos that `text` sets: p=16,goal_speed=400.
-
-    Raises
-    ------
-    InputError
-        If it names one that does not act on the motion, or a value that it cannot have.
-    """
+    """Registers of emulated servos that `text` sets: p=16,goal_speed=400."""
     from pupper_sysid.sim.emulator.pendulum import REGISTERS
 
     return _registers(text, REGISTERS, "p=16")[None]
 
 
 def parse_servo_registers(text: str, series: Series) -> dict[int | None, dict[str, int]]:
-    """Registers of emulated servos by id, of all servos under None: p=16,5:mode=1.
-
-    Raises
-    ------
-    InputError
-        If the series has no such register, or a value does not fit into it.
-    """
+    """Registers of emulated servos by id, of all servos under None: p=16,5:mode=1."""
     chosen = _registers(text, sorted([*series.registers, *series.aliases]), "p=16 or 5:mode=1")
     for own in chosen.values():
         for name, value in own.items():

@@ -10,7 +10,7 @@ import difflib
 import functools
 import operator
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib import import_module
 from typing import Annotated, Any, NamedTuple, get_args
 
@@ -40,6 +40,31 @@ class Command(NamedTuple):
         """Import the class."""
         module, name = self.where.split(":")
         return getattr(import_module(f"pupper_sysid.cli.commands.{module}"), name)
+
+
+def commands_of(
+    summaries: Mapping[str, Mapping[str, str]],
+    module: Callable[[str, str], str],
+    holding_bus: Collection[str] = (),
+) -> dict[str, Command]:
+    """Commands by word, from their summaries by group; `fit-servo` is a class `FitServo`.
+
+    Parameters
+    ----------
+    summaries : mapping of str to mapping of str to str
+    module : callable
+        Module of a group's word, below `pupper_sysid.cli.commands`.
+    holding_bus : collection of str
+        Words of those that must release a bus before they end.
+    """
+    return {
+        word: Command(
+            group, summary, f"{module(group, word)}:{word.title().replace('-', '')}",
+            word in holding_bus,
+        )
+        for group, words in summaries.items()
+        for word, summary in words.items()
+    }  # fmt: skip
 
 
 def run_command(

@@ -96,13 +96,7 @@ class Driver:
 
     @contextmanager
     def driving(self) -> Iterator[Driver]:
-        """Read keys one by one, without echo, during the block.
-
-        Raises
-        ------
-        InputError
-            If there is no terminal to type in.
-        """
+        """Read keys one by one, without echo, during the block."""
         if not sys.stdin.isatty():
             raise InputError("--keyboard needs a terminal to type in; use --command or --script.")
         with terminal_without(termios.ICANON | termios.ECHO, sys.stdin.fileno()), self._live:

@@ -87,7 +87,10 @@ def _subcommands(parser: argparse.ArgumentParser) -> dict[str, argparse.Argument
 def _page(
     parser: argparse.ArgumentParser, program: str, width: int, whole: bool, nested: bool
 ) -> list[str]:
-    words = " ".join(_name(a) for a in parser._actions if _is_positional(a))
+    positional = [
+        a for a in parser._actions if not (a.option_strings or isinstance(a.choices, dict))
+    ]
+    words = " ".join(map(_name, positional))
     subcommands = _subcommands(parser)
     usage = [program, "COMMAND" if subcommands else words, "[OPTIONS]"]
     lines = [f"usage: {' '.join(part for part in usage if part)}"]
@@ -121,19 +124,12 @@ def _groups(
         own = [
             action
             for action in group._group_actions
-            if not isinstance(action.choices, dict) and (nested or not _is_nested(action))
+            if not isinstance(action.choices, dict)
+            and (nested or not any("." in name for name in action.option_strings))
         ]
         if own:
             title = "" if group.title in ("options", "positional arguments") else group.title
             yield (title or "").removesuffix(" options"), own
-
-
-def _is_nested(action: argparse.Action) -> bool:
-    return any("." in name for name in action.option_strings)
-
-
-def _is_positional(action: argparse.Action) -> bool:
-    return not (action.option_strings or isinstance(action.choices, dict))
 
 
 def _left_out(parser: argparse.ArgumentParser) -> str:

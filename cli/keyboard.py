@@ -62,13 +62,7 @@ class Keyboard:
             yield
 
     def line(self) -> str | None:
-        """A line if one has been typed.
-
-        Raises
-        ------
-        InputError
-            If the input has ended.
-        """
+        """A line if one has been typed."""
         if b"\n" not in self._typed and select.select([self._fd], [], [], 0)[0]:
             typed = os.read(self._fd, 1024)
             if not typed:

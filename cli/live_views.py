@@ -216,15 +216,15 @@ class LiveViews:
         wanted = self._wanted
         names = [str(name) for name in (wanted.rerun, wanted.mcap) if name is not None]
         if wrong:
-            terminal.warn([f"{' and '.join(names)}: {wrong}"])
+            terminal.warn(f"{' and '.join(names)}: {wrong}")
             return
         for path in filter(None, (wanted.rerun_file, wanted.mcap)):
-            terminal.err.print(f"Wrote {path}.", soft_wrap=True)
+            terminal.err.print(f"Wrote {path}.")
         if self._dropped:
             terminal.warn(
-                [f"{' and '.join(names)}: {self._dropped} ticks were dropped, for the writer was "
-                 "behind. Recordings of this command are whole."]
-            )  # fmt: skip
+                f"{' and '.join(names)}: {self._dropped} ticks were dropped, for the writer was "
+                "behind. Recordings of this command are whole."
+            )
 
     def _tell_events(self) -> None:
         """Send what the guard changed since the last time."""

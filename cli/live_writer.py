@@ -22,8 +22,7 @@ from pupper_sysid.cli.live_views import TICK
 from pupper_sysid.cli.side_process import LONGEST_MESSAGE
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.view.channels import TickChannels
-from pupper_sysid.sysid.view.mcap_file import McapStream
-from pupper_sysid.sysid.view.rerun_file import RerunStream
+from pupper_sysid.sysid.view.files import McapStream, RerunStream
 
 Array = NDArray[np.float64]
 
@@ -47,11 +46,6 @@ class Writer:
     ----------
     every_s : float
         Time between two parts [s].
-
-    Raises
-    ------
-    InputError
-        If a library is not installed, a file is there or cannot be written, or no viewer answers.
     """
 
     def __init__(self, about: dict[str, Any]):

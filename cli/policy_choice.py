@@ -45,13 +45,7 @@ def run_folder(path: Path) -> Path:
 
 
 def policy_at(path: Path) -> tuple[Policy, Run | None]:
-    """The policy in a policy folder, or the best (else the last) of a run, and the run.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
+    """The policy in a policy folder, or the best (else the last) of a run, and the run."""
     from pupper_sysid.policies.network.policy_file import (  # torch takes seconds to import
         CONTRACT,
         load_policy,
@@ -68,7 +62,7 @@ def policy_at(path: Path) -> tuple[Policy, Run | None]:
         )
     for name in ("policy_best", "policy_last"):
         if (path / name / CONTRACT).is_file():
-            err.print(f"Taking {path / name}.", soft_wrap=True)
+            err.print(f"Taking {path / name}.")
             return load_policy(path / name), load_run(path)
     run = load_run(path)
     if run.architecture.privileged_actor:
@@ -98,13 +92,7 @@ def trained_actuator(path: Path, policy: Policy, run: Run | None) -> tuple[str |
 
 
 def chosen_actuator(path: Path, policy: Policy, run: Run | None, given: str | None) -> str:
-    """The actuator for the policy at `path`: the `given` one, else that of its training.
-
-    Raises
-    ------
-    InputError
-        If it is not here.
-    """
+    """The actuator for the policy at `path`: the `given` one, else that of its training."""
     if given is not None:
         check_actuator(given)
         return given
@@ -117,10 +105,8 @@ def chosen_actuator(path: Path, policy: Policy, run: Run | None, given: str | No
         )
     if not same:
         warn(
-            [
-                f"{found} is not the file with which {path} was trained: it was changed, or only "
-                "has the same name. Give the right one, or this one, with --actuator."
-            ]
+            f"{found} is not the file with which {path} was trained: it was changed, or only "
+            "has the same name. Give the right one, or this one, with --actuator."
         )
     return found
 
@@ -131,30 +117,18 @@ def _near(name: str, path: Path) -> list[Path]:
     return [p for p in (Path(name), *(f / name for f in (folder, *folder.parents))) if p.exists()]
 
 
-def refuse_other_robot(policy: Policy, program: str) -> None:
-    """Refuse a policy that walks another robot than the Mini Pupper 2.
-
-    Raises
-    ------
-    InputError
-        If it does.
-    """
+def refuse_other_robot(policy: Policy) -> None:
+    """Refuse a policy that walks another robot than the Mini Pupper 2."""
     if (own := policy.contract.robot) is not None:
         raise InputError(
-            f"{program} knows the Mini Pupper 2 only, and this policy walks {own.name}. Look at it "
-            "with pupper-play, measure it with pupper-eval, compare its servos with "
+            f"pupper-analyze knows the Mini Pupper 2 only, and this policy walks {own.name}. Look "
+            "at it with pupper-play, measure it with pupper-eval, compare its servos with "
             "pupper-analyze servo-demand, and walk it with pupper-deploy."
         )
 
 
 def body_at(path: Path, policy: Policy, run: Run | None) -> Body:
-    """The robot that the policy at `path` was trained on.
-
-    Raises
-    ------
-    InputError
-        If its MJCF or YAML is not here as it was.
-    """
+    """The robot that the policy at `path` was trained on."""
     return _of_robot(run.task if run else Walking(), path, policy, run).body
 
 
@@ -227,8 +201,7 @@ def trained_commands(policy: Policy, run: Run | None) -> CommandRanges:
     assumed = CommandRanges.of(WALKING[of].commands)
     err.print(
         "The policy's file does not say which commands it was trained for. Assumed are those of "
-        f"the preset {of}: {assumed}.",
-        soft_wrap=True,
+        f"the preset {of}: {assumed}."
     )
     return assumed
 
@@ -236,7 +209,7 @@ def trained_commands(policy: Policy, run: Run | None) -> CommandRanges:
 def warn_of_fallbacks(servos: Iterable[ServoRanges]) -> None:
     """Which joints go by another's numbers, once per calibration."""
     warn(
-        dict.fromkeys(
+        *dict.fromkeys(
             f"{s.source} has no {', '.join(s.fallbacks)}: they take the numbers of "
             f"{', '.join(sorted(set(s.fallbacks.values())))}. Calibrate them to know."
             for s in servos
@@ -250,7 +223,7 @@ def show_match(match: Match) -> None:
     if match.fits:
         err.print(match.sentence())
         return
-    warn([match.sentence()])
+    warn(match.sentence())
     rows = [row for row in match.table() if row["frequency_hz"] % 1 == 0]
     titles = (name.replace("_", " ") for name in rows[0])
     shown = table("Swing over command, and phase", *titles)
@@ -264,10 +237,9 @@ def show_servos(match: ServoMatch | None, carried: bool) -> None:
     if match is None:
         err.print(
             "The robot's servos were not compared with those of the training: "
-            + ("a learned model has no numbers." if carried else "the policy's file has none."),
-            soft_wrap=True,
+            + ("a learned model has no numbers." if carried else "the policy's file has none.")
         )
     elif match.outside:
-        warn([f"{match.here} is not what the policy was trained for:", *match.sentences()])
+        warn(f"{match.here} is not what the policy was trained for:", *match.sentences())
     else:
-        err.print(*match.sentences(), soft_wrap=True)
+        err.print(*match.sentences())

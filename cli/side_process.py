@@ -54,13 +54,7 @@ class SideProcess:
         return True
 
     def answer(self, within_s: float) -> bytes:
-        """A message of the process; empty if it ended.
-
-        Raises
-        ------
-        InputError
-            If it did not come in time.
-        """
+        """A message of the process; empty if it ended."""
         if not select.select([self.here], [], [], within_s)[0]:
             raise InputError(
                 f"A helping process did not answer within {within_s:.0f} s. Check the machine's "

@@ -2,6 +2,18 @@
 
 Results go to stdout, everything else (progress, warnings, what to run next) to stderr: with
 `--json`, stdout is one JSON object.
+
+A message below `cli/` names an argument in back-quotes, as Python spells it; `spell` replaces it by
+the option of the running command, and leaves every other word alone. So a message reads right both
+for a caller of the library and at the command line::
+
+    `stall_torque_nm`    --stall-torque
+    `force=True`         --force
+    `preset='paper'`     --preset paper
+    `learning_rate`      --learner.learning-rate
+
+An option is found by the argument's name, by its name without the unit, or by `_OTHER_NAMES`.
+Errors (`user_errors`) and warnings (`terminal.warn`) are spelled so; a command need not call this.
 """
 
 from __future__ import annotations
@@ -12,6 +24,8 @@ import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +36,6 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from pupper_sysid.cli.flags import spell
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.joints import select_joints, share_sentences
 from pupper_sysid.common.reading.dialect import whole
@@ -42,14 +55,16 @@ _CONTROL = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u20
 class _PlainConsole(Console):
     """Console on which text from files cannot move the cursor, set colours or reverse lines.
 
-    Sentences that are one line for other programs (`soft_wrap`) are broken between words on a
-    terminal, unless they hold a command, which would then be copied in parts.
+    Sentences are one line for other programs. On a terminal they are broken between words, unless
+    they hold a command, which would then be copied in parts.
     """
 
     def print(self, *objects: Any, soft_wrap: bool | None = None, **how: Any) -> None:
         """As rich's."""
-        if soft_wrap and self.is_terminal and not _COMMAND.search(" ".join(map(str, objects))):
-            soft_wrap = False
+        if soft_wrap is None:
+            words = all(isinstance(one, str | Text) for one in objects)
+            command = _COMMAND.search(" ".join(map(str, objects)))
+            soft_wrap = words and (command is not None or not self.is_terminal)
         super().print(*objects, soft_wrap=soft_wrap, **how)
 
     def render(
@@ -79,13 +94,13 @@ def load_all(paths: Sequence[Path]) -> list[Recording]:
     chosen = list(paths)
     if not chosen:
         chosen = [newest_recording()]
-        err.print(f"Taking the newest recording, {chosen[0]}.", soft_wrap=True)
+        err.print(f"Taking the newest recording, {chosen[0]}.")
     recordings = [load(log) for path in chosen for log in logs_in(path)]
     by_name: dict[str, tuple[str, ...]] = {}
     for recording in recordings:
         by_name[recording.name] = (*by_name.get(recording.name, ()), *recording.warnings)
     for names, text in share_sentences(by_name):
-        warn([f"{'all logs' if names == 'All joints' else names}: {text}"])
+        warn(f"{'all logs' if names == 'All joints' else names}: {text}")
     return recordings
 
 
@@ -103,7 +118,7 @@ def print_json(value: Any) -> None:
     print(_CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text))
 
 
-def warn(sentences: Iterable[str]) -> None:
+def warn(*sentences: str) -> None:
     """Print warnings on stderr, one per line."""
     for sentence in sentences:
         err.print(Text.assemble(("warning: ", "yellow"), spell(sentence)))
@@ -211,15 +226,13 @@ def _print_fleet_table(
     for _, row in known.query("outliers != ''").iterrows():
         out.print(
             f"{row['robot']} {row['joint']} is an outlier: "
-            f"{', '.join(str(row['outliers']).split(';'))}.",
-            soft_wrap=True,
+            f"{', '.join(str(row['outliers']).split(';'))}."
         )
     for name, problem in sorted(fleet.problems.items()):
-        warn([f"{name} was left out: {problem}"])
+        warn(f"{name} was left out: {problem}")
     err.print(
         f"{len(fleet.made)} made, {len(fleet.kept)} kept, {len(fleet.failed)} failed in "
-        f"{elapsed_s:.0f} s. Wrote {folder / TABLE} and {what} per robot beside it.",
-        soft_wrap=True,
+        f"{elapsed_s:.0f} s. Wrote {folder / TABLE} and {what} per robot beside it."
     )
 
 
@@ -289,6 +302,56 @@ def _bar(label: str, total: float, count: str) -> Iterator[Any]:
                 said = time.monotonic()
                 shown = bar.tasks[0]
                 err.print(f"{shown.description}: {shown.percentage:.0f} %, "
-                          f"{said - started:.0f} s", soft_wrap=True)  # fmt: skip
+                          f"{said - started:.0f} s")  # fmt: skip
 
         yield update
+
+
+# ----- arguments of the library, spelled as options
+
+
+_OTHER_NAMES = {"frequencies": "freqs", "address": "bus", "workers": "jobs", "p_gain": "gain"}
+_OF_EVERY_PROGRAM = {"read_limit": "--read-limit"}
+"""Options with a name of their own, by the library's argument (without its unit)."""
+
+_ARGUMENT = re.compile(r"`([a-z][a-z0-9_]*)(?:=('?)([^`']*)\2)?`")
+_UNIT = re.compile(r"_(rad_s|m_s|s|ms|hz|rad|nm)$")
+_flags: ContextVar[Mapping[str, str]] = ContextVar("flags")
+
+
+def remember(options: Any) -> None:
+    """Take the options of the running command, parsed, as those that messages may name."""
+    _flags.set(_flags_of(options))
+
+
+def forget() -> None:
+    """Spell nothing from now on: the command has ended."""
+    _flags.set({})
+
+
+def spell(text: str) -> str:
+    """`text` with the arguments in back-quotes replaced by the running command's options."""
+    known = _OF_EVERY_PROGRAM | dict(_flags.get({}))
+
+    def flag(found: re.Match[str]) -> str:
+        name = _UNIT.sub("", found[1])
+        options = (known.get(n) for n in (found[1], name, _OTHER_NAMES.get(name)) if n)
+        option = next(filter(None, options), None)
+        if option is None:
+            return found[0]
+        return option if found[3] in (None, "True") else f"{option} {found[3]}"
+
+    return _ARGUMENT.sub(flag, text)
+
+
+def _flags_of(options: Any, prefix: str = "--") -> dict[str, str]:
+    """Flag of every option that is not positional, by field; those of nested groups, too."""
+    own, nested = {}, {}
+    for field in fields(options):
+        value, kind = getattr(options, field.name), str(field.type)
+        flag = prefix + field.name.replace("_", "-")
+        if is_dataclass(value):
+            nested = _flags_of(value, prefix if "name=''" in kind else f"{flag}.") | nested
+        elif "Positional" not in kind:
+            own[field.name] = flag
+    return nested | own

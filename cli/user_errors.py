@@ -14,24 +14,24 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from traceback import walk_tb
-from typing import Any, NoReturn, TypeVar
+from types import NoneType
+from typing import Any, NoReturn, TypeVar, get_args
 
 import tyro
 from rich.text import Text
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from pupper_sysid.cli.flags import forget, remember, spell
 from pupper_sysid.cli.help_page import ALL, HELP, help_page
-from pupper_sysid.cli.numerals import NUMERALS
-from pupper_sysid.cli.terminal import err, out
+from pupper_sysid.cli.terminal import err, forget, out, remember, spell
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import holding_outputs, versions
 from pupper_sysid.common.processes.stop import STOPPED, Stop, stoppable
 from pupper_sysid.common.processes.stop import end_politely as end_politely
 from pupper_sysid.common.reading.content import reading_up_to
-from pupper_sysid.common.reading.dialect import decimal
+from pupper_sysid.common.reading.dialect import decimal, whole
 
 _COMPLETIONS = {
     "bash": ".local/share/bash-completion/completions/{}",
@@ -62,6 +62,12 @@ _CURES = {
 """What helps where the system names no file."""
 _SHARED, _POOLS = "multiprocessing.synchronize", ("concurrent.futures", "multiprocessing.pool")
 _OUTPUT, _ERRORS = "standard output", "standard error"
+
+NUMERALS = ConstructorRegistry()
+"""Rules for `tyro.cli`: numbers as in files, optional values by their type alone. Its own rules
+take `4_1` for 41 and the digits of every script, and show an optional value as `{None}|STR`."""
+
+_READERS: dict[Any, Callable[[str], float]] = {int: whole, float: decimal}
 
 Options = TypeVar("Options")
 
@@ -273,7 +279,7 @@ def _silence(stream: Any) -> None:
 
 def _print_error(error: str) -> None:
     try:
-        err.print(Text.assemble(("error: ", "red"), error), soft_wrap=True)
+        err.print(Text.assemble(("error: ", "red"), error))
     except OSError:  # nowhere to say it; the exit code does
         _silence(sys.stderr)
 
@@ -302,5 +308,48 @@ def _completion(program: str) -> list[str]:
     hint = "Open a new terminal to use it."
     if shell == "zsh":
         hint = f"With `fpath+=({path.parent})` before compinit in ~/.zshrc, open a new terminal."
-    err.print(f"Writing {path}. {hint}", soft_wrap=True)
+    err.print(f"Writing {path}. {hint}")
     return ["--tyro-write-completion", shell, str(path)]
+
+
+# ----- values of the command line
+
+
+@NUMERALS.primitive_rule
+def numeral(type_info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """How an option of type int or float is read; None for other types."""
+    kind: Any = type_info.type
+    if kind not in _READERS:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=kind.__name__.upper(),
+        instance_from_str=lambda words: _READERS[kind](words[0]),
+        is_instance=lambda value: (
+            isinstance(value, (int, kind)) and (not isinstance(value, bool) or kind is float)
+        ),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+@NUMERALS.primitive_rule
+def optional(type_info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """How an option of a type or None is read: as the type, or `None` as typed."""
+    kinds = [kind for kind in get_args(type_info.type) if kind is not NoneType]
+    if NoneType not in get_args(type_info.type) or len(kinds) != 1:
+        return None
+    inner = ConstructorRegistry.get_primitive_spec(
+        PrimitiveTypeInfo.make(kinds[0], parent_markers=type_info.markers)
+    )
+    if not isinstance(inner, PrimitiveConstructorSpec) or inner.nargs != 1:
+        return None
+    return replace(
+        inner,
+        instance_from_str=lambda words: (
+            None if words == ["None"] else inner.instance_from_str(words)
+        ),
+        is_instance=lambda value: value is None or inner.is_instance(value),
+        str_from_instance=lambda value: (
+            ["None"] if value is None else inner.str_from_instance(value)
+        ),
+    )

@@ -82,23 +82,12 @@ def read_bytes(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "
         Larger files are refused without being read (`common.reading.content` raises it).
     remedy : str
         What to do, as a sentence; by default, to check the file's name.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, no regular file, larger, or cannot be read.
     """
     return content(path, largest_bytes, remedy)
 
 
 def read_text(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> str:
-    """Text of a UTF-8 file of limited size, without a byte order mark.
-
-    Raises
-    ------
-    InputError
-        As `read_bytes`, and if the file is not text.
-    """
+    """Text of a UTF-8 file of limited size, without a byte order mark."""
     try:
         return read_bytes(path, largest_bytes, remedy).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -121,24 +110,12 @@ def read_yaml(path: Path) -> tuple[Any, dict[Place, int]]:
 
 
 def read_json(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> Any:
-    """Data of a JSON file of limited size.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or is not JSON.
-    """
+    """Data of a JSON file of limited size."""
     return parse_json(read_text(path, largest_bytes, remedy), str(path), remedy)
 
 
 def parse_json(text: str, name: str, remedy: str = "") -> Any:
-    """Data of JSON `text`; `name` says in messages what it is, `remedy` what to do.
-
-    Raises
-    ------
-    InputError
-        If it is not JSON, has too many values, or is nested too deeply.
-    """
+    """Data of JSON `text`; `name` says in messages what it is, `remedy` what to do."""
     refuse_more(name, sum(map(text.count, ",:[{")), MOST_VALUES, "values", remedy)
     refuse_more(name, _depth(text), MAX_DEPTH, "levels of nesting", remedy)
     try:
@@ -217,11 +194,6 @@ def validated(
     remedy : str
         What to do instead of editing the file, such as "fit the model again".
 
-    Raises
-    ------
-    InputError
-        On the fault that most likely caused the others.
-
     Examples
     --------
     >>> class Servo(BaseModel, extra="forbid"):
@@ -294,7 +266,8 @@ def _fault(fault: ErrorDetails, top: type[BaseModel], place: Place) -> str:
     if kind == "extra_forbidden":
         return _unknown_key(name, siblings)
     field = siblings.get(name)
-    meaning = _meaning(field)
+    text = (field.description or "").strip().rstrip(".") if field else ""
+    meaning = f": {text[:1].lower()}{text[1:]}" if text else ""
     if kind == "missing":
         return f"is missing. Add it{meaning}."
     if kind in _NOT_A_MAPPING:
@@ -347,11 +320,6 @@ def _not_a_mapping(given: Any, field: FieldInfo | None, meaning: str) -> str:
     checks = (getattr(getattr(entry, "func", None), "problem", None) for entry in field.metadata)
     problem = next((said for check in checks if check and (said := check(given))), "")
     return f"is a bare number{f' ({problem})' if problem else ''}. Write {example}{meaning}."
-
-
-def _meaning(field: FieldInfo | None) -> str:
-    text = (field.description or "").strip().rstrip(".") if field else ""
-    return f": {text[:1].lower()}{text[1:]}" if text else ""
 
 
 def _unit_in_words(place: Place) -> str:

@@ -48,11 +48,6 @@ def refuse_outside(name: str, value: float, low: float, high: float, unit: str =
     unit : str
         Of all three; empty for none.
 
-    Raises
-    ------
-    InputError
-        With what is allowed.
-
     Examples
     --------
     >>> refuse_outside("`seconds`", 1e9, 0.1, 600, "s")

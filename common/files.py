@@ -71,11 +71,6 @@ def as_path(value: object, what: str) -> Path:
     value : Path or str
     what : str
         What it leads to, for the message.
-
-    Raises
-    ------
-    InputError
-        If it is neither a path nor text.
     """
     if not isinstance(value, str | os.PathLike):
         raise InputError(f"{what} is named by a path or a str, not by a {type(value).__name__}.")
@@ -118,11 +113,6 @@ def replacing(path: Path, force: bool = False, hold: bool = True) -> Iterator[Pa
         Replace an existing file.
     hold : bool
         Whether a stop waits for the block; not for one that takes long.
-
-    Raises
-    ------
-    InputError
-        If `path` exists and `force` is not given, or it cannot be written.
     """
     _refuse_existing(path, force)
     _refuse_held(path)
@@ -187,13 +177,7 @@ class SyncedText:
         return self._file.closed
 
     def write(self, lines: Sequence[str]) -> None:
-        """Write whole lines.
-
-        Raises
-        ------
-        InputError
-            If the disk does not take them; what is there stays.
-        """
+        """Write whole lines."""
         try:
             self._file.writelines(f"{line}\n" for line in lines)
             self._file.flush()

@@ -149,11 +149,6 @@ def printable(text: str) -> str:
 def load(text: str, name: str = "the text") -> tuple[Any, dict[Place, int]]:
     """Data of YAML `text`, and the line (from 1) of every place in it.
 
-    Raises
-    ------
-    InputError
-        If the text is not YAML, or uses what this module refuses.
-
     Examples
     --------
     >>> load("{legs: 4, names: [yes, '5']}")[0]

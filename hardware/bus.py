@@ -152,34 +152,6 @@ class ServoBus(Protocol):
         ...
 
 
-class RegisterBus(ServoBus, Protocol):
-    """A bus whose servos' registers can be read and set (names: those of its family)."""
-
-    def servo_setups(self) -> dict[str, dict[str, Any]]:
-        """By joint, what a recording's header says of its servo."""
-        ...
-
-    def register(self, joint: str, name: str) -> int:
-        """Present value of a register.
-
-        Raises
-        ------
-        BusError
-            If it cannot be read.
-        """
-        ...
-
-    def set_register(self, joint: str, name: str, value: int) -> None:
-        """Set a register.
-
-        Raises
-        ------
-        BusError
-            If it is not read back with this value.
-        """
-        ...
-
-
 def finite_angles(position_rad: NDArray[np.float64], joints: int, bus: str) -> NDArray[np.float64]:
     """`position_rad` as an array of shape (joints,).
 

@@ -417,6 +417,7 @@ class DynamixelLine(SerialLine):
     longest_return_delay_s = 0.00051  # 254 units of 2 µs
     model_bytes = 3  # model number and firmware, in the reply to a ping
     rates_in_words = "57600, 115200, 1000000, 2000000, 3000000 or 4000000"
+    torque_address = _TORQUE
 
     def __init__(self, device: str, baud: int, exclusive: bool = True):
         super().__init__(device, baud, exclusive)
@@ -482,10 +483,10 @@ class DynamixelLine(SerialLine):
             for k, frame in enumerate(frames)
         }
 
-    def try_fast(self, servos: Sequence[int], address: int, size: int) -> bool:
+    def try_fast(self, servos: Sequence[int], address: int) -> bool:
         """Whether all of these servos answer one fast sync read; if so, it is used from then on."""
         usual_s, self.patience_s = self.patience_s, max(self.patience_s, SLOWEST_ADAPTER_S)
-        replies = self.fast_sync_read(servos, address, size)
+        replies = self.fast_sync_read(servos, address, 1)
         self.patience_s = usual_s
         self.fast = frozenset(replies) if len(replies) == len(servos) else frozenset()
         return bool(self.fast)
@@ -497,26 +498,13 @@ class DynamixelLine(SerialLine):
         whole = FAST_HEAD_BYTES + len(delays_s) * (size + FAST_BLOCK_BYTES)
         return delays_s[0] + whole * self._byte_s()
 
-    def sync_write(self, address: int, values: dict[int, bytes]) -> float:
-        """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed."""
-        size = len(next(iter(values.values())))
-        params = [byte for servo, value in values.items() for byte in (servo, *value)]
-        return self._sync_written(
-            lambda: self._packets.syncWriteTxOnly(self._port, address, size, params, len(params))
-        )
-
-    def torque_off(self, servos: Sequence[int] | None = None) -> None:
-        """Switch the torque of these (default: all) off at once; unacknowledged."""
-        if servos is None:
-            off = Frame(BROADCAST_ID, WRITE, _TORQUE.to_bytes(2, "little") + b"\0").encode()
-            self._sync_written(lambda: self._send_raw(off))
-        else:
-            self.sync_write(_TORQUE, {servo: b"\0" for servo in servos})
-
     def ask_model(self, servo: int) -> int:
         """Send a ping, whose reply holds the model number; 0 if sent."""
         request = [0, 0, 0, 0, servo, 3, 0, PING, 0, 0]
         return self._packets.txPacket(self._port, request)
+
+    def _all_off(self) -> bytes:
+        return Frame(BROADCAST_ID, WRITE, _TORQUE.to_bytes(2, "little") + b"\0").encode()
 
     def echo_probe(self) -> bytes:
         """A request to which no servo answers."""
@@ -596,7 +584,7 @@ class DynamixelBus(SerialBus):
         assert isinstance(self.line, DynamixelLine)
         if len(able) > 1 and len(able) == len(self._servos):
             where = self._servos[0].series.register("present_temperature").address
-            if self.line.try_fast(able, where, 1):
+            if self.line.try_fast(able, where):
                 return "fast sync read"
         return super()._choose_reading()
 

@@ -262,6 +262,7 @@ class FeetechLine(SerialLine):
     longest_return_delay_s = 0.00051  # 254 units of 2 µs
     model_bytes = 2
     rates_in_words = "1000000, 500000, 250000, 128000, 115200, 57600 or 38400"
+    torque_address = TORQUE_ADDRESS
 
     def __init__(self, device: str, baud: int, exclusive: bool = True):
         super().__init__(device, baud, exclusive)
@@ -281,28 +282,12 @@ class FeetechLine(SerialLine):
             lambda: self._packets.syncReadTx(self._port, address, size, ids, len(ids)), ids, size
         )
 
-    def sync_write(self, address: int, values: dict[int, bytes]) -> float:
-        """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed."""
-        sizes = {len(v) for v in values.values()}
-        if len(sizes) != 1:
-            raise ValueError(f"sync_write: values of {sorted(sizes)} bytes; all must be as long.")
-        size = sizes.pop()
-        params = [byte for servo, value in values.items() for byte in (servo, *value)]
-        return self._sync_written(
-            lambda: self._packets.syncWriteTxOnly(self._port, address, size, params, len(params))
-        )
-
-    def torque_off(self, servos: Sequence[int] | None = None) -> None:
-        """Switch the torque of these (default: all) off at once; unacknowledged."""
-        if servos is None:
-            off = Frame(BROADCAST_ID, 3, bytes([TORQUE_ADDRESS, 0])).encode()
-            self._sync_written(lambda: self._send_raw(off))
-        else:
-            self.sync_write(TORQUE_ADDRESS, {servo: b"\0" for servo in servos})
-
     def ask_model(self, servo: int) -> int:
         """Send the request whose reply holds the model number; 0 if sent."""
         return self._packets.readTx(self._port, servo, MODEL_ADDRESS, 2)
+
+    def _all_off(self) -> bytes:
+        return Frame(BROADCAST_ID, 3, bytes([TORQUE_ADDRESS, 0])).encode()
 
     def echo_probe(self) -> bytes:
         """A request to which no servo answers."""

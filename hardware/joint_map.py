@@ -180,14 +180,7 @@ class JointMap:
         return tuple(self._entry(j).id for j in self.joint_names)
 
     def select(self, joints: Sequence[str]) -> JointMap:
-        """The map of some joints only.
-
-        Raises
-        ------
-        InputError
-            If a joint is not in the map, or a calf on a push rod comes without its thigh while
-            joint coordinates are requested.
-        """
+        """The map of some joints only."""
         missing = [j for j in joints if j not in self.file.joints]
         if missing:
             raise InputError(
@@ -380,11 +373,6 @@ class JointMap:
 
 def load_joint_map(path_or_preset: Path | str) -> JointMap:
     """Read a joint map, or a preset by its name.
-
-    Raises
-    ------
-    InputError
-        If there is no such file, or if anything in it cannot be trusted.
 
     Examples
     --------

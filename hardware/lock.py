@@ -22,13 +22,7 @@ LOG = "watchdog.log"
 
 
 def runtime_folder() -> Path:
-    """The folder, made if missing.
-
-    Raises
-    ------
-    BusError
-        If it is not a folder that only this user can write to.
-    """
+    """The folder, made if missing."""
     given = os.environ.get("XDG_RUNTIME_DIR", "")
     folder = Path(f"/tmp/pupper-sysid-{os.getuid()}")
     if given and Path(given).is_absolute() and Path(given).is_dir():
@@ -48,13 +42,7 @@ def runtime_folder() -> Path:
 
 
 def open_here(name: str, flags: int) -> int:
-    """Descriptor of a regular file in the folder, made if missing.
-
-    Raises
-    ------
-    BusError
-        If it is a link, a FIFO or anything else, or cannot be opened.
-    """
+    """Descriptor of a regular file in the folder, made if missing."""
     path = runtime_folder() / name
     safe = os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:

@@ -36,8 +36,7 @@ from pupper_sysid.common.processes.stop import held
 from pupper_sysid.common.reading.content import refuse_large_header
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.interface import AtControlRate, substeps
-from pupper_sysid.servo_models.joint_arrays import same_rate
-from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
+from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork, same_rate
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS, SparseEquation
 
 SCHEMA = "pupper-servo-model"
@@ -232,14 +231,7 @@ def load_servo_model(
 
 
 def build(contract: Contract, parameters: Mapping[str, NDArray]) -> Model:
-    """The model of a contract and its arrays.
-
-    Raises
-    ------
-    InputError
-        If the arrays do not fit the contract's architecture, joints and inputs, or hold impossible
-        numbers.
-    """
+    """The model of a contract and its arrays."""
     joints, step = tuple(contract.joints), contract.time_step_s
     _check_names(contract.arch, set(parameters))
     for name, value in parameters.items():

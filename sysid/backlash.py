@@ -177,7 +177,13 @@ def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> J
     groups: dict[float, list[_Stroke]] = {}
     for trial in trials:
         groups.setdefault(trial.p_gain, []).extend(_strokes(trial))
-    groups = {g: own for g, own in sorted(groups.items()) if _enough(own)}
+    groups = {
+        g: own
+        for g, own in sorted(groups.items())
+        if len(own) >= _LEAST_STROKES
+        and len({round(s.speed_rad_s, 3) for s in own}) > 1
+        and len({s.side for s in own}) > 1
+    }
     if not groups:
         raise InputError(
             f"{joint}: the recording has no slow strokes at two speeds (at least {_LEAST_STROKES} "
@@ -190,8 +196,18 @@ def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> J
     quantum = max(t.truncation.quantum_rad for t in trials)
     notes: list[str] = []
     several = len(gains) > 1 and bool(np.isfinite(gains).all())
-    limited = _by_friction(gains, fits) if several else np.ones(len(gains), bool)
-    measured = [_hysteresis(g, f, quantum) for g, f in fits.items()]
+    limited = np.ones(len(gains), bool)
+    if several:  # where friction, not the dead zone, sets the hysteresis, `a · P` is the same
+        product = gains * np.array([f.best[1] for f in fits.values()])
+        limited = product < 1.04 * product[0]
+    measured = []
+    for gain, fit in fits.items():
+        width = _interval(2 * fit.best[1], 2 * fit.draws[:, 1], fit.count)
+        lag = _interval(fit.best[-1], fit.draws[:, -1], fit.count)
+        width = width.widened(_COUNT_SHARE * quantum)
+        measured.append(
+            GainHysteresis(p_gain=gain, hysteresis_rad=width, lag_s=lag, strokes=fit.count)
+        )
     zone = None
     if several:
         zone = _dead_zone(measured[-1], bool(limited[-1]), quantum, notes)
@@ -216,16 +232,6 @@ def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> J
         dead_zone_rad=zone,
         backlash_rad=play,
         notes=tuple(notes),
-    )
-
-
-def _hysteresis(gain: float, fit: _Fit, quantum: float) -> GainHysteresis:
-    width = _interval(2 * fit.best[1], 2 * fit.draws[:, 1], fit.count)
-    return GainHysteresis(
-        p_gain=gain,
-        hysteresis_rad=width.widened(_COUNT_SHARE * quantum),
-        lag_s=_interval(fit.best[-1], fit.draws[:, -1], fit.count),
-        strokes=fit.count,
     )
 
 
@@ -296,11 +302,6 @@ def _runs(flags: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
     return np.split(index, np.flatnonzero(np.diff(index) > 1) + 1) if len(index) else []
 
 
-def _enough(strokes: Sequence[_Stroke]) -> bool:
-    speeds = {round(s.speed_rad_s, 3) for s in strokes}
-    return len(strokes) >= _LEAST_STROKES and len(speeds) > 1 and len({s.side for s in strokes}) > 1
-
-
 class _Fit:
     """Regression over the strokes of one gain, and over bootstrap draws of them."""
 
@@ -343,12 +344,6 @@ def _interval(value: float, draws: _Array, count: int) -> Interval:
     freedom = max(count // 2 - 4, 2)
     half = float(stdtrit(freedom, (1 + LEVEL) / 2)) * spread * np.sqrt(count / (count - 6))
     return Interval(centre, centre - half, centre + half)
-
-
-def _by_friction(gains: _Array, fits: dict[float, _Fit]) -> NDArray[np.bool_]:
-    """Gains at which friction, not the dead zone, sets the hysteresis: `a · P` is the same."""
-    product = gains * np.array([f.best[1] for f in fits.values()])
-    return product < 1.04 * product[0]
 
 
 def _dead_zone(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from pupper_sysid.cli.dispatch import Command, run_command
+from pupper_sysid.cli.dispatch import commands_of, run_command
 from pupper_sysid.cli.user_errors import user_errors
 from pupper_sysid.common.errors import InputError
 
@@ -16,30 +16,26 @@ DESCRIPTION = """Analyse the walk of policies in the simulator: tables, JSON and
 
 Example: pupper-analyze gait runs/<name> --command 0.15 0 0
 """
-COMMANDS = {
-    "gait": Command("rhythm", "Frequency, sine fit, phases, duty, jitter.", "analyze.gait:Gait"),
-    "attractor": Command(
-        "rhythm", "Orbits of actions and hidden states.", "analyze.gait:Attractor"
-    ),
-    "autonomy": Command(
-        "rhythm", "Frozen inputs, pushes, other control rates.", "analyze.robustness:Autonomy"
-    ),
-    "delay": Command("walk", "More delay, in replay and closed loop.", "analyze.robustness:Delay"),
-    "ablation": Command(
-        "walk", "Noise, zeros and staleness per channel.", "analyze.robustness:Ablation"
-    ),
-    "terrain": Command("walk", "Rough ground, slopes, troughs.", "analyze.robustness:Terrain"),
-    "compliance": Command(
-        "walk", "Path, drift and arc in six directions.", "analyze.robustness:Compliance"
-    ),
-    "servo": Command("servos", "Four servo models on unseen readings.", "analyze.servo:Servo"),
-    "twin": Command(
-        "servos", "A recording's commands on the whole simulated robot.", "analyze.twin:Twin"
-    ),
-    "servo-demand": Command(
-        "servos", "What a gait needs, against what a servo has.", "analyze.servo_demand:ServoDemand"
-    ),
+_SUMMARIES = {
+    "rhythm": {
+        "gait": "Frequency, sine fit, phases, duty, jitter.",
+        "attractor": "Orbits of actions and hidden states.",
+        "autonomy": "Frozen inputs, pushes, other control rates.",
+    },
+    "walk": {
+        "delay": "More delay, in replay and closed loop.",
+        "ablation": "Noise, zeros and staleness per channel.",
+        "terrain": "Rough ground, slopes, troughs.",
+        "compliance": "Path, drift and arc in six directions.",
+    },
+    "servos": {
+        "servo": "Four servo models on unseen readings.",
+        "twin": "A recording's commands on the whole simulated robot.",
+        "servo-demand": "What a gait needs, against what a servo has.",
+    },
 }
+_MODULES = {"servo": "servos", "servo-demand": "servos", "twin": "twin"}
+COMMANDS = commands_of(_SUMMARIES, lambda _, word: f"analyze.{_MODULES.get(word, 'walks')}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

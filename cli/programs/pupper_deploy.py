@@ -36,12 +36,11 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_path
 from pupper_sysid.hardware.address import EMULATED, SOCKET, bus_name, parse_address
 from pupper_sysid.hardware.bus import header_entries
-from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.imu import Imu
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
-from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
 from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, StackName, suited
 
 if TYPE_CHECKING:
@@ -192,10 +191,8 @@ def _run(options: Deploy) -> None:
             )
         elif not known:
             warn(
-                [
-                    "the actuator with which the policy was trained is not here, so the observer "
-                    "was not compared with it."
-                ]
+                "the actuator with which the policy was trained is not here, so the observer "
+                "was not compared with it."
             )
         else:
             show_match(parts.match)
@@ -214,7 +211,7 @@ def _commands(options: Deploy, trained: CommandRanges) -> Commands:
     from pupper_sysid.cli.drive import Driver
     from pupper_sysid.policies.deploy.commands import constant, script
 
-    say = partial(err.print, soft_wrap=True)
+    say = err.print
     if options.keyboard:
         return Driver(trained)
     return (
@@ -232,10 +229,8 @@ def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
     own = 1 / contract.control_step_s
     if stack.rate_hz and abs(stack.rate_hz / own - 1) > 1e-6:
         warn(
-            [
-                f"the policy was trained at {own:g} Hz and runs at {stack.rate_hz:g} Hz: its gait "
-                f"is {stack.rate_hz / own:.2f} times as fast."
-            ]
+            f"the policy was trained at {own:g} Hz and runs at {stack.rate_hz:g} Hz: its gait "
+            f"is {stack.rate_hz / own:.2f} times as fast."
         )
     return name, stack
 
@@ -298,10 +293,8 @@ def _map_of(options: Deploy, body: Body) -> JointMap:
             "called as in the robot's MJCF."
         )
     warn(
-        [
-            f"the IMU's axes are taken for those of {body.name}'s trunk (x forward, y to the left, "
-            "z up), and the joint map's angles for those of its MJCF."
-        ]
+        f"the IMU's axes are taken for those of {body.name}'s trunk (x forward, y to the left, "
+        "z up), and the joint map's angles for those of its MJCF."
     )
     return replace(joint_map, joint_names=body.joints)
 
@@ -325,11 +318,10 @@ def _emulated(options: Deploy, rng: np.random.Generator, body: Body, trained: st
         if options.actuator is None:
             err.print(
                 f"The emulated {body.name} has the servos of the training, {Path(trained).name}. "
-                "Give yours with --actuator.",
-                soft_wrap=True,
+                "Give yours with --actuator."
             )
         else:
-            err.print(f"The emulated {body.name} has the servos of {trained}.", soft_wrap=True)
+            err.print(f"The emulated {body.name} has the servos of {trained}.")
         servos = servo_ranges(trained, body=body)
         if not is_card(trained):
             warn_of_fallbacks([servos])
@@ -340,11 +332,10 @@ def _emulated(options: Deploy, rng: np.random.Generator, body: Body, trained: st
     if is_servo_model(options.actuator):
         err.print(
             f"{options.actuator} is a learned model, which the emulated robot cannot have: its "
-            "servos are drawn from published measurements.",
-            soft_wrap=True,
+            "servos are drawn from published measurements."
         )
         return draw_robot(rng)
-    err.print(f"The emulated robot has the servos of {options.actuator}.", soft_wrap=True)
+    err.print(f"The emulated robot has the servos of {options.actuator}.")
     return calibrated_robot(servo_ranges(options.actuator), rng)
 
 
@@ -369,7 +360,7 @@ def _live(open_things: ExitStack, bus: GuardedBus) -> list[Any]:
     from pupper_sysid.cli.oscilloscope import Oscilloscope
 
     if not err.is_terminal:
-        warn(["--live needs a terminal to draw in; it was left out."])
+        warn("--live needs a terminal to draw in; it was left out.")
         return []
     scope = open_things.enter_context(Oscilloscope(bus.name, bus.joint_names))
     return [lambda t: scope.tick(t.elapsed_s, t.sent, t.reading, t.missed_deadlines)]
@@ -447,7 +438,7 @@ def _walk(
     for key, value in found.items():
         shown.add_row(key, terminal.cell(value, 3))
     out.print(shown)
-    err.print(f"Repeat it: pupper-deploy {options.policy} --replay {log}", soft_wrap=True)
+    err.print(f"Repeat it: pupper-deploy {options.policy} --replay {log}")
 
 
 if __name__ == "__main__":

@@ -25,7 +25,6 @@ from pupper_sysid.sim.robot.terrain import Terrain
 if TYPE_CHECKING:
     from pupper_sysid.common.interval import Interval
     from pupper_sysid.policies.evaluation.evaluate import Evaluation
-    from pupper_sysid.policies.evaluation.figures import Figures
 
 _FULL, _QUICK = (100, 20.0), (30, 10.0)  # episodes, seconds each
 _FULL_BATTERY, _QUICK_BATTERY = (40, 20.0), (10, 8.0)
@@ -139,7 +138,7 @@ def _run(options: Eval) -> None:
         return
     _show(found, options.quick)
     if page:
-        err.print(f"Wrote {page}.", soft_wrap=True)
+        err.print(f"Wrote {page}.")
 
 
 def _show(found: Evaluation, quick: bool) -> None:
@@ -147,8 +146,7 @@ def _show(found: Evaluation, quick: bool) -> None:
     err.print(
         f"{'Quick look: ' if quick else ''}{first.episodes} episodes of {found.episode_s:g} s, "
         f"actuator {found.actuator}, feedback {found.feedback}. The trot is open-loop: it has a "
-        "clock and sees nothing. Episode k has the same robot in every row; intervals are of 90 %.",
-        soft_wrap=True,
+        "clock and sees nothing. Episode k has the same robot in every row; intervals are of 90 %."
     )
     _show_falls(found)
     _show_errors(found, "every instant", "")
@@ -165,8 +163,10 @@ def _show_falls(found: Evaluation) -> None:
     )  # fmt: skip
     for row in found.conditions:
         own = row.policy
+        rates = [each.intervals.fall_rate for each in (row.policy, row.trot, row.standing)]
         shown.add_row(
-            row.name, *(_fallen(f) for f in (row.policy, row.trot, row.standing)),
+            row.name,
+            *(f"{100 * r.value:.0f} ({100 * r.low:.0f}–{100 * r.high:.0f})" for r in rates),
             number(sum(own.duty) / len(own.duty), 2), number(own.stride_hz, 1),
             number(own.foot_slip_m_s, 3),
         )  # fmt: skip
@@ -196,10 +196,11 @@ def _show_errors(found: Evaluation, of_what: str, prefix: str) -> None:
     )  # fmt: skip
     names = [f"{prefix}{name}" for name in ("mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s")]
     for row in found.conditions:
-        cells = [_error(getattr(f.intervals, n)) for f in (row.policy, row.trot) for n in names]
+        walkers = (row.policy.intervals, row.trot.intervals)
+        cells = [_within(getattr(own, n), 1000) for own in walkers for n in names]
         shown.add_row(row.name, *cells)
     still = found.conditions[0].standing
-    standing = [_error(getattr(still.intervals, name)) for name in names]
+    standing = [_within(getattr(still.intervals, name), 1000) for name in names]
     shown.add_row("standing, random", *standing, *[""] * 3)
     out.print(shown)
 
@@ -245,15 +246,6 @@ def _show_effort(found: Evaluation) -> None:
 
 
 _SIDES = {"forward": "front", "backward": "rear", "left": "left", "right": "right"}
-
-
-def _fallen(figures: Figures) -> str:
-    own = figures.intervals.fall_rate
-    return f"{100 * own.value:.0f} ({100 * own.low:.0f}–{100 * own.high:.0f})"
-
-
-def _error(error: Interval) -> str:
-    return _within(error, 1000)
 
 
 def _within(interval: Interval, scale: float) -> str:

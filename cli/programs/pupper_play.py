@@ -9,7 +9,6 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -98,7 +97,7 @@ def _run(options: Play) -> None:
     policy, run = policy_at(options.policy)
     task, servos = simulator(options.policy, policy, run, options.actuator, options.feedback)
     warn_of_fallbacks([servos])
-    say = partial(err.print, soft_wrap=True)
+    say = err.print
     command = trained_commands(policy, run).clipped(command[None], say)[0]
     task = replace(evaluation_task(task, options.seconds + 1.0), terrain=options.terrain)
     model = servo_model_of(servos.source, task.control_step_s)
@@ -160,8 +159,7 @@ class _Track:
             return
         from pupper_sysid.policies.twin.drawing import bodies_over_time
         from pupper_sysid.sysid.recordings.recording import Recording
-        from pupper_sysid.sysid.view.mcap_file import write_mcap
-        from pupper_sysid.sysid.view.rerun_file import write_rerun
+        from pupper_sysid.sysid.view.files import write_mcap, write_rerun
 
         time_s, joints = np.array(self._time_s), self._env.body.joints
         sent, read, qpos = (np.array(part) for part in zip(*self._rows, strict=True))
@@ -177,7 +175,7 @@ class _Track:
             bodies = bodies_over_time(self._env.robots.batch.get_model(0), qpos)
             write_rerun(recording, options.rerun, time_s, bodies, options.force)
         for path in filter(None, (options.rerun, options.mcap)):
-            err.print(f"Wrote {path}.", soft_wrap=True)
+            err.print(f"Wrote {path}.")
 
 
 class _Screen:
@@ -218,7 +216,7 @@ class _Screen:
         except InputError as error:
             if "imageio" in str(error):
                 raise
-            warn([f"{error} The walk goes on."])
+            warn(f"{error} The walk goes on.")
 
     def show(self, span_s: float, velocity: NDArray[np.float64]) -> bool:
         """Show one more picture; False when the window was closed."""
@@ -240,7 +238,7 @@ class _Screen:
         """Finish the video."""
         if self._film is not None:
             self._film.close()
-            err.print(f"Wrote {self._path}.", soft_wrap=True)
+            err.print(f"Wrote {self._path}.")
         if self._viewer is not None:
             self._viewer.close()
 

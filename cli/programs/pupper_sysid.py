@@ -9,7 +9,7 @@ from collections.abc import Sequence
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from pupper_sysid.cli.dispatch import Command, run_command
+from pupper_sysid.cli.dispatch import commands_of, run_command
 
 DESCRIPTION = "Measure a cheap servo."
 _SUMMARIES = {
@@ -45,19 +45,16 @@ _SUMMARIES = {
         "samples": "Copy sample recordings, policies and models here.",
     },
 }
-_HOLD_BUS = {"scan", "monitor", "park", "calibrate-joints", "emulate", "sweep"}
-_MODULES = {"import": "import_log"}  # a module cannot be called `import`
-# `fit-servo` of the group `model` is the class FitServo in commands/model/fit_servo.py
-COMMANDS = {
-    word: Command(
-        group,
-        summary,
-        f"{group}.{_MODULES.get(word, word.replace('-', '_'))}:{word.title().replace('-', '')}",
-        word in _HOLD_BUS,
-    )
-    for group, summaries in _SUMMARIES.items()
-    for word, summary in summaries.items()
-}
+_MODULES = {
+    "import": "files", "view": "files", "doctor": "measure", "delay": "measure", "bode": "measure",
+    "backlash": "measure", "compare-truth": "compare", "sindy": "fit_servo", "report": "pages",
+    "samples": "pages",
+}  # fmt: skip
+COMMANDS = commands_of(
+    _SUMMARIES,
+    lambda group, word: f"{group}.{_MODULES.get(word, word.replace('-', '_'))}",
+    holding_bus={"scan", "monitor", "park", "calibrate-joints", "emulate", "sweep"},
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -146,14 +146,14 @@ def _run(options: Options, given: list[str]) -> None:
         here = with_sample(run)
         check_actuator(here.actuator)
         if here is not run:
-            warn([f"There is no {run.actuator} here; measuring with {here.actuator}."])
+            warn(f"There is no {run.actuator} here; measuring with {here.actuator}.")
         found = measure(here)
         if options.json:
             print_json(found)
         else:
             for name, value in found.items():
                 text = f"{value:,.3g}" if isinstance(value, float) else str(value)
-                out.print(f"{name:28} {text}", soft_wrap=True)
+                out.print(f"{name:28} {text}")
         return
     begun = time.monotonic()
     ranks = Ranks.join()
@@ -162,17 +162,15 @@ def _run(options: Options, given: list[str]) -> None:
         raise InputError(f"{options.resume} does not exist. Give the folder of a run.")
     if ranks.rank == 0:
         hold_output(folder)
-        err.print(
-            f"{'Going on with' if options.resume else 'Training into'} {folder}.", soft_wrap=True
-        )
+        err.print(f"{'Going on with' if options.resume else 'Training into'} {folder}.")
     if options.resume is None:
         refuse_taken(folder)
         if ranks.rank == 0:
             for note in run.task.body.notes:
-                err.print(note, soft_wrap=True)
+                err.print(note)
         run = _with_first_gait(run, ranks)
     with _bar() as watch:
-        notice = (lambda text: warn([text])) if ranks.rank == 0 else (lambda text: None)
+        notice = (warn) if ranks.rank == 0 else (lambda text: None)
         stopping = (lambda text: err.print(text)) if ranks.rank == 0 else (lambda text: None)
         if options.resume:
             learner = train(folder, None, watch, *_extension(options, given), notice, stopping)
@@ -203,7 +201,7 @@ def _with_first_gait(run: Run, ranks: Ranks) -> Run:
     task = run.task
     if ranks.rank == 0:
         with share_progress("first gait") as advance:
-            say = partial(err.print, soft_wrap=True)
+            say = err.print
             task = with_first_gait(run, say, partial(advance, "searching")).task
     parts = json.loads(ranks.same(json.dumps(plain({"trot": task.trot, "rewards": task.rewards}))))
     trot, rewards = Trot(**parts["trot"]), Rewards(**parts["rewards"])

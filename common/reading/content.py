@@ -46,11 +46,6 @@ def reading_up_to(times: float) -> Iterator[None]:
     ----------
     times : float
         1 to 1000.
-
-    Raises
-    ------
-    InputError
-        If it is another number.
     """
     if not 1 <= times <= MOST_TIMES:
         raise InputError(
@@ -93,11 +88,6 @@ def refuse_more(
         What to do, as a sentence.
     exact : bool
         Whether `found` is all, rather than what was counted until the limit was passed.
-
-    Raises
-    ------
-    InputError
-        If `found` is more than `most`, raised as it is now.
     """
     bound = allowed(most)
     if found <= bound:
@@ -130,11 +120,6 @@ def open_regular(path: Path | str, remedy: str = "") -> BufferedReader:
     path : Path or str
     remedy : str
         What to do, as a sentence; by default, to check the file's name.
-
-    Raises
-    ------
-    InputError
-        If there is none, or it cannot be opened.
     """
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):  # opening a device may already do something

@@ -40,11 +40,6 @@ def distinct(where: Path | str, names: Iterable[str], what: str = "columns") -> 
     what : str
         Things that are named, in the plural.
 
-    Raises
-    ------
-    InputError
-        If one stands twice.
-
     Examples
     --------
     >>> distinct("log.npz", ["knee", "ankle", "knee"], "joints")
@@ -364,11 +359,6 @@ def numbers_of(
         Of the cells, for messages.
     nothing : collection of str
         Words in lower case that stand for an empty cell.
-
-    Raises
-    ------
-    InputError
-        If a cell is no number, or infinite.
     """
     values, shown = np.full(len(cells), np.nan), printable(name)[:60]
     for k, cell in enumerate(cells):

@@ -18,15 +18,17 @@ to what was found, and the watchdog does if this process dies.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import BusError, SafetyStop
+from pupper_sysid.hardware.address import KINDS, BusAddress
 from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent, ServoBus
+from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.hardware.loop import BUS, GUARD, TimeSpent, raised_cosine
 from pupper_sysid.hardware.safety.monitor import Angles, GuardLimits, Monitor
 from pupper_sysid.hardware.safety.watchdog import Watchdog
@@ -293,13 +295,7 @@ class GuardedBus:
         return getattr(self.bus, "servo_setups", dict)()
 
     def set_register(self, joint: str, name: str, value: int) -> None:
-        """Set a register of a servo, until `close` sets it back.
-
-        Raises
-        ------
-        BusError
-            If the bus has no registers, or the register does not take the value.
-        """
+        """Set a register of a servo, until `close` sets it back."""
         self._beat()
         self.registers.set(joint, name, value)
         self._beat()
@@ -309,11 +305,6 @@ class GuardedBus:
 
         Like `torque(True)`, but a servo that does not confirm does not prevent the way back of the
         others.
-
-        Raises
-        ------
-        BusError
-            If a joint returns no position.
         """
         self._on = True
         self._locate()
@@ -500,13 +491,7 @@ class ChangedRegisters:
         """Values to be set back, by joint and register."""
 
     def set(self, joint: str, name: str, value: int) -> None:
-        """Set a register; the first time, keep what was found.
-
-        Raises
-        ------
-        BusError
-            If the bus has no registers, or the register does not take the value.
-        """
+        """Set a register; the first time, keep what was found."""
         if not hasattr(self._bus, "set_register"):
             raise BusError(
                 f"{self._bus.name}: registers of its servos cannot be set over this bus. Leave the "
@@ -542,3 +527,33 @@ class ChangedRegisters:
     def _tell(self) -> None:
         if self._watchdog:
             self._watchdog.restore(self.found)
+
+
+def open_bus(
+    address: BusAddress,
+    joint_map: JointMap | None = None,
+    joints: Sequence[str] | None = None,
+    exclusive: bool = True,
+) -> Any:
+    """The bus itself, unguarded; see its class for parameters and errors."""
+    cls = KINDS[address.kind].bus_class()
+    return cls.open_address(address, joint_map, joints, exclusive)
+
+
+def open_guarded(
+    address: BusAddress,
+    joint_map: JointMap | None = None,
+    joints: Sequence[str] | None = None,
+    limits: GuardLimits | None = None,
+) -> GuardedBus:
+    """The bus behind its guard, with a watchdog that parks the robot if this process dies."""
+    bus = open_bus(address, joint_map, joints)
+    try:
+        if hasattr(bus, "refuse_unfit"):
+            bus.refuse_unfit()
+        # rate and map as found: nothing is to be detected when it is urgent
+        watchdog = Watchdog(replace(address, baud=bus.metadata.get("baud")), bus.joint_map)
+    except BaseException:
+        bus.close()
+        raise
+    return GuardedBus(bus, limits, watchdog)

@@ -11,9 +11,9 @@ from typing import Any
 
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.address import KINDS, BusAddress
-from pupper_sysid.hardware.connect import open_bus
 from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.hardware.lock import LOG, open_here
+from pupper_sysid.hardware.safety.guard import open_bus
 
 _CONNECT_WITHIN_S = 0.4
 _TRIES = 5

@@ -49,11 +49,6 @@ class Watchdog:
     address : BusAddress
     joint_map : JointMap
         That of the bus.
-
-    Raises
-    ------
-    BusError
-        If the process does not start.
     """
 
     def __init__(self, address: BusAddress, joint_map: JointMap):
@@ -169,11 +164,6 @@ class Watchdog:
         """Torque-off or a register was not confirmed and the bus is released: keep trying.
 
         A watchdog process that has ended or does not answer, which may be why, is replaced.
-
-        Raises
-        ------
-        BusError
-            If a new one does not start.
         """
         self._take_answers()
         if self._process.poll() is not None or self._silent(time.monotonic()):

@@ -32,10 +32,9 @@ import numpy as np
 # everything that parking needs is loaded at the start, not when it is urgent
 from pupper_sysid.common.errors import PupperError
 from pupper_sysid.hardware.address import BusAddress
-from pupper_sysid.hardware.connect import open_bus
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from
 from pupper_sysid.hardware.loop import lasting_s
-from pupper_sysid.hardware.safety.guard import ChangedRegisters, GuardedBus
+from pupper_sysid.hardware.safety.guard import ChangedRegisters, GuardedBus, open_bus
 from pupper_sysid.hardware.safety.limp import can_come_back, is_there, may_be_on, say, switch_off
 from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.hardware.safety.notes import remove_note

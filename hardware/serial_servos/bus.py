@@ -30,16 +30,18 @@ from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.hardware.loop import HostClock
 from pupper_sysid.hardware.serial_servos.line import Reply, slow_adapter
-from pupper_sysid.hardware.serial_servos.opening import (
+from pupper_sysid.hardware.serial_servos.scan import (
     MINI_PUPPER_IDS,
+    LineReport,
     answering_joints,
     default_map,
     known_series,
     one_series,
     open_line,
     refuse_other_servos,
+    scan_line,
+    two_of_one_id,
 )
-from pupper_sysid.hardware.serial_servos.scan import LineReport, scan_line, two_of_one_id
 from pupper_sysid.hardware.serial_servos.series import Family, Series
 from pupper_sysid.hardware.serial_servos.settings import (
     RegisterFault,
@@ -289,7 +291,7 @@ class SerialBus(HostClock):
         return {joint: own for joint, own in weak.items() if own}
 
     def register(self, joint: str, name: str) -> int:
-        """Present value of a register; see `hardware.bus.RegisterBus`."""
+        """Present value of a register; `BusError` if it cannot be read."""
         servo = self._servo(joint, name)
         value = read_register(self.line, servo.id, servo.series, name)
         if value is None:
@@ -297,7 +299,7 @@ class SerialBus(HostClock):
         return value
 
     def set_register(self, joint: str, name: str, value: int) -> None:
-        """Set a register and read it back; see `hardware.bus.RegisterBus`."""
+        """Set a register; `BusError` if it is not read back with this value."""
         servo = self._servo(joint, name)
         if not write_register(self.line, servo.id, servo.series, name, value):
             raise BusError(
@@ -438,13 +440,6 @@ class SerialBus(HostClock):
             servo.doubtful_s = -np.inf
         return good
 
-    def _speeds_rad_s(self) -> list[float]:
-        """Speed of each servo by its data sheet, at its supply voltage."""
-        return [
-            no_load_speed(setup["model"], setup.get("supply_voltage_v")) or SPEED_LIMIT_RAD_S
-            for setup in self._setups.values()
-        ]
-
     def _choose_reading(self) -> str:
         """Request with which the servos are read, for the header."""
         together = all(servo.series.has_sync_read for servo in self._servos)
@@ -455,6 +450,10 @@ class SerialBus(HostClock):
             supply_band(self.family, servo.series, servo.registers or {}) for servo in self._servos
         )
         supply = [band for band in bands if band]
+        speeds = [  # by their data sheets, at their supply voltage
+            no_load_speed(setup["model"], setup.get("supply_voltage_v")) or SPEED_LIMIT_RAD_S
+            for setup in self._setups.values()
+        ]
         known: dict[str, Any] = {
             "kind": self.family.name,
             "readings": "live",
@@ -463,7 +462,7 @@ class SerialBus(HostClock):
             "baud": self.line.baud,
             "echo": self.line.echoes,
             "latency_s": round(self.line.latency_s, 6),
-            "speed_limit_rad_s": min(self._speeds_rad_s(), default=SPEED_LIMIT_RAD_S),
+            "speed_limit_rad_s": min(speeds, default=SPEED_LIMIT_RAD_S),
             "poll_rate_hz": 0.0,
             "real_time": True,
         }

@@ -124,6 +124,8 @@ class SerialLine(ABC):
     """Data of the reply to `ask_model`; the first two are the model number."""
     rates_in_words: str
     """Rates that the SDK can set."""
+    torque_address: int
+    """Of the register that switches a servo's torque."""
     _packets: Any
     """The SDK's packet handler."""
 
@@ -178,8 +180,8 @@ class SerialLine(ABC):
         """The same bytes of several servos with one request."""
 
     @abstractmethod
-    def sync_write(self, address: int, values: dict[int, bytes]) -> float:
-        """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed."""
+    def _all_off(self) -> bytes:
+        """The request that switches the torque of all servos off."""
 
     def sync_read_s(self, delays_s: Sequence[float], size: int) -> float:
         """Time that the replies to the last `sync_read` need on the wire [s].
@@ -193,11 +195,25 @@ class SerialLine(ABC):
         """
         return sum(delays_s) + len(delays_s) * (size + self.reply_bytes) * self._byte_s()
 
-    @abstractmethod
+    # ----- what all share
+
+    def sync_write(self, address: int, values: dict[int, bytes]) -> float:
+        """Write to several servos, unacknowledged; `time.monotonic()` of sending, NaN if failed."""
+        sizes = {len(v) for v in values.values()}
+        if len(sizes) != 1:
+            raise ValueError(f"sync_write: values of {sorted(sizes)} bytes; all must be as long.")
+        size = sizes.pop()
+        params = [byte for servo, value in values.items() for byte in (servo, *value)]
+        return self._sync_written(
+            lambda: self._packets.syncWriteTxOnly(self._port, address, size, params, len(params))
+        )
+
     def torque_off(self, servos: Sequence[int] | None = None) -> None:
         """Switch the torque of these (default: all) off at once; unacknowledged."""
-
-    # ----- what all share
+        if servos is None:
+            self._sync_written(lambda: self._send_raw(self._all_off()))
+        else:
+            self.sync_write(self.torque_address, {servo: b"\0" for servo in servos})
 
     def read(self, servo: int, address: int, size: int) -> Reply | None:
         """`size` bytes of the memory of `servo`, or None if they did not come complete."""

@@ -3,8 +3,10 @@
     series.decode("present_position", memory)      # a register of a whole memory
     series.encode("goal_position", 2048)           # bytes to write
 
-Registers have the names of the vendor's table. Every series also answers to the common names in
-`COMMON`, so that guard, recorder and scan need not know the vendor.
+Registers have the names of the vendor's table. Every series that has them also answers to model,
+id, p, i, d, mode, min_angle, max_angle, homing_offset, response_level, return_delay, min_voltage,
+max_voltage, torque_enable, goal_position and present_position, _load, _voltage and _temperature, so
+that guard, recorder and scan need not know the vendor.
 """
 
 from __future__ import annotations
@@ -16,13 +18,6 @@ from typing import Any
 
 ERROR_BITS = {1: "voltage", 2: "angle sensor", 4: "overheat", 8: "overcurrent", 32: "overload"}
 """Bits of a status byte in words, where a bus does not name others."""
-
-COMMON = (
-    "model", "id", "p", "i", "d", "mode", "min_angle", "max_angle", "homing_offset",
-    "response_level", "return_delay", "min_voltage", "max_voltage", "torque_enable",
-    "goal_position", "present_position", "present_load", "present_voltage", "present_temperature",
-)  # fmt: skip
-"""Names by which every series that has such a register knows it."""
 
 
 @dataclass(frozen=True)

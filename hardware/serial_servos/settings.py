@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pupper_sysid.common.data_sheet import counts_of, no_load_speed, supply_range
+from pupper_sysid.common.data_sheet import no_load_speed, supply_range
 from pupper_sysid.hardware.serial_servos.line import SerialLine
 from pupper_sysid.hardware.serial_servos.series import Family, Series
 
@@ -276,11 +276,6 @@ def _profile_remarks(
     return [
         RegisterFault(name, registers[name], meaning, cure, False) for name in profile.registers
     ]
-
-
-def count_rad(series: Series) -> float:
-    """Angle of one count [rad]."""
-    return math.tau / (counts_of(series.name) or series.counts)
 
 
 def read_register(line: SerialLine, servo: int, series: Series, name: str) -> int | None:

@@ -27,7 +27,7 @@ from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.policies.deploy.stacks import ObserverKind
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.interface import substeps as physics_substeps
-from pupper_sysid.servo_models.joint_arrays import JointArrays, same_rate
+from pupper_sysid.servo_models.networks import JointArrays, same_rate
 
 Array = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ from pupper_sysid.sim.walking.servo_ranges import (
 )
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.view.channels import poses
-from pupper_sysid.sysid.view.rerun_file import Body
+from pupper_sysid.sysid.view.files import Body
 
 if TYPE_CHECKING:
     from pupper_sysid.sim.robot.servo_robot import ServoRobot

@@ -46,13 +46,14 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sim.robot.replay import Replayed, replay
 from pupper_sysid.sim.walking.config import Randomisation
 from pupper_sysid.sysid.servo_fit.data import Run, ServoData
-from pupper_sysid.sysid.servo_fit.readings import on_ticks, received
 from pupper_sysid.sysid.servo_fit.scores import (
     Errors,
     Tracks,
     counted_ticks,
     interval,
+    on_ticks,
     predicted,
+    received,
     steps_per_tick,
 )
 from pupper_sysid.sysid.servo_fit.windows import Part, chosen

@@ -3,7 +3,7 @@
 `twin` gives the commands of a recording to the whole simulated robot, with the servos of one or of
 several actuators, in the air (its trunk fixed) and on the ground. Each predicts the readings that
 the recording's bus would have shown of it: their age, and an offset per joint
-(`sysid.servo_fit.readings`). Errors per joint stand beside the robot's repeatability
+(`sysid.servo_fit.scores`). Errors per joint stand beside the robot's repeatability
 and persistence, and readings say whether the robot was on the ground (`policies.twin.playing`).
 
 On the ground several copies move, which differ in friction and payload; the prediction is the mean
@@ -40,8 +40,7 @@ from pupper_sysid.sysid.fit.predict import ReadingRule, in_words, rule_of
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
-from pupper_sysid.sysid.servo_fit.readings import offsets, with_ages
-from pupper_sysid.sysid.servo_fit.scores import Errors, Tracks
+from pupper_sysid.sysid.servo_fit.scores import Errors, Tracks, offsets, with_ages
 from pupper_sysid.sysid.servo_fit.windows import Part, everything
 
 if TYPE_CHECKING:

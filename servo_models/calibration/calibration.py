@@ -336,7 +336,7 @@ def load_calibration(path_or_preset: Path | str) -> Calibration:
         with resources.as_file(folder / f"{path_or_preset}.yaml") as file:
             return _load(file)
     if _cards().is_card(path_or_preset):
-        return _cards().card_calibration(path_or_preset)
+        return _cards().load_card(path_or_preset).calibration()
     path = Path(path_or_preset)
     if not path.exists():
         near = difflib.get_close_matches(path.name, PRESETS, n=1)

@@ -23,20 +23,19 @@ from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.strict_yaml import dump
 from pupper_sysid.servo_models.calibration.calibration import Calibration, InputFile
-from pupper_sysid.servo_models.calibration.operating_point import (
-    NOT_STATED,
-    Armature,
-    OperatingPoint,
-)
 from pupper_sysid.servo_models.calibration.parts import (
     NO_SPEED_LIMIT_RAD_S,
+    NOT_STATED,
     P_GAINS,
     Actuator,
+    Armature,
     Feedback,
     JointCalibration,
+    OperatingPoint,
     RatiosToArmature,
     Scale,
     Selection,
+    UnderLoad,
 )
 from pupper_sysid.servo_models.calibration.quantity import (
     NotNegative,
@@ -44,7 +43,6 @@ from pupper_sysid.servo_models.calibration.quantity import (
     Part,
     Quantity,
 )
-from pupper_sysid.servo_models.calibration.under_load import UnderLoad
 from pupper_sysid.servo_models.cards.numbers import (
     LOADED_KEYS,
     LoadedLoop,
@@ -226,7 +224,11 @@ class ServoCard(Part):
             created=f"{self.date}T00:00:00+00:00",
             inputs=self.data,
             notes=tuple(self._notes()),
-            joints={name: self._joint(name) for name in self._in_default_order()},
+            # the default first: it is what other joints fall back on
+            joints={
+                name: self._joint(name)
+                for name in sorted(self.specimens, key=lambda name: name != self.default)
+            },
         )
 
     def to_yaml(self) -> str:
@@ -237,10 +239,6 @@ class ServoCard(Part):
     def save(self, path: Path | str, force: bool = False) -> None:
         """Write this card to `path` as YAML, in one atomic step."""
         write_text(Path(path), self.to_yaml(), force)
-
-    def _in_default_order(self) -> list[str]:
-        """Specimens, the default first: it is what other joints fall back on."""
-        return sorted(self.specimens, key=lambda name: name != self.default)
 
     def _notes(self) -> list[str]:
         kind = "cited from" if self.published else "fitted here to recordings of"

@@ -12,8 +12,12 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result, derived
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
-from pupper_sysid.servo_models.calibration.operating_point import ARMATURES, Armature
-from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S, PARAMETER_KEYS
+from pupper_sysid.servo_models.calibration.parts import (
+    ARMATURES,
+    NO_SPEED_LIMIT_RAD_S,
+    PARAMETER_KEYS,
+    Armature,
+)
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.cards.card import ServoCard
 from pupper_sysid.servo_models.cards.files import card_names, is_card, load_card

@@ -1,16 +1,35 @@
-"""Read servo cards: files, the ones that are shipped, and parameter files of BAM.
+"""Servo cards from files and back: our YAML, those that are shipped, parameter files of BAM.
 
 card = load_card("sts3215-bam-m1")         # shipped, see `card_names`
 card = load_card("my_servo.yaml")
 card = load_card("params/m6.json")         # as BAM's fit writes it
+
+"Better actuator models" (BAM, Rhoban/bam) identifies servos on a pendulum and writes one JSON file
+per friction model, M1 to M6. The file has the motor as torque constant kt [N·m/A = V·s/rad] and
+resistance R [Ω]; supply voltage, P gain, duty per error and largest duty are constants of BAM's
+class for that actuator (`ACTUATORS`). Ours follow as::
+
+    stall torque = kt / R * supply voltage        at full duty, standstill
+    back-EMF     = kt^2 / R
+    duty_per_rad = error_gain of the class * error_gain_ratio
+
+and back as kt = back-EMF / s, R = kt / s with s = stall torque / supply voltage. `q_offset` is the
+zero of the test bench, no number of the servo. The largest duty clips the torque; BAM's own
+`to_mujoco` multiplies the stiffness by it, too, which makes it 3 % smaller than here.
 """
 
 from __future__ import annotations
 
 import difflib
+import json
+import math
+from datetime import UTC, datetime
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from pydantic import ConfigDict
 
 from pupper_sysid.common.border import (
     read_json,
@@ -20,9 +39,346 @@ from pupper_sysid.common.border import (
     validated,
 )
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.servo_models.cards.bam import load_bam
-from pupper_sysid.servo_models.cards.card import SCHEMA, SCHEMA_VERSION, ServoCard
+from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.servo_models.calibration.parts import LOADED_KEYS, UnderLoad
+from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number, Part
+from pupper_sysid.servo_models.cards.card import SCHEMA, SCHEMA_VERSION, Gains, ServoCard, Source
+from pupper_sysid.servo_models.cards.numbers import PositionLoop, stated
+
+URL = "https://github.com/Rhoban/bam"
+
+
+class Actuator(NamedTuple):
+    """Constants of one of BAM's actuator classes."""
+
+    servo: str
+    supply_v: float
+    p_gain: float
+    error_gain: float
+    """Duty per unit of the P register and radian [1/rad]."""
+    duty_limit: float
+    has_ratio: bool
+    """Whether the file may scale the error gain and limit the set-point's speed."""
+
+
+ACTUATORS = {
+    "sts3215": Actuator("Feetech STS3215", 7.4, 32, 0.166, 0.97, True),
+    "xl330": Actuator("Dynamixel XL330-M288", 7.4, 400, 0.00246, 1.0, False),
+    "sts3215v12": Actuator("Feetech STS3215", 12.1, 32, 0.164890901, 1.0, False),
+    "sts3215_12v": Actuator("Feetech STS3215", 12.1, 32, 0.164787755, 1.0, True),
+}
+"""By the file's `actuator`: the first two are BAM's, the others K-Scale's."""
+
+
+class BamParameters(Part):
+    """Content of a parameter file; a friction that its model lacks is absent."""
+
+    model_config = ConfigDict(protected_namespaces=())
+
+    model: Literal["m1", "m2", "m3", "m4", "m5", "m6"]
+    """Friction model."""
+    actuator: str
+    """Name of BAM's actuator class."""
+    kt: NotNegative
+    """Torque constant [N·m/A]."""
+    R: NotNegative
+    """Resistance [Ω]."""
+    armature: NotNegative
+    """Reflected inertia [kg·m²]."""
+    friction_base: NotNegative
+    """Coulomb friction [N·m]."""
+    friction_viscous: NotNegative
+    """Viscous friction [N·m·s/rad]."""
+    error_gain_ratio: NotNegative | None = None
+    """Factor on the class's error gain."""
+    max_velocity: NotNegative | None = None
+    """Largest rate of the set-point [rad/s]."""
+    command_delay: NotNegative | None = None
+    """Dead time [s]."""
+    q_offset: Number | None = None
+    """Zero of the test bench [rad]."""
+    friction_stribeck: NotNegative | None = None
+    """Friction that is added at standstill [N·m]."""
+    dtheta_stribeck: NotNegative | None = None
+    """Speed over which it fades [rad/s]."""
+    alpha: NotNegative | None = None
+    """Exponent of its decay."""
+    load_friction_base: NotNegative | None = None
+    """Friction per torque, M3 and M4."""
+    load_friction_stribeck: NotNegative | None = None
+    """The same that is added at standstill, M4."""
+    load_friction_motor: NotNegative | None = None
+    """Friction per torque of the motor, M5 and M6."""
+    load_friction_external: NotNegative | None = None
+    """Friction per torque of the load, M5 and M6."""
+    load_friction_motor_stribeck: NotNegative | None = None
+    """Per torque of the motor, added at standstill, M5 and M6."""
+    load_friction_external_stribeck: NotNegative | None = None
+    """Per torque of the load, added at standstill, M5 and M6."""
+    load_friction_motor_quad: NotNegative | None = None
+    """Per squared torque of the motor, M6."""
+    load_friction_external_quad: NotNegative | None = None
+    """Per squared torque of the load, M6."""
+    score: Number | None = None
+    """Mean absolute error of the fit [rad], as K-Scale writes it."""
+    trial_number: Number | None = None
+    """Trial of the search, as K-Scale writes it."""
+
+
+def load_bam(path: Path) -> ServoCard:
+    """A card of a BAM parameter file, with the constants of its actuator class."""
+    data = read_json(path)
+    if not isinstance(data, dict) or not {"kt", "R", "model"} <= data.keys():
+        raise InputError(
+            f"{path} is neither a servo card nor a parameter file of BAM: it has no kt, R and "
+            "model. Give a card (.yaml) or a file that BAM's fit wrote."
+        )
+    parameters = validated(BamParameters, data, path)
+    kind = ACTUATORS.get(parameters.actuator)
+    if kind is None:
+        raise InputError(
+            f"{path}: the actuator {printable(parameters.actuator)} is not known here, so its P "
+            f"gain and supply voltage are not, either. Known are {', '.join(ACTUATORS)}."
+        )
+    return ServoCard(
+        name=_name(path.stem),
+        servo=kind.servo,
+        supply_v=kind.supply_v,
+        gains=Gains(p=kind.p_gain, i=0, d=0),
+        load="pendulum",
+        published=True,
+        source=Source(
+            title=f"BAM parameter file {printable(path.name)}", url=URL, licence="that of the file"
+        ),
+        date=datetime.now(UTC).date().isoformat(),
+        as_published=data,
+        specimens={"servo": from_bam(parameters, kind, path)},
+    )
+
+
+def from_bam(
+    parameters: BamParameters, kind: Actuator, name: Path | str = "The parameters"
+) -> PositionLoop:
+    """Numbers of a card from BAM's; see the module's text."""
+    p = parameters
+    if p.R == 0 or p.kt == 0:
+        raise InputError(f"{name}: kt and R must be above 0. Fit it again.")
+    if p.error_gain_ratio == 0:
+        raise InputError(f"{name}: error_gain_ratio is 0; it must be above 0. Fit it again.")
+    ratio = 1.0 if p.error_gain_ratio is None else p.error_gain_ratio
+    both = p.load_friction_base, p.load_friction_stribeck
+    ours = {
+        "duty_per_rad": kind.error_gain * ratio,
+        "duty_limit": kind.duty_limit,
+        "stall_torque_nm": p.kt / p.R * kind.supply_v,
+        "back_emf_nm_s_per_rad": p.kt**2 / p.R,
+        "armature_kg_m2": p.armature,
+        "friction_loss_nm": p.friction_base,
+        "viscous_friction_nm_s_per_rad": p.friction_viscous,
+        "stribeck_friction_nm": p.friction_stribeck,
+        "stribeck_speed_rad_s": p.dtheta_stribeck,
+        "stribeck_exponent": p.alpha,
+        "load_friction_motor": _first(p.load_friction_motor, both[0]),
+        "load_friction_load": _first(p.load_friction_external, both[0]),
+        "load_stribeck_motor": _first(p.load_friction_motor_stribeck, both[1]),
+        "load_stribeck_load": _first(p.load_friction_external_stribeck, both[1]),
+        "load_quadratic_motor": p.load_friction_motor_quad,
+        "load_quadratic_load": p.load_friction_external_quad,
+        "velocity_limit_rad_s": p.max_velocity,
+        "dead_time_s": p.command_delay,
+    }
+    given = {key: stated(value) for key, value in ours.items() if value is not None}
+    return validated(
+        PositionLoop, {"model": "position_loop", **given}, name, remedy="Fit it again."
+    )
+
+
+def to_bam(card: ServoCard, specimen: str | None = None) -> dict[str, Any]:
+    """Content of a BAM parameter file with a card's numbers.
+
+    Parameters
+    ----------
+    card : ServoCard
+    specimen : str, optional
+        Which of its numbers; by default the card's default.
+    """
+    numbers = card.specimens.get(specimen or card.default)
+    if numbers is None:
+        raise InputError(f"{card.name} has no specimen {specimen}: {', '.join(card.specimens)}.")
+    if not isinstance(numbers, PositionLoop) or card.supply_v is None:
+        raise InputError(
+            f"{card.name} states torques of a simulator, not position loop and motor, which BAM "
+            "needs. Take a card of a position_loop (`pupper-sysid servo list`)."
+        )
+    name, kind = class_of(card)
+    per_volt, emf = numbers.stall_torque_nm.value / card.supply_v, numbers.back_emf_nm_s_per_rad
+    if per_volt == 0 or emf.value == 0:
+        raise InputError(f"{card.name} has no stall torque or no back-EMF, so kt is unknown.")
+    kt = emf.value / per_volt
+    made: dict[str, Any] = {"kt": kt}
+    if kind.has_ratio:
+        made["error_gain_ratio"] = numbers.duty_per_rad.value / kind.error_gain
+    made |= {"R": kt / per_volt, "armature": numbers.armature_kg_m2.value, "q_offset": 0.0}
+    if kind.has_ratio:
+        made["max_velocity"] = numbers.velocity_limit_rad_s
+    made |= {"command_delay": numbers.dead_time_s, "friction_base": numbers.friction_loss_nm}
+    model, frictions = _frictions(numbers)
+    made |= frictions
+    made["friction_viscous"] = numbers.viscous_friction_nm_s_per_rad or stated(0.0)
+    plain = {k: getattr(v, "value", v) for k, v in made.items() if v is not None}
+    return plain | {"model": model, "actuator": name}
+
+
+def to_bam_json(card: ServoCard, specimen: str | None = None) -> str:
+    """Text of a parameter file, as BAM's `load_model(json_file=…)` reads it; see `to_bam`."""
+    return json.dumps(to_bam(card, specimen), indent=4) + "\n"
+
+
+def not_in_bam(card: ServoCard) -> list[str]:
+    """What BAM's class for this servo fixes and the card has otherwise, in sentences."""
+    name, kind = class_of(card)
+    numbers, told = card.numbers, []
+    if isinstance(numbers, PositionLoop):
+        gain = numbers.duty_per_rad.value
+        if not kind.has_ratio and abs(gain / kind.error_gain - 1) > 1e-6:
+            told.append(
+                f"BAM's class {name} has the error gain {kind.error_gain:g} built in; the card's "
+                f"is {gain:.5g}, so its stiffness will differ by that ratio."
+            )
+        if abs(numbers.duty_limit.value - kind.duty_limit) > 1e-9:
+            told.append(
+                f"BAM's class {name} limits the duty to {kind.duty_limit:g}; the card has "
+                f"{numbers.duty_limit.value:g}."
+            )
+        if not kind.has_ratio and numbers.velocity_limit_rad_s is not None:
+            told.append(f"BAM's class {name} has no limit of the set-point's speed.")
+    if (card.supply_v, card.gains.p) != (kind.supply_v, kind.p_gain):
+        told.append(
+            f"BAM's logs state supply voltage and P gain; where one does not, its class takes "
+            f"{kind.supply_v:g} V and {kind.p_gain:g}, the card is for {card.supply_v:g} V and "
+            f"{card.gains.p:g}."
+        )
+    return told
+
+
+def class_of(card: ServoCard) -> tuple[str, Actuator]:
+    """BAM's actuator class for the servo of a card."""
+    own = card.as_published.get("actuator")
+    if isinstance(own, str) and own in ACTUATORS:
+        return own, ACTUATORS[own]
+    for name, kind in ACTUATORS.items():
+        if kind.servo.split()[-1] in card.servo:
+            return name, kind
+    raise InputError(
+        f"BAM has no actuator class for {card.servo}; known here are "
+        f"{', '.join(ACTUATORS)}. Its parameter file would not be readable there."
+    )
+
+
+STRIBECK_EXPONENT = 1.35
+"""Decay of the friction at standstill where a source states none: that of BAM's own fits."""
+
+_NOT_IN_BAM = {
+    "duty_s_per_rad": "duty per velocity (a D gain)",
+    "load_friction_quadratic_per_nm": "friction that grows with the squared torque",
+    "dead_zone_rad": "the dead zone",
+    "start_duty": "the minimum start force",
+    "acceleration_limit_rad_s2": "the limit on the set-point's acceleration",
+}
+
+
+def motor_of(servo: UnderLoad) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Motor and friction of a servo fitted under load, by the names of Isaac Lab's `BamMotorCfg`.
+
+    BAM's friction at standstill decays as exp(-(v / v0)^a), ours as 1 / (1 + (v / v1)^2); v0 is
+    such that half of it is left at the same speed.
+
+    Returns
+    -------
+    motor : dict
+    lost : tuple of str
+        What BAM's models do not have, in words.
+    """
+    value = {
+        key: quantity.value if (quantity := getattr(servo, key)) is not None else 0.0
+        for key in (*LOADED_KEYS.values(),)
+        if hasattr(servo, key)
+    }
+    viscous = value["off_brake"] * value["back_emf_nm_s_per_rad"]
+    emf, per_volt = (
+        value["back_emf_nm_s_per_rad"] - viscous,
+        value["stall_torque_nm"] / (servo.reference_voltage_v or 1.0),
+    )
+    if not emf > 0:
+        raise InputError(
+            "This servo was fitted without a back-EMF, so its kt is unknown. Export it to isaaclab."
+        )
+    kt = emf / per_volt
+    static = value["load_friction_static"]
+    on_motor, on_load = value["load_friction_motor"], value["load_friction_load"]
+    decay = math.log(2) ** (1 / STRIBECK_EXPONENT)
+    stribeck, loaded = value["stribeck_friction_nm"], on_motor + on_load
+    motor = {
+        "model": "m5" if loaded else "m2" if stribeck else "m1",
+        "kt": kt,
+        "resistance": kt / per_volt,
+        "error_gain": value["duty_per_rad"],
+        "max_pwm": 1.0,
+        "max_current": value["torque_limit_nm"] / kt,
+        "friction_base": value["friction_loss_nm"],
+        "friction_viscous": viscous,
+        "friction_stribeck": stribeck,
+        "dtheta_stribeck": (value["stribeck_speed_rad_s"] or 0.1) / decay,
+        "alpha": STRIBECK_EXPONENT,
+        "load_friction_motor": on_motor,
+        "load_friction_external": on_load,
+        "load_friction_motor_stribeck": static * on_motor,
+        "load_friction_external_stribeck": static * on_load,
+    }
+    return motor, tuple(words for key, words in _NOT_IN_BAM.items() if value.get(key))
+
+
+def _frictions(numbers: PositionLoop) -> tuple[str, dict[str, Any]]:
+    """The smallest friction model that holds the numbers, and its parameters."""
+    n = numbers
+    stribeck = {
+        "friction_stribeck": n.stribeck_friction_nm or stated(0.0),
+        "dtheta_stribeck": n.stribeck_speed_rad_s or stated(0.2),
+        "alpha": n.stribeck_exponent or stated(STRIBECK_EXPONENT),
+    }
+    slow = n.stribeck_friction_nm is not None or n.load_stribeck_load is not None
+    if n.load_friction_load is None:
+        return ("m2", stribeck) if slow else ("m1", {})
+    motor, external = n.load_friction_motor or stated(0.0), n.load_friction_load
+    slow_pair = n.load_stribeck_motor or stated(0.0), n.load_stribeck_load or stated(0.0)
+    same = motor == external and slow_pair[0] == slow_pair[1]
+    if same and n.load_quadratic_load is None:
+        made = {"load_friction_base": external}
+        if not slow:
+            return "m3", made
+        return "m4", stribeck | made | {"load_friction_stribeck": slow_pair[1]}
+    made = stribeck | {
+        "load_friction_motor": motor,
+        "load_friction_external": external,
+        "load_friction_motor_stribeck": slow_pair[0],
+        "load_friction_external_stribeck": slow_pair[1],
+    }
+    if n.load_quadratic_load is None:
+        return "m5", made
+    return "m6", made | {
+        "load_friction_motor_quad": n.load_quadratic_motor or stated(0.0),
+        "load_friction_external_quad": n.load_quadratic_load,
+    }
+
+
+def _first(*values: float | None) -> float | None:
+    return next((v for v in values if v is not None), None)
+
+
+def _name(stem: str) -> str:
+    """A file's name as the name of a card."""
+    plain = "".join(c if c.isascii() and c.isalnum() else "-" for c in stem.lower()).strip("-")
+    return plain[:64] or "bam"
 
 
 def _folder() -> Traversable:
@@ -94,8 +450,3 @@ def _load(path: Path) -> ServoCard:
         )
     refuse_other_version(path, data.get("schema_version"), SCHEMA_VERSION)
     return validated(ServoCard, data, path, lines)
-
-
-def card_calibration(path_or_name: Path | str) -> Calibration:
-    """A card as a calibration; what `load_calibration` does with the name or file of one."""
-    return load_card(path_or_name).calibration()

@@ -221,11 +221,11 @@ class EmulatedBus:
         return own | getattr(plant, "servo_setups", lambda joints: {})(self.joint_names)
 
     def register(self, joint: str, name: str) -> int:
-        """Present value of a register; see `hardware.bus.RegisterBus`."""
+        """Present value of a register, by the name that its family has for it."""
         return self._registers().register(self.joint_names.index(joint), name)
 
     def set_register(self, joint: str, name: str, value: int) -> None:
-        """Set a register; see `hardware.bus.RegisterBus`."""
+        """Set a register."""
         at = max(self._clock.now(), self._arrival_s)
         self._registers().set_register(self.joint_names.index(joint), at, name, value)
 

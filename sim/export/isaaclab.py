@@ -12,7 +12,7 @@ finds out which names are there. `BamActuatorCfg` is that of Isaac Lab after 3.0
 from __future__ import annotations
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.cards.bam import motor_of
+from pupper_sysid.servo_models.cards.files import motor_of
 from pupper_sysid.servo_models.delayed_pd import whole_steps
 from pupper_sysid.sim.export.shared import (
     CALIBRATED_PD,

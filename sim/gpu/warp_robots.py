@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.joint_arrays import JointArrays
+from pupper_sysid.servo_models.networks import JointArrays
 from pupper_sysid.sim.gpu.worlds import Worlds
 from pupper_sysid.sim.robot.motion import Moved
 from pupper_sysid.sim.robot.robot_batch import RobotBatch

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.joint_arrays import JointArrays, same_rate
+from pupper_sysid.servo_models.networks import JointArrays, same_rate
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.motion import Moved
 from pupper_sysid.sim.robot.servo_mjcf import (

@@ -22,8 +22,8 @@ import numpy as np
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import strange_joint
+from pupper_sysid.hardware.joint_calibration import LeRobotJoint, apply_lerobot
 from pupper_sysid.hardware.joint_map import SCHEMA, SCHEMA_VERSION, JointMap, joint_map_from
-from pupper_sysid.hardware.lerobot_calibration import LeRobotJoint, apply_lerobot
 from pupper_sysid.sim.robot.hinges import Hinge, hinges_of
 
 _TURN = (4096, 2 * np.pi)

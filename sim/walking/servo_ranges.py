@@ -32,7 +32,7 @@ from pupper_sysid.servo_models.calibration.parts import (
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
-from pupper_sysid.servo_models.joint_arrays import JointArrays
+from pupper_sysid.servo_models.networks import JointArrays
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.servo_models.step_size import at_step, delay_at_step
 from pupper_sysid.sim.robot.body import Body

@@ -25,6 +25,7 @@ from pupper_sysid.servo_models.calibration.calibration import (
     is_shipped,
     load_calibration,
 )
+from pupper_sysid.servo_models.cards.card import CardCalibration
 from pupper_sysid.servo_models.cards.files import card_names
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model
@@ -55,10 +56,17 @@ from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
-from pupper_sysid.sysid.servo_fit.readings import as_rows, learned_run, run_with_offset
 from pupper_sysid.sysid.servo_fit.result import ServoFit
-from pupper_sysid.sysid.servo_fit.scores import LINEAR, ModelScores
+from pupper_sysid.sysid.servo_fit.scores import (
+    LINEAR,
+    ModelScores,
+    as_rows,
+    learned_run,
+    run_with_offset,
+)
 from pupper_sysid.sysid.servo_fit.windows import everything, grouped, merged_groups, only, samples
+
+_ENDINGS = (".yaml", ".yml", ".json")  # of calibrations and of BAM's parameter files
 
 
 def compare(
@@ -242,22 +250,14 @@ def _on_ticks(
 
 def _refuse_missing_joints(calibration: Calibration, name: str, joints: Sequence[str]) -> None:
     """Refuse to compare on joints that a calibration does not have."""
-    missing = [j for j in joints if not _has(calibration, j)]
-    if missing:
+    missing = [j for j in joints if j not in calibration.joints]
+    if missing and not isinstance(calibration, CardCalibration):  # which has every joint
         common = [j for j in joints if j not in missing]
         advice = f" Compare on {', '.join(common)} only (`joints`)." if common else ""
         raise InputError(
             f"{name} has no joint {', '.join(missing)}; it has "
             f"{', '.join(calibration.joints)}.{advice}"
         )
-
-
-def _has(calibration: Calibration, joint: str) -> bool:
-    try:
-        calibration.joint(joint)  # a servo card has every joint
-    except InputError:
-        return False
-    return True
 
 
 def _is_folder(given: str | Path | Calibration) -> bool:
@@ -299,8 +299,14 @@ def _calibrations(
             calibration, called = given, ""
         elif isinstance(given, ServoFit) or _is_folder(given):
             continue
-        elif not _is_calibration(given):
-            raise InputError(_unknown(given))
+        elif not is_shipped(given) and Path(given).suffix.lower() not in _ENDINGS:
+            near = difflib.get_close_matches(str(given), (*PRESETS, *card_names()), n=1)
+            usual = "Make one with `pupper-sysid fit-servo` or `calibrate`."
+            raise InputError(
+                f"{given} is neither a servo model's folder, nor a calibration (.yaml), nor a "
+                "servo card (`pupper-sysid servo list`), nor one of the presets "
+                f"{', '.join(PRESETS)}. {f'Did you mean {near[0]}?' if near else usual}"
+            )
         else:
             calibration, called = load_calibration(given), Path(given).name
         loaded = any(j.under_load for j in calibration.joints.values())
@@ -310,10 +316,6 @@ def _calibrations(
             label = f"{kind} ({given if called else len(found) + 1})"
         found[label] = calibration
     return found
-
-
-def _is_calibration(given: str | Path) -> bool:
-    return is_shipped(given) or Path(given).suffix.lower() in (".yaml", ".yml", ".json")
 
 
 @dataclass(frozen=True)
@@ -343,21 +345,6 @@ def _open(given: str | Path | ServoFit, data: ServoData) -> _Opened:
         band={j: (c.band_noise_rad, c.band_timing_s) for j, c in contract.joints.items()},
         of_rows=tuple(j for j, mode in contract.readings_counted.items() if mode == "all"),
     )  # fmt: skip
-
-
-def _unknown(given: str | Path) -> str:
-    """What to say of a model that is none."""
-    shipped = (*PRESETS, *card_names())
-    near = difflib.get_close_matches(str(given), shipped, n=1)
-    advice = (
-        f"Did you mean {near[0]}?"
-        if near
-        else "Make one with `pupper-sysid fit-servo` or `calibrate`."
-    )
-    return (
-        f"{given} is neither a servo model's folder, nor a calibration (.yaml), nor a servo card "
-        f"(`pupper-sysid servo list`), nor one of the presets {', '.join(PRESETS)}. {advice}"
-    )
 
 
 def _linear(data: ServoData, seed: int) -> tuple[scores.Tracks, dict[str, scores.Errors]]:

@@ -29,9 +29,8 @@ from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData
 from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
-from pupper_sysid.sysid.servo_fit.readings import FreeRun, run_with_offset
 from pupper_sysid.sysid.servo_fit.result import ServoFit
-from pupper_sysid.sysid.servo_fit.scores import LINEAR, ModelScores
+from pupper_sysid.sysid.servo_fit.scores import LINEAR, FreeRun, ModelScores, run_with_offset
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

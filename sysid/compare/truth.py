@@ -28,8 +28,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.servo_models.calibration.operating_point import OperatingPoint
-from pupper_sysid.servo_models.calibration.parts import JointCalibration
+from pupper_sysid.servo_models.calibration.parts import JointCalibration, OperatingPoint
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import at_step

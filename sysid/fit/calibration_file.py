@@ -28,6 +28,7 @@ from pupper_sysid.servo_models.calibration.calibration import (
     utc_now,
 )
 from pupper_sysid.servo_models.calibration.parts import (
+    LOADED_KEYS,
     NO_SPEED_LIMIT_RAD_S,
     Actuator,
     CandidateModel,
@@ -35,12 +36,13 @@ from pupper_sysid.servo_models.calibration.parts import (
     JointCalibration,
     Lag,
     RatiosToArmature,
+    RecordedLoad,
     Scale,
     Scores,
     Selection,
+    UnderLoad,
 )
 from pupper_sysid.servo_models.calibration.quantity import Quantity, measured, quantity_of
-from pupper_sysid.servo_models.calibration.under_load import LOADED_KEYS, RecordedLoad, UnderLoad
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, whole_steps
 from pupper_sysid.servo_models.step_size import at_step
 from pupper_sysid.sysid.feedback.poll_lattice import NO_LOSS

@@ -14,8 +14,7 @@ import numpy as np
 
 from pupper_sysid.common.data_sheet import factory_p_gain
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.servo_models.calibration.operating_point import NOT_STATED, OperatingPoint
-from pupper_sysid.servo_models.calibration.parts import JointCalibration
+from pupper_sysid.servo_models.calibration.parts import NOT_STATED, JointCalibration, OperatingPoint
 from pupper_sysid.sysid.recordings.recording import Trial
 
 

@@ -27,8 +27,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     readings,
     redate,
 )
-from pupper_sysid.sysid.feedback.slips import Motion
-from pupper_sysid.sysid.feedback.upsets import Upset, find_upsets
+from pupper_sysid.sysid.feedback.slips import Motion, Upset, find_upsets
 from pupper_sysid.sysid.fit.claimed_load import check_claimed_load
 from pupper_sysid.sysid.fit.loads import loaded_joints
 from pupper_sysid.sysid.fit.noise import noise_by_run

@@ -58,7 +58,7 @@ class TransferFunction(Result):
 
     @property
     def dead_time_s(self) -> float:
-        """The delay beside `rational()`; exact in `evaluate`, `control.pade` may approximate it."""
+        """The delay of the form; exact in `evaluate`, `control.pade` may approximate it."""
         return self.parameters["dead_time_s"].value
 
     def values(self) -> NDArray[np.float64]:
@@ -68,15 +68,6 @@ class TransferFunction(Result):
     def evaluate(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Response at `frequency_hz`, delay included."""
         return _MODELS[self.name].response(self.values(), np.asarray(frequency_hz, float))
-
-    def rational(self) -> control.TransferFunction:
-        """The part without the delay, for python-control."""
-        import control
-
-        v = self.values()
-        if self.name == "FOPDT":
-            return control.TransferFunction([v[0]], [v[2], 1.0])
-        return control.TransferFunction([v[0] * v[2] ** 2], [1.0, 2 * v[3] * v[2], v[2] ** 2])
 
     @derived
     def text(self) -> str:
@@ -123,21 +114,6 @@ _MODELS = {
         ((10.0, 20.0, 35.0, 60.0, 100.0, 170.0, 300.0), (0.3, 0.6, 1.0, 1.8)), _sopdt,
     ),
 }  # fmt: skip
-
-
-def fit_transfer_functions(
-    tones: Sequence[ToneResponse], draws: NDArray
-) -> dict[str, TransferFunction]:
-    """FOPDT and SOPDT, unless there are too few frequencies for their parameters.
-
-    Parameters
-    ----------
-    tones : sequence of ToneResponse
-    draws : ndarray of complex, shape (tones, draws)
-        Bootstrap of the tones' responses.
-    """
-    numbers = 2 * len({round(t.frequency_hz, 2) for t in tones})
-    return {n: _fit(n, tones, draws) for n, model in _MODELS.items() if numbers > len(model.names)}
 
 
 def _fit(name: str, tones: Sequence[ToneResponse], draws: NDArray) -> TransferFunction:
@@ -331,7 +307,12 @@ def joint_response(
     return FrequencyResponse(
         joint=joint,
         bandwidth_hz=_bandwidth(tones, draws),
-        transfer_functions=fit_transfer_functions(tones, draws),
+        # not where there are too few frequencies for their parameters
+        transfer_functions={
+            n: _fit(n, tones, draws)
+            for n, model in _MODELS.items()
+            if 2 * len({round(t.frequency_hz, 2) for t in tones}) > len(model.names)
+        },
         warnings=cautions(joint, trials),
         frequency_hz=np.array([t.frequency_hz for t in tones]),
         amplitude_rad=np.array([abs(t.command_held) for t in tones]),

@@ -157,7 +157,15 @@ def load_plan(path: Path) -> SweepPlan:
         | {
             "made_from": tuple(Source(**s.model_dump()) for s in file.made_from),
             "trials": tuple(PlannedTrial(**t.model_dump()) for t in file.trials),
-            "predictions": tuple(_prediction(p) for p in file.predictions),
+            "predictions": tuple(
+                Prediction(
+                    joint=p.joint,
+                    quantity=p.quantity,
+                    now=Interval(**p.now.model_dump()),
+                    after=Interval(**p.after.model_dump()),
+                )
+                for p in file.predictions
+            ),
         }
     )
 
@@ -212,8 +220,3 @@ def executable(
     }
     trials = tuple(t for p in parts for t in p.trials)
     return Plan(trials, dict(start_pose_rad), description, changes)
-
-
-def _prediction(entry: PredictionEntry) -> Prediction:
-    now, after = (Interval(**e.model_dump()) for e in (entry.now, entry.after))
-    return Prediction(joint=entry.joint, quantity=entry.quantity, now=now, after=after)

@@ -143,14 +143,16 @@ def plan_from_fits(
         Largest excursions [rad]; by default those of the recordings.
     seed : int
     """
+    limits = [(r.metadata.get("bus") or {}).get("speed_limit_rad_s") for r in recordings]
     base = Setup(
         loop_period_s=round(float(np.median([r.loop_period_s for r in recordings])), 6),
-        speed_limit_rad_s=_speed_limit(recordings),
+        speed_limit_rad_s=float(min(filter(None, limits), default=_SPEED_LIMIT_RAD_S)),
     )
     plans, polls = [], []
     for joint, fit in fits.items():
         trials = joint_trials(recordings, joint)
-        setup = feedback_setup(fit.lag, _within(base, joint, margins, _excursion(trials)))
+        moved = (np.max(np.abs(t.command_rad - t.initial_command_rad)) for t in trials)
+        setup = feedback_setup(fit.lag, _within(base, joint, margins, float(max(moved))))
         length = min(recorded_s(trials), PLANS_S[1]) if seconds is None else _checked(seconds)
         plans.append(propose(joint, [fitted_servo(fit)], setup, length))
         polls.append(setup.poll_rate_hz)
@@ -192,7 +194,11 @@ def plan_from_calibration(
     plans, polls = [], []
     for joint in joints:
         own = calibration.joint(joint)
-        setup = calibrated_setup(own, _within(base, joint, margins, LARGEST_RAD))
+        poll = own.feedback
+        setup = replace(
+            _within(base, joint, margins, LARGEST_RAD), poll_period_s=poll.poll_period_s.value,
+            loss=poll.loss.value, quantum_rad=poll.quantum_rad.value,
+        )  # fmt: skip
         plans.append(propose(joint, [calibrated_servo(own)], setup, _checked(seconds)))
         polls.append(setup.poll_rate_hz)
     return _pooled(plans, (source,), seed, replace(base, poll_period_s=_period(polls)))
@@ -273,15 +279,6 @@ def _checked(seconds: float) -> float:
 def recorded_s(trials: Sequence[Trial]) -> float:
     """Recorded time of all trials [s]."""
     return float(sum(t.send_time_s[-1] - t.send_time_s[0] for t in trials))
-
-
-def _excursion(trials: Sequence[Trial]) -> float:
-    return max(float(np.max(np.abs(t.command_rad - t.initial_command_rad))) for t in trials)
-
-
-def _speed_limit(recordings: Sequence[Recording]) -> float:
-    found = [(r.metadata.get("bus") or {}).get("speed_limit_rad_s") for r in recordings]
-    return float(min([x for x in found if x] or [_SPEED_LIMIT_RAD_S]))
 
 
 _LEAST_NOISE_RAD = 1e-4
@@ -402,15 +399,6 @@ def feedback_setup(lag: LagBudget, setup: Setup) -> Setup:
         return replace(known, poll_period_s=lattice.poll_period_s, loss=lattice.assumed_loss)
     fresh = 1.0 if lattice.kind == "every read" else lattice.fresh_fraction
     return replace(known, poll_period_s=0.0, loss=min(max(1 - fresh, 0.0), 0.95))
-
-
-def calibrated_setup(joint: JointCalibration, setup: Setup) -> Setup:
-    """`setup` with a calibration's poll, loss and quantisation step."""
-    f = joint.feedback
-    return replace(
-        setup, poll_period_s=f.poll_period_s.value, loss=f.loss.value,
-        quantum_rad=f.quantum_rad.value,
-    )  # fmt: skip
 
 
 def _values(fit: CandidateFit) -> NDArray[np.float64]:

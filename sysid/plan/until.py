@@ -22,7 +22,7 @@ from pupper_sysid.sysid.doctor.checks import joint_trials
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.plan.candidates import trial_seconds
 from pupper_sysid.sysid.plan.planner import DEAD_TIME, LEAST_HALF_WIDTH_S, SHORTEST_S
-from pupper_sysid.sysid.plan.proposal import Margins, SweepPlan, plan_from_fits, recorded_s
+from pupper_sysid.sysid.plan.proposal import SweepPlan, plan_from_fits, recorded_s
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
 
@@ -94,11 +94,6 @@ def half_width(interval: Interval) -> float:
 def parse_goal(text: str) -> Goal:
     """Goal that `text` names: quantity, colon, half width with its unit.
 
-    Raises
-    ------
-    InputError
-        If it is not of that form, or narrower than any recording can make it.
-
     Examples
     --------
     >>> parse_goal("dead_time:2ms")
@@ -130,7 +125,6 @@ def record_until(
     record_next: RecordNext,
     *,
     most_seconds: float,
-    margins: Margins | None = None,
     seed: int = 0,
     report: Callable[[dict[str, JointOutcome]], None] | None = None,
 ) -> Outcome:
@@ -148,17 +142,10 @@ def record_until(
         See `RecordNext`.
     most_seconds : float
         Most recorded time of a joint, the first sweep included [s].
-    margins : mapping of joint to float, optional
-        Largest excursions [rad].
     seed : int
         For the plans' record.
     report : callable, optional
         Called with the joints' state after every round of fits.
-
-    Raises
-    ------
-    InputError
-        If a joint has too little motion.
     """
     files, found, widths = list(paths), dict[str, JointOutcome](), dict[str, list[float]]()
     left = list(joints)
@@ -167,9 +154,7 @@ def record_until(
         plans: dict[str, SweepPlan] = {}
         for joint, one in fit(recordings, left).items():
             widths.setdefault(joint, []).append(half_width(one.dead_time_s))
-            found[joint], plan = _judged(
-                goal, one, recordings, widths[joint], most_seconds, margins, seed
-            )
+            found[joint], plan = _judged(goal, one, recordings, widths[joint], most_seconds, seed)
             if plan is not None:
                 plans[joint] = plan
         left = list(plans)
@@ -178,7 +163,13 @@ def record_until(
         if not left:
             ordered = {joint: found[joint] for joint in joints}
             return Outcome(joints=ordered, recordings=tuple(files))
-        files.append(record_next(_together(plans), len(files) + 1))
+        planned = replace(
+            next(iter(plans.values())),
+            trials=tuple(t for p in plans.values() for t in p.trials),
+            predictions=tuple(x for p in plans.values() for x in p.predictions),
+            notes=tuple(n for p in plans.values() for n in p.notes),
+        )
+        files.append(record_next(planned, len(files) + 1))
 
 
 def _judged(
@@ -187,7 +178,6 @@ def _judged(
     recordings: Sequence[Recording],
     widths: Sequence[float],
     most_seconds: float,
-    margins: Margins | None,
     seed: int,
 ) -> tuple[JointOutcome, SweepPlan | None]:
     """State of a joint, and what to record next if that may help."""
@@ -207,7 +197,7 @@ def _judged(
         return state(
             f"{done:.0f} s are recorded and `most_seconds` is {most_seconds:g}; allow more"
         ), None
-    plan = plan_from_fits(recordings, {fit.joint: fit}, seconds=seconds, margins=margins, seed=seed)
+    plan = plan_from_fits(recordings, {fit.joint: fit}, seconds=seconds, seed=seed)
     notes = " ".join(n.removeprefix(f"{fit.joint}: ") for n in plan.notes if "dead time" in n)
     if len(widths) > 2 and min(widths[-2:]) > _PROGRESS * widths[-3]:
         return state(f"the last two rounds did not narrow it. {notes}".strip().rstrip(".")), None
@@ -215,14 +205,3 @@ def _judged(
     if half_width(dead.after) > _EXPECTED * half_width(dead.now):
         return state(notes.rstrip(".") or "no trial within the limits would narrow it"), None
     return state("more recordings are needed"), plan
-
-
-def _together(plans: Mapping[str, SweepPlan]) -> SweepPlan:
-    """One plan of several joints."""
-    first = next(iter(plans.values()))
-    return replace(
-        first,
-        trials=tuple(t for p in plans.values() for t in p.trials),
-        predictions=tuple(x for p in plans.values() for x in p.predictions),
-        notes=tuple(n for p in plans.values() for n in p.notes),
-    )

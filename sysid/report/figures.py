@@ -207,20 +207,12 @@ _FREQUENCY_TICKS = (0.1, 0.2, 0.5, 1, 2, 3, 4, 5, 7, 10, 15, 20)
 
 
 @styled
-def sweep_figure(trials: Sequence[Trial], periods: float = 3.0) -> Figure:
-    """Commands and readings, a panel per frequency; stale readings are faint.
-
-    Parameters
-    ----------
-    trials : sequence of Trial
-        Tones of one joint.
-    periods : float
-        Number of periods to show, from the middle of each trial.
-    """
+def sweep_figure(trials: Sequence[Trial]) -> Figure:
+    """Three periods of commands and readings of a joint's tones; stale readings are faint."""
     figure, panels = axes_column(len(trials), 0.6 + 1.35 * len(trials))
     for axes, trial in zip(panels, trials, strict=True):
         start = float(np.median(trial.send_time_s))
-        shown = within(trial.send_time_s, start, start + periods / trial.frequency_hz)
+        shown = within(trial.send_time_s, start, start + 3.0 / trial.frequency_hz)
         time = trial.send_time_s[shown] - start
         reading = trial.position_rad[shown]
         fresh = np.diff(reading, prepend=np.nan) != 0
@@ -394,9 +386,7 @@ def _expected(period_rows: float, loss: float) -> NDArray[np.float64]:
 
 
 @styled
-def overlay_figure(
-    result: JointCalibrationResult, found: list[Track] | None = None, panels: int = 4
-) -> Figure:
+def overlay_figure(result: JointCalibrationResult, found: list[Track] | None = None) -> Figure:
     """Command, model and readings, the fresh ones at the time they were measured.
 
     Parameters
@@ -404,10 +394,8 @@ def overlay_figure(
     result : JointCalibrationResult
     found : list of Track, optional
         From `sysid.report.figures.tracks`, if they have been computed.
-    panels : int
-        At most so many frequencies.
     """
-    shown = some_tracks(tracks(result) if found is None else found, panels)
+    shown = some_tracks(tracks(result) if found is None else found)
     figure, grid = axes_column(len(shown), 1.2 + 1.75 * len(shown))
     for axes, track in zip(grid, shown, strict=True):
         _overlay(axes, track, result.joint, 1.0)
@@ -459,7 +447,8 @@ def _overlay(axes: Axes, track: Track, joint: str, size: float) -> None:
         track.fresh_time_s[fresh], track.fresh_rad[fresh], "o", color=RED, ms=5 * size,
         mec="white", mew=0.6 * size, label="fresh readings, when measured", gid="part:fresh",
     )  # fmt: skip
-    axes.set_title(_trial_name(track, joint))
+    hertz = f", {track.frequency_hz:.3g} Hz" if track.frequency_hz > 0 else ""
+    axes.set_title(f"{joint}{hertz}")
     axes.set_xlim(start, stop)
 
 
@@ -540,10 +529,6 @@ def _residuals_over_speed(axes: Axes, found: list[Track], size: float, rows: str
         ms=3.5 * size, mec="white", mew=0.3, label="fresh rows when they were measured",
         rasterized=True, gid="part:fresh",
     )  # fmt: skip
-
-
-def _trial_name(track: Track, joint: str) -> str:
-    return f"{joint}, {track.frequency_hz:.3g} Hz" if track.frequency_hz > 0 else joint
 
 
 _PANEL_IN = 2.8

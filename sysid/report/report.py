@@ -132,10 +132,9 @@ def write_report(
         results |= fitted.joints
     assert calibration is not None
     results = {name: results[name] for name in names}
-    examinations, responses = [], {}
+    responses = {}
     lags = {joint: result.lag for joint, result in results.items()}
     examined = examine(recordings, names, seed=seed, lags=lags)
-    examinations.append((examined.recording, examined))
     for joint, result in results.items():
         if result.lag.by_frequency:
             trials, rng = joint_trials(recordings, joint), joint_rng(seed, joint)
@@ -148,8 +147,8 @@ def write_report(
         lattices = {joint: lag.feedback for joint, lag in lags.items()}
         comparison = compare(recordings, models, names, seed=seed, lattices=lattices)
     found = Findings(
-        recordings=recordings, results=results, examinations=examinations, responses=responses,
-        calibration=calibration, comparison=comparison,
+        recordings=recordings, results=results, calibration=calibration, responses=responses,
+        examinations=((examined.recording, examined),), comparison=comparison,
     )  # fmt: skip
     return write_findings(found, Path(folder), force)
 
@@ -294,6 +293,8 @@ def _fit(
         for name, value in candidate.parameters.items()
     }
     scores = score(free_run(model, values, ready.runs), ready.runs)
+    names = {f.name for f in fields(Scores)} & set(type(candidate).model_fields)
+    in_file = {n: math.nan if (x := getattr(candidate, n)) is None else x for n in names}
     return CandidateFit(
         model=candidate.model,
         parameters=parameters,
@@ -302,15 +303,8 @@ def _fit(
             for name in quantities.keys() & parameters.keys()
             if quantities[name].identified == "no"
         },
-        scores=replace(scores, **_stated(candidate)),
+        scores=replace(scores, **in_file),
     )
-
-
-def _stated(candidate: CandidateModel) -> dict[str, float]:
-    """Scores that the file holds; null there is NaN."""
-    names = {f.name for f in fields(Scores)} & set(type(candidate).model_fields)
-    stated = {name: getattr(candidate, name) for name in names}
-    return {name: float("nan") if value is None else value for name, value in stated.items()}
 
 
 def _quantities(joint: JointCalibration) -> dict[str, Quantity]:

@@ -247,7 +247,9 @@ def _bode(found: Findings) -> Section:
 def _models(results: Mapping[str, JointCalibrationResult]) -> Section:
     misled: dict[str, list[str]] = {}
     for joint, result in results.items():
-        if (best := _best_by_raw_score(result)) != result.model:
+        raw = {name: r.scores.rmse_raw_rad for name, r in result.candidate_models.items()}
+        raw |= {name: s.rmse_raw_rad for name, s in result.presets.items()}
+        if (best := min(raw, key=lambda name: raw[name])) != result.model:
             misled[joint] = [tables.model_name(best)]
     preferred = [f"It prefers {model} on {names}." for names, model in share_sentences(misled)]
     return Section(
@@ -266,12 +268,6 @@ def _models(results: Mapping[str, JointCalibrationResult]) -> Section:
             "best: do not choose by it. " + " ".join(preferred),
         ],
     )
-
-
-def _best_by_raw_score(result: JointCalibrationResult) -> str:
-    scores = {name: r.scores.rmse_raw_rad for name, r in result.candidate_models.items()}
-    scores |= {name: s.rmse_raw_rad for name, s in result.presets.items()}
-    return min(scores, key=lambda name: scores[name])
 
 
 def _parameters(found: Findings, parameters: Table) -> Section:

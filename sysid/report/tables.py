@@ -139,7 +139,11 @@ def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:
             )
     columns = (
         KEY,
-        Column("model", _model_cell, "words"),
+        Column(
+            "model",
+            lambda r: model_name(r["model"]) + (", chosen" if r["is_chosen"] else ""),
+            "words",
+        ),
         number("parameters fitted", "parameter_count", 0),
         number("fresh, mrad", "rmse_fresh_rad", 1, 1e3),
         number("unseen frequency (under load: run), mrad", "rmse_unseen_rad", 1, 1e3),
@@ -150,10 +154,6 @@ def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:
     )
     title = "Candidate models, simplest first"
     return Table("candidate_models", title, columns, tuple(rows), "is_chosen")
-
-
-def _model_cell(row: Row) -> str:
-    return model_name(row["model"]) + (", chosen" if row["kind"] == "chosen" else "")
 
 
 def model_name(name: str) -> str:

@@ -9,7 +9,7 @@ Where the feedback is held (more than a fifth of the rows repeat the one before 
 moves), only fresh readings count, each at its own time; otherwise every row as logged.
 
 Every row has the instants at which its reading may have been measured (`Run.reading_tick`): the
-one found, where the poll lattice is known, else that of the read. `sysid.servo_fit.readings` puts
+one found, where the poll lattice is known, else that of the read. `sysid.servo_fit.scores` puts
 the instants of a known bus in their place; a predicted reading is the mean of a model over them.
 
 Trials that follow each other without a pause, like the loops of a playback, are one run. Nothing is
@@ -139,13 +139,15 @@ def servo_data(
         Of the search for the poll.
     lattices : mapping of joint to PollLattice, optional
         Of the joints whose poll has been found already.
-
-    Raises
-    ------
-    InputError
-        If recordings differ in rate, or a joint has no readings.
     """
-    period = _common_period(recordings)
+    periods = sorted((r.loop_period_s, r.name) for r in recordings)
+    (shortest, fast), (longest, slow) = periods[0], periods[-1]
+    if not longest / shortest - 1 < _SAME_RATE:
+        raise InputError(
+            f"Recordings of different rates cannot be pooled: {fast} has a command every "
+            f"{1e3 * shortest:.1f} ms, {slow} every {1e3 * longest:.1f} ms. Fit them one by one."
+        )
+    period = float(np.median([p for p, _ in periods]))
     labels: dict[str, int] = {}
     runs: dict[str, tuple[Run, ...]] = {}
     modes: dict[str, str] = {}
@@ -198,17 +200,6 @@ def look_up(track: NDArray[np.floating], tick: NDArray[np.float64]) -> NDArray[n
 # ------------------------------------------------------------------------------- runs
 
 
-def _common_period(recordings: Sequence[Recording]) -> float:
-    periods = sorted((r.loop_period_s, r.name) for r in recordings)
-    (shortest, fast), (longest, slow) = periods[0], periods[-1]
-    if not longest / shortest - 1 < _SAME_RATE:
-        raise InputError(
-            f"Recordings of different rates cannot be pooled: {fast} has a command every "
-            f"{1e3 * shortest:.1f} ms, {slow} every {1e3 * longest:.1f} ms. Fit them one by one."
-        )
-    return float(np.median([p for p, _ in periods]))
-
-
 def _joint_runs(
     recordings: Sequence[Recording],
     joint: str,
@@ -236,7 +227,11 @@ def _joint_runs(
             tone = np.isfinite(trial.frequency_hz) and trial.frequency_hz > 0
             name = f"{trial.frequency_hz:g} Hz" if tone else f"{prefix}loop {trial.number}"
             group = labels.setdefault(name, len(labels))
-            counted = next(timed) if mode == "fresh" else _all_rows(trial, next(timed))
+            counted = next(timed)
+            if mode == "all":
+                rows = np.flatnonzero(np.isfinite(trial.position_rad))
+                time_s, position = trial.read_time_s[rows], trial.position_rad[rows]
+                counted = replace(counted, rows=rows, time_s=time_s, position_rad=position)
             if not known:
                 first = trial.position_rad[np.isfinite(trial.position_rad)][:1]
                 rest = float(first[0]) if len(first) else trial.initial_command_rad
@@ -256,13 +251,6 @@ def _fresh_while_moving(trials: Sequence[Trial]) -> float:
         move &= np.isfinite(t.position_rad)
         changed, moving = changed + int(move[fresh_rows(t)].sum()), moving + int(move.sum())
     return changed / max(moving, 1)
-
-
-def _all_rows(trial: Trial, timed: Readings) -> Readings:
-    rows = np.flatnonzero(np.isfinite(trial.position_rad))
-    return replace(
-        timed, rows=rows, time_s=trial.read_time_s[rows], position_rad=trial.position_rad[rows]
-    )
 
 
 _ROWS = ("send_time_s", "read_time_s", "command_rad", "position_rad")

@@ -146,7 +146,13 @@ def merged_groups(data: ServoData, most: int = 5) -> ServoData:
     """The same data with at most `most` groups to hold out; similar tones are kept apart."""
     if len(data.groups) <= most:
         return data
-    order = sorted(range(len(data.groups)), key=lambda g: _sort_key(data.groups[g]))
+
+    def by_frequency(g: int) -> tuple[float, str]:
+        label = data.groups[g]
+        number = label.removesuffix(" Hz")
+        return (float(number) if number != label else 0.0), label
+
+    order = sorted(range(len(data.groups)), key=by_frequency)
     fold = np.empty(len(order) + 1, int)
     fold[-1] = -1
     for place, g in enumerate(order):
@@ -156,11 +162,6 @@ def merged_groups(data: ServoData, most: int = 5) -> ServoData:
         j: tuple(replace(r, group=fold[r.group]) for r in found) for j, found in data.runs.items()
     }
     return replace(data, runs=runs, groups=tuple(names))
-
-
-def _sort_key(label: str) -> tuple[float, str]:
-    number = label.removesuffix(" Hz")
-    return (float(number) if number != label else 0.0), label
 
 
 def samples(data: ServoData, part: Part, past: int) -> Samples:

@@ -124,13 +124,7 @@ def footer(path: Path) -> dict[str, Any]:
 
 
 def resume_point(path: Path, plan: Plan, period_s: float) -> Resume:
-    """Where `plan`, partly recorded at `path`, continues.
-
-    Raises
-    ------
-    InputError
-        If the recording cannot be read, or was made with another plan.
-    """
+    """Where `plan`, partly recorded at `path`, continues."""
     written_at = path.stat().st_mtime
     text = as_text(path, read_bytes(path))
     planned = header(path, text).get("excitation") or {}

@@ -18,9 +18,9 @@ import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.dispatch import overview, words
-from pupper_sysid.cli.flags import remember, spell
 from pupper_sysid.cli.help_page import SCREEN_LINES
 from pupper_sysid.cli.programs import pupper_analyze, pupper_sysid
+from pupper_sysid.cli.terminal import remember, spell
 from pupper_sysid.cli.user_errors import parse
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import select_joints
@@ -206,8 +206,8 @@ def test_tables_warnings_and_json_have_no_control_characters(capsys, escape):
     shown = terminal.table(f"of {escape}", f"joint{escape}")
     shown.add_row(f"a{escape}b")
     terminal.out.print(shown)
-    terminal.out.print(f"x{escape}y", soft_wrap=True)
-    terminal.warn([f"odd {escape}"])
+    terminal.out.print(f"x{escape}y")
+    terminal.warn(f"odd {escape}")
     terminal.print_json({"name": f"k{escape}"})
     printed = capsys.readouterr()
     assert escape[0] not in printed.out + printed.err
@@ -228,8 +228,8 @@ def test_sentences_are_broken_between_words_on_a_terminal_and_commands_are_not(o
     command = "Next: pupper-sysid calibrate a.csv b.csv c.csv"
     file = io.StringIO()
     console = type(terminal.out)(file=file, force_terminal=on_terminal, width=20)
-    console.print(sentence, soft_wrap=True)
-    console.print(command, soft_wrap=True)
+    console.print(sentence)
+    console.print(command)
     lines = file.getvalue().splitlines()
     assert lines[-1] == command
     assert " ".join(line.strip() for line in lines[:-1]) == sentence

@@ -20,10 +20,10 @@ from pupper_sysid.cli.programs.pupper_sysid import COMMANDS
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.hardware import loop as clock
 from pupper_sysid.hardware.address import parse_address
-from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lock import runtime_folder
 from pupper_sysid.hardware.safety import watchdog
+from pupper_sysid.hardware.safety.guard import open_guarded
 from pupper_sysid.hardware.safety.notes import notes, remove_note, write_note
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from support.servo_servers import limp, robot_behind, wait_until
@@ -41,7 +41,7 @@ DRIVER = f"""{PATIENT}
 import os, sys
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.address import parse_address
-from pupper_sysid.hardware.connect import open_guarded
+from pupper_sysid.hardware.safety.guard import open_guarded
 bus = open_guarded(parse_address(sys.argv[1]))
 for _ in range(20):
     try:

@@ -11,8 +11,13 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.servo_models.cards.bam import BamParameters, class_of, from_bam, to_bam
-from pupper_sysid.servo_models.cards.files import load_card
+from pupper_sysid.servo_models.cards.files import (
+    BamParameters,
+    class_of,
+    from_bam,
+    load_card,
+    to_bam,
+)
 from pupper_sysid.sysid.sweep.bench import bench_plan, parse_load
 from support.package import ROOT
 

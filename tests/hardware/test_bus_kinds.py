@@ -6,7 +6,7 @@ import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware.address import KINDS, BusKind, parse_address
-from pupper_sysid.hardware.connect import open_bus
+from pupper_sysid.hardware.safety.guard import open_bus
 from pupper_sysid.hardware.safety.limp import switch_off
 
 

@@ -61,7 +61,7 @@ class Drawn(ABC):
             print_json({**self.about(), **found, "picture": picture})
             return
         out.print(table)
-        err.print(f"Picture: {picture}", soft_wrap=True)
+        err.print(f"Picture: {picture}")
 
     def caption(self, title: str) -> str:
         """Title of the picture of a table with a title; none if it has its own."""
@@ -188,11 +188,6 @@ def tries_of(
     """Policies by the names of their runs, and how each is tried.
 
     `other_robots` is whether the analysis is one for any robot's policy.
-
-    Raises
-    ------
-    InputError
-        If two have the same name, or one cannot be read.
     """
     from pupper_sysid.cli.policy_choice import (
         policy_at,
@@ -220,10 +215,10 @@ def tries_of(
     for name, path in zip(names, options.policies, strict=True):
         policy, run = policy_at(path)
         if not other_robots:
-            refuse_other_robot(policy, "pupper-analyze")
+            refuse_other_robot(policy)
         task, servos = simulator(path, policy, run, options.actuator, options.feedback)
         wanted = np.array([command], float)
-        within = trained_commands(policy, run).clipped(wanted, lambda text: warn([text]))[0]
+        within = trained_commands(policy, run).clipped(wanted, warn)[0]
         tries[name] = (
             policy,
             Trial(task, servos, (within[0], within[1], within[2]), robots, seconds, options.seed),

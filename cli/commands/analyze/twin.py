@@ -115,7 +115,7 @@ def _explain(found: Result, seen: dict[str, Gyro | None]) -> None:
     terminal.out.print(joints)
     if seen:
         terminal.out.print(_gyro_table(found, seen))
-    terminal.warn(found.notes)
+    terminal.warn(*found.notes)
     for line in wrap(found.verdict_in_words, _WIDTH):
         terminal.out.print(line)
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.cli.commands.common import OfRecordings
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, resolved
 from pupper_sysid.common.joints import (
@@ -34,7 +35,7 @@ _SHOWN = {
 
 
 @dataclass(frozen=True)
-class Calibrate:
+class Calibrate(OfRecordings):
     """Fit a servo model per joint and write it as YAML, with intervals and caveats.
 
     Example: pupper-sysid calibrate recordings/sweep.csv --out calibrated.yaml
@@ -50,8 +51,6 @@ class Calibrate:
     out: Path | None = None
     """Calibration file to write, calibrated.yaml by default; of a fleet the folder, by default the
     given one's name and _calibrated."""
-    joints: str = "all"
-    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
     stall_torque: float | None = None
     """Torque the servo stalls at [N·m]: sets the scale of all torques and of the armature. By
     default of the recorded servo's data sheet; a recording with a known load needs none."""
@@ -65,10 +64,6 @@ class Calibrate:
     controls it can run programs on this computer: see docs/exports.md."""
     force: bool = False
     """Replace the calibration file if it exists."""
-    json: bool = False
-    """Print one JSON object and nothing else."""
-    seed: int = 0
-    """Seed of the bootstrap and of the models' global starts."""
 
     def run(self) -> None:
         """Calibrate, print, write."""
@@ -86,8 +81,7 @@ class Calibrate:
             raise InputError("--cluster is for a fleet: give the folder of its recordings.")
         out = self.out or Path("calibrated.yaml")
         refuse_overwrite(out, self.force)  # before the work, not after it
-        recordings = terminal.load_all(self.recordings)
-        joints = terminal.pick_joints(recordings, self.joints)
+        recordings, joints = self.load()
         left = dict.fromkeys(joints, len(STAGES))
         with terminal.progress("calibrating", sum(left.values())) as advance:
 
@@ -99,18 +93,17 @@ class Calibrate:
                 for _ in range(left.pop(joint)):
                     advance(joint)
 
-            made = calibrate(
+            result = calibrate(
                 recordings, joints, self.seed, self.stall_torque,
                 workers=2, progress=done, staged=staged, prior=self.prior,
             )  # fmt: skip
-        made.save(out, force=self.force)
+        result.save(out, force=self.force)
         if self.json:
-            terminal.print_json(made)
+            terminal.print_json(result)
         else:
-            self._print(made)
+            self._print(result)
             terminal.err.print(
-                f"Wrote {out} in {time.perf_counter() - started:.1f} s. Next: pupper-sysid report",
-                soft_wrap=True,
+                f"Wrote {out} in {time.perf_counter() - started:.1f} s. Next: pupper-sysid report"
             )
 
     def _fleet(self, root: Path, started: float) -> None:
@@ -129,7 +122,7 @@ class Calibrate:
         out = self.out or resolved(root).with_name(f"{resolved(root).name}_calibrated")
         settings = Settings(self.seed, self.stall_torque)
         if self.cluster is not None:
-            terminal.warn([trust(self.cluster)])
+            terminal.warn(trust(self.cluster))
         with terminal.progress("calibrating", len(robots_in(root))) as advance:
             fleet = calibrate_fleet(
                 root, out, settings, self.jobs, self.cluster, self.force, advance
@@ -138,63 +131,53 @@ class Calibrate:
             fleet, out, time.perf_counter() - started, self.json, "a calibration", _SHOWN
         )
 
-    def _print(self, made: CalibrationResult) -> None:
-        shown = terminal.table(
+    def _print(self, result: CalibrationResult) -> None:
+        table = terminal.table(
             "DelayedPD per joint", "joint", "dead time ms", "90 %", "fit", "Kp", "Kd", "fric. N·m",
             "speed rad/s", "limit", "error mrad", "unseen mrad",
         )  # fmt: skip
-        for name, r in made.items():
-            a, s = made.calibration.joint(name).actuator, r.delayed_pd.scores
+        for name, r in result.items():
+            a, s = result.calibration.joint(name).actuator, r.delayed_pd.scores
             brakes = a.back_emf_nm_s_per_rad.value > 0
             limit = a.back_emf_nm_s_per_rad if brakes else a.velocity_limit_rad_s
-            shown.add_row(
+            table.add_row(
                 name,
                 _number(a.dead_time_s, 1, 1e3),
                 f"{1e3 * r.dead_time_s.low:.0f}–{1e3 * r.dead_time_s.high:.0f}",
-                terminal.number(made.calibration.joint(name).scores.residual_over_noise, 1),
+                terminal.number(result.calibration.joint(name).scores.residual_over_noise, 1),
                 _number(a.stiffness_nm_per_rad, 1), _damping(a),
                 _number(a.friction_loss_nm, 3),
                 f"{terminal.number(a.top_speed_rad_s)}{_mark(limit)}",
                 "EMF" if brakes else "slew",
                 terminal.ms(s.rmse_fresh_rad), terminal.ms(s.rmse_unseen_rad),
             )  # fmt: skip
-        terminal.out.print(shown)
-        scales = {name: made.calibration.joint(name).actuator.scale for name in made}
+        terminal.out.print(table)
+        scales = {name: result.calibration.joint(name).actuator.scale for name in result}
         assumed = {s.value_nm for s in scales.values() if s.anchor == "stall torque"}
         torques = "Torques are in N·m by the known load. "
         if assumed:
+            listed = " and ".join(f"{t:.3g}" for t in sorted(assumed))
             torques = (
-                f"Torques assume a stall torque of {_listed(assumed)} N·m; recordings without a "
+                f"Torques assume a stall torque of {listed} N·m; recordings without a "
                 "known load give only their ratios. "
             )
         terminal.out.print(
             "\nfit: errors over the noise of the readings; about 1 where the model describes the "
             f"servo. {torques}? is not identified; Σ: damping and back-EMF together; "
             "limit: what limits the speed, the set-point's slew or back-EMF (EMF). Errors are "
-            "free-run, on fresh readings.",
-            soft_wrap=True,
+            "free-run, on fresh readings."
         )
-        for point, names in made.calibration.operating_points().items():
-            terminal.out.print(f"{', '.join(names)}: {point}.", soft_wrap=True)
-        for r in made.values():
-            terminal.warn(r.warnings)
-        strangers = [
-            name
-            for name, scale in scales.items()
-            if scale.source == STALL_TORQUE_SOURCE and name not in JOINT_NAMES
-        ]
-        if strangers:
+        for point, names in result.calibration.operating_points().items():
+            terminal.out.print(f"{', '.join(names)}: {point}.")
+        for r in result.values():
+            terminal.warn(*r.warnings)
+        of_pupper = [n for n, scale in scales.items() if scale.source == STALL_TORQUE_SOURCE]
+        if strangers := [name for name in of_pupper if name not in JOINT_NAMES]:
             terminal.warn(
-                [
-                    f"{', '.join(strangers)}: {STALL_TORQUE_NM:g} N·m is the stall torque of the "
-                    "Mini Pupper's servo. Give --stall-torque from your servo's data sheet: all "
-                    "torques scale with it."
-                ]
+                f"{', '.join(strangers)}: {STALL_TORQUE_NM:g} N·m is the stall torque of the Mini "
+                "Pupper's servo. Give --stall-torque from your servo's data sheet: all torques "
+                "scale with it."
             )
-
-
-def _listed(torques: set[float]) -> str:
-    return " and ".join(f"{t:.3g}" for t in sorted(torques))
 
 
 def _mark(quantity: Quantity) -> str:

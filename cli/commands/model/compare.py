@@ -1,4 +1,4 @@
-"""`compare`: servo models and calibrations on the same readings, as a table and a picture."""
+"""`compare` and `compare-truth`: models on the same readings, a calibration beside the truth."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ from typing import Annotated, Literal
 import tyro
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.cli.commands.common import OfRecordings
 from pupper_sysid.common.errors import InputError
+
+_UNITS = {"_rad_s": ("rad/s", 1.0, 2), "_rad": ("mrad", 1e3, 2), "_s": ("ms", 1e3, 2)}
 
 
 @dataclass(frozen=True)
-class Compare:
+class Compare(OfRecordings):
     """Which model moves like the servo? Free run of each on the same recording, per joint.
 
     Every model predicts readings: with the age that the bus gives them, and the offset of this
@@ -23,13 +26,9 @@ class Compare:
     Example: pupper-sysid compare recordings/playback.csv --models servo/ calibrated.yaml
     """
 
-    recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Recordings to compare on; by default the newest in recordings/."""
     models: Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODEL [MODEL ...]")] = ()
     """Folders of fit-servo, calibration files, servo cards (names or files), or presets (paper,
     release)."""
-    joints: str = "all"
-    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
     readings: Literal["auto", "fresh", "all"] = "auto"
     """Which readings count: fresh ones at the time they were taken, all rows as logged, or what
     suits the recording."""
@@ -37,10 +36,6 @@ class Compare:
     """Picture to draw, PNG or SVG."""
     force: bool = False
     """Replace the picture if it exists."""
-    json: bool = False
-    """Print one JSON object and nothing else."""
-    seed: int = 0
-    """Seed of the bootstrap."""
 
     def run(self) -> None:
         """Compare, print, draw."""
@@ -52,35 +47,107 @@ class Compare:
                 "Nothing to compare: name models, such as `--models servo/ calibrated.yaml`."
             )
         refuse_picture(self.plot, self.force)
-        recordings = terminal.load_all(self.recordings)
-        joints = terminal.pick_joints(recordings, self.joints)
-        found = compare(recordings, self.models, joints, self.readings, self.seed)
-        save(found.plot(), self.plot, self.force)
+        recordings, joints = self.load()
+        result = compare(recordings, self.models, joints, self.readings, self.seed)
+        save(result.plot(), self.plot, self.force)
         if self.json:
-            terminal.print_json(found.to_dict() | {"written": str(self.plot)})
+            terminal.print_json(result.to_dict() | {"written": str(self.plot)})
             return
-        shown = terminal.table(
-            "RMS error in free run, mrad", "joint", *found.models, "persistence", "repeatability"
+        table = terminal.table(
+            "RMS error in free run, mrad", "joint", *result.models, "persistence", "repeatability"
         )
         for joint in joints:
-            errors = [m.joints[joint].rmse_free_run_rad for m in found.models.values()]
-            errors += [found.persistence_rmse_rad[joint], found.repeatability_rad[joint]]
-            shown.add_row(joint, *map(terminal.ms, errors))
+            errors = [m.joints[joint].rmse_free_run_rad for m in result.models.values()]
+            errors += [result.persistence_rmse_rad[joint], result.repeatability_rad[joint]]
+            table.add_row(joint, *map(terminal.ms, errors))
         if len(joints) > 1:
-            means = (terminal.ms(m.mean.rmse_free_run_rad) for m in found.models.values())
-            shown.add_row("mean", *means, style="bold")
-        terminal.out.print(shown)
+            means = (terminal.ms(m.mean.rmse_free_run_rad) for m in result.models.values())
+            table.add_row("mean", *means, style="bold")
+        terminal.out.print(table)
         for title in ("held", "raw", "one_step"):
-            means = {n: getattr(m.mean, f"rmse_{title}_rad") for n, m in found.models.items()}
+            means = {n: getattr(m.mean, f"rmse_{title}_rad") for n, m in result.models.items()}
             text = ", ".join(f"{name} {terminal.ms(value)}" for name, value in means.items())
-            terminal.out.print(f"Mean, {title.replace('_', ' ')}: {text}", soft_wrap=True)
-        shifted = {name: m.offset_rad for name, m in found.models.items() if m.offset_rad}
+            terminal.out.print(f"Mean, {title.replace('_', ' ')}: {text}")
+        shifted = {name: m.offset_rad for name, m in result.models.items() if m.offset_rad}
         offsets = terminal.table("Offset of this recording, mrad", "joint", *shifted)
         for joint in joints:
             offsets.add_row(joint, *(terminal.ms(own[joint]) for own in shifted.values()))
         terminal.out.print()
         terminal.out.print(offsets)
-        for sentence in found.reading_notes():
-            terminal.out.print(sentence, soft_wrap=True)
-        terminal.warn(found.notes)
-        terminal.err.print(f"Wrote {self.plot}.", soft_wrap=True)
+        for sentence in result.reading_notes():
+            terminal.out.print(sentence)
+        terminal.warn(*result.notes)
+        terminal.err.print(f"Wrote {self.plot}.")
+
+
+@dataclass(frozen=True)
+class CompareTruth:
+    """Was it found? Each calibrated number beside the true one of an emulated robot.
+
+    `sweep --truth` writes the truth beside the recording. Where the interval holds it, the last
+    column says yes; of many robots that should be nine in ten.
+
+    Example: pupper-sysid compare-truth sweep.csv calibrated.yaml
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """Recording of an emulated robot, with its .truth.yaml beside it."""
+    calibration: tyro.conf.Positional[Path | None] = None
+    """Calibration file; by default the recording is calibrated now."""
+    joints: str = "all"
+    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+    seed: int = 0
+    """Seed of the calibration, where none is given."""
+
+    def run(self) -> None:
+        """Calibrate if need be, compare, print."""
+        from pupper_sysid.servo_models.calibration.calibration import load_calibration
+        from pupper_sysid.servo_models.calibration.quantity import unit_of
+        from pupper_sysid.sysid.compare.truth import compared_with_truth, read_truth
+        from pupper_sysid.sysid.fit.calibrate import calibrate
+
+        truth = read_truth(self.recording)  # before the work, not after it
+        (recording,) = terminal.load_all([self.recording])
+        joints = terminal.pick_joints([recording], self.joints)
+        if self.calibration:
+            fitted = load_calibration(self.calibration)
+        else:
+            with terminal.progress("calibrating", len(joints)) as advance:
+                fitted = calibrate(
+                    recording, joints, self.seed, workers=2, progress=advance
+                ).calibration
+        rows = compared_with_truth(recording, truth, fitted, joints)
+        if self.json:
+            terminal.print_json(rows)
+            return
+        table = terminal.table(
+            "Found and true", "joint", "quantity", "found", "90 % interval", "truth", "identified",
+            "held",
+        )  # fmt: skip
+        for row in rows:
+            end = next((end for end in _UNITS if row.quantity.endswith(end)), "")
+            plain_unit = (unit_of(row.quantity), 1.0, 3 if abs(row.truth) < 1 else 0)
+            unit, factor, digits = _UNITS.get(end, plain_unit)
+            name = row.quantity.removesuffix(end).replace("_", " ")
+            low, high = (
+                terminal.number(factor * x, digits) for x in (row.found.low, row.found.high)
+            )
+            table.add_row(
+                row.joint, f"{name}, {unit}".removesuffix(", 1"),
+                terminal.number(factor * row.found.value, digits), f"{low}…{high}",
+                terminal.number(factor * row.truth, digits), row.identified,
+                {True: "yes", False: "no", None: "–"}[row.held],
+            )  # fmt: skip
+        terminal.out.print(table)
+        known_rows = [row for row in rows if row.held is not None and row.identified != "no"]
+        held = sum(bool(row.held) for row in known_rows)
+        terminal.out.print(
+            f"\n{held} of {len(known_rows)} intervals of identified numbers hold the truth. "
+            "stiffness, damping, friction loss, effort limit and back EMF are ratios to the "
+            "armature."
+        )
+        for definition in rows.definitions:
+            terminal.out.print(f"Both sides of {definition}")
+        terminal.warn(*rows.notes)

@@ -1,4 +1,4 @@
-"""`fit-servo`: fit a servo model per joint, score it on unseen data, save it with its contract."""
+"""`fit-servo` and `sindy`: a servo model per joint, scored on unseen data; a sparse equation."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import tyro
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.cli.commands.common import OfRecordings
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, resolved
 from pupper_sysid.sysid.sweep.excitation import TRIAL_S
@@ -18,6 +19,7 @@ from pupper_sysid.sysid.sweep.excitation import TRIAL_S
 if TYPE_CHECKING:
     from pupper_sysid.sysid.servo_fit.fit import Split
     from pupper_sysid.sysid.servo_fit.result import ServoFit
+    from pupper_sysid.sysid.sparse import Equations
 
 _SHOWN = {
     "free_run_mrad": ("free run mrad", 1),
@@ -38,7 +40,7 @@ _SCORES = (
 
 
 @dataclass(frozen=True)
-class FitServo:
+class FitServo(OfRecordings):
     """Fit a model per joint that predicts, from commands alone, where the servo is.
 
     Example: pupper-sysid fit-servo recordings/walk.csv --train-loops 0,1 --test-loops 2
@@ -53,8 +55,6 @@ class FitServo:
     """Kind of model: networks, the linear filter they build on, or a physical model."""
     preset: Literal["default", "paper"] = "default"
     """paper: an mlp or lstm trained as in the paper, one step ahead from measured positions."""
-    joints: str = "all"
-    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
     out: Path | None = None
     """Folder to write the model to; by default servo/, or the next free servo-2/, servo-3/, …; of a
     fleet the folder of its models, by default the given one's name and _servos."""
@@ -78,14 +78,17 @@ class FitServo:
     controls it can run programs on this computer: see docs/exports.md."""
     force: bool = False
     """Replace the model in --out."""
-    json: bool = False
-    """Print one JSON object and nothing else."""
     seed: int = 0
     """Seed of the networks, of the physical models' starts and of the bootstrap."""
 
     def run(self) -> None:
         """Fit, score, save, print."""
-        self._check_numbers()
+        refuse_outside("--jobs", self.jobs, *terminal.JOBS)
+        for option, value in (
+            ("--train-before", self.train_before), ("--test-after", self.test_after),
+        ):  # fmt: skip
+            if value is not None:
+                refuse_outside(option, value, 0, TRIAL_S[1], "s")
         from pupper_sysid.servo_models.servo_file import CONTRACT
         from pupper_sysid.sysid.recordings.importers.recognise import is_fleet
         from pupper_sysid.sysid.servo_fit.fit import fit_servo
@@ -99,8 +102,7 @@ class FitServo:
         folder = self.out or _free_folder()
         refuse_overwrite(folder / CONTRACT, self.force)
         started = time.perf_counter()
-        recordings = terminal.load_all(self.recordings)
-        joints = terminal.pick_joints(recordings, self.joints)
+        recordings, joints = self.load()
         with terminal.share_progress(f"fitting {self.arch}") as advance:
             fit = fit_servo(
                 recordings, joints, self.arch, self.preset, split, self.readings, self.seed,
@@ -112,10 +114,9 @@ class FitServo:
             terminal.print_json(fit.to_dict() | {"elapsed_s": elapsed, "written": str(folder)})
             return
         self._print(fit)
-        terminal.warn(fit.notes)
+        terminal.warn(*fit.notes)
         terminal.err.print(
-            f"Wrote {folder}/ in {elapsed:.0f} s. Next: pupper-sysid compare --models {folder}",
-            soft_wrap=True,
+            f"Wrote {folder}/ in {elapsed:.0f} s. Next: pupper-sysid compare --models {folder}"
         )
 
     def _fleet(self, root: Path, split: Split) -> None:
@@ -128,7 +129,7 @@ class FitServo:
         started = time.perf_counter()
         out = self.out or resolved(root).with_name(f"{resolved(root).name}_servos")
         if self.cluster is not None:
-            terminal.warn([trust(self.cluster)])
+            terminal.warn(trust(self.cluster))
         settings = ServoSettings(self.arch, self.preset, split, self.readings, self.seed)
         with terminal.progress(f"fitting {self.arch}", len(robots_in(root))) as advance:
             fleet = fit_servo_fleet(
@@ -137,15 +138,6 @@ class FitServo:
         terminal.print_fleet(
             fleet, out, time.perf_counter() - started, self.json, "a servo model", _SHOWN
         )
-
-    def _check_numbers(self) -> None:
-        """Refuse numbers out of range, before anything is imported or read."""
-        refuse_outside("--jobs", self.jobs, *terminal.JOBS)
-        for option, value in (
-            ("--train-before", self.train_before), ("--test-after", self.test_after),
-        ):  # fmt: skip
-            if value is not None:
-                refuse_outside(option, value, 0, TRIAL_S[1], "s")
 
     def _split(self) -> Split:
         from pupper_sysid.sysid.servo_fit.fit import EACH_GROUP_IN_TURN, Split
@@ -171,22 +163,21 @@ class FitServo:
         return Split.by_time(self.train_before, self.test_after)
 
     def _print(self, fit: ServoFit) -> None:
-        shown = terminal.table(
+        table = terminal.table(
             f"{fit.arch}, {fit.split}; RMS error in mrad", "joint", *(title for _, title in _SCORES)
         )
         for name, one in fit.joints.items():
-            shown.add_row(name, *(terminal.ms(getattr(one, key)) for key, _ in _SCORES))
+            table.add_row(name, *(terminal.ms(getattr(one, key)) for key, _ in _SCORES))
         if len(fit.joints) > 1:
             means = (terminal.ms(getattr(fit.mean, key)) for key, _ in _SCORES)
-            shown.add_row("mean", *means, style="bold")
-        terminal.out.print(shown)
+            table.add_row("mean", *means, style="bold")
+        terminal.out.print(table)
         terminal.out.print(
             "\nFree run: commands only, from the start of each run. DelayedPD (PD), the linear "
             "filter and the model were fitted to the same readings and scored on the same unseen "
-            "ones.",
-            soft_wrap=True,
+            "ones."
         )
-        terminal.out.print(Text(f"\n{fit.verdict}", "bold"), soft_wrap=True)
+        terminal.out.print(Text(f"\n{fit.verdict}", "bold"))
 
 
 def _free_folder() -> Path:
@@ -197,3 +188,50 @@ def _free_folder() -> Path:
     while (Path(f"servo-{n}" if n > 1 else "servo") / CONTRACT).exists():
         n += 1
     return Path(f"servo-{n}" if n > 1 else "servo")
+
+
+@dataclass(frozen=True)
+class Sindy(OfRecordings):
+    """A short equation of motion per joint, with units (SINDy, refined by output error).
+
+    Example: pupper-sysid sindy recordings/sweep.csv --joints LF_thigh
+    """
+
+    def run(self) -> None:
+        """Find the equations and print them."""
+        from pupper_sysid.sysid.sparse import sparse_equations
+
+        started = time.perf_counter()
+        recordings, joints = self.load()
+        with terminal.progress("finding equations", len(joints)) as advance:
+            results = sparse_equations(recordings, joints, self.seed, workers=2, progress=advance)
+        if self.json:
+            terminal.print_json(results)
+            return
+        self._print(results)
+        terminal.err.print(f"Took {time.perf_counter() - started:.1f} s.")
+
+    def _print(self, results: Equations) -> None:
+        for name, r in results.items():
+            terminal.out.print(Text.assemble((name, "bold"), f": {r.equation}"))
+            for line in r.explanation():
+                terminal.out.print(f"  - {line}")
+            terminal.out.print()
+        table = terminal.table(
+            "Free-run error, mrad", "joint", "equation, fresh", "all rows", "unseen Hz",
+            "DelayedPD, fresh", "unseen Hz", "structures tried",
+        )  # fmt: skip
+        for name, r in results.items():
+            table.add_row(
+                name, terminal.ms(r.scores.rmse_fresh_rad), terminal.ms(r.scores.rmse_held_rad),
+                terminal.ms(r.scores.rmse_unseen_rad),
+                terminal.ms(r.delayed_pd.rmse_fresh_rad),
+                terminal.ms(r.delayed_pd.rmse_unseen_rad), str(len(r.candidates)),
+            )  # fmt: skip
+        terminal.out.print(table)
+        terminal.out.print(
+            "\nq: joint angle, u: command, e: error. Per unit of inertia; each reading is compared "
+            "with the motion at the time it was measured, none is fed back."
+        )
+        for r in results.values():
+            terminal.warn(*r.warnings)

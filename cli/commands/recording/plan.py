@@ -70,9 +70,7 @@ class Plan:
             return
         show(made)
         if self.out is not None:
-            terminal.err.print(
-                f"Wrote {self.out}. Next: pupper-sysid sweep --plan {self.out}", soft_wrap=True
-            )
+            terminal.err.print(f"Wrote {self.out}. Next: pupper-sysid sweep --plan {self.out}")
         else:
             terminal.err.print("Nothing was written; --out plan.yaml keeps it.")
 
@@ -191,4 +189,4 @@ def show(plan: SweepPlan) -> None:
         terminal.out.print()
         terminal.out.print(expected)
     for note in plan.notes:
-        terminal.out.print(note, soft_wrap=True)
+        terminal.out.print(note)

@@ -9,13 +9,16 @@ from typing import Any, Literal
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE, joints_on, parse_registers
-from pupper_sysid.cli.commands.recording.bench import BENCH_MAP, BENCH_RATE_HZ, loads_of
 from pupper_sysid.cli.commands.recording.sweeping import (
+    BENCH_MAP,
+    BENCH_RATE_HZ,
     guard_warnings,
     in_virtual_time,
+    loads_of,
     open_bus_of,
     plan_of,
     priority_of,
+    run_rounds,
     say_how_to_resume,
     say_what_stays,
     shown,
@@ -25,7 +28,7 @@ from pupper_sysid.common.errors import BusError, InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import select_joints
 from pupper_sysid.hardware.address import EMULATED, bus_name
-from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import guarded
 from pupper_sysid.sysid.sweep.bench import (
     BENCH,
@@ -152,8 +155,6 @@ class Sweep:
                     "--until makes several recordings, and --rerun and --mcap show one. Leave "
                     "them out, and give the recordings to `pupper-sysid view`."
                 )
-            from pupper_sysid.cli.commands.recording.rounds import run_rounds
-
             run_rounds(
                 lambda *asked: self._record(*asked)[1], path, request,
                 resume=self.resume is not None, whole=whole, force=self.force, as_json=self.json,
@@ -175,7 +176,7 @@ class Sweep:
         except BaseException:
             bus.close()
             raise
-        terminal.warn(chosen.warnings)
+        terminal.warn(*chosen.warnings)
         if point:
             terminal.err.print(
                 f"Continuing {path} at trial {point.next_trial + 1} of {len(chosen.trials)}."
@@ -198,15 +199,11 @@ class Sweep:
                 say_how_to_resume(path)
             raise
         say_what_stays(bus)
-        terminal.warn(guard_warnings(path))
+        terminal.warn(*guard_warnings(path))
         written = [path]
         if self.truth and isinstance(bus.bus, EmulatedBus):
             written += bus.bus.write_truth(path.with_suffix(""), self.force)
         return chosen, written
-
-    @property
-    def _draws(self) -> bool:
-        return self.live and terminal.err.is_terminal
 
     @property
     def _views(self) -> Wanted:
@@ -229,7 +226,10 @@ class Sweep:
         loop_period_s = 1.0 / rate
         self._refuse_bench_options()
         if self.plan is None:
-            joints = joints_on(bus, self._map_there(), self.joints)
+            here = JOINTS_FILE if bus != EMULATED and JOINTS_FILE.exists() else None
+            chosen = self._map() or here
+            joint_map = load_joint_map(chosen) if chosen else None
+            joints = joints_on(bus, joint_map, self.joints)
         else:
             from pupper_sysid.sysid.plan.plan_file import load_plan
 
@@ -243,16 +243,26 @@ class Sweep:
                 f"--load: a bench is one servo, and {len(joints)} were chosen; name it with "
                 "--joints."
             )
+        if self.freqs is None and self.load is not None:
+            frequencies = list(FREQUENCIES_HZ)
+        else:
+            frequencies = parse_frequencies("1-10" if self.freqs is None else self.freqs)
+        amplitude = self.amplitude
+        if amplitude is not None:
+            check_amplitude(amplitude)
+        elif not self.load:  # a bench's kinds of motion have excursions of their own
+            amplitude = 0.3
         return {
             "bus": bus,
             "joint_map": self._map(),
-            "real_time": self.real_time or (bus == EMULATED and self._draws),
+            "real_time": self.real_time
+            or (bus == EMULATED and self.live and terminal.err.is_terminal),
             "seed": self.seed,
             "loop_period_s": loop_period_s,
             "kind": self.kind or ("sine" if self.load is None else BENCH),
             "joints": joints,
-            "frequencies_hz": self._frequencies(),
-            "amplitude_rad": self._amplitude(),
+            "frequencies_hz": frequencies,
+            "amplitude_rad": amplitude,
             "duration_s": self.duration,
             "playback": str(self.playback) if self.playback else None,
             "loops": self.loops,
@@ -262,18 +272,6 @@ class Sweep:
             "until": self._series(joints) if self.until is not None else None,
             "registers": self._registers(bus),
         }
-
-    def _amplitude(self) -> float | None:
-        """Excursion of the request; None leaves it to a bench's kinds of motion."""
-        if self.amplitude is None:
-            return None if self.load else 0.3
-        check_amplitude(self.amplitude)
-        return self.amplitude
-
-    def _frequencies(self) -> list[float]:
-        if self.freqs is None and self.load is not None:
-            return list(FREQUENCIES_HZ)
-        return parse_frequencies("1-10" if self.freqs is None else self.freqs)
 
     def _refuse_bench_options(self) -> None:
         """Gains, drops and strokes are for a bench, and a bench has no plan or playback."""
@@ -319,12 +317,6 @@ class Sweep:
             "number": 1,
         }  # fmt: skip
 
-    def _map_there(self) -> JointMap | None:
-        """The joint map that is named or is in this folder."""
-        here = JOINTS_FILE if bus_name(self.bus) != EMULATED and JOINTS_FILE.exists() else None
-        chosen = self._map() or here
-        return load_joint_map(chosen) if chosen else None
-
     def _print(self, joints: list[str], chosen: Plan, written: list[Path], elapsed: float) -> None:
         path = written[0]
         if self.json:
@@ -339,18 +331,14 @@ class Sweep:
         trials = _counted(len(chosen.trials), "trial")
         terminal.out.print(
             f"Recorded {trials} of {_counted(len(joints), 'joint')}, "
-            f"{chosen.duration_s:.0f} s of motion, in {elapsed:.1f} s.",
-            soft_wrap=True,
+            f"{chosen.duration_s:.0f} s of motion, in {elapsed:.1f} s."
         )
         for name in written:
-            terminal.out.print(f"  {name}", soft_wrap=True)
+            terminal.out.print(f"  {name}")
         last = f"delay {path}\n  pupper-sysid calibrate {path} --out calibrated.yaml"
         if self.kind == "reversal":
             last = f"backlash {path}"
-        terminal.out.print(
-            f"Next:\n  pupper-sysid doctor {path}\n  pupper-sysid {last}",
-            soft_wrap=True,
-        )
+        terminal.out.print(f"Next:\n  pupper-sysid doctor {path}\n  pupper-sysid {last}")
 
 
 def _counted(number: int, name: str) -> str:

@@ -21,9 +21,9 @@ from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.hardware import joint_calibration as jc
 from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
 from pupper_sysid.hardware.bus import ServoBus
-from pupper_sysid.hardware.connect import open_bus
+from pupper_sysid.hardware.joint_calibration import write_lerobot
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
-from pupper_sysid.hardware.lerobot_calibration import write_lerobot
+from pupper_sysid.hardware.safety.guard import open_bus
 
 _PERIOD_S = 0.02
 _MEAN_OVER_S = 0.5
@@ -92,7 +92,7 @@ class CalibrateJoints:
             here = [n for n in names if n in bus.joint_names]
             silent = [n for n in names if n not in here]
             if silent:
-                terminal.warn([f"{', '.join(silent)}: no answer; their part of the map is kept."])
+                terminal.warn(f"{', '.join(silent)}: no answer; their part of the map is kept.")
             if self.scale_joint in silent:
                 raise BusError(f"--scale-joint {self.scale_joint}: it does not answer.")
             self._calibrate(Guide(bus, start, here, Keyboard()), self.scale_joint or here[0])
@@ -106,7 +106,7 @@ class CalibrateJoints:
         scale, use_it = guide.scale(scale_joint, self.scale_deg)
         measured = jc.Measured(offsets, limits, scale_joint, scale, use_it)
         new = jc.calibrated(guide.start.file, measured, time.strftime("%Y-%m-%d"))
-        terminal.warn(jc.doubts(new, offsets))
+        terminal.warn(*jc.doubts(new, offsets))
         guide.stay_limp()
         new.save(self.out, self.force)
         if self.lerobot_calibration:
@@ -132,8 +132,7 @@ class CalibrateJoints:
             f"Wrote {self.out}. The servos are limp.\nNext:\n"
             f"  pupper-sysid monitor --bus {self.bus} --joint-map {self.out}\n"
             f"  pupper-sysid sweep --freqs 1-10 --joints {next(iter(offsets))} --bus {self.bus} "
-            f"--joint-map {self.out}",
-            soft_wrap=True,
+            f"--joint-map {self.out}"
         )
 
 
@@ -227,7 +226,7 @@ class Guide:
         cut = [n for n in travel.cut_off(self.joints) if n not in refused]
         if cut:
             terminal.warn(
-                [f"{_some(cut)}: the travel runs into the end of the encoder; an end is not seen."]
+                f"{_some(cut)}: the travel runs into the end of the encoder; an end is not seen."
             )
         return {
             name: jc.limits_within(int(travel.low[k]), int(travel.high[k]))

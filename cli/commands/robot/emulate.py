@@ -1,12 +1,15 @@
-"""`emulate`: an emulated robot behind the real protocols."""
+"""`emulate`: an emulated robot behind the real protocols, whose limp joints keys move by hand."""
 
 from __future__ import annotations
 
 import math
+import os
+import sys
 import tempfile
+import termios
 import threading
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -17,6 +20,7 @@ import yaml
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import parse_servo_registers
+from pupper_sysid.cli.keyboard import terminal_without
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.reading.dialect import whole
@@ -44,6 +48,11 @@ from pupper_sysid.sim.emulator.serial_line import LineEmulator, SerialPty
 from pupper_sysid.sysid.sweep.bench import parse_load
 
 _MOST_BACKLASH_DEG = 20.0
+_KEYS = (
+    "Keys move limp joints, in this window: a and d by 0.05 rad, A and D by 0.4 rad, 0 back to "
+    "where they went limp; n chooses the next joint (all at first)."
+)
+_STEPS_RAD = {"a": -0.05, "d": 0.05, "A": -0.4, "D": 0.4}
 
 
 @dataclass(frozen=True)
@@ -86,7 +95,7 @@ class Esp32(Common):
             _write_truth(self, bench)
             name = "esp32" if self.socket == SOCKET else f"esp32:{self.socket}"
             what = "Emulated Mini Pupper 2" + (", standing," if self.walking else "")
-            with _hand_of(self, bench):
+            with keys_move(bench) if self.by_hand else nullcontext():
                 _serve(server, f"{what} at {self.socket}.", name, self.walking)
 
 
@@ -283,15 +292,6 @@ def _bench(
     return ServoBench(robot, layout, own, keep_log=False, plant=plant)
 
 
-def _hand_of(options: Common, bench: ServoBench) -> AbstractContextManager[None]:
-    """Keys that move limp joints, if they are to."""
-    if not options.by_hand:
-        return nullcontext()
-    from pupper_sysid.cli.commands.robot.hand import keys_move
-
-    return keys_move(bench)
-
-
 @contextmanager
 def _imu_beside(bench: ServoBench, path: Path | None, rng: np.random.Generator) -> Iterator[None]:
     """The IMU of the same robot on a socket of its own, if there is a path, during the block."""
@@ -319,7 +319,7 @@ def _serve_line(
     """Serve a line of servos until Ctrl-C."""
     with (
         closing(SerialPty(emulator, options.place(), options.adapter_ms / 1e3)) as server,
-        _hand_of(options, bench),
+        keys_move(bench) if options.by_hand else nullcontext(),
     ):
         _write_truth(options, bench)
         what = f"{len(emulator.servos)} emulated {emulator.series.name} at {server.device}, "
@@ -358,8 +358,8 @@ def _serve(
 
 def _serve_with(server: ProxySocket | SerialPty, what: str, commands: str) -> None:
     """Serve until Ctrl-C; `commands` are what to type elsewhere."""
-    terminal.out.print(what, soft_wrap=True)
-    terminal.out.print(f"In another terminal:\n{commands}Ctrl-C ends it.", soft_wrap=True)
+    terminal.out.print(what)
+    terminal.out.print(f"In another terminal:\n{commands}Ctrl-C ends it.")
     with real_time_priority():  # bytes that come late would look like a slow servo
         server.serve()
 
@@ -384,3 +384,55 @@ def _parse_ids(text: str, known: tuple[int, ...]) -> list[int]:
             f"--ids {text}: the emulated robot has the ids {min(known)} to {max(known)}."
         )
     return sorted(set(ids))
+
+
+class Hand:
+    """Moves all joints, or one.
+
+    Parameters
+    ----------
+    bench : ServoBench
+    """
+
+    def __init__(self, bench: ServoBench):
+        self._bench = bench
+        self._names: Sequence[str] = bench.robot.joint_names
+        self._chosen: int | None = None
+
+    def press(self, key: str) -> str:
+        """What to say of a key; empty if it has no meaning."""
+        if key == "n":
+            following = 0 if self._chosen is None else self._chosen + 1
+            self._chosen = following if following < len(self._names) else None
+            return f"{self._what()}: chosen"
+        if key not in _STEPS_RAD and key != "0":
+            return ""
+        indices = range(len(self._names)) if self._chosen is None else (self._chosen,)
+        limp = [i for i in indices if not self._bench.is_on(i)]
+        for i in limp:
+            self._bench.move_by_hand(i, _STEPS_RAD.get(key))
+        if not limp:
+            return f"{self._what()}: holds its position; only a limp joint moves by hand"
+        return f"{self._what()}: {self._bench.hand_rad[limp[0]]:+.2f} rad"
+
+    def _what(self) -> str:
+        return "all joints" if self._chosen is None else self._names[self._chosen]
+
+
+@contextmanager
+def keys_move(bench: ServoBench) -> Iterator[None]:
+    """Keys of the standard input move limp joints of `bench` during the block."""
+    hand, fd = Hand(bench), sys.stdin.fileno()
+
+    def listen() -> None:
+        with suppress(OSError):  # the terminal is gone
+            while typed := os.read(fd, 64):
+                for key in typed.decode(errors="ignore"):
+                    if said := hand.press(key):
+                        terminal.err.print(said)
+
+    raw = terminal_without(termios.ICANON | termios.ECHO, fd) if os.isatty(fd) else nullcontext()
+    with raw:
+        terminal.out.print(_KEYS)
+        threading.Thread(target=listen, daemon=True).start()
+        yield

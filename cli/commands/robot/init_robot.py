@@ -48,7 +48,7 @@ class InitRobot:
 
     def run(self) -> None:
         """Read the model, write the map, print the next commands."""
-        from pupper_sysid.hardware.lerobot_calibration import read_lerobot
+        from pupper_sysid.hardware.joint_calibration import read_lerobot
         from pupper_sysid.sim.robot.robot_map import joint_map_of, joint_map_of_servos
 
         lerobot = read_lerobot(self.lerobot_calibration) if self.lerobot_calibration else None
@@ -75,23 +75,19 @@ class InitRobot:
         ]
         if left_out:
             terminal.warn(
-                [
-                    f"no actuator of {self.model} drives these, left out: {', '.join(left_out)}."
-                    " If they have servos, give them actuators there, or take all actuators out."
-                ]
+                f"no actuator of {self.model} drives these, left out: {', '.join(left_out)}."
+                " If they have servos, give them actuators there, or take all actuators out."
             )
-        terminal.warn(robot.doubts)
+        terminal.warn(*robot.doubts)
         if robot.following:
             pairs = ", ".join(f"{name} (follows {of})" for name, of in robot.following.items())
-            terminal.warn([f"no servo of their own, left out: {pairs}."])
+            terminal.warn(f"no servo of their own, left out: {pairs}.")
         narrow = [n for n, r in zip(found.joint_names, margin, strict=True) if r < _SMALLEST_RAD]
         if narrow:
             terminal.warn(
-                [
-                    f"{', '.join(narrow)}: less than {_SMALLEST_RAD:g} rad of margin, too little "
-                    f"for a sweep. Are the limits in {self.model} in another unit? MJCF counts in "
-                    'degrees, unless it says <compiler angle="radian"/>; URDF in radians.'
-                ]
+                f"{', '.join(narrow)}: less than {_SMALLEST_RAD:g} rad of margin, too little "
+                f"for a sweep. Are the limits in {self.model} in another unit? MJCF counts in "
+                'degrees, unless it says <compiler angle="radian"/>; URDF in radians.'
             )
         if self.json:
             terminal.print_json(
@@ -128,8 +124,7 @@ class InitRobot:
             f"--bus {bus}\n"
             f"Sweep, first without the robot, then with --bus {bus}:\n"
             + "".join(f"  {line}\n" for line in sweeps)
-            + "Then doctor, delay, calibrate, fit-servo and export, as for any recording.",
-            soft_wrap=True,
+            + "Then doctor, delay, calibrate, fit-servo and export, as for any recording."
         )
 
 

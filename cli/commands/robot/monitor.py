@@ -19,7 +19,7 @@ from pupper_sysid.cli.live_views import LiveViews, Wanted, live_views
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, error_words
-from pupper_sysid.hardware.connect import open_bus
+from pupper_sysid.hardware.safety.guard import open_bus
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
 
@@ -81,7 +81,13 @@ class Monitor:
             if self.once or self.json:
                 self._watch(watched, _ONCE_S if self.seconds is None else self.seconds)
                 if self.json:
-                    terminal.print_json(watched.as_data(bus_name(self.bus)))
+                    terminal.print_json(
+                        {
+                            "bus": bus_name(self.bus), "joints": watched.rows(),
+                            "joint_map": bus.metadata.get("joint_map"),
+                            "coordinates": bus.metadata.get("coordinates"),
+                        }
+                    )  # fmt: skip
                 else:
                     terminal.out.print(watched.table(bus_name(self.bus)))
                 return
@@ -186,15 +192,6 @@ class Watched:
             count = "" if row["count"] is None else f"{row['count']} cts"
             notes.append(" ".join(filter(None, [row["errors"], word, age, count])))
         scope.notes(notes)
-
-    def as_data(self, bus_name: str) -> dict[str, Any]:
-        """The table as plain data."""
-        return {
-            "bus": bus_name,
-            "joint_map": self.bus.metadata.get("joint_map"),
-            "coordinates": self.bus.metadata.get("coordinates"),
-            "joints": self.rows(),
-        }
 
     def rows(self) -> list[dict[str, Any]]:
         """One dict per joint; None where the bus has no value."""

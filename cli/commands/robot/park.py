@@ -108,7 +108,7 @@ def _take(note: Note, seconds: float, say: bool = True) -> bool:
     if not settled and not is_there(note.address) and not can_come_back(note.address):
         told, settled = f"gone for good; {may_be_on(note.joints)}", True
     if settled or say:
-        terminal.err.print(f"{where}: {told}", soft_wrap=True)
+        terminal.err.print(f"{where}: {told}")
     if not on:
         restore(note.address, note.joint_map, note.registers)
     if settled:  # last: what is interrupted here is said again, not lost

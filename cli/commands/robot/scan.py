@@ -57,9 +57,9 @@ class Scan:
         for servo in servos:
             table.add_row(*_cells(servo))
         terminal.out.print(table)
-        terminal.warn(fault for servo in servos for fault in servo.faults)
+        terminal.warn(*(fault for servo in servos for fault in servo.faults))
         for remark in report.remarks:
-            terminal.err.print(remark, soft_wrap=True)
+            terminal.err.print(remark)
 
     def _everywhere(self) -> None:
         """Try all serial ports, and the proxy's socket."""
@@ -85,11 +85,11 @@ class Scan:
             return
         for report in reports:
             self._show(report)
-            terminal.out.print(f"Use it with --bus {report.family}:{report.device}", soft_wrap=True)
+            terminal.out.print(f"Use it with --bus {report.family}:{report.device}")
         for device, why in silent.items():
-            terminal.err.print(f"{device}: {why}", soft_wrap=True)
+            terminal.err.print(f"{device}: {why}")
         if proxy:
-            terminal.out.print("A Mini Pupper 2's proxy is here: --bus esp32", soft_wrap=True)
+            terminal.out.print("A Mini Pupper 2's proxy is here: --bus esp32")
         if not reports and not proxy:
             listed = ", ".join(ports) or "none"
             raise BusError(

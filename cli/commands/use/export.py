@@ -96,7 +96,7 @@ class Export:
         if self.json:
             terminal.print_json({"written": str(target)})
         else:
-            terminal.err.print(f"Wrote {target}.", soft_wrap=True)
+            terminal.err.print(f"Wrote {target}.")
 
     def _policy(self, folder: Path) -> Path:
         if self.to not in ("onnx", "torchscript"):
@@ -114,7 +114,7 @@ class Export:
 
     def _servo_model(self, folder: Path) -> Path:
         from pupper_sysid.servo_models.servo_file import load_servo_model
-        from pupper_sysid.sysid.export.servo_networks import ENDINGS, export_servo_model
+        from pupper_sysid.sysid.export.network import ENDINGS, export_servo_model
 
         if self.to not in ("csv", "onnx", "torchscript"):
             raise InputError(
@@ -135,7 +135,7 @@ class Export:
             load_calibration,
         )
         from pupper_sysid.servo_models.cards.files import is_card
-        from pupper_sysid.sysid.export.servo_card import to_csv
+        from pupper_sysid.sysid.export.tidy_table import to_csv
         from pupper_sysid.sysid.recordings.files import load
 
         if path.name in ("contract.json", "weights.safetensors"):
@@ -170,7 +170,7 @@ class Export:
             )
         else:
             found = load(path)
-            terminal.warn(found.warnings)
+            terminal.warn(*found.warnings)
         target = self.out or Path(path.name).with_suffix(".tidy.csv" if kind == ".csv" else ".csv")
         to_csv(found, target, self.force)
         return target
@@ -185,13 +185,12 @@ class Export:
         }
         found = calibration.at_p_gain(gain)
         for sentence in sorted(said):
-            terminal.err.print(sentence, soft_wrap=True)
+            terminal.err.print(sentence)
         return found
 
     def _bam(self, path: Path, card: bool) -> Path:
         """A servo card as a parameter file of BAM."""
-        from pupper_sysid.servo_models.cards.bam import not_in_bam, to_bam_json
-        from pupper_sysid.servo_models.cards.files import load_card
+        from pupper_sysid.servo_models.cards.files import load_card, not_in_bam, to_bam_json
 
         if not card:
             raise InputError(
@@ -201,7 +200,7 @@ class Export:
         found = load_card(self.source)
         target = self.out or Path(f"{path.name.removesuffix(path.suffix)}_bam.json")
         write_text(target, to_bam_json(found), self.force)
-        terminal.warn(not_in_bam(found))
+        terminal.warn(*not_in_bam(found))
         return target
 
     def _check(self, calibration: Calibration, links: dict[str, float]) -> None:
@@ -237,7 +236,7 @@ class Export:
                 parts.add_row(name, *(n(1e3 * cost, 2) for cost in row.step_rad.values()))
             terminal.out.print(parts)
         for sentence in checked.notes:
-            terminal.err.print(sentence, soft_wrap=True)
+            terminal.err.print(sentence)
 
     def _simulator(self, path: Path, calibration: Calibration, links: dict[str, float]) -> Path:
         """The calibration for another simulator."""
@@ -256,18 +255,15 @@ class Export:
         write_text(target, text, self.force)
         terminal.err.print(
             f"For a physics step of {1e3 * servos.physics_step_s:g} ms (--physics-step).",
-            *servos.operating_points(), sep="\n", soft_wrap=True,
-        )  # fmt: skip
+            *servos.operating_points(), sep="\n")  # fmt: skip
         absent = [n for n in calibration.joint_names if n not in servos.calibration.joint_names]
         if absent and not isinstance(calibration, CardCalibration):
-            terminal.warn([f"{self.model} has no joint {', '.join(absent)}; left out."])
+            terminal.warn(f"{self.model} has no joint {', '.join(absent)}; left out.")
         if servos.with_link:
             terminal.warn(
-                [
-                    f"{', '.join(servos.with_link)}: {INCLUDES_LINK[0].lower()}{INCLUDES_LINK[1:]} "
-                    "For example --link-inertia "
-                    f"{servos.with_link[0]}=0.0002, or --to mjcf --model robot.xml."
-                ]
+                f"{', '.join(servos.with_link)}: {INCLUDES_LINK[0].lower()}{INCLUDES_LINK[1:]} "
+                "For example --link-inertia "
+                f"{servos.with_link[0]}=0.0002, or --to mjcf --model robot.xml."
             )
         return target
 

@@ -12,8 +12,7 @@ import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError, refuse_outside
-from pupper_sysid.servo_models.calibration.operating_point import ARMATURES
-from pupper_sysid.servo_models.calibration.parts import P_GAINS
+from pupper_sysid.servo_models.calibration.parts import ARMATURES, P_GAINS
 
 if TYPE_CHECKING:
     from pupper_sysid.servo_models.calibration.calibration import InputFile
@@ -64,10 +63,9 @@ class List:
         ours = any(not card.published for card in cards.values())
         terminal.err.print(
             ("* fitted here, all others cited. " if ours else "All are cited from others. ")
-            + "`pupper-sysid servo show NAME` says where from. An armature with + holds the link.",
-            soft_wrap=True,
+            + "`pupper-sysid servo show NAME` says where from. An armature with + holds the link."
         )
-        terminal.warn(doubts)
+        terminal.warn(*doubts)
 
 
 @dataclass(frozen=True)

@@ -196,7 +196,7 @@ def test_reading_times_are_those_of_the_measurement_within_0_3_ms(firmware, requ
 DRIVER = """
 import sys, time
 from pupper_sysid.hardware.address import parse_address
-from pupper_sysid.hardware.connect import open_guarded
+from pupper_sysid.hardware.safety.guard import open_guarded
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.serial_servos import line
 line.REPLY_TIMEOUT_S = 0.1  # the servos share a busy machine with their driver

@@ -14,9 +14,8 @@ import pytest
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.bus import header_entries
-from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.feetech import PROTECTIONS, SCS0009, STS3215, FeetechBus, FeetechLine
-from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
 from support.servo_servers import (
@@ -167,7 +166,7 @@ def test_the_torque_stays_off_if_a_servo_does_not_take_its_protection(sts):
 CHANGED = """
 import sys, time
 from pupper_sysid.hardware.address import parse_address
-from pupper_sysid.hardware.connect import open_guarded
+from pupper_sysid.hardware.safety.guard import open_guarded
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.serial_servos import line
 line.REPLY_TIMEOUT_S = 0.1  # the servos share a busy machine with their driver

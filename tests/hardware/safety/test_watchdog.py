@@ -18,12 +18,11 @@ import pytest
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.hardware.address import BusAddress, parse_address
-from pupper_sysid.hardware.connect import open_guarded
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lock import LOG
 from pupper_sysid.hardware.safety import limp as limp_module
 from pupper_sysid.hardware.safety import watchdog_process
-from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
 from pupper_sysid.hardware.safety.watchdog import Watchdog
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.bus import EmulatedBus
@@ -55,7 +54,7 @@ DRIVER = f"""{PATIENT}
 import sys, time
 import numpy as np
 from pupper_sysid.hardware.address import parse_address
-from pupper_sysid.hardware.connect import open_guarded
+from pupper_sysid.hardware.safety.guard import open_guarded
 bus = open_guarded(parse_address(sys.argv[1]))
 pose = bus.read().position_rad
 while not np.isfinite(pose).all():

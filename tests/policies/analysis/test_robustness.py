@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pupper_sysid.cli.commands.analyze.robustness import Delay
+from pupper_sysid.cli.commands.analyze.walks import Delay
 from pupper_sysid.policies.analysis import figures
 from pupper_sysid.policies.analysis.attractor import orbits
 from pupper_sysid.policies.analysis.autonomy import Autonomy, RatePoint, frozen, push_response

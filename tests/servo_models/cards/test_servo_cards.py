@@ -13,10 +13,16 @@ import pytest
 from pupper_sysid.common.data_sheet import data_sheet, recorded_stall_torque, stall_torque
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
-from pupper_sysid.servo_models.cards.bam import ACTUATORS, BamParameters, from_bam, to_bam
 from pupper_sysid.servo_models.cards.card import ServoCard
 from pupper_sysid.servo_models.cards.compare import Comparison, compared, servo_of
-from pupper_sysid.servo_models.cards.files import card_names, load_card
+from pupper_sysid.servo_models.cards.files import (
+    ACTUATORS,
+    BamParameters,
+    card_names,
+    from_bam,
+    load_card,
+    to_bam,
+)
 from pupper_sysid.servo_models.cards.numbers import PositionLoop, TorquePD, stated
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
 from pupper_sysid.servo_models.loaded_servo import LoadedServo

@@ -10,8 +10,8 @@ import pytest
 
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.feetech import STS3215, FeetechBus
+from pupper_sysid.hardware.joint_calibration import lerobot_calibration, read_lerobot
 from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.hardware.lerobot_calibration import lerobot_calibration, read_lerobot
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.bench import ServoBench

@@ -20,7 +20,7 @@ from pupper_sysid.sysid.recordings.recording import Recording, Trial
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import servo_data
 from pupper_sysid.sysid.servo_fit.fit import ServoFit, Split, fit_servo
-from pupper_sysid.sysid.servo_fit.readings import run_with_offset, with_ages
+from pupper_sysid.sysid.servo_fit.scores import run_with_offset, with_ages
 from support.package import ROOT
 from support.runs import PAD, run_of
 from support.servo_recordings import JOINT, recording, trial

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
-from pupper_sysid.servo_models.calibration.operating_point import ARMATURES, OperatingPoint
+from pupper_sysid.servo_models.calibration.parts import ARMATURES, OperatingPoint
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sim.emulator.bus import EmulatedBus

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks.card_of_fits import to_card, to_drive_card
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import JOINT_NAMES
@@ -20,7 +21,7 @@ from pupper_sysid.servo_models.cards.card import Source
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.cards.numbers import LoadedLoop, TorquePD
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
-from pupper_sysid.sysid.export.servo_card import CALIBRATION_COLUMNS, to_card, to_csv, to_drive_card
+from pupper_sysid.sysid.export.tidy_table import CALIBRATION_COLUMNS, to_csv
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
 from pupper_sysid.sysid.fit.joint_fit import LoadedFit, StructureFit
 from pupper_sysid.sysid.recordings.files import load

@@ -26,7 +26,7 @@ from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import FileExistsRefusal, InputError, PupperError
 from pupper_sysid.servo_models.networks import RecurrentNetwork
 from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model, save_servo_model
-from pupper_sysid.sysid.export.servo_networks import ENDINGS, export_servo_model, parameter_table
+from pupper_sysid.sysid.export.network import ENDINGS, export_servo_model, parameter_table
 from support.command_line import refused, run
 from support.refusals import assert_each_refused
 from support.saved_servo_models import JOINTS, KINDS, P, arrays, commands, contract, saved

@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 
 from pupper_sysid.sysid.doctor.examination import examine
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
+from pupper_sysid.sysid.feedback.slips import find_upsets, without_commands
 from pupper_sysid.sysid.feedback.staleness import episodes, quantum, staleness
-from pupper_sysid.sysid.feedback.upsets import find_upsets, without_commands
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 from support.real_recordings import real_recording

@@ -12,8 +12,8 @@ import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
+from pupper_sysid.servo_models.calibration.parts import RecordedLoad, UnderLoad
 from pupper_sysid.servo_models.calibration.quantity import Quantity
-from pupper_sysid.servo_models.calibration.under_load import RecordedLoad, UnderLoad
 from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
 from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.fit.calibrate import calibrate

@@ -11,7 +11,7 @@ import pytest
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.sim.export.export import SIMULATORS, exported_text
-from pupper_sysid.sysid.export.servo_card import to_csv
+from pupper_sysid.sysid.export.tidy_table import to_csv
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
 from pupper_sysid.sysid.fit.operating_point import reference_gain, with_operating_points
 from pupper_sysid.sysid.fit.preparation import scales_of

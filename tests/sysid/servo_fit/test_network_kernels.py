@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from pupper_sysid.sysid.servo_fit.kernels import Lstm, Mlp
+from pupper_sysid.sysid.servo_fit.training import Lstm, Mlp
 
 ROUNDING = 1e-5  # of 32 bits, summed over some hundred terms
 

@@ -1,4 +1,4 @@
-"""`report`: everything about some recordings as one page, with its figures and tables."""
+"""`report` and `samples`: findings as one page, and sample files to try everything with."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from pathlib import Path
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.common.files import refuse_overwrite, resolved
+from pupper_sysid.cli.commands.common import OfRecordings
+from pupper_sysid.common.files import refuse_overwrite, resolved, write_bytes
 
 
 @dataclass(frozen=True)
-class Report:
+class Report(OfRecordings):
     """Write one HTML page that opens anywhere, with its figures as PNG and SVG, its tables as CSV.
 
     Example: pupper-sysid report recordings/sweep.csv --out reports/sweep
@@ -21,10 +22,6 @@ class Report:
     Example: pupper-sysid report --open
     """
 
-    recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
-    """Recordings, pooled per joint; by default the newest in recordings/."""
-    joints: str = "all"
-    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
     out: Path | None = None
     """Folder to write; by default reports/ and the first recording's name."""
     calibration: Path | None = None
@@ -35,10 +32,6 @@ class Report:
     """Show it in the browser when it is written."""
     force: bool = False
     """Replace files of a report that is there already."""
-    json: bool = False
-    """Print one JSON object that names the files written, and nothing else."""
-    seed: int = 0
-    """Seed of the bootstrap and of the models' global starts."""
 
     def run(self) -> None:
         """Examine, measure, calibrate, write."""
@@ -46,8 +39,7 @@ class Report:
         from pupper_sysid.servo_models.calibration.calibration import load_calibration
         from pupper_sysid.sysid.report.report import PAGE, write_report
 
-        recordings = terminal.load_all(self.recordings)
-        joints = terminal.pick_joints(recordings, self.joints)
+        recordings, joints = self.load()
         folder = self.out or Path("reports") / recordings[0].name
         refuse_overwrite(folder / PAGE, self.force)
         calibration = load_calibration(self.calibration) if self.calibration else None
@@ -67,6 +59,44 @@ class Report:
             )
         else:
             hint = "" if self.open else " Open it in a browser, or add --open."
-            terminal.err.print(f"Wrote {written.path}.{hint}", soft_wrap=True)
+            terminal.err.print(f"Wrote {written.path}.{hint}")
         if self.open and not webbrowser.open(resolved(written.path).as_uri()):
-            terminal.warn([f"No browser could be started here; open {written.path} yourself."])
+            terminal.warn(f"No browser could be started here; open {written.path} yourself.")
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Copy the samples into a folder: recordings with their truth, a calibration, policies, an arm.
+
+    README.md beside them says how each was made.
+
+    Example: pupper-sysid samples
+
+    Example: pupper-sysid delay samples/sweep.csv
+    """
+
+    out: tyro.conf.Positional[Path] = Path("samples")
+    """Folder to write; made if missing."""
+    force: bool = False
+    """Replace files that exist."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+    def run(self) -> None:
+        """Copy the files, then name them."""
+        from pupper_sysid.data import SAMPLES
+
+        sources = [p for p in sorted(SAMPLES.rglob("*")) if p.is_file()]
+        files = {self.out / p.relative_to(SAMPLES): p for p in sources}
+        for target in files:  # before the first is written
+            refuse_overwrite(target, self.force)
+        for target, source in files.items():
+            write_bytes(target, source.read_bytes(), self.force)
+        if self.json:
+            terminal.print_json({"files": list(files)})
+            return
+        for target in files:
+            terminal.out.print(f"  {target}")
+        terminal.err.print(
+            f"Wrote {len(files)} files. Next: pupper-sysid delay {self.out / 'sweep.csv'}"
+        )

@@ -1,33 +1,20 @@
-"""Exports of a calibration: servo cards (`servo_models.cards`) of fits under load, and tidy CSV.
-
-A tidy table is for a spreadsheet or for pandas, of a calibration or of a recording. Both open with
-comment lines (`# key: JSON value`) on the origin of the numbers; `pandas.read_csv(path,
-comment="#")` skips them. A calibration becomes one row per joint and quantity; a recording becomes
-a recording file of this project, from whatever layout it was read.
-"""
+"""Servo cards of fits under load: what `servo_cards.py` writes into `servo_models/cards/data`."""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
 
 from pupper_sysid.common.data_sheet import stall_torque
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import write_text
-from pupper_sysid.servo_models.calibration.calibration import Calibration, InputFile, utc_now
-from pupper_sysid.servo_models.calibration.parts import JointCalibration
-from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
+from pupper_sysid.servo_models.calibration.calibration import InputFile, utc_now
+from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.cards.card import Gains, Score, ServoCard, Source
 from pupper_sysid.servo_models.cards.numbers import LOADED_KEYS, LoadedLoop, TorquePD
 from pupper_sysid.sysid.fit.joint_fit import LoadedFit
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.recordings.table import comments
 
 _TORQUES = (
     "stall_torque", "back_emf", "armature", "friction_loss", "stribeck_friction", "torque_limit",
@@ -76,7 +63,7 @@ def to_card(
     notes : sequence of str
         Sentences for the reader.
     """
-    first = _first(fits)
+    first = _first_fit(fits)
     volts = first.reference_voltage_v if supply_v is None else supply_v
     if not volts > 0:
         raise InputError(f"{name}: the recordings hold no supply voltage. Give `supply_v`.")
@@ -133,7 +120,7 @@ def to_drive_card(
     notes : sequence of str
         Sentences for the reader.
     """
-    _first(fits)
+    _first_fit(fits)
     set_there = "set in the drive and stated by the recording; the scale of all torques"
     specimens = {}
     for specimen, fit in fits.items():
@@ -168,7 +155,7 @@ def to_drive_card(
     )  # fmt: skip
 
 
-def _first(fits: Mapping[str, LoadedFit]) -> LoadedFit:
+def _first_fit(fits: Mapping[str, LoadedFit]) -> LoadedFit:
     if not fits:
         raise InputError("A servo card needs a fit. Name a joint that was fitted.")
     return next(iter(fits.values()))
@@ -252,64 +239,3 @@ def _scores(specimen: str, fit: LoadedFit) -> list[Score]:
             )
         )  # fmt: skip
     return told
-
-
-CALIBRATION_COLUMNS = (
-    "joint", "part", "quantity", "unit", "value", "low", "high", "identified", "why",
-)  # fmt: skip
-
-
-def to_csv(source: Calibration | Recording, path: Path | None = None, force: bool = False) -> str:
-    """`source` as CSV text, written to `path` if one is given.
-
-    Parameters
-    ----------
-    source : Calibration or Recording
-        A calibration gives the columns `CALIBRATION_COLUMNS`: `part` is where the quantity stands
-        in the calibration file (`actuator`, `feedback`, `lag`, `scores`, …), `low` and `high` are
-        the ends of its 90 % interval, and a number that is not a measured quantity (a score, a
-        count of steps) leaves the last four empty. What the calibration does not hold has no row.
-        A recording gives its rows with the columns of `sysid.recordings.recording`.
-    path : Path, optional
-        Where to write; nothing is written without it.
-    force : bool
-        Replace `path` if it exists.
-    """
-    text = _calibration(source) if isinstance(source, Calibration) else source.to_csv()
-    if path is not None:
-        write_text(path, text, force)
-    return text
-
-
-def _calibration(calibration: Calibration) -> str:
-    header = calibration.model_dump(mode="json", by_alias=True, exclude={"joints"})
-    header["operating_points"] = {
-        name: joint.holds_at.model_dump(mode="json") for name, joint in calibration.joints.items()
-    }
-    buffer = io.StringIO()
-    buffer.write(comments("pupper-sysid calibration table", header))
-    # text is quoted: a '#' in a sentence must not begin a comment
-    table = csv.writer(buffer, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n")
-    buffer.write(",".join(CALIBRATION_COLUMNS) + "\n")
-    for name, joint in calibration.joints.items():
-        table.writerows([name, *row] for row in _rows(joint))
-    return buffer.getvalue()
-
-
-def _rows(joint: JointCalibration) -> Iterator[list[Any]]:
-    """Part, quantity, unit, value, low, high, identified, why of all numbers of one joint."""
-    parts: dict[str, BaseModel] = {
-        "actuator": joint.actuator,
-        "ratios_to_armature": joint.actuator.ratios_to_armature,
-        "scale": joint.actuator.scale,
-        "feedback": joint.feedback,
-        "lag": joint.lag,
-        "scores": joint.scores,
-    }
-    for part, model in parts.items():
-        for name, entry in model:
-            if isinstance(entry, Quantity):
-                numbers = [entry.value, entry.low, entry.high]
-                yield [part, name, unit_of(name), *numbers, entry.identified, entry.why]
-            elif isinstance(entry, int | float):
-                yield [part, name, unit_of(name), entry, "", "", "", ""]

@@ -1,4 +1,4 @@
-"""`import`: another project's log as a recording of this one."""
+"""`import` and `view`: another project's log as a recording, a recording for other viewers."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import tyro
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.cli.live_views import refuse_file
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, resolved
+from pupper_sysid.common.joints import JOINT_NAMES
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ class Import:
 
         name = plain_stem(resolved(self.log))
         out = self.out or Path(f"{name}.csv")
-        if _same(out, self.log):
+        if out.exists() and self.log.exists() and out.samefile(self.log):  # also by links
             if self.out:
                 raise InputError(f"--out {out} is the log itself. Choose another name.")
             out = Path(f"{name}_recording.csv")
@@ -90,7 +93,7 @@ class Import:
             options = merged(options, read_mapping(self.mapping))
         recording = load(self.log, options)
         recording.save(out, self.force)
-        terminal.warn(recording.warnings)
+        terminal.warn(*recording.warnings)
         layout = recording.metadata.get("imported_from", "recording of this project")
         if self.json:
             terminal.print_json(
@@ -116,7 +119,7 @@ class Import:
                   for c in ("command_rad", "position_rad")),
             )  # fmt: skip
         terminal.out.print(shown)
-        terminal.err.print(f"Wrote {out}. Next: pupper-sysid doctor {out}", soft_wrap=True)
+        terminal.err.print(f"Wrote {out}. Next: pupper-sysid doctor {out}")
 
 
 def _names(text: str) -> dict[str, str]:
@@ -127,6 +130,53 @@ def _names(text: str) -> dict[str, str]:
     return {name: name for name in names}
 
 
-def _same(one: Path, other: Path) -> bool:
-    """Whether both are one file, also by links."""
-    return one.exists() and other.exists() and one.samefile(other)
+@dataclass(frozen=True)
+class View:
+    """Write a recording as a file for Rerun (.rrd) or Foxglove (.mcap).
+
+    Commands, readings and their ages per joint; with Rerun also the robot in three dimensions.
+    Example: pupper-sysid view recordings/sweep.csv --rerun sweep.rrd
+    """
+
+    recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Recording to show; by default the newest in recordings/."""
+    rerun: Path | None = None
+    """File to write for Rerun, .rrd."""
+    mcap: Path | None = None
+    """File to write in ROS 2's messages for Foxglove, .mcap; `import` reads it back."""
+    model: Path | None = None
+    """MJCF or URDF of the robot that Rerun shows; by default it is the Mini Pupper where the joints
+    are."""
+    force: bool = False
+    """Replace files that exist."""
+
+    def run(self) -> None:
+        """Read and write."""
+        from pupper_sysid.sysid.view.files import write_mcap, write_rerun
+
+        wanted = {"rerun": self.rerun, "mcap": self.mcap}
+        if self.rerun is None and self.mcap is None:
+            raise InputError("Nothing to write: give --rerun FILE.rrd, --mcap FILE.mcap or both.")
+        if self.model is not None and self.rerun is None:
+            raise InputError("--model: only a Rerun file shows the robot; add --rerun FILE.rrd.")
+        for option, path in wanted.items():
+            if path is not None:
+                refuse_file(option, path, self.force)
+        recordings = terminal.load_all(self.recordings)
+        if len(recordings) != 1:
+            raise InputError(f"view: {len(recordings)} recordings were given; give one.")
+        (recording,) = recordings
+        if self.mcap is not None:
+            write_mcap(recording, self.mcap, self.force)
+        if self.rerun is not None:
+            time_s, bodies = np.empty(0), []
+            if self.model is not None or set(recording.joints) <= set(JOINT_NAMES):
+                from pupper_sysid.policies.twin.drawing import robot_over_time
+
+                time_s, bodies = robot_over_time(recording, self.model)
+            write_rerun(recording, self.rerun, time_s, bodies, self.force)
+        for path in wanted.values():
+            if path is not None:
+                terminal.out.print(f"Wrote {path}")
+        if self.rerun is not None:
+            terminal.out.print(f"Next:\n  rerun {self.rerun}")
