@@ -692,6 +692,7 @@ def _in_free_air(
         r_hat=choice.carried.r_hat,
         effective_draws=choice.carried.effective,
         between_recordings=by_number(choice.repeats),
+        differences=_differences(ready.joint, choice),
         presets={
             name: score_preset(by_joint[ready.joint], runs)
             for name, by_joint in (presets or {}).items()
@@ -825,13 +826,18 @@ def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) ->
         yield choice.misfit.sentence(joint)
     own = choice.carried
     yield from _foreign(joint, own)
-    if choice.repeats is not None:
-        yield from (d.sentence(joint) for d in choice.repeats.differences)
+    yield from _differences(joint, choice)
     if not (own.r_hat <= R_HAT and own.effective >= EFFECTIVE):
         yield (
             f"{joint}: the draws have not converged (R̂ {own.r_hat:.2f}, {own.effective:.0f} "
             "effective); intervals may be too narrow."
         )
+
+
+def _differences(joint: str, choice: _Choice) -> tuple[str, ...]:
+    if choice.repeats is None:
+        return ()
+    return tuple(each.sentence(joint) for each in choice.repeats.differences)
 
 
 def _candidate_fit(
@@ -1100,6 +1106,7 @@ def _under_load(
         r_hat=choice.carried.r_hat,
         effective_draws=choice.carried.effective,
         between_recordings=by_number(choice.repeats),
+        differences=_differences(ready.joint, choice),
         presets={},
         warnings=(
             *lag.warnings, *ready.warnings(), *_fit_warnings(ready.joint, goodness, choice),

@@ -170,6 +170,8 @@ class JointCalibrationResult(Result):
         R̂ of the draws behind the intervals, and how many independent ones they are worth.
     between_recordings : dict of str to float
         Standard deviation between several recordings of the logarithm of a fitted number.
+    differences : tuple of str
+        Recordings that differ from the others, and in which number, in sentences.
     loaded : LoadedFit or None
         The servo at any gain and load, where the recordings tell of a load or several gains.
     runs : tuple of Run
@@ -189,6 +191,7 @@ class JointCalibrationResult(Result):
     r_hat: float = float("nan")
     effective_draws: float = float("nan")
     between_recordings: dict[str, float] = field(default_factory=dict)
+    differences: tuple[str, ...] = ()
     loaded: LoadedFit | None = None
     runs: tuple[Run, ...] = internal(default=())
 

@@ -82,7 +82,11 @@ def _summary(results: Mapping[str, JointCalibrationResult]) -> Section:
     return Section(
         "found",
         "What was found",
-        findings=[(joint, str(r.lag)) for joint, r in results.items()],
+        findings=[
+            (joint, text)
+            for joint, r in results.items()
+            for text in (str(r.lag), *(d.removeprefix(f"{joint}: ") for d in r.differences))
+        ],
         notes=[
             "Raw lag: from a command's row to the position's row, as a cross-correlation of the "
             "log measures it. Only the servo's own part belongs to a simulated actuator; stale "
@@ -284,7 +288,7 @@ def _parameters(found: Findings, parameters: Table) -> Section:
         tables=[tables.parameter_matrix(parameters)],
         notes=shared(
             {
-                joint: [w for w in r.warnings if w not in r.lag.warnings]
+                joint: [w for w in r.warnings if w not in (*r.lag.warnings, *r.differences)]
                 for joint, r in found.results.items()
             }
         ),

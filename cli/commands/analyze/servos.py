@@ -124,6 +124,11 @@ class ServoDemand(Commanded):
             )
         if len(self.policies) != 1:
             raise InputError("One gait at a time: name one policy.")
+        (policy,) = self.policies
+        if Path(policy).is_file() and Path(policy).suffix != ".onnx":
+            raise InputError(
+                f"{policy} holds no policy. Give a run, a policy folder, or an ONNX file (.onnx)."
+            )
         check_actuator(self.servo)
         card = is_card(self.servo)
         known = not card or load_card(self.servo).pd().dead_time_s is not None
