@@ -205,11 +205,6 @@ class ForeignPolicy:
         Complete: metadata and YAML together.
     notes : sequence of str
         What was assumed, in sentences.
-
-    Raises
-    ------
-    InputError
-        If numbers of joints, actions and observation do not go together.
     """
 
     def __init__(self, network: OnnxNetwork, about: PolicyYaml, notes: Sequence[str] = ()):
@@ -257,11 +252,6 @@ class ForeignPolicy:
         path : Path
         config : Path, optional
             The YAML; by default the file of the same name, if there is one.
-
-        Raises
-        ------
-        InputError
-            If either cannot be used, or something is missing; the sentence says what to add.
         """
         return cls.of(OnnxNetwork(path), config)
 
@@ -300,11 +290,6 @@ class ForeignPolicy:
             MJCF; None for the Mini Pupper 2.
         robot_config : Path, optional
             YAML of the robot (`sim.robot.robot_file`); a pose in it goes before the policy's.
-
-        Raises
-        ------
-        InputError
-            If a joint of the policy is not the robot's, or the pose is beyond its limits.
         """
         step_s = float(self.about.control_step_s or 0.0)
         substeps = int(np.ceil(step_s / EVALUATION_STEP_S - 1e-6))
@@ -470,13 +455,7 @@ class ForeignPolicy:
 
 
 def exported_policy(network: OnnxNetwork) -> Policy | None:
-    """The policy of a file that this project exported, with its contract; None for others.
-
-    Raises
-    ------
-    InputError
-        If the contract is damaged, or not that of the network.
-    """
+    """The policy of a file that this project exported, with its contract; None for others."""
     text = network.metadata.get("contract")
     if text is None:
         return None
@@ -498,11 +477,6 @@ def servos_of_training(policy: ForeignPolicy, task: Walking, robot: Path | None)
 
     Those of the MJCF's position actuators, with the stiffness and damping of the metadata
     (joint_stiffness, joint_damping), where they are there. Readings are exact.
-
-    Raises
-    ------
-    InputError
-        If the MJCF has no such actuator for a joint.
     """
     metadata, body = policy.network.metadata, task.body
     servos = position_servos(robot) if robot is not None else {}

@@ -72,11 +72,6 @@ def assemble(
         Calibration or preset with which the policy was trained, if not with `actuator`.
     body : Body, optional
         The robot; the Mini Pupper 2 by default.
-
-    Raises
-    ------
-    InputError
-        If a part is missing, damaged, or for another rate.
     """
     contract = policy.contract
     period = stack.period_s(contract)
@@ -115,13 +110,7 @@ def assemble(
 def reassemble(
     policy: Policy, header: dict[str, Any], log: Path, body: Body | None = None
 ) -> Controller:
-    """The controller of a log, from its header; `body` is another robot than the Mini Pupper 2.
-
-    Raises
-    ------
-    InputError
-        If the policy, or a file it was used with, is not what it was.
-    """
+    """The controller of a log, from its header; `body` is another robot than the Mini Pupper 2."""
     try:
         if header["policy_sha256"] != policy.contract.weights_sha256:
             raise InputError(f"{log} was made with another policy. Give that one.")

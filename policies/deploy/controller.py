@@ -72,11 +72,6 @@ class Controller:
         Of the bus, in joint coordinates: limits, and the linkage of the knees.
     stall_torque_nm : float
         Torque at a reported load of 1 [N·m].
-
-    Raises
-    ------
-    InputError
-        If the policy expects another observation.
     """
 
     def __init__(

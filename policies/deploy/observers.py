@@ -57,11 +57,6 @@ class Observer(ABC):
         Control period [s].
     joints : int
         Number of joints.
-
-    Raises
-    ------
-    InputError
-        If the period is not positive, or another parameter is out of range.
     """
 
     name: str
@@ -71,13 +66,7 @@ class Observer(ABC):
         self.reset(np.zeros(joints))
 
     def reset(self, position: ArrayLike) -> None:
-        """Rest at `position` [rad], shape (..., 12), its target and reading so far.
-
-        Raises
-        ------
-        InputError
-            If it is of another number of joints, or not finite.
-        """
+        """Rest at `position` [rad], shape (..., 12), its target and reading so far."""
         position = np.array(position, float)
         if position.shape[-1:] != (self.joints,):
             raise InputError(
@@ -98,11 +87,6 @@ class Observer(ABC):
             Command of this period [rad].
         reading : array_like, shape (..., 12)
             Reading at its end [rad]; NaN where there is none.
-
-        Raises
-        ------
-        InputError
-            If one that is used has another shape than at `reset`, or a target is not finite.
         """
 
     def _target(self, target: ArrayLike) -> Array:
@@ -139,12 +123,6 @@ class SyntheticPD(Observer):
         Lowest and highest position, scalars or arrays of 12 [rad]. A joint that reaches one stops.
     joints : int
         Number of joints, where they are not twelve.
-
-    Raises
-    ------
-    InputError
-        If a parameter is out of range, of another number of joints, or the time step so long that
-        the integration would explode.
     """
 
     name = "synthetic-pd"
@@ -188,11 +166,6 @@ class SyntheticPD(Observer):
         Stiffness 70, damping 1.2, inertia 0.20, friction 0.03, delay 9 control steps at 50 Hz and 5
         at 25 Hz. It resonates: near 3 Hz its gain is three. As in the authors' final controller its
         torque has no limit, and the effort it reports is 0.
-
-        Raises
-        ------
-        InputError
-            If the rate is neither 50 nor 25 Hz: nothing was published for others.
         """
         delay = next((n for t, n in _PAPER_DELAY_STEPS.items() if abs(t - period_s) < 1e-9), None)
         if delay is None:
@@ -282,11 +255,6 @@ class ServoModelObserver(Observer):
         Of all twelve joints, in order, one step per control period; the observer owns its state.
     period_s : float
         Control period [s].
-
-    Raises
-    ------
-    InputError
-        If the model is of other joints or another rate.
     """
 
     name = "servo-model"
@@ -392,11 +360,6 @@ def make_observer(
         For `servo-model`.
     joints : int
         Number of joints.
-
-    Raises
-    ------
-    InputError
-        If a servo model is needed and none is given, or it does not fit.
     """
     if kind == "readings":
         return HeldEncoder(period_s, velocity_steps, joints)

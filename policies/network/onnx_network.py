@@ -58,11 +58,6 @@ class OnnxNetwork:
         Parts of the state of a recurrent network.
     metadata : dict of str to str
         The file's own properties.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or is no policy; the sentence says what is wrong with it.
     """
 
     def __init__(self, path: Path):

@@ -35,13 +35,7 @@ def judged_weights(content: dict[str, Any]) -> dict[str, torch.Tensor]:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Content of a checkpoint, without executing anything in it.
-
-    Raises
-    ------
-    InputError
-        If there is none, or it is damaged.
-    """
+    """Content of a checkpoint, without executing anything in it."""
     if not path.exists():
         raise InputError(f"{path} does not exist. Give the folder of a run that has a checkpoint.")
     data = read_bytes(path, LARGEST_CHECKPOINT, _ANOTHER)

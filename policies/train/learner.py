@@ -133,11 +133,6 @@ class Learner:
         Whether a loaded checkpoint goes on exactly; see `PupperEnv.restore`.
     taken_back : bool
         Whether the last update was undone, because it changed the actions too much.
-
-    Raises
-    ------
-    InputError
-        If a recurrent policy has fewer environments than minibatches.
     """
 
     def __init__(
@@ -353,13 +348,7 @@ class Learner:
         return all(bool(torch.isfinite(t).all()) for t in whole)
 
     def save(self, path: Path, more: dict[str, Any]) -> None:
-        """Write a checkpoint in one atomic step; the one before survives if that fails.
-
-        Raises
-        ------
-        InputError
-            If it cannot be written, for example because the disk is full.
-        """
+        """Write a checkpoint in one atomic step; the one before survives if that fails."""
         hidden = self.actor.get_hidden_state()
         content = {
             "schema": CHECKPOINT_SCHEMA,
@@ -383,13 +372,7 @@ class Learner:
         write_bytes(path, buffer.getvalue(), force=True)
 
     def load(self, path: Path) -> dict[str, Any]:
-        """Return to a checkpoint exactly; returns the `more` of `save`.
-
-        Raises
-        ------
-        InputError
-            If it is damaged, or of another architecture or environment.
-        """
+        """Return to a checkpoint exactly; returns the `more` of `save`."""
         content = read_checkpoint(path)
         if content["architecture"] != self.architecture.kind:
             raise InputError(

@@ -48,11 +48,6 @@ def refuse_impossible(run: Any) -> None:
     ----------
     run : Run
         `policies.train.run_file.Run`; `seed` is any whole number from 0 on.
-
-    Raises
-    ------
-    InputError
-        With the setting's name, as the command line and the file have it.
     """
     for name, value in _numbers(run, ""):
         low, high = _RANGES.get(name, (-_LARGEST, _LARGEST))

@@ -181,13 +181,7 @@ def _teacher(kind: Kind) -> Run:
 
 
 def with_robot(run: Run, robot: str | Path, robot_config: str | Path | None) -> Run:
-    """The run for another robot than the Mini Pupper 2, its task scaled by that one's size.
-
-    Raises
-    ------
-    InputError
-        If the files do not describe a robot that can walk.
-    """
+    """The run for another robot than the Mini Pupper 2, its task scaled by that one's size."""
     task = for_robot(run.task, robot, robot_config)
     mirror = run.learner.mirror and task.body.mirror_joints is not None
     return replace(run, task=task, learner=replace(run.learner, mirror=mirror))
@@ -214,13 +208,7 @@ def teacher_of(run: Run) -> Run:
 
 
 def check_teacher(folder: Path, run: Run) -> Run:
-    """Settings of a teacher's run, which `run` is to learn from.
-
-    Raises
-    ------
-    InputError
-        If the folder holds no such run, or its actions or its clock mean something else.
-    """
+    """Settings of a teacher's run, which `run` is to learn from."""
     own = load_run(folder)
     if not own.architecture.privileged_actor:
         raise InputError(
@@ -240,13 +228,7 @@ def check_teacher(folder: Path, run: Run) -> Run:
 
 
 def load_run(folder: Path) -> Run:
-    """Settings of the run in `folder`.
-
-    Raises
-    ------
-    InputError
-        If there is none, or they cannot be understood.
-    """
+    """Settings of the run in `folder`."""
     path = folder / RUN_FILE
     model = create_model("File", settings=(_model_of(Run), ...))
     data, lines = _read(path)
@@ -255,13 +237,7 @@ def load_run(folder: Path) -> Run:
 
 
 def resume_run(folder: Path, iterations: int | None, minutes: float | None) -> Run:
-    """Settings of a resumed run, perhaps with a new end, which is written to its file.
-
-    Raises
-    ------
-    InputError
-        If they cannot be understood, or the actuator's file is not what it was.
-    """
+    """Settings of a resumed run, perhaps with a new end, which is written to its file."""
     path, run = folder / RUN_FILE, load_run(folder)
     before, source = _read(path)[0].get("actuator_sha256"), Path(run.actuator)
     if before and not source.is_file():
@@ -321,13 +297,7 @@ def _dataclass_of(kind: type, settings: Any) -> Any:
 
 
 def save_run(folder: Path, run: Run) -> None:
-    """Write the settings of a run that begins.
-
-    Raises
-    ------
-    InputError
-        If the folder holds a run already.
-    """
+    """Write the settings of a run that begins."""
     refuse_taken(folder)
     _write(folder / RUN_FILE, run)
 

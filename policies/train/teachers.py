@@ -216,11 +216,6 @@ def load_teacher(folder: Path, checkpoint: str, run: Run, seen: TensorDict) -> M
         That is to learn from it.
     seen : TensorDict
         Observations of its environment, for their sizes.
-
-    Raises
-    ------
-    InputError
-        If the folder holds no such run, or its actions mean something else.
     """
     own = check_teacher(folder, run)
     content = read_checkpoint(folder / checkpoint)

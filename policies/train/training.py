@@ -78,13 +78,7 @@ def make_env(run: Run, ranks: Ranks, servos: ServoRanges | None = None) -> Puppe
 
 
 def learner_device(run: Run, ranks: Ranks) -> str:
-    """Torch's name of the device on which the networks of this process learn.
-
-    Raises
-    ------
-    InputError
-        If there is no such device.
-    """
+    """Torch's name of the device on which the networks of this process learn."""
     wanted = run.device if run.learner_device == "as-device" else run.learner_device
     if wanted != "cuda":
         return "cpu"

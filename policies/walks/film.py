@@ -39,11 +39,6 @@ class Film:
         Said in every picture: policy, servos.
     command : sequence of float, length 3
         Forward and sideways speed [m/s], turn rate [rad/s].
-
-    Raises
-    ------
-    InputError
-        If no frames can be drawn here, or the package imageio is missing.
     """
 
     def __init__(

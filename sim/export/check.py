@@ -94,13 +94,7 @@ class Check(JointResults[JointCheck]):
 
 
 def check(servos: ExportedServos) -> Check:
-    """Simulate an export in MuJoCo beside its calibration.
-
-    Raises
-    ------
-    InputError
-        If the step is too long for the servos.
-    """
+    """Simulate an export in MuJoCo beside its calibration."""
     names = servos.calibration.joint_names
     tones, walk = unseen_tones(), walk_commands()
     model = compiled(servos)

@@ -57,13 +57,7 @@ def foreign_servo(path: Path | str, joint: str | None = None) -> Servo:
 
 
 def position_servos(path: Path) -> dict[str, Servo]:
-    """Servos that the position actuators of an MJCF make of its joints, by joint; may be none.
-
-    Raises
-    ------
-    InputError
-        If MuJoCo cannot compile the file.
-    """
+    """Servos that the position actuators of an MJCF make of its joints, by joint; may be none."""
     model, driven = _compiled(path)
     return {name: _driven_servo(path, model, name, i) for name, i in driven.items()}
 

@@ -231,11 +231,6 @@ def body_of(robot: str, robot_config: str, knee: Knee = "linkage") -> Body:
         Paths of a MJCF and of its YAML; both empty for the Mini Pupper 2.
     knee : {"linkage", "serial"}
         Of the Mini Pupper.
-
-    Raises
-    ------
-    InputError
-        If a file is missing, or does not describe a legged robot.
     """
     if not robot:
         return mini_pupper(knee)

@@ -91,11 +91,6 @@ def replay(
         0 for all cores.
     progress : callable
         Called with the share that is done.
-
-    Raises
-    ------
-    InputError
-        If a servo is not stable in physics steps of 2 ms, or its dead time is negative.
     """
     from mujoco.batch import Batch  # needs mujoco 4; its message names the module
 

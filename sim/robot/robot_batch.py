@@ -77,12 +77,6 @@ class RobotBatch:
         What else differs from the model.
     linked : tuple of int
         Servos that turn their joint and the one before it.
-
-    Raises
-    ------
-    InputError
-        If a servo is not stable in such physics steps, a dead time does not fit its buffer, or the
-        servo model is of other joints or another rate.
     """
 
     def __init__(

@@ -74,11 +74,6 @@ def body_from_file(path: Path, config: Path | None) -> Body:
     path : Path
     config : Path or None
         Its YAML.
-
-    Raises
-    ------
-    InputError
-        If a file is missing, a name in it is not there, or the robot is none that can walk.
     """
     if not path.is_file():
         raise InputError(f"There is no {path}. Give the robot's MJCF as `robot`.")

@@ -69,11 +69,6 @@ def joint_map_of(
         Type of all servos; one of `SERVOS`.
     lerobot : mapping of str to LeRobotJoint, optional
         LeRobot's calibration of the arm, whose ids, directions and ranges are then taken.
-
-    Raises
-    ------
-    InputError
-        If MuJoCo cannot read the file, or it has no hinge that a servo turns.
     """
     hinges = hinges_of(path)
     if not hinges:
@@ -116,11 +111,6 @@ def joint_map_of_servos(ids: Mapping[str, int], servo: str) -> RobotMap:
         Servo id of each joint.
     servo : str
         Type of all servos; one of `SERVOS`.
-
-    Raises
-    ------
-    InputError
-        If a name cannot be a joint's, or an id is no servo's or there twice.
     """
     hinges = [Hinge(name, True, -_UNKNOWN_RAD, _UNKNOWN_RAD, driven=True) for name in ids]
     source = f"names and ids as stated, for {servo} servos; centres, signs and limits are guesses"

@@ -63,11 +63,6 @@ def actuator_attributes(parameters: DelayedPDParameters, time_step_s: float) -> 
     """Attributes of the `<pid>` actuator: delay, gains, limits.
 
     An infinite `effort_limit` or `velocity_limit` leaves its attribute out.
-
-    Raises
-    ------
-    InputError
-        If the dead time is negative or not finite.
     """
     delay = float(np.asarray(parameters.dead_time_s))
     if not (np.isfinite(delay) and delay >= 0):
@@ -157,11 +152,6 @@ def for_commands_between_steps(
 
     That keeps the timing of commands that come between steps, and delays them by one step, which is
     taken off the dead time here.
-
-    Raises
-    ------
-    InputError
-        If the dead time is shorter than two steps: MuJoCo takes the rest for a whole step.
     """
     delay = float(np.asarray(parameters.dead_time_s))
     if not delay >= 2 * time_step_s:

@@ -82,11 +82,6 @@ def robot_of(path: Path, recorded: Sequence[str]) -> ServoRobot:
     path : Path
     recorded : sequence of str
         Joints of the recordings.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or lacks a recorded joint.
     """
     hinges = {hinge.name: hinge for hinge in hinges_of(path)}  # also holds it to limits
     if missing := [joint for joint in recorded if joint not in hinges]:

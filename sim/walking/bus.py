@@ -49,11 +49,6 @@ def calibrated_robot(
     body : Body, optional
         The robot, of which the servos are; the Mini Pupper 2 by default. Others read as fine as the
         calibration's servos.
-
-    Raises
-    ------
-    InputError
-        If a servo is not stable in the emulator's physics steps.
     """
     feedback = servos.feedback
     spec = RobotSpec(
@@ -102,11 +97,6 @@ class WalkingBus:
     ----------
     robot : WalkingRobot
         The robot behind the bus.
-
-    Raises
-    ------
-    InputError
-        If a servo's dead time is too short to emulate.
     """
 
     name = "emulated"

@@ -90,11 +90,6 @@ class WalkingRobot:
         Physics step [s].
     body : Body, optional
         The Mini Pupper 2 by default; the servos are in the order of its joints.
-
-    Raises
-    ------
-    InputError
-        If a dead time is shorter than two physics steps.
     """
 
     def __init__(

@@ -28,13 +28,7 @@ _PER_SPEED = ("bounce", "foot_slip", "mechanical_power", "clearance_speed")
 
 
 def for_robot(task: Walking, robot: str | Path, robot_config: str | Path | None) -> Walking:
-    """A task of the Mini Pupper, for the robot in a MJCF and its YAML.
-
-    Raises
-    ------
-    InputError
-        See `sim.robot.robot_file.body_from_file`.
-    """
+    """A task of the Mini Pupper, for the robot in a MJCF and its YAML."""
     task = replace(
         task, robot=str(Path(robot).resolve()),
         robot_config=str(Path(robot_config).resolve()) if robot_config else "",

@@ -152,11 +152,6 @@ def servo_ranges(
         calibration, whose feedback is taken.
     body : Body, optional
         The robot; the Mini Pupper 2 by default.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be read.
     """
     joints = JOINT_NAMES if body is None else body.joints
     servo_of = {} if body is None else body.servo_of
@@ -254,13 +249,7 @@ def is_servo_model(actuator: str | Path) -> bool:
 
 
 def servo_model_of(actuator: str | Path, control_step_s: float) -> JointArrays | None:
-    """The learned servo model in a folder; None for anything that is not a folder.
-
-    Raises
-    ------
-    InputError
-        If it is damaged, is not for all joints or this rate, or is no learned model.
-    """
+    """The learned servo model in a folder; None for anything that is not a folder."""
     if not is_servo_model(actuator):
         return None
     model = load_servo_model(Path(actuator), JOINT_NAMES, control_step_s).model
@@ -273,13 +262,7 @@ def servo_model_of(actuator: str | Path, control_step_s: float) -> JointArrays |
 
 
 def check_actuator(actuator: str) -> None:
-    """Refuse what is neither a preset, nor a shipped card, nor `ideal`, nor something that exists.
-
-    Raises
-    ------
-    InputError
-        If it is none of them.
-    """
+    """Refuse what is neither a preset, a shipped card, `ideal`, nor something that exists."""
     if actuator != IDEAL and not is_shipped(actuator) and not Path(actuator).exists():
         near = difflib.get_close_matches(actuator, (*PRESETS, IDEAL), n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
