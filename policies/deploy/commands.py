@@ -32,13 +32,8 @@ def constant(
 ) -> Commands:
     """A constant command.
 
-    Parameters
-    ----------
-    command : (float, float, float)
-    trained : CommandRanges, optional
-        To clip it to.
-    say : callable
-        Called with a sentence if it is clipped.
+    It is clipped to the ranges of the training, where they are known; `say` is then called with a
+    sentence.
     """
     value = checked_command(command)
     if trained is not None:

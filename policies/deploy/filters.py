@@ -151,14 +151,8 @@ class ComplementaryFilter:
     def step(self, gyro_rad_s: ArrayLike, acceleration_m_s2: ArrayLike, dt_s: float) -> Attitude:
         """Rate and gravity after one more sample.
 
-        Parameters
-        ----------
-        gyro_rad_s : array_like, shape (3,)
-            With the gyro's bias.
-        acceleration_m_s2 : array_like, shape (3,)
-            Specific force.
-        dt_s : float
-            Measured time since the last sample [s]; less than 1 ms counts as 1 ms.
+        The rate has the gyro's bias, the acceleration is the specific force, shape (3,) each;
+        `dt_s` is the measured time since the last sample, at least 1 ms.
         """
         rate = _finite(gyro_rad_s, (3,), "A gyro's sample") - self._bias
         force = _finite(acceleration_m_s2, (3,), "An accelerometer's sample")
@@ -176,10 +170,7 @@ class ComplementaryFilter:
 def at_rest(gyro_rad_s: ArrayLike, acceleration_m_s2: ArrayLike) -> Rest:
     """The gyro's bias and the first direction of gravity, from samples of a robot at rest.
 
-    Parameters
-    ----------
-    gyro_rad_s, acceleration_m_s2 : array_like, shape (samples, 3)
-        About a second of them, 50 or so, in the trunk's frame.
+    About a second of samples, 50 or so, in the trunk's frame, shape (samples, 3).
     """
     rates = np.asarray(gyro_rad_s, float)
     forces = np.asarray(acceleration_m_s2, float)

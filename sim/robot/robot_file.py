@@ -69,11 +69,7 @@ class RobotFile(BaseModel):
 def body_from_file(path: Path, config: Path | None) -> Body:
     """The body of a robot's MJCF.
 
-    Parameters
-    ----------
-    path : Path
-    config : Path or None
-        Its YAML.
+    `config` is its YAML.
     """
     if not path.is_file():
         raise InputError(f"There is no {path}. Give the robot's MJCF as `robot`.")

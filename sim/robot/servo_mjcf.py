@@ -114,32 +114,6 @@ def free_air_xml(servos: Sequence[DelayedPDParameters], time_step_s: float) -> s
     )
 
 
-def pendulum_xml(
-    servo: DelayedPDParameters, mass_kg: float, length_m: float, time_step_s: float
-) -> str:
-    """MJCF of a servo, `joint0`, that swings a point mass; at 0 it hangs straight down.
-
-    The load is a body and gravity is on, so the servo's armature is its own.
-
-    Parameters
-    ----------
-    servo : DelayedPDParameters
-    mass_kg, length_m : float
-        The mass, and its distance from the axis.
-    time_step_s : float
-    """
-    joint = attributes({"name": "joint0"} | joint_attributes(servo, time_step_s))
-    option = (
-        f'<option timestep="{_number(time_step_s)}" integrator="{INTEGRATOR}" gravity="0 0 -9.81"/>'
-    )
-    return (
-        f'<mujoco>{option}<worldbody><body><joint type="hinge" axis="0 1 0" {joint}/>'
-        f'<inertial pos="0 0 {_number(-length_m)}" mass="{_number(mass_kg)}" '
-        'diaginertia="1e-15 1e-15 1e-15"/></body></worldbody>'
-        f"<actuator>{pid_element({'joint': 'joint0'}, servo, time_step_s)}</actuator></mujoco>"
-    )
-
-
 def attributes(values: Mapping[str, str]) -> str:
     """As they stand in an MJCF element."""
     return " ".join(f'{name}="{value}"' for name, value in values.items())

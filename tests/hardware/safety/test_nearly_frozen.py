@@ -11,7 +11,7 @@ from pupper_sysid.common.errors import InputError, SafetyStop
 from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
 from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.pendulum_bench import (
+from pupper_sysid.sim.emulator.pendulum import (
     BenchSpec,
     Pendulum,
     PendulumBench,

@@ -10,7 +10,7 @@ import pytest
 from pupper_sysid.common.errors import BusError, InputError, SafetyStop
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.pendulum_bench import (
+from pupper_sysid.sim.emulator.pendulum import (
     BenchSpec,
     Pendulum,
     PendulumBench,
