@@ -30,7 +30,7 @@ from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.dynamixel import DynamixelEmulator
-from pupper_sysid.sim.emulator.pendulum_bench import (
+from pupper_sysid.sim.emulator.pendulum import (
     Pendulum,
     PendulumBench,
     draw_bench,

@@ -15,8 +15,7 @@ from pupper_sysid.common.files import resolved, sha256
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, is_shipped
 from pupper_sysid.sim.walking.config import PRESETS as WALKING
-from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.scaled import for_robot
+from pupper_sysid.sim.walking.config import Walking, for_robot
 from pupper_sysid.sim.walking.servo_ranges import IDEAL, ServoRanges, check_actuator, servo_ranges
 
 if TYPE_CHECKING:

@@ -57,12 +57,7 @@ def claim(
 ) -> Callable[[Callable[[Evidence], Finding]], Callable[[Evidence], Claim]]:
     """Decorate a function of evidence so that it returns a row of the report.
 
-    Parameters
-    ----------
-    id, text, paper : str
-        See `Claim`.
-    how : str
-        How it is measured.
+    `how` says how it is measured; the others are those of `Claim`.
     """
 
     def decorate(look: Callable[[Evidence], Finding]) -> Callable[[Evidence], Claim]:
@@ -92,10 +87,7 @@ _COLUMNS = ("id", "ours", "verdict")
 def differences(found: Sequence[Claim], beside: Path) -> list[dict[str, str]]:
     """Claims that another page judges otherwise.
 
-    Returns
-    -------
-    list of dict of str to str
-        `id`, `claim`, `here`, `verdict`, `there` and `verdict_there` of each such claim.
+    Each has `id`, `claim`, `here`, `verdict`, `there` and `verdict_there`.
     """
     text = read_text(beside)
     header = text.split("\n", 1)[0].strip().split(",")

@@ -86,15 +86,8 @@ def gather(
 ) -> PolicyEvidence:
     """Run every analysis.
 
-    Parameters
-    ----------
-    name : str
-    policy : Policy
-    trial : Trial
-    run_folder : Path or None
-        With its training's curve and settings.
-    progress : callable
-        Called with the name of the next analysis.
+    The run's folder has its training's curve and settings; `progress` is called with the name of
+    the next analysis.
     """
     rng = np.random.default_rng(trial.seed)
 

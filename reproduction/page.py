@@ -6,25 +6,62 @@ Beside them lie the pictures as PNG and SVG and the tables as CSV.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.policy_choice import chosen_actuator, policy_at, run_folder
 from pupper_sysid.cli.terminal import err, out, print_json
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.figure_style import JOINT_COLOURS, axes_column, styled
 from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_text
+from pupper_sysid.common.page import Column, Picture, Section, Table, write_page
+from pupper_sysid.policies.analysis import figures
+from pupper_sysid.policies.analysis.attractor import DELAYS_MS
+from pupper_sysid.policies.deploy.stacks import STACKS
+from pupper_sysid.servo_models.servo_file import WEIGHTS
+from pupper_sysid.sysid.report.figures import sweep_figure
+from reproduction import servos as servo_claims
+from reproduction import walks as walk_claims
+from reproduction.claims import Claim, differences
+from reproduction.evidence import KINDS, PolicyEvidence, gather, over
+from reproduction.policies import judge
+from reproduction.servos import ServoEvidence
+from reproduction.walks import Walker, compare_stacks
 
 if TYPE_CHECKING:
     from pupper_sysid.cli.commands.analyze.common import Tries
-    from pupper_sysid.common.page import Picture, Section
     from reproduction.__main__ import Options
-    from reproduction.claims import Claim
-    from reproduction.evidence import PolicyEvidence
-    from reproduction.servos import ServoEvidence
+
+_SHOWN_S = 2.0
+_THIGH = 1  # LF thigh, as the paper draws
+
+
+@styled
+def delay_trace_figure(
+    actions: Mapping[str, Sequence[NDArray[np.floating]]], delays_ms: Sequence[float], step_s: float
+) -> Figure:
+    """The LF thigh's action over two seconds, a panel per delay, a line per policy."""
+    figure, axes = axes_column(len(delays_ms), 1.9 * len(delays_ms))
+    count = round(_SHOWN_S / step_s)
+    time = step_s * np.arange(count)
+    for i, (one, delay) in enumerate(zip(axes, delays_ms, strict=True)):
+        for k, (policy, conditions) in enumerate(actions.items()):
+            one.plot(
+                time, conditions[i][:count, _THIGH], "-" if k == 0 else "--",
+                color=JOINT_COLOURS[k], label=policy,
+            )  # fmt: skip
+        one.set(title=f"joints late by {delay:g} ms", ylabel="rad", xlim=(0, time[-1]))
+    axes[-1].set_xlabel("time [s]")
+    axes[0].legend(fontsize=7, loc="upper right")
+    return figure
+
 
 PAGE, REPORT = "claims.md", "claims.html"
 PICTURES = (
@@ -40,17 +77,10 @@ _STACK_COMMANDS = ((0.15, 0.0, 0.0), (0.0, 0.08, 0.0), (0.0, 0.0, 0.4))
 
 def write_claims(options: Options, tries: Tries) -> None:
     """Gather, judge, draw and write."""
-    from pupper_sysid.common.page import write_page
-    from reproduction import servos as servo_claims
-    from reproduction import walks as walk_claims
-    from reproduction.claims import differences
-    from reproduction.evidence import KINDS, gather
-    from reproduction.policies import judge
-
     page, report = options.out / PAGE, options.out / REPORT
-    figures = [f"figures/{name}{ending}" for name in PICTURES for ending in (".png", ".svg")]
+    drawings = [f"figures/{name}{ending}" for name in PICTURES for ending in (".png", ".svg")]
     tables = [f"tables/{name}.csv" for name in TABLES]
-    for name in (PAGE, REPORT, *figures, *tables):  # before hours of work
+    for name in (PAGE, REPORT, *drawings, *tables):  # before hours of work
         refuse_overwrite(options.out / name, options.force)
     if options.beside is not None:
         differences([], options.beside)
@@ -105,8 +135,6 @@ def _stacks(options: Options) -> list[dict[str, Any]]:
     """Closed loop against the servo model's prediction, walked by the first policy."""
     if options.servo is None:
         return []
-    from pupper_sysid.policies.deploy.stacks import STACKS
-    from reproduction.walks import Walker, compare_stacks
 
     policy, run = policy_at(options.policies[0])
     actuator = chosen_actuator(options.policies[0], policy, run, options.actuator)
@@ -135,10 +163,6 @@ def _played(robot: ServoEvidence) -> dict[str, tuple[np.ndarray, np.ndarray, np.
 def _draw(evidence: list[PolicyEvidence], robot: ServoEvidence) -> list[Picture]:
     """What can be shown of the evidence."""
     from pupper_sysid.common.page import Picture
-    from pupper_sysid.policies.analysis import figures
-    from pupper_sysid.policies.analysis.attractor import DELAYS_MS
-    from pupper_sysid.sysid.report.figures import sweep_figure
-    from reproduction.figures import delay_trace_figure
 
     made: list[Picture] = []
     if robot.sweep is not None:
@@ -245,8 +269,6 @@ def _sections(
     pictures: list[Picture], inputs: dict[str, str], options: Options,
 ) -> list[Section]:  # fmt: skip
     """The report as a page in the style of the others."""
-    from pupper_sysid.common.page import Column, Section, Table
-
     claims = tuple(
         {**c.to_dict(), "here": c.ours + (f" (90 %: {_bounds(c)})" if c.interval else "")}
         for c in found
@@ -356,8 +378,6 @@ def _versions() -> str:
 
 def _inputs(options: Options, tries: Tries) -> dict[str, str]:
     """SHA-256 of everything the page rests on, by name."""
-    from pupper_sysid.servo_models.servo_file import WEIGHTS
-
     found = {
         f"policy {name}": policy.contract.weights_sha256 for name, (policy, _) in tries.items()
     }
@@ -377,8 +397,6 @@ def _bounds(claim: Claim) -> str:
 
 def _table_one(evidence: list[PolicyEvidence]) -> tuple[list[str], list[tuple[str, list[str]]]]:
     """A column per architecture: their names, and rows of a title and a cell for each."""
-    from reproduction.evidence import KINDS, over
-
     kinds = [k for k in KINDS if any(e.kind == k for e in evidence)]
     known = [e for e in evidence if e.trained]
     rows: dict[str, Any] = {

@@ -67,7 +67,6 @@ def judge(evidence: ServoEvidence) -> list[Claim]:
     "Sweeps: lag of all rows, of fresh rows, and of the servo (`pupper-sysid delay`).",
 )  # fmt: skip
 def constant_lag(found: ServoEvidence) -> Finding:
-    """A1."""
     budgets = list(_sweeps(found).values())
     raw, fresh, servo = (
         1e3 * np.mean([getattr(b, k).value for b in budgets])
@@ -93,7 +92,6 @@ def constant_lag(found: ServoEvidence) -> Finding:
     "Sweeps: gain per tone, of all rows and of fresh ones.",
 )  # fmt: skip
 def above_three_hertz(found: ServoEvidence) -> Finding:
-    """A2."""
     tones = [f for d in found.lag.values() for f in d.by_frequency]
     high = [f for f in tones if f.frequency_hz > 3.0]
     if not high:
@@ -114,7 +112,6 @@ def above_three_hertz(found: ServoEvidence) -> Finding:
     "Sweeps: noise of fresh readings about their tone; share of rows that repeat an old value.",
 )  # fmt: skip
 def reading_noise(found: ServoEvidence) -> Finding:
-    """A3."""
     noise = float(np.mean([d.noise_rad for d in _sweeps(found).values()]))
     fresh = float(np.mean([h.fresh_fraction for h in found.health.values()]))
     return Finding(
@@ -129,7 +126,6 @@ def reading_noise(found: ServoEvidence) -> Finding:
     "Playback, last loop held out, free run from commands alone, per joint.",
 )  # fmt: skip
 def servo_error(found: ServoEvidence) -> Finding:
-    """S1."""
     published, fitted, mlp = (_by_joint(found, name) for name in (PUBLISHED, FITTED, "MLP"))
     return Finding(
         f"published PD {_range(published)}, a fitted PD {_range(fitted)}, MLP {_range(mlp)} mrad",
@@ -143,7 +139,6 @@ def servo_error(found: ServoEvidence) -> Finding:
     "As S1, mean of the joints, 90 % intervals over stretches of time.",
 )  # fmt: skip
 def free_run(found: ServoEvidence) -> Finding:
-    """S2."""
     spans = {k: _servos(found).models[k].rmse_free_run_rad for k in ("LSTM", "MLP")}
     mean = {k: 1e3 * i.value for k, i in spans.items()}
     return Finding(
@@ -159,7 +154,6 @@ def free_run(found: ServoEvidence) -> Finding:
     "As S1, one step ahead of the last reading; beside it persistence (the last reading).",
 )  # fmt: skip
 def one_step(found: ServoEvidence) -> Finding:
-    """S3."""
     servos = _servos(found)
     ahead = {k: 1e3 * servos.models[k].mean.rmse_one_step_rad for k in ("LSTM", "MLP")}
     still = 1e3 * float(np.nanmean(list(servos.persistence_rmse_rad.values())))
@@ -174,7 +168,6 @@ def one_step(found: ServoEvidence) -> Finding:
     "As S1: MLP against the robot's repeatability.",
 )  # fmt: skip
 def enough_data(found: ServoEvidence) -> Finding:
-    """S4."""
     mlp = 1e3 * float(np.mean(_by_joint(found, "MLP")))
     known = [v for v in _servos(found).repeatability_rad.values() if np.isfinite(v)]
     if not known:

@@ -83,7 +83,6 @@ def judge(walks: Sequence[ImuWalk]) -> list[Claim]:
     "10 Hz, and the share of its variance that it explains.",
 )  # fmt: skip
 def rate(walks: Sequence[ImuWalk]) -> Finding:
-    """G4."""
     lstm = [w.gyro.peak_hz[_YAW] for w in _of(walks, "lstm")]
     near = [abs(hz / _PAPER_HZ - 1) < 0.05 for hz in lstm]
     return Finding(
@@ -98,7 +97,6 @@ def rate(walks: Sequence[ImuWalk]) -> Finding:
     "As G4: the share of the turn rate's variance that one sine explains.",
 )  # fmt: skip
 def steadiness(walks: Sequence[ImuWalk]) -> Finding:
-    """G5."""
     lstm = [w.gyro.peak_share[_YAW] for w in _of(walks, "lstm")]
     mlp = [w.gyro.peak_share[_YAW] for w in _of(walks, "mlp")]
     return Finding(
@@ -113,7 +111,6 @@ def steadiness(walks: Sequence[ImuWalk]) -> Finding:
     "IMU logs of the robot's walks: whether its trunk stays upright while it moves.",
 )  # fmt: skip
 def transfer(walks: Sequence[ImuWalk]) -> Finding:
-    """N5."""
     seen = [w for w in walks if np.isfinite(w.tilt_deg)]
     if not seen:
         raise NotTestable("Give IMU logs with accelerations with --imu.")

@@ -12,7 +12,7 @@ periods, on average `mean_age_s = poll_period_s * (1/2 + loss / (1 - loss))`.
 This is the definition, and its simulation in NumPy. Three more modules simulate it; they stay apart
 because each has a random stream of its own, which recordings, checkpoints and exports repeat bit
 for bit, and needs other parts: `sim.emulator.bench` gives the poll instants of one robot at
-any time, with jitter and drift (the emulated buses measure there); `sim.walking.held_readings`
+any time, with jitter and drift (the emulated buses measure there); `sim.walking.senses`
 gives readings of many robots, a control step at a time; `sim.export.torch_servos` is copied into
 exports and needs only torch (`tests/sim` holds each to the mean age above).
 """

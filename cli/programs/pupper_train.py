@@ -43,7 +43,7 @@ from pupper_sysid.sim.walking.rewards.weights import Rewards
 from pupper_sysid.sim.walking.servo_ranges import check_actuator
 
 if TYPE_CHECKING:
-    from pupper_sysid.policies.train.ranks import Ranks
+    from pupper_sysid.policies.train.learner import Ranks
 
 DESCRIPTION = """Train a walking policy in a simulator that moves like the measured robot.
 
@@ -137,7 +137,7 @@ def _run(options: Options, given: list[str]) -> None:
             check_teacher(Path(run.imitation.teacher), run)
     # torch and rsl_rl take seconds to import: only after the settings were checked
     warnings.filterwarnings("ignore", category=UserWarning, module="torch")
-    from pupper_sysid.policies.train.ranks import Ranks
+    from pupper_sysid.policies.train.learner import Ranks
     from pupper_sysid.policies.train.training import train
 
     if options.benchmark:

@@ -12,9 +12,8 @@ in three dimensions.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,12 +67,8 @@ def principal_components(
     joint that hardly moves should count little. Every state counts the same, so conditions count
     by their lengths.
 
-    Parameters
-    ----------
-    conditions : sequence of ndarray, each of shape (..., d)
-        Actions or hidden states, for example (steps, robots, d).
-    count : int
-        How many axes to keep.
+    Conditions are actions or hidden states of shape (..., d), for example (steps, robots, d);
+    `count` axes are kept.
     """
     states = np.concatenate([np.asarray(c, float).reshape(-1, np.shape(c)[-1]) for c in conditions])
     if len(states) <= count or states.shape[1] < count:
@@ -98,26 +93,18 @@ def closure(orbit: NDArray[np.floating], step_s: float, frequency_hz: float) -> 
 
     Root mean square distance between points one period apart, over the one between two points
     drawn at random from the orbit (√2 times its RMS radius). Between samples the orbit is
-    interpolated by a cubic spline, since a period is no whole number of steps.
+    interpolated by a cubic spline, since a period is no whole number of steps. NaN of an orbit that
+    is shorter than two periods, or stays at one point.
 
-    Parameters
-    ----------
-    orbit : ndarray, shape (steps, k)
-        Of one robot; any number of dimensions.
-    step_s : float
-    frequency_hz : float
-        Of the gait.
+    The orbit is of one robot, shape (steps, k) in any number of dimensions; the frequency is its
+    gait's.
     """
     orbit = np.asarray(orbit, float)
     time = step_s * np.arange(len(orbit))
     period = 1.0 / frequency_hz
-    if not time[-1] >= 2 * period:
-        raise InputError(
-            f"An orbit of {time[-1]:.2f} s is too short for two periods of {period:.2f} s."
-        )
     radius2 = ((orbit - orbit.mean(axis=0)) ** 2).sum(axis=1).mean()
-    if not radius2 > 0:
-        raise InputError("The orbit stays at one point: nothing can return to itself.")
+    if not time[-1] >= 2 * period or not radius2 > 0:
+        return NAN
     before = time + period <= time[-1]
     later = CubicSpline(time, orbit)(time[before] + period)
     away2 = ((later - orbit[before]) ** 2).sum(axis=1).mean()
@@ -130,10 +117,7 @@ def area(orbit: NDArray[np.floating]) -> float:
     A half axis a has the variance a²/2. Noise makes a band look rounder than it is; `closure`
     distinguishes noise from an orbit.
 
-    Parameters
-    ----------
-    orbit : ndarray, shape (steps, 2) or (steps, n, 2)
-        Of n robots, each about its own centre.
+    Orbits have the shape (steps, 2), or (steps, n, 2) of n robots, each about its own centre.
     """
     orbit = np.asarray(orbit, float)
     away = (orbit - orbit.mean(axis=0)).reshape(-1, 2)
@@ -142,16 +126,12 @@ def area(orbit: NDArray[np.floating]) -> float:
 
 
 def area_ratio(orbit: NDArray[np.floating], reference: NDArray[np.floating]) -> float:
-    """Area of an orbit over that of `reference`, on the same axes.
+    """Area of an orbit over that of `reference`, on the same axes; NaN if that encloses none.
 
-    Parameters
-    ----------
-    orbit, reference : ndarray, shape (steps, 2) or (steps, n, 2)
+    Both as `area` takes them.
     """
     before = area(reference)
-    if not before > 0:
-        raise InputError("The reference orbit encloses no area.")
-    return area(orbit) / before
+    return area(orbit) / before if before > 0 else NAN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,15 +181,7 @@ def orbits(
             explained=axes.explained.tolist(),
             explained_3=float(axes.explained[:3].sum()),
             participation_ratio=float(axes.participation_ratio),
-            closure=[_or_nan(closure, path, plain.step_s, rate) for path in paths],
-            area_ratio=[_or_nan(area_ratio, path[:, :2], paths[0][:, :2]) for path in paths],
+            closure=[closure(path, plain.step_s, rate) for path in paths],
+            area_ratio=[area_ratio(path[:, :2], paths[0][:, :2]) for path in paths],
         )
     return found
-
-
-def _or_nan(measure: Callable[..., float], *given: Any) -> float:
-    """A measure of an orbit; NaN where nothing moves any more."""
-    try:
-        return measure(*given)
-    except InputError:
-        return NAN

@@ -54,10 +54,9 @@ from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.sim.export.foreign import position_servos
 from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.robot_file import RobotFile
-from pupper_sysid.sim.walking.config import EVALUATION_STEP_S, Walking
+from pupper_sysid.sim.walking.config import EVALUATION_STEP_S, Walking, for_robot
 from pupper_sysid.sim.walking.differences import Differences
 from pupper_sysid.sim.walking.observation import VELOCITY_STEPS, observation_of
-from pupper_sysid.sim.walking.scaled import for_robot
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
 Array = NDArray[np.float64]
@@ -198,18 +197,7 @@ _KEYS = {
 class ForeignPolicy:
     """A policy of another trainer, in the place of a `Policy` in a walk.
 
-    Parameters
-    ----------
-    network : OnnxNetwork
-    about : PolicyYaml
-        Complete: metadata and YAML together.
-    notes : sequence of str
-        What was assumed, in sentences.
-
-    Raises
-    ------
-    InputError
-        If numbers of joints, actions and observation do not go together.
+    `about` is complete, metadata and YAML together; `notes` are sentences about what was assumed.
     """
 
     def __init__(self, network: OnnxNetwork, about: PolicyYaml, notes: Sequence[str] = ()):
@@ -252,16 +240,7 @@ class ForeignPolicy:
     def load(cls, path: Path, config: Path | None = None) -> ForeignPolicy:
         """Read an ONNX file and the YAML beside it.
 
-        Parameters
-        ----------
-        path : Path
-        config : Path, optional
-            The YAML; by default the file of the same name, if there is one.
-
-        Raises
-        ------
-        InputError
-            If either cannot be used, or something is missing; the sentence says what to add.
+        `config` is the YAML; by default the file of the same name, if there is one.
         """
         return cls.of(OnnxNetwork(path), config)
 
@@ -294,36 +273,21 @@ class ForeignPolicy:
     def task(self, robot: Path | None, robot_config: Path | None = None) -> Walking:
         """The walking task of this policy's robot, in its default pose.
 
-        Parameters
-        ----------
-        robot : Path or None
-            MJCF; None for the Mini Pupper 2.
-        robot_config : Path, optional
-            YAML of the robot (`sim.robot.robot_file`); a pose in it goes before the policy's.
-
-        Raises
-        ------
-        InputError
-            If a joint of the policy is not the robot's, or the pose is beyond its limits.
+        `robot` is its MJCF, None for the Mini Pupper 2; a pose in `robot_config`
+        (`sim.robot.robot_file`) goes before the policy's.
         """
         step_s = float(self.about.control_step_s or 0.0)
         substeps = int(np.ceil(step_s / EVALUATION_STEP_S - 1e-6))
+        velocity = "true" if any(t.term == "base_lin_vel" for t in self.terms) else "zero"
         base = Walking()
         base = replace(
             base, physics_step_s=step_s / substeps, control_step_s=step_s,
             action_scale=float(np.abs(self.scale).mean()), differences=Differences(),
-            observation=replace(base.observation, noise=False, base_velocity=self._velocity),
+            observation=replace(base.observation, noise=False, base_velocity=velocity),
         )  # fmt: skip
         if robot is None:
             self._refuse_unknown(base.body, "the Mini Pupper 2, which walks without `robot`,")
             return base
-        return self._on(base, robot, robot_config)
-
-    @property
-    def _velocity(self) -> Literal["zero", "true"]:
-        return "true" if any(t.term == "base_lin_vel" for t in self.terms) else "zero"
-
-    def _on(self, base: Walking, robot: Path, robot_config: Path | None) -> Walking:
         settings: dict[str, Any] = {}
         if robot_config is not None:
             content, lines = read_yaml(robot_config)
@@ -422,12 +386,9 @@ class ForeignPolicy:
             value = value * np.array(term.scale, np.float32)
             kept.extend([value] * (kept.maxlen if not kept and kept.maxlen else 1))
             columns.append(_in_order(list(kept)[: term.history], term.newest))
-        self._frames.extend([np.concatenate(columns, axis=1)] * self._missing_frames)
+        missing = 1 if self._frames else self.about.frames
+        self._frames.extend([np.concatenate(columns, axis=1)] * missing)
         return _in_order(list(self._frames), self.about.newest_frame)
-
-    @property
-    def _missing_frames(self) -> int:
-        return 1 if self._frames else self.about.frames
 
     def _value(self, term: Term, parts: Mapping[str, NDArray[np.floating]]) -> NDArray:
         name, count = term.term, len(self._angles[-1])
@@ -450,7 +411,10 @@ class ForeignPolicy:
         if term.joints is not None:
             at = np.array([self._body.joints.index(j) for j in term.joints])
         if name == "joint_vel":
-            return self._velocity_of(term.steps, parts)[:, at]
+            if term.steps == VELOCITY_STEPS:  # the task's own, which knows the time before
+                return parts["joint_velocity"][:, at]
+            past = self._angles[max(len(self._angles) - 1 - term.steps, 0)]
+            return ((self._angles[-1] - past) / np.float32(term.steps * self._step_s))[:, at]
         if name == "joint_effort":
             return parts["joint_effort"][:, at]
         angles = self._angles[-1][:, at]
@@ -461,22 +425,9 @@ class ForeignPolicy:
             away = (self._body.pose[at] - default).astype(np.float32)
         return angles + away
 
-    def _velocity_of(self, steps: int, parts: Mapping[str, NDArray[np.floating]]) -> NDArray:
-        """Joint velocities over some actions, of as many as there were."""
-        if steps == VELOCITY_STEPS:  # the task's own, which knows the time before the first action
-            return parts["joint_velocity"]
-        past = self._angles[max(len(self._angles) - 1 - steps, 0)]
-        return (self._angles[-1] - past) / np.float32(steps * self._step_s)
-
 
 def exported_policy(network: OnnxNetwork) -> Policy | None:
-    """The policy of a file that this project exported, with its contract; None for others.
-
-    Raises
-    ------
-    InputError
-        If the contract is damaged, or not that of the network.
-    """
+    """The policy of a file that this project exported, with its contract; None for others."""
     text = network.metadata.get("contract")
     if text is None:
         return None
@@ -498,11 +449,6 @@ def servos_of_training(policy: ForeignPolicy, task: Walking, robot: Path | None)
 
     Those of the MJCF's position actuators, with the stiffness and damping of the metadata
     (joint_stiffness, joint_damping), where they are there. Readings are exact.
-
-    Raises
-    ------
-    InputError
-        If the MJCF has no such actuator for a joint.
     """
     metadata, body = policy.network.metadata, task.body
     servos = position_servos(robot) if robot is not None else {}

@@ -149,18 +149,9 @@ def phases(signal: Signal, step_s: float, frequency_hz: float) -> Array:
     averaged over two strides under a Hann window): the angle of its mean product with the first
     channel's. A wandering rhythm moves all channels alike and leaves these phases as they are.
 
-    Parameters
-    ----------
-    signal : ndarray, shape (steps, channels)
-        For feet: contacts, or thigh angles.
-    step_s : float
-    frequency_hz : float
-
-    Returns
-    -------
-    ndarray, shape (channels,)
-        From -0.25 up to 0.75, so that neither 0 (together) nor 0.5 (in turn) is at the border;
-        NaN where a channel, or the first, does not change.
+    The signal (steps, channels) is of feet: contacts, or thigh angles. Phases, shape (channels,),
+    are from -0.25 up to 0.75, so that neither 0 (together) nor 0.5 (in turn) is at the border; NaN
+    where a channel, or the first, does not change.
     """
     y = standardised(signal)
     angle = 2 * np.pi * frequency_hz * times(len(y), step_s)
@@ -177,14 +168,7 @@ def diagonal_coordination(contact: NDArray[np.bool_]) -> float:
     φ is Pearson's r of two booleans: 1 in a trot, 0 if independent, below 0 if they take turns
     (pace, bound). A pronk has 1, too: see `phases`.
 
-    Parameters
-    ----------
-    contact : ndarray of bool, shape (steps, 4)
-
-    Returns
-    -------
-    float
-        NaN if one of the feet never changes.
+    Contacts have the shape (steps, 4). NaN if one of the feet never changes.
     """
     down = standardised(contact)
     together = (down[:, 0] * down[:, 3]).mean(), (down[:, 1] * down[:, 2]).mean()
@@ -197,11 +181,7 @@ def intervals(down: NDArray[np.bool_], step_s: float) -> Array:
     Stances cut by the ends of the recording have their recorded length. Swings are
     `intervals(~down, …)`.
 
-    Parameters
-    ----------
-    down : ndarray of bool, shape (steps,)
-        Of one foot.
-    step_s : float
+    `down` is of one foot, shape (steps,).
 
     Examples
     --------
@@ -230,16 +210,8 @@ def fast_share(signal: Signal, step_s: float, frequency_hz: float) -> float:
 
     The border is at 2.5 times the gait frequency, midway between harmonics.
 
-    Parameters
-    ----------
-    signal : ndarray, shape (steps, channels)
-    step_s : float
-    frequency_hz : float
-
-    Returns
-    -------
-    float
-        Of the power of all channels; NaN if nothing moves.
+    The signal has the shape (steps, channels). It is that of the power of all channels; NaN if
+    nothing moves.
     """
     y = np.asarray(signal, float)
     away = (y - y.mean(axis=0)) * np.hanning(len(y))[:, None]
@@ -253,9 +225,7 @@ def amplitude(signal: Signal) -> tuple[Array, Array]:
 
     Of a sine of amplitude A they are 0.988 A and 0.707 A.
 
-    Parameters
-    ----------
-    signal : ndarray, shape (steps, …)
+    The signal has the shape (steps, …).
 
     Returns
     -------
@@ -273,10 +243,7 @@ def correlation(actions_a: Signal, actions_b: Signal) -> float:
     A joint that stands still in the second only counts as r = 0; one that stands still in the first
     is left out.
 
-    Parameters
-    ----------
-    actions_a, actions_b : ndarray, shape (steps, 12) or (steps, n, 12)
-        The gait to compare with, and the other.
+    Both have the shape (steps, 12) or (steps, n, 12).
     """
     a, b = (np.asarray(x, float).reshape(len(x), -1) for x in (actions_a, actions_b))
     if a.shape != b.shape:

@@ -51,10 +51,7 @@ def frequency(signal: Signal, step_s: float) -> Interval:
     This interval covers 91-98 % for noise on a steady rhythm and 70-88 % for one that wanders,
     which a few seconds hardly show.
 
-    Parameters
-    ----------
-    signal : ndarray, shape (steps, channels)
-    step_s : float
+    The signal has the shape (steps, channels).
     """
     best = sine_frequency(signal, step_s)
     y = standardised(signal)
@@ -83,10 +80,7 @@ def sine_frequency(signal: Signal, step_s: float) -> float:
     highest point of a periodogram padded to eighths of a bin, refined continuously. A gait and its
     harmonics differ by their size only.
 
-    Parameters
-    ----------
-    signal : ndarray, shape (steps, channels)
-    step_s : float
+    The signal has the shape (steps, channels).
     """
     y = standardised(signal)
     if len(y) * step_s < SHORTEST_S - 1e-9:
@@ -108,16 +102,8 @@ def sine_frequency(signal: Signal, step_s: float) -> float:
 def sine_fit_r2(signal: Signal, step_s: float, frequency_hz: float) -> Array:
     """R² of the least-squares sine of one frequency, with its own phase and offset per channel.
 
-    Parameters
-    ----------
-    signal : ndarray, shape (steps, channels)
-    step_s : float
-    frequency_hz : float
-
-    Returns
-    -------
-    ndarray, shape (channels,)
-        0 for a channel that does not move.
+    The signal has the shape (steps, channels). R² has the shape (channels,); it is 0 for a channel
+    that does not move.
     """
     y = standardised(signal)
     design = sine_design(2 * np.pi * frequency_hz * times(len(y), step_s))
@@ -132,17 +118,8 @@ def null_r2(signal: Signal, step_s: float, rng: np.random.Generator, draws: int 
     The noise is AR(1) with each channel's own autocorrelation at one step, its innovations
     correlated between channels as the channels are.
 
-    Parameters
-    ----------
-    signal : ndarray, shape (steps, channels)
-    step_s : float
-    rng : numpy.random.Generator
-    draws : int
-
-    Returns
-    -------
-    ndarray, shape (draws, channels)
-        Each draw at its own best frequency.
+    The signal has the shape (steps, channels). R² has the shape (draws, channels), each draw at its
+    own best frequency.
     """
     y = standardised(signal)
     steps, channels = y.shape

@@ -252,7 +252,10 @@ def _measured(walked: Rollout) -> dict[str, Any]:
             "share": UNKNOWN if len(robots) else mean_of(shares),
             "drift": UNKNOWN, "arc_rad_m": UNKNOWN, "wander_m": UNKNOWN, "path": np.zeros((0, 2)),
         }  # fmt: skip
-    place = _from_start(walked.position[start:, robots])
+    away = walked.position[start:, robots] - walked.position[start, robots]
+    c, s = np.cos(walked.position[start, robots, 2]), np.sin(walked.position[start, robots, 2])
+    x, y = away[..., 0], away[..., 1]
+    place = np.stack([c * x + s * y, c * y - s * x, away[..., 2]], axis=-1)  # as it stood then
     seconds = walked.step_s * (len(place) - 1)
     speed = float(np.linalg.norm(command))
     nothing = np.full(len(robots), np.nan)
@@ -271,11 +274,3 @@ def _measured(walked: Rollout) -> dict[str, Any]:
         wander = nothing
     measures = {"share": shares, "drift": drift, "arc_rad_m": arc, "wander_m": wander}
     return {k: mean_of(v) for k, v in measures.items()} | {"path": place[:, 0, :2]}
-
-
-def _from_start(position: Array) -> Array:
-    """Places and headings (steps, n, 3) in the frame of the first of them."""
-    away = position - position[0]
-    c, s = np.cos(position[0, :, 2]), np.sin(position[0, :, 2])
-    x, y = away[..., 0], away[..., 1]
-    return np.stack([c * x + s * y, c * y - s * x, away[..., 2]], axis=-1)

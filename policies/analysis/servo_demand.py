@@ -211,7 +211,13 @@ def servo_demand(
     survived = [walk.survival for walk in walks]
     enough = [s >= STILL_UP * survived[0] for s in survived]
     last = enough.index(False) - 1 if False in enough else len(enough) - 1
-    on_it = _walk_on(policy, trial, candidate)
+    try:
+        (on_it,) = walk_together(
+            policy, candidate, [trial.condition()], trial.seconds, trial.seed, trial.threads,
+            _Recorder,
+        )  # fmt: skip
+    except InputError:  # too stiff for the task's physics steps
+        on_it = None
     found = ServoDemand(
         servo=candidate.source,
         walked_on=trial.servos.source,
@@ -240,18 +246,6 @@ def _load(need: Array, speed: Array, own: Mapping[str, Array]) -> tuple[Array, N
     left = own["effort_limit"] - own["back_emf"] * speed * np.sign(need)
     used = np.minimum(np.abs(need) / np.maximum(left, 1e-9), _MOST_USED)
     return used, (used > _TOLERANCE) | (np.abs(speed) > _TOLERANCE * _top_speed(own))
-
-
-def _walk_on(policy: Actor, trial: Trial, candidate: ServoRanges) -> _Kept | None:
-    """The walk on the servo in question; None if it cannot be simulated."""
-    try:
-        (walk,) = walk_together(
-            policy, candidate, [trial.condition()], trial.seconds, trial.seed, trial.threads,
-            _Recorder,
-        )  # fmt: skip
-    except InputError:  # too stiff for the task's physics steps
-        return None
-    return walk
 
 
 def _top_speed(own: Mapping[str, Array]) -> Array:

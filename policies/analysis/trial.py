@@ -83,13 +83,7 @@ class Trial:
         The one with nothing altered is kept per policy: most analyses begin with it. Altered ones
         have no observations and hidden states if there are several.
 
-        Parameters
-        ----------
-        policy : Policy
-        conditions : sequence of Condition
-            See `condition`.
-        part : (float, float)
-            Shares of the analysis that are done before and after.
+        `part` are the shares of the analysis that are done before and after.
         """
         plain = self.condition()
         known = next((r for p, r in self._plain if p is policy), None)

@@ -1,24 +1,31 @@
-"""Assembly of a controller from policy, stack and observer, with a check that they match."""
+"""Assembly of a controller from policy, stack and observer, with checks.
+
+The observer is compared with the training's actuator, and the servos with the training's. While the
+robot walks, `FrozenReadings` compares readings with a model of the servo.
+"""
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, SafetyStop
 from pupper_sysid.common.files import sha256
+from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.policies.deploy.controller import Controller
-from pupper_sysid.policies.deploy.frozen_readings import FrozenReadings
 from pupper_sysid.policies.deploy.observer_match import Match, compare
-from pupper_sysid.policies.deploy.observers import SyntheticPD, make_observer
+from pupper_sysid.policies.deploy.observers import Observer, SyntheticPD, make_observer
 from pupper_sysid.policies.deploy.servo_match import ServoMatch, servo_match
 from pupper_sysid.policies.deploy.stacks import Stack
-from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.network.trained_servo import trained_servo
+from pupper_sysid.policies.network.policy_file import Policy, trained_servo
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.servo_file import WEIGHTS
 from pupper_sysid.sim.robot.body import Body
@@ -30,6 +37,9 @@ from pupper_sysid.sim.walking.servo_ranges import (
     servo_model_of,
     servo_ranges,
 )
+
+if TYPE_CHECKING:
+    from pupper_sysid.policies.deploy.deployment import Tick
 
 
 @dataclass(frozen=True)
@@ -72,11 +82,6 @@ def assemble(
         Calibration or preset with which the policy was trained, if not with `actuator`.
     body : Body, optional
         The robot; the Mini Pupper 2 by default.
-
-    Raises
-    ------
-    InputError
-        If a part is missing, damaged, or for another rate.
     """
     contract = policy.contract
     period = stack.period_s(contract)
@@ -98,7 +103,9 @@ def assemble(
     else:
         of_training = DelayedPDParameters(**servo_ranges(trained, body=body).value)
         match = compare(observer, of_training, period, parameters, pose)
-    controller = Controller(policy, stack, observer, joint_map, _stall_torque(servos))
+    stall = float(np.median(servos.value["effort_limit"]))  # torque at full duty
+    stall = stall if np.isfinite(stall) else 0.0
+    controller = Controller(policy, stack, observer, joint_map, stall)
     ends = (limits.low_rad, limits.high_rad)
     moving = SyntheticPD(parameters, period, limits_rad=ends, joints=len(pose))
     frozen = FrozenReadings(moving, controller.to_servo, controller.joints)
@@ -115,13 +122,7 @@ def assemble(
 def reassemble(
     policy: Policy, header: dict[str, Any], log: Path, body: Body | None = None
 ) -> Controller:
-    """The controller of a log, from its header; `body` is another robot than the Mini Pupper 2.
-
-    Raises
-    ------
-    InputError
-        If the policy, or a file it was used with, is not what it was.
-    """
+    """The controller of a log, from its header; `body` is another robot than the Mini Pupper 2."""
     try:
         if header["policy_sha256"] != policy.contract.weights_sha256:
             raise InputError(f"{log} was made with another policy. Give that one.")
@@ -155,11 +156,82 @@ def _servo_match(policy: Policy, here: ServoRanges, trained: str | None) -> Serv
     return None if own is None else servo_match(own, here)
 
 
-def _stall_torque(servos: ServoRanges) -> float:
-    """Torque at full duty [N·m]."""
-    limit = float(np.median(servos.value["effort_limit"]))
-    return limit if np.isfinite(limit) else 0.0
-
-
 def _hash(path: Path) -> str | None:
     return sha256(path) if path.is_file() else None
+
+
+Array = NDArray[np.float64]
+
+WINDOW_S = 2.0
+"""Longer than any run of lost polls, and than most rests of a live reading."""
+_LATE_S = 0.3  # motion that a reading may not show yet: dead time, servo lag, age
+_MOVED_RAD = 0.03  # five quantisation steps of the robot's proxy; the models' error in free run
+_SAME_RAD = 1e-6
+_FOLLOWS_SHARE = GuardLimits().follows_share  # of the model's motion; less is noise about one place
+_CHECK_EVERY_TICKS = 5
+
+
+class FrozenReadings:
+    """Watcher of a walk: stops it if a reading stays the same while its servo must have moved.
+
+    The guard stops a robot if a command moved by 0.1 rad and the reading did not change
+    (`hardware.safety.monitor`). A hip is commanded less than that in most walks. Less is no
+    evidence by itself: dry friction holds a servo, and servos under load stood still for seconds
+    against commands that moved by 0.05 rad. So the commands are passed through a model of the
+    servo, friction included: where the model moves and the reading does not, the reading is frozen,
+    or the servo is. Where the model does not move either, nothing can be found, and the motion is
+    too small to matter.
+
+    `servos` is a model of them in free run at the loop's period, in servo coordinates, to which
+    `to_servo` converts joint angles [rad].
+    """
+
+    def __init__(
+        self,
+        servos: Observer,
+        to_servo: Callable[[Array], Array],
+        joints: Sequence[str] = JOINT_NAMES,
+    ):
+        self._joints = joints
+        self._servos, self._to_servo = servos, to_servo
+        ticks = round(WINDOW_S / servos.period_s)
+        self._moved: deque[Array] = deque(maxlen=ticks)
+        self._read: deque[Array] = deque(maxlen=ticks)
+        self._late = max(round(_LATE_S / servos.period_s), 1)
+        self._ticks = 0
+
+    def __call__(self, tick: Tick) -> None:
+        """Take a tick.
+
+        Raises
+        ------
+        SafetyStop
+            If a reading has not changed in the last two seconds, but for noise, in which the model
+            moved.
+        """
+        sent = self._to_servo(tick.sent)
+        if not self._ticks:  # after standing still: at rest where it was commanded to be
+            self._servos.reset(sent)
+        self._ticks += 1
+        self._read.append(self._to_servo(tick.reading.position_rad))
+        self._moved.append(self._servos.step(sent, self._read[-1]).position)
+        if len(self._read) == self._read.maxlen and self._ticks % _CHECK_EVERY_TICKS == 0:
+            self._check()
+
+    def _check(self) -> None:
+        moved = np.ptp(np.array(self._moved)[: -self._late], axis=0)
+        read = np.array(self._read)
+        # a joint without any reading is the guard's business
+        spread = np.nanmax(read, axis=0, initial=-np.inf) - np.nanmin(read, axis=0, initial=np.inf)
+        noise = np.maximum(_FOLLOWS_SHARE * moved, _SAME_RAD)
+        frozen = (moved > _MOVED_RAD) & (spread >= 0) & (spread < noise)
+        if frozen.any():
+            k = int(np.argmax(frozen))
+            same = "the same position"
+            if spread[k] >= _SAME_RAD:
+                same = f"positions within {spread[k]:.3f} rad"
+            raise SafetyStop(
+                f"{self._joints[k]} has reported {same} for {WINDOW_S:g} s, in which a "
+                f"servo under its commands moves by {moved[k]:.2f} rad. It is blocked, without "
+                "power, or has stopped answering; switch the servos' power off and on."
+            )

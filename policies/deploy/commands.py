@@ -32,18 +32,8 @@ def constant(
 ) -> Commands:
     """A constant command.
 
-    Parameters
-    ----------
-    command : (float, float, float)
-    trained : CommandRanges, optional
-        To clip it to.
-    say : callable
-        Called with a sentence if it is clipped.
-
-    Raises
-    ------
-    InputError
-        If it is no command.
+    It is clipped to the ranges of the training, where they are known; `say` is then called with a
+    sentence.
     """
     value = checked_command(command)
     if trained is not None:
@@ -52,13 +42,7 @@ def constant(
 
 
 def checked_command(command: tuple[float, float, float]) -> NDArray[np.float64]:
-    """The command as an array, shape (3,).
-
-    Raises
-    ------
-    InputError
-        If it is out of range.
-    """
+    """The command as an array, shape (3,)."""
     value = np.array(command, float)
     if not np.isfinite(value).all() or np.abs(value).max() > _LARGEST:
         raise InputError(
@@ -76,11 +60,6 @@ def script(
     """Commands of a CSV file with `COLUMNS`, one row after another, then a stop.
 
     `trained` and `say` as for `constant`.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or a row is no command.
     """
     text = read_text(path)
     if tuple(column_names(path, text)) != COLUMNS:

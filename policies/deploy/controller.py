@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError, SafetyStop
 from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.policies.deploy.filters import ComplementaryFilter, LowPass, Rest
-from pupper_sysid.policies.deploy.observers import JointEstimate, Observer
+from pupper_sysid.policies.deploy.observers import Observer
 from pupper_sysid.policies.deploy.stacks import Stack
 from pupper_sysid.policies.network.policy_file import Policy, refuse_other_observation
 
@@ -72,11 +72,6 @@ class Controller:
         Of the bus, in joint coordinates: limits, and the linkage of the knees.
     stall_torque_nm : float
         Torque at a reported load of 1 [N·m].
-
-    Raises
-    ------
-    InputError
-        If the policy expects another observation.
     """
 
     def __init__(
@@ -116,12 +111,7 @@ class Controller:
     def reset(self, position: Array, rest: Rest) -> None:
         """Begin from standing still.
 
-        Parameters
-        ----------
-        position : ndarray, shape (12,)
-            Position and target of the joints [rad].
-        rest : Rest
-            Bias of the gyroscope and direction of gravity, measured at rest.
+        `position` is that of the joints and their target [rad], shape (12,).
         """
         self.observer.reset(self.to_servo(position))
         self._attitude.reset(rest)
@@ -149,14 +139,21 @@ class Controller:
         # without an IMU sample the trunk is assumed to turn on; zero force has no direction
         force = senses.acceleration if answered else np.zeros(3)
         attitude = self._attitude.step(self._rate, force, since)
-        joints = self._estimate(senses)
+        # the joints as the policy observes them, in joint coordinates
+        joints = self.observer.step(self.to_servo(self._target), self.to_servo(senses.position))
+        position = _apply(self._to_joint, joints.position)
+        measured = self.stack.observer == "readings"
+        # the trunk's speed is not measured: zeros, or the paper's estimate from commands
+        speed = np.zeros(3)
+        if self.policy.contract.base_velocity != "zero":
+            speed[:2] = _PUBLISHED_SPEED_SHARE * senses.command[:2]
         # a reading beyond the range of single precision becomes infinite; the output tells
         with np.errstate(over="ignore"):
             observation = np.concatenate(
                 [
-                    self._speed(senses.command), attitude.rate_rad_s, attitude.gravity,
-                    senses.command, joints.position - self.default, joints.velocity, joints.effort,
-                    self._action,
+                    speed, attitude.rate_rad_s, attitude.gravity, senses.command,
+                    position - self.default, joints.velocity @ self._to_joint[0],
+                    senses.load if measured else joints.effort, self._action,
                 ],
                 dtype=np.float32,
             )  # fmt: skip
@@ -175,20 +172,6 @@ class Controller:
         target = self._limits.clip(self.default + grown * self._scale * sent)
         self._target = target
         return Decision(observation, action, target, self._limits.margin(target))
-
-    def _estimate(self, senses: Senses) -> JointEstimate:
-        """The joints as the policy observes them, in joint coordinates."""
-        found = self.observer.step(self.to_servo(self._target), self.to_servo(senses.position))
-        position = _apply(self._to_joint, found.position)
-        velocity = found.velocity @ self._to_joint[0]
-        measured = self.stack.observer == "readings"
-        return JointEstimate(position, velocity, senses.load if measured else found.effort)
-
-    def _speed(self, command: Array) -> Array:
-        """The trunk's speed, not measured: zeros, or the paper's estimate from commands."""
-        if self.policy.contract.base_velocity == "zero":
-            return np.zeros(3)
-        return np.array([*(_PUBLISHED_SPEED_SHARE * command[:2]), 0.0])
 
     def to_servo(self, joints: Array) -> Array:
         """Joint angles as the servos' own (`hardware.joint_map`, servo coordinates)."""

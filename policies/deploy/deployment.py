@@ -212,7 +212,10 @@ def _walk(
                 outcome.missing_imu_samples += 1
             if reading.load is not None:
                 load_nm = np.nan_to_num(reading.load) * controller.stall_torque_nm
-            senses = Senses(elapsed, command, reading.position_rad, load_nm, *_motion(sample))
+            unknown = np.full(3, np.nan)
+            rate = unknown if sample is None else sample.rate_rad_s
+            force = unknown if sample is None else sample.acceleration_m_s2
+            senses = Senses(elapsed, command, reading.position_rad, load_nm, rate, force)
             begun = time.perf_counter()
             with spent.on(POLICY):
                 decision = controller.step(senses)
@@ -271,12 +274,6 @@ def _sample(imu: Imu) -> ImuSample | None:
         return None
     numbers = np.concatenate([sample.rate_rad_s, sample.acceleration_m_s2])
     return sample if np.isfinite(numbers).all() else None
-
-
-def _motion(sample: ImuSample | None) -> tuple[Array, Array]:
-    if sample is None:
-        return np.full(3, np.nan), np.full(3, np.nan)
-    return sample.rate_rad_s, sample.acceleration_m_s2
 
 
 def _rows(controller: Controller, sent: Sent, reading: BusSample) -> list[dict[str, Any]]:

@@ -62,11 +62,10 @@ def walk_once(
     seed: int,
     actuator: str,
     servo: Path | None = None,
-    log: Path | None = None,
     rows: Rows | None = None,
     noise: int = 0,
 ) -> tuple[Outcome, WalkScore]:
-    """One walk of one emulated robot.
+    """One walk of one emulated robot; its log is discarded.
 
     Parameters
     ----------
@@ -81,8 +80,6 @@ def walk_once(
         Calibration of a simulated PD; see `policies.deploy.assembly.assemble`.
     servo : Path, optional
         Servo model's folder.
-    log : Path, optional
-        Where to keep the log; discarded by default.
     rows : Rows, optional
         Takes the servos' rows, as of a recording.
     noise : int
@@ -96,6 +93,6 @@ def walk_once(
         score = WalkScore(bus, inner.robot)
         outcome = deploy(
             bus, inner, parts.controller, constant(command), seconds,
-            log or Path(folder) / "walk.csv", parts.header, rows, [score, parts.frozen_readings],
+            Path(folder) / "walk.csv", parts.header, rows, [score, parts.frozen_readings],
         )  # fmt: skip
     return outcome, score

@@ -48,11 +48,6 @@ class LowPass:
         Samples per second.
     channels : int
 
-    Raises
-    ------
-    InputError
-        If the cut-off is not between zero and half the rate.
-
     Notes
     -----
     It delays: at 25 Hz and a cut-off of 8 Hz, a gait of 2.8 Hz comes 19 ms later.
@@ -129,11 +124,6 @@ class ComplementaryFilter:
     limit_m_s2 : float
         Full scale of the accelerometer's axes [m/s²]. Footfalls of small robots exceed ±2 g; a
         clipped sample has lost its direction.
-
-    Raises
-    ------
-    InputError
-        If the weight or the limit is out of range.
     """
 
     def __init__(self, weight: float = 0.02, limit_m_s2: float = 2 * STANDARD_GRAVITY):
@@ -150,13 +140,7 @@ class ComplementaryFilter:
         self.reset(Rest(gravity=np.array([0.0, 0.0, -1.0]), bias_rad_s=np.zeros(3)))
 
     def reset(self, rest: Rest) -> None:
-        """Start from rest; see `at_rest`.
-
-        Raises
-        ------
-        InputError
-            If one is not three finite numbers, or gravity has no direction.
-        """
+        """Start from rest; see `at_rest`."""
         gravity = _finite(rest.gravity, (3,), "The direction of gravity")
         length = np.linalg.norm(gravity)
         if length == 0:
@@ -167,19 +151,8 @@ class ComplementaryFilter:
     def step(self, gyro_rad_s: ArrayLike, acceleration_m_s2: ArrayLike, dt_s: float) -> Attitude:
         """Rate and gravity after one more sample.
 
-        Parameters
-        ----------
-        gyro_rad_s : array_like, shape (3,)
-            With the gyro's bias.
-        acceleration_m_s2 : array_like, shape (3,)
-            Specific force.
-        dt_s : float
-            Measured time since the last sample [s]; less than 1 ms counts as 1 ms.
-
-        Raises
-        ------
-        InputError
-            If a number is not finite.
+        The rate has the gyro's bias, the acceleration is the specific force, shape (3,) each;
+        `dt_s` is the measured time since the last sample, at least 1 ms.
         """
         rate = _finite(gyro_rad_s, (3,), "A gyro's sample") - self._bias
         force = _finite(acceleration_m_s2, (3,), "An accelerometer's sample")
@@ -197,16 +170,7 @@ class ComplementaryFilter:
 def at_rest(gyro_rad_s: ArrayLike, acceleration_m_s2: ArrayLike) -> Rest:
     """The gyro's bias and the first direction of gravity, from samples of a robot at rest.
 
-    Parameters
-    ----------
-    gyro_rad_s, acceleration_m_s2 : array_like, shape (samples, 3)
-        About a second of them, 50 or so, in the trunk's frame.
-
-    Raises
-    ------
-    InputError
-        If there are too few, the robot moved, it stands tilted by more than 30°, or the
-        accelerometer does not measure 1 g.
+    About a second of samples, 50 or so, in the trunk's frame, shape (samples, 3).
     """
     rates = np.asarray(gyro_rad_s, float)
     forces = np.asarray(acceleration_m_s2, float)

@@ -179,11 +179,6 @@ def compare(
     pose : mapping of str to float
         Default pose by joint [rad], about which they swing.
 
-    Raises
-    ------
-    InputError
-        If the observer has another period, or the actuator's parameters are out of range.
-
     Examples
     --------
     >>> trained = DelayedPDParameters(

@@ -17,7 +17,7 @@ coordinates: one number per servo, as its `DelayedPD` or servo model was fitted 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +27,7 @@ from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.policies.deploy.stacks import ObserverKind
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.interface import substeps as physics_substeps
-from pupper_sysid.servo_models.networks import JointArrays, same_rate
+from pupper_sysid.servo_models.networks import JointArrays
 
 Array = NDArray[np.float64]
 
@@ -57,36 +57,17 @@ class Observer(ABC):
         Control period [s].
     joints : int
         Number of joints.
-
-    Raises
-    ------
-    InputError
-        If the period is not positive, or another parameter is out of range.
     """
 
     name: str
 
     def __init__(self, period_s: float, joints: int = _JOINTS):
-        self.period_s, self.joints = _positive(period_s), joints
+        self.period_s, self.joints = float(period_s), joints
         self.reset(np.zeros(joints))
 
     def reset(self, position: ArrayLike) -> None:
-        """Rest at `position` [rad], shape (..., 12), its target and reading so far.
-
-        Raises
-        ------
-        InputError
-            If it is of another number of joints, or not finite.
-        """
-        position = np.array(position, float)
-        if position.shape[-1:] != (self.joints,):
-            raise InputError(
-                f"An observer was reset to positions of shape {position.shape}; the last axis must "
-                f"be the {self.joints} joints."
-            )
-        if not np.isfinite(position).all():
-            raise InputError("An observer was reset to positions that are not finite.")
-        self._position = position
+        """Rest at `position` [rad], shape (..., 12), its target and reading so far."""
+        self._position = np.array(position, float)
 
     @abstractmethod
     def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
@@ -98,28 +79,14 @@ class Observer(ABC):
             Command of this period [rad].
         reading : array_like, shape (..., 12)
             Reading at its end [rad]; NaN where there is none.
-
-        Raises
-        ------
-        InputError
-            If one that is used has another shape than at `reset`, or a target is not finite.
         """
 
     def _target(self, target: ArrayLike) -> Array:
         """A checked target: one NaN would stay in a model's state."""
-        value = self._spread(target, "A target")
+        value = np.asarray(target, float)
         if not np.isfinite(value).all():
             raise InputError("A target is not finite: the policy or a filter before it failed.")
-        return value
-
-    def _spread(self, value: ArrayLike, name: str) -> Array:
-        value, batch = np.asarray(value, float), self._position.shape
-        try:
-            return np.broadcast_to(value, batch)
-        except ValueError:
-            raise InputError(
-                f"{name} has shape {value.shape}; the observer was reset with {batch}."
-            ) from None
+        return np.broadcast_to(value, self._position.shape)
 
 
 class SyntheticPD(Observer):
@@ -139,12 +106,6 @@ class SyntheticPD(Observer):
         Lowest and highest position, scalars or arrays of 12 [rad]. A joint that reaches one stops.
     joints : int
         Number of joints, where they are not twelve.
-
-    Raises
-    ------
-    InputError
-        If a parameter is out of range, of another number of joints, or the time step so long that
-        the integration would explode.
     """
 
     name = "synthetic-pd"
@@ -157,18 +118,8 @@ class SyntheticPD(Observer):
         limits_rad: tuple[ArrayLike, ArrayLike] = (-np.inf, np.inf),
         joints: int = _JOINTS,
     ):
-        substeps = physics_substeps(_positive(period_s)) if substeps is None else substeps
-        if substeps < 1:
-            raise InputError(f"SyntheticPD: {substeps} substeps; it must be at least 1.")
-        for value in (*astuple(parameters), *limits_rad):
-            if np.shape(value) not in ((), (joints,)):
-                raise InputError(
-                    f"SyntheticPD: a parameter has shape {np.shape(value)}; it must be one number "
-                    f"or {joints}, in the order of the joints."
-                )
+        substeps = substeps or physics_substeps(period_s)
         low, high = (np.asarray(limit, float) for limit in limits_rad)
-        if not np.all(low < high):
-            raise InputError("SyntheticPD: a lower limit is not below its upper limit.")
         self._substeps = substeps
         self._servo = _StoppedServo(parameters, period_s / substeps, low, high)
         needed = self._servo.longest_time_step_s()
@@ -188,11 +139,6 @@ class SyntheticPD(Observer):
         Stiffness 70, damping 1.2, inertia 0.20, friction 0.03, delay 9 control steps at 50 Hz and 5
         at 25 Hz. It resonates: near 3 Hz its gain is three. As in the authors' final controller its
         torque has no limit, and the effort it reports is 0.
-
-        Raises
-        ------
-        InputError
-            If the rate is neither 50 nor 25 Hz: nothing was published for others.
         """
         delay = next((n for t, n in _PAPER_DELAY_STEPS.items() if abs(t - period_s) < 1e-9), None)
         if delay is None:
@@ -276,32 +222,13 @@ class _StoppedServo(DelayedPD):
 class ServoModelObserver(Observer):
     """A learned servo model in free run on targets.
 
-    Parameters
-    ----------
-    model : JointArrays
-        Of all twelve joints, in order, one step per control period; the observer owns its state.
-    period_s : float
-        Control period [s].
-
-    Raises
-    ------
-    InputError
-        If the model is of other joints or another rate.
+    The model is of all twelve joints, in order, one step per control period; the observer owns its
+    state.
     """
 
     name = "servo-model"
 
     def __init__(self, model: JointArrays, period_s: float):
-        if model.joints != JOINT_NAMES:
-            raise InputError(
-                f"The servo model is of {', '.join(model.joints)}; an observer needs all twelve "
-                "joints, in order: fit one for all joints."
-            )
-        if not same_rate(model.time_step_s, period_s):
-            raise InputError(
-                f"The servo model steps every {model.time_step_s:g} s, the controller every "
-                f"{period_s:g} s. Fit a model at the controller's rate, or run it at the model's."
-            )
         self._model = model
         super().__init__(period_s)
 
@@ -328,8 +255,6 @@ class HeldEncoder(Observer):
     name = "encoder"
 
     def __init__(self, period_s: float, velocity_steps: int, joints: int = _JOINTS):
-        if velocity_steps < 1:
-            raise InputError(f"HeldEncoder: {velocity_steps} velocity steps; at least 1 is needed.")
         self._velocity_steps = velocity_steps
         super().__init__(period_s, joints)
 
@@ -341,7 +266,7 @@ class HeldEncoder(Observer):
 
     def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
         """See `Observer`; `target` is not used. Effort is not known."""
-        now = self._spread(reading, "A reading")
+        now = np.broadcast_to(np.asarray(reading, float), self._position.shape)
         self._seen[1:] = self._seen[:-1].copy()
         self._seen[0] = np.where(np.isfinite(now), now, self._seen[1])
         velocity = (self._seen[0] - self._seen[-1]) / (self._velocity_steps * self.period_s)
@@ -357,12 +282,6 @@ class Zero(Observer):
         """See `Observer`; neither is used."""
         nothing = np.zeros_like(self._position)
         return JointEstimate(self._position.copy(), nothing, nothing.copy())
-
-
-def _positive(period_s: float) -> float:
-    if not (np.isfinite(period_s) and period_s > 0):
-        raise InputError(f"An observer's control period is {period_s} s; it must be positive.")
-    return float(period_s)
 
 
 def make_observer(
@@ -392,11 +311,6 @@ def make_observer(
         For `servo-model`.
     joints : int
         Number of joints.
-
-    Raises
-    ------
-    InputError
-        If a servo model is needed and none is given, or it does not fit.
     """
     if kind == "readings":
         return HeldEncoder(period_s, velocity_steps, joints)

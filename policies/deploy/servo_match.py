@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result
-from pupper_sysid.policies.network.trained_servo import (
+from pupper_sysid.policies.network.policy_file import (
     Range,
     ServoNumbers,
     TrainedServo,
@@ -79,16 +79,8 @@ class ServoMatch(Result):
 def servo_match(trained: TrainedServo, here: ServoRanges) -> ServoMatch | None:
     """Compare a robot's servos with those of a training.
 
-    Parameters
-    ----------
-    trained : TrainedServo
-    here : ServoRanges
-        Of the calibration of the robot at hand.
-
-    Returns
-    -------
-    ServoMatch or None
-        None if the training's servos were a learned model, which has no numbers.
+    `here` are those of the calibration of the robot at hand. None if the training's servos were a
+    learned model, which has no numbers.
     """
     if trained.joints is None:
         return None
@@ -126,7 +118,11 @@ def _outside(
 
 
 def _sentence(quantity: str, own: Sequence[Outside]) -> str:
-    worst = max(own, key=_distance)
+
+    def distance(one: Outside) -> float:
+        return abs(one.beyond) / max(abs(one.trained_low), abs(one.trained_high), 1e-12)
+
+    worst = max(own, key=distance)
     joint = f" ({worst.joint})" if worst.joint else ""
     among = f", and {len(own) - 1} more joints differ" if len(own) > 1 else ""
     unit = f" {worst.unit}" if worst.unit else ""
@@ -134,10 +130,6 @@ def _sentence(quantity: str, own: Sequence[Outside]) -> str:
         f"{quantity.capitalize()}{joint}: {worst.here.value:.3g}{unit}, {worst.amount()} "
         f"({worst.trained_low:.3g} to {worst.trained_high:.3g}{unit}){among}."
     )
-
-
-def _distance(one: Outside) -> float:
-    return abs(one.beyond) / max(abs(one.trained_low), abs(one.trained_high), 1e-12)
 
 
 # ---------------------------------------------------------------------------------- quantities

@@ -155,13 +155,7 @@ def start_header(position: NDArray[np.float64], rest: Rest) -> dict[str, Any]:
 
 
 def read_walk(path: Path) -> Walk:
-    """Read a log; an incomplete last line is left out.
-
-    Raises
-    ------
-    InputError
-        If it is none, or damaged.
-    """
+    """Read a log; an incomplete last line is left out."""
     text = one_line_end(read_text(path, _LARGEST_BYTES))
     text = text[: text.rfind("\n") + 1]  # the last line may be cut short
     if text.partition("\n")[0] != TITLE:

@@ -29,7 +29,6 @@ from pupper_sysid.policies.evaluation.figures import (
     Fall,
     Figures,
     Recorder,
-    Walk,
     falls_of,
     figures_of,
 )
@@ -136,40 +135,6 @@ def table(
             if extra
         ),
     )
-
-
-def walk(
-    policy: Policy | None,
-    task: Walking,
-    servos: ServoRanges,
-    episodes: int,
-    seed: int,
-    command: tuple[float, float, float] | None = None,
-    threads: int = 0,
-    walker: Walker = "policy",
-) -> Walk:
-    """Run episodes under one condition.
-
-    Parameters
-    ----------
-    policy : Policy or None
-        None stands still.
-    task : Walking
-        See `evaluation_task`.
-    servos : ServoRanges
-    episodes, seed : int
-    command : (float, float, float), optional
-        Instead of random ones.
-    threads : int
-    walker : {"policy", "trot", "standing"}
-    """
-    one = [Condition(task, episodes, command, walker=walker)]
-    return walk_together(policy, servos, one, task.episode_s, seed, threads, Recorder)[0]
-
-
-def summary(found: Walk) -> Figures:
-    """Figures of a number of episodes under random commands."""
-    return figures_of(found)
 
 
 def evaluate(

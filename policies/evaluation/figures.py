@@ -343,15 +343,8 @@ def falls_of(
 ) -> list[Fall]:  # fmt: skip
     """Falls of the robots of a condition.
 
-    Parameters
-    ----------
-    row : str
-    condition : Condition
-    fell : ndarray of bool, shape (n,)
-    alive : ndarray of bool, shape (steps, n)
-    gravity : ndarray, shape (steps, n, 3)
-        The ground's normal, downwards, in the trunk's frame.
-    command : ndarray, shape (steps, n, 3)
+    `fell` has the shape (n,), `alive` (steps, n), `command` (steps, n, 3), and so has `gravity`,
+    the ground's normal, downwards, in the trunk's frame.
     """
     step_s = condition.task.control_step_s
     before = round(BEFORE_S / step_s)

@@ -42,18 +42,17 @@ def walking_sections(
 ) -> list[Section]:
     """The page's sections.
 
-    Parameters
-    ----------
-    policy : Policy
-    run : Run or None
-        How it was trained, if its folder says so.
-    folder : Path
-        Of the run or policy; its curves are shown if they are there.
-    found : Evaluation
+    `run` is None where the folder does not say how the policy was trained; the folder's curves are
+    shown if they are there.
     """
     rows = [_cells(row) for row in found.conditions]
+    walked = (
+        f"Walked with the servos of {Path(str(found.actuator)).name}, feedback {found.feedback}, "
+        f"seed {found.seed}, in simulation, on robots and terrain of which no training knows. "
+        "Evaluate with the calibration of another robot before the policy walks on it."
+    )
     sections = [
-        Section("found", "What was found", findings=_findings(found), notes=[_with_what(found)]),
+        Section("found", "What was found", findings=_findings(found), notes=[walked]),
         Section(
             "walks",
             "How it walks",
@@ -139,14 +138,6 @@ def _findings(found: Evaluation) -> list[tuple[str, str]]:
             f"{worst.policy.mae_vy_m_s:.3f} m/s sideways.",
         ),
     ]
-
-
-def _with_what(found: Evaluation) -> str:
-    return (
-        f"Walked with the servos of {Path(str(found.actuator)).name}, feedback {found.feedback}, "
-        f"seed {found.seed}, in simulation, on robots and terrain of which no training knows. "
-        "Evaluate with the calibration of another robot before the policy walks on it."
-    )
 
 
 def _cells(row: Row) -> dict[str, Any]:

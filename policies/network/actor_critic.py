@@ -1,6 +1,24 @@
-"""Actor and critic of each architecture, for rsl_rl.
+"""Actor and critic of each architecture, for rsl_rl, and the noise with which actors explore.
 
 The critic is an MLP for all of them, so that they differ in the policy alone.
+
+Exploration is persistent: noise that lasts over several control steps, with its exact likelihood.
+White noise of a few milliradians stays within the dead band of a servo with dry friction, and
+larger white noise shakes the friction loose, so that the policy would learn on another robot. Noise
+that lasts moves the joint instead. It is an autoregressive process of first order: with network
+output m, correlation c from step to step and standard deviation s,
+
+    action = m + e,    e = c · e_before + √(1 − c²) · s · z,    z ~ N(0, 1)
+
+so that, given the state and `e_before`, the action is Gaussian about m + c · e_before with standard
+deviation √(1 − c²) · s. `e_before` is the observation group `noise`; it is known to the likelihood
+and to the critic, and never enters the policy's network.
+
+Where steps are to be found, white noise is better. The likelihood takes e from the step before as
+it was, so a change of m counts as if it lasted as the noise does: filtered by 1 / (1 − c·z⁻¹). At
+the 3.6 Hz of a trot, with a time constant of 0.15 s, the gradient of what a joint does within a
+stride is then turned by 61 degrees of the stride and is a third as large, beside that of where the
+joint is on average.
 """
 
 from __future__ import annotations
@@ -8,17 +26,182 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from rsl_rl.models import MLPModel
+from rsl_rl.models import MLPModel, RNNModel
+from rsl_rl.modules.distribution import GaussianDistribution
+from rsl_rl.utils import unpad_trajectories
 from tensordict import TensorDict
+from torch.distributions import Normal
 
-from pupper_sysid.policies.network.exploration import (
-    MLPActor,
-    PersistentGaussian,
-    RNNActor,
-    TransformerActor,
-)
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
-from pupper_sysid.policies.network.teacher import TeacherActor
+from pupper_sysid.policies.network.policy_network import CONTEXT, WIDTH, CausalAttention, step
+from pupper_sysid.sim.walking.observation import CLOCK_SEEN, OBSERVATION_PARTS
+
+
+class PersistentGaussian(GaussianDistribution):
+    """Gaussian of an action, given the noise of the step before.
+
+    `correlation` is that of the noise from one step to the next, 0 for white noise; `least_std` is
+    the floor of the standard deviation.
+
+    Attributes
+    ----------
+    centre : Tensor, shape (…, output_dim)
+        Output of the network, m.
+    noise_before : Tensor, shape (…, output_dim)
+        To be set before `update`.
+    """
+
+    def __init__(
+        self, output_dim: int, correlation: float = 0.0, least_std: float = 1e-6, **more: Any
+    ):
+        super().__init__(output_dim, std_range=(least_std, 1e6), std_type="log", **more)
+        self.correlation = correlation
+        self.centre = self.noise_before = torch.zeros(0)
+
+    def update(self, mlp_output: torch.Tensor) -> None:
+        """Take the network's output."""
+        self.centre = mlp_output
+        mean = mlp_output + self.correlation * self.noise_before
+        std = torch.exp(self.log_std_param.clamp(*self.log_std_range))
+        self._distribution = Normal(mean, (1.0 - self.correlation**2) ** 0.5 * std)
+
+    @property
+    def whole_std(self) -> torch.Tensor:
+        """Standard deviation of the noise itself, s, shape (output_dim,)."""
+        return torch.exp(self.log_std_param.detach().clamp(*self.log_std_range))
+
+    def set_std(self, std: torch.Tensor) -> None:
+        """Set the noise's standard deviation, shape (output_dim,)."""
+        self.log_std_param.data.copy_(torch.log(std))
+
+
+class _Exploring(MLPModel):
+    """Gives the noise of the step before to the distribution."""
+
+    def forward(
+        self,
+        obs: TensorDict,
+        masks: torch.Tensor | None = None,
+        hidden_state: Any = None,
+        stochastic_output: bool = False,
+    ) -> torch.Tensor:
+        """The action, or its mean without noise."""
+        if stochastic_output:
+            noise = obs["noise"]
+            before = noise if masks is None else unpad_trajectories(noise, masks)
+            assert isinstance(self.distribution, PersistentGaussian)
+            self.distribution.noise_before = before
+        return super().forward(obs, masks, hidden_state, stochastic_output)
+
+
+class MLPActor(_Exploring):
+    """Feed-forward policy."""
+
+
+class RNNActor(_Exploring, RNNModel):
+    """Policy with an LSTM or GRU."""
+
+
+class TransformerActor(_Exploring):
+    """Policy that attends to its past observations, with `CausalAttention` before the head.
+
+    An update runs one pass over whole sequences of a rollout instead of one window per sample, at a
+    tenth of the cost. Rollout and update have the same window, which ends on the present
+    observation and begins not before the episode.
+    """
+
+    is_recurrent = True
+
+    def __init__(
+        self, obs: TensorDict, obs_groups: dict, obs_set: str, output_dim: int, **more: Any
+    ):
+        super().__init__(obs, obs_groups, obs_set, output_dim, **more)
+        self.attention = CausalAttention(self.obs_dim)
+        self._context: torch.Tensor | None = None  # (CONTEXT - 1, n, obs_dim + 1)
+
+    def _get_latent_dim(self) -> int:
+        return WIDTH
+
+    def get_latent(
+        self, obs: TensorDict, masks: torch.Tensor | None = None, hidden_state: Any = None
+    ) -> torch.Tensor:
+        """Latent of the present step, or of all steps of padded trajectories."""
+        raw = torch.cat([obs[group] for group in self.obs_groups], dim=-1)
+        if masks is None:
+            if self._context is None:
+                size = CONTEXT - 1, len(raw), self.obs_dim + 1
+                self._context = torch.zeros(size, device=raw.device)
+            latent, self._context = step(self.attention, self.obs_normalizer, raw, self._context)
+            return latent
+        if hidden_state is None:
+            raise ValueError("The context before each trajectory is needed in an update.")
+        before = hidden_state.transpose(0, 1)
+        tokens = torch.cat([before[..., :-1], raw.transpose(0, 1)], dim=1)
+        present = torch.cat([before[..., -1] > 0.5, masks.transpose(0, 1)], dim=1)
+        latent = self.attention(self.obs_normalizer(tokens), present, raw.shape[0])
+        return unpad_trajectories(latent.transpose(0, 1), masks)
+
+    def reset(self, dones: torch.Tensor | None = None, hidden_state: Any = None) -> None:
+        """Clear the context of all robots, or of those whose episodes ended."""
+        if dones is None:
+            self._context = hidden_state
+        elif self._context is not None:
+            self._context = self._context.clone()
+            self._context[:, dones.bool()] = 0.0
+
+    def get_hidden_state(self) -> Any:
+        """The observations before the next one."""
+        return self._context
+
+    def detach_hidden_state(self, dones: torch.Tensor | None = None) -> None:
+        """Nothing to do: the context holds observations, not results."""
+
+
+_SEEN = ("base_angular_velocity", "projected_gravity", "command")
+_HARMONICS = torch.tensor([1.0, 2.0, 3.0])
+"""Of the clock: feet rise and come down within a quarter of a cycle."""
+
+
+class TeacherActor(MLPActor):
+    """Network of a teacher: a gait by a clock, with little besides that its network could follow.
+
+    A teacher learns from nothing, by PPO. Adam moves every weight about as far whether its gradient
+    is signal or noise, and PPO limits how far all of them together move the actions. So inputs that
+    say nothing about a gait cost most of what an update may change: with the 145 numbers that a
+    critic sees a teacher travelled after 1.4 million samples, with 19 of these after 0.5, and with
+    the products of command and clock after 0.4 (one run each).
+
+    It sees rates and gravity as the IMU reads them, the command, the clock of its reward with two
+    harmonics, and these times each part of the command; nothing of the joints. But for the clock
+    it sees nothing that a policy does not: what it answers to can be imitated.
+    """
+
+    def get_latent(
+        self, obs: TensorDict, masks: torch.Tensor | None = None, hidden_state: Any = None
+    ) -> torch.Tensor:
+        """Its inputs, normalised, shape (…, 34)."""
+        return self.obs_normalizer(inputs(obs))
+
+    def update_normalization(self, obs: TensorDict) -> None:
+        """Take means and deviations of its inputs."""
+        if self.obs_normalization:
+            self.obs_normalizer.update(inputs(obs))  # pyright: ignore
+
+    def _get_obs_dim(self, obs: TensorDict, obs_groups: dict, obs_set: str):
+        return obs_groups[obs_set], inputs(obs).shape[-1]
+
+
+def inputs(obs: TensorDict) -> torch.Tensor:
+    """What a teacher sees of the groups `policy` and `privileged`, shape (…, 34)."""
+    policy, privileged = obs["policy"], obs["privileged"]
+    seen = [policy[..., OBSERVATION_PARTS[name]] for name in _SEEN]
+    cos, sin, in_time = privileged[..., CLOCK_SEEN].split(1, -1)
+    angles = torch.atan2(sin, cos) * _HARMONICS.to(sin.device)
+    waves = torch.cat([torch.cos(angles), torch.sin(angles)], dim=-1)
+    # a foot's stroke is its speed times a function of the clock: Raibert's rule
+    strokes = (seen[-1][..., None] * waves[..., None, :]).flatten(-2)
+    return torch.cat([*seen, in_time, waves, strokes], dim=-1)
+
 
 _FIRST_HEAD = 0.01  # factor on a policy's last weights (Andrychowicz et al., 2021)
 
@@ -32,16 +215,8 @@ def build(
 ) -> tuple[MLPModel, MLPModel]:
     """Actor and critic.
 
-    Parameters
-    ----------
-    architecture : Architecture
-    observations : TensorDict
-        An example, for the sizes.
-    hyper : Hyperparameters
-    control_step_s : float
-        Time between two actions, over which the noise of exploration decays.
-    first_action : Tensor, shape (12,), optional
-        What the policy does at first, whatever it sees; by default 0, the default pose.
+    `observations` are an example, for the sizes. `first_action`, shape (12,), is what the policy
+    does at first, whatever it sees; by default 0, the default pose.
     """
     actor_groups = ["policy"]
     if architecture.kind == "mlp-actions":

@@ -26,7 +26,6 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.export.network import onnx_library
 
-SUFFIX = ".onnx"
 _LARGEST_BYTES = 200_000_000
 _MOST_NODES = 20_000
 _MOST_VALUES = 20_000_000  # of one array, and of all inputs together
@@ -46,11 +45,6 @@ OPERATORS = frozenset(
 class OnnxNetwork:
     """A network that acts for many robots at once, with the interface of `PolicyNetwork`.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-
     Attributes
     ----------
     observation_size, actions : int
@@ -58,11 +52,6 @@ class OnnxNetwork:
         Parts of the state of a recurrent network.
     metadata : dict of str to str
         The file's own properties.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or is no policy; the sentence says what is wrong with it.
     """
 
     def __init__(self, path: Path):

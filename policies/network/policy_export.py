@@ -21,9 +21,9 @@ from pupper_sysid.policies.network.policy_file import (
     ObservationPart,
     Policy,
     save_policy,
+    trained_servo,
 )
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
-from pupper_sysid.policies.network.trained_servo import trained_servo
 from pupper_sysid.policies.train.run_file import Run as TrainingRun
 from pupper_sysid.sim.walking.observation import VELOCITY_STEPS, observation_of
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges

@@ -37,10 +37,10 @@ from pupper_sysid.policies.walks.tracking import planar_velocity
 from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.draws import Twins
 from pupper_sysid.sim.walking.effort import LOW_SWING_M, by_kind
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
-from pupper_sysid.sim.walking.shared_draws import Twins
 
 Array = NDArray[np.float64]
 
@@ -176,13 +176,8 @@ def with_first_gait(
 ) -> Run:
     """The run with a first gait for its servos: its own where that walks, else a fitted one.
 
-    Parameters
-    ----------
-    run : Run
-    say : callable
-        Called with sentences about the gait.
-    progress : callable
-        Called with the share of the search that is done.
+    `say` is called with sentences about the gait, `progress` with the share of the search that is
+    done.
     """
     servos = servo_ranges(run.actuator, run.feedback, run.task.body)
     name = Path(run.actuator).name
@@ -292,13 +287,7 @@ def fit_trot(
 ) -> FirstGait:
     """Search a trot for some servos, beginning with that of a task.
 
-    Parameters
-    ----------
-    task : Walking
-    servos : ServoRanges
-    seed, threads : int
-    progress : callable
-        Called with the share of the work that is done.
+    `progress` is called with the share of the work that is done.
     """
     rng = np.random.default_rng([seed, 6])
     quick = _quick(task, servos)
@@ -386,7 +375,10 @@ def _gentle(task: Walking, seconds: float) -> Walking:
 def _quick(task: Walking, servos: ServoRanges) -> Walking:
     """The task of the search: as evaluated, but in the physics of training and in longer steps."""
     found = replace(_gentle(task, _SEARCH_S), physics="training")
-    longer = replace(found, physics_step_s=_SEARCH_STEP_S) if _divides(task) else found
+    steps = task.control_step_s / _SEARCH_STEP_S
+    if abs(steps - round(steps)) > 1e-6:
+        return found
+    longer = replace(found, physics_step_s=_SEARCH_STEP_S)
     try:
         servos.in_steps_of(longer.physics_step_s)
     except InputError:  # too stiff for them
@@ -402,11 +394,6 @@ def _box(body: Body) -> tuple[Array, Array]:
     ]
     low, high = np.array(list(_BOX.values())).T * size
     return low, high
-
-
-def _divides(task: Walking) -> bool:
-    steps = task.control_step_s / _SEARCH_STEP_S
-    return abs(steps - round(steps)) < 1e-6
 
 
 def _values(trot: Trot) -> Array:

@@ -1,6 +1,6 @@
 """PPO of rsl_rl, with additions in thin subclasses.
 
-- Noise of the actions persists (`policies.network.exploration`); its size is scheduled.
+- Noise of the actions persists (`policies.network.actor_critic`); its size is scheduled.
 - After each update the KL divergence and the share of clipped ratios are measured at the first step
   of its data; the policy's learning rate follows the former, and a policy that went much too far is
   taken back. The critic has a rate of its own.
@@ -9,40 +9,212 @@
   new command or a push follows a step, the value of the state without them counts.
 - A checkpoint holds everything that an exact continuation needs: networks, optimiser, learning
   rate, random numbers, recurrent state, environments with their delay lines, the last observation
-  and the counters. It is written atomically and read with `weights_only`.
-- Several processes exchange gradients through gloo, on processors, as the physics.
+  and the counters. It is written atomically and read with `weights_only`; a teacher's is also read
+  by those who learn from it.
+- Several processes, which `torchrun` starts, each with environments of its own, exchange gradients
+  through gloo, on processors, as the physics.
+- Every sample can be learned from as its mirror image, left for right, too. The robot, its task and
+  its ground look the same in a mirror: an observation and an action whose left and right are
+  exchanged are as true as those that were collected, with the same reward. With both in every
+  minibatch the policy cannot limp, and sees twice the data for no physics (Mittal et al., Symmetry
+  Considerations for Learning Task Symmetric Robot Policies, ICRA 2024).
 """
 
 from __future__ import annotations
 
 import copy
 import io
+import os
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from rsl_rl.algorithms import PPO
+from rsl_rl.extensions import Symmetry
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from pupper_sysid.common.border import read_bytes, refuse_other_version
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_bytes
-from pupper_sysid.policies.network.actor_critic import build
-from pupper_sysid.policies.network.exploration import PersistentGaussian
+from pupper_sysid.common.reading.content import LARGEST_CHECKPOINT, refuse_bomb
+from pupper_sysid.policies.network.actor_critic import PersistentGaussian, build
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
-from pupper_sysid.policies.train.checkpoint import (
-    CHECKPOINT_SCHEMA,
-    CHECKPOINT_VERSION,
-    read_checkpoint,
-)
-from pupper_sysid.policies.train.mirror import MirrorImages, mirrored
-from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
+from pupper_sysid.sim.robot.body import Body, mini_pupper
 from pupper_sysid.sim.robot.trot import stance
+from pupper_sysid.sim.walking.observation import observation_of, privileged_parts
+
+_POLAR, _AXIAL = ([0, 1, 2], [1.0, -1.0, 1.0]), ([0, 1, 2], [-1.0, 1.0, -1.0])
+_COMMAND = [0, 1, 2], [1.0, -1.0, -1.0]
+
+
+@cache
+def _images(body: Body) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    """Order and signs of each group of observations, and of actions (`noise`), in the mirror."""
+    if body.mirror_joints is None or body.mirror_signs is None or body.mirror_feet is None:
+        raise InputError(
+            f"{body.name} is not the same in a mirror, so it cannot learn from mirror images. Give "
+            "`learner.mirror` as False."
+        )
+    joints, legs = body.mirror_joints.tolist(), body.mirror_feet.tolist()
+    angles, sizes = (joints, body.mirror_signs.tolist()), (joints, [1.0] * len(joints))
+    feet = legs, [1.0] * len(legs)
+    # whose value each element has, and its sign; other quantities stay as they are
+    known: dict[str, tuple[list[int], list[float]]] = {
+        "base_linear_velocity": _POLAR, "base_angular_velocity": _AXIAL,
+        "projected_gravity": _POLAR, "command": _COMMAND, "joint_position_relative": angles,
+        "joint_velocity": angles, "joint_effort": angles, "last_action": angles, "air_s": feet,
+        "contact_s": feet, "dead_time_s": sizes, "centre_of_mass": _POLAR, "leg_strength": feet,
+        "joint_zero": angles, "imu_mounting": _AXIAL, "gyro_bias": _AXIAL,
+        "true_angular_velocity": _AXIAL, "true_gravity": _POLAR, "stride_velocity": _COMMAND,
+        "earlier_action": angles, "clock": ([0, 1, 2], [-1.0, -1.0, 1.0]),
+    }  # fmt: skip
+
+    def image(parts: list[tuple[str, int]]) -> tuple[torch.Tensor, torch.Tensor]:
+        order: list[int] = []
+        signs: list[float] = []
+        for name, size in parts:
+            first = len(order)
+            own, sign = known.get(name, (list(range(size)), [1.0] * size))
+            order += [first + i for i in own]
+            signs += sign
+        return torch.tensor(order), torch.tensor(signs)
+
+    return {
+        "policy": image([(name, size) for name, size, _ in observation_of(len(joints))]),
+        "privileged": image(list(privileged_parts(len(joints), len(legs)))),
+        "noise": image([("last_action", len(joints))]),
+    }
+
+
+def mirrored(values: torch.Tensor, group: str = "noise", body: Body | None = None) -> torch.Tensor:
+    """Mirror image of a group of observations, or of actions.
+
+    The group is `policy`, `privileged`, `noise` (as actions), or `actions`, of which there are
+    several; it is the last axis of `values`. The Mini Pupper is the body by default.
+    """
+    body = body or mini_pupper()
+    if group == "actions":
+        several = values.unflatten(-1, (-1, len(body.joints)))
+        return mirrored(several, "noise", body).flatten(-2)
+    order, signs = _images(body)[group]
+    return values[..., order] * signs.to(values.device)
+
+
+class MirrorImages(Symmetry):
+    """Appends the mirror image of every sample to a minibatch."""
+
+    def __init__(self, body: Body):
+        super().__init__(None, self._both, use_data_augmentation=True)  # pyright: ignore
+        self._body = body
+        _images(body)  # refuses one without an image
+
+    def _both(
+        self, env: Any, obs: TensorDict, actions: torch.Tensor
+    ) -> tuple[TensorDict, torch.Tensor]:
+        names = [str(name) for name in obs.keys()]
+        image = TensorDict({n: mirrored(obs[n], n, self._body) for n in names}, obs.batch_size)
+        return torch.cat([obs, image]), torch.cat([actions, mirrored(actions, "noise", self._body)])  # pyright: ignore
+
+    def compute_loss(self, actor, batch, original_batch_size: int) -> torch.Tensor:
+        """No loss besides; the samples suffice."""
+        return torch.zeros((), device=next(actor.parameters()).device)
+
+
+CHECKPOINT_SCHEMA = "pupper-checkpoint"
+CHECKPOINT_VERSION = 4
+_ANOTHER = "Resume from another checkpoint of the run."
+_PARTS = (
+    "architecture", "actor_state_dict", "critic_state_dict", "optimizer_state_dict",
+    "learning_rate", "iteration", "torch_rng", "hidden", "observations", "environment", "more",
+)  # fmt: skip
+_AVERAGED = "module."  # before the names of weights in `AveragedModel`
+
+
+def judged_weights(content: dict[str, Any]) -> dict[str, torch.Tensor]:
+    """Of the policy that was judged when a checkpoint was written: `Learner.averaged`."""
+    average = content.get("average")
+    if average is None or not average["n_averaged"]:
+        return content["actor_state_dict"]
+    whole = {name: value for name, value in average.items() if name.startswith(_AVERAGED)}
+    return {name.removeprefix(_AVERAGED): value for name, value in whole.items()}
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """Content of a checkpoint, without executing anything in it."""
+    if not path.exists():
+        raise InputError(f"{path} does not exist. Give the folder of a run that has a checkpoint.")
+    data = read_bytes(path, LARGEST_CHECKPOINT, _ANOTHER)
+    refuse_bomb(path, data, _ANOTHER)
+    try:
+        content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception as error:  # torch raises many kinds for damaged files
+        raise InputError(f"{path} is damaged and cannot be read. {_ANOTHER}") from error
+    if not isinstance(content, dict) or content.get("schema") != CHECKPOINT_SCHEMA:
+        raise InputError(f"{path} is not a checkpoint of pupper-train.")
+    if content.get("schema_version") in (1, 2, 3):
+        raise InputError(
+            f"{path} is of an older version of pupper-train, whose critic has other inputs, and "
+            "cannot be resumed or imitated. Its policies can be played and evaluated; start a new "
+            "run."
+        )
+    refuse_other_version(path, content.get("schema_version"), CHECKPOINT_VERSION)
+    missing = [part for part in _PARTS if part not in content]
+    if missing:
+        raise InputError(f"{path} has no {missing[0]}. {_ANOTHER}")
+    average = content.get("average", {"n_averaged": 0})  # older files have none
+    if not isinstance(average, dict) or "n_averaged" not in average:
+        raise InputError(f"The average in {path} is no set of weights. {_ANOTHER}")
+    return content
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """This process among those that train together."""
+
+    rank: int = 0
+    size: int = 1
+    local_rank: int = 0
+
+    @classmethod
+    def join(cls) -> Ranks:
+        """Join the processes that `torchrun` started; alone if it did not."""
+        size = int(os.environ.get("WORLD_SIZE", "1"))
+        if size == 1:
+            return cls()
+        found = cls(int(os.environ["RANK"]), size, int(os.environ.get("LOCAL_RANK", "0")))
+        if not torch.distributed.is_initialized():
+            torch.distributed.init_process_group("gloo", rank=found.rank, world_size=size)
+        return found
+
+    def same(self, text: str) -> str:
+        """The first process's `text`, in all."""
+        found = [text]
+        if self.size > 1:
+            torch.distributed.broadcast_object_list(found, src=0)
+        return found[0]
+
+    def any(self, here: bool) -> bool:
+        """Whether it is so in any process; all must decide alike, or they would deadlock."""
+        return bool(self._reduced(float(here), "MAX"))
+
+    def mean(self, here: float) -> float:
+        """Mean over the processes, the same in all."""
+        return self._reduced(here, "SUM") / self.size
+
+    def _reduced(self, here: float, operation: str) -> float:
+        if self.size == 1:
+            return here
+        found = torch.tensor(here, dtype=torch.float64)
+        torch.distributed.all_reduce(found, getattr(torch.distributed.ReduceOp, operation))
+        return float(found)
+
 
 _TOO_FAR, _TOO_NEAR, _FACTOR = 2.0, 0.5, 1.3
 _LOST, _MUCH = 10.0, 3.0  # beyond so many times the desired KL a policy is taken back
@@ -119,11 +291,6 @@ class _Probe:
         return {"kl": float(kl.mean()), "clip_fraction": float(clipped.float().mean())}
 
 
-def _copied(state: dict[str, Any]) -> dict[str, Any]:
-    """A copy of an optimiser's state of one parameter."""
-    return {k: v.clone() if isinstance(v, torch.Tensor) else v for k, v in state.items()}
-
-
 class Learner:
     """An environment, a policy, a critic and PPO.
 
@@ -133,11 +300,6 @@ class Learner:
         Whether a loaded checkpoint goes on exactly; see `PupperEnv.restore`.
     taken_back : bool
         Whether the last update was undone, because it changed the actions too much.
-
-    Raises
-    ------
-    InputError
-        If a recurrent policy has fewer environments than minibatches.
     """
 
     def __init__(
@@ -278,21 +440,19 @@ class Learner:
     def update(self) -> dict[str, float]:
         """Update policy and critic on the data of `rollout`.
 
-        Returns
-        -------
-        dict of str to float
-            Mean losses, `kl` and `clip_fraction`.
+        Gives mean losses, `kl` and `clip_fraction`.
         """
         ppo, hyper = self.ppo, self.hyper
         actor_learns = self.iteration >= hyper.critic_warmup
+        fixed = None if hyper.exploration.learned else self._noise.log_std_param
         for parameter in ppo.actor.parameters():
-            parameter.requires_grad_(actor_learns and parameter is not self._fixed_std)
+            parameter.requires_grad_(actor_learns and parameter is not fixed)
         if hyper.freeze_normaliser:
             for network in (ppo.actor, ppo.critic):
                 network.obs_normalizer.until = 0  # pyright: ignore[reportArgumentType]
         probe = _Probe.of(ppo)
         before = [parameter.detach().clone() for parameter in ppo.actor.parameters()]
-        moments = [_copied(ppo.optimizer.state.get(p, {})) for p in ppo.actor.parameters()]
+        moments = [copy.deepcopy(ppo.optimizer.state.get(p, {})) for p in ppo.actor.parameters()]
         losses = ppo.update()
         self.iteration += 1
         found = {name: self.ranks.mean(value) for name, value in probe.compare(ppo).items()}
@@ -310,10 +470,6 @@ class Learner:
                         ppo.optimizer.state[parameter] = state
             self._average.update_parameters(ppo.actor)
         return losses | found
-
-    @property
-    def _fixed_std(self) -> torch.Tensor | None:
-        return None if self.hyper.exploration.learned else self._noise.log_std_param
 
     def _adapt(self, kl: float) -> None:
         """Let the policy's learning rate follow the divergence of an update."""
@@ -353,13 +509,7 @@ class Learner:
         return all(bool(torch.isfinite(t).all()) for t in whole)
 
     def save(self, path: Path, more: dict[str, Any]) -> None:
-        """Write a checkpoint in one atomic step; the one before survives if that fails.
-
-        Raises
-        ------
-        InputError
-            If it cannot be written, for example because the disk is full.
-        """
+        """Write a checkpoint in one atomic step; the one before survives if that fails."""
         hidden = self.actor.get_hidden_state()
         content = {
             "schema": CHECKPOINT_SCHEMA,
@@ -383,13 +533,7 @@ class Learner:
         write_bytes(path, buffer.getvalue(), force=True)
 
     def load(self, path: Path) -> dict[str, Any]:
-        """Return to a checkpoint exactly; returns the `more` of `save`.
-
-        Raises
-        ------
-        InputError
-            If it is damaged, or of another architecture or environment.
-        """
+        """Return to a checkpoint exactly; returns the `more` of `save`."""
         content = read_checkpoint(path)
         if content["architecture"] != self.architecture.kind:
             raise InputError(

@@ -6,7 +6,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, is_dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_origin, get_type_hints
@@ -27,10 +28,8 @@ from pupper_sysid.policies.network.hyperparameters import (
     Imitation,
     Kind,
 )
-from pupper_sysid.policies.train.ranges import refuse_impossible
-from pupper_sysid.sim.walking.config import PRESETS, Curriculum, Observation, Walking
+from pupper_sysid.sim.walking.config import PRESETS, Curriculum, Observation, Walking, for_robot
 from pupper_sysid.sim.walking.rewards.weights import CLOCK, Rewards
-from pupper_sysid.sim.walking.scaled import for_robot
 
 Start = Literal["imitation", "scratch", "teacher"]
 """How a policy comes to its first gait: by imitation of a trot, or of a teacher that was trained
@@ -181,13 +180,7 @@ def _teacher(kind: Kind) -> Run:
 
 
 def with_robot(run: Run, robot: str | Path, robot_config: str | Path | None) -> Run:
-    """The run for another robot than the Mini Pupper 2, its task scaled by that one's size.
-
-    Raises
-    ------
-    InputError
-        If the files do not describe a robot that can walk.
-    """
+    """The run for another robot than the Mini Pupper 2, its task scaled by that one's size."""
     task = for_robot(run.task, robot, robot_config)
     mirror = run.learner.mirror and task.body.mirror_joints is not None
     return replace(run, task=task, learner=replace(run.learner, mirror=mirror))
@@ -214,13 +207,7 @@ def teacher_of(run: Run) -> Run:
 
 
 def check_teacher(folder: Path, run: Run) -> Run:
-    """Settings of a teacher's run, which `run` is to learn from.
-
-    Raises
-    ------
-    InputError
-        If the folder holds no such run, or its actions or its clock mean something else.
-    """
+    """Settings of a teacher's run, which `run` is to learn from."""
     own = load_run(folder)
     if not own.architecture.privileged_actor:
         raise InputError(
@@ -240,13 +227,7 @@ def check_teacher(folder: Path, run: Run) -> Run:
 
 
 def load_run(folder: Path) -> Run:
-    """Settings of the run in `folder`.
-
-    Raises
-    ------
-    InputError
-        If there is none, or they cannot be understood.
-    """
+    """Settings of the run in `folder`."""
     path = folder / RUN_FILE
     model = create_model("File", settings=(_model_of(Run), ...))
     data, lines = _read(path)
@@ -255,13 +236,7 @@ def load_run(folder: Path) -> Run:
 
 
 def resume_run(folder: Path, iterations: int | None, minutes: float | None) -> Run:
-    """Settings of a resumed run, perhaps with a new end, which is written to its file.
-
-    Raises
-    ------
-    InputError
-        If they cannot be understood, or the actuator's file is not what it was.
-    """
+    """Settings of a resumed run, perhaps with a new end, which is written to its file."""
     path, run = folder / RUN_FILE, load_run(folder)
     before, source = _read(path)[0].get("actuator_sha256"), Path(run.actuator)
     if before and not source.is_file():
@@ -321,13 +296,7 @@ def _dataclass_of(kind: type, settings: Any) -> Any:
 
 
 def save_run(folder: Path, run: Run) -> None:
-    """Write the settings of a run that begins.
-
-    Raises
-    ------
-    InputError
-        If the folder holds a run already.
-    """
+    """Write the settings of a run that begins."""
     refuse_taken(folder)
     _write(folder / RUN_FILE, run)
 
@@ -352,3 +321,70 @@ def _write(path: Path, run: Run) -> None:
     }
     text = "# Settings of a training run, written by pupper-train.\n"
     write_text(path, text + yaml.safe_dump(found, sort_keys=False), force=True)
+
+
+_LARGEST = 1e9
+_MOST_LAYERS = 16
+_RANGES: dict[str, tuple[float, float]] = {
+    "environments": (1, 1_000_000),
+    "iterations": (1, 10_000_000),
+    "minutes": (1e-3, 1e8),
+    "threads": (0, 4096),
+    "architecture.hidden": (1, 8192),
+    "architecture.critic_hidden": (1, 8192),
+    "architecture.memory": (1, 8192),
+    "task.episode_s": (1e-3, 3600),
+    "task.physics_step_s": (1e-4, 0.1),
+    "task.control_step_s": (1e-3, 1),
+    "task.action_scale": (1e-3, 10),
+    "learner.steps_per_environment": (1, 10_000),
+    "learner.epochs": (1, 1000),
+    "learner.learning_rate": (1e-12, 10),
+    "learner.learning_rates": (1e-12, 10),
+    "learner.critic_learning_rate": (1e-12, 10),
+    "learner.discount": (0, 1),
+    "learner.gae_lambda": (0, 1),
+    "imitation.iterations": (0, 1_000_000),
+    "imitation.rollouts": (1, 1_000),
+    "imitation.epochs": (1, 10_000),
+    "imitation.learning_rate": (1e-12, 10),
+}
+"""Smallest and largest value, by the dotted name of a setting."""
+
+
+def refuse_impossible(run: Run) -> None:
+    """Refuse settings outside their ranges: a misprint, or what fills the memory.
+
+    They come from the command line and from a run's file, which may be damaged or anybody's. The
+    ranges are far wider than anything that trains.
+
+    `seed` is any whole number from 0 on.
+    """
+    for name, value in _numbers(run, ""):
+        low, high = _RANGES.get(name, (-_LARGEST, _LARGEST))
+        if name != "seed" and not low <= value <= high:  # NaN is in no range
+            shown = str(value)[:20]
+            raise InputError(f"{name} is {shown}; it must be from {low:g} to {high:g}.")
+    if not 0 <= run.seed < 2**63:  # what torch's generators take
+        raise InputError(f"seed is {str(run.seed)[:24]}; it must be 0 or more, below 2^63.")
+    for name in ("hidden", "critic_hidden"):
+        layers = len(getattr(run.architecture, name))
+        if layers > _MOST_LAYERS:
+            raise InputError(f"architecture.{name} has {layers} layers; at most {_MOST_LAYERS}.")
+    samples = run.environments * run.learner.steps_per_environment
+    if run.learner.minibatches > samples:
+        raise InputError(
+            f"learner.minibatches is {run.learner.minibatches}; an update has {samples} samples."
+        )
+
+
+def _numbers(settings: Any, before: str) -> Iterator[tuple[str, float]]:
+    """Dotted names and values of all numbers."""
+    for setting in fields(settings):
+        value, name = getattr(settings, setting.name), f"{before}{setting.name}"
+        if is_dataclass(value):
+            yield from _numbers(value, f"{name}.")
+            continue
+        for one in value if isinstance(value, tuple) else (value,):
+            if isinstance(one, int | float) and not isinstance(one, bool):
+                yield name, one

@@ -35,18 +35,8 @@ _STANDING = np.abs(COMMANDS).mean(axis=0)  # errors of a robot that stands [m/s,
 class Judge:
     """Scores a policy, the same walks each time.
 
-    Parameters
-    ----------
-    task : Walking
-        Of the training.
-    servos : ServoRanges
-    seed : int
-        Of the training; robots, starts and terrain are others.
-    threads : int
-    servo_model : JointArrays, optional
-    action_history : int
-    device : str
-        As for `WalkingVecEnv`.
+    Task and seed are those of the training; robots, starts and terrain are others. The last two are
+    as for `WalkingVecEnv`.
     """
 
     def __init__(
@@ -120,14 +110,9 @@ def scored(
 ) -> dict[str, float]:
     """Score of walks with its parts; see `Judge`.
 
-    Parameters
-    ----------
-    velocity : ndarray, shape (steps, n, 3)
-        Forward and sideways speed [m/s], turn rate [rad/s].
-    up : ndarray of bool, shape (steps, n)
-        Whether the robot has not fallen so far.
-    command : ndarray, shape (n, 3)
-        `COMMANDS`, or others.
+    Velocities have the shape (steps, n, 3): forward and sideways speed [m/s], turn rate [rad/s].
+    `up`, shape (steps, n), says whether the robot has not fallen so far. Commands have the shape
+    (n, 3).
     """
     fell = ~up[-1]
     # a robot that fell has the errors of one that stands, from then on

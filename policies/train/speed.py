@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 
 from pupper_sysid.data import SAMPLES
-from pupper_sysid.policies.train.ranks import Ranks
+from pupper_sysid.policies.train.learner import Ranks
 from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.policies.train.training import make_env, make_learner
 from pupper_sysid.sim.walking.env import PupperEnv
@@ -37,10 +37,7 @@ _SAMPLE = SAMPLES / "calibrated.yaml"
 class Paces:
     """The steps of an environment, and the same physics without it, in turns.
 
-    Parameters
-    ----------
-    env : PupperEnv
-        It trots on, as it is timed.
+    The environment trots on, as it is timed.
     """
 
     def __init__(self, env: PupperEnv):

@@ -21,7 +21,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from rsl_rl.models import MLPModel
 
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.processes.stop import finishing
@@ -29,9 +28,14 @@ from pupper_sysid.common.processes.workers import keep_freed_memory
 from pupper_sysid.policies.network.hyperparameters import OWN, TROT
 from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.train.curves import CurveWriter, EpisodeMeans
-from pupper_sysid.policies.train.imitation import imitate
-from pupper_sysid.policies.train.learner import Learner
-from pupper_sysid.policies.train.ranks import Ranks
+from pupper_sysid.policies.train.imitation import (
+    LearnedTeacher,
+    Teacher,
+    TrotTeacher,
+    imitate,
+    load_teacher,
+)
+from pupper_sysid.policies.train.learner import Learner, Ranks
 from pupper_sysid.policies.train.run_file import (
     RUN_FILE,
     Run,
@@ -41,7 +45,6 @@ from pupper_sysid.policies.train.run_file import (
     teacher_of,
 )
 from pupper_sysid.policies.train.selection import Judge
-from pupper_sysid.policies.train.teachers import LearnedTeacher, Teacher, TrotTeacher, load_teacher
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
@@ -78,13 +81,7 @@ def make_env(run: Run, ranks: Ranks, servos: ServoRanges | None = None) -> Puppe
 
 
 def learner_device(run: Run, ranks: Ranks) -> str:
-    """Torch's name of the device on which the networks of this process learn.
-
-    Raises
-    ------
-    InputError
-        If there is no such device.
-    """
+    """Torch's name of the device on which the networks of this process learn."""
     wanted = run.device if run.learner_device == "as-device" else run.learner_device
     if wanted != "cuda":
         return "cpu"
@@ -302,11 +299,9 @@ class _Session:
             folder = Path(wanted) if wanted != OWN else self._train_teacher(ends)
         if ends():
             return None
-        return LearnedTeacher(learner.env, self._network_of(folder), state)
-
-    def _network_of(self, teacher: Path) -> MLPModel:
         with torch.random.fork_rng(devices=[]):
-            return load_teacher(teacher, BEST, self.run, self.learner.observations)
+            network = load_teacher(folder, BEST, self.run, learner.observations)
+        return LearnedTeacher(learner.env, network, state)
 
     def _train_teacher(self, ends: Callable[[], bool]) -> Path:
         folder = self.folder / _TEACHER

@@ -1,7 +1,7 @@
 """WalkingVecEnv: `sim.walking.env.PupperEnv` with the contract that rsl_rl's learner expects.
 
 Observation groups: `policy` is the observation of 60 numbers, `privileged` the true state for the
-critic, `noise` the noise of the last action (see `policies.network.exploration`), and `actions` the
+critic, `noise` the noise of the last action (`policies.network.actor_critic`), and `actions` the
 last `action_history` actions, newest first: with them the delayed system is Markov again (the
 paper's augmented state). Tensors are copies, since the learner keeps them.
 """
@@ -21,13 +21,8 @@ from pupper_sysid.sim.walking.env import PupperEnv
 class WalkingVecEnv:
     """Adapter; `env` is the environment itself.
 
-    Parameters
-    ----------
-    env : PupperEnv
-    action_history : int
-        How many past actions the group `actions` holds; 0 leaves the group out.
-    device : str
-        Torch's name of where the learner wants its tensors.
+    `action_history` is how many past actions the group `actions` holds, 0 leaves the group out;
+    `device` is torch's name of where the learner wants its tensors.
 
     Attributes
     ----------

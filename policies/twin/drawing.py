@@ -55,12 +55,7 @@ class Actuator:
 def actuator_of(name: str, robot: ServoRobot, recording: Recording) -> Actuator:
     """The servos that `name` means, on the joints of a robot.
 
-    Parameters
-    ----------
-    name : str
-        A calibration file, a servo card, a preset, or `ideal`.
-    robot : ServoRobot
-    recording : Recording
+    It is a calibration file, a servo card, a preset, or `ideal`.
     """
     check_actuator(name)
     if is_servo_model(name):
@@ -79,12 +74,7 @@ def actuator_of(name: str, robot: ServoRobot, recording: Recording) -> Actuator:
 def of_calibration(calibration: Calibration, robot: ServoRobot, recording: Recording) -> Actuator:
     """The servos of a calibration, on the joints of a robot.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        One that knows other P gains is taken at the one that the recording names.
-    robot : ServoRobot
-    recording : Recording
+    A calibration that knows other P gains is taken at the one that the recording names.
     """
     calibration, fallbacks = spread_over(calibration, robot.joints)
     gains = {t.p_gain for joint in recording.joints for t in recording.trials(joint)}
@@ -105,11 +95,7 @@ def of_calibration(calibration: Calibration, robot: ServoRobot, recording: Recor
 def stronger(values: dict[str, Array], factor: float) -> dict[str, Array]:
     """Servos with the same motion in free air whose torques are larger by a factor.
 
-    Parameters
-    ----------
-    values : dict of str to ndarray, shape (joints,)
-        By field of `DelayedPDParameters`.
-    factor : float
+    `values` are by field of `DelayedPDParameters`, shape (joints,).
     """
     servo = DelayedPDParameters(**values)
     scaled = servo.scaled(factor * values["armature"])
@@ -129,11 +115,7 @@ def spread_over(
 def robot_for(recording: Recording, model: Path | None = None) -> ServoRobot:
     """The robot that a recording is of.
 
-    Parameters
-    ----------
-    recording : Recording
-    model : Path, optional
-        Its MJCF or URDF; by default the Mini Pupper, if the joints are its.
+    `model` is its MJCF or URDF; by default it is the Mini Pupper, if the joints are its.
     """
     from pupper_sysid.sim.robot.servo_robot import mini_pupper_robot, robot_of
 
@@ -164,18 +146,8 @@ _BALL = np.concatenate(
 def robot_over_time(recording: Recording, model: Path | None = None) -> tuple[Array, list[Body]]:
     """Bodies of the recorded robot at the readings, each held until the next.
 
-    Parameters
-    ----------
-    recording : Recording
-    model : Path, optional
-        MJCF or URDF of the robot; by default the Mini Pupper.
-
-    Returns
-    -------
-    time_s : ndarray, shape (n,)
-        At most `POSES_PER_S` a second [s].
-    bodies : list of Body
-        Those that have a shape.
+    As `robot_for` finds it. Gives times [s], at most `POSES_PER_S` a second, and the bodies that
+    have a shape.
     """
     robot = robot_for(recording, model)
     time_s, held = poses(recording, POSES_PER_S)
@@ -196,13 +168,9 @@ class HungRobot:
     def bodies(self, servo_rad: Array, gravity: Array | None = None) -> list[Body]:
         """Its bodies that have a shape.
 
-        Parameters
-        ----------
-        servo_rad : ndarray, shape (n, joints)
-            Servo angles as recordings have them, in the order of the robot's joints.
-        gravity : ndarray, shape (n, 3), optional
-            Direction of gravity in the trunk's frame, which gives roll and pitch; the heading stays
-            forward. By default, and where it is NaN, the trunk is level.
+        Servo angles (n, joints) are as recordings have them, in the order of the robot's joints.
+        The direction of gravity in the trunk's frame, shape (n, 3), gives roll and pitch; the
+        heading stays forward. By default, and where it is NaN, the trunk is level.
         """
         model, joints = self._model, self.robot.joints
         data = mujoco.MjData(model)
@@ -218,16 +186,8 @@ def bodies_over_time(
 ) -> list[Body]:
     """Bodies of a robot that have a shape, in its poses.
 
-    Parameters
-    ----------
-    model : mujoco.MjModel
-    qpos : ndarray, shape (n, model.nq)
-    surfaces : dict, optional
-        The shapes, by number of the body, where they are known already.
-
-    Returns
-    -------
-    list of Body
+    Poses are `qpos`, shape (n, model.nq); `surfaces` the shapes, by number of the body, where they
+    are known already.
     """
     data = mujoco.MjData(model)
     position = np.empty((len(qpos), model.nbody, 3))

@@ -59,11 +59,8 @@ class ImuLog:
 def read_imu(path: Path) -> ImuLog:
     """Read the log of an IMU.
 
-    Parameters
-    ----------
-    path : Path
-        CSV file with the columns `timestamp` or `time_s` [s], `gx`, `gy`, `gz` [rad/s], and perhaps
-        `ax`, `ay`, `az` [m/s²].
+    It is a CSV file with the columns `timestamp` or `time_s` [s], `gx`, `gy`, `gz` [rad/s], and
+    perhaps `ax`, `ay`, `az` [m/s²].
     """
     data = content(path, _MOST_BYTES, "Give a shorter log.")
     table = read_table(path, data.decode("utf-8", errors="replace"))
@@ -93,11 +90,7 @@ def read_imu(path: Path) -> ImuLog:
 def spectrum(time_s: Array, rates_rad_s: Sequence[Array]) -> Gyro | None:
     """Spectrum after the first two seconds; None if less than five are left.
 
-    Parameters
-    ----------
-    time_s : ndarray, shape (n,)
-    rates_rad_s : sequence of ndarray, shape (n, 3)
-        Of several robots, whose spectra are averaged.
+    Rates have the shape (n, 3); spectra of several robots are averaged.
     """
     late = time_s >= _SETTLE_S
     time = time_s[late]

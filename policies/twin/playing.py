@@ -83,11 +83,7 @@ class Sequences:
 def sequences(data: ServoData, robot: ServoRobot) -> Sequences:
     """Commands of the recorded joints for the whole robot.
 
-    Parameters
-    ----------
-    data : ServoData
-    robot : ServoRobot
-        Has all joints of `data`.
+    The robot has all joints of `data`.
     """
     found: dict[tuple, dict[str, int]] = {}
     for joint in data.joints:
@@ -287,15 +283,8 @@ class Evidence(Result):
 def evidence(cases: Sequence[Case], data: ServoData, part: Part, seed: int) -> Evidence:
     """What predictions of the same readings in the air and on the ground say.
 
-    Parameters
-    ----------
-    cases : sequence of Case
-        With the torques as they are, and stronger.
-    data : ServoData
-    part : Part
-        Readings that count.
-    seed : int
-        Of the bootstrap.
+    Cases are with the torques as they are, and stronger; `part` chooses the readings that count;
+    the seed is the bootstrap's.
     """
     motion = [_motion(case, data, part, seed) for case in cases]
     load = [_load_share(case.offsets) for case in cases]
@@ -371,9 +360,9 @@ def _load_share(offsets: Mapping[str, tuple[float, float]]) -> Interval | None:
 def _verdict(found: Sequence[Motion | None]) -> Verdict:
     if any(one is not None and one.correlation.low > _CORRELATED for one in found):
         return "ground"
-    return "air" if all(one is not None and _nothing_in(one) for one in found) else "cannot tell"
-
-
-def _nothing_in(one: Motion) -> bool:
-    small = -_NONE < one.share.low and one.share.high < _NONE
-    return small and one.correlation.high < _UNCORRELATED
+    nothing = [
+        one is not None and -_NONE < one.share.low and one.share.high < _NONE
+        and one.correlation.high < _UNCORRELATED
+        for one in found
+    ]  # fmt: skip
+    return "air" if all(nothing) else "cannot tell"

@@ -189,7 +189,11 @@ def twin(
         name: _twin_of([own[k :: len(actuators)] for own in conditions], data, test, seed)
         for k, name in enumerate(actuators)
     }
-    judges = [n for n, a in actuators.items() if not _fitted_to(a, recording)]
+    judges = [
+        name for name, actuator in actuators.items()
+        if all(one.sha256 != recording.sha256
+               for one in (actuator.calibration.inputs if actuator.calibration else []))
+    ]  # fmt: skip
     judge = min(judges, key=lambda name: models[name].best_rad, default=None)
     found = models[judge].evidence if judge else None
     return Twin(
@@ -199,11 +203,6 @@ def twin(
         repeatability_rad=scores.repeatability(data, test), time_step_s=data.period_s,
         notes=tuple(_notes(actuators, robot, models, rules)), data=data,
     )  # fmt: skip
-
-
-def _fitted_to(actuator: Actuator, recording: Recording) -> bool:
-    inputs = actuator.calibration.inputs if actuator.calibration else []
-    return any(one.sha256 == recording.sha256 for one in inputs)
 
 
 def _parts(recording: Recording, test_loops: Sequence[int]) -> tuple[Part, Part, str]:

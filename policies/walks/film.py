@@ -39,11 +39,6 @@ class Film:
         Said in every picture: policy, servos.
     command : sequence of float, length 3
         Forward and sideways speed [m/s], turn rate [rad/s].
-
-    Raises
-    ------
-    InputError
-        If no frames can be drawn here, or the package imageio is missing.
     """
 
     def __init__(
@@ -78,12 +73,8 @@ class Film:
     def add(self, data: Any, velocity: NDArray[np.float64]) -> None:
         """One more picture.
 
-        Parameters
-        ----------
-        data : mujoco.MjData
-            With positions of bodies as of now (`mj_forward`).
-        velocity : ndarray, shape (3,)
-            Forward and sideways speed [m/s], turn rate [rad/s].
+        `data` has the positions of bodies as of now (`mj_forward`); the velocity, shape (3,), is
+        forward and sideways speed [m/s], and turn rate [rad/s].
         """
         self._velocity.append(np.asarray(velocity, float))
         at, trunk = self._camera.lookat, data.qpos[:3]

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, LEGS
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import TRUNK_BOX_AT_M, TRUNK_BOX_M
@@ -57,18 +56,6 @@ class Handicap:
     friction: float | None = None
     """Sliding friction of the feet on the ground, instead of the task's."""
 
-    def __post_init__(self):
-        if self.riser_m is not None and self.riser_m not in STAIRS_M:
-            raise InputError(
-                f"There are no steps of {self.riser_m} m; there are "
-                f"{', '.join(f'{riser:g}' for riser in STAIRS_M)} m."
-            )
-        for name in ("push_m_s", "extra_jitter_s", "payload_kg", "weak_leg"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be a number ≥ 0.")
-        if not 0 <= self.missed_ticks < 1:
-            raise InputError(f"missed_ticks is {self.missed_ticks}; it must be from 0 to below 1.")
-
     @property
     def gravity_direction(self) -> Array:
         """Unit vector, shape (3,), in axes of which the third is the ground's normal."""
@@ -85,12 +72,7 @@ class Handicap:
 def impose(robots: RobotBatch, ids: NDArray[np.intp], own: Handicap) -> None:
     """Give robots a handicap, at the start of their walk.
 
-    Parameters
-    ----------
-    robots : RobotBatch
-    ids : ndarray of int
-        Robots in the order of their numbers, from 0 on.
-    own : Handicap
+    `ids` are robots in the order of their numbers, from 0 on.
     """
     if own.weak_leg != 1.0:
         first = _PER_LEG * (np.arange(len(ids)) % len(LEGS))

@@ -11,8 +11,7 @@ latent of a Transformer, the last hidden layer of an MLP.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
@@ -169,38 +168,18 @@ def replay(
     Starts as at the start of an episode; a policy that sees its past actions begins with the one in
     the first observation for all of them, and continues with its own.
 
-    Parameters
-    ----------
-    policy : Policy
-        Keeps its own state.
-    observations : ndarray, shape (steps, n, 60)
-
-    Returns
-    -------
-    actions : ndarray of float32, shape (steps, n, 12)
-    hidden : ndarray of float32, shape (steps, n, k)
-        See `Rollout`.
+    The policy keeps its own state. Observations have the shape (steps, n, 60). Actions have the
+    shape (steps, n, 12), hidden states (steps, n, k); see `Rollout`.
     """
-    with _observed(policy) as (own, hidden):
+    hidden: list[NDArray[np.float32]] = []
+    handle = _listen(policy.network, lambda state: hidden.append(state.numpy().copy()))
+    own = copy(policy)  # a policy replaces its state and never writes into it
+    try:
         own.reset(observations[0][:, _LAST_ACTION])
         actions = [own.act(row) for row in observations]
-    return np.array(actions), np.array(hidden)
-
-
-@contextmanager
-def _observed(policy: Policy) -> Iterator[tuple[Policy, list[NDArray[np.float32]]]]:
-    """A copy of a policy with its own state, and the hidden states as it acts."""
-    hidden: list[NDArray[np.float32]] = []
-
-    def keep(state: torch.Tensor) -> None:
-        hidden.append(state.numpy().copy())
-
-    handle = _listen(policy.network, keep)
-    try:
-        # a policy replaces its state and never writes into it
-        yield copy(policy), hidden
     finally:
         handle.remove()
+    return np.array(actions), np.array(hidden)
 
 
 def _listen(network: PolicyNetwork, keep: Callable[[torch.Tensor], None]) -> RemovableHandle:

@@ -40,11 +40,10 @@ from pupper_sysid.policies.walks.handicaps import (
 )
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import PRESETS, Walking
-from pupper_sysid.sim.walking.draws import at_rest
+from pupper_sysid.sim.walking.draws import Twins, at_rest
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of
-from pupper_sysid.sim.walking.shared_draws import Twins
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -274,14 +273,11 @@ class _Group:
         direction = self.pushes.get(step)
         for own, robots in zip(self.conditions, self.robots, strict=True):
             if own.handicap.push_m_s and direction is not None:
-                self._push(_numbers(robots), own.handicap.push_m_s * direction)
+                ids, added = _numbers(robots), own.handicap.push_m_s * direction
+                self.env.robots.push(ids, self.env.robots.qvel[ids, :2] + added[: len(ids)])
             see_slope(observation[robots], _numbers(robots), self.env.robots, own.handicap)
             if own.change:
                 observation[robots] = own.change(step, observation[robots])
-
-    def _push(self, ids: NDArray[np.intp], added: Array) -> None:
-        robots = self.env.robots
-        robots.push(ids, robots.qvel[ids, :2] + added[: len(ids)])
 
     def _action(self, step: int, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """What each robot does by its walker."""

@@ -34,19 +34,9 @@ def planar_velocity(facts: Step) -> Array:
 def counted(velocity: Array, alive: Bools, fell: Bools) -> tuple[Array, Bools]:
     """What counts of walks: velocities, 0 after a fall, and the steps that count.
 
-    Parameters
-    ----------
-    velocity : ndarray, shape (steps, n, 3)
-    alive : ndarray of bool, shape (steps, n)
-        Whether the robot has neither fallen nor left the ground's edge so far.
-    fell : ndarray of bool, shape (n,)
-        Whether it fell.
-
-    Returns
-    -------
-    velocity : ndarray, shape (steps, n, 3)
-    counts : ndarray of bool, shape (steps, n)
-        Of each robot, the steps up to some step.
+    Velocities have the shape (steps, n, 3). `alive`, shape (steps, n), says whether the robot has
+    neither fallen nor left the ground's edge so far; `fell`, shape (n,), whether it fell. The steps
+    that count, shape (steps, n), are of each robot those up to some step.
     """
     return np.where(alive[..., None], velocity, 0.0), alive | fell
 
@@ -54,12 +44,7 @@ def counted(velocity: Array, alive: Bools, fell: Bools) -> tuple[Array, Bools]:
 def tracking_errors(velocity: Array, command: Array, alive: Bools, fell: Bools) -> Array:
     """Mean absolute error of each robot at every control step, shape (n, 3).
 
-    Parameters
-    ----------
-    velocity : ndarray, shape (steps, n, 3)
-    command : ndarray, shape (3,) or (steps, n, 3)
-    alive, fell : ndarray of bool, shapes (steps, n) and (n,)
-        See `counted`.
+    Commands have the shape (3,) or (steps, n, 3), the others are as `counted` takes them.
     """
     shown, counts = counted(velocity, alive, fell)
     error = (counts[..., None] * np.abs(shown - command)).sum(axis=0)
@@ -104,15 +89,8 @@ def pooled_errors(
 ) -> dict[str, float]:
     """Mean absolute errors by name, over all steps of all robots that count.
 
-    Parameters
-    ----------
-    velocity : ndarray, shape (k, n, 3)
-        Until no robot was up any more.
-    command : ndarray, shape (3,)
-    alive, fell : ndarray of bool, shapes (k, n) and (n,)
-        See `counted`.
-    steps : int
-        Of the whole walk: to its end, a robot that fell stands still.
+    Velocities, `alive` and `fell` are as `counted` takes them, until no robot was up any more;
+    `steps` is the length of the whole walk: to its end, a robot that fell stands still.
     """
     shown, counts = counted(velocity, alive, fell)
     after = int(fell.sum()) * max(steps - len(velocity), 0)

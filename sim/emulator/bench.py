@@ -133,12 +133,7 @@ class ServoPlant(Protocol):
 
 
 class ServosOnStand:
-    """A `ServoPlant` whose trunk is level and at rest: each servo moves alone.
-
-    Parameters
-    ----------
-    servos : sequence of FreeAirServo or PendulumServo
-    """
+    """A `ServoPlant` whose trunk is level and at rest: each servo moves alone."""
 
     def __init__(self, servos: Sequence[Any]):
         self._servos = servos

@@ -35,11 +35,7 @@ from pupper_sysid.sim.emulator.robot import CENTRE_COUNT, RADIANS_PER_COUNT, Emu
 class VirtualClock:
     """Time that passes only in sleeps and exchanges with the bus.
 
-    Parameters
-    ----------
-    overshoot_s : float
-        Mean of the exponential time by which a sleep ends late [s].
-    rng : numpy.random.Generator
+    A sleep ends late by an exponential time of mean `overshoot_s`.
     """
 
     def __init__(self, overshoot_s: float, rng: np.random.Generator):
@@ -191,7 +187,11 @@ class EmulatedBus:
         before = self._clock.now()
         self._clock.spend(self.robot.spec.read_duration_s)
         time_s = round((before + self._clock.now()) / 2, 6)
-        measured = self._last_polls(time_s)
+        if self._schedule is not None:
+            measured = self._schedule.advance(time_s)
+        else:
+            succeeded = self._polls.random(len(self.joint_names)) >= self.robot.spec.loss
+            measured = np.where(succeeded, time_s, self._measured_s)
         fresh = np.flatnonzero(measured > self._measured_s)
         noise = self.robot.spec.reading_noise_rad * self._noise.standard_normal(len(fresh))
         position = np.array([self._plant.angle(i, measured[i]) for i in fresh.tolist()])
@@ -262,13 +262,6 @@ class EmulatedBus:
         write_text(numbers, yaml.safe_dump(self.truth(), sort_keys=False), force)
         write_text(rows, text.getvalue(), force)
         return numbers, rows
-
-    def _last_polls(self, time_s: float) -> NDArray[np.float64]:
-        """When each joint's present reading was measured [s]."""
-        if self._schedule is not None:
-            return self._schedule.advance(time_s)
-        succeeded = self._polls.random(len(self.joint_names)) >= self.robot.spec.loss
-        return np.where(succeeded, time_s, self._measured_s)
 
     def _quantised(
         self,

@@ -41,13 +41,8 @@ _CENTRE = 512
 class ProxyEmulator:
     """Proxy, firmware and servos.
 
-    Parameters
-    ----------
-    bench : ServoBench
-        With a joint map of the proxy's counts, ids 1 to 12.
-    rng : numpy.random.Generator
-        Lost polls, and the answers to unknown requests.
-    faults : BusFaults, optional
+    The bench has a joint map of the proxy's counts, ids 1 to 12; `rng` decides lost polls, and the
+    answers to unknown requests.
     """
 
     def __init__(

@@ -53,13 +53,7 @@ class BusFaults:
 
     @classmethod
     def parse(cls, text: str, rng: np.random.Generator) -> BusFaults:
-        """Faults from `kind=rate,kind=rate`; an empty text is none.
-
-        Raises
-        ------
-        InputError
-            If a kind is unknown or a rate is no probability.
-        """
+        """Faults from `kind=rate,kind=rate`; an empty text is none."""
         rates = {}
         for part in filter(None, (piece.strip() for piece in text.split(","))):
             kind, _, rate = part.partition("=")

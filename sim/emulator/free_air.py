@@ -31,14 +31,8 @@ _STEPS_BETWEEN_LOOKS = 50
 class FreeAirServo:
     """A servo in free air; time starts at 0 and must not go backwards.
 
-    Parameters
-    ----------
-    parameters : DelayedPDParameters
-        Scalars; `dead_time_s` at least two physics steps.
-    position_rad : float
-        Where it rests at the start, commanded there for long.
-    time_step_s : float
-        Physics step [s].
+    Parameters are scalars, the dead time at least two physics steps. It rests at `position_rad` at
+    the start, commanded there for long.
     """
 
     def __init__(

@@ -10,12 +10,11 @@ statistics of twelve recordings.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from pupper_sysid.common.data_sheet import data_sheet
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
@@ -76,14 +75,6 @@ class RobotSpec:
     """Time the host spends in one write."""
     read_duration_s: float = 0.0005
     """Time the host spends in one read."""
-
-    def __post_init__(self):
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (np.isfinite(value) and value >= 0):
-                raise InputError(f"RobotSpec: {field.name} is {value}; it must be a number ≥ 0.")
-        if not self.loss < 1:
-            raise InputError(f"RobotSpec: loss is {self.loss}; it must be below 1.")
 
 
 @dataclass(frozen=True)

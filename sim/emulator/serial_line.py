@@ -415,13 +415,8 @@ _TCGETS2, _TERMIOS2 = 0x802C542A, struct.Struct("=4IB19s2I")
 class SerialPty:
     """Serves an emulator; `device` is what a client opens.
 
-    Parameters
-    ----------
-    emulator : LineEmulator
-    link : Path, optional
-        A stable name for the device, which survives being unplugged.
-    latency_s : float
-        Period of the adapter's latency timer; 0 for an adapter that delivers at once.
+    `link` is a stable name for the device, which survives being unplugged; `latency_s` the period
+    of the adapter's latency timer, 0 for an adapter that delivers at once.
     """
 
     def __init__(self, emulator: LineEmulator, link: Path | None = None, latency_s: float = 0.0):
@@ -450,7 +445,9 @@ class SerialPty:
                 data = os.read(self._host, 4096)
                 for due, piece in self.emulator.receive(data, self.now(), self._baud()):
                     self._count += 1
-                    heapq.heappush(self._due, (self._delivered(due), self._count, piece))
+                    if self.latency_s:  # the adapter delivers with the next tick of its timer
+                        due = math.ceil(due / self.latency_s) * self.latency_s
+                    heapq.heappush(self._due, (due, self._count, piece))
 
     def stop(self) -> None:
         """End `serve`; may be called from anywhere."""
@@ -463,12 +460,6 @@ class SerialPty:
                 os.close(descriptor)
         if self._link is not None:
             self._link.unlink(missing_ok=True)
-
-    def _delivered(self, due: float) -> float:
-        """When the adapter delivers bytes that it has at `due`: at the next tick of its timer."""
-        if not self.latency_s:
-            return due
-        return math.ceil(due / self.latency_s) * self.latency_s
 
     def _deliver(self) -> None:
         while self._due and self._due[0][0] <= self.now():

@@ -94,13 +94,7 @@ class Check(JointResults[JointCheck]):
 
 
 def check(servos: ExportedServos) -> Check:
-    """Simulate an export in MuJoCo beside its calibration.
-
-    Raises
-    ------
-    InputError
-        If the step is too long for the servos.
-    """
+    """Simulate an export in MuJoCo beside its calibration."""
     names = servos.calibration.joint_names
     tones, walk = unseen_tones(), walk_commands()
     model = compiled(servos)
@@ -156,7 +150,11 @@ def _own_motion(
     joint: JointCalibration, commands: NDArray
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Times and positions of the calibration's own model, in the steps of its fit."""
-    servo = own_model(joint)
+    actuator, loaded = joint.actuator, joint.under_load
+    servo: DelayedPD | LoadedServo = DelayedPD(actuator.parameters, actuator.fitted_step_s)
+    if loaded is not None:
+        carried = loaded.servo(actuator.dead_time_s.value)
+        servo = LoadedServo(carried, loaded.p_gain, time_step_s=actuator.fitted_step_s)
     servo.reset(commands[0])
     moved = servo.rollout(held(commands, servo.time_step_s))
     return servo.time_step_s * np.arange(len(moved) + 1), np.append(commands[0], moved)
@@ -202,15 +200,6 @@ def _notes(servos: ExportedServos, joints: Mapping[str, JointCheck]) -> Iterator
             f"{', '.join(loaded)}: fitted under load, so the calibration's own model has frictions "
             f"that no simulator's actuator carries; they cost up to {most:.2g} mrad."
         )
-
-
-def own_model(joint: JointCalibration) -> DelayedPD | LoadedServo:
-    """The servo model of a joint's calibration, in the steps of its fit."""
-    actuator = joint.actuator
-    if joint.under_load is not None:
-        servo = joint.under_load.servo(actuator.dead_time_s.value)
-        return LoadedServo(servo, joint.under_load.p_gain, time_step_s=actuator.fitted_step_s)
-    return DelayedPD(actuator.parameters, actuator.fitted_step_s)
 
 
 def compiled(servos: ExportedServos, defaults: str = _MODEL_DEFAULTS) -> Any:

@@ -53,22 +53,6 @@ def foreign_servo(path: Path | str, joint: str | None = None) -> Servo:
     path = Path(path)
     if path.suffix == ".py":
         return _in_python(path, joint)
-    return _in_mjcf(path, joint)
-
-
-def position_servos(path: Path) -> dict[str, Servo]:
-    """Servos that the position actuators of an MJCF make of its joints, by joint; may be none.
-
-    Raises
-    ------
-    InputError
-        If MuJoCo cannot compile the file.
-    """
-    model, driven = _compiled(path)
-    return {name: _driven_servo(path, model, name, i) for name, i in driven.items()}
-
-
-def _in_mjcf(path: Path, joint: str | None) -> Servo:
     model, driven = _compiled(path)
     if not driven or (joint is not None and joint not in driven):
         raise InputError(
@@ -77,6 +61,12 @@ def _in_mjcf(path: Path, joint: str | None) -> Servo:
         )
     name = joint or next(iter(driven))
     return _driven_servo(path, model, name, driven[name])
+
+
+def position_servos(path: Path) -> dict[str, Servo]:
+    """Servos that the position actuators of an MJCF make of its joints, by joint; may be none."""
+    model, driven = _compiled(path)
+    return {name: _driven_servo(path, model, name, i) for name, i in driven.items()}
 
 
 def _compiled(path: Path) -> tuple[Any, dict[str, int]]:
@@ -144,7 +134,12 @@ def _in_python(path: Path, joint: str | None) -> Servo:
         tree = ast.parse(path.read_text(encoding="utf-8"))
     except (SyntaxError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is no Python that can be read: {error}.") from error
-    literals = _literals(tree)
+    # names at the top of the file that stand for literals, or for arithmetic with such names
+    literals: dict[str, Any] = {}
+    for node in tree.body:
+        name, value = _assigned(node)
+        if name and (number := _value(value, literals)) is not None:
+            literals[name] = number
     groups = [
         g for g in _groups(tree, literals) if _first(g, _WORDS["stiffness_nm_per_rad"], joint)
     ]
@@ -192,16 +187,6 @@ def _in_python(path: Path, joint: str | None) -> Servo:
 
 def _pd(numbers: dict[str, Any]) -> TorquePD:
     return TorquePD(model="delayed_pd", **{k: stated(float(v)) for k, v in numbers.items()})
-
-
-def _literals(tree: ast.Module) -> dict[str, Any]:
-    """Names at the top of the file that stand for literals, or for arithmetic with such names."""
-    literals: dict[str, Any] = {}
-    for node in tree.body:
-        name, value = _assigned(node)
-        if name and (number := _value(value, literals)) is not None:
-            literals[name] = number
-    return literals
 
 
 def _assigned(node: ast.stmt) -> tuple[str, ast.expr | None]:

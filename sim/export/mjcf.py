@@ -205,7 +205,9 @@ def to_model(
     step_s = float(theirs.opt.timestep) if physics_step_s is None else physics_step_s
     servos = ExportedServos.of(calibration, step_s, gain, links, sha256)
     before = _actuators(root)
-    changes = list(_put_servos(root, servos, model, _free_group(theirs)))
+    # a group of actuators that the model's options do not disable
+    group = next(n for n in range(31) if not int(theirs.opt.disableactuator) >> n & 1)
+    changes = list(_put_servos(root, servos, model, str(group)))
     changes += _options(root, servos, theirs)
     if absent:
         changes.append(
@@ -273,11 +275,6 @@ def _inlined(path: Path, root_folder: Path | None = None, depth: int = 0) -> Ele
                 for n, element in enumerate(included):
                     parent.insert(place + n, element)
     return root
-
-
-def _free_group(theirs: Any) -> str:
-    """A group of actuators that the model's options do not disable."""
-    return str(next(n for n in range(31) if not int(theirs.opt.disableactuator) >> n & 1))
 
 
 def _put_servos(root: Element, servos: ExportedServos, model: Path, group: str) -> Iterator[str]:

@@ -94,12 +94,6 @@ class ExportedServos:
             By joint, the inertia of link and load to take off the armature [kg·m²].
         sha256 : str, optional
             Of the calibration's file; by default of the text that it would be saved as.
-
-        Raises
-        ------
-        InputError
-            If the step is no physics step, the calibration holds at its own P gain only, or an
-            armature does not hold such a link.
         """
         if not 0 < physics_step_s <= _LONGEST_STEP_S:
             raise InputError(

@@ -157,11 +157,8 @@ class Worlds:
     def advance(self, qpos: Array, qvel: Array, commands: Array) -> dict[str, NDArray[np.float32]]:
         """Let all worlds take the physics steps of one control step.
 
-        Parameters
-        ----------
-        qpos, qvel : ndarray, shape (n, 19), (n, 18)
-        commands : ndarray, shape (n, actuators) or (n, substeps, actuators)
-            Set-points [rad], held or of each physics step.
+        Positions and speeds are (n, 19) and (n, 18), commands set-points [rad], held, (n,
+        actuators), or of each physics step, (n, substeps, actuators).
 
         Returns
         -------

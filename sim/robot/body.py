@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.joints import JOINT_NAMES, KINDS, LEGS
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-from pupper_sysid.sim.robot import falls
 from pupper_sysid.sim.robot.mini_pupper import (
     FOOT_RADIUS_M,
     MASS_KG,
@@ -34,6 +33,7 @@ from pupper_sysid.sim.robot.mini_pupper import (
     joint_angles,
     limits,
     robot_xml,
+    touches_ground,
 )
 
 if TYPE_CHECKING:
@@ -46,75 +46,53 @@ MINI_PUPPER = "mini_pupper_2"
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A legged robot with position servos; arrays are in the order of `joints` and of `feet`.
-
-    Attributes
-    ----------
-    name : str
-    joints : tuple of str
-        With a servo each; after the trunk they are all of MuJoCo's positions, in its order.
-    feet : tuple of str
-        Names of sites; `<foot>_touch` are touch sensors.
-    pose, low, high : ndarray, shape (joints,)
-        Default pose and limits [rad].
-    linked : tuple of int
-        Servos that hold the sum of their joint and the one before it, through a linkage.
-    leg_of : ndarray of int, shape (joints,)
-        The foot that a joint moves, -1 of none.
-    feet_at : ndarray, shape (feet, 3)
-        In the trunk's frame in the default pose [m].
-    sole_m : ndarray, shape (feet,)
-        Height of a foot's site over the ground while it stands.
-    offsets : ndarray, shape (feet,)
-        Gait table: by how much of a cycle a foot is behind the first one's phase.
-    mirror_joints, mirror_signs, mirror_feet : ndarray or None
-        Which joint (foot) a joint is the image of, and its sign; None of a robot without an image.
-    standing_height_m : float
-        Of the trunk's origin above the ground, in the default pose.
-    mass_kg : float
-    xml : callable
-        `xml(servos, time_step_s, ground, physics)` gives the MJCF on a `Ground`.
-    feet_in_trunk : callable
-        Feet in the trunk's frame [m], shape (n, feet, 3), of joint angles (n, joints) [rad].
-    joints_at : callable
-        The inverse: joint angles (n, joints) that put the feet there, or near.
-    touches_ground : callable
-        `touches_ground(qpos, gravity, ground)`: whether more than feet do, shape (n,).
-    foot_geoms, trunk : tuple of str, str
-        Names of geoms that carry, and of the body with the floating base.
-    servo_of : dict of str to str
-        The joint of a calibration whose servo each joint has.
-    commands : dict of str to (float, float)
-        Ranges by field of `Commands`, where the robot has its own.
-    notes : tuple of str
-        Sentences about what was assumed.
-    """
+    """A legged robot with position servos; arrays are in the order of `joints` and of `feet`."""
 
     name: str
     joints: tuple[str, ...]
+    """With a servo each; after the trunk they are all of MuJoCo's positions, in its order."""
     feet: tuple[str, ...]
+    """Names of sites; `<foot>_touch` are touch sensors."""
     pose: Array
     low: Array
     high: Array
+    """`pose`, `low` and `high`: default pose and limits [rad]; shape (joints,)."""
     linked: tuple[int, ...]
+    """Servos that hold the sum of their joint and the one before it, through a linkage."""
     leg_of: NDArray[np.intp]
+    """The foot that a joint moves, -1 of none; shape (joints,)."""
     feet_at: Array
+    """In the trunk's frame in the default pose [m]; shape (feet, 3)."""
     sole_m: Array
+    """Height of a foot's site over the ground while it stands; shape (feet,)."""
     offsets: Array
+    """Gait table: by how much of a cycle a foot is behind the first one's phase; shape (feet,)."""
     mirror_joints: NDArray[np.intp] | None
     mirror_signs: Array | None
     mirror_feet: NDArray[np.intp] | None
+    """`mirror_joints`, `mirror_signs` and `mirror_feet`: which joint (foot) a joint is the image
+    of, and its sign; None of a robot without an image."""
     standing_height_m: float
+    """Of the trunk's origin above the ground, in the default pose."""
     mass_kg: float
     xml: Callable[[dict[str, DelayedPDParameters], float, Ground, Physics], str]
+    """`xml(servos, time_step_s, ground, physics)` gives the MJCF on a `Ground`."""
     feet_in_trunk: Callable[[Array], Array]
+    """Feet in the trunk's frame [m], shape (n, feet, 3), of joint angles (n, joints) [rad]."""
     joints_at: Callable[[Array], Array]
+    """The inverse: joint angles (n, joints) that put the feet there, or near."""
     touches_ground: Callable[[Array, Array, Ground], NDArray[np.bool_]]
+    """`touches_ground(qpos, gravity, ground)`: whether more than feet do, shape (n,)."""
     foot_geoms: tuple[str, ...]
     trunk: str = "trunk"
+    """`foot_geoms` and `trunk`: names of geoms that carry, and of the body with the floating
+    base."""
     servo_of: dict[str, str] = field(default_factory=dict)
+    """The joint of a calibration whose servo each joint has."""
     commands: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Ranges by field of `Commands`, where the robot has its own."""
     notes: tuple[str, ...] = ()
+    """Sentences about what was assumed."""
     hashes: dict[str, str] = field(default_factory=dict)
 
     @cached_property
@@ -216,7 +194,7 @@ def _mini_pupper(knee: Knee) -> Body:
         mirror_signs=np.array([-1.0 if name.endswith("hip") else 1.0 for name in JOINT_NAMES]),
         mirror_feet=np.array(other), standing_height_m=STANDING_HEIGHT_M, mass_kg=MASS_KG,
         xml=xml, feet_in_trunk=feet_in_trunk, joints_at=joints_at,
-        touches_ground=falls.touches_ground,
+        touches_ground=touches_ground,
         foot_geoms=tuple(f"{leg}_foot" for leg in LEGS),
     )  # fmt: skip
 
@@ -225,17 +203,7 @@ def _mini_pupper(knee: Knee) -> Body:
 def body_of(robot: str, robot_config: str, knee: Knee = "linkage") -> Body:
     """The body that a task's settings name.
 
-    Parameters
-    ----------
-    robot, robot_config : str
-        Paths of a MJCF and of its YAML; both empty for the Mini Pupper 2.
-    knee : {"linkage", "serial"}
-        Of the Mini Pupper.
-
-    Raises
-    ------
-    InputError
-        If a file is missing, or does not describe a legged robot.
+    Paths of a MJCF and of its YAML are both empty for the Mini Pupper 2, of which `knee` is.
     """
     if not robot:
         return mini_pupper(knee)

@@ -26,32 +26,22 @@ _ADVICE = "Give an MJCF or URDF that MuJoCo's viewer opens, with its meshes besi
 
 @dataclass(frozen=True)
 class Hinge:
-    """A hinge joint of a model.
-
-    Attributes
-    ----------
-    name : str
-        Empty if it has none.
-    limited : bool
-    low, high : float or None
-        Its range [rad]; where it is not limited as the file has them, None for other than finite
-        numbers.
-    driven : bool
-        Whether an actuator drives it, by itself or through a tendon; in a model without actuators
-        every hinge that does not follow another.
-    follows : str
-        Joint that it follows (URDF `mimic`, MJCF equality of two joints); empty for none.
-    zero_range : bool
-        Whether the file states a range of 0 to 0, which MuJoCo takes for no limits.
-    """
+    """A hinge joint of a model."""
 
     name: str
+    """Empty if it has none."""
     limited: bool
     low: float | None
     high: float | None
+    """`low` and `high`: its range [rad]; where it is not limited as the file has them, None for
+    other than finite numbers."""
     driven: bool
+    """Whether an actuator drives it, by itself or through a tendon; in a model without actuators
+    every hinge that does not follow another."""
     follows: str = ""
+    """Joint that it follows (URDF `mimic`, MJCF equality of two joints); empty for none."""
     zero_range: bool = False
+    """Whether the file states a range of 0 to 0, which MuJoCo takes for no limits."""
 
 
 def hinges_of(path: Path) -> list[Hinge]:

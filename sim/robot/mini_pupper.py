@@ -13,14 +13,19 @@ knee, as the paper and the URDF do.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, LEGS
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, attributes, joint_attributes, pid_element
 
+if TYPE_CHECKING:
+    from pupper_sysid.sim.robot.terrain import Ground
+
+Array = NDArray[np.float64]
 Knee = Literal["linkage", "serial"]
 Physics = Literal["training", "evaluation"]
 """`evaluation`: the whole robot touches the ground, and Newton solves the constraints to their end.
@@ -113,8 +118,13 @@ def robot_xml(
     legs = "".join(_leg(leg, servos, time_step_s, knee, whole) for leg in LEGS)
     tendons = ""
     if knee == "linkage":
-        tendons = "<tendon>" + "".join(_knee_tendon(leg, servos, time_step_s) for leg in LEGS)
-        tendons += "</tendon>"
+        each = {leg: joint_attributes(servos[f"{leg}_calf"], time_step_s) for leg in LEGS}
+        tendons = "".join(
+            f'<fixed name="{leg}_calf_servo" {attributes(own)}><joint joint="{leg}_thigh" '
+            f'coef="1"/><joint joint="{leg}_calf" coef="1"/></fixed>'
+            for leg, own in each.items()
+        )
+        tendons = f"<tendon>{tendons}</tendon>"
     actuators = []
     for name in JOINT_NAMES:
         at = "tendon" if knee == "linkage" and name.endswith("calf") else "joint"
@@ -261,14 +271,6 @@ def _leg(
       </body>"""
 
 
-def _knee_tendon(leg: str, servos: dict[str, DelayedPDParameters], step: float) -> str:
-    own = joint_attributes(servos[f"{leg}_calf"], step)
-    return (
-        f'<fixed name="{leg}_calf_servo" {attributes(own)}>'
-        f'<joint joint="{leg}_thigh" coef="1"/><joint joint="{leg}_calf" coef="1"/></fixed>'
-    )
-
-
 def _mirrored(body: tuple, side: int) -> str:
     mass, (x, y, z), (xx, yy, zz, xy, xz, yz) = body
     return _inertial(mass, (x, side * y, z), (xx, yy, zz, side * xy, xz, side * yz))
@@ -280,3 +282,75 @@ def _inertial(mass: float, centre: tuple, inertia: tuple) -> str:
 
 def _numbers(values) -> str:
     return " ".join(repr(float(v)) for v in values)
+
+
+_SIDE = np.array([SIDE[leg] for leg in LEGS])
+_HIPS_M = np.stack([[HIP_X_M[leg] for leg in LEGS], _SIDE * HIP_Y_M, np.zeros(4)], axis=1)
+_DOWN_M = float(np.hypot(THIGH_M, THIGH_Y_M)) + THIGH_RADIUS_M
+_ASIDE_M = float(np.hypot(np.abs(_HIPS_M[:, 0]).max() + THIGH_M, HIP_Y_M + _DOWN_M))
+"""No point of trunk, hips and thighs is farther below the trunk's origin, or aside of it."""
+
+
+def touches_ground(qpos: Array, gravity: Array, ground: Ground) -> NDArray[np.bool_]:
+    """Whether trunk, hips or thighs touch the ground, shape (n,): a fall.
+
+    Their lowest points are compared with the ground below them, so that a fall needs no contact,
+    and is the same in both kinds of `Physics`.
+
+    `qpos`, shape (n, 19), is MuJoCo's: position and quaternion of the trunk, joint angles.
+    `gravity`, shape (n, 3), is its direction in the trunk's frame.
+    """
+    tilt = np.hypot(gravity[:, 0], gravity[:, 1])
+    above = qpos[:, 2] - ground.highest_near(qpos[:, 0], qpos[:, 1])
+    # a walking robot is too high for any pose to reach the ground, but with its feet
+    low = np.flatnonzero(above < _DOWN_M + _ASIDE_M * tilt)
+    found = np.zeros(len(qpos), bool)
+    if len(low):
+        points, radius = lowest_points(qpos[low, 7:])
+        at = qpos[low, None, :3] + np.einsum("nij,npj->npi", _axes(qpos[low, 3:7]), points)
+        gap = at[..., 2] - radius - ground.height(at[..., 0], at[..., 1])
+        found[low] = gap.min(axis=1) < 0.0
+    return found
+
+
+def lowest_points(joints: Array) -> tuple[Array, Array]:
+    """Points of which the lowest is that of trunk, hips and thighs, while the trunk is upright.
+
+    Joint angles [rad] have the shape (n, 12). Gives points in the trunk's frame [m], shape (n, 28,
+    3): lower corners of the boxes, ends of the thighs; and the radius around each [m], shape (28,).
+    """
+    angles = joints.reshape(len(joints), 4, 3)
+    thigh = angles[:, :, 1]
+    corner = np.broadcast_to(_lower_corners(HIP_BOX_AT_M, HIP_BOX_M), (len(joints), 4, 4, 3)).copy()
+    corner[..., 1] *= _SIDE[:, None]
+    top = np.zeros((len(joints), 4, 2, 3))
+    top[..., 0], top[..., 1] = THIGH_X_M, (_SIDE * THIGH_Y_M)[:, None]
+    top[:, :, 1, 0] -= THIGH_M * np.sin(thigh)
+    top[:, :, 1, 2] -= THIGH_M * np.cos(thigh)
+    own = np.concatenate([corner, top], axis=2)  # in the hips' frames
+    c, s = np.cos(angles[:, :, :1]), np.sin(angles[:, :, :1])
+    y, z = own[..., 1].copy(), own[..., 2].copy()
+    own[..., 1], own[..., 2] = c * y - s * z, s * y + c * z
+    own += _HIPS_M[:, None]
+    trunk = np.broadcast_to(_lower_corners(TRUNK_BOX_AT_M, TRUNK_BOX_M), (len(joints), 4, 3))
+    points = np.concatenate([trunk, own.reshape(len(joints), 24, 3)], axis=1)
+    radius = np.zeros(points.shape[1])
+    radius[4:].reshape(4, 6)[:, 4:] = THIGH_RADIUS_M
+    return points, radius
+
+
+def _lower_corners(at: tuple[float, ...], half: tuple[float, ...]) -> Array:
+    """Lower four corners of a box, shape (4, 3)."""
+    signs = np.array([(1, 1, -1), (1, -1, -1), (-1, 1, -1), (-1, -1, -1)])
+    return np.array(at) + signs * half
+
+
+def _axes(quaternion: Array) -> Array:
+    """Rotation matrices, shape (n, 3, 3): columns are the trunk's axes in the world."""
+    w, x, y, z = quaternion.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)

@@ -12,31 +12,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Moved:
-    """One control step of some robots, k of them. Arrays are overwritten by the next step.
-
-    Attributes
-    ----------
-    rows : slice
-        Which robots.
-    start : ndarray, shape (k, 12)
-        Joint angles before [rad].
-    qpos : ndarray, shape (k, physics steps, 19)
-        MuJoCo's, after each physics step; joint angles last.
-    load : ndarray, shape (k, physics steps, 12)
-        Servo torques in each physics step [N·m].
-    touch : ndarray, shape (k, 4)
-        Largest force on each foot in the last 6 ms [N].
-    feet : ndarray, shape (k, physics steps, 4, 3)
-        Places of the feet in the world before each physics step [m]; on a Warp device only the
-        last.
-    """
+    """One control step of some robots, k of them. Arrays are overwritten by the next step."""
 
     rows: slice
+    """Which robots."""
     start: Array
+    """Joint angles before [rad]; shape (k, 12)."""
     qpos: Array
+    """MuJoCo's, after each physics step; joint angles last; shape (k, physics steps, 19)."""
     load: Array
+    """Servo torques in each physics step [N·m]; shape (k, physics steps, 12)."""
     touch: Array
+    """Largest force on each foot in the last 6 ms [N]; shape (k, 4)."""
     feet: Array
+    """Places of the feet in the world before each physics step [m]; on a Warp device only the last;
+    shape (k, physics steps, 4, 3)."""
 
 
 def gravity_direction(qpos: Array) -> Array:
@@ -65,10 +55,6 @@ def own_velocity(qpos: Array, qvel: Array) -> Array:
 def planar(velocity: Array, qvel: Array) -> Array:
     """Forward and sideways speed [m/s] and turn rate [rad/s], shape (n, 3).
 
-    Parameters
-    ----------
-    velocity : ndarray, shape (n, 3)
-        `own_velocity`.
-    qvel : ndarray, shape (n, 18)
+    `velocity` is that of `own_velocity`.
     """
     return np.column_stack([velocity[:, :2], qvel[:, 5]])

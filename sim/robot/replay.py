@@ -39,21 +39,16 @@ _BEYOND_RAD = 0.05  # of a limit beyond what was read
 
 @dataclass(frozen=True)
 class Replayed:
-    """Motion of n copies of a robot.
-
-    Attributes
-    ----------
-    servo_rad : ndarray of float32, shape (n, steps + 1, joints)
-        Servo angles at the edges of physics steps, as recordings have them.
-    fell_s : ndarray, shape (n,)
-        When a trunk had tilted by 60° [s]; infinite where it never did, or is fixed.
-    gyro_rad_s : ndarray of float32, shape (n, steps // 10, 3)
-        Rates of the trunk about its own axes at every tenth step; 0 where it is fixed.
-    """
+    """Motion of n copies of a robot."""
 
     servo_rad: NDArray[np.float32]
+    """Servo angles at the edges of physics steps, as recordings have them; shape (n, steps + 1,
+    joints)."""
     fell_s: Array
+    """When a trunk had tilted by 60° [s]; infinite where it never did, or is fixed; shape (n,)."""
     gyro_rad_s: NDArray[np.float32]
+    """Rates of the trunk about its own axes at every tenth step; 0 where it is fixed; shape (n,
+    steps // 10, 3)."""
 
 
 def replay(
@@ -91,11 +86,6 @@ def replay(
         0 for all cores.
     progress : callable
         Called with the share that is done.
-
-    Raises
-    ------
-    InputError
-        If a servo is not stable in physics steps of 2 ms, or its dead time is negative.
     """
     from mujoco.batch import Batch  # needs mujoco 4; its message names the module
 
@@ -103,9 +93,15 @@ def replay(
     joints = np.array([int(model.joint(name).qposadr[0]) for name in robot.joints])
     mix = _mixing(model)  # servo angles are qpos @ mix
     unmix = np.linalg.inv(mix[joints])
-    _widen_limits(model, robot, (reach + robot.shift_rad) @ unmix)
+    reached = (reach + robot.shift_rad) @ unmix
+    low, high = reached.min(axis=0) - _BEYOND_RAD, reached.max(axis=0) + _BEYOND_RAD
+    for joint, name in enumerate(robot.joints):  # each may go to where it was read
+        ends = model.joint(name).range
+        ends[:] = min(ends[0], low[joint]), max(ends[1], high[joint])
     trunk = int(model.body_rootid[model.joint(robot.joints[0]).bodyid[0]])
-    root = _root_address(model, trunk)
+    base = int(model.body_jntadr[trunk])
+    free = base >= 0 and model.jnt_type[base] == mujoco.mjtJoint.mjJNT_FREE
+    root = int(model.jnt_qposadr[base]) if free else None  # of its position in qpos
     spin = int(model.body_dofadr[trunk]) + 3  # a free joint's rates are in the body's axes
     n, steps = len(which), commands.shape[1] - 1
     batch = Batch(model, n, threads)
@@ -157,21 +153,6 @@ def _mixing(model) -> Array:
         for wrap in range(first, first + model.tendon_num[target]):
             mix[model.jnt_qposadr[model.wrap_objid[wrap]], servo] = model.wrap_prm[wrap]
     return mix
-
-
-def _widen_limits(model, robot: ServoRobot, reached: Array) -> None:
-    """Let every joint go to where it was read."""
-    low, high = reached.min(axis=0) - _BEYOND_RAD, reached.max(axis=0) + _BEYOND_RAD
-    for joint, name in enumerate(robot.joints):
-        ends = model.joint(name).range
-        ends[:] = min(ends[0], low[joint]), max(ends[1], high[joint])
-
-
-def _root_address(model, trunk: int) -> int | None:
-    """Where the position of a free trunk begins in qpos; None if it is fixed."""
-    joint = int(model.body_jntadr[trunk])
-    free = joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
-    return int(model.jnt_qposadr[joint]) if free else None
 
 
 def _equip(

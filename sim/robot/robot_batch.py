@@ -77,12 +77,6 @@ class RobotBatch:
         What else differs from the model.
     linked : tuple of int
         Servos that turn their joint and the one before it.
-
-    Raises
-    ------
-    InputError
-        If a servo is not stable in such physics steps, a dead time does not fit its buffer, or the
-        servo model is of other joints or another rate.
     """
 
     def __init__(
@@ -318,13 +312,8 @@ class RobotBatch:
     ) -> None:
         """Place some robots at random, with `joints` as their command for long.
 
-        Parameters
-        ----------
-        ids : ndarray of int
-        joints, joint_velocity : ndarray, shape (len(ids), 12)
-        margin_m : float
-            Least distance from the ground's edge.
-        rng : numpy.random.Generator
+        Joints and their velocities have the shape (len(ids), 12); `margin_m` is the least distance
+        from the ground's edge.
         """
         random: Randomisation = self.config.randomisation
         n = len(ids)

@@ -69,16 +69,7 @@ class RobotFile(BaseModel):
 def body_from_file(path: Path, config: Path | None) -> Body:
     """The body of a robot's MJCF.
 
-    Parameters
-    ----------
-    path : Path
-    config : Path or None
-        Its YAML.
-
-    Raises
-    ------
-    InputError
-        If a file is missing, a name in it is not there, or the robot is none that can walk.
+    `config` is its YAML.
     """
     if not path.is_file():
         raise InputError(f"There is no {path}. Give the robot's MJCF as `robot`.")

@@ -61,19 +61,8 @@ def joint_map_of(
 ) -> RobotMap:
     """Joint map of the robot described in `path`, and what was left out of it.
 
-    Parameters
-    ----------
-    path : Path
-        MJCF or URDF.
-    servo : str
-        Type of all servos; one of `SERVOS`.
-    lerobot : mapping of str to LeRobotJoint, optional
-        LeRobot's calibration of the arm, whose ids, directions and ranges are then taken.
-
-    Raises
-    ------
-    InputError
-        If MuJoCo cannot read the file, or it has no hinge that a servo turns.
+    It is a MJCF or URDF; all servos are of one type of `SERVOS`. With LeRobot's calibration of an
+    arm its ids, directions and ranges are taken.
     """
     hinges = hinges_of(path)
     if not hinges:
@@ -110,17 +99,7 @@ def joint_map_of(
 def joint_map_of_servos(ids: Mapping[str, int], servo: str) -> RobotMap:
     """Joint map of servos without a model file: a bench, or a part of a robot.
 
-    Parameters
-    ----------
-    ids : mapping of str to int
-        Servo id of each joint.
-    servo : str
-        Type of all servos; one of `SERVOS`.
-
-    Raises
-    ------
-    InputError
-        If a name cannot be a joint's, or an id is no servo's or there twice.
+    `ids` are servo ids by joint; all servos are of one type of `SERVOS`.
     """
     hinges = [Hinge(name, True, -_UNKNOWN_RAD, _UNKNOWN_RAD, driven=True) for name in ids]
     source = f"names and ids as stated, for {servo} servos; centres, signs and limits are guesses"

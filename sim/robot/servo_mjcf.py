@@ -63,11 +63,6 @@ def actuator_attributes(parameters: DelayedPDParameters, time_step_s: float) -> 
     """Attributes of the `<pid>` actuator: delay, gains, limits.
 
     An infinite `effort_limit` or `velocity_limit` leaves its attribute out.
-
-    Raises
-    ------
-    InputError
-        If the dead time is negative or not finite.
     """
     delay = float(np.asarray(parameters.dead_time_s))
     if not (np.isfinite(delay) and delay >= 0):
@@ -119,32 +114,6 @@ def free_air_xml(servos: Sequence[DelayedPDParameters], time_step_s: float) -> s
     )
 
 
-def pendulum_xml(
-    servo: DelayedPDParameters, mass_kg: float, length_m: float, time_step_s: float
-) -> str:
-    """MJCF of a servo, `joint0`, that swings a point mass; at 0 it hangs straight down.
-
-    The load is a body and gravity is on, so the servo's armature is its own.
-
-    Parameters
-    ----------
-    servo : DelayedPDParameters
-    mass_kg, length_m : float
-        The mass, and its distance from the axis.
-    time_step_s : float
-    """
-    joint = attributes({"name": "joint0"} | joint_attributes(servo, time_step_s))
-    option = (
-        f'<option timestep="{_number(time_step_s)}" integrator="{INTEGRATOR}" gravity="0 0 -9.81"/>'
-    )
-    return (
-        f'<mujoco>{option}<worldbody><body><joint type="hinge" axis="0 1 0" {joint}/>'
-        f'<inertial pos="0 0 {_number(-length_m)}" mass="{_number(mass_kg)}" '
-        'diaginertia="1e-15 1e-15 1e-15"/></body></worldbody>'
-        f"<actuator>{pid_element({'joint': 'joint0'}, servo, time_step_s)}</actuator></mujoco>"
-    )
-
-
 def attributes(values: Mapping[str, str]) -> str:
     """As they stand in an MJCF element."""
     return " ".join(f'{name}="{value}"' for name, value in values.items())
@@ -157,11 +126,6 @@ def for_commands_between_steps(
 
     That keeps the timing of commands that come between steps, and delays them by one step, which is
     taken off the dead time here.
-
-    Raises
-    ------
-    InputError
-        If the dead time is shorter than two steps: MuJoCo takes the rest for a whole step.
     """
     delay = float(np.asarray(parameters.dead_time_s))
     if not delay >= 2 * time_step_s:

@@ -37,30 +37,21 @@ _NUMBERS = DelayedPDParameters(
 
 @dataclass(frozen=True)
 class ServoRobot:
-    """A robot and its servos' joints, before it is compiled.
-
-    Attributes
-    ----------
-    name : str
-    joints : tuple of str
-        With a servo each, in the order of all arrays.
-    rest_rad : ndarray, shape (joints,)
-        Servo angles of the pose that it is described in, as recordings have them.
-    shift_rad : ndarray, shape (joints,)
-        MuJoCo's servo angle less that of a recording: behind a linkage a recording's is measured
-        with the other joint at its neutral.
-    free : bool
-        Whether it can stand on the ground: nothing fixes it to the world.
-    spec : callable
-        Its description, a new `mujoco.MjSpec` with a servo on each joint.
-    """
+    """A robot and its servos' joints, before it is compiled."""
 
     name: str
     joints: tuple[str, ...]
+    """With a servo each, in the order of all arrays."""
     rest_rad: Array
+    """Servo angles of the pose that it is described in, as recordings have them; shape
+    (joints,)."""
     shift_rad: Array
+    """MuJoCo's servo angle less that of a recording: behind a linkage a recording's is measured
+    with the other joint at its neutral; shape (joints,)."""
     free: bool
+    """Whether it can stand on the ground: nothing fixes it to the world."""
     spec: Callable[[], Any]
+    """Its description, a new `mujoco.MjSpec` with a servo on each joint."""
 
 
 def mini_pupper_robot(knee: Knee = "linkage") -> ServoRobot:
@@ -77,16 +68,7 @@ def mini_pupper_robot(knee: Knee = "linkage") -> ServoRobot:
 def robot_of(path: Path, recorded: Sequence[str]) -> ServoRobot:
     """A robot from its MJCF or URDF, with servos on its driven and on its recorded joints.
 
-    Parameters
-    ----------
-    path : Path
-    recorded : sequence of str
-        Joints of the recordings.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or lacks a recorded joint.
+    `recorded` are the joints of the recordings.
     """
     hinges = {hinge.name: hinge for hinge in hinges_of(path)}  # also holds it to limits
     if missing := [joint for joint in recorded if joint not in hinges]:
@@ -114,13 +96,8 @@ def robot_of(path: Path, recorded: Sequence[str]) -> ServoRobot:
 def compiled(robot: ServoRobot, longest_dead_time_s: float, fixed: bool) -> Any:
     """The robot as a `mujoco.MjModel` in steps of 2 ms; its actuators are the servos, in order.
 
-    Parameters
-    ----------
-    robot : ServoRobot
-    longest_dead_time_s : float
-        Of the servos that it will get [s].
-    fixed : bool
-        Whether a free robot hangs in the air, its trunk fixed; else it is above the ground.
+    Its servos have at most that dead time [s]. A free robot is above the ground, or, if `fixed`,
+    hangs in the air, its trunk fixed.
     """
     spec = robot.spec()
     root = _root(spec, robot.joints[0])

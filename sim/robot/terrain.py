@@ -40,25 +40,18 @@ _TILES = {
 
 @dataclass(frozen=True)
 class Ground:
-    """A piece of ground, its middle at the origin.
-
-    Attributes
-    ----------
-    xml, assets : str
-        MJCF inside `<worldbody>` and `<asset>`.
-    heights : ndarray, shape (rows, columns) or None
-        Heights [m] at `SPACING_M`, row along y; None for a plane.
-    half_size_m : float
-        Distance of its edge from the origin; infinite for a plane.
-    boxes : ndarray, shape (k, 4)
-        Square boxes on a plane: x and y of the middle, half of the width, height of the top [m].
-    """
+    """A piece of ground, its middle at the origin."""
 
     xml: str
     assets: str
+    """`xml` and `assets`: MJCF inside `<worldbody>` and `<asset>`."""
     heights: NDArray[np.float64] | None
+    """Heights [m] at `SPACING_M`, row along y; None for a plane; shape (rows, columns)."""
     half_size_m: float
+    """Distance of its edge from the origin; infinite for a plane."""
     boxes: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4)))
+    """Square boxes on a plane: x and y of the middle, half of the width, height of the top [m];
+    shape (k, 4)."""
 
     def height(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Height [m] at positions [m], as MuJoCo sees it; at the edge beyond the edge.

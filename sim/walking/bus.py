@@ -49,11 +49,6 @@ def calibrated_robot(
     body : Body, optional
         The robot, of which the servos are; the Mini Pupper 2 by default. Others read as fine as the
         calibration's servos.
-
-    Raises
-    ------
-    InputError
-        If a servo is not stable in the emulator's physics steps.
     """
     feedback = servos.feedback
     spec = RobotSpec(
@@ -68,20 +63,14 @@ def calibrated_robot(
         spec = replace(spec, quantum_rad=quantum, reading_noise_rad=quantum / 2)
     drawn = draw_robot(rng, spec, layout)
     own = servos.in_steps_of(PHYSICS_STEP_S).nominal()
-    return replace(
-        drawn,
-        servos=tuple(
-            replace(servo, actuator=_without_jitter(own[servo.joint], spec.command_jitter_s))
-            for servo in drawn.servos
-        ),
-    )
-
-
-def _without_jitter(own: DelayedPDParameters, jitter_s: float) -> DelayedPDParameters:
-    """A servo whose dead time is without the mean latency of commands."""
-    values = {name: float(np.asarray(value)) for name, value in asdict(own).items()}
-    dead_time_s = max(values["dead_time_s"] - jitter_s, SHORTEST_DELAY_S)
-    return DelayedPDParameters(**values | {"dead_time_s": dead_time_s})
+    emulated = []
+    for servo in drawn.servos:
+        values = {name: float(np.asarray(x)) for name, x in asdict(own[servo.joint]).items()}
+        # an emulated servo's dead time is without the mean latency of commands
+        late = values["dead_time_s"] - spec.command_jitter_s
+        values["dead_time_s"] = max(late, SHORTEST_DELAY_S)
+        emulated.append(replace(servo, actuator=DelayedPDParameters(**values)))
+    return replace(drawn, servos=tuple(emulated))
 
 
 class WalkingBus:
@@ -102,11 +91,6 @@ class WalkingBus:
     ----------
     robot : WalkingRobot
         The robot behind the bus.
-
-    Raises
-    ------
-    InputError
-        If a servo's dead time is too short to emulate.
     """
 
     name = "emulated"

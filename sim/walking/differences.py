@@ -2,7 +2,7 @@
 
 `Differences` are the settings: each is a named range, 0 (or a factor of 1) is off. `TYPICAL` holds
 the values that this robot's parts give reason for, with their sources. What concerns the body and
-its servos is drawn here and written by `sim.robot.robot_batch`; the IMU is `sim.walking.imu`.
+its servos is drawn here and written by `sim.robot.robot_batch`; the IMU is `sim.walking.senses`.
 """
 
 from __future__ import annotations
@@ -159,12 +159,8 @@ class Bodies:
     ) -> None:
         """Draw the bodies of some robots; nothing is drawn for what is off.
 
-        Parameters
-        ----------
-        ids : ndarray of int
-        servos : dict of str to ndarray, shape (len(ids), 12)
-            Their servos, by field of `DelayedPDParameters`; weakened in place.
-        rng : numpy.random.Generator
+        `servos` are theirs, by field of `DelayedPDParameters`, shape (len(ids), 12); they are
+        weakened in place.
         """
         own, n = self._settings, len(ids)
         differ = np.ones(n, bool)

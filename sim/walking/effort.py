@@ -30,14 +30,7 @@ _AT_LIMIT = 0.999
 
 
 class EffortMeter:
-    """Effort of robots, step by step.
-
-    Parameters
-    ----------
-    robots : RobotBatch
-    step_s : float
-        Control step [s].
-    """
+    """Effort of robots, step by step."""
 
     def __init__(self, robots: RobotBatch, step_s: float):
         self._robots, self._step_s = robots, step_s

@@ -22,8 +22,8 @@ from pupper_sysid.servo_models.networks import JointArrays
 from pupper_sysid.sim.robot.motion import Moved, gravity_direction, own_velocity, planar
 from pupper_sysid.sim.robot.robot_batch import RobotBatch
 from pupper_sysid.sim.robot.terrain import make_ground
-from pupper_sysid.sim.walking.config import PRESETS, Walking
-from pupper_sysid.sim.walking.draws import at_rest, draw_commands, draw_pose
+from pupper_sysid.sim.walking.config import PRESETS, Walking, for_robot
+from pupper_sysid.sim.walking.draws import Twins, at_rest, draw_commands, draw_pose, generator
 from pupper_sysid.sim.walking.effort import EffortMeter
 from pupper_sysid.sim.walking.observation import (
     FALLEN_TILT,
@@ -36,10 +36,8 @@ from pupper_sysid.sim.walking.observation import (
 from pupper_sysid.sim.walking.rewards.strides import Strides
 from pupper_sysid.sim.walking.rewards.terms import TERMS, weighted
 from pupper_sysid.sim.walking.rewards.weights import Rewards, narrowed
-from pupper_sysid.sim.walking.scaled import for_robot
 from pupper_sysid.sim.walking.senses import Rows, Senses
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
-from pupper_sysid.sim.walking.shared_draws import Twins, generator
 from pupper_sysid.sim.walking.step import Step, StepResult, Unfinished, empty_facts, unforeseen_of
 
 Array = NDArray[np.float64]

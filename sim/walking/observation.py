@@ -75,14 +75,8 @@ def observed(
 ) -> NDArray[np.float32]:
     """Observations of n robots, shape (n, 60).
 
-    Parameters
-    ----------
-    parts : sequence of ndarray
-        True values in the order of `OBSERVATION`, each of shape (n, size of the part).
-    noise : ndarray of float32, shape (n, 60), or None
-        See `noise_of`.
-    out : ndarray of float32, shape (n, 60), optional
-        Where to write them.
+    Parts are true values in the order of `OBSERVATION`, each of shape (n, size of the part); noise
+    is that of `noise_of`. They are written to `out`, where it is given.
     """
     if out is None:
         out = np.empty((len(parts[0]), sum(p.shape[1] for p in parts)), np.float32)

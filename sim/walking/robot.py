@@ -52,29 +52,19 @@ _NOISE = np.repeat([ACCELERATION_NOISE_G, RATE_NOISE_DEG_S], 3)
 
 @dataclass(frozen=True)
 class Trunk:
-    """True motion of the trunk.
-
-    Attributes
-    ----------
-    time_s : float
-    position_m : ndarray, shape (3,)
-        Of its origin, from its place at time 0; z above the ground.
-    heading_rad : float
-        Its direction along the ground, to the left of that at time 0; ±pi.
-    velocity_m_s : ndarray, shape (3,)
-        In its own axes: forward, to the left, up.
-    yaw_rate_rad_s : float
-        About its own vertical axis, to the left.
-    upright : float
-        Cosine of its tilt: 1 standing level, 0 on its side, -1 on its back.
-    """
+    """True motion of the trunk."""
 
     time_s: float
     position_m: NDArray[np.float64]
+    """Of its origin, from its place at time 0; z above the ground; shape (3,)."""
     heading_rad: float
+    """Its direction along the ground, to the left of that at time 0; ±pi."""
     velocity_m_s: NDArray[np.float64]
+    """In its own axes: forward, to the left, up; shape (3,)."""
     yaw_rate_rad_s: float
+    """About its own vertical axis, to the left."""
     upright: float
+    """Cosine of its tilt: 1 standing level, 0 on its side, -1 on its back."""
 
 
 class WalkingRobot:
@@ -90,11 +80,6 @@ class WalkingRobot:
         Physics step [s].
     body : Body, optional
         The Mini Pupper 2 by default; the servos are in the order of its joints.
-
-    Raises
-    ------
-    InputError
-        If a dead time is shorter than two physics steps.
     """
 
     def __init__(
@@ -144,7 +129,8 @@ class WalkingRobot:
             goal = float(angle_rad) - self._shift[index]
             queued = [g for _, i, g in self._queue if i == index]
             latest = queued[-1] if queued else self._goal[index]
-            if not self._is_limp(index) and goal != latest:
+            limp = not self._model.actuator_biasprm[index].any()
+            if not limp and goal != latest:
                 self._queue.append((time_s, index, goal))
 
     def torque(self, index: int, time_s: float, on: bool) -> None:
@@ -297,9 +283,6 @@ class WalkingRobot:
             mean[index] += share * (goal - self._goal[index])
             self._goal[index] = goal
         return mean
-
-    def _is_limp(self, index: int) -> bool:
-        return not self._model.actuator_biasprm[index].any()
 
     def _resting(self) -> bool:
         """Whether another step would change nothing visible."""

@@ -43,33 +43,24 @@ _NO_LIMIT_NM = 1e3
 
 @dataclass(frozen=True)
 class ServoRanges:
-    """Ranges of twelve servos, in the order of `JOINT_NAMES`.
-
-    Attributes
-    ----------
-    source : str
-        A path, a preset's name or `ideal`.
-    low, value, high : dict of str to ndarray, shape (12,)
-        By field of `DelayedPDParameters`: ends of the interval, and the value.
-    feedback : tuple of HeldFeedback
-        Of each servo.
-    fallbacks : dict of str to str
-        Joints that were not calibrated, and the joint whose numbers they have.
-    command_jitter_s : float
-        Standard deviation of the (exponential) latency of a robot's commands, whose mean is in the
-        dead times [s]: the median of the joints that show one.
-    joints : tuple of str
-        Of the robot, the Mini Pupper's twelve by default.
-    """
+    """Ranges of twelve servos, in the order of `JOINT_NAMES`."""
 
     source: str
+    """A path, a preset's name or `ideal`."""
     low: dict[str, NDArray[np.float64]]
     value: dict[str, NDArray[np.float64]]
     high: dict[str, NDArray[np.float64]]
+    """`low`, `value` and `high`: by field of `DelayedPDParameters`: ends of the interval, and the
+    value; shape (12,)."""
     feedback: tuple[HeldFeedback, ...]
+    """Of each servo."""
     fallbacks: dict[str, str]
+    """Joints that were not calibrated, and the joint whose numbers they have."""
     command_jitter_s: float = 0.0
+    """Standard deviation of the (exponential) latency of a robot's commands, whose mean is in the
+    dead times [s]: the median of the joints that show one."""
     joints: tuple[str, ...] = JOINT_NAMES
+    """Of the robot, the Mini Pupper's twelve by default."""
 
     @property
     def longest_dead_time_s(self) -> float:
@@ -114,18 +105,9 @@ class ServoRanges:
     ) -> dict[str, NDArray[np.float64]]:
         """Servos of `count` robots, each number uniform in its interval.
 
-        Parameters
-        ----------
-        count : int
-        torque_scale : (float, float)
-            Range of a factor on all torques and the armature of a robot: free-air recordings
-            leave their common scale open.
-        rng : numpy.random.Generator
-
-        Returns
-        -------
-        dict of str to ndarray, shape (count, 12)
-            By field of `DelayedPDParameters`.
+        `torque_scale` is the range of a factor on all torques and the armature of a robot: free-air
+        recordings leave their common scale open. The numbers are by field of `DelayedPDParameters`,
+        shape (count, 12).
         """
         drawn = {
             f: rng.uniform(self.low[f], self.high[f], (count, len(self.joints)))
@@ -152,11 +134,6 @@ def servo_ranges(
         calibration, whose feedback is taken.
     body : Body, optional
         The robot; the Mini Pupper 2 by default.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be read.
     """
     joints = JOINT_NAMES if body is None else body.joints
     servo_of = {} if body is None else body.servo_of
@@ -254,13 +231,7 @@ def is_servo_model(actuator: str | Path) -> bool:
 
 
 def servo_model_of(actuator: str | Path, control_step_s: float) -> JointArrays | None:
-    """The learned servo model in a folder; None for anything that is not a folder.
-
-    Raises
-    ------
-    InputError
-        If it is damaged, is not for all joints or this rate, or is no learned model.
-    """
+    """The learned servo model in a folder; None for anything that is not a folder."""
     if not is_servo_model(actuator):
         return None
     model = load_servo_model(Path(actuator), JOINT_NAMES, control_step_s).model
@@ -273,13 +244,7 @@ def servo_model_of(actuator: str | Path, control_step_s: float) -> JointArrays |
 
 
 def check_actuator(actuator: str) -> None:
-    """Refuse what is neither a preset, nor a shipped card, nor `ideal`, nor something that exists.
-
-    Raises
-    ------
-    InputError
-        If it is none of them.
-    """
+    """Refuse what is neither a preset, a shipped card, `ideal`, nor something that exists."""
     if actuator != IDEAL and not is_shipped(actuator) and not Path(actuator).exists():
         near = difflib.get_close_matches(actuator, (*PRESETS, IDEAL), n=1)
         hint = f" Did you mean {near[0]}?" if near else ""

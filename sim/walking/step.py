@@ -27,73 +27,64 @@ _FLAGS = ("contact", "landed", "lifted", "swing_ended")
 
 @dataclass(frozen=True)
 class Step:
-    """What happened in one control step, for all environments, whose robots have 12 joints, 4 feet.
-
-    Attributes
-    ----------
-    body : Body
-        The robot; of another one the numbers of joints and feet are its own.
-    command : ndarray, shape (n, 3)
-        Forward and sideways speed [m/s], turn rate [rad/s].
-    linear_velocity, angular_velocity, gravity : ndarray, shape (n, 3)
-        Of the trunk, in its own frame [m/s, rad/s, unit vector].
-    position_relative, velocity, acceleration, torque : ndarray, shape (n, 12)
-        Of the joints, from the default pose [rad, rad/s, rad/s², N·m].
-    action, last_action, earlier_action : ndarray, shape (n, 12)
-        Raw outputs of the policy: this, the one before, and the one before that.
-    contact : ndarray of bool, shape (n, 4)
-    air_s, contact_s : ndarray, shape (n, 4)
-        Time that each foot has been in the air, on the ground; 0 if it is not.
-    last_air_s, last_contact_s : ndarray, shape (n, 4)
-        Duration of the last swing and stance.
-    landed, lifted : ndarray of bool, shape (n, 4)
-        Feet that came down, or left the ground, in this step.
-    stride_velocity : ndarray, shape (n, 3)
-        Forward and sideways speed and turn rate, averaged over about a stride [m/s, rad/s].
-    foot_height_m, foot_speed_m_s : ndarray, shape (n, 4)
-        Of the sole above the ground; of the foot along it.
-    clock : ndarray, shape (n, 3)
-        Cosine and sine of a trot's clock that follows the feet, and how well they keep to it, -1
-        to 1; see `Strides`.
-    swing_ended : ndarray of bool, shape (n, 4)
-        Feet that came down after a swing; see `sim.walking.effort`, as for all that follow.
-    clearance_m : ndarray, shape (n, 4)
-        Of the swings that ended; NaN of other feet.
-    saturated, torque_square : ndarray, shape (n, 12)
-        Share of the step in which a servo is at its torque limit; mean square of torque over limit.
-    power_w, weight_n : ndarray, shape (n,)
-        Positive mechanical power of all servos; weight of the robot.
-    """
+    """What happened in one control step, for all environments: robots of 12 joints and 4 feet."""
 
     body: Body
+    """The robot; of another one the numbers of joints and feet are its own."""
     command: Array
+    """Forward and sideways speed [m/s], turn rate [rad/s]; shape (n, 3)."""
     linear_velocity: Array
     angular_velocity: Array
     gravity: Array
+    """`linear_velocity`, `angular_velocity` and `gravity`: of the trunk, in its own frame [m/s,
+    rad/s, unit vector]; shape (n, 3)."""
     position_relative: Array
     velocity: Array
     acceleration: Array
     torque: Array
+    """`position_relative`, `velocity`, `acceleration` and `torque`: of the joints, from the default
+    pose [rad, rad/s, rad/s², N·m]; shape (n, 12)."""
     action: Array
     last_action: Array
     earlier_action: Array
+    """`action`, `last_action` and `earlier_action`: raw outputs of the policy: this, the one
+    before, and the one before that; shape (n, 12)."""
     contact: NDArray[np.bool_]
+    """Shape (n, 4)."""
     air_s: Array
     contact_s: Array
+    """`air_s` and `contact_s`: time that each foot has been in the air, on the ground; 0 if it is
+    not; shape (n, 4)."""
     last_air_s: Array
     last_contact_s: Array
+    """`last_air_s` and `last_contact_s`: duration of the last swing and stance; shape (n, 4)."""
     landed: NDArray[np.bool_]
     lifted: NDArray[np.bool_]
+    """`landed` and `lifted`: feet that came down, or left the ground, in this step; shape (n,
+    4)."""
     foot_height_m: Array
     foot_speed_m_s: Array
+    """`foot_height_m` and `foot_speed_m_s`: of the sole above the ground; of the foot along it;
+    shape (n, 4)."""
     stride_velocity: Array
+    """Forward and sideways speed and turn rate, averaged over about a stride [m/s, rad/s]; shape
+    (n, 3)."""
     clock: Array
+    """Cosine and sine of a trot's clock that follows the feet, and how well they keep to it, -1 to
+    1; see `Strides`; shape (n, 3)."""
     swing_ended: NDArray[np.bool_]
+    """Feet that came down after a swing; see `sim.walking.effort`, as for all that follow; shape
+    (n, 4)."""
     clearance_m: Array
+    """Of the swings that ended; NaN of other feet; shape (n, 4)."""
     saturated: Array
     torque_square: Array
+    """`saturated` and `torque_square`: share of the step in which a servo is at its torque limit;
+    mean square of torque over limit; shape (n, 12)."""
     power_w: Array
     weight_n: Array
+    """`power_w` and `weight_n`: positive mechanical power of all servos; weight of the robot; shape
+    (n,)."""
 
     def moving(self, threshold_m_s: float) -> NDArray[np.bool_]:
         """Whether a robot is commanded to move, or moves, shape (n,)."""
@@ -103,36 +94,26 @@ class Step:
 
 @dataclass(frozen=True)
 class StepResult:
-    """What one step gave.
-
-    Attributes
-    ----------
-    observation : ndarray of float32, shape (n, 60)
-    privileged : ndarray of float32, shape (n, k)
-        The truth, for a critic.
-    reward : ndarray, shape (n,)
-    done, timed_out : ndarray of bool, shape (n,)
-        Episode over; over because its time was up.
-    terms : dict of str to ndarray, shape (n,)
-        Each reward term, weighted and times the control period.
-    terminal : dict of str to ndarray
-        `ids` of environments whose time was up, and their last `observation` and `privileged`.
-    unforeseen : dict of str to ndarray
-        `ids` of other environments that were given a new command or a push after this step, and
-        `observation` and `privileged` as they would be without.
-    facts : Step
-        What happened, before any new episode.
-    """
+    """What one step gave."""
 
     observation: NDArray[np.float32]
+    """Shape (n, 60)."""
     privileged: NDArray[np.float32]
+    """The truth, for a critic; shape (n, k)."""
     reward: Array
+    """Shape (n,)."""
     done: NDArray[np.bool_]
     timed_out: NDArray[np.bool_]
+    """`done` and `timed_out`: episode over; over because its time was up; shape (n,)."""
     terms: dict[str, Array]
+    """Each reward term, weighted and times the control period; shape (n,)."""
     terminal: dict[str, NDArray]
+    """`ids` of environments whose time was up, and their last `observation` and `privileged`."""
     unforeseen: dict[str, NDArray]
+    """`ids` of other environments that were given a new command or a push after this step, and
+    `observation` and `privileged` as they would be without."""
     facts: Step
+    """What happened, before any new episode."""
 
 
 @dataclass(frozen=True)

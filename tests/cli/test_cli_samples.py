@@ -15,7 +15,7 @@ from pupper_sysid.hardware.feetech import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.pendulum_bench import draw_of_map
+from pupper_sysid.sim.emulator.pendulum import draw_of_map
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run_program
 from support.servo_servers import on_a_port

@@ -17,7 +17,7 @@ import yaml
 from pupper_sysid.cli.programs import pupper_eval, pupper_play, pupper_train
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.evaluation.evaluate import BATTERY
-from pupper_sysid.policies.train.checkpoint import read_checkpoint
+from pupper_sysid.policies.train.learner import read_checkpoint
 from pupper_sysid.policies.train.run_file import load_run, preset
 from pupper_sysid.policies.walks.film import SIZE
 from pupper_sysid.sim.walking import env

@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
-from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
-from pupper_sysid.sim.robot.servo_mjcf import pendulum_xml, rest_at
+from pupper_sysid.servo_models.loaded_servo import (
+    Load,
+    LoadedServo,
+    LoadedServoParameters,
+)
+from pupper_sysid.sim.robot.servo_mjcf import free_air_xml, rest_at
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.structure import loaded_columns
 from support.refusals import assert_each_refused
@@ -56,9 +60,11 @@ def test_mujoco_swings_the_same_pendulum():
     servo, gain = SERVO, 16.0
     mass, length = 0.49, 0.1
     load = Load(mass * length**2, mass * 9.81 * length, 0.0)
-    model = mujoco.MjModel.from_xml_string(
-        pendulum_xml(servo.delayed_pd(gain), mass, length, STEP_S)
-    )
+    # a point mass on an arm in place of free air; at 0 it hangs straight down
+    xml = free_air_xml([servo.delayed_pd(gain)], STEP_S)
+    xml = xml.replace('gravity="0 0 0"', 'gravity="0 0 -9.81"')
+    xml = xml.replace('pos="0 0 0" mass="1e-9"', f'pos="0 0 {-length}" mass="{mass}"')
+    model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     rest_at(model, data, [0.0])
     own = LoadedServo(servo, gain, load, STEP_S)

@@ -21,7 +21,7 @@ import pupper_sysid as ps
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.pendulum_bench import (
+from pupper_sysid.sim.emulator.pendulum import (
     Pendulum,
     PendulumBench,
     draw_bench,

@@ -23,7 +23,7 @@ from pupper_sysid.sim.emulator.dynamixel import DynamixelEmulator
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator, ProxySocket
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.pendulum_bench import (
+from pupper_sysid.sim.emulator.pendulum import (
     BENCH_MAP,
     Pendulum,
     PendulumBench,

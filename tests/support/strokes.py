@@ -7,8 +7,13 @@ from functools import cache
 import numpy as np
 import pandas as pd
 
-from pupper_sysid.sim.emulator.pendulum import PendulumServo, PendulumServoParameters
-from pupper_sysid.sim.emulator.pendulum_bench import BenchSpec, Pendulum, draw_bench
+from pupper_sysid.sim.emulator.pendulum import (
+    BenchSpec,
+    Pendulum,
+    PendulumServo,
+    PendulumServoParameters,
+    draw_bench,
+)
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.sweep.bench import STROKE_RAD, STROKE_SPEEDS_RAD_S
 from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, after, strokes

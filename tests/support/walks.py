@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from pupper_sysid.policies.analysis.trial import Trial
+from pupper_sysid.policies.evaluation.figures import Recorder, Walk
+from pupper_sysid.policies.walks.conditions import Condition
 from pupper_sysid.policies.walks.rollouts import Rollout
+from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
@@ -45,3 +48,9 @@ def recorded(plain: Rollout, *others: Rollout) -> Trial:
             return [others[i * len(others) // len(conditions)] for i in range(len(conditions))]
 
     return Recorded(Walking(), servo_ranges("ideal"), robots=plain.alive.shape[1])
+
+
+def walk(policy, task, servos, episodes, seed, command=None, threads=0, walker="policy") -> Walk:
+    """Episodes under one condition, as an evaluation walks them."""
+    one = [Condition(task, episodes, command, walker=walker)]
+    return walk_together(policy, servos, one, task.episode_s, seed, threads, Recorder)[0]

@@ -183,7 +183,7 @@ def loads_of(request: dict[str, Any]) -> dict[str, Any]:
 def open_emulated(request: dict[str, Any]) -> ServoBus:
     """The emulated robot: that of the joint map, or a Mini Pupper 2."""
     from pupper_sysid.sim.emulator.bus import EmulatedBus
-    from pupper_sysid.sim.emulator.pendulum_bench import draw_of_map, has_registers
+    from pupper_sysid.sim.emulator.pendulum import draw_of_map, has_registers
     from pupper_sysid.sim.emulator.robot import draw_robot
 
     rng = np.random.default_rng(request["seed"])
@@ -209,7 +209,7 @@ def open_bench(request: dict[str, Any]) -> ServoBus:
     if request["bus"] != EMULATED:
         return connect(request["bus"], request["joint_map"], request["joints"], BENCH_LIMITS)
     from pupper_sysid.sim.emulator.bus import EmulatedBus
-    from pupper_sysid.sim.emulator.pendulum_bench import Pendulum, PendulumBench, draw_bench
+    from pupper_sysid.sim.emulator.pendulum import Pendulum, PendulumBench, draw_bench
 
     rng = np.random.default_rng(request["seed"])
     load = load_of(request)

@@ -33,9 +33,9 @@ from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator, ProxySocket
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.pendulum import REGISTERS
-from pupper_sysid.sim.emulator.pendulum_bench import (
+from pupper_sysid.sim.emulator.pendulum import (
     BENCH_MAP,
+    REGISTERS,
     BenchSpec,
     Pendulum,
     PendulumBench,

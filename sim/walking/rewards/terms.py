@@ -279,16 +279,8 @@ def weighted(
 ) -> dict[str, Array]:
     """Every term that counts, times its weight.
 
-    Parameters
-    ----------
-    step : Step
-    rewards : Rewards
-    penalties, guides, progress : float
-        Factors on negative weights and on those of `GUIDES` and `PROGRESS`, for a curriculum.
-
-    Returns
-    -------
-    dict of str to ndarray, shape (n,)
+    `penalties`, `guides` and `progress` are factors on negative weights and on those of `GUIDES`
+    and `PROGRESS`, for a curriculum.
     """
     factors: dict[str, float] = {
         **dict.fromkeys(GUIDES, guides), **dict.fromkeys(PROGRESS, progress),

@@ -11,7 +11,12 @@ from pupper_sysid.common.errors import InputError, SafetyStop
 from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
 from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.pendulum_bench import BenchSpec, Pendulum, PendulumBench, draw_bench
+from pupper_sysid.sim.emulator.pendulum import (
+    BenchSpec,
+    Pendulum,
+    PendulumBench,
+    draw_bench,
+)
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sysid.sweep.excitation import plan
 from pupper_sysid.sysid.sweep.recorder import record

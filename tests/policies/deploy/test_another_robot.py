@@ -17,8 +17,8 @@ from pupper_sysid.policies.deploy.walk_log import read_walk
 from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
 from pupper_sysid.sim.walking.bus import WalkingBus, calibrated_robot
+from pupper_sysid.sim.walking.config import for_robot
 from pupper_sysid.sim.walking.robot import _model, body_joint_map
-from pupper_sysid.sim.walking.scaled import for_robot
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.command_line import run_program
 from support.tiny_training import CALIBRATION, tiny_run

@@ -14,11 +14,10 @@ from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
-from pupper_sysid.policies.deploy.assembly import assemble
+from pupper_sysid.policies.deploy.assembly import WINDOW_S, FrozenReadings, assemble
 from pupper_sysid.policies.deploy.commands import constant
 from pupper_sysid.policies.deploy.controller import Decision, Senses
 from pupper_sysid.policies.deploy.deployment import Outcome, Tick, deploy
-from pupper_sysid.policies.deploy.frozen_readings import WINDOW_S, FrozenReadings
 from pupper_sysid.policies.deploy.observers import SyntheticPD
 from pupper_sysid.policies.deploy.stacks import STACKS, suited
 from pupper_sysid.policies.network.policy_file import load_policy

@@ -9,7 +9,7 @@ import pytest
 
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.policies.deploy.servo_match import servo_match
-from pupper_sysid.policies.network.trained_servo import trained_servo
+from pupper_sysid.policies.network.policy_file import trained_servo
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.differences import Differences
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_ranges

@@ -13,10 +13,8 @@ from pupper_sysid.policies.evaluation.evaluate import (
     Case,
     battery_robots,
     evaluate,
-    summary,
     table,
     usual_robots,
-    walk,
 )  # fmt: skip
 from pupper_sysid.policies.evaluation.evaluate import RANDOM as RANDOM_COMMANDS
 from pupper_sysid.policies.evaluation.figures import Recorder, figures_of, in_short, share_interval
@@ -26,6 +24,7 @@ from pupper_sysid.sim.robot.mini_pupper import MASS_KG
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Curriculum, Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from support.walks import walk
 
 CALIBRATION = str(Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml")
 
@@ -64,7 +63,7 @@ def test_a_fall_counts_once_and_its_error_is_that_of_standing_to_the_end_of_the_
     for policy, fell in ((Scripted(), [False, True] * 2), (Folding(), [True] * 4)):
         walked = walk(policy, task, servo_ranges(CALIBRATION), 4, 3, tuple(command), threads=1)
         assert walked.command.shape == (60, 4, 3) and walked.fell.tolist() == fell
-        assert summary(walked).fall_rate == np.mean(fell)
+        assert figures_of(walked).fall_rate == np.mean(fell)
         np.testing.assert_allclose(walked.commanded, [np.abs(command)] * 4)
         steps = walked.alive.sum(axis=0)
         assert ((steps < 60) == walked.fell).all(), "the end of the episode is no fall"
@@ -173,7 +172,7 @@ def test_intervals_are_over_episodes():
     every = share_interval(30, 30)
     assert every.high == 1.0 and every.low == pytest.approx(0.05 ** (1 / 30))
     found = walk(None, evaluation_task(Walking(), 0.1), servo_ranges("ideal"), 2, 0, threads=1)
-    own = summary(found).intervals.mae_yaw_rad_s
+    own = figures_of(found).intervals.mae_yaw_rad_s
     half = abs(found.error[0, 2] - found.error[1, 2]) / 2
     assert own.value == pytest.approx(found.error[:, 2].mean())
     assert own.high - own.value == pytest.approx(6.3138 * half, rel=1e-4)

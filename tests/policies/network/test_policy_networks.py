@@ -13,19 +13,17 @@ import torch
 from tensordict import TensorDict
 
 from pupper_sysid.common.errors import PupperError
-from pupper_sysid.policies.network.actor_critic import build
-from pupper_sysid.policies.network.attention import (
-    CONTEXT,
-    WIDTH,
-    CausalAttention,
-    empty_context,
-    step,
-)
+from pupper_sysid.policies.network.actor_critic import build, inputs
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
 from pupper_sysid.policies.network.policy_export import export_policy
 from pupper_sysid.policies.network.policy_file import Contract, load_policy
-from pupper_sysid.policies.network.policy_network import PolicyNetwork
-from pupper_sysid.policies.network.teacher import inputs
+from pupper_sysid.policies.network.policy_network import (
+    CONTEXT,
+    WIDTH,
+    CausalAttention,
+    PolicyNetwork,
+    step,
+)
 from pupper_sysid.policies.train.training import action_history
 from pupper_sysid.sim.walking.observation import (
     OBSERVATION_PARTS,
@@ -154,7 +152,7 @@ def test_acting_step_by_step_a_transformer_sees_sixteen_observations_as_in_a_seq
     series = torch.randn(steps, 2, 5)
 
     def walk(series: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        context, latents = empty_context(2, 5, series), []
+        context, latents = torch.zeros(CONTEXT - 1, 2, 6), []
         with torch.inference_mode():
             for row in series:
                 latent, context = step(made, torch.nn.Identity(), row, context)

@@ -13,8 +13,7 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.policies.network.policy_file import CONTRACT, VERSION, load_policy
-from pupper_sysid.policies.network.trained_servo import trained_servo
+from pupper_sysid.policies.network.policy_file import CONTRACT, VERSION, load_policy, trained_servo
 from pupper_sysid.sim.walking.config import Randomisation, Walking
 from pupper_sysid.sim.walking.differences import Differences
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges

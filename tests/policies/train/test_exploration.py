@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.policies.network.exploration import PersistentGaussian
+from pupper_sysid.policies.network.actor_critic import PersistentGaussian
 from pupper_sysid.policies.network.hyperparameters import Exploration, Hyperparameters
-from pupper_sysid.policies.train.ranks import Ranks
+from pupper_sysid.policies.train.learner import Ranks
 from pupper_sysid.policies.train.selection import Judge
 from pupper_sysid.policies.train.training import make_learner
 from pupper_sysid.sim.robot.mini_pupper import default_pose

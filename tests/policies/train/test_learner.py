@@ -15,13 +15,13 @@ import torch
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import LEGS
-from pupper_sysid.policies.train.checkpoint import (
+from pupper_sysid.policies.train.learner import (
     CHECKPOINT_VERSION,
+    Learner,
+    Ranks,
     judged_weights,
     read_checkpoint,
 )
-from pupper_sysid.policies.train.learner import Learner
-from pupper_sysid.policies.train.ranks import Ranks
 from pupper_sysid.policies.train.training import make_env, make_learner
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.robot.body import mini_pupper

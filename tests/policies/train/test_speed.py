@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.policies.train import speed
-from pupper_sysid.policies.train.ranks import Ranks
+from pupper_sysid.policies.train.learner import Ranks
 from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.policies.train.training import make_env
 from pupper_sysid.sim.walking.config import Walking

@@ -13,10 +13,8 @@ from tensordict import TensorDict
 
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters, Imitation
 from pupper_sysid.policies.train import imitation, training
-from pupper_sysid.policies.train.checkpoint import read_checkpoint
-from pupper_sysid.policies.train.imitation import imitate
-from pupper_sysid.policies.train.learner import Learner
-from pupper_sysid.policies.train.ranks import Ranks
+from pupper_sysid.policies.train.imitation import LearnedTeacher, TrotTeacher, imitate, load_teacher
+from pupper_sysid.policies.train.learner import Learner, Ranks, read_checkpoint
 from pupper_sysid.policies.train.run_file import (
     check_teacher,
     load_run,
@@ -24,7 +22,6 @@ from pupper_sysid.policies.train.run_file import (
     save_run,
     teacher_of,
 )
-from pupper_sysid.policies.train.teachers import LearnedTeacher, TrotTeacher, load_teacher
 from pupper_sysid.policies.train.training import BEST, LAST, make_env, make_learner, train
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.walking.config import Walking

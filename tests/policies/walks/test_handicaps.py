@@ -21,7 +21,6 @@ from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
-from support.refusals import assert_each_refused
 
 SERVOS = servo_ranges(Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml")
 TASK = evaluation_task(Walking())
@@ -207,12 +206,3 @@ def test_jitter_leaves_the_mean_latency_and_no_command_comes_before_an_earlier_o
     assert np.ptp(late, axis=2).max() < 0.03
     assert late.std() > 0.008 and np.abs(late.mean()) < 0.005
     assert plain.alive.all() and jittered.alive.all()
-
-
-def test_a_handicap_that_cannot_be_is_refused():
-    cases = [
-        ({"riser_m": 0.02}, "there are 0.005, 0.01, 0.015"),
-        ({"missed_ticks": 1.0}, "missed_ticks"), ({"push_m_s": np.nan}, "push_m_s"),
-        ({"payload_kg": -0.1}, "payload_kg"),
-    ]  # fmt: skip
-    assert_each_refused(cases, lambda case: Handicap(**case))

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from pupper_sysid.policies.analysis.trial import outcome
-from pupper_sysid.policies.evaluation.evaluate import walk
-from pupper_sysid.policies.network.attention import WIDTH
 from pupper_sysid.policies.network.policy_file import Policy
+from pupper_sysid.policies.network.policy_network import WIDTH
 from pupper_sysid.policies.walks.conditions import Condition, evaluation_task
 from pupper_sysid.policies.walks.rollouts import Rollout, collect, replay
 from pupper_sysid.policies.walks.tracking import (
@@ -24,6 +23,7 @@ from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.observation import OBSERVATION
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.tiny_training import ALL_KINDS, CALIBRATION
+from support.walks import walk
 
 TASK = evaluation_task(Walking())
 COMMAND = (0.1, -0.05, 0.3)

@@ -14,12 +14,13 @@ from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.pendulum import PendulumServo, PendulumServoParameters
-from pupper_sysid.sim.emulator.pendulum_bench import (
+from pupper_sysid.sim.emulator.pendulum import (
     BENCH_MAP,
     BenchSpec,
     Pendulum,
     PendulumBench,
+    PendulumServo,
+    PendulumServoParameters,
     draw_bench,
 )
 from support.servo_servers import on_a_port

@@ -12,9 +12,8 @@ from pupper_sysid.policies.walks.conditions import evaluation_task
 from pupper_sysid.sim.robot.body import Body, body_of, fixed_offsets, mini_pupper
 from pupper_sysid.sim.robot.mini_pupper import robot_xml
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.config import PRESETS, Walking
+from pupper_sysid.sim.walking.config import PRESETS, Walking, for_robot
 from pupper_sysid.sim.walking.env import PupperEnv
-from pupper_sysid.sim.walking.scaled import for_robot
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
 LEG = """<body name="{name}_hip" pos="{x} {y} 0"><inertial mass="0.05" pos="0 0 0"

@@ -9,8 +9,7 @@ import pytest
 
 from pupper_sysid.common.joints import LEGS
 from pupper_sysid.sim.robot.engine import mujoco
-from pupper_sysid.sim.robot.falls import touches_ground
-from pupper_sysid.sim.robot.mini_pupper import limits, robot_xml
+from pupper_sysid.sim.robot.mini_pupper import limits, robot_xml, touches_ground
 from pupper_sysid.sim.robot.terrain import SPACING_M, STAIRS_M, TILE_M, Ground, make_ground
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 

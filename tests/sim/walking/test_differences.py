@@ -16,13 +16,11 @@ from pupper_sysid.sim.walking.config import (
     Walking,
 )
 from pupper_sysid.sim.walking.differences import TYPICAL, Differences
-from pupper_sysid.sim.walking.draws import at_rest
+from pupper_sysid.sim.walking.draws import Twins, at_rest, generator
 from pupper_sysid.sim.walking.env import PupperEnv
-from pupper_sysid.sim.walking.held_readings import HeldReadings
-from pupper_sysid.sim.walking.imu import Imu
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
+from pupper_sysid.sim.walking.senses import HeldReadings, Imu
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
-from pupper_sysid.sim.walking.shared_draws import Twins, generator
 from support.refusals import assert_each_refused
 
 MEASURED = "data/samples/calibrated.yaml"

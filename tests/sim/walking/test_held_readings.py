@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
-from pupper_sysid.sim.walking.held_readings import HeldReadings
+from pupper_sysid.sim.walking.senses import HeldReadings
 
 H, SUBSTEPS = 0.002, 10
 SPAN = H * SUBSTEPS
