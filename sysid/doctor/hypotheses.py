@@ -152,13 +152,9 @@ def _clocks_drift(trials: Sequence[Trial], step: float, base: Explanation) -> Fi
     return replace(found, verdict=REFUSE) if found else None
 
 
-def _followed(
-    trials: Sequence[Trial], step: float, base: Explanation, servo: Servo
-) -> Followed:
+def _followed(trials: Sequence[Trial], step: float, base: Explanation, servo: Servo) -> Followed:
     predicted = tuple(base.predicted(servo))
-    return Followed(
-        tuple(trials), step, base, servo, predicted, float(trials[0].send_time_s[0])
-    )
+    return Followed(tuple(trials), step, base, servo, predicted, float(trials[0].send_time_s[0]))
 
 
 def _smooth_rest(base: Explanation, servo: Servo) -> bool:

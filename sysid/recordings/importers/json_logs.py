@@ -162,6 +162,8 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
             prefix, inside = pending.pop()
             for name, value in inside.items():
                 full = f"{prefix}.{name}".strip(".")[:200]
+                if records is not None and isinstance(value, list):
+                    value = _by_name(value)
                 if isinstance(value, Mapping):
                     pending.append((full, value))
                 elif records is None:
@@ -192,6 +194,15 @@ def _of_frame(data: Any) -> Any:
         return {str(n): list(v) for n, v in zip(names, zip(*rows, strict=True), strict=True)}
     numbered = data and all(isinstance(v, Mapping) and "0" in v and "1" in v for v in data.values())
     return {n: list(v.values()) for n, v in data.items()} if numbered else data
+
+
+def _by_name(value: list[Any]) -> Any:
+    """A list with a record per joint by the joints' names; another as it is."""
+    if not value or not all(isinstance(each, Mapping) for each in value):
+        return value
+    key = next((k for k in ("name", "joint", "id", "motor_id", "index") if k in value[0]), "")
+    return {str(each.get(key, n)): {k: v for k, v in each.items() if k != key}
+            for n, each in enumerate(value)}  # fmt: skip
 
 
 def _records(data: Any) -> list[Any] | None:

@@ -16,7 +16,8 @@ import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from functools import cached_property
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -68,12 +69,14 @@ _FEWEST_ROWS = 3  # of a joint in a table with a row per joint
 _SHORTEST_TONE = 20  # rows of one frequency; a chirp changes it sooner
 _MOST_CHOICES = 4  # that a message lists
 _COMPARED = 8  # columns for one purpose
+_COMPARED_BY_VALUE, _ALIKE = 24, 0.7  # columns; concordance of a command and its position
 _WIDEST_ANGLE = 1e6  # of a joint, in any unit
 _ORDERED = 100_000  # rows
 _OF_TURNS = {
-    "ODrive": (("setpoint", "estimate"), "pos_setpoint and pos_estimate"),
-    "moteus": (("servo_stats.position",), "servo_stats.position"),
-    "moteus's decoder": (("command_position", "q_current"), "command_position and q_current"),
+    "ODrive": ({"setpoint", "estimate"}, "pos_setpoint and pos_estimate"),
+    "moteus": ({"servo_stats.position"}, "servo_stats.position"),
+    "moteus's decoder": ({"command_position", "q_current"}, "command_position and q_current"),
+    "moteus's telemetry": ({"control_position", "q_current"}, "control_position and q_current"),
 }
 """Programs that count turns and do not say so, and what gives their logs away."""
 
@@ -97,7 +100,7 @@ class Table:
     notes: tuple[str, ...] = ()
     """What was assumed, in sentences."""
 
-    @property
+    @cached_property
     def names(self) -> list[str]:
         """Names of all columns."""
         return list(dict.fromkeys([*self.columns, *self.texts, *self.faults]))
@@ -115,8 +118,11 @@ class Table:
 
     def first(self, names: Sequence[str]) -> str | None:
         """The first of these names, in any case, that a column of numbers has."""
-        own = {n.lower(): n for n in self.columns}
-        return next((own[n] for n in names if n in own), None)
+        return next((self._lower[n] for n in names if n in self._lower), None)
+
+    @cached_property
+    def _lower(self) -> dict[str, str]:
+        return {n.lower(): n for n in self.columns}
 
     @property
     def increasing(self) -> list[str]:
@@ -240,22 +246,25 @@ def _pairs_by_words(
     path: Path | str, table: Table, options: LogOptions
 ) -> tuple[dict[str, _Pair], list[str]]:
     every = [column(name) for name in table.names if name not in table.texts]
-    by_kind = {kind: [c for c in every if c.kind == kind] for kind in ("command", "position")}
-    shared = {c.key for c in by_kind["command"]} & {c.key for c in by_kind["position"]}
-    if not shared:
-        return _lone_pair(path, table, by_kind["command"], by_kind["position"])
+    by_key: dict[str, dict[str, list[Column]]] = {"command": {}, "position": {}}
+    for c in every:
+        if c.kind in by_key:
+            by_key[c.kind].setdefault(c.key, []).append(c)
+    commands, positions = by_key.values()
+    if not commands.keys() & positions.keys():
+        return _lone_pair(path, table, *(sum(own.values(), []) for own in by_key.values()))
     used = Counter(c.template for c in every)
     pairs: dict[str, _Pair] = {}
     names: list[str] = []
     notes: list[str] = []
-    for key in dict.fromkeys(c.key for c in by_kind["command"]):
-        if key not in shared:
-            continue
+    marked = {
+        program: (marks - {*table.names}, shown) for program, (marks, shown) in _OF_TURNS.items()
+    }
+    for key in (key for key in commands if key in positions):
         ranked = [
-            sorted((c for c in by_kind[kind] if c.key == key),
-                   key=lambda c: (c.rank, -used[c.template]))[:_COMPARED]
-            for kind in ("command", "position")
-        ]  # fmt: skip
+            sorted(own[key], key=lambda c: (c.rank, -used[c.template]))[:_COMPARED]
+            for own in (commands, positions)
+        ]
         best = sorted((_Pair(c, p) for c, p in product(*ranked)), key=lambda q: _cost(q, used))
         pair = _decided(path, table, best, used)
         if (
@@ -273,10 +282,10 @@ def _pairs_by_words(
             )
         pairs[key] = pair
         names.append(_joint_name(pair))
-        signs = {*table.names, *pair.command.words, *pair.position.words}
-        for program, (marks, shown) in _OF_TURNS.items():
+        words = pair.command.words | pair.position.words
+        for program, (marks, shown) in marked.items():
             unnamed = not pair.command.unit + pair.position.unit and not options.unit
-            if unnamed and signs.issuperset(marks):
+            if unnamed and marks <= words:
                 notes.append(
                     f"{shown} are names of {program}, which counts turns; the values were taken as "
                     "rad. If they are turns, give `unit='turns'`; lag and dead time are the same."
@@ -435,7 +444,8 @@ def unknown_numbers(path: Path | str, table: Table) -> str:
         if len(known):
             up = ", increasing" if name in table.increasing else ""
             shown.append(f"{name} ({known.min():.4g} … {known.max():.4g}{up})")
-    time = (table.increasing or ["0"])[0]
+    times = [*table.increasing, *table.texts, *table.faults]
+    time = times[0] if times else ""
     others: list[str] = []  # that move, each once
     for name, values in table.columns.items():
         known = values[np.isfinite(values)]
@@ -446,13 +456,35 @@ def unknown_numbers(path: Path | str, table: Table) -> str:
             others.append(name)
         elif (known % 1 == 0).all() and known.min() >= 0 and known.max() < 1e9 and "," not in time:
             time = f"{time},{name}"  # nanoseconds
-    first, second = _in_order(table, [*others, "1", "2"][:2])
-    choices = dict.fromkeys([(first, second), (second, first), (first, (others or [second])[-1])])
-    lines = [import_line(path, time=time, command=c, position=p) for c, p in choices]
+    pairs = [_in_order(table, p) for p in _alike(table, others) or [[*others, "1", "2"][:2]]]
+    first, second = pairs[0]
+    every = (",".join(names) for names in zip(*sorted(pairs), strict=True))
+    last = (others or [second])[-1]
+    choices = dict.fromkeys([tuple(every), (first, second), (second, first), (first, last)])
+    when = {"time": time} if time else {"rate": "50"}
+    lines = [import_line(path, **when, command=c, position=p) for c, p in choices]
     return (
         f"its columns have no names. By their numbers, from 0, they are {'; '.join(shown)}. Say "
         f"which is which: {', '.join(lines)}, or others."
     )
+
+
+def _alike(table: Table, names: Sequence[str]) -> list[list[str]]:
+    """Pairs of columns that go together, as a joint's command and position do, the best first.
+
+    Lin's coefficient of concordance is 1 for equal columns; an offset counts, another scale, too.
+    """
+    known = {n: np.nan_to_num(table.columns[n][:_ORDERED]) for n in names[:_COMPARED_BY_VALUE]}
+    ranked = sorted(
+        (-2 * np.mean((x - x.mean()) * (y - y.mean()))
+         / (np.var(x) + np.var(y) + (x.mean() - y.mean()) ** 2), n, m)
+        for (n, x), (m, y) in combinations(known.items(), 2)
+    )  # fmt: skip
+    found: list[list[str]] = []
+    for rank, one, other in ranked:
+        if -rank > _ALIKE and not {one, other} & {name for pair in found for name in pair}:
+            found.append([one, other])
+    return found
 
 
 def _in_order(table: Table, pair: Sequence[str]) -> list[str]:

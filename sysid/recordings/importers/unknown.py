@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import product
 from pathlib import Path
@@ -16,6 +18,7 @@ OURS = (
 )  # fmt: skip
 SWEEP = ("time_s", "freq_hz", "motor_idx", "signal", "command_rad", "actual_rad")
 PLAYBACK = ("time_s", "loop", "LF_hip_command_rad", "LF_hip_position_rad")
+_CURRENT = re.compile(r"cur(r|rent)?(?![A-Za-z])", re.IGNORECASE)
 _IMU = {"gx", "gy", "gz", "ax", "ay", "az"}
 
 FILES = (
@@ -62,11 +65,12 @@ def unknown_columns(
             if own & {*columns}
         ),
     ]
+    lines = _examples(path, names, timed, increasing)
+    rest = "" if lines else f" Other layouts: {'; '.join(FILES)}."
     return (
         f"its columns ({_listed(names)}) belong to no known layout. {'; '.join(parts)}. "
-        f"{_hint(names)}Name the columns{_examples(path, names, timed, increasing)} with "
-        "`pupper-sysid import` --time (or --rate, the rows a second), --command and --position. "
-        f"Other layouts: {'; '.join(FILES)}."
+        f"{_hint(names)}Name the columns{lines} with `pupper-sysid import` --time (or --rate, the "
+        f"rows a second), --command and --position.{rest}"
     )
 
 
@@ -79,12 +83,20 @@ def _examples(
     if not times and (len(columns) > 2 or timed):  # of another event
         times = [c.name for c in columns if c.kind in ("time", "unknown")][:1]
     when = {"time": times[0]} if times else {"rate": "50"}
+    numbered = Counter(re.sub(r"\d+", "{joint}", c.name, count=1) for c in columns)
     by_kind = {}
     for kind in ("command", "position"):
-        ranked = ((kind,), ("unknown",), ("time",))
-        chosen = ([c.template for c in columns if c.kind in kinds and c.name not in times]
-                  for kinds in ranked)  # fmt: skip
-        by_kind[kind] = next(filter(None, chosen), [])
+        sure = [c for c in columns if c.kind == kind]
+        if kind == "position" and not sure:  # beside a command a bare `current` may be a place
+            sure = [c for c in columns if not c.kind and _CURRENT.search(c.name)]
+        chosen = [c.template for c in sure]
+        for others in ("unknown", "time"):
+            chosen = chosen or [
+                every if numbered[every := re.sub(r"\d+", "{joint}", c.name, count=1)] > 1 else
+                c.template
+                for c in columns if c.kind == others and c.name not in times
+            ]  # fmt: skip
+        by_kind[kind] = chosen
     lines = [
         import_line(path, **when, command=c, position=p)
         for c, p in product(by_kind["command"], by_kind["position"])
