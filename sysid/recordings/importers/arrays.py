@@ -40,6 +40,7 @@ ZIP, NPY, MAT = b"PK\x03\x04", b"\x93NUMPY", b"MATLAB 5.0"
 
 _NAMES = ("joint_names", "joints", "names", "motor_names", "dof_names")
 _PERIODS = ("dt", "timestep", "time_step", "sample_time", "period")  # of a log without times
+_RATES = ("fs", "rate", "rate_hz", "hz", "sample_rate")
 _DEEPEST = 3  # of dictionaries in a torch file, of structures in MATLAB's
 
 
@@ -73,9 +74,10 @@ def read_arrays(path: Path, data: bytes, options: LogOptions) -> Log:
         path, {k: v for k, v in numeric.items() if v.ndim < 3}, names, named
     )
     steps = {k.lower(): float(v) for k, v in arrays.items() if v.dtype.kind in "iuf" and not v.ndim}
-    period = next((steps[k] for k in _PERIODS if steps.get(k, 0) > 0), None)
-    if period and not rows and not (options.rate or options.time or has_time(table.names)):
-        options = replace(options, rate=1 / period)
+    rates = [1 / steps[k] for k in _PERIODS if steps.get(k, 0) > 0]
+    rates += [steps[k] for k in _RATES if steps.get(k, 0) > 0]
+    if rates and not rows and not (options.rate or options.time or has_time(table.names)):
+        options = replace(options, rate=rates[0])
     return read_table(path, table, options, layout)
 
 

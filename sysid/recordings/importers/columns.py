@@ -14,7 +14,7 @@ a bare `position`, plain before filtered or simulated values.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -32,10 +32,10 @@ WORDS: dict[str, str] = {
                   "requested action actions soll sollwert sv consigne consigna riferimento "
                   "referencia börvärde 目标 目標 指令 给定 设定"),
         (MAYBE_COMMAND, "u r ctrl control input inputs send sent tx request planned plan "
-                        "trajectory traj leader nominal wanted write written order"),
-        (STATE, "actual act present measured measurement meas msr feedback fb fbk observed "
-                "observation observations obs state states estimate estimated est real encoder enc "
-                "reading readings sensed sensor response resp "
+                        "expected trajectory traj leader nominal wanted write written order"),
+        (STATE, "actual act present measured measurement measurements meas msr feedback fb fbk "
+                "observed observation observations obs state states estimate estimated est real "
+                "encoder enc reading readings sensed sensor response resp "
                 "potentiometer pot resolver pv ist istwert ärvärde mesure misura medida "
                 "实际 当前 実測 反馈"),
         (MAYBE_STATE, "y output outputs read rx follower receive received recv rcv process"),
@@ -179,6 +179,21 @@ def _column(name: str) -> Column:
     key = "_".join(f"{int(p)}" if p.isascii() and p.isdigit() else p.lower() for p in bare)
     template = name if kind == "unknown" else _template(name, bare)
     return Column(name, kind, joint, key, unit, rank, words, template)
+
+
+def columns_of(names: Iterable[str]) -> list[Column]:
+    """What the names of a table say, with the joints' bare names beside their commands.
+
+    In `hip_cmd, hip` and `phi_ref, phi` the name of a joint alone is its position.
+    """
+    found = [column(name) for name in names]
+    commands = {c.key for c in found if c.kind == "command"}
+    placed = {c.key for c in found if c.kind == "position"}
+    return [
+        replace(c, kind="position", template=_template(c.name, [c.name]))
+        if c.kind == "unknown" and c.key in commands - placed else c
+        for c in found
+    ]  # fmt: skip
 
 
 def _parts(word: str) -> list[str]:

@@ -29,7 +29,12 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS, distinct, one_each
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.columns import Column, column, time_columns
+from pupper_sysid.sysid.recordings.importers.columns import (
+    Column,
+    column,
+    columns_of,
+    time_columns,
+)
 from pupper_sysid.sysid.recordings.importers.log import (
     MOST_JOINTS,
     Log,
@@ -52,13 +57,13 @@ LAYOUT = "table"
 
 _TRIALS = ("trial", "episode_index", "episode", "loop", "run", "segment")
 _TONES = ("frequency_hz", "freq_hz", "frequency", "freq")
-_SERIES = ("name", "signal", "event", "type", "kind", "variable", "topic", "field", "series",
+SERIES = ("name", "signal", "event", "type", "kind", "variable", "topic", "field", "series",
            "metric", "key", "channel", "_field", "_measurement")  # fmt: skip
 _GROUPS = ("leg", "limb", "arm", "side", "joint", "joint_name", "motor", "motor_name", "servo",
            "servo_name", "actuator", "name", "axis", "dof", "motor_idx", "motor_id", "motor_index",
            "joint_idx", "joint_id", "joint_index", "servo_id", "actuator_id", "dxl_id", "can_id",
            "node_id", "id")  # fmt: skip
-LABELS = frozenset((*_SERIES, *_GROUPS, *_TRIALS))
+LABELS = frozenset((*SERIES, *_GROUPS, *_TRIALS))
 """Columns that may hold text, in lower case."""
 _SUBSECONDS = ("nanosec", "nanosecs", "nsec", "nsecs", "usec", "usecs")
 _KEPT = ("p_gain", "torque_enabled", "voltage_v", "temperature_c", "load")
@@ -245,14 +250,16 @@ def _pairs(
 def _pairs_by_words(
     path: Path | str, table: Table, options: LogOptions
 ) -> tuple[dict[str, _Pair], list[str]]:
-    every = [column(name) for name in table.names if name not in table.texts]
+    every = columns_of(name for name in table.names if name not in table.texts)
     by_key: dict[str, dict[str, list[Column]]] = {"command": {}, "position": {}}
     for c in every:
         if c.kind in by_key:
             by_key[c.kind].setdefault(c.key, []).append(c)
     commands, positions = by_key.values()
     if not commands.keys() & positions.keys():
-        return _lone_pair(path, table, *(sum(own.values(), []) for own in by_key.values()))
+        return _lone_pair(
+            path, table, *([c for each in own.values() for c in each] for own in by_key.values())
+        )
     used = Counter(c.template for c in every)
     pairs: dict[str, _Pair] = {}
     names: list[str] = []
@@ -506,7 +513,7 @@ def has_time(names: Sequence[str]) -> bool:
 
 def missing(names: Sequence[str]) -> str:
     """What a table lacks to be a servo's log; empty if a joint may have command and position."""
-    kinds = {column(name).kind for name in names}
+    kinds = {c.kind for c in columns_of(names)}
     if {"command", "position"} <= kinds:
         return ""
     if "command" in kinds:
@@ -606,7 +613,7 @@ def spread(path: Path | str, table: Table, options: LogOptions) -> Table:
     back as they are.
     """
     by_case = {n.lower(): n for n in table.texts}
-    series = next((by_case[n] for n in _SERIES if n in by_case), None)
+    series = next((by_case[n] for n in SERIES if n in by_case), None)
     value = table.first(("value", "values", "val", "_value", "data"))
     if series is None or value is None or options.command:
         return table

@@ -10,7 +10,7 @@ from itertools import product
 from pathlib import Path
 
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.columns import column, time_columns
+from pupper_sysid.sysid.recordings.importers.columns import column, columns_of, time_columns
 from pupper_sysid.sysid.recordings.importers.tables import has_time, import_line, missing
 
 OURS = (
@@ -78,7 +78,7 @@ def _examples(
     path: Path | str, names: Sequence[str], timed: bool, increasing: Sequence[str]
 ) -> str:
     """Command lines that take columns whose names say nothing for what is missing."""
-    columns = [column(name) for name in names]
+    columns = columns_of(names)
     times = time_columns(names)[:1] or [n for n in increasing if column(n).kind != "position"][:1]
     if not times and (len(columns) > 2 or timed):  # of another event
         times = [c.name for c in columns if c.kind in ("time", "unknown")][:1]
@@ -87,6 +87,8 @@ def _examples(
     by_kind = {}
     for kind in ("command", "position"):
         sure = [c for c in columns if c.kind == kind]
+        if kind == "command" and not sure:  # qd beside q may be the desired angle
+            sure = [c for c in columns if c.name[-1:] == "d" and c.name[:-1] in names]
         if kind == "position" and not sure:  # beside a command a bare `current` may be a place
             sure = [c for c in columns if not c.kind and _CURRENT.search(c.name)]
         chosen = [c.template for c in sure]

@@ -237,6 +237,11 @@ FORMS = {
     "numbers in hexadecimal": "time_us,cmd [rad],pos [rad]\n" + "".join(
         f"0x{round(1e6 * t):08X},{c},{p}\n" for t, c, p in ROWS_OF),
     "a letter for desired": joined(",", ("t", "theta_d", "theta")),
+    "a joint's bare name": joined(",", ("t", "phi_ref", "phi")),
+    "JSON, rows below names": json.dumps({"columns": ["t", "cmd", "pos"], "rows": ROWS_OF}),
+    "JSON Lines of topics": "".join(
+        f'{{"topic": "{topic}", "t": {t}, "data": [{value}]}}\n'
+        for t, c, p in ROWS_OF for topic, value in (("cmd", c), ("state", p))),
     "abbreviated current": joined(",", ("t", "goalPos", "curPos")),
     "tenths of a degree behind an underscore": "time,cmd_0.1deg,pos_0.1deg\n" + "".join(
         f"{t!r},{1800 / np.pi * c!r},{1800 / np.pi * p!r}\n" for t, c, p in ROWS_OF),
@@ -300,10 +305,11 @@ def test_columns_without_names_are_offered_in_the_pairs_that_go_together(tmp_pat
 
 
 def test_an_archive_without_times_takes_its_time_step_for_the_rate(tmp_path):
-    np.savez(tmp_path / "log.npz", dt=0.005, q=POSITION, q_des=COMMAND)
-    recording = load(tmp_path / "log.npz")
-    assert recording.loop_period_s == pytest.approx(0.005)
-    assert any("row numbers over 200 Hz" in text for text in recording.warnings)
+    for step in ({"dt": 0.005}, {"fs": 200}):
+        np.savez(tmp_path / "log.npz", q=POSITION, q_des=COMMAND, **step)
+        recording = load(tmp_path / "log.npz")
+        assert recording.loop_period_s == pytest.approx(0.005)
+        assert any("row numbers over 200 Hz" in text for text in recording.warnings)
 
 
 def test_what_the_unit_may_be_is_offered_as_lines(tmp_path):
