@@ -74,7 +74,7 @@ _FEWEST_ROWS = 3  # of a joint in a table with a row per joint
 _SHORTEST_TONE = 20  # rows of one frequency; a chirp changes it sooner
 _MOST_CHOICES = 4  # that a message lists
 _COMPARED = 8  # columns for one purpose
-_COMPARED_BY_VALUE, _ALIKE = 24, 0.7  # columns; concordance of a command and its position
+_COMPARED_BY_VALUE, _ALIKE = 12, 0.7  # columns; concordance of a command and its position
 _WIDEST_ANGLE = 1e6  # of a joint, in any unit
 _ORDERED = 100_000  # rows
 _OF_TURNS = {
@@ -463,7 +463,7 @@ def unknown_numbers(path: Path | str, table: Table) -> str:
             others.append(name)
         elif (known % 1 == 0).all() and known.min() >= 0 and known.max() < 1e9 and "," not in time:
             time = f"{time},{name}"  # nanoseconds
-    pairs = [_in_order(table, p) for p in _alike(table, others) or [[*others, "1", "2"][:2]]]
+    pairs = _alike(table, others) or [_likeness(table, [*others, "1", "2"][:2])[1]]
     first, second = pairs[0]
     every = (",".join(names) for names in zip(*sorted(pairs), strict=True))
     last = (others or [second])[-1]
@@ -477,33 +477,33 @@ def unknown_numbers(path: Path | str, table: Table) -> str:
 
 
 def _alike(table: Table, names: Sequence[str]) -> list[list[str]]:
-    """Pairs of columns that go together, as a joint's command and position do, the best first.
-
-    Lin's coefficient of concordance is 1 for equal columns; an offset counts, another scale, too.
-    """
-    known = {n: np.nan_to_num(table.columns[n][:_ORDERED]) for n in names[:_COMPARED_BY_VALUE]}
-    ranked = sorted(
-        (-2 * np.mean((x - x.mean()) * (y - y.mean()))
-         / (np.var(x) + np.var(y) + (x.mean() - y.mean()) ** 2), n, m)
-        for (n, x), (m, y) in combinations(known.items(), 2)
-    )  # fmt: skip
+    """Pairs of columns that go together, as a joint's command and position do, the best first."""
+    pairs = combinations(names[:_COMPARED_BY_VALUE], 2)
+    ranked = sorted((_likeness(table, pair) for pair in pairs), reverse=True)
     found: list[list[str]] = []
-    for rank, one, other in ranked:
-        if -rank > _ALIKE and not {one, other} & {name for pair in found for name in pair}:
-            found.append([one, other])
+    for likeness, pair in ranked:
+        if likeness > _ALIKE and not {*pair} & {name for other in found for name in other}:
+            found.append(pair)
     return found
 
 
-def _in_order(table: Table, pair: Sequence[str]) -> list[str]:
-    """Two columns, first the one that the other follows."""
+def _likeness(table: Table, pair: Sequence[str]) -> tuple[float, list[str]]:
+    """How alike two columns are, and the pair, first the one that the other follows.
+
+    Lin's coefficient of concordance at the best lag: 1 for equal columns; an offset counts, another
+    scale, too.
+    """
     known = [table.columns.get(name) for name in pair]
     if any(v is None or not np.isfinite(v).all() for v in known):
-        return [*pair]
+        return 0.0, [*pair]
     first, second = (np.asarray(v[:_ORDERED]) - np.mean(v[:_ORDERED]) for v in known)
     product_at = np.fft.irfft(np.fft.rfft(second, 2 * len(second)).conj()
                               * np.fft.rfft(first, 2 * len(first)))  # fmt: skip
     best = int(np.argmax(np.abs(product_at)))
-    return [*pair][::-1] if 0 < best < len(first) else [*pair]
+    apart = len(first) * float(np.mean(known[0][:_ORDERED]) - np.mean(known[1][:_ORDERED])) ** 2
+    total = float(first @ first + second @ second) + apart
+    likeness = 2 * float(np.abs(product_at[best])) / max(total, 1e-300)
+    return likeness, [*pair][::-1] if 0 < best < len(first) else [*pair]
 
 
 def has_time(names: Sequence[str]) -> bool:
