@@ -198,8 +198,8 @@ def _of_frame(data: Any) -> Any:
     if not isinstance(data, Mapping):
         return data
     names = data.get("columns")
-    for each in data.values() if isinstance(names, list) else ():
-        if isinstance(each, list) and each and all(
+    for each in data.values():
+        if isinstance(names, list) and isinstance(each, list) and each and all(
             isinstance(row, list) and len(row) == len(names) for row in each
         ):  # fmt: skip
             return {str(n): list(v) for n, v in zip(names, zip(*each, strict=True), strict=True)}

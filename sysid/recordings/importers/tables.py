@@ -493,8 +493,8 @@ def _likeness(table: Table, pair: Sequence[str]) -> tuple[float, list[str]]:
     Lin's coefficient of concordance at the best lag: 1 for equal columns; an offset counts, another
     scale, too.
     """
-    known = [table.columns.get(name) for name in pair]
-    if any(v is None or not np.isfinite(v).all() for v in known):
+    known = [table.columns.get(name, np.full(1, np.nan)) for name in pair]
+    if not all(np.isfinite(v).all() for v in known):
         return 0.0, [*pair]
     first, second = (np.asarray(v[:_ORDERED]) - np.mean(v[:_ORDERED]) for v in known)
     product_at = np.fft.irfft(np.fft.rfft(second, 2 * len(second)).conj()
