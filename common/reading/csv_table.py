@@ -97,7 +97,10 @@ _EXACTLY: dict[str, Any] = {"float_precision": "round_trip"} if _OLD_PANDAS else
 _SPLIT = "Split it by joint or by time."
 _BLOCK = 4_000_000  # characters
 _FEW_BROKEN = 0.01  # of the lines: a serial line lost characters
-_NOTHING = frozenset({"none", "null", "n/a", "na", "#n/a", "-", "--", "<na>"})
+_NOTHING = frozenset(
+    "none null nil n/a na #n/a - -- ? <na> missing invalid lost failed err error timeout".split()
+)
+"""Words for a reading that failed."""
 _COMMENT = re.compile(r"^#.*$", re.MULTILINE)
 _QUOTED = re.compile(r'(?:^|(?<=[,\n]))"([^",\n]*)"(?=[,\n]|$)')
 

@@ -109,7 +109,8 @@ _PAIR = re.compile(
     re.IGNORECASE,
 )
 _STAMPED = re.compile(
-    r"^[ \t]*(?:\[?((?:\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,]\d+)?)\]?|"
+    r"^[ \t]*(?:\[[A-Za-z]+\][ \t]*)?"  # [INFO]
+    r"(?:\[?((?:\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,]\d+)?)\]?|"
     r"[(\[][ \t]*(\d+\.\d+)[ \t]*[)\]])"
     r"[ \t]*(?:->|[|:])?[ \t]+(?=\S)",
     re.MULTILINE,
@@ -117,7 +118,16 @@ _STAMPED = re.compile(
 _REMARK = re.compile(r"\W*\w+\W*:$")  # a first word such as WARN: or [INFO]:
 _NUMBERS = re.compile(r"[\s,;]+")
 _LONGEST_LIST = 1000
-_BRACKETED = re.compile(r"^[ \t]*[\[(]([^\[\]()\n]+)[\])][ \t]*[,;]?[ \t]*$", re.MULTILINE)
+_BRACKETED = re.compile(
+    r"^[ \t]*[\[(]([^\[\]()\n]+|[-+.\deE,; \t\[\]()]+)[\])][ \t]*[,;]?[ \t]*$",
+    re.MULTILINE,
+)
+_BRACKETS = re.compile(r"[\[\]()]")
+_HEX = re.compile(r"(?<![\w.])0x[0-9a-f]{1,8}(?![\w.])", re.IGNORECASE)
+_TELEPLOT = re.compile(
+    r"^>([\w./ \[\]-]+):(?:(\d+(?:\.\d+)?):)?([-+]?[\d.]+(?:e[-+]?\d+)?)(?:[§|].*)?$",
+    re.IGNORECASE | re.MULTILINE,
+)
 _LIST = re.compile(r'"?[\[(]\s*([-+.\d][-+.\deE,;\s]*?)\s*[\])]"?')
 
 
@@ -162,6 +172,8 @@ def plain(text: str) -> Plain:
     rows = [lines[n] for n in bare[len(bare) // 2 :][:_ROWS]]
     if (usual := _usual_numbers(text, [*rows, *text[-2000:].split("\n")[1:-1]])) != text:
         return plain(usual)
+    if all(_TELEPLOT.match(row) for row in rows):
+        return _teleplot(text)
     names = Counter(tuple(name for name, _ in _PAIR.findall(row)) for row in rows).most_common(1)[0]
     if len(set(names[0])) == len(names[0]) > 1 and names[1] >= _SAME_SHAPE * len(rows):
         return _labelled(text, list(names[0]))
@@ -170,7 +182,7 @@ def plain(text: str) -> Plain:
         separator = inner.separator if inner else ","
         return plain(_STAMPED.sub(lambda m: _stamp(m) + separator, text))
     if all(_BRACKETED.match(row) for row in rows):
-        return plain(_BRACKETED.sub(r"\1", text))
+        return plain(_BRACKETED.sub(lambda m: _BRACKETS.sub("", m[1]), text))
     if all(_LIST.search(row) for row in rows) and (flat := _unlisted(text, lines, bare, rows)):
         return plain(flat)
     shape = _shape(rows)
@@ -189,6 +201,8 @@ def _usual_numbers(text: str, rows: Sequence[str]) -> str:
     sample = "\n".join(rows)
     if "\u2212" in text:
         text = text.replace("\u2212", "-")
+    if _HEX.search(sample):
+        text = _HEX.sub(lambda m: str(int(m[0], 16)), text)
     if _FORTRAN.search(sample):
         text = _FORTRAN.sub("E", text)
     if _GROUPED.search(sample):
@@ -262,6 +276,9 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
     first = next((n for n in bare if _is_row(lines[n], shape)), None)
     if first is None:
         return Plain(text)
+    whole = next((n for n in bare if _is_row(lines[n], shape, whole=True)), first)
+    if any(_wordy(lines[n], shape) for n in bare if first < n < whole):
+        first = whole  # lines above the names have as many cells, some of them numbers
     before = [n for n in bare if n < first]
     notes, columns, units = [], None, []
     if before and (cells := _units(lines[before[-1]], shape)) and len(before) > 1:
@@ -375,6 +392,17 @@ def _labelled(text: str, columns: list[str]) -> Plain:
                  notes=_sentence(notes))  # fmt: skip
 
 
+def _teleplot(text: str) -> Plain:
+    """Lines of Teleplot, `>name:milliseconds:value` or `>name:value`, one value each."""
+    found = _TELEPLOT.findall(text)
+    if all(stamp for _, stamp, _ in found):
+        rows = [f"{stamp},{name},{value}" for name, stamp, value in found]
+        return Plain("\n".join(rows), ["time_ms", "name", "value"])
+    names = list(dict.fromkeys(name for name, _, _ in found))
+    columns = [[value for own, _, value in found if own == name] for name in names]
+    return Plain("\n".join(map(",".join, zip(*columns, strict=False))), names)
+
+
 def _unlisted(text: str, lines: list[str], bare: list[int], rows: Sequence[str]) -> str | None:
     """The text with a cell per number where a cell held a list (`"[0.1, 0.2]"`)."""
 
@@ -437,8 +465,20 @@ def _number(cell: str, comma: bool) -> bool:
     return not (comma and "." in cell)
 
 
-def _is_row(line: str, shape: _Shape) -> bool:
-    """Whether a line is a row of the table rather than its names, units or a remark."""
+def _wordy(line: str, shape: _Shape) -> bool:
+    """Whether a line has a word in each cell where the rows have numbers."""
+    cells = _split(line, shape.separator)
+    if len(cells) != shape.columns:
+        return False
+    numeric = zip(cells, shape.numeric, strict=True)
+    return all(cell and not _number(cell, shape.comma) for cell, number in numeric if number)
+
+
+def _is_row(line: str, shape: _Shape, whole: bool = False) -> bool:
+    """Whether a line is a row of the table rather than its names, units or a remark.
+
+    Of a whole row all cells are numbers where the others' are, rather than most of them.
+    """
     cells = _split(line, shape.separator)
     if len(cells) != shape.columns:
         return False
@@ -447,7 +487,7 @@ def _is_row(line: str, shape: _Shape) -> bool:
         c for k, c in full
         if _number(c, shape.comma) or (k in shape.units and _WITH_UNIT.fullmatch(c))
     ]  # fmt: skip
-    return len(numbers) > len(full) / 2
+    return len(numbers) > (len(full) - 1 if whole else len(full) / 2)
 
 
 def _names(line: str, shape: _Shape) -> list[str] | None:

@@ -18,6 +18,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from pupper_sysid.common.tones import fit_sine, least_squares
 from pupper_sysid.sysid.doctor.bends import CLEAR_NATS, bend_findings, bends
@@ -59,7 +60,7 @@ _SAME_TONE_HZ = 0.02
 _DIFFERENT = 0.35  # of the gain
 _DRIFT_RAD, _DRIFT_SHARE = 0.1, 0.3
 _TWO_ZEROS = 0.5  # of the residuals' variance that two zeros may leave
-_SLOPE, _SLOPE_ERRORS, _LAG_DRIFT_S, _GAIN_DRIFT = 4e-4, 6.0, 0.008, 0.2
+_SLOPE, _CHANCE, _LAG_DRIFT_S, _GAIN_DRIFT = 4e-4, 1e-3, 0.008, 0.2
 _QUICKER, _STEADILY = 1.7, 0.7
 _STOOD_S, _STOOD_SHARE, _SETTLED_S = 0.5, 0.25, 0.15  # the share of the path's range
 _SURELY_TWO, _SURELY_MOVED = 0.35, (0.03, 0.08)  # rad; of the command's range
@@ -131,12 +132,29 @@ def relation_findings(
         return [Finding("not_a_position_servo", REFUSE, {"percent": 100 * share})], base, None
     if best.code != "columns_swapped" and (scaled := _scale(base, best.servo)):
         return [scaled], base, None
+    at_once = None if best.code else _at_once(base, best.servo)
+    if at_once or best.code in ("position_early", "columns_swapped"):
+        if apart := _clocks_drift(trials, step, base):
+            return [apart], base, None
     if best.code:
         near = second.servo.nats < best.servo.nats + CLEAR_NATS
         return [_refusal(best, second.code if near else "")], base, None
-    if at_once := _at_once(base, best.servo):
+    if at_once:
         return [at_once], base, None
     return [] if bent else _loose(trials, base, best.servo), base, best.servo
+
+
+def _clocks_drift(trials: Sequence[Trial], step: float, base: Explanation) -> Finding | None:
+    """Clocks that drift: a position that is early at one time and late as a servo's at another."""
+    servo = base.best(1.0, np.ones(base.total_s.shape, bool))
+    joint = _followed(trials, step, base, servo)
+    found = next((f for f in drifts(joint) if f.code == "lag_drifts"), None)
+    return replace(found, verdict=REFUSE) if found else None
+
+
+def _followed(trials: Sequence[Trial], step: float, base: Explanation, servo: Servo) -> Followed:
+    predicted = tuple(base.predicted(servo))
+    return Followed(tuple(trials), step, base, servo, predicted, float(trials[0].send_time_s[0]))
 
 
 def _smooth_rest(base: Explanation, servo: Servo) -> bool:
@@ -384,10 +402,7 @@ def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     findings, base, servo = relation_findings(trials, step)
     if base is None or servo is None or 1 - servo.unexplained < _LOOSE:
         return findings
-    followed = Followed(
-        tuple(trials), step, base, servo, tuple(base.predicted(servo)),
-        float(trials[0].send_time_s[0]),
-    )  # fmt: skip
+    followed = _followed(trials, step, base, servo)
     for change in CHANGES:
         findings = [*findings, *change(followed)]
     return findings
@@ -553,20 +568,18 @@ def _quickens(windows: NDArray[np.float64]) -> bool:
 
 
 def _slope(lines: Sequence[tuple[NDArray, NDArray]], least: float) -> float:
-    """Common slope of several lines of points; 0 where it is less than six times its error."""
-    slopes, errors = [], []
-    for time, value in lines:
-        t, v = time - time.mean(), value - value.mean()
-        slopes.append(float(t @ v / (t @ t)))
-        away = v - slopes[-1] * t
-        errors.append(np.sqrt(away @ away / (len(t) - 2) / (t @ t)) + least / 20)
-    weights = 1 / np.array(errors) ** 2
-    slope = float(np.average(slopes, weights=weights))
-    error = float(np.sum(weights)) ** -0.5
-    if len(slopes) > 1:
-        spread = np.average((np.array(slopes) - slope) ** 2, weights=weights)
-        error = max(error, float(np.sqrt(spread / (len(slopes) - 1))))
-    return slope if abs(slope) > _SLOPE_ERRORS * error else 0.0
+    """Common slope of several lines of points; 0 where chance explains it.
+
+    Windows of real motion differ by themselves: the scatter about the lines says by how much, and a
+    few windows say little of it, hence Student's distribution.
+    """
+    time = np.concatenate([t - t.mean() for t, _ in lines])
+    value = np.concatenate([v - v.mean() for _, v in lines])
+    freedom, square = len(time) - len(lines) - 1, float(time @ time)
+    slope = float(time @ value) / square
+    away = value - slope * time
+    error = float(np.sqrt(away @ away / freedom / square)) + least / 20
+    return slope if abs(slope) > -stdtrit(freedom, _CHANCE / 2) * error else 0.0
 
 
 def stood_still(joint: Followed) -> list[Finding]:

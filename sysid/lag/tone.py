@@ -244,6 +244,8 @@ def without_ripple(
     lags = tone_lags(np.array([t.response for t in tones]), frequency, near_s)
     edges = _edges(max(float(lags.max()), 0.0), loop)
     masses = _servos(edges, frequency, lags)
+    if not len(masses):
+        return list(tones)  # a position that precedes its command: the lags as they are
     by_number = {t.number: (t, r) for t, r in zip(trials, read, strict=True)}
     turn = -2j * np.pi * np.outer(frequency, edges)
     own = np.diff(np.exp(turn)) / np.diff(turn)

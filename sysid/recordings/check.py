@@ -21,6 +21,8 @@ from pupper_sysid.sysid.recordings.table import LARGEST_COUNT, LARGEST_RAD
 
 _LEAST_ROWS = 20
 _COUNTS, _FEWEST_COUNTS = (1024, 4096, 16384, 65536), 100  # a turn
+_OF_300_DEGREES = "scale:0.005113"  # of 1,024 counts, as of AX-12 and SCS servos
+_PULSES_US = (400.0, 2700.0)
 _MOST_DEGREES = 360.0  # of whole numbers that may be degrees
 _FARTHEST_RAD = 200 * np.pi  # of angles whose unit was stated
 _IDENTITY = ["joint", "trial", "send_time_s", "read_time_s", "command_rad", "position_rad"]
@@ -152,6 +154,12 @@ def _refuse_degrees(
     kind = "position" if column == "position_rad" else "command"
     source = (names.get(joint) or {}).get(kind) if isinstance(names, dict) else None
     place = f"{printable(str(source))[:60]} (the {kind} of {joint})" if source else column
+    if kind == "command" and _PULSES_US[0] < np.nanmin(known) <= largest < _PULSES_US[1] and stated:
+        raise InputError(
+            f"{path}, column {place}: values of {np.nanmin(known):.4g} to {largest:.4g} beside "
+            "angles look like pulse widths in µs. Write them as angles, about (µs - 1500) * "
+            "0.0016 rad, and give that column."
+        )
     if stated:
         raise InputError(
             f"{path}, column {place}: values reach {largest:.4g} rad, more than a hundred turns. "
@@ -163,6 +171,9 @@ def _refuse_degrees(
     if (both >= 0).all() and (both % 1 == 0).all() and largest > _FEWEST_COUNTS:
         turns = [f"counts:{n}" for n in _COUNTS if known.max() < n][:2]
         units = turns if turns and largest > _MOST_DEGREES else units + turns[:1]
+        units += [_OF_300_DEGREES] if largest < 1024 else []
+    elif str(source).endswith(".pos") and largest <= 100:
+        units.append("percent:3.5")  # LeRobot's, of a range that it does not log
     kind = units[0].replace("deg", "degrees").replace(":", " of an encoder with ")
     kind += " a turn" if kind != "degrees" else ""
     lines = "; or ".join(import_line(path, **(options.words | {"unit": u})) for u in units)

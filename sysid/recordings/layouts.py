@@ -90,6 +90,8 @@ def _table(parsed: Parsed) -> Table:
         values = parsed.table[name]
         if not pd.api.types.is_numeric_dtype(values):
             texts[str(name)] = [str(v) for v in values.to_numpy(object)]  # 5 times as fast
+            if name == "":
+                texts["time"] = texts.pop("")
         else:
             numbers[str(name)] = values.to_numpy(float)
     return Table(numbers, texts, parsed.faults, numbered=parsed.numbered)

@@ -28,7 +28,7 @@ from pupper_sysid.common.reading.dialect import plain
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.columns import time_columns
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.tables import LABELS
+from pupper_sysid.sysid.recordings.importers.tables import LABELS, has_time
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 
 SCHEMA_VERSION = 1
@@ -126,6 +126,8 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
     ours = "send_time_s" in columns
     strict = ours or "motor_idx" in columns
     texts = [c for c in columns if c in TEXT_COLUMNS or (not ours and _may_be_text(c, options))]
+    if columns[0] == "" and not has_time(columns):
+        texts.append("")  # a frame's index, which is its time unless it counts rows
     # killed in the middle of a line: of ours the last one has no end
     found = read_table(path, opened.text, texts, strict, whole_lines=ours, columns=opened.columns)
     entries = _entries(path, text, found.comments)

@@ -109,14 +109,16 @@ class Import:
             return
         shown = terminal.table(f"{self.log}: {layout}", "joint", "trials", "rows", "s",
                                "command rad", "position rad")  # fmt: skip
+        own = recording.table.groupby("joint")
+        ranges = own[["command_rad", "position_rad"]].agg(["min", "max"])
+        counts = own.size()
         for joint in recording.joints:
             trials = recording.trials(joint)
-            rows = recording.table[recording.table["joint"] == joint]
             shown.add_row(
-                joint, str(len(trials)), str(len(rows)),
+                joint, str(len(trials)), str(counts[joint]),
                 terminal.number(sum(float(t.send_time_s[-1] - t.send_time_s[0]) for t in trials)),
-                *(f"{rows[c].min():.2f} … {rows[c].max():.2f}"
-                  for c in ("command_rad", "position_rad")),
+                *(f"{low:.2f} … {high:.2f}"
+                  for low, high in ranges.loc[joint].to_numpy().reshape(2, 2)),
             )  # fmt: skip
         terminal.out.print(shown)
         terminal.err.print(f"Wrote {out}. Next: pupper-sysid doctor {out}")

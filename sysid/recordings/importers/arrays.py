@@ -14,6 +14,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,13 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_bomb, refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS, distinct
 from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.columns import time_columns
 from pupper_sysid.sysid.recordings.importers.log import LARGEST_BYTES, MOST_JOINTS, Log
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.tables import (
     Table,
     expanded,
+    has_time,
     read_table,
     unknown_numbers,
 )
@@ -36,6 +39,8 @@ from pupper_sysid.sysid.recordings.importers.tables import (
 ZIP, NPY, MAT = b"PK\x03\x04", b"\x93NUMPY", b"MATLAB 5.0"
 
 _NAMES = ("joint_names", "joints", "names", "motor_names", "dof_names")
+_PERIODS = ("dt", "timestep", "time_step", "sample_time", "period")  # of a log without times
+_RATES = ("fs", "rate", "rate_hz", "hz", "sample_rate")
 _DEEPEST = 3  # of dictionaries in a torch file, of structures in MATLAB's
 
 
@@ -54,13 +59,40 @@ def read_arrays(path: Path, data: bytes, options: LogOptions) -> Log:
     if named is not None:
         refuse_more(f"{path}, array {named}", arrays[named].size, MOST_JOINTS, "joints")
         names = [str(n) for n in arrays[named].ravel().astype(str)]
-    numeric = {}
-    for key, values in arrays.items():
-        if values.ndim == 2 and 1 in values.shape and "time" in key.lower():
-            values = values.ravel()
-        if values.dtype.kind in "biuf" and values.ndim in (1, 2):
-            numeric[key] = values.astype(float)
-    return read_table(path, expanded(path, numeric, names, named), options, layout)
+    numeric = {k: v.astype(float) for k, v in arrays.items() if v.dtype.kind in "biuf" and v.ndim}
+    for key, values in numeric.items():
+        if values.ndim > 1 and values.size == max(values.shape) and "time" in key.lower():
+            numeric[key] = values.ravel()
+    rows = next((len(v) for k, v in numeric.items() if v.ndim == 1 and time_columns([k])), 0)
+    for key, values in numeric.items():
+        if values.ndim == 3 and values.shape[1] == 1:  # of one robot of many
+            values = values[:, 0]
+        if values.ndim == 2 and values.shape[1] == rows != len(values):
+            values = values.T
+        numeric[key] = values
+    table = _with_names(path, numeric, arrays) or expanded(
+        path, {k: v for k, v in numeric.items() if v.ndim < 3}, names, named
+    )
+    steps = {k.lower(): float(v) for k, v in arrays.items() if v.dtype.kind in "iuf" and not v.ndim}
+    rates = [1 / steps[k] for k in _PERIODS if steps.get(k, 0) > 0]
+    rates += [steps[k] for k in _RATES if steps.get(k, 0) > 0]
+    if rates and not rows and not (options.rate or options.time or has_time(table.names)):
+        options = replace(options, rate=rates[0])
+    return read_table(path, table, options, layout)
+
+
+def _with_names(
+    path: Path, numeric: Mapping[str, NDArray[np.float64]], arrays: Mapping[str, NDArray[Any]]
+) -> Table | None:
+    """The columns of one array that another array names, time included; None without them."""
+    for key, values in numeric.items():
+        for names in arrays.values():
+            if values.ndim == 2 and names.dtype.kind in "US" and names.size == values.shape[1]:
+                listed = [str(n) for n in names.ravel()]
+                if has_time(listed):
+                    distinct(f"{path}, the names of {key}", listed)
+                    return Table(dict(zip(listed, values.T, strict=True)))
+    return None
 
 
 def _read_npy(path: Path, data: bytes, options: LogOptions) -> Log:

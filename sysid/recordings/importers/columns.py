@@ -14,7 +14,7 @@ a bare `position`, plain before filtered or simulated values.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -32,18 +32,18 @@ WORDS: dict[str, str] = {
                   "requested action actions soll sollwert sv consigne consigna riferimento "
                   "referencia börvärde 目标 目標 指令 给定 设定"),
         (MAYBE_COMMAND, "u r ctrl control input inputs send sent tx request planned plan "
-                        "trajectory traj leader nominal wanted write written order"),
-        (STATE, "actual act present measured measurement meas msr feedback fb fbk observed "
-                "observation observations obs state states estimate estimated est real encoder enc "
-                "reading readings sensed sensor response resp "
+                        "expected trajectory traj leader nominal wanted write written order"),
+        (STATE, "actual act present measured measurement measurements meas msr feedback fb fbk "
+                "observed observation observations obs state states estimate estimated est real "
+                "encoder enc reading readings sensed sensor response resp "
                 "potentiometer pot resolver pv ist istwert ärvärde mesure misura medida "
                 "实际 当前 実測 反馈"),
-        (MAYBE_STATE, "y output outputs read rx follower received process"),
+        (MAYBE_STATE, "y output outputs read rx follower receive received recv rcv process"),
         (ANGLE, "position positions pos posn angle angles ang qpos q p theta θ winkel "
                 "角度 位置"),
         (OTHER, "v w velocity velocities vel vels speed speeds omega qd dq qdot qvel rate accel "
                 "acceleration accelerations acc qdd ddq torque torques tau effort efforts load "
-                "current currents curr amps ampere voltage volt volts temperature temperatures "
+                "current currents curr cur amps ampere voltage volt volts temperature temperatures "
                 "temp temps pwm duty power pw error errors err deviation mode status flag flags "
                 "latency delay age dt counter crc checksum quat quaternion gyro imu mag battery "
                 "gain gains kp ki kd stiffness damping limit limits lim max min seq index idx "
@@ -54,7 +54,8 @@ WORDS: dict[str, str] = {
         (TIME, "time times timestamp timestamps t ts stamp stamps clock elapsed seconds secs sec "
                "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
                "nanosec nanosecs nsecs usec usecs zeit temps tiempo tempo tid 时间 時間"),
-        (UNIT, "rad rads radian radians deg degs degree degrees ° count counts tick ticks turn "
+        (UNIT, "rad rads radian radians deg degs degree degrees ° count counts tick ticks pulse "
+               "pulses turn "
                "turns rev revs revolution revolutions mrad percent pct"),
         (JOINT, "joint joints dof dofs motor motors servo servos actuator actuators axis axes dxl "
                 "group controller controllers data value values val field name names msg body "
@@ -80,7 +81,7 @@ _CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-zµθ°]+|\d+|[^A-Za-z\d]+")
 _SOLE_LETTERS = frozenset("ury")  # that mean something where no other word does
 _LETTERS = frozenset("qput")  # that begin a word such as qdes or tcmd
 _LONGEST = 200
-_PARTS_OF = re.compile(r"(?<![\w.])(\d*\.\d+)\s*\*?\s*(deg|rad|°)(?![a-z])")  # 0.1deg
+_PARTS_OF = re.compile(r"(?<![^\W_])(?<!\.)(\d*\.\d+)\s*\*?\s*(deg|rad|°)(?![a-z])")  # 0.1deg
 _RAD = {"deg": np.pi / 180, "°": np.pi / 180, "rad": 1.0}
 
 
@@ -122,7 +123,7 @@ def _column(name: str) -> Column:
     known = [WORDS.get(p.lower(), "") for p in parts]
     kinds = set(known)
     lower = [p.lower() for p in parts]
-    if "d" in lower and "q" in lower and not kinds & {COMMAND, STATE}:  # q_d
+    if "d" in lower and ANGLE in kinds and not kinds & {COMMAND, STATE, OTHER}:  # q_d, theta_d
         known[lower.index("d")] = COMMAND
         kinds.add(COMMAND)
     if kinds & {COMMAND, STATE, ANGLE}:  # a joint that is called y
@@ -132,7 +133,8 @@ def _column(name: str) -> Column:
                                 or "pos" in "".join(lower))  # fmt: skip
     if angle and lower[-1:] != ["current"]:  # current position, not a current
         known = [
-            STATE if w in ("current", "curr") else k for w, k in zip(lower, known, strict=True)
+            STATE if w in ("current", "curr", "cur") else k
+            for w, k in zip(lower, known, strict=True)
         ]
         kinds = set(known)
     unit = next((UNITS.get(w, "counts") for w, k in zip(lower[::-1], known[::-1], strict=True)
@@ -177,6 +179,21 @@ def _column(name: str) -> Column:
     key = "_".join(f"{int(p)}" if p.isascii() and p.isdigit() else p.lower() for p in bare)
     template = name if kind == "unknown" else _template(name, bare)
     return Column(name, kind, joint, key, unit, rank, words, template)
+
+
+def columns_of(names: Iterable[str]) -> list[Column]:
+    """What the names of a table say, with the joints' bare names beside their commands.
+
+    In `hip_cmd, hip` and `phi_ref, phi` the name of a joint alone is its position.
+    """
+    found = [column(name) for name in names]
+    commands = {c.key for c in found if c.kind == "command"}
+    placed = {c.key for c in found if c.kind == "position"}
+    return [
+        replace(c, kind="position", template=_template(c.name, [c.name]))
+        if c.kind == "unknown" and c.key in commands - placed else c
+        for c in found
+    ]  # fmt: skip
 
 
 def _parts(word: str) -> list[str]:
@@ -238,7 +255,7 @@ def time_columns(names: Sequence[str]) -> list[str]:
             bare = [w for w in lower if WORDS.get(w) == TIME and w not in _TIME_UNITS] or lower
             place = TIMES.index(bare[0]) if bare[0] in TIMES else len(TIMES)
             found.append(((len(own.key) > 0, place, len(lower)), name))
-        elif lower[:3] == ["time", "since", "start"]:
+        elif lower[:3] == ["time", "since", "start"] or name.lower() == "x_value":  # LabVIEW's
             found.append(((False, 4, 3), name))
     return [name for _, name in sorted(found, key=lambda pair: pair[0])]
 

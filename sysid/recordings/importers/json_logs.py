@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
+from pupper_sysid.sysid.recordings.importers.columns import time_columns
 from pupper_sysid.sysid.recordings.importers.log import (
     Log,
     joint_names,
@@ -42,7 +43,12 @@ from pupper_sysid.sysid.recordings.importers.log import (
     rows,
 )
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.tables import expanded, missing, read_table
+from pupper_sysid.sysid.recordings.importers.tables import (
+    SERIES,
+    expanded,
+    missing,
+    read_table,
+)
 from pupper_sysid.sysid.recordings.importers.times import doubt_of_a_turn
 
 BAM, KTUNE = "BAM JSON", "ktune JSON"
@@ -157,11 +163,17 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     if records is None and not isinstance(data, Mapping):
         return None
     for k, record in enumerate([data] if records is None else records):
+        series = next((k for k in record if k.lower() in SERIES), "") if records else ""
+        of = record[series] if isinstance(record.get(series), str) else ""
         pending = [("", record)]
         while pending:
             prefix, inside = pending.pop()
             for name, value in inside.items():
                 full = f"{prefix}.{name}".strip(".")[:200]
+                if of and not prefix and not time_columns([name]):
+                    full = f"{of}.{full}"[:200]  # a message of one topic
+                if records is not None and isinstance(value, list):
+                    value = _by_name(value)
                 if isinstance(value, Mapping):
                     pending.append((full, value))
                 elif records is None:
@@ -182,16 +194,26 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
 
 
 def _of_frame(data: Any) -> Any:
-    """The columns of a frame that pandas wrote as JSON, `split` or by row numbers; else `data`."""
+    """The columns of rows below a list of names, or by numbers, as pandas has them; else `data`."""
     if not isinstance(data, Mapping):
         return data
-    names, rows = data.get("columns"), data.get("data")
-    if isinstance(names, list) and isinstance(rows, list) and rows and all(
-        isinstance(row, list) and len(row) == len(names) for row in rows
-    ):  # fmt: skip
-        return {str(n): list(v) for n, v in zip(names, zip(*rows, strict=True), strict=True)}
+    names = data.get("columns")
+    for each in data.values():
+        if isinstance(names, list) and isinstance(each, list) and each and all(
+            isinstance(row, list) and len(row) == len(names) for row in each
+        ):  # fmt: skip
+            return {str(n): list(v) for n, v in zip(names, zip(*each, strict=True), strict=True)}
     numbered = data and all(isinstance(v, Mapping) and "0" in v and "1" in v for v in data.values())
     return {n: list(v.values()) for n, v in data.items()} if numbered else data
+
+
+def _by_name(value: list[Any]) -> Any:
+    """A list with a record per joint by the joints' names; another as it is."""
+    if not value or not all(isinstance(each, Mapping) for each in value):
+        return value
+    key = next((k for k in ("name", "joint", "id", "motor_id", "index") if k in value[0]), "")
+    return {str(each.get(key, n)): {k: v for k, v in each.items() if k != key}
+            for n, each in enumerate(value)}  # fmt: skip
 
 
 def _records(data: Any) -> list[Any] | None:
@@ -207,8 +229,10 @@ def _numbers(values: list[Any]) -> NDArray[np.float64] | None:
     """Numbers, or equally long lists of them; None where they are others. A null is missing."""
     first = next((v for v in values if v is not None), None)
     kinds = (list,) if isinstance(first, list) else (int, float, type(None))
-    if first is None or not all(isinstance(v, kinds) for v in values):
+    if first is None or not all(v is None or isinstance(v, kinds) for v in values):
         return None
+    if kinds == (list,):
+        values = [[None] * len(first) if v is None else v for v in values]
     inside = [v for row in values for v in row] if kinds == (list,) else []
     if not all(isinstance(v, int | float | None) for v in inside):
         return None

@@ -25,9 +25,11 @@ from pupper_sysid.sysid.recordings.importers.unknown import unknown_folder, unkn
 
 _ENDINGS = (".csv", ".tsv", ".json", ".jsonl", ".mcap", ".db3", ".npz", ".parquet", ".pt", ".mat")
 _PACKED = (".gz", ".bz2", ".xz")
-_STAMP = re.compile(rb"\[[\d.:, TZ-]+\][ \t]*[A-Za-z(]")  # before a message: a line of text
+_STAMP = re.compile(
+    rb"\[(?:[\d.:, TZ-]+\][ \t]*[A-Za-z(]|[A-Za-z]+\][ \t:]*[\[\w])"
+)  # before a message: a line of text
 _YAML = re.compile(rb"(?:---\s*\n)?(?:- \w+:|\w+:[ \t]*\r?\n[ \t]+\w+:)")
-_ROW = re.compile(rb"\[[-+\d.eE, \t]+\][ \t]*\r?\n")  # a list of numbers that is a whole line
+_ROW = re.compile(rb"\[[-+\d.eE, \t\[\]()]+\][ \t]*\r?\n")  # numbers, a whole line
 
 
 def is_log_folder(folder: Path) -> bool:

@@ -16,7 +16,8 @@ import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from functools import cached_property
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,12 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS, distinct, one_each
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.columns import Column, column, time_columns
+from pupper_sysid.sysid.recordings.importers.columns import (
+    Column,
+    column,
+    columns_of,
+    time_columns,
+)
 from pupper_sysid.sysid.recordings.importers.log import (
     MOST_JOINTS,
     Log,
@@ -51,13 +57,13 @@ LAYOUT = "table"
 
 _TRIALS = ("trial", "episode_index", "episode", "loop", "run", "segment")
 _TONES = ("frequency_hz", "freq_hz", "frequency", "freq")
-_SERIES = ("name", "signal", "event", "type", "kind", "variable", "topic", "field", "series",
+SERIES = ("name", "signal", "event", "type", "kind", "variable", "topic", "field", "series",
            "metric", "key", "channel", "_field", "_measurement")  # fmt: skip
 _GROUPS = ("leg", "limb", "arm", "side", "joint", "joint_name", "motor", "motor_name", "servo",
            "servo_name", "actuator", "name", "axis", "dof", "motor_idx", "motor_id", "motor_index",
            "joint_idx", "joint_id", "joint_index", "servo_id", "actuator_id", "dxl_id", "can_id",
            "node_id", "id")  # fmt: skip
-LABELS = frozenset((*_SERIES, *_GROUPS, *_TRIALS))
+LABELS = frozenset((*SERIES, *_GROUPS, *_TRIALS))
 """Columns that may hold text, in lower case."""
 _SUBSECONDS = ("nanosec", "nanosecs", "nsec", "nsecs", "usec", "usecs")
 _KEPT = ("p_gain", "torque_enabled", "voltage_v", "temperature_c", "load")
@@ -68,12 +74,14 @@ _FEWEST_ROWS = 3  # of a joint in a table with a row per joint
 _SHORTEST_TONE = 20  # rows of one frequency; a chirp changes it sooner
 _MOST_CHOICES = 4  # that a message lists
 _COMPARED = 8  # columns for one purpose
+_COMPARED_BY_VALUE, _ALIKE = 12, 0.7  # columns; concordance of a command and its position
 _WIDEST_ANGLE = 1e6  # of a joint, in any unit
 _ORDERED = 100_000  # rows
 _OF_TURNS = {
-    "ODrive": (("setpoint", "estimate"), "pos_setpoint and pos_estimate"),
-    "moteus": (("servo_stats.position",), "servo_stats.position"),
-    "moteus's decoder": (("command_position", "q_current"), "command_position and q_current"),
+    "ODrive": ({"setpoint", "estimate"}, "pos_setpoint and pos_estimate"),
+    "moteus": ({"servo_stats.position"}, "servo_stats.position"),
+    "moteus's decoder": ({"command_position", "q_current"}, "command_position and q_current"),
+    "moteus's telemetry": ({"control_position", "q_current"}, "control_position and q_current"),
 }
 """Programs that count turns and do not say so, and what gives their logs away."""
 
@@ -97,7 +105,7 @@ class Table:
     notes: tuple[str, ...] = ()
     """What was assumed, in sentences."""
 
-    @property
+    @cached_property
     def names(self) -> list[str]:
         """Names of all columns."""
         return list(dict.fromkeys([*self.columns, *self.texts, *self.faults]))
@@ -115,8 +123,11 @@ class Table:
 
     def first(self, names: Sequence[str]) -> str | None:
         """The first of these names, in any case, that a column of numbers has."""
-        own = {n.lower(): n for n in self.columns}
-        return next((own[n] for n in names if n in own), None)
+        return next((self._lower[n] for n in names if n in self._lower), None)
+
+    @cached_property
+    def _lower(self) -> dict[str, str]:
+        return {n.lower(): n for n in self.columns}
 
     @property
     def increasing(self) -> list[str]:
@@ -239,23 +250,28 @@ def _pairs(
 def _pairs_by_words(
     path: Path | str, table: Table, options: LogOptions
 ) -> tuple[dict[str, _Pair], list[str]]:
-    every = [column(name) for name in table.names if name not in table.texts]
-    by_kind = {kind: [c for c in every if c.kind == kind] for kind in ("command", "position")}
-    shared = {c.key for c in by_kind["command"]} & {c.key for c in by_kind["position"]}
-    if not shared:
-        return _lone_pair(path, table, by_kind["command"], by_kind["position"])
+    every = columns_of(name for name in table.names if name not in table.texts)
+    by_key: dict[str, dict[str, list[Column]]] = {"command": {}, "position": {}}
+    for c in every:
+        if c.kind in by_key:
+            by_key[c.kind].setdefault(c.key, []).append(c)
+    commands, positions = by_key.values()
+    if not commands.keys() & positions.keys():
+        return _lone_pair(
+            path, table, *([c for each in own.values() for c in each] for own in by_key.values())
+        )
     used = Counter(c.template for c in every)
     pairs: dict[str, _Pair] = {}
     names: list[str] = []
     notes: list[str] = []
-    for key in dict.fromkeys(c.key for c in by_kind["command"]):
-        if key not in shared:
-            continue
+    marked = {
+        program: (marks - {*table.names}, shown) for program, (marks, shown) in _OF_TURNS.items()
+    }
+    for key in (key for key in commands if key in positions):
         ranked = [
-            sorted((c for c in by_kind[kind] if c.key == key),
-                   key=lambda c: (c.rank, -used[c.template]))[:_COMPARED]
-            for kind in ("command", "position")
-        ]  # fmt: skip
+            sorted(own[key], key=lambda c: (c.rank, -used[c.template]))[:_COMPARED]
+            for own in (commands, positions)
+        ]
         best = sorted((_Pair(c, p) for c, p in product(*ranked)), key=lambda q: _cost(q, used))
         pair = _decided(path, table, best, used)
         if (
@@ -273,10 +289,10 @@ def _pairs_by_words(
             )
         pairs[key] = pair
         names.append(_joint_name(pair))
-        signs = {*table.names, *pair.command.words, *pair.position.words}
-        for program, (marks, shown) in _OF_TURNS.items():
+        words = pair.command.words | pair.position.words
+        for program, (marks, shown) in marked.items():
             unnamed = not pair.command.unit + pair.position.unit and not options.unit
-            if unnamed and signs.issuperset(marks):
+            if unnamed and marks <= words:
                 notes.append(
                     f"{shown} are names of {program}, which counts turns; the values were taken as "
                     "rad. If they are turns, give `unit='turns'`; lag and dead time are the same."
@@ -435,7 +451,8 @@ def unknown_numbers(path: Path | str, table: Table) -> str:
         if len(known):
             up = ", increasing" if name in table.increasing else ""
             shown.append(f"{name} ({known.min():.4g} … {known.max():.4g}{up})")
-    time = (table.increasing or ["0"])[0]
+    times = [*table.increasing, *table.texts, *table.faults]
+    time = times[0] if times else ""
     others: list[str] = []  # that move, each once
     for name, values in table.columns.items():
         known = values[np.isfinite(values)]
@@ -446,25 +463,47 @@ def unknown_numbers(path: Path | str, table: Table) -> str:
             others.append(name)
         elif (known % 1 == 0).all() and known.min() >= 0 and known.max() < 1e9 and "," not in time:
             time = f"{time},{name}"  # nanoseconds
-    first, second = _in_order(table, [*others, "1", "2"][:2])
-    choices = dict.fromkeys([(first, second), (second, first), (first, (others or [second])[-1])])
-    lines = [import_line(path, time=time, command=c, position=p) for c, p in choices]
+    pairs = _alike(table, others) or [_likeness(table, [*others, "1", "2"][:2])[1]]
+    first, second = pairs[0]
+    every = (",".join(names) for names in zip(*sorted(pairs), strict=True))
+    last = (others or [second])[-1]
+    choices = dict.fromkeys([tuple(every), (first, second), (second, first), (first, last)])
+    when = {"time": time} if time else {"rate": "50"}
+    lines = [import_line(path, **when, command=c, position=p) for c, p in choices]
     return (
         f"its columns have no names. By their numbers, from 0, they are {'; '.join(shown)}. Say "
         f"which is which: {', '.join(lines)}, or others."
     )
 
 
-def _in_order(table: Table, pair: Sequence[str]) -> list[str]:
-    """Two columns, first the one that the other follows."""
-    known = [table.columns.get(name) for name in pair]
-    if any(v is None or not np.isfinite(v).all() for v in known):
-        return [*pair]
+def _alike(table: Table, names: Sequence[str]) -> list[list[str]]:
+    """Pairs of columns that go together, as a joint's command and position do, the best first."""
+    pairs = combinations(names[:_COMPARED_BY_VALUE], 2)
+    ranked = sorted((_likeness(table, pair) for pair in pairs), reverse=True)
+    found: list[list[str]] = []
+    for likeness, pair in ranked:
+        if likeness > _ALIKE and not {*pair} & {name for other in found for name in other}:
+            found.append(pair)
+    return found
+
+
+def _likeness(table: Table, pair: Sequence[str]) -> tuple[float, list[str]]:
+    """How alike two columns are, and the pair, first the one that the other follows.
+
+    Lin's coefficient of concordance at the best lag: 1 for equal columns; an offset counts, another
+    scale, too.
+    """
+    known = [table.columns.get(name, np.full(1, np.nan)) for name in pair]
+    if not all(np.isfinite(v).all() for v in known):
+        return 0.0, [*pair]
     first, second = (np.asarray(v[:_ORDERED]) - np.mean(v[:_ORDERED]) for v in known)
     product_at = np.fft.irfft(np.fft.rfft(second, 2 * len(second)).conj()
                               * np.fft.rfft(first, 2 * len(first)))  # fmt: skip
     best = int(np.argmax(np.abs(product_at)))
-    return [*pair][::-1] if 0 < best < len(first) else [*pair]
+    apart = len(first) * float(np.mean(known[0][:_ORDERED]) - np.mean(known[1][:_ORDERED])) ** 2
+    total = float(first @ first + second @ second) + apart
+    likeness = 2 * float(np.abs(product_at[best])) / max(total, 1e-300)
+    return likeness, [*pair][::-1] if 0 < best < len(first) else [*pair]
 
 
 def has_time(names: Sequence[str]) -> bool:
@@ -474,7 +513,7 @@ def has_time(names: Sequence[str]) -> bool:
 
 def missing(names: Sequence[str]) -> str:
     """What a table lacks to be a servo's log; empty if a joint may have command and position."""
-    kinds = {column(name).kind for name in names}
+    kinds = {c.kind for c in columns_of(names)}
     if {"command", "position"} <= kinds:
         return ""
     if "command" in kinds:
@@ -574,7 +613,7 @@ def spread(path: Path | str, table: Table, options: LogOptions) -> Table:
     back as they are.
     """
     by_case = {n.lower(): n for n in table.texts}
-    series = next((by_case[n] for n in _SERIES if n in by_case), None)
+    series = next((by_case[n] for n in SERIES if n in by_case), None)
     value = table.first(("value", "values", "val", "_value", "data"))
     if series is None or value is None or options.command:
         return table

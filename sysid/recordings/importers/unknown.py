@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import difflib
+import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from itertools import product
 from pathlib import Path
 
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.columns import column, time_columns
+from pupper_sysid.sysid.recordings.importers.columns import column, columns_of, time_columns
 from pupper_sysid.sysid.recordings.importers.tables import has_time, import_line, missing
 
 OURS = (
@@ -16,6 +18,7 @@ OURS = (
 )  # fmt: skip
 SWEEP = ("time_s", "freq_hz", "motor_idx", "signal", "command_rad", "actual_rad")
 PLAYBACK = ("time_s", "loop", "LF_hip_command_rad", "LF_hip_position_rad")
+_CURRENT = re.compile(r"cur(r|rent)?(?![A-Za-z])", re.IGNORECASE)
 _IMU = {"gx", "gy", "gz", "ax", "ay", "az"}
 
 FILES = (
@@ -62,11 +65,12 @@ def unknown_columns(
             if own & {*columns}
         ),
     ]
+    lines = _examples(path, names, timed, increasing)
+    rest = "" if lines else f" Other layouts: {'; '.join(FILES)}."
     return (
         f"its columns ({_listed(names)}) belong to no known layout. {'; '.join(parts)}. "
-        f"{_hint(names)}Name the columns{_examples(path, names, timed, increasing)} with "
-        "`pupper-sysid import` --time (or --rate, the rows a second), --command and --position. "
-        f"Other layouts: {'; '.join(FILES)}."
+        f"{_hint(names)}Name the columns{lines} with `pupper-sysid import` --time (or --rate, the "
+        f"rows a second), --command and --position.{rest}"
     )
 
 
@@ -74,17 +78,27 @@ def _examples(
     path: Path | str, names: Sequence[str], timed: bool, increasing: Sequence[str]
 ) -> str:
     """Command lines that take columns whose names say nothing for what is missing."""
-    columns = [column(name) for name in names]
+    columns = columns_of(names)
     times = time_columns(names)[:1] or [n for n in increasing if column(n).kind != "position"][:1]
     if not times and (len(columns) > 2 or timed):  # of another event
         times = [c.name for c in columns if c.kind in ("time", "unknown")][:1]
     when = {"time": times[0]} if times else {"rate": "50"}
+    numbered = Counter(re.sub(r"\d+", "{joint}", c.name, count=1) for c in columns)
     by_kind = {}
     for kind in ("command", "position"):
-        ranked = ((kind,), ("unknown",), ("time",))
-        chosen = ([c.template for c in columns if c.kind in kinds and c.name not in times]
-                  for kinds in ranked)  # fmt: skip
-        by_kind[kind] = next(filter(None, chosen), [])
+        sure = [c for c in columns if c.kind == kind]
+        if kind == "command" and not sure:  # qd beside q may be the desired angle
+            sure = [c for c in columns if c.name[-1:] == "d" and c.name[:-1] in names]
+        if kind == "position" and not sure:  # beside a command a bare `current` may be a place
+            sure = [c for c in columns if not c.kind and _CURRENT.search(c.name)]
+        chosen = [c.template for c in sure]
+        for others in ("unknown", "time"):
+            chosen = chosen or [
+                every if numbered[every := re.sub(r"\d+", "{joint}", c.name, count=1)] > 1 else
+                c.template
+                for c in columns if c.kind == others and c.name not in times
+            ]  # fmt: skip
+        by_kind[kind] = chosen
     lines = [
         import_line(path, **when, command=c, position=p)
         for c, p in product(by_kind["command"], by_kind["position"])

@@ -12,7 +12,7 @@ from pupper_sysid.sysid.doctor.checks import findings
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, RIVALS, USE, WORDS, Finding, rivalled
 from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.excitation import named_tones
-from support.real_recordings import case
+from support.real_recordings import case, real_recording
 from support.strange_servos import ACCUSING, FAULTS, draw_recording, draw_world, simulated
 
 
@@ -105,6 +105,25 @@ def test_free_motion_shows_what_happened_within_a_trial(fault, code):
     )  # fmt: skip
     assert code not in codes(recorded(simulated(world)))
     assert code in codes(recorded(FAULTS[fault][0](world, rng)[1]))
+
+
+def test_windows_that_differ_by_themselves_are_no_drift():
+    """Three short trials of one policy: gains of windows from 0.6 to 1.1 in no order."""
+    recording = ps.load(real_recording("playback_lstm_25hz.csv"))
+    assert not {"gain_drifts", "lag_drifts"} & set(codes(recording, "LB_calf"))
+
+
+def test_clocks_that_drift_are_no_early_position_and_no_swapped_columns():
+    world = draw_world(np.random.default_rng(3), "smart", "walk", 3e-4)
+    world = replace(
+        world, rate_hz=80.0, poll_s=0.0, friction_rad=0.0, gravity_rad=0.0, duration_s=20.0,
+        quantum_rad=0.0015,
+    )  # fmt: skip
+    table = simulated(world)
+    late = np.interp(1.006 * table.read_time_s, table.read_time_s, table.position_rad)
+    found = codes(recorded(table.assign(position_rad=late)))
+    assert found["lag_drifts"].verdict == REFUSE and len(found) == 1
+    assert found["lag_drifts"].values["drift_ms"] == pytest.approx(-6, rel=0.1)
 
 
 CASES = {

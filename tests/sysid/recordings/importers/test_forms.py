@@ -84,6 +84,12 @@ def grouped(mark, quote="", separator=","):
     )
 
 
+def archived(**arrays):
+    out = io.BytesIO()
+    np.savez(out, **arrays)
+    return out.getvalue()
+
+
 def repeated():
     lines = joined(",").splitlines()
     return "\n".join([lines[0], *(line for line in lines[1:] for _ in range(4)), ""])
@@ -214,6 +220,36 @@ FORMS = {
     "names of a controller in ROS 1": joined(",", ("%time", "field.set_point",
                                                    "field.process_value")),
     "missing in words": joined(",") + f"{TIME[-1] + 0.005:.6f},0.1,None\n",
+    "a word for a failed read": joined(",") + f"{TIME[-1] + 0.005:.6f},0.1,timeout\n",
+    "Teleplot": "".join(
+        f">goal:{1e3 * t!r}:{c}\n>pos:{1e3 * t!r}:{p}§rad\n" for t, c, p in ROWS_OF),
+    "LabVIEW's measurement": "LabVIEW Measurement\t\nSeparator\tTab\n***End_of_Header***\t\n"
+        "Channels\t2\t\t\nSamples\t80\t80\t\nX0\t0.0E+0\t0.0E+0\t\n***End_of_Header***\t\t\t\n"
+        + joined("\t", ("X_Value", "Setpoint", "Encoder", "Comment"), tail="\t").replace(
+            "Comment\t", "Comment"),
+    "an index of dates": pd.DataFrame(
+        {"cmd": COMMAND, "pos": POSITION},
+        pd.Timestamp("2026-05-04 12:00+02:00") + pd.to_timedelta(TIME, "s")).to_csv(),
+    "records of joints": json.dumps(
+        [{"t": t, "motors": [{"id": 3, "goal": c, "present": p}]} for t, c, p in ROWS_OF]),
+    "a logger of ROS": "".join(
+        f"[INFO] [{1000 + t:.9f}] [ctrl]: cmd: {c:.6f} meas: {p:.6f}\n" for t, c, p in ROWS_OF),
+    "numbers in hexadecimal": "time_us,cmd [rad],pos [rad]\n" + "".join(
+        f"0x{round(1e6 * t):08X},{c},{p}\n" for t, c, p in ROWS_OF),
+    "a letter for desired": joined(",", ("t", "theta_d", "theta")),
+    "a joint's bare name": joined(",", ("t", "phi_ref", "phi")),
+    "JSON, rows below names": json.dumps({"columns": ["t", "cmd", "pos"], "rows": ROWS_OF}),
+    "JSON Lines of topics": "".join(
+        f'{{"topic": "{topic}", "t": {t}, "data": [{value}]}}\n'
+        for t, c, p in ROWS_OF for topic, value in (("cmd", c), ("state", p))),
+    "abbreviated current": joined(",", ("t", "goalPos", "curPos")),
+    "tenths of a degree behind an underscore": "time,cmd_0.1deg,pos_0.1deg\n" + "".join(
+        f"{t!r},{1800 / np.pi * c!r},{1800 / np.pi * p!r}\n" for t, c, p in ROWS_OF),
+    "arrays with time last": archived(time=TIME, q=POSITION[None], q_des=COMMAND[None]),
+    "arrays of one robot of many": archived(
+        time=TIME, q=POSITION[:, None, None], q_des=COMMAND[:, None, None]),
+    "an array and its columns": archived(
+        data=np.column_stack([TIME, COMMAND, POSITION]), columns=["time", "cmd", "pos"]),
 }  # fmt: skip
 
 
@@ -255,6 +291,40 @@ def test_seconds_and_nanoseconds_without_names_are_offered_as_one_time(tmp_path)
     with pytest.raises(InputError, match="log.txt --time 0,1 --command 3 --position 4 --out"):
         load(tmp_path / "log.txt")
     same(load(tmp_path / "log.txt", LogOptions("0,1", "3", "4")))
+
+
+def test_columns_without_names_are_offered_in_the_pairs_that_go_together(tmp_path):
+    rows = [f"{c},{50 * c},{p},{p - c},{c * c},{p * p}\n" for _, c, p in ROWS_OF]
+    (tmp_path / "log.txt").write_text("".join(rows))
+    with pytest.raises(InputError, match="log.txt --rate 50 --command 0,4 --position 2,5 --out"):
+        load(tmp_path / "log.txt")
+    tuples = [f"({t}, [{c}, {c * c}], [{p}, {p * p}])\n" for t, c, p in ROWS_OF]
+    (tmp_path / "log.txt").write_text("".join(tuples))
+    with pytest.raises(InputError, match="log.txt --time 0 --command 1,2 --position 3,4 --out"):
+        load(tmp_path / "log.txt")
+
+
+def test_an_archive_without_times_takes_its_time_step_for_the_rate(tmp_path):
+    for step in ({"dt": 0.005}, {"fs": 200}):
+        np.savez(tmp_path / "log.npz", q=POSITION, q_des=COMMAND, **step)
+        recording = load(tmp_path / "log.npz")
+        assert recording.loop_period_s == pytest.approx(0.005)
+        assert any("row numbers over 200 Hz" in text for text in recording.warnings)
+
+
+def test_what_the_unit_may_be_is_offered_as_lines(tmp_path):
+    for names, values, words in (
+        ("t,goal,pos", (512 + 200 * COMMAND, 512 + 200 * POSITION), "--unit scale:0.005113 --out"),
+        ("t,action.pan.pos,observation.state.pan.pos", (200 * COMMAND, 200 * POSITION),
+         "--unit percent:3.5 --out"),
+        ("t,cmd_pwm_us,angle_deg", (1500 + 640 * COMMAND, 57.3 * POSITION), ""),
+    ):  # fmt: skip
+        rows = zip(TIME, *(np.round(v) if "goal" in names else v for v in values), strict=True)
+        text = "\n".join([names, *(",".join(map(str, row)) for row in rows), ""])
+        (tmp_path / "log.csv").write_text(text)
+        options = None if words else LogOptions(None, "cmd_pwm_us", "angle_deg")
+        with pytest.raises(InputError, match=words or "pulse widths in µs"):
+            load(tmp_path / "log.csv", options)
 
 
 def test_the_line_of_a_refusal_keeps_what_was_stated(tmp_path):
