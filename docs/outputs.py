@@ -8,6 +8,7 @@ and compare (`tests/test_docs.py`).
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import shlex
@@ -70,5 +71,7 @@ def write(page: Path) -> None:
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+    importlib.import_module("support.avx2")  # the same kernels as when the page is tested
     for name in sys.argv[1:]:
         write(Path(name))
