@@ -560,8 +560,8 @@ def _settled(
         return ready, every, plain
     wider = _choice(any_servo, ladder)
     better = (choice.carried.fit.cost - wider.carried.fit.cost) / choice.carried.temperature
-    if plain.misfit is not None and better < plain.misfit.nats:  # that is no term of a servo
-        return ready, every, plain
+    if profiled is None and plain.misfit is not None and better < plain.misfit.nats:
+        return ready, every, plain  # that is no term of a servo
     return any_servo, ladder, _explained(any_servo, wider)
 
 
