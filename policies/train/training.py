@@ -217,7 +217,9 @@ class _Session:
         """Write a first checkpoint, then the settings: from then on the run can be resumed."""
         if self.run.imitation.iterations and self.run.imitation.teacher not in (TROT, OWN):
             # one that cannot be read is refused while the folder's name is still free
-            self._network_of(Path(self.run.imitation.teacher))
+            with torch.random.fork_rng(devices=[]):
+                teacher = Path(self.run.imitation.teacher)
+                load_teacher(teacher, BEST, self.run, self.learner.observations)
         if self.ranks.rank == 0:
             refuse_taken(self.folder)
         self.ranks.any(False)  # no process writes before that
