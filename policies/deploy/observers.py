@@ -118,7 +118,7 @@ class SyntheticPD(Observer):
         limits_rad: tuple[ArrayLike, ArrayLike] = (-np.inf, np.inf),
         joints: int = _JOINTS,
     ):
-        substeps = substeps or physics_substeps(period_s)
+        substeps = physics_substeps(period_s) if substeps is None else substeps
         low, high = (np.asarray(limit, float) for limit in limits_rad)
         self._substeps = substeps
         self._servo = _StoppedServo(parameters, period_s / substeps, low, high)
