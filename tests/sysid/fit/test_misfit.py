@@ -9,13 +9,21 @@ import numpy as np
 import pytest
 
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
+from pupper_sysid.sysid.fit.kernel import edges_of
 from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, filtered
-from pupper_sysid.sysid.fit.run import free_run
+from pupper_sysid.sysid.fit.run import Run, free_run
 from pupper_sysid.sysid.fit.search import Problem, refine
-from pupper_sysid.sysid.fit.structure import SIMULATED, Structure, candidate, servo_structure
-from support.runs import fine_run
+from pupper_sysid.sysid.fit.structure import (
+    LONGEST_DEAD_TIME_S,
+    SIMULATED,
+    Structure,
+    candidate,
+    servo_structure,
+)
+from support.runs import fine_run, run_of
 
 NOISE_RAD = 5e-4
+STEP_S = 5e-4
 NUMBERS = {
     "dead_time_s": 0.015, "stiffness_per_s2": 4000.0, "damping_per_s": 80.0,
     "friction_rad_s2": 20.0, "effort_rad_s2": 1500.0, "velocity_limit_rad_s": 20.0,
@@ -23,14 +31,23 @@ NUMBERS = {
 }  # fmt: skip
 
 
+def stepped_run(command: np.ndarray) -> Run:
+    """A run under `command`, one a step of half a millisecond, read every 10 ms from 0.1 s on."""
+    sample = np.arange(0.1 / STEP_S, len(command) - 1, 0.01 / STEP_S)
+    rest = int(LONGEST_DEAD_TIME_S / STEP_S) + 4
+    held = np.concatenate([np.full(rest, command[0]), command])
+    run = run_of(command, sample_step=sample, sample_rad=np.zeros(len(sample)))
+    return replace(run, held=held[None], edges=edges_of(held), pad=rest, step_s=STEP_S)
+
+
 def explanation(
     structure: Structure, numbers: dict, filter_s: float = 0.0, undescribed: bool = True
 ) -> Explanation | None:
     """What is found of the motion of one servo, by a fit of the plain one."""
     rng = np.random.default_rng(0)
-    time = CONTINUOUS_S * np.arange(int(2.0 / CONTINUOUS_S))
+    time = STEP_S * np.arange(int(2.0 / STEP_S))
     levels = np.repeat(0.3 * rng.standard_normal(8), len(time) // 8)
-    runs = (fine_run(levels), fine_run(0.3 * np.sin(2 * np.pi * 2.0 * time)))
+    runs = (stepped_run(levels), stepped_run(0.3 * np.sin(2 * np.pi * 2.0 * time)))
     moved = tuple(filtered(r, filter_s) for r in runs) if filter_s else runs
     tracks = free_run(structure, np.array([numbers[n] for n in structure.names]), moved)
     read = tuple(

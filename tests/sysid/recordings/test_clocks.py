@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import pupper_sysid as ps
+from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
+from pupper_sysid.sysid.lag.lag_budget import lag_budget
 
 PERIOD_S, LAG_S = 0.01, 0.06
 SENT_S = PERIOD_S * np.arange(3000)
@@ -29,7 +31,8 @@ def test_readings_on_a_clock_that_drifts_are_dated_by_that_of_the_commands():
     (trial,) = recording(1e-3 * SENT_S).trials("pan")
     assert trial.clock_drift == pytest.approx(1e-3, rel=0.02)
     assert np.abs(trial.read_time_s - SENT_S - 0.0025).max() < 1e-3
-    lag = ps.lag(recording(1e-3 * SENT_S)).joints["pan"].lag_s
+    rng = np.random.default_rng(0)
+    lag = lag_budget("pan", (trial,), rng, find_poll_lattice((trial,), rng)).lag_s
     # the command is held for half a turn on average before it is renewed
     assert lag.low <= LAG_S - PERIOD_S / 2 <= lag.high and lag.high - lag.low < 6 * PERIOD_S
 
