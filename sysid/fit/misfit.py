@@ -1,9 +1,10 @@
 """What a servo that the model does not describe looks like: explanations, tried one by one.
 
 Each explanation is the carried fit with one thing more, fitted from there: a low-pass filter in
-front of the servo, or one of `_FEATURES`. The best is named where the likelihood is
-decidedly better with it. Simulators do not run these, so the numbers stay those of the carried fit;
-but a number that another explanation moves is not known better than the two are apart.
+front of the servo, play, a dead zone or an integral term of the controller, more friction at rest,
+or gravity. The best is named where the likelihood is decidedly better with it. Simulators do not
+run these, so the numbers stay those of the carried fit; but a number that another explanation moves
+is not known better than the two are apart.
 """
 
 from __future__ import annotations

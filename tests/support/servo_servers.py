@@ -240,8 +240,8 @@ def robot_behind(kind: str, folder: Path) -> Iterator[tuple[SerialPty | ProxySoc
 
 def spare_this_process(patch: pytest.MonkeyPatch) -> None:
     """Have watchdogs kill no driver: where a test is the driver, a busy machine can hold it up."""
-    nobody = 2**22 + 1  # above the largest process id of Linux
-    patch.setattr(watchdog, "os", SimpleNamespace(**vars(os) | {"getpid": lambda: nobody}))
+    unused_id = 2**22 + 1  # above the largest process id of Linux
+    patch.setattr(watchdog, "os", SimpleNamespace(**vars(os) | {"getpid": lambda: unused_id}))
 
 
 def limp(server: SerialPty | ProxySocket) -> bool:
