@@ -15,6 +15,7 @@ import hypothesis
 import pytest
 
 import support.avx2  # noqa: F401
+import support.compiled_once  # noqa: F401
 from support.package import ROOT
 from support.real_recordings import real_recording
 

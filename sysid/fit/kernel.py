@@ -197,7 +197,9 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
     plain = not (friction or firmware or gravity or supply)
     for i in range(LANES):
         plain = plain and not p[14, i] < np.inf
-    earliest, latest = shift.min(), shift.max()
+    earliest, latest = shift[0], shift[0]
+    for i in range(1, LANES):
+        earliest, latest = min(earliest, shift[i]), max(latest, shift[i])
     direct = plain and not (slew or profile or backlash)
     half = 0.5 * h
     for k in range(steps):
@@ -440,18 +442,20 @@ _NONE, _NO_TABLE = np.empty(0), np.empty((0, 0))
 
 @njit(cache=True, nogil=True, fastmath=SAFE, error_model="numpy")
 def _evaluate(
-    task, kind, values, dead_time, held, edges, gain, load, start, pad, h, step, reading, noise,
-    later, out, total,
+    task, order, kind, values, dead_time, held, edges, gain, load, start, pad, h, step, reading,
+    noise, later, out, total,
 ):  # fmt: skip
     """Simulate each candidate and do one of four tasks: one function, compiled once."""
     count, last, samples = len(values), values.shape[1] - 1, len(step)
     steps = held.shape[1] - pad
     if task == _RESIDUALS or task == _COSTS:
-        steps = min(int(np.ceil(np.max(step))) + 1, steps) if samples else 0
+        last_step = -1.0
+        for n in range(samples):
+            last_step = max(last_step, step[n])
+        steps = min(int(np.ceil(last_step)) + 1, steps)
     who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
     offset, cost, error_sum = _lanes(), _lanes(), _lanes()
     per_noise = 1.0 / noise
-    order = np.argsort(dead_time)  # those abreast meet a command in about the same step
     until = np.full(edges.shape[1], edges.shape[1] - 1)
     for k in range(edges.shape[1] - 2, -1, -1):
         until[k] = until[k + 1] if edges[0, k] == edges[0, k + 1] else k
@@ -561,11 +565,16 @@ def edges_of(
     return np.stack([end, np.clip(share, 0.0, 1.0)])
 
 
+def _abreast(simulated: Simulated) -> NDArray[np.int64]:
+    """Candidates in order of their dead time: those abreast meet a command in about one step."""
+    return np.argsort(simulated[2])
+
+
 def positions(*simulated: *Simulated) -> NDArray[np.float64]:
     """Readings at the edges of the steps, shape (steps + 1, candidates) [rad]."""
     values, held, pad = simulated[1], simulated[3], simulated[8]
     out = np.empty((held.shape[1] - pad + 1, len(values)))
-    _evaluate(_POSITIONS, *simulated, _NONE, _NONE, 1.0, _NONE, out, _NO_TABLE)
+    _evaluate(_POSITIONS, _abreast(simulated), *simulated, _NONE, _NONE, 1.0, _NONE, out, _NO_TABLE)
     return out
 
 
@@ -582,7 +591,9 @@ def residuals(
         When the readings were measured, in steps, and their values [rad].
     """
     out = np.empty((len(simulated[1]), len(step)))
-    _evaluate(_RESIDUALS, *simulated, step, reading, 1.0, _NONE, out, _NO_TABLE)
+    _evaluate(
+        _RESIDUALS, _abreast(simulated), *simulated, step, reading, 1.0, _NONE, out, _NO_TABLE
+    )
     return out
 
 
@@ -595,7 +606,7 @@ def costs(
     Parameters as for `residuals`.
     """
     out = np.empty((1, len(simulated[1])))
-    _evaluate(_COSTS, *simulated, step, reading, noise, _NONE, out, _NO_TABLE)
+    _evaluate(_COSTS, _abreast(simulated), *simulated, step, reading, noise, _NONE, out, _NO_TABLE)
     return out[0]
 
 
@@ -622,5 +633,5 @@ def moments_if_later(
         In rad².
     """
     total, square = np.zeros((2, len(later), len(simulated[1])))
-    _evaluate(_MOMENTS, *simulated, step, reading, 1.0, later, total, square)
+    _evaluate(_MOMENTS, _abreast(simulated), *simulated, step, reading, 1.0, later, total, square)
     return total, square

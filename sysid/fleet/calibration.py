@@ -46,6 +46,7 @@ deviations."""
 FEWEST = 5
 """Robots needed to mark outliers."""
 
+_CONNECT_S = 10
 _ADDRESS = re.compile(r"(tls|tcp)://[A-Za-z0-9_.:\[\]-]+:[0-9]{1,5}")
 
 QUANTITIES = {
@@ -341,7 +342,7 @@ def _on(cluster: str, tasks: Sequence[tuple[Any, ...]]) -> Iterator[tuple[str, s
     from joblib import Parallel, delayed, parallel_config
 
     try:
-        client = Client(cluster, timeout=10)
+        client = Client(cluster, timeout=_CONNECT_S)
     except (OSError, ValueError) as error:
         raise InputError(
             f"`cluster={cluster}`: no Dask scheduler answers there ({error}). Start one with "

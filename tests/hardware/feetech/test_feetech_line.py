@@ -242,7 +242,7 @@ def test_b5_11_an_error_byte_above_7f_is_read():
 
 
 def test_b5_12_a_scan_finds_every_servo_with_its_model(monkeypatch):
-    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.03)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.1)
     family = replace(FAMILY, highest_id=8)
     servos = still_servos(SCS0009, ids=[3, 7])
     with on_a_port(servos) as server:

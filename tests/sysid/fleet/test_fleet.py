@@ -203,7 +203,7 @@ def test_an_outlier_is_named_in_any_order_and_equal_servos_are_not():
     assert _outliers(pd.DataFrame(rows[2:6]), NAMES) == [""] * 4  # too few to say what is usual
 
 
-def test_what_is_no_fleet_is_refused_in_a_sentence(sweeps, tmp_path, capsys):
+def test_what_is_no_fleet_is_refused_in_a_sentence(sweeps, tmp_path, capsys, monkeypatch):
     (tmp_path / "empty").mkdir()
     program = pupper_sysid
     assert "no recording" in refused(capsys, program, "calibrate", tmp_path / "empty")
@@ -212,6 +212,7 @@ def test_what_is_no_fleet_is_refused_in_a_sentence(sweeps, tmp_path, capsys):
     shutil.copy(sweeps / "r1.csv", double / "a_r1.csv")
     assert "a_r1" in refused(capsys, program, "calibrate", double)
     assert "--jobs" in refused(capsys, program, "calibrate", sweeps, "--jobs", "0")
+    monkeypatch.setattr(fleet, "_CONNECT_S", 0.5)
     assert "--cluster" in refused(
         capsys, program, "calibrate", sweeps, "--cluster", "tcp://127.0.0.1:1", "--out", tmp_path
     )

@@ -1,0 +1,30 @@
+"""A function is compiled by one process of the tests; the others wait for it and load it.
+
+On a fresh clone every worker would compile the same functions at the same time.
+"""
+
+import fcntl
+
+from numba.core.dispatcher import Dispatcher
+
+from support.package import ROOT
+
+_compile = Dispatcher.compile
+_lock = (ROOT / "Makefile").open()
+_depth = 0
+
+
+def _compile_alone(dispatcher: Dispatcher, signature: object) -> object:
+    global _depth
+    if not _depth:
+        fcntl.flock(_lock, fcntl.LOCK_EX)
+    _depth += 1
+    try:
+        return _compile(dispatcher, signature)
+    finally:
+        _depth -= 1
+        if not _depth:
+            fcntl.flock(_lock, fcntl.LOCK_UN)
+
+
+Dispatcher.compile = _compile_alone
