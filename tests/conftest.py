@@ -14,7 +14,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import hypothesis
 import pytest
 
-import support.avx2  # noqa: F401
+import support.avx2
 import support.compiled_once  # noqa: F401
 from support.package import ROOT
 from support.real_recordings import real_recording
