@@ -145,16 +145,18 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
     lag, loaded, s = result.lag, result.loaded, result.delayed_pd.scores
     if loaded is None:
         actuator, block = _free_actuator(result, stall, source), None
-        offset = result.delayed_pd.parameters["offset_rad"]
+        numbers, undecided = result.delayed_pd.parameters, result.delayed_pd.undecided
     else:
         # without a known load torques are per inertia: the anchor makes them N·m
         torque = 1.0 if loaded.known_load else stall / loaded.numbers["stall_torque"].value
         actuator = _loaded_actuator(result, loaded, torque, stall, source)
-        block, offset = _block(loaded, torque), loaded.numbers["offset_rad"]
+        block, numbers, undecided = _block(loaded, torque), loaded.numbers, loaded.undecided
     return JointCalibration(
         actuator=actuator,
         under_load=block,
-        feedback=_feedback(lag, offset),
+        feedback=_feedback(
+            lag, quantity_of(numbers["offset_rad"], why=undecided.get("offset_rad"))
+        ),
         lag=measured(
             Lag,
             lag_s=quantity_of(lag.lag_s),
@@ -393,7 +395,7 @@ def _anchored(pd: CandidateFit, stall: float) -> Quantity:
     return quantity_of(armature, "ratio only", why)
 
 
-def _feedback(lag: LagBudget, offset_rad: Interval) -> Feedback:
+def _feedback(lag: LagBudget, offset_rad: Quantity) -> Feedback:
     lattice, step = lag.feedback, lag.quantum_rad
     quantum = Quantity(value=step, low=step, high=step, identified="yes")
     if step == 0:
@@ -414,7 +416,7 @@ def _feedback(lag: LagBudget, offset_rad: Interval) -> Feedback:
         age = Quantity(value=0.0 if live else lattice.time_doubt_s, identified="no", why=why)
     return measured(
         Feedback, poll_period_s=period, loss=loss, quantum_rad=quantum,
-        offset_rad=quantity_of(offset_rad), mean_age_s=age,
+        offset_rad=offset_rad, mean_age_s=age,
     )  # fmt: skip
 
 

@@ -476,8 +476,16 @@ def _dead_time(ready: PreparedJoint, carried: Fitted, likely: Sequence[Fitted]) 
     ends = [_intervals(f, value)["dead_time_s"] for f in likely]
     # readings that were taken later than dated lengthen the dead time, as they do the lag
     doubt = ready.lag.feedback.time_doubt_s + max(t.read_time_doubt_s for t in ready.recorded)
-    hull = Interval(value, min(e.low for e in ends), max(e.high for e in ends)).widened(doubt)
-    return replace(hull, low=max(hull.low, 0.0))
+    hull = Interval(value, min(e.low for e in ends), max(e.high for e in ends))
+    return _less_age(hull, ready, doubt)
+
+
+def _less_age(dead_time_s: Interval, ready: PreparedJoint, doubt_s: float = 0.0) -> Interval:
+    """A fitted dead time without the age of readings whose poll is unresolved, and in doubt."""
+    fitted, age = dead_time_s, ready.lag.feedback.time_doubt_s
+    low, high = fitted.low - age - doubt_s, fitted.high - age + doubt_s
+    # readings are no older than the fitted dead time is long
+    return Interval(max(fitted.value - age, fitted.value / 2), max(low, 0.0), max(high, 0.0))
 
 
 def _intervals(fitted: Fitted, dead_time_s: float | None = None) -> dict[str, Interval]:
@@ -545,7 +553,7 @@ def _settled(
     rival = -np.inf if plain.misfit is None else plain.misfit.nats
     most = _DESCRIBES_BETTER * overall(goodness)
     if gained < max(enough, rival):
-        plain, profiled = _perhaps_profiled(plain, profiled, gained), None
+        plain, profiled = _perhaps_profiled(ready, plain, profiled, gained), None
     elif stated or not _undescribed(_goodness(ready, profiled)):
         most = np.inf
     else:  # a motor's friction beside it may describe it
@@ -556,7 +564,7 @@ def _settled(
     ladder = _ladder(any_servo, any_servo.fit_rng(), SHORT_LADDER, most, profiled)
     if not ladder:
         if profiled is not None:
-            plain = _perhaps_profiled(plain, profiled, gained)
+            plain = _perhaps_profiled(ready, plain, profiled, gained)
         return ready, every, plain
     wider = _choice(any_servo, ladder)
     better = (choice.carried.fit.cost - wider.carried.fit.cost) / choice.carried.temperature
@@ -575,7 +583,10 @@ def _explained(ready: PreparedJoint, choice: _Choice, anew: bool = False) -> _Ch
     best = replace(carried.fit, cost=float(problem.costs(carried.fit.point[None])[0]))
     likely = explanations(problem, best, carried.temperature, anew, ready.fit_rng())
     named = decided(likely)
-    if named is None and likely and carried.draws is not None and ready.scales.free_air:
+    if named is not None:
+        age = ready.lag.feedback.time_doubt_s
+        named = replace(named, dead_time_s=max(named.dead_time_s - age, 0.0))
+    elif likely and carried.draws is not None and ready.scales.free_air:
         choice = _stacked(ready, choice, likely)
     return replace(choice, misfit=named)
 
@@ -583,13 +594,18 @@ def _explained(ready: PreparedJoint, choice: _Choice, anew: bool = False) -> _Ch
 def _stacked(ready: PreparedJoint, choice: _Choice, rivals: Sequence[Explanation]) -> _Choice:
     """The choice with draws of the carried servo about what its numbers are in each rival, too.
 
-    The data do not tell the servo from its rivals, so none has more draws than another.
+    The data do not tell the servo from its rivals: each has draws in proportion to its likelihood.
     """
     carried = choice.carried
     assert carried.draws is not None
-    apart = [np.zeros_like(carried.fit.point)]
-    apart += [one.point - carried.fit.point for one in rivals if one.point is not None]
-    turn = np.arange(len(carried.draws)) % len(apart)
+    apart, weights = [np.zeros_like(carried.fit.point)], [1.0]
+    for one in rivals:
+        if one.point is not None:
+            apart.append(one.point - carried.fit.point)
+            weights.append(one.weight)
+    ends = np.cumsum(weights) / np.sum(weights)
+    places = (np.arange(len(carried.draws)) + 0.5) / len(carried.draws)
+    turn = ready.fit_rng().permutation(np.searchsorted(ends, places))
     draws = np.clip(carried.draws + np.array(apart)[turn], *carried.structure.box)
     wider = replace(carried, draws=draws)
     likely = tuple(wider if f is carried else f for f in choice.likely)
@@ -615,14 +631,16 @@ def _with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]
     return fitted, nats[carried.structure.name] - nats[structure.name]
 
 
-def _perhaps_profiled(choice: _Choice, profiled: Fitted, gained: float) -> _Choice:
+def _perhaps_profiled(
+    ready: PreparedJoint, choice: _Choice, profiled: Fitted, gained: float
+) -> _Choice:
     """The choice with a profile as its explanation, where the data allow one as well.
 
     One that leaves the dead time where it is changes nothing.
     """
     dead = choice.lag.dead_time_s
     assert dead is not None
-    delay = float(profiled.values[0])
+    delay = max(float(profiled.values[0]) - ready.lag.feedback.time_doubt_s, 0.0)
     if choice.misfit is not None or gained < -TELLING_NATS or dead.low <= delay <= dead.high:
         return choice
     limit = float(profiled.values[profiled.structure.names.index("acceleration_limit")])
@@ -664,16 +682,22 @@ def _in_free_air(
     goodness = _goodness(ready, choice.carried)
     lag = choice.lag
     if why := _doubt(choice, goodness):
-        results = {name: _doubted(fit, why) for name, fit in results.items()}
+        kept = _kept(choice)
+        results = {name: _doubted(fit, why, kept) for name, fit in results.items()}
         lag = _lag(ready, choice, goodness)
+        parameters = results[carried.name].parameters
+        hidden = _hidden_rad(ready, choice, goodness)
+        offset = _as_wide_as_misfit(parameters["offset_rad"], goodness, hidden)
+        results[carried.name] = replace(
+            results[carried.name], parameters={**parameters, "offset_rad": offset}
+        )
         if _hardly_known(lag):
             fit = results[carried.name]
             undecided = {"dead_time_s": why} | fit.undecided
             results[carried.name] = replace(fit, undecided=undecided)
     elif why := _unconverged(choice.carried):
-        fit = _doubted(results[carried.name], why)
-        undecided = {"dead_time_s": why} | fit.undecided
-        results[carried.name] = replace(fit, undecided=undecided)
+        fit = _doubted(results[carried.name], why, ("offset_rad",))
+        results[carried.name] = fit
     # where the carried one errs no more than the noise, differences between models are chance
     chosen = _best(results, carried.name) if _doubt(choice, goodness) else carried.name
     jitter = command_jitter(
@@ -750,43 +774,55 @@ def _doubt(choice: _Choice, goodness: Mapping[str, float]) -> str | None:
     return choice.misfit.claim
 
 
-def _doubted(fit: CandidateFit, why: str) -> CandidateFit:
-    kept = ("offset_rad", "dead_time_s")
+def _kept(choice: _Choice) -> tuple[str, ...]:
+    """Numbers that are known, though the model is in doubt: what was fitted without a weight or an
+    integral term has another offset.
+    """
+    return ("dead_time_s",) if choice.misfit is not None else ("offset_rad", "dead_time_s")
+
+
+def _doubted(fit: CandidateFit, why: str, kept: Sequence[str]) -> CandidateFit:
     return replace(fit, undecided={n: why for n in fit.parameters if n not in kept} | fit.undecided)
 
 
 def _lag(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, float]) -> LagBudget:
     """The lag budget with the dead time of the choice, as wide as its misfit makes it."""
-    lag = _with_misfit(ready, choice, goodness) if _undescribed(goodness) else choice.lag
-    dead = lag.dead_time_s
-    if choice.misfit is None or dead is None:
-        return lag
-    other = choice.misfit.dead_time_s
-    low = min(dead.low, max(other - (dead.value - dead.low), 0.0))
-    high = max(dead.high, other + dead.high - dead.value)
-    return replace(lag, dead_time_s=replace(dead, low=low, high=high))
-
-
-def _with_misfit(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, float]) -> LagBudget:
-    """The lag budget with a dead time as wide as the misfit allows.
-
-    A motion in a wrong shape can hide a dead time that is wrong by its error over its speed; and
-    where errors are larger than noise, so are those of fitted numbers.
-    """
-    structure, values = choice.carried.structure, choice.carried.values
-    tracks = free_run(structure, values, ready.runs)
+    dead, lag_s = choice.lag.dead_time_s, choice.lag.lag_s
+    if dead is None:
+        return choice.lag
+    tracks = free_run(choice.carried.structure, choice.carried.values, ready.runs)
     speed = rms([np.gradient(t) / r.step_s for t, r in zip(tracks, ready.runs, strict=True)])
-    error = rms(fresh_residuals(structure, values, ready.runs))
-    ratio = overall(goodness)
-    hidden = error * np.sqrt(1.0 - ratio**-2) / max(speed, 1e-9)
-    own = choice.lag.dead_time_s
-    assert own is not None
-    low = own.value - ratio * (own.value - own.low) - hidden
-    high = own.value + ratio * (own.high - own.value) + hidden
-    if np.isfinite(choice.lag.lag_s.high):  # the dynamics lag, too
-        high = max(min(high, choice.lag.lag_s.high), own.high)
-    wide = Interval(own.value, max(float(low), 0.0), float(high))
-    return replace(choice.lag, dead_time_s=wide)
+    hidden = _hidden_rad(ready, choice, goodness) / max(speed, 1e-9)
+    wide = _as_wide_as_misfit(dead, goodness, hidden)
+    if np.isfinite(lag_s.high):  # the dynamics lag, too
+        wide = replace(wide, high=max(min(wide.high, lag_s.high), dead.high))
+    if choice.misfit is not None:
+        wide = _with_other(wide, dead, choice.misfit.dead_time_s)
+    return replace(choice.lag, dead_time_s=replace(wide, low=max(wide.low, 0.0)))
+
+
+def _hidden_rad(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, float]) -> float:
+    """RMS error that is not noise [rad]: a motion in a wrong shape can hide as much."""
+    if not _undescribed(goodness):
+        return 0.0
+    error = rms(fresh_residuals(choice.carried.structure, choice.carried.values, ready.runs))
+    return float(error * np.sqrt(1.0 - overall(goodness) ** -2))
+
+
+def _as_wide_as_misfit(
+    interval: Interval, goodness: Mapping[str, float], hidden: float
+) -> Interval:
+    """An interval wider by what is hidden; errors of numbers grow with those of readings."""
+    ratio = overall(goodness) if _undescribed(goodness) else 1.0
+    value = interval.value
+    low = value - ratio * (value - interval.low) - hidden
+    return Interval(value, low, value + ratio * (interval.high - value) + hidden)
+
+
+def _with_other(wide: Interval, interval: Interval, other: float) -> Interval:
+    """An interval that holds another value, as uncertain as its own."""
+    below, above = interval.value - interval.low, interval.high - interval.value
+    return Interval(wide.value, min(wide.low, other - below), max(wide.high, other + above))
 
 
 def _unconverged(carried: Fitted) -> str | None:
@@ -852,6 +888,7 @@ def _candidate_fit(
         }
     else:
         parameters, sd = _intervals(fitted), fitted.draws.std(axis=0)
+    parameters["dead_time_s"] = _less_age(parameters["dead_time_s"], ready)
     speed = max(_command_speed(r) for r in ready.runs)
     undecided = {
         p.name: why
@@ -1062,13 +1099,16 @@ def _under_load(
     scores = score(free_run(structure, values, ready.runs), ready.runs, left_out)
     goodness, lag = _goodness(ready, choice.carried), choice.lag
     if why := _doubt(choice, goodness):
-        doubted = {n: why for n in loaded.numbers if n not in ("offset_rad", "dead_time_s")}
+        kept = _kept(choice)
+        doubted = {n: why for n in loaded.numbers if n not in kept}
         lag = _lag(ready, choice, goodness)
         assert lag.dead_time_s is not None
         doubted |= {"dead_time_s": why} if _hardly_known(lag) else {}
+        hidden = _hidden_rad(ready, choice, goodness)
+        offset = _as_wide_as_misfit(loaded.numbers["offset_rad"], goodness, hidden)
         loaded = replace(
             loaded, undecided=doubted | loaded.undecided,
-            numbers=loaded.numbers | {"dead_time_s": lag.dead_time_s},
+            numbers=loaded.numbers | {"dead_time_s": lag.dead_time_s, "offset_rad": offset},
         )  # fmt: skip
     elif why := _unconverged(choice.carried):
         doubted = {n: why for n in loaded.numbers if n != "offset_rad"}

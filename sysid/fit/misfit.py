@@ -29,9 +29,8 @@ _SEARCHED_S = 0.016
 """Time constant from which a fit with a filter may lie far from the fit without it."""
 _NATS = 10.0
 """Log-likelihood by which an explanation is named."""
-_AS_LIKELY_NATS = -1.0
-"""Log-likelihood from which the servo may as well be like that: a number that changes nothing has
-it, by its own price of 1."""
+_POSSIBLE_NATS = -3.0
+"""Logarithm of a twentieth: an explanation that is less likely moves no end of a 90 % interval."""
 _WITHIN_NATS = float(ndtri(0.5 + LEVEL / 2)) ** 2 / 2
 """Log-likelihood that a number at the end of its interval costs."""
 _SHARES = np.array([0.4, 0.7, 0.95])
@@ -87,9 +86,11 @@ class Explanation:
     ----------
     words : str
     nats : float
-        By how much the log-likelihood is better; about 0 where the data do not decide.
+        By how much the log-likelihood is better, less one per number that is added.
     dead_time_s : float
         Of the fit with it.
+    weight : float
+        Its posterior density over that of the fit alone, 1 at most.
     point : ndarray, shape (parameters,), optional
         The carried structure's numbers in the fit with it, in fitted coordinates.
     """
@@ -97,6 +98,7 @@ class Explanation:
     words: str
     nats: float
     dead_time_s: float
+    weight: float = 1.0
     point: NDArray[np.float64] | None = None
 
     @property
@@ -117,7 +119,7 @@ class Explanation:
 def explanations(
     problem: Problem, best: Fit, temperature: float, anew: bool, rng: np.random.Generator
 ) -> list[Explanation]:
-    """What describes the servo at least as well as the fit alone, best first.
+    """What describes the servo about as well as the fit alone, or better, best first.
 
     Parameters
     ----------
@@ -178,13 +180,13 @@ def _low_pass(
         middle = min(fits, key=lambda t: fits[t].cost)
     least = _tempered(problem, best, temperature)
     nats = {t: least - _tempered(problem, fit, temperature) - 1.0 for t, fit in fits.items()}
-    slowest = max((t for t in fits if nats[t] >= _AS_LIKELY_NATS), default=middle)
+    slowest = max((t for t in fits if nats[t] >= nats[middle] - _WITHIN_NATS), default=middle)
     return [
         Explanation(
             f"a low-pass filter of about {1e3 * t:.0f} ms in front of it", nats[t],
-            float(structure.decode(fits[t].point)[0]), fits[t].point,
+            float(structure.decode(fits[t].point)[0]), _weight(nats[t] + 1.0), fits[t].point,
         )
-        for t in dict.fromkeys((middle, slowest)) if nats[t] >= _AS_LIKELY_NATS
+        for t in dict.fromkeys((middle, slowest)) if nats[t] + 1.0 >= _POSSIBLE_NATS
     ]  # fmt: skip
 
 
@@ -192,6 +194,10 @@ def _tempered(problem: Problem, fit: Fit, temperature: float) -> float:
     """Minus the logarithm of the posterior's density at a fit."""
     prior = float(problem.prior(fit.point[None])[0])
     return (fit.cost - prior) / temperature + prior
+
+
+def _weight(nats: float) -> float:
+    return float(np.exp(min(nats, 0.0)))
 
 
 def _behind(problem: Problem, time_constant_s: float) -> Problem:
@@ -243,7 +249,7 @@ def _with_feature(
     def nats(fit: Fit) -> float:
         return least - _tempered(behind, fit, temperature) - price
 
-    if nats(best_with) < _AS_LIKELY_NATS:
+    if nats(best_with) + price < _POSSIBLE_NATS:
         return []
     fits = [best_with]
     if name in _TRADED and "friction_rad_s2" in wider.names:
@@ -254,7 +260,7 @@ def _with_feature(
     return [
         Explanation(
             feature.words.format(float(wider.decode(fit.point)[place]) / feature.unit), nats(fit),
-            float(wider.decode(fit.point)[0]), fit.point[shared],
+            float(wider.decode(fit.point)[0]), _weight(nats(fit) + price), fit.point[shared],
         )
         for fit in fits
     ]  # fmt: skip

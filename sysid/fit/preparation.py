@@ -22,6 +22,7 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.doctor.checks import joint_rng
 from pupper_sysid.sysid.feedback.poll_lattice import (
     PollLattice,
+    Readings,
     find_poll_lattice,
     quantum,
     readings,
@@ -330,7 +331,7 @@ def _upsets(
     """Commands that never arrived, in all trials."""
 
     def of_trial(trial: Trial, scale: float) -> list[Upset]:
-        read = readings(trial, lattice)
+        read = _readings(trial, lattice)
         time = read.time_s[read.time_s >= trial.send_time_s[0]]
 
         def simulate(command: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -343,6 +344,19 @@ def _upsets(
     return tuple(upset for of_one in upsets for upset in of_one)
 
 
+def _readings(trial: Trial, lattice: PollLattice) -> Readings:
+    """Readings with their dates; of an unresolved poll, those of their reads.
+
+    They may be live, and a dead time less half a loop would be negative then. The fitted dead time
+    contains their age: `sysid.fit.joint_fit` takes it off again.
+    """
+    read = readings(trial, lattice)
+    if trial.readings == "live":
+        return read
+    age = lattice.time_doubt_s
+    return replace(read, time_s=read.time_s + age, held_time_s=read.held_time_s + age)
+
+
 def _dated(
     trials: Sequence[Trial], lattice: PollLattice, volts: float, free_air: bool,
     step_s: float = TIME_STEP_S, upsets: Sequence[Upset] = (),
@@ -352,7 +366,8 @@ def _dated(
         t.number: [k for u in upsets if u.trial == t.number for k in u.readings] for t in trials
     }
     least = 1 if free_air else _LEAST_READINGS + 1
-    pairs = [(t, _without(prepare(t, lattice, volts, step_s), touched[t.number])) for t in trials]
+    runs = [prepare(t, _readings(t, lattice), volts, step_s) for t in trials]
+    pairs = [(t, _without(r, touched[t.number])) for t, r in zip(trials, runs, strict=True)]
     if free_air:
         pairs = [(t, run.in_free_air()) for t, run in pairs]
     used = [(t, r) for t, r in pairs if len(r.sample_step) >= least]
@@ -371,7 +386,8 @@ def _step_for(
     structure = problem.structure
 
     def shorter(step_s: float) -> Problem:
-        runs = tuple(prepare(t, lattice, volts, step_s).in_free_air() for t in recorded)
+        dated = ((t, _readings(t, lattice)) for t in recorded)
+        runs = tuple(prepare(t, read, volts, step_s).in_free_air() for t, read in dated)
         return replace(problem, runs=runs)
 
     low, high = structure.box

@@ -61,19 +61,22 @@ def servo_recording(seed: int, frequencies=(1.0, 2.0, 3.0, 4.0)) -> Recording:
     return recorded(trials)
 
 
-def exact_recording(noise_rad: float, effort: float) -> Recording:
-    """Live readings at 200 Hz of a servo that chirps at its torque limit."""
+def exact_recording(
+    noise_rad: float, effort: float, loop_s: float = 0.005, readings: str = "live",
+    dead_time_s: float = 0.025,
+) -> Recording:  # fmt: skip
+    """Live readings of a servo that chirps at its torque limit."""
     rng, step_s = np.random.default_rng(2), CONTINUOUS_S
     time = step_s * np.arange(int(6.0 / step_s))
-    sent = np.arange(0.0, 6.0, 0.005)
+    sent = np.arange(0.0, 6.0, loop_s)
     command = 0.5 * np.sin(2 * np.pi * (0.5 * sent + 0.15 * sent**2))
-    servo = replace(TRUE, effort_limit=effort, velocity_limit=np.inf)
-    motion = DelayedPD(servo, step_s).rollout(command[(time / 0.005 + 1e-9).astype(int)])
+    servo = replace(TRUE, effort_limit=effort, velocity_limit=np.inf, dead_time_s=dead_time_s)
+    motion = DelayedPD(servo, step_s).rollout(command[(time / loop_s + 1e-9).astype(int)])
     position = np.interp(sent + 0.002, time + step_s, motion)
     position += noise_rad * rng.standard_normal(len(sent))
     return Recording.from_arrays(
         sent, {JOINT: command}, {JOINT: position}, read_time_s=sent + 0.002,
-        metadata={"readings": "live", "start_pose_rad": {JOINT: 0.0}},
+        metadata={"readings": readings, "start_pose_rad": {JOINT: 0.0}},
     )  # fmt: skip
 
 
@@ -84,6 +87,19 @@ def test_exact_readings_of_a_servo_at_its_limit_are_fitted_in_shorter_steps():
     )
     assert {run.step_s for run in exact.runs} <= {0.001, 0.0005}
     assert {run.step_s for run in coarse.runs} == {TIME_STEP_S}
+
+
+def test_readings_that_may_be_live_do_not_ask_for_a_negative_dead_time():
+    """Dated to half a loop before their reads, they would bend the gains instead."""
+    stiffness = []
+    for readings_are in ("live", "polled"):
+        trials = exact_recording(1e-3, 450.0, 0.02, readings_are, 0.002).trials(JOINT)
+        ready = prepare_joint(JOINT, trials, 0)
+        doubt = 0.0 if readings_are == "live" else 0.01
+        assert ready.lag.feedback.time_doubt_s == pytest.approx(doubt)
+        structure, fit = ready.first["delayed_pd"]
+        stiffness.append(structure.decode(fit.point)[structure.names.index("stiffness_per_s2")])
+    assert stiffness[1] == pytest.approx(stiffness[0], rel=0.05)
 
 
 @pytest.fixture(scope="module")

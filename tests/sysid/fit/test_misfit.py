@@ -40,10 +40,10 @@ def stepped_run(command: np.ndarray) -> Run:
     return replace(run, held=held[None], edges=edges_of(held), pad=rest, step_s=STEP_S)
 
 
-def explanation(
+def found(
     structure: Structure, numbers: dict, filter_s: float = 0.0, undescribed: bool = True
-) -> Explanation | None:
-    """What is found of the motion of one servo, by a fit of the plain one."""
+) -> tuple[Problem, list[Explanation]]:
+    """What may explain the motion of one servo, beside a fit of the plain one."""
     rng = np.random.default_rng(0)
     time = STEP_S * np.arange(int(2.0 / STEP_S))
     levels = np.repeat(0.3 * rng.standard_normal(8), len(time) // 8)
@@ -58,7 +58,13 @@ def explanation(
     plain = candidate(SIMULATED[0])
     problem = Problem(plain, read, (NOISE_RAD,) * len(read))
     start = plain.encode(np.array([NUMBERS[n] for n in plain.names]))
-    return decided(explanations(problem, refine(problem, start[None]), 1.0, undescribed, rng))
+    best = refine(problem, start[None])
+    return problem, explanations(problem, best, 1.0, undescribed, rng)
+
+
+def explanation(*servo, **options) -> Explanation | None:
+    """The one that is decidedly better."""
+    return decided(found(*servo, **options)[1])
 
 
 def test_a_filter_of_a_step_command_rises_as_an_exponential():
@@ -71,6 +77,18 @@ def test_a_filter_of_a_step_command_rises_as_an_exponential():
 
 def test_a_servo_without_anything_more_is_left_alone():
     assert explanation(candidate(SIMULATED[0]), NUMBERS) is None
+
+
+def test_a_small_dead_zone_that_does_not_show_leaves_the_friction_open():
+    """What a dead zone and friction hold back together is known, and not how much each does."""
+    wider = servo_structure((*candidate(SIMULATED[0]).features, "dead zone"))
+    numbers = NUMBERS | {"dead_zone_rad": 0.0006, "friction_rad_s2": 12.0}
+    problem, rivals = found(wider, numbers, undescribed=False)
+    assert decided(rivals) is None
+    place = problem.structure.names.index("friction_rad_s2")
+    frictions = [float(problem.structure.decode(r.point)[place]) for r in rivals]
+    assert min(frictions) == pytest.approx(12.0, rel=0.1) and max(frictions) > 13.5
+    assert all(0.0 < r.weight <= 1.0 for r in rivals)
 
 
 def test_a_low_pass_filter_is_named_and_its_dead_time_is_the_true_one():
