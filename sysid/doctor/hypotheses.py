@@ -132,7 +132,7 @@ def relation_findings(
         return [Finding("not_a_position_servo", REFUSE, {"percent": 100 * share})], base, None
     if best.code != "columns_swapped" and (scaled := _scale(base, best.servo)):
         return [scaled], base, None
-    at_once = None if best.code else _at_once(base, best.servo)
+    at_once = None if best.code else _at_once(trials, base, best.servo)
     if at_once or best.code in ("position_early", "columns_swapped"):
         if apart := _clocks_drift(trials, step, base):
             return [apart], base, None
@@ -233,12 +233,21 @@ def _scale(base: Explanation, servo: Servo) -> Finding | None:
     return None
 
 
+def _since_command_s(trial: Trial) -> float:
+    """Usual time between the last command and a read [s]."""
+    sent = trial.send_time_s
+    last = np.searchsorted(sent, trial.read_time_s, "right") - 1
+    return float(np.median(trial.read_time_s - sent[np.maximum(last, 0)]))
+
+
 def _at(base: Explanation, servo: Servo) -> int:
     return int(np.argmin(np.abs(base.lags_s - servo.lag_s)))
 
 
-def _at_once(base: Explanation, servo: Servo) -> Finding | None:
+def _at_once(trials: Sequence[Trial], base: Explanation, servo: Servo) -> Finding | None:
     """A position that goes with the command, beyond doubt: no servo is that fast."""
+    if all(_since_command_s(t) >= _LATE_S for t in trials):
+        return None  # read when a fast servo has arrived
     plain = np.tensordot(base.weight, np.maximum(base.rho[:, 0], 0.0) ** 2, axes=1)
     at = int(np.argmax(plain))
     lag = float(base.lags_s[at])

@@ -84,6 +84,21 @@ def test_a_servo_that_settles_after_each_step_is_no_echo(rate_hz):
     assert {"echo", "echo_between_rows"} & set(codes(recording))
 
 
+def test_a_fast_servo_that_is_read_before_the_next_command_is_no_echo():
+    """It has arrived by then, so that its readings are the command of the row before."""
+    rng, sent = np.random.default_rng(0), 0.03 * np.arange(450)
+    command = np.repeat(0.2 * rng.standard_normal(45), 10)
+    noise = 2e-3 * rng.standard_normal(450)
+    before = np.concatenate([command[:1], command[:-1]])
+    for position, read, refused in (
+        (before, sent - 0.005, False), (command, sent + 0.001, True),
+    ):  # fmt: skip
+        log = ps.Recording.from_arrays(
+            sent, {"joint": command}, {"joint": position + noise}, read_time_s=read
+        )
+        assert ("at_once" in codes(log)) == refused
+
+
 def test_a_runner_up_is_named_in_words_and_by_its_code():
     best = Finding("clipped", CARE, {"level_rad": 0.2, "percent": 20.0})
     near = rivalled(best, "held_by_friction")
