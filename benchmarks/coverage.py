@@ -26,6 +26,7 @@ from shared import print_rows  # isort: skip
 import numpy as np
 import tyro
 from random_robots import SweptRobot, sweep_random_robot
+from wide_servo import best_shift_s
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
@@ -95,24 +96,12 @@ def moved(seed: int) -> Iterator[Row]:
     yield row("lag, all [s]", lag, true_lag(robot))
 
 
-def true_lag(robot: SweptRobot, longest_s: float = 1.0, earliest_s: float = 0.05) -> float:
-    """Time shift at which true motion and held command correlate best, as defined for `lag` [s]."""
+def true_lag(robot: SweptRobot) -> float:
+    """Lag of the true motion behind the held command, as defined for `lag` [s]."""
     (trial,) = robot.recording.trials(robot.joint)
     motion = robot.bus.motion(trial)
     sent = np.searchsorted(trial.send_time_s, motion.time_s, side="right") - 1
-    command, position = trial.command_rad[sent], motion.position_rad
-    count, step_s = len(command), 0.001
-    first, last = round(longest_s / step_s), count - round(earliest_s / step_s)
-    # one window of the motion against each shifted window of the command
-    window = position[first:last] - position[first:last].mean()
-    shifts = np.arange(-round(earliest_s / step_s) + 1, first)
-    scores = np.empty(len(shifts))
-    for n, shift in enumerate(shifts):
-        earlier = command[first - shift : last - shift]
-        scores[n] = window @ (earlier - earlier.mean()) / np.std(earlier)
-    top = int(np.clip(np.argmax(scores), 1, len(scores) - 2))
-    left, middle, right = scores[top - 1 : top + 2]
-    return float(step_s * (shifts[top] + 0.5 * (left - right) / (left - 2 * middle + right)))
+    return best_shift_s(trial.command_rad[sent], motion.position_rad, 0.05, 1.0)
 
 
 def stroked(seed: int) -> Iterator[Row]:

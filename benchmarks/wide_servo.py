@@ -586,6 +586,7 @@ def sender(twin: Twin, part: str) -> np.random.Generator:
 
 
 GAP_S = 1.2
+SHIFT_S = 0.001
 
 
 def sends(twin: Twin) -> tuple[Array, Array, NDArray[np.int64]]:
@@ -761,20 +762,25 @@ def _phasor(time: Array, value: Array, hz: float) -> complex:
     return complex(fit[1], fit[2])
 
 
-def lag_truth(
-    twin: Twin, path: Path, sent: Array, commands: Array, longest_s: float = 0.6
-) -> float:
+def lag_truth(twin: Twin, path: Path, sent: Array, commands: Array) -> float:
     """Time shift at which the motion and the held command correlate best [s]."""
-    step = 0.001
-    grid = np.arange(sent[0] - longest_s, path.time_s[-1], step)
+    grid = np.arange(sent[0] - 0.6, path.time_s[-1], SHIFT_S)
     held = commands[np.maximum(np.searchsorted(sent, grid, "right") - 1, 0)]
     moved = np.interp(grid, path.time_s, path.angle)
-    first = round(longest_s / step) + 1
-    window = moved[first:] - moved[first:].mean()
-    scores = []
-    for shift in range(first):
-        earlier = held[first - shift : len(held) - shift]
-        scores.append(window @ (earlier - earlier.mean()) / max(earlier.std(), 1e-12))
+    return best_shift_s(held, moved, SHIFT_S, 0.6) + age_s(twin.bus)
+
+
+def best_shift_s(held: Array, moved: Array, earliest_s: float, longest_s: float) -> float:
+    """Shift of a motion behind its command that correlates best, both every `SHIFT_S` [s]."""
+    early, first = round(earliest_s / SHIFT_S), round(longest_s / SHIFT_S)
+    # one window of the motion against each shifted window of the command
+    last = len(held) - early
+    window = moved[first:last] - moved[first:last].mean()
+    shifts = np.arange(1 - early, first)
+    scores = np.empty(len(shifts))
+    for n, shift in enumerate(shifts):
+        earlier = held[first - shift : last - shift]
+        scores[n] = window @ (earlier - earlier.mean()) / max(earlier.std(), 1e-12)
     top = int(np.clip(np.argmax(scores), 1, len(scores) - 2))
     a, b, c = scores[top - 1 : top + 2]
-    return float(step * (top + 0.5 * (a - c) / (a - 2 * b + c))) + age_s(twin.bus)
+    return float(SHIFT_S * (shifts[top] + 0.5 * (a - c) / (a - 2 * b + c)))
