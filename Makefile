@@ -31,12 +31,12 @@ docs: setup
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs docs/_build/html
 
 # the rooms as one package on disk, for tools that do not read setuptools' package-dir
-links: setup
-	mkdir -p $(VENV)/links/pupper_sysid
-	ln -sfn ../../../api/__init__.py $(VENV)/links/pupper_sysid/__init__.py
-	ln -sfn ../../../api/py.typed $(VENV)/links/pupper_sysid/py.typed
+links:
+	mkdir -p build/links/pupper_sysid
+	ln -sfn ../../../api/__init__.py build/links/pupper_sysid/__init__.py
+	ln -sfn ../../../api/py.typed build/links/pupper_sysid/py.typed
 	for room in common data servo_models hardware sysid sim policies cli; do \
-		ln -sfn ../../../$$room $(VENV)/links/pupper_sysid/$$room; done
+		ln -sfn ../../../$$room build/links/pupper_sysid/$$room; done
 
 setup: $(VENV)/.installed
 

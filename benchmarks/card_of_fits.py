@@ -40,28 +40,10 @@ def to_card(
     With a known load torques are as fitted. Without one they are known per inertia only, and the
     stall torque of the servo's data sheet at `supply_v` sets their scale.
 
-    Parameters
-    ----------
-    name : str
-        Of the card.
-    servo : str
-        Manufacturer and model.
-    fits : dict of str to LoadedFit
-        By specimen, such as a joint.
-    recordings : sequence of Recording
-        The data; names and hashes go into the card.
-    source : Source
-        Of the recordings.
-    load : str
-        What the servo moved, in words.
-    supply_v : float, optional
-        Supply voltage [V]; by default the reference voltage of the first fit.
-    gains : Gains, optional
-        I and D gain of the recordings; the P gain is the fit's.
-    default : str, optional
-        Specimen that stands for the servo type; by default the one nearest to the medians of all.
-    notes : sequence of str
-        Sentences for the reader.
+    `fits` are by specimen, such as a joint; of `recordings` names and hashes go into the card;
+    `load` says in words what the servo moved. The supply voltage [V] is by default the reference
+    voltage of the first fit, `gains` adds I and D gain of the recordings, and `default` names the
+    specimen that stands for the servo type, by default the one nearest to the medians of all.
     """
     first = _first_fit(fits)
     volts = first.reference_voltage_v if supply_v is None else supply_v
@@ -101,24 +83,7 @@ def to_drive_card(
     Such a drive commands torque, so its numbers are those of a PD servo. Motions that never reach
     its torque limit cannot tell its D gain from drag: `damping_nm_s_per_rad` is their sum.
 
-    Parameters
-    ----------
-    name : str
-        Of the card.
-    servo : str
-        Manufacturer and model.
-    fits : dict of str to LoadedFit
-        By specimen, such as a joint.
-    drives : dict of str to (float, float)
-        By specimen: P gain [N·m/rad] and torque limit [N·m] that were set in the drive.
-    recordings : sequence of Recording
-        The data; names and hashes go into the card.
-    source : Source
-        Of the recordings.
-    load : str
-        What the drive moved, in words.
-    notes : sequence of str
-        Sentences for the reader.
+    `drives` has by specimen the P gain [N·m/rad] and the torque limit [N·m] that were set in it.
     """
     _first_fit(fits)
     set_there = "set in the drive and stated by the recording; the scale of all torques"

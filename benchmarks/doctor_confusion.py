@@ -3,8 +3,7 @@
 Each recording is drawn from `tests/support/strange_servos.py`, which simulates servos of four
 classes, nine motions and many buses with no code of the package, and spoils them with one fault.
 
-    .venv/bin/python benchmarks/doctor_confusion.py --seed 1 [--count 14] [--only clamp] [--each]
-        [--out FILE]
+    .venv/bin/python benchmarks/doctor_confusion.py --count 38 --seed 606 [--only clamp]
 
 Right: a finding of the fault's codes that asks for care or refuses, or a refusal to read it for its
 unit. Undecided: none, or one that names the fault as its runner-up. Accused: a finding that names
@@ -13,19 +12,14 @@ another fault (`ACCUSING`), on a healthy recording any.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import sys
 import time
 import warnings
 from collections import Counter
-from itertools import product
-from pathlib import Path
+from collections.abc import Iterator
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+from shared import print_rows  # isort: skip
+
+import tyro
 
 import pupper_sysid as ps
 from pupper_sysid.sysid.doctor.checks import findings
@@ -66,45 +60,30 @@ def judged(fault: str, number: int, seed: int) -> dict:
             "codes": codes, "rivals": rivals, "spent_s": spent}  # fmt: skip
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=14, help="recordings of each fault")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", nargs="+", default=list(FAULTS), choices=list(FAULTS))
-    parser.add_argument("--each", action="store_true", help="a line for each that is not right")
-    parser.add_argument("--out", type=Path, help="JSON lines, which a next call goes on with")
-    options = parser.parse_args()
+def main(count: int = 14, seed: int = 1, only: tuple[str, ...] = tuple(FAULTS)) -> None:
+    """Print the table of `count` recordings of each fault, and a line of each that is not right."""
     warnings.simplefilter("ignore")
-    lines = options.out.read_text().splitlines() if options.out and options.out.exists() else []
-    rows = {(r["fault"], r["number"], r["seed"]): r for r in map(json.loads, lines)}
-    for number, fault in product(range(options.count), options.only):
-        key = fault, number, options.seed
-        if key in rows:
-            continue
-        rows[key] = judged(*key)
-        if options.out:
-            with options.out.open("a") as file:
-                file.write(json.dumps(rows[key]) + "\n")
-    rows = {k: r for k, r in rows.items()
-            if k[0] in options.only and k[1] < options.count and k[2] == options.seed}  # fmt: skip
-    print("| fault | n | right | undecided | another named | not right |\n|" + " --- |" * 6)
+    rows = [judged(fault, number, seed) for number in range(count) for fault in only]
     kinds = ("right", "undecided", "accused")
-    total: Counter[str] = Counter(r["kind"] for r in rows.values())
-    for fault in options.only:
-        judgements = [r for r in rows.values() if r["fault"] == fault]
-        wrong = [r for r in judgements if r["kind"] != "right"]
-        others = Counter(code for r in wrong for code in r["codes"] or ["nothing"])
-        count = Counter(r["kind"] for r in judgements)
-        listed = ", ".join(f"{code} {n}" for code, n in others.most_common())
-        print("|", " | ".join(map(str, (fault, len(judgements), *(count[k] for k in kinds),
-                                        listed))), "|")  # fmt: skip
-        for r in wrong if options.each else ():
-            print("   ", r["number"], r["motion"], r["codes"], r["rivals"])
-    right, undecided, wrong_named = (total[k] / len(rows) for k in kinds)
-    longest = max(r["spent_s"] for r in rows.values())
-    print(f"\n{len(rows)} recordings: {right:.1%} right, {undecided:.1%} undecided,"
-          f" {wrong_named:.1%} another fault named; {longest:.1f} s at most")  # fmt: skip
+
+    def cells() -> Iterator[list[object]]:
+        for fault in only:
+            judgements = [r for r in rows if r["fault"] == fault]
+            wrong = [r for r in judgements if r["kind"] != "right"]
+            others = Counter(code for r in wrong for code in r["codes"] or ["nothing"])
+            counts = Counter(r["kind"] for r in judgements)
+            listed = ", ".join(f"{code} {n}" for code, n in others.most_common())
+            yield [fault, len(judgements), *(counts[k] for k in kinds), listed]
+
+    print_rows(("fault", "recordings", "right", "undecided", "another fault named",
+                "codes where it is not right"), cells())  # fmt: skip
+    for r in rows:
+        if r["kind"] != "right":
+            print(r["fault"], r["number"], r["motion"], r["codes"], r["rivals"])
+    total = Counter(r["kind"] for r in rows)
+    shares = ", ".join(f"{total[k] / len(rows):.1%} {k}" for k in kinds)
+    print(f"\n{len(rows)} recordings: {shares}; {max(r['spent_s'] for r in rows):.1f} s at most")
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

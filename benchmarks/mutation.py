@@ -12,7 +12,6 @@ in the tests: `benchmarks/README.md` has the survivors of the last run.
 
 from __future__ import annotations
 
-import argparse
 import ast
 import os
 import shutil
@@ -21,14 +20,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from queue import SimpleQueue
 
 import numpy as np
+import tyro
+from shared import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 ROOMS = ("common", "servo_models", "hardware", "sysid", "sim", "policies", "cli")
 COPIED = (*ROOMS, "api", "tests", "data", "benchmarks", "reproduction", "pyproject.toml")
 
@@ -128,19 +126,8 @@ def changed(mutation: Mutation) -> str:
     mutation.set_to(True)
     after = ast.unparse(mutation.statement).splitlines()
     mutation.set_to(False)
-    for old, new in zip(before, after, strict=True):
-        if old != new:
-            return f"{old.strip()} → {_different(old.strip(), new.strip())}"
-    return "no change"
-
-
-def _different(old: str, new: str) -> str:
-    """The part of `new` around what differs from `old`."""
-    first = next((k for k, (a, b) in enumerate(zip(old, new, strict=False)) if a != b), 0)
-    tail = next(
-        (k for k, (a, b) in enumerate(zip(old[::-1], new[::-1], strict=False)) if a != b), 0
-    )
-    return f"…{new[max(first - 12, 0) : len(new) - max(tail - 12, 0)]}…"
+    pairs = zip(before, after, strict=True)
+    return next((f"{a.strip()} → {b.strip()}" for a, b in pairs if a != b), "no change")
 
 
 def copy_of_the_repository(folder: Path) -> Path:
@@ -160,7 +147,7 @@ def copy_of_the_repository(folder: Path) -> Path:
     return folder
 
 
-def run_tests(copy: Path, tests: list[str], select: str, limit_s: float) -> str:
+def run_tests(copy: Path, tests: tuple[str, ...], select: str, limit_s: float) -> str:
     """`killed` or `survived`, or what else pytest made of it."""
     environment = os.environ | {
         "PYTHONPATH": str(copy / "links"), "PYTHONDONTWRITEBYTECODE": "1",
@@ -180,64 +167,39 @@ def run_tests(copy: Path, tests: list[str], select: str, limit_s: float) -> str:
     return {0: "survived", 1: "killed", 2: "killed"}.get(code, f"pytest ended with {code}")
 
 
-def main() -> None:
-    """Copy, mutate, test, print."""
-    parser = argparse.ArgumentParser(
-        description="Small errors in a module, and which of them its tests notice."
-    )
-    parser.add_argument("module", type=Path, nargs="+", help="modules, relative to the repository")
-    parser.add_argument("--tests", nargs="+", required=True, help="files or folders of tests")
-    parser.add_argument("--select", default="", help="marker expression for pytest -m")
-    parser.add_argument("--mutants", type=int, default=50, help="how many to draw; 0 for all")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=1, help="copies that are tested at a time")
-    given = parser.parse_args()
-
-    texts = {m: (ROOT / m).read_text() for m in given.module}
-    trees = {m: ast.parse(text) for m, text in texts.items()}
+def main(
+    modules: tyro.conf.Positional[tuple[Path, ...]],
+    tests: tuple[str, ...],
+    select: str = "",
+    mutants: int = 50,
+    seed: int = 0,
+) -> None:
+    """Copy, mutate, test, print: `mutants` of the `modules` (0: all), by pytest's `-m select`."""
+    trees = {m: ast.parse((ROOT / m).read_text()) for m in modules}
     every = [(m, mutation) for m, tree in trees.items() for mutation in mutations(tree)]
-    chosen = every
-    if 0 < given.mutants < len(every):
-        rng = np.random.default_rng(given.seed)
-        drawn = sorted(rng.choice(len(every), given.mutants, replace=False))
-        chosen = [every[k] for k in drawn]
-    made = []
-    for module, mutation in chosen:
-        what = changed(mutation)
-        mutation.set_to(True)
-        made.append((module, mutation.line, what, ast.unparse(trees[module])))
-        mutation.set_to(False)
-
+    chosen = range(len(every))
+    if 0 < mutants < len(every):
+        chosen = sorted(np.random.default_rng(seed).choice(len(every), mutants, replace=False))
+    killed = 0
     with tempfile.TemporaryDirectory(prefix="mutation-") as name:
-        copies: SimpleQueue[Path] = SimpleQueue()
-        for k in range(given.workers):
-            copies.put(copy_of_the_repository(Path(name) / str(k)))
-        first = copies.get()
-        started = time.monotonic()
+        copy = copy_of_the_repository(Path(name))
         for module, tree in trees.items():  # without comments, as the mutants are
-            (first / module).write_text(ast.unparse(tree))
-        if (verdict := run_tests(first, given.tests, given.select, 1e4)) != "survived":
+            (copy / module).write_text(ast.unparse(tree))
+        started = time.monotonic()
+        if (verdict := run_tests(copy, tests, select, 1e4)) != "survived":
             raise SystemExit(f"The tests fail without any change: {verdict}.")
-        took_s = time.monotonic() - started
-        copies.put(first)
-
-        def tested(mutant: tuple[Path, int, str, str]) -> tuple[Path, int, str, str]:
-            module, line, what, text = mutant
-            copy = copies.get()
-            try:
-                (copy / module).write_text(text)
-                verdict = run_tests(copy, given.tests, given.select, 20 + 5 * took_s)
-                (copy / module).write_text(texts[module])
-            finally:
-                copies.put(copy)
-            print(f"{verdict:9} {module}:{line}  {what}", flush=True)
-            return module, line, what, verdict
-
-        with ThreadPoolExecutor(given.workers) as pool:
-            results = list(pool.map(tested, made))
-    killed = sum(verdict == "killed" for *_, verdict in results)
-    print(f"\n{killed} of {len(results)} mutants killed ({len(every)} possible).")
+        limit_s = 20 + 5 * (time.monotonic() - started)
+        for module, mutation in (every[k] for k in chosen):
+            what = changed(mutation)
+            mutation.set_to(True)
+            (copy / module).write_text(ast.unparse(trees[module]))
+            mutation.set_to(False)
+            verdict = run_tests(copy, tests, select, limit_s)
+            (copy / module).write_text(ast.unparse(trees[module]))
+            killed += verdict == "killed"
+            print(f"{verdict:9} {module}:{mutation.line}  {what}", flush=True)
+    print(f"\n{killed} of {len(chosen)} mutants killed ({len(every)} possible).")
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

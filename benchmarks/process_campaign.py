@@ -15,7 +15,6 @@ its state. Exits with 1 if one did not end as it should.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import resource
@@ -27,10 +26,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
+
+from shared import print_rows  # isort: skip
 
 import numpy as np
+import tyro
 
 from pupper_sysid.hardware.address import KINDS as KINDS_OF_BUS
 from pupper_sysid.hardware.dynamixel import SERIES
@@ -45,6 +48,7 @@ from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sim.emulator.serial_line import LineEmulator, SerialPty
 from pupper_sysid.sim.robot.robot_map import joint_map_of_servos
 
+Server = SerialPty | ProxySocket
 PARK = [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "park"]
 DYNAMIXELS = {"xl330-m288": 1200, "xm430-w350": 1020}
 """Model numbers by name."""
@@ -129,7 +133,7 @@ finally:
 class Drive:
     """A driven robot."""
 
-    server: SerialPty | ProxySocket
+    server: Server
     where: str
     driver: subprocess.Popen
     watchdog: int
@@ -176,12 +180,10 @@ def send(drive: Drive, number: int, *processes: int) -> None:
 
 
 def to_driver(number: int) -> Fault:
-    """A signal to the driver."""
     return lambda drive: send(drive, number, drive.driver.pid)
 
 
 def to_watchdog(number: int) -> Fault:
-    """A signal to the watchdog."""
     return lambda drive: send(drive, number, drive.watchdog)
 
 
@@ -208,11 +210,8 @@ def lock_wanted(then: Fault) -> Fault:
 
     def inject(drive: Drive) -> None:
         kind, _, where = drive.where.partition(":")
-        lock = (
-            where
-            if KINDS_OF_BUS[kind].is_serial
-            else str(runtime_folder() / lock_name(Path(where)))
-        )
+        serial = KINDS_OF_BUS[kind].is_serial
+        lock = where if serial else str(runtime_folder() / lock_name(Path(where)))
         waiting = subprocess.Popen(["flock", "-x", lock, "sleep", "30"], start_new_session=True)
         drive.held.callback(lambda: os.killpg(waiting.pid, signal.SIGKILL))
         time.sleep(0.2)
@@ -255,31 +254,21 @@ def short(to: Callable[[int], Fault], seconds: float) -> Fault:
     return in_turn(to(STOP), seconds, to(GO_ON))
 
 
-def unplugged(seconds: float) -> Fault:
-    """The adapter is pulled, and comes back."""
+def on_the_line(fault: Callable[[LineEmulator, float], object]) -> Fault:
+    """A fault of the line or of its servos, from now on."""
 
     def inject(drive: Drive) -> None:
         drive.injected_s = time.monotonic()
-        drive.server.emulator.unplug_for_s = seconds
+        emulator = drive.server.emulator
+        assert isinstance(emulator, LineEmulator)
+        fault(emulator, drive.server.now())
 
     return inject
 
 
-def brown_out(drive: Drive) -> None:
-    """The supply is too low for a second."""
-    drive.injected_s = time.monotonic()
-    emulator = drive.server.emulator
-    assert isinstance(emulator, LineEmulator)
-    emulator.brown_out(drive.server.now(), 1.0)
-
-
-def overloaded(drive: Drive) -> None:
-    """A servo reports an overload until its power is switched off."""
-    drive.injected_s = time.monotonic()
-    emulator = drive.server.emulator
-    assert isinstance(emulator, LineEmulator)
-    emulator.fail(min(emulator.servos), drive.server.now(), OVERLOAD, 60.0)
-
+UNPLUGGED = on_the_line(lambda line, now: setattr(line, "unplug_for_s", 1.5))
+BROWN_OUT = on_the_line(lambda line, now: line.brown_out(now, 1.0))
+OVERLOADED = on_the_line(lambda line, now: line.fail(min(line.servos), now, OVERLOAD, 60.0))
 
 SCENARIOS = (
     Scenario("driver", "SIGINT (Ctrl-C)", to_driver(signal.SIGINT)),
@@ -314,28 +303,14 @@ SCENARIOS = (
         "both", "SIGKILL, lock taken, supervised", lock_wanted(to_both(KILL)), supervised=True
     ),
     Scenario("both", "SIGKILL, then `park`", parked_by_hand),
-    Scenario("line", "cable pulled for 1.5 s", unplugged(1.5), serial=True),
-    Scenario("line", "brown-out of 1 s", brown_out, serial=True),
-    Scenario("servo", "overload, reported by one", overloaded, serial=True),
+    Scenario("line", "cable pulled for 1.5 s", UNPLUGGED, serial=True),
+    Scenario("line", "brown-out of 1 s", BROWN_OUT, serial=True),
+    Scenario("servo", "overload, reported by one", OVERLOADED, serial=True),
 )
 
 
-@dataclass
-class Tally:
-    """Outcomes of one scenario."""
-
-    limp_s: list[float] = field(default_factory=list)
-    on_again: int = 0
-    restored: int = 0
-    as_expected: int = 0
-    undriven: int = 0
-    """Drives that the busy machine ended before anything happened, and that were repeated."""
-
-
 @contextmanager
-def driven(
-    server: SerialPty | ProxySocket, where: str, layout: str, scenario: Scenario
-) -> Iterator[Drive | None]:
+def driven(server: Server, where: str, layout: str, scenario: Scenario) -> Iterator[Drive | None]:
     """A driver and its watchdog, in the midst of a swing; None if it did not begin."""
     reads, writes = os.pipe()
     master, tty = os.openpty() if scenario.terminal else (-1, -1)
@@ -371,7 +346,7 @@ def driven(
 
 
 @contextmanager
-def served(kind: str, seed: int) -> Iterator[tuple[SerialPty | ProxySocket, str, str]]:
+def served(kind: str, seed: int) -> Iterator[tuple[Server, str, str]]:
     """A running server of one emulated robot, the address of its bus, and its joint map's file.
 
     The file is empty where the map needs no name.
@@ -448,28 +423,35 @@ def repaired(server, found: dict[tuple[int, str], int]) -> None:
                 emulator._set(servo, "hardware_error_status", 0)
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """What one repeat came to."""
+
+    limp_s: float  # from the fault to the last torque; infinite where the drive goes on
+    on_again: bool
+    restored: bool
+    as_expected: bool
+
+
 def once(
-    server: SerialPty | ProxySocket, where: str, layout: str, scenario: Scenario,
-    rng: np.random.Generator, tally: Tally,
-) -> bool:  # fmt: skip
-    """One repeat; False if it has to be repeated."""
+    server: Server, where: str, layout: str, scenario: Scenario, rng: np.random.Generator
+) -> Outcome | None:
+    """One repeat; None if the busy machine ended the drive before anything happened."""
     found = registers(server)
     repaired(server, found)
     with driven(server, where, layout, scenario) as drive:
-        if drive is None:
+        if drive is not None:
+            time.sleep(float(rng.uniform(*SWINGS_S)))
+        if drive is None or limp(server) or drive.driver.poll() is not None:
             repaired(server, found)
-            return False
-        time.sleep(float(rng.uniform(*SWINGS_S)))
-        if limp(server) or drive.driver.poll() is not None:
-            repaired(server, found)
-            return False
-        at = threading.Event()
-        limp_s = [np.inf]
+            return None
+        at, limp_s = threading.Event(), np.inf
 
         def watch() -> None:
+            nonlocal limp_s
             while not at.is_set() and not limp(server):
                 time.sleep(0.002)
-            limp_s[0] = time.monotonic() if limp(server) else np.inf
+            limp_s = time.monotonic() if limp(server) else np.inf
 
         watcher = threading.Thread(target=watch)
         watcher.start()  # a pause ends after the robot may be limp
@@ -478,75 +460,59 @@ def once(
         at.set()
         watcher.join()
         time.sleep(AFTER_S)
-        again = np.isfinite(limp_s[0]) and not limp(server)
-        outcome = LIMP if np.isfinite(limp_s[0]) else GOES_ON
-        running = drive.driver.poll() is None
-        restored = True
-        if outcome == LIMP:
-            until = time.monotonic() + RESTORED_WITHIN_S
-            while not (restored := registers(server) == found) and time.monotonic() < until:
-                time.sleep(0.05)
-        tally.on_again += again
-        tally.restored += restored
-        if np.isfinite(limp_s[0]):
-            tally.limp_s.append(limp_s[0] - drive.injected_s)
-        tally.as_expected += (
-            outcome == scenario.expected and not again and restored and (outcome == LIMP or running)
-        )
+        ended = bool(np.isfinite(limp_s))
+        again, running = ended and not limp(server), drive.driver.poll() is None
+        until, restored = time.monotonic() + RESTORED_WITHIN_S, True
+        while ended and not (restored := registers(server) == found) and time.monotonic() < until:
+            time.sleep(0.05)
+        right = ended == (scenario.expected == LIMP) and not again and restored
     repaired(server, found)
-    return True
+    return Outcome(limp_s - drive.injected_s, again, restored, right and (ended or running))
 
 
-def main() -> None:
-    """Run it, and print a table."""
-    parser = argparse.ArgumentParser(description="Processes killed, stopped and starved.")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--bus", choices=KINDS, help="one of the robots")
-    parser.add_argument("--only", default="", help="scenarios whose name contains this")
-    options = parser.parse_args()
-    print("| bus | process | what happens | repeats | limp after s: median | worst | on again "
-          "| registers as before | as it should | drives ended before by the load |")  # fmt: skip
-    print("|" + "---|" * 10)
+def main(repeats: int = 3, seed: int = 0, bus: Literal["", *KINDS] = "", only: str = "") -> None:
+    """Print a table of one robot or all, of the scenarios whose name has `only`."""
     rows = failed = 0
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under `nohup` drivers would ignore it, too
+
+    def table() -> Iterator[list[object]]:
+        nonlocal rows, failed
+        for kind in [bus] if bus else KINDS:
+            with served(kind, seed) as (server, where, layout):
+                for number, scenario in enumerate(SCENARIOS):
+                    name = f"{scenario.process} {scenario.what}"
+                    if only not in name or (scenario.serial and kind == "esp32"):
+                        continue
+                    rng, done, undriven = np.random.default_rng([seed, number]), [], 0
+                    while len(done) < repeats:
+                        outcome = once(server, where, layout, scenario, rng)
+                        undriven += outcome is None
+                        done += [outcome] if outcome else []
+                        if undriven > 20:
+                            raise SystemExit(f"{kind}: no drive begins on this machine.")
+                    times = [o.limp_s for o in done if np.isfinite(o.limp_s)]
+                    right = sum(o.as_expected for o in done)
+                    rows, failed = rows + 1, failed + repeats - right
+                    yield [
+                        kind, scenario.process, scenario.what,
+                        f"{np.median(times):.2f} ({max(times):.2f})" if times else GOES_ON,
+                        sum(o.on_again for o in done), sum(o.restored for o in done),
+                        f"{right} of {repeats}", undriven,
+                    ]  # fmt: skip
+
     with tempfile.TemporaryDirectory(prefix="runtime") as runtime:
         os.environ["XDG_RUNTIME_DIR"] = runtime
-        for kind in [options.bus] if options.bus else KINDS:
-            with served(kind, options.seed) as (server, where, layout):
-                for number, scenario in enumerate(SCENARIOS):
-                    if options.only not in f"{scenario.process} {scenario.what}":
-                        continue
-                    if scenario.serial and kind == "esp32":
-                        continue
-                    rng = np.random.default_rng([options.seed, number])
-                    tally, done = Tally(), 0
-                    while done < options.repeats:
-                        if once(server, where, layout, scenario, rng, tally):
-                            done += 1
-                        else:
-                            tally.undriven += 1
-                            if tally.undriven > 20:
-                                raise SystemExit(f"{kind}: no drive begins on this machine.")
-                    times = np.array(tally.limp_s)
-                    shown = f"{np.median(times):.2f} | {times.max():.2f}" if len(times) else "– | –"
-                    if scenario.expected == GOES_ON:
-                        shown = "goes on | –" if not len(times) else shown
-                    rows += 1
-                    failed += options.repeats - tally.as_expected
-                    print(
-                        f"| {kind} | {scenario.process} | {scenario.what} | {done} | {shown} "
-                        f"| {tally.on_again} | {tally.restored} of {done} "
-                        f"| {tally.as_expected} of {done} | {tally.undriven} |",
-                        flush=True,
-                    )
+        print_rows(
+            ("bus", "process", "what happens", "limp after s, median (worst)", "on again",
+             "registers as before", "as it should", "drives ended before by the load"), table(),
+        )  # fmt: skip
     load = " ".join(f"{x:.1f}" for x in os.getloadavg())
     print(
-        f"\n{rows} scenarios, {rows * options.repeats} runs, {failed} did not end as they should. "
+        f"\n{rows} scenarios, {rows * repeats} runs, {failed} did not end as they should. "
         f"Load of the machine: {load}."
     )
     sys.exit(failed > 0)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

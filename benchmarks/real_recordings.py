@@ -14,19 +14,18 @@ fitted to the first 40 s of three motions, scored on the rest and on a fourth mo
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import subprocess
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+from shared import REAL, mrad, print_rows  # isort: skip
 
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
@@ -56,8 +55,6 @@ from pupper_sysid.sysid.servo_fit.scores import (
 )
 from pupper_sysid.sysid.servo_fit.windows import everything
 
-HERE = Path(__file__).resolve().parent
-REAL = Path(os.environ.get("PUPPER_REAL_DATA") or HERE.parents[1] / "shared" / "real")
 SWEEPS = ("real_motor_0_LF_hip_amp0.3.csv", "real_motor_1_LF_thigh_amp0.3.csv")
 WALK = "playback_lstm_25hz.csv"
 SPLIT = Split(
@@ -72,19 +69,6 @@ JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll")
 MOTIONS = ("chirp_sweep", "prbs_excitation", "step_response", "frequency_sweep")
 FITTED_S = 40.0
 """Of each motion of the SO-101 but the last, of which nothing is fitted."""
-
-
-def print_rows(head: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
-    """Print a Markdown table, row by row as they come."""
-    head = list(head)
-    print(f"\n| {' | '.join(head)} |\n|{'---|' * len(head)}")
-    for row in rows:
-        print(f"| {' | '.join(row)} |", flush=True)
-
-
-def mrad(value_rad: float) -> str:
-    """An error in mrad."""
-    return f"{1e3 * value_rad:.1f}"
 
 
 # ---------------------------------------------------------------------------------- Mini Pupper 2
@@ -189,7 +173,7 @@ def dead_time(fit: LoadedFit) -> str:
     return f"{1e3 * d.value:.1f} [{1e3 * d.low:.1f}, {1e3 * d.high:.1f}]"
 
 
-def xl330(seed: int, bam: str | None, bam_trials: int) -> None:
+def xl330(seed: int, bam: str, bam_trials: int) -> None:
     """Mean absolute error at the gain that was not fitted, by trajectory."""
     files = sorted((REAL / "bam_xl330").glob("*.json"))
     gain = {f: json.loads(f.read_text())["kp"] for f in files}
@@ -202,7 +186,8 @@ def xl330(seed: int, bam: str | None, bam_trials: int) -> None:
             float(np.mean(np.abs(row_errors(fit, trial)[0]))) for trial in trials
         ]}  # fmt: skip
         for model in ("m4", "m6") if bam else ():
-            command = [bam, HERE / "peers" / "bam_pendulum.py", model, bam_trials, seed, "xl330",
+            script = Path(__file__).parent / "peers" / "bam_pendulum.py"
+            command = [bam, script, model, bam_trials, seed, "xl330",
                        *fitted, "--", *scored]  # fmt: skip
             answer = subprocess.run(
                 [*map(str, command)], check=True, capture_output=True, text=True
@@ -245,20 +230,19 @@ def first(trial: Trial) -> Trial:
     )  # fmt: skip
 
 
-def main() -> None:
-    """Print the tables of the parts."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("parts", nargs="+", choices=("walk", "sweep", "xl330", "so101"))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--bam", help="Python of BAM's environment")
-    parser.add_argument("--bam-trials", type=int, default=2500)
-    options = parser.parse_args()
-    for part in options.parts:
+def main(
+    parts: tyro.conf.Positional[tuple[Literal["walk", "sweep", "xl330", "so101"], ...]],
+    seed: int = 0,
+    bam: str = "",
+    bam_trials: int = 2500,
+) -> None:
+    """Print the tables of the parts; `bam` is the Python of BAM's environment."""
+    for part in parts:
         if part == "xl330":
-            xl330(options.seed, options.bam, options.bam_trials)
+            xl330(seed, bam, bam_trials)
         else:
-            {"walk": walk, "sweep": sweep, "so101": so101}[part](options.seed)
+            {"walk": walk, "sweep": sweep, "so101": so101}[part](seed)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

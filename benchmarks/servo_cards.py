@@ -14,21 +14,20 @@ Of the SO-101 only the first 40 s of three motions are fitted, so that the rest,
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+from shared import REAL, ROOT  # isort: skip
 
 import numpy as np
+import tyro
 from card_of_fits import to_card, to_drive_card
-from real_recordings import FITTED_S, JOINTS, MOTIONS, REAL, first, loaded_fit, track
+from real_recordings import FITTED_S, JOINTS, MOTIONS, first, loaded_fit, track
 
 from pupper_sysid.servo_models.cards.card import Gains, ServoCard, Source
 from pupper_sysid.sysid.fit.results import LoadedFit
@@ -36,7 +35,7 @@ from pupper_sysid.sysid.fit.run import at_steps
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Trial
 
-OUT = Path(__file__).resolve().parents[1] / "servo_models" / "cards" / "data"
+OUT = ROOT / "servo_models" / "cards" / "data"
 
 
 def xl330(seed: int) -> ServoCard:
@@ -160,21 +159,16 @@ CARDS: dict[str, Callable[[int], ServoCard]] = {
 }
 
 
-def main() -> None:
-    """Fit and write the cards."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
-    parser.add_argument("--only", choices=CARDS, help="one card")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=OUT)
-    options = parser.parse_args()
-    for name in [options.only] if options.only else CARDS:
+def main(only: Literal["", *CARDS] = "", seed: int = 0, out: Path = OUT) -> None:
+    """Fit and write all cards, or `only` one."""
+    for name in [only] if only else CARDS:
         begun = time.monotonic()
-        card = CARDS[name](options.seed)
-        card.save(options.out / f"{name}.yaml", force=True)
+        card = CARDS[name](seed)
+        card.save(out / f"{name}.yaml", force=True)
         print(f"{name}: {time.monotonic() - begun:.0f} s")
         for score in card.scores:
             print(f"  {1e3 * score.value:6.1f} mrad  {score.what}")
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -10,17 +10,16 @@ guesses that its LSTM would overtake its MLP with thousands of samples.
 
 from __future__ import annotations
 
-import argparse
-import os
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+from shared import print_rows  # isort: skip
 
 import numpy as np
 import pandas as pd
+import tyro
 
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.servo_models.interface import ServoModel
@@ -29,7 +28,6 @@ from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.report.sections import FILE
 from pupper_sysid.sysid.report.sections import MODELS as CURVES
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
@@ -42,7 +40,6 @@ from pupper_sysid.sysid.sweep.recorder import record
 from pupper_sysid.sysid.sweep.resume import playback
 
 JOINTS = ("LF_hip", "LF_calf")
-CSV = f"sysid/report/data/{FILE}"
 PERIOD_S, LOOP_ROWS = 0.02, 500
 SIZES = (30, 100, 390, 1000, 5000, 20000)
 TEST_LOOPS = 6
@@ -91,55 +88,49 @@ def fitted_model(arch: str, preset: str, data: ServoData, part: Part, seed: int)
     return fit_network(arch, data.joints, data.period_s, ready, seed).model
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--csv", type=Path, help=f"write the table, such as {CSV}")
-    parser.add_argument("--sizes", type=int, nargs="*", default=SIZES)
-    options = parser.parse_args()
-    last = -(-max(options.sizes) // LOOP_ROWS)  # first loop of the test
+def main(seed: int = 0, csv: Path | None = None, sizes: tuple[int, ...] = SIZES) -> None:
+    """Print the table, and write it to the file `csv`."""
+    last = -(-max(sizes) // LOOP_ROWS)  # first loop of the test
     with tempfile.TemporaryDirectory() as name:
-        recording = recorded(options.seed, last + TEST_LOOPS, Path(name))
+        recording = recorded(seed, last + TEST_LOOPS, Path(name))
     rows = []
-    print("| samples per joint | " + " | ".join(CURVES[_key(m)][0] for m in MODELS) + " |")
-    print("|---|" + "---|" * len(MODELS))
-    for size in options.sizes:
+
+    def cells(size: int) -> Iterator[str]:
         loops, rest = divmod(size, LOOP_ROWS)
         stop = LEAD_IN_S + recording.loop_period_s * rest
 
-        def first(number, elapsed, group, loops=loops, stop=stop):
+        def first(number, elapsed, group):
             moving = elapsed >= LEAD_IN_S  # a loop starts with a stretch at rest, which says little
             return moving & ((number < loops) | ((number == loops) & (elapsed < stop)))
 
         def unseen(number, elapsed, group):
             return number >= last
 
-        data, _ = grouped(servo_data([recording], JOINTS), first)
-        data = merged_groups(data)
-        cells = []
-        for model in MODELS:
-            if model[1] == "paper" and size > PUBLISHED_MOST:
-                cells.append("–")
+        data = merged_groups(grouped(servo_data([recording], JOINTS), first)[0])
+        yield f"{size:,}"
+        for arch, preset in MODELS:
+            if preset == "paper" and size > PUBLISHED_MOST:
+                yield "–"
                 continue
             started = time.perf_counter()
-            fit = fitted_model(*model, data, first, options.seed)
+            fit = fitted_model(arch, preset, data, first, seed)
             seconds = time.perf_counter() - started
             errors = scores.errors(fit, scores.tracks(fit, data), data, unseen)
             error = float(np.mean([scores.rms(e.free_run) for e in errors.values()]))
             rows.append(
-                {"model": _key(model), "samples_per_joint": size, "rmse_free_run_rad": error,
-                 "fit_s": round(seconds, 1)}
+                {"model": _key(arch, preset), "samples_per_joint": size,
+                 "rmse_free_run_rad": error, "fit_s": round(seconds, 1)}
             )  # fmt: skip
-            cells.append(f"{1e3 * error:.1f} ({seconds:.0f} s)")
-        print(f"| {size} | " + " | ".join(cells) + " |", flush=True)
-    if options.csv:
-        pd.DataFrame(rows).to_csv(options.csv, index=False)
+            yield f"{1e3 * error:.1f} ({seconds:.0f} s)"
+
+    print_rows(["samples per joint", *(CURVES[_key(*m)][0] for m in MODELS)], map(cells, sizes))
+    if csv:
+        pd.DataFrame(rows).to_csv(csv, index=False)
 
 
-def _key(model: tuple[str, str]) -> str:
-    return model[0] if model[1] == "default" else f"{model[0]} paper"
+def _key(arch: str, preset: str) -> str:
+    return arch if preset == "default" else f"{arch} paper"
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -20,7 +20,6 @@ traceback of its own. Such stops are counted apart ("Python"): they end, too, an
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
@@ -30,13 +29,14 @@ import sys
 import tempfile
 import time
 import zipfile
-from collections import defaultdict
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tyro
+from shared import ROOT, print_rows
 
-ROOT = Path(__file__).resolve().parents[1]
 SAMPLES = ROOT / "data/samples"
 SWEEP, CALIBRATION = str(SAMPLES / "sweep.csv"), str(SAMPLES / "calibrated.yaml")
 POLICY = str(SAMPLES / "policies/mlp")
@@ -62,7 +62,7 @@ LINES = ("Stopped.", "finishing this iteration; again ends at once")
 WRONG = ("Traceback", "defect", "error:", "Exception ignored", "Error")
 
 
-def cases() -> list[tuple[str, bool, int, bool, float]]:
+def drawn_cases() -> list[tuple[str, bool, int, bool, float]]:
     """Command, whether later, signal, whether to the group, and moment in processor time [s]."""
     rng = np.random.default_rng(39)
     every = [
@@ -204,66 +204,51 @@ def _by_python(said: str, code: int, number: int) -> bool:
     return before and code in (-number, 1, 130) and "Stopped." not in said
 
 
-def table(rows: list[dict[str, Any]]) -> str:
+def print_table(rows: list[dict[str, Any]]) -> None:
     """Verdicts by command."""
-    by_name: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    for row in rows:
-        by_name[row["command"]].append(row)
-    lines = [
-        "| command | stops at start | right | Python | later | right | ended before | wrong | "
-        "median s | longest s |",
-        "|---|" + "---|" * 9,
-    ]
-    for name in [*COMMANDS, "all"]:
-        mine = rows if name == "all" else by_name[name]
-        if not mine:
-            continue
 
-        def count(later: bool | None, *verdicts: str, mine: Any = mine) -> int:
-            kept = [r for r in mine if later is None or r["later"] == later]
-            return len([r for r in kept if not verdicts or r["verdict"] in verdicts])
+    def cells(name: str) -> list[object]:
+        chosen = [r for r in rows if name in (r["command"], "all")]
+        took = [r["took_s"] for r in chosen if r["verdict"] != "ended before"]
+        count = Counter((r["later"], r["verdict"]) for r in chosen)
+        both = Counter(r["verdict"] for r in chosen)
+        start = sum(n for (later, _), n in count.items() if not later)
+        return [
+            name, start, count[False, "right"], both["Python"], len(chosen) - start,
+            count[True, "right"], both["ended before"], both["wrong"],
+            f"{np.median(took):.2f}", f"{max(took):.2f}",
+        ]  # fmt: skip
 
-        took = [r["took_s"] for r in mine if r["verdict"] != "ended before"]
-        lines.append(
-            f"| {name} | {count(False)} | {count(False, 'right')} | {count(None, 'Python')} | "
-            f"{count(True)} | {count(True, 'right')} | {count(None, 'ended before')} | "
-            f"{count(None, 'wrong')} | {np.median(took):.2f} | {max(took):.2f} |"
-        )
+    print_rows(
+        ("command", "stops at start", "right", "Python", "later", "right", "ended before", "wrong",
+         "median s", "longest s"),
+        map(cells, [*sorted({r["command"] for r in rows}), "all"]),
+    )  # fmt: skip
     load = [r["load"] for r in rows]
-    lines.append(f"\nLoad average of the machine: {min(load):.0f} to {max(load):.0f}.")
-    return "\n".join(lines)
+    print(f"\nLoad average of the machine: {min(load):.0f} to {max(load):.0f}.")
 
 
-def main() -> None:
-    """Run some of the cases, and add a line each to the log; or print the table."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--cases", default="0:120", help="which of the 120, such as 0:30")
-    parser.add_argument("--only", help="one command")
-    parser.add_argument("--patience", type=float, default=1.0)
-    parser.add_argument("--minutes", type=float, default=60.0, help="end after this long")
-    parser.add_argument("--log", type=Path, default=Path("stops.jsonl"))
-    parser.add_argument("--table", action="store_true")
-    options = parser.parse_args()
-    rows = []
-    if options.log.exists():
-        rows = [json.loads(line) for line in options.log.read_text().splitlines()]
-    if not options.table:
-        done, until = {row["case"] for row in rows}, time.monotonic() + 60 * options.minutes
-        first, _, last = options.cases.partition(":")
-        for k, case in list(enumerate(cases()))[int(first) : int(last)]:
-            if k in done or (options.only and case[0] != options.only):
+def main(
+    cases: str = "0:120", patience: float = 1.0, log: Path = Path("stops.jsonl"),
+    table: bool = False,
+) -> None:  # fmt: skip
+    """Run the `cases` that the log lacks, and add a line each to it; then print the table."""
+    lines = log.read_text().splitlines() if log.exists() else []
+    rows = [json.loads(line) for line in lines]
+    if not table:
+        done, (first, _, last) = {row["case"] for row in rows}, cases.partition(":")
+        for k, case in list(enumerate(drawn_cases()))[int(first) : int(last)]:
+            if k in done:
                 continue
-            if time.monotonic() > until:
-                break
-            row = {"case": k} | stop_at(case, options.patience)
-            with options.log.open("a") as log:
-                log.write(json.dumps(row) + "\n")
+            row = {"case": k} | stop_at(case, patience)
+            with log.open("a") as file:
+                file.write(json.dumps(row) + "\n")
             rows.append(row)
             print(k, *case[:4], f"{case[4]:.2f} s:", row["verdict"], *row["wrong"],
                   f"({row['took_s']:.2f} s)", flush=True)  # fmt: skip
     if rows:
-        print(table(rows))
+        print_table(rows)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

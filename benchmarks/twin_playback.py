@@ -12,23 +12,22 @@ filter and an MLP fitted to loops 0 and 1 stand beside them (`real_recordings.py
 
 from __future__ import annotations
 
-import argparse
-import os
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+from shared import REAL, print_rows  # isort: skip
 
 import numpy as np
+import tyro
 from matplotlib.figure import Figure
-from real_recordings import REAL, SPLIT, SWEEPS, WALK
+from real_recordings import SPLIT, SWEEPS, WALK
 
 from pupper_sysid.common.figure_style import ORANGE, PINK, save, styled
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.policies.twin.drawing import Actuator, of_calibration, robot_for
 from pupper_sysid.policies.twin.figures import draw_bars, draw_joint
-from pupper_sysid.policies.twin.twin import ActuatorTwin, Condition, Twin, twin
+from pupper_sysid.policies.twin.twin import ActuatorTwin, Twin, twin
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.recordings.files import load
@@ -44,38 +43,28 @@ def mrad(error: Interval) -> str:
     return f"{1e3 * error.value:.1f} ({1e3 * error.low:.1f}–{1e3 * error.high:.1f})"
 
 
-def cells(own: Condition | None) -> str:
-    """RMS and mean absolute error of a place."""
-    return "– | –" if own is None else f"{mrad(own.rmse_rad)} | {1e3 * own.mean.mae_rad:.1f}"
-
-
-def line_of(name: str, model: ActuatorTwin) -> str:
+def cells(name: str, model: ActuatorTwin) -> list[str]:
     """Row of the first table."""
-    assert model.ground is not None and model.evidence is not None
-    return (
-        f"| {name} | {cells(model.air)} | {cells(model.ground)} "
-        f"| {model.ground.upright} of {model.ground.copies} | {model.evidence.verdict} |"
-    )
+    assert model.air is not None and model.ground is not None and model.evidence is not None
+    errors = [(mrad(c.rmse_rad), f"{1e3 * c.mean.mae_rad:.1f}") for c in (model.air, model.ground)]
+    upright = f"{model.ground.upright} of {model.ground.copies}"
+    return [name, *errors[0], *errors[1], upright, model.evidence.verdict]
 
 
-def evidence_of(found: Twin) -> str:
-    """Table of each actuator's evidence of where the robot was."""
-    lines = ["| actuator | torques | correlation | share of the motion | share of the load |",
-             "|---|---|---|---|---|"]  # fmt: skip
+def evidence_of(found: Twin) -> Iterator[list[str]]:
+    """Rows of each actuator's evidence of where the robot was."""
     for name, model in found.models.items():
         assert model.evidence is not None
         every = zip(model.evidence.motion, model.evidence.load_share, strict=True)
         for scale, (motion, sag) in zip(("as they are", "× 4"), every, strict=True):
             shares = (motion and motion.correlation, motion and motion.share, sag)
-            row = " | ".join(
+            yield [name, scale, *(
                 "–" if x is None else f"{x.value:.2f} ({x.low:.2f}–{x.high:.2f})" for x in shares
-            )
-            lines.append(f"| {name} | {scale} | {row} |")
-    return "\n".join(lines)
+            )]  # fmt: skip
 
 
 @styled
-def picture(found: Twin, beside: dict[str, float]) -> Figure:
+def drawn(found: Twin, beside: dict[str, float]) -> Figure:
     """Errors by actuator with the fitted models as lines, and one leg of the calibrated robot."""
     figure = Figure(figsize=(7.6, 6.0), layout="constrained")
     grid = figure.add_gridspec(2, 3, height_ratios=[1.5, 1])
@@ -96,50 +85,44 @@ def picture(found: Twin, beside: dict[str, float]) -> Figure:
     return figure
 
 
-def main() -> None:
+def main(picture: Path | None = None, seed: int = 0) -> None:
     """Print the tables, draw the picture."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--picture", type=Path)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
     walk = load(REAL / WALK)
     robot = robot_for(walk)
     first = Recording.from_frame(walk.table[walk.table["trial"] < 2], metadata=walk.metadata)
-    made = {name: load_calibration(name) for name in PRESETS} | {
+    calibrations = {name: load_calibration(name) for name in PRESETS} | {
         CALIBRATED: calibrate([load(REAL / name) for name in SWEEPS]).calibration,
         REFITTED: calibrate(first).calibration,
     }
     actuators: dict[str, Actuator] = {
-        name: of_calibration(own, robot, walk) for name, own in made.items()
+        name: of_calibration(own, robot, walk) for name, own in calibrations.items()
     }
-    published = {name: actuators[name] for name in PRESETS}
-    loops = {"test_loops": [2], "seed": options.seed}
+    loops = {"test_loops": [2], "seed": seed}
     found = twin(walk, actuators, robot, **loops)
-    ideal = twin(walk, published, robot, **loops).models
+    ideal = twin(walk, {name: actuators[name] for name in PRESETS}, robot, **loops).models
     models = {f"{name}, ideal feedback": own for name, own in ideal.items()} | found.models
-    fitted = fit_servo(walk, None, "mlp", split=SPLIT, seed=options.seed).scored
-    print("| servos | in the air: RMS mrad (90 %) | mean abs. | on the ground: RMS mrad (90 %) | "
-          "mean abs. | upright | the robot was |")  # fmt: skip
-    print("|---|---|---|---|---|---|---|")
-    for name, model in models.items():
-        print(line_of(name, model))
-    for name in ("linear", "mlp"):
-        print(f"| {name}, fitted to loops 0 and 1, no robot "
-              f"| {mrad(fitted[name].rmse_free_run_rad)} | – | – | – | – | – |")  # fmt: skip
-    print(f"| repeatability | {1e3 * np.mean(list(found.repeatability_rad.values())):.1f} "
-          "| – | – | – | – | – |\n")  # fmt: skip
-    print(f"{evidence_of(found)}\n")
+    fitted = fit_servo(walk, None, "mlp", split=SPLIT, seed=seed).scored
+    errors = {name: fitted[name].rmse_free_run_rad for name in ("linear", "mlp")}
+    rows = [cells(name, model) for name, model in models.items()]
+    for name, error in errors.items():
+        rows.append([f"{name}, fitted to loops 0 and 1, no robot", mrad(error), *["–"] * 5])
+    floor = 1e3 * np.mean(list(found.repeatability_rad.values()))
+    print_rows(
+        ("servos", "in the air: RMS mrad (90 %)", "mean abs.", "on the ground: RMS mrad (90 %)",
+         "mean abs.", "upright", "the robot was"),
+        [*rows, ["repeatability", f"{floor:.1f}", *["–"] * 5]],
+    )  # fmt: skip
+    print_rows(
+        ("actuator", "torques", "correlation", "share of the motion", "share of the load"),
+        evidence_of(found),
+    )
     evidence = found.models[CALIBRATED].evidence
     assert evidence is not None
-    print(f"{CALIBRATED}: {evidence.why}")
-    if options.picture:
-        errors = {
-            words: fitted[name].rmse_free_run_rad.value
-            for name, words in (("linear", "linear filter"), ("mlp", "MLP"))
-        }
-        drawn = picture(replace(found, models=models), errors)
-        save(drawn, options.picture, force=True)
+    print(f"\n{CALIBRATED}: {evidence.why}")
+    if picture:
+        beside = {"linear filter": errors["linear"].value, "MLP": errors["mlp"].value}
+        save(drawn(replace(found, models=models), beside), picture, force=True)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -13,24 +13,21 @@ logarithm 0.2), dead times by 3 ms, all torques together by another factor (0.5)
 
 from __future__ import annotations
 
-import argparse
-import os
 import tempfile
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import replace
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+from shared import print_rows  # isort: skip
 
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 from random_robots import random_spec
 
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.policies.twin.drawing import Actuator, robot_for
-from pupper_sysid.policies.twin.playing import Evidence
 from pupper_sysid.policies.twin.twin import twin
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS
@@ -158,8 +155,8 @@ def polled(robot: EmulatedRobot) -> Calibration:
     return base.model_copy(update={"joints": joints})
 
 
-def tested(seed: int) -> tuple[dict, Evidence] | None:
-    """Truth and evidence of one robot; None if it fell or was stopped."""
+def tested(seed: int) -> tuple[tuple[str, str, float], str] | None:
+    """Truth and verdict of one robot; None if it fell or was stopped."""
     rng = np.random.default_rng([20261124, seed])
     kind, ground = ("trot", "tones")[seed % 2], bool(seed // 2 % 2)
     zero = (0.0, 0.005, 0.02)[seed // 4 % 3]
@@ -173,31 +170,22 @@ def tested(seed: int) -> tuple[dict, Evidence] | None:
     found = twin(walk, {"calibration": mistaken(robot, rng)}, robot_for(walk), copies=8, threads=1)
     evidence = found.models["calibration"].evidence
     assert evidence is not None
-    return {"kind": kind, "ground": ground, "zero": zero}, evidence
+    return ("ground" if ground else "air", kind, 1e3 * zero), evidence.verdict
 
 
-def main() -> None:
+def main(robots: int = 60) -> None:
     """Print the verdicts by truth."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--robots", type=int, default=60)
-    options = parser.parse_args()
-    counts: dict[tuple, Counter] = {}
-    left_out = 0
-    for seed in range(options.robots):
-        result = tested(seed)
-        if result is None:
-            left_out += 1
-            continue
-        truth, evidence = result
-        key = ("ground" if truth["ground"] else "air", truth["kind"], truth["zero"])
-        counts.setdefault(key, Counter())[evidence.verdict] += 1
-    print(f"{left_out} fell, or were stopped by the guard, and are left out.\n")
-    print("| truth | commands | zeros mrad | ground | air | cannot tell |")
-    print("|---|---|---|---|---|---|")
-    for (truth, kind, zero), own in sorted(counts.items()):
-        cells = " | ".join(str(own[v]) for v in ("ground", "air", "cannot tell"))
-        print(f"| {truth} | {kind} | {1e3 * zero:g} | {cells} |")
+    results = [tested(seed) for seed in range(robots)]
+    counts: dict[tuple, Counter] = defaultdict(Counter)
+    for truth, verdict in filter(None, results):
+        counts[truth][verdict] += 1
+    print(f"{results.count(None)} fell, or were stopped by the guard, and are left out.")
+    verdicts = ("ground", "air", "cannot tell")
+    print_rows(
+        ("truth", "commands", "zeros mrad", *verdicts),
+        ((*truth, *(own[v] for v in verdicts)) for truth, own in sorted(counts.items())),
+    )
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

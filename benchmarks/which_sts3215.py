@@ -21,19 +21,18 @@ torques.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
+from shared import REAL, ROOT  # isort: skip
 
 import numpy as np
-from real_recordings import FITTED_S, HERE, JOINTS, MOTIONS, REAL, first
+import tyro
+from real_recordings import FITTED_S, JOINTS, MOTIONS, first
 
 from pupper_sysid.servo_models.cards.card import ServoCard
 from pupper_sysid.servo_models.cards.files import load_card
@@ -45,9 +44,9 @@ from pupper_sysid.sysid.fit.structure import Parameter, Structure, loaded_column
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Trial
 
-PAGE = HERE.parent / "docs" / "which_sts3215.md"
-PICTURE = HERE.parent / "docs" / "pictures" / "which_sts3215.png"
-FILE = HERE / "which_sts3215.json"
+PAGE = ROOT / "docs/which_sts3215.md"
+PICTURE = ROOT / "docs/pictures/which_sts3215.png"
+FILE = ROOT / "benchmarks/which_sts3215.json"
 OURS = "pupper-sysid"
 MODELS = {
     "BAM M6": "sts3215-bam-m6",
@@ -87,11 +86,7 @@ TERMS = ("stiffness", "inertia", "damping", "friction", "largest torque", "dead 
 class Model:
     """A servo with its load at the P gain of the recordings.
 
-    Attributes
-    ----------
-    columns : ndarray, shape (columns,)
-        `sysid.fit.kernel.COLUMNS`, the stiffness in N·m/rad.
-    dead_time_s : float
+    `columns` are those of `sysid.fit.kernel.COLUMNS`, the stiffness in N·m/rad.
     """
 
     columns: np.ndarray
@@ -137,17 +132,8 @@ def with_load(
 ) -> Model:
     """The model with gravity, offset and by choice inertia of the arm, fitted to runs.
 
-    Parameters
-    ----------
-    model : Model
-        Its gravity and offset are where the fit starts.
-    runs : sequence of Run
-    inertia : bool
-        Whether inertia is added to the armature.
-    stiffness : bool
-        Whether the stiffness is fitted, too.
-    starts : int
-        Up to 3, of inertia and stiffness.
+    The fit starts from the model's gravity and offset. `inertia` adds one to the armature,
+    `stiffness` fits that, too; both have up to three `starts`.
     """
     own = {name: model.columns[place] for name, place in AT.items()}
     arm = [
@@ -495,20 +481,17 @@ def picture(joints: Mapping[str, Any]) -> None:
     drawn.savefig(PICTURE, dpi=130)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--joints", nargs="+", choices=JOINTS, default=JOINTS)
-    parser.add_argument("--print-only", action="store_true", help="write no files")
-    options = parser.parse_args()
+def main(joints: tuple[str, ...] = JOINTS, print_only: bool = False) -> None:
+    """Print the tables, and write page, file and picture."""
     found = {}
-    for joint in options.joints:
+    for joint in joints:
         begun = time.process_time()
         found[joint] = _plain(evaluate(joint))
         print(f"{joint}: {time.process_time() - begun:.0f} s of processor time", flush=True)
     inputs = {m: load(REAL / "sage_so101" / m).sha256 for m in MOTIONS}
     cards = {card: numbers_hash(load_card(card)) for card in MODELS.values()}
-    publish({"recordings": inputs, "cards": cards, "joints": found}, write=not options.print_only)
+    publish({"recordings": inputs, "cards": cards, "joints": found}, write=not print_only)
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

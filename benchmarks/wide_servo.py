@@ -20,6 +20,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -42,66 +43,39 @@ class Servo(NamedTuple):
     """One servo; torques are per total inertia of motor and link."""
 
     dead_time_s: float = 0.01
-    stiffness: float = 4000.0
-    """[1/s²]"""
-    damping: float = 80.0
-    """Inside of the effort limit [1/s]."""
-    back_emf: float = 0.0
-    """Outside of the effort limit: back-EMF and viscous friction [1/s]."""
-    friction: float = 10.0
-    """Coulomb [rad/s²]."""
-    effort: float = 1000.0
-    """[rad/s²]"""
-    speed_limit: float = NEVER
-    """Of the set-point [rad/s]."""
-    acceleration_limit: float = NEVER
-    """Of the set-point [rad/s²]."""
-    low_pass_s: float = 0.0
-    """Time constant of a first-order filter on the command."""
-    dead_zone: float = 0.0
-    """Half width, subtracted from the position error [rad]."""
-    integral: float = 0.0
-    """[1/s³]"""
-    integral_clamp: float = 0.0
-    """[rad/s²]"""
-    loop_s: float = 0.0
-    """Period of the position loop; 0 for a continuous one."""
-    latch_s: float = 0.0
-    """Period at which commands are taken over; 0 for at once."""
-    asymmetry: float = 0.0
-    """Share by which the effort is smaller downward."""
-    sag: float = 0.0
-    """Share of the torque lost to the supply at full effort."""
-    stribeck: float = 0.0
-    """Share by which static friction exceeds the Coulomb one."""
-    stribeck_speed: float = 0.1
-    """[rad/s]"""
-    cogging: float = 0.0
-    """[rad/s²]"""
+    stiffness: float = 4000.0  # [1/s²]
+    damping: float = 80.0  # inside of the effort limit [1/s]
+    back_emf: float = 0.0  # outside of the effort limit: back-EMF and viscous friction [1/s]
+    friction: float = 10.0  # Coulomb [rad/s²]
+    effort: float = 1000.0  # [rad/s²]
+    speed_limit: float = NEVER  # of the set-point [rad/s]
+    acceleration_limit: float = NEVER  # of the set-point [rad/s²]
+    low_pass_s: float = 0.0  # time constant of a first-order filter on the command
+    dead_zone: float = 0.0  # half width, subtracted from the position error [rad]
+    integral: float = 0.0  # [1/s³]
+    integral_clamp: float = 0.0  # [rad/s²]
+    loop_s: float = 0.0  # period of the position loop; 0 for a continuous one
+    latch_s: float = 0.0  # period at which commands are taken over; 0 for at once
+    asymmetry: float = 0.0  # share by which the effort is smaller downward
+    sag: float = 0.0  # share of the torque lost to the supply at full effort
+    stribeck: float = 0.0  # share by which static friction exceeds the Coulomb one
+    stribeck_speed: float = 0.1  # [rad/s]
+    cogging: float = 0.0  # [rad/s²]
     cogging_per_rad: float = 0.0
-    gravity: float = 0.0
-    """Torque -gravity sin(angle + gravity_phase) on the link [rad/s²]."""
+    gravity: float = 0.0  # torque -gravity sin(angle + gravity_phase) on the link [rad/s²]
     gravity_phase: float = 0.0
-    motor_share: float = 1.0
-    """Of the inertia; 1 for a rigid joint."""
-    link_stiffness: float = 0.0
-    """Of the contact or the link, per total inertia [1/s²]."""
-    link_damping: float = 0.0
-    """[1/s]"""
-    play: float = 0.0
-    """Total [rad]."""
+    motor_share: float = 1.0  # of the inertia; 1 for a rigid joint
+    link_stiffness: float = 0.0  # of the contact or the link, per total inertia [1/s²]
+    link_damping: float = 0.0  # [1/s]
+    play: float = 0.0  # total [rad]
     link_friction_share: float = 0.0
-    loop_on_motor: float = 1.0
-    """1 where the loop measures the motor, 0 where the link."""
+    loop_on_motor: float = 1.0  # 1 where the loop measures the motor, 0 where the link
     read_on_motor: float = 1.0
-    bend: float = 0.0
-    """Largest deviation of the potentiometer's slope from 1."""
+    bend: float = 0.0  # largest deviation of the potentiometer's slope from 1
     bend_per_rad: float = 1.0
     bend_phase: float = 0.0
-    dead_time_jitter_s: float = 0.0
-    """Mean of an exponential addition per command."""
-    dead_time_drift_s: float = 0.0
-    """Added from first to last row."""
+    dead_time_jitter_s: float = 0.0  # mean of an exponential addition per command
+    dead_time_drift_s: float = 0.0  # added from first to last row
 
     def slope(self, angle: Array) -> Array:
         """Slope of the potentiometer."""
@@ -378,27 +352,16 @@ def _teleop(rng: np.random.Generator, total: float, centre: float, reach: Reach)
     return [Stretch(total, lambda t: centre + np.interp(t, grid, angle))]
 
 
-def _levels(
-    rng: np.random.Generator, total: float, size: float, low: float, high: float, two: bool
-):
+def _steps(rng: np.random.Generator, total: float, centre: float, reach: Reach, two: bool = False):
+    """Jumps to levels, every 0.5 to 1.2 s or, between `two` levels, at a clock's ticks."""
+    low, high = (rng.uniform(0.1, 0.25),) * 2 if two else (0.5, 1.2)
     starts = [0.0]
     while starts[-1] < total:
         starts.append(starts[-1] + rng.uniform(low, high))
-    values = size * rng.uniform(-1, 1, len(starts))
+    values = reach.size_rad * rng.uniform(-1, 1, len(starts))
     if two:
-        values = size * rng.choice([-1.0, 1.0], len(starts))
+        values = 0.5 * reach.size_rad * rng.choice([-1.0, 1.0], len(starts))
     values[0] = 0.0
-    return np.array(starts), values
-
-
-def _steps(rng: np.random.Generator, total: float, centre: float, reach: Reach):
-    starts, values = _levels(rng, total, reach.size_rad, 0.5, 1.2, False)
-    return [Stretch(total, lambda t: centre + values[np.searchsorted(starts, t, "right") - 1])]
-
-
-def _prbs(rng: np.random.Generator, total: float, centre: float, reach: Reach):
-    clock = rng.uniform(0.1, 0.25)
-    starts, values = _levels(rng, total, 0.5 * reach.size_rad, clock, clock, True)
     return [Stretch(total, lambda t: centre + values[np.searchsorted(starts, t, "right") - 1])]
 
 
@@ -416,7 +379,7 @@ def _chirp(rng: np.random.Generator, total: float, centre: float, reach: Reach):
 
 MOTIONS = {
     "tones": _tones, "tones_unnamed": _one_after_another, "walk": _walk, "teleop": _teleop,
-    "steps": _steps, "chirp": _chirp, "prbs": _prbs,
+    "steps": _steps, "chirp": _chirp, "prbs": partial(_steps, two=True),
 }  # fmt: skip
 
 
@@ -425,43 +388,22 @@ MOTIONS = {
 
 @dataclass(frozen=True)
 class Bus:
-    """How the host sends and reads.
-
-    Attributes
-    ----------
-    rate_hz : float
-    jitter : float
-        Standard deviation of the time of a turn, as a share of the period.
-    read_after_s : float
-        From a command to the read of the same row; negative where the read comes first.
-    quantum_rad, noise_rad, offset_rad, age_s : float
-    stamps : {"true", "end"}
-        Send and read times of each row, or one time at its end.
-    stated : bool
-        Whether the header states if readings are live.
-    poll_s, loss : float
-        Of a polled bus; 0 for live readings.
-    resampled_hz : float
-        Rate to which rows are interpolated; 0 for not.
-    drift : float
-        By which share the clock of the readings runs faster than that of the commands.
-    header : dict
-    """
+    """How the host sends and reads."""
 
     rate_hz: float
-    jitter: float
-    read_after_s: float
+    jitter: float  # standard deviation of the time of a turn, as a share of the period
+    read_after_s: float  # from a row's command to its read; negative where the read comes first
     quantum_rad: float
     noise_rad: float
     offset_rad: float
-    age_s: float
-    stamps: str = "true"
-    stated: bool = True
-    poll_s: float = 0.0
+    age_s: float  # of live readings
+    stamps: str = "true"  # or "end": one time per row, when its last transaction is over
+    stated: bool = True  # whether the header states if readings are live
+    poll_s: float = 0.0  # period of a polled bus; 0 for live readings
     loss: float = 0.0
-    resampled_hz: float = 0.0
-    drift: float = 0.0
-    setup: dict | None = None
+    resampled_hz: float = 0.0  # rate to which rows are interpolated; 0 for not
+    drift: float = 0.0  # share by which the readings' clock is faster than that of the commands
+    setup: dict | None = None  # of the servo, as the header states it
 
 
 @dataclass(frozen=True)
@@ -512,25 +454,39 @@ def _sts3215(rng: np.random.Generator) -> Servo:
 
 
 def _featured(rng: np.random.Generator, kind: str, servo: Servo, size: float) -> Servo:
-    """The servo with the feature of its kind."""
+    """The servo with the feature of its kind; the draws of a kind come in the order they stand."""
     k, total = servo.stiffness, servo.damping + servo.back_emf
+    uniform = rng.uniform
+    simple: dict[str, Callable[[], dict[str, float]]] = {
+        "low_pass": lambda: {"low_pass_s": _log(rng, 0.005, 0.06)},
+        "dead_zone": lambda: {"dead_zone": min(_log(rng, 0.002, 0.03), 0.2 * size)},
+        # below k * total the loop is stable
+        "integral": lambda: {"integral": k * total * uniform(0.05, 0.4),
+                             "integral_clamp": servo.effort * uniform(0.1, 0.5)},
+        "gravity": lambda: {"gravity": min(_log(rng, 5, 150), 0.6 * servo.effort),
+                            "gravity_phase": uniform(-np.pi, np.pi)},
+        "stribeck": lambda: {"stribeck": uniform(0.3, 1.5), "stribeck_speed": _log(rng, 0.03, 0.5)},
+        "cogging": lambda: {"cogging": servo.friction * uniform(0.3, 1.5),
+                            "cogging_per_rad": _log(rng, 6, 60)},
+        "bent_pot": lambda: {"bend": _log(rng, 0.05, 0.3), "bend_per_rad": 1 / uniform(0.2, 1.0),
+                             "bend_phase": uniform(-np.pi, np.pi)},
+        "asymmetric": lambda: {"asymmetry": uniform(0.1, 0.4)},
+        "sag": lambda: {"sag": uniform(0.1, 0.4)},
+        "jitter_dead_time": lambda: {"dead_time_jitter_s": _log(rng, 0.001, 0.01)},
+        "drifting_dead_time": lambda: {"dead_time_drift_s": servo.dead_time_s * uniform(0.2, 1.0)},
+    }  # fmt: skip
+    if kind in simple:
+        return servo._replace(**simple[kind]())
     if kind == "profile":
         speed = _log(rng, 2, 15) if rng.random() < 0.5 else NEVER
         return servo._replace(acceleration_limit=_log(rng, 10, 200), speed_limit=speed)
-    if kind == "low_pass":
-        return servo._replace(low_pass_s=_log(rng, 0.005, 0.06))
-    if kind == "dead_zone":
-        return servo._replace(dead_zone=min(_log(rng, 0.002, 0.03), 0.2 * size))
-    if kind == "integral":
-        gain = k * total * rng.uniform(0.05, 0.4)  # below k * total the loop is stable
-        return servo._replace(integral=gain, integral_clamp=servo.effort * rng.uniform(0.1, 0.5))
     if kind == "slow_loop":
         period = 1 / _log(rng, 20, 50)
         if rng.random() < 0.5:  # a fast loop that takes over commands at its frame rate
             return servo._replace(latch_s=period)
         while True:  # a loop that is slow itself: weaker, and stable
             k, ratio = _log(rng, 50, 4000), _log(rng, 0.3, 1.5)
-            total, share = 2 * ratio * np.sqrt(k), rng.uniform(0.5, 1.0)
+            total, share = 2 * ratio * np.sqrt(k), uniform(0.5, 1.0)
             slow = servo._replace(
                 stiffness=k, damping=(1 - share) * total, back_emf=share * total, loop_s=period,
                 friction=min(servo.friction, 0.3 * k * size), speed_limit=NEVER,
@@ -538,8 +494,8 @@ def _featured(rng: np.random.Generator, kind: str, servo: Servo, size: float) ->
             if _radius(slow) < 0.9:
                 return slow
     if kind in ("backlash", "flexible"):
-        m = rng.uniform(0.5, 0.9)
-        two = servo._replace(motor_share=m, link_friction_share=rng.uniform(0.1, 0.4))
+        m = uniform(0.5, 0.9)
+        two = servo._replace(motor_share=m, link_friction_share=uniform(0.1, 0.4))
         if kind == "flexible":
             w = 2 * np.pi * _log(rng, 6, 25)  # resonance of the link on a held motor
             return two._replace(
@@ -551,29 +507,6 @@ def _featured(rng: np.random.Generator, kind: str, servo: Servo, size: float) ->
             play=min(_log(rng, 0.005, 0.05), 0.3 * size), read_on_motor=0.0,
             loop_on_motor=float(rng.random() < 0.5),
         )  # fmt: skip
-    if kind == "gravity":
-        most = 0.6 * servo.effort
-        return servo._replace(
-            gravity=min(_log(rng, 5, 150), most), gravity_phase=rng.uniform(-np.pi, np.pi)
-        )
-    if kind == "stribeck":
-        return servo._replace(stribeck=rng.uniform(0.3, 1.5), stribeck_speed=_log(rng, 0.03, 0.5))
-    if kind == "cogging":
-        size = servo.friction * rng.uniform(0.3, 1.5)
-        return servo._replace(cogging=size, cogging_per_rad=_log(rng, 6, 60))
-    if kind == "bent_pot":
-        return servo._replace(
-            bend=_log(rng, 0.05, 0.3), bend_per_rad=1 / rng.uniform(0.2, 1.0),
-            bend_phase=rng.uniform(-np.pi, np.pi),
-        )  # fmt: skip
-    if kind == "asymmetric":
-        return servo._replace(asymmetry=rng.uniform(0.1, 0.4))
-    if kind == "sag":
-        return servo._replace(sag=rng.uniform(0.1, 0.4))
-    if kind == "jitter_dead_time":
-        return servo._replace(dead_time_jitter_s=_log(rng, 0.001, 0.01))
-    if kind == "drifting_dead_time":
-        return servo._replace(dead_time_drift_s=servo.dead_time_s * rng.uniform(0.2, 1.0))
     return servo
 
 
@@ -653,6 +586,7 @@ def sender(twin: Twin, part: str) -> np.random.Generator:
 
 
 GAP_S = 1.2
+SHIFT_S = 0.001
 
 
 def sends(twin: Twin) -> tuple[Array, Array, NDArray[np.int64]]:
@@ -828,20 +762,25 @@ def _phasor(time: Array, value: Array, hz: float) -> complex:
     return complex(fit[1], fit[2])
 
 
-def lag_truth(
-    twin: Twin, path: Path, sent: Array, commands: Array, longest_s: float = 0.6
-) -> float:
+def lag_truth(twin: Twin, path: Path, sent: Array, commands: Array) -> float:
     """Time shift at which the motion and the held command correlate best [s]."""
-    step = 0.001
-    grid = np.arange(sent[0] - longest_s, path.time_s[-1], step)
+    grid = np.arange(sent[0] - 0.6, path.time_s[-1], SHIFT_S)
     held = commands[np.maximum(np.searchsorted(sent, grid, "right") - 1, 0)]
     moved = np.interp(grid, path.time_s, path.angle)
-    first = round(longest_s / step) + 1
-    window = moved[first:] - moved[first:].mean()
-    scores = []
-    for shift in range(first):
-        earlier = held[first - shift : len(held) - shift]
-        scores.append(window @ (earlier - earlier.mean()) / max(earlier.std(), 1e-12))
+    return best_shift_s(held, moved, SHIFT_S, 0.6) + age_s(twin.bus)
+
+
+def best_shift_s(held: Array, moved: Array, earliest_s: float, longest_s: float) -> float:
+    """Shift of a motion behind its command that correlates best, both every `SHIFT_S` [s]."""
+    early, first = round(earliest_s / SHIFT_S), round(longest_s / SHIFT_S)
+    # one window of the motion against each shifted window of the command
+    last = len(held) - early
+    window = moved[first:last] - moved[first:last].mean()
+    shifts = np.arange(1 - early, first)
+    scores = np.empty(len(shifts))
+    for n, shift in enumerate(shifts):
+        earlier = held[first - shift : last - shift]
+        scores[n] = window @ (earlier - earlier.mean()) / max(earlier.std(), 1e-12)
     top = int(np.clip(np.argmax(scores), 1, len(scores) - 2))
     a, b, c = scores[top - 1 : top + 2]
-    return float(step * (top + 0.5 * (a - c) / (a - 2 * b + c))) + age_s(twin.bus)
+    return float(SHIFT_S * (shifts[top] + 0.5 * (a - c) / (a - 2 * b + c)))

@@ -6,43 +6,37 @@ calibration file calls identified is compared with the truth.
 
     .venv/bin/python benchmarks/wide_twins.py --kinds profile gravity --motions tones walk \
         --count 4 --seed 1 --out twins.json
-    .venv/bin/python benchmarks/wide_twins.py --table twins.json [--detail]
-    .venv/bin/python benchmarks/wide_twins.py --compare before.json after.json
+    .venv/bin/python benchmarks/wide_twins.py --tables before.json after.json
     .venv/bin/python benchmarks/wide_twins.py --self-test
 
-`--out` is a file of JSON lines, one twin each, written as they end; `--resume` continues it.
-Definitions: a number *holds* where its 90 % interval touches the truth, which is an interval itself
-where the servo has no single number (`wide_servo.truths`); a miss counts as the factor (times: ms)
-between the nearer ends; *identified* is what the file calls so, `ratio only` included; *stretch* is
-the factor by which intervals must grow about their values for 90 % to hold.
+`--out` is a file of JSON lines, one twin each, written as they end; a file that is there goes on.
+Of several files in `--tables` the twins count that all have. Definitions: a number *holds* where
+its 90 % interval touches the truth, which is an interval itself where the servo has no single
+number (`wide_servo.truths`); a miss counts as the factor (times: ms) between the nearer ends;
+*identified* is what the file calls so, `ratio only` included; *stretch* is the factor by which
+intervals must grow about their values for 90 % to hold.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import os
-import re
 import resource
-import subprocess
 import sys
 import tempfile
-import time
 import warnings
-from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+from shared import print_rows  # isort: skip
 
 import numpy as np
 import pandas as pd
+import tyro
 from wide_servo import (
     IN_CLASS,
     KINDS,
@@ -62,15 +56,14 @@ import pupper_sysid as ps
 
 JOINT = "knee"
 RATIOS = ("stiffness", "damping", "back_emf", "damping_sum", "friction_loss", "effort_limit")
-QUANTITIES = ("dead_time_s", *RATIOS, "speed_limit", "acceleration_limit", "offset_rad")
-DIFFERENCES = {"dead_time_s": (1e3, "ms"), "offset_rad": (1e3, "mrad"), "lag": (1e3, "ms")}
-"""Quantities whose errors and widths are differences; all others are factors."""
+LAGS = ("lag by tone", "lag of motion")
+QUANTITIES = (
+    "dead_time_s", *RATIOS, "speed_limit", "acceleration_limit", "offset_rad", *LAGS
+)  # fmt: skip
+DIFFERENCES = {"dead_time_s": "ms", "offset_rad": "mrad", **dict.fromkeys(LAGS, "ms")}
+"""Quantities whose errors and widths are differences, in thousandths; all others are factors."""
 NO_LIMIT = 300.0
 """A limit from here on, in rad/s or 100 rad/s², counts as none."""
-GOODNESS = re.compile(
-    r"goodness|misfit|chi2|chi_2|residual_over|over_noise|r_hat|rhat|effective_draws|"
-    r"prior_share|between_rec|converged"
-)
 
 
 # -------------------------------------------------------------------------------------- one twin
@@ -80,13 +73,12 @@ def recording(twin: Twin, rows: Rows, folder: Path) -> ps.Recording:
     """The rows as a user has them: arrays with true times, or a table with one time per row."""
     bus = twin.bus
     if bus.stamps == "end":
-        path = folder / "log.csv"
         columns = {"time_s": rows.sent_s, f"{JOINT}_command_rad": rows.command,
                    f"{JOINT}_position_rad": rows.position, "trial": rows.trial}  # fmt: skip
         if np.isfinite(rows.frequency_hz).any():
             columns["freq_hz"] = rows.frequency_hz
-        pd.DataFrame(columns).to_csv(path, index=False)
-        return ps.load(path)
+        pd.DataFrame(columns).to_csv(folder / "log.csv", index=False)
+        return ps.load(folder / "log.csv")
     metadata: dict[str, Any] = {}
     if bus.stated:
         metadata["readings"] = "polled" if bus.poll_s > 0 else "live"
@@ -99,37 +91,34 @@ def recording(twin: Twin, rows: Rows, folder: Path) -> ps.Recording:
 
 
 def measured(kind: str, motion: str, number: int, seed: int) -> dict[str, Any]:
-    """Calibrate one twin: truth, answers, times."""
+    """Calibrate one twin: truth, answers, processor time."""
     warnings.simplefilter("ignore")
     twin, path, sent, commands = draw_twin(kind, motion, number, seed)
     rows = readings(twin, path)
     record: dict[str, Any] = {
         "kind": kind, "motion": motion, "number": number, "seed": seed,
-        "servo": twin.servo._asdict(),
-        "bus": {k: v for k, v in vars(twin.bus).items() if k != "setup"},
-        "stated_registers": bool((twin.bus.setup or {}).get("registers")),
-        "rows": len(rows.sent_s), "truth": truths(twin, path),
-        "lag_truth": lag_truth(twin, path, sent, commands), "refused": None,
+        "servo": twin.servo._asdict(), "rows": len(rows.sent_s), "refused": None,
     }  # fmt: skip
-    tones = tone_truths(twin, path, sent, commands)
-    wall, processor = time.perf_counter(), _processor_s()
+    begun = _processor_s()
     try:
         with tempfile.TemporaryDirectory() as folder:
             result = ps.calibrate(recording(twin, rows, Path(folder)))
-        joint = result.calibration.joints[JOINT].model_dump(mode="json")
-        lag = result.joints[JOINT].to_dict()["lag"]
     except ps.PupperError as error:
         record["refused"] = str(error)
     else:
-        answers = {t["trial"]: t["lag_s"] for t in lag["by_frequency"]}
-        record["answers"] = answered(joint)
-        record["tones"] = [t | {"answer": answers.get(t["trial"])} for t in tones]
-        record["lag"] = lag["lag_s"]
-        record["goodness"] = {k: v for k, v in leaves(joint) if GOODNESS.search(k)}
+        joint = result.calibration.joints[JOINT].model_dump(mode="json")
+        lag = result.joints[JOINT].to_dict()["lag"]
+        truth = truths(twin, path)
+        record["answers"] = [(q, a, truth[q]) for q, a in answered(joint).items()]
+        by_trial = {t["trial"]: t["lag_s"] for t in lag["by_frequency"]}
+        lags = [(LAGS[0], by_trial.get(t["trial"]), [t["truth"]] * 2)
+                for t in tone_truths(twin, path, sent, commands)]  # fmt: skip
+        if not any(answer for _, answer, _ in lags):
+            lags = [(LAGS[1], lag["lag_s"], [lag_truth(twin, path, sent, commands)] * 2)]
+        record["answers"] += [(q, a | {"identified": "yes"}, t) for q, a, t in lags if a]
         record["calibration"] = joint
-    record["wall_s"] = time.perf_counter() - wall
-    record["processor_s"] = _processor_s() - processor
-    return record
+    record["processor_s"] = _processor_s() - begun
+    return finite(record)
 
 
 def _processor_s() -> float:
@@ -137,56 +126,42 @@ def _processor_s() -> float:
     return sum(u.ru_utime + u.ru_stime for u in used)
 
 
-def leaves(tree: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Values of nested mappings and sequences, by dotted name."""
-    pairs: Iterable = ()
+def finite(tree: Any) -> Any:
+    """Infinite numbers become null, as JSON has none."""
     if isinstance(tree, dict):
-        pairs = tree.items()
-    elif isinstance(tree, list):
-        pairs = enumerate(tree)
-    else:
-        yield name, tree
-    for key, value in pairs:
-        yield from leaves(value, f"{name}.{key}" if name else str(key))
+        return {k: finite(v) for k, v in tree.items()}
+    if isinstance(tree, (list, tuple)):
+        return [finite(v) for v in tree]
+    tree = tree.item() if isinstance(tree, np.generic) else tree
+    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
 
 
 def answered(joint: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Numbers of a joint in the calibration file, by quantity; those that it lacks are absent."""
-    actuator = joint["actuator"]
-    ratios = actuator["ratios_to_armature"]
-    numbers = {name: ratios.get(name) for name in RATIOS if name in ratios}
-    numbers |= {
+    actuator, ratios = joint["actuator"], joint["actuator"]["ratios_to_armature"]
+    numbers = {name: ratios.get(name) for name in RATIOS} | {
+        "damping_sum": ratios["damping_and_back_emf"],
         "dead_time_s": actuator["dead_time_s"],
         "speed_limit": actuator["velocity_limit_rad_s"],
+        "acceleration_limit": (joint["under_load"] or {}).get("acceleration_limit_rad_s2"),
         "offset_rad": joint["feedback"]["offset_rad"],
     }
-    for part in (ratios, actuator, joint):
-        for key, value in part.items():
-            if not (isinstance(value, dict) and "value" in value):
-                continue
-            if "damping" in key and "back_emf" in key:
-                numbers.setdefault("damping_sum", value)
-            if "acceleration_limit" in key:
-                numbers.setdefault("acceleration_limit", value)
-    under_load = joint.get("under_load") or {}
-    for name, value in leaves(under_load):
-        stem, _, leaf = name.rpartition(".")
-        if leaf == "value" and "acceleration_limit" in stem:
-            ends = {k: v for k, v in leaves(under_load) if k.startswith(f"{stem}.")}
-            own = {k.rpartition(".")[2]: v for k, v in ends.items()}
-            numbers.setdefault("acceleration_limit", own | {"value": value})
-    parts = [numbers.get(n) for n in ("damping", "back_emf")]
-    if "damping_sum" not in numbers and all(p and identified(p) for p in parts):
-        numbers["damping_sum"] = {
-            k: sum(p[k] for p in parts if p) for k in ("value", "low", "high")
-        } | {"identified": "yes", "why": "the sum of two identified numbers"}
-    return {n: q for n, q in numbers.items() if q is not None}
+    parts = numbers["damping"], numbers["back_emf"]
+    if numbers["damping_sum"] is None and all(p and identified(p) for p in parts):
+        total = {k: sum(p[k] for p in parts) for k in ("value", "low", "high")}
+        numbers["damping_sum"] = total | {"identified": "yes"}
+    return {name: answer for name, answer in numbers.items() if answer is not None}
+
+
+# ------------------------------------------------------------------------------------ statistics
+
+Answer = tuple[str, dict[str, Any], list[float], dict[str, Any]]
+"""Quantity, answer of the file, truth, and the twin's record."""
 
 
 def identified(answer: dict[str, Any]) -> bool:
     """Whether the file calls a number identified and gives its interval."""
-    ends = [answer.get("low"), answer.get("high")]
-    return answer.get("identified") != "no" and None not in ends
+    return answer["identified"] != "no" and None not in (answer["low"], answer["high"])
 
 
 def holds(answer: dict[str, Any], truth: list[float]) -> bool:
@@ -201,7 +176,7 @@ def miss(quantity: str, answer: dict[str, Any], truth: list[float]) -> float:
     """Distance of the interval from the truth: a factor ≥ 1, or a difference in ms or mrad."""
     low, high = answer["low"], answer["high"]
     if quantity in DIFFERENCES:
-        return DIFFERENCES[quantity][0] * max(low - truth[1], truth[0] - high, 0.0)
+        return 1e3 * max(low - truth[1], truth[0] - high, 0.0)
     if math.isinf(truth[0]):
         return 1.0 if high >= NO_LIMIT else math.inf
     up = low / truth[1] if truth[1] > 0 else math.inf
@@ -209,62 +184,11 @@ def miss(quantity: str, answer: dict[str, Any], truth: list[float]) -> float:
     return max(up, down, 1.0)
 
 
-# ----------------------------------------------------------------------------------------- tables
-
-
-WORDS = ("identified", "holds", "beyond a factor 2", "worst miss", "median width", "stretch")
-Answer = tuple[str, dict[str, Any], list[float], dict[str, Any]]
-"""Quantity, answer of the file, truth, and the twin's record."""
-
-
-def answers(records: list[dict[str, Any]]) -> list[Answer]:
-    """All answers of all twins, lags included."""
-    every = []
-    for record in records:
-        if record["refused"]:
-            continue
-        for quantity, answer in record["answers"].items():
-            truth = [math.inf if x is None else x for x in record["truth"][quantity]]
-            every.append((quantity, answer, truth, record))
-        for tone in record["tones"]:
-            if tone["answer"] is not None:
-                every.append(("lag by tone", _known(tone["answer"]), [tone["truth"]] * 2, record))
-        if not any(t["answer"] for t in record["tones"]):
-            every.append(
-                ("lag of motion", _known(record["lag"]), [record["lag_truth"]] * 2, record)
-            )
-    return every
-
-
-def _known(interval: dict[str, Any]) -> dict[str, Any]:
-    return interval | {"identified": "yes"}
-
-
-def coverage(rows: list[Answer]) -> dict[str, Any]:
-    """Counts of some answers: all, identified, holding; worst miss, median width."""
-    known = [r for r in rows if identified(r[1])]
-    inside = [r for r in known if holds(r[1], r[2])]
-    misses = [miss(_named(q), a, t) for q, a, t, _ in known]
-    widths = [width(_named(q), a) for q, a, _, _ in known]
-    scores = [stretch(_named(q), a, t) for q, a, t, _ in known]
-    return {
-        "all": len(rows), "identified": len(known), "holds": len(inside),
-        "misses": [m for (q, a, t, _), m in zip(known, misses, strict=True) if not holds(a, t)],
-        "worst": max(misses, default=math.nan),
-        "width": float(np.median(widths)) if widths else math.nan,
-        "stretch": float(np.quantile(scores, 0.9, method="higher")) if scores else math.nan,
-    }  # fmt: skip
-
-
-def _named(quantity: str) -> str:
-    return "lag" if quantity.startswith("lag") else quantity
-
-
 def width(quantity: str, answer: dict[str, Any]) -> float:
     """Ratio of the ends, or their difference in ms or mrad."""
     low, high = answer["low"], answer["high"]
     if quantity in DIFFERENCES:
-        return DIFFERENCES[quantity][0] * (high - low)
+        return 1e3 * (high - low)
     return high / low if low > 0 else math.inf
 
 
@@ -285,32 +209,83 @@ def stretch(quantity: str, answer: dict[str, Any], truth: list[float]) -> float:
     return float(part / whole) if whole > 0 else math.inf
 
 
+# ----------------------------------------------------------------------------------------- tables
+
+
+def answers(records: Iterable[dict[str, Any]]) -> list[Answer]:
+    """All answers of all twins, lags included."""
+    return [
+        (quantity, answer, [math.inf if x is None else x for x in truth], record)
+        for record in records
+        for quantity, answer, truth in record.get("answers", ())
+    ]
+
+
 def share(part: int, whole: int) -> str:
     """Counts, with the percentage."""
     return f"{part} of {whole} ({100 * part / whole:.0f} %)" if whole else "–"
 
 
-def size(quantity: str, value: float) -> str:
-    """A width or a miss with its unit."""
-    if math.isnan(value):
-        return "–"
-    unit = DIFFERENCES.get(_named(quantity))
+def size(value: float, unit: str = "") -> str:
+    """A width or a miss with its unit, or as a factor."""
     digits = f"{value:.3g}" if unit or not 1 < value < 1.1 else f"{value:.4f}"
-    return f"{digits} {unit[1]}" if unit else f"× {digits}".replace("inf", "∞")
+    return f"{digits} {unit}" if unit else f"× {digits}".replace("inf", "∞")
 
 
-def table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> None:
-    """Print a Markdown table."""
-    heads = list(heads)
-    print("\n| " + " | ".join(heads) + " |\n|" + "---|" * len(heads))
-    for row in rows:
-        print("| " + " | ".join(row) + " |")
+def cells(rows: list[Answer]) -> list[str]:
+    """Counts of answers that are identified and hold, worst miss, median width."""
+    known = [r for r in rows if identified(r[1])]
+    unit = DIFFERENCES.get(rows[0][0], "") if rows else ""
+    misses = [miss(q, a, t) for q, a, t, _ in known if not holds(a, t)]
+    widths = [width(q, a) for q, a, _, _ in known]
+    return [
+        share(len(known), len(rows)), share(len(known) - len(misses), len(known)),
+        size(max(misses), unit) if misses else "–",
+        size(float(np.median(widths)), unit) if widths else "–",
+    ]  # fmt: skip
 
 
-def order(quantity: str) -> int:
-    """Place of a quantity in tables."""
-    names = [*QUANTITIES, "lag by tone", "lag of motion"]
-    return names.index(quantity)
+def quantity_row(quantity: str, rows: list[Answer]) -> list[str]:
+    """Cells of one quantity, with far misses and stretch."""
+    shares, held, worst, middle = cells(rows)
+    known = [(q, a, t) for q, a, t, _ in rows if identified(a)]
+    far = "–" if quantity in DIFFERENCES else str(sum(miss(*one) > 2 for one in known))
+    scores = [stretch(*one) for one in known]
+    factor = size(float(np.quantile(scores, 0.9, method="higher"))) if scores else "–"
+    return [quantity, shares, held, far, worst, middle, factor]
+
+
+def print_tables(records: list[dict[str, Any]]) -> None:
+    """Print coverage by quantity, in class and out of it, by kind and by motion."""
+    every = answers(records)
+    spent = [r["processor_s"] for r in records]
+    print(
+        f"\n{len(records)} twins, seeds {sorted({r['seed'] for r in records})}; processor time per "
+        f"twin {np.median(spent):.1f} s (median), {max(spent):.1f} s (largest)"
+    )
+    for record in records:
+        if record["refused"]:
+            print(f"refused: {record['kind']}, {record['motion']}: {record['refused']}")
+    for title, in_class in (("in class", True), ("out of class", False)):
+        part = grouped((r for r in every if (r[3]["kind"] in IN_CLASS) is in_class), lambda r: r[0])
+        print(f"\n{title}")
+        print_rows(
+            ("quantity", "identified", "holds", "beyond a factor 2", "worst miss", "median width",
+             "stretch"), (quantity_row(q, part[q]) for q in QUANTITIES if q in part),
+        )  # fmt: skip
+    both = [
+        (name, rows)
+        for label, names in (("kind", KINDS), ("motion", MOTIONS))
+        for name, rows in ((n, [r for r in every if r[3][label] == n]) for n in names)
+        if rows
+    ]
+    print_rows(
+        ("kind or motion", "dead time: identified", "holds", "worst", "width",
+         "ratios: identified", "holds", "worst", "width", "lag holds"),
+        ((name, *cells([r for r in rows if r[0] == "dead_time_s"]),
+          *cells([r for r in rows if r[0] in RATIOS]), cells([r for r in rows if r[0] in LAGS])[1])
+         for name, rows in both),
+    )  # fmt: skip
 
 
 def grouped(rows: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[Any]]:
@@ -321,160 +296,10 @@ def grouped(rows: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[An
     return groups
 
 
-def print_tables(records: list[dict[str, Any]], detail: bool = False) -> None:
-    """Print coverage by quantity, by kind and by motion; with `detail` by all three."""
-    every = answers(records)
-    refused = [r for r in records if r["refused"]]
-    spent = [r["processor_s"] for r in records]
-    seeds, wall = sorted({r["seed"] for r in records}), sum(r["wall_s"] for r in records)
-    print(f"\n{len(records)} twins, {len(refused)} refused; seeds {seeds}")
-    print(
-        f"processor time per twin {np.median(spent):.1f} s (median), {max(spent):.1f} s (largest), "
-        f"{sum(spent) / 60:.1f} min in all; wall {wall / 60:.1f} min"
-    )
-    for text, count in sorted(grouped(refused, lambda r: r["refused"].split(":")[0]).items()):
-        print(f"refused, {len(count)}: {text}")
-    for name, chosen in (("in class", True), ("out of class", False)):
-        part = [r for r in every if (r[3]["kind"] in IN_CLASS) is chosen]
-        if part:
-            print(f"\n{name}")
-            quantities = grouped(part, lambda r: r[0])
-            table(
-                ("quantity", *WORDS),
-                (quantity_row(q, quantities[q]) for q in sorted(quantities, key=order)),
-            )
-    heads = ("dead time: identified", "holds", "worst", "width",
-             "ratios: identified", "holds", "worst", "width", "lag holds",
-             "processor s")  # fmt: skip
-    kinds = grouped(every, lambda r: r[3]["kind"])
-    motions = grouped(every, lambda r: r[3]["motion"])
-    both = grouped(every, lambda r: (r[3]["kind"], r[3]["motion"]))
-    table(("kind", *heads), ((k, *cells(kinds[k])) for k in KINDS if k in kinds))
-    table(("motion", *heads), ((m, *cells(motions[m])) for m in MOTIONS if m in motions))
-    table(
-        ("kind, motion", *heads),
-        ((f"{k}, {m}", *cells(both[k, m])) for k in KINDS for m in MOTIONS if (k, m) in both),
-    )
-    goodness(records)
-    if detail:
-        for quantity, rows in sorted(
-            grouped(every, lambda r: r[0]).items(), key=lambda x: order(x[0])
-        ):
-            parts = grouped(rows, lambda r: (r[3]["kind"], r[3]["motion"]))
-            table(
-                (quantity, *WORDS),
-                (
-                    (f"{k}, {m}", *quantity_row(quantity, parts[k, m])[1:])
-                    for k in KINDS for m in MOTIONS if (k, m) in parts
-                ),
-            )  # fmt: skip
-
-
-def quantity_row(quantity: str, rows: list[Answer]) -> tuple[str, ...]:
-    """Cells of one quantity."""
-    c = coverage(rows)
-    far = "–" if _named(quantity) in DIFFERENCES else str(sum(m > 2 for m in c["misses"]))
-    return (
-        quantity, share(c["identified"], c["all"]), share(c["holds"], c["identified"]), far,
-        size(quantity, c["worst"]) if c["misses"] else "–", size(quantity, c["width"]),
-        size("", c["stretch"]),
-    )  # fmt: skip
-
-
-def cells(rows: list[Answer]) -> tuple[str, ...]:
-    """Dead time, ratios, lags and time of some twins."""
-    row = []
-    for quantities, unit in ((("dead_time_s",), "dead_time_s"), (RATIOS, "ratio")):
-        c = coverage([r for r in rows if r[0] in quantities])
-        row += [share(c["identified"], c["all"]), share(c["holds"], c["identified"]),
-                size(unit, c["worst"]) if c["misses"] else "–", size(unit, c["width"])]  # fmt: skip
-    lags = coverage([r for r in rows if r[0].startswith("lag")])
-    twins = {(r[3]["kind"], r[3]["motion"], r[3]["number"]): r[3]["processor_s"] for r in rows}
-    return (
-        *row,
-        share(lags["holds"], lags["identified"]),
-        f"{np.median(list(twins.values())):.1f}",
-    )
-
-
-def goodness(records: list[dict[str, Any]]) -> None:
-    """Print what the files say of their fit by kind: medians of numbers, the commonest word."""
-    by_name = defaultdict(lambda: defaultdict(list))
-    for record in records:
-        for name, value in (record.get("goodness") or {}).items():
-            if value is not None:
-                by_name[name][record["kind"]].append(value)
-    common = [n for n, by in by_name.items() if sum(map(len, by.values())) >= len(records) / 4][:10]
-    if common:
-        kinds = [k for k in KINDS if any(by_name[n][k] for n in common)]
-        rows = ((k, *(summary(by_name[n][k]) for n in common)) for k in kinds)
-        table(("goodness of fit", *common), rows)
-
-
-def summary(values: list[Any]) -> str:
-    """Median of numbers, or the commonest of other values with its share."""
-    if not values:
-        return "–"
-    if all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in values):
-        return f"{np.median(values):.3g}"
-    word, count = Counter(map(str, values)).most_common(1)[0]
-    return f"{word[:30]}, {share(count, len(values))}"
-
-
-def print_comparison(before: list[dict[str, Any]], after: list[dict[str, Any]]) -> None:
-    """Print two versions side by side on the twins that both have."""
-
-    def key(record: dict[str, Any]) -> tuple:
-        return tuple(record[k] for k in ("kind", "motion", "number", "seed"))
-
-    common = {key(r) for r in before} & {key(r) for r in after}
-    sides = [[r for r in records if key(r) in common] for records in (before, after)]
-    refused = " → ".join(str(sum(bool(r["refused"]) for r in s)) for s in sides)
-    spent = " → ".join(f"{np.mean([r['processor_s'] for r in s]):.1f}" for s in sides)
-    print(f"{len(common)} twins in both; refused {refused}; processor s per twin {spent}")
-    every = [answers(s) for s in sides]
-    heads = ("identified", "still identified", "holds", "worst miss", "median width")
-    for title, of in (
-        ("in class", lambda k: k in IN_CLASS),
-        ("out of class", lambda k: k not in IN_CLASS),
-    ):
-        parts = [[r for r in rows if of(r[3]["kind"])] for rows in every]
-        names = sorted({r[0] for r in parts[0]} | {r[0] for r in parts[1]}, key=order)
-        if names:
-            print(f"\n{title}")
-            rows = [[[r for r in p if r[0] == q] for p in parts] for q in names]
-            table(
-                ("quantity", *heads),
-                ((q, *pair(own, q, key)) for q, own in zip(names, rows, strict=True)),
-            )
-    for label in ("kind", "motion"):
-        rows = []
-        for name in KINDS if label == "kind" else MOTIONS:
-            parts = [[r for r in p if r[3][label] == name] for p in every]
-            if any(parts):
-                dead = [[r for r in p if r[0] == "dead_time_s"] for p in parts]
-                ratios = [[r for r in p if r[0] in RATIOS] for p in parts]
-                rows.append((name, *pair(dead, "dead_time_s", key), *pair(ratios, "ratio", key)))
-        table((label, *(f"{q}: {h}" for q in ("dead time", "ratios") for h in heads)), rows)
-
-
-def pair(parts: list[list[Answer]], quantity: str, key: Callable) -> tuple[str, ...]:
-    """Cells of one quantity in two versions."""
-    a, b = map(coverage, parts)
-    known = [{(key(r[3]), r[0]) for r in p if identified(r[1])} for p in parts]
-    kept = share(len(known[0] & known[1]), len(known[0]))
-    return (
-        f"{a['identified']} → {b['identified']} of {max(a['all'], b['all'])}", kept,
-        f"{share(a['holds'], a['identified'])} → {share(b['holds'], b['identified'])}",
-        f"{size(quantity, a['worst'])} → {size(quantity, b['worst'])}",
-        f"{size(quantity, a['width'])} → {size(quantity, b['width'])}",
-    )  # fmt: skip
-
-
 # -------------------------------------------------------------------------------------- self-test
 
 
-def self_test() -> None:
+def check_simulator() -> None:
     """Compare the simulator with closed forms, and 0.2 ms with 0.05 ms steps."""
     rng, checks = np.random.default_rng(0), []
     hard = {"dead_time_s": 0.0, "friction": 0.0, "effort": 1e9}
@@ -550,127 +375,49 @@ def self_test() -> None:
 # -------------------------------------------------------------------------------------------- main
 
 
-def read_records(path: Path) -> list[dict[str, Any]]:
-    """Twins of a file; a last line that was cut short is left out."""
-    lines = path.read_text().splitlines()
-    records = []
-    for n, line in enumerate(lines):
-        try:
-            records.append(json.loads(line))
-        except json.JSONDecodeError:
-            if n < len(lines) - 1:
-                raise
-    return records
+def key(record: dict[str, Any]) -> tuple[str, str, int, int]:
+    """What names a twin."""
+    return record["kind"], record["motion"], record["number"], record["seed"]
 
 
-def finite(tree: Any) -> Any:
-    """Infinite numbers become null, as JSON has none."""
-    if isinstance(tree, dict):
-        return {k: finite(v) for k, v in tree.items()}
-    if isinstance(tree, (list, tuple)):
-        return [finite(v) for v in tree]
-    if isinstance(tree, np.generic):
-        tree = tree.item()
-    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
+def read_records(path: Path) -> dict[tuple[str, str, int, int], dict[str, Any]]:
+    """Twins of a file."""
+    lines = path.read_text().splitlines() if path.exists() else []
+    return {key(record): record for record in map(json.loads, lines)}
 
 
-def line(record: dict[str, Any]) -> str:
-    """One twin in one line."""
-    name = f"{record['kind']:>18} {record['motion']:<13} {record['number']:>3}"
-    if record["refused"]:
-        return f"{name}  refused: {record['refused'][:90]}"
-    words = []
-    for quantity, answer, truth, _ in answers([record]):
-        if quantity == "dead_time_s":
-            ends = "…".join(
-                f"{1e3 * x:.1f}" for x in (answer["low"], answer["high"]) if x is not None
-            )
-            words.append(f"dead time {ends} ms of {1e3 * truth[0]:.1f} {answer['identified']}")
-    known = [a for a in answers([record]) if identified(a[1]) and not a[0].startswith("lag")]
-    wrong = [f"{q} {size(q, miss(q, a, t))}" for q, a, t, _ in known if not holds(a, t)]
-    words.append(f"{len(known)} identified, wrong: {', '.join(wrong) or 'none'}")
-    return f"{name}  {'; '.join(words)}  ({record['processor_s']:.1f} s)"
-
-
-def version() -> str:
-    """Commit of the package under test."""
-    done = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=Path(ps.__file__).parent,
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    return done.stdout.strip()
-
-
-def main() -> None:
-    """Run twins, or print the tables of finished ones."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
-    parser.add_argument("--motions", nargs="+", choices=list(MOTIONS), default=list(MOTIONS))
-    parser.add_argument("--count", type=int, default=2, help="twins of each kind and motion")
-    parser.add_argument("--first", type=int, default=0, help="number of the first twin")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--minutes", type=float, default=math.inf, help="start none after that")
-    parser.add_argument("--out", type=Path, default=Path("twins.json"))
-    parser.add_argument("--resume", action="store_true", help="continue the file of --out")
-    parser.add_argument("--table", type=Path, help="print the tables of a file")
-    parser.add_argument("--detail", action="store_true", help="by quantity, kind and motion, too")
-    parser.add_argument("--compare", type=Path, nargs=2, help="two files side by side")
-    parser.add_argument("--self-test", action="store_true")
-    options = parser.parse_args()
-    if options.self_test:
-        return self_test()
-    if options.table:
-        return print_tables(read_records(options.table), options.detail)
-    if options.compare:
-        return print_comparison(*map(read_records, options.compare))
-    if options.out.exists() and not options.resume:
-        sys.exit(f"{options.out} exists. Continue it with --resume, or name another.")
-    done = read_records(options.out) if options.out.exists() else []
-    options.out.write_text("".join(f"{json.dumps(r)}\n" for r in done))  # without a cut line
-    finished = {(r["kind"], r["motion"], r["number"], r["seed"]) for r in done}
+def main(
+    kinds: tuple[str, ...] = KINDS,
+    motions: tuple[str, ...] = tuple(MOTIONS),
+    count: int = 2,
+    seed: int = 1,
+    jobs: int = 1,
+    out: Path = Path("twins.json"),
+    tables: tuple[Path, ...] = (),
+    self_test: bool = False,
+) -> None:
+    """Run `count` twins of each kind and motion, or print the tables of finished ones."""
+    if self_test:
+        return check_simulator()
+    if tables:
+        files = [read_records(path) for path in tables]
+        common = set.intersection(*map(set, files))
+        for file in files:
+            print_tables([r for k, r in file.items() if k in common])
+        return None
+    done = read_records(out)
     # number by number, so that a run that is stopped has some of every kind
-    wanted = [
-        (kind, motion, number, options.seed)
-        for number in range(options.first, options.first + options.count)
-        for kind in options.kinds
-        for motion in options.motions
-    ]
-    todo = [w for w in wanted if w not in finished]
-    start, about = time.monotonic(), {"version": version()}
-    with options.out.open("a") as file:
-        for record in run(
-            todo, options.jobs, lambda: time.monotonic() - start > 60 * options.minutes
-        ):
-            record = finite(record | about)
-            file.write(json.dumps(record) + "\n")
-            file.flush()
-            done.append(record)
-            print(line(record), flush=True)
-    print_tables(done, options.detail)
-
-
-def run(
-    todo: list[tuple[str, str, int, int]], jobs: int, late: Callable[[], bool]
-) -> Iterator[dict[str, Any]]:
-    """Records of the twins as they end; Ctrl-C ends with those that are done."""
-    try:
-        if jobs == 1:
-            for one in todo:
-                if late():
-                    return
-                yield measured(*one)
-            return
-        with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-            waiting = {pool.submit(partial(measured, *one)) for one in todo}
-            for future in as_completed(waiting):
-                yield future.result()
-                if late():
-                    pool.shutdown(wait=False, cancel_futures=True)
-                    return
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
+    wanted = [(k, m, n, seed) for n in range(count) for k in kinds for m in motions]
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool, out.open("a") as file:
+        for future in as_completed(pool.submit(measured, *w) for w in wanted if w not in done):
+            record = future.result()
+            done[key(record)] = record
+            print(json.dumps(record), file=file, flush=True)
+            known = [a for a in answers([record]) if identified(a[1])]
+            wrong = ", ".join(q for q, a, t, _ in known if not holds(a, t))
+            print(*key(record), f"{len(known)} identified, wrong: {wrong or 'none'}", flush=True)
+    print_tables(list(done.values()))
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

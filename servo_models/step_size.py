@@ -203,7 +203,7 @@ def nearest_in_loop(
 
 def _loop_tones() -> NDArray[np.float64]:
     """Commands of a control loop: tones one after the other [rad]."""
-    n = np.arange(_LOOP_TONES)
+    n = np.arange(_LOOP_TONES, dtype=float)
     # the golden ratio and its like spread frequencies, amplitudes and phases evenly
     hz, amplitude, turn = (
         low + (high - low) * (n * ratio % 1.0)
@@ -242,7 +242,7 @@ def in_loop(
     batch = np.broadcast_shapes(*(value.shape for value in values.values()))
     # a step takes the mean of the held command: the loop's own where steps divide its period
     edges = CONTROL_S * np.arange(len(commands) + 1)
-    times = time_step_s * np.arange(int(edges[-1] / time_step_s + 1e-9) + 1)
+    times = time_step_s * np.arange(int(edges[-1] / time_step_s + 1e-9) + 1, dtype=float)
     area = np.append(0.0, np.cumsum(commands) * CONTROL_S)
     means = np.diff(np.interp(times, edges, area)) / time_step_s
     rest = np.full(batch, float(commands[0]))

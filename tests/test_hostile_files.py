@@ -18,7 +18,8 @@ import shutil
 import sqlite3
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -400,35 +401,34 @@ def good_files(tmp_path_factory) -> Callable[[str], Path]:
     return good
 
 
+@contextmanager
+def lent(good_files, name: str) -> Iterator[tuple[Path, bytes]]:
+    """Path and content of a good file, which may be damaged in the block."""
+    if KINDS[name].needs:
+        pytest.importorskip(KINDS[name].needs)
+    path = good_files(name)
+    whole = path.read_bytes()
+    try:
+        yield path, whole
+    finally:
+        path.write_bytes(whole)
+
+
 @pytest.mark.parametrize("name", KINDS)
 @SOME
 @given(damage=damages())
 def test_a_damaged_file_is_read_or_refused_in_a_sentence(good_files, name, damage):
-    kind = KINDS[name]
-    if kind.needs:
-        pytest.importorskip(kind.needs)
-    path = good_files(name)
-    whole = path.read_bytes()
-    try:
+    with lent(good_files, name) as (path, whole):
         path.write_bytes(damage(whole))
-        limited(lambda: kind.read(path))
-    finally:
-        path.write_bytes(whole)
+        limited(lambda: KINDS[name].read(path))
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_what_is_no_file_of_the_kind_at_all_is_refused(good_files, name):
-    kind = KINDS[name]
-    if kind.needs:
-        pytest.importorskip(kind.needs)
-    path = good_files(name)
-    whole = path.read_bytes()
-    try:
+    with lent(good_files, name) as (path, _):
         for content in (b"", b"\n \n\t\n", bytes(range(256)) * 20, b"[" * 100_000):
             path.write_bytes(content)
-            assert limited(lambda: kind.read(path))
-    finally:
-        path.write_bytes(whole)
+            assert limited(lambda: KINDS[name].read(path))
 
 
 @pytest.mark.parametrize(
@@ -440,16 +440,9 @@ def test_what_is_no_file_of_the_kind_at_all_is_refused(good_files, name):
     ],
 )
 def test_control_characters_of_names_are_not_in_the_refusal(good_files, name, good, bad):
-    kind = KINDS[name]
-    if kind.needs:
-        pytest.importorskip(kind.needs)
-    path = good_files(name)
-    whole = path.read_bytes()
-    try:
+    with lent(good_files, name) as (path, whole):
         path.write_bytes(whole.replace(good, bad, 1))
-        assert limited(lambda: kind.read(path))
-    finally:
-        path.write_bytes(whole)
+        assert limited(lambda: KINDS[name].read(path))
 
 
 # ------------------------------------------------------------------------------------------ frames

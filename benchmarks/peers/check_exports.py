@@ -17,7 +17,13 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from shared import ROOT, print_rows  # isort: skip
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +33,9 @@ from pupper_sysid.sim.export.check import compiled, held, moved_by, unseen_tones
 from pupper_sysid.sim.export.export import SIMULATORS
 from pupper_sysid.sim.export.shared import ExportedServos
 from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
+from support import exported_servos as ours
 
-HERE = Path(__file__).resolve().parent
-ROOT = HERE.parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
-
+HERE = ROOT / "benchmarks/peers"
 CARDS = (str(ROOT / "data/samples/calibrated.yaml"), "sts3215-bam-m1", "sts3215-open-duck")
 STEPS_S = (0.002, 0.005)
 VENVS = Path(os.environ.get("EXPORT_VENVS", HERE))
@@ -64,18 +68,15 @@ def fetched(package: str, folder: Path) -> tuple[str, Path]:
 
 def fields(root: Path, part: str, names: tuple[str, ...]) -> set[str]:
     """Annotated fields of some classes, wherever below `part` they stand."""
-    found: set[str] = set()
-    for path in root.rglob("*.py"):
-        if part not in path.as_posix():
-            continue
-        for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.ClassDef) and node.name in names:
-                found |= {
-                    b.target.id
-                    for b in node.body
-                    if isinstance(b, ast.AnnAssign) and isinstance(b.target, ast.Name)
-                }
-    return found
+    return {
+        field.target.id
+        for path in root.rglob("*.py")
+        if part in path.as_posix()
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.ClassDef) and node.name in names
+        for field in node.body
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+    }
 
 
 def ran(
@@ -102,36 +103,24 @@ def ran(
     return out["position"], out["reading"]
 
 
-def print_parity(folder: Path) -> None:
-    """Print how far each card is from its own model in each simulator that is installed."""
-    print(
-        "\n| card | step ms | simulator | tones mrad | walk mrad | readings: age ms | of the card "
-        "| whole steps would cost mrad |\n|---|---|---|---|---|---|---|---|"
-    )
-    tones, walk = unseen_tones(), walk_commands()
-    for card in CARDS:
-        for step_s in STEPS_S:
-            servos = ExportedServos.of(load_calibration(card), step_s)
-            for simulator in ("mujoco", "mjlab", "newton", "isaaclab"):
-                if simulator != "mujoco" and not (VENVS / f".venv-{simulator}").exists():
-                    continue
-                apart, age = [], np.nan
-                for commands in (tones, walk):
-                    there, readings = ran(simulator, servos, commands, folder)
-                    here = own_motion(servos, commands, len(there))
-                    apart.append(1e3 * np.sqrt(np.mean((there - here) ** 2)))
-                    age = mean_age_s(there, readings, step_s)
-                held_s = np.mean([
-                    servos.calibration.held_feedback(n).mean_age_s
-                    for n in servos.calibration.joint_names
-                ])  # fmt: skip
-                of_card = f"{1e3 * held_s:.1f}" if simulator != "mujoco" else ""
-                shown = f"{1e3 * age:.1f}" if simulator != "mujoco" else ""
-                cost = 1e3 * servos.cost_of_whole_steps()
-                print(
-                    f"| {Path(card).stem} | {1e3 * step_s:g} | {simulator} | {apart[0]:.2f} "
-                    f"| {apart[1]:.2f} | {shown} | {of_card} | {cost:.1f} |"
-                )
+def parity(folder: Path) -> Iterator[list[str]]:
+    """Rows: how far each card is from its own model in each simulator that is installed."""
+    for card, step_s in product(CARDS, STEPS_S):
+        servos = ExportedServos.of(load_calibration(card), step_s)
+        of = servos.calibration
+        held_s = np.mean([of.held_feedback(name).mean_age_s for name in of.joint_names])
+        cost = f"{1e3 * servos.cost_of_whole_steps():.1f}"
+        for simulator in ("mujoco", "mjlab", "newton", "isaaclab"):
+            if simulator != "mujoco" and not (VENVS / f".venv-{simulator}").exists():
+                continue
+            apart, age = [], np.nan
+            for commands in (unseen_tones(), walk_commands()):
+                there, readings = ran(simulator, servos, commands, folder)
+                off = there - own_motion(servos, commands, len(there))
+                apart.append(f"{1e3 * np.sqrt(np.mean(off**2)):.2f}")
+                age = mean_age_s(there, readings, step_s)
+            ages = ["", ""] if simulator == "mujoco" else [f"{1e3 * x:.1f}" for x in (age, held_s)]
+            yield [Path(card).stem, f"{1e3 * step_s:g}", simulator, *apart, *ages, cost]
 
 
 def own_motion(servos: ExportedServos, commands: NDArray, steps: int) -> NDArray[np.float64]:
@@ -158,28 +147,30 @@ def mean_age_s(positions: NDArray, readings: NDArray, step_s: float) -> float:
     return float(ages[int(np.argmin(errors))])
 
 
+def names(folder: Path) -> Iterator[list[str]]:
+    """Rows: the fields that we write and that the released packages do not know."""
+    for package, written in (("isaaclab", ours.ISAACLAB), ("mjlab", ours.MJLAB)):
+        version, root = fetched(package, folder)
+        yield [package, version, *sorted(written - fields(root, *_CLASSES[package]))]
+    version, root = fetched("newton", folder)
+    text = {p.stem: p.read_text() for p in root.rglob("*.py") if p.stem in _NEWTON}
+    yield ["newton", version, *sorted(n for k, own in _NEWTON.items() for n in own
+                                      if n not in text[k])]  # fmt: skip
+
+
 def main() -> None:
     """Print what was found; ends with 1 if a name is unknown."""
-    from support import exported_servos as ours
-
-    bad = 0
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        print("| simulator | released | fields we write that it does not know |")
-        print("|---|---|---|")
-        for package, held in (("isaaclab", ours.ISAACLAB), ("mjlab", ours.MJLAB)):
-            version, root = fetched(package, folder)
-            there = fields(root, *_CLASSES[package])
-            bad += len(held - there)
-            print(f"| {package} | {version} | {', '.join(sorted(held - there)) or 'none'} |")
-        version, root = fetched("newton", folder)
-        text = {p.stem: p.read_text() for p in root.rglob("*.py") if p.stem in _NEWTON}
-        unknown = sorted(n for k, names in _NEWTON.items() for n in names if n not in text[k])
-        bad += len(unknown)
-        print(f"| newton | {version} | {', '.join(unknown) or 'none'} |")
-
-        print_parity(folder)
-    sys.exit(1 if bad else 0)
+        rows = list(names(Path(name)))
+        print_rows(
+            ("simulator", "released", "fields we write that it does not know"),
+            ((package, version, ", ".join(bad) or "none") for package, version, *bad in rows),
+        )
+        print_rows(
+            ("card", "step ms", "simulator", "tones mrad", "walk mrad", "readings: age ms",
+             "of the card", "whole steps would cost mrad"), parity(Path(name)),
+        )  # fmt: skip
+    sys.exit(any(len(row) > 2 for row in rows))
 
 
 if __name__ == "__main__":

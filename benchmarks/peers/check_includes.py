@@ -23,6 +23,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from shared import print_rows  # isort: skip
+
 from pupper_sysid.common.errors import PupperError
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
@@ -105,33 +108,32 @@ def rises_apart_s(model: mujoco.MjModel, servos: ExportedServos) -> float:
     return worst
 
 
+def rows(folder: Path, out: Path, counts: Counter[str]) -> Iterator[list[str]]:
+    """A row per model of a folder, and what it counts as."""
+    for path in with_hinges(folder):
+        label = path.relative_to(folder).as_posix()
+        try:
+            text, servos = to_model(load_calibration(CARD), path, out)
+        except PupperError as error:
+            counts["refused"] += 1
+            yield [label, f"refused: {str(error).replace(str(path), path.name)}", ""]
+            continue
+        out.write_text(text)
+        model = mujoco.MjModel.from_xml_path(str(out))
+        numbers = compiled_numbers(model, servos).values()
+        equal = all(np.allclose(*pair, rtol=1e-12, atol=0) for pair in numbers)
+        apart = rises_apart_s(model, servos)
+        counts["same servo" if equal and apart < LATE_S else "another servo"] += 1
+        yield [label, str(len(servos.calibration.joints)), f"{1e3 * apart:.3f}"]
+
+
 def main() -> None:
     """Print a row per model and the count; ends with 1 if a servo is another one in a model."""
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as name:
-        folders = [Path(arg) for arg in sys.argv[1:]] or [downloaded(Path(name))]
         out = Path(name) / "with_servos.xml"
-        print("| model | servos | step apart ms |\n|---|---|---|")
-        for folder in folders:
-            for path in with_hinges(folder):
-                label = path.relative_to(folder).as_posix()
-                try:
-                    text, servos = to_model(load_calibration(CARD), path, out)
-                except PupperError as error:
-                    counts["refused"] += 1
-                    print(f"| {label} | refused: {str(error).replace(str(path), path.name)} | |")
-                    continue
-                out.write_text(text)
-                model = mujoco.MjModel.from_xml_path(str(out))
-                numbers = compiled_numbers(model, servos).values()
-                equal = all(np.allclose(*pair, rtol=1e-12, atol=0) for pair in numbers)
-                apart = rises_apart_s(model, servos)
-                same = equal and apart < LATE_S
-                counts["same servo" if same else "another servo"] += 1
-                print(
-                    f"| {label} | {len(servos.calibration.joints)} | {1e3 * apart:.3f} |",
-                    flush=True,
-                )
+        for folder in [Path(arg) for arg in sys.argv[1:]] or [downloaded(Path(name))]:
+            print_rows(("model", "servos", "step apart ms"), rows(folder, out, counts))
     print(", ".join(f"{key}: {count}" for key, count in counts.items()))
     sys.exit(1 if counts["another servo"] else 0)
 

@@ -12,20 +12,19 @@ measured (held), against fresh readings of tones it has not seen (unseen), again
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
 import subprocess
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from shared import print_rows  # isort: skip
+
 import numpy as np
+import tyro
 from exchange import STEP_S, dump
 from exchange import Trial as PeerTrial
 from numpy.typing import NDArray
@@ -54,6 +53,7 @@ PEERS = {
 }
 RETIMED = "mujoco.sysid, times by pupper-sysid"
 OURS = "pupper-sysid calibrate"
+ERRORS = ("held", "unseen", "raw", "true")
 SLOW = {"BAM 1.0.2, M4", "PACE's fit (CMA-ES)"}
 
 
@@ -125,11 +125,9 @@ def off_truth(tracks: list[NDArray], case: Case) -> float:
     """RMS distance of a model's positions, shape (steps + 1,) per trial, to the true motion."""
     if case.motion is None:
         return float("nan")
-    parts = []
-    for track, true in zip(tracks, case.motion, strict=True):
-        length = min(len(track), len(true))
-        parts.append(track[:length] - true[:length])
-    return rms(parts)
+    lengths = map(min, map(len, tracks), map(len, case.motion))
+    pairs = zip(tracks, case.motion, lengths, strict=True)
+    return rms([track[:n] - true[:n] for track, true, n in pairs])
 
 
 def peer_trials(case: Case, data: tuple[Run, ...], retimed: bool) -> list[PeerTrial]:
@@ -171,12 +169,9 @@ def theirs(
     tracks = [track_of(a["positions_rad"], data) for a in answers]
     held_out = {}
     for (name, out), track in zip(folds.items(), tracks[1:], strict=True):
+        rows = zip(track, data, out, strict=True)
         held_out[name] = np.concatenate(
-            [
-                at_steps(position, one.sample_step) - one.sample_rad
-                for position, one, gone in zip(track, data, out, strict=True)
-                if gone
-            ]
+            [at_steps(p, one.sample_step) - one.sample_rad for p, one, gone in rows if gone]
         )
     scores = score(tracks[0], data, held_out)
     whole, span = answers[0], answers[0]["dead_time_interval_s"]
@@ -199,72 +194,65 @@ def track_of(positions_rad: list[list[float]], data: tuple[Run, ...]) -> list[ND
     ]
 
 
-def table(outcomes: list[Outcome], names: list[str]) -> str:
-    """Medians over the cases that every method of the table has seen, as Markdown."""
-    shared = {o.case for o in outcomes if o.method == names[0]}
-    shared &= set.intersection(*({o.case for o in outcomes if o.method == n} for n in names))
-    lines = [
-        "| method | held | unseen tone | raw | true motion | dead time off, ms | 90 % interval "
-        "holds it | its width ms | s per joint |",
-        "|" + "---|" * 9,
-    ]
-    for name in names:
-        own = [o for o in outcomes if o.method == name and o.case in shared]
-        known = [o for o in outcomes if o.method == name and np.isfinite(o.true)]
+def print_table(outcomes: list[Outcome], names: list[str]) -> None:
+    """Print medians over the cases that every method of the table has seen."""
+    by_method = {n: [o for o in outcomes if o.method == n] for n in names}
+    shared = set.intersection(*({o.case for o in own} for own in by_method.values()))
+
+    def shown(value: float) -> str:
+        return f"{1e3 * value:.1f}" if np.isfinite(value) else "–"
+
+    def cells(name: str) -> list[str]:
+        own = [o for o in by_method[name] if o.case in shared]
+        known = [o for o in by_method[name] if np.isfinite(o.true)]
         spans = [o for o in known if o.covered is not None]
-        middle = [
-            np.median([getattr(o, key) for o in own])
-            for key in ("held", "unseen", "raw", "true", "seconds")
-        ]
-        errors = [f"{1e3 * m:.1f}" if np.isfinite(m) else "–" for m in middle[:4]]
+        errors = [shown(float(np.median([getattr(o, k) for o in own]))) for k in ERRORS]
         off = np.median([abs(o.delay_error_s) for o in known]) if known else np.nan
-        cells = [
-            *errors,
-            f"{1e3 * off:.1f}" if np.isfinite(off) else "–",
-            f"{sum(bool(o.covered) for o in spans)} of {len(spans)}" if spans else "none stated",
-            f"{1e3 * np.median([o.width_s for o in spans]):.1f}" if spans else "–",
-            f"{middle[4]:.1f}",
-        ]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(lines) + f"\n\nErrors in mrad, medians of {len(shared)} recordings."
+        covered = f"{sum(bool(o.covered) for o in spans)} of {len(spans)}" if spans else ""
+        width = np.median([o.width_s for o in spans]) if spans else np.nan
+        seconds = f"{np.median([o.seconds for o in own]):.1f}"
+        return [name, *errors, shown(off), covered or "none stated", shown(width), seconds]
+
+    print_rows(
+        ("method", "held", "unseen tone", "raw", "true motion", "dead time off, ms",
+         "90 % interval holds it", "its width ms", "s per joint"), map(cells, names),
+    )  # fmt: skip
+    print(f"\nErrors in mrad, medians of {len(shared)} recordings.\n")
 
 
 def real_cases(folder: Path) -> list[Case]:
     """The sweeps in a folder of the published recordings."""
-    cases = []
-    for path in sorted(folder.glob("real_motor_*.csv")):
-        recording = load(path)
-        cases += [Case(f"real {joint}", recording, joint) for joint in recording.joints]
-    return cases
+    recordings = [load(path) for path in sorted(folder.glob("real_motor_*.csv"))]
+    return [Case(f"real {joint}", r, joint) for r in recordings for joint in r.joints]
 
 
-def main() -> None:
-    """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--robots", type=int, default=12)
-    parser.add_argument("--slow", type=int, default=2, help="robots given to BAM and PACE, too")
-    parser.add_argument("--real", type=Path, help="folder with real_motor_*.csv")
-    parser.add_argument("--only", help="part of a method's name: that one and ours")
-    options = parser.parse_args()
-    methods = {k: v for k, v in PEERS.items() if not options.only or options.only in k}
+def main(robots: int = 12, slow: int = 2, real: Path | None = None, only: str = "") -> None:
+    """Print the tables: of `robots`, `slow` of them given to BAM and PACE, too, and of a folder.
+
+    `only` is a part of a method's name: that one and ours.
+    """
+    methods = {k: v for k, v in PEERS.items() if only in k}
     if any("mujoco" in name for name in methods):
         methods[RETIMED] = PEERS["mujoco.sysid 4.0.0"]
-    real = real_cases(options.real) if options.real else []
-    groups = (("Real recordings", real), ("Emulated robots", range(options.robots)))
-    for title, members in groups:
+    groups = {
+        "Real recordings": real_cases(real) if real else [],
+        "Emulated robots": range(robots),
+    }
+    for title, members in groups.items():
         outcomes: list[Outcome] = []
         for number, member in enumerate(members):
             case = emulated(member) if isinstance(member, int) else member
             mine, data = ours(case)
             outcomes.append(mine)
             for name, (script, environment) in methods.items():
-                if name in SLOW and isinstance(member, int) and number >= options.slow:
+                if name in SLOW and isinstance(member, int) and number >= slow:
                     continue
                 outcomes.append(theirs(name, script, environment, case, data))
             print(case.name, file=sys.stderr, flush=True)
         if outcomes:
-            print(f"{title}\n\n{table(outcomes, [*methods, OURS])}\n", flush=True)
+            print(title)
+            print_table(outcomes, [*methods, OURS])
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -7,7 +7,8 @@ from this one shows in the latter only.
 
 `env_ratio` is the time of a bare `Batch.step` over that of `PupperEnv.step`, with the same model,
 threads and substeps, and nothing recorded; `end_to_end_ratio` is the rate of whole updates over
-that of environment and update one after the other.
+that of environment and update one after the other. On two cores the former was 0.71 with 20
+environments, 0.89 with 100 and 0.94 with 512, the latter 0.86 to 0.97 by policy (November 2026).
 """
 
 from __future__ import annotations

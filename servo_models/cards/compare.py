@@ -287,11 +287,11 @@ def differences(first: Servo, second: Servo) -> list[Difference]:
         one, other = (getattr(s.pd, key) for s in (first, second))
         if key != "model" and not (one is None and other is None):
             found.append(Difference(_TITLES[key], unit(key), one, other))
-    speeds = [_quantity(s.pd.top_speed_rad_s) for s in (first, second)]
-    found.append(Difference("top speed", "rad/s", *speeds))
+    one, other = (_quantity(s.pd.top_speed_rad_s) for s in (first, second))
+    found.append(Difference("top speed", "rad/s", one, other))
     if first.link_kg_m2 or second.link_kg_m2:
-        moved = [_quantity(s.pd.armature_kg_m2.value + s.link_kg_m2) for s in (first, second)]
-        found.append(Difference("armature and link", "kg·m²", *moved))
+        one, other = (_quantity(s.pd.armature_kg_m2.value + s.link_kg_m2) for s in (first, second))
+        found.append(Difference("armature and link", "kg·m²", one, other))
     return found
 
 

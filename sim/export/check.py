@@ -157,7 +157,7 @@ def _own_motion(
         servo = LoadedServo(carried, loaded.p_gain, time_step_s=actuator.fitted_step_s)
     servo.reset(commands[0])
     moved = servo.rollout(held(commands, servo.time_step_s))
-    return servo.time_step_s * np.arange(len(moved) + 1), np.append(commands[0], moved)
+    return servo.time_step_s * np.arange(len(moved) + 1, dtype=float), np.append(commands[0], moved)
 
 
 def _apart(at: NDArray, moved: NDArray, other_at: NDArray, other: NDArray) -> float:

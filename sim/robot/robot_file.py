@@ -383,8 +383,8 @@ class _Reader:
         names = tuple(self.feet)
         if len(names) < 2:
             raise InputError(
-                f"{self.where}: only one foot ({names[0]}) was found; a robot that walks has two "
-                "or more. Give `feet` in the YAML."
+                f"{self.where}: only one foot ({', '.join(names) or 'or none'}) was found; a robot "
+                "that walks has two or more. Give `feet` in the YAML."
             )
         geoms = [g[0] for g in self.feet.values()]
         feet_at = data.geom_xpos[geoms].copy()
@@ -600,24 +600,24 @@ class _Reader:
                 option.solver = mujoco.mjtSolver.mjSOL_PGS
                 option.iterations = _TRAINING_ITERATIONS
             for joint_name in self.joints:
-                servo, joint = servos[joint_name], own.joint(joint_name)
-                joint.armature = float(servo.armature)
-                joint.frictionloss = float(servo.friction_loss)
-                joint.damping = np.array([float(np.asarray(servo.back_emf)), 0.0, 0.0])
+                servo = {name: float(x) for name, x in servos[joint_name].arrays().items()}
+                joint = own.joint(joint_name)
+                joint.armature, joint.frictionloss = servo["armature"], servo["friction_loss"]
+                joint.damping = np.array([servo["back_emf"], 0.0, 0.0])
                 joint.solref_friction = list(friction_solref(step_s))
                 joint.solimp_friction = list(FRICTION_SOLIMP)
                 actuator = own.add_actuator(
                     name=joint_name, target=joint_name, trntype=mujoco.mjtTrn.mjTRN_JOINT
                 )
-                speed, effort = float(servo.velocity_limit), float(servo.effort_limit)
+                speed, effort = servo["velocity_limit"], servo["effort_limit"]
                 actuator.set_to_pid(
-                    float(servo.stiffness), float(servo.damping),
+                    servo["stiffness"], servo["damping"],
                     slewmax=speed if np.isfinite(speed) else 0.0, ctrlspec=1,
                 )  # fmt: skip
                 actuator.interp = 1
                 # two more than whole steps: MuJoCo silently truncates a delay beyond its buffer
-                actuator.nsample = int(float(servo.dead_time_s) / step_s) + 2
-                actuator.delay = float(servo.dead_time_s)
+                actuator.nsample = int(servo["dead_time_s"] / step_s) + 2
+                actuator.delay = servo["dead_time_s"]
                 if np.isfinite(effort):
                     actuator.forcelimited, actuator.forcerange = 1, [-effort, effort]
             own.compile()

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -260,7 +261,7 @@ def _refuse_missing_joints(calibration: Calibration, name: str, joints: Sequence
         )
 
 
-def _is_folder(given: str | Path | Calibration) -> bool:
+def _is_folder(given: str | Path | Calibration) -> TypeGuard[str | Path]:
     return not isinstance(given, Calibration) and Path(given).is_dir()
 
 

@@ -88,7 +88,7 @@ class _Scan:
         shares = self.shares(operator, pairs, self.paths)
         at = shares.argmin(axis=1)
         return min(
-            (self.bend(shares[n, k], values[k], servo)
+            (self.bend(shares[n, k], values[int(k)], servo)
              for n, (servo, k) in enumerate(zip(self.servos, at, strict=True))), key=_by_nats,
         )  # fmt: skip
 
@@ -370,10 +370,10 @@ def _saturated(trials: Sequence[Trial], step: float, found: dict[str, Bend]) -> 
     if found["play"].nats < bend.nats - 2 * CLEAR_NATS:
         return None
     paths = base.predicted(bend.servo)
-    levels = bend.values
-    bent = [np.clip(x, *levels) for x in paths]
+    lowest, highest = bend.values
+    bent = [np.clip(x, lowest, highest) for x in paths]
     if bend.of_goal:
-        bent = base.predicted(bend.servo, lambda c: np.clip(c, *levels))
+        bent = base.predicted(bend.servo, lambda c: np.clip(c, lowest, highest))
     # the readings follow the bent path, and what the levels cut off moves them no further
     along = np.concatenate([x - x.mean() for x in bent])
     cut = np.concatenate([x - y - np.mean(x - y) for x, y in zip(paths, bent, strict=True)])
@@ -384,8 +384,8 @@ def _saturated(trials: Sequence[Trial], step: float, found: dict[str, Bend]) -> 
     low, high = float(every.min()), float(every.max())
     best: tuple[float, float] | None = None
     for top in (False, True):
-        depth = high - levels[1] if top else levels[0] - low
-        beyond = every > levels[1] if top else every < levels[0]
+        depth = high - highest if top else lowest - low
+        beyond = every > highest if top else every < lowest
         share = float(np.mean(beyond))
         if depth > _DEEP * (high - low) and share > max(_BEYOND_SHARE, best[0] if best else 0.0):
             readings = np.concatenate([s.position_rad for s in base.samples])[beyond]

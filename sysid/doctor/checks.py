@@ -17,7 +17,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePath
-from typing import TypeVar
+from typing import Any, TypeVar
 from zlib import crc32
 
 import numpy as np
@@ -212,8 +212,10 @@ Found = TypeVar("Found")
 
 def as_sequence(recordings: Recordings) -> Sequence[Recording]:
     """The recordings as a sequence."""
-    whole = isinstance(recordings, str | PurePath | Mapping) or not isinstance(recordings, Iterable)
-    several = [recordings] if whole or _is_frame(recordings) else list(recordings)
+    single = isinstance(recordings, str | PurePath | Mapping) or _is_frame(recordings)
+    several: list[Any] = [recordings]
+    if isinstance(recordings, Iterable) and not single:
+        several = list(recordings)
     for one in several:
         if not isinstance(one, Recording):
             kind = type(one).__name__

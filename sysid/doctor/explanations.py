@@ -20,10 +20,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import OptimizeResult, minimize_scalar
+from scipy.optimize import minimize_scalar
 
 from pupper_sysid.common.filters import filtered
 from pupper_sysid.sysid.doctor.findings import REFUSE, Finding
@@ -214,7 +215,7 @@ def explain(trials: Sequence[Trial], step: float, exchanged: bool = False) -> Ex
             return None
     loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
     grid = max(min(loop / 4, _GRID_S), _FINEST_S)
-    lags = grid * np.arange(round(EARLIEST_S / grid), round(LATEST_S / grid) + 1)
+    lags = grid * np.arange(round(EARLIEST_S / grid), round(LATEST_S / grid) + 1, dtype=float)
     live = exchanged or staleness(trials).kind == "live"
     samples, maps, spread = [], [], []
     for t in trials:
@@ -436,8 +437,8 @@ def _delayed(trials: Sequence[Trial], near: float, loop: float) -> Finding | Non
 
     coarse = min(np.arange(-loop, _LONGEST_ECHO_S / 2, loop / 2), key=spread)
     around = (coarse - loop / 2, coarse + loop / 2)
-    fine: OptimizeResult = minimize_scalar(spread, bounds=around, method="bounded")
-    late = float(fine["x"])
+    fine: Any = minimize_scalar(spread, bounds=around, method="bounded")
+    late = float(fine.x)
     if np.mean(np.abs(left(late)) <= near) < _ECHO_SHARE:
         return None
     return Finding("echo_between_rows", REFUSE, {"late_ms": 1e3 * late})

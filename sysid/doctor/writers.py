@@ -94,7 +94,7 @@ def _pushes(joint: Followed, number: int) -> tuple[NDArray[np.float64], ...]:
     rate = np.gradient(path, time)
     design = np.column_stack([np.ones_like(path), path, rate, np.gradient(rate, time)])
     design /= np.maximum(np.abs(design).max(axis=0), 1e-12)
-    weight = np.ones_like(path)
+    weight, rest, usual = np.ones_like(path), position, 0.0
     for _ in range(4):
         rest = position - design @ least_squares(design * weight[:, None], position * weight)
         usual = max(_usual(rest), joint.step / 3, 1e-5)

@@ -234,9 +234,9 @@ def from_about(problem: Problem, best: Fit, rng: np.random.Generator) -> Fit:
     if not problem.structure.scales.free_air:
         return best
     low, high = problem.structure.box
-    shape = (_NEAR, len(best.point))
+    shape, (least, most) = (_NEAR, len(best.point)), np.log(_NEAR_SD)
     for _ in range(_NEAR_ROUNDS):
-        sd = np.exp(rng.uniform(*np.log(_NEAR_SD), (_NEAR, 1))) * problem.structure.scale
+        sd = np.exp(rng.uniform(least, most, (_NEAR, 1))) * problem.structure.scale
         near = np.clip(best.point + sd * rng.standard_normal(shape), low, high)
         fits = local(problem, near, _NEAR_ITERATIONS, _NEAR_STEP)
         before, best = best.cost, min(best, *fits, key=lambda f: f.cost)

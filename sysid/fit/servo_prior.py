@@ -26,7 +26,8 @@ PER_INERTIA = ("stiffness_per_s2", "damping_per_s", "friction_rad_s2", "effort_r
 _AT_GAIN = ("stiffness_per_s2", "damping_per_s", "stiffness", "damping")
 _UNIT_SD = 0.15
 """Of the logarithm of a number, between units: a tenth in stall torques and speeds of one batch of
-hobby servos (the default spread in training), more between batches."""
+hobby servos (the default spread in training), more between batches. With 20 s of one joint of an
+SO-101 and the four others as the prior, errors on a chirp are 0.80 to 1.31 of those with 60 s."""
 _DEAD_TIME_SD = 0.3  # the bus and the host are a part of the dead time, and another robot's
 _GAIN_SD = 0.5  # of stiffness and damping where the P gain of one of the two is not known
 _DOUBTED_SD = 0.3  # of a number whose interval is not to be trusted: the model does not describe it

@@ -349,7 +349,8 @@ def _on(cluster: str, tasks: Sequence[tuple[Any, ...]]) -> Iterator[tuple[str, s
             "`dask scheduler`, and workers with `dask worker ADDRESS`."
         ) from None
     with client, parallel_config(backend="dask"):
-        yield from Parallel(n_jobs=-1)(delayed(_one)(*task) for task in tasks)
+        results: Any = Parallel(n_jobs=-1)(delayed(_one)(*task) for task in tasks)
+        yield from results
 
 
 def _outliers(table: pd.DataFrame, quantities: Sequence[str]) -> list[str]:

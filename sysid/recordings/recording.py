@@ -288,7 +288,7 @@ class Recording:
             )
         if metadata is not None and not isinstance(metadata, Mapping):
             raise InputError(f"{name}: metadata is a {type(metadata).__name__}, not a dictionary.")
-        given = {"imported_from": "a table in memory"} | dict(metadata or {})
+        given: dict[str, Any] = {"imported_from": "a table in memory"} | dict(metadata or {})
         check_metadata(name, given)
         distinct(name, map(str, table.columns))
         table = table.copy()
@@ -313,13 +313,14 @@ class Recording:
                     raise InputError(fault) from None
                 faults[str(column)] = fault
                 continue
-            if column in ("send_time_s", "read_time_s") and table[column].isna().any():
-                row = int(np.flatnonzero(table[column].isna())[0])
+            values = table[column].to_numpy(float)
+            if column in ("send_time_s", "read_time_s") and np.isnan(values).any():
+                row = int(np.flatnonzero(np.isnan(values))[0])
                 raise InputError(
                     f"{name}, column {column}: row {row} has no time (NaN). Leave rows without a "
                     "time out."
                 )
-            if np.isinf(table[column]).any():
+            if np.isinf(values).any():
                 raise InputError(f"{name}, column {column}: a value is infinite.")
         tidy, known, warnings = convert(name, Parsed(given, table, faults=faults), options)
         if "send_time_s" in table and not timed and given.get("read_after_send_s") is None:

@@ -120,7 +120,7 @@ def write_report(
 
     for given in models:  # before the work, not after it
         named = isinstance(given, str | Path) and not is_shipped(given)
-        if named and not Path(given).exists():
+        if named and not Path(str(given)).exists():
             raise InputError(f"`servo` is {given}: there is no such servo model, file or folder.")
     results: dict[str, JointCalibrationResult] = {}
     if calibration is not None:

@@ -24,11 +24,12 @@ from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.robot import draw_robot
 from support.servo_servers import bench_of, on_a_port, still_servos, wait_until
+from support.virtual_time import VirtualTime
 
 PRESET = load_joint_map("mini_pupper_2")
 
 
-class ScriptedBus:
+class ScriptedBus(VirtualTime):
     """Twelve servos in virtual time that stand where the test puts them."""
 
     name = "scripted"
@@ -37,17 +38,10 @@ class ScriptedBus:
         self.joint_names = joint_map.joint_names
         self.counts = np.full(len(self.joint_names), joint_map.file.counts // 2)
         self.confirms, self.limp = confirms, False
-        self._now = 0.0
-
-    def now(self):
-        return self._now
-
-    def sleep_until(self, time_s):
-        self._now = max(self._now, time_s)
 
     def read(self):
         position = np.zeros(len(self.counts))
-        return BusSample(np.full(len(self.counts), self._now), position, self.counts.copy())
+        return BusSample(np.full(len(self.counts), self.time), position, self.counts.copy())
 
     def torque(self, on):
         assert not on, "a calibration never holds"

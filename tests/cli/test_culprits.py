@@ -29,6 +29,7 @@ from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.walking.bus import WalkingBus
 from support.command_line import refused
+from support.virtual_time import VirtualTime
 
 SAMPLES = Path(__file__).parents[2] / "data/samples"
 PERIOD_S, LATE_S = 0.02, 0.055
@@ -104,7 +105,7 @@ def test_a_reader_that_has_gone_ends_the_program_and_a_broken_pipe_elsewhere_is_
 
 
 @dataclass
-class _Bus:
+class _Bus(VirtualTime):
     """One joint that is where it is commanded; an exchange takes as long as it is set to."""
 
     exchange_s: float = 0.0
@@ -116,12 +117,6 @@ class _Bus:
         self.limits = PositionLimits(np.full(1, -2.0), np.full(1, 2.0))
         self.metadata: dict = {}
         self.goal = np.zeros(1)
-
-    def now(self) -> float:
-        return self.time
-
-    def sleep_until(self, time_s: float) -> None:
-        self.time = max(self.time, time_s)
 
     def write(self, position_rad) -> Sent:
         self.goal = position_rad

@@ -10,23 +10,11 @@ import pytest
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.hardware.loop import FixedRateLoop, real_time_priority
 from support.refusals import assert_each_refused
-
-
-class FakeTime:
-    """Time that passes only where a test says so."""
-
-    def __init__(self):
-        self.time = 0.0
-
-    def now(self) -> float:
-        return self.time
-
-    def sleep_until(self, time_s: float) -> None:
-        self.time = max(self.time, time_s)
+from support.virtual_time import VirtualTime
 
 
 def test_ticks_come_at_multiples_of_the_period_whatever_the_work_takes():
-    clock, starts = FakeTime(), []
+    clock, starts = VirtualTime(), []
     loop = FixedRateLoop(clock, 0.02)
     for elapsed in loop.ticks(1.0):
         starts.append(elapsed)
@@ -37,7 +25,7 @@ def test_ticks_come_at_multiples_of_the_period_whatever_the_work_takes():
 
 
 def test_a_slow_tick_is_counted_and_the_schedule_does_not_drift():
-    clock, starts = FakeTime(), []
+    clock, starts = VirtualTime(), []
     loop = FixedRateLoop(clock, 0.02)
     for tick, elapsed in enumerate(loop.ticks(0.5)):
         starts.append(elapsed)
@@ -49,7 +37,7 @@ def test_a_slow_tick_is_counted_and_the_schedule_does_not_drift():
 
 
 def test_ten_misses_in_a_row_end_it_in_a_sentence():
-    clock = FakeTime()
+    clock = VirtualTime()
     loop = FixedRateLoop(clock, 0.02)
     with pytest.raises(SafetyStop, match="too slow or too busy"):
         for _ in loop.ticks(10.0):
@@ -58,7 +46,7 @@ def test_ten_misses_in_a_row_end_it_in_a_sentence():
 
 
 def test_misses_that_are_not_in_a_row_do_not_end_it():
-    clock = FakeTime()
+    clock = VirtualTime()
     loop = FixedRateLoop(clock, 0.02)
     for tick, _ in enumerate(loop.ticks(10.0)):
         clock.time += 0.05 if tick % 3 == 0 else 0.001
@@ -68,7 +56,7 @@ def test_misses_that_are_not_in_a_row_do_not_end_it():
 def test_a_period_that_is_none_is_refused():
     assert_each_refused(
         [(period, "loop_period_s") for period in (0.0, -1.0, float("nan"), float("inf"))],
-        lambda period: FixedRateLoop(FakeTime(), period),
+        lambda period: FixedRateLoop(VirtualTime(), period),
     )
 
 

@@ -188,21 +188,19 @@ def bench_of(emulator: LineEmulator | ProxyEmulator) -> StillBench:
 def on_a_port(emulator: LineEmulator) -> Iterator[SerialPty]:
     """The servos behind a pseudo-terminal that is there for as long as the block."""
     with tempfile.TemporaryDirectory(prefix="fp") as folder:
-        server = SerialPty(emulator, Path(folder) / "bus")
-        thread = threading.Thread(target=server.serve, daemon=True)
-        thread.start()
-        try:
+        with _served(SerialPty(emulator, Path(folder) / "bus")) as server:
             yield server
-        finally:
-            server.stop()
-            thread.join(5)
-            server.close()
 
 
 @contextmanager
 def on_a_socket(emulator: ProxyEmulator, path: Path) -> Iterator[ProxySocket]:
     """The proxy on its socket for as long as the block."""
-    server = ProxySocket(emulator, path)
+    with _served(ProxySocket(emulator, path)) as server:
+        yield server
+
+
+@contextmanager
+def _served(server):
     thread = threading.Thread(target=server.serve, daemon=True)
     thread.start()
     try:

@@ -9,11 +9,17 @@ from pupper_sysid.policies.evaluation.figures import Recorder, Walk
 from pupper_sysid.policies.walks.conditions import Condition
 from pupper_sysid.policies.walks.rollouts import Rollout
 from pupper_sysid.policies.walks.together import walk_together
-from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.config import Randomisation, Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
 STEP = 0.02
 """Their control step [s]."""
+STILL = Randomisation(
+    friction=(0.8, 0.8), payload_kg=(0.0, 0.0), torque_scale=(1.0, 1.0), joint_rad=0.0,
+    joint_rad_s=0.0, base_velocity_m_s=(0.0, 0.0, 0.0), base_rate_rad_s=(0.0, 0.0, 0.0),
+    push_m_s=0.0, on_the_move=0.0,
+)  # fmt: skip
+"""Robots that are alike, start at rest and are not pushed."""
 
 
 def walked(command, forward, left, turn, seconds=6.0, robots=3, action=None) -> Rollout:

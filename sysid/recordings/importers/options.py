@@ -246,16 +246,10 @@ class LogOptions:
             )
 
 
+_KEYS: dict[str, Any] = {name: (kind, None) for name, kind in get_type_hints(LogOptions).items()}
+_KEYS |= {"joints": (list[str] | dict[str, str], []), "units": (dict[str, str], {})}
 _MappingFile = create_model(
-    "_MappingFile",
-    __config__=ConfigDict(extra="forbid", strict=True),
-    joints=(list[str] | dict[str, str], []),
-    units=(dict[str, str], {}),
-    **{
-        name: (kind, None)
-        for name, kind in get_type_hints(LogOptions).items()
-        if name not in ("joints", "units")
-    },
+    "_MappingFile", __config__=ConfigDict(extra="forbid", strict=True), **_KEYS
 )
 """A mapping file holds what `LogOptions` does; see the module."""
 

@@ -332,7 +332,9 @@ def _decided(
         distinct(path, [bare_name(own.joint or _SOLE)] * len(twice), "joints")
         columns = list({getattr(pair, kind).name: getattr(pair, kind) for pair in alike})
         values = [table.columns.get(name) for name in columns]
-        if any(v is None or not np.array_equal(v, values[0], equal_nan=True) for v in values[1:]):
+        first = values[0]
+        if any(v is None or first is None or not np.array_equal(v, first, equal_nan=True)
+               for v in values[1:]):  # fmt: skip
             why = f"{len(columns)} columns may be the {kind} of {own.joint or 'the joint'}"
             _refuse_choices(path, why, alike)
     return best

@@ -12,12 +12,13 @@ from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.hardware.bus import BusSample, Coupling, PositionLimits, Sent
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits, guarded
 from pupper_sysid.hardware.safety.watchdog import Watchdog
+from support.virtual_time import VirtualTime
 
 PERIOD = 0.02
 NOTHING_CHANGED = {"clipped": 0, "slowed": 0, "unsent": 0, "missing": 0}
 
 
-class PlainBus:
+class PlainBus(VirtualTime):
     """Two servos in virtual time that follow at once, until a fault is set."""
 
     name = "plain"
@@ -32,12 +33,6 @@ class PlainBus:
         self.silent = np.zeros(2, bool)
         self.load, self.volts, self.heat, self.status = np.zeros(2), 7.4, 30.0, np.zeros(2, int)
         self.ticks = 0
-
-    def now(self):
-        return self.time
-
-    def sleep_until(self, time_s):
-        self.time = max(self.time, time_s)
 
     def write(self, position_rad):
         if self.deaf:

@@ -11,6 +11,7 @@ from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.hardware.bus import BusSample, Coupling, PositionLimits, Sent
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
+from support.virtual_time import VirtualTime
 
 FEW = settings(max_examples=60, deadline=None)
 MAPS = {
@@ -25,7 +26,7 @@ LONGEST_TICK_S = 0.06
 NEAR = 1e-9
 
 
-class Follower:
+class Follower(VirtualTime):
     """A bus in virtual time whose servos are where they are commanded to be."""
 
     name = "follower"
@@ -36,12 +37,6 @@ class Follower:
         self.metadata: dict = {}
         self.time, self.position = 0.0, self.limits.clip(chosen.rest_pose())
         self.received: list[tuple[float, np.ndarray]] = []
-
-    def now(self):
-        return self.time
-
-    def sleep_until(self, time_s):
-        self.time = max(self.time, time_s)
 
     def write(self, position_rad):
         self.received.append((self.time, position_rad.copy()))

@@ -20,13 +20,14 @@ from pupper_sysid.sim.emulator.pendulum import (
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sysid.sweep.excitation import plan
 from pupper_sysid.sysid.sweep.recorder import record
+from support.virtual_time import VirtualTime
 
 PERIOD_S = 0.02
 COARSE, FINE = 2 * np.pi / 1024, 2 * np.pi / 4096
 STOPS = "its reading stayed within"
 
 
-class Following:
+class Following(VirtualTime):
     """One servo that moves by a share of its command; its reading is noisy by whole steps."""
 
     name, joint_names = "following", ("LF_hip",)
@@ -37,12 +38,6 @@ class Following:
         self.quantum, self.share, self.noise = quantum or COARSE, share, noise_steps
         self.time, self.goal, self.rng = 0.0, np.zeros(1), np.random.default_rng(0)
         self.silent_from_s = np.inf
-
-    def now(self) -> float:
-        return self.time
-
-    def sleep_until(self, time_s: float) -> None:
-        self.time = max(self.time, time_s)
 
     def write(self, position_rad) -> Sent:
         self.goal = position_rad.copy()

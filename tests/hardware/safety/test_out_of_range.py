@@ -19,12 +19,13 @@ from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import HostClock
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
 from pupper_sysid.hardware.serial_servos.settings import supply_band
+from support.virtual_time import VirtualTime
 
 PERIOD_S = 0.02
 NO_NUMBERS = [np.nan, np.inf, -np.inf]
 
 
-class Servos:
+class Servos(VirtualTime):
     """Two servos at rest, whose second reports what it is set to."""
 
     name, joint_names = "servos", ("LF_hip", "LF_thigh")
@@ -35,12 +36,6 @@ class Servos:
         self.time, self.ticks = 0.0, 0
         self.volts, self.degrees, self.load = 7.4, 30.0, 0.1
         self.lost = lambda tick: False
-
-    def now(self) -> float:
-        return self.time
-
-    def sleep_until(self, time_s: float) -> None:
-        self.time = max(self.time, time_s)
 
     def write(self, position_rad) -> Sent:
         return Sent(self.time, position_rad)

@@ -14,17 +14,12 @@ from pupper_sysid.policies.network.hyperparameters import Hyperparameters
 from pupper_sysid.policies.train.learner import Learner, mirrored
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.robot.mini_pupper import foot_position
-from pupper_sysid.sim.walking.config import Observation, Randomisation, Walking
+from pupper_sysid.sim.walking.config import Observation, Walking
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.observation import PRIVILEGED_SIZE
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.tiny_training import HISTORY, observations, tiny_run
-
-STILL = Randomisation(
-    friction=(0.8, 0.8), payload_kg=(0.0, 0.0), torque_scale=(1.0, 1.0), joint_rad=0.0,
-    joint_rad_s=0.0, base_velocity_m_s=(0.0, 0.0, 0.0), base_rate_rad_s=(0.0, 0.0, 0.0),
-    push_m_s=0.0, on_the_move=0.0,
-)  # fmt: skip
+from support.walks import STILL
 
 
 def test_feet_of_mirrored_joints_are_mirrored_feet():

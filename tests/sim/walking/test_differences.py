@@ -12,7 +12,6 @@ from pupper_sysid.sim.walking.config import (
     Commands,
     Curriculum,
     Observation,
-    Randomisation,
     Walking,
 )
 from pupper_sysid.sim.walking.differences import TYPICAL, Differences
@@ -22,13 +21,9 @@ from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 from pupper_sysid.sim.walking.senses import HeldReadings, Imu
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.refusals import assert_each_refused
+from support.walks import STILL
 
 MEASURED = "data/samples/calibrated.yaml"
-STILL = Randomisation(
-    friction=(0.8, 0.8), payload_kg=(0.0, 0.0), torque_scale=(1.0, 1.0), joint_rad=0.0,
-    joint_rad_s=0.0, base_velocity_m_s=(0.0, 0.0, 0.0), base_rate_rad_s=(0.0, 0.0, 0.0),
-    push_m_s=0.0, on_the_move=0.0,
-)  # fmt: skip
 SPAN = 0.02
 
 

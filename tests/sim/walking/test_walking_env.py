@@ -38,15 +38,11 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_ranges
 from pupper_sysid.sim.walking.step import StepResult
 from support.refusals import assert_each_refused
 from support.robot_in_air import error_in_air, lags_in_air
+from support.walks import STILL
 
 MEASURED = "data/samples/calibrated.yaml"
 ACTUATORS = (MEASURED, "ideal")
 H, SPAN = 0.002, 0.02
-STILL = Randomisation(
-    friction=(0.8, 0.8), payload_kg=(0.0, 0.0), torque_scale=(1.0, 1.0), joint_rad=0.0,
-    joint_rad_s=0.0, base_velocity_m_s=(0.0, 0.0, 0.0), base_rate_rad_s=(0.0, 0.0, 0.0),
-    push_m_s=0.0, on_the_move=0.0,
-)  # fmt: skip
 SEEN = Observation(noise=False, base_velocity="true")
 QUIET = Walking(randomisation=STILL, observation=SEEN)
 

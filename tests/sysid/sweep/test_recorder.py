@@ -26,6 +26,7 @@ from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, Plan, plan
 from pupper_sysid.sysid.sweep.recorder import REST_S, record
 from pupper_sysid.sysid.sweep.resume import playback
 from support.command_line import refused
+from support.virtual_time import VirtualTime
 
 PERIOD = 0.019
 
@@ -39,7 +40,7 @@ def short_sweep(joints=("LF_hip",), frequencies=(2.0, 3.0), **more) -> Plan:
     return plan("sine", list(joints), list(frequencies), duration_s=1.0, **more)
 
 
-class ScriptedBus:
+class ScriptedBus(VirtualTime):
     """Perfect servos: a read gives the last goal. Logs calls; is slow or fails on demand."""
 
     name = "scripted"
@@ -51,12 +52,6 @@ class ScriptedBus:
         self.goal, self.time, self.calls = start.astype(float), 0.0, []
         self.written: list[tuple[float, np.ndarray]] = []
         self._slow_at, self._fail_at, self._raises = slow_at, fail_at, raises
-
-    def now(self):
-        return self.time
-
-    def sleep_until(self, time_s):
-        self.time = max(self.time, time_s)
 
     def write(self, position_rad):
         if len(self.written) == self._fail_at:
