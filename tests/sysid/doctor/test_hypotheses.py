@@ -10,6 +10,7 @@ import pytest
 import pupper_sysid as ps
 from pupper_sysid.sysid.doctor.checks import findings
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, RIVALS, USE, WORDS, Finding, rivalled
+from pupper_sysid.sysid.doctor.hypotheses import _since_command_s
 from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.excitation import named_tones
 from support.real_recordings import case, real_recording
@@ -84,19 +85,19 @@ def test_a_servo_that_settles_after_each_step_is_no_echo(rate_hz):
     assert {"echo", "echo_between_rows"} & set(codes(recording))
 
 
-def test_a_fast_servo_that_is_read_before_the_next_command_is_no_echo():
-    """It has arrived by then, so that its readings are the command of the row before."""
-    rng, sent = np.random.default_rng(0), 0.03 * np.arange(450)
-    command = np.repeat(0.2 * rng.standard_normal(45), 10)
-    noise = 2e-3 * rng.standard_normal(450)
+def test_an_echo_is_told_from_a_fast_servo_by_the_time_that_it_had():
+    """A servo that is read before the next command may have arrived, and one at once has not."""
+    rng, sent = np.random.default_rng(0), 0.02 * np.arange(650)
+    command = np.repeat(0.2 * rng.standard_normal(65), 10)
     before = np.concatenate([command[:1], command[:-1]])
-    for position, read, refused in (
-        (before, sent - 0.005, False), (command, sent + 0.001, True),
-    ):  # fmt: skip
+    noise = 2e-3 * rng.standard_normal(650)
+    for position, read, since in ((before, sent - 0.005, 0.015), (command, sent + 0.001, 0.001)):
         log = ps.Recording.from_arrays(
             sent, {"joint": command}, {"joint": position + noise}, read_time_s=read
         )
-        assert ("at_once" in codes(log)) == refused
+        (trial,) = log.trials("joint")
+        assert _since_command_s(trial) == pytest.approx(since)
+        assert ("at_once" in codes(log)) == (since < 0.008)
 
 
 def test_a_runner_up_is_named_in_words_and_by_its_code():
