@@ -1157,6 +1157,14 @@ def _under_load(
     )  # fmt: skip
 
 
+def _sag_rad(structure: Structure, values: NDArray[np.float64], runs: Sequence[Run]) -> float:
+    """Mean deflection under a weight that was fitted [rad]: without one it would be an offset."""
+    servo = dict(zip(kernel.COLUMNS, structure.columns(values[None])[0], strict=True))
+    angles = [r.sample_rad - servo["offset_rad"] - servo["hanging_rad"] for r in runs]
+    pulls = [np.mean(np.sin(a)) / r.p_gain for a, r in zip(angles, runs, strict=True) if len(a)]
+    return float(-servo["gravity_nm"] / servo["stiffness"] * np.mean(pulls))
+
+
 def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice) -> LoadedFit:
     carried, runs = choice.carried, ready.runs
     structure, scales = carried.structure, ready.scales
@@ -1177,6 +1185,9 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice) 
     }
     assert choice.lag.dead_time_s is not None
     numbers["dead_time_s"] = choice.lag.dead_time_s
+    if "gravity_sin" in structure.names:
+        offset, sag = numbers["offset_rad"], _sag_rad(structure, carried.values, runs)
+        numbers["offset_rad"] = _with_other(offset, offset, offset.value + sag)
     speed, undecided = max(_command_speed(r) for r in runs), {}
     named = {_shown(p.name): p for p in structure.parameters}
     for name, interval in numbers.items():
