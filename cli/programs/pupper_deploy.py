@@ -34,7 +34,7 @@ from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.cli.user_errors import end_politely, run_program
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_path
-from pupper_sysid.hardware.address import EMULATED, SOCKET, bus_name, parse_address
+from pupper_sysid.hardware.address import EMULATED, KINDS, SOCKET, bus_name, parse_address
 from pupper_sysid.hardware.bus import header_entries
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.imu import Imu
@@ -69,9 +69,10 @@ class Deploy:
     policy: Annotated[Path | None, tyro.conf.Positional] = None
     """A run (`runs/<name>`) or a policy folder."""
     bus: str = EMULATED
-    """`emulated` (no robot, as fast as it goes), `esp32`, `esp32:SOCKET` or `feetech:DEVICE`."""
+    """`emulated` (no robot, as fast as it goes), `esp32`, `esp32:SOCKET`, `feetech:DEVICE` or
+    `dynamixel:DEVICE`."""
     imu: Path | None = None
-    """Socket of the proxy whose IMU to read, for a Feetech line, which has none."""
+    """Socket of the proxy whose IMU to read, for a serial line, which has none."""
     joint_map: str | None = None
     """Joint map of the bus: a file of `calibrate-joints` or a preset."""
     stack: Literal["auto", "closed-loop", "lstm-servo", "mlp-observer"] = "auto"
@@ -260,14 +261,16 @@ def _open(
         bus = open_things.enter_context(closing(GuardedBus(inner)))
         return bus, inner, body_joint_map(body), inner.robot
     address = parse_address(options.bus)
+    serial = KINDS[address.kind].is_serial
     if body.is_mini_pupper:
-        preset = "mini_pupper_2" if address.kind == "esp32" else "sts3215"
+        preset = "sts3215" if serial else "mini_pupper_2"
         joint_map = chosen_map(options.joint_map) or load_joint_map(preset)
     else:
         joint_map = _map_of(options, body)
-    if address.kind == "feetech" and options.imu is None:
+    if serial and options.imu is None:
         raise InputError(
-            "A Feetech line has no IMU, and a policy needs one. Give the proxy's socket with --imu."
+            "A line of servos has no IMU, and a policy needs one. Give the proxy's socket with "
+            "--imu."
         )
     bus = open_things.enter_context(closing(open_guarded(address, joint_map)))
     if isinstance(bus.bus, Imu):

@@ -102,9 +102,11 @@ class Calibrate(OfRecordings):
             terminal.print_json(result)
         else:
             self._print(result)
-            terminal.err.print(
-                f"Wrote {out} in {time.perf_counter() - started:.1f} s. Next: pupper-sysid report"
+            elapsed = time.perf_counter() - started
+            following = terminal.command(
+                "pupper-sysid", "report", *self.recordings, "--calibration", out
             )
+            terminal.err.print(f"Wrote {out} in {elapsed:.1f} s. Next: {following}")
 
     def _fleet(self, root: Path, started: float) -> None:
         """Many robots, one after the other or side by side."""

@@ -374,5 +374,5 @@ def _print_outcome(outcome: Outcome, written: list[Path], goal: str) -> None:
             terminal.warn(f"{joint}: the goal was not reached: {state.why}.")
     for name in written:
         terminal.out.print(f"  {name}")
-    files = " ".join(map(str, outcome.recordings))
-    terminal.out.print(f"Next:\n  pupper-sysid calibrate {files} --out calibrated.yaml")
+    following = ("calibrate", *outcome.recordings, "--out", "calibrated.yaml")
+    terminal.out.print(f"Next:\n  {terminal.command('pupper-sysid', *following)}")

@@ -22,7 +22,8 @@ class InitRobot:
     """Make a joint map of another robot with hobby servos, and plan its sweeps.
 
     Example: pupper-sysid init-robot my_robot.xml --servo sts3215
-    Without a model file: pupper-sysid init-robot --servo xl330-m288 --joints pan=1,tilt=2
+
+    Example: pupper-sysid init-robot --servo xl330-m288 --joints pan=1,tilt=2
     """
 
     model: tyro.conf.Positional[Path | None] = None
