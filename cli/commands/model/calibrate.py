@@ -53,7 +53,8 @@ class Calibrate(OfRecordings):
     given one's name and _calibrated."""
     stall_torque: float | None = None
     """Torque the servo stalls at [N·m]: sets the scale of all torques and of the armature. By
-    default of the recorded servo's data sheet; a recording with a known load needs none."""
+    default of the recorded servo's data sheet, else that of --from; a recording with a known load
+    needs none."""
     prior: Annotated[str | None, tyro.conf.arg(name="from")] = None
     """Calibration or servo card (`pupper-sysid servo list`) of another unit of the servo: its
     numbers are the prior, so that 20 s in free air are enough."""
