@@ -65,6 +65,7 @@ import log.csv --command "u {joint}" | belong together
 import log.csv --unit furlong | Write rad, deg
 import wide.csv | raise the limits of reading with --read-limit 2.
 calibrate nowhere.csv --stall-torque [0 1e308 -1 1e-9 nan inf] | --stall-torque is
+calibrate log.csv --out [cal.csv calibrated] | a calibration is a .yaml file
 calibrate nowhere.csv --jobs [0 -2 999999999999999999999] | --jobs is
 [calibrate fit-servo report] nowhere.csv --seed 999999999999999999999 | --seed is
 calibrate nowhere.csv --seed -1 | --seed is

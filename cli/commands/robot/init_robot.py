@@ -104,7 +104,14 @@ class InitRobot:
                 }
             )
             return
-        table = terminal.table(f"{target}", "joint", "id", "centre rad", "limits rad", "margin rad")
+        table = terminal.table(
+            f"{target}, servos {self.servo}",
+            "joint",
+            "id",
+            "centre rad",
+            "limits rad",
+            "margin rad",
+        )
         for k, name in enumerate(found.joint_names):
             entry = found.file.joints[name]
             low, high = entry.limits_rad

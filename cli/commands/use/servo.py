@@ -120,7 +120,7 @@ class Diff:
     """A card's name or file, a parameter file of BAM, a calibration or a preset; a robot's MJCF, or
     a Python configuration, which is read and not run."""
     second: tyro.conf.Positional[str]
-    """Another one."""
+    """What it is compared with, alike."""
     joint: str | None = None
     """Joint of a calibration, or specimen of a card; by default the first."""
     gain: float | None = None
@@ -228,7 +228,8 @@ def _with_interval(quantity: Quantity | None) -> str:
         return "–"
     text = f"{quantity.value:.4g}"
     if quantity.low is not None and quantity.high is not None:
-        text += f" [{quantity.low:.3g}, {quantity.high:.3g}]"
+        if quantity.low < quantity.high:  # else known without error, such as a term left out
+            text += f" [{quantity.low:.3g}, {quantity.high:.3g}]"
     return text
 
 
