@@ -441,7 +441,8 @@ def _walk(
     for key, value in found.items():
         shown.add_row(key, terminal.cell(value, 3))
     out.print(shown)
-    err.print(f"Repeat it: pupper-deploy {options.policy} --replay {log}")
+    repeat = terminal.command("pupper-deploy", options.policy, "--replay", log)
+    err.print(f"Repeat it: {repeat}")
 
 
 if __name__ == "__main__":

@@ -83,10 +83,8 @@ def shown(
 
 def say_how_to_resume(path: Path) -> None:
     """Print the command that continues a recording."""
-    terminal.err.print(
-        f"The recording up to here is in {path}; continue it with\n"
-        f"  pupper-sysid sweep --resume {path}"
-    )
+    resuming = terminal.command("pupper-sysid", "sweep", "--resume", path)
+    terminal.err.print(f"The recording up to here is in {path}; continue it with\n  {resuming}")
 
 
 def say_what_stays(bus: ServoBus) -> None:

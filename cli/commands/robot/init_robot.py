@@ -70,10 +70,12 @@ class InitRobot:
         margin = servos.position_limits().margin(servos.rest_pose())
         plan = _plan(found.joint_names, margin)
         sweeps = [
-            f"pupper-sysid sweep --joint-map {target} --joints {','.join(names)} --freqs 1-6 "
-            f"--amplitude {amplitude:g}"
+            terminal.command(
+                "pupper-sysid", "sweep", "--joint-map", target, "--joints", ",".join(names),
+                "--freqs", "1-6", "--amplitude", f"{amplitude:g}",
+            )
             for amplitude, names in plan
-        ]
+        ]  # fmt: skip
         if left_out:
             terminal.warn(
                 f"no actuator of {self.model} drives these, left out: {', '.join(left_out)}."
@@ -122,13 +124,14 @@ class InitRobot:
         terminal.out.print(table)
         feetech = self.servo.startswith(("sts", "scs", "hd"))
         bus = f"{'feetech' if feetech else 'dynamixel'}:/dev/ttyUSB0"
+        quoted = terminal.command(target)
         terminal.out.print(
             "Ids, signs and centres are guesses. Ids and signs are for you to check: with the "
             "servos limp, move one joint after the other by hand to its positive side and watch\n"
-            f"  pupper-sysid monitor --joint-map {target} --bus {bus}\n"
+            f"  pupper-sysid monitor --joint-map {quoted} --bus {bus}\n"
             f"If another row changes, correct the id in {target}; if the angle falls, the sign.\n"
             "Then measure centres, ranges and scale:\n"
-            f"  pupper-sysid calibrate-joints --joint-map {target} --out {target} --force "
+            f"  pupper-sysid calibrate-joints --joint-map {quoted} --out {quoted} --force "
             f"--bus {bus}\n"
             f"Sweep, first without the robot, then with --bus {bus}:\n"
             + "".join(f"  {line}\n" for line in sweeps)
