@@ -286,7 +286,7 @@ def seconds_progress(label: str, total_s: float) -> Iterator[Any]:
     """Show a bar over seconds; yields `advance(done_s, total_s, what)`."""
     with _bar(label, total_s, "{task.completed:.0f} s") as update:
         yield lambda done_s, total_s, what: update(
-            completed=done_s, total=total_s, description=f"{label} {what}"
+            completed=done_s, total=total_s, description=f"{label} {what}".strip()
         )
 
 
