@@ -250,6 +250,8 @@ def cell(value: Any, digits: int) -> str:
         return ", ".join(f"{k} {cell(v, digits)}" for k, v in value.items())
     if isinstance(value, list | tuple):
         return ", ".join(cell(v, digits) for v in value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return number(value, digits) if isinstance(value, float) else str(value)
 
 

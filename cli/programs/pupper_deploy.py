@@ -59,6 +59,21 @@ walks/<name>/recording.csv is a recording for `pupper-sysid fit-servo`.
 Example: pupper-deploy runs/<name> --command 0.15 0 0 --seconds 20
 """
 
+_SHOWN = {
+    "stop_reason": "ended because",
+    "fell": "fell",
+    "mae_vx_m_s": "mean absolute error forward, m/s",
+    "mae_vy_m_s": "the same sideways, m/s",
+    "mae_yaw_rad_s": "the same in turning, rad/s",
+    "mean_motion": "mean speed, m/s, m/s, rad/s",
+    "rate_hz": "control loop, Hz",
+    "deadline_misses": "missed deadlines",
+    "step_ms": "time of a step of the policy, ms",
+    "guard": "commands that the guard changed",
+    "imu": "readings of the IMU",
+    "log": "log",
+}
+"""What of the result the table shows, in words; the match of servos stands before the walk."""
 PLAYBACK_LOOPS, PLAYBACK_HZ = 3, 50.0
 
 
@@ -437,9 +452,10 @@ def _walk(
         print_json(found)
         return
     shown = terminal.table(f"{outcome.seconds:.1f} s on {bus.name}", "", "")
-    del found["servo_match"], found["commands"]  # shown before the walk, where they matter
-    for key, value in found.items():
-        shown.add_row(key, terminal.cell(value, 3))
+    shown.show_header = False
+    for key, label in _SHOWN.items():
+        if found.get(key) is not None:  # true motion is known of an emulated robot only
+            shown.add_row(label, terminal.cell(found[key], 3))
     out.print(shown)
     repeat = terminal.command("pupper-deploy", options.policy, "--replay", log)
     err.print(f"Repeat it: {repeat}")
