@@ -161,11 +161,12 @@ def _run(options: Options, given: list[str]) -> None:
     folder = options.resume or Path("runs") / ranks.same(options.name or _name(options))
     if options.resume is not None and not options.resume.is_dir():
         raise InputError(f"{options.resume} does not exist. Give the folder of a run.")
+    if options.resume is None:
+        refuse_taken(folder)
     if ranks.rank == 0:
         hold_output(folder)
         err.print(f"{'Going on with' if options.resume else 'Training into'} {folder}.")
     if options.resume is None:
-        refuse_taken(folder)
         if ranks.rank == 0:
             warn_of_fallbacks([servo_ranges(run.actuator, run.feedback, run.task.body)])
             for note in run.task.body.notes:
