@@ -81,9 +81,9 @@ class Calibrate(OfRecordings):
         if self.cluster is not None:
             raise InputError("--cluster is for a fleet: give the folder of its recordings.")
         out = self.out or Path("calibrated.yaml")
+        refuse_overwrite(out, self.force)  # before the work, not after it
         if out.suffix.lower() not in (".yaml", ".yml"):
             raise InputError(f"--out {out}: a calibration is a .yaml file. Choose another name.")
-        refuse_overwrite(out, self.force)  # before the work, not after it
         recordings, joints = self.load()
         left = dict.fromkeys(joints, len(STAGES))
         with terminal.progress("calibrating", sum(left.values())) as advance:
