@@ -95,7 +95,7 @@ def _page(
     usage = [program, "COMMAND" if subcommands else words, "[OPTIONS]"]
     lines = [f"usage: {' '.join(part for part in usage if part)}"]
     example = "Example: "
-    for paragraph in (parser.description or "").strip().split("\n\n"):
+    for paragraph in re.split(r"\n\n|\s+(?=Example: )", (parser.description or "").strip()):
         if not (paragraph.startswith(example) and lines[-1].startswith((example, " "))):
             lines.append("")
         lines += textwrap.wrap(

@@ -21,6 +21,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shlex
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -170,8 +171,15 @@ def number(value: float | None, digits: int = 2) -> str:
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
+def command(*words: Any) -> str:
+    """A command to copy: a name with a space, or with another sign of the shell, is in quotes."""
+    return shlex.join(map(str, words))
+
+
 def spread(values: Any, digits: int) -> str:
-    """Median and middle 90 % of a pandas column."""
+    """Median and middle 90 % of a pandas column; a single value as it is."""
+    if values.count() == 1:
+        return number(values.median(), digits)
     return "{} ({} … {})".format(*(number(x, digits) for x in values.quantile([0.5, 0.05, 0.95])))
 
 
@@ -242,6 +250,8 @@ def cell(value: Any, digits: int) -> str:
         return ", ".join(f"{k} {cell(v, digits)}" for k, v in value.items())
     if isinstance(value, list | tuple):
         return ", ".join(cell(v, digits) for v in value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return number(value, digits) if isinstance(value, float) else str(value)
 
 
@@ -278,7 +288,7 @@ def seconds_progress(label: str, total_s: float) -> Iterator[Any]:
     """Show a bar over seconds; yields `advance(done_s, total_s, what)`."""
     with _bar(label, total_s, "{task.completed:.0f} s") as update:
         yield lambda done_s, total_s, what: update(
-            completed=done_s, total=total_s, description=f"{label} {what}"
+            completed=done_s, total=total_s, description=f"{label} {what}".strip()
         )
 
 

@@ -162,7 +162,7 @@ def save(figure: Figure, path: Path, force: bool = False) -> None:
 def axes_grid(count: int, columns: int, height: float) -> tuple[Figure, list[Axes]]:
     """Small multiples: `count` axes in rows of `columns`, each row `height` inches high.
 
-    Axes share their scales; a figure of several columns is twice as wide as others.
+    A figure of three or more columns is twice as wide as others.
     """
     columns = min(columns, max(count, 1))
     rows = -(-max(count, 1) // columns)

@@ -34,7 +34,7 @@ from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.cli.user_errors import end_politely, run_program
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_path
-from pupper_sysid.hardware.address import EMULATED, SOCKET, bus_name, parse_address
+from pupper_sysid.hardware.address import EMULATED, KINDS, SOCKET, bus_name, parse_address
 from pupper_sysid.hardware.bus import header_entries
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.imu import Imu
@@ -59,6 +59,21 @@ walks/<name>/recording.csv is a recording for `pupper-sysid fit-servo`.
 Example: pupper-deploy runs/<name> --command 0.15 0 0 --seconds 20
 """
 
+_SHOWN = {
+    "stop_reason": "ended because",
+    "fell": "fell",
+    "mae_vx_m_s": "mean absolute error forward, m/s",
+    "mae_vy_m_s": "the same sideways, m/s",
+    "mae_yaw_rad_s": "the same in turning, rad/s",
+    "mean_motion": "mean speed, m/s, m/s, rad/s",
+    "rate_hz": "control loop, Hz",
+    "deadline_misses": "missed deadlines",
+    "step_ms": "time of a step of the policy, ms",
+    "guard": "commands that the guard changed",
+    "imu": "readings of the IMU",
+    "log": "log",
+}
+"""What of the result the table shows, in words; the match of servos stands before the walk."""
 PLAYBACK_LOOPS, PLAYBACK_HZ = 3, 50.0
 
 
@@ -69,9 +84,10 @@ class Deploy:
     policy: Annotated[Path | None, tyro.conf.Positional] = None
     """A run (`runs/<name>`) or a policy folder."""
     bus: str = EMULATED
-    """`emulated` (no robot, as fast as it goes), `esp32`, `esp32:SOCKET` or `feetech:DEVICE`."""
+    """`emulated` (no robot, as fast as it goes), `esp32`, `esp32:SOCKET`, `feetech:DEVICE` or
+    `dynamixel:DEVICE`."""
     imu: Path | None = None
-    """Socket of the proxy whose IMU to read, for a Feetech line, which has none."""
+    """Socket of the proxy whose IMU to read, for a serial line, which has none."""
     joint_map: str | None = None
     """Joint map of the bus: a file of `calibrate-joints` or a preset."""
     stack: Literal["auto", "closed-loop", "lstm-servo", "mlp-observer"] = "auto"
@@ -260,14 +276,16 @@ def _open(
         bus = open_things.enter_context(closing(GuardedBus(inner)))
         return bus, inner, body_joint_map(body), inner.robot
     address = parse_address(options.bus)
+    serial = KINDS[address.kind].is_serial
     if body.is_mini_pupper:
-        preset = "mini_pupper_2" if address.kind == "esp32" else "sts3215"
+        preset = "sts3215" if serial else "mini_pupper_2"
         joint_map = chosen_map(options.joint_map) or load_joint_map(preset)
     else:
         joint_map = _map_of(options, body)
-    if address.kind == "feetech" and options.imu is None:
+    if serial and options.imu is None:
         raise InputError(
-            "A Feetech line has no IMU, and a policy needs one. Give the proxy's socket with --imu."
+            "A line of servos has no IMU, and a policy needs one. Give the proxy's socket with "
+            "--imu."
         )
     bus = open_things.enter_context(closing(open_guarded(address, joint_map)))
     if isinstance(bus.bus, Imu):
@@ -434,11 +452,13 @@ def _walk(
         print_json(found)
         return
     shown = terminal.table(f"{outcome.seconds:.1f} s on {bus.name}", "", "")
-    del found["servo_match"], found["commands"]  # shown before the walk, where they matter
-    for key, value in found.items():
-        shown.add_row(key, terminal.cell(value, 3))
+    shown.show_header = False
+    for key, label in _SHOWN.items():
+        if found.get(key) is not None:  # true motion is known of an emulated robot only
+            shown.add_row(label, terminal.cell(found[key], 3))
     out.print(shown)
-    err.print(f"Repeat it: pupper-deploy {options.policy} --replay {log}")
+    repeat = terminal.command("pupper-deploy", options.policy, "--replay", log)
+    err.print(f"Repeat it: {repeat}")
 
 
 if __name__ == "__main__":

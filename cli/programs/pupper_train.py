@@ -24,7 +24,8 @@ import tyro
 import yaml
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from pupper_sysid.cli.terminal import err, out, print_json, share_progress, warn
+from pupper_sysid.cli.policy_choice import warn_of_fallbacks
+from pupper_sysid.cli.terminal import err, out, print_json, share_progress, spell, warn
 from pupper_sysid.cli.user_errors import begin_work, parse, user_errors
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import hold_output, refuse_path
@@ -40,7 +41,7 @@ from pupper_sysid.policies.train.run_file import (
 )
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.rewards.weights import Rewards
-from pupper_sysid.sim.walking.servo_ranges import check_actuator
+from pupper_sysid.sim.walking.servo_ranges import check_actuator, servo_ranges
 
 if TYPE_CHECKING:
     from pupper_sysid.policies.train.learner import Ranks
@@ -160,12 +161,14 @@ def _run(options: Options, given: list[str]) -> None:
     folder = options.resume or Path("runs") / ranks.same(options.name or _name(options))
     if options.resume is not None and not options.resume.is_dir():
         raise InputError(f"{options.resume} does not exist. Give the folder of a run.")
+    if options.resume is None:
+        refuse_taken(folder)
     if ranks.rank == 0:
         hold_output(folder)
         err.print(f"{'Going on with' if options.resume else 'Training into'} {folder}.")
     if options.resume is None:
-        refuse_taken(folder)
         if ranks.rank == 0:
+            warn_of_fallbacks([servo_ranges(run.actuator, run.feedback, run.task.body)])
             for note in run.task.body.notes:
                 err.print(note)
         run = _with_first_gait(run, ranks)
@@ -201,7 +204,10 @@ def _with_first_gait(run: Run, ranks: Ranks) -> Run:
     task = run.task
     if ranks.rank == 0:
         with share_progress("first gait") as advance:
-            say = err.print
+
+            def say(text: str) -> None:
+                err.print(spell(text))
+
             task = with_first_gait(run, say, partial(advance, "searching")).task
     parts = json.loads(ranks.same(json.dumps(plain({"trot": task.trot, "rewards": task.rewards}))))
     trot, rewards = Trot(**parts["trot"]), Rewards(**parts["rewards"])

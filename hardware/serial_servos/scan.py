@@ -95,7 +95,8 @@ def scan_line(
     if not servos:
         raise BusError(
             f"{device}: no servo answers at {rates_in_words(family, baud)} baud. Check that the "
-            "servos have power and the data line is connected."
+            "servos have power and the data line is connected; `pupper-sysid scan` alone tries "
+            "the other protocols, too."
         )
     rates = sorted({servo.baud for servo in servos})
     if len(rates) > 1:

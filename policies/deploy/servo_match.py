@@ -101,11 +101,14 @@ def servo_match(trained: TrainedServo, here: ServoRanges) -> ServoMatch | None:
     )
 
 
+_SLACK = 1e-3  # of a number: less is of the digits that two files write
+
+
 def _outside(
     quantity: str, unit: str, relative: bool, joint: str | None, trained: Interval, here: Interval
 ) -> list[Outside]:
     low, high = trained.low, trained.high
-    slack = 1e-9 * max(abs(low), abs(high))
+    slack = _SLACK * max(abs(low), abs(high))
     if here.low <= high + slack and here.high >= low - slack:
         return []
     beyond = here.value - (high if here.low > high else low)

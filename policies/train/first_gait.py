@@ -142,8 +142,8 @@ class GaitScore(Result):
 
     def __str__(self) -> str:
         return (
-            f"score {self.score:.2f}, {100 * self.forward_share:.0f} % of "
-            f"{self.forward_m_s:.3g} m/s forward, {100 * self.turn_share:.0f} % of "
+            f"score {self.score:.2f}, {round(100 * self.forward_share)} % of "
+            f"{self.forward_m_s:.3g} m/s forward, {round(100 * self.turn_share)} % of "
             f"{self.turn_rad_s:.3g} rad/s on the spot, {100 * self.falls:.0f} % fell; "
             f"clearance {1e3 * self.clearance_p10_m:.1f} mm (p10), "
             f"{100 * self.low_swing_share:.0f} % of the swings low, thighs and calves at their "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -40,6 +41,23 @@ def unit_of(name: str) -> str:
     ('N·m·s/rad', 's', '1')
     """
     return UNIT_OF_NAME.get(name) or border.unit_of(name)
+
+
+_UNIT_ENDING = re.compile(
+    "_(per_s2|per_s|per_nm|rad_s2|nm_s_per_rad|nm_per_rad|kg_m2|rad_s|(?<!per_)rad|nm|s)$"
+)
+_WORDS = {"effort_rad_s2": "effort limit", "friction_rad_s2": "friction loss"}
+
+
+def words_of(name: str) -> str:
+    """A quantity's name without its unit, as tables and sentences have it.
+
+    Examples
+    --------
+    >>> words_of("dead_time_s"), words_of("stiffness_per_s2"), words_of("duty_per_rad")
+    ('dead time', 'stiffness', 'duty per rad')
+    """
+    return _WORDS.get(name) or _UNIT_ENDING.sub("", name).replace("_", " ")
 
 
 def _python_number(value: Any) -> Any:

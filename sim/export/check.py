@@ -42,6 +42,7 @@ from pupper_sysid.sim.robot.servo_mjcf import hold
 TONES_HZ, AMPLITUDE_RAD, TONE_S = (1.7, 2.7, 3.7), 0.25, 1.0
 WALK_S = 2.0
 _SETTLE_S = 0.5
+_SEEN_MRAD = 0.005  # of tables with two decimals
 WHOLE = "whole servo"
 SWITCHED_OFF: dict[str, dict[str, float]] = {
     WHOLE: {},
@@ -179,6 +180,7 @@ def _notes(servos: ExportedServos, joints: Mapping[str, JointCheck]) -> Iterator
         continuous = min(fitted) <= CONTINUOUS_S
         basis = "in continuous time" if continuous else f"for steps of {1e3 * min(fitted):g} ms"
         worst = max(joints, key=lambda name: joints[name].step_rad[WHOLE])
+        here = 1e3 * joints[worst].step_rad[WHOLE]
         far = 1e3 * joints[worst].step_of_full_torque_rad
         actuator = servos.moving.joint(worst).actuator
         half = nearest_in_loop(actuator.parameters, h / 2, actuator.fitted_step_s, MUJOCO_PID)
@@ -189,13 +191,23 @@ def _notes(servos: ExportedServos, joints: Mapping[str, JointCheck]) -> Iterator
             f"The servos' numbers are {basis}, and no numbers of an actuator make up for steps of "
             f"{1e3 * h:g} ms: in one, the largest torque moves {worst} by {far:.2g} mrad, and "
             "torque, friction and set-point change once. The second table says what that costs, "
-            f"and what it would cost without a term. Steps of {1e3 * h / 2:g} ms would leave "
-            f"{there:.2g} mrad of {worst}'s {1e3 * joints[worst].step_rad[WHOLE]:.2g}."
+            "and what it would cost without a term."
+            + (
+                f" Steps of {1e3 * h / 2:g} ms would leave {there:.2g} mrad of {worst}'s "
+                f"{here:.2g}."
+                if there < here
+                else ""
+            )
         )
     yield from servos.short_delays()
-    loaded = [n for n in joints if servos.calibration.joint(n).under_load is not None]
-    if loaded:
-        most = 1e3 * max(joints[name].not_carried_rad for name in loaded)
+    costs = {
+        name: 1e3 * row.not_carried_rad
+        for name, row in joints.items()
+        if servos.calibration.joint(name).under_load is not None
+    }
+    # such a servo without the frictions of the load moves as its actuator to rounding
+    if loaded := [name for name, cost in costs.items() if cost >= _SEEN_MRAD]:
+        most = max(costs[name] for name in loaded)
         yield (
             f"{', '.join(loaded)}: fitted under load, so the calibration's own model has frictions "
             f"that no simulator's actuator carries; they cost up to {most:.2g} mrad."

@@ -48,7 +48,7 @@ KNOWN = {"yes": "measured", "ratio only": "ratio measured, scale assumed", "no":
 """How well a number is known, by `Quantity.identified`."""
 INCLUDES_LINK = (
     "An armature with the link and load counts their inertia twice in a model whose bodies have "
-    "it, too: take it off (options link-inertia and model of the export)."
+    "it, too: take it off by the export's link-inertia or model."
 )
 _LONGEST_STEP_S = 0.1
 _FASTEST_HZ, _AMPLITUDE_RAD = 4.0, 0.3  # the sweeps' fastest common tone

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import as_path
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.calibration.calibration import (
     PRESETS,
@@ -137,6 +138,7 @@ def servo_ranges(
     """
     joints = JOINT_NAMES if body is None else body.joints
     servo_of = {} if body is None else body.servo_of
+    as_path(actuator, "An actuator")
     if str(actuator) == IDEAL or is_servo_model(actuator):
         found = _ideal(str(actuator), joints)
     else:

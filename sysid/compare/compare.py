@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.files import as_path
 from pupper_sysid.servo_models.calibration.calibration import (
     PRESETS,
     Calibration,
@@ -40,6 +41,7 @@ from pupper_sysid.sysid.doctor.checks import (
     usable_trials,
 )
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
+from pupper_sysid.sysid.fit.calibrate import CalibrationResult
 from pupper_sysid.sysid.fit.predict import (
     ComparedRun,
     Prediction,
@@ -67,12 +69,13 @@ from pupper_sysid.sysid.servo_fit.scores import (
 )
 from pupper_sysid.sysid.servo_fit.windows import everything, grouped, merged_groups, only, samples
 
+Model = str | Path | Calibration | CalibrationResult | ServoFit
 _ENDINGS = (".yaml", ".yml", ".json")  # of calibrations and of BAM's parameter files
 
 
 def compare(
     recordings: Recordings,
-    models: Sequence[str | Path | Calibration | ServoFit],
+    models: Model | Sequence[Model],
     joints: Joints = None,
     readings: str = "auto",
     seed: int = 0,
@@ -84,7 +87,7 @@ def compare(
     ----------
     recordings : Recording or sequence of Recording
         Of any rates, gains and loads; models of `fit-servo` need one rate.
-    models : sequence of str, Path, Calibration or ServoFit
+    models : str, Path, Calibration, CalibrationResult or ServoFit, or a sequence of such
         Models, or names of servo model folders, calibration files, servo cards and presets. The
         score of each does not depend on the others.
     joints : str or sequence of str, optional
@@ -107,6 +110,7 @@ def compare(
         If a model cannot be read, or is for another rate or other joints.
     """
     recordings, names = as_sequence(recordings), chosen_joints(recordings, joints)
+    models = _each(models)
     calibrations = _calibrations(models)
     for name, calibration in calibrations.items():  # before the work, not after it
         _refuse_missing_joints(calibration, name, names)
@@ -259,6 +263,16 @@ def _refuse_missing_joints(calibration: Calibration, name: str, joints: Sequence
             f"{name} has no joint {', '.join(missing)}; it has "
             f"{', '.join(calibration.joints)}.{advice}"
         )
+
+
+def _each(models: Model | Sequence[Model]) -> list[str | Path | Calibration | ServoFit]:
+    """The models one by one, those of `calibrate` as calibrations."""
+    several = isinstance(models, Sequence) and not isinstance(models, str)
+    each = [getattr(m, "calibration", m) for m in (models if several else [models])]
+    for model in each:
+        if not isinstance(model, Calibration | ServoFit):
+            as_path(model, "A model")
+    return each
 
 
 def _is_folder(given: str | Path | Calibration) -> TypeGuard[str | Path]:

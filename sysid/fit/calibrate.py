@@ -104,7 +104,7 @@ def calibrate(
         Results of a joint depend on the seed and its name alone, not on the other joints.
     stall_torque_nm : float, optional
         Torque anchor [N·m]: the servo's torque at zero speed; by default that of the recorded
-        servo's data sheet, or of the Mini Pupper's servo.
+        servo's data sheet, else the prior's, else the Mini Pupper's.
     workers : int
         Processes. Joints are independent, and so are the two structures of a joint.
     progress : callable, optional
@@ -143,7 +143,7 @@ def calibrate(
             )
             if progress:
                 progress(joint)
-    calibration = to_calibration(fits, as_sequence(recordings), seed, stall_torque_nm)
+    calibration = to_calibration(fits, as_sequence(recordings), seed, stall_torque_nm, priors)
     calibration = with_operating_points(calibration, every)
     if note:
         calibration = calibration.model_copy(update={"notes": (*calibration.notes, note)})

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -54,6 +55,7 @@ from pupper_sysid.sysid.fit.results import (
     JointCalibrationResult,
     LoadedFit,
 )
+from pupper_sysid.sysid.fit.servo_prior import ServoPrior
 from pupper_sysid.sysid.fit.structure import candidate
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
@@ -80,6 +82,7 @@ def to_calibration(
     recordings: Sequence[Recording],
     seed: int,
     stall_torque_nm: float | None = None,
+    priors: Mapping[str, ServoPrior] = MappingProxyType({}),
 ) -> Calibration:
     """The calibration file of `results`.
 
@@ -89,10 +92,10 @@ def to_calibration(
     recordings : sequence of Recording
         Their sources; names and hashes go into the file.
     seed : int
-    stall_torque_nm : float, optional
+    stall_torque_nm, priors : optional
         As for `torque_anchors`.
     """
-    anchors = torque_anchors(list(results), recordings, stall_torque_nm)
+    anchors = torque_anchors(list(results), recordings, stall_torque_nm, priors)
     buses = [r.metadata.get("bus") or {} for r in recordings]
     kinds = {str(bus.get("kind", "unknown bus")) for bus in buses}
     maps = {str(bus["joint_map"]) for bus in buses if bus.get("joint_map")}
@@ -118,7 +121,10 @@ def to_calibration(
 
 
 def torque_anchors(
-    joints: Sequence[str], recordings: Sequence[Recording], stall_torque_nm: float | None = None
+    joints: Sequence[str],
+    recordings: Sequence[Recording],
+    stall_torque_nm: float | None = None,
+    priors: Mapping[str, ServoPrior] = MappingProxyType({}),
 ) -> dict[str, tuple[float, str]]:
     """Stall torque [N·m] that sets the scale of each joint's torques, and its source.
 
@@ -128,15 +134,22 @@ def torque_anchors(
     recordings : sequence of Recording
         Their headers may name the servo.
     stall_torque_nm : float, optional
-        Of all joints; by default that of the data sheet of the recorded servo, or of the Mini
-        Pupper's servo where no recording names one.
+        Of all joints; by default that of the data sheet of the recorded servo; where no recording
+        names one, of the prior's, or of the Mini Pupper's servo.
+    priors : mapping of str to ServoPrior
+        By joint, of those that have one.
     """
     if stall_torque_nm is not None:
         return dict.fromkeys(joints, (stall_torque_nm, GIVEN_TORQUE))
+    known = {
+        joint: (prior.effort_limit_nm, f"effort limit of {prior.source}")
+        for joint, prior in priors.items()
+        if prior.effort_limit_nm is not None
+    }
     headers = [r.metadata.get("servos") or {} for r in recordings]
     return {
         joint: recorded_stall_torque(h.get(joint, {}) for h in headers)
-        or (STALL_TORQUE_NM, STALL_TORQUE_SOURCE)
+        or known.get(joint, (STALL_TORQUE_NM, STALL_TORQUE_SOURCE))
         for joint in joints
     }
 

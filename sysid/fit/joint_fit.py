@@ -22,6 +22,7 @@ from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.servo_models.calibration.quantity import words_of
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
@@ -1062,8 +1063,7 @@ def _free_warnings(
         )
     for name in ("effort_rad_s2", "friction_rad_s2", "stiffness_per_s2", "damping_per_s"):
         if name in pd.undecided:
-            quantity = name.split("_")[0]
-            yield f"{joint}: {quantity} is not identified: {pd.undecided[name]}."
+            yield f"{joint}: {words_of(name)} is not identified: {pd.undecided[name]}."
     own = pd.scores.rmse_unseen_rad
     if chosen != carried:
         best = results[chosen].scores.rmse_unseen_rad
@@ -1308,9 +1308,12 @@ def _summary(fitted: Fitted, runs: Sequence[Run], choice: _Choice) -> StructureF
     )
 
 
+_NAMED = {"duty_s_per_rad": "damping"}  # as a share of the duty
+
+
 def _load_warnings(joint: str, loaded: LoadedFit) -> Iterator[str]:
     for name, why in loaded.undecided.items():
-        yield f"{joint}: {name} is not identified: {why}."
+        yield f"{joint}: {_NAMED.get(name, words_of(name))} is not identified: {why}."
     if lost := loaded.servo.beyond_delayed_pd():
         yield (
             f"{joint}: simulators' actuators do not carry {', '.join(lost)}; DelayedPD has the "

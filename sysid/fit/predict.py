@@ -102,7 +102,7 @@ def _sentence(rule: str, source: str, own: Sequence[ReadingRule]) -> str:
     poll = ", ".join(known)
     return {
         "live": f"the readings of {source} are live and predicted at their read",
-        "own dates": f"predicted at the dates of {source}'s own poll lattice ({poll})",
+        "own dates": f"predicted at the dates of {source}'s own poll schedule ({poll})",
         "expected": (
             "the recording does not show its poll; predicted in the mean over the phase and the "
             f"losses of {source} ({poll})"

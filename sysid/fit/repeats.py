@@ -9,7 +9,6 @@ recordings widens its interval, which then is for the next recording, too.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
+from pupper_sysid.servo_models.calibration.quantity import words_of
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.noise import noise_by_run
 from pupper_sysid.sysid.fit.posterior import temperature_of
@@ -64,9 +64,8 @@ class Difference:
 
     def sentence(self, joint: str) -> str:
         """The difference in words."""
-        quantity = re.sub("_(per_s2|per_s|rad_s2|rad_s|rad|s)$", "", self.name).replace("_", " ")
         return (
-            f"{joint}: {self.recording} differs from the other recordings: {quantity} "
+            f"{joint}: {self.recording} differs from the other recordings: {words_of(self.name)} "
             f"{self.factor.value:.2f} ({self.factor.low:.2f} to {self.factor.high:.2f}) of theirs "
             f"(Δ log-likelihood {self.nats:.0f})."
         )

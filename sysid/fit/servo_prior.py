@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import median
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import HALF_WIDTH_SD
@@ -47,11 +48,14 @@ class ServoPrior:
         Mean and standard deviation by the name of a fitted number, per inertia and in N·m.
     shared_sd : float
         Standard deviation of what the logarithms of `PER_INERTIA` have in common.
+    effort_limit_nm : float, optional
+        Of that unit: the scale of the torques, where the recording does not name its servo.
     """
 
     source: str
     logarithms: Mapping[str, tuple[float, float]]
     shared_sd: float
+    effort_limit_nm: float | None = None
 
 
 def servo_prior(
@@ -98,7 +102,8 @@ def servo_prior(
     shared = math.sqrt((_LINK_SD**2 * _WEIGHT + sum(x * x for x in links)) / (
         _WEIGHT + len(links) - 1
     ))  # fmt: skip
-    return ServoPrior(source, logarithms, shared)
+    torque = median(unit.actuator.effort_limit_nm.value for unit in units)
+    return ServoPrior(source, logarithms, shared, torque)
 
 
 def _logarithms(

@@ -29,6 +29,7 @@ from scipy.optimize import least_squares
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import JointResults, Result, derived, internal
+from pupper_sysid.servo_models.calibration.quantity import words_of
 from pupper_sysid.sysid.doctor.checks import Joints, Recordings, cautions, each_joint, joint_rng
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice, readings
 from pupper_sysid.sysid.lag.tone import ToneResponse, line_responses, tone_lags, without_ripple
@@ -264,9 +265,11 @@ class FrequencyResponse(Result):
             )
         lines.append(f"  −3 dB bandwidth: {self.bandwidth_text}")
         for name, fit in self.transfer_functions.items():
-            lines.append(f"  {name}: {fit.text}   (chi²/dof {fit.chi2_per_dof:.1f})")
+            order = {"FOPDT": "first order", "SOPDT": "second order"}[name]
+            lines.append(f"  {order} and delay ({name}), χ²/dof {fit.chi2_per_dof:.1f}:")
+            lines.append(f"    {fit.text}")
             if fit.at_bound:
-                names = ", ".join(n.replace("_", " ") for n in fit.at_bound)
+                names = ", ".join(map(words_of, fit.at_bound))
                 lines.append(f"    at its bound, so not identified: {names}")
         return "\n".join(lines)
 

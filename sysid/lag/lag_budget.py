@@ -63,6 +63,7 @@ from pupper_sysid.sysid.lag.step_response import (
     rough_lag,
 )
 from pupper_sysid.sysid.lag.tone import (
+    FOLLOWS,
     ToneResponse,
     lag_near,
     line_responses,
@@ -144,10 +145,12 @@ class LagBudget(Result):
         """
         if not self.by_frequency:
             return ""
-        hz = sorted({float(f"{f.frequency_hz:.3g}") for f in self.by_frequency})
+        most = max(f.gain for f in self.by_frequency)
+        followed = [f for f in self.by_frequency if f.gain >= FOLLOWS * most]  # as `tone_weights`
+        hz = sorted({float(f"{f.frequency_hz:.3g}") for f in followed})
         if len(hz) == 1:
             return f"at {hz[0]:g} Hz"
-        lags = sorted(1e3 * f.lag_s.value for f in self.by_frequency)
+        lags = sorted(1e3 * f.lag_s.value for f in followed)
         return f"mean over {hz[0]:g}–{hz[-1]:g} Hz; {lags[0]:.0f}–{lags[-1]:.0f} ms by tone"
 
     def with_dead_time(self, dead_time_s: Interval, offset_rad: float) -> LagBudget:

@@ -329,7 +329,7 @@ def _chances(
 
 
 _ONE_TONE_HZ = 0.05  # closer than that is one tone, twice
-_FOLLOWS = 0.5  # of the largest gain: below, a tone says nothing about the delay
+FOLLOWS = 0.5  # of the largest gain: below, a tone says nothing about the delay
 
 
 def slope(tones: Sequence[ToneResponse], pair: str, near_s: float | None = None) -> Interval:
@@ -375,7 +375,7 @@ def tone_weights(tones: Sequence[ToneResponse]) -> NDArray[np.float64]:
     """
     gain = np.array([abs(t.response) for t in tones])
     weight = 1.0 / np.array([t.lag_variance_s2 for t in tones])
-    weight = np.where(gain >= _FOLLOWS * gain.max(), weight, 0.0)
+    weight = np.where(gain >= FOLLOWS * gain.max(), weight, 0.0)
     return weight / weight.sum()
 
 

@@ -72,10 +72,10 @@ def load(path: Path | str, options: LogOptions | None = None) -> Recording:
     path, options = Path(path), options or LogOptions()
     if path.is_dir():
         return _imported(path, read_folder(path, options), options)
-    if path.name.endswith(".truth.csv"):
+    if path.name.endswith((".truth.csv", ".truth.yaml")):
+        recording = f"{Path(path.stem).stem}.csv"
         raise InputError(
-            f"{path} holds the true values of {path.name.removesuffix('.truth.csv')}.csv, "
-            "not a recording; load that file instead."
+            f"{path} holds the true values of {recording}, not a recording; load that file instead."
         )
     data = read_bytes(path)
     content = unpacked(path, data, LARGEST_BYTES)

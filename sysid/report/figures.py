@@ -422,7 +422,8 @@ def overlay_grid(found: Mapping[str, list[Track]]) -> Figure:
             axes.set_ylabel("from rest [rad]")
         if n >= len(grid) - 3:
             axes.set_xlabel("time in the trial [s]")
-    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    columns = 2 if len(found) < 3 else 4  # of a narrow and of a wide figure
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=columns)
     return figure
 
 
@@ -512,7 +513,8 @@ def residual_grid(found: Mapping[str, list[Track]]) -> Figure:
             axes.set_ylabel("reading − model [mrad]")
         if n >= len(grid) - 3:
             axes.set_xlabel("speed of the model [rad/s]")
-    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    columns = 1 if len(found) < 3 else 2
+    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=columns)
     return figure
 
 

@@ -16,7 +16,7 @@ from pupper_sysid.common.page import Column, Row, Table
 from pupper_sysid.common.results import flat, plain
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
-from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
+from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of, words_of
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
 
@@ -248,11 +248,7 @@ def _matrix(
 
 def _readable(name: str, part: str) -> str:
     """A parameter's name without its unit, in words."""
-    for end in ("_nm_s_per_rad", "_nm_per_rad", "_kg_m2", "_rad_s", "_rad", "_nm", "_s"):
-        if name.endswith(end):
-            name = name[: -len(end)]
-            break
-    return name.replace("_", " ") + (" / armature" if part == "ratios to armature" else "")
+    return words_of(name) + (" / armature" if part == "ratios to armature" else "")
 
 
 def _value_cell(row: Row, factor: float = 1.0) -> str:

@@ -82,6 +82,7 @@ def test_a_teacher_is_trained_and_then_learned_from(capsys, here):
     code, _, err = run(capsys, pupper_train, *TINY, "--start", "teacher", "--name", "t")
     assert code == 0
     assert "pupper-train --start scratch --imitation.teacher runs/t" in " ".join(err.split())
+    assert "has no RF_hip, " in err and "take the numbers of" in err  # its servos are those of LF
     taught = (*TINY, "--start", "scratch", "--imitation.teacher", "runs/t", "--name", "s")
     code, _, err = run(capsys, pupper_train, *taught)
     assert code == 0 and "pupper-eval runs/s" in " ".join(err.split())

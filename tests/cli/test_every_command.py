@@ -7,6 +7,7 @@ import importlib
 import io
 import json
 import re
+import shlex
 import subprocess
 import sys
 from contextvars import copy_context
@@ -234,6 +235,19 @@ def test_sentences_are_broken_between_words_on_a_terminal_and_commands_are_not(o
     assert lines[-1] == command
     assert " ".join(line.strip() for line in lines[:-1]) == sentence
     assert (len(lines) > 2) is on_terminal
+
+
+def test_a_command_to_run_next_can_be_copied(capsys, tmp_path):
+    recording = tmp_path / "my log.csv"
+    code, _, err = run(capsys, "import", ROOT / "data/samples/sweep.csv", "--out", recording)
+    assert code == 0
+    assert shlex.split(err.split("Next: ")[1]) == ["pupper-sysid", "doctor", str(recording)]
+
+
+def test_an_example_begins_a_line_of_the_help(capsys):
+    for command in ("monitor", "plan", "init-robot"):
+        _, out, _ = run(capsys, command, "--help")
+        assert f"\nExample: pupper-sysid {command} " in out
 
 
 # ----- messages of the library name arguments; at the command line they name its options

@@ -57,10 +57,15 @@ delay log.csv --joints LF_hipp | Did you mean LF_hip
 doctor log.csv --read-limit [0 0.5 1001 nan inf x 4_1 ٣ ""] | --read-limit
 doctor log.csv [--read-limit=0 --read-limit] | --read-limit
 [import doctor calibrate fit-servo] loop.csv | loop.csv
+[import doctor delay calibrate report] cal.yaml | a file of pupper-sysid, but not a recording
+doctor other.yaml | is YAML
+doctor sweep.truth.yaml | true values of sweep.csv
+doctor robot.xml | is XML
 import log.csv --command "u {joint}" | belong together
 import log.csv --unit furlong | Write rad, deg
 import wide.csv | raise the limits of reading with --read-limit 2.
 calibrate nowhere.csv --stall-torque [0 1e308 -1 1e-9 nan inf] | --stall-torque is
+calibrate log.csv --out [cal.csv calibrated] | a calibration is a .yaml file
 calibrate nowhere.csv --jobs [0 -2 999999999999999999999] | --jobs is
 [calibrate fit-servo report] nowhere.csv --seed 999999999999999999999 | --seed is
 calibrate nowhere.csv --seed -1 | --seed is
@@ -201,7 +206,7 @@ DEPLOYMENT = r"""
 | No policy was named
 nowhere | neither a run nor a policy
 policy --actuator nowhere.yaml | no such file
-policy --actuator cal.yaml --bus feetech:/dev/none | no IMU
+policy --actuator cal.yaml --bus [feetech:/dev/none dynamixel:/dev/none] | no IMU
 policy --actuator cal.yaml --bus serial | bus serial
 policy --actuator cal.yaml --stack lstm-servo | --servo
 policy --actuator cal.yaml --command 9 0 0 | --command
@@ -259,6 +264,7 @@ def stocked(here) -> Path:
     for name, path in (
         ("log.csv", "sweep.csv"), ("walk.csv", "playback.csv"), ("cal.yaml", "calibrated.yaml"),
         ("commands.csv", "walk_commands.csv"), ("policy", "policies/lstm"),
+        ("sweep.truth.yaml", "sweep.truth.yaml"),
     ):  # fmt: skip
         (here / name).symlink_to(SAMPLES / path)
     (here / "loop.csv").symlink_to("loop.csv")
@@ -268,6 +274,7 @@ def stocked(here) -> Path:
     for name in ("taken.yaml", "there.mp4", "mine.mcap"):
         (here / name).write_text("mine")
     (here / "other.yaml").write_text("schema: other\n")
+    (here / "robot.xml").write_text("<mujoco>\n  <worldbody/>\n</mujoco>\n")
     row = ",".join(map(str, range(3000)))
     (here / "wide.csv").write_text(f"{row}\n{row}\n")
     text = (SAMPLES / "calibrated.yaml").read_text()

@@ -53,7 +53,8 @@ class Calibrate(OfRecordings):
     given one's name and _calibrated."""
     stall_torque: float | None = None
     """Torque the servo stalls at [N·m]: sets the scale of all torques and of the armature. By
-    default of the recorded servo's data sheet; a recording with a known load needs none."""
+    default of the recorded servo's data sheet, else that of --from; a recording with a known load
+    needs none."""
     prior: Annotated[str | None, tyro.conf.arg(name="from")] = None
     """Calibration or servo card (`pupper-sysid servo list`) of another unit of the servo: its
     numbers are the prior, so that 20 s in free air are enough."""
@@ -81,6 +82,8 @@ class Calibrate(OfRecordings):
             raise InputError("--cluster is for a fleet: give the folder of its recordings.")
         out = self.out or Path("calibrated.yaml")
         refuse_overwrite(out, self.force)  # before the work, not after it
+        if out.suffix.lower() not in (".yaml", ".yml"):
+            raise InputError(f"--out {out}: a calibration is a .yaml file. Choose another name.")
         recordings, joints = self.load()
         left = dict.fromkeys(joints, len(STAGES))
         with terminal.progress("calibrating", sum(left.values())) as advance:
@@ -102,9 +105,11 @@ class Calibrate(OfRecordings):
             terminal.print_json(result)
         else:
             self._print(result)
-            terminal.err.print(
-                f"Wrote {out} in {time.perf_counter() - started:.1f} s. Next: pupper-sysid report"
+            elapsed = time.perf_counter() - started
+            following = terminal.command(
+                "pupper-sysid", "report", *self.recordings, "--calibration", out
             )
+            terminal.err.print(f"Wrote {out} in {elapsed:.1f} s. Next: {following}")
 
     def _fleet(self, root: Path, started: float) -> None:
         """Many robots, one after the other or side by side."""

@@ -104,7 +104,7 @@ class CompareTruth:
     def run(self) -> None:
         """Calibrate if need be, compare, print."""
         from pupper_sysid.servo_models.calibration.calibration import load_calibration
-        from pupper_sysid.servo_models.calibration.quantity import unit_of
+        from pupper_sysid.servo_models.calibration.quantity import unit_of, words_of
         from pupper_sysid.sysid.compare.truth import compared_with_truth, read_truth
         from pupper_sysid.sysid.fit.calibrate import calibrate
 
@@ -130,12 +130,11 @@ class CompareTruth:
             end = next((end for end in _UNITS if row.quantity.endswith(end)), "")
             plain_unit = (unit_of(row.quantity), 1.0, 3 if abs(row.truth) < 1 else 0)
             unit, factor, digits = _UNITS.get(end, plain_unit)
-            name = row.quantity.removesuffix(end).replace("_", " ")
             low, high = (
                 terminal.number(factor * x, digits) for x in (row.found.low, row.found.high)
             )
             table.add_row(
-                row.joint, f"{name}, {unit}".removesuffix(", 1"),
+                row.joint, f"{words_of(row.quantity)}, {unit}".removesuffix(", 1"),
                 terminal.number(factor * row.found.value, digits), f"{low}…{high}",
                 terminal.number(factor * row.truth, digits), row.identified,
                 {True: "yes", False: "no", None: "–"}[row.held],

@@ -116,7 +116,8 @@ class FitServo(OfRecordings):
         self._print(fit)
         terminal.warn(*fit.notes)
         terminal.err.print(
-            f"Wrote {folder}/ in {elapsed:.0f} s. Next: pupper-sysid compare --models {folder}"
+            f"Wrote {folder}/ in {elapsed:.0f} s. Next: "
+            + terminal.command("pupper-sysid", "compare", *self.recordings, "--models", folder)
         )
 
     def _fleet(self, root: Path, split: Split) -> None:

@@ -121,7 +121,8 @@ class Import:
                   for low, high in ranges.loc[joint].to_numpy().reshape(2, 2)),
             )  # fmt: skip
         terminal.out.print(shown)
-        terminal.err.print(f"Wrote {out}. Next: pupper-sysid doctor {out}")
+        following = terminal.command("pupper-sysid", "doctor", out)
+        terminal.err.print(f"Wrote {out}. Next: {following}")
 
 
 def _names(text: str) -> dict[str, str]:
@@ -181,4 +182,4 @@ class View:
             if path is not None:
                 terminal.out.print(f"Wrote {path}")
         if self.rerun is not None:
-            terminal.out.print(f"Next:\n  rerun {self.rerun}")
+            terminal.out.print(f"Next:\n  {terminal.command('rerun', self.rerun)}")

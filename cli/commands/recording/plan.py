@@ -70,7 +70,8 @@ class Plan:
             return
         show(made)
         if self.out is not None:
-            terminal.err.print(f"Wrote {self.out}. Next: pupper-sysid sweep --plan {self.out}")
+            following = terminal.command("pupper-sysid", "sweep", "--plan", self.out)
+            terminal.err.print(f"Wrote {self.out}. Next: {following}")
         else:
             terminal.err.print("Nothing was written; --out plan.yaml keeps it.")
 
@@ -158,6 +159,7 @@ def _some_margins(joint_map: JointMap, joints: list[str]) -> dict[str, float] | 
 
 def show(plan: SweepPlan) -> None:
     """Print a plan's trials, what to expect of them, and its notes."""
+    from pupper_sysid.servo_models.calibration.quantity import unit_of, words_of
     from pupper_sysid.sysid.plan.candidates import trial_seconds
     from pupper_sysid.sysid.plan.planner import DEAD_TIME
 
@@ -175,9 +177,7 @@ def show(plan: SweepPlan) -> None:
             "90 % intervals, now and to expect", "joint", "quantity", "value", "now", "after"
         )
         for p in plan.predictions:
-            scale, name = 1.0, p.quantity
-            if name == DEAD_TIME:
-                scale, name = 1e3, "dead_time_ms"
+            scale, unit = (1e3, "ms") if p.quantity == DEAD_TIME else (1.0, unit_of(p.quantity))
             digits = int(np.clip(2 - np.floor(np.log10(scale * p.now.value + 1e-9)), 0, 4))
             now, after = (
                 f"{terminal.number(scale * i.low, digits)} … "
@@ -185,6 +185,7 @@ def show(plan: SweepPlan) -> None:
                 for i in (p.now, p.after)
             )
             value = terminal.number(scale * p.now.value, digits)
+            name = f"{words_of(p.quantity)}, {unit}"
             expected.add_row(p.joint, name, value, now, after)
         terminal.out.print()
         terminal.out.print(expected)

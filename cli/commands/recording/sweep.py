@@ -335,10 +335,13 @@ class Sweep:
         )
         for name in written:
             terminal.out.print(f"  {name}")
-        last = f"delay {path}\n  pupper-sysid calibrate {path} --out calibrated.yaml"
+        following = [("doctor", path), ("delay", path)]
+        following.append(("calibrate", path, "--out", "calibrated.yaml"))
         if self.kind == "reversal":
-            last = f"backlash {path}"
-        terminal.out.print(f"Next:\n  pupper-sysid doctor {path}\n  pupper-sysid {last}")
+            following[1:] = [("backlash", path)]
+        terminal.out.print("Next:")
+        for words in following:
+            terminal.out.print(f"  {terminal.command('pupper-sysid', *words)}")
 
 
 def _counted(number: int, name: str) -> str:

@@ -83,10 +83,8 @@ def shown(
 
 def say_how_to_resume(path: Path) -> None:
     """Print the command that continues a recording."""
-    terminal.err.print(
-        f"The recording up to here is in {path}; continue it with\n"
-        f"  pupper-sysid sweep --resume {path}"
-    )
+    resuming = terminal.command("pupper-sysid", "sweep", "--resume", path)
+    terminal.err.print(f"The recording up to here is in {path}; continue it with\n  {resuming}")
 
 
 def say_what_stays(bus: ServoBus) -> None:
@@ -374,5 +372,5 @@ def _print_outcome(outcome: Outcome, written: list[Path], goal: str) -> None:
             terminal.warn(f"{joint}: the goal was not reached: {state.why}.")
     for name in written:
         terminal.out.print(f"  {name}")
-    files = " ".join(map(str, outcome.recordings))
-    terminal.out.print(f"Next:\n  pupper-sysid calibrate {files} --out calibrated.yaml")
+    following = ("calibrate", *outcome.recordings, "--out", "calibrated.yaml")
+    terminal.out.print(f"Next:\n  {terminal.command('pupper-sysid', *following)}")

@@ -128,11 +128,12 @@ class CalibrateJoints:
                 terminal.number(entry.counts_per_rad, 2),
             )  # fmt: skip
         terminal.out.print(table)
+        where = ("--bus", self.bus, "--joint-map", self.out)
+        sweep = ("sweep", "--freqs", "1-10", "--joints", next(iter(offsets)), *where)
         terminal.out.print(
             f"Wrote {self.out}. The servos are limp.\nNext:\n"
-            f"  pupper-sysid monitor --bus {self.bus} --joint-map {self.out}\n"
-            f"  pupper-sysid sweep --freqs 1-10 --joints {next(iter(offsets))} --bus {self.bus} "
-            f"--joint-map {self.out}"
+            f"  {terminal.command('pupper-sysid', 'monitor', *where)}\n"
+            f"  {terminal.command('pupper-sysid', *sweep)}"
         )
 
 

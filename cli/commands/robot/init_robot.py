@@ -22,7 +22,8 @@ class InitRobot:
     """Make a joint map of another robot with hobby servos, and plan its sweeps.
 
     Example: pupper-sysid init-robot my_robot.xml --servo sts3215
-    Without a model file: pupper-sysid init-robot --servo xl330-m288 --joints pan=1,tilt=2
+
+    Example: pupper-sysid init-robot --servo xl330-m288 --joints pan=1,tilt=2
     """
 
     model: tyro.conf.Positional[Path | None] = None
@@ -69,10 +70,12 @@ class InitRobot:
         margin = servos.position_limits().margin(servos.rest_pose())
         plan = _plan(found.joint_names, margin)
         sweeps = [
-            f"pupper-sysid sweep --joint-map {target} --joints {','.join(names)} --freqs 1-6 "
-            f"--amplitude {amplitude:g}"
+            terminal.command(
+                "pupper-sysid", "sweep", "--joint-map", target, "--joints", ",".join(names),
+                "--freqs", "1-6", "--amplitude", f"{amplitude:g}",
+            )
             for amplitude, names in plan
-        ]
+        ]  # fmt: skip
         if left_out:
             terminal.warn(
                 f"no actuator of {self.model} drives these, left out: {', '.join(left_out)}."
@@ -103,7 +106,14 @@ class InitRobot:
                 }
             )
             return
-        table = terminal.table(f"{target}", "joint", "id", "centre rad", "limits rad", "margin rad")
+        table = terminal.table(
+            f"{target}, servos {self.servo}",
+            "joint",
+            "id",
+            "centre rad",
+            "limits rad",
+            "margin rad",
+        )
         for k, name in enumerate(found.joint_names):
             entry = found.file.joints[name]
             low, high = entry.limits_rad
@@ -114,13 +124,14 @@ class InitRobot:
         terminal.out.print(table)
         feetech = self.servo.startswith(("sts", "scs", "hd"))
         bus = f"{'feetech' if feetech else 'dynamixel'}:/dev/ttyUSB0"
+        quoted = terminal.command(target)
         terminal.out.print(
             "Ids, signs and centres are guesses. Ids and signs are for you to check: with the "
             "servos limp, move one joint after the other by hand to its positive side and watch\n"
-            f"  pupper-sysid monitor --joint-map {target} --bus {bus}\n"
+            f"  pupper-sysid monitor --joint-map {quoted} --bus {bus}\n"
             f"If another row changes, correct the id in {target}; if the angle falls, the sign.\n"
             "Then measure centres, ranges and scale:\n"
-            f"  pupper-sysid calibrate-joints --joint-map {target} --out {target} --force "
+            f"  pupper-sysid calibrate-joints --joint-map {quoted} --out {quoted} --force "
             f"--bus {bus}\n"
             f"Sweep, first without the robot, then with --bus {bus}:\n"
             + "".join(f"  {line}\n" for line in sweeps)

@@ -234,7 +234,9 @@ class Export:
             )  # fmt: skip
             for name, row in checked.joints.items():
                 parts.add_row(name, *(n(1e3 * cost, 2) for cost in row.step_rad.values()))
+            terminal.out.print()
             terminal.out.print(parts)
+            terminal.out.print()
         for sentence in checked.notes:
             terminal.err.print(sentence)
 

@@ -98,5 +98,6 @@ class Samples:
         for target in files:
             terminal.out.print(f"  {target}")
         terminal.err.print(
-            f"Wrote {len(files)} files. Next: pupper-sysid delay {self.out / 'sweep.csv'}"
+            f"Wrote {len(files)} files. Next: "
+            + terminal.command("pupper-sysid", "delay", self.out / "sweep.csv")
         )

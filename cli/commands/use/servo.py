@@ -120,7 +120,7 @@ class Diff:
     """A card's name or file, a parameter file of BAM, a calibration or a preset; a robot's MJCF, or
     a Python configuration, which is read and not run."""
     second: tyro.conf.Positional[str]
-    """Another one."""
+    """What it is compared with, alike."""
     joint: str | None = None
     """Joint of a calibration, or specimen of a card; by default the first."""
     gain: float | None = None
@@ -203,6 +203,7 @@ def _files(data: Sequence[InputFile]) -> str:
 
 def _numbers(card: ServoCard, name: str, gain: float | None) -> Any:
     """Table of one specimen: as it is stated, and as a PD in torque."""
+    from pupper_sysid.servo_models.calibration.quantity import words_of
     from pupper_sysid.servo_models.cards.numbers import TorquePD, unit
 
     numbers, pd = card.specimens[name], card.pd(name, gain)
@@ -218,20 +219,8 @@ def _numbers(card: ServoCard, name: str, gain: float | None) -> Any:
             value: Any = getattr(part, key)
             if key != "model" and value is not None:
                 unit_text = unit(key)
-                table.add_row(f"  {_words(key)}", _with_interval(value), unit_text)
+                table.add_row(f"  {words_of(key)}", _with_interval(value), unit_text)
     return table
-
-
-def _words(key: str) -> str:
-    """A field's name without its unit."""
-    from pupper_sysid.common.border import UNIT_OF_SUFFIX
-    from pupper_sysid.servo_models.cards.numbers import unit
-
-    # a name may only look as if it ended in a unit: duty_per_rad is in 1/rad
-    end = next(
-        (e for e, u in UNIT_OF_SUFFIX.items() if key.endswith(f"_{e}") and u == unit(key)), ""
-    )
-    return key.removesuffix(f"_{end}").replace("_", " ")
 
 
 def _with_interval(quantity: Quantity | None) -> str:
@@ -239,7 +228,8 @@ def _with_interval(quantity: Quantity | None) -> str:
         return "–"
     text = f"{quantity.value:.4g}"
     if quantity.low is not None and quantity.high is not None:
-        text += f" [{quantity.low:.3g}, {quantity.high:.3g}]"
+        if quantity.low < quantity.high:  # else known without error, such as a term left out
+            text += f" [{quantity.low:.3g}, {quantity.high:.3g}]"
     return text
 
 

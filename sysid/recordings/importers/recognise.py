@@ -29,6 +29,8 @@ _STAMP = re.compile(
     rb"\[(?:[\d.:, TZ-]+\][ \t]*[A-Za-z(]|[A-Za-z]+\][ \t:]*[\[\w])"
 )  # before a message: a line of text
 _YAML = re.compile(rb"(?:---\s*\n)?(?:- \w+:|\w+:[ \t]*\r?\n[ \t]+\w+:)")
+_SCHEMA = re.compile(rb'^[ \t{]*"?schema"?: *"?(pupper-[a-z -]*[a-z])"?,?\s*$', re.MULTILINE)
+_MARKUP = re.compile(rb"<[?!A-Za-z]")
 _ROW = re.compile(rb"\[[-+\d.eE, \t\[\]()]+\][ \t]*\r?\n")  # numbers, a whole line
 
 
@@ -95,7 +97,15 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
     if data.startswith(parquet.MAGIC):
         return replace(parquet.read_parquet(path, data, options), sha256=digest)
     start = data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")
-    if _YAML.match(start):
+    if schema := _SCHEMA.search(data[:4096]):
+        raise InputError(
+            f"{path} is a file of pupper-sysid, but not a recording (schema: "
+            f"{schema[1].decode()}). Give a log: what `pupper-sysid sweep` recorded, or another "
+            "project's."
+        )
+    if _MARKUP.match(start):
+        raise InputError(f"{path} is XML or HTML, such as a robot's model or a page, not a log.")
+    if _YAML.match(start) or path.suffix.lower() in (".yaml", ".yml"):
         raise InputError(
             f"{path} is YAML, which is not read: write rows as CSV, or record messages with "
             "`ros2 bag record`."

@@ -385,7 +385,7 @@ def _refuse_choices(path: Path | str, why: str, pairs: Sequence[_Pair]) -> None:
 
 def import_line(path: Path | str, **options: str) -> str:
     """The command that imports a log with these options."""
-    words = [f"pupper-sysid import {shlex.quote(Path(path).name)}"]
+    words = [f"pupper-sysid import {shlex.quote(str(path))}"]
     for name, value in (options | {"out": "rec.csv"}).items():
         words.append(f"--{name.replace('_', '-')} {shlex.quote(printable(value)) if value else ''}")
     return f"`{' '.join(map(str.rstrip, words))}`"

@@ -44,6 +44,11 @@ def test_the_servos_of_the_training_are_within_its_ranges():
     assert "within the ranges that the policy was trained for (calibrated.yaml; 97" in said
 
 
+def test_digits_that_two_files_round_apart_are_no_difference():
+    feedback = tuple(replace(f, quantum_rad=1.0001 * f.quantum_rad) for f in HERE.feedback)
+    assert not outside(replace(HERE, feedback=feedback))
+
+
 def test_a_later_servo_is_outside_by_the_time_beyond_the_longest_of_the_training():
     here = HERE.later(0.02)
     found = outside(here)

@@ -19,6 +19,7 @@ from pupper_sysid.sysid.fit.posterior import EFFECTIVE, R_HAT
 from pupper_sysid.sysid.fit.preparation import prepare_joint
 from pupper_sysid.sysid.fit.results import plausible
 from pupper_sysid.sysid.fit.run import prepare
+from pupper_sysid.sysid.fit.servo_prior import ServoPrior
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording, Trial, Truncation
 from support.planned_servos import two_joints
@@ -207,6 +208,9 @@ def test_each_joint_has_the_stall_torque_of_its_own_servo_unless_one_is_given():
     # 30 kg·cm
     assert anchors["knee"][0] == pytest.approx(30 * 0.0980665) and "C018" in anchors["knee"][1]
     assert anchors["wrist"] == (STALL_TORQUE_NM, STALL_TORQUE_SOURCE)
+    prior = ServoPrior("card.yaml", {}, 0.7, effort_limit_nm=1.9)
+    of_prior = torque_anchors(["knee", "wrist"], [arm], priors=dict.fromkeys(both, prior))
+    assert of_prior == anchors | {"wrist": (1.9, "effort limit of card.yaml")}
     assert torque_anchors(["knee", "wrist"], [arm], 2.0) == dict.fromkeys(both, (2.0, GIVEN_TORQUE))
 
 

@@ -99,6 +99,17 @@ def test_a_harmonic_that_the_rows_cannot_tell_from_the_tone_is_left_out():
         assert late == pytest.approx(0.02, abs=1e-4)
 
 
+def test_tones_that_the_servo_cannot_follow_are_in_neither_the_lag_nor_its_range():
+    """A servo whose gain falls below a half at 5 Hz."""
+    trials = []
+    for trial in tone_trials(0.04, np.random.default_rng(5), (1.0, 3.0, 5.0), period_s=0.0):
+        share = 0.3 if trial.frequency_hz == 5.0 else 1.0
+        trials.append(replace(trial, position_rad=share * trial.position_rad))
+    budget = lag_budget("LF_hip", trials, np.random.default_rng(5))
+    assert len(budget.by_frequency) == 3 and "at 5 Hz" in " ".join(budget.warnings)
+    assert budget.lag_range.startswith("mean over 1–3 Hz; ")
+
+
 def test_readings_that_are_never_held_are_dated_to_the_read():
     rng = np.random.default_rng(5)
     trials = tone_trials(0.04, rng, (1.0, 3.0), period_s=0.0, quantum_rad=0.0001)

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
 from pupper_sysid.common.errors import InputError
@@ -391,6 +392,15 @@ def test_letters_in_figures_are_nine_points_or_more():
     for figure in drawn:
         sizes = [t.get_fontsize() for t in figure.findobj(Text) if t.get_text()]
         assert sizes and min(sizes) >= 9.0
+
+
+@pytest.mark.parametrize("joints", (2, 4))
+def test_a_legend_lies_within_its_figure(joints):
+    shown = {f"LF_{n}": figures.tracks(result_of()) for n in range(joints)}
+    for figure in (figures.overlay_grid(shown), figures.residual_grid(shown)):
+        FigureCanvasAgg(figure).draw()
+        (legend,) = figure.legends
+        assert legend.get_window_extent().width < figure.bbox.width
 
 
 def test_the_lag_figure_draws_the_parts_end_to_end():

@@ -137,8 +137,8 @@ def test_two_columns_that_are_as_good_are_refused_with_the_line_that_takes_each(
     with pytest.raises(InputError) as caught:
         load(tmp_path / "log.csv")
     for word in ("goal", "target"):
-        line = f"import log.csv --command '{word}.{{joint}}' --position 'present.{{joint}}' --out"
-        assert f"`pupper-sysid {line}" in str(caught.value)
+        line = f"log.csv --command '{word}.{{joint}}' --position 'present.{{joint}}' --out"
+        assert line in str(caught.value)
     holds(
         load(tmp_path / "log.csv", LogOptions(command="goal.{joint}", position="present.{joint}")),
         ["knee"],
@@ -156,14 +156,14 @@ def test_refusals_name_what_is_there_and_a_line_that_takes_it(tmp_path):
         (file("a.csv", "time=t|cmd=c|hippo=p"), "a.csv --time time --command cmd --position hippo"),
         (file("b.csv", "when=t|cmd=c|pos=p"), "b.csv --time when --command cmd --position pos"),
         (file("c.csv", "tick=t|cmd=c|pos=p"), "--rate"),
-        (file("d.csv", "time=t|goal_position=cc|present_position=pc"), "import d.csv --unit deg"),
+        (file("d.csv", "time=t|goal_position=cc|present_position=pc"), "d.csv --unit deg"),
         (file("e.csv", "time=t|cmd_1=c|cmd_2=c|pos_a=p|pos_b=p"),
          "--command cmd_1,cmd_2 --position pos_a,pos_b"),
     ]  # fmt: skip
     assert_each_refused(cases, load, names="pupper-sysid import")
     whole = frame("time=t|goal_position=cc|present_position=pc").round()
     whole.to_csv(tmp_path / "f.csv", index=False)
-    assert_each_refused([(tmp_path / "f.csv", "import f.csv --unit counts:4096")], load)
+    assert_each_refused([(tmp_path / "f.csv", "f.csv --unit counts:4096")], load)
     two = LogOptions(command="cmd_1,cmd_2", position="pos_a,pos_b", joints={"a": "a", "b": "b"})
     holds(load(tmp_path / "e.csv", two), ["a", "b"])
 

@@ -273,9 +273,7 @@ def test_a_log_is_read_in_each_form(tmp_path, form):
 def test_columns_without_names_have_numbers_and_the_refusal_has_the_line_that_takes_them(tmp_path):
     for separator in (",", "\t", "  "):
         (tmp_path / "log.txt").write_text(joined(separator, ()))
-        with pytest.raises(
-            InputError, match=r"import log.txt --time 0 --command 1 --position 2 --out"
-        ):
+        with pytest.raises(InputError, match=r"log.txt --time 0 --command 1 --position 2 --out"):
             load(tmp_path / "log.txt")
         same(load(tmp_path / "log.txt", COLUMNS))
     np.save(tmp_path / "log.npy", np.column_stack([TIME, COMMAND, POSITION]))
@@ -360,7 +358,7 @@ def test_what_cannot_be_read_is_refused_with_the_cure(tmp_path):
     (tmp_path / "log.xls").write_bytes(b"\xd0\xcf\x11\xe0" + bytes(200))
     text = joined(",").replace(f"\n{TIME[3]:.6f},", "\nsoon,")
     (tmp_path / "word.csv").write_text(text)
-    cases = [("log.csv", "import log.csv --unit percent:3.5 --out"), ("log.mat", "writematrix"),
+    cases = [("log.csv", "log.csv --unit percent:3.5 --out"), ("log.mat", "writematrix"),
              ("echo.txt", "ros2 bag record"), ("log73.mat", "'-v7'"),
              ("log.h5", "h5py"), ("log.xls", "save it as CSV"),
              ("word.csv", "'soon' is no")]  # fmt: skip

@@ -228,7 +228,7 @@ def test_tables_that_are_no_log_are_refused_with_the_way_out(tmp_path):
     alike = pd.DataFrame({"time": TIME, "a-b_command": 0.0, "a-b_position": 0.1,
                           "a b_command": 0.0, "a b_position": 0.1})  # fmt: skip
     cases = [
-        (degrees, "import deg.csv --unit deg"), (file("imu.csv", imu), "IMU's readings"),
+        (degrees, "deg.csv --unit deg"), (file("imu.csv", imu), "IMU's readings"),
         (file("up.csv", worded), "line 9, column knee_command: 'up' is not a number"),
         (file("alike.csv", alike), "two joints would be called a_b"),
     ]  # fmt: skip
