@@ -10,6 +10,7 @@ from typing import Any
 
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.file_kinds import RECORDING, refuse_other_kind
 from pupper_sysid.common.reading.dialect import decoded
 from pupper_sysid.sysid.recordings.importers import (
     arrays,
@@ -44,6 +45,7 @@ def logs_in(path: Path) -> list[Path]:
     """The logs that a path stands for: itself, or those in a folder that is none."""
     if not path.is_dir() or is_log_folder(path):
         return [path]
+    refuse_other_kind(path, RECORDING)
     found = [p for p in sorted(path.iterdir()) if is_log_folder(p) or _may_be_log(p)]
     if not found:
         raise InputError(f"{path}: {unknown_folder(p.name for p in path.iterdir())}")
