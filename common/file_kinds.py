@@ -24,9 +24,8 @@ _KINDS = {
     "pupper-servo-model": (
         "a fitted servo model", "`pupper-sysid compare` takes its folder as one of `models`"),
     "pupper-sysid plan": ("a plan", "`pupper-sysid sweep` takes it as `plan`"),
-    "pupper-policy": ("a policy", "`pupper-eval`, `pupper-play` and `pupper-deploy` read its folder"),
-    "pupper-run": (
-        "a training run", "`pupper-eval` reads its folder, and `pupper-train` resumes it"),
+    "pupper-policy": ("a policy", "`pupper-eval`, `pupper-play` and `pupper-deploy` read it"),
+    "pupper-run": ("a training run", "`pupper-eval` reads its folder, `pupper-train` resumes it"),
 }  # fmt: skip
 """By the schema that a file states: what it is, and what reads it."""
 _INSIDE = ("contract.json", "run.yaml")  # of a folder

@@ -34,8 +34,10 @@ READERS = {
 @pytest.mark.parametrize("kind", FILES)
 @pytest.mark.parametrize("wanted", READERS)
 def test_a_file_of_another_kind_is_named_with_what_reads_it(kind, wanted):
-    if kind == wanted or (wanted == "a fitted servo model" and FILES[kind].is_file()):
-        return
+    if kind == wanted or (kind, wanted) == ("a servo card", "a calibration"):
+        return  # which a card stands for
+    if wanted == "a fitted servo model" and FILES[kind].is_file():
+        return  # which is a folder
     with pytest.raises(InputError, match=rf"is {kind}, not {wanted}: `pupper-[a-z]+"):
         READERS[wanted](FILES[kind])
 
