@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from pupper_sysid.cli.terminal import cell, err, table, warn
 from pupper_sysid.common.border import read_json
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import resolved, sha256
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, is_shipped
@@ -55,6 +56,7 @@ def policy_at(path: Path) -> tuple[Policy, Run | None]:
         of_run = next((f for f in (path, path.parent) if (f / RUN_FILE).is_file()), None)
         return load_policy(path), load_run(of_run) if of_run else None
     if not (path / RUN_FILE).is_file():
+        refuse_other_kind(path, "pupper-run")
         raise InputError(
             f"{path} is neither a run nor a policy. Give a folder that pupper-train wrote, "
             "like runs/<name>."

@@ -30,6 +30,7 @@ from pupper_sysid.common.border import (
     validated,
 )
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import as_path, refuse_overwrite, write_bytes, write_text
 from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.processes.stop import held
@@ -316,6 +317,7 @@ def _check_names(arch: str, found: set[str]) -> None:
 
 
 def _read_contract(folder: Path) -> Contract:
+    refuse_other_kind(folder, SCHEMA)
     path = folder / CONTRACT
     if not os.path.exists(path):
         raise InputError(

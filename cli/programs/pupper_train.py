@@ -28,6 +28,7 @@ from pupper_sysid.cli.policy_choice import warn_of_fallbacks
 from pupper_sysid.cli.terminal import err, out, print_json, share_progress, spell, warn
 from pupper_sysid.cli.user_errors import begin_work, parse, user_errors
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import hold_output, refuse_path
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.network.hyperparameters import OWN, TROT, Kind
@@ -160,6 +161,7 @@ def _run(options: Options, given: list[str]) -> None:
     ranks = Ranks.join()
     folder = options.resume or Path("runs") / ranks.same(options.name or _name(options))
     if options.resume is not None and not options.resume.is_dir():
+        refuse_other_kind(options.resume, "pupper-run")
         raise InputError(f"{options.resume} does not exist. Give the folder of a run.")
     if options.resume is None:
         refuse_taken(folder)

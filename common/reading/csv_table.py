@@ -15,7 +15,9 @@ import csv
 import io
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import allowed, refuse_more
-from pupper_sysid.common.reading.dialect import decimal
+from pupper_sysid.common.reading.dialect import decimal, is_clock
 from pupper_sysid.common.strict_yaml import printable
 
 
@@ -95,11 +97,13 @@ LONGEST_COMMENT = 1_000_000
 _OLD_PANDAS = tuple(map(int, pd.__version__.split(".")[:2])) < (3, 1)
 _EXACTLY: dict[str, Any] = {"float_precision": "round_trip"} if _OLD_PANDAS else {}
 _SPLIT = "Split it by joint or by time."
-_BLOCK = 4_000_000  # characters
+_BLOCK, _TAIL, _FEW_LINES = 4_000_000, 20_000, 20  # characters, the last of them; lines
 _FEW_BROKEN = 0.01  # of the lines: a serial line lost characters
-_NOTHING = frozenset(
-    "none null nil n/a na #n/a - -- ? <na> missing invalid lost failed err error timeout".split()
+_NOTHING = re.compile(
+    r"[\W_]*(\d\.#([qs]?nan|ind)\d*|nan(\(\w+\))?|none|null|nil|n/?a|div/0|num|value|ref|missing|"
+    r"invalid|lost|failed|err|error|timeout)?[\W_]*"
 )
+_LONGEST_WORD = 30
 """Words for a reading that failed."""
 _COMMENT = re.compile(r"^#.*$", re.MULTILINE)
 _QUOTED = re.compile(r'(?:^|(?<=[,\n]))"([^",\n]*)"(?=[,\n]|$)')
@@ -122,7 +126,8 @@ class CsvTable:
     comments: list[tuple[int, str]] = field(default_factory=list)
     """Comment lines, numbered."""
     broken: list[int] = field(default_factory=list)
-    """Lines with another number of cells, which have been left out; few, and not if strict."""
+    """Lines that are no rows, and have been left out: remarks without a number, and a few with
+    another number of cells; none if strict."""
     cut: bool = False
     """Whether the last row was incomplete and has been left out."""
 
@@ -164,7 +169,7 @@ def read_table(
     refuse_more(path, rows, MOST_ROWS, "rows", _SPLIT)
     refuse_more(path, rows * len(found.columns), MOST_CELLS, "cells", _SPLIT)
     end = len(text)
-    if whole_lines and not text.endswith("\n"):
+    if not text.endswith("\n") and (whole_lines or _is_cut(text)):
         end = max(text.rfind("\n") + 1, at)
         last = text[end:].strip()
         found.cut = bool(last) and last[0] != "#"
@@ -175,6 +180,13 @@ def read_table(
         at = stop
     blocks.finish()
     return found
+
+
+def _is_cut(text: str) -> bool:
+    """Whether the last line of a text, which does not end, is the shortest of many."""
+    *others, last = text[-_TAIL:].split("\n")[1:] or [""]
+    shortest = min(map(len, others[-_FEW_LINES:]), default=0)
+    return len(others) >= _FEW_LINES and last[:1] != "#" and len(last.rstrip()) < shortest
 
 
 def one_line_end(text: str) -> str:
@@ -307,14 +319,15 @@ class _Blocks:
         # line by line: a stray quote must not swallow the lines behind it
         rows = [_cells(path, n, line) for n, line in given]
         lines = [n for n, _ in given]
+        numeric = [self._strict or _numeric(row) for row in rows]
+        if any(numeric):
+            rows, lines = self._only(numeric, rows, lines)
         if last and rows and len(rows[-1]) < len(found.columns):
             found.cut = True
             rows, lines = rows[:-1], lines[:-1]
         whole = [len(row) == len(found.columns) for row in rows]
         if not self._strict and 0 < whole.count(False) <= max(_FEW_BROKEN * len(rows), 1):
-            found.broken += [n for n, good in zip(lines, whole, strict=True) if not good]
-            rows = [row for row, good in zip(rows, whole, strict=True) if good]
-            lines = [n for n, good in zip(lines, whole, strict=True) if good]
+            rows, lines = self._only(whole, rows, lines)
         for n, row in zip(lines, rows, strict=True):
             if len(row) != len(found.columns):
                 raise InputError(
@@ -330,13 +343,20 @@ class _Blocks:
             elif name in self._numbers:
                 try:
                     self._numbers[name].append(
-                        numbers_of(path, name, cells, lines, () if self._strict else _NOTHING)
+                        numbers_of(path, name, cells, lines, not self._strict)
                     )
                 except InputError as error:
                     if self._strict:
                         raise
                     found.faults[name] = str(error)
                     del self._numbers[name]
+
+    def _only(
+        self, good: list[bool], rows: list[list[str]], lines: list[int]
+    ) -> tuple[list[list[str]], list[int]]:
+        """Rows that are `good`, and their lines; the others are broken."""
+        self._found.broken += [n for n, one in zip(lines, good, strict=True) if not one]
+        return list(compress(rows, good)), list(compress(lines, good))
 
     def _text(self, cell: str) -> str:
         cell = cell.strip()
@@ -348,7 +368,7 @@ def numbers_of(
     name: str,
     cells: Sequence[str],
     lines: Sequence[int] | NDArray[np.int64],
-    nothing: Collection[str] = (),
+    words: bool = False,
 ) -> NDArray[np.float64]:
     """Numbers of a column's cells; an empty one is NaN.
 
@@ -360,12 +380,14 @@ def numbers_of(
     cells : sequence of str
     lines : sequence of int
         Of the cells, for messages.
-    nothing : collection of str
-        Words in lower case that stand for an empty cell.
+    words : bool
+        Whether a word for a reading that failed, such as `timeout`, stands for an empty cell.
     """
     values, shown = np.full(len(cells), np.nan), printable(name)[:60]
     for k, cell in enumerate(cells):
-        if not (text := cell.strip()) or text.lower() in nothing:
+        if not (text := cell.strip()):
+            continue
+        if words and len(text) < _LONGEST_WORD and _NOTHING.fullmatch(text.lower()):
             continue
         try:
             values[k] = decimal(text)
@@ -377,6 +399,15 @@ def numbers_of(
         if np.isinf(values[k]):
             raise InputError(f"{path}, line {lines[k]}, column {shown}: the value is infinite.")
     return values
+
+
+def _numeric(row: Sequence[str]) -> bool:
+    """Whether a cell is a number or a time of day: in a table of numbers no remark has one."""
+    for cell in row:
+        with suppress(ValueError):
+            decimal(cell)
+            return True
+    return any(map(is_clock, row))
 
 
 def _bare(block: str, first: int, comments: Sequence[int]) -> tuple[str, NDArray[np.int64]]:

@@ -20,7 +20,7 @@ import io
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from pupper_sysid.common.errors import InputError
 
@@ -85,15 +85,21 @@ _ROWS = 100  # of the table, from which its shape is taken
 _SEPARATORS = ("\t", ";", ",", "|", " ")
 _NAMES_OF = {"\t": "tabs", ";": "semicolons", "|": "bars", " ": "spaces", ",": "commas"}
 _USUAL = 0.9  # share of ASCII in tables of numbers that are not in UTF-8
+_FEWEST_TIMES, _LONGEST_TRANSPOSED = 20, 20_000_000  # rows of a log; characters
 _SAME_SHAPE, _NUMERIC = 0.9, 0.9  # shares of rows, of cells
 _COMMENT = re.compile(r"[ \t]*(#|%|//|!)")
 _COMMA_NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:,[0-9]*)?|,[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _CLOCK = re.compile(
     r"(\d{4}-\d\d-\d\d[T ]|\d{1,4}([-/.])\d{1,2}\2\d{1,4} |\d+ days? )?"
-    r"(\d{1,2}:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?|\d{1,3}:\d\d[.,]\d+)"
+    r"(\d{1,2}:\d\d:\d\d([.,]\d+|:\d{3})?(Z|[+-]\d\d:?\d\d| ?[AP]M)?|\d{1,3}:\d\d[.,]\d+)"
 )
-_FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]\d{2,3}(?![\w.]))")
-_GROUPED = re.compile(r"(?<![\w.,'’])[+-]?\d{1,3}(?:['’]\d{3})+(?![\w'’])")
+_EXPONENT = re.compile(r"(?<=[\d.])(?:[dD](?=[+-]\d{2,3}(?![\w.]))|\*\^(?=-?\d))")  # Mathematica's
+_GROUP_MARKS = "['’\u00a0\u2009\u202f]"
+_GROUPED = re.compile(rf"(?<![\w.,'’])[+-]?\d{{1,3}}(?:{_GROUP_MARKS}\d{{3}})+(?![\w'’])")
+_COLOUR = re.compile(r"\x1b\[[\d;]*m")  # of a terminal
+_WRAPPED = re.compile(r"\b(?:tensor|array)\((?:'\w', ?)?(\[[^\]\n]*\])[^()\n]{0,80}\)")
+_RULE = re.compile(r"^[ \t|+:]*-{3}[-+ |:]*$", re.MULTILINE)  # below the names of a printed table
+_SINGLE = re.compile(r"(?:^|[,;\t|])'[^',;\t|\n]*'")
 _QUOTED_GROUPS = re.compile(r'"([+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?)"')
 _COMMA_GROUPS = re.compile(r"(?<![\w.,])[+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?(?![\w,])")
 _POINT_GROUPS = re.compile(r"(?<![\w.,])[+-]?\d{1,3}(?:\.\d{3})+(?:,\d+)?(?![\w.])")
@@ -103,16 +109,18 @@ _UNITS = (
 )
 _UNIT = re.compile(rf"[(\[<{{]?\s*({_UNITS}|raw|-|1|none)\s*[)\]>}}]?", re.IGNORECASE)
 _WITH_UNIT = re.compile(rf"([-+]?[\d.]+(?:[eE][-+]?\d+)?) ?({_UNITS})", re.IGNORECASE)
+_NAMED_LIST = re.compile(r"([A-Za-z_][\w./]*)\s*[:=]\s*[\[(]\s*([-+.\deE,; \t]+?)\s*[\])]")
 _PAIR = re.compile(
-    r"(?<![\w\"'])([A-Za-z_][\w./]*)\s*[:=]\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
+    r"(?<![\w\"'])[\"']?([A-Za-z_][\w./]*)[\"']?\s*[:=]\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
     rf"(?:{_UNITS})?(?![\w:])",
     re.IGNORECASE,
 )
 _STAMPED = re.compile(
     r"^[ \t]*(?:\[[A-Za-z]+\][ \t]*)?"  # [INFO]
     r"(?:\[?((?:\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,]\d+)?)\]?|"
-    r"[(\[][ \t]*(\d+\.\d+)[ \t]*[)\]])"
-    r"[ \t]*(?:->|[|:])?[ \t]+(?=\S)",
+    r"[(\[][ \t]*(\d+\.\d+)[ \t]*[)\]]|"
+    r"[EWIDV] \((\d+)\) [\w.-]+:)"  # ESP-IDF's milliseconds and tag
+    r"[ \t]*(?:->|[|:>])?[ \t]+(?=\S)",
     re.MULTILINE,
 )
 _REMARK = re.compile(r"\W*\w+\W*:$")  # a first word such as WARN: or [INFO]:
@@ -155,6 +163,7 @@ class _Shape:
     numeric: tuple[bool, ...]  # by column
     units: dict[int, str]  # of columns in whose cells one stands behind the number
     counted: bool  # whether the first column counts the rows
+    blank: tuple[bool, ...]  # by column
 
 
 def plain(text: str) -> Plain:
@@ -169,11 +178,15 @@ def plain(text: str) -> Plain:
         bare.pop(0)
     if len(bare) < 3:
         return Plain(text)
+    if (turned := _transposed(text)) is not None:
+        return replace(turned, notes=[*turned.notes, "its rows were taken for columns."])
     rows = [lines[n] for n in bare[len(bare) // 2 :][:_ROWS]]
     if (usual := _usual_numbers(text, [*rows, *text[-2000:].split("\n")[1:-1]])) != text:
         return plain(usual)
     if all(_TELEPLOT.match(row) for row in rows):
         return _teleplot(text)
+    if all(_NAMED_LIST.search(row) for row in rows):
+        return plain(_NAMED_LIST.sub(_apart, text))
     names = Counter(tuple(name for name, _ in _PAIR.findall(row)) for row in rows).most_common(1)[0]
     if len(set(names[0])) == len(names[0]) > 1 and names[1] >= _SAME_SHAPE * len(rows):
         return _labelled(text, list(names[0]))
@@ -191,8 +204,20 @@ def plain(text: str) -> Plain:
     return _rewritten(text, lines, bare, shape)
 
 
+def _transposed(text: str) -> Plain | None:
+    """The table of a text with a line per quantity and a cell per time; None if it is none."""
+    if len(text) > _LONGEST_TRANSPOSED or text.count("\n") > _FEWEST_TIMES:
+        return None
+    lines = [line for line in text.split("\n") if line.strip() and not _COMMENT.match(line)]
+    for separator in _SEPARATORS:
+        rows = [_split(line, separator) for line in lines]
+        if len({len(row) for row in rows}) == 1 and len(rows[0]) > 3 * _FEWEST_TIMES:
+            return plain("\n".join(separator.join(row) for row in zip(*rows, strict=True)))
+    return None
+
+
 def _usual_numbers(text: str, rows: Sequence[str]) -> str:
-    """The text without thousands separators, Fortran's exponents and typeset minus signs.
+    """The text without thousands separators, odd exponents, quotes and minus signs, and colours.
 
     A comma groups thousands where it is quoted, or where cells are separated otherwise, every
     comma stands before three digits, and other numbers have a decimal point; a point where the
@@ -203,10 +228,18 @@ def _usual_numbers(text: str, rows: Sequence[str]) -> str:
         text = text.replace("\u2212", "-")
     if _HEX.search(sample):
         text = _HEX.sub(lambda m: str(int(m[0], 16)), text)
-    if _FORTRAN.search(sample):
-        text = _FORTRAN.sub("E", text)
+    if "---" in text[:_SAMPLE]:
+        text = _RULE.sub("", text)
+    if "\x1b" in text:
+        text = _COLOUR.sub("", text)
+    if _WRAPPED.search(sample):
+        text = _WRAPPED.sub(r"\1", text)
+    if _EXPONENT.search(sample):
+        text = _EXPONENT.sub("E", text)
     if _GROUPED.search(sample):
-        text = _GROUPED.sub(lambda m: re.sub("['’]", "", m[0]), text)
+        text = _GROUPED.sub(lambda m: re.sub(_GROUP_MARKS, "", m[0]), text)
+    if all(_SINGLE.search(row) for row in rows) and '"' not in sample:
+        text = text.replace("'", '"')
     if _QUOTED_GROUPS.search(sample):
         text = _QUOTED_GROUPS.sub(lambda m: m[1].replace(",", ""), text)
     elif all(";" in row or "\t" in row for row in rows):
@@ -219,7 +252,15 @@ def _usual_numbers(text: str, rows: Sequence[str]) -> str:
 
 def _stamp(match: re.Match[str]) -> str:
     """The time at the start of a line as a cell."""
+    if match[3]:
+        return f"{int(match[3][:15]) / 1000}"
     return match[2] or match[1].replace(" ", "T").replace(",", ".")
+
+
+def _apart(match: re.Match[str]) -> str:
+    """The numbers of a named list with a name each."""
+    numbers = _NUMBERS.split(match[2].strip())[:_LONGEST_LIST]
+    return " ".join(f"{match[1]}.{k}:{number}" for k, number in enumerate(numbers))
 
 
 def is_clock(cell: str) -> bool:
@@ -248,7 +289,8 @@ def _shape(rows: Sequence[str]) -> _Shape | None:
                 most = sum(shares) / columns
                 numeric = tuple(s >= _NUMERIC and f for s, f in zip(shares, full, strict=True))
                 counted = _counted([row[0] for row in cells])
-                best = _Shape(separator, comma, columns, numeric, units, counted)
+                blank = tuple(not f for f in full)
+                best = _Shape(separator, comma, columns, numeric, units, counted, blank)
     return best if best is not None and any(best.numeric) else None
 
 
@@ -284,6 +326,8 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
     if before and (cells := _units(lines[before[-1]], shape)) and len(before) > 1:
         units = cells
         before.pop()
+    if before and all(map(_is_decimal, _split(lines[before[-1]], shape.separator))):
+        lines[before.pop()] = ""  # the end of a row, where a monitor was opened
     if before:
         columns = _names(lines[before[-1]], shape)
         if columns is None or len(columns) != shape.columns:
@@ -291,13 +335,15 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
                 return Plain(text)
     else:
         comments = [line for line in lines[:first] if _COMMENT.match(line)]
-        columns = next((c for c in map(lambda x: _named_in(x, shape), comments[::-1]) if c), None)
+        columns = next((c for c in map(lambda x: _named_in(x, shape), comments[:-4:-1]) if c), None)
         if columns is not None:
             notes.append("the names of its columns were taken from a comment")
     while columns and len(before) > 1 and shape.separator != " " and not _distinct(columns):
         above = _names(lines[before[-2]], shape)  # names in several lines, as of groups
         if above is None or len(above) != shape.columns:
             break
+        for k in range(1, len(above)):  # a cell over several columns
+            above[k] = above[k] or above[k - 1]
         columns = [f"{a}.{b}".strip(".") for a, b in zip(above, columns, strict=True)]
         lines[before.pop(-2)] = ""
     plain_names = (
@@ -319,7 +365,7 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
         columns[k : k + 1] = [f"{name} [{word}]" for name in columns[k : k + 1]]
     if units:
         notes.append("the row below the names was taken for their units")
-    if above := len(before) - (not numbered):
+    if (above := len(before) - (not numbered)) > 0:
         what = "the numbers" if numbered else "the names of the columns"
         notes.append(f"{above} line{'s' if above > 1 else ''} above {what} left out")
     if shape.separator != ",":
@@ -381,7 +427,7 @@ def _labelled(text: str, columns: list[str]) -> Plain:
         pairs = _PAIR.findall(line)
         same = columns == [name for name, _ in pairs]
         stamp = _STAMPED.match(line) if same else None
-        stamped = stamped or (stamp is not None and not rows)
+        stamped = stamped or (stamp is not None and not any(rows))
         cells = [value for _, value in pairs] if same else []
         cells = [_stamp(stamp) if stamp else "", *cells] if stamped and same else cells
         rows.append(",".join(cells))
@@ -480,7 +526,11 @@ def _is_row(line: str, shape: _Shape, whole: bool = False) -> bool:
     Of a whole row all cells are numbers where the others' are, rather than most of them.
     """
     cells = _split(line, shape.separator)
-    if len(cells) != shape.columns:
+    if len(cells) != shape.columns or any(
+        c and not _number(c, shape.comma)
+        for c, none in zip(cells, shape.blank, strict=True)
+        if none
+    ):
         return False
     full = [(k, c) for k, c in enumerate(cells) if shape.numeric[k] and c]
     numbers = [
@@ -553,6 +603,10 @@ _BINARY = {
     b"\x89HDF\r\n": ("an HDF5 file", "pandas.read_hdf or h5py reads it; write it with to_csv"),
     b"ARROW1": ("a feather file", "write it with pandas.read_feather(path).to_parquet"),
     b"\xd0\xcf\x11\xe0": ("a spreadsheet", "save it as CSV"),
+    b"<?xml": ("XML", "write its numbers as CSV"),
+    b"<": ("a web page or XML", "write its numbers as CSV"),
+    b"ULog": ("a PX4 log", "convert it with ulog2csv"),
+    b"#ROSBAG": ("a bag of ROS 1", "convert it with `rosbags-convert` to rosbag2"),
     b"\x80\x04\x95": ("a pickle, which can hold programs", "write its arrays with numpy.savez"),
 }
 """First bytes of files that are read by other programs, and what to do with them."""
@@ -567,7 +621,7 @@ def decoded(path: object, data: bytes) -> str:
     Zeros at the end, where a file system lost the last rows, are left out.
     """
     for first, (kind, cure) in _BINARY.items():
-        if data.startswith(first):
+        if data.lstrip(b"\xef\xbb\xbf \r\n").startswith(first):
             raise InputError(f"{path} is {kind}, which is not read: {cure}, then give that file.")
     wide = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}.get(data[:2])
     if wide is None and b"\0" in data[:2]:

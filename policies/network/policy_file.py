@@ -36,6 +36,7 @@ from pupper_sysid.common.border import (
     validated,
 )
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import (
     as_path,
     refuse_overwrite,
@@ -454,6 +455,8 @@ def load_policy(folder: Path | str) -> Policy:
         If a file is missing, damaged, of another version, or fails the gate.
     """
     folder = as_path(folder, "The folder of a policy")
+    if not (folder / CONTRACT).is_file():
+        refuse_other_kind(folder, SCHEMA)
     path, weights = folder / CONTRACT, folder / WEIGHTS
     for file in (path, weights):
         if not file.is_file():

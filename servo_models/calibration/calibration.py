@@ -25,6 +25,7 @@ from pydantic import Field, field_validator
 
 from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import as_path, write_text
 from pupper_sysid.common.joints import in_order, strange_joint
 from pupper_sysid.common.strict_yaml import dump
@@ -352,6 +353,7 @@ def load_calibration(path_or_preset: Path | str) -> Calibration:
 
 
 def _load(path: Path) -> Calibration:
+    refuse_other_kind(path, SCHEMA)
     data, lines = read_yaml(path)
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise InputError(

@@ -39,6 +39,7 @@ from pupper_sysid.common.border import (
     validated,
 )
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.servo_models.calibration.parts import LOADED_KEYS, UnderLoad
 from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number, Part
@@ -442,6 +443,7 @@ def load_card(path_or_name: Path | str) -> ServoCard:
 def _load(path: Path) -> ServoCard:
     if path.suffix.lower() == ".json":
         return load_bam(path)
+    refuse_other_kind(path, SCHEMA)
     data, lines = read_yaml(path)
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise InputError(

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import as_path
 from pupper_sysid.servo_models.calibration.calibration import (
     PRESETS,
@@ -315,6 +316,7 @@ def _calibrations(
         elif isinstance(given, ServoFit) or _is_folder(given):
             continue
         elif not is_shipped(given) and Path(given).suffix.lower() not in _ENDINGS:
+            refuse_other_kind(Path(given), "pupper-calibration")
             near = difflib.get_close_matches(str(given), (*PRESETS, *card_names()), n=1)
             usual = "Make one with `pupper-sysid fit-servo` or `calibrate`."
             raise InputError(

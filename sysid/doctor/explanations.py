@@ -145,15 +145,20 @@ class Explanation:
             Instead of the servo's.
         """
         lag = servo.lag_s if lag_s is None else lag_s
-        found = []
-        for s in self.samples:
-            before = round(LATEST_S / self.grid_s)
-            command = np.concatenate([np.full(before, s.rest_rad), s.command_rad])
-            command = command if changed is None else changed(command)
-            time = s.start_s + self.grid_s * (np.arange(len(command)) - before)
-            moved = _low_pass(command, *FILTERS[servo.filter], self.grid_s)
-            found.append(np.interp(s.time_s - lag, time, moved))
-        return found
+        return [
+            np.interp(s.time_s - lag, *self.path(servo.filter, n, changed))
+            for n, s in enumerate(self.samples)
+        ]
+
+    def path(
+        self, filter_number: int, number: int = 0, changed: Filtered | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Times, and the command of a trial behind a low-pass without a lag."""
+        s, before = self.samples[number], round(LATEST_S / self.grid_s)
+        command = np.concatenate([np.full(before, s.rest_rad), s.command_rad])
+        command = command if changed is None else changed(command)
+        time = s.start_s + self.grid_s * (np.arange(len(command)) - before)
+        return time, _low_pass(command, *FILTERS[filter_number], self.grid_s)
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,13 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import OptimizeResult, minimize
 from scipy.special import stdtrit
 
 from pupper_sysid.common.tones import fit_sine, least_squares
 from pupper_sysid.sysid.doctor.bends import CLEAR_NATS, bend_findings, bends
 from pupper_sysid.sysid.doctor.explanations import (
+    FILTERS,
     Explanation,
     Followed,
     Samples,
@@ -61,6 +63,9 @@ _DIFFERENT = 0.35  # of the gain
 _DRIFT_RAD, _DRIFT_SHARE = 0.1, 0.3
 _TWO_ZEROS = 0.5  # of the residuals' variance that two zeros may leave
 _SLOPE, _CHANCE, _LAG_DRIFT_S, _GAIN_DRIFT = 4e-4, 1e-3, 0.008, 0.2
+_STRETCH_READINGS, _ONE_CLOCK, _CLOCK_FLOOR = 1000, 0.3, 1e-4  # shares of the variance
+_STRETCH_LAGS_S = np.arange(-0.1, 0.3, 0.02)
+_STRETCH_GROWTHS_S = np.linspace(-0.36, 0.36, 25)  # from the first reading to the last
 _QUICKER, _STEADILY = 1.7, 0.7
 _STOOD_S, _STOOD_SHARE, _SETTLED_S = 0.5, 0.25, 0.15  # the share of the path's range
 _SURELY_TWO, _SURELY_MOVED = 0.35, (0.03, 0.08)  # rad; of the command's range
@@ -449,7 +454,7 @@ def _two_gains(
     rate = np.gradient(path, time) if (np.diff(time) > 0).all() else np.zeros_like(path)
     design = np.column_stack([np.ones_like(path), path, rate])
 
-    def left(rows: slice) -> tuple[float, float]:
+    def left(rows: slice | NDArray[np.bool_]) -> tuple[float, float]:
         d, y = design[rows], position[rows]
         gram = d.T @ d + 1e-12 * np.eye(3) * len(d)
         solution = np.linalg.solve(gram, d.T @ y)
@@ -468,6 +473,13 @@ def _two_gains(
             best = a + b, float(at), before, after
     if best is None or whole <= 0:
         return None
+    # what is faster in one part moves less by itself, but not from one second to the next
+    near = [(time > best[1] - _PART_S) & (time < best[1]), (time >= best[1])
+            & (time < best[1] + _PART_S)]  # fmt: skip
+    if min(np.var(path[rows]) if rows.sum() >= 15 else 0.0 for rows in near) > 0.2 * total:
+        gains = sorted(abs(left(rows)[1]) for rows in near)
+        if gains[0] > _OTHER_GAIN * gains[1]:
+            return None
     floor = 1e-3 * float(np.var(position)) * len(position)
     return (best[0] + floor) / (whole + floor), *best[1:]
 
@@ -557,15 +569,71 @@ def drifts(joint: Followed) -> list[Finding]:
                 stretches.append(np.array(found))
                 span = max(span, float(np.ptp(s.time_s)))
     if not stretches:
-        return []
+        lag = _stretch(joint)
+        return [_lag_drifts(lag)] if lag else []
     lag, gain = (_slope([(f[:, 0], f[:, k]) for f in stretches], least)
                  for k, least in ((1, _SLOPE), (2, _GAIN_DRIFT / span)))  # fmt: skip
+    lag = _stretch(joint) or lag
     found = []
     if abs(lag) > _SLOPE and abs(lag) * span > _LAG_DRIFT_S:
-        found.append(Finding("lag_drifts", CARE, {"drift_ms": 1e3 * lag, "percent": 100 * lag}))
+        found.append(_lag_drifts(lag))
     if abs(gain) * span > _GAIN_DRIFT:
         found.append(Finding("gain_drifts", CARE, {"percent": 100 * gain * span}))
     return found
+
+
+def _lag_drifts(lag: float) -> Finding:
+    return Finding("lag_drifts", CARE, {"drift_ms": 1e3 * lag, "percent": 100 * lag})
+
+
+def _stretch(joint: Followed) -> float:
+    """Growth of the lag per second that one clock for all readings leaves; 0 where it leaves none.
+
+    Servos whose lag grows in proportion to time are compared with servos of a constant one: each
+    low-pass, lag and growth is tried on the longest trial, and the best is refined.
+    """
+    sample = max(joint.base.samples, key=lambda s: len(s.time_s))
+    every = max(1, len(sample.time_s) // _STRETCH_READINGS)
+    time, position = sample.time_s[::every], sample.position_rad[::every]
+    span = float(np.ptp(time))
+    if len(time) < 60 or 2 * len(sample.time_s) < sum(len(s.time_s) for s in joint.base.samples):
+        return 0.0
+    base = replace(joint.base, samples=(replace(sample, time_s=time),))
+    path = base.predicted(joint.servo)[0]
+    parts = [p for p in np.array_split(np.arange(len(time)), 8) if len(p) > 2]
+    paces = [[time[p].mean(), 0.0, 0.0, np.log(np.std(np.gradient(path[p], time[p])) + 1e-9)
+              - np.log(np.std(path[p]) + 1e-9)] for p in parts]  # fmt: skip
+    if _quickens(np.array(paces)):
+        return 0.0  # a limit of the speed delays what is faster
+    share = (time - time.mean()) / span
+    position = position - position.mean()
+    total = max(float(position @ position), 1e-12)
+
+    def unexplained(filter_number: int, lag_s: float, growth_s: float) -> float:
+        path = np.interp(time - lag_s - growth_s * share, *paths[filter_number])
+        path = path - path.mean()
+        product = max(float(path @ position), 0.0)
+        return 1 - product**2 / max(float(path @ path) * total, 1e-18)
+
+    paths = {f: base.path(f) for f in range(0, len(FILTERS), 2)}
+    tried = [
+        (unexplained(f, lag, growth), f, lag, growth)
+        for f in paths for lag in _STRETCH_LAGS_S for growth in _STRETCH_GROWTHS_S
+    ]  # fmt: skip
+    best = []
+    for free in (False, True):
+        _, f, *start = min(t for t in tried if free or (t[3] == 0 and t[2] >= 0))
+        scale = np.array([1.0, float(free)])
+        found: OptimizeResult = minimize(
+            lambda x, f=f, scale=scale: unexplained(f, *(x * scale)), start, method="Nelder-Mead",
+            options={"initial_simplex": start + np.array([[0, 0], [0.01, 0], [0, 0.015]]),
+                     "maxiter": 60},
+        )  # fmt: skip
+        best.append((float(found["fun"]), float(found["x"][1])))
+    (plain, _), (left, growth) = best
+    if left + _CLOCK_FLOOR > _ONE_CLOCK * (plain + _CLOCK_FLOOR) or abs(growth) < _LAG_DRIFT_S:
+        return 0.0
+    return growth / span
 
 
 def _quickens(windows: NDArray[np.float64]) -> bool:

@@ -249,7 +249,18 @@ def without_ripple(
     by_number = {t.number: (t, r) for t, r in zip(trials, read, strict=True)}
     turn = -2j * np.pi * np.outer(frequency, edges)
     own = np.diff(np.exp(turn)) / np.diff(turn)
-    ripple = np.stack([_ripple_row(*by_number[t.trial], t, edges) for t in tones])
+    held_means: dict[tuple[float, ...], NDArray[np.float64]] = {}  # of the tones of one trial
+
+    def row(tone: ToneResponse) -> NDArray[np.complex128]:
+        trial, reading = by_number[tone.trial]
+        window = tone.trial, tone.start_s, tone.stop_s
+        time = reading.time_s[(reading.time_s >= tone.start_s) & (reading.time_s <= tone.stop_s)]
+        if window not in held_means:
+            held_means.clear()
+            held_means[window] = HeldCommand.of(trial).means(time, edges)
+        return _ripple_row(held_means[window], time, tone, edges)
+
+    ripple = np.stack([row(t) for t in tones])
     held = np.array([t.command_held for t in tones])
     predicted = masses @ (ripple + held[:, None] * own).T
     chance, gain = _chances(predicted, tones)
@@ -299,13 +310,11 @@ def _second_order(past: NDArray, damping: float) -> NDArray[np.float64]:
 
 
 def _ripple_row(
-    trial: Trial, reading: Readings, tone: ToneResponse, edges: NDArray
+    means: NDArray, time: NDArray, tone: ToneResponse, edges: NDArray
 ) -> NDArray[np.complex128]:
     """Phasor that the tone's fit finds in the images, per unit of mass in each bin."""
-    time = reading.time_s[(reading.time_s >= tone.start_s) & (reading.time_s <= tone.stop_s)]
-    images = HeldCommand.of(trial).means(time, edges)
     one = np.array([tone.frequency_hz]), np.array([tone.command_held])
-    images -= past_tones(time, edges, *one)
+    images = means - past_tones(time, edges, *one)
     # before the tone was steady the command was no tone
     images = np.where(time[:, None] - edges[1:] >= tone.steady_s, images, 0.0)
     return phasors(least_squares(tone_design(time, tone.frequency_hz), images).T)[:, 0]

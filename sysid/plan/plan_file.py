@@ -16,6 +16,7 @@ from pydantic import Field, field_validator
 
 from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import sha256, versions, write_text
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import strange_joint
@@ -142,6 +143,7 @@ def save_plan(proposal: SweepPlan, path: Path, force: bool = False) -> None:
 
 def load_plan(path: Path) -> SweepPlan:
     """Read a plan file."""
+    refuse_other_kind(path, SCHEMA)
     data, lines = read_yaml(path)
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise InputError(

@@ -15,20 +15,22 @@ from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.options import (
+    LARGEST_RAD,
+    LogOptions,
+    likely_units,
+)
 from pupper_sysid.sysid.recordings.importers.tables import import_line
-from pupper_sysid.sysid.recordings.table import LARGEST_COUNT, LARGEST_RAD
+from pupper_sysid.sysid.recordings.table import LARGEST_COUNT
 
 _LEAST_ROWS = 20
-_COUNTS, _FEWEST_COUNTS = (1024, 4096, 16384, 65536), 100  # a turn
-_OF_300_DEGREES = "scale:0.005113"  # of 1,024 counts, as of AX-12 and SCS servos
 _PULSES_US = (400.0, 2700.0)
-_MOST_DEGREES = 360.0  # of whole numbers that may be degrees
 _FARTHEST_RAD = 200 * np.pi  # of angles whose unit was stated
 _IDENTITY = ["joint", "trial", "send_time_s", "read_time_s", "command_rad", "position_rad"]
 _MANY_REPEATED = 0.1  # of the rows
 _SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
 _LATEST_S = 1e11
+_FASTEST_HZ = 20_000.0  # loop of a servo
 _MANY_ROWS = 5  # that lie apart from the others
 _FEW_TRIALS = 10  # that are named one by one
 
@@ -63,6 +65,7 @@ def check(
         If a joint is unknown, times run backwards, angles cannot be radians, or too little is left.
     """
     warnings: list[str] = []
+    options = options or LogOptions()
     if strange := strange_joint(table["joint"].unique().tolist(), "columns" in metadata):
         raise InputError(f"{path}, column joint: '{strange[0]}' is no joint; {strange[1]}")
     needed = ["send_time_s", "read_time_s", "trial", "command_rad"]
@@ -81,7 +84,8 @@ def check(
     if missing > 0:
         warnings.append(f"{100 * missing:.1f} % of the positions are missing.")
     for column in ("command_rad", "position_rad"):
-        _refuse_degrees(path, column, table, metadata, options or LogOptions())
+        _refuse_degrees(path, column, table, metadata, options)
+    first = table.loc[table["joint"] == table["joint"].iloc[0], "send_time_s"]
     same = table.duplicated(_IDENTITY).to_numpy()
     if same.any():
         warnings.append(
@@ -91,10 +95,15 @@ def check(
         table = table.loc[~same]
     again = table.duplicated(["joint", "trial", "send_time_s"])
     if again.mean() > _MANY_REPEATED:
+        ticks = np.unique(first)
+        rate = len(first) / max(float(np.ptp(ticks) + np.diff(ticks).min(initial=1.0)), 1e-9)
+        words = {"rate": f"{rate:.3g}"} | {k: v for k, v in options.words.items() if k != "time"}
+        line = import_line(path, **words) if rate < _FASTEST_HZ else ""
         raise InputError(
             f"{path}, column send_time_s: {100 * again.mean():.0f} % of the rows repeat a time "
             "stamp of their trial: a clock too coarse, or two logs in one. Record with a clock of "
-            "1 ms or finer, and give each pass its own trial number."
+            "1 ms or finer, and give each pass its own trial number"
+            + (f"; or take the rows as evenly spaced: {line}." if line else ".")
         )
     if again.any():
         warnings.append(f"{int(again.sum())} rows with a repeated time stamp were left out.")
@@ -166,21 +175,21 @@ def _refuse_degrees(
             "Check the unit, or take the start's angle off."
         )
     both = table[["command_rad", "position_rad"]].to_numpy(float)
-    both = both[np.isfinite(both)]
-    units = ["deg"]
-    if (both >= 0).all() and (both % 1 == 0).all() and largest > _FEWEST_COUNTS:
-        turns = [f"counts:{n}" for n in _COUNTS if known.max() < n][:2]
-        units = turns if turns and largest > _MOST_DEGREES else units + turns[:1]
-        units += [_OF_300_DEGREES] if largest < 1024 else []
-    elif str(source).endswith(".pos") and largest <= 100:
+    units = likely_units(both[np.isfinite(both)])
+    if units == ["deg"] and str(source).endswith(".pos") and largest <= 100:
         units.append("percent:3.5")  # LeRobot's, of a range that it does not log
     kind = units[0].replace("deg", "degrees").replace(":", " of an encoder with ")
     kind += " a turn" if kind != "degrees" else ""
+    text = (
+        f"{path}, column {place}: values reach {largest:.4g}, more than a turn, which looks like "
+        f"{kind}. Angles must be radians: multiply degrees by 0.0174533"
+    )
+    if not isinstance(path, Path):  # arrays in memory
+        raise InputError(f"{text}.")
     lines = "; or ".join(import_line(path, **(options.words | {"unit": u})) for u in units)
     raise InputError(
-        f"{path}, column {place}: values reach {largest:.4g}, more than a turn, which looks like "
-        f"{kind}. Angles must be radians: multiply degrees by 0.0174533, or convert the log with "
-        f"{lines} (or turns, counts:4096, scale:…; rad if the joint turns so far)."
+        f"{text}, or convert the log with {lines} (or turns, counts:4096, scale:…; rad if the "
+        "joint turns so far)."
     )
 
 

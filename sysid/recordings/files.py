@@ -18,6 +18,7 @@ import numpy as np
 
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.file_kinds import RECORDING, refuse_other_kind
 from pupper_sysid.common.files import SyncedText, versions
 from pupper_sysid.common.reading.content import unpacked
 from pupper_sysid.common.reading.dialect import decoded
@@ -70,12 +71,13 @@ def load(path: Path | str, options: LogOptions | None = None) -> Recording:
             "table or arrays in memory: Recording.from_frame, Recording.from_arrays."
         )
     path, options = Path(path), options or LogOptions()
+    refuse_other_kind(path, RECORDING)
     if path.is_dir():
         return _imported(path, read_folder(path, options), options)
-    if path.name.endswith((".truth.csv", ".truth.yaml")):
-        recording = f"{Path(path.stem).stem}.csv"
+    if path.name.endswith(".truth.csv"):
         raise InputError(
-            f"{path} holds the true values of {recording}, not a recording; load that file instead."
+            f"{path} holds the true values of {path.name.removesuffix('.truth.csv')}.csv, "
+            "not a recording; load that file instead."
         )
     data = read_bytes(path)
     content = unpacked(path, data, LARGEST_BYTES)

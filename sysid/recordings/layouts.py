@@ -65,7 +65,7 @@ def convert(
         if parsed.numbered:
             raise InputError(f"{path}: {unknown_numbers(path, table)}")
         timed = bool(options.time or options.rate)
-        if text := unknown_columns(path, table.names, timed, table.increasing):
+        if text := unknown_columns(path, table, timed):
             raise InputError(f"{path}: {text}")
     log = read_table(path, table, options)
     # what the log's own header says of its robot counts
@@ -94,7 +94,7 @@ def _table(parsed: Parsed) -> Table:
                 texts["time"] = texts.pop("")
         else:
             numbers[str(name)] = values.to_numpy(float)
-    return Table(numbers, texts, parsed.faults, numbered=parsed.numbered)
+    return Table(numbers, texts, parsed.faults, numbered=parsed.numbered, rate=parsed.rate)
 
 
 def _metadata(layout: str, joints: list[str], pose: dict[str, float] | None) -> dict[str, Any]:

@@ -27,8 +27,9 @@ from pupper_sysid.common.reading.csv_table import (
 from pupper_sysid.common.reading.dialect import plain
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.columns import time_columns
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.options import LARGEST_RAD, LogOptions
 from pupper_sysid.sysid.recordings.importers.tables import LABELS, has_time
+from pupper_sysid.sysid.recordings.importers.times import rate_in
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 
 SCHEMA_VERSION = 1
@@ -40,12 +41,11 @@ OPTIONAL_COLUMNS = (
     "position_count", "voltage_v", "temperature_c", "load", "p_gain", "torque_enabled",
 )  # fmt: skip
 
-LARGEST_RAD = 2 * np.pi + 0.5
-"""Largest angle: no joint of a legged robot turns further."""
 LARGEST_COUNT = 2**31
 """Largest number of a trial, and largest count of an encoder."""
 _FINEST_RAD, _COARSEST_RAD = 1e-7, 0.2  # of a count
 _FARTHEST_ZERO_RAD = 100.0  # angle of count 0: a servo of several turns
+_HEAD = 4000  # characters in which a log may state its rate
 TEXT_COLUMNS = ("joint", "signal")
 
 
@@ -103,6 +103,8 @@ class Parsed:
     sentence on the first such cell."""
     numbered: bool = False
     """Whether the file names no columns, so that they have their numbers as names."""
+    rate: float | None = None
+    """Rows a second by the lines above the table."""
 
 
 def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
@@ -131,7 +133,7 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
     # killed in the middle of a line: of ours the last one has no end
     found = read_table(path, opened.text, texts, strict, whole_lines=ours, columns=opened.columns)
     entries = _entries(path, text, found.comments)
-    metadata = _metadata(path, entries)
+    metadata = _metadata(path, text, entries)
     warnings: list[str] = list(opened.notes)
     keep = np.ones(len(found), bool)
     for trial, rows in _cancelled(path, found, entries) if ours else []:
@@ -143,8 +145,8 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
         warnings.append("its last line was cut short and has been left out.")
     if found.broken:
         warnings.append(
-            f"{len(found.broken)} lines with another number of cells were left out, the first of "
-            f"them line {found.broken[0]}."
+            f"{len(found.broken)} lines that are no rows of the table were left out, the first of "
+            f"them line {min(found.broken)}."
         )
     if text.startswith(TITLE) and "completed" not in metadata:
         warnings.append("it was not recorded to its end; what is there is used.")
@@ -158,8 +160,9 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
             data[name] = found.numbers[name]
     table = pd.DataFrame(data)
     return Parsed(
-        metadata, table if keep.all() else table.loc[keep], warnings, found.faults, opened.numbered
-    )
+        metadata, table if keep.all() else table.loc[keep], warnings, found.faults, opened.numbered,
+        rate_in(text[:_HEAD].split("\n")),
+    )  # fmt: skip
 
 
 def _may_be_text(name: str, options: LogOptions) -> bool:
@@ -185,7 +188,7 @@ def require(path: Path | str, table: pd.DataFrame, columns: tuple[str, ...]) -> 
 
 def header(path: Path, text: str) -> dict[str, Any]:
     """Validated entries of a file's comment lines."""
-    return _metadata(path, _entries(path, text, comments_of(path, text)))
+    return _metadata(path, text, _entries(path, text, comments_of(path, text)))
 
 
 def _entries(path: Path, text: str, lines: list[tuple[int, str]]) -> list[tuple[int, str, Any]]:
@@ -206,10 +209,17 @@ def _entries(path: Path, text: str, lines: list[tuple[int, str]]) -> list[tuple[
     return found
 
 
-def _metadata(path: Path, entries: list[tuple[int, str, Any]]) -> dict[str, Any]:
+def _metadata(path: Path, text: str, entries: list[tuple[int, str, Any]]) -> dict[str, Any]:
     metadata = {key: value for _, key, value in entries}
-    check_metadata(path, metadata)
-    return metadata
+    if text.startswith(TITLE):
+        check_metadata(path, metadata)
+        return metadata
+    known: dict[str, Any] = {}  # others use the same words for other things
+    for key, value in metadata.items():
+        with suppress(InputError):
+            check_metadata(path, {key: value})
+            known[key] = value
+    return known
 
 
 def check_metadata(path: Path | str, metadata: dict[str, Any]) -> None:

@@ -57,9 +57,9 @@ delay log.csv --joints LF_hipp | Did you mean LF_hip
 doctor log.csv --read-limit [0 0.5 1001 nan inf x 4_1 ٣ ""] | --read-limit
 doctor log.csv [--read-limit=0 --read-limit] | --read-limit
 [import doctor calibrate fit-servo] loop.csv | loop.csv
-[import doctor delay calibrate report] cal.yaml | a file of pupper-sysid, but not a recording
+[import doctor delay calibrate report] cal.yaml | cal.yaml is a calibration, not a recording
 doctor other.yaml | is YAML
-doctor sweep.truth.yaml | true values of sweep.csv
+doctor sweep.truth.yaml | the truth of an emulated recording
 doctor robot.xml | is XML
 import log.csv --command "u {joint}" | belong together
 import log.csv --unit furlong | Write rad, deg
@@ -82,7 +82,7 @@ fit-servo walk.csv --train-before 0.2 --test-after 1 --train-loops 0 | one way
 fit-servo walk.csv --preset paper --arch fir | no published fir
 sindy none.csv | none.csv
 compare walk.csv | --models
-compare walk.csv --models log.csv | neither a servo model
+compare walk.csv --models log.csv | log.csv is a recording, not a calibration
 compare walk.csv --models sts3215-bam | Did you mean sts3215-bam-m
 compare nowhere.csv --models paper --seed 999999999999999999999 | --seed is
 export x.docx | neither

@@ -32,15 +32,15 @@ from pupper_sysid.sysid.recordings.importers.tables import (
     Table,
     expanded,
     has_time,
+    missing,
+    read_numbered,
     read_table,
-    unknown_numbers,
 )
+from pupper_sysid.sysid.recordings.importers.times import stated_rate
 
 ZIP, NPY, MAT = b"PK\x03\x04", b"\x93NUMPY", b"MATLAB 5.0"
 
 _NAMES = ("joint_names", "joints", "names", "motor_names", "dof_names")
-_PERIODS = ("dt", "timestep", "time_step", "sample_time", "period")  # of a log without times
-_RATES = ("fs", "rate", "rate_hz", "hz", "sample_rate")
 _DEEPEST = 3  # of dictionaries in a torch file, of structures in MATLAB's
 
 
@@ -65,20 +65,26 @@ def read_arrays(path: Path, data: bytes, options: LogOptions) -> Log:
             numeric[key] = values.ravel()
     rows = next((len(v) for k, v in numeric.items() if v.ndim == 1 and time_columns([k])), 0)
     for key, values in numeric.items():
-        if values.ndim == 3 and values.shape[1] == 1:  # of one robot of many
-            values = values[:, 0]
+        if values.ndim == 3 and 1 in values.shape[:2]:  # of one robot of many
+            values = values[0] if len(values) == 1 else values[:, 0]
         if values.ndim == 2 and values.shape[1] == rows != len(values):
             values = values.T
         numeric[key] = values
-    table = _with_names(path, numeric, arrays) or expanded(
-        path, {k: v for k, v in numeric.items() if v.ndim < 3}, names, named
-    )
-    steps = {k.lower(): float(v) for k, v in arrays.items() if v.dtype.kind in "iuf" and not v.ndim}
-    rates = [1 / steps[k] for k in _PERIODS if steps.get(k, 0) > 0]
-    rates += [steps[k] for k in _RATES if steps.get(k, 0) > 0]
-    if rates and not rows and not (options.rate or options.time or has_time(table.names)):
-        options = replace(options, rate=rates[0])
-    return read_table(path, table, options, layout)
+    several = next((k for k, v in numeric.items() if v.ndim == 3), None)
+    numeric = {k: v for k, v in numeric.items() if v.ndim < 3}
+    table = _with_names(path, numeric, arrays) or expanded(path, numeric, names, named)
+    if several is not None and missing(table.names):
+        shape = " × ".join(map(str, arrays[several].shape))
+        raise InputError(
+            f"{path}: {several} has {shape} values, of several robots. Save those of one, such as "
+            f"{several}[:, 0]."
+        )
+    if len(numeric) == 1 and missing(table.names):  # Simulink's rows
+        (values,) = numeric.values()
+        wide = values.ndim == 2 and len(values) < values.shape[1]
+        return read_numbered(path, np.atleast_2d(values.T if wide else values), options, layout)
+    scalars = {k: float(v) for k, v in arrays.items() if v.dtype.kind in "iuf" and not v.ndim}
+    return read_table(path, replace(table, rate=stated_rate(scalars)), options, layout)
 
 
 def _with_names(
@@ -103,17 +109,13 @@ def _read_npy(path: Path, data: bytes, options: LogOptions) -> Log:
         fields = {n: values[n] for n in values.dtype.names}
         columns = {n: v.ravel().astype(float) for n, v in fields.items() if v.dtype.kind in "biuf"}
     elif values.dtype.kind in "biuf" and values.ndim == 2:
-        refuse_more(path, values.shape[1], MOST_COLUMNS, "columns", "Split it by joint.")
-        columns = {str(k): column.astype(float) for k, column in enumerate(values.T)}
+        return read_numbered(path, values, options, "NumPy array")
     if not columns:
         raise InputError(
             f"{path} holds an array of shape {values.shape}; a log has a row per time and a column "
             "per quantity. Save time, command and position with numpy.savez."
         )
-    table = Table(columns, numbered=not values.dtype.names)
-    if table.numbered and not options.command:
-        raise InputError(f"{path}: {unknown_numbers(path, table)}")
-    return read_table(path, table, options, "NumPy array")
+    return read_table(path, Table(columns), options, "NumPy array")
 
 
 def _npz_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
@@ -226,6 +228,8 @@ def _torch_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
             refuse_more(f"{path}, {prefix}", value.numel(), MOST_CELLS, "values", remedy)
             if not value.is_complex():
                 arrays[prefix] = value.detach().to(torch.float64).numpy()
+        elif isinstance(value, int | float):
+            arrays[prefix] = np.array(float(value))
         elif isinstance(value, list | tuple) and 0 < len(value) <= MOST_CELLS:
             if all(isinstance(v, str) for v in value[:MOST_JOINTS]):
                 arrays[prefix] = np.array([str(v)[:200] for v in value[: MOST_JOINTS + 1]])

@@ -50,12 +50,13 @@ WORDS: dict[str, str] = {
                 "frame iteration iter step overrun moving force feedforward ff tff integral prev "
                 "previous last offset home initial init delta diff frequency freq hz cov "
                 "covariance enable enabled reached done warning fault trial episode loop "
-                "strom spannung dot"),
+                "strom spannung dot iq uq ud trq torq"),
         (TIME, "time times timestamp timestamps t ts stamp stamps clock elapsed seconds secs sec "
                "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
-               "nanosec nanosecs nsecs usec usecs zeit temps tiempo tempo tid 时间 時間"),
+               "nanosec nanosecs nsecs usec usecs tout minutes days datenum zeit temps tiempo "
+               "tempo tid 时间 時間"),
         (UNIT, "rad rads radian radians deg degs degree degrees ° count counts tick ticks pulse "
-               "pulses turn "
+               "pulses turn cdeg centideg centidegree centidegrees "
                "turns rev revs revolution revolutions mrad percent pct"),
         (JOINT, "joint joints dof dofs motor motors servo servos actuator actuators axis axes dxl "
                 "group controller controllers data value values val field name names msg body "
@@ -75,6 +76,8 @@ UNITS = {"rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "mrad":
          "turn": "turns", "turns": "turns", "rev": "turns", "revs": "turns",
          "revolution": "turns", "revolutions": "turns", "percent": "percent",
          "pct": "percent"}  # fmt: skip
+UNITS |= dict.fromkeys(("cdeg", "centideg", "centidegree", "centidegrees"),
+                       f"scale:{np.pi / 18000:.9g}")  # fmt: skip
 _UNIT_RANK = {"rad": 0, "": 1, "mrad": 2, "deg": 3, "turns": 4, "counts": 5, "percent": 6}
 _SEPARATORS = re.compile(r"[\s_./:\\\[\](){}<>$%#*,;|='\"-]+")
 _CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-zµθ°]+|\d+|[^A-Za-z\d]+")
@@ -131,7 +134,8 @@ def _column(name: str) -> Column:
         kinds = set(known)
     angle = ANGLE in kinds and (lower.count("p") == 0 or kinds & {COMMAND, STATE, UNIT}
                                 or "pos" in "".join(lower))  # fmt: skip
-    if angle and lower[-1:] != ["current"]:  # current position, not a current
+    long_angle = any(k == ANGLE and len(w) > 1 for w, k in zip(lower, known, strict=True))
+    if long_angle and lower[-1:] != ["current"]:  # current position, not a current of an axis
         known = [
             STATE if w in ("current", "curr", "cur") else k
             for w, k in zip(lower, known, strict=True)
@@ -166,7 +170,7 @@ def _column(name: str) -> Column:
     sure = COMMAND in kinds if kind == "command" else bool(angle or STATE in kinds)
     doubt = 0 if sure else 2 if lower == ["u"] else 1  # beside a reference, u is a drive's input
     style = (0 if angle and (STATE in kinds) else 1 if angle else 2) if kind == "position" else 0
-    rank = (int(DERIVED in set(known)), doubt, _UNIT_RANK[unit], style)
+    rank = (int(DERIVED in set(known)), doubt, _UNIT_RANK.get(unit, 3), style)
     runs: list[list[tuple[str, str]]] = [[]]  # of words that are no others'
     for part, k in zip(parts, known, strict=True):
         if k in ("", JOINT):
@@ -208,6 +212,8 @@ def _parts(word: str) -> list[str]:
             if split := _known(piece):
                 found += [rest, *split] if rest else split
                 rest = ""
+            elif piece == "d" and rest.isdigit():  # q1d, the desired q1
+                found, rest = [*found, rest, "d"], ""
             else:
                 rest += piece
         return [*found, rest] if rest else found

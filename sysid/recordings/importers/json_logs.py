@@ -25,6 +25,8 @@ Others are tables: lists by name, a list of records, or a record a line (JSON Li
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +36,10 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
-from pupper_sysid.sysid.recordings.importers.columns import time_columns
+from pupper_sysid.common.reading.dialect import decimal
+from pupper_sysid.sysid.recordings.importers.columns import column
 from pupper_sysid.sysid.recordings.importers.log import (
+    MOST_JOINTS,
     Log,
     joint_names,
     number,
@@ -46,15 +50,19 @@ from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.tables import (
     SERIES,
     expanded,
+    has_time,
     missing,
+    read_numbered,
     read_table,
 )
-from pupper_sysid.sysid.recordings.importers.times import doubt_of_a_turn
+from pupper_sysid.sysid.recordings.importers.times import doubt_of_a_turn, stated_rate
 
 BAM, KTUNE = "BAM JSON", "ktune JSON"
 
 _SLEEP_S = 0.00106  # sleep(0.001) as Linux keeps it
 _REGISTERS = {"xl330": 5}  # reads of one register each, the position first
+_FAR, _LONGEST_NUMBER = 1e9, 40
+_LONGER = 10  # times as many values over time as joints
 _NUMBERS = ("mass", "length", "kp", "vin")
 
 
@@ -161,7 +169,10 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     data = _of_frame(data)
     records = _records(data)
     if records is None and not isinstance(data, Mapping):
-        return None
+        values = _numbers(data)
+        if values is None or values.ndim != 2:
+            return None
+        return read_numbered(path, values, options, "JSON table")
     for k, record in enumerate([data] if records is None else records):
         series = next((k for k in record if k.lower() in SERIES), "") if records else ""
         of = record[series] if isinstance(record.get(series), str) else ""
@@ -170,7 +181,7 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
             prefix, inside = pending.pop()
             for name, value in inside.items():
                 full = f"{prefix}.{name}".strip(".")[:200]
-                if of and not prefix and not time_columns([name]):
+                if of and not prefix and column(name).kind != "time":
                     full = f"{of}.{full}"[:200]  # a message of one topic
                 if records is not None and isinstance(value, list):
                     value = _by_name(value)
@@ -187,10 +198,24 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
                     lists[full][k] = value
     found = {name: _numbers(values) for name, values in lists.items() if len(values) > 1}
     arrays = {name: values for name, values in found.items() if values is not None}
+    texts = {
+        n: list(map(str, v)) for n, v in lists.items() if v and n not in arrays and has_time([n])
+    }
+    scalars = {k: float(v) for k, v in _scalars(data).items()}
     table = expanded(path, arrays, list(options.joints))
+    table = replace(table, texts=texts, rate=stated_rate(scalars))
     if not arrays or (missing(table.names) and not options.command):
         return None
     return read_table(path, table, options, "JSON table")
+
+
+def _scalars(data: Any) -> dict[str, float]:
+    """Numbers beside the lists of JSON, also those a level below, by name."""
+    if not isinstance(data, Mapping):
+        return {}
+    levels = [data, *(v for v in data.values() if isinstance(v, Mapping))]
+    return {k: v for level in levels for k, v in level.items()
+            if isinstance(v, int | float) and abs(v) < _FAR}  # fmt: skip
 
 
 def _of_frame(data: Any) -> Any:
@@ -203,8 +228,21 @@ def _of_frame(data: Any) -> Any:
             isinstance(row, list) and len(row) == len(names) for row in each
         ):  # fmt: skip
             return {str(n): list(v) for n, v in zip(names, zip(*each, strict=True), strict=True)}
-    numbered = data and all(isinstance(v, Mapping) and "0" in v and "1" in v for v in data.values())
-    return {n: list(v.values()) for n, v in data.items()} if numbered else data
+    if data and all(isinstance(v, Mapping) for v in data.values()):
+        if all("0" in v and "1" in v for v in data.values()):
+            return {n: list(v.values()) for n, v in data.items()}
+        if "0" in data and "1" in data:  # rows by their numbers
+            return list(data.values())
+    series = next((n for n, v in data.items() if _series_by_name(v)), None)
+    return data if series is None else {**data, **_by_name(data[series]), series: None}
+
+
+def _series_by_name(value: Any) -> bool:
+    """Whether this is a list with a record per joint, whose values are lists over time."""
+    if not isinstance(value, list) or not all(isinstance(each, Mapping) for each in value):
+        return False
+    longest = (len(v) for each in value for v in each.values() if isinstance(v, list))
+    return len(value) <= MOST_JOINTS and max(longest, default=0) > _LONGER * len(value)
 
 
 def _by_name(value: list[Any]) -> Any:
@@ -225,9 +263,12 @@ def _records(data: Any) -> list[Any] | None:
     return max(own, key=len, default=None)
 
 
-def _numbers(values: list[Any]) -> NDArray[np.float64] | None:
+def _numbers(values: Any) -> NDArray[np.float64] | None:
     """Numbers, or equally long lists of them; None where they are others. A null is missing."""
-    first = next((v for v in values if v is not None), None)
+    first = next((v for v in values if v is not None), None) if isinstance(values, list) else None
+    if isinstance(first, str) and len(first) < _LONGEST_NUMBER:
+        with suppress(ValueError, AttributeError):
+            return np.array([decimal(v) if v else np.nan for v in values])
     kinds = (list,) if isinstance(first, list) else (int, float, type(None))
     if first is None or not all(v is None or isinstance(v, kinds) for v in values):
         return None

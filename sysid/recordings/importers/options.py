@@ -35,6 +35,11 @@ from pupper_sysid.common.strict_yaml import printable
 COUNT_RAD = 2 * np.pi / 4096
 """One count of an encoder with 4,096 a turn."""
 
+LARGEST_RAD = 2 * np.pi + 0.5
+"""Largest angle: no joint of a legged robot turns further."""
+_COUNTS, _FEWEST_COUNTS = (1024, 4096, 16384, 65536), 100  # a turn
+_OF_300_DEGREES = "scale:0.005113"  # of 1,024 counts, as of AX-12 and SCS servos
+_MOST_DEGREES = 360.0  # of whole numbers that may be degrees
 _ANGLE_SCALES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turns": 2 * np.pi}
 _NARROWEST_RAD, _WIDEST_RAD = 0.2, 2 * np.pi  # range of a joint
 
@@ -138,6 +143,16 @@ def unit(text: str, name: str = "`unit`") -> Unit:
         f"{name} is {printable(text)[:40]}. Write rad, deg, turns, counts:4096 (counts of a turn), "
         "percent:3.5 (rad that −100 … 100 span) or scale:0.01 (rad per unit of the log)."
     )
+
+
+def likely_units(values: NDArray[np.float64]) -> list[str]:
+    """What commands and positions beyond a turn may be in, the likeliest unit first."""
+    largest = float(np.abs(values).max())
+    if (values < 0).any() or (values % 1 != 0).any() or largest <= _FEWEST_COUNTS:
+        return ["deg"]
+    turns = [f"counts:{n}" for n in _COUNTS if largest < n][:2]
+    units = turns if turns and largest > _MOST_DEGREES else ["deg", *turns[:1]]
+    return [*units, _OF_300_DEGREES] if largest < 1024 else units
 
 
 Stamp = Literal["start", "middle", "end"]

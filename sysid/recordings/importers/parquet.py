@@ -29,16 +29,24 @@ from pupper_sysid.sysid.recordings.importers.log import (
     Log,
 )
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.tables import expanded, read_table
+from pupper_sysid.sysid.recordings.importers.tables import (
+    LABELS,
+    expanded,
+    has_time,
+    read_table,
+)
 
 LAYOUT = "parquet table"
 MAGIC = b"PAR1"
+_INDEX = "__index_level_0__"  # of pandas, without a name
 
 
 def read_parquet(path: Path, data: bytes, options: LogOptions) -> Log:
     """A file's columns of numbers as rows."""
     columns = columns_of(path, data)
     arrays = read_columns(path, data, [name for name, numeric in columns.items() if numeric])
+    if _INDEX in arrays and not has_time(list(arrays)):
+        arrays["time"] = arrays.pop(_INDEX)
     table = replace(expanded(path, arrays, list(options.joints)), texts=_texts(path, data))
     return read_table(path, table, options, LAYOUT)
 
@@ -63,9 +71,8 @@ def columns_of(path: Path, data: bytes) -> dict[str, bool]:
     def numeric(kind: Any) -> bool:
         if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
             kind = kind.value_type
-        return bool(
-            pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
-        )
+        of_numbers = pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean
+        return any(test(kind) for test in (*of_numbers, pa.types.is_timestamp))
 
     return {field.name: numeric(field.type) for field in schema}
 
@@ -114,7 +121,7 @@ def _texts(path: Path, data: bytes) -> dict[str, list[str]]:
         return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
 
     schema = _open(path, data).schema_arrow
-    names = [f.name for f in schema if f.name in ("joint", "motor") and textual(f.type)]
+    names = [f.name for f in schema if f.name.lower() in LABELS and textual(f.type)]
     if not names:
         return {}
     file = _open(path, data, names)
@@ -149,6 +156,9 @@ def _array(path: Path, name: str, column: Any) -> NDArray[np.float64]:
     """Numbers of a column; an empty cell is NaN."""
     pa = _library(path)
     kind = column.type
+    if pa.types.is_timestamp(kind):  # seconds from the first, as exact as they are
+        ticks = column.cast("int64").to_pandas().to_numpy(float)
+        return (ticks - ticks[:1]) / {"s": 1, "ms": 1e3, "us": 1e6, "ns": 1e9}[kind.unit]
     if not (pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind)):
         return np.asarray(column.to_pandas().to_numpy(), float)
     flat = np.asarray(column.combine_chunks().flatten().to_pandas().to_numpy(), float)

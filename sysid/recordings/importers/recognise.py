@@ -10,6 +10,7 @@ from typing import Any
 
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.file_kinds import RECORDING, refuse_other_kind
 from pupper_sysid.common.reading.dialect import decoded
 from pupper_sysid.sysid.recordings.importers import (
     arrays,
@@ -28,8 +29,8 @@ _PACKED = (".gz", ".bz2", ".xz")
 _STAMP = re.compile(
     rb"\[(?:[\d.:, TZ-]+\][ \t]*[A-Za-z(]|[A-Za-z]+\][ \t:]*[\[\w])"
 )  # before a message: a line of text
+_JSON = re.compile(rb"(?:#[^\n]*\n\s*)*(?:\{|\[[\s\[]*(?:[\"{\d\]-]|true|false|null|NaN|Inf))")
 _YAML = re.compile(rb"(?:---\s*\n)?(?:- \w+:|\w+:[ \t]*\r?\n[ \t]+\w+:)")
-_SCHEMA = re.compile(rb'^[ \t{]*"?schema"?: *"?(pupper-[a-z -]*[a-z])"?,?\s*$', re.MULTILINE)
 _MARKUP = re.compile(rb"<[?!A-Za-z]")
 _ROW = re.compile(rb"\[[-+\d.eE, \t\[\]()]+\][ \t]*\r?\n")  # numbers, a whole line
 
@@ -45,6 +46,7 @@ def logs_in(path: Path) -> list[Path]:
     """The logs that a path stands for: itself, or those in a folder that is none."""
     if not path.is_dir() or is_log_folder(path):
         return [path]
+    refuse_other_kind(path, RECORDING)
     found = [p for p in sorted(path.iterdir()) if is_log_folder(p) or _may_be_log(p)]
     if not found:
         raise InputError(f"{path}: {unknown_folder(p.name for p in path.iterdir())}")
@@ -88,6 +90,8 @@ def read_folder(folder: Path, options: LogOptions) -> Log:
 def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
     """The log in a file's content; None if it is CSV text."""
     digest = hashlib.sha256(data).hexdigest()
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        data = decoded(path, data).encode()
     if data.startswith(ros.MAGIC):
         return replace(ros.read_mcap(path, data, options), sha256=digest)
     if data.startswith(ros.SQLITE):
@@ -97,12 +101,6 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
     if data.startswith(parquet.MAGIC):
         return replace(parquet.read_parquet(path, data, options), sha256=digest)
     start = data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")
-    if schema := _SCHEMA.search(data[:4096]):
-        raise InputError(
-            f"{path} is a file of pupper-sysid, but not a recording (schema: "
-            f"{schema[1].decode()}). Give a log: what `pupper-sysid sweep` recorded, or another "
-            "project's."
-        )
     if _MARKUP.match(start):
         raise InputError(f"{path} is XML or HTML, such as a robot's model or a page, not a log.")
     if _YAML.match(start) or path.suffix.lower() in (".yaml", ".yml"):
@@ -110,7 +108,7 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
             f"{path} is YAML, which is not read: write rows as CSV, or record messages with "
             "`ros2 bag record`."
         )
-    if start[:1] not in (b"{", b"[") or _STAMP.match(start) or _ROW.match(data):
+    if not _JSON.match(start) or _STAMP.match(start) or _ROW.match(data):
         return None
     found = border.parse_json(_whole_json(decoded(path, data)), str(path), "Give it as written.")
     for layout, known, read in (
@@ -131,8 +129,14 @@ def _whole_json(text: str) -> str:
     if text.lstrip()[:2] == "{'":
         text = text.replace("'", '"').replace(": None", ": null")
     lines = text.strip().split("\n")
-    if len(lines) > 1 and all(line.strip()[:1] + line.strip()[-1:] == "{}" for line in lines[:2]):
-        return f"[{','.join(line for line in lines if line.strip())}]"
+    bare = [line.strip() for line in lines[:20] if line.strip() and line[:1] != "#"][:2]
+    if len(lines) > 1 and all(line[:1] + line[-1:] == "{}" for line in bare):
+        full = [line for line in lines if line.strip() and line[:1] != "#"]
+        whole = [line for line in full if line.strip()[:1] + line.strip()[-1:] == "{}"]
+        # one or the last may be cut
+        return (
+            f"[{','.join(whole if len(full) - len(whole) <= max(0.01 * len(full), 1) else full)}]"
+        )
     return text
 
 

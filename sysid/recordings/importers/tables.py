@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS, distinct, one_each
+from pupper_sysid.common.reading.dialect import is_clock
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.columns import (
     Column,
@@ -43,7 +44,13 @@ from pupper_sysid.sysid.recordings.importers.log import (
     joint_names,
     rows,
 )
-from pupper_sysid.sysid.recordings.importers.options import LogOptions, Unit, unit
+from pupper_sysid.sysid.recordings.importers.options import (
+    LARGEST_RAD,
+    LogOptions,
+    Unit,
+    likely_units,
+    unit,
+)
 from pupper_sysid.sysid.recordings.importers.times import (
     clock,
     doubt_of_a_turn,
@@ -58,7 +65,9 @@ LAYOUT = "table"
 _TRIALS = ("trial", "episode_index", "episode", "loop", "run", "segment")
 _TONES = ("frequency_hz", "freq_hz", "frequency", "freq")
 SERIES = ("name", "signal", "event", "type", "kind", "variable", "topic", "field", "series",
-           "metric", "key", "channel", "_field", "_measurement")  # fmt: skip
+           "metric", "key", "channel", "_field", "_measurement", "op", "operation", "direction",
+           "dir", "param", "parameter", "quantity", "label", "source")  # fmt: skip
+_VALUES = ("value", "values", "val", "_value", "data")
 _GROUPS = ("leg", "limb", "arm", "side", "joint", "joint_name", "motor", "motor_name", "servo",
            "servo_name", "actuator", "name", "axis", "dof", "motor_idx", "motor_id", "motor_index",
            "joint_idx", "joint_id", "joint_index", "servo_id", "actuator_id", "dxl_id", "can_id",
@@ -75,12 +84,16 @@ _SHORTEST_TONE = 20  # rows of one frequency; a chirp changes it sooner
 _MOST_CHOICES = 4  # that a message lists
 _COMPARED = 8  # columns for one purpose
 _COMPARED_BY_VALUE, _ALIKE = 12, 0.7  # columns; concordance of a command and its position
+_MOSTLY_BLANK, _ONE_STAMP = 0.3, 0.9  # shares of positions without a command, with its time
+_TIME_STEP = re.compile(r"(d_?t|delta_?t(ime)?|time_?(step|delta))([_ (\[].*)?", re.IGNORECASE)
 _WIDEST_ANGLE = 1e6  # of a joint, in any unit
 _ORDERED = 100_000  # rows
 _OF_TURNS = {
     "ODrive": ({"setpoint", "estimate"}, "pos_setpoint and pos_estimate"),
+    "ODrive's API": ({"input", "estimate"}, "input_pos and pos_estimate"),
     "moteus": ({"servo_stats.position"}, "servo_stats.position"),
     "moteus's decoder": ({"command_position", "q_current"}, "command_position and q_current"),
+    "moteus's registers": ({"Register.POSITION"}, "Register.POSITION"),
     "moteus's telemetry": ({"control_position", "q_current"}, "control_position and q_current"),
 }
 """Programs that count turns and do not say so, and what gives their logs away."""
@@ -104,6 +117,8 @@ class Table:
     """Whether the columns have no names but their numbers."""
     notes: tuple[str, ...] = ()
     """What was assumed, in sentences."""
+    rate: float | None = None
+    """Rows a second that the log states beside its columns."""
 
     @cached_property
     def names(self) -> list[str]:
@@ -131,9 +146,10 @@ class Table:
 
     @property
     def increasing(self) -> list[str]:
-        """Columns whose numbers never decrease, and are not all the same."""
+        """Columns whose numbers never decrease, and are not all the same, nor count named rows."""
         steps = {n: np.diff(v[np.isfinite(v)]) for n, v in self.columns.items()}
-        return [n for n, s in steps.items() if (s >= 0).all() and (s > 0).any()]
+        return [n for n, s in steps.items() if (s >= 0).all() and (s > 0).any()
+                and (self.numbered or not (s == 1).all())]  # fmt: skip
 
     def check_joints(self, path: Path | str, columns: Iterable[str]) -> None:
         """Refuse arrays, of which these are columns, with other numbers of joints than names."""
@@ -182,11 +198,27 @@ def expanded(
     return Table(columns, {}, faults, widths, None if named is None else (named, len(names)))
 
 
+def read_numbered(
+    path: Path | str, values: NDArray[np.float64], options: LogOptions, layout: str
+) -> Log:
+    """The columns of one array, shape (rows, columns), by their numbers."""
+    refuse_more(path, values.shape[1], MOST_COLUMNS, "columns", "Split it by joint.")
+    table = Table(
+        {str(k): column.astype(float) for k, column in enumerate(values.T)}, numbered=True
+    )
+    if not options.command:
+        raise InputError(f"{path}: {unknown_numbers(path, table)}")
+    return read_table(path, table, options, layout)
+
+
 def read_table(path: Path | str, table: Table, options: LogOptions, layout: str = LAYOUT) -> Log:
     """The rows of a table."""
     refuse_more(path, len(table.names), MOST_COLUMNS, "columns", "Split it by joint.")
     refuse_more(path, sum(map(len, table.columns.values())), MOST_CELLS, "cells", "Split it.")
     table = spread(path, table, options)
+    timed = [n for n in table.names if n not in table.columns or np.ptp(_known(table, n)) > 0]
+    if table.rate and not (options.rate or options.time or has_time(timed)):
+        options = replace(options, rate=table.rate)
     notes = list(table.notes)
     pairs, texts = _pairs(path, table, options)
     notes += texts
@@ -363,7 +395,9 @@ def _lone_pair(
             pairs = [_Pair(*(_joined(own) for own in first))]
         _refuse_choices(path, "no joint has both a command and a position by its name", pairs)
     table.check_joints(path, [c.name for c in (*commands, *positions)])
-    raise InputError(f"{path}: {missing(table.names)}; it has {_listed(table.names)}.")
+    lines = "; or ".join(lines_by_value(path, table))
+    lines = f" Say which is which: {lines}." if lines else ""
+    raise InputError(f"{path}: {missing(table.names)}; it has {_listed(table.names)}.{lines}")
 
 
 def _joined(columns: Sequence[Column]) -> Column:
@@ -453,7 +487,16 @@ def unknown_numbers(path: Path | str, table: Table) -> str:
         if len(known):
             up = ", increasing" if name in table.increasing else ""
             shown.append(f"{name} ({known.min():.4g} … {known.max():.4g}{up})")
-    times = [*table.increasing, *table.texts, *table.faults]
+    text = f"its columns have no names. By their numbers, from 0, they are {'; '.join(shown)}. "
+    if lines := lines_by_value(path, table):
+        return f"{text}Say which is which: {', '.join(lines)}, or others."
+    return f"{text}A log has a column of commands and one of positions, which these are not."
+
+
+def lines_by_value(path: Path | str, table: Table) -> list[str]:
+    """Commands that import the columns that go together as a command and its position do."""
+    clocks = [n for n, cells in table.texts.items() if is_clock(cells[0])]
+    times = [*time_columns(table.names)[:1], *table.increasing, *clocks]
     time = times[0] if times else ""
     others: list[str] = []  # that move, each once
     for name, values in table.columns.items():
@@ -465,17 +508,17 @@ def unknown_numbers(path: Path | str, table: Table) -> str:
             others.append(name)
         elif (known % 1 == 0).all() and known.min() >= 0 and known.max() < 1e9 and "," not in time:
             time = f"{time},{name}"  # nanoseconds
-    pairs = _alike(table, others) or [_likeness(table, [*others, "1", "2"][:2])[1]]
+    if len(others) < 2:
+        return []
+    pairs = _alike(table, others) or [_likeness(table, others[:2])[1]]
     first, second = pairs[0]
     every = (",".join(names) for names in zip(*sorted(pairs), strict=True))
-    last = (others or [second])[-1]
-    choices = dict.fromkeys([tuple(every), (first, second), (second, first), (first, last)])
-    when = {"time": time} if time else {"rate": "50"}
-    lines = [import_line(path, **when, command=c, position=p) for c, p in choices]
-    return (
-        f"its columns have no names. By their numbers, from 0, they are {'; '.join(shown)}. Say "
-        f"which is which: {', '.join(lines)}, or others."
-    )
+    choices = dict.fromkeys([tuple(every), (first, second), (second, first), (first, others[-1])])
+    how = {"time": time} if time else {"rate": f"{table.rate or 50:g}"}
+    values = np.concatenate([_known(table, name) for name in pairs[0]])
+    if np.abs(values).max() > LARGEST_RAD:
+        how["unit"] = likely_units(values)[0]
+    return [import_line(path, **how, command=c, position=p) for c, p in choices if c != p]
 
 
 def _alike(table: Table, names: Sequence[str]) -> list[list[str]]:
@@ -508,9 +551,18 @@ def _likeness(table: Table, pair: Sequence[str]) -> tuple[float, list[str]]:
     return likeness, [*pair][::-1] if 0 < best < len(first) else [*pair]
 
 
+def _known(table: Table, name: str) -> NDArray[np.float64]:
+    """The numbers of a column; two zeros if it has none."""
+    values = table.columns.get(name, np.zeros(0))
+    known = values[np.isfinite(values)]
+    return known if len(known) else np.zeros(2)
+
+
 def has_time(names: Sequence[str]) -> bool:
     """Whether one of these columns is a time."""
-    return bool(time_columns(names) or any(column(n).kind == "time" for n in names))
+    return any(column(n).kind == "time" or _TIME_STEP.fullmatch(n) for n in names) or bool(
+        time_columns(names)
+    )
 
 
 def missing(names: Sequence[str]) -> str:
@@ -540,7 +592,10 @@ def _times(
     if options.rate:
         return np.arange(count) / options.rate, None, []  # of each joint's own rows: `_joint`
     names = [name for name in table.names if name in table.columns or name in table.texts]
-    found = time_columns(names)
+    moving = [n for n in names if n in table.texts or np.ptp(_known(table, n)) > 0]
+    names = moving if has_time(moving) else names
+    steps = next((n for n in names if _TIME_STEP.fullmatch(n)), None)
+    found = [n for n in time_columns(names) if n != steps]
     sent = [n for n in names if (c := column(n)).kind == "time" and c.words & _SENT]
     read = [n for n in names if (c := column(n)).kind == "time" and c.words and n not in sent]
     time, command_time, notes = options.time, options.command_time, []
@@ -554,6 +609,11 @@ def _times(
         notes.append(f"commands were taken as sent at {command_time}, positions as read at {time}.")
     elif found or read:
         time = (found or read)[0]
+    elif steps is not None:
+        total = np.cumsum(table.numbers(path, steps))
+        found_clock = clock(steps.lower().removeprefix("d"), total)
+        text = f"times are the sums of {steps}, the time between rows."
+        return found_clock.seconds(total), None, [*found_clock.notes, text]
     else:
         raise InputError(
             f"{path}: no column is a time (time, timestamp, t …, also with _s, _ms, _us or _ns); "
@@ -585,7 +645,11 @@ def _seconds(
 ) -> tuple[NDArray[np.float64], float, list[str]]:
     """Times of a column in seconds, the time that counts as 0, and notes."""
     if name in table.texts:
-        return times_of_day(path, name, table.texts[name]), 0.0, []
+        seconds = times_of_day(path, name, table.texts[name])
+        below = table.first(("ms", "msec", "millis", "milliseconds", "millisecond"))
+        if below is not None and not (seconds % 1).any():  # 12:30:01 and 250
+            seconds = seconds + 1e-3 * (table.numbers(path, below) % 1000)
+        return seconds, 0.0, []
     values = table.numbers(path, name)
     lower = {n.lower(): n for n in table.columns}
     whole = re.fullmatch(r"(.*?)secs?", name.lower())
@@ -611,34 +675,27 @@ def _of_two(
 def spread(path: Path | str, table: Table, options: LogOptions) -> Table:
     """A table with one value a row and its name (`time, name, value`) as columns by name.
 
-    Values are put at the times of the positions, commands as they were in force. Other tables come
-    back as they are.
+    A row has its value in the column of its name. Other tables come back as they are.
     """
+    if options.command:
+        return table
     by_case = {n.lower(): n for n in table.texts}
-    series = next((by_case[n] for n in SERIES if n in by_case), None)
-    value = table.first(("value", "values", "val", "_value", "data"))
-    if series is None or value is None or options.command:
-        return table
-    codes, found = pd.factorize(np.array(table.texts[series], object))
-    if len(found) > MOST_COLUMNS or missing([*map(str, found)]):
-        return table
-    read_s, _, notes = _times(path, table, options)
-    values = table.numbers(path, value)
-    own = {str(name): codes == k for k, name in enumerate(found)}
-    positions = [n for n in own if column(n).kind == "position"]
-    most = max(positions, key=lambda n: int(own[n].sum()))
-    at = read_s[own[most]]
-    columns: dict[str, NDArray[np.float64]] = {"time_s": at}
-    kept = np.ones(len(at), bool)
-    for name, rows_of in own.items():
-        order = np.argsort(read_s[rows_of], kind="stable")
-        _, held, known = held_commands(read_s[rows_of][order], values[rows_of][order], at)
-        columns[name] = np.full(len(at), np.nan)
-        columns[name][known] = held
-        if column(name).kind in ("command", "position"):
-            kept &= known
-    columns = {name: v[kept] for name, v in columns.items()}
-    return Table(columns, notes=(*notes, f"each row holds one value, named by {series}."))
+    value = table.first(_VALUES)
+    if value is None:
+        own = [n for n in table.columns if column(n).kind != "time" and n.lower() not in LABELS]
+        value = own[0] if len(own) == 1 else None
+    for series in (by_case[n] for n in SERIES if n in by_case and value is not None):
+        codes, found = pd.factorize(np.array(table.texts[series], object))
+        if len(found) > MOST_COLUMNS or missing([*map(str, found)]):
+            continue
+        refuse_more(path, len(codes) * len(found), MOST_CELLS, "cells", "Split it by joint.")
+        values = table.numbers(path, value)
+        columns = {n: v for n, v in table.columns.items() if n != value}
+        columns |= {str(n): np.where(codes == k, values, np.nan) for k, n in enumerate(found)}
+        texts = {n: t for n, t in table.texts.items() if n != series}
+        note = f"each row holds one value, named by {series}."
+        return replace(table, columns=columns, texts=texts, notes=(*table.notes, note))
+    return table
 
 
 def _groups(path: Path | str, table: Table) -> dict[str, NDArray[np.bool_]]:
@@ -691,17 +748,22 @@ def _joint(
     """Rows of one joint; its doubt goes into the header."""
     own, held = _apart(path, table, times_s, pair, own)
     stamp, sent = times_s[0][own], None if times_s[1] is None else times_s[1][own]
-    if held is not None:
+    if held is not None and held[0] is not None:
         sent = held[0]
     if options.rate:
         stamp = np.arange(len(stamp)) / options.rate
     trial, tone, warnings = _trials(path, table, options, own)
-    if held is not None:
+    if held is not None and held[0] is not None:
         warnings.append(
             "commands and positions stand in rows of their own: each row's time is that of what "
             "it holds, and a command was taken as in force until the next one."
         )
     number, shifted = one_after_another(stamp, trial)
+    if trial is None and number.max(initial=0) > 0:
+        warnings.append(
+            f"its times start again ({number.max():g} ×): each run of rows was taken for a trial "
+            "of the same joint."
+        )
     if sent is not None:
         send, read, doubt = sent_at(sent, stamp) + (shifted - stamp), shifted, 0.0
     else:
@@ -756,23 +818,26 @@ def _apart(
     times_s: tuple[NDArray[np.float64], NDArray[np.float64] | None],
     pair: _Pair,
     own: NDArray[np.bool_],
-) -> tuple[NDArray[np.bool_], tuple[NDArray[np.float64], NDArray[np.float64]] | None]:
-    """Rows of a joint's positions, and its commands at them, where no row has both.
+) -> tuple[NDArray[np.bool_], tuple[NDArray[np.float64] | None, NDArray[np.float64]] | None]:
+    """Rows of a joint's positions, and its commands at them, where most rows lack one of both.
 
-    As PlotJuggler and outer joins write signals of several clocks.
+    As PlotJuggler, long tables and outer joins write signals of several clocks. An empty cell of a
+    command means that the last one stays in force.
     """
     command, position = (table.numbers(path, c.name) for c in (pair.command, pair.position))
     sent, read = own & np.isfinite(command), own & np.isfinite(position)
     apart = (sent & read).sum() < _TOGETHER * min(sent.sum(), read.sum())
-    if not apart or times_s[1] is not None:
+    if times_s[1] is not None or not (apart or (read & ~sent).sum() > _MOSTLY_BLANK * read.sum()):
         return own, None
-    at = times_s[0] if times_s[1] is None else times_s[1]
-    order = np.argsort(at[sent], kind="stable")
-    send, held, kept = held_commands(at[sent][order], command[sent][order], times_s[0][read])
-    rows_of = np.flatnonzero(read)[kept]
+    rows_of = np.flatnonzero(read if apart else own)
+    order = np.flatnonzero(sent)[np.argsort(times_s[0][sent], kind="stable")]
+    send, held, kept = held_commands(times_s[0][order], command[order], times_s[0][rows_of])
     chosen = np.zeros(len(own), bool)
-    chosen[rows_of] = True
-    return chosen, (send, held)
+    chosen[rows_of[kept]] = True
+    if not kept.any():
+        return own, None
+    one_stamp = not apart or np.isin(times_s[0][chosen], times_s[0][sent]).mean() > _ONE_STAMP
+    return chosen, (None if one_stamp else send, held)
 
 
 def _trials(
@@ -823,6 +888,8 @@ def _of_name(path: Path | str, source: Column, positions: NDArray[np.float64]) -
         )
     if source.unit == "counts":
         known = positions[np.isfinite(positions)]
+        if (known % 1 != 0).any():  # a raw angle
+            return None
         fine = len(known) > 0 and float(np.median(known)) > 4096 and known.max() < 16384
         return unit(f"counts:{16384 if fine else 4096}")
     return unit(source.unit)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,12 +27,24 @@ _LONGEST_DOUBT_S = 1.0
 _KNOWN_ORDER_DOUBT_S = 0.001
 _SCALES = {"ns": 1e-9, "nsec": 1e-9, "nanosec": 1e-9, "nsecs": 1e-9, "usec": 1e-6, "us": 1e-6,
             "µs": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0,
-           "secs": 1.0, "seconds": 1.0, "nanos": 1e-9, "micros": 1e-6, "millis": 1e-3}  # fmt: skip
+           "secs": 1.0, "seconds": 1.0, "nanos": 1e-9, "micros": 1e-6, "millis": 1e-3, "min": 60.0,
+           "minutes": 60.0}  # fmt: skip
 _UNIT = re.compile(rf"(?:^|[_\s.(\[])({'|'.join(_SCALES)})[)\]]*$", re.IGNORECASE)
 _LOOP_S = (2e-5, 0.5)  # fastest and slowest loop of a servo
-_GUESSED = (("s", 1.0), ("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
+_GUESSED = (("s", 1.0), ("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9),
+            ("days", 86_400.0))  # fmt: skip
 _DAY_S = 86_400.0
 _OTHER_DATE = re.compile(r"^(?!\d{4}-)\d{1,4}([-/.])\d{1,2}\1\d{1,4} ")
+_HALF_DAY = re.compile(r" ?([AP])M$")
+_PERIODS = ("dt", "ts", "timestep", "time_step", "sample_time", "sampling_time", "sample_period",
+            "sampling_period", "period", "delta_x", "delta_t", "wf_increment")  # fmt: skip
+_RATES = ("fs", "fps", "rate", "rate_hz", "hz", "frequency_hz", "sample_rate", "sample_rate_hz",
+          "sampling_rate", "sampling_rate_hz", "sampling_frequency")  # fmt: skip
+_STATED = re.compile(
+    r"(?<![\w-])([a-z]\w*(?:[ _]\w+)?)\s*[\s:=,;]\s*[\"']?(\d[\d.]*(?:e[-+]?\d+)?)"
+    r"\s*(khz|hz|s|ms|us|µs)?(?![\w.])", re.IGNORECASE,
+)  # fmt: skip
+_STATED_IN = {"khz": 1e3, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 _NUMBER = re.compile(r"[-+]?[\d.]+(?:[eE][-+]?\d+)?")
 
 
@@ -84,6 +96,10 @@ def times_of_day(path: object, name: str, cells: Sequence[str]) -> NDArray[np.fl
     )
     bare = [_OTHER_DATE.sub("", cell.strip()) for cell in cells]
     bare = [f"00:{cell}" if cell.count(":") == 1 else cell for cell in bare]  # minutes and seconds
+    bare = [f"{cell[:-4]}.{cell[-3:]}" if cell.count(":") == 3 and cell[-4] == ":" else cell
+            for cell in bare]  # fmt: skip
+    halves = [_HALF_DAY.search(cell) for cell in bare]
+    bare = [_HALF_DAY.sub("", cell) for cell in bare]
     texts = pd.Series([cell.replace(",", ".") or None for cell in bare], dtype=object)
     try:
         if bad is not None:
@@ -92,6 +108,9 @@ def times_of_day(path: object, name: str, cells: Sequence[str]) -> NDArray[np.fl
             parsed = pd.to_datetime(texts, format="ISO8601", utc=True)
             return (parsed - parsed.min()).dt.total_seconds().to_numpy()
         seconds = pd.to_timedelta(texts).dt.total_seconds().to_numpy()
+        if any(halves):  # 12 AM is 0
+            afternoon = np.array([m is not None and m[1] == "P" for m in halves])
+            seconds = seconds % (_DAY_S / 2) + _DAY_S / 2 * afternoon
     except (ValueError, TypeError, OverflowError):
         shown = printable(cells[bad])[:40] if bad is not None else "a cell"
         raise InputError(
@@ -100,6 +119,21 @@ def times_of_day(path: object, name: str, cells: Sequence[str]) -> NDArray[np.fl
         ) from None
     midnights = np.cumsum(np.concatenate([[0], np.diff(seconds) < -_DAY_S / 2]))
     return seconds + _DAY_S * midnights
+
+
+def stated_rate(values: Mapping[str, float]) -> float | None:
+    """Rows a second by an entry beside a log without times, such as `dt` or `sample rate`."""
+    lower = {name.lower().replace(" ", "_"): value for name, value in values.items() if value > 0}
+    rates = [1 / lower[name] for name in _PERIODS if name in lower]
+    rates += [lower[name] for name in _RATES if name in lower]
+    return next((rate for rate in rates if 1 <= rate <= 1 / _LOOP_S[0]), None)
+
+
+def rate_in(lines: Iterable[str]) -> float | None:
+    """Rows a second by the remarks above a table: `# fs = 100 Hz`, `dt: 10 ms`, `Rate,100`."""
+    found = (m for line in lines for m in _STATED.finditer(line[:200]))
+    return stated_rate({m[1]: float(m[2]) * _STATED_IN.get((m[3] or "").lower(), 1.0)
+                        for m in found if m[2].count(".") < 2})  # fmt: skip
 
 
 def loop_period_s(stamp: NDArray[np.float64]) -> float:

@@ -11,7 +11,13 @@ from pathlib import Path
 
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.columns import column, columns_of, time_columns
-from pupper_sysid.sysid.recordings.importers.tables import has_time, import_line, missing
+from pupper_sysid.sysid.recordings.importers.tables import (
+    Table,
+    has_time,
+    import_line,
+    lines_by_value,
+    missing,
+)
 
 OURS = (
     "send_time_s", "read_time_s", "trial", "joint", "frequency_hz", "command_rad", "position_rad",
@@ -33,17 +39,16 @@ FILES = (
 """Layouts other than tables of text."""
 
 
-def unknown_columns(
-    path: Path | str, names: Sequence[str], timed: bool = False, increasing: Sequence[str] = ()
-) -> str:
+def unknown_columns(path: Path | str, table: Table, timed: bool = False) -> str:
     """Why a table has no known layout; empty where it may have one.
 
     Tabular layouts that share columns with it are listed with those that it lacks. `timed` tables
-    have their times from elsewhere; columns that are `increasing` may be times.
+    have their times from elsewhere.
     """
+    names = table.names
     own = set(names)
     lacks_pair = missing(names)
-    timed = timed or has_time(names)
+    timed = timed or bool(table.rate) or has_time(names)
     if lacks_pair == "" and timed:
         return ""
     if {n.lower() for n in own} >= _IMU and lacks_pair.startswith("no column"):
@@ -65,7 +70,7 @@ def unknown_columns(
             if own & {*columns}
         ),
     ]
-    lines = _examples(path, names, timed, increasing)
+    lines = _examples(path, table, timed)
     rest = "" if lines else f" Other layouts: {'; '.join(FILES)}."
     return (
         f"its columns ({_listed(names)}) belong to no known layout. {'; '.join(parts)}. "
@@ -74,15 +79,15 @@ def unknown_columns(
     )
 
 
-def _examples(
-    path: Path | str, names: Sequence[str], timed: bool, increasing: Sequence[str]
-) -> str:
+def _examples(path: Path | str, table: Table, timed: bool) -> str:
     """Command lines that take columns whose names say nothing for what is missing."""
+    names = table.names
     columns = columns_of(names)
-    times = time_columns(names)[:1] or [n for n in increasing if column(n).kind != "position"][:1]
+    times = time_columns(names)[:1]
+    times = times or [n for n in table.increasing if column(n).kind != "position"][:1]
     if not times and (len(columns) > 2 or timed):  # of another event
         times = [c.name for c in columns if c.kind in ("time", "unknown")][:1]
-    when = {"time": times[0]} if times else {"rate": "50"}
+    when = {"time": times[0]} if times else {"rate": f"{table.rate or 50:g}"}
     numbered = Counter(re.sub(r"\d+", "{joint}", c.name, count=1) for c in columns)
     by_kind = {}
     for kind in ("command", "position"):
@@ -104,6 +109,7 @@ def _examples(
         for c, p in product(by_kind["command"], by_kind["position"])
         if c != p
     ]
+    lines = lines or lines_by_value(path, table)
     return f" ({'; or '.join(list(dict.fromkeys(lines))[:3])})" if lines else ""
 
 

@@ -142,6 +142,28 @@ def test_clocks_that_drift_are_no_early_position_and_no_swapped_columns():
     assert found["lag_drifts"].values["drift_ms"] == pytest.approx(-6, rel=0.1)
 
 
+@pytest.mark.parametrize("motion", ["prbs", "steps"])
+def test_clocks_that_drift_are_found_in_motion_with_sharp_edges(motion):
+    """All readings together show what the lags of short windows do not."""
+    world = replace(
+        draw_world(np.random.default_rng(3), "smart", motion, 3e-4), rate_hz=100.0, poll_s=0.0,
+        friction_rad=0.0, gravity_rad=0.0, duration_s=14.0, quantum_rad=0.0015,
+    )  # fmt: skip
+    table = simulated(world)
+    late = np.interp(1.006 * table.read_time_s, table.read_time_s, table.position_rad)
+    assert "lag_drifts" in codes(recorded(table.assign(position_rad=late)))
+    assert "lag_drifts" not in codes(recorded(table))
+
+
+def test_a_chirp_beyond_the_speed_limit_is_no_change_of_gain_and_no_drift():
+    world = draw_world(np.random.default_rng(1), "smart", "chirp", 3e-4)
+    world = replace(
+        world, amplitude_rad=0.4, speed_rad_s=3.0, bandwidth_hz=8.0, rate_hz=80.0, poll_s=0.0,
+        friction_rad=0.0, gravity_rad=0.0, gain=0.9, duration_s=14.0, quantum_rad=0.0015,
+    )  # fmt: skip
+    assert not {"gain_changed", "lag_drifts"} & set(codes(recorded(simulated(world))))
+
+
 CASES = {
     "made/C6_sample_sweep_LF_hip_sign_flipped.csv": ("LF_hip", "sign_inverted", REFUSE),
     "made/D1_goal_clamped_by_firmware.csv": ("hip", "clipped", CARE),

@@ -132,7 +132,7 @@ def test_logs_beyond_the_limits_are_refused_before_they_are_unpacked(tmp_path, m
 def test_joints_with_strange_names_are_called_by_letters_and_digits(tmp_path):
     made = table().rename(columns=lambda n: n.replace("knee", "\x1b[31m<b>Knie</b>"))
     made.to_csv(tmp_path / "log.csv", index=False)
-    assert load(tmp_path / "log.csv").joints == ["joint_31m_b_Knie_b"]
+    assert load(tmp_path / "log.csv").joints == ["b_Knie_b"]
 
 
 def test_a_parquet_file_without_the_library_names_the_extra(tmp_path, monkeypatch):

@@ -1,0 +1,249 @@
+"""Logs as monitors, data bases, drives and simulators write them: read, or refused with a line.
+
+`READ` are read, `LINES` are refused and the first `import` line of the message reads them, `WRONG`
+are refused in words that name what they are.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import shlex
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from scipy.io import savemat
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from support.refusals import assert_each_refused
+
+ROWS = 80
+TIME = np.round(0.01 * np.arange(ROWS), 3)
+COMMAND = np.round(0.3 * np.sin(8 * TIME), 6)
+POSITION = np.round(0.28 * np.sin(8 * (TIME - 0.03)), 6)
+SECOND = (np.round(0.2 * np.cos(5 * TIME), 6), np.round(0.19 * np.cos(5 * (TIME - 0.03)), 6))
+LOG = list(zip(TIME.tolist(), COMMAND.tolist(), POSITION.tolist(), strict=True))
+BOTH = [(*row, c, p) for row, c, p in zip(LOG, *map(np.ndarray.tolist, SECOND), strict=True)]
+JOINTS = (COMMAND, POSITION), SECOND
+
+
+def each(pattern, rows=LOG):
+    """A line a row: `t` or `m` (milliseconds), `c`, `p`; of a second joint `d` and `q`."""
+    names = "tcpdq"[: len(rows[0])]
+    return "".join(
+        pattern.format(**dict(zip(names, row, strict=True)), m=round(1e3 * row[0]), n=n) + "\n"
+        for n, row in enumerate(rows)
+    )
+
+
+CSV = each("{t},{c},{p}")
+NAMED = "time,cmd,pos\n" + CSV
+
+
+def saved(write, *values, **arrays):
+    out = io.BytesIO()
+    write(out, *values, **arrays)
+    return out.getvalue()
+
+
+def matlab(**variables):
+    return saved(savemat, variables)
+
+
+LONG = pd.DataFrame({"time": TIME, "knee_cmd": COMMAND, "knee_pos": POSITION, "hip_cmd": SECOND[0],
+                     "hip_pos": SECOND[1]}).melt("time", var_name="signal")  # fmt: skip
+STACKED = {"q": np.column_stack([POSITION, SECOND[1]]),
+           "q_des": np.column_stack([COMMAND, SECOND[0]])}  # fmt: skip
+INFLUX = "#group,false,false,false,true,true\n#datatype,string,long,dateTime:RFC3339,double,string"
+
+READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
+    # monitors
+    "ESP-IDF, in colours": (
+        "boot:0x13\n" + each("\x1b[0;32mI ({m}) servo: cmd={c} pos={p}\x1b[0m"), "joint"),
+    "PlatformIO": (
+        "--- Quit: Ctrl+C\n" + each("12:30:{t:06.3f} > cmd:{c},pos:{p}"), "joint"),
+    "remarks of other programs": (NAMED.replace("\n", "\n[D][BLE] scan\n"), "joint"),
+    "a traceback": (NAMED + '^CTraceback:\n  File "log.py", line 12, in <module>\n', "joint"),
+    "a first line that was cut": ("m [ms],cmd,pos\n.1,-0.1\n" + each("{m},{c},{p}"), "joint"),
+    "a last line that was cut": (NAMED + "0.8,0.3,-", "joint"),
+    "vectors by name": (
+        each("t: {t} cmd: [{c}, {d}] pos: [{p}, {q}]", BOTH), "joint_0 joint_1"),
+    "JSON behind a time": (each('2026-05-04 12:30:{t:09.6f} INFO {{"cmd": {c}, "pos": {p}}}'),
+                           "joint"),
+    # words and marks in cells
+    "words for failed reads": (NAMED + "".join(f"{0.8 + 0.01 * k:.2f},0.1,{word}\n" for k, word in (
+        enumerate(("-nan(ind)", "1.#QNAN", "#DIV/0!", "-1.#IND", "(null)", "----", ".")))),
+        "joint"),
+    "names again with blanks": (NAMED + "time, cmd, pos\n0.8,0.1,0.1\n", "joint"),
+    "single quotes": ("'" + NAMED.strip().replace(",", "','").replace("\n", "'\n'") + "'\n",
+                      "joint"),
+    "thin spaces": ("time_us;cmd;pos\n" + "".join(
+        f"{1e6 * t:,.0f};{c};{p}\n".replace(",", "\u202f") for t, c, p in LOG), "joint"),
+    "Mathematica": (re.sub(r"(0\.\d+)", r"\1*^0", NAMED), "joint"),
+    "tensors in cells": ("time,action,state\n" + each(
+        "{t},\"tensor([{c}, {d}])\",\"array('d', [{p}, {q}])\"", BOTH), "joint_0 joint_1"),
+    "centidegrees": ("t,cmd (cdeg),pos (cdeg)\n" + "".join(
+        f"{t},{18000 / np.pi * c!r},{18000 / np.pi * p!r}\n" for t, c, p in LOG), "joint"),
+    # tables that were printed, turned or grouped
+    "SQL": ("  time | goal | present \n-------+------+------\n" + each("{t} | {c} | {p}")
+            + "(80 rows)\n", "joint"),
+    "a row for each quantity": ("".join(
+        f"{name},{','.join(map(str, values))}\n"
+        for name, values in (("time", TIME), ("cmd", COMMAND), ("pos", POSITION))), "joint"),
+    "cells over two columns": (
+        ",Knee,,Hip,\nTime,Goal,Present,Goal,Present\n" + each("{t},{c},{p},{d},{q}", BOTH),
+        "Knee Hip"),
+    "LabVIEW without times": (
+        "Separator\tTab\n***End_of_Header***\t\n\t\nChannels\t2\t\nSamples\t80\t80\nDelta_X\t0.01"
+        "\t0.01\n***End_of_Header***\t\t\nX_Value\tSetpoint\tPosition\tComment\n"
+        + each("\t{c}\t{p}"), "joint"),
+    # times
+    "minutes": ("Time (min),Goal,Present\n" + "".join(
+        f"{t / 60!r},{c},{p}\n" for t, c, p in LOG), "joint"),
+    "days of a spreadsheet": ("Timestamp,Goal,Present\n" + "".join(
+        f"{46146 + t / 86400:.12f},{c},{p}\n" for t, c, p in LOG), "joint"),
+    "afternoon": ("Time,Goal,Present\n" + each("5/4/2026 12:30:{t:06.3f} PM,{c},{p}"), "joint"),
+    "milliseconds behind a colon": ("Time,Goal,Present\n" + "".join(
+        f"12:30:00:{1e3 * t:03.0f},{c},{p}\n" for t, c, p in LOG), "joint"),
+    "milliseconds beside": ("time,ms,goal,present\n" + each("12:30:01,{m},{c},{p}"), "joint"),
+    "time between rows": ("dt_us,cmd,pos\n" + each("10000,{c},{p}"), "joint"),
+    "a rate in a remark": ("# sample rate: 100 Hz\nsample,cmd,pos\n" + each("{n},{c},{p}"),
+                           "joint"),
+    "a first time column that is empty": (
+        "header_stamp,receive_time,cmd,pos\n" + each(",{t},{c},{p}"), "joint"),
+    # commands in rows of their own, several joints
+    "InfluxDB": (f"{INFLUX},string\n,result,table,_time,_value,_field,joint\n" + each(
+        ",,0,2026-05-04T12:30:{t:09.6f}Z,{c},goal,knee\n,,1,2026-05-04T12:30:{t:09.6f}Z,{p},present"
+        ",knee\n,,2,2026-05-04T12:30:{t:09.6f}Z,{d},goal,hip\n,,3,2026-05-04T12:30:{t:09.6f}Z,{q},"
+        "present,hip", BOTH), "knee hip"),
+    "a kind and a joint": ("time,joint,kind,angle\n" + each(
+        "{t},knee,target,{c}\n{t},knee,measured,{p}\n{t},hip,target,{d}\n{t},hip,measured,{q}",
+        BOTH), "knee hip"),
+    "writes and reads": ("time,op,id,value\n" + each("{t},write,1,{c}\n{t},read,1,{p}"),
+                         "motor_1"),
+    "commands as they change": ("time,cmd,pos\n" + "".join(
+        f"{t},{c if n == 0 or c != COMMAND[n - 1] else ''},{p}\n" for n, (t, c, p) in
+        enumerate(LOG)), "joint"),
+    "a melted parquet": (saved(lambda f: LONG.to_parquet(f)), "knee hip"),
+    "a parquet of dates": (saved(lambda f: pd.DataFrame({"cmd": COMMAND, "pos": POSITION},
+        pd.to_datetime(TIME, unit="s", utc=True)).to_parquet(f)), "joint"),
+    # drives: what their words mean
+    "SimpleFOC": ("time,target,voltage.q,current.q,current.d,angle\n"
+                  + each("{t},{c},{p},{p},{c},{p}"), "joint"),
+    "ODrive's current": ("time,input_pos,pos_estimate,Iq_setpoint,Iq_measured\n"
+                         + each("{t},{c},{p},0,0"), "joint"),
+    "torques beside": ("time,pos_cmd,trq_cmd,pos,trq\n" + each("{t},{c},0,{p},0"), "joint"),
+    "d behind a number": ("t,q1,q2,q1d,q2d\n" + each("{t},{p},{q},{c},{d}", BOTH),
+                          "joint_1 joint_2"),
+    "a raw angle": ("time,cmd,pos_raw\n" + each("{t},{c},{p}"), "joint"),
+    # JSON and arrays
+    "rows by number": (pd.DataFrame({"t": TIME, "cmd": COMMAND, "pos": POSITION}).to_json(
+        orient="index", double_precision=12), "joint"),
+    "a record a joint": (json.dumps({"dt": 0.01, "joints": [
+        {"name": name, "cmd": c.tolist(), "pos": p.tolist()}
+        for name, (c, p) in zip(("knee", "hip"), JOINTS, strict=True)]}), "knee hip"),
+    "a line that was cut": (each('{{"t": {t}, "cmd": {c}, "pos": {p}}}') + '{"t": 0.8, "c',
+                            "joint"),
+    "numbers in quotes": (json.dumps([{"t": f"{t}", "cmd": f"{c}", "pos": f"{p}"}
+                                      for t, c, p in LOG]), "joint"),
+    "dates in JSON": (json.dumps([{"time": f"2026-05-04T12:30:{t:09.6f}Z", "cmd": c, "pos": p}
+                                  for t, c, p in LOG]), "joint"),
+    "JSON in UTF-16": (json.dumps({"t": TIME.tolist(), "cmd": COMMAND.tolist(),
+                                   "pos": POSITION.tolist()}).encode("utf-16"), "joint"),
+    "Foxglove's messages": ("".join(json.dumps(
+        {"topic": topic, "receiveTime": {"sec": 1_700_000_000, "nsec": round(1e9 * t)},
+         "message": {"position": list(values)}}) + "\n" for t, c, p, d, q in BOTH
+        for topic, values in (("/command", (c, d)), ("/joint_states", (p, q)))),
+        "message_joint_0 message_joint_1"),
+    "frames a second": (saved(np.savez, action=STACKED["q_des"], qpos=STACKED["q"], fps=100),
+                        "joint_0 joint_1"),
+    "Isaac Lab": (saved(lambda f: torch.save(
+        {"joint_pos": torch.tensor(STACKED["q"]), "joint_pos_target": torch.tensor(
+            STACKED["q_des"]), "dt": 0.01}, f)), "joint_0 joint_1"),
+    "one environment first": (saved(np.savez, time=TIME, dof_pos=STACKED["q"][None],
+                                    des_dof_pos=STACKED["q_des"][None]), "joint_0 joint_1"),
+    "Simulink's time": (matlab(tout=TIME[:, None], **STACKED), "joint_0 joint_1"),
+}  # fmt: skip
+
+LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
+    "Simulink's rows": (matlab(ans=np.vstack([TIME, COMMAND, POSITION])), "--time 0 --command 1"),
+    "Simulink's structure": (
+        matlab(simout={"time": TIME[:, None], "signals": {"values": np.column_stack([COMMAND,
+                                                                                     POSITION])}}),
+        "--time simout.time"),
+    "Octave": ("# Created by Octave\n# name: data\n# type: matrix\n# rows: 80\n# columns: 3\n"
+               + each(" {t} {c} {p}"), "--time 0 --command 1 --position 2"),
+    "JSON without names": (json.dumps(LOG), "--time 0 --command 1 --position 2"),
+    "names that say nothing": ("Var1,Var2,Var3\n" + CSV, "--time Var1 --command Var2"),
+    "two angles": ("t,angle_in,angle_out\n" + CSV, "--command angle_in --position angle_out"),
+    "Russian": ("время,задание,положение\n" + CSV, "--time 'время' --command 'задание'"),
+    "counts without names": ("".join(
+        f"{1e3 * t:.0f},{2048 + 652 * c:.0f},{2048 + 652 * p:.0f}\n" for t, c, p in LOG),
+        "--unit counts:4096"),
+    "whole seconds": ("time,cmd,pos\n" + "".join(
+        f"12:30:{int(2.5 * t):02d},{c},{p}\n" for t, c, p in LOG), "--rate 40"),
+}  # fmt: skip
+
+WRONG: dict[str, tuple[str | bytes, str]] = {
+    "XML": ("<?xml version='1.0'?><log/>", "is XML"),
+    "a page": ("<html><table></table></html>", "a web page"),
+    "a bag of ROS 1": (b"#ROSBAG V2.0\n" + bytes(50), "rosbags-convert"),
+    "several robots": (saved(np.savez, dof_pos=np.zeros((90, 2, 3)), dt=0.01),
+                       "90 × 2 × 3 values, of several robots"),
+    "servo's answers alone": (each("ID 1 at {p}"), "no names"),
+}  # fmt: skip
+
+
+def written(tmp_path, content):
+    path = tmp_path / "log.txt"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize("form", READ)
+def test_a_log_of_another_tool_is_read(tmp_path, form):
+    content, joints = READ[form]
+    recording = load(written(tmp_path, content))
+    assert set(recording.joints) == set(joints.split())
+    for joint, (command, position) in zip(joints.split(), JOINTS, strict=False):
+        trial = recording.trials(joint)[0]
+        rows = np.arange(ROWS)
+        assert len(trial.send_time_s) >= ROWS and recording.loop_period_s == pytest.approx(
+            0.01, rel=1e-4
+        )
+        np.testing.assert_allclose(trial.command_rad[rows], command, atol=1e-9)
+        np.testing.assert_allclose(trial.position_rad[rows], position, atol=1e-9)
+
+
+@pytest.mark.parametrize("form", LINES)
+def test_the_first_line_of_a_refusal_reads_the_log(tmp_path, form):
+    content, words = LINES[form]
+    with pytest.raises(InputError) as refused:
+        load(written(tmp_path, content))
+    line = re.findall(r"`pupper-sysid import ([^`]*) --out rec\.csv`", str(refused.value))[0]
+    assert words in line
+    options = dict(part.split(maxsplit=1) for part in line.split(" --")[1:])
+    stated = {k.replace("-", "_"): shlex.split(v)[0] for k, v in options.items()}
+    rate = {"rate": float(stated.pop("rate"))} if "rate" in stated else {}
+    recording = load(tmp_path / "log.txt", LogOptions(**stated, **rate))
+    (trial, *_) = recording.trials(recording.joints[0])
+    assert np.corrcoef(trial.command_rad, COMMAND)[0, 1] > 0.9999
+    assert np.corrcoef(trial.position_rad, POSITION)[0, 1] > 0.9999
+
+
+def test_what_is_no_table_is_called_by_its_name(tmp_path):
+    def read(form):
+        load(written(tmp_path, WRONG[form][0]))
+
+    assert_each_refused([(form, words) for form, (_, words) in WRONG.items()], read)
+
+
+def test_what_may_be_several_joints_is_said_to_be_taken_as_trials(tmp_path):
+    blocks = f"# t cmd pos\n{each('{t} {c} {p}')}\n\n# knee\n{each('{t} {c} {p}')}"
+    recording = load(written(tmp_path, blocks))
+    assert any("start again" in text for text in recording.warnings)
