@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.joints import NO_LOAD_SPEED_RAD_S
+from pupper_sysid.common.joints import JOINT_NAMES, NO_LOAD_SPEED_RAD_S
 from pupper_sysid.common.results import JointResults, Result, internal
 from pupper_sysid.sysid.doctor.checks import (
     Joints,
@@ -89,7 +89,7 @@ class JointExamination(Result):
     peak_command_rad_s: float = math.nan
     speed_share: float = math.nan
     """`peak_command_rad_s` and `speed_share`: fastest command, and the same as a share of the
-    servo's speed limit."""
+    servo's speed limit; NaN where that is not known."""
     hold_histogram: tuple[int, ...] = ()
     """How many runs of 1, 2, 3, … equal readings there are while the joint must have moved."""
     feedback: PollLattice | None = internal(default=None)
@@ -162,11 +162,18 @@ def examine(
     given = as_sequence(recordings)
     rng = np.random.default_rng(seed)
     limits = [(r.metadata.get("bus") or {}).get("speed_limit_rad_s") for r in given]
-    limit = max(float(each or NO_LOAD_SPEED_RAD_S) for each in limits)
+    known = [float(limit) for limit in limits if limit]
     recorded = {joint: recorded_trials(given, joint) for joint in chosen_joints(given, joints)}
     mixed = crossed({joint: long_enough(trials) for joint, trials in recorded.items()})
     found = {
-        joint: _examine_joint(joint, trials, mixed.get(joint), limit, rng, (lags or {}).get(joint))
+        joint: _examine_joint(
+            joint,
+            trials,
+            mixed.get(joint),
+            _speed_limit_rad_s(joint, known),
+            rng,
+            (lags or {}).get(joint),
+        )
         for joint, trials in recorded.items()
     }
     held = any(j.feedback and j.feedback.kind == "lattice" for j in found.values())
@@ -176,6 +183,13 @@ def examine(
         advice=(_HELD,) if held else (),
         joints=found,
     )
+
+
+def _speed_limit_rad_s(joint: str, stated: Sequence[float]) -> float:
+    """The fastest that a joint moves: as its bus states, or of a Mini Pupper; else NaN."""
+    if stated:
+        return max(stated)
+    return NO_LOAD_SPEED_RAD_S if joint in JOINT_NAMES else math.nan
 
 
 def hold_histogram(trials: Sequence[Trial]) -> tuple[int, ...]:
