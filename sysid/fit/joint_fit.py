@@ -125,6 +125,8 @@ _POLL_SD_S = 1e-3
 """Standard deviation of a poll's instant about its lattice: jitter of the bus and drift."""
 _AT_BOUND = 0.03
 """Distance from a bound, in fitted coordinates, that counts as on it."""
+_CUT_SHARE = 0.1
+"""The same as a share of a 90 % interval: a bound within two standard deviations cuts the draws."""
 _COMMAND_WINDOW_S = 0.05
 _COVARIANCE_STEP = 0.03  # the slope over a likely error, not of one kink
 
@@ -1008,7 +1010,10 @@ def _why_unidentified(
         return f"commands reach {speed:.1f} rad/s only, so the limit was never reached"
     for bound, end in ((p.low, min(value, interval.low)), (p.high, max(value, interval.high))):
         end = max(end, p.low)
-        on = float(abs(p.encode(end) - p.encode(bound))) < _AT_BOUND
+        near = _AT_BOUND
+        if p.logarithmic and p.name != "dead_time_s" and interval.low > 0:
+            near = max(near, _CUT_SHARE * float(np.log(interval.high / interval.low)))
+        on = float(abs(p.encode(end) - p.encode(bound))) < near
         if on and (p.logarithmic or abs(value - bound) < _AT_BOUND):
             return f"on its bound, {bound:g}: the recording does not limit it on that side"
     if sd > 0.7 * p.marginal_sd:
