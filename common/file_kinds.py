@@ -57,11 +57,12 @@ def refuse_other_kind(path: Path, wanted: str) -> None:
 
 
 def _kind_of(path: Path) -> str | None:
-    if path.is_dir():
-        inside = (path / name for name in _INSIDE)
-        return next((kind for p in inside if p.is_file() and (kind := _kind_of(p))), None)
-    with suppress(InputError, OSError), open_regular(path) as file:
-        head = file.read(_HEAD).decode(errors="replace")
+    with suppress(InputError, OSError):
+        if path.is_dir():
+            inside = (path / name for name in _INSIDE)
+            return next((kind for p in inside if p.is_file() and (kind := _kind_of(p))), None)
+        with open_regular(path) as file:
+            head = file.read(_HEAD).decode(errors="replace")
         if _OURS.match(head):
             return RECORDING
         if _EMULATED.match(head):

@@ -603,8 +603,6 @@ _BINARY = {
     b"\x89HDF\r\n": ("an HDF5 file", "pandas.read_hdf or h5py reads it; write it with to_csv"),
     b"ARROW1": ("a feather file", "write it with pandas.read_feather(path).to_parquet"),
     b"\xd0\xcf\x11\xe0": ("a spreadsheet", "save it as CSV"),
-    b"<?xml": ("XML", "write its numbers as CSV"),
-    b"<": ("a web page or XML", "write its numbers as CSV"),
     b"ULog": ("a PX4 log", "convert it with ulog2csv"),
     b"#ROSBAG": ("a bag of ROS 1", "convert it with `rosbags-convert` to rosbag2"),
     b"\x80\x04\x95": ("a pickle, which can hold programs", "write its arrays with numpy.savez"),

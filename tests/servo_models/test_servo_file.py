@@ -164,7 +164,7 @@ def test_a_contract_is_refused_that_says_what_the_model_is_not(tmp_path: Path):
         ({"colour": "red"}, "colour is not a key of this file"),
         ({"schema_version": 3}, "newer version"),
         ({"schema_version": "one"}, "schema_version"),
-        ({"schema": "pupper-calibration"}, "is no servo model's contract"),
+        ({"schema": "pupper-calibration"}, "is a calibration, not a fitted servo model"),
         ({"arch": "transformer"}, "arch"),
         ({"units": "degrees"}, "units"),
         ({"time_step_s": 0.0}, "time_step_s"),

@@ -217,7 +217,7 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
     refuse_more(path, sum(map(len, table.columns.values())), MOST_CELLS, "cells", "Split it.")
     table = spread(path, table, options)
     timed = [n for n in table.names if n not in table.columns or np.ptp(_known(table, n)) > 0]
-    if table.rate and not (options.rate or options.time or has_time(timed)):
+    if table.rate is not None and options.rate is None and not (options.time or has_time(timed)):
         options = replace(options, rate=table.rate)
     notes = list(table.notes)
     pairs, texts = _pairs(path, table, options)
@@ -514,7 +514,8 @@ def lines_by_value(path: Path | str, table: Table) -> list[str]:
     first, second = pairs[0]
     every = (",".join(names) for names in zip(*sorted(pairs), strict=True))
     choices = dict.fromkeys([tuple(every), (first, second), (second, first), (first, others[-1])])
-    how = {"time": time} if time else {"rate": f"{table.rate or 50:g}"}
+    rate = 50 if table.rate is None else table.rate
+    how = {"time": time} if time else {"rate": f"{rate:g}"}
     values = np.concatenate([_known(table, name) for name in pairs[0]])
     if np.abs(values).max() > LARGEST_RAD:
         how["unit"] = likely_units(values)[0]
@@ -589,7 +590,7 @@ def _times(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None, list[str]]:
     """Times of the rows, when their commands were sent where that is known, and notes."""
     count = max(map(len, table.columns.values()), default=0)
-    if options.rate:
+    if options.rate is not None:
         return np.arange(count) / options.rate, None, []  # of each joint's own rows: `_joint`
     names = [name for name in table.names if name in table.columns or name in table.texts]
     moving = [n for n in names if n in table.texts or np.ptp(_known(table, n)) > 0]
@@ -750,7 +751,7 @@ def _joint(
     stamp, sent = times_s[0][own], None if times_s[1] is None else times_s[1][own]
     if held is not None and held[0] is not None:
         sent = held[0]
-    if options.rate:
+    if options.rate is not None:
         stamp = np.arange(len(stamp)) / options.rate
     trial, tone, warnings = _trials(path, table, options, own)
     if held is not None and held[0] is not None:
@@ -769,7 +770,7 @@ def _joint(
     else:
         send, read, doubt, texts = turns(shifted, options)
         warnings += texts
-    if options.rate:
+    if options.rate is not None:
         doubt = max(doubt, doubt_of_a_turn(stamp)[0])
         warnings.append(
             f"its times are row numbers over {options.rate:g} Hz: lag and dead time scale with "

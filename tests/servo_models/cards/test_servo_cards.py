@@ -131,7 +131,7 @@ def test_cards_that_cannot_be_trusted_are_refused_in_a_sentence(tmp_path):
         (("armature_kg_m2: 0.027", "armature_kg_m2: 27.0"), "looks like g·cm²"),
         (("schema_version: 1", "schema_version: 2"), "newer version"),
         (("default: servo", "default: knee"), "no specimen"),
-        (("pupper-servo-card", "pupper-calibration"), "is not a servo card"),
+        (("pupper-servo-card", "pupper-calibration"), "not a servo card"),
         (("commit: 20ce9d0f", "commit: 20ce9d"), "commit"),
     ]
     assert_each_refused(cases, read, names=path)

@@ -190,8 +190,8 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
 }  # fmt: skip
 
 WRONG: dict[str, tuple[str | bytes, str]] = {
-    "XML": ("<?xml version='1.0'?><log/>", "is XML"),
-    "a page": ("<html><table></table></html>", "a web page"),
+    "XML": ("<?xml version='1.0'?><log/>", "is XML or HTML"),
+    "a page": ("<html><table></table></html>", "is XML or HTML"),
     "a bag of ROS 1": (b"#ROSBAG V2.0\n" + bytes(50), "rosbags-convert"),
     "several robots": (saved(np.savez, dof_pos=np.zeros((90, 2, 3)), dt=0.01),
                        "90 × 2 × 3 values, of several robots"),
