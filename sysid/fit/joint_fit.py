@@ -582,9 +582,11 @@ def _explained(ready: PreparedJoint, choice: _Choice, anew: bool = False) -> _Ch
     anew = anew or bool(_undescribed(_goodness(ready, carried)))
     if not (anew or ready.scales.free_air):
         return choice  # a motor under load has enough terms to imitate a filter
-    problem = ready.searched(carried.structure)
-    best = replace(carried.fit, cost=float(problem.costs(carried.fit.point[None])[0]))
-    likely = explanations(problem, best, carried.temperature, anew, ready.fit_rng())
+    likely = []
+    for fitted in choice.likely:
+        if fitted is carried or ready.scales.free_air:
+            likely += _rivals(ready, fitted, carried, choice.nats, anew and fitted is carried)
+    likely.sort(key=lambda one: -one.nats)
     named = decided(likely)
     if named is not None:
         age = ready.lag.feedback.time_doubt_s
@@ -592,6 +594,31 @@ def _explained(ready: PreparedJoint, choice: _Choice, anew: bool = False) -> _Ch
     elif likely and carried.draws is not None and ready.scales.free_air:
         choice = _stacked(ready, choice, likely)
     return replace(choice, misfit=named)
+
+
+def _rivals(
+    ready: PreparedJoint, fitted: Fitted, carried: Fitted, nats: Mapping[str, float], anew: bool
+) -> list[Explanation]:
+    """What explains the servo beside a likely structure, in the carried one's numbers."""
+    problem = ready.searched(fitted.structure)
+    best = replace(fitted.fit, cost=float(problem.costs(fitted.fit.point[None])[0]))
+    tried = explanations(problem, best, carried.temperature, anew, ready.fit_rng())
+    if fitted is carried:
+        return tried
+    below = nats[fitted.structure.name] - nats[carried.structure.name]
+    shared = [
+        (carried.structure.names.index(name), k)
+        for k, name in enumerate(fitted.structure.names) if name in carried.structure.names
+    ]  # fmt: skip
+    found = []
+    for one in tried:
+        assert one.point is not None
+        point = carried.fit.point.copy()
+        for place, k in shared:
+            point[place] = one.point[k]
+        weight = min(one.weight * float(np.exp(-below)), 1.0)
+        found.append(replace(one, nats=one.nats - below, weight=weight, point=point))
+    return found
 
 
 def _stacked(ready: PreparedJoint, choice: _Choice, rivals: Sequence[Explanation]) -> _Choice:

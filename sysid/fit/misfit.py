@@ -192,8 +192,13 @@ def _low_pass(
 
 def _tempered(problem: Problem, fit: Fit, temperature: float) -> float:
     """Minus the logarithm of the posterior's density at a fit."""
-    prior = float(problem.prior(fit.point[None])[0])
-    return (fit.cost - prior) / temperature + prior
+    cost = _unlikely(problem, fit)
+    return cost / temperature + fit.cost - cost
+
+
+def _unlikely(problem: Problem, fit: Fit) -> float:
+    """Cost of a fit without its prior."""
+    return fit.cost - float(problem.prior(fit.point[None])[0])
 
 
 def _weight(nats: float) -> float:
@@ -241,39 +246,50 @@ def _with_feature(
         values = np.concatenate([values, traded])
     starts = np.clip(wider.encode(values), *wider.box)
     behind = replace(problem, structure=wider)
-    best_with = from_about(behind, refine(behind, starts), rng)
-    price = len(wider.names) - len(structure.names)
-
-    least = _tempered(problem, best, temperature)
-
-    def nats(fit: Fit) -> float:
-        return least - _tempered(behind, fit, temperature) - price
-
-    if nats(best_with) + price < _POSSIBLE_NATS:
-        return []
-    fits = [best_with]
+    fits = [from_about(behind, refine(behind, starts), rng)]
     if name in _TRADED and "friction_rad_s2" in wider.names:
         # what the two hold back together may be all that the data tell: the least likely friction
-        less = [_with_less_friction(behind, starts, share) for share in _LEFT]
-        fits += [fit for fit in less if nats(fit) >= nats(best_with) - _WITHIN_NATS][-1:]
+        known = np.concatenate([fits[0].point[None], starts])
+        fits += [_with_less_friction(behind, known, share, place) for share in _LEFT]
+    price = len(wider.names) - len(structure.names)
+    least = _tempered(problem, best, temperature)
+    nats = [least - _tempered(behind, fit, temperature) for fit in fits]
+    if max(nats) < _POSSIBLE_NATS:
+        return []
+    chosen = {int(np.argmax(nats)): _weight(max(nats))}
+    # by the readings alone: what they tell of friction is not its prior's to say
+    read = [(_unlikely(problem, best) - _unlikely(behind, fit)) / temperature for fit in fits]
+    for k in range(1, len(fits)):
+        if read[k] >= max(read) - _WITHIN_NATS:
+            chosen[k] = _weight(read[k])
     shared = [wider.names.index(name) for name in structure.names]
     return [
         Explanation(
-            feature.words.format(float(wider.decode(fit.point)[place]) / feature.unit), nats(fit),
-            float(wider.decode(fit.point)[0]), _weight(nats(fit) + price), fit.point[shared],
+            feature.words.format(float(wider.decode(fits[k].point)[place]) / feature.unit),
+            nats[k] - price, float(wider.decode(fits[k].point)[0]), weight, fits[k].point[shared],
         )
-        for fit in fits
+        for k, weight in chosen.items()
     ]  # fmt: skip
 
 
-def _with_less_friction(behind: Problem, starts: NDArray[np.float64], share: float) -> Fit:
-    """The fit from starts with no more friction than a share of the most that they have."""
+def _with_less_friction(
+    behind: Problem, known: NDArray[np.float64], share: float, place: int
+) -> Fit:
+    """The fit with no more friction than a share of the most that is in some points.
+
+    From these points, with a larger dead zone or play (number `place`), which hold back as much.
+    """
     wider = behind.structure
-    place = wider.names.index("friction_rad_s2")
-    friction = wider.parameters[place]
-    most = max(share * float(np.exp(starts[:, place].max())), 1.01 * friction.low)
+    friction, stiffness = (wider.names.index(n) for n in ("friction_rad_s2", "stiffness_per_s2"))
+    values = wider.decode(known)
+    limit = wider.parameters[friction]
+    most = max(share * float(values[:, friction].max()), 1.01 * limit.low)
+    less = np.minimum(values[:, friction], most)
+    values[:, place] += (values[:, friction] - less) / values[:, stiffness]
+    values[:, friction] = less
     bounded = list(wider.parameters)
-    bounded[place] = replace(friction, high=most)
+    bounded[friction] = replace(limit, high=most)
     structure = replace(wider, parameters=tuple(bounded))
-    fit = refine(replace(behind, structure=structure), np.clip(starts, *structure.box))
+    starts = np.clip(structure.encode(values), *structure.box)
+    fit = refine(replace(behind, structure=structure), starts)
     return replace(fit, point=np.clip(fit.point, *wider.box))
