@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -266,10 +266,10 @@ def _refuse_missing_joints(calibration: Calibration, name: str, joints: Sequence
         )
 
 
-def _each(models: Model | Sequence[Model]) -> list[str | Path | Calibration | ServoFit]:
+def _each(models: Model | Sequence[Model]) -> Sequence[str | Path | Calibration | ServoFit]:
     """The models one by one, those of `calibrate` as calibrations."""
-    several = isinstance(models, Sequence) and not isinstance(models, str)
-    each = [getattr(m, "calibration", m) for m in (models if several else [models])]
+    several = [models] if isinstance(models, str) or not isinstance(models, Sequence) else models
+    each: list[Any] = [getattr(m, "calibration", m) for m in several]
     for model in each:
         if not isinstance(model, Calibration | ServoFit):
             as_path(model, "A model")

@@ -152,7 +152,7 @@ class Explanation:
 
     def path(
         self, filter_number: int, number: int = 0, changed: Filtered | None = None
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[NDArray, NDArray[np.float64]]:
         """Times, and the command of a trial behind a low-pass without a lag."""
         s, before = self.samples[number], round(LATEST_S / self.grid_s)
         command = np.concatenate([np.full(before, s.rest_rad), s.command_rad])

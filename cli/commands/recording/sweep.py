@@ -335,7 +335,7 @@ class Sweep:
         )
         for name in written:
             terminal.out.print(f"  {name}")
-        following = [("doctor", path), ("delay", path)]
+        following: list[tuple[object, ...]] = [("doctor", path), ("delay", path)]
         following.append(("calibrate", path, "--out", "calibrated.yaml"))
         if self.kind == "reversal":
             following[1:] = [("backlash", path)]

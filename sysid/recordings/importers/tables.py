@@ -684,8 +684,10 @@ def spread(path: Path | str, table: Table, options: LogOptions) -> Table:
     value = table.first(_VALUES)
     if value is None:
         own = [n for n in table.columns if column(n).kind != "time" and n.lower() not in LABELS]
-        value = own[0] if len(own) == 1 else None
-    for series in (by_case[n] for n in SERIES if n in by_case and value is not None):
+        if len(own) != 1:
+            return table
+        value = own[0]
+    for series in (by_case[n] for n in SERIES if n in by_case):
         codes, found = pd.factorize(np.array(table.texts[series], object))
         if len(found) > MOST_COLUMNS or missing([*map(str, found)]):
             continue
