@@ -478,17 +478,17 @@ def _dead_time(ready: PreparedJoint, carried: Fitted, likely: Sequence[Fitted]) 
     value = float(carried.values[0])
     ends = [_intervals(f, value)["dead_time_s"] for f in likely]
     # readings that were taken later than dated lengthen the dead time, as they do the lag
-    doubt = ready.lag.feedback.time_doubt_s + max(t.read_time_doubt_s for t in ready.recorded)
+    doubt = max(t.read_time_doubt_s for t in ready.recorded)
     hull = Interval(value, min(e.low for e in ends), max(e.high for e in ends))
     return _less_age(hull, ready, doubt)
 
 
 def _less_age(dead_time_s: Interval, ready: PreparedJoint, doubt_s: float = 0.0) -> Interval:
-    """A fitted dead time without the age of readings whose poll is unresolved, and in doubt."""
+    """A fitted dead time without the age of readings whose poll is unresolved: up to a loop."""
     fitted, age = dead_time_s, ready.lag.feedback.time_doubt_s
-    low, high = fitted.low - age - doubt_s, fitted.high - age + doubt_s
+    low = max(fitted.low - 2 * age - doubt_s, 0.0)
     # readings are no older than the fitted dead time is long
-    return Interval(max(fitted.value - age, fitted.value / 2), max(low, 0.0), max(high, 0.0))
+    return Interval(max(fitted.value - age, fitted.value / 2), low, fitted.high + doubt_s)
 
 
 def _intervals(fitted: Fitted, dead_time_s: float | None = None) -> dict[str, Interval]:

@@ -247,7 +247,7 @@ def _with_feature(
     starts = np.clip(wider.encode(values), *wider.box)
     behind = replace(problem, structure=wider)
     fits = [from_about(behind, refine(behind, starts), rng)]
-    if name in _TRADED and "friction_rad_s2" in wider.names:
+    if name in _TRADED and {"friction_rad_s2", "stiffness_per_s2"} <= {*wider.names}:
         # what the two hold back together may be all that the data tell: the least likely friction
         known = np.concatenate([fits[0].point[None], starts])
         fits += [_with_less_friction(behind, known, share, place) for share in _LEFT]

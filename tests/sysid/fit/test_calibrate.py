@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
@@ -15,6 +17,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
 from pupper_sysid.sysid.fit.calibrate import STAGES, calibrate
 from pupper_sysid.sysid.fit.calibration_file import GIVEN_TORQUE, to_calibration, torque_anchors
 from pupper_sysid.sysid.fit.dead_time import lag
+from pupper_sysid.sysid.fit.joint_fit import _less_age
 from pupper_sysid.sysid.fit.posterior import EFFECTIVE, R_HAT
 from pupper_sysid.sysid.fit.preparation import prepare_joint
 from pupper_sysid.sysid.fit.results import plausible
@@ -101,6 +104,16 @@ def test_readings_that_may_be_live_do_not_ask_for_a_negative_dead_time():
         structure, fit = ready.first["delayed_pd"]
         stiffness.append(structure.decode(fit.point)[structure.names.index("stiffness_per_s2")])
     assert stiffness[1] == pytest.approx(stiffness[0], rel=0.05)
+
+
+@pytest.mark.parametrize("fitted", [0.002, 0.008, 0.05])
+def test_a_dead_time_without_the_age_of_its_readings_lies_in_its_interval(fitted):
+    feedback = SimpleNamespace(time_doubt_s=0.007)
+    ready = SimpleNamespace(lag=SimpleNamespace(feedback=feedback))
+    dead_time = _less_age(Interval(fitted, 0.9 * fitted, 1.1 * fitted), ready)
+    assert 0.0 <= dead_time.low <= dead_time.value <= dead_time.high == 1.1 * fitted
+    # the readings may be a loop old, or live
+    assert dead_time.low == pytest.approx(max(0.9 * fitted - 0.014, 0.0))
 
 
 @pytest.fixture(scope="module")
