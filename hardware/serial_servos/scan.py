@@ -23,6 +23,7 @@ from pupper_sysid.hardware.serial_servos.settings import (
 
 _USUAL_IDS = tuple(range(31))
 _SLOW_RETURN_S = 1e-4
+_TRIES = 3  # a servo that answered a ping has registers: a reply was late or damaged
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,8 @@ def _report(family: Family, line: SerialLine, servo: int, model: int) -> ServoRe
         return ServoReport(servo, f"unknown ({model})", "", line.baud)
     reply = line.read(servo, series.register(family.present).address, family.reading_bytes[0])
     errors = bits_in_words(reply.frame.code, family.error_bits) if reply else ""
-    memory = memory_of(line, servo, family.memory_pieces)
+    tries = (memory_of(line, servo, family.memory_pieces) for _ in range(_TRIES))
+    memory = next((one for one in tries if one is not None), None)
     if memory is None:
         return ServoReport(servo, series.name, errors, line.baud)
     registers = registers_of(series, memory)
