@@ -371,11 +371,12 @@ def described_fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
         if not issubclass(base, BaseModel) or base is BaseModel:
             continue
         try:
-            (part,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+            source = ast.parse(textwrap.dedent(inspect.getsource(base))).body
         except (OSError, TypeError):  # made at run time, or shipped without its source
             continue
-        assert isinstance(part, ast.ClassDef)
-        for line, after in pairwise(part.body):
+        # of a class typed at a prompt, Python 3.13 returns what else was typed with it
+        parts = (p.body for p in source if isinstance(p, ast.ClassDef) and p.name == base.__name__)
+        for line, after in pairwise(next(parts, [])):
             if not (isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name)):
                 continue
             if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
