@@ -167,7 +167,7 @@ def _sentences(arguments: Sequence[str], program: str, stop: Stop) -> Iterator[l
         stream = error.filename if isinstance(error, OSError) else None
         if stream in (_OUTPUT, _ERRORS):  # its buffer would fail once more at the exit
             _silence(sys.stdout if stream == _OUTPUT else sys.stderr)
-        if stop.number and stop.phase != "robot":  # the interrupt, as a library passed it on
+        if stop.number and (stop.phase != "robot" or _is_interrupt(error)):
             _stopped(stop)
         if stream in (_OUTPUT, _ERRORS) and isinstance(error, BrokenPipeError):
             sys.exit(0)  # `| head` closed its end: no error
@@ -183,6 +183,15 @@ def _sentences(arguments: Sequence[str], program: str, stop: Stop) -> Iterator[l
         sys.exit(1)
     finally:
         sys.stdout, sys.stderr = streams
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether an error is a KeyboardInterrupt, as a library passed it on: pydantic in its words."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt) or "KeyboardInterrupt" in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _stopped(stop: Stop) -> NoReturn:

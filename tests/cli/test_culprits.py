@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.cli.programs import pupper_sysid
-from pupper_sysid.cli.user_errors import user_errors
+from pupper_sysid.cli.user_errors import _is_interrupt, user_errors
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent
 from pupper_sysid.hardware.joint_map import load_joint_map
@@ -274,3 +274,16 @@ def test_a_home_that_cannot_be_written_is_said_in_a_sentence(capsys, monkeypatch
     monkeypatch.setenv("HOME", "/proc")
     monkeypatch.setenv("SHELL", "/bin/bash")
     assert "cannot be made" in refused(capsys, pupper_sysid, "--install-completion")
+
+
+def test_an_interrupt_that_a_library_passed_on_is_known_beside_a_failing_bus():
+    try:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            raise ValueError("model") from None
+    except ValueError as error:
+        passed_on = error
+    assert _is_interrupt(passed_on)
+    assert _is_interrupt(TypeError('Error building "literal" validator: KeyboardInterrupt: '))
+    assert not _is_interrupt(OSError("the bus does not answer"))
