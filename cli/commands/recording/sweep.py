@@ -195,7 +195,9 @@ class Sweep:
                 )  # fmt: skip
         except (BusError, KeyboardInterrupt):
             say_what_stays(bus)
-            if path.exists() and (point or not existed or self.force):
+            if path.exists() and not existed and path.stat().st_size == 0:
+                path.unlink()  # stopped before its header
+            elif path.exists() and (point or not existed or self.force):
                 say_how_to_resume(path)
             raise
         say_what_stays(bus)
