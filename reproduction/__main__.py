@@ -26,6 +26,9 @@ class Options:
 
     policies: tyro.conf.Positional[tuple[Path, ...]]
     """Runs (`runs/<name>`) or policy folders."""
+    from_nothing: tuple[Path, ...] = ()
+    """Runs from random weights (`pupper-train --preset paper`), for the claims about training:
+    their curves count, whether they walk or not."""
     recordings: tuple[Path, ...] = ()
     """Sweeps and a playback of a robot."""
     imu: tuple[str, ...] = ()

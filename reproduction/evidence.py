@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import nan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.policies.analysis.attractor import Orbits, orbits
 from pupper_sysid.policies.analysis.autonomy import Autonomy, autonomy
 from pupper_sysid.policies.analysis.gait import GaitReport, describe
-from pupper_sysid.policies.analysis.rhythm import mean_of
 from pupper_sysid.policies.analysis.robustness import (
     AblationPoint,
     DelayPoint,
@@ -37,6 +38,8 @@ from reproduction.claims import NotTestable
 
 KINDS = {"mlp": "MLP", "lstm": "LSTM", "gru": "GRU", "transformer": "Transformer"}
 """Names of the architectures compared."""
+A_TROT = "a trot"
+"""What a policy imitated, where that was the open-loop gait."""
 SCALES_RAD = (0.45, 0.6, 0.75)
 """Of the published deployments."""
 _EXTRA_DELAYS_MS = (0, 80, 160, 320)
@@ -48,6 +51,28 @@ class ScalePoint(Outcome):
     """A walk with another scale of what is sent than that of the training."""
 
     scale_rad: float
+
+
+@dataclass(frozen=True)
+class Training:
+    """A training from random weights, by means over its last updates."""
+
+    name: str
+    kind: str
+    reward: float
+    """Per second."""
+    std: float
+    """Standard deviation of the exploration."""
+    steps_per_s: float
+    million_samples: float
+    lasted_s: float
+    """Duration of an episode: until a fall, or `episode_s`."""
+    episode_s: float
+    learned_noise: bool
+    """Whether the exploration is learned, as in the publication, not scheduled."""
+    curriculum: bool
+    curve: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+    """Of every update: millions of samples, reward per second, duration of an episode [s]."""
 
 
 @dataclass(frozen=True)
@@ -116,11 +141,42 @@ def gather(
     )  # fmt: skip
 
 
+def training(folder: Path) -> Training:
+    """The training in a run's folder.
+
+    Raises
+    ------
+    InputError
+        If there is no run, or it began with the imitation of a gait.
+    """
+    run = load_run(folder)
+    if first := imitated(run):
+        raise InputError(
+            f"{folder} imitated {first} before PPO, so that it says nothing about what is learned "
+            "from random weights. Give runs of `pupper-train --preset paper`."
+        )
+    if not (folder / PROGRESS).is_file():
+        raise InputError(f"{folder} has no {PROGRESS}: nothing was trained yet.")
+    step_s, table = run.task.control_step_s, pd.read_csv(folder / PROGRESS).astype(float)
+    last = table.tail(_LAST_UPDATES).mean()
+    took = (table["collect_s"] + table["update_s"]).sum()
+    return Training(
+        folder.name, run.architecture.kind, last["reward"] / step_s, last["std"],
+        float(table["samples"].iloc[-1] / took), 1e-6 * float(table["samples"].iloc[-1]),
+        last["episode_steps"] * step_s, run.task.episode_s, run.learner.exploration.learned,
+        run.task.curriculum != Curriculum(),
+        (
+            1e-6 * table["samples"].to_numpy(), table["reward"].to_numpy() / step_s,
+            table["episode_steps"].to_numpy() * step_s,
+        ),
+    )  # fmt: skip
+
+
 def imitated(run: Run) -> str | None:
     """What a run's policy imitated before PPO; None if nothing."""
     if not run.imitation.iterations:
         return None
-    return "a trot" if run.imitation.teacher == TROT else "a teacher that learned from nothing"
+    return A_TROT if run.imitation.teacher == TROT else "a teacher that learned from nothing"
 
 
 def scales(policy: Policy, trial: Trial) -> list[ScalePoint]:
@@ -133,19 +189,23 @@ def scales(policy: Policy, trial: Trial) -> list[ScalePoint]:
     ]
 
 
-def over(evidence: Sequence[PolicyEvidence], kind: str, value: Callable[[PolicyEvidence], float]):
-    """Mean over the policies of a kind, with the interval over them (NaN for one policy).
+def over(evidence: Sequence[Any], kind: str, value: Callable[[Any], float]) -> Interval:
+    """Mean over the policies or trainings of a kind, and their range (NaN for one).
 
-    Those without a number (NaN) are left out; one infinite number is an infinite mean.
+    Those without a number (NaN) are left out; one infinite number is an infinite mean. Two or three
+    say nothing of a distribution, so that no interval is computed from them.
     """
     values = np.array([value(e) for e in evidence if e.kind == kind], float)
     if np.isposinf(values).any():
         return Interval(float("inf"), float("nan"), float("nan"))
-    return mean_of(values)
+    values = values[np.isfinite(values)]
+    if len(values) < 2:
+        return Interval(float(values[0]) if len(values) else nan, nan, nan)
+    return Interval(float(values.mean()), float(values.min()), float(values.max()))
 
 
 def of_kinds(
-    evidence: Sequence[PolicyEvidence], value: Callable[[PolicyEvidence], float], *needed: str
+    evidence: Sequence[Any], value: Callable[[Any], float], *needed: str
 ) -> dict[str, Interval]:
     """`over` for each of `KINDS` of which there is a number."""
     given = [k for k in KINDS if any(e.kind == k for e in evidence)]

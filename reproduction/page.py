@@ -30,10 +30,12 @@ from pupper_sysid.sysid.report.figures import sweep_figure
 from reproduction import servos as servo_claims
 from reproduction import walks as walk_claims
 from reproduction.claims import Claim, differences
-from reproduction.evidence import KINDS, PolicyEvidence, gather, over
-from reproduction.policies import judge
+from reproduction.evidence import A_TROT, KINDS, PolicyEvidence, Training, gather, over, training
+from reproduction.policies import TAUGHT, judge
 from reproduction.servos import ServoEvidence
 from reproduction.walks import Walker, compare_stacks
+
+Evidence = tuple[list[PolicyEvidence], list[Training]]
 
 if TYPE_CHECKING:
     from pupper_sysid.cli.commands.analyze.common import Tries
@@ -63,10 +65,27 @@ def delay_trace_figure(
     return figure
 
 
+@styled
+def training_figure(trainings: Sequence[Training]) -> Figure:
+    """Reward per second and duration of an episode against samples, a line per training."""
+    figure, axes = axes_column(2, 2 * 2.2)
+    kinds, drawn = list(KINDS), set()
+    for each in trainings:
+        samples, *curves = each.curve
+        label = KINDS[each.kind] if each.kind not in drawn else None
+        drawn.add(each.kind)
+        for one, curve in zip(axes, curves, strict=True):
+            one.plot(samples, curve, color=JOINT_COLOURS[kinds.index(each.kind)], label=label)
+    axes[0].set(ylabel="reward per second")
+    axes[1].set(ylabel="episode [s]", xlabel="samples [millions]")
+    axes[0].legend(fontsize=7)
+    return figure
+
+
 PAGE, REPORT = "claims.md", "claims.html"
 PICTURES = (
-    "sweep", "gait-lstm", "gait-mlp", "orbits", "late", "ablation", "delay", "autonomy", "terrain",
-    "compliance", "servos",
+    "training", "sweep", "gait-lstm", "gait-mlp", "orbits", "late", "ablation", "delay",
+    "autonomy", "terrain", "compliance", "servos",
 )  # fmt: skip
 """All that may be drawn; which are depends on the evidence."""
 TABLES = ("claims", "beside", "table_one", "inputs")
@@ -90,6 +109,7 @@ def write_claims(options: Options, tries: Tries) -> None:
                 f"{name} is of the kind {policy.contract.kind}, about which nothing was published. "
                 f"Leave it out; claims are about {', '.join(KINDS)}."
             )
+    trainings = [training(folder) for folder in options.from_nothing]
     recordings = terminal.load_all(options.recordings) if options.recordings else []
     walks = walk_claims.gather(options.imu)
     robot = servo_claims.gather(recordings, options.seed, _show_step)
@@ -99,16 +119,18 @@ def write_claims(options: Options, tries: Tries) -> None:
     stacks = _stacks(options)
     found = [
         *servo_claims.judge(robot),
-        *judge(evidence, _played(robot), stacks),
+        *judge(evidence, _played(robot), stacks, trainings),
         *walk_claims.judge(walks),
     ]
     other = differences(found, options.beside) if options.beside is not None else None
-    pictures = _draw(evidence, robot)
+    pictures = _draw(evidence, robot, trainings)
     inputs = _inputs(options, tries)
-    text = _page(found, other, evidence, pictures, inputs, options)
+    summary = _summary(found, evidence, trainings)
+    text = _page(found, other, (evidence, trainings), pictures, inputs, options, summary)
     write_text(page, text, options.force)
     write_page(
-        report, _TITLE, _tally(found), _sections(found, other, evidence, pictures, inputs, options),
+        report, _TITLE, summary[0],
+        _sections(found, other, (evidence, trainings), pictures, inputs, options, summary),
         options.force,
     )  # fmt: skip
     if options.json:
@@ -160,11 +182,16 @@ def _played(robot: ServoEvidence) -> dict[str, tuple[np.ndarray, np.ndarray, np.
     return found
 
 
-def _draw(evidence: list[PolicyEvidence], robot: ServoEvidence) -> list[Picture]:
+def _draw(
+    evidence: list[PolicyEvidence], robot: ServoEvidence, trainings: list[Training]
+) -> list[Picture]:
     """What can be shown of the evidence."""
     from pupper_sysid.common.page import Picture
 
     made: list[Picture] = []
+    if trainings:
+        caption = "Trainings from random weights in the published task, each a line."
+        made.append(Picture("training", caption, training_figure(trainings)))
     if robot.sweep is not None:
         joint = robot.sweep.joints[-1]
         trials = [t for t in robot.sweep.trials(joint) if np.isfinite(t.frequency_hz)]
@@ -233,18 +260,18 @@ def _one_per_kind(evidence: list[PolicyEvidence]) -> list[PolicyEvidence]:
 
 
 def _page(
-    found: list[Claim], other: list[dict[str, str]] | None, evidence: list[PolicyEvidence],
-    pictures: list[Picture], inputs: dict[str, str], options: Options,
+    found: list[Claim], other: list[dict[str, str]] | None, evidence: Evidence,
+    pictures: list[Picture], inputs: dict[str, str], options: Options, summary: list[str],
 ) -> str:  # fmt: skip
     """The report as Markdown."""
     lines = [
-        f"# {_TITLE}", "", _tally(found), "", "Made by", "", "```", _command(options), "```", "",
-        _ABOUT, "",
+        f"# {_TITLE}", "", *(line for text in summary for line in (text, "")), _ABOUT, "",
         "| | claim | paper | here | interval | verdict | how |", "|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     for c in found:
         lines.append(
-            f"| {c.id} | {c.claim} | {c.paper} | {c.ours} | {_bounds(c)} | **{c.verdict}** | "
+            f"| {_id(c, evidence[0])} | {c.claim} | {c.paper} | {c.ours} | {_bounds(c)} | "
+            f"**{c.verdict}** | "
             f"{c.how} |"
         )
     if other is not None:
@@ -259,20 +286,34 @@ def _page(
     lines += ["", "## Pictures", ""]
     for picture in pictures:
         lines += [f"![{picture.caption}]({_file(picture)})", "", picture.caption, ""]
-    lines += [f"## {_MADE}", "", f"{_versions()}.", "", "| input | SHA-256 |", "|---|---|"]
+    lines += [
+        f"## {_MADE}",
+        "",
+        "```",
+        _command(options),
+        "```",
+        "",
+        f"{_versions()}.",
+        "",
+        "| input | SHA-256 |",
+        "|---|---|",
+    ]
     lines += [f"| {name} | `{digest}` |" for name, digest in inputs.items()]
     return "\n".join([*lines, ""])
 
 
 def _sections(
-    found: list[Claim], other: list[dict[str, str]] | None, evidence: list[PolicyEvidence],
-    pictures: list[Picture], inputs: dict[str, str], options: Options,
+    found: list[Claim], other: list[dict[str, str]] | None, evidence: Evidence,
+    pictures: list[Picture], inputs: dict[str, str], options: Options, summary: list[str],
 ) -> list[Section]:  # fmt: skip
     """The report as a page in the style of the others."""
     claims = tuple(
-        {**c.to_dict(), "here": c.ours + (f" (90 %: {_bounds(c)})" if c.interval else "")}
+        {
+            **c.to_dict(), "id": _id(c, evidence[0]),
+            "here": c.ours + (f" ({_bounds(c)})" if c.interval else ""),
+        }
         for c in found
-    )
+    )  # fmt: skip
     columns = (
         Column("", lambda row: row["id"], "key"),
         *(
@@ -296,14 +337,14 @@ def _sections(
         compared = [Section("beside", _BESIDE, [_other(other)], tables=tables)]
     return [
         Section(
-            "claims", "Claims", [_ABOUT],
+            "claims", "Claims", [*summary[1:], _ABOUT],
             tables=[Table("claims", "What the paper says, and what is found here",
                           columns, claims)],
         ),
         *compared,
         Section(
             "table", _TABLE_ONE,
-            tables=[Table("table_one", "Architectures, means and 90 % intervals",
+            tables=[Table("table_one", "Architectures, means and ranges",
                           (first, *(Column(k, lambda row, k=k: row[k]) for k in kinds)), one)],
         ),
         Section(
@@ -329,9 +370,10 @@ _OTHER = (
 """Headings and keys of what another page judges otherwise."""
 _MORE = ("torch", "pandas")  # packages that shape these numbers beside the usual ones
 _ABOUT = (
-    "Intervals are 90 %: over policies of a kind where there are several, else over robots or "
-    "stretches of time. Policies were trained and walked in simulation with a calibrated robot; "
-    "claims about the physical one are judged by its recordings and the logs of its IMU."
+    "Behind a number stands the range of the policies of a kind where there are several, else the "
+    "90 % interval over robots or stretches of time. Policies were trained and walked in "
+    "simulation with a calibrated robot; claims about the physical one are judged by its "
+    "recordings and the logs of its IMU."
 )
 
 
@@ -341,15 +383,52 @@ def _other(rows: list[dict[str, str]]) -> str:
     return "Claims that the page given with `--beside` judges otherwise."
 
 
-def _tally(found: list[Claim]) -> str:
-    verdicts = [c.verdict for c in found]
-    tally = ", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts))
-    return f"{len(found)} claims: {tally}."
+def _summary(
+    found: list[Claim], evidence: list[PolicyEvidence], trainings: list[Training]
+) -> list[str]:
+    """A paragraph each: the answer, what imitation decides, what was not tested as published."""
+    by_verdict: dict[str, list[Claim]] = {}
+    for one in found:
+        by_verdict.setdefault(one.verdict, []).append(one)
+    tally = ", ".join(f"{len(rows)} {verdict}" for verdict, rows in by_verdict.items())
+    answer = f"Of {len(found)} published claims: {tally}."
+    for verdict, words in (("holds", "What holds"), ("holds partly", "In part")):
+        if rows := by_verdict.get(verdict):
+            answer += f" {words}: " + "; ".join(f"{c.claim} ({c.id})" for c in rows) + "."
+    paragraphs = [answer]
+    if any(e.first_gait == A_TROT for e in evidence):
+        paragraphs.append(
+            "**What the teacher decides (†).** These policies first imitated an open-loop trot, "
+            "whose action follows from the command and the last two actions alone: joints, IMU and "
+            "memory play no part in it. So a rhythm that runs through the last action, walking on "
+            "with late, noisy or frozen joints, and much of the survival on other ground is what "
+            "they were taught, whatever their architecture, and says nothing about one."
+        )
+    paragraphs.append(
+        "**Not tested as published.** "
+        + (
+            f"{len(trainings)} trainings began from random weights, with the published task and "
+            "rewards, without clock and teacher, the exploration learned: the claims about "
+            "training (T1 to T4) are judged by them. No policy that walks was trained so here."
+            if trainings
+            else "No policy here was trained from random weights, so that the claims about "
+            "training (T1 to T4) are open."
+        )
+    )
+    return paragraphs
+
+
+def _id(claim: Claim, evidence: list[PolicyEvidence]) -> str:
+    """Its name, marked where the imitated trot decides it."""
+    taught = claim.id in TAUGHT and any(e.first_gait == A_TROT for e in evidence)
+    return claim.id + (" †" if taught else "")
 
 
 def _command(options: Options) -> str:
     """The command that makes the page, with files by their names."""
     parts = ["python -m reproduction", *(str(p) for p in options.policies)]
+    if options.from_nothing:
+        parts += ["--from-nothing", *(str(p) for p in options.from_nothing)]
     if options.recordings:
         parts += ["--recordings", *(p.name for p in options.recordings)]
     if options.imu:
@@ -395,15 +474,21 @@ def _bounds(claim: Claim) -> str:
     return "; ".join(f"{k} {_number(v.low)} to {_number(v.high)}" for k, v in known) or "–"
 
 
-def _table_one(evidence: list[PolicyEvidence]) -> tuple[list[str], list[tuple[str, list[str]]]]:
+def _table_one(both: Evidence) -> tuple[list[str], list[tuple[str, list[str]]]]:
     """A column per architecture: their names, and rows of a title and a cell for each."""
-    kinds = [k for k in KINDS if any(e.kind == k for e in evidence)]
+    evidence, trainings = both
+    kinds = [k for k in KINDS if any(e.kind == k for e in (*evidence, *trainings))]
     known = [e for e in evidence if e.trained]
     rows: dict[str, Any] = {
-        "reward per second": (known, lambda e: e.trained["reward"], 2),
-        "action noise": (known, lambda e: e.trained["std"], 4),
+        "from random weights: million samples": (trainings, lambda t: t.million_samples, 1),
+        "reward per second, published task": (trainings, lambda t: t.reward, 2),
+        "learned action noise": (trainings, lambda t: t.std, 2),
+        "stays up, s": (trainings, lambda t: t.lasted_s, 1),
+        "steps/s, from random weights": (trainings, lambda t: t.steps_per_s, 0),
+        "after imitation: reward per second": (known, lambda e: e.trained["reward"], 2),
+        "scheduled action noise": (known, lambda e: e.trained["std"], 4),
         "updates of PPO": (known, lambda e: e.trained["updates"], 0),
-        "steps/s in training": (known, lambda e: e.trained["steps_per_s"], 0),
+        "steps/s, after imitation": (known, lambda e: e.trained["steps_per_s"], 0),
         "still up after 10 s, flat": (evidence, lambda e: e.terrain[0].survival, 2),
         "still up, other ground": (
             evidence, lambda e: float(np.mean([r.survival for r in e.terrain[1:]])), 2,

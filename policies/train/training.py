@@ -94,8 +94,10 @@ def learner_device(run: Run, ranks: Ranks) -> str:
 
 
 def _local(device: str, ranks: Ranks) -> str:
-    """The device of this process among those of its machine."""
-    return f"{device}:{ranks.local_rank}" if ranks.size > 1 else device
+    """The device of this process among those of its machine, which processes may share."""
+    if ranks.size == 1:
+        return device
+    return f"{device}:{ranks.local_rank % max(torch.cuda.device_count(), 1)}"
 
 
 def threads_of(run: Run, ranks: Ranks) -> int:

@@ -121,10 +121,13 @@ class Worlds:
         self._wp = self._engine.wp
         self.device, self._substeps = device_of(device), substeps
         self._graph, self._warm = None, False
+        self._written: dict[str, NDArray[np.float32]] = {}
         own = _without_pid(model)
         with self._wp.ScopedDevice(self.device):
             self._model = self._engine.mjw.put_model(own, batch_sizes=dict.fromkeys(fields, worlds))
             self._model.opt.tolerance.fill_(_TOLERANCE)
+            # robots that tumble reach the limit in most steps, and each would be a printed line
+            self._model.opt.warn_overflow &= ~self._engine.mjw.OverflowType.ITERATIONS
             self._data = self._engine.mjw.make_data(own, worlds)
             self._commands = self._wp.zeros((substeps, worlds, model.nu), dtype=float)
             self._records = {
@@ -134,9 +137,15 @@ class Worlds:
         self._model.callback.act_bias = _servos
 
     def write_fields(self, fields: dict[str, Array]) -> None:
-        """Give every world its own values of model fields, shape (n, …)."""
+        """Give every world its own values of model fields, shape (n, …), where they have changed.
+
+        Between episodes only the delays change; comparing is cheaper than a transfer.
+        """
         for name, value in fields.items():
-            getattr(self._model, name).assign(np.asarray(value, np.float32))
+            new = value.astype(np.float32)
+            if not np.array_equal(new, self._written.get(name, np.empty(0))):
+                getattr(self._model, name).assign(new)
+                self._written[name] = new
 
     def write(self, ids: NDArray[np.intp], state: dict[str, Array]) -> None:
         """Overwrite delay lines, times, warm starts and set-points of some worlds."""

@@ -515,14 +515,16 @@ def test_alone_a_process_decides_for_itself():
 
 def test_networks_learn_where_the_physics_is_unless_the_run_names_another_device(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     for device, learner, expected in (
         ("cpu", "as-device", "cpu"), ("cpu", "cuda", "cuda"), ("cuda", "as-device", "cuda"),
         ("cuda", "cpu", "cpu"), ("warp-cpu", "as-device", "cpu"),
     ):  # fmt: skip
         run = tiny_run(device=device, learner_device=learner)
         assert learner_device(run, Ranks()) == expected
-        several = learner_device(run, Ranks(rank=5, size=8, local_rank=1))
-        assert several == ("cuda:1" if expected == "cuda" else "cpu")
+        for local_rank in (1, 3):  # processes share two devices
+            several = learner_device(run, Ranks(rank=5, size=8, local_rank=local_rank))
+            assert several == ("cuda:1" if expected == "cuda" else "cpu")
 
 
 def test_a_device_that_torch_does_not_find_is_answered_in_a_sentence(monkeypatch, tmp_path):
