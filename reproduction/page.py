@@ -112,11 +112,11 @@ def write_claims(options: Options, tries: Tries) -> None:
     trainings = [training(folder) for folder in options.from_nothing]
     recordings = terminal.load_all(options.recordings) if options.recordings else []
     walks = walk_claims.gather(options.imu)
+    stacks = _stacks(options)  # before hours of work, too: its servo model may not suit
     robot = servo_claims.gather(recordings, options.seed, _show_step)
     evidence = []
     for (name, (policy, trial)), path in zip(tries.items(), options.policies, strict=True):
         evidence.append(gather(name, policy, trial, run_folder(path), _show_step))
-    stacks = _stacks(options)
     found = [
         *servo_claims.judge(robot),
         *judge(evidence, _played(robot), stacks, trainings),

@@ -30,6 +30,10 @@ DESCRIBED = 1.6
 """Residual over noise up to which a servo describes a recording: in twins from an independent
 simulator (facts of `benchmarks/wide_twins.py`) servos of the fitted structure stay below."""
 
+LEAST_NOISE_RAD = 1e-4
+"""What counts as noise where readings are exact, as in logs of a simulation: a fifteenth of a count
+of 12 bits, and about what a physics step of half a millisecond leaves of the fastest motions."""
+
 _STRIDE_S = 0.005  # between the readings of a sum, at least
 _REACH_S = 0.12  # of earlier commands: dead time and settling of a servo
 _ORDER = 4  # earlier readings of a sum
@@ -157,7 +161,8 @@ def goodness_of_fit(
     values : ndarray, shape (parameters,)
     runs : sequence of Run
     quantum_rad : float
-        Quantisation step of readings: their noise is not below that of rounding.
+        Quantisation step of readings: their noise is not below that of rounding, nor below
+        `LEAST_NOISE_RAD`.
 
     Returns
     -------
@@ -165,7 +170,7 @@ def goodness_of_fit(
         By tone, or label of the run; NaN where the noise is not known.
     """
     residuals = fresh_residuals(structure, values, runs)
-    least = quantum_rad / np.sqrt(12.0)
+    least = max(quantum_rad / np.sqrt(12.0), LEAST_NOISE_RAD)
     kinds = [f"{r.tone:g} Hz" if r.tone > 0 else r.label for r in runs]
     ratios = {}
     for kind in dict.fromkeys(kinds):
@@ -173,7 +178,7 @@ def goodness_of_fit(
         parts = [residuals[n] for n in own]
         size = np.sqrt(_clipped_square(np.concatenate(parts)))
         noise = reading_noise([runs[n] for n in own], parts)
-        ratios[kind] = float(size / max(noise, least, 1e-12)) if np.isfinite(noise) else np.nan
+        ratios[kind] = float(size / max(noise, least)) if np.isfinite(noise) else np.nan
     return ratios
 
 

@@ -573,6 +573,10 @@ def _settled(
     better = (choice.carried.fit.cost - wider.carried.fit.cost) / choice.carried.temperature
     if profiled is None and plain.misfit is not None and better < plain.misfit.nats:
         return ready, every, plain  # that is no term of a servo
+    # the noise that `most` is relative to is an upper bound, which a worse fit finds larger
+    smaller = _DESCRIBES_BETTER * _error_rad(ready, choice.carried)
+    if profiled is None and _error_rad(any_servo, wider.carried) > smaller:
+        return ready, every, plain
     return any_servo, ladder, _explained(any_servo, wider)
 
 
@@ -785,6 +789,11 @@ def _goodness(ready: PreparedJoint, fitted: Fitted) -> dict[str, float]:
         fitted.structure, fitted.values, ready.runs,
         quantum_rad if np.isfinite(quantum_rad) else 0.0,
     )  # fmt: skip
+
+
+def _error_rad(ready: PreparedJoint, fitted: Fitted) -> float:
+    """RMS error on fresh readings [rad]."""
+    return rms(fresh_residuals(fitted.structure, fitted.values, ready.runs))
 
 
 def _undescribed(goodness: Mapping[str, float]) -> str | None:

@@ -30,6 +30,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
 )
 from pupper_sysid.sysid.feedback.slips import Motion, Upset, find_upsets
 from pupper_sysid.sysid.fit.claimed_load import check_claimed_load
+from pupper_sysid.sysid.fit.goodness import LEAST_NOISE_RAD
 from pupper_sysid.sysid.fit.loads import loaded_joints
 from pupper_sysid.sysid.fit.noise import noise_by_run
 from pupper_sysid.sysid.fit.operating_point import reference_gain
@@ -54,7 +55,6 @@ from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _NOISE_RAD = 0.02  # of a first fit where no lag could be measured
-_LEAST_NOISE_RAD = 1e-4
 _ROUNDS = 3
 _LEAST_READINGS = 20  # of a run under load: fewer tell nothing that the others do not
 _RIPPLE = 0.7  # autocorrelation below which a logged voltage is ripple, not the supply
@@ -196,7 +196,7 @@ def prepare_joint(
     scales = _in_free_air(joint, recorded) if free_air else scales_of(recorded, runs)
     scales = replace(scales, prior=prior)
     # fits of a noise-free servo still meet rounding: a third of a quantisation step
-    least = max(quantum(trials) / 3, _LEAST_NOISE_RAD)
+    least = max(quantum(trials) / 3, LEAST_NOISE_RAD)
     scale = max(lag.noise_rad, least) if free_air and np.isfinite(lag.noise_rad) else _NOISE_RAD
     noise = (max(scale, least),) * len(runs)
     if known is None:

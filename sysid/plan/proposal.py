@@ -22,6 +22,7 @@ from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import Actuator, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.sysid.doctor.checks import each_joint, joint_trials
+from pupper_sysid.sysid.fit.goodness import LEAST_NOISE_RAD
 from pupper_sysid.sysid.fit.joint_fit import fit_joint
 from pupper_sysid.sysid.fit.results import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.fit.run import Run
@@ -281,7 +282,6 @@ def recorded_s(trials: Sequence[Trial]) -> float:
     return float(sum(t.send_time_s[-1] - t.send_time_s[0] for t in trials))
 
 
-_LEAST_NOISE_RAD = 1e-4
 _MOST_INFLATION = 100.0
 _Z = float(ndtri((1 + LEVEL) / 2))
 
@@ -294,7 +294,7 @@ def fitted_servo(result: JointCalibrationResult) -> Servo:
     """The servo that the fits of a recording's joint describe, with their intervals."""
     trials, nats = result.runs, result.structure_nats
     best = result.candidate_models[min(nats, key=lambda name: nats[name])]
-    least = max(result.lag.quantum_rad / math.sqrt(12), _LEAST_NOISE_RAD)
+    least = max(result.lag.quantum_rad / math.sqrt(12), LEAST_NOISE_RAD)
     noise = fitted_noise(candidate(best.model), _values(best), trials, least)
     # the carried structure first: its value is the one that is reported
     names = sorted(nats, key=lambda name: name != result.simulated_model)
@@ -341,7 +341,7 @@ def _sd(parameter: Parameter, interval: Interval) -> float:
 def calibrated_servo(joint: JointCalibration) -> Servo:
     """The servo that a calibration file describes, with intervals for want of readings."""
     named = {c.model: c.parameters for c in joint.selection.candidate_models}
-    floor = max(joint.feedback.quantum_rad.value / math.sqrt(12), _LEAST_NOISE_RAD)
+    floor = max(joint.feedback.quantum_rad.value / math.sqrt(12), LEAST_NOISE_RAD)
     jitter = joint.actuator.command_jitter_s
     noise = Noise(
         max(joint.scores.rmse_free_run_fresh_rad or 0.0, floor),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
+from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.kernel import edges_of
 from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, filtered
 from pupper_sysid.sysid.fit.run import Run, free_run
@@ -65,6 +66,22 @@ def found(
 def explanation(*servo, **options) -> Explanation | None:
     """The one that is decidedly better."""
     return decided(found(*servo, **options)[1])
+
+
+def test_exact_readings_have_no_noise_below_a_tenth_of_a_milliradian():
+    """A simulation of a simulation is off by its time step, which is no misfit."""
+    plain = candidate(SIMULATED[0])
+    time = STEP_S * np.arange(int(4.0 / STEP_S))
+    run = replace(stepped_run(0.3 * np.sin(2 * np.pi * 2.0 * time)), frequency_hz=2.0)
+    true = np.array([NUMBERS[n] for n in plain.names])
+    track = free_run(plain, true, (run,))[0]
+    run = replace(run, sample_rad=np.interp(run.sample_step, np.arange(len(track)), track))
+
+    def ratio(damping_share: float) -> float:
+        values = np.where(np.array(plain.names) == "damping_per_s", damping_share * true, true)
+        return overall(goodness_of_fit(plain, values, (run,), 0.0))
+
+    assert 0.0 < ratio(1.0005) < DESCRIBED < ratio(1.02)
 
 
 def test_a_filter_of_a_step_command_rises_as_an_exponential():
