@@ -361,6 +361,11 @@ def _sections(
     ]  # fmt: skip
 
 
+_HOLD = {
+    "holds": "hold", "holds partly": "hold in part", "does not hold here": "do not hold here",
+    "not testable here": "cannot be tested here",
+}  # fmt: skip
+"""Verdicts about several."""
 _TITLE, _TABLE_ONE = "The published claims, one by one", "Table I, regenerated"
 _MADE, _BESIDE = "Where this comes from", "Beside the other page"
 _OTHER = (
@@ -390,8 +395,8 @@ def _summary(
     by_verdict: dict[str, list[Claim]] = {}
     for one in found:
         by_verdict.setdefault(one.verdict, []).append(one)
-    tally = ", ".join(f"{len(rows)} {verdict}" for verdict, rows in by_verdict.items())
-    answer = f"Of {len(found)} published claims: {tally}."
+    counts = [f"{len(by_verdict[v])} {words}" for v, words in _HOLD.items() if v in by_verdict]
+    answer = f"Of {len(found)} published claims {', '.join(counts)}."
     for verdict, words in (("holds", "What holds"), ("holds partly", "In part")):
         if rows := by_verdict.get(verdict):
             answer += f" {words}: " + "; ".join(f"{c.claim} ({c.id})" for c in rows) + "."
@@ -508,4 +513,4 @@ def _table_one(both: Evidence) -> tuple[list[str], list[tuple[str, list[str]]]]:
 
 
 def _number(value: float) -> str:
-    return f"{value:.3g}"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"

@@ -174,9 +174,14 @@ def _low_pass(
                 search_widely(behind, rng, starts, short=True), fits[constant], key=lambda f: f.cost
             )
     middle = min(fits, key=lambda t: fits[t].cost)
+    # gains make up for a part of a filter, so that its own lie along a ridge
+    fits[middle] = from_about(_behind(problem, middle), fits[middle], rng)
     for factor in (0.71, 1.41, 0.84, 1.19):  # between the constants that were tried
         between = middle * factor
-        fits[between] = refine(_behind(problem, between), fits[middle].point[None])
+        behind = _behind(problem, between)
+        fits[between] = refine(behind, fits[middle].point[None])
+        if fits[middle].cost < best.cost:  # there is a filter, so that its constant matters
+            fits[between] = from_about(behind, fits[between], rng)
         middle = min(fits, key=lambda t: fits[t].cost)
     least = _tempered(problem, best, temperature)
     nats = {t: least - _tempered(problem, fit, temperature) - 1.0 for t, fit in fits.items()}

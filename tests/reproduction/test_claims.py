@@ -314,7 +314,7 @@ def test_several_of_a_kind_have_their_range():
 def test_the_page_says_what_imitation_decides_and_what_was_not_tested():
     found = judge(BOTH, {}, [])
     first, taught, untested = reproduction.page._summary(found, list(BOTH), [])
-    assert first.startswith(f"Of {len(found)} published claims: ") and "(C1)" in first
+    assert first.startswith(f"Of {len(found)} published claims ") and "(C1)" in first
     assert "(†)" in taught and "are open" in untested
     alone = [replace(policy, first_gait=None) for policy in BOTH]
     assert len(reproduction.page._summary(found, alone, [learned("gru")])) == 2
