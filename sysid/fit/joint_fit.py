@@ -28,7 +28,7 @@ from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit import kernel
-from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
+from pupper_sysid.sysid.fit.goodness import DESCRIBED, DESCRIBED_ONE, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations
 from pupper_sysid.sysid.fit.noise import command_jitter, noise_by_run
 from pupper_sysid.sysid.fit.posterior import (
@@ -557,11 +557,11 @@ def _settled(
     most = _DESCRIBES_BETTER * overall(goodness)
     if gained < max(enough, rival):
         plain, profiled = _perhaps_profiled(ready, plain, profiled, gained), None
-    elif stated or not _undescribed(_goodness(ready, profiled)):
+    elif stated or not undescribed(_goodness(ready, profiled)):
         most = np.inf
     else:  # a motor's friction beside it may describe it
         most = DESCRIBED
-    if profiled is None and not _undescribed(goodness):
+    if profiled is None and not undescribed(goodness):
         return ready, every, plain
     any_servo = ready.as_any_servo()
     ladder = _ladder(any_servo, any_servo.fit_rng(), SHORT_LADDER, most, profiled)
@@ -583,7 +583,7 @@ def _settled(
 def _explained(ready: PreparedJoint, choice: _Choice, anew: bool = False) -> _Choice:
     """The choice with what a misfit looks like; `anew` searches for it far from the fit."""
     carried = choice.carried
-    anew = anew or bool(_undescribed(_goodness(ready, carried)))
+    anew = anew or bool(undescribed(_goodness(ready, carried)))
     if not (anew or ready.scales.free_air):
         return choice  # a motor under load has enough terms to imitate a filter
     likely = []
@@ -796,17 +796,23 @@ def _error_rad(ready: PreparedJoint, fitted: Fitted) -> float:
     return rms(fresh_residuals(fitted.structure, fitted.values, ready.runs))
 
 
-def _undescribed(goodness: Mapping[str, float]) -> str | None:
+def undescribed(goodness: Mapping[str, float]) -> str | None:
     """Why the model's gains mean little; None if it describes the servo, as far as is known."""
     ratio = overall(goodness)
-    if not ratio > DESCRIBED:
+    if ratio > DESCRIBED:
+        return f"the model does not describe this servo: its errors are {ratio:.1f} times the noise"
+    motion = max(goodness, key=lambda name: np.nan_to_num(goodness[name]), default=None)
+    if motion is None or not goodness[motion] > DESCRIBED_ONE:
         return None
-    return f"the model does not describe this servo: its errors are {ratio:.1f} times the noise"
+    return (
+        f"the model does not describe this servo in the motion {motion}: its errors are "
+        f"{goodness[motion]:.1f} times the noise there"
+    )
 
 
 def _doubt(choice: _Choice, goodness: Mapping[str, float]) -> str | None:
     """Why the gains mean little: errors above the noise, or an explanation that is better."""
-    if why := _undescribed(goodness):
+    if why := undescribed(goodness):
         return why
     if choice.misfit is None:
         return None
@@ -842,7 +848,7 @@ def _lag(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, float]) -
 
 def _hidden_rad(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, float]) -> float:
     """RMS error that is not noise [rad]: a motion in a wrong shape can hide as much."""
-    if not _undescribed(goodness):
+    if not undescribed(goodness):
         return 0.0
     error = rms(fresh_residuals(choice.carried.structure, choice.carried.values, ready.runs))
     return float(error * np.sqrt(1.0 - overall(goodness) ** -2))
@@ -852,7 +858,7 @@ def _as_wide_as_misfit(
     interval: Interval, goodness: Mapping[str, float], hidden: float
 ) -> Interval:
     """An interval wider by what is hidden; errors of numbers grow with those of readings."""
-    ratio = overall(goodness) if _undescribed(goodness) else 1.0
+    ratio = overall(goodness) if undescribed(goodness) else 1.0
     value = interval.value
     low = value - ratio * (value - interval.low) - hidden
     return Interval(value, low, value + ratio * (interval.high - value) + hidden)
@@ -892,7 +898,7 @@ def _foreign(joint: str, carried: Fitted) -> Iterator[str]:
 
 
 def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) -> Iterator[str]:
-    if why := _undescribed(goodness):
+    if why := undescribed(goodness):
         worst = max((r, name) for name, r in goodness.items() if np.isfinite(r))
         yield f"{joint}: {why} ({worst[0]:.1f} at {worst[1]}). The lag holds; gains do not."
     elif not np.isfinite(overall(goodness)):

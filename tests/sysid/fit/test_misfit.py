@@ -10,6 +10,7 @@ import pytest
 
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
+from pupper_sysid.sysid.fit.joint_fit import undescribed
 from pupper_sysid.sysid.fit.kernel import edges_of
 from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, filtered
 from pupper_sysid.sysid.fit.run import Run, free_run
@@ -82,6 +83,13 @@ def test_exact_readings_have_no_noise_below_a_tenth_of_a_milliradian():
         return overall(goodness_of_fit(plain, values, (run,), 0.0))
 
     assert 0.0 < ratio(1.0005) < DESCRIBED < ratio(1.02)
+
+
+def test_one_motion_that_is_not_described_is_a_misfit_among_others_that_are():
+    others = {"1 Hz": 1.0, "2 Hz": 1.05, "3 Hz": 1.0, "4 Hz": float("nan")}
+    assert undescribed(others | {"7 Hz": 2.0}) is None and undescribed({}) is None
+    assert "in the motion 7 Hz: its errors are 2.5 times" in undescribed(others | {"7 Hz": 2.5})
+    assert "its errors are 3.0 times the noise" in undescribed({"7 Hz": 3.0})
 
 
 def test_a_filter_of_a_step_command_rises_as_an_exponential():
