@@ -6,6 +6,7 @@ import importlib
 import os
 import sys
 import time
+import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -195,6 +196,9 @@ class _Screen:
 
     def _open_viewer(self) -> None:
         try:
+            with warnings.catch_warnings():  # without a display, launch_passive ends the process
+                warnings.simplefilter("error")
+                importlib.import_module("glfw").init()
             viewer = importlib.import_module("mujoco.viewer")
             self._data = self._env.robots.batch.get_data(0)
             self._viewer = viewer.launch_passive(self._model, self._data)

@@ -41,6 +41,7 @@ from pupper_sysid.sysid.lag.step_response import LONGEST_S
 from pupper_sysid.sysid.recordings.excitation import split_tones
 from pupper_sysid.sysid.recordings.recording import Trial
 
+_TONE_DRAWS = 1000  # of sweeps and of multisines alike: they stand in one array
 _ALIASED = 30.0  # condition number beyond which a harmonic looks like the tone or the offset
 _GRID_S = 5e-4
 _SETTLE_S = 0.2  # after the tone is at full amplitude: several times the servo's slowest pole
@@ -106,7 +107,7 @@ def tone_response(
     trial: Trial,
     reading: Readings,
     rng: np.random.Generator,
-    draws: int = 1000,
+    draws: int = _TONE_DRAWS,
 ) -> ToneResponse | None:
     """Fit the tone of `trial`; None if it is no tone or has fewer than two steady periods.
 
@@ -472,7 +473,7 @@ def line_responses(trial: Trial, reading: Readings, rng: np.random.Generator) ->
 
 
 def multisine_responses(
-    trial: Trial, reading: Readings, rng: np.random.Generator, draws: int = 400
+    trial: Trial, reading: Readings, rng: np.random.Generator
 ) -> list[ToneResponse]:
     """Response at each line of the command of `trial`; empty if it is no multisine.
 
@@ -483,7 +484,6 @@ def multisine_responses(
         Of the same trial: when its fresh rows were measured.
     rng : numpy.random.Generator
         Weights stretches of half a second for the draws.
-    draws : int
     """
     send = trial.send_time_s
     if len(send) < 100 or np.ptp(trial.command_rad) < 1e-3:
@@ -500,11 +500,11 @@ def multisine_responses(
         return []
     command_held = _phasors(*HeldCommand.of(trial).levels(start, send[-1], _LINES_GRID_S), lines)
     command_rows = _phasors(send[rows], trial.command_rad[rows], lines)
-    raw = _draw(trial.read_time_s[rows], trial.position_rad[rows], lines, rng, draws)
-    measured = _draw(reading.time_s[fresh], reading.position_rad[fresh], lines, rng, draws)
+    raw = _draw(trial.read_time_s[rows], trial.position_rad[rows], lines, rng, _TONE_DRAWS)
+    measured = _draw(reading.time_s[fresh], reading.position_rad[fresh], lines, rng, _TONE_DRAWS)
     if measured[2] ** 2 > _INCOHERENT * float(np.var(reading.position_rad[fresh])):
         return []
-    shift = rng.normal(0.0, reading.time_sd_s, draws)
+    shift = rng.normal(0.0, reading.time_sd_s, _TONE_DRAWS)
     return [
         ToneResponse(
             trial.number, float(f), complex(command_rows[k]), complex(command_held[k]),

@@ -333,11 +333,7 @@ def test_a_video_runs_as_fast_as_the_robot_at_any_control_rate(capsys, trained, 
 
 
 def test_where_no_window_opens_that_is_said(capsys, trained, monkeypatch):
-    import mujoco.viewer
-
-    def no_display(*_, **__):
-        raise RuntimeError("no display")
-
-    monkeypatch.setattr(mujoco.viewer, "launch_passive", no_display)
+    for display in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(display, raising=False)
     said = refused(capsys, pupper_play, trained, "--viewer")
-    assert "No window could be opened (no display)" in said and "--video" in said
+    assert "No window could be opened" in said and "DISPLAY" in said and "--video" in said

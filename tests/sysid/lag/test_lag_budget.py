@@ -38,6 +38,21 @@ def test_hold_aware_lag_is_unbiased_whatever_share_of_the_reads_is_lost():
     assert np.max(np.abs(errors)) < 1.5e-3
 
 
+def test_tones_and_a_motion_of_several_lines_give_one_lag():
+    rng = np.random.default_rng(0)
+
+    def command(t):
+        return 0.15 * np.sin(2 * np.pi * 1.5 * t) + 0.1 * np.sin(2 * np.pi * 4.0 * t)
+
+    walk = held_trial(
+        lambda t: command(t - 0.040 - LOOP_S / 2), command, rng, number=4, start_s=30.0,
+        duration_s=8.0,
+    )  # fmt: skip
+    b = lag_budget("LF_hip", [*tone_trials(0.040, rng), walk], rng)
+    assert [round(f.frequency_hz, 1) for f in b.by_frequency] == [1.0, 2.0, 3.0, 4.0, 1.5, 4.0]
+    assert b.lag_s.value == pytest.approx(0.040, abs=1e-3)
+
+
 def test_the_poll_is_found_and_the_parts_of_the_budget_are_those_of_the_theory():
     b = budget(0.42, 0)
     assert b.feedback.kind == "lattice" and b.feedback.z_score > 4
