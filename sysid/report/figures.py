@@ -41,9 +41,10 @@ from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.backlash import JointBacklash
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
-from pupper_sysid.sysid.fit.results import JointCalibrationResult
-from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
-from pupper_sysid.sysid.fit.structure import candidate
+from pupper_sysid.sysid.fit.kernel import COLUMNS
+from pupper_sysid.sysid.fit.results import JointCalibrationResult, LoadedFit
+from pupper_sysid.sysid.fit.run import Run, at_steps, free_run, simulate
+from pupper_sysid.sysid.fit.structure import candidate, loaded_columns
 from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Trial
@@ -185,7 +186,7 @@ def bode_figure(responses: Mapping[str, FrequencyResponse]) -> Figure:
             gain.plot(fine, 20 * np.log10(np.abs(fitted)), color=colour, lw=1.2)
             phase.plot(fine, np.degrees(np.unwrap(np.angle(fitted))), color=colour, lw=1.2)
     gain.axhline(-3.01, color=INK, lw=1, ls=(0, (4, 2)))
-    gain.text(1.0, -3.01, "−3 dB ", transform=gain.get_yaxis_transform(), ha="right", va="bottom")
+    gain.text(0.0, -3.01, " −3 dB", transform=gain.get_yaxis_transform(), va="top")
     low, high = gain.get_ylim()
     gain.set_ylim(min(low, -4.0), max(high, 1.0))
     for axes in (gain, phase):
@@ -264,15 +265,27 @@ def tracks(result: JointCalibrationResult, model: str | None = None) -> list[Tra
     ----------
     result : JointCalibrationResult
     model : str, optional
-        Name of a candidate model; by default the one that simulators run.
+        Name of a candidate model; by default the one that simulators run. A joint under load has
+        one.
     """
     if not result.runs:
         return []
+    if result.loaded is not None:
+        simulated = [_under_load(result.loaded, run) for run in result.runs]
+        return [_track(*pair) for pair in zip(result.runs, simulated, strict=True)]
     model = model or result.simulated_model
     fitted = candidate(model)
     values = np.array([result.candidate_models[model].values[name] for name in fitted.names])
     simulated = free_run(fitted, values, result.runs)
     return [_track(*pair) for pair in zip(result.runs, simulated, strict=True)]
+
+
+def _under_load(loaded: LoadedFit, run: Run) -> NDArray[np.float64]:
+    columns = loaded_columns(loaded.servo)
+    for name in {"gravity_nm", "hanging_rad", "offset_rad"} & loaded.numbers.keys():
+        columns[COLUMNS.index(name)] = loaded.numbers[name].value
+    dead_time_s = np.array([float(np.asarray(loaded.servo.dead_time_s))])
+    return simulate(columns[None], dead_time_s, run)[:, 0]
 
 
 def _track(run: Run, simulated: NDArray) -> Track:

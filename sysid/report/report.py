@@ -75,7 +75,7 @@ def write_report(
     folder : Path or str
         Made if missing; gets `report.html`, `figures/*.png`, `figures/*.svg` and `tables/*.csv`.
     joints : str or sequence of str, optional
-        By default all that were recorded.
+        By default all that were recorded, and are in the calibration if one is given.
     calibration : Calibration, optional
         Made from these recordings: its numbers are shown and its seed is used, and nothing is
         fitted again but joints under load, whose fits the file does not hold. By default the
@@ -108,6 +108,8 @@ def write_report(
     refuse_overwrite(Path(folder) / PAGE, force)  # before the work, not after it
     recordings, names = as_sequence(recordings), chosen_joints(recordings, joints)
     if calibration is not None:
+        if joints in (None, "all"):
+            names = [name for name in names if name in calibration.joints] or names
         _refuse_foreign(calibration, recordings, names)
         seed = seed if calibration.seed is None else calibration.seed
     steps, done = 2 * len(names), 0
@@ -124,8 +126,8 @@ def write_report(
             raise InputError(f"`servo` is {given}: there is no such servo model, file or folder.")
     results: dict[str, JointCalibrationResult] = {}
     if calibration is not None:
-        known = [name for name in names if can_recall(calibration.joint(name))]
-        results = recall(calibration, recordings, known, advance)
+        if known := [name for name in names if can_recall(calibration.joint(name))]:
+            results = recall(calibration, recordings, known, advance)
     if left := [name for name in names if name not in results]:
         fitted = calibrate(recordings, left, seed, workers=workers, progress=advance)
         calibration = calibration or fitted.calibration

@@ -360,11 +360,12 @@ def advice(
         joint: _gaps(result, calibration.joint(joint).actuator) for joint, result in results.items()
     }
     found = [f"{j}: {text}" for own in (again, gaps) for j, text in share_sentences(own)]
-    found.append(
-        "Torques rest on an assumed stall torque, because a joint that swings in free air shows "
-        "only ratios to its inertia. Hang a known mass at a known distance from the joint and "
-        "record the same sweep: that gives the scale."
-    )
+    if any(calibration.joint(j).actuator.scale.anchor == "stall torque" for j in results):
+        found.append(
+            "Torques rest on an assumed stall torque, because a joint that swings in free air "
+            "shows only ratios to its inertia. Hang a known mass at a known distance from the "
+            "joint and record the same sweep: that gives the scale."
+        )
     missing = [j for j in JOINT_NAMES if j not in results]
     if 0 < len(missing) < len(JOINT_NAMES):  # of a Mini Pupper; how many others have is not known
         found.append(f"Not recorded yet: {', '.join(missing)}. `pupper-sysid sweep` records them.")

@@ -82,7 +82,7 @@ class Compare(OfRecordings):
 
 @dataclass(frozen=True)
 class CompareTruth:
-    """Was it found? Each calibrated number beside the true one of an emulated robot.
+    """Each calibrated number beside the true one of an emulated robot.
 
     `sweep --truth` writes the truth beside the recording. Where the interval holds it, the last
     column says yes; of many robots that should be nine in ten.
@@ -128,8 +128,8 @@ class CompareTruth:
         )  # fmt: skip
         for row in rows:
             end = next((end for end in _UNITS if row.quantity.endswith(end)), "")
-            plain_unit = (unit_of(row.quantity), 1.0, 3 if abs(row.truth) < 1 else 0)
-            unit, factor, digits = _UNITS.get(end, plain_unit)
+            places = 3 if abs(row.truth) < 1 else max(0, 3 - len(f"{abs(row.truth):.0f}"))
+            unit, factor, digits = _UNITS.get(end, (unit_of(row.quantity), 1.0, places))
             low, high = (
                 terminal.number(factor * x, digits) for x in (row.found.low, row.found.high)
             )

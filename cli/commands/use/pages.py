@@ -25,7 +25,8 @@ class Report(OfRecordings):
     out: Path | None = None
     """Folder to write; by default reports/ and the first recording's name."""
     calibration: Path | None = None
-    """Calibration made from these recordings: it is shown, and nothing is fitted again."""
+    """Calibration made from these recordings: it is shown, and only joints under load are fitted
+    again."""
     servo: tuple[str, ...] = ()
     """Servo models of fit-servo to show on these recordings, beside the calibration."""
     open: bool = False
@@ -39,13 +40,13 @@ class Report(OfRecordings):
         from pupper_sysid.servo_models.calibration.calibration import load_calibration
         from pupper_sysid.sysid.report.report import PAGE, write_report
 
-        recordings, joints = self.load()
+        recordings = terminal.load_all(self.recordings)
         folder = self.out or Path("reports") / recordings[0].name
         refuse_overwrite(folder / PAGE, self.force)
         calibration = load_calibration(self.calibration) if self.calibration else None
         with terminal.share_progress("report") as advance:
             written = write_report(
-                recordings, folder, joints=joints, calibration=calibration, models=self.servo,
+                recordings, folder, joints=self.joints, calibration=calibration, models=self.servo,
                 seed=self.seed, workers=2, force=self.force, progress=advance,
             )  # fmt: skip
         if self.json:

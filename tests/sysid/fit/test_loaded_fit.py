@@ -18,8 +18,11 @@ from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServ
 from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.report import report
+from pupper_sysid.sysid.report.figures import tracks
 from pupper_sysid.sysid.servo_fit.fit import fit_servo
 from pupper_sysid.sysid.servo_fit.scores import LINEAR
+from support.undrawn import leave_undrawn
 
 MASS_KG, LENGTH_M = 0.4, 0.12
 TRUE = LoadedServoParameters(
@@ -91,11 +94,14 @@ def calibration(gains: tuple[float, ...] = (8.0, 32.0)) -> Calibration:
     return preset.model_copy(update={"joints": {"knee": own}})
 
 
-def test_a_known_load_gives_numbers_in_newton_metres_and_left_out_runs_have_errors_of_their_own():
+def test_a_known_load_gives_numbers_in_newton_metres_and_left_out_runs_have_errors_of_their_own(
+    tmp_path, monkeypatch
+):
     def short(whole: Recording) -> Recording:
         return replace(whole, table=whole.table[whole.table.send_time_s < 1.5])
 
-    fit = calibrate([short(recording(8.0)), short(recording(32.0, 3))])
+    recordings = [short(recording(8.0)), short(recording(32.0, 3))]
+    fit = calibrate(recordings)
     result, joint = fit["knee"], fit.calibration.joint("knee")
     block = joint.under_load
     assert block is not None
@@ -118,6 +124,13 @@ def test_a_known_load_gives_numbers_in_newton_metres_and_left_out_runs_have_erro
     # the chosen structure's mean absolute error is below its RMS error on the same rows
     mean = models[joint.selection.model].mae_unseen_runs_rad
     assert mean is not None and unseen is not None and mean < unseen
+    # a report draws the servo that was scored, and knows the scale of its torques
+    errors = np.concatenate([track.fresh_error_rad for track in tracks(result)])
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(scores.rmse_fresh_rad)
+    monkeypatch.setattr(report, "calibrate", lambda *_, **__: fit)
+    leave_undrawn(monkeypatch)
+    page = report.write_report(recordings, tmp_path, calibration=fit.calibration).path.read_text()
+    assert "from the known load" in page and "assumed stall torque" not in page
 
 
 def test_a_calibration_predicts_a_gain_it_has_not_seen_and_one_of_a_single_gain_does_not(

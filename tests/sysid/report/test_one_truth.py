@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import plain
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
@@ -57,6 +59,22 @@ def folder(swept, made, tmp_path_factory) -> Path:
 
 def never(*given, **more):
     raise AssertionError("a report with a calibration fits nothing")
+
+
+def test_a_report_shows_the_joints_that_its_calibration_has(monkeypatch, tmp_path):
+    sweep, calibration = load(SAMPLES / "sweep.csv"), load_calibration(SAMPLES / "calibrated.yaml")
+    part = calibration.model_copy(update={"joints": {JOINT: calibration.joint(JOINT)}})
+    shown = []
+
+    def stop(_, __, joints, ___):
+        shown.extend(joints)
+        raise InputError("enough")
+
+    monkeypatch.setattr(report, "recall", stop)
+    for joints in (None, "all"):
+        with pytest.raises(InputError, match="enough"):
+            report.write_report(sweep, tmp_path, joints=joints, calibration=part)
+    assert shown == 2 * [JOINT]
 
 
 def table(folder: Path, name: str) -> list[dict[str, str]]:
