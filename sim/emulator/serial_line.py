@@ -199,12 +199,13 @@ class LineEmulator(ABC):
             Pieces in order of the time at which they have arrived.
         """
         byte_s = 10.0 / (self.baud if baud is None or baud <= 0 else baud)  # 0: without a name
-        end = max(now, self._free_at) + len(data) * byte_s
-        self._free_at = end
-        pieces = [(end, data)] if self.echo else []
-        if baud is None or baud == self.baud:
-            for frame in self._reader.feed(data):
-                pieces += self._execute(frame, byte_s)
+        self._free_at = max(now, self._free_at)
+        pieces = [(self._free_at + len(data) * byte_s, data)] if self.echo else []
+        for byte in data:  # a request acts at its own end, however many come at once
+            self._free_at += byte_s
+            if baud is None or baud == self.baud:
+                for frame in self._reader.feed(bytes([byte])):
+                    pieces += self._execute(frame, byte_s)
         return sorted(pieces, key=lambda p: p[0])
 
     def _holds_position(self, servo_id: int) -> bool:

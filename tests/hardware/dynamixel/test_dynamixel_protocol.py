@@ -117,6 +117,21 @@ def test_servos_build_the_manuals_answer_to_a_fast_sync_read_and_it_is_read():
     assert fast_replies(answer, [3, 4, 7], 4) == frames[:1]
 
 
+def test_requests_that_the_host_sends_without_a_pause_act_each_at_its_own_end():
+    servos = still_dynamixels([1, 2], model=1030, registers={None: {"return_delay_time": 0}})
+    goals = {}
+    for apart in (False, True):
+        parts = [wire("sync write"), wire("read")]
+        start = servos._free_at
+        servos.bench.command = lambda k, at, count, start=start: goals.setdefault(start, at - start)
+        pieces = []
+        for part in parts if apart else [b"".join(parts)]:
+            pieces += servos.receive(part, start)
+        arrived = len(b"".join(parts)) + len(wire("read answer"))
+        assert pieces[-1][0] - start == pytest.approx(arrived * 1e-5)
+    assert list(goals.values()) == pytest.approx([len(wire("sync write")) * 1e-5] * 2)
+
+
 @pytest.mark.parametrize("bit", range(0, 8 * len(FAST_ANSWER), 5))
 def test_of_a_damaged_fast_answer_only_the_blocks_before_the_damage_are_taken(bit):
     damaged = bytearray(FAST_ANSWER)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections import deque
 from pathlib import Path
 
 import numpy as np
 import pytest
+import serial
+from numpy.lib.stride_tricks import sliding_window_view
 
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.sim.emulator.serial_line import SerialPty
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
 from support.servo_servers import moving_dynamixel, on_a_port
@@ -15,6 +19,34 @@ from support.servo_servers import moving_dynamixel, on_a_port
 TONES_HZ = (2.0, 4.0)
 WIRE_S = 19 * 10 / 1_000_000
 """A sync write of one goal on the wire at 1 Mbaud."""
+
+
+def act_when_written(monkeypatch, server: SerialPty) -> None:
+    """Let the servos act on requests from the moment the host wrote them.
+
+    A busy machine wakes the thread that serves them up to several milliseconds later, and more so
+    after the pause before a command than between the command and the reading.
+    """
+    written: deque[tuple[float, int]] = deque()
+    receive, write = server.emulator.receive, serial.Serial.write
+
+    def noted(port, data):
+        written.append((server.now(), len(data)))
+        return write(port, data)
+
+    def receive_then(data, now, baud=None):
+        pieces = []
+        while data:
+            # another process, the watchdog, is not noted
+            at, size = written.popleft() if written else (now, len(data))
+            pieces += receive(data[:size], at, baud)
+            if size > len(data):
+                written.appendleft((at, size - len(data)))
+            data = data[size:]
+        return pieces
+
+    monkeypatch.setattr(serial.Serial, "write", noted)
+    monkeypatch.setattr(server.emulator, "receive", receive_then)
 
 
 def phase(times: np.ndarray, values: np.ndarray, frequency_hz: float) -> float:
@@ -45,6 +77,7 @@ def test_a_sweep_shows_the_emulated_servos_lag_and_leaves_its_registers(
     servos.bench.map.save(Path("map.yaml"))
     before = bytes(servos.servos[1].memory)
     with on_a_port(servos) as server:
+        act_when_written(monkeypatch, server)
         code, _, err = run(
             capsys, "sweep", "--bus", f"dynamixel:{server.device}@1000000", "--joint-map",
             "map.yaml", "--freqs", "2,4", "--amplitude", "0.2", "--duration", "4", "--rate", "100",
@@ -66,11 +99,13 @@ def test_a_sweep_shows_the_emulated_servos_lag_and_leaves_its_registers(
             trial.send_time_s, trial.command_rad, trial.read_time_s[here],
             trial.position_rad[here], tone,
         )  # fmt: skip
-        # the same tone on the servo's own clock, by the length of the trial
-        span = trial.send_time_s[-1] - trial.send_time_s[0]
-        moving = _window(arrived, tone, span)
-        then = (measured[:, 0] >= moving[0, 0]) & (measured[:, 0] <= moving[-1, 0])
-        true = lag_s(moving[:, 0], moving[:, 1], *measured[then].T, tone)
+        # the same commands and readings on the servo's own clock
+        rows = sliding_window_view(arrived[:, 0], len(trial.send_time_s)) - trial.send_time_s
+        first = int(np.argmin(rows.std(axis=1)))
+        moving = arrived[first : first + len(trial.send_time_s)]
+        reads = trial.read_time_s[here] + np.median(rows[first])
+        nearest = np.abs(measured[:, :1] - reads).argmin(axis=0)
+        true = lag_s(moving[:, 0], moving[:, 1], *measured[nearest].T, tone)
         assert abs(recorded - true) < 3e-4, f"{tone} Hz: {1e3 * (recorded - true):.2f} ms"
     code, _, err = run(capsys, "doctor", "a.csv")
     assert code == 0, err
@@ -79,19 +114,3 @@ def test_a_sweep_shows_the_emulated_servos_lag_and_leaves_its_registers(
     fitted = load_calibration(Path("c.yaml")).joint("bench").actuator.dead_time_s
     truth = float(np.asarray(servos.bench.robot.servos[0].actuator.dead_time_s))
     assert fitted.low <= truth <= fitted.high
-
-
-def _window(commands: np.ndarray, frequency_hz: float, span_s: float) -> np.ndarray:
-    """The commands that hold this tone: the window in which it explains most of their variance."""
-    best, kept = -np.inf, commands
-    for start in np.arange(commands[0, 0], commands[-1, 0] - 0.8 * span_s, 0.25):
-        window = commands[(commands[:, 0] >= start) & (commands[:, 0] < start + 0.8 * span_s)]
-        if len(window) < 50:
-            continue
-        angle = 2 * np.pi * frequency_hz * window[:, 0]
-        basis = np.stack([np.sin(angle), np.cos(angle), np.ones_like(angle)], axis=1)
-        rest = window[:, 1] - basis @ np.linalg.lstsq(basis, window[:, 1], rcond=None)[0]
-        share = np.var(window[:, 1]) - 2 * np.var(rest)
-        if share > best:
-            best, kept = share, window
-    return kept
