@@ -51,7 +51,7 @@ _PAUSE_S = 0.003
 _REOPEN_S = 0.01
 _ATTEMPTS = 4
 _MORE_PATIENCE = 10
-_MEASURED_ON = 4  # servos
+_MEASURED_ON = 8  # exchanges
 _GARBLED_AT_LEAST, _CONFIRMED_BY = 3, 6
 
 
@@ -363,7 +363,7 @@ class SerialLine(ABC):
         usual_s, late_s = self.patience_s, []
         self.patience_s = max(usual_s, SLOWEST_ADAPTER_S)
         wire = (self.model_bytes + self.reply_bytes) * self._byte_s()
-        for servo in list(servos[:_MEASURED_ON]) * 2:
+        for servo in (list(servos) * _MEASURED_ON)[:_MEASURED_ON]:
             before = time.monotonic()
             if self.model(servo) is not None:
                 need_s = len(self._port.sent) * self._byte_s() + wire
@@ -585,7 +585,10 @@ def slow_adapter(line: SerialLine) -> str | None:
     )
     timer_s = latency_timer_s(line.device)
     if timer_s is None:
-        return f"{said} The USB adapter collects bytes; another adapter, or its driver, cures it."
+        return (
+            f"{said} The USB adapter collects bytes, which another adapter or its driver cures, or "
+            "this computer is busy with other work."
+        )
     return (
         f"{said} The adapter's latency timer is {1e3 * timer_s:.0f} ms: "
         f"`echo 1 | sudo tee {_latency_timer(line.device)}`."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -53,6 +54,16 @@ def test_a_fast_adapter_is_not_called_slow():
         bus = FeetechBus(server.device, 1_000_000, map_of(4))
         bus.line.latency_s = 0.0004
         assert slow_adapter(bus.line) is None
+        bus.close()
+
+
+def test_one_reply_that_a_busy_host_took_late_is_no_slow_adapter(monkeypatch):
+    with on_a_port(still_servos(ids=[4])) as server:
+        bus = FeetechBus(server.device, 1_000_000, map_of(4))
+        late_s = iter([0.02])
+        monkeypatch.setattr(bus.line, "model", lambda servo: time.sleep(next(late_s, 0)) or 777)
+        bus.line._measure_latency([4])
+        assert slow_adapter(bus.line) is None and bus.line.patience_s > 0.02
         bus.close()
 
 
