@@ -21,6 +21,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 from pupper_sysid.common.errors import InputError
 
@@ -98,27 +99,36 @@ _GROUP_MARKS = "['’\u00a0\u2009\u202f]"
 _GROUPED = re.compile(rf"(?<![\w.,'’])[+-]?\d{{1,3}}(?:{_GROUP_MARKS}\d{{3}})+(?![\w'’])")
 _COLOUR = re.compile(r"\x1b\[[\d;]*m")  # of a terminal
 _WRAPPED = re.compile(r"\b(?:tensor|array)\((?:'\w', ?)?(\[[^\]\n]*\])[^()\n]{0,80}\)")
-_RULE = re.compile(r"^[ \t|+:]*-{3}[-+ |:]*$", re.MULTILINE)  # below the names of a printed table
+_NUMPY = re.compile(r"\bnp\.\w+\(([-+.\w]+)\)")
+_RULE = re.compile(
+    r"^[ \t|+:]*[-=]{3}[-=+ |:\t]*$", re.MULTILINE
+)  # below the names of a printed table
 _SINGLE = re.compile(r"(?:^|[,;\t|])'[^',;\t|\n]*'")
 _QUOTED_GROUPS = re.compile(r'"([+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?)"')
 _COMMA_GROUPS = re.compile(r"(?<![\w.,])[+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?(?![\w,])")
+_SPACE_GROUPS = re.compile(r"(?<![\w.,:-])[+-]?\d{1,3}(?: \d{3})+(?:[.,]\d+)?(?![\w.,:])")
 _POINT_GROUPS = re.compile(r"(?<![\w.,])[+-]?\d{1,3}(?:\.\d{3})+(?:,\d+)?(?![\w.])")
 _UNITS = (
     r"s|sec|seconds?|ms|us|µs|ns|rad|radians?|deg|degrees?|°|counts?|ticks?|turns?|rev|v|volts?|a|"
     r"amps?|ma|mv|n\*?m|nm|%|°?c|hz|rad/s|deg/s|rpm|rad/s\^?2|m|mm"
 )
 _UNIT = re.compile(rf"[(\[<{{]?\s*({_UNITS}|raw|-|1|none)\s*[)\]>}}]?", re.IGNORECASE)
+_ANGLE_UNIT = re.compile(r"rad(ians?)?|deg(rees?)?|°|turns?|rev|counts?|ticks?", re.IGNORECASE)
 _WITH_UNIT = re.compile(rf"([-+]?[\d.]+(?:[eE][-+]?\d+)?) ?({_UNITS})", re.IGNORECASE)
 _NAMED_LIST = re.compile(r"([A-Za-z_][\w./]*)\s*[:=]\s*[\[(]\s*([-+.\deE,; \t]+?)\s*[\])]")
-_PAIR = re.compile(
-    r"(?<![\w\"'])[\"']?([A-Za-z_][\w./]*)[\"']?\s*[:=]\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)"
-    rf"(?:{_UNITS})?(?![\w:])",
-    re.IGNORECASE,
+_PAIR, _LONG_PAIR = (  # with names of a word, or of two
+    re.compile(
+        rf"(?<![\w\"'])[\"']?([A-Za-z_][\w./]*{more})[\"']?\s*[:=]\s*"
+        rf"([-+]?[\d.]+(?:[eE][-+]?\d+)?)(?: ?({_UNITS})(?!\s*[:=]))?(?![\w:])",
+        re.IGNORECASE,
+    )
+    for more in ("", r"(?: [A-Za-z_]\w*)?")
 )
+_AHEAD = re.compile(r"[ \t]*(\d+(?:\.\d+)?)[ \t]*[,;|:>]?[ \t]+(?=[\[(A-Za-z])")
 _STAMPED = re.compile(
     r"^[ \t]*(?:\[[A-Za-z]+\][ \t]*)?"  # [INFO]
     r"(?:\[?((?:\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,]\d+)?)\]?|"
-    r"[(\[][ \t]*(\d+\.\d+)[ \t]*[)\]]|"
+    r"[(\[][ \t]*(\d+\.\d+|\d+(?=[ \t]*[mu]?s))[ \t]*([mu]?s)?[ \t]*[)\]]|"
     r"[EWIDV] \((\d+)\) [\w.-]+:)"  # ESP-IDF's milliseconds and tag
     r"[ \t]*(?:->|[|:>])?[ \t]+(?=\S)",
     re.MULTILINE,
@@ -163,6 +173,7 @@ class _Shape:
     numeric: tuple[bool, ...]  # by column
     units: dict[int, str]  # of columns in whose cells one stands behind the number
     counted: bool  # whether the first column counts the rows
+    clocked: bool  # whether the first column holds times of day
     blank: tuple[bool, ...]  # by column
 
 
@@ -187,13 +198,14 @@ def plain(text: str) -> Plain:
         return _teleplot(text)
     if all(_NAMED_LIST.search(row) for row in rows):
         return plain(_NAMED_LIST.sub(_apart, text))
-    names = Counter(tuple(name for name, _ in _PAIR.findall(row)) for row in rows).most_common(1)[0]
-    if len(set(names[0])) == len(names[0]) > 1 and names[1] >= _SAME_SHAPE * len(rows):
-        return _labelled(text, list(names[0]))
+    if labels := _labels(rows):
+        return _labelled(text, rows, *labels)
     if all(_STAMPED.match(row) for row in rows):  # of a serial monitor
         inner = _shape([_STAMPED.sub("", row) for row in rows])
         separator = inner.separator if inner else ","
-        return plain(_STAMPED.sub(lambda m: _stamp(m) + separator, text))
+        stamped = _STAMPED.sub(lambda m: _stamp(m) + separator, text)
+        if stamped != text:
+            return plain(stamped)
     if all(_BRACKETED.match(row) for row in rows):
         return plain(_BRACKETED.sub(lambda m: _BRACKETS.sub("", m[1]), text))
     if all(_LIST.search(row) for row in rows) and (flat := _unlisted(text, lines, bare, rows)):
@@ -228,10 +240,11 @@ def _usual_numbers(text: str, rows: Sequence[str]) -> str:
         text = text.replace("\u2212", "-")
     if _HEX.search(sample):
         text = _HEX.sub(lambda m: str(int(m[0], 16)), text)
-    if "---" in text[:_SAMPLE]:
+    if "---" in text[:_SAMPLE] or "===" in text[:_SAMPLE]:
         text = _RULE.sub("", text)
     if "\x1b" in text:
         text = _COLOUR.sub("", text)
+    text = without_numpy(text) if "np." in sample else text
     if _WRAPPED.search(sample):
         text = _WRAPPED.sub(r"\1", text)
     if _EXPONENT.search(sample):
@@ -243,6 +256,8 @@ def _usual_numbers(text: str, rows: Sequence[str]) -> str:
     if _QUOTED_GROUPS.search(sample):
         text = _QUOTED_GROUPS.sub(lambda m: m[1].replace(",", ""), text)
     elif all(";" in row or "\t" in row for row in rows):
+        if _SPACE_GROUPS.search(sample):
+            text = _SPACE_GROUPS.sub(lambda m: m[0].replace(" ", ""), text)
         for groups, mark, point in ((_COMMA_GROUPS, ",", "."), (_POINT_GROUPS, ".", ",")):
             rest = groups.sub("", sample)
             if rest != sample and mark not in rest and re.search(rf"\d[{point}]\d", rest):
@@ -250,10 +265,17 @@ def _usual_numbers(text: str, rows: Sequence[str]) -> str:
     return text
 
 
+def without_numpy(text: str) -> str:
+    """Numbers that are printed as `np.float64(0.1)` without their type."""
+    return _NUMPY.sub(r"\1", text)
+
+
 def _stamp(match: re.Match[str]) -> str:
     """The time at the start of a line as a cell."""
+    if match[4]:
+        return f"{int(match[4][:15]) / 1000}"
     if match[3]:
-        return f"{int(match[3][:15]) / 1000}"
+        return f"{float(match[2][:15]) / {'s': 1, 'ms': 1e3, 'us': 1e6}[match[3]]!r}"
     return match[2] or match[1].replace(" ", "T").replace(",", ".")
 
 
@@ -289,8 +311,9 @@ def _shape(rows: Sequence[str]) -> _Shape | None:
                 most = sum(shares) / columns
                 numeric = tuple(s >= _NUMERIC and f for s, f in zip(shares, full, strict=True))
                 counted = _counted([row[0] for row in cells])
+                clocked = all(is_clock(row[0]) for row in cells)
                 blank = tuple(not f for f in full)
-                best = _Shape(separator, comma, columns, numeric, units, counted, blank)
+                best = _Shape(separator, comma, columns, numeric, units, counted, clocked, blank)
     return best if best is not None and any(best.numeric) else None
 
 
@@ -346,6 +369,9 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
             above[k] = above[k] or above[k - 1]
         columns = [f"{a}.{b}".strip(".") for a, b in zip(above, columns, strict=True)]
         lines[before.pop(-2)] = ""
+    if columns and len(columns) == shape.columns:
+        units = units or next(filter(None, (_units_above(lines[n], shape) for n in before)), [])
+        columns = _once(columns, [_split(row, shape.separator) for row in lines[first:]])
     plain_names = (
         shape.separator == "," and len(before) == 1 and not units and not shape.comma
         and not shape.units and columns == _split(lines[before[0]], ",")
@@ -358,6 +384,7 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
     numbered = columns is None
     if columns is None:
         columns = [str(k) for k in range(shape.columns)]
+        columns[0] = "time_of_day" if shape.clocked else "0"
     for k, word in enumerate(units):
         if word and word not in ("-", "1"):
             columns[k] = f"{columns[k]} [{word}]"
@@ -419,23 +446,52 @@ def _cells(body: str, shape: _Shape, trailing: int) -> str:
     return body
 
 
-def _labelled(text: str, columns: list[str]) -> Plain:
-    """Lines such as `t:0.1,cmd:0.3` (serial plotters, monitors) as rows; others are left empty."""
+def _labels(sample: Sequence[str]) -> tuple[re.Pattern[str], list[str]] | None:
+    """How to find the pairs of name and number that most lines have, and their names."""
+    found = []
+    for pattern in (_PAIR, _LONG_PAIR):
+        named = Counter(tuple(m[1] for m in pattern.finditer(line)) for line in sample)
+        names, count = named.most_common(1)[0]
+        times = {*Counter(names).values()}
+        if count >= _SAME_SHAPE * len(sample) and len({*names}) > 1 and len(times) == 1:
+            found.append((max(times), pattern, list(names)))
+    return min(found, key=lambda each: each[0])[1:] if found else None
+
+
+def _labelled(
+    text: str, sample: Sequence[str], pattern: re.Pattern[str], names: list[str]
+) -> Plain:
+    """Lines such as `t:0.1,cmd:0.3` (serial plotters, monitors) as rows; others are left empty.
+
+    Names that a line has twice are of several joints, and get numbers.
+    """
+    found = [[m.groups() for m in pattern.finditer(line)] for line in sample]
+    alike = [pairs for pairs in found if [name for name, *_ in pairs] == names]
+    columns = []
+    for k, name in enumerate(names):
+        again = f"_{names[:k].count(name) + 1}" if names.count(name) > 1 else ""
+        units = {pairs[k][2] for pairs in alike}
+        unit = units.pop() if len(units) == 1 else None
+        columns.append(f"{name}{again} [{unit}]" if unit else f"{name}{again}")
+    ahead = [float(m[1]) for line in sample if (m := _AHEAD.match(line))]
+    steps = {b - a for a, b in pairwise(ahead)}
+    timed = len(ahead) == len(sample) and min(steps) >= 0 and not steps <= {0, 1}
     rows, others = [], 0
     stamped = False
     for line in text.split("\n"):
-        pairs = _PAIR.findall(line)
-        same = columns == [name for name, _ in pairs]
-        stamp = _STAMPED.match(line) if same else None
+        pairs = [(m[1], m[2]) for m in pattern.finditer(line)]
+        same = names == [name for name, _ in pairs]
+        stamp = (_AHEAD if timed else _STAMPED).match(line) if same else None
         stamped = stamped or (stamp is not None and not any(rows))
         cells = [value for _, value in pairs] if same else []
-        cells = [_stamp(stamp) if stamp else "", *cells] if stamped and same else cells
+        if stamped and same:
+            cells = ["" if stamp is None else stamp[1] if timed else _stamp(stamp), *cells]
         rows.append(",".join(cells))
         others += not same and bool(line.strip())
     notes = ["its lines are pairs of name and number"]
     notes += [f"{others} other lines were left out"] if others else []
-    return Plain("\n".join(rows), ["time_of_day", *columns] if stamped else columns,
-                 notes=_sentence(notes))  # fmt: skip
+    clock = ["stamp" if timed else "time_of_day"] if stamped else []
+    return Plain("\n".join(rows), [*clock, *columns], notes=_sentence(notes))
 
 
 def _teleplot(text: str) -> Plain:
@@ -557,8 +613,10 @@ def _names(line: str, shape: _Shape) -> list[str] | None:
             cells = [*cells, ""]
         if len(cells) == shape.columns + 1 and cells[-1].lower() in ("comment", "remark", "note"):
             cells = cells[:-1]
-        if len(cells) == shape.columns - 1 and shape.counted:
-            cells = ["row", *cells]
+        if len(cells) == shape.columns - 1 and (shape.counted or shape.clocked):
+            cells = ["row" if shape.counted else "time_of_day", *cells]
+        if shape.clocked and is_clock(cells[0]):  # a monitor's, before the names
+            cells[0] = "time_of_day"
         if len(cells) == shape.columns and not any(_is_decimal(c) for c in cells if c):
             return cells
     return ways[0] if len(ways[0]) > 1 else None
@@ -581,6 +639,25 @@ def _units(line: str, shape: _Shape) -> list[str]:
         return []
     found = [c.strip("()[]<>{} ") for c in cells]
     return found if sum(map(bool, found)) > 1 else []
+
+
+def _units_above(line: str, shape: _Shape) -> list[str]:
+    """Units of the columns in a line above their names, as LabVIEW's `Y_Unit_Label`."""
+    head, *cells = _split(line, shape.separator)
+    if "unit" not in head.lower() or not all(_ANGLE_UNIT.fullmatch(c) for c in cells if c):
+        return []
+    return ["", *cells, *[""] * shape.columns][: shape.columns]
+
+
+def _once(columns: list[str], rows: list[list[str]]) -> list[str]:
+    """Names of columns, where one that repeats another, cells included, is called an index."""
+    full = [row for row in rows if len(row) >= len(columns)]
+    names = [*columns]
+    for k, name in enumerate(columns):
+        first = columns.index(name)
+        if name and first < k and all(row[first] == row[k] for row in full):
+            names[k] = f"index {k}"
+    return names
 
 
 def _is_decimal(cell: str) -> bool:

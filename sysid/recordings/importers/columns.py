@@ -33,9 +33,9 @@ WORDS: dict[str, str] = {
                   "referencia börvärde 目标 目標 指令 给定 设定"),
         (MAYBE_COMMAND, "u r ctrl control input inputs send sent tx request planned plan "
                         "expected trajectory traj leader nominal wanted write written order"),
-        (STATE, "actual act present measured measurement measurements meas msr feedback fb fbk "
-                "observed observation observations obs state states estimate estimated est real "
-                "encoder enc reading readings sensed sensor response resp "
+        (STATE, "actual act present pres measured measurement measurements meas msr feedback fb "
+                "fbk observed observation observations obs state states estimate estimated est "
+                "real encoder enc reading readings sensed sensor response resp "
                 "potentiometer pot resolver pv ist istwert ärvärde mesure misura medida "
                 "实际 当前 実測 反馈"),
         (MAYBE_STATE, "y output outputs read rx follower receive received recv rcv process"),
@@ -54,7 +54,7 @@ WORDS: dict[str, str] = {
         (TIME, "time times timestamp timestamps t ts stamp stamps clock elapsed seconds secs sec "
                "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
                "nanosec nanosecs nsecs usec usecs tout minutes days datenum zeit temps tiempo "
-               "tempo tid 时间 時間"),
+               "tempo tid datum fecha uhrzeit hora heure 时间 時間"),
         (UNIT, "rad rads radian radians deg degs degree degrees ° count counts tick ticks pulse "
                "pulses turn cdeg centideg centidegree centidegrees "
                "turns rev revs revolution revolutions mrad percent pct"),
@@ -68,7 +68,8 @@ WORDS: dict[str, str] = {
 }  # fmt: skip
 """What each word of a column's name stands for."""
 
-TIMES = ("time", "timestamp", "t", "stamp", "time_since_start", "ts", "elapsed", "seconds", "clock")
+TIMES = ("time", "timestamp", "t", "stamp", "time_since_start", "ts", "elapsed", "seconds", "clock",
+         "uhrzeit", "hora", "heure")  # fmt: skip
 """Names of times, the likeliest first."""
 
 UNITS = {"rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "mrad": "mrad",

@@ -11,7 +11,7 @@ from typing import Any
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import RECORDING, refuse_other_kind
-from pupper_sysid.common.reading.dialect import decoded
+from pupper_sysid.common.reading.dialect import decoded, without_numpy
 from pupper_sysid.sysid.recordings.importers import (
     arrays,
     json_logs,
@@ -26,9 +26,7 @@ from pupper_sysid.sysid.recordings.importers.unknown import unknown_folder, unkn
 
 _ENDINGS = (".csv", ".tsv", ".json", ".jsonl", ".mcap", ".db3", ".npz", ".parquet", ".pt", ".mat")
 _PACKED = (".gz", ".bz2", ".xz")
-_STAMP = re.compile(
-    rb"\[(?:[\d.:, TZ-]+\][ \t]*[A-Za-z(]|[A-Za-z]+\][ \t:]*[\[\w])"
-)  # before a message: a line of text
+_STAMP = re.compile(rb"\[[^\[\]{}\"\n]*\][ \t:]*[A-Za-z(\[\d]")  # before a message: a line of text
 _JSON = re.compile(rb"(?:#[^\n]*\n\s*)*(?:\{|\[[\s\[]*(?:[\"{\d\]-]|true|false|null|NaN|Inf))")
 _YAML = re.compile(rb"(?:---\s*\n)?(?:- \w+:|\w+:[ \t]*\r?\n[ \t]+\w+:)")
 _MARKUP = re.compile(rb"<[?!A-Za-z]")
@@ -127,7 +125,7 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
 def _whole_json(text: str) -> str:
     """JSON Lines as one list, in Python's quotes, too; other JSON as it is."""
     if text.lstrip()[:2] == "{'":
-        text = text.replace("'", '"').replace(": None", ": null")
+        text = without_numpy(text).replace("'", '"').replace(": None", ": null")
     lines = text.strip().split("\n")
     bare = [line.strip() for line in lines[:20] if line.strip() and line[:1] != "#"][:2]
     if len(lines) > 1 and all(line[:1] + line[-1:] == "{}" for line in bare):

@@ -55,9 +55,11 @@ from pupper_sysid.sysid.recordings.importers.times import (
     clock,
     doubt_of_a_turn,
     one_after_another,
+    scrambled,
     sent_at,
     times_of_day,
     turns,
+    unwrapped,
 )
 
 LAYOUT = "table"
@@ -151,6 +153,12 @@ class Table:
         return [n for n, s in steps.items() if (s >= 0).all() and (s > 0).any()
                 and (self.numbered or not (s == 1).all())]  # fmt: skip
 
+    def taken(self, order: NDArray[np.int64]) -> Table:
+        """The table with its rows in another order."""
+        columns = {name: np.asarray(values)[order] for name, values in self.columns.items()}
+        texts = {name: [cells[k] for k in order] for name, cells in self.texts.items()}
+        return replace(self, columns=columns, texts=texts)
+
     def check_joints(self, path: Path | str, columns: Iterable[str]) -> None:
         """Refuse arrays, of which these are columns, with other numbers of joints than names."""
         used = {key: n for key, n in self.widths.items()
@@ -216,7 +224,7 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
     refuse_more(path, len(table.names), MOST_COLUMNS, "columns", "Split it by joint.")
     refuse_more(path, sum(map(len, table.columns.values())), MOST_CELLS, "cells", "Split it.")
     table = spread(path, table, options)
-    timed = [n for n in table.names if n not in table.columns or np.ptp(_known(table, n)) > 0]
+    timed = [n for n in table.names if n not in table.columns or np.ptp(known(table, n)) > 0]
     if table.rate is not None and options.rate is None and not (options.time or has_time(timed)):
         options = replace(options, rate=table.rate)
     notes = list(table.notes)
@@ -225,6 +233,14 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
     read_s, send_s, texts = _times(path, table, options)
     notes += texts
     groups = _groups(path, table)
+    if any(scrambled(read_s[own]) for own in groups.values() or [slice(None)]):
+        first = table.first(_TRIALS)
+        trial = np.zeros(len(read_s)) if first is None else table.columns[first]
+        order = np.lexsort((read_s, trial))
+        read_s, send_s = read_s[order], None if send_s is None else send_s[order]
+        table = table.taken(order)
+        groups = _groups(path, table)
+        notes.append("its rows, which were in no order of time or the newest first, were sorted.")
     if not (len(groups) > 1 or (groups and [*pairs] == [_SOLE])):
         groups = {"": np.ones(len(read_s), bool)}
     wanted = {  # by the log's own name
@@ -395,8 +411,9 @@ def _lone_pair(
             pairs = [_Pair(*(_joined(own) for own in first))]
         _refuse_choices(path, "no joint has both a command and a position by its name", pairs)
     table.check_joints(path, [c.name for c in (*commands, *positions)])
-    lines = "; or ".join(lines_by_value(path, table))
-    lines = f" Say which is which: {lines}." if lines else ""
+    listed = lines_by_value(path, table)
+    note = rate_note(listed[0], table) if listed else ""
+    lines = f" Say which is which: {'; or '.join(listed)}{note}." if listed else ""
     raise InputError(f"{path}: {missing(table.names)}; it has {_listed(table.names)}.{lines}")
 
 
@@ -489,7 +506,8 @@ def unknown_numbers(path: Path | str, table: Table) -> str:
             shown.append(f"{name} ({known.min():.4g} … {known.max():.4g}{up})")
     text = f"its columns have no names. By their numbers, from 0, they are {'; '.join(shown)}. "
     if lines := lines_by_value(path, table):
-        return f"{text}Say which is which: {', '.join(lines)}, or others."
+        note = rate_note(lines[0], table)
+        return f"{text}Say which is which: {', '.join(lines)}, or others{note}."
     return f"{text}A log has a column of commands and one of positions, which these are not."
 
 
@@ -516,10 +534,23 @@ def lines_by_value(path: Path | str, table: Table) -> list[str]:
     choices = dict.fromkeys([tuple(every), (first, second), (second, first), (first, others[-1])])
     rate = 50 if table.rate is None else table.rate
     how = {"time": time} if time else {"rate": f"{rate:g}"}
-    values = np.concatenate([_known(table, name) for name in pairs[0]])
-    if np.abs(values).max() > LARGEST_RAD:
-        how["unit"] = likely_units(values)[0]
+    how |= unit_of(table, pairs[0])
     return [import_line(path, **how, command=c, position=p) for c, p in choices if c != p]
+
+
+def unit_of(table: Table, names: Iterable[str]) -> dict[str, str]:
+    """The option for columns whose values, in radians, are no angles of a joint."""
+    values = np.concatenate(
+        [known(table, name) for name in names if name in table.columns] or [[0]]
+    )
+    units = [] if any(column(n).unit for n in names) else likely_units(values)
+    return {"unit": units[0]} if units and np.abs(values).max() > LARGEST_RAD else {}
+
+
+def rate_note(line: str | Mapping[str, str], table: Table) -> str:
+    """What to put in place of a rate that a command line takes for example."""
+    example = "rate" in line and table.rate is None
+    return ", with your rows a second in place of 50: the lag scales with them" if example else ""
 
 
 def _alike(table: Table, names: Sequence[str]) -> list[list[str]]:
@@ -552,7 +583,7 @@ def _likeness(table: Table, pair: Sequence[str]) -> tuple[float, list[str]]:
     return likeness, [*pair][::-1] if 0 < best < len(first) else [*pair]
 
 
-def _known(table: Table, name: str) -> NDArray[np.float64]:
+def known(table: Table, name: str) -> NDArray[np.float64]:
     """The numbers of a column; two zeros if it has none."""
     values = table.columns.get(name, np.zeros(0))
     known = values[np.isfinite(values)]
@@ -593,7 +624,7 @@ def _times(
     if options.rate is not None:
         return np.arange(count) / options.rate, None, []  # of each joint's own rows: `_joint`
     names = [name for name in table.names if name in table.columns or name in table.texts]
-    moving = [n for n in names if n in table.texts or np.ptp(_known(table, n)) > 0]
+    moving = [n for n in names if n in table.texts or np.ptp(known(table, n)) > 0]
     names = moving if has_time(moving) else names
     steps = next((n for n in names if _TIME_STEP.fullmatch(n)), None)
     found = [n for n in time_columns(names) if n != steps]
@@ -651,7 +682,7 @@ def _seconds(
         if below is not None and not (seconds % 1).any():  # 12:30:01 and 250
             seconds = seconds + 1e-3 * (table.numbers(path, below) % 1000)
         return seconds, 0.0, []
-    values = table.numbers(path, name)
+    values = unwrapped(table.numbers(path, name))
     lower = {n.lower(): n for n in table.columns}
     whole = re.fullmatch(r"(.*?)secs?", name.lower())
     rest = [lower[n] for end in _SUBSECONDS if whole and (n := whole[1] + end) in lower]

@@ -34,6 +34,8 @@ _LOOP_S = (2e-5, 0.5)  # fastest and slowest loop of a servo
 _GUESSED = (("s", 1.0), ("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9),
             ("days", 86_400.0))  # fmt: skip
 _DAY_S = 86_400.0
+_NEAR_STEPS = 3  # by which the step over a counter's end may differ from the others
+_SCRAMBLED = 0.25  # share of steps back in time
 _OTHER_DATE = re.compile(r"^(?!\d{4}-)\d{1,4}([-/.])\d{1,2}\1\d{1,4} ")
 _HALF_DAY = re.compile(r" ?([AP])M$")
 _PERIODS = ("dt", "ts", "timestep", "time_step", "sample_time", "sampling_time", "sample_period",
@@ -66,7 +68,7 @@ def clock(name: str, values: NDArray[np.float64]) -> Clock:
     shown = printable(name)[:60]
     if found := _UNIT.search(name):
         return Clock(_SCALES[found[1].lower()])
-    steps = np.diff(values)
+    steps = np.diff(np.sort(values) if scrambled(values) else values)
     steps = steps[steps > 0]
     if not len(steps):
         raise InputError(
@@ -134,6 +136,25 @@ def rate_in(lines: Iterable[str]) -> float | None:
     found = (m for line in lines for m in _STATED.finditer(line[:200]))
     return stated_rate({m[1]: float(m[2]) * _STATED_IN.get((m[3] or "").lower(), 1.0)
                         for m in found if m[2].count(".") < 2})  # fmt: skip
+
+
+def unwrapped(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Times of a counter of 16 or 32 bits that began again at 0, as those of a longer one."""
+    steps = np.diff(values)
+    back = steps < 0
+    if not back.any() or not (steps > 0).any() or (values % 1 != 0).any():
+        return values
+    step = float(np.median(steps[steps > 0]))
+    for turn in (2.0**16, 2.0**32):
+        if (np.abs(steps[back] + turn - step) <= _NEAR_STEPS * step).all():
+            return values + turn * np.concatenate([[0], np.cumsum(back)])
+    return values
+
+
+def scrambled(stamp: NDArray[np.float64]) -> bool:
+    """Whether rows are in no order of time, or the newest first, rather than in runs."""
+    steps = np.diff(stamp)
+    return bool((steps < 0).sum() > _SCRAMBLED * max((steps != 0).sum(), 1))
 
 
 def loop_period_s(stamp: NDArray[np.float64]) -> float:

@@ -9,14 +9,19 @@ from collections.abc import Iterable, Sequence
 from itertools import product
 from pathlib import Path
 
+import numpy as np
+
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.columns import column, columns_of, time_columns
 from pupper_sysid.sysid.recordings.importers.tables import (
     Table,
     has_time,
     import_line,
+    known,
     lines_by_value,
     missing,
+    rate_note,
+    unit_of,
 )
 
 OURS = (
@@ -86,7 +91,9 @@ def _examples(path: Path | str, table: Table, timed: bool) -> str:
     times = time_columns(names)[:1]
     times = times or [n for n in table.increasing if column(n).kind != "position"][:1]
     if not times and (len(columns) > 2 or timed):  # of another event
-        times = [c.name for c in columns if c.kind in ("time", "unknown")][:1]
+        still = [n for n in table.columns if np.ptp(known(table, n)) == 0]
+        other = [c for c in columns if c.kind in ("time", "unknown") and c.name not in still]
+        times = [c.name for c in other][:1]
     when = {"time": times[0]} if times else {"rate": f"{table.rate or 50:g}"}
     numbered = Counter(re.sub(r"\d+", "{joint}", c.name, count=1) for c in columns)
     by_kind = {}
@@ -105,12 +112,13 @@ def _examples(path: Path | str, table: Table, timed: bool) -> str:
             ]  # fmt: skip
         by_kind[kind] = chosen
     lines = [
-        import_line(path, **when, command=c, position=p)
+        import_line(path, **when, **unit_of(table, (c, p)), command=c, position=p)
         for c, p in product(by_kind["command"], by_kind["position"])
         if c != p
     ]
     lines = lines or lines_by_value(path, table)
-    return f" ({'; or '.join(list(dict.fromkeys(lines))[:3])})" if lines else ""
+    listed = "; or ".join(list(dict.fromkeys(lines))[:3])
+    return f" ({listed}{rate_note(when, table)})" if lines else ""
 
 
 def unknown_json(keys: Iterable[str]) -> str:

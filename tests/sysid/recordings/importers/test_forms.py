@@ -328,7 +328,7 @@ def test_what_the_unit_may_be_is_offered_as_lines(tmp_path):
 def test_the_line_of_a_refusal_keeps_what_was_stated(tmp_path):
     rows = [f"{400 * c:.1f},{400 * p:.1f}" for _, c, p in ROWS_OF]
     (tmp_path / "log.txt").write_text("\n".join(["target,actual", *rows]))
-    with pytest.raises(InputError, match="log.txt --rate 50 --command target --position actual"):
+    with pytest.raises(InputError, match="--rate 50 --unit deg --command target --position actual"):
         load(tmp_path / "log.txt")
     options = LogOptions(None, "target", "actual", rate=50.0, read_before_send=True)
     with pytest.raises(InputError, match=r"actual --read-before-send --rate 50 --unit deg --out"):

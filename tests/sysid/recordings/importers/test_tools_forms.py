@@ -61,6 +61,12 @@ STACKED = {"q": np.column_stack([POSITION, SECOND[1]]),
            "q_des": np.column_stack([COMMAND, SECOND[0]])}  # fmt: skip
 INFLUX = "#group,false,false,false,true,true\n#datatype,string,long,dateTime:RFC3339,double,string"
 
+DEGREES = [(t, *np.degrees((c, p)).tolist()) for t, c, p in LOG]
+GERMAN = "".join(f"{t:.2f}\t{c!r}\t{t:.2f}\t{p!r}\n" for t, c, p in DEGREES).replace(".", ",")
+KEYED = [f"{t},{name},{c},{p}\n" for name, (commands, positions) in zip("ab", JOINTS, strict=True)
+         for t, c, p in zip(TIME, commands, positions, strict=True)]  # fmt: skip
+COUNTS = [(t, *(round(2048 + 652 * v) for v in (c, p))) for t, c, p in LOG]
+
 READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     # monitors
     "ESP-IDF, in colours": (
@@ -75,7 +81,24 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
         each("t: {t} cmd: [{c}, {d}] pos: [{p}, {q}]", BOTH), "joint_0 joint_1"),
     "JSON behind a time": (each('2026-05-04 12:30:{t:09.6f} INFO {{"cmd": {c}, "pos": {p}}}'),
                            "joint"),
+    "Tera Term": ("[2026-05-04 12:29:59.900] cmd,pos\n"
+                  + each("[2026-05-04 12:30:{t:06.3f}] {c},{p}"), "joint"),
+    "names without a clock": ("cmd\tpos\n" + each("12:30:{t:06.3f} -> {c}\t{p}"), "joint"),
+    "Dynamixel's servos in a line": (
+        each("{t} [ID:001] goal:{c}  pos:{p}\t[ID:002] goal:{d}  pos:{q}", BOTH),
+        "joint_1 joint_2"),
+    "Dynamixel's servos in turn": (
+        each("[{m} ms] [ID:1] goal:{c} pos:{p}\n[{m} ms] [ID:2] goal:{d} pos:{q}", BOTH),
+        "motor_1 motor_2"),
+    "units behind named numbers": (
+        each("t = {m} ms | target = {c!r}° | actual = {p!r}°", DEGREES), "joint"),
+    "names of two words": (
+        each("Target angle: {c!r} deg, Actual angle: {p!r} deg, elapsed: {m} ms", DEGREES),
+        "joint"),
     # words and marks in cells
+    "spaces between thousands": ("time_us;cmd;pos\n" + "".join(
+        f"{1e6 * t:,.0f};".replace(",", " ") + f"{c};{p}\n".replace(".", ",") for t, c, p in LOG),
+        "joint"),
     "words for failed reads": (NAMED + "".join(f"{0.8 + 0.01 * k:.2f},0.1,{word}\n" for k, word in (
         enumerate(("-nan(ind)", "1.#QNAN", "#DIV/0!", "-1.#IND", "(null)", "----", ".")))),
         "joint"),
@@ -89,7 +112,14 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
         "{t},\"tensor([{c}, {d}])\",\"array('d', [{p}, {q}])\"", BOTH), "joint_0 joint_1"),
     "centidegrees": ("t,cmd (cdeg),pos (cdeg)\n" + "".join(
         f"{t},{18000 / np.pi * c!r},{18000 / np.pi * p!r}\n" for t, c, p in LOG), "joint"),
+    "numbers of NumPy": (each("np.float64({t}), np.float32({c}), np.float64({p})").join((
+        "time,cmd,pos\n", "")), "joint"),
+    "dictionaries of NumPy": (each("{{'t': np.float64({t}), 'cmd': np.float32({c}), 'pos': {p}}}"),
+                              "joint"),
     # tables that were printed, turned or grouped
+    "rules of equals signs": (
+        "=====  =====  =====\ntime   goal   pos\n=====  =====  =====\n" + each("{t}  {c}  {p}")
+        + "=====  =====  =====\n", "joint"),
     "SQL": ("  time | goal | present \n-------+------+------\n" + each("{t} | {c} | {p}")
             + "(80 rows)\n", "joint"),
     "a row for each quantity": ("".join(
@@ -98,11 +128,22 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "cells over two columns": (
         ",Knee,,Hip,\nTime,Goal,Present,Goal,Present\n" + each("{t},{c},{p},{d},{q}", BOTH),
         "Knee Hip"),
+    "LabVIEW's times for each channel": (
+        "Separator\tTab\n***End_of_Header***\t\n\t\nChannels\t2\t\t\t\nY_Unit_Label\tdeg\t\tdeg\t\n"
+        "***End_of_Header***\t\t\t\t\nX_Value\tSetpoint\tX_Value\tPosition\tComment\n" + GERMAN,
+        "joint"),
     "LabVIEW without times": (
         "Separator\tTab\n***End_of_Header***\t\n\t\nChannels\t2\t\nSamples\t80\t80\nDelta_X\t0.01"
         "\t0.01\n***End_of_Header***\t\t\nX_Value\tSetpoint\tPosition\tComment\n"
         + each("\t{c}\t{p}"), "joint"),
     # times
+    "newest first": ("time,cmd,pos\n" + "".join(CSV.splitlines(True)[::-1]), "joint"),
+    "rows in no order": ("t,servo,target,actual\n" + "".join(
+        np.random.default_rng(1).permutation(KEYED)), "a b"),
+    "a counter of 16 bits": ("t_us,cmd,pos\n" + "".join(
+        f"{round(1e6 * t) % 65536},{c},{p}\n" for t, c, p in LOG), "joint"),
+    "a date beside": ("Datum;Uhrzeit;Soll;Ist\n" + each("04.05.2026;12:30:{t:06.3f};{c};{p}"),
+                      "joint"),
     "minutes": ("Time (min),Goal,Present\n" + "".join(
         f"{t / 60!r},{c},{p}\n" for t, c, p in LOG), "joint"),
     "days of a spreadsheet": ("Timestamp,Goal,Present\n" + "".join(
@@ -182,6 +223,11 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
     "names that say nothing": ("Var1,Var2,Var3\n" + CSV, "--time Var1 --command Var2"),
     "two angles": ("t,angle_in,angle_out\n" + CSV, "--command angle_in --position angle_out"),
     "Russian": ("время,задание,положение\n" + CSV, "--time 'время' --command 'задание'"),
+    "a clock without names": (each("2026-05-04 12:30:{t:06.3f}\t{c}\t{p}"), "--time time_of_day"),
+    "Dynamixel's example": (each("[ID:001] GoalPos:{c:03d}  PresPos:{p:03d}", COUNTS),
+                            "--rate 50 --unit counts:4096 --command GoalPos"),
+    "a current angle": (each("Millis:{m}\tTarget:{c}\tCurrent:{p}", DEGREES),
+                        "--time Millis --unit deg --command Target --position Current"),
     "counts without names": ("".join(
         f"{1e3 * t:.0f},{2048 + 652 * c:.0f},{2048 + 652 * p:.0f}\n" for t, c, p in LOG),
         "--unit counts:4096"),
