@@ -232,7 +232,11 @@ def _offset_faults(
     )
     if series.wraps(get):
         meaning += ", and the servo's counts wrap there"
-        return [RegisterFault("homing_offset", offset, meaning, "Nothing has to be done", False)]
+        cure = (
+            "Nothing has to be done if the joint map was made with this offset, else measure it "
+            "anew with `pupper-sysid calibrate-joints`"
+        )
+        return [RegisterFault("homing_offset", offset, meaning, cure, False)]
     meaning += ", where the position jumps by a turn"
     cure = write(0, "homing_offset") + "; or mount the horn so that the range is in the middle"
     return [RegisterFault("homing_offset", offset, meaning, cure)]

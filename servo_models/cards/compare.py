@@ -50,6 +50,8 @@ class Servo(Result):
     """Reasons for distrust, in sentences."""
     as_it_stands: bool = False
     """Whether a simulator's file states the numbers, which are compared as they are."""
+    assumed: tuple[str, ...] = ()
+    """Keys of `pd` that stand for what the file does not state: they move, and are not compared."""
 
     @property
     def parameters(self) -> DelayedPDParameters:
@@ -282,15 +284,24 @@ def _gain(servo: Servo) -> str:
 
 def differences(first: Servo, second: Servo) -> list[Difference]:
     """Every number of two servos side by side, in the order of `TorquePD`, and their top speed."""
-    found = []
+    found, servos = [], (first, second)
     for key in TorquePD.model_fields:
-        one, other = (getattr(s.pd, key) for s in (first, second))
+        one, other = (None if key in s.assumed else getattr(s.pd, key) for s in servos)
         if key != "model" and not (one is None and other is None):
             found.append(Difference(_TITLES[key], unit(key), one, other))
-    one, other = (_quantity(s.pd.top_speed_rad_s) for s in (first, second))
+    one, other = (
+        s.pd.velocity_limit_rad_s if "effort_limit_nm" in s.assumed
+        else _quantity(s.pd.top_speed_rad_s)
+        for s in servos
+    )  # fmt: skip
     found.append(Difference("top speed", "rad/s", one, other))
     if first.link_kg_m2 or second.link_kg_m2:
-        one, other = (_quantity(s.pd.armature_kg_m2.value + s.link_kg_m2) for s in (first, second))
+        one, other = (
+            _quantity(
+                None if "armature_kg_m2" in s.assumed else s.pd.armature_kg_m2.value + s.link_kg_m2
+            )
+            for s in servos
+        )
         found.append(Difference("armature and link", "kg·m²", one, other))
     return found
 

@@ -40,7 +40,12 @@ _WORDS = {
     "dead_time_s": ("dead_time_s",),
 }
 """Numbers of a PD by the names that configurations have for them."""
-_STEPS = ("max_delay", "delay_max_lag", "delay_steps")
+_STEPS = (
+    ("min_delay", "delay_min_lag", "delay_steps"),
+    ("max_delay", "delay_max_lag", "delay_steps"),
+)
+_STEP_S = ("PHYSICS_DT", "SIM_DT", "physics_dt", "sim_dt", "dt", "timestep")
+"""A physics step, by the names that it has at the top of a file or in its simulator's settings."""
 _ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul,
     ast.Div: operator.truediv, ast.Pow: math.pow,
@@ -113,8 +118,9 @@ def _driven_servo(path: Path, model: Any, name: str, i: int) -> Servo:
     speed = float(model.actuator_dynprm[i, 1]) if model.actuator_actnum[i] else 0.0
     if 0 < speed < 1000:
         numbers["velocity_limit_rad_s"] = speed
-    notes = []
+    notes, assumed = [], []
     if min(efforts) == _NO_LIMIT_NM:
+        assumed.append("effort_limit_nm")
         notes.append(f"{path.name} does not limit the effort; {_NO_LIMIT_NM:g} N·m stand for it.")
     if model.jnt_stiffness[j] > 0:
         notes.append(
@@ -124,6 +130,7 @@ def _driven_servo(path: Path, model: Any, name: str, i: int) -> Servo:
     return Servo(
         path.name, name, None, False, "servo", None, _pd(numbers),
         link_kg_m2=link_inertias(model, [name])[name], notes=tuple(notes), as_it_stands=True,
+        assumed=tuple(assumed),
     )  # fmt: skip
 
 
@@ -140,10 +147,11 @@ def _in_python(path: Path, joint: str | None) -> Servo:
         name, value = _assigned(node)
         if name and (number := _value(value, literals)) is not None:
             literals[name] = number
-    groups = [
-        g for g in _groups(tree, literals) if _first(g, _WORDS["stiffness_nm_per_rad"], joint)
-    ]
-    fitting = [g for g in groups if _is_of(g, joint)]
+    groups = list(_groups(tree, literals))
+    fitting = [
+        group for group in groups
+        if _first(group, _WORDS["stiffness_nm_per_rad"], joint) and _is_of(group, joint)
+    ]  # fmt: skip
     if not fitting:
         raise InputError(
             f"{path}: no stiffness{f' of {joint}' if joint else ''} stands there as a number. "
@@ -153,16 +161,21 @@ def _in_python(path: Path, joint: str | None) -> Servo:
         )
     group = fitting[0]
     numbers = {key: _first(group, words, joint) for key, words in _WORDS.items()}
-    notes = []
-    steps = _first(group, _STEPS, joint)
+    notes, assumed = [], []
+    ends = [n for words in _STEPS if (n := _first(group, words, joint)) is not None]
+    steps, between = float(np.mean(ends or [0.0])), " to ".join(f"{n:g}" for n in sorted({*ends}))
     if steps and numbers["dead_time_s"] is None:
-        step_s = literals.get("PHYSICS_DT")
-        if isinstance(step_s, float):
-            numbers["dead_time_s"] = steps * step_s
+        lengths = {n for g in (literals, *groups) if (n := _first(g, _STEP_S, None)) is not None}
+        if len(lengths) == 1:
+            numbers["dead_time_s"] = steps * lengths.pop()
+            notes += [f"{path.name} delays by {between} physics steps; their mean is compared."] * (
+                len({*ends}) > 1
+            )
         else:
             notes.append(
-                f"{path.name} delays by {steps:g} physics steps, whose length it does not state as "
-                "PHYSICS_DT."
+                f"{path.name} delays by {between} physics steps, but their length is "
+                + ("ambiguous" if lengths else "missing")
+                + " there: state it as PHYSICS_DT (s)."
             )
     for key, stand_in in (
         ("damping_nm_s_per_rad", 0.0), ("friction_loss_nm", 0.0), ("armature_kg_m2", 1e-4),
@@ -170,19 +183,13 @@ def _in_python(path: Path, joint: str | None) -> Servo:
     ):  # fmt: skip
         if numbers[key] is None:
             numbers[key] = stand_in
+            assumed.append(key)
             notes.append(f"{path.name} states no {_WORDS[key][0]}; {stand_in:g} stands for it.")
     known = {key: value for key, value in numbers.items() if value is not None}
     return Servo(
-        path.name,
-        joint,
-        None,
-        False,
-        "servo",
-        None,
-        _pd(known),
-        notes=tuple(notes),
-        as_it_stands=True,
-    )
+        path.name, joint, None, False, "servo", None, _pd(known), notes=tuple(notes),
+        as_it_stands=True, assumed=tuple(assumed),
+    )  # fmt: skip
 
 
 def _pd(numbers: dict[str, Any]) -> TorquePD:
@@ -239,9 +246,19 @@ def _groups(tree: ast.Module, literals: dict[str, Any]) -> Iterator[dict[str, An
                 for name, value in (_assigned(inner),)
                 if name and value is not None
             }
-    for node in ast.walk(tree):
+    named = {name: value for node in tree.body for name, value in (_assigned(node),) if name}
+
+    def wraps(call: ast.AST) -> ast.Call | None:
+        """Call that makes the actuator which this one delays, as mjlab's `base_cfg`."""
+        base = next((k.value for k in getattr(call, "keywords", ()) if k.arg == "base_cfg"), None)
+        base = named.get(base.id) if isinstance(base, ast.Name) else base
+        return base if isinstance(base, ast.Call) else None
+
+    for node in sorted(ast.walk(tree), key=lambda node: wraps(node) is None):
         if isinstance(node, ast.Call):
-            group = {k.arg: value_of(k.value) for k in node.keywords if k.arg}
+            base = wraps(node)
+            keywords = [*(base.keywords if base else ()), *node.keywords]
+            group = {k.arg: value_of(k.value) for k in keywords if k.arg}
             for keyword in node.keywords:  # `**dict(…)`, as of limits under other names
                 if keyword.arg is None and isinstance(keyword.value, ast.Call):
                     group |= {k.arg: value_of(k.value) for k in keyword.value.keywords if k.arg}

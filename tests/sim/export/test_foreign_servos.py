@@ -11,7 +11,7 @@ import pytest
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
-from pupper_sysid.servo_models.cards.compare import implausible, motion_of, servo_of
+from pupper_sysid.servo_models.cards.compare import differences, implausible, motion_of, servo_of
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.sim.export.export import exported_text
 from pupper_sysid.sim.export.foreign import foreign_servo
@@ -90,6 +90,46 @@ def test_the_common_styles_of_configurations_are_read(style, tmp_path):
     (tmp_path / "cfg.py").write_text(text)
     pd = foreign_servo(tmp_path / "cfg.py", "LF_thigh").pd.parameters
     assert (pd.stiffness, pd.damping, pd.effort_limit) == pytest.approx(wanted)
+
+
+LEG = "stiffness=20.0, damping=0.5, armature=0.001"
+DELAYED = {
+    "simulation settings": (
+        f"A = Cfg({LEG}, min_delay=2, max_delay=6)\nS = Sim(dt=1 / 200)\n",
+        0.02,
+    ),
+    "legged_gym": (
+        "class C:\n  class control:\n    stiffness = {'hip': 9.0}\n    delay_steps = 3\n"
+        "  class sim:\n    dt = 0.004\n",
+        0.012,
+    ),
+    "a wrapper of a named actuator": (
+        f"SIM_DT = 0.002\nB = Cfg({LEG})\nA = Late(base_cfg=B, delay_min_lag=4, delay_max_lag=5)\n",
+        0.009,
+    ),
+    "two steps": (f"A = Cfg({LEG}, max_delay=6)\nS = Sim(dt=0.005)\nT = Sim(dt=0.002)\n", None),
+}
+
+
+@pytest.mark.parametrize("style", DELAYED)
+def test_a_delay_in_steps_is_their_mean_times_the_step_that_the_file_states(style, tmp_path):
+    text, seconds = DELAYED[style]
+    (tmp_path / "cfg.py").write_text(text)
+    servo = foreign_servo(tmp_path / "cfg.py", "LF_hip")
+    dead_time = servo.pd.dead_time_s
+    assert (dead_time and dead_time.value) == (seconds and pytest.approx(seconds))
+    assert seconds or any("ambiguous" in note for note in servo.notes)
+
+
+def test_what_stands_for_a_missing_number_is_no_difference(tmp_path):
+    (tmp_path / "cfg.py").write_text("A = Cfg(stiffness=20.0)\n")
+    (tmp_path / "robot.xml").write_text(ROBOT.replace('forcerange="-2 2"', ""))
+    known = servo_of(str(CALIBRATED), "LF_hip")
+    for name, joint in (("cfg.py", "LF_hip"), ("robot.xml", "hip")):
+        rows = differences(known, foreign_servo(tmp_path / name, joint))
+        effort = next(row for row in rows if row.quantity == "effort limit")
+        assert effort.first is not None and effort.second is None and effort.ratio is None
+        assert next(row for row in rows if row.quantity == "top speed").second is None
 
 
 def test_arithmetic_that_grows_without_end_is_no_number(tmp_path):
