@@ -56,6 +56,8 @@ def delay_figure(curves: Mapping[str, Sequence[DelayPoint]]) -> Figure:
                         line, color=colour, marker="o", ms=3, label=f"{policy}, {mode}",
                     )  # fmt: skip
         one.set_ylabel(title)
+    if "survival" in names:
+        axes[0].set_ylim(-0.05, 1.05)
     axes[-1].set_xlabel("more delay [ms]")
     axes[min(1, len(axes) - 1)].legend(fontsize=7)
     return figure

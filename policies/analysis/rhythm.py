@@ -83,7 +83,7 @@ def sine_frequency(signal: Signal, step_s: float) -> float:
     The signal has the shape (steps, channels).
     """
     y = standardised(signal)
-    if len(y) * step_s < SHORTEST_S - 1e-9:
+    if len(y) < int(SHORTEST_S / step_s + 1e-9):  # whole steps, of any control rate
         raise InputError(
             f"A signal of {len(y) * step_s:.2f} s is too short for a gait's frequency: "
             f"{SHORTEST_S:g} s are needed."

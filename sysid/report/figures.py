@@ -454,8 +454,8 @@ def _overlay(axes: Axes, track: Track, joint: str, size: float) -> None:
         drawstyle="steps-post", label="raw readings", gid="part:raw",
     )  # fmt: skip
     axes.plot(
-        track.time_s[fine], track.model_rad[fine], color=BLUE, lw=2 * size, label="DelayedPD",
-        gid="part:model",
+        track.time_s[fine], track.model_rad[fine], color=BLUE, lw=1.5 * size, label="DelayedPD",
+        gid="part:model", zorder=3,  # over readings that follow each other closely
     )  # fmt: skip
     axes.plot(
         track.fresh_time_s[fresh], track.fresh_rad[fresh], "o", color=RED, ms=5 * size,

@@ -11,7 +11,9 @@ import pytest
 from rich.console import Console
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.cli.commands.analyze.common import interval, table_of
 from pupper_sysid.cli.programs import pupper_sysid
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import plain
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sysid.recordings.files import load
@@ -159,3 +161,21 @@ def test_a_report_opens_in_the_browser_that_there_is(capsys, tmp_path, monkeypat
     code, _, err = run(capsys, "report", hip, "--out", page.parent, "--open")
     assert code == 0 and "No browser could be started" in err
     assert opened == [page.resolve().as_uri()]
+
+
+def test_tables_of_analyses_fit_a_terminal_whatever_the_policy_is_called():
+    rows = [
+        {"extra_delay_ms": 40, "mode": "jittered", "survival": 1.0, "frequency_hz": 3.569,
+         "amplitude_rad": 0.139, "mae_vx_m_s": 0.018},
+        {"channel": "joint_position_relative", "kind": "noise", "level": 0.05, "sigma": 0.005,
+         "correlation": 1.0, "survival": 1.0, "mae_vx_m_s": 0.018},
+        {"ground": "slopes", "survival": 1.0, "frequency_hz": 3.569, "mae_vx_m_s": 0.018,
+         "mae_vy_m_s": 0.1, "mae_yaw_rad_s": 0.123},
+    ]  # fmt: skip
+    for row in rows:
+        table = table_of("Rows", {"lstm_high_steps": [SimpleNamespace(**row)]}, list(row))
+        with terminal.out.capture() as printed:
+            terminal.out.print(table, width=80)
+        *_, last = [line for line in printed.get().splitlines() if "lstm_high_steps" in line]
+        assert last.split()[-1] == f"{list(row.values())[-1]:.3f}" and "_" not in last[16:]
+    assert interval(Interval(0.5, float("nan"), float("nan")), 2) == "0.50"

@@ -157,7 +157,7 @@ class OfPolicies(Analysis):
         """Title of the table, with what it is made of."""
         robots, seconds = self.size
         look = "; a quick look" if self.quick else ""
-        return f"{title} ({robots} robots, {seconds:g} s each{look})"
+        return f"{title} ({robots} robot{'s' * (robots != 1)}, {seconds:g} s each{look})"
 
 
 @dataclass(frozen=True)
@@ -227,16 +227,24 @@ def tries_of(
     return tries
 
 
+_HEADINGS = {
+    "extra_delay_ms": "delay ms", "survival": "still up", "frequency_hz": "gait Hz",
+    "amplitude_rad": "amplitude rad", "mae_vx_m_s": "vx error m/s", "mae_vy_m_s": "vy error m/s",
+    "mae_yaw_rad_s": "yaw error rad/s",
+}  # fmt: skip
+
+
 def table_of(title: str, tables: Mapping[str, Sequence[Any]], columns: Sequence[str]) -> Table:
     """Rows of results by policy, with these fields as columns."""
-    made = terminal.table(title, "policy", *columns)
+    made = terminal.table(title, "policy", *(_HEADINGS.get(c, c) for c in columns))
     for name, rows in tables.items():
         for row in rows:
-            made.add_row(name, *(terminal.cell(getattr(row, c), 3) for c in columns))
+            cells = (terminal.cell(getattr(row, c), 3) for c in columns)
+            made.add_row(name, *(cell.replace("_", " ") for cell in cells))
     return made
 
 
 def interval(value: Interval, digits: int) -> str:
-    """A value with its interval."""
+    """A value, and its interval where it has one."""
     number, low, high = (terminal.number(x, digits) for x in (value.value, value.low, value.high))
-    return f"{number} ({low}–{high})"
+    return f"{number} ({low}–{high})" if np.isfinite([value.low, value.high]).all() else number

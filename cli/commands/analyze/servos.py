@@ -8,6 +8,7 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.commands.analyze.common import Analysis, Commanded, tries_of
@@ -38,6 +39,8 @@ class Servo(Analysis):
     Example: pupper-analyze servo recordings/playback.csv
     """
 
+    policies: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """One recording, or one run or policy folder."""
     command: tuple[float, float, float] = (0.15, 0.0, 0.0)
     """Forward and sideways speed [m/s], turn rate [rad/s]."""
     seconds: float = 10.0

@@ -110,6 +110,8 @@ def test_a_strong_drift_and_a_still_joint_do_not_hide_the_gait():
 def test_signals_that_are_short_still_or_of_other_shapes_are_refused():
     joints, _ = trot(5.0)
     frequency(joints, STEP_S)
+    # 5 s are 166.7 steps of 0.03 s, and 7 s less 2 s are 166
+    sine_frequency(joints[:166], 0.03)
     short = rollout([3.2, 3.3], fell_at={0: 6.0, 1: 3.0})
     cases = [
         (lambda: frequency(joints[1:], STEP_S), "4.98 s is too short"),
