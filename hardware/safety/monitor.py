@@ -240,8 +240,8 @@ class Monitor:
         if k is not None:
             raise SafetyStop(
                 f"{self._names[k]} was commanded to move by {moved[k]:.2f} rad within "
-                f"{window:g} s, and its reading did not change once. It is blocked, without "
-                "power, or has stopped answering; switch the servos' power off and on."
+                f"{window:g} s, and its reading did not change once. "
+                + self._why_still(k, "has stopped answering")
             )
 
     def _check_following(self, now: float) -> None:
@@ -254,9 +254,18 @@ class Monitor:
             raise SafetyStop(
                 f"{self._names[k]} was commanded to move by {moved[k]:.2f} rad within "
                 f"{limits.follows_within_s:g} s, and its reading stayed within {spread[k]:.3f} "
-                "rad. It is blocked, without power, or its reading is stuck but for noise; switch "
-                "the servos' power off and on."
+                "rad. " + self._why_still(k, "its reading is stuck but for noise")
             )
+
+    def _why_still(self, k: int, otherwise: str) -> str:
+        """Why a joint does not move, and what to do; asks its servo for its torque."""
+        ask = getattr(self._bus, "has_lost_torque", None)
+        if ask is not None and ask(self._names[k]):
+            return (
+                "Its torque is off although it was switched on: its supply failed for a moment, or "
+                "it shut down. Check the supply and the plugs, then start again."
+            )
+        return f"It is blocked, without power, or {otherwise}; switch the servos' power off and on."
 
     def _motion(self, begin: float, shown: float) -> tuple[Angles, Angles]:
         """Range of each command from `begin` to `shown`, and of its readings from `begin` on [rad].

@@ -264,6 +264,11 @@ class SerialBus(HostClock):
             self.line.torque_off([s.id for s in self._servos])
         return all([any(self._torque(s, on) for _ in range(tries)) for s in self._servos])
 
+    def has_lost_torque(self, joint: str) -> bool:
+        """Whether a servo answers that its torque is off."""
+        servo = self._servo(joint, "torque_enable")
+        return read_register(self.line, servo.id, servo.series, "torque_enable") == 0
+
     def goals(self) -> NDArray[np.float64]:
         """Goal_Position of each servo as an angle, shape (joints,); NaN where the read failed."""
         counts = np.full(len(self._servos), np.nan)

@@ -153,7 +153,8 @@ def test_an_offset_of_a_servo_whose_counts_wrap_is_no_reason_to_refuse(lines):
     with set_to(servos, 4, homing_offset=1800):
         bench_of(servos).counts[4] = 2048 + 1800
         bus = GuardedBus(FeetechBus(device, 1_000_000, map_of(*IDS)))
-        assert "wrap there" in " ".join(bus.bus.remarks())
+        remarks = " ".join(bus.bus.remarks())
+        assert "wrap there" in remarks and "if the joint map was made with this offset" in remarks
         assert bus.torque(True)
         bus.close()
         bench_of(servos).counts[4] = 2048

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pupper_sysid.common.errors import BusError
+from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.hardware import dynamixel
 from pupper_sysid.hardware.dynamixel import TRIGGERED, WATCHDOG_UNITS, DynamixelBus
-from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
 from pupper_sysid.hardware.safety.notes import notes, write_note
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.dynamixel import DynamixelEmulator
@@ -191,6 +191,25 @@ def test_reading_times_are_those_of_the_measurement_within_0_3_ms(firmware, requ
         # a busy host delivers some replies late: those exchanges last longer
         held_up = np.maximum(np.array(took) - 1e-3, 0.0)
         assert np.percentile(error - held_up, 25) < 3e-4
+
+
+def test_a_servo_that_a_moment_without_supply_left_limp_is_named_as_limp():
+    servos = moving_dynamixel()
+    chosen = servos.bench.map.per_servo()
+    with on_a_port(servos) as server:
+        line = DynamixelBus(server.device, 1_000_000, chosen)
+        bus = GuardedBus(line, GuardLimits(astray_rad=9.0))
+        bus.torque(True)
+        here = bus.read().position_rad
+        bus.write(here)
+        servos.brown_out(server.now(), 0.05)
+        start = bus.now()
+        with pytest.raises(SafetyStop, match="Its torque is off although it was switched on"):
+            while (elapsed := bus.now() - start) < 8:
+                bus.write(here + 0.4 * np.sin(2 * elapsed))
+                bus.sleep_until(start + elapsed + 0.02)
+                bus.read()
+        bus.close()
 
 
 DRIVER = """
