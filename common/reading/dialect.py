@@ -99,6 +99,8 @@ _GROUP_MARKS = "['’\u00a0\u2009\u202f]"
 _GROUPED = re.compile(rf"(?<![\w.,'’])[+-]?\d{{1,3}}(?:{_GROUP_MARKS}\d{{3}})+(?![\w'’])")
 _COLOUR = re.compile(r"\x1b\[[\d;]*m")  # of a terminal
 _WRAPPED = re.compile(r"\b(?:tensor|array)\((?:'\w', ?)?(\[[^\]\n]*\])[^()\n]{0,80}\)")
+_CHECKSUM = re.compile(r"\*[0-9A-F]{2}[ \t]*$", re.MULTILINE)  # of NMEA's lines
+_BOX = re.compile("[\u2500-\u257f]")  # lines around cells
 _NUMPY = re.compile(r"\bnp\.\w+\(([-+.\w]+)\)")
 _RULE = re.compile(
     r"^[ \t|+:]*[-=]{3}[-=+ |:\t]*$", re.MULTILINE
@@ -113,6 +115,7 @@ _UNITS = (
     r"amps?|ma|mv|n\*?m|nm|%|°?c|hz|rad/s|deg/s|rpm|rad/s\^?2|m|mm"
 )
 _UNIT = re.compile(rf"[(\[<{{]?\s*({_UNITS}|raw|-|1|none)\s*[)\]>}}]?", re.IGNORECASE)
+_WORD_OF = {"%": "percent"}  # in names, whose marks separate words
 _ANGLE_UNIT = re.compile(r"rad(ians?)?|deg(rees?)?|°|turns?|rev|counts?|ticks?", re.IGNORECASE)
 _WITH_UNIT = re.compile(rf"([-+]?[\d.]+(?:[eE][-+]?\d+)?) ?({_UNITS})", re.IGNORECASE)
 _NAMED_LIST = re.compile(r"([A-Za-z_][\w./]*)\s*[:=]\s*[\[(]\s*([-+.\deE,; \t]+?)\s*[\])]")
@@ -126,7 +129,7 @@ _PAIR, _LONG_PAIR = (  # with names of a word, or of two
 )
 _AHEAD = re.compile(r"[ \t]*(\d+(?:\.\d+)?)[ \t]*[,;|:>]?[ \t]+(?=[\[(A-Za-z])")
 _STAMPED = re.compile(
-    r"^[ \t]*(?:\[[A-Za-z]+\][ \t]*)?"  # [INFO]
+    r"^[ \t]*(?:\[[A-Za-z]+\][ \t]*)?(?:[A-Z][a-z]{2} +\d{1,2} )?"  # [INFO], May 04
     r"(?:\[?((?:\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,]\d+)?)\]?|"
     r"[(\[][ \t]*(\d+\.\d+|\d+(?=[ \t]*[mu]?s))[ \t]*([mu]?s)?[ \t]*[)\]]|"
     r"[EWIDV] \((\d+)\) [\w.-]+:)"  # ESP-IDF's milliseconds and tag
@@ -137,7 +140,7 @@ _REMARK = re.compile(r"\W*\w+\W*:$")  # a first word such as WARN: or [INFO]:
 _NUMBERS = re.compile(r"[\s,;]+")
 _LONGEST_LIST = 1000
 _BRACKETED = re.compile(
-    r"^[ \t]*[\[(]([^\[\]()\n]+|[-+.\deE,; \t\[\]()]+)[\])][ \t]*[,;]?[ \t]*$",
+    r"^[ \t]*[\[(<]([^\[\]()<>\n]+|[-+.\deE,; \t\[\]()]+)[\])>][ \t]*[,;]?[ \t]*$",
     re.MULTILINE,
 )
 _BRACKETS = re.compile(r"[\[\]()]")
@@ -240,6 +243,10 @@ def _usual_numbers(text: str, rows: Sequence[str]) -> str:
         text = text.replace("\u2212", "-")
     if _HEX.search(sample):
         text = _HEX.sub(lambda m: str(int(m[0], 16)), text)
+    if "│" in text[:_SAMPLE] or "┃" in text[:_SAMPLE]:
+        text = _BOX.sub("-", re.sub("[│┃]", "|", text))
+    if all(_CHECKSUM.search(row) for row in rows):
+        text = _CHECKSUM.sub("", text)
     if "---" in text[:_SAMPLE] or "===" in text[:_SAMPLE]:
         text = _RULE.sub("", text)
     if "\x1b" in text:
@@ -370,7 +377,8 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
         columns = [f"{a}.{b}".strip(".") for a, b in zip(above, columns, strict=True)]
         lines[before.pop(-2)] = ""
     if columns and len(columns) == shape.columns:
-        units = units or next(filter(None, (_units_above(lines[n], shape) for n in before)), [])
+        above = (_units_above(line, shape) for line in lines[:first])
+        units = units or next(filter(None, above), [])
         columns = _once(columns, [_split(row, shape.separator) for row in lines[first:]])
     plain_names = (
         shape.separator == "," and len(before) == 1 and not units and not shape.comma
@@ -387,11 +395,11 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
         columns[0] = "time_of_day" if shape.clocked else "0"
     for k, word in enumerate(units):
         if word and word not in ("-", "1"):
-            columns[k] = f"{columns[k]} [{word}]"
+            columns[k] = f"{columns[k]} [{_WORD_OF.get(word, word)}]"
     for k, word in shape.units.items():
-        columns[k : k + 1] = [f"{name} [{word}]" for name in columns[k : k + 1]]
+        columns[k : k + 1] = [f"{name} [{_WORD_OF.get(word, word)}]" for name in columns[k : k + 1]]
     if units:
-        notes.append("the row below the names was taken for their units")
+        notes.append("a line beside the names was taken for their units")
     if (above := len(before) - (not numbered)) > 0:
         what = "the numbers" if numbered else "the names of the columns"
         notes.append(f"{above} line{'s' if above > 1 else ''} above {what} left out")
@@ -472,7 +480,7 @@ def _labelled(
         again = f"_{names[:k].count(name) + 1}" if names.count(name) > 1 else ""
         units = {pairs[k][2] for pairs in alike}
         unit = units.pop() if len(units) == 1 else None
-        columns.append(f"{name}{again} [{unit}]" if unit else f"{name}{again}")
+        columns.append(f"{name}{again} [{_WORD_OF.get(unit, unit)}]" if unit else f"{name}{again}")
     ahead = [float(m[1]) for line in sample if (m := _AHEAD.match(line))]
     steps = {b - a for a, b in pairwise(ahead)}
     timed = len(ahead) == len(sample) and min(steps) >= 0 and not steps <= {0, 1}
@@ -642,11 +650,18 @@ def _units(line: str, shape: _Shape) -> list[str]:
 
 
 def _units_above(line: str, shape: _Shape) -> list[str]:
-    """Units of the columns in a line above their names, as LabVIEW's `Y_Unit_Label`."""
-    head, *cells = _split(line, shape.separator)
-    if "unit" not in head.lower() or not all(_ANGLE_UNIT.fullmatch(c) for c in cells if c):
-        return []
-    return ["", *cells, *[""] * shape.columns][: shape.columns]
+    """Units of the columns in a line above their names, as LabVIEW's `Y_Unit_Label`, or a comment.
+
+    Without an angle's among them there are none: volts are LabVIEW's own, whatever was measured.
+    """
+    for separator in (shape.separator, ","):
+        head, *cells = _split(_COMMENT.sub("", line), separator) or [""]
+        if "unit" in head.lower():
+            head = head.partition(":")[2].strip()
+        cells = [head, *cells, *[""] * shape.columns][: shape.columns]
+        if all(_UNIT.fullmatch(c) for c in cells if c) and any(map(_ANGLE_UNIT.fullmatch, cells)):
+            return [c.strip("()[]<>{} ") for c in cells]
+    return []
 
 
 def _once(columns: list[str], rows: list[list[str]]) -> list[str]:

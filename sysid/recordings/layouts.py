@@ -94,7 +94,8 @@ def _table(parsed: Parsed) -> Table:
                 texts["time"] = texts.pop("")
         else:
             numbers[str(name)] = values.to_numpy(float)
-    return Table(numbers, texts, parsed.faults, numbered=parsed.numbered, rate=parsed.rate)
+    return Table(numbers, texts, parsed.faults, numbered=parsed.numbered, rate=parsed.rate,
+                 unit=parsed.unit)  # fmt: skip
 
 
 def _metadata(layout: str, joints: list[str], pose: dict[str, float] | None) -> dict[str, Any]:

@@ -193,6 +193,9 @@ def columns_of(names: Iterable[str]) -> list[Column]:
     """
     found = [column(name) for name in names]
     commands = {c.key for c in found if c.kind == "command"}
+    if any(c.kind == "command" and c.name.lower().startswith("p_") for c in found):  # p_des
+        found = [replace(c, kind="position", rank=(0, 0, 1, 1)) if c.name == "p" else c
+                 for c in found]  # fmt: skip
     placed = {c.key for c in found if c.kind == "position"}
     return [
         replace(c, kind="position", template=_template(c.name, [c.name]))

@@ -48,6 +48,7 @@ from pupper_sysid.sysid.recordings.importers.log import (
 )
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.tables import (
+    GROUPS,
     SERIES,
     expanded,
     has_time,
@@ -199,7 +200,11 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     found = {name: _numbers(values) for name, values in lists.items() if len(values) > 1}
     arrays = {name: values for name, values in found.items() if values is not None}
     texts = {
-        n: list(map(str, v)) for n, v in lists.items() if v and n not in arrays and has_time([n])
+        n: list(map(str, v))
+        for n, v in lists.items()
+        if v
+        and n not in arrays
+        and (has_time([n]) or (n in GROUPS and all(isinstance(each, str) for each in v)))
     }
     scalars = {k: float(v) for k, v in _scalars(data).items()}
     table = expanded(path, arrays, list(options.joints))

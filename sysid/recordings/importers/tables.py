@@ -70,11 +70,11 @@ SERIES = ("name", "signal", "event", "type", "kind", "variable", "topic", "field
            "metric", "key", "channel", "_field", "_measurement", "op", "operation", "direction",
            "dir", "param", "parameter", "quantity", "label", "source")  # fmt: skip
 _VALUES = ("value", "values", "val", "_value", "data")
-_GROUPS = ("leg", "limb", "arm", "side", "joint", "joint_name", "motor", "motor_name", "servo",
+GROUPS = ("leg", "limb", "arm", "side", "joint", "joint_name", "motor", "motor_name", "servo",
            "servo_name", "actuator", "name", "axis", "dof", "motor_idx", "motor_id", "motor_index",
            "joint_idx", "joint_id", "joint_index", "servo_id", "actuator_id", "dxl_id", "can_id",
            "node_id", "id")  # fmt: skip
-LABELS = frozenset((*SERIES, *_GROUPS, *_TRIALS))
+LABELS = frozenset((*SERIES, *GROUPS, *_TRIALS))
 """Columns that may hold text, in lower case."""
 _SUBSECONDS = ("nanosec", "nanosecs", "nsec", "nsecs", "usec", "usecs")
 _KEPT = ("p_gain", "torque_enabled", "voltage_v", "temperature_c", "load")
@@ -82,6 +82,7 @@ _SOLE = "joint"  # of a log that names none
 _MOST_GROUPS = 1000
 _TOGETHER = 0.2  # share of the rows with a command or position that have both
 _FEWEST_ROWS = 3  # of a joint in a table with a row per joint
+_COUNTING = 0.3  # share of rows with another trial than the row before: it counts them
 _SHORTEST_TONE = 20  # rows of one frequency; a chirp changes it sooner
 _MOST_CHOICES = 4  # that a message lists
 _COMPARED = 8  # columns for one purpose
@@ -121,6 +122,8 @@ class Table:
     """What was assumed, in sentences."""
     rate: float | None = None
     """Rows a second that the log states beside its columns."""
+    unit: str = ""
+    """Unit of its angles that the log states beside its columns."""
 
     @cached_property
     def names(self) -> list[str]:
@@ -514,7 +517,9 @@ def unknown_numbers(path: Path | str, table: Table) -> str:
 def lines_by_value(path: Path | str, table: Table) -> list[str]:
     """Commands that import the columns that go together as a command and its position do."""
     clocks = [n for n, cells in table.texts.items() if is_clock(cells[0])]
-    times = [*time_columns(table.names)[:1], *table.increasing, *clocks]
+    rising = table.increasing
+    named = sorted(time_columns(table.names)[:2], key=lambda n: n not in (*rising, *clocks))
+    times = [*named[:1], *rising, *clocks]
     time = times[0] if times else ""
     others: list[str] = []  # that move, each once
     for name, values in table.columns.items():
@@ -737,7 +742,7 @@ def _groups(path: Path | str, table: Table) -> dict[str, NDArray[np.bool_]]:
     found: dict[str, NDArray[np.bool_]] = {}
     texts = {n.lower(): n for n in table.texts}
     numbers = {n.lower(): n for n in table.columns}
-    for name in _GROUPS:
+    for name in GROUPS:
         if name in texts:
             codes, values = pd.factorize(np.array(table.texts[texts[name]], object))
             refuse_more(f"{path}, column {name}", len(values), MOST_JOINTS, "joints")
@@ -821,7 +826,12 @@ def _joint(
         values = table.numbers(path, source.name)[own]
         if held is not None and key == "command_rad":
             values = held[1]
-        factor = stated or _of_name(path, source, measured) or Unit()
+        factor = stated or _of_name(path, source, measured)
+        if factor is None and not source.unit and table.unit:
+            factor = unit(table.unit)
+            metadata["angle_unit"] = "stated"
+            warnings.append(f"{source.name} was taken as {table.unit}, as a remark above says.")
+        factor = factor or Unit()
         columns[key] = (values - factor.zero) * factor.scale
         if factor.counts and stated is None:
             warnings.append(
@@ -886,6 +896,9 @@ def _trials(
     name = table.first(_TRIALS)
     if options.trial:
         name = _column_named(path, table, "trial", options.trial)
+    if name is not None and options.trial is None and name in table.columns:
+        runs = np.count_nonzero(np.diff(table.numbers(path, name)[own]))
+        name = None if runs > _COUNTING * own.sum() else name
     if name is not None and name in table.texts:
         codes, labels = pd.factorize(np.array(table.texts[name], object))
         trial = codes[own].astype(float)

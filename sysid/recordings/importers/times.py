@@ -14,6 +14,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.dialect import is_clock
 from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.columns import UNITS
 from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 
@@ -36,6 +37,8 @@ _GUESSED = (("s", 1.0), ("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanose
 _DAY_S = 86_400.0
 _NEAR_STEPS = 3  # by which the step over a counter's end may differ from the others
 _SCRAMBLED = 0.25  # share of steps back in time
+_SLOW_S = 2.0  # no loop of a servo is slower
+_CLOCK_SET_S = 3600.0  # a step forward between two trials
 _OTHER_DATE = re.compile(r"^(?!\d{4}-)\d{1,4}([-/.])\d{1,2}\1\d{1,4} ")
 _HALF_DAY = re.compile(r" ?([AP])M$")
 _PERIODS = ("dt", "ts", "timestep", "time_step", "sample_time", "sampling_time", "sample_period",
@@ -47,6 +50,10 @@ _STATED = re.compile(
     r"\s*(khz|hz|s|ms|us|µs)?(?![\w.])", re.IGNORECASE,
 )  # fmt: skip
 _STATED_IN = {"khz": 1e3, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
+_ANGLES_IN = re.compile(
+    r"\b(?:angles|positions|values|units?)\b *(?:(?:are )?in|are|[:=]) *"
+    r"(deg|degs|degrees?|rad|radians?|turns|revolutions)\b", re.IGNORECASE,
+)  # fmt: skip
 _NUMBER = re.compile(r"[-+]?[\d.]+(?:[eE][-+]?\d+)?")
 
 
@@ -66,17 +73,25 @@ class Clock:
 def clock(name: str, values: NDArray[np.float64]) -> Clock:
     """Unit of the times in the column `name`, by its ending, else by their distance."""
     shown = printable(name)[:60]
-    if found := _UNIT.search(name):
-        return Clock(_SCALES[found[1].lower()])
     steps = np.diff(np.sort(values) if scrambled(values) else values)
     steps = steps[steps > 0]
+    found = _UNIT.search(name)
+    stated = _SCALES[found[1].lower()] if found else 0.0
+    usual = [float(of(steps)) * stated for of in (np.median, np.mean)] if len(steps) else [1.0]
+    if found and any(_LOOP_S[0] <= step < _SLOW_S for step in usual):
+        return Clock(stated)
     if not len(steps):
         raise InputError(
             f"column {shown}: its values do not increase, so they are no times. Give the rows a "
             "second with `rate`, or another column with `time`."
         )
     loop = float(np.median(steps))
-    for unit, scale in _GUESSED:
+    for unit, scale in _GUESSED[: 4 if found else None]:
+        if found and _LOOP_S[0] < loop * scale <= _LOOP_S[1]:
+            return Clock(scale, float(values[0]), [
+                f"the values of column {shown} are {loop:.4g} apart, which in {found[1]} is no "
+                f"servo's loop; they were taken as {unit}. Rename it if that is wrong."
+            ])  # fmt: skip
         if _LOOP_S[0] < loop * scale <= _LOOP_S[1]:
             if unit == "s":
                 break
@@ -84,7 +99,7 @@ def clock(name: str, values: NDArray[np.float64]) -> Clock:
                 f"column {shown} names no unit; its values were taken as {unit}, since they are "
                 f"{loop:.4g} apart. Call it {shown}_s, _ms, _us or _ns if that is wrong."
             ])  # fmt: skip
-    return Clock()
+    return Clock(stated or 1.0)
 
 
 def times_of_day(path: object, name: str, cells: Sequence[str]) -> NDArray[np.float64]:
@@ -157,6 +172,12 @@ def scrambled(stamp: NDArray[np.float64]) -> bool:
     return bool((steps < 0).sum() > _SCRAMBLED * max((steps != 0).sum(), 1))
 
 
+def angle_unit_in(text: str) -> str:
+    """The unit that remarks such as `angles in degrees` say; empty without, or with several."""
+    units = {UNITS[word.lower()] for word in _ANGLES_IN.findall(text)}
+    return units.pop() if len(units) == 1 else ""
+
+
 def loop_period_s(stamp: NDArray[np.float64]) -> float:
     """Median time between rows that follow one another."""
     steps = np.diff(stamp)
@@ -222,11 +243,17 @@ def one_after_another(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Trial number of each row, and times with trials that start again put after one another.
 
-    A trial is a run of rows of one number in `trial`; a step back in time starts one, too.
+    A trial is a run of rows of one number in `trial`; a step back in time starts one, too, and so
+    does one of more than an hour, when a clock was set.
     """
     number = np.zeros(len(stamp)) if trial is None else trial
     with np.errstate(invalid="ignore"):
-        new = np.concatenate([[False], (np.diff(number) != 0) | (np.diff(stamp) < 0)])
+        new = np.concatenate(
+            [
+                [False],
+                (np.diff(number) != 0) | (np.diff(stamp) < 0) | (np.diff(stamp) > _CLOCK_SET_S),
+            ]
+        )
     runs = np.cumsum(new)
     shifted, last = stamp.astype(float).copy(), -np.inf
     starts = np.flatnonzero(np.concatenate([[True], new[1:]]))

@@ -92,6 +92,8 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
         "motor_1 motor_2"),
     "units behind named numbers": (
         each("t = {m} ms | target = {c!r}° | actual = {p!r}°", DEGREES), "joint"),
+    "journald": (each("May 04 12:30:{t:09.6f} pi servo[812]: cmd={c} pos={p}"), "joint"),
+    "angle brackets": ("time,cmd,pos\n" + each("<{t},{c},{p}>"), "joint"),
     "names of two words": (
         each("Target angle: {c!r} deg, Actual angle: {p!r} deg, elapsed: {m} ms", DEGREES),
         "joint"),
@@ -110,6 +112,12 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "Mathematica": (re.sub(r"(0\.\d+)", r"\1*^0", NAMED), "joint"),
     "tensors in cells": ("time,action,state\n" + each(
         "{t},\"tensor([{c}, {d}])\",\"array('d', [{p}, {q}])\"", BOTH), "joint_0 joint_1"),
+    "units in a comment": (
+        "# units: s, deg, deg\ntime\tcmd\tpos\n" + each("{t}\t{c!r}\t{p!r}", DEGREES), "joint"),
+    "units above the names": (
+        "s,deg,deg\ntime,cmd,pos\n" + each("{t},{c!r},{p!r}", DEGREES), "joint"),
+    "a unit in a remark": (
+        "Bench 3 (angles in degrees)\ntime,cmd,pos\n" + each("{t},{c!r},{p!r}", DEGREES), "joint"),
     "centidegrees": ("t,cmd (cdeg),pos (cdeg)\n" + "".join(
         f"{t},{18000 / np.pi * c!r},{18000 / np.pi * p!r}\n" for t, c, p in LOG), "joint"),
     "numbers of NumPy": (each("np.float64({t}), np.float32({c}), np.float64({p})").join((
@@ -117,6 +125,8 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "dictionaries of NumPy": (each("{{'t': np.float64({t}), 'cmd': np.float32({c}), 'pos': {p}}}"),
                               "joint"),
     # tables that were printed, turned or grouped
+    "boxes": ("┌──────┬──────┬──────┐\n│ time │ goal │ pos  │\n├──────┼──────┼──────┤\n"
+              + each("│ {t} │ {c} │ {p} │") + "└──────┴──────┴──────┘\n", "joint"),
     "rules of equals signs": (
         "=====  =====  =====\ntime   goal   pos\n=====  =====  =====\n" + each("{t}  {c}  {p}")
         + "=====  =====  =====\n", "joint"),
@@ -137,6 +147,9 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
         "\t0.01\n***End_of_Header***\t\t\nX_Value\tSetpoint\tPosition\tComment\n"
         + each("\t{c}\t{p}"), "joint"),
     # times
+    "seconds that are milliseconds": ("time (s),cmd,pos\n" + each("{m},{c},{p}"), "joint"),
+    "a clock that was set": ("time,cmd,pos\n0,0,0\n" + "".join(
+        f"{1_790_000_000 + t:.4f},{c},{p}\n" for t, c, p in LOG), "joint"),
     "newest first": ("time,cmd,pos\n" + "".join(CSV.splitlines(True)[::-1]), "joint"),
     "rows in no order": ("t,servo,target,actual\n" + "".join(
         np.random.default_rng(1).permutation(KEYED)), "a b"),
@@ -179,6 +192,7 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "ODrive's current": ("time,input_pos,pos_estimate,Iq_setpoint,Iq_measured\n"
                          + each("{t},{c},{p},0,0"), "joint"),
     "torques beside": ("time,pos_cmd,trq_cmd,pos,trq\n" + each("{t},{c},0,{p},0"), "joint"),
+    "MIT's letters": ("t,p_des,v_des,p,v,t_ff\n" + each("{t},{c},0,{p},1,0"), "joint"),
     "d behind a number": ("t,q1,q2,q1d,q2d\n" + each("{t},{p},{q},{c},{d}", BOTH),
                           "joint_1 joint_2"),
     "a raw angle": ("time,cmd,pos_raw\n" + each("{t},{c},{p}"), "joint"),
@@ -188,6 +202,9 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "a record a joint": (json.dumps({"dt": 0.01, "joints": [
         {"name": name, "cmd": c.tolist(), "pos": p.tolist()}
         for name, (c, p) in zip(("knee", "hip"), JOINTS, strict=True)]}), "knee hip"),
+    "a record a servo": (each(
+        '{{"t": {t}, "servo": "knee", "cmd": {c}, "pos": {p}}}\n'
+        '{{"t": {t}, "servo": "hip", "cmd": {d}, "pos": {q}}}', BOTH), "knee hip"),
     "a line that was cut": (each('{{"t": {t}, "cmd": {c}, "pos": {p}}}') + '{"t": 0.8, "c',
                             "joint"),
     "numbers in quotes": (json.dumps([{"t": f"{t}", "cmd": f"{c}", "pos": f"{p}"}
@@ -226,6 +243,12 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
     "a clock without names": (each("2026-05-04 12:30:{t:06.3f}\t{c}\t{p}"), "--time time_of_day"),
     "Dynamixel's example": (each("[ID:001] GoalPos:{c:03d}  PresPos:{p:03d}", COUNTS),
                             "--rate 50 --unit counts:4096 --command GoalPos"),
+    "NMEA": (each("$SRV,{m},{c},{p}*5A"), "--time 1 --command 2 --position 3"),
+    "a counter called loop": ("loop,cmd,pos\n" + each("{n},{c},{p}"), "--rate 50 --command cmd"),
+    "letters": (each("[2026-05-04 12:30:{t:06.3f}] T:{c} A:{p}", DEGREES),
+                "--time time_of_day --unit deg --command T --position A"),
+    "a percent sign": ("time,cmd,pos\n" + "".join(
+        f"{t},{60 * c:.2f}%,{60 * p:.2f}%\n" for t, c, p in LOG), "--unit percent:3.5"),
     "a current angle": (each("Millis:{m}\tTarget:{c}\tCurrent:{p}", DEGREES),
                         "--time Millis --unit deg --command Target --position Current"),
     "counts without names": ("".join(
