@@ -99,6 +99,7 @@ _GROUP_MARKS = "['’\u00a0\u2009\u202f]"
 _GROUPED = re.compile(rf"(?<![\w.,'’])[+-]?\d{{1,3}}(?:{_GROUP_MARKS}\d{{3}})+(?![\w'’])")
 _COLOUR = re.compile(r"\x1b\[[\d;]*m")  # of a terminal
 _WRAPPED = re.compile(r"\b(?:tensor|array)\((?:'\w', ?)?(\[[^\]\n]*\])[^()\n]{0,80}\)")
+_COLON = re.compile(r"^[ \t]*(\d+(?:\.\d+)?):(?=[ \t])", re.MULTILINE)  # behind a time
 _CHECKSUM = re.compile(r"\*[0-9A-F]{2}[ \t]*$", re.MULTILINE)  # of NMEA's lines
 _BOX = re.compile("[\u2500-\u257f]")  # lines around cells
 _NUMPY = re.compile(r"\bnp\.\w+\(([-+.\w]+)\)")
@@ -117,8 +118,10 @@ _UNITS = (
 _UNIT = re.compile(rf"[(\[<{{]?\s*({_UNITS}|raw|-|1|none)\s*[)\]>}}]?", re.IGNORECASE)
 _WORD_OF = {"%": "percent"}  # in names, whose marks separate words
 _ANGLE_UNIT = re.compile(r"rad(ians?)?|deg(rees?)?|°|turns?|rev|counts?|ticks?", re.IGNORECASE)
-_WITH_UNIT = re.compile(rf"([-+]?[\d.]+(?:[eE][-+]?\d+)?) ?({_UNITS})", re.IGNORECASE)
-_NAMED_LIST = re.compile(r"([A-Za-z_][\w./]*)\s*[:=]\s*[\[(]\s*([-+.\deE,; \t]+?)\s*[\])]")
+_WITH_UNIT = re.compile(rf"([-+]?[\d.,]+(?:[eE][-+]?\d+)?) ?({_UNITS})", re.IGNORECASE)
+_NAMED_LIST = re.compile(
+    r"([A-Za-z_][\w./]*)(?:\s*[:=]\s*[\[(]|(?<=\w\w) +\[)\s*([-+.\deE,; \t]+?)\s*[\])]"
+)
 _PAIR, _LONG_PAIR = (  # with names of a word, or of two
     re.compile(
         rf"(?<![\w\"'])[\"']?([A-Za-z_][\w./]*{more})[\"']?\s*[:=]\s*"
@@ -133,7 +136,7 @@ _STAMPED = re.compile(
     r"(?:\[?((?:\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,]\d+)?)\]?|"
     r"[(\[][ \t]*(\d+\.\d+|\d+(?=[ \t]*[mu]?s))[ \t]*([mu]?s)?[ \t]*[)\]]|"
     r"[EWIDV] \((\d+)\) [\w.-]+:)"  # ESP-IDF's milliseconds and tag
-    r"[ \t]*(?:->|[|:>])?[ \t]+(?=\S)",
+    r"[ \t]*(?:->|[|:>])?[ \t]+(?![AP]M)(?=\S)",
     re.MULTILINE,
 )
 _REMARK = re.compile(r"\W*\w+\W*:$")  # a first word such as WARN: or [INFO]:
@@ -245,6 +248,8 @@ def _usual_numbers(text: str, rows: Sequence[str]) -> str:
         text = _HEX.sub(lambda m: str(int(m[0], 16)), text)
     if "│" in text[:_SAMPLE] or "┃" in text[:_SAMPLE]:
         text = _BOX.sub("-", re.sub("[│┃]", "|", text))
+    if all(_COLON.match(row) for row in rows):
+        text = _COLON.sub(r"\1", text)
     if all(_CHECKSUM.search(row) for row in rows):
         text = _CHECKSUM.sub("", text)
     if "---" in text[:_SAMPLE] or "===" in text[:_SAMPLE]:
@@ -312,7 +317,7 @@ def _shape(rows: Sequence[str]) -> _Shape | None:
                 sum(_number(row[k], comma) for row in cells) / len(cells) for k in range(columns)
             ]
             full = tuple(any(row[k] for row in cells) for k in range(columns))
-            units = {} if separator == " " else _units_of(cells, shares)
+            units = {} if separator == " " else _units_of(cells, shares, comma)
             shares = [1.0 if k in units else share for k, share in enumerate(shares)]
             if sum(shares) > most * columns:
                 most = sum(shares) / columns
@@ -324,14 +329,16 @@ def _shape(rows: Sequence[str]) -> _Shape | None:
     return best if best is not None and any(best.numeric) else None
 
 
-def _units_of(cells: Sequence[Sequence[str]], shares: Sequence[float]) -> dict[int, str]:
+def _units_of(
+    cells: Sequence[Sequence[str]], shares: Sequence[float], comma: bool
+) -> dict[int, str]:
     """Columns, of such shares of numbers, in which one unit stands behind each; and the unit."""
     units = {}
     for k, share in enumerate(shares):
         matches = (
             [] if share >= _NUMERIC else [_WITH_UNIT.fullmatch(row[k]) for row in cells if row[k]]
         )
-        words = {m[2] if m else "" for m in matches}
+        words = {m[2] if m and _number(m[1], comma) else "" for m in matches}
         if len(words) == 1 and "" not in words:
             units[k] = words.pop()
     return units

@@ -68,7 +68,8 @@ _TRIALS = ("trial", "episode_index", "episode", "loop", "run", "segment")
 _TONES = ("frequency_hz", "freq_hz", "frequency", "freq")
 SERIES = ("name", "signal", "event", "type", "kind", "variable", "topic", "field", "series",
            "metric", "key", "channel", "_field", "_measurement", "op", "operation", "direction",
-           "dir", "param", "parameter", "quantity", "label", "source")  # fmt: skip
+           "dir", "param", "parameter", "quantity", "label", "source", "item",
+           "register")  # fmt: skip
 _VALUES = ("value", "values", "val", "_value", "data")
 GROUPS = ("leg", "limb", "arm", "side", "joint", "joint_name", "motor", "motor_name", "servo",
            "servo_name", "actuator", "name", "axis", "dof", "motor_idx", "motor_id", "motor_index",

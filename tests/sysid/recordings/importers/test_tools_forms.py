@@ -92,6 +92,8 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
         "motor_1 motor_2"),
     "units behind named numbers": (
         each("t = {m} ms | target = {c!r}° | actual = {p!r}°", DEGREES), "joint"),
+    "vectors behind names": (
+        each("{t} target [{c} {d}] actual [{p} {q}]", BOTH), "joint_0 joint_1"),
     "journald": (each("May 04 12:30:{t:09.6f} pi servo[812]: cmd={c} pos={p}"), "joint"),
     "angle brackets": ("time,cmd,pos\n" + each("<{t},{c},{p}>"), "joint"),
     "names of two words": (
@@ -118,6 +120,8 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
         "s,deg,deg\ntime,cmd,pos\n" + each("{t},{c!r},{p!r}", DEGREES), "joint"),
     "a unit in a remark": (
         "Bench 3 (angles in degrees)\ntime,cmd,pos\n" + each("{t},{c!r},{p!r}", DEGREES), "joint"),
+    "units behind decimal commas": ("Zeit;Soll;Ist\n" + "".join(
+        f"{1e3 * t:.1f} ms;{c!r} °;{p!r} °\n".replace(".", ",") for t, c, p in DEGREES), "joint"),
     "centidegrees": ("t,cmd (cdeg),pos (cdeg)\n" + "".join(
         f"{t},{18000 / np.pi * c!r},{18000 / np.pi * p!r}\n" for t, c, p in LOG), "joint"),
     "numbers of NumPy": (each("np.float64({t}), np.float32({c}), np.float64({p})").join((
@@ -162,6 +166,8 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "days of a spreadsheet": ("Timestamp,Goal,Present\n" + "".join(
         f"{46146 + t / 86400:.12f},{c},{p}\n" for t, c, p in LOG), "joint"),
     "afternoon": ("Time,Goal,Present\n" + each("5/4/2026 12:30:{t:06.3f} PM,{c},{p}"), "joint"),
+    "afternoon without a date": (
+        "Time;Goal;Present\n" + each("1:30:{t:06.3f} PM;{c};{p}"), "joint"),
     "milliseconds behind a colon": ("Time,Goal,Present\n" + "".join(
         f"12:30:00:{1e3 * t:03.0f},{c},{p}\n" for t, c, p in LOG), "joint"),
     "milliseconds beside": ("time,ms,goal,present\n" + each("12:30:01,{m},{c},{p}"), "joint"),
@@ -178,6 +184,8 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "a kind and a joint": ("time,joint,kind,angle\n" + each(
         "{t},knee,target,{c}\n{t},knee,measured,{p}\n{t},hip,target,{d}\n{t},hip,measured,{q}",
         BOTH), "knee hip"),
+    "Dynamixel's Wizard": ("Time,ID,Item,Value\n" + each(
+        "{m},1,Goal Position,{c}\n{m},1,Present Position,{p}"), "motor_1"),
     "writes and reads": ("time,op,id,value\n" + each("{t},write,1,{c}\n{t},read,1,{p}"),
                          "motor_1"),
     "commands as they change": ("time,cmd,pos\n" + "".join(
@@ -243,6 +251,7 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
     "a clock without names": (each("2026-05-04 12:30:{t:06.3f}\t{c}\t{p}"), "--time time_of_day"),
     "Dynamixel's example": (each("[ID:001] GoalPos:{c:03d}  PresPos:{p:03d}", COUNTS),
                             "--rate 50 --unit counts:4096 --command GoalPos"),
+    "arrows": (each("{t}: {c} -> {p}"), "--time 0 --command 1 --position 3"),
     "NMEA": (each("$SRV,{m},{c},{p}*5A"), "--time 1 --command 2 --position 3"),
     "a counter called loop": ("loop,cmd,pos\n" + each("{n},{c},{p}"), "--rate 50 --command cmd"),
     "letters": (each("[2026-05-04 12:30:{t:06.3f}] T:{c} A:{p}", DEGREES),
