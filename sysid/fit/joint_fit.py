@@ -891,7 +891,8 @@ def _foreign(joint: str, carried: Fitted) -> Iterator[str]:
         apart = float(p.encode(value) - p.encode(p.nominal))
         if p.prior_source and abs(apart) > _FOREIGN * p.marginal_sd:
             yield (
-                f"{joint}: {_shown(p.name)} is {np.exp(apart):.2g} times that of {p.prior_source}, "
+                f"{joint}: {_words(_shown(p.name))} is {np.exp(apart):.2g} times that of "
+                f"{p.prior_source}, "
                 "which units of one servo do not differ by. Is it the same servo at the same gain? "
                 "Calibrate without that prior if not."
             )
@@ -900,7 +901,8 @@ def _foreign(joint: str, carried: Fitted) -> Iterator[str]:
 def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) -> Iterator[str]:
     if why := undescribed(goodness):
         worst = max((r, name) for name, r in goodness.items() if np.isfinite(r))
-        yield f"{joint}: {why} ({worst[0]:.1f} at {worst[1]}). The lag holds; gains do not."
+        at = f" ({worst[0]:.1f} at {worst[1]})" if overall(goodness) > DESCRIBED else ""
+        yield f"{joint}: {why}{at}. The lag holds; gains do not."
     elif not np.isfinite(overall(goodness)):
         yield f"{joint}: too few readings to say how well the model describes this servo."
     if choice.misfit is not None:
@@ -1108,9 +1110,8 @@ def _free_warnings(
             "time and gains cover both. Faster tones at a smaller amplitude separate them "
             "(`pupper-sysid plan`)."
         )
-    for name in ("effort_rad_s2", "friction_rad_s2", "stiffness_per_s2", "damping_per_s"):
-        if name in pd.undecided:
-            yield f"{joint}: {words_of(name)} is not identified: {pd.undecided[name]}."
+    gains = ("effort_rad_s2", "friction_rad_s2", "stiffness_per_s2", "damping_per_s")
+    yield from unidentified(joint, {n: pd.undecided[n] for n in gains if n in pd.undecided})
     own = pd.scores.rmse_unseen_rad
     if chosen != carried:
         best = results[chosen].scores.rmse_unseen_rad
@@ -1355,12 +1356,23 @@ def _summary(fitted: Fitted, runs: Sequence[Run], choice: _Choice) -> StructureF
     )
 
 
-_NAMED = {"duty_s_per_rad": "damping"}  # as a share of the duty
+def _words(name: str) -> str:
+    return "damping" if name == "duty_s_per_rad" else words_of(name)  # as a share of the duty
+
+
+def unidentified(joint: str, undecided: Mapping[str, str]) -> Iterator[str]:
+    """A sentence for each reason why numbers are not identified."""
+    by_reason: dict[str, list[str]] = {}
+    for name, why in undecided.items():
+        by_reason.setdefault(why, []).append(_words(name))
+    for why, names in by_reason.items():
+        *most, last = names
+        listed = f"{', '.join(most)} and {last} are" if most else f"{last} is"
+        yield f"{joint}: {listed} not identified: {why}."
 
 
 def _load_warnings(joint: str, loaded: LoadedFit) -> Iterator[str]:
-    for name, why in loaded.undecided.items():
-        yield f"{joint}: {_NAMED.get(name, words_of(name))} is not identified: {why}."
+    yield from unidentified(joint, loaded.undecided)
     if lost := loaded.servo.beyond_delayed_pd():
         yield (
             f"{joint}: simulators' actuators do not carry {', '.join(lost)}; DelayedPD has the "

@@ -10,7 +10,7 @@ import pytest
 
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
-from pupper_sysid.sysid.fit.joint_fit import undescribed
+from pupper_sysid.sysid.fit.joint_fit import undescribed, unidentified
 from pupper_sysid.sysid.fit.kernel import edges_of
 from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, filtered
 from pupper_sysid.sysid.fit.run import Run, free_run
@@ -90,6 +90,14 @@ def test_one_motion_that_is_not_described_is_a_misfit_among_others_that_are():
     assert undescribed(others | {"7 Hz": 2.0}) is None and undescribed({}) is None
     assert "in the motion 7 Hz: its errors are 2.5 times" in undescribed(others | {"7 Hz": 2.5})
     assert "its errors are 3.0 times the noise" in undescribed({"7 Hz": 3.0})
+
+
+def test_numbers_that_are_unknown_for_one_reason_share_a_sentence():
+    reasons = {"stiffness_per_s2": "too slow", "friction_rad_s2": "no load", "damping": "too slow"}
+    assert list(unidentified("knee", reasons)) == [
+        "knee: stiffness and damping are not identified: too slow.",
+        "knee: friction loss is not identified: no load.",
+    ]
 
 
 def test_a_filter_of_a_step_command_rises_as_an_exponential():
