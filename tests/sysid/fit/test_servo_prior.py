@@ -114,4 +114,4 @@ def test_numbers_that_no_unit_of_the_servo_has_are_named():
     far = structure.prior[0] + np.log(5.0) * (np.arange(len(structure.names)) == place)
     assert list(_foreign("pan", usual)) == []
     (sentence,) = _foreign("pan", Fitted(structure, Fit(far, 0.0)))
-    assert "velocity_limit_rad_s is 5 times that of sample" in sentence
+    assert "velocity limit is 5 times that of sample" in sentence
