@@ -215,7 +215,8 @@ class _Screen:
         try:
             with ExitStack() as opened:
                 file = opened.enter_context(replacing(self._path, options.force, hold=False))
-                self._film = Film(file, self._model, step_s, lines, options.command)
+                scale = self._env.body.scale
+                self._film = Film(file, self._model, step_s, lines, options.command, scale)
                 self._files.push(opened.pop_all())  # the file is kept if the walk is
         except InputError as error:
             if "imageio" in str(error):

@@ -20,9 +20,11 @@ from pupper_sysid.common.errors import InputError
 SIZE = (720, 1280)
 """Height and width [pixels]."""
 _AZIMUTH_DEG, _ELEVATION_DEG, _DISTANCE_M = 125.0, -18.0, 0.62
+_HEIGHT_M = 0.06  # at which the camera looks
+_HIDDEN_GROUP = 3  # of geoms, from which on MuJoCo draws none
 _FOLLOW = 0.1  # share of the way to the robot that the camera goes with each picture
 _MEAN_S = 1.0
-_TEXT = (30, 34, 40)
+_TEXT, _EDGE = (30, 34, 40), (255, 255, 255)
 
 
 class Film:
@@ -39,12 +41,17 @@ class Film:
         Said in every picture: policy, servos.
     command : sequence of float, length 3
         Forward and sideways speed [m/s], turn rate [rad/s].
+    scale : float
+        Size of the robot over the Mini Pupper's (`sim.robot.body.Body.scale`).
     """
 
     def __init__(
-        self, path: Path, model: Any, step_s: float, lines: Sequence[str], command: Sequence[float]
-    ):
+        self, path: Path, model: Any, step_s: float, lines: Sequence[str], command: Sequence[float],
+        scale: float = 1.0,
+    ):  # fmt: skip
         self._mujoco: Any = importlib.import_module("mujoco")
+        frame = model.vis.global_  # of a user's model it may be smaller
+        frame.offheight, frame.offwidth = np.maximum((frame.offheight, frame.offwidth), SIZE)
         try:
             self._renderer = self._mujoco.Renderer(model, *SIZE)
         except Exception as error:  # EGL, OSMesa and GLFW each fail in their own way
@@ -67,7 +74,11 @@ class Film:
         self._velocity: deque[NDArray[np.float64]] = deque(maxlen=max(1, round(_MEAN_S / step_s)))
         self._camera = self._mujoco.MjvCamera()
         self._camera.azimuth, self._camera.elevation = _AZIMUTH_DEG, _ELEVATION_DEG
-        self._camera.distance = _DISTANCE_M
+        self._camera.distance = _DISTANCE_M * scale
+        self._height_m = _HEIGHT_M * scale
+        self._shown = self._mujoco.MjvOption()
+        if not (model.geom_group[model.geom_bodyid > 0] < _HIDDEN_GROUP).any():
+            self._shown.geomgroup[:] = 1  # a robot without meshes is drawn as what collides
         self._pictures = 0
 
     def add(self, data: Any, velocity: NDArray[np.float64]) -> None:
@@ -80,8 +91,8 @@ class Film:
         at, trunk = self._camera.lookat, data.qpos[:3]
         share = _FOLLOW if self._pictures else 1.0
         at[:2] += share * (trunk[:2] - at[:2])
-        at[2] = 0.06
-        self._renderer.update_scene(data, camera=self._camera)
+        at[2] = self._height_m
+        self._renderer.update_scene(data, camera=self._camera, scene_option=self._shown)
         self._writer.append_data(self._written(self._renderer.render()))
         self._pictures += 1
 
@@ -108,5 +119,8 @@ class Film:
             f"last {_MEAN_S:g} s {speeds.format(*mean)}",
         ]
         for n, row in enumerate(rows):
-            drawn.text((28, 24 + 32 * n), row, fill=_TEXT, font=self._font)
+            drawn.text(
+                (28, 24 + 32 * n), row, fill=_TEXT, font=self._font, stroke_width=2,
+                stroke_fill=_EDGE,
+            )  # fmt: skip
         return np.asarray(image)

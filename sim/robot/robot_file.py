@@ -624,13 +624,20 @@ class _Reader:
             text = own.to_xml()
             at = text.index("<worldbody>") + len("<worldbody>")
             text = text[:at] + ground.xml + text[at:]
+            skybox = mujoco.mjtTexture.mjTEXTURE_SKYBOX
+            drawn = physics == "evaluation" and all(t.type != skybox for t in own.textures)
+            sky = _SKY if drawn else ""
             return text.replace(
-                "<worldbody>", f"<asset>{_GRID}{ground.assets}</asset><worldbody>", 1
+                "<worldbody>", f"<asset>{_GRID}{sky}{ground.assets}</asset><worldbody>", 1
             )
 
         return xml
 
 
+_SKY = (
+    '<texture name="sky of the walk" type="skybox" builtin="gradient" rgb1="0.95 0.97 1" '
+    'rgb2="0.7 0.8 0.95" width="64" height="64"/>'
+)
 _GRID = (
     '<texture name="grid" type="2d" builtin="checker" rgb1="0.80 0.83 0.87" rgb2="0.68 0.72 0.77" '
     'width="300" height="300"/><material name="grid" texture="grid" texrepeat="5 5" '

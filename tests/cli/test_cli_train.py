@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from pupper_sysid.common.results import plain
 from pupper_sysid.policies.evaluation.evaluate import BATTERY
 from pupper_sysid.policies.train.learner import read_checkpoint
 from pupper_sysid.policies.train.run_file import load_run, preset
-from pupper_sysid.policies.walks.film import SIZE
+from pupper_sysid.policies.walks.film import SIZE, Film
 from pupper_sysid.sim.walking import env
 from support.command_line import refused
 from support.command_line import run_program as run
@@ -330,6 +331,39 @@ def test_a_video_runs_as_fast_as_the_robot_at_any_control_rate(capsys, trained, 
     assert told["fps"] == pytest.approx(25) and told["pictures"] == 10
     # policy, speeds and time stand at the top of each picture
     assert told["written"][:160].sum() > 500 and not told["written"][200:].any()
+
+
+def test_a_robot_of_another_size_whose_shapes_are_hidden_is_drawn(tmp_path, monkeypatch):
+    import mujoco
+
+    imageio = pytest.importorskip("imageio.v2")
+    shown = {}
+
+    class Screen:
+        def __init__(self, model, height, width):
+            assert model.vis.global_.offheight >= height and model.vis.global_.offwidth >= width
+
+        def update_scene(self, data, camera, scene_option):
+            shown.update(groups=scene_option.geomgroup.tolist(), distance_m=camera.distance)
+
+        def render(self):
+            return np.zeros((*SIZE, 3), np.uint8)
+
+    monkeypatch.setattr(mujoco, "Renderer", Screen)
+    monkeypatch.setattr(imageio, "get_writer", lambda *_, **__: SimpleNamespace(
+        append_data=lambda picture: None
+    ))  # fmt: skip
+    distances = []
+    for group, scale in ((3, 4.0), (0, 1.0)):
+        model = mujoco.MjModel.from_xml_string(
+            '<mujoco><worldbody><geom type="plane" size="1 1 1"/><body><freejoint/>'
+            f'<geom size="0.1" group="{group}"/></body></worldbody></mujoco>'
+        )
+        film = Film(tmp_path / "walk.mp4", model, 0.02, ("a",), (0.1, 0.0, 0.0), scale)
+        film.add(mujoco.MjData(model), np.zeros(3))
+        assert shown["groups"][3] == (group == 3) and shown["groups"][0] == 1
+        distances.append(shown["distance_m"])
+    assert distances[0] == pytest.approx(4 * distances[1])
 
 
 def test_where_no_window_opens_that_is_said(capsys, trained, monkeypatch):
