@@ -17,6 +17,7 @@ silently.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from threading import RLock
 from typing import Any, Protocol
 
 import numpy as np
@@ -218,10 +219,13 @@ class ServoBench:
         self.index_of_id = {i: k for k, i in enumerate(self.map.ids)}
         self.supply_v, self.keep_log = SUPPLY_V, keep_log
         self.commands: list[tuple[float, int, int]] = []
+        # a simulation that two threads step at once breaks, and starts anew at zero
+        self._alone = RLock()
 
     def command(self, index: int, time_s: float, count: int) -> None:
         """Command one servo from `time_s` on, which must not go backwards."""
-        self.plant.command(index, time_s, (count - self._zero[index]) / self._scale[index])
+        with self._alone:
+            self.plant.command(index, time_s, (count - self._zero[index]) / self._scale[index])
         if self.keep_log:
             self.commands.append((time_s, index, count))
 
@@ -231,15 +235,17 @@ class ServoBench:
             return
         self._on[index] = on
         self.hand_rad[index] = 0.0
-        self.plant.torque(index, time_s, on)
+        with self._alone:
+            self.plant.torque(index, time_s, on)
 
     def is_on(self, index: int) -> bool:
         """Whether the servo holds."""
         return bool(self._on[index])
 
     def angle(self, index: int, time_s: float) -> float:
-        """True angle of a servo [rad], servo coordinates."""
-        return self.plant.angle(index, time_s) + float(self.hand_rad[index])
+        """True angle of a servo [rad], servo coordinates; from any thread."""
+        with self._alone:
+            return self.plant.angle(index, time_s) + float(self.hand_rad[index])
 
     def move_by_hand(self, index: int, by_rad: float | None) -> None:
         """Move a limp servo by an angle [rad], or (None) back to where it went limp."""
