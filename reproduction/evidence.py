@@ -44,6 +44,7 @@ SCALES_RAD = (0.45, 0.6, 0.75)
 """Of the published deployments."""
 _EXTRA_DELAYS_MS = (0, 80, 160, 320)
 _LAST_UPDATES = 10
+_CURVES = ("reward", "std", "episode_steps")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,8 +159,8 @@ def training(folder: Path) -> Training:
     if not (folder / PROGRESS).is_file():
         raise InputError(f"{folder} has no {PROGRESS}: nothing was trained yet.")
     step_s, table = run.task.control_step_s, pd.read_csv(folder / PROGRESS).astype(float)
-    last = table.tail(_LAST_UPDATES).mean()
-    took = (table["collect_s"] + table["update_s"]).sum()
+    last = {name: float(table[name].to_numpy()[-_LAST_UPDATES:].mean()) for name in _CURVES}
+    took = float(table["collect_s"].to_numpy().sum() + table["update_s"].to_numpy().sum())
     return Training(
         folder.name, run.architecture.kind, last["reward"] / step_s, last["std"],
         float(table["samples"].iloc[-1] / took), 1e-6 * float(table["samples"].iloc[-1]),
