@@ -103,9 +103,8 @@ _COLON = re.compile(r"^[ \t]*(\d+(?:\.\d+)?):(?=[ \t])", re.MULTILINE)  # behind
 _CHECKSUM = re.compile(r"\*[0-9A-F]{2}[ \t]*$", re.MULTILINE)  # of NMEA's lines
 _BOX = re.compile("[\u2500-\u257f]")  # lines around cells
 _NUMPY = re.compile(r"\bnp\.\w+\(([-+.\w]+)\)")
-_RULE = re.compile(
-    r"^[ \t|+:]*[-=]{3}[-=+ |:\t]*$", re.MULTILINE
-)  # below the names of a printed table
+# below the names of a printed table
+_RULE = re.compile(r"^[ \t|+:]*[-=]{3}[-=+ |:\t]*$", re.MULTILINE)
 _SINGLE = re.compile(r"(?:^|[,;\t|])'[^',;\t|\n]*'")
 _QUOTED_GROUPS = re.compile(r'"([+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?)"')
 _COMMA_GROUPS = re.compile(r"(?<![\w.,])[+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?(?![\w,])")

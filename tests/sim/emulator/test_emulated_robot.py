@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from threading import Thread
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,8 +15,9 @@ import yaml
 
 from pupper_sysid.common.errors import BusError, FileExistsRefusal, InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
-from pupper_sysid.sim.emulator.bench import PollSchedule
+from pupper_sysid.sim.emulator.bench import PollSchedule, ServoBench
 from pupper_sysid.sim.emulator.bus import TRUTH_COLUMNS, EmulatedBus
 from pupper_sysid.sim.emulator.free_air import FreeAirServo
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
@@ -286,3 +290,29 @@ def test_a_minute_in_virtual_time_takes_seconds_and_in_real_time_as_long_as_it_s
     real.sleep_until(start + 0.3)
     end, after = real.now(), time.monotonic()
     assert 0.3 <= end - start <= after - before + 1e-5  # to the microsecond
+
+
+def test_a_bench_is_simulated_by_one_thread_at_a_time():
+    """A simulation that two threads step at once breaks, and starts anew at zero."""
+    inside, most = [0], []
+
+    def alone(*_) -> float:
+        inside[0] += 1
+        most.append(inside[0])
+        time.sleep(0.001)
+        inside[0] -= 1
+        return 0.0
+
+    plant: Any = SimpleNamespace(angle=alone, command=alone)
+    robot = draw_robot(np.random.default_rng(0), RobotSpec())
+    bench = ServoBench(
+        robot, load_joint_map("mini_pupper_2"), np.random.default_rng(0), plant=plant
+    )
+    looks = [Thread(target=lambda: [bench.angle(0, 0.0) for _ in range(20)]) for _ in range(2)]
+    for thread in looks:
+        thread.start()
+    for _ in range(20):
+        bench.command(0, 0.0, 2048)
+    for thread in looks:
+        thread.join()
+    assert len(most) == 60 and max(most) == 1
