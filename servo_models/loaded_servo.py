@@ -272,9 +272,14 @@ def _steps(delayed, on, volts, positions, position, velocity, setpoint, rates, t
             y, v, target = position[n], velocity[n], setpoint[n]
             way = delayed[k, n] - target
             if np.isfinite(ramp):
-                rate = min(math.sqrt(2.0 * ramp * abs(way)), abs(way) / h) * np.sign(way)
-                rates[n] += min(max(rate - rates[n], -ramp * h), ramp * h)
-                target += rates[n] * h
+                # at which the step may end for the set-point to come to rest at the command
+                brake = 0.5 * h * ramp
+                toward = rates[n] * np.sign(way)
+                room = max(brake**2 + 2.0 * (ramp * abs(way) - brake * toward), brake**2)
+                rate = min(math.sqrt(room) - brake, abs(way) / h) * np.sign(way)
+                change = min(max(rate - rates[n], -ramp * h), ramp * h)
+                target += (rates[n] + 0.5 * change) * h
+                rates[n] += change
             else:
                 target = delayed[k, n]
             error = target - y

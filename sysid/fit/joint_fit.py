@@ -29,7 +29,7 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, DESCRIBED_ONE, goodness_of_fit, overall
-from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations
+from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, with_delays
 from pupper_sysid.sysid.fit.noise import command_jitter, noise_by_run
 from pupper_sysid.sysid.fit.posterior import (
     EFFECTIVE,
@@ -593,8 +593,10 @@ def _explained(ready: PreparedJoint, choice: _Choice, anew: bool = False) -> _Ch
     likely.sort(key=lambda one: -one.nats)
     named = decided(likely)
     if named is not None:
+        named = with_delays(named, likely, carried.temperature)
         age = ready.lag.feedback.time_doubt_s
-        named = replace(named, dead_time_s=max(named.dead_time_s - age, 0.0))
+        dead, *ends = (max(t - age, 0.0) for t in (named.dead_time_s, *named.delays_s))
+        named = replace(named, dead_time_s=dead, delays_s=(ends[0], ends[1]))
     elif likely and carried.draws is not None and ready.scales.free_air:
         choice = _stacked(ready, choice, likely)
     return replace(choice, misfit=named)
@@ -842,7 +844,9 @@ def _lag(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, float]) -
     if np.isfinite(lag_s.high):  # the dynamics lag, too
         wide = replace(wide, high=max(min(wide.high, lag_s.high), dead.high))
     if choice.misfit is not None:
+        shortest, longest = choice.misfit.delays_s
         wide = _with_other(wide, dead, choice.misfit.dead_time_s)
+        wide = replace(wide, low=min(wide.low, shortest), high=max(wide.high, longest))
     return replace(choice.lag, dead_time_s=replace(wide, low=max(wide.low, 0.0)))
 
 

@@ -255,9 +255,11 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
                     weight = 1.0 - share[i] if part_of else share[i]
                     way = (after[i] if part_of else before[i]) - s[i]
                     long = h * weight if weight > 1e-6 else 1e-6 * h
-                    # from which the profile comes to rest at the command
+                    # at which the step may end for the profile to come to rest at the command
                     brake = 0.5 * long * most
-                    fastest = np.sqrt(brake * brake + 2.0 * most * abs(way)) - brake
+                    toward = rate[i] if way > 0.0 else -rate[i]
+                    room = brake * brake + 2.0 * (most * abs(way) - brake * toward)
+                    fastest = np.sqrt(room if room > brake * brake else brake * brake) - brake
                     fastest = fastest if fastest < p[6, i] / h else p[6, i] / h
                     change = clip(clip(way / long, fastest) - rate[i], most * long)
                     rate[i] += change

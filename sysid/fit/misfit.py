@@ -25,6 +25,8 @@ from pupper_sysid.sysid.fit.structure import Structure, servo_structure
 
 _LOW_PASS_S = (0.004, 0.008, 0.016, 0.032, 0.064)
 """Time constants that are tried: below the first a filter is a delay, above the last a slow one."""
+_BETWEEN, _NEAR_BY = (0.71, 1.41, 0.84, 1.19), (0.92, 1.09, 0.96, 1.04)
+"""Factors about the likeliest: all between two that were tried, then more closely."""
 _SEARCHED_S = 0.016
 """Time constant from which a fit with a filter may lie far from the fit without it."""
 _NATS = 10.0
@@ -33,6 +35,8 @@ _POSSIBLE_NATS = -3.0
 """Logarithm of a twentieth: an explanation that is less likely moves no end of a 90 % interval."""
 _WITHIN_NATS = float(ndtri(0.5 + LEVEL / 2)) ** 2 / 2
 """Log-likelihood that a number at the end of its interval costs."""
+_DELAY_STEP_S, _DELAY_STEPS = 0.0005, 14
+"""First step to another dead time, half as long again each time, and how many at most: 0.3 s."""
 _SHARES = np.array([0.4, 0.7, 0.95])
 """Of what friction holds back: parts that a dead zone or play is given at the start."""
 _LEFT = (0.3, 0.05)
@@ -93,6 +97,10 @@ class Explanation:
         Its posterior density over that of the fit alone, 1 at most.
     point : ndarray, shape (parameters,), optional
         The carried structure's numbers in the fit with it, in fitted coordinates.
+    fitted : (Problem, Fit), optional
+        With it.
+    delays_s : tuple of float
+        The shortest and the longest dead time with it.
     """
 
     words: str
@@ -100,6 +108,8 @@ class Explanation:
     dead_time_s: float
     weight: float = 1.0
     point: NDArray[np.float64] | None = None
+    fitted: tuple[Problem, Fit] | None = None
+    delays_s: tuple[float, float] = (np.inf, -np.inf)
 
     @property
     def claim(self) -> str:
@@ -144,6 +154,52 @@ def decided(likely: Sequence[Explanation]) -> Explanation | None:
     return next((one for one in likely if one.nats > _NATS), None)
 
 
+def with_delays(
+    best: Explanation, likely: Sequence[Explanation], temperature: float
+) -> Explanation:
+    """The best explanation with the dead times that those as likely as it allow.
+
+    Parameters
+    ----------
+    best : Explanation
+    likely : sequence of Explanation
+        All, the best one among them.
+    temperature : float
+        How many readings count as one.
+    """
+    ends = [best.dead_time_s]
+    for one in likely:
+        room = one.nats - best.nats + _WITHIN_NATS
+        if one.fitted is not None and room >= 0:
+            ends += [_end(*one.fitted, temperature, room, way) for way in (-1.0, 1.0)]
+    return replace(best, delays_s=(min(ends), max(ends)))
+
+
+def _end(problem: Problem, fit: Fit, temperature: float, room: float, way: float) -> float:
+    """The dead time [s] to one side of a fit's at which the log-likelihood has lost `room`.
+
+    All other numbers are fitted anew: gains trade against a delay along ridges that are longer than
+    the scatter about one point of them.
+    """
+    structure = problem.structure
+    first, least = structure.parameters[0], _tempered(problem, fit, temperature)
+    point, delay, lost = fit.point, float(structure.decode(fit.point)[0]), 0.0
+    step = _DELAY_STEP_S
+    for _ in range(_DELAY_STEPS):
+        there = float(np.clip(delay + way * step, first.low, first.high))
+        if there == delay:
+            break
+        there_only = replace(first, low=there, high=there)
+        at = replace(structure, parameters=(there_only, *structure.parameters[1:]))
+        start = np.concatenate([[first.encode(there)], point[1:]])
+        best = refine(replace(problem, structure=at), start[None])
+        costs = _tempered(problem, best, temperature) - least
+        if costs > room:
+            return delay + (there - delay) * max(room - lost, 0.0) / (costs - lost)
+        point, delay, lost, step = best.point, there, costs, 1.5 * step
+    return delay
+
+
 def filtered(run: Run, time_constant_s: float) -> Run:
     """The run with its command behind a first-order low-pass filter, at rest before."""
     ratio = time_constant_s / run.step_s
@@ -162,7 +218,7 @@ def filtered(run: Run, time_constant_s: float) -> Run:
 def _low_pass(
     problem: Problem, best: Fit, temperature: float, anew: bool, rng: np.random.Generator
 ) -> list[Explanation]:
-    """The likeliest filter, and the slowest that is as likely as none."""
+    """The likeliest filter, and those that are about as likely."""
     structure = problem.structure
     anew = anew and structure.scales.free_air  # under load a search takes minutes
     fits = {}
@@ -176,22 +232,30 @@ def _low_pass(
     middle = min(fits, key=lambda t: fits[t].cost)
     # gains make up for a part of a filter, so that its own lie along a ridge
     fits[middle] = from_about(_behind(problem, middle), fits[middle], rng)
-    for factor in (0.71, 1.41, 0.84, 1.19):  # between the constants that were tried
+    least = _tempered(problem, best, temperature)
+    for factor in _BETWEEN:  # the constants that were tried
         between = middle * factor
         behind = _behind(problem, between)
-        fits[between] = refine(behind, fits[middle].point[None])
+        fits[between] = refine(behind, _earlier(structure, fits[middle].point, between - middle))
         if fits[middle].cost < best.cost:  # there is a filter, so that its constant matters
             fits[between] = from_about(behind, fits[between], rng)
         middle = min(fits, key=lambda t: fits[t].cost)
-    least = _tempered(problem, best, temperature)
+    if least - _tempered(problem, fits[middle], temperature) - 1.0 > _NATS:
+        for factor in _NEAR_BY:
+            between = middle * factor
+            starts = _earlier(structure, fits[middle].point, between - middle)
+            behind = _behind(problem, between)
+            fits[between] = from_about(behind, refine(behind, starts), rng)
+            middle = min(fits, key=lambda t: fits[t].cost)
     nats = {t: least - _tempered(problem, fit, temperature) - 1.0 for t, fit in fits.items()}
-    slowest = max((t for t in fits if nats[t] >= nats[middle] - _WITHIN_NATS), default=middle)
+    as_likely = [t for t in fits if nats[t] >= nats[middle] - _WITHIN_NATS]
     return [
         Explanation(
             f"a low-pass filter of about {1e3 * t:.0f} ms in front of it", nats[t],
             float(structure.decode(fits[t].point)[0]), _weight(nats[t] + 1.0), fits[t].point,
+            (_behind(problem, t), fits[t]),
         )
-        for t in dict.fromkeys((middle, slowest)) if nats[t] + 1.0 >= _POSSIBLE_NATS
+        for t in dict.fromkeys((middle, *as_likely)) if nats[t] + 1.0 >= _POSSIBLE_NATS
     ]  # fmt: skip
 
 
@@ -272,6 +336,7 @@ def _with_feature(
         Explanation(
             feature.words.format(float(wider.decode(fits[k].point)[place]) / feature.unit),
             nats[k] - price, float(wider.decode(fits[k].point)[0]), weight, fits[k].point[shared],
+            (behind, fits[k]),
         )
         for k, weight in chosen.items()
     ]  # fmt: skip

@@ -2,7 +2,7 @@
 
 A run is one trial with its dated readings, its held command, gain, load and torque state. `prepare`
 makes it; every fit, score and comparison reads runs and nothing else. Angles are absolute, because
-gravity depends on them. A run starts at rest at its first reading. The functions below simulate any
+gravity depends on them. A run starts at rest where the joint rested. The functions below simulate any
 number of candidates, which are parameter vectors of one structure; `sysid.fit.kernel` does the
 arithmetic.
 """
@@ -25,6 +25,8 @@ _ACCELERATION = kernel.COLUMNS.index("acceleration_limit")
 SHORTEST_STEP_S = TIME_STEP_S / 4
 """Physics step in which servos are nearly those of continuous time [s]: predictions take it, and
 fits where longer ones would move a number."""
+_LEAST_AT_REST, _SETTLES = 8, 3.0
+"""Readings whose halves can be compared, and the difference [standard errors] of a moving joint."""
 _VOLTAGE_WINDOW_S = 0.1
 """Length of the mean of logged voltages: single ones catch the ripple of the pulse width."""
 
@@ -52,7 +54,7 @@ class Run:
     pad : int
         Steps of rest.
     start_rad : float
-        First reading.
+        Where the joint rested before the first command (`_rest_rad`).
     sample_step, sample_rad : ndarray, shape (samples,)
         Readings that count: time in physics steps from the first command on, and position [rad].
     row_step, held_step : ndarray, shape (rows,)
@@ -191,7 +193,6 @@ def prepare(
         return np.clip((time - start) / step_s, 0.0, steps)
 
     inside = (reading.time_s >= start) & np.isfinite(reading.position_rad)
-    known = trial.position_rad[np.isfinite(trial.position_rad)]
     load, ramp = trial.load, trial.servo.set_point_acceleration_rad_s2
     return Run(
         label=_label(trial),
@@ -203,7 +204,7 @@ def prepare(
         held=held,
         edges=edges,
         pad=pad,
-        start_rad=float(known[0]) if len(known) else trial.initial_command_rad,
+        start_rad=_rest_rad(trial),
         sample_step=to_step(reading.time_s[inside]),
         sample_rad=reading.position_rad[inside],
         row_step=to_step(trial.read_time_s),
@@ -214,6 +215,25 @@ def prepare(
         ramp_known=ramp is not None,
         source=trial.source,
     )  # fmt: skip
+
+
+def _rest_rad(trial: Trial) -> float:
+    """Mean of what was read before a command changed; the first reading of a joint that settles.
+
+    Friction keeps a joint where it rests: until it moves, an error of this is one of all readings.
+    """
+    known = np.isfinite(trial.position_rad)
+    if not known.any():
+        return trial.initial_command_rad
+    changed = np.append(trial.initial_command_rad, trial.command_rad[:-1]) != trial.command_rad
+    moved_s = trial.send_time_s[changed.argmax()] if changed.any() else np.inf
+    rest = trial.position_rad[known & (trial.read_time_s <= moved_s)]
+    if len(rest) < _LEAST_AT_REST:
+        return float(trial.position_rad[known][0])
+    early, late = np.array_split(rest, 2)
+    error = np.std(rest) / np.sqrt(len(early))
+    settles = abs(early.mean() - late.mean()) > _SETTLES * error
+    return float(rest[0] if settles else rest.mean())
 
 
 def _commanded(

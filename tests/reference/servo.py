@@ -77,8 +77,10 @@ def servo(
             way = command - setpoint
             if np.isfinite(limit := w["acceleration_limit"]):
                 long = h * max(part, 1e-6)
-                fastest = np.sqrt((limit * long / 2) ** 2 + 2 * limit * abs(way)) - limit * long / 2
-                fastest = min(fastest, w["velocity_limit"])
+                brake = limit * long / 2  # half of what the rate may change by
+                toward = rate if way > 0 else -rate
+                room = max(brake**2 + 2 * (limit * abs(way) - brake * toward), brake**2)
+                fastest = min(np.sqrt(room) - brake, w["velocity_limit"])
                 wanted_rate = np.clip(way / long, -fastest, fastest)
                 change = np.clip(wanted_rate - rate, -limit * long, limit * long)
                 rate += change

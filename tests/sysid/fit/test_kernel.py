@@ -59,6 +59,24 @@ def compiled(rows, dead_time, signal, gain=1.0, load=NO_LOAD, start=0.1):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("name", ["slew", "profile", "profile of limited speed"])
+def test_the_set_point_moves_in_long_steps_as_in_short_ones(name):
+    """Commands in stairs, as a loop of 50 Hz sends them. An error here is one of the dead time."""
+    stairs = np.repeat(0.3 * np.sin(2.0 * np.arange(90) * 0.02), 10)
+
+    def positions(times: int) -> np.ndarray:
+        signal = np.concatenate([np.zeros(PAD * times), np.repeat(stairs, times)])[None]
+        signals = (signal, kernel.edges_of(signal[0]))
+        row, delay = columns(**BASE, **TERMS[name])[None], np.array([7.0 * times])
+        return kernel.positions(
+            kernel.SERVO, row, delay, *signals, 1.0, NO_LOAD, 0.0, PAD * times, STEP_S / times
+        )[::times, 0]
+
+    exact = positions(64)
+    long, short = (np.sqrt(np.mean((positions(n) - exact) ** 2)) for n in (1, 4))
+    assert long < 1e-4 and short < long / 3
+
+
 @pytest.mark.parametrize("name", TERMS)
 def test_every_term_moves_as_its_equation_says(name):
     row = columns(**BASE, **TERMS[name], offset_rad=0.03)

@@ -12,7 +12,13 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.joint_fit import undescribed, unidentified
 from pupper_sysid.sysid.fit.kernel import edges_of
-from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, filtered
+from pupper_sysid.sysid.fit.misfit import (
+    Explanation,
+    decided,
+    explanations,
+    filtered,
+    with_delays,
+)
 from pupper_sysid.sysid.fit.run import Run, free_run
 from pupper_sysid.sysid.fit.search import Problem, refine
 from pupper_sysid.sysid.fit.structure import (
@@ -125,11 +131,22 @@ def test_a_small_dead_zone_that_does_not_show_leaves_the_friction_open():
 
 
 def test_a_low_pass_filter_is_named_and_its_dead_time_is_the_true_one():
-    found = explanation(candidate(SIMULATED[0]), NUMBERS, 0.016, undescribed=False)
-    assert found is not None
-    constant = re.fullmatch(r"a low-pass filter of about (\d+) ms in front of it", found.words)
+    named = explanation(candidate(SIMULATED[0]), NUMBERS, 0.016, undescribed=False)
+    assert named is not None
+    constant = re.fullmatch(r"a low-pass filter of about (\d+) ms in front of it", named.words)
     assert constant is not None and 13 <= int(constant[1]) <= 19
-    assert found.dead_time_s == pytest.approx(0.015, abs=1e-3)
+    assert named.dead_time_s == pytest.approx(0.015, abs=1e-3)
+
+
+def test_gains_make_up_for_a_part_of_a_filter_so_that_its_dead_time_is_a_range():
+    _, rivals = found(candidate(SIMULATED[0]), NUMBERS, 0.016, undescribed=False)
+    named = with_delays(rivals[0], rivals, 1.0)
+    shortest, longest = named.delays_s
+    assert shortest < named.dead_time_s < longest
+    doubtful = with_delays(rivals[0], rivals, 9.0)  # a ninth of the readings
+    width = longest - shortest
+    assert shortest - width < 0.015 < longest + width
+    assert 2.0 * width < doubtful.delays_s[1] - doubtful.delays_s[0] < 4.0 * width
 
 
 @pytest.mark.parametrize(

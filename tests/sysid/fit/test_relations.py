@@ -173,6 +173,25 @@ def test_a_slower_clock_scales_dead_time_and_gains():
     np.testing.assert_allclose(one, expected, rtol=1e-9)
 
 
+def test_a_run_starts_where_the_joint_rested():
+    """Friction holds a joint where it rests, and with it the error of one noisy reading."""
+    (trial,) = recording("XL330", "steps").trials(JOINT)
+    count = np.arange(len(trial.command_rad))
+    command = np.where(count < 40, 0.1, trial.command_rad)
+    noisy = 0.1 + 2e-3 * np.random.default_rng(0).standard_normal(len(count))
+    lattice = lattice_of((trial,))
+
+    def start_rad(position_rad) -> float:
+        rested = replace(
+            trial, command_rad=command, position_rad=position_rad, initial_command_rad=0.1
+        )
+        return prepare(rested, lattice).start_rad
+
+    assert start_rad(noisy) == pytest.approx(0.1, abs=4 * 2e-3 / np.sqrt(40))
+    settling = noisy - 0.1 * np.exp(-count / 10)
+    assert start_rad(settling) == settling[0]
+
+
 def test_free_air_is_a_load_of_nothing():
     """The servo per inertia and the one in N·m with the same armature move alike."""
     (trial,) = recording("XL330", "steps").trials(JOINT)
