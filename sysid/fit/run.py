@@ -2,8 +2,8 @@
 
 A run is one trial with its dated readings, its held command, gain, load and torque state. `prepare`
 makes it; every fit, score and comparison reads runs and nothing else. Angles are absolute, because
-gravity depends on them. A run starts at rest where the joint rested. The functions below simulate any
-number of candidates, which are parameter vectors of one structure; `sysid.fit.kernel` does the
+gravity depends on them. A run starts at rest, where the joint rested. The functions below simulate
+any number of candidates, which are parameter vectors of one structure; `sysid.fit.kernel` does the
 arithmetic.
 """
 

@@ -146,7 +146,7 @@ def test_gains_make_up_for_a_part_of_a_filter_so_that_its_dead_time_is_a_range()
     doubtful = with_delays(rivals[0], rivals, 9.0)  # a ninth of the readings
     width = longest - shortest
     assert shortest - width < 0.015 < longest + width
-    assert 2.0 * width < doubtful.delays_s[1] - doubtful.delays_s[0] < 4.0 * width
+    assert doubtful.delays_s[1] - doubtful.delays_s[0] > 2.0 * width
 
 
 @pytest.mark.parametrize(
