@@ -21,7 +21,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.fit import search
 from pupper_sysid.sysid.fit.noise import noise_by_run
 from pupper_sysid.sysid.fit.operating_point import loads_in_words
-from pupper_sysid.sysid.fit.posterior import temperature_of
+from pupper_sysid.sysid.fit.posterior import temperature_at
 from pupper_sysid.sysid.fit.run import Run, fresh_residuals
 from pupper_sysid.sysid.fit.search import Fit, Problem
 from pupper_sysid.sysid.fit.structure import Structure
@@ -83,7 +83,7 @@ def check_claimed_load(
     if not structure.scales.known_load:
         return ()
     claim = Problem(structure, runs, noise_rad)
-    temperature = _temperature(claim, fit)
+    temperature = temperature_at(claim, fit)
     unloaded = tuple(replace(run, load=np.zeros(3)) for run in runs)
     bare = Problem(structure, unloaded, noise_rad)
     near = search.refine(bare, _with_armature(structure, fit, structure.scales.inertia)[None])
@@ -95,7 +95,7 @@ def check_claimed_load(
     noise_rad = noise_by_run(residuals, unloaded, least_rad)
     bare, claim = (replace(problem, noise_rad=noise_rad) for problem in (bare, claim))
     free = search.refine(bare, np.array([rough.point, near.point]))
-    temperature = _temperature(bare, free)
+    temperature = temperature_at(bare, free)
     plausible = _plausible(trials, structure)
     loaded = Problem(plausible, runs, noise_rad)
     heaviest = _high(plausible, "armature")
@@ -220,13 +220,6 @@ def _low(structure: Structure, name: str) -> float:
 
 def _high(structure: Structure, name: str) -> float:
     return structure.parameters[structure.names.index(name)].high
-
-
-def _temperature(problem: Problem, fit: Fit) -> float:
-    structure = problem.structure
-    parts = fresh_residuals(structure, structure.decode(fit.point), problem.runs)
-    scaled = [r / n for r, n in zip(parts, problem.noise_rad, strict=True)]
-    return temperature_of(scaled, problem.runs, len(structure.parameters))
 
 
 def _with_armature(structure: Structure, fit: Fit, more: float) -> NDArray[np.float64]:

@@ -19,16 +19,19 @@ from scipy.special import ndtri
 from pupper_sysid.common import filters
 from pupper_sysid.common.interval import LEVEL
 from pupper_sysid.sysid.fit import kernel
+from pupper_sysid.sysid.fit.posterior import temperature_at
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.search import Fit, Problem, from_about, refine, search_widely
 from pupper_sysid.sysid.fit.structure import Structure, servo_structure
 
 _LOW_PASS_S = (0.004, 0.008, 0.016, 0.032, 0.064)
 """Time constants that are tried: below the first a filter is a delay, above the last a slow one."""
+_CLOSER_S = tuple(np.geomspace(0.004, 0.064, 17))
+"""The same where errors are larger than noise, and how many of them are searched widely: of many
+exact readings a constant that is off by a tenth makes no sense."""
+_SEARCHED = 2
 _BETWEEN, _NEAR_BY = (0.71, 1.41, 0.84, 1.19), (0.92, 1.09, 0.96, 1.04)
 """Factors about the likeliest: all between two that were tried, then more closely."""
-_SEARCHED_S = 0.016
-"""Time constant from which a fit with a filter may lie far from the fit without it."""
 _NATS = 10.0
 """Log-likelihood by which an explanation is named."""
 _POSSIBLE_NATS = -3.0
@@ -99,6 +102,8 @@ class Explanation:
         The carried structure's numbers in the fit with it, in fitted coordinates.
     fitted : (Problem, Fit), optional
         With it.
+    temperature : float
+        At which its likelihood is counted: that of the better of the two fits.
     delays_s : tuple of float
         The shortest and the longest dead time with it.
     """
@@ -109,6 +114,7 @@ class Explanation:
     weight: float = 1.0
     point: NDArray[np.float64] | None = None
     fitted: tuple[Problem, Fit] | None = None
+    temperature: float = 1.0
     delays_s: tuple[float, float] = (np.inf, -np.inf)
 
     @property
@@ -146,7 +152,40 @@ def explanations(
     tried = _low_pass(problem, best, temperature, anew, rng)
     for feature in _FEATURES:
         tried += _with_feature(problem, best, temperature, feature, rng)
-    return sorted(tried, key=lambda x: -x.nats)
+    # all at the temperature of the best: a worse fit would excuse itself by its own errors
+    temperature = min([temperature, *(temperature_at(one.problem, one.fit) for one in tried)])
+    explained = [_explanation(one, problem, best, temperature) for one in tried]
+    return sorted((x for x in explained if x is not None), key=lambda x: -x.nats)
+
+
+@dataclass(frozen=True)
+class _Tried:
+    """A fit with one thing more, the numbers that it adds, and the carried structure's in it."""
+
+    words: str
+    problem: Problem
+    fit: Fit
+    price: int
+    shared: Sequence[int]
+    of_readings: bool = False
+    """Whether its weight is that of the readings alone."""
+
+
+def _explanation(
+    tried: _Tried, problem: Problem, best: Fit, temperature: float
+) -> Explanation | None:
+    """What was tried beside the carried fit; None if it is less likely than counts."""
+    fit, behind = tried.fit, tried.problem
+    better = _tempered(problem, best, temperature) - _tempered(behind, fit, temperature)
+    if tried.of_readings:
+        read = (_unlikely(problem, best) - _unlikely(behind, fit)) / temperature
+    if (read if tried.of_readings else better) < _POSSIBLE_NATS:
+        return None
+    return Explanation(
+        tried.words, better - tried.price, float(behind.structure.decode(fit.point)[0]),
+        float(np.exp(min(read if tried.of_readings else better, 0.0))),
+        fit.point[list(tried.shared)], (behind, fit), temperature,
+    )  # fmt: skip
 
 
 def decided(likely: Sequence[Explanation]) -> Explanation | None:
@@ -154,9 +193,7 @@ def decided(likely: Sequence[Explanation]) -> Explanation | None:
     return next((one for one in likely if one.nats > _NATS), None)
 
 
-def with_delays(
-    best: Explanation, likely: Sequence[Explanation], temperature: float
-) -> Explanation:
+def with_delays(best: Explanation, likely: Sequence[Explanation]) -> Explanation:
     """The best explanation with the dead times that those as likely as it allow.
 
     Parameters
@@ -164,14 +201,12 @@ def with_delays(
     best : Explanation
     likely : sequence of Explanation
         All, the best one among them.
-    temperature : float
-        How many readings count as one.
     """
     ends = [best.dead_time_s]
     for one in likely:
         room = one.nats - best.nats + _WITHIN_NATS
         if one.fitted is not None and room >= 0:
-            ends += [_end(*one.fitted, temperature, room, way) for way in (-1.0, 1.0)]
+            ends += [_end(*one.fitted, best.temperature, room, way) for way in (-1.0, 1.0)]
     return replace(best, delays_s=(min(ends), max(ends)))
 
 
@@ -217,45 +252,40 @@ def filtered(run: Run, time_constant_s: float) -> Run:
 
 def _low_pass(
     problem: Problem, best: Fit, temperature: float, anew: bool, rng: np.random.Generator
-) -> list[Explanation]:
+) -> list[_Tried]:
     """The likeliest filter, and those that are about as likely."""
     structure = problem.structure
     anew = anew and structure.scales.free_air  # under load a search takes minutes
-    fits = {}
-    for constant in _LOW_PASS_S:
-        behind, starts = _behind(problem, constant), _earlier(structure, best.point, constant)
-        fits[constant] = refine(behind, starts)
-        if anew and constant >= _SEARCHED_S:  # far from the fit without it
-            fits[constant] = min(
-                search_widely(behind, rng, starts, short=True), fits[constant], key=lambda f: f.cost
-            )
+    behind = {t: _behind(problem, t) for t in (_CLOSER_S if anew else _LOW_PASS_S)}
+    fits = {t: refine(p, _earlier(structure, best.point, t)) for t, p in behind.items()}
+    if anew:
+        for t in sorted(fits, key=lambda t: fits[t].cost)[:_SEARCHED]:
+            wide = search_widely(behind[t], rng, fits[t].point[None], short=True)
+            fits[t] = min(wide, fits[t], key=lambda f: f.cost)
     middle = min(fits, key=lambda t: fits[t].cost)
     # gains make up for a part of a filter, so that its own lie along a ridge
-    fits[middle] = from_about(_behind(problem, middle), fits[middle], rng)
-    least = _tempered(problem, best, temperature)
-    for factor in _BETWEEN:  # the constants that were tried
-        between = middle * factor
-        behind = _behind(problem, between)
-        fits[between] = refine(behind, _earlier(structure, fits[middle].point, between - middle))
-        if fits[middle].cost < best.cost:  # there is a filter, so that its constant matters
-            fits[between] = from_about(behind, fits[between], rng)
-        middle = min(fits, key=lambda t: fits[t].cost)
-    if least - _tempered(problem, fits[middle], temperature) - 1.0 > _NATS:
-        for factor in _NEAR_BY:
+    fits[middle] = from_about(behind[middle], fits[middle], rng)
+    for factors, least_nats in ((_BETWEEN, -np.inf), (_NEAR_BY, _NATS)):
+        own = min(temperature, temperature_at(behind[middle], fits[middle]))
+        if best.cost - fits[middle].cost < least_nats * own:
+            break
+        for factor in factors:
             between = middle * factor
             starts = _earlier(structure, fits[middle].point, between - middle)
-            behind = _behind(problem, between)
-            fits[between] = from_about(behind, refine(behind, starts), rng)
+            behind[between] = _behind(problem, between)
+            fits[between] = refine(behind[between], starts)
+            if fits[middle].cost < best.cost:  # there is a filter, so that its constant matters
+                fits[between] = from_about(behind[between], fits[between], rng)
             middle = min(fits, key=lambda t: fits[t].cost)
-    nats = {t: least - _tempered(problem, fit, temperature) - 1.0 for t, fit in fits.items()}
-    as_likely = [t for t in fits if nats[t] >= nats[middle] - _WITHIN_NATS]
+    temperature = min(temperature, temperature_at(behind[middle], fits[middle]))
+    most = _tempered(behind[middle], fits[middle], temperature) + _WITHIN_NATS
+    as_likely = [t for t in fits if _tempered(behind[t], fits[t], temperature) <= most]
     return [
-        Explanation(
-            f"a low-pass filter of about {1e3 * t:.0f} ms in front of it", nats[t],
-            float(structure.decode(fits[t].point)[0]), _weight(nats[t] + 1.0), fits[t].point,
-            (_behind(problem, t), fits[t]),
+        _Tried(
+            f"a low-pass filter of about {1e3 * t:.0f} ms in front of it", behind[t], fits[t], 1,
+            range(len(best.point)),
         )
-        for t in dict.fromkeys((middle, *as_likely)) if nats[t] + 1.0 >= _POSSIBLE_NATS
+        for t in dict.fromkeys((middle, *as_likely))
     ]  # fmt: skip
 
 
@@ -268,10 +298,6 @@ def _tempered(problem: Problem, fit: Fit, temperature: float) -> float:
 def _unlikely(problem: Problem, fit: Fit) -> float:
     """Cost of a fit without its prior."""
     return fit.cost - float(problem.prior(fit.point[None])[0])
-
-
-def _weight(nats: float) -> float:
-    return float(np.exp(min(nats, 0.0)))
 
 
 def _behind(problem: Problem, time_constant_s: float) -> Problem:
@@ -291,7 +317,7 @@ def _earlier(structure: Structure, point: NDArray, time_constant_s: float) -> ND
 
 def _with_feature(
     problem: Problem, best: Fit, temperature: float, name: str, rng: np.random.Generator
-) -> list[Explanation]:
+) -> list[_Tried]:
     structure, feature = problem.structure, _FEATURES[name]
     if name in structure.features or (feature.free_air_only and not structure.scales.free_air):
         return []
@@ -320,25 +346,23 @@ def _with_feature(
         # what the two hold back together may be all that the data tell: the least likely friction
         known = np.concatenate([fits[0].point[None], starts])
         fits += [_with_less_friction(behind, known, share, place) for share in _LEFT]
-    price = len(wider.names) - len(structure.names)
-    least = _tempered(problem, best, temperature)
-    nats = [least - _tempered(behind, fit, temperature) for fit in fits]
-    if max(nats) < _POSSIBLE_NATS:
+    temperature = min(temperature, temperature_at(behind, fits[0]))
+    likeliest = int(np.argmin([_tempered(behind, fit, temperature) for fit in fits]))
+    gained = _tempered(problem, best, temperature)
+    gained -= _tempered(behind, fits[likeliest], temperature)
+    if gained < _POSSIBLE_NATS:
         return []
-    chosen = {int(np.argmax(nats)): _weight(max(nats))}
     # by the readings alone: what they tell of friction is not its prior's to say
-    read = [(_unlikely(problem, best) - _unlikely(behind, fit)) / temperature for fit in fits]
-    for k in range(1, len(fits)):
-        if read[k] >= max(read) - _WITHIN_NATS:
-            chosen[k] = _weight(read[k])
-    shared = [wider.names.index(name) for name in structure.names]
+    most = min(_unlikely(behind, fit) for fit in fits) + temperature * _WITHIN_NATS
     return [
-        Explanation(
-            feature.words.format(float(wider.decode(fits[k].point)[place]) / feature.unit),
-            nats[k] - price, float(wider.decode(fits[k].point)[0]), weight, fits[k].point[shared],
-            (behind, fits[k]),
+        _Tried(
+            feature.words.format(float(wider.decode(fit.point)[place]) / feature.unit), behind, fit,
+            len(wider.names) - len(structure.names),
+            [wider.names.index(name) for name in structure.names],
+            of_readings=k > 0 and _unlikely(behind, fit) <= most,
         )
-        for k, weight in chosen.items()
+        for k, fit in enumerate(fits)
+        if k == likeliest or (k > 0 and _unlikely(behind, fit) <= most)
     ]  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from scipy.special import logsumexp, ndtri
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.tones import least_squares
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.sysid.fit.run import Run
+from pupper_sysid.sysid.fit.run import Run, fresh_residuals
 from pupper_sysid.sysid.fit.search import Fit, Problem, curvatures, local
 from pupper_sysid.sysid.fit.structure import Structure
 
@@ -368,6 +368,14 @@ def temperature_of(
     if sum(len(r) for r, _ in tones) > sum(len(r) for r, _ in pairs) / 2:
         return weight * _at_harmonics(tones, parameters)
     return weight * _autocorrelation([(r, run) for r, run in pairs if len(r) > 1])
+
+
+def temperature_at(problem: Problem, fit: Fit) -> float:
+    """The temperature of a fit's own residuals."""
+    values = problem.structure.decode(fit.point)
+    residuals = fresh_residuals(problem.structure, values, problem.runs)
+    scaled = [r / noise for r, noise in zip(residuals, problem.noise_rad, strict=True)]
+    return temperature_of(scaled, problem.runs, len(values))
 
 
 def _at_harmonics(tones: Sequence[tuple[NDArray, Run]], parameters: int) -> float:

@@ -140,10 +140,10 @@ def test_a_low_pass_filter_is_named_and_its_dead_time_is_the_true_one():
 
 def test_gains_make_up_for_a_part_of_a_filter_so_that_its_dead_time_is_a_range():
     _, rivals = found(candidate(SIMULATED[0]), NUMBERS, 0.016, undescribed=False)
-    named = with_delays(rivals[0], rivals, 1.0)
+    named = with_delays(rivals[0], rivals)
     shortest, longest = named.delays_s
     assert shortest < named.dead_time_s < longest
-    doubtful = with_delays(rivals[0], rivals, 9.0)  # a ninth of the readings
+    doubtful = with_delays(replace(rivals[0], temperature=9.0), rivals)  # a ninth of the readings
     width = longest - shortest
     assert shortest - width < 0.015 < longest + width
     assert doubtful.delays_s[1] - doubtful.delays_s[0] > 2.0 * width
