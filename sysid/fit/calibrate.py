@@ -61,17 +61,8 @@ class CalibrationResult(JointResults[JointCalibrationResult]):
     def save(self, path: Path | str, force: bool = False) -> None:
         """Write the calibration file.
 
-        Parameters
-        ----------
-        path : Path or str
-            Ends in `.yaml`.
-        force : bool
-            Replace an existing file.
-
-        Raises
-        ------
-        InputError
-            If the file exists and `force` is not given, or it cannot be written.
+        `path`: ends in `.yaml`. `force`: replace an existing file. Raises InputError if the file
+        exists and `force` is not given, or it cannot be written.
         """
         self.calibration.save(path, force=force)
 
@@ -204,28 +195,10 @@ def side_by_side(
 ) -> dict[str, JointCalibrationResult]:
     """`fit_joint` of every joint, its stages on several processes, so that none waits long.
 
-    Parameters
-    ----------
-    trials : dict of str to tuple of Trial
-        By joint.
-    free_air : dict of str to bool
-        Whether each joint carried no load.
-    seed : int
-    presets : dict
-        As for `fit_joint`.
-    workers : int
-        Processes.
-    progress : callable or None
-        Called with a joint's name when it is done.
-    staged : callable or None
-        See `Staged`.
-    priors : mapping of joint to ServoPrior, optional
-        Numbers of another unit.
-
-    Raises
-    ------
-    InputError
-        If a joint has too little motion; the others are not waited for.
+    `trials`: by joint. `free_air`: whether each joint carried no load. `presets`: as for
+    `fit_joint`. `workers`: processes. `progress`: called with a joint's name when it is done.
+    `staged`: see `Staged`. `priors`: numbers of another unit. Raises InputError if a joint has too
+    little motion; the others are not waited for.
     """
     ready: dict[str, PreparedJoint] = {}
     fitted: dict[str, dict[str, list[Fitted]]] = {joint: {} for joint in trials}

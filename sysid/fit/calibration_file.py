@@ -86,14 +86,8 @@ def to_calibration(
 ) -> Calibration:
     """The calibration file of `results`.
 
-    Parameters
-    ----------
-    results : dict of joint to JointCalibrationResult
-    recordings : sequence of Recording
-        Their sources; names and hashes go into the file.
-    seed : int
-    stall_torque_nm, priors : optional
-        As for `torque_anchors`.
+    `recordings`: their sources; names and hashes go into the file. `stall_torque_nm`, `priors`: as
+    for `torque_anchors`.
     """
     anchors = torque_anchors(list(results), recordings, stall_torque_nm, priors)
     buses = [r.metadata.get("bus") or {} for r in recordings]
@@ -128,16 +122,9 @@ def torque_anchors(
 ) -> dict[str, tuple[float, str]]:
     """Stall torque [N·m] that sets the scale of each joint's torques, and its source.
 
-    Parameters
-    ----------
-    joints : sequence of str
-    recordings : sequence of Recording
-        Their headers may name the servo.
-    stall_torque_nm : float, optional
-        Of all joints; by default that of the data sheet of the recorded servo; where no recording
-        names one, of the prior's, or of the Mini Pupper's servo.
-    priors : mapping of str to ServoPrior
-        By joint, of those that have one.
+    `recordings`: their headers may name the servo. `stall_torque_nm`: of all joints; by default
+    that of the data sheet of the recorded servo; where no recording names one, of the prior's, or
+    of the Mini Pupper's servo. `priors`: by joint, of those that have one.
     """
     if stall_torque_nm is not None:
         return dict.fromkeys(joints, (stall_torque_nm, GIVEN_TORQUE))

@@ -60,25 +60,9 @@ def check_claimed_load(
 ) -> tuple[str, ...]:
     """Notes on a claimed load that the recording cannot confirm, or contradicts in its size.
 
-    Parameters
-    ----------
-    joint : str
-    trials : sequence of Trial
-    structure : Structure
-        Without a known load nothing is checked.
-    runs : tuple of Run
-    noise_rad : tuple of float
-        Of each run.
-    fit : Fit
-        Of `structure` to the runs with the claimed load.
-    least_rad : float
-        Least noise.
-    rng : numpy.random.Generator
-
-    Raises
-    ------
-    InputError
-        If the runs move as without a load, or with a small part of it.
+    `structure`: without a known load nothing is checked. `noise_rad`: of each run. `fit`: of
+    `structure` to the runs with the claimed load. `least_rad`: least noise. Raises InputError if
+    the runs move as without a load, or with a small part of it.
     """
     if not structure.scales.known_load:
         return ()
@@ -137,10 +121,7 @@ def _size_notes(
 ) -> tuple[str, ...]:
     """Notes on a load that is there, and of another size than claimed.
 
-    Raises
-    ------
-    InputError
-        If it is much smaller, by what the named servo can be.
+    Raises InputError if it is much smaller, by what the named servo can be.
     """
     values = dict(zip(structure.names, structure.decode(fit.point), strict=True))
     told = f"{joint}: the load of {loads_in_words(trials)} that the header claims"

@@ -53,17 +53,8 @@ _OUTLIER_MAD = 4.0 * 1.4826
 def reading_noise(runs: Sequence[Run], residuals: Sequence[NDArray[np.float64]]) -> float:
     """Standard deviation of the noise of readings that count, an upper bound [rad].
 
-    Parameters
-    ----------
-    runs : sequence of Run
-        Of one kind of motion.
-    residuals : sequence of ndarray, shape (samples,) each
-        Of the best model known [rad].
-
-    Returns
-    -------
-    float
-        NaN where there are too few readings.
+    `runs`: of one kind of motion. `residuals` of shape (samples,) each: of the best model known
+    [rad]. Returns NaN where there are too few readings.
     """
     of_readings = [run.sample_rad for run in runs]
     bounds = [
@@ -160,19 +151,9 @@ def goodness_of_fit(
 ) -> dict[str, float]:
     """Residual over noise of each kind of motion: 1 where the servo explains all but noise.
 
-    Parameters
-    ----------
-    structure : Structure
-    values : ndarray, shape (parameters,)
-    runs : sequence of Run
-    quantum_rad : float
-        Quantisation step of readings: their noise is not below that of rounding, nor below
-        `LEAST_NOISE_RAD`.
-
-    Returns
-    -------
-    dict of str to float
-        By tone, or label of the run; NaN where the noise is not known.
+    `values` of shape (parameters,). `quantum_rad`: quantisation step of readings: their noise is
+    not below that of rounding, nor below `LEAST_NOISE_RAD`. Returns by tone, or label of the run;
+    NaN where the noise is not known.
     """
     residuals = fresh_residuals(structure, values, runs)
     least = max(quantum_rad / np.sqrt(12.0), LEAST_NOISE_RAD)

@@ -176,24 +176,10 @@ def fit_joint(
 ) -> JointCalibrationResult:
     """Fit the structures to one joint and choose.
 
-    Parameters
-    ----------
-    joint : str
-    trials : sequence of Trial
-        All of this joint.
-    seed : int
-        Results depend on the seed and the joint's name.
-    presets : dict of str to (dict of joint to DelayedPDParameters), optional
-        Published settings to score beside the fits.
-    free_air : bool, optional
-        Whether the joint carried no load; by default what its trials tell.
-    prior : ServoPrior, optional
-        Numbers of another unit of the servo.
-
-    Raises
-    ------
-    InputError
-        If there is too little motion.
+    `trials`: all of this joint. `seed`: results depend on the seed and the joint's name. `presets`:
+    published settings to score beside the fits. `free_air`: whether the joint carried no load; by
+    default what its trials tell. `prior`: numbers of another unit of the servo. Raises InputError
+    if there is too little motion.
     """
     ready = prepare_joint(joint, trials, seed, free_air, prior=prior)
     fitted = {stage: fit_structures(ready, stage) for stage in stages(ready)}
@@ -517,13 +503,7 @@ def conclude(
 ) -> JointCalibrationResult:
     """Choose among the fits of a joint, and say what they tell.
 
-    Parameters
-    ----------
-    ready : PreparedJoint
-    fitted : dict of str to sequence of Fitted
-        By stage (`stages`), from `fit_structures`.
-    presets : dict, optional
-        As for `fit_joint`.
+    `fitted`: by stage (`stages`), from `fit_structures`. `presets`: as for `fit_joint`.
     """
     ready, every, choice = _settled(ready, _joined(fitted))
     if not ready.scales.free_air:
@@ -988,11 +968,7 @@ def score_preset(parameters: DelayedPDParameters, runs: Sequence[Run]) -> Scores
 
     The offset is that of these readings: their median about it, as in `sysid.fit.predict`.
 
-    Parameters
-    ----------
-    parameters : DelayedPDParameters
-        Of the joint.
-    runs : sequence of Run
+    `parameters`: of the joint.
     """
     # published for steps of MuJoCo, as those of older calibrations
     one = at_step(parameters.per_inertia(), CONTINUOUS_S, TIME_STEP_S)
@@ -1038,14 +1014,8 @@ def _why_unidentified(
 ) -> str | None:
     """Why the data do not identify a number; None if they do.
 
-    Parameters
-    ----------
-    p : Parameter
-    value, sd : float
-        Its value, and the standard deviation of the fitted coordinate.
-    interval : Interval
-    speed : float
-        Fastest command [rad/s].
+    `value`, `sd`: its value, and the standard deviation of the fitted coordinate. `speed`: fastest
+    command [rad/s].
     """
     if p.name in ("offset_rad", "hanging_rad") or p.name.startswith("gravity"):
         return None

@@ -552,12 +552,8 @@ def edges_of(
 ) -> NDArray[np.float64]:
     """When within each step a held command changed, shape (2, steps): see `Simulated`.
 
-    Parameters
-    ----------
-    mean : ndarray, shape (steps,)
-        Command of each step [rad].
-    end : ndarray, shape (steps,), optional
-        Command at the end of each step [rad]; by default commands change on steps.
+    `mean` of shape (steps,): command of each step [rad]. `end` of shape (steps,): command at the
+    end of each step [rad]; by default commands change on steps.
     """
     if end is None:
         return np.stack([mean, np.zeros_like(mean)])
@@ -585,12 +581,8 @@ def residuals(
 ) -> NDArray[np.float64]:
     """Model minus reading, shape (candidates, samples) [rad].
 
-    Parameters
-    ----------
-    *simulated
-        See `Simulated`.
-    step, reading : ndarray, shape (samples,)
-        When the readings were measured, in steps, and their values [rad].
+    `*simulated`: see `Simulated`. `step`, `reading` of shape (samples,): when the readings were
+    measured, in steps, and their values [rad].
     """
     out = np.empty((len(simulated[1]), len(step)))
     _evaluate(
@@ -618,21 +610,9 @@ def moments_if_later(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
     """Sums of the residuals and of their squares if every candidate had moved later.
 
-    Parameters
-    ----------
-    *simulated
-        See `Simulated`.
-    step, reading : ndarray, shape (samples,)
-        When the readings were measured, in steps, and their values [rad].
-    later : ndarray, shape (delays,)
-        In steps.
-
-    Returns
-    -------
-    total : ndarray, shape (delays, candidates)
-        In rad.
-    square : ndarray, shape (delays, candidates)
-        In rad².
+    `*simulated`: see `Simulated`. `step`, `reading` of shape (samples,): when the readings were
+    measured, in steps, and their values [rad]. `later` of shape (delays,): in steps. Returns
+    both of shape (delays, candidates), in rad and rad².
     """
     total, square = np.zeros((2, len(later), len(simulated[1])))
     _evaluate(_MOMENTS, _abreast(simulated), *simulated, step, reading, 1.0, later, total, square)

@@ -137,17 +137,8 @@ def explanations(
 ) -> list[Explanation]:
     """What describes the servo about as well as the fit alone, or better, best first.
 
-    Parameters
-    ----------
-    problem : Problem
-    best : Fit
-        Of the carried structure.
-    temperature : float
-        How many readings count as one.
-    anew : bool
-        Whether a filter is searched for far from the fit, too, as it is where errors are larger
-        than noise.
-    rng : numpy.random.Generator
+    `best`: of the carried structure. `temperature`: how many readings count as one. `anew`: whether
+    a filter is searched for far from the fit, too, as it is where errors are larger than noise.
     """
     tried = _low_pass(problem, best, temperature, anew, rng)
     for feature in _FEATURES:
@@ -196,11 +187,7 @@ def decided(likely: Sequence[Explanation]) -> Explanation | None:
 def with_delays(best: Explanation, likely: Sequence[Explanation]) -> Explanation:
     """The best explanation with the dead times that those as likely as it allow.
 
-    Parameters
-    ----------
-    best : Explanation
-    likely : sequence of Explanation
-        All, the best one among them.
+    `likely`: all, the best one among them.
     """
     ends = [best.dead_time_s]
     for one in likely:

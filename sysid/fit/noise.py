@@ -32,20 +32,10 @@ def noise_by_run(
 ) -> tuple[float, ...]:
     """Root mean square of the residuals of each tone, or run without a tone, outliers clipped.
 
-    Parameters
-    ----------
-    residuals : sequence of ndarray, shape (samples,) each
-        Model minus fresh reading, per run [rad].
-    runs : sequence of Run
-        Runs of one tone, gain and load share their noise. That of runs without a tone is not far
-        from the others': it is the model's error, and a run that it suits would decide the fit.
-    least_rad : float
-        Noise of a tone that is fitted better than readings can be.
-
-    Returns
-    -------
-    tuple of float
-        One per run [rad].
+    `residuals` of shape (samples,) each: model minus fresh reading, per run [rad]. `runs`: runs of
+    one tone, gain and load share their noise. That of runs without a tone is not far from the
+    others': it is the model's error, and a run that it suits would decide the fit. `least_rad`:
+    noise of a tone that is fitted better than readings can be. Returns one per run [rad].
     """
     kinds = [(r.tone, r.p_gain, *r.load, n if r.tone < 0 else 0) for n, r in enumerate(runs)]
     sizes = {}
@@ -78,25 +68,11 @@ def command_jitter(
     Commands late at random (exponentially, about the dead time as mean) are simulated. The squared
     noise of a tone is a floor, common to all tones, and a share that grows as the squared jitter.
 
-    Parameters
-    ----------
-    structure : Structure
-    values : ndarray, shape (parameters,)
-    recorded : sequence of Trial
-        The trials of the runs as recorded, with the times at which commands were sent.
-    runs : sequence of Run
-    noise_rad : sequence of float
-        From `noise_by_run`.
-    date_sd_s : float
-        Standard deviation of the dates of readings [s]: it grows with the speed, too, and is taken
-        off, half to one and a half of it.
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    Interval
-        An upper bound where the model errs more at fast tones for other reasons; (0, 0, high) where
-        nothing is seen; NaN with fewer than two tones.
+    `values` of shape (parameters,). `recorded`: the trials of the runs as recorded, with the times
+    at which commands were sent. `noise_rad`: from `noise_by_run`. `date_sd_s`: standard deviation
+    of the dates of readings [s]: it grows with the speed, too, and is taken off, half to one and a
+    half of it. Returns an upper bound where the model errs more at fast tones for other reasons;
+    (0, 0, high) where nothing is seen; NaN with fewer than two tones.
     """
     tones = sorted({r.tone for r in runs})
     if len(tones) < 2:

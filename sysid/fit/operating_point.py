@@ -43,10 +43,7 @@ def reference_gain(trials: Sequence[Trial]) -> ReferenceGain:
     In this order: the one that the headers state; that of all runs; the factory setting of the
     servo that the headers name; the largest that was recorded.
 
-    Parameters
-    ----------
-    trials : sequence of Trial
-        All of one joint.
+    `trials`: all of one joint.
     """
     headers = {t.servo.p_gain for t in trials if t.servo.p_gain}
     if len(headers) == 1:
@@ -76,11 +73,7 @@ def with_operating_points(
 ) -> Calibration:
     """The calibration with the operating point of each joint, and notes on gains that were assumed.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    trials : mapping of joint to sequence of Trial
-        That it was made from.
+    `trials`: that it was made from.
     """
     joints, notes = {}, list(calibration.notes)
     for name, joint in calibration.joints.items():

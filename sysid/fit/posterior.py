@@ -318,11 +318,7 @@ def convergence(points: NDArray[np.float64], weight: NDArray[np.float64]) -> tup
     The variance of a mean over independent weighted points is the weighted mean square of
     w (x − mean); R̂ is that between `_GROUPS` parts of the points and within them.
 
-    Parameters
-    ----------
-    points : ndarray, shape (points, parameters)
-    weight : ndarray, shape (points,)
-        Their sum is 1.
+    `points` of shape (points, parameters). `weight` of shape (points,): their sum is 1.
     """
     middle = weight @ points
     apart = points - middle
@@ -350,13 +346,8 @@ def temperature_of(
     is at low frequencies: 1 + 2 Σ ρ(k), up to where the autocorrelation ρ vanishes, and no further
     than half a second, because what friction leaves for longer hardly moves with a parameter.
 
-    Parameters
-    ----------
-    residuals : sequence of ndarray, shape (samples,) each
-        In units of their noise.
-    runs : sequence of Run
-    parameters : int
-        Fitted to them: so many numbers less are left of the power at the harmonics.
+    `residuals` of shape (samples,) each: in units of their noise. `parameters`: fitted to them: so
+    many numbers less are left of the power at the harmonics.
     """
     every = np.concatenate([np.empty(0), *residuals])
     if not len(every):
@@ -418,12 +409,7 @@ def with_date_errors(
     `PHASE_SD_S`. No likelihood of independent readings knows that, and stiffness, damping and
     friction move more by it than the dead time does.
 
-    Parameters
-    ----------
-    draws : ndarray, shape (draws, parameters)
-    problem : Problem
-    best : Fit
-    rng : numpy.random.Generator
+    `draws` of shape (draws, parameters).
     """
     moved = []
     for _ in range(_DATE_DRAWS):
@@ -492,12 +478,7 @@ def as_wide_as_folds(
 def interval_of(name: str, value: float, draws: NDArray) -> Interval:
     """Interval of one number from its draws, no narrower than the simulation's steps allow.
 
-    Parameters
-    ----------
-    name : str
-    value : float
-        As fitted.
-    draws : ndarray, shape (draws,)
+    `value`: as fitted. `draws` of shape (draws,).
     """
     own = Interval.of_draws(value, draws)
     low, high = min(value, own.low), max(value, own.high)

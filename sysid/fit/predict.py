@@ -128,16 +128,9 @@ def rule_of(
 ) -> ReadingRule:
     """When the readings of a joint were measured.
 
-    Parameters
-    ----------
-    joint : str
-    lattice : PollLattice
-        Of the recordings.
-    source : str
-        Names of the recordings.
-    calibrations : dict of str to Calibration, optional
-        Of the same bus, by name: the poll of the first that knows it is used where the recordings
-        do not show theirs.
+    `lattice`: of the recordings. `source`: names of the recordings. `calibrations`: of the same
+    bus, by name: the poll of the first that knows it is used where the recordings do not show
+    theirs.
     """
     if lattice.kind == "every read":
         return ReadingRule(rule="live", source=source, poll_period_s=0.0, loss=0.0, mean_age_s=0.0)
@@ -202,10 +195,7 @@ def compared_runs(
 ) -> list[ComparedRun]:
     """Runs of a joint in all recordings.
 
-    Raises
-    ------
-    InputError
-        If there are no readings.
+    Raises InputError if there are no readings.
     """
     runs = [
         ComparedRun(trial, run, place, trial.load is not None)
@@ -307,14 +297,7 @@ def predict(
 ) -> Prediction:
     """Predict the readings of each run.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    joint : str
-    runs : sequence of ComparedRun
-    rule : ReadingRule
-    readings : {"auto", "fresh", "all"}
-        Which readings count; `auto`: those that are dated, else all rows.
+    `readings`: which readings count; `auto`: those that are dated, else all rows.
     """
     servo = _Servo.of(calibration, joint)
     runs = tuple(_at_voltage(own, servo.reference_voltage_v) for own in runs)
@@ -477,12 +460,7 @@ def run_figure(
 ) -> Figure:
     """Commands, readings and models in free run, a panel per run.
 
-    Parameters
-    ----------
-    runs : mapping of joint to runs
-    tracks : mapping of model, then joint, to tracks
-    joints : sequence of str, optional
-        By default all.
+    `joints`: by default all.
     """
     from matplotlib.figure import Figure
 

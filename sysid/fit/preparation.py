@@ -164,24 +164,10 @@ def prepare_joint(
 ) -> PreparedJoint:
     """Measure the lag of a joint, date its readings, and put its trials on the physics clock.
 
-    Parameters
-    ----------
-    joint : str
-    trials : sequence of Trial
-        All of this joint.
-    seed : int
-    free_air : bool, optional
-        Whether the joint carried no load; by default what its trials tell.
-    known : dict of str to ndarray, optional
-        Values of candidates of free air by name, from an earlier fit to these trials; nothing is
-        fitted then.
-    prior : ServoPrior, optional
-        Numbers of another unit of the servo.
-
-    Raises
-    ------
-    InputError
-        If there is too little motion, or none of the load that is claimed.
+    `trials`: all of this joint. `free_air`: whether the joint carried no load; by default what its
+    trials tell. `known`: values of candidates of free air by name, from an earlier fit to these
+    trials; nothing is fitted then. `prior`: numbers of another unit of the servo. Raises InputError
+    if there is too little motion, or none of the load that is claimed.
     """
     trials = tuple(trials)
     if free_air is None:

@@ -101,16 +101,8 @@ def compare_repeats(
 ) -> Repeats | None:
     """Compare the recordings that a fit is of; None of one recording.
 
-    Parameters
-    ----------
-    problem : Problem
-        All runs.
-    best : Fit
-        To all of them.
-    least_rad : float
-        Least noise that a run may have [rad].
-    quantum_rad : float
-        Step of the readings [rad]; 0 if there is none.
+    `problem`: all runs. `best`: to all of them. `least_rad`: least noise that a run may have [rad].
+    `quantum_rad`: step of the readings [rad]; 0 if there is none.
     """
     structure, runs = problem.structure, problem.runs
     sources = list(dict.fromkeys(r.source for r in runs))

@@ -162,15 +162,9 @@ def prepare(
 ) -> Run:
     """Put one trial on the physics clock.
 
-    Parameters
-    ----------
-    trial : Trial
-    reading : Readings or PollLattice
-        Which readings are fresh, and when they were measured.
-    reference_voltage_v : float
-        The voltage at which the stall torque is defined; NaN where torques do not depend on it.
-    step_s : float
-        Length of a physics step [s].
+    `reading`: which readings are fresh, and when they were measured. `reference_voltage_v`: the
+    voltage at which the stall torque is defined; NaN where torques do not depend on it. `step_s`:
+    length of a physics step [s].
     """
     if isinstance(reading, PollLattice):
         reading = readings(trial, reading)
@@ -270,15 +264,8 @@ def with_voltage(run: Run, trial: Trial, reference_voltage_v: float) -> Run:
 def with_late_commands(run: Run, trial: Trial, jitter_s: float, rng: np.random.Generator) -> Run:
     """The run with every command late or early at random, with a mean of 0.
 
-    Parameters
-    ----------
-    run : Run
-    trial : Trial
-        The same, as recorded.
-    jitter_s : float
-        Standard deviation of the latency [s], which is exponential: most commands come a little
-        early, few much too late. None overtakes another.
-    rng : numpy.random.Generator
+    `trial`: the same, as recorded. `jitter_s`: standard deviation of the latency [s], which is
+    exponential: most commands come a little early, few much too late. None overtakes another.
     """
     late = jitter_s * (rng.exponential(1.0, len(trial.send_time_s)) - 1.0)
     sent = np.maximum.accumulate(np.maximum(trial.send_time_s - trial.send_time_s[0] + late, 0.0))
@@ -323,11 +310,7 @@ def residuals(
 ) -> list[NDArray[np.float64]]:
     """Model minus readings that count, (candidates, samples) for each run [rad].
 
-    Parameters
-    ----------
-    structure : Structure
-    values : ndarray, shape (candidates, parameters)
-    runs : sequence of Run
+    `values` of shape (candidates, parameters).
     """
     columns = structure.columns(values)
     return [
@@ -355,20 +338,8 @@ def moments_if_later(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Sums of the residuals and of their squares if every candidate had moved later.
 
-    Parameters
-    ----------
-    structure : Structure
-    values : ndarray, shape (candidates, parameters)
-    run : Run
-    later : ndarray, shape (delays,)
-        In physics steps of the run.
-
-    Returns
-    -------
-    total : ndarray, shape (delays, candidates)
-        In rad.
-    square : ndarray, shape (delays, candidates)
-        In rad².
+    `values` of shape (candidates, parameters). `later` of shape (delays,): in physics steps of the
+    run. Returns both of shape (delays, candidates), in rad and rad².
     """
     return kernel.moments_if_later(
         *_simulated(structure.kind, structure.columns(values), values[:, 0], run),
@@ -381,11 +352,7 @@ def free_run(
 ) -> list[NDArray[np.float64]]:
     """Readings that one servo predicts at the edges of the steps of each run, (steps + 1,) [rad].
 
-    Parameters
-    ----------
-    structure : Structure
-    values : ndarray, shape (parameters,)
-    runs : sequence of Run
+    `values` of shape (parameters,).
     """
     columns = structure.columns(values[None])
     return [simulate(columns, values[:1], run, structure.kind)[:, 0] for run in runs]

@@ -65,13 +65,8 @@ def score(
 ) -> Scores:
     """Scores of simulated readings.
 
-    Parameters
-    ----------
-    tracks : sequence of ndarray, shape (steps + 1,) each
-        Readings at step edges [rad].
-    runs : sequence of Run
-    held_out : dict of str to ndarray, optional
-        Residuals on what was left out, from `held_out_residuals`.
+    `tracks` of shape (steps + 1,) each: readings at step edges [rad]. `held_out`: residuals on what
+    was left out, from `held_out_residuals`.
     """
     fresh, held, raw, one_step, spread = [], [], [], [], []
     for track, run in zip(tracks, runs, strict=True):
@@ -104,14 +99,7 @@ def held_out_residuals(
 ) -> dict[str, NDArray[np.float64]]:
     """Residuals on the runs of each fold [rad], from the fit that has not seen them.
 
-    Parameters
-    ----------
-    structure : Structure
-    fits : sequence of Fit
-        One per fold.
-    folds : dict of str to ndarray of bool
-        From `sysid.fit.search.folds_of`.
-    runs : sequence of Run
+    `fits`: one per fold. `folds`: from `sysid.fit.search.folds_of`.
     """
     return {
         name: np.concatenate(

@@ -81,12 +81,9 @@ class Problem:
     ) -> NDArray[np.float64]:
         """Cost of each of `points` (candidates, parameters).
 
-        Parameters
-        ----------
-        points : ndarray, shape (candidates, parameters)
-        ceiling : ndarray, shape (candidates,), or float
-            A candidate that costs as much after some runs is not simulated on the others; its cost
-            is what it had by then.
+        `points` of shape (candidates, parameters). `ceiling` of shape (candidates,): a candidate
+        that costs as much after some runs is not simulated on the others; its cost is what it had
+        by then.
         """
         cost = self.prior(points)
         values = self.structure.decode(points)
@@ -151,16 +148,8 @@ def search(
 ) -> list[Fit]:
     """Fits from the best of many starts, best first.
 
-    Parameters
-    ----------
-    problem : Problem
-    rng : numpy.random.Generator
-    more : ndarray, shape (starts, parameters), optional
-        Further starts, in fitted coordinates.
-    keep : int
-        How many of the starts are improved a little.
-    final : int
-        How many of those are fitted to the end.
+    `more` of shape (starts, parameters): further starts, in fitted coordinates. `keep`: how many of
+    the starts are improved a little. `final`: how many of those are fitted to the end.
     """
     starts = Starts(problem.coarse, rng).best(np.ones(len(problem.runs), bool), keep)
     if more is not None and len(more):
@@ -178,14 +167,8 @@ def search_widely(
 ) -> Fit:
     """The best fit of `search`, then of a population of its starts that evolves.
 
-    Parameters
-    ----------
-    problem : Problem
-    rng : numpy.random.Generator
-    more : ndarray, shape (starts, parameters), optional
-        Further starts, in fitted coordinates.
-    short : bool
-        Fewer generations.
+    `more` of shape (starts, parameters): further starts, in fitted coordinates. `short`: fewer
+    generations.
     """
     crowd = Starts(problem.coarse, rng).best(np.ones(len(problem.runs), bool), _POPULATION)
     starts = crowd[:_KEEP]
@@ -203,15 +186,8 @@ def evolved(
 ) -> Fit:
     """The best fit from starts, searched in coarse steps and fitted to the end in fine ones.
 
-    Parameters
-    ----------
-    problem : Problem
-    starts : ndarray, shape (starts, parameters)
-        In fitted coordinates; those of simpler structures are kept as they are, too.
-    rng : numpy.random.Generator
-    short : bool
-    crowd : ndarray, optional
-        As for `evolve`.
+    `starts` of shape (starts, parameters): in fitted coordinates; those of simpler structures are
+    kept as they are, too. `crowd`: as for `evolve`.
     """
     best = evolve(problem.coarse, refined(problem.coarse, starts), rng, short, crowd)
     near = np.concatenate([best.point[None], starts[-_FINAL:]])
@@ -224,12 +200,6 @@ def from_about(problem: Problem, best: Fit, rng: np.random.Generator) -> Fit:
 
     A ridge has dents in which a local fit ends; in coarse steps they lie elsewhere. In free air
     only: the structures under load have so many numbers that a better optimum predicts worse.
-
-    Parameters
-    ----------
-    problem : Problem
-    best : Fit
-    rng : numpy.random.Generator
     """
     if not problem.structure.scales.free_air:
         return best
@@ -264,12 +234,7 @@ class Starts:
     where there is one. A delay only shifts the motion in time, so that one simulation serves all
     delays, and any choice of runs (`best`): the most rugged coordinate is not searched.
 
-    Parameters
-    ----------
-    problem : Problem
-    rng : numpy.random.Generator
-    count : int
-        How many vectors.
+    `count`: how many vectors.
     """
 
     def __init__(
@@ -340,15 +305,8 @@ def local(
 ) -> list[Fit]:
     """Levenberg-Marquardt from every start (starts, parameters), all abreast.
 
-    Parameters
-    ----------
-    problem : Problem
-    starts : ndarray, shape (starts, parameters)
-        In fitted coordinates.
-    iterations : int
-        At most; starts that no longer improve drop out.
-    difference : float
-        Step of the Jacobian.
+    `starts` of shape (starts, parameters): in fitted coordinates. `iterations`: at most; starts
+    that no longer improve drop out. `difference`: step of the Jacobian.
     """
     structure = problem.structure
     low, high = structure.box
@@ -429,15 +387,8 @@ def evolve(
     Differential evolution finds its way between the local optima of a servo with dry friction,
     where a gradient does not.
 
-    Parameters
-    ----------
-    problem : Problem
-    fits : sequence of Fit
-    rng : numpy.random.Generator
-    short : bool
-        Fewer generations.
-    crowd : ndarray, shape (places, parameters), optional
-        Further members, in fitted coordinates.
+    `short`: fewer generations. `crowd` of shape (places, parameters): further members, in fitted
+    coordinates.
     """
     low, high = problem.structure.box
     seeds = np.array([f.point for f in fits])
@@ -470,12 +421,9 @@ def evolve(
 def folds_of(runs: Sequence[Run]) -> dict[str, NDArray[np.bool_]]:
     """Which runs are left out together: a tone, or else a part of the runs of every gain and load.
 
-    Returns
-    -------
-    dict of str to ndarray of bool, shape (runs,)
-        True where left out, by what is. A tone is named by its frequency [Hz]. Of many tones some
-        are picked, evenly; runs without tones are divided in as many parts, all of a gain between
-        others besides. Empty if there is only one run or tone.
+    Returns shape (runs,): true where left out, by what is. A tone is named by its frequency [Hz].
+    Of many tones some are picked, evenly; runs without tones are divided in as many parts, all of a
+    gain between others besides. Empty if there is only one run or tone.
     """
     tones = np.array([r.tone for r in runs])
     labels = [r.label for r in runs]
@@ -505,12 +453,8 @@ def in_blocks(problem: Problem) -> tuple[Problem, dict[str, NDArray[np.bool_]]]:
 
     For runs of which `folds_of` finds too few parts: one motion still has a beginning and an end.
 
-    Returns
-    -------
-    Problem
-        With as many runs for each run as there are blocks, under the same commands.
-    dict of str to ndarray of bool, shape (runs,)
-        As from `folds_of`.
+    Returns the fit with as many runs for each run as there are blocks, under the same commands,
+    and folds as from `folds_of`.
     """
     runs, noise = [], []
     for run, own in zip(problem.runs, problem.noise_rad, strict=True):
@@ -543,17 +487,8 @@ def fit_folds(
     over the box without any), and from the fits of simpler structures to the same runs: so it is
     as good an optimum as that of all runs.
 
-    Parameters
-    ----------
-    problem : Problem
-        All runs.
-    folds : dict of str to ndarray of bool
-        From `folds_of`.
-    rng : numpy.random.Generator
-    draws : ndarray, shape (draws, parameters), optional
-        In fitted coordinates.
-    parents : sequence of (Structure, sequence of Fit)
-        Structures that this one contains, and their fits, one per fold.
+    `problem`: all runs. `folds`: from `folds_of`. `draws` of shape (draws, parameters): in fitted
+    coordinates. `parents`: structures that this one contains, and their fits, one per fold.
     """
     if not folds:
         return []

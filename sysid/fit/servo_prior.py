@@ -63,21 +63,9 @@ def servo_prior(
 ) -> ServoPrior:
     """The prior of a joint from the same joint of a calibration, or else from all joints of it.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Of another unit, or a servo card.
-    source : str
-        Its name in messages.
-    joint : str
-        Joint to be fitted.
-    p_gain : float or None
-        P gain at which that was recorded; None if not known.
-
-    Raises
-    ------
-    InputError
-        If the calibration has no joint with numbers that are known.
+    `calibration`: of another unit, or a servo card. `source`: its name in messages. `joint`: joint
+    to be fitted. `p_gain`: P gain at which that was recorded; None if not known. Raises InputError
+    if the calibration has no joint with numbers that are known.
     """
     every = calibration.joints
     units = [every[joint]] if joint in every else list(every.values())

@@ -367,10 +367,7 @@ class Structure:
     def adopt(self, other: Structure, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points of another structure as points of this one; what is new is nearly without effect.
 
-        Parameters
-        ----------
-        other : Structure
-        points : ndarray, shape (..., parameters of the other)
+        `points` of shape (..., parameters of the other).
         """
         low, high = self.box
         adopted = np.empty((*points.shape[:-1], len(self.parameters)))
@@ -398,13 +395,7 @@ def servo_structure(
 ) -> Structure:
     """The servo with some features.
 
-    Parameters
-    ----------
-    features : sequence of str
-        Of `FEATURES`.
-    scales : Scales
-    name : str
-        By default the features in words.
+    `features`: of `FEATURES`. `name`: by default the features in words.
     """
     wanted = [n for n in _BASE if n != "damping"]
     wanted += dict.fromkeys(n for f in features for n in FEATURES[f])

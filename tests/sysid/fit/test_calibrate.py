@@ -149,14 +149,6 @@ def test_the_fit_is_as_good_as_the_readings_allow(result):
     assert scores.rmse_fresh_rad < result.candidate_models["pure_delay"].scores.rmse_fresh_rad
 
 
-@pytest.mark.slow
-def test_the_interval_of_a_fast_servo_ends_at_zero():
-    trials = tone_trials(0.002, np.random.default_rng(2), (1.0, 3.0), period_s=0.0)
-    dead_time = lag(recorded(trials, readings="live"))[JOINT].dead_time_s
-    # the shortest dead time that is fitted is 1 ms; the position is ahead of the held command
-    assert dead_time is not None and dead_time.low < 0.002 < dead_time.high
-
-
 def test_ratios_are_identified_and_torques_only_by_the_anchor(result):
     small, large = (to_calibration({JOINT: result}, [], 0, torque) for torque in (0.2, 0.4))
     a, b = small.joint(JOINT).actuator, large.joint(JOINT).actuator
