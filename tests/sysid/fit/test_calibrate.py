@@ -16,7 +16,6 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
 from pupper_sysid.sysid.fit.calibrate import STAGES, calibrate
 from pupper_sysid.sysid.fit.calibration_file import GIVEN_TORQUE, to_calibration, torque_anchors
-from pupper_sysid.sysid.fit.dead_time import lag
 from pupper_sysid.sysid.fit.joint_fit import _less_age
 from pupper_sysid.sysid.fit.posterior import EFFECTIVE, R_HAT
 from pupper_sysid.sysid.fit.preparation import prepare_joint
