@@ -931,6 +931,14 @@ def _candidate_fit(
         undecided |= {"back_emf_per_s": both, "damping_per_s": both}
     if why := _undated(ready.lag.feedback):
         undecided["dead_time_s"] = why
+    doubt_s = max(t.read_time_doubt_s for t in ready.recorded)
+    least = structure.parameters[0].low
+    if doubt_s > 0 and float(values[0]) < (1.0 + _AT_BOUND) * least:
+        why = (
+            f"the dead time is on its bound, and readings are dated to {1e3 * doubt_s:.0f} ms "
+            "only: gains make up for what the dates are off"
+        )
+        undecided |= {name: why for name in parameters if name not in ("dead_time_s", "offset_rad")}
     left_out = (
         held_out_residuals(structure, fitted.folds, folds, ready.runs) if (fitted.folds) else {}
     )

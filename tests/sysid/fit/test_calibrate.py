@@ -16,7 +16,7 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
 from pupper_sysid.sysid.fit.calibrate import STAGES, calibrate
 from pupper_sysid.sysid.fit.calibration_file import GIVEN_TORQUE, to_calibration, torque_anchors
-from pupper_sysid.sysid.fit.joint_fit import _less_age
+from pupper_sysid.sysid.fit.joint_fit import _less_age, fit_joint
 from pupper_sysid.sysid.fit.posterior import EFFECTIVE, R_HAT
 from pupper_sysid.sysid.fit.preparation import prepare_joint
 from pupper_sysid.sysid.fit.results import plausible
@@ -118,6 +118,17 @@ def test_a_dead_time_without_the_age_of_its_readings_lies_in_its_interval(fitted
 @pytest.fixture(scope="module")
 def result():
     return calibrate(servo_recording(1))[JOINT]
+
+
+@pytest.mark.parametrize("doubt_s", [0.0, 0.006])
+def test_gains_make_up_for_dates_that_leave_no_dead_time(doubt_s):
+    """Commands of a servo of 3 ms, dated 4 ms too late."""
+    (trial,) = exact_recording(1e-3, 450.0, 0.02, "live", 0.003).trials(JOINT)
+    late = replace(trial, send_time_s=trial.send_time_s + 0.004, read_time_doubt_s=doubt_s)
+    fit = fit_joint(JOINT, (late,), 0).candidate_models["delayed_pd"]
+    assert fit.parameters["dead_time_s"].value < 0.0011
+    doubted = [name for name, why in fit.undecided.items() if "readings are dated to" in why]
+    assert ("stiffness_per_s2" in doubted) is (doubt_s > 0)
 
 
 def test_delayed_pd_is_recovered_from_lossy_readings(result):
