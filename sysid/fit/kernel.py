@@ -540,7 +540,7 @@ gain : float
 load : ndarray, shape (3,)
     Inertia [kg·m²], gravity [N·m], hanging position [rad].
 start : float
-    First reading [rad], at rest.
+    Where the joint rests [rad].
 pad : int
 h : float
     Duration of a step [s].

@@ -1,6 +1,6 @@
 """Predict what a bus would have shown of a calibrated servo: on each run, by one rule for all.
 
-Every trial is a run of its own (`sysid.fit.run`): it starts at rest at its first reading, and the
+Every trial is a run of its own (`sysid.fit.run`): it starts at rest where the joint rested, and the
 servo moves freely under its commands, at its gain and load, with the torque off where it was. What
 a calibration predicts comes from what it says; the readings that score it choose nothing but the
 offset, which is a property of the recording (its zero, or its joint map's): the median of reading

@@ -145,7 +145,7 @@ def _free_runs(
     results: Mapping[str, JointCalibrationResult], runs: Mapping[str, list[Track]]
 ) -> Section:
     """Overlays and residuals of DelayedPD, a panel per joint."""
-    text = "DelayedPD runs freely from the first reading on: its input is commands only."
+    text = "DelayedPD runs freely from where the joint rested: its input is commands only."
     pictures = []
     if len(runs) == 1:
         ((joint, own),) = runs.items()
