@@ -62,9 +62,9 @@ def say_remarks(bus: ServoBus) -> None:
 
 def parse_registers(text: str) -> dict[str, int]:
     """Registers of emulated servos that `text` sets: p=16,goal_speed=400."""
-    from pupper_sysid.sim.emulator.pendulum import REGISTERS
+    from pupper_sysid.sim.emulator.pendulum import FEETECH_REGISTERS
 
-    return _registers(text, REGISTERS, "p=16")[None]
+    return _registers(text, FEETECH_REGISTERS, "p=16")[None]
 
 
 def parse_servo_registers(text: str, series: Series) -> dict[int | None, dict[str, int]]:

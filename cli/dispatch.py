@@ -49,13 +49,8 @@ def commands_of(
 ) -> dict[str, Command]:
     """Commands by word, from their summaries by group; `fit-servo` is a class `FitServo`.
 
-    Parameters
-    ----------
-    summaries : mapping of str to mapping of str to str
-    module : callable
-        Module of a group's word, below `pupper_sysid.cli.commands`.
-    holding_bus : collection of str
-        Words of those that must release a bus before they end.
+    `module` gives the module of a group's word, below `pupper_sysid.cli.commands`; those
+    `holding_bus` must release a bus before they end.
     """
     return {
         word: Command(
@@ -73,18 +68,10 @@ def run_command(
     commands: Mapping[str, Command],
     arguments: Sequence[str] | None = None,
 ) -> None:
-    """Run the command that the first argument names.
+    """Run the command that the first of the arguments (by default the process's) names.
 
-    Ends the process with 0, 2 (bad input, one sentence) or 1.
-
-    Parameters
-    ----------
-    program : str
-    description : str
-        What the program is for, above its table of commands.
-    commands : mapping of str to Command
-    arguments : sequence of str, optional
-        Without the program's name; those of the process by default.
+    Ends the process with 0, 2 (bad input, one sentence) or 1. `description`, what the program is
+    for, stands above its table of commands.
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     with user_errors(given, program) as left:

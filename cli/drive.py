@@ -32,14 +32,9 @@ _SHOWN_EVERY_S = 0.2
 
 
 class Driver:
-    """Commands from the keyboard, and a live table of the ticks.
+    """Commands from the keyboard, no further than those `trained`, and a live table of the ticks.
 
     Use it as a context; it is a `policies.deploy.commands.Commands`.
-
-    Parameters
-    ----------
-    trained : CommandRanges
-        Commands go no further than these.
     """
 
     def __init__(self, trained: CommandRanges) -> None:

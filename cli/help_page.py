@@ -36,23 +36,10 @@ def help_page(
 ) -> str:
     """Help of the command whose options are `options`, as wide as the terminal.
 
-    Parameters
-    ----------
-    options : type
-        Dataclass of the options, or a union of some as subcommands.
-    arguments : sequence of str
-        As typed: they name a subcommand, and hold `--help` or `--help-all`.
-    program : str
-        Its words, such as `pupper-sysid servo`.
-    description : str, optional
-        What it is for; by default the dataclass's docstring.
-    **keywords
-        Of `tyro.cli`.
-
-    Returns
-    -------
-    str
-        The page.
+    `options` is their dataclass, or a union of some as subcommands; `arguments`, as typed, name a
+    subcommand and hold `--help` or `--help-all`; `program` is its words, such as `pupper-sysid
+    servo`; the description is by default the dataclass's docstring; `keywords` are those of
+    `tyro.cli`.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # since tyro 1.0, without a successor

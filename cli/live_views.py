@@ -49,16 +49,7 @@ def refuse_file(option: str, path: Path, force: bool) -> None:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a command was asked to show while it runs.
-
-    Parameters
-    ----------
-    rerun : str or None
-        A .rrd file, `viewer`, or a viewer's address.
-    mcap : Path or None
-    force : bool
-        Replace files that exist.
-    """
+    """What a command was asked to show while it runs."""
 
     rerun: str | None
     mcap: Path | None
@@ -96,12 +87,8 @@ class Wanted:
 def live_views(bus: ServoBus, wanted: Wanted, waits: bool = False) -> Iterator[LiveViews]:
     """Start the writer, and finish the files at the end of the block.
 
-    Parameters
-    ----------
-    bus : ServoBus
-    wanted : Wanted
-    waits : bool
-        Wait for a writer that is behind: of a bus in virtual time, where that delays nothing.
+    With `waits` a writer that is behind is awaited: of a bus in virtual time, where that delays
+    nothing.
     """
     views = LiveViews(bus, wanted, waits)
     reason = ""
@@ -159,17 +146,10 @@ class LiveViews:
         reading: BusSample,
         gravity: Array | None = None,
     ) -> None:
-        """Show one tick.
+        """Show one tick; NaN where nothing was sent.
 
-        Parameters
-        ----------
-        trial : int
-            Ages of readings begin anew with each.
-        sent : Sent
-            NaN where nothing was sent.
-        reading : BusSample
-        gravity : ndarray, shape (3,), optional
-            Its direction in the trunk's frame.
+        Ages of readings begin anew with each trial. `gravity`, shape (3,), is its direction in the
+        trunk's frame.
         """
         more = () if gravity is None else (gravity,)
         # a tick that was dropped may have held the first reading of a value
@@ -180,14 +160,7 @@ class LiveViews:
             self._tell_events()
 
     def walk_tick(self, to_servo: Callable[[Array], Array], tick: Tick) -> None:
-        """Show one tick of a walk, in the servos' own angles.
-
-        Parameters
-        ----------
-        to_servo : callable
-            From joint angles to those of the servos.
-        tick : Tick
-        """
+        """Show one tick of a walk in servo angles, which `to_servo` makes of joint angles."""
         from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 
         reading = replace(tick.reading, position_rad=to_servo(tick.reading.position_rad))

@@ -35,18 +35,7 @@ _VIEWER_PORT = 9876
 
 
 class Writer:
-    """Files and viewers that ticks are written to.
-
-    Parameters
-    ----------
-    about : dict
-        As `live_views` sends it.
-
-    Attributes
-    ----------
-    every_s : float
-        Time between two parts [s].
-    """
+    """Files and viewers that ticks are written to; `about` is what `live_views` sends."""
 
     def __init__(self, about: dict[str, Any]):
         self.every_s = _VIEWED_EVERY_S if about["rerun_address"] else _FILED_EVERY_S

@@ -50,13 +50,8 @@ _CHANNELS: tuple[str, ...] = ("command", "position", "load", "voltage", "tempera
 class Oscilloscope:
     """Shows what a loop hands it, until the end of the block.
 
-    Parameters
-    ----------
-    title : str
-    joints : sequence of str
-        In the order of the arrays that it is given.
-    lag : bool
-        Whether to show how far readings lag behind commands.
+    `joints` are in the order of the arrays that it is given; `lag` shows how far readings lag
+    behind commands.
     """
 
     def __init__(self, title: str, joints: Sequence[str], lag: bool = True):
@@ -77,17 +72,7 @@ class Oscilloscope:
     def tick(
         self, time_s: float, command: NDArray[np.floating], reading: BusSample, missed: int = 0
     ) -> None:
-        """Show one tick.
-
-        Parameters
-        ----------
-        time_s : float
-        command : ndarray, shape (joints,)
-            What was sent [rad]; NaN where nothing was.
-        reading : BusSample
-        missed : int
-            Deadlines missed so far.
-        """
+        """Show one tick: what was sent [rad], NaN where nothing was; deadlines missed so far."""
         optional = (reading.load, reading.voltage_v, reading.temperature_c)
         nothing = np.full(self._joints, np.nan)
         rows = [command, reading.position_rad, *(nothing if x is None else x for x in optional)]

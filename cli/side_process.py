@@ -19,10 +19,6 @@ class SideProcess:
     """A module in a process of its own, behind a socket whose descriptor is its argument.
 
     Its reading end ends with this process, however that ends.
-
-    Parameters
-    ----------
-    module : str
     """
 
     def __init__(self, module: str):
@@ -36,14 +32,9 @@ class SideProcess:
         self.here.setblocking(False)
 
     def send(self, message: bytes, within_s: float = 0.0) -> bool:
-        """Hand over a message; whether it was taken.
+        """Hand over a message, at most `LONGEST_MESSAGE`; whether it was taken.
 
-        Parameters
-        ----------
-        message : bytes
-            At most `LONGEST_MESSAGE`.
-        within_s : float
-            Longest wait for space [s].
+        For `within_s` space is awaited.
         """
         try:
             if within_s:

@@ -193,12 +193,8 @@ def print_fleet(
 ) -> None:
     """Print a fleet's joints, outliers and failed recordings, and the files written.
 
-    `what` names the result per robot; `columns` gives title and digits by column of the table.
-
-    Raises
-    ------
-    PupperError
-        At the end, if a recording could not be used: the exit code says so, too.
+    `what` names the result per robot; `columns` gives title and digits by column of the table. A
+    recording that could not be used is a `PupperError` at the end: the exit code says so, too.
     """
     from pupper_sysid.sysid.fleet.calibration import TABLE
 

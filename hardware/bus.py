@@ -153,13 +153,7 @@ class ServoBus(Protocol):
 
 
 def finite_angles(position_rad: NDArray[np.float64], joints: int, bus: str) -> NDArray[np.float64]:
-    """`position_rad` as an array of shape (joints,).
-
-    Raises
-    ------
-    BusError
-        If it has another shape, or a value is not finite.
-    """
+    """`position_rad` as an array of shape (joints,); `BusError` if it is none, or not finite."""
     angles = np.asarray(position_rad, float)
     if angles.shape != (joints,) or not np.isfinite(angles).all():
         raise BusError(f"{bus}: commands must be {joints} finite angles, got {angles}.")

@@ -33,7 +33,7 @@ from typing import Any
 
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.serial_servos.bus import LineServo, SerialBus
-from pupper_sysid.hardware.serial_servos.line import SLOWEST_ADAPTER_S, Reply, SerialLine
+from pupper_sysid.hardware.serial_servos.line import SLOWEST_ADAPTER_S, LineFrame, Reply, SerialLine
 from pupper_sysid.hardware.serial_servos.series import Family, Profile, Register, Series
 from pupper_sysid.hardware.serial_servos.settings import RegisterFault, read_register
 
@@ -264,14 +264,9 @@ def crc16(data: bytes | bytearray, crc: int = 0) -> int:
 
 
 @dataclass(frozen=True)
-class Frame:
-    """A frame with a correct CRC."""
+class Frame(LineFrame):
+    """A frame of these servos; its data are without stuffing."""
 
-    id: int
-    code: int
-    """Instruction of a request, error byte of a reply."""
-    data: bytes
-    """Parameters, without stuffing."""
     is_status: bool = False
 
     def encode(self) -> bytes:
@@ -305,18 +300,10 @@ def fast_head(servos: int, size: int) -> bytes:
 
 
 def fast_replies(answer: bytes, servos: Sequence[int], size: int) -> list[Frame]:
-    """Status frames that the answer to a fast sync read stands for.
+    """Status frames of servos, in the request's order, from the answer to a fast sync read.
 
-    A block counts if all bytes up to its CRC are right, so those before a damaged byte are kept.
-
-    Parameters
-    ----------
-    answer : bytes
-        From its header on; may be incomplete.
-    servos : sequence of int
-        Ids in the order of the request.
-    size : int
-        Bytes read of each.
+    The answer, from its header on, may be incomplete: a block counts if all bytes up to its CRC are
+    right, so those before a damaged byte are kept.
     """
     frames, at = [], FAST_HEAD_BYTES
     crc = crc16(answer[:at])
@@ -332,17 +319,11 @@ def fast_replies(answer: bytes, servos: Sequence[int], size: int) -> list[Frame]
 
 
 class FrameReader:
-    """Finds frames in a stream that may hold anything.
+    """Finds status frames, or requests, in a stream that may hold anything.
 
     Where a frame is incomplete behind a new header, or its CRC wrong, its first byte is dropped and
-    the search goes on, so garbage before, between or around frames is skipped.
-
-    Parameters
-    ----------
-    plausible : callable
-        `(id, parameter bytes) -> bool`: frames that can occur.
-    status : bool
-        Whether to take status frames, or requests.
+    the search goes on, so garbage before, between or around frames is skipped. `plausible(id,
+    parameter bytes)` says which frames can occur.
     """
 
     def __init__(
@@ -383,27 +364,20 @@ class FrameReader:
                 self.crc_errors.append(buffer[4])
                 self._drop(1)
                 continue
-            frame = self._frame(bytes(buffer[:whole]))
-            if frame is None:
-                self.rejected_bytes += whole
+            body = bytes(buffer[7 : whole - 2]).replace(_STUFFING, _STUFFED)
+            is_status = body[0] == STATUS
+            code, data = body[is_status : is_status + 1], body[is_status + 1 :]
+            # one of the other kind, or without a code, is none
+            if is_status == self._status and code and self._plausible(buffer[4], len(data)):
+                frames.append(Frame(buffer[4], code[0], data, is_status))
             else:
-                frames.append(frame)
+                self.rejected_bytes += whole
             del buffer[:whole]
         return frames
 
     def _drop(self, count: int) -> None:
         self.rejected_bytes += count
         del self._buffer[:count]
-
-    def _frame(self, whole: bytes) -> Frame | None:
-        """A frame of the kind that is read; None for any other."""
-        body = whole[7:-2].replace(_STUFFING, _STUFFED)
-        is_status = body[0] == STATUS
-        if is_status != self._status or (is_status and len(body) < 2):
-            return None
-        code, data = (body[1], body[2:]) if is_status else (body[0], body[1:])
-        frame = Frame(whole[4], code, data, is_status)
-        return frame if self._plausible(frame.id, len(data)) else None
 
 
 _PROTOCOL = 2.0
@@ -426,10 +400,10 @@ class DynamixelLine(SerialLine):
         """Ids of servos that answer fast sync reads."""
         self._was_fast = self._incomplete = False
 
-    def ping(self, servo: int) -> Frame | None:
+    def ping(self, servo: int) -> LineFrame | None:
         """Status frame of `servo`, or None if it does not answer."""
         reply = self._exchange(lambda: self.ask_model(servo), [servo], self.model_bytes).get(servo)
-        return reply.frame if reply else None  # pyright: ignore[reportReturnType]
+        return reply.frame if reply else None
 
     def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
         """The same bytes of several servos with one request; fast, if all of them can."""

@@ -20,7 +20,6 @@ import socket
 import struct
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -46,21 +45,13 @@ NO_COUNT = -1
 HIGHEST_COUNT = 1023
 
 _SET = struct.Struct("<BB12B12H")
-_COUNTS = struct.Struct("<BB12H")
-_LOADS = struct.Struct("<BB12h")
-_IMU = struct.Struct("<BB6f")
-_POWER = struct.Struct("<BB2f")
+_REPLIES = {
+    GET_POSITION: struct.Struct("<BB12H"), GET_LOAD: struct.Struct("<BB12h"),
+    GET_IMU: struct.Struct("<BB6f"), GET_POWER: struct.Struct("<BB2f"),
+}  # fmt: skip
+"""Layouts of replies that carry numbers."""
 _IMU_FULL_SCALE = np.repeat([2.0, 2048.0], 3)  # g, °/s
 ACKNOWLEDGED = bytes([2, SET_POSITION])
-REPLY_SIZES = {SET_POSITION: 2, GET_POSITION: 26, GET_LOAD: 26, GET_IMU: 26, GET_POWER: 10}
-
-
-@dataclass(frozen=True)
-class Power:
-    """Supply of the servos."""
-
-    voltage_v: float
-    current_a: float
 
 
 def set_position(on: NDArray[np.bool_], counts: NDArray[np.int64]) -> bytes:
@@ -91,17 +82,17 @@ def parse_counts(reply: bytes) -> NDArray[np.int64] | None:
     The proxy starts with zeros and keeps a zero for a servo that never answers, so a zero is no
     reading; neither is a count beyond the encoder.
     """
-    if not _is(reply, GET_POSITION):
+    if (numbers := _numbers(reply, GET_POSITION)) is None:
         return None
-    counts = np.array(_COUNTS.unpack(reply)[2:], np.int64)
+    counts = np.array(numbers, np.int64)
     return np.where((counts > 0) & (counts <= HIGHEST_COUNT), counts, NO_COUNT)
 
 
 def parse_load(reply: bytes) -> NDArray[np.float64] | None:
     """Signed fraction of full duty by id, NaN where impossible; None if another message."""
-    if not _is(reply, GET_LOAD):
+    if (numbers := _numbers(reply, GET_LOAD)) is None:
         return None
-    load = np.array(_LOADS.unpack(reply)[2:], float) / 1000.0
+    load = np.array(numbers, float) / 1000.0
     return np.where(np.abs(load) <= 1.03, load, np.nan)
 
 
@@ -111,26 +102,25 @@ def parse_imu(reply: bytes) -> NDArray[np.float64] | None:
     None if it is another message or a number is beyond the chip's range. Six zeros are a failed
     read.
     """
-    if not _is(reply, GET_IMU):
+    if (numbers := _numbers(reply, GET_IMU)) is None:
         return None
-    raw = np.array(_IMU.unpack(reply)[2:], float)
+    raw = np.array(numbers, float)
     return raw if np.all(np.abs(raw) <= _IMU_FULL_SCALE) else None  # refuses NaN, too
 
 
-def parse_power(reply: bytes) -> Power | None:
-    """Voltage and current; None if it is another message or a number is impossible."""
-    if not _is(reply, GET_POWER):
-        return None
-    volts, amperes = _POWER.unpack(reply)[2:]
+def parse_supply(reply: bytes) -> float | None:
+    """Voltage of the servos [V]; None if another message or a number is impossible."""
+    volts, amperes = _numbers(reply, GET_POWER) or (np.nan, np.nan)
     # the divider's full scale is 10.3 V and 13.2 A
-    if not (0 <= volts <= 11 and -1 <= amperes <= 14):
+    return volts if 0 <= volts <= 11 and -1 <= amperes <= 14 else None
+
+
+def _numbers(reply: bytes, opcode: int) -> tuple[Any, ...] | None:
+    """Numbers of the reply to a request; None if it is another message."""
+    layout = _REPLIES[opcode]
+    if len(reply) != layout.size or reply[:2] != bytes([layout.size, opcode]):
         return None
-    return Power(volts, amperes)
-
-
-def _is(reply: bytes, opcode: int) -> bool:
-    size = REPLY_SIZES[opcode]
-    return len(reply) == size and reply[0] == size and reply[1] == opcode
+    return layout.unpack(reply)[2:]
 
 
 TIMEOUT_S = 0.03
@@ -150,17 +140,11 @@ Answer = TypeVar("Answer")
 
 
 class Esp32Bus(HostClock):
-    """The twelve servos behind the proxy.
+    """The twelve servos behind the proxy at this socket.
 
-    Parameters
-    ----------
-    path : Path
-        The proxy's socket.
-    joint_map : JointMap, optional
-        For the proxy's counts; by default the preset mini_pupper_2, in servo coordinates.
-    exclusive : bool
-        Whether to refuse a robot that another program drives. Only what switches the torque off
-        goes without.
+    `joint_map` is for the proxy's counts; by default the preset mini_pupper_2, in servo
+    coordinates. `exclusive` refuses a robot that another program drives; only what switches the
+    torque off goes without.
     """
 
     name = "esp32"
@@ -174,19 +158,18 @@ class Esp32Bus(HostClock):
         name = self.joint_map.file.name
         if self.joint_map.frame != "proxy":
             raise InputError(
-                f"the joint map {name} holds raw counts, and the proxy uses "
-                "calibrated ones. Make a map with `pupper-sysid calibrate-joints --bus esp32`."
+                f"the joint map {name} holds raw counts, and the proxy uses calibrated ones. Make "
+                "a map with `pupper-sysid calibrate-joints --bus esp32`."
             )
         if self.joint_map.file.counts != HIGHEST_COUNT + 1:
             raise InputError(
-                f"the joint map {name} is for servos of {self.joint_map.file.counts} "
-                f"counts; the proxy's have {HIGHEST_COUNT + 1}. Choose another map, such "
-                "as mini_pupper_2."
+                f"the joint map {name} is for servos of {self.joint_map.file.counts} counts; the "
+                f"proxy's have {HIGHEST_COUNT + 1}. Choose another map, such as mini_pupper_2."
             )
         if sorted(self.joint_map.ids) != list(range(1, SERVOS + 1)):
             raise InputError(
-                f"the joint map {name} has the ids {sorted(self.joint_map.ids)}; the "
-                "proxy drives the servos 1 to 12 together, so the map must have them all."
+                f"the joint map {name} has the ids {sorted(self.joint_map.ids)}; the proxy drives "
+                "the servos 1 to 12 together, so the map must have them all."
             )
         self._by_id = np.array(self.joint_map.ids) - 1
         if not hasattr(socket, "SOCK_SEQPACKET") or not hasattr(socket, "AF_UNIX"):
@@ -194,8 +177,8 @@ class Esp32Bus(HostClock):
         self._owner = own(self.path) if exclusive else None
         self._socket: socket.socket | None = None
         self._retry_s = 0.0
-        self._power: Power | None = None
-        self._power_s = -np.inf
+        self._supply_v: float | None = None
+        self._supply_s = -np.inf
         self._on = np.ones(SERVOS, bool)
         self._command = np.full(SERVOS, NO_COUNT)  # which cannot be sent
         self.joint_names = self.joint_map.joint_names
@@ -244,17 +227,17 @@ class Esp32Bus(HostClock):
         at = round((before + self.now()) / 2, 6)
         count = by_id[self._by_id]
         load = self._ask(GET_LOAD, parse_load)
-        if self.now() - self._power_s > _POWER_EVERY_S:
+        if self.now() - self._supply_s > _POWER_EVERY_S:
             # one that cannot be is none; an older one would hide that the supply has changed
-            self._power = self._ask(GET_POWER, parse_power)
-            self._power_s = self.now() if self._power else self._power_s
+            self._supply_v = self._ask(GET_POWER, parse_supply)
+            self._supply_s = self._supply_s if self._supply_v is None else self.now()
         joints = len(self.joint_names)
         missing = np.full(joints, np.nan)
         return BusSample(
             np.full(joints, at),
             self.joint_map.to_angles(np.where(count < 0, np.nan, count)),
             count,
-            voltage_v=missing if self._power is None else np.full(joints, self._power.voltage_v),
+            voltage_v=missing if self._supply_v is None else np.full(joints, self._supply_v),
             load=missing if load is None else load[self._by_id],
         )
 
@@ -333,10 +316,10 @@ class Esp32Bus(HostClock):
         # with a torque byte of 0 the count is not used, but must be valid
         counts = np.where(self._on | (self._command > 0), self._command, _ANY_COUNT)
         request = set_position(self._on, counts)
-        acknowledged = self._exchange(request) == ACKNOWLEDGED
-        if not acknowledged:
-            self._disconnect()
-        return acknowledged
+        if self._exchange(request) == ACKNOWLEDGED:
+            return True
+        self._disconnect()
+        return False
 
     def _ask(self, opcode: int, parse: Callable[[bytes], Answer | None]) -> Answer | None:
         reply = self._exchange(request(opcode))
@@ -351,7 +334,6 @@ class Esp32Bus(HostClock):
         if not self._connected():
             return None
         assert self._socket is not None
-        reply = b""
         try:
             # what is there already answers an earlier request
             for _ in range(_MOST_OLD_REPLIES):
@@ -359,13 +341,12 @@ class Esp32Bus(HostClock):
                     break
                 self._socket.recv(_LARGEST_REPLY)
             self._socket.sendall(request)
-            reply = self._socket.recv(_LARGEST_REPLY)
+            if reply := self._socket.recv(_LARGEST_REPLY):
+                return reply
         except OSError:  # time-outs too
             pass
-        if not reply:
-            self._disconnect()
-            return None
-        return reply
+        self._disconnect()
+        return None
 
     def _connected(self) -> bool:
         """Whether there is a connection; tries to make one."""

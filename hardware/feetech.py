@@ -21,13 +21,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from pupper_sysid.common.data_sheet import counts_of
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.serial_servos.bus import SerialBus
-from pupper_sysid.hardware.serial_servos.line import Reply, SerialLine
+from pupper_sysid.hardware.serial_servos.line import LineFrame, Reply, SerialLine
 from pupper_sysid.hardware.serial_servos.series import ERROR_BITS, Family, Profile, Register, Series
 
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
@@ -176,15 +176,8 @@ SHORTEST = 6
 _HIGHEST_LENGTH = 252
 
 
-@dataclass(frozen=True)
-class Frame:
-    """A frame with a correct checksum."""
-
-    id: int
-    code: int
-    """Instruction of a request, error byte of a reply."""
-    data: bytes
-    """Parameters."""
+class Frame(LineFrame):
+    """A frame of these servos."""
 
     def encode(self) -> bytes:
         """The frame on the wire.
@@ -206,11 +199,8 @@ def checksum(body: bytes | bytearray) -> int:
 class FrameReader:
     """Finds frames in a stream of bytes.
 
-    Parameters
-    ----------
-    plausible : callable
-        `(id, length byte) -> bool`: frames that can occur. Garbage that looks like the start of a
-        long frame would otherwise hide the true ones behind it.
+    `plausible(id, length byte)` says which can occur: garbage that looks like the start of a long
+    frame would otherwise hide the true ones behind it.
     """
 
     def __init__(self, plausible: Callable[[int, int], bool] = lambda frame_id, length: True):
@@ -222,7 +212,7 @@ class FrameReader:
     def feed(self, data: bytes) -> list[Frame]:
         """Frames completed by `data`."""
         self._buffer += data
-        found: list[Frame] = []
+        frames: list[Frame] = []
         buffer, start, end = self._buffer, 0, len(self._buffer)
         while end - start >= SHORTEST:
             if buffer[start] != 0xFF or buffer[start + 1] != 0xFF:
@@ -234,25 +224,19 @@ class FrameReader:
                 continue
             frame_id, length = buffer[start + 2], buffer[start + 3]
             whole = start + length + 4
-            if (
-                frame_id == 0xFF
-                or not 2 <= length <= _HIGHEST_LENGTH
-                or not self._plausible(frame_id, length)
-            ):
-                start += 1
-                self.rejected_bytes += 1
-            elif whole > end:
+            possible = frame_id != 0xFF and 2 <= length <= _HIGHEST_LENGTH
+            possible = possible and self._plausible(frame_id, length)
+            if possible and whole > end:
                 break
-            elif checksum(buffer[start + 2 : whole - 1]) != buffer[whole - 1]:
+            if possible and checksum(buffer[start + 2 : whole - 1]) == buffer[whole - 1]:
+                data = bytes(buffer[start + 5 : whole - 1])
+                frames.append(Frame(frame_id, buffer[start + 4], data))
+                start = whole
+            else:
                 start += 1
                 self.rejected_bytes += 1
-            else:
-                found.append(
-                    Frame(frame_id, buffer[start + 4], bytes(buffer[start + 5 : whole - 1]))
-                )
-                start = whole
         del buffer[:start]
-        return found
+        return frames
 
 
 class FeetechLine(SerialLine):
@@ -268,12 +252,12 @@ class FeetechLine(SerialLine):
         super().__init__(device, baud, exclusive)
         self._packets = self._sdk().protocol_packet_handler()
 
-    def ping(self, servo: int) -> Frame | None:
+    def ping(self, servo: int) -> LineFrame | None:
         """Status frame of `servo`, or None if it does not answer."""
         reply = self._exchange(
             lambda: self._packets.txPacket(self._port, [0, 0, servo, 2, PING, 0]), [servo], 0
         ).get(servo)
-        return reply.frame if reply else None  # pyright: ignore[reportReturnType]
+        return reply.frame if reply else None
 
     def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
         """The same bytes of several servos with one request (not on the SCS series)."""

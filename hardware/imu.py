@@ -56,18 +56,9 @@ class Imu(Protocol):
 
 
 def from_chip(time_s: float, raw: NDArray[np.float64]) -> ImuSample | None:
-    """Sample from the chip's six numbers.
+    """Sample from the chip's acceleration [g] and rate [°/s] along its own axes, shape (6,).
 
-    Parameters
-    ----------
-    time_s : float
-    raw : ndarray, shape (6,)
-        Acceleration [g], then rate [°/s], along the chip's axes.
-
-    Returns
-    -------
-    ImuSample or None
-        None if all six are 0, which is how the firmware reports a failed read.
+    None if all six are 0, which is how the firmware reports a failed read.
 
     Examples
     --------

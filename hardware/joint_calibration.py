@@ -65,17 +65,11 @@ _MARK = " Calibrated by calibrate-joints"
 
 
 class Travel:
-    """Lowest and highest counts seen so far.
+    """Lowest and highest counts seen so far, `low` and `high`, -1 where nothing has been read.
 
     An extreme counts once two successive readings have been there: the checksum of a serial frame
     lets one garbled frame in 256 by, and a joint at the end of its travel stands still anyway.
-
-    Attributes
-    ----------
-    now, low, high : ndarray of int, shape (joints,)
-        -1 where nothing has been read.
-    wrapped : ndarray of bool, shape (joints,)
-        Whether the counts jumped from one end of the encoder to the other.
+    `wrapped` joints jumped from one end of the encoder to the other.
 
     Examples
     --------
@@ -163,19 +157,9 @@ def middle_pose_in_words(file: JointMapFile, joints: tuple[str, ...]) -> str:
 
 
 def mean_counts(readings: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean count of held joints, and their motion meanwhile.
+    """Mean count of held joints, NaN without a reading, and by how far they moved meanwhile.
 
-    Parameters
-    ----------
-    readings : ndarray of int, shape (readings, joints)
-        -1 where a reading is missing.
-
-    Returns
-    -------
-    mean : ndarray, shape (joints,)
-        NaN where there is no reading.
-    strayed : ndarray, shape (joints,)
-        The highest less the lowest reading.
+    `readings` have the shape (readings, joints), -1 where one is missing.
     """
     known = np.where(readings < 0, np.nan, readings.astype(float))
     mean, strayed = np.full((2, readings.shape[1]), np.nan)
@@ -392,11 +376,7 @@ def lerobot_calibration(
 ) -> dict[str, dict[str, int]]:
     """Entries of LeRobot's file for a joint map.
 
-    Parameters
-    ----------
-    joint_map : JointMap
-    homing_offsets : mapping of str to int
-        Of the servos' registers, by joint; those of servos without one are 0.
+    `homing_offsets` are those of the servos' registers, by joint; of servos without one they are 0.
     """
     software = not (joint_map.file.servo or "STS").startswith(("X", "MX"))
     entries = {}

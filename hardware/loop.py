@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,17 +133,9 @@ _WORTH_NAMING = 0.05  # share of the time from which a part is named beside the 
 
 
 class TimeSpent:
-    """Time of a loop's ticks, by what it was spent on.
+    """Time of a loop's ticks, by what it was spent on, in `total_s`.
 
-    Parameters
-    ----------
-    now : callable
-        Clock [s].
-
-    Attributes
-    ----------
-    total_s : dict of str to float
-        So far; time within an inner block counts for that one only.
+    Time within an inner block counts for that one only.
 
     Examples
     --------
@@ -173,24 +164,12 @@ class TimeSpent:
             self._inner_s = outer_s + took
 
 
-class Timed(Protocol):
-    """A clock that a loop can wait for."""
-
-    def now(self) -> float:
-        """Time [s]."""
-        ...
-
-    def sleep_until(self, time_s: float) -> None:
-        """Return when `now()` has reached `time_s`."""
-        ...
-
-
 @dataclass
 class FixedRateLoop:
     """Ticks at a fixed rate."""
 
-    timed: Timed
-    """Its `spent`, a `TimeSpent`, is used if it has one, as a `GuardedBus` has."""
+    timed: ServoBus
+    """Its clock is used, and its `spent`, a `TimeSpent`, if it has one, as a `GuardedBus` has."""
     period_s: float
     most_misses: int = MOST_MISSES_IN_A_ROW
     """Missed deadlines in a row after which the loop stops."""
@@ -246,19 +225,18 @@ class FixedRateLoop:
 
     def summary(self) -> dict[str, float]:
         """Statistics for the recording's footer."""
-        found = {
-            "period_s": self.period_s,
-            "ticks": self.ticks_done,
+        counts = {
+            "period_s": self.period_s, "ticks": self.ticks_done,
             "missed_deadlines": self.missed_deadlines,
+        }  # fmt: skip
+        if not self.periods.count:
+            return counts
+        return counts | {
+            "mean_period_s": round(self.periods.mean_s, 7),
+            "sd_period_s": round(self.periods.sd_s, 7),
+            "longest_period_s": round(self.periods.largest_s, 7),
+            "jitter_p99_s": round(self.jitter.quantile(0.99), 7),
         }
-        if self.periods.count:
-            found |= {
-                "mean_period_s": round(self.periods.mean_s, 7),
-                "sd_period_s": round(self.periods.sd_s, 7),
-                "longest_period_s": round(self.periods.largest_s, 7),
-                "jitter_p99_s": round(self.jitter.quantile(0.99), 7),
-            }
-        return found
 
 
 @contextmanager
@@ -333,14 +311,8 @@ def glide(
 ) -> None:
     """Move from `origin` to `goal` [rad], shape (joints,), on a raised cosine.
 
-    Parameters
-    ----------
-    loop : FixedRateLoop
-    send : callable
-        Called with the pose of each tick.
-    origin, goal : ndarray, shape (joints,)
-    least_s : float
-        Shortest duration; longer if `GENTLE_RAD_S` asks for it.
+    `send` takes the pose of each tick. It takes `least_s`, or longer where `GENTLE_RAD_S` asks for
+    it.
     """
     way = goal - origin
     farthest = float(np.max(np.abs(way)))

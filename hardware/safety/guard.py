@@ -42,14 +42,7 @@ _RECENT_TICKS = 9
 
 
 class RateLimit:
-    """Speed and acceleration limits of the servo angles of a bus.
-
-    Parameters
-    ----------
-    limits : PositionLimits
-    speed_rad_s, acceleration_rad_s2 : float
-        Deceleration is free.
-    """
+    """Speed and acceleration limits of the servo angles of a bus; deceleration is free."""
 
     def __init__(self, limits: PositionLimits, speed_rad_s: float, acceleration_rad_s2: float):
         self._limits = limits
@@ -66,12 +59,7 @@ class RateLimit:
     ) -> NDArray[np.float64]:
         """`command`, or a point towards it that the limits allow; `command` itself if they do.
 
-        Parameters
-        ----------
-        command, sent : ndarray, shape (joints,)
-            The command, and the last one that was sent [rad].
-        since_s : float
-            Time since then.
+        Both it and the last one `sent`, `since_s` ago, have the shape (joints,) [rad].
         """
         limits = self._limits
         wanted, here = limits.servo_angles(command), limits.servo_angles(sent)
@@ -137,15 +125,7 @@ class GuardReport:
 
 
 class GuardedBus:
-    """A guarded `ServoBus`.
-
-    Parameters
-    ----------
-    bus : ServoBus
-    limits : GuardLimits, optional
-    watchdog : Watchdog, optional
-        Armed while the torque is on.
-    """
+    """A guarded `ServoBus`; the watchdog is armed while the torque is on."""
 
     def __init__(
         self,
@@ -180,90 +160,68 @@ class GuardedBus:
         """Sleep until `now()` has reached `time_s`; the watchdog gets its beats meanwhile."""
         while self._on and (left := time_s - self.bus.now()) > _HEARTBEAT_S:
             self._beat()
-            if alive := getattr(
-                self.bus, "keep_alive", None
-            ):  # servos with a watchdog of their own
-                alive()
+            getattr(self.bus, "keep_alive", lambda: None)()  # servos with a watchdog of their own
             self.bus.sleep_until(self.bus.now() + min(_HEARTBEAT_S, left))
         self.bus.sleep_until(time_s)
 
     def read(self) -> BusSample:
-        """Read all joints once and check the readings.
-
-        Raises
-        ------
-        SafetyStop
-            The sentence names the joint, the fault, and what to check.
-        """
+        """Read all joints once and check the readings; a fault is a `SafetyStop`."""
         with self.spent.on(BUS):
             sample = self.bus.read()
         with self.spent.on(GUARD):
-            return self._checked(sample)
-
-    def _checked(self, sample: BusSample) -> BusSample:
-        valid = np.isfinite(sample.position_rad)
-        self._present = np.where(valid, sample.position_rad, self._present)
-        self._present_s[valid] = self.bus.now()
-        self.report.missing += int((~valid).sum())
-        if self._on:
-            self._beat()
-            try:
-                self._monitor.check(sample, self._sent)
-            except SafetyStop:
-                self._stopped_for_safety = True
-                raise
-        return sample
+            valid = np.isfinite(sample.position_rad)
+            self._present = np.where(valid, sample.position_rad, self._present)
+            self._present_s[valid] = self.bus.now()
+            self.report.missing += int((~valid).sum())
+            if self._on:
+                self._beat()
+                try:
+                    self._monitor.check(sample, self._sent)
+                except SafetyStop:
+                    self._stopped_for_safety = True
+                    raise
+            return sample
 
     def write(self, position_rad: Angles) -> Sent:
         """Send commands after all limits; `Sent` holds the limited ones.
 
-        Raises
-        ------
-        BusError
-            If a command is NaN, or they are not one per joint.
-        SafetyStop
-            If the first command is far from the robot's pose, or the pose is outside the limits.
+        `SafetyStop` if the first command is far from the robot's pose, or the pose is outside the
+        limits.
         """
         with self.spent.on(GUARD):
-            return self._write(position_rad)
-
-    def _write(self, position_rad: Angles) -> Sent:
-        command = np.asarray(position_rad, float)
-        # one that is no number would stay in the velocity
-        if command.shape != self._present.shape or np.isnan(command).any():
-            wanted = f"{len(self.joint_names)} numbers"
-            raise BusError(f"{self.name}: a command must be {wanted}, got {command}.")
-        allowed = self.limits.clip(command)
-        now = self.bus.now()
-        if np.any(allowed != command):
-            self.report.add("clipped", now)
-        if self._sent is None:
-            self._check_first(allowed)
-            self._rates.rest()
-        else:
-            slower = self._rates.limited(allowed, self._sent, now - self._sent_s)
-            if slower is not allowed:
-                self.report.add("slowed", now)
-            allowed = slower
-        with self.spent.on(BUS):
-            sent = self.bus.write(allowed)
-        self._beat()
-        if np.isfinite(sent.time_s):
-            self._sent, self._sent_s = sent.position_rad, now
-            self._monitor.add_command(now, sent.position_rad)
-        else:
-            self.report.add("unsent", now)
-        return sent
+            command = np.asarray(position_rad, float)
+            # one that is no number would stay in the velocity
+            if command.shape != self._present.shape or np.isnan(command).any():
+                wanted = f"{len(self.joint_names)} numbers"
+                raise BusError(f"{self.name}: a command must be {wanted}, got {command}.")
+            allowed = self.limits.clip(command)
+            now = self.bus.now()
+            if np.any(allowed != command):
+                self.report.add("clipped", now)
+            if self._sent is None:
+                self._check_first(allowed)
+                self._rates.rest()
+            else:
+                slower = self._rates.limited(allowed, self._sent, now - self._sent_s)
+                if slower is not allowed:
+                    self.report.add("slowed", now)
+                allowed = slower
+            with self.spent.on(BUS):
+                sent = self.bus.write(allowed)
+            self._beat()
+            if np.isfinite(sent.time_s):
+                self._sent, self._sent_s = sent.position_rad, now
+                self._monitor.add_command(now, sent.position_rad)
+            else:
+                self.report.add("unsent", now)
+            return sent
 
     def torque(self, on: bool) -> bool:
         """Switch the torque; on only after every joint has returned a valid position.
 
-        Raises
-        ------
-        BusError
-            If a servo's registers do not let it be driven (`SerialBus.refuse_unfit`), a position is
-            missing, a servo does not take a protection that it lacks, or a servo
-            did not confirm that its torque is on; the torque of all is switched off then.
+        `BusError` if a servo's registers do not let it be driven (`SerialBus.refuse_unfit`), a
+        position is missing, a servo does not take a protection that it lacks, or one did not
+        confirm that its torque is on; the torque of all is switched off then.
         """
         if not on:
             self._torque_off()
@@ -468,15 +426,10 @@ _TRIES, _PAUSE_S = 3, 0.02
 
 
 class ChangedRegisters:
-    """Registers of a bus's servos that differ from what was found.
+    """Registers of a bus's servos that differ from what was found, in `found` by joint and name.
 
-    Parameters
-    ----------
-    bus : ServoBus
-    watchdog : Watchdog, optional
-        Sets them back if this process dies.
-    found : mapping of joint to mapping of str to int, optional
-        Values before the change, by another driver.
+    The watchdog sets them back if this process dies. What another driver had `found` is set back,
+    too.
     """
 
     def __init__(
@@ -509,20 +462,16 @@ class ChangedRegisters:
             return True
         for joint, own in self.found.items():
             for name, value in list(own.items()):
-                if self._set_back(joint, name, value):
-                    del own[name]
+                for _ in range(_TRIES):
+                    try:
+                        self._bus.set_register(joint, name, value)
+                        del own[name]
+                        break
+                    except BusError:
+                        self._bus.sleep_until(self._bus.now() + _PAUSE_S)
         self.found = {joint: own for joint, own in self.found.items() if own}
         self._tell()
         return not self.found
-
-    def _set_back(self, joint: str, name: str, value: int) -> bool:
-        for _ in range(_TRIES):
-            try:
-                self._bus.set_register(joint, name, value)
-                return True
-            except BusError:
-                self._bus.sleep_until(self._bus.now() + _PAUSE_S)
-        return False
 
     def _tell(self) -> None:
         if self._watchdog:

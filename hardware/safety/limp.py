@@ -22,28 +22,12 @@ _TRIES = 5
 def switch_off(
     address: BusAddress, joint_map: JointMap | None = None, joints: Sequence[str] | None = None
 ) -> list[str]:
-    """Switch the torque off once, without a lock.
+    """Switch the torque off once, without a lock; joints whose servos did not confirm it.
 
     Servos of a serial line get it in one frame before anything is known of the line, so that those
-    that hear but do not answer go limp, too; without a joint map all servos do.
-
-    Parameters
-    ----------
-    address : BusAddress
-    joint_map : JointMap, optional
-        Without one every servo of a serial line is switched off, whatever it moves.
-    joints : sequence of str, optional
-        On a serial line only these; by default all of the map.
-
-    Returns
-    -------
-    list of str
-        Joints whose servos did not confirm it; without a map, `id 5` and so on.
-
-    Raises
-    ------
-    BusError
-        If the bus cannot be opened, or no servo answers.
+    that hear but do not answer go limp, too. Without a joint map every servo of the line is
+    switched off, whatever it moves, and those that did not confirm are named `id 5` and so on.
+    `BusError` if the bus cannot be opened, or no servo answers.
     """
     kind = KINDS[address.kind].bus_class()
     chosen = joint_map.per_servo() if joint_map else None

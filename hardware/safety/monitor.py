@@ -130,13 +130,7 @@ class Monitor:
         self._commands.append((now_s, self._servo_angles(command)))
 
     def check(self, sample: BusSample, command: Angles | None) -> None:
-        """Store a reading and check it together with the ones before it.
-
-        Raises
-        ------
-        SafetyStop
-            If a fault is found; the sentence names the joint, the fault and what to check.
-        """
+        """Store a reading and check it with the ones before it; a fault is a `SafetyStop`."""
         now = self._now()
         valid = np.isfinite(sample.position_rad)
         self._last_read_s[valid] = now
@@ -175,7 +169,7 @@ class Monitor:
     def _check_faults(self, sample: BusSample, valid: NDArray[np.bool_], now: float) -> None:
         if sample.voltage_v is not None:
             low, high = self._supply_v
-            k = self._out_of("voltage", sample.voltage_v, low, high, valid, now)
+            k = self._out_of("voltage", sample.voltage_v, self._supply_v, valid, now)
             if k is not None:
                 volts = sample.voltage_v[k]
                 cure = "Charge the battery or check the supply."
@@ -189,7 +183,7 @@ class Monitor:
                 )
         if sample.temperature_c is not None:
             low, high = self._limits.coldest_c, self._limits.temperature_c
-            k = self._out_of("heat", sample.temperature_c, low, high, valid, now)
+            k = self._out_of("heat", sample.temperature_c, (low, high), valid, now)
             if k is not None:
                 degrees = sample.temperature_c[k]
                 cure = "Let it cool down, then use a smaller amplitude or fewer frequencies."
@@ -206,15 +200,14 @@ class Monitor:
                 )
 
     def _out_of(
-        self, what: str, value: Angles, low: float, high: float, valid: NDArray[np.bool_],
-        now: float,
-    ) -> int | None:  # fmt: skip
+        self, what: str, value: Angles, ends: tuple, valid: NDArray[np.bool_], now: float
+    ) -> int | None:
         """Index of a joint whose value has been out of range, or none, for `fault_for_s`.
 
         Where the position is missing, too, a value that is none is a lost reading.
         """
         number = np.isfinite(value)
-        inside = number & (value >= low) & (value <= high)
+        inside = number & (value >= ends[0]) & (value <= ends[1])
         return self._persistent(what, ~inside & (number | valid), inside, now)
 
     def _persistent(

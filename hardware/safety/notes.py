@@ -58,13 +58,8 @@ class Note:
 def write_note(orders: dict[str, Any], joints: Sequence[str], watchdog: int) -> None:
     """Note that the torque of these joints is on.
 
-    Parameters
-    ----------
-    orders : dict
-        First message to the watchdog, and the registers to be set back.
-    joints : sequence of str
-    watchdog : int
-        Its process id.
+    `orders` are the first message to the watchdog, and the registers to be set back; `watchdog` is
+    its process id.
     """
     processes = [[number, _state(number)[1]] for number in (orders["driver"], watchdog)]
     text = json.dumps(orders | {"joints": list(joints), "processes": processes}).encode()
@@ -97,18 +92,24 @@ def notes() -> list[Note]:
 def _read(name: str) -> Note:
     descriptor = open_here(name, os.O_RDONLY)
     try:
-        told = json.loads(os.read(descriptor, _MOST_BYTES))
+        orders = json.loads(os.read(descriptor, _MOST_BYTES))
     finally:
         os.close(descriptor)
-    joint_map = joint_map_from(told["map"], name)
+    registers = orders.get("registers", {})
     return Note(
-        BusAddress(told["kind"], told["where"], told["baud"]),
-        joint_map if told["coordinates"] == "joint" else joint_map.per_servo(),
-        tuple(told["joints"]),
-        int(told["driver"]),
-        tuple((int(number), int(start)) for number, start in told["processes"]),
-        {j: {n: int(v) for n, v in own.items()} for j, own in told.get("registers", {}).items()},
+        *robot_of(orders, name),
+        tuple(orders["joints"]),
+        int(orders["driver"]),
+        tuple((int(number), int(start)) for number, start in orders["processes"]),
+        {j: {n: int(v) for n, v in own.items()} for j, own in registers.items()},
     )
+
+
+def robot_of(orders: dict[str, Any], name: str) -> tuple[BusAddress, JointMap]:
+    """Address and joint map of the first message to a watchdog."""
+    joint_map = joint_map_from(orders["map"], name)
+    address = BusAddress(orders["kind"], orders["where"], orders["baud"])
+    return address, joint_map if orders["coordinates"] == "joint" else joint_map.per_servo()
 
 
 def _name(where: str) -> str:

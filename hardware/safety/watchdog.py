@@ -42,14 +42,7 @@ _START_WITHIN_S = 20.0
 
 
 class Watchdog:
-    """Start the watchdog process and send it beats.
-
-    Parameters
-    ----------
-    address : BusAddress
-    joint_map : JointMap
-        That of the bus.
-    """
+    """Start the watchdog process and send it beats; `joint_map` is that of the bus."""
 
     def __init__(self, address: BusAddress, joint_map: JointMap):
         self._beaten_s, self._due_s = 0.0, math.inf
@@ -111,11 +104,8 @@ class Watchdog:
     def beat(self) -> None:
         """Report that the driver is in control; cheap enough for every tick.
 
-        Raises
-        ------
-        SafetyStop
-            If the watchdog process has ended, or has not answered for half a second; or if this
-            process, or the machine, stood still for so long that the torque may be off by now.
+        `SafetyStop` if the watchdog process has ended, or has not answered for half a second; or if
+        this process, or the machine, stood still for so long that the torque may be off by now.
         """
         now, lasting = time.monotonic(), lasting_s()
         late_s = lasting - self._due_s

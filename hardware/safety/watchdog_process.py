@@ -32,12 +32,12 @@ import numpy as np
 # everything that parking needs is loaded at the start, not when it is urgent
 from pupper_sysid.common.errors import PupperError
 from pupper_sysid.hardware.address import BusAddress
-from pupper_sysid.hardware.joint_map import JointMap, joint_map_from
+from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.hardware.loop import lasting_s
 from pupper_sysid.hardware.safety.guard import ChangedRegisters, GuardedBus, open_bus
 from pupper_sysid.hardware.safety.limp import can_come_back, is_there, may_be_on, say, switch_off
 from pupper_sysid.hardware.safety.monitor import GuardLimits
-from pupper_sysid.hardware.safety.notes import remove_note
+from pupper_sysid.hardware.safety.notes import remove_note, robot_of
 from pupper_sysid.hardware.safety.watchdog import HANG_S, SWITCH_ON_S
 
 PARK_WITHIN_S = 0.5
@@ -102,11 +102,7 @@ def main() -> None:
 
 def first_orders(message: dict[str, Any]) -> _Orders:
     """Orders of the first message of `Watchdog`: address, joint map, and the driver's id."""
-    joint_map = joint_map_from(message["map"], "the joint map")
-    if message["coordinates"] == "servo":
-        joint_map = joint_map.per_servo()
-    address = BusAddress(message["kind"], message["where"], message["baud"])
-    return _Orders(address, joint_map, message["driver"])
+    return _Orders(*robot_of(message, "the joint map"), message["driver"])
 
 
 def _follow(orders: _Orders, pipe: int, answers: int) -> None:

@@ -64,6 +64,7 @@ _TORQUE_ON_TRIES, _TORQUE_OFF_TRIES = 10, 3
 _GOAL_TRIES = 3
 _SILENT_AFTER = 3
 _SILENT_AT_ONCE = 3
+_NO_DOUBT = (-np.inf, -1)
 _DOUBTS = 10  # exchanges from which the uncertainty of reading times is estimated
 
 
@@ -78,8 +79,8 @@ class LineServo:
     misses: int = 0
     last_s: float = -np.inf
     last_count: int = -1
-    doubtful_s: float = -np.inf
-    doubtful_count: int = -1
+    doubtful: tuple[float, int] = _NO_DOUBT
+    """Time and count of a reading that the one before it does not explain."""
     voltage_v: float = np.nan
     temperature_c: float = np.nan
 
@@ -87,19 +88,10 @@ class LineServo:
 class SerialBus(HostClock):
     """Servos on a serial line.
 
-    Parameters
-    ----------
-    device : str
-        Serial port.
-    baud : int, optional
-        Detected if not given.
-    joint_map : JointMap, optional
-        For raw counts; by default that of the Mini Pupper's layout, if the line has its twelve
-        servos and no other.
-    joints : sequence of str, optional
-        Only these, and all of them; by default those of the map that answer.
-    exclusive : bool
-        Whether to refuse a port that another program has open.
+    The rate is detected without a `baud`. `joint_map` is for raw counts; by default that of the
+    Mini Pupper's layout, if the line has its twelve servos and no other. Of `joints` all must
+    answer; by default the bus has those of the map that do. `exclusive` refuses a port that another
+    program has open.
     """
 
     family: ClassVar[Family]
@@ -122,17 +114,16 @@ class SerialBus(HostClock):
             self.family, device, baud, ids, exclusive, patiently=wanted is not None
         )
         try:
-            series = known_series(
-                self.family, models, device, wanted.file.servo if wanted else None
-            )
+            named = wanted.file.servo if wanted else None
+            series = known_series(self.family, models, device, named)
             if wanted is None:
                 wanted = default_map(self.family, self.line, series)
                 wanted = wanted.select(joints) if joints else wanted
             else:
                 refuse_other_servos(wanted, self.family, one_series(series, device), device)
-            given = joints is not None
-            names = answering_joints(self.family, wanted, series, given, self.line)
-            self.joint_map = wanted.select(names)
+            self.joint_map = wanted.select(
+                answering_joints(self.family, wanted, series, joints is not None, self.line)
+            )
             self._servos = [LineServo(i, series[i]) for i in self.joint_map.ids]
             super().__init__()
             first = self._servos[0].series.register(self.family.present)
@@ -181,13 +172,7 @@ class SerialBus(HostClock):
             line.close()
 
     def refuse_unfit(self) -> None:
-        """Refuse servos whose registers do not let them be driven by this map.
-
-        Raises
-        ------
-        BusError
-            It names joint, register, value and cure.
-        """
+        """Refuse servos whose registers do not let them be driven by this map."""
         for joint, servo in zip(self.joint_names, self._servos, strict=True):
             if servo.registers is None:
                 self._remember(servo)
@@ -271,16 +256,11 @@ class SerialBus(HostClock):
 
     def goals(self) -> NDArray[np.float64]:
         """Goal_Position of each servo as an angle, shape (joints,); NaN where the read failed."""
-        counts = np.full(len(self._servos), np.nan)
-        for k, servo in enumerate(self._servos):
-            goal = servo.series.register("goal_position")
-            for _ in range(_GOAL_TRIES):
-                reply = self.line.read(servo.id, goal.address, goal.size)
-                if reply:
-                    data = reply.frame.data
-                    counts[k] = servo.series.decode("goal_position", data, goal.address)
-                    break
-        return self.joint_map.to_angles(counts)
+        goals = [
+            read_register(self.line, s.id, s.series, "goal_position", _GOAL_TRIES)
+            for s in self._servos
+        ]
+        return self.joint_map.to_angles(np.array([np.nan if x is None else x for x in goals]))
 
     def servo_setups(self) -> dict[str, dict[str, Any]]:
         """Model, firmware, gains and registers of each servo, as found when the bus was opened."""
@@ -331,26 +311,24 @@ class SerialBus(HostClock):
             faults = register_faults(
                 self.family, servo.series, servo.registers, entry.limits_counts
             )
-            for fault in [*faults, *self._other_offset(servo, entry.homing_offset)]:
+            name, expected = servo.series.name_of("homing_offset"), entry.homing_offset
+            value = servo.registers.get(name)
+            if expected is not None and value is not None and value != expected:
+                meaning = (
+                    f"the joint map holds with {expected} only, and all angles are off by the rest"
+                )
+                cure = (
+                    f"Write {expected} into {name} with {self.family.tool} or LeRobot, or measure "
+                    "the map anew with `pupper-sysid calibrate-joints`"
+                )
+                faults.append(RegisterFault("homing_offset", value, meaning, cure))
+            for fault in faults:
                 joints.setdefault((fault, servo.series.name), []).append(self.joint_names[k])
         series = {servo.series.name: servo.series for servo in self._servos}
         return [
             (fault, fault.sentence(", ".join(names), series[name]))
             for (fault, name), names in joints.items()
         ]
-
-    def _other_offset(self, servo: LineServo, expected: int | None) -> list[RegisterFault]:
-        """Fault of a homing offset that is not that of the joint map."""
-        name = servo.series.name_of("homing_offset")
-        value = (servo.registers or {}).get(name)
-        if expected is None or value is None or value == expected:
-            return []
-        meaning = f"the joint map holds with {expected} only, and all angles are off by the rest"
-        cure = (
-            f"Write {expected} into {name} with {self.family.tool} or LeRobot, or measure the map "
-            "anew with `pupper-sysid calibrate-joints`"
-        )
-        return [RegisterFault("homing_offset", value, meaning, cure)]
 
     def _status(self, servo: LineServo, reply: Reply) -> int:
         """Error bits of a reply."""
@@ -372,11 +350,9 @@ class SerialBus(HostClock):
         series = servo.series
         if on:
             # else it would jump to an old Goal_Position
-            where = series.register("present_position")
-            here = self.line.read(servo.id, where.address, where.size)
-            if here is None:
+            present = read_register(self.line, servo.id, series, "present_position", tries=1)
+            if present is None:
                 return False
-            present = series.decode("present_position", here.frame.data, where.address)
             goal = series.encode("goal_position", int(np.clip(present, 0, series.counts - 1)))
             if not self.line.write(servo.id, self._goal_address, goal):
                 return False
@@ -429,21 +405,19 @@ class SerialBus(HostClock):
             return False
         per_rad = float(self.joint_map.counts_per_rad()[index])
 
-        def reachable(since_s: float, from_count: int) -> bool:
+        def near(since_s: float, from_count: int) -> bool:  # anything is, of long ago
             farthest = _SLACK_RAD + _FASTEST_RAD_S * (at - since_s)
             return abs(count - from_count) <= per_rad * farthest
 
-        good = not np.isfinite(servo.last_s) or reachable(servo.last_s, servo.last_count)
-        if not good:
-            # a second reading that agrees is accepted: the earlier one was wrong
-            good = bool(np.isfinite(servo.doubtful_s)) and reachable(
-                servo.doubtful_s, servo.doubtful_count
-            )
-            servo.doubtful_s, servo.doubtful_count = at, count
-        if good:
-            servo.last_s, servo.last_count = at, count
-            servo.doubtful_s = -np.inf
-        return good
+        doubtful_s, doubtful_count = servo.doubtful
+        # a second reading that agrees is accepted: the earlier one was wrong
+        if near(servo.last_s, servo.last_count) or (
+            np.isfinite(doubtful_s) and near(doubtful_s, doubtful_count)
+        ):
+            servo.last_s, servo.last_count, servo.doubtful = at, count, _NO_DOUBT
+            return True
+        servo.doubtful = at, count
+        return False
 
     def _choose_reading(self) -> str:
         """Request with which the servos are read, for the header."""

@@ -55,23 +55,15 @@ _MEASURED_ON = 8  # exchanges
 _GARBLED_AT_LEAST, _CONFIRMED_BY = 3, 6
 
 
-class Frame(Protocol):
-    """A reply as the line's reader gives it."""
+@dataclass(frozen=True)
+class LineFrame:
+    """A frame with a correct checksum, of any vendor."""
 
-    @property
-    def id(self) -> int:
-        """Servo that sent it."""
-        ...
-
-    @property
-    def code(self) -> int:
-        """Error byte."""
-        ...
-
-    @property
-    def data(self) -> bytes:
-        """Parameters."""
-        ...
+    id: int
+    code: int
+    """Instruction of a request, error byte of a reply."""
+    data: bytes
+    """Parameters."""
 
 
 class Reader(Protocol):
@@ -79,7 +71,7 @@ class Reader(Protocol):
 
     rejected_bytes: int
 
-    def feed(self, data: bytes) -> Sequence[Frame]:
+    def feed(self, data: bytes) -> Sequence[LineFrame]:
         """Frames completed by `data`."""
         ...
 
@@ -88,7 +80,7 @@ class Reader(Protocol):
 class Reply:
     """Reply of a servo, with `time.monotonic()` around its own part of the exchange."""
 
-    frame: Frame
+    frame: LineFrame
     before_s: float
     after_s: float
     waited_s: float = 0.0
@@ -98,22 +90,9 @@ class Reply:
 class SerialLine(ABC):
     """An open serial line of one vendor's servos; see the module's docstring.
 
-    Parameters
-    ----------
-    device : str
-        Serial port.
-    baud : int
-        Bits per second.
-    exclusive : bool
-        Whether to refuse a port that another program has open.
-
-    Attributes
-    ----------
-    latency_s : float
-        Time by which replies came later than bytes and servos need: the adapter's; 0 until `find`
-        has measured it.
-    patience_s : float
-        Time for which a reply is awaited beyond that.
+    `exclusive` refuses a port that another program has open. `latency_s` is the time by which
+    replies came later than bytes and servos need, the adapter's; 0 until `find` has measured it.
+    For `patience_s` beyond that a reply is awaited.
     """
 
     reply_bytes: int
@@ -160,7 +139,7 @@ class SerialLine(ABC):
         """A reader of replies; `accepted(id, data length)` says which can occur."""
 
     @abstractmethod
-    def _request(self, frame: Frame) -> bytes:
+    def _request(self, frame: LineFrame) -> bytes:
         """Bytes that a request with the content of `frame` would have."""
 
     @abstractmethod
@@ -172,7 +151,7 @@ class SerialLine(ABC):
         """A request to which no servo answers."""
 
     @abstractmethod
-    def ping(self, servo: int) -> Frame | None:
+    def ping(self, servo: int) -> LineFrame | None:
         """Status frame of `servo`, or None if it does not answer."""
 
     @abstractmethod
@@ -184,14 +163,9 @@ class SerialLine(ABC):
         """The request that switches the torque of all servos off."""
 
     def sync_read_s(self, delays_s: Sequence[float], size: int) -> float:
-        """Time that the replies to the last `sync_read` need on the wire [s].
+        """Time that replies of `size` bytes to the last `sync_read` need on the wire [s].
 
-        Parameters
-        ----------
-        delays_s : sequence of float
-            Return delays of the servos that replied, in order [s].
-        size : int
-            Bytes read of each.
+        `delays_s` are the return delays of the servos that replied, in order.
         """
         return sum(delays_s) + len(delays_s) * (size + self.reply_bytes) * self._byte_s()
 
@@ -241,15 +215,10 @@ class SerialLine(ABC):
     def roll_call(
         self, servos: Iterable[int], advance: Callable[[int], None] = lambda servo: None
     ) -> dict[int, tuple[int, float]]:
-        """Ask each servo for its model number, and collect the replies however late they come.
+        """Model number (its bytes as little endian) and latency [s] of each servo that answers.
 
         Requests go out as soon as a servo would have answered on a fast adapter, or earlier if it
         did. Replies of a slow adapter arrive during later requests, and are matched by their ids.
-
-        Returns
-        -------
-        dict of int to (int, float)
-            By id: model number (its bytes as little endian), and the latency of its reply [s].
         """
         requests: dict[int, float] = {}
         sent: set[bytes] = set()
@@ -322,14 +291,9 @@ class SerialLine(ABC):
     def doubled(self, servos: Sequence[int], address: int, size: int) -> list[int]:
         """Ids whose replies are garbled while those of the other ids are clean.
 
-        Two servos of one id answer at the same time, and destroy each other's replies. Suspects are
-        read again, patiently: a late or half reply is no sign of a second servo.
-
-        Parameters
-        ----------
-        servos : sequence of int
-        address, size : int
-            Registers in which two servos differ: their positions.
+        Two servos of one id answer at the same time, and destroy each other's replies, at the
+        registers at `address` in which they differ: their positions. Suspects are read again,
+        patiently: a late or half reply is no sign of a second servo.
         """
         suspects = [servo for servo in servos if self.garbled[servo] >= _GARBLED_AT_LEAST]
         others = [servo for servo in servos if servo not in suspects]
@@ -427,7 +391,7 @@ class SerialLine(ABC):
         """Send, and collect one reply of `size` parameter bytes from each of `servos`."""
         wanted = set(servos)
         reader = self._reader(lambda servo, length: servo in wanted and length == size)
-        replies: dict[int, tuple[Frame, float]] = {}
+        replies: dict[int, tuple[LineFrame, float]] = {}
         contradicted: set[int] = set()
         arrived = bytearray()
 
@@ -459,22 +423,10 @@ class SerialLine(ABC):
     def _listen(
         self, send: Callable[[], int], size: int, delays: int, take: Callable[[bytes], bool]
     ) -> float | None:
-        """Send, and hand what arrives to `take` until it has all, or the time is over.
+        """Send, and hand what arrives, without echo, to `take` until it has all or time is over.
 
-        Parameters
-        ----------
-        send : callable
-        size : int
-            Bytes that should come.
-        delays : int
-            Servos whose return delays add up.
-        take : callable
-            Takes bytes without echo; returns whether all has come.
-
-        Returns
-        -------
-        float or None
-            `time.monotonic()` when the request's last byte was on the wire; None if not sent.
+        `size` bytes should come, after the return delays of `delays` servos. Gives
+        `time.monotonic()` when the request's last byte was on the wire; None if it was not sent.
         """
         before = time.monotonic()
         if not self._sent(send):

@@ -14,11 +14,11 @@ from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.serial_servos.line import SerialLine, slow_adapter
 from pupper_sysid.hardware.serial_servos.series import Family, Series, bits_in_words
 from pupper_sysid.hardware.serial_servos.settings import (
-    GAINS,
     memory_of,
     register_faults,
     registers_of,
     return_delay_s,
+    setup_of,
 )
 
 _USUAL_IDS = tuple(range(31))
@@ -88,7 +88,11 @@ def scan_line(
                 continue
             first = first or rate
             servos += [_report(family, line, servo, model) for servo, model in answering.items()]
-            remarks += _doubled(family, line, answering)
+            known = next((family.series[m] for m in answering.values() if m in family.series), None)
+            if known is not None:
+                where, size = known.register(family.present).address, family.reading_bytes[0]
+                doubled = line.doubled(list({*answering, *line.garbled}), where, size)
+                remarks += [two_of_one_id(line, servo) for servo in doubled]
             if slow := slow_adapter(line):
                 remarks.append(slow)
         finally:
@@ -141,38 +145,25 @@ def _report(family: Family, line: SerialLine, servo: int, model: int) -> ServoRe
     def value(name: str) -> int:
         return registers[series.name_of(name)]
 
-    firmware = registers.get("firmware", None)
+    setup = setup_of(servo, family, series, registers)
     # without a joint map any limits fit
     low, high = value("min_angle"), value("max_angle")
     inside = (low, high) if 0 <= low < high else (0, series.counts - 1)
     faults = register_faults(family, series, registers, inside)
-    delay_s = return_delay_s(family, {"registers": registers})
     return ServoReport(
         servo,
         series.name,
         errors,
         line.baud,
-        str(firmware)
-        if firmware is not None
-        else f"{value('firmware_major')}.{value('firmware_minor')}",
+        setup["firmware"],
         round(value("present_voltage") * family.volt_scale, 1),
         float(value("present_temperature")),
         value("present_position"),
         (low, high),
-        tuple(value(GAINS[key]) for key in ("p_gain", "d_gain", "i_gain")),
-        round(1e6 * delay_s),
+        tuple(setup[key] for key in ("p_gain", "d_gain", "i_gain")),
+        round(1e6 * return_delay_s(family, setup)),
         tuple(fault.sentence(f"id {servo}", series) for fault in faults),
     )
-
-
-def _doubled(family: Family, line: SerialLine, answering: dict[int, int]) -> list[str]:
-    """Sentences about ids that two servos have."""
-    series = next((family.series[m] for m in answering.values() if m in family.series), None)
-    if series is None:
-        return []
-    where = series.register(family.present).address
-    ids = line.doubled(list({*answering, *line.garbled}), where, family.reading_bytes[0])
-    return [two_of_one_id(line, servo) for servo in ids]
 
 
 def two_of_one_id(line: SerialLine, servo: int) -> str:
@@ -186,17 +177,14 @@ def two_of_one_id(line: SerialLine, servo: int) -> str:
 
 
 def _slow_returns(servos: list[ServoReport]) -> list[str]:
-    slow = [
-        s
-        for s in servos
-        if s.return_delay_us is not None and s.return_delay_us > 1e6 * _SLOW_RETURN_S
-    ]
+    delay_us = {s.id: s.return_delay_us or 0 for s in servos}
+    slow = [servo for servo, us in delay_us.items() if us > 1e6 * _SLOW_RETURN_S]
     if not slow:
         return []
-    delays = sorted({s.return_delay_us for s in slow if s.return_delay_us is not None})
+    delays = sorted({delay_us[servo] for servo in slow})
     many = len(slow) > 1
     return [
-        f"{'Servos' if many else 'Servo'} {ids_in_words([s.id for s in slow])} "
+        f"{'Servos' if many else 'Servo'} {ids_in_words(slow)} "
         f"{'have' if many else 'has'} a return delay of {' or '.join(map(str, delays))} µs; 0 "
         "would make reading faster."
     ]
@@ -215,13 +203,7 @@ def open_line(
     exclusive: bool = True,
     patiently: bool = True,
 ) -> tuple[SerialLine, dict[int, int]]:
-    """Open a line at the first of the baud rates at which a servo answers.
-
-    Returns
-    -------
-    (SerialLine, dict of int to int)
-        The line; those of `ids` that answer, and their model numbers.
-    """
+    """Open a line at the first rate at which one of `ids` answers; and models of all that do."""
     for rate in family.rates if baud is None else (baud,):
         line = family.open_line(device, rate, exclusive)
         line.detect_echo()
@@ -283,16 +265,13 @@ def answering_joints(
 
 def one_series(series: dict[int, Series], device: str) -> Series:
     """The series of all servos."""
-    kinds = {s.name: s for s in series.values()}
-    if (
-        len({s.counts for s in kinds.values()}) != 1
-        or len({s.big_endian for s in kinds.values()}) != 1
-    ):
+    if len({(s.counts, s.big_endian) for s in series.values()}) != 1:
+        names = sorted({s.name for s in series.values()})
         raise BusError(
-            f"{device}: servos of different series ({', '.join(sorted(kinds))}) share the line, "
-            "and their counts differ. Use one series per line."
+            f"{device}: servos of different series ({', '.join(names)}) share the line, and their "
+            "counts differ. Use one series per line."
         )
-    return next(iter(kinds.values()))
+    return next(iter(series.values()))
 
 
 def default_map(family: Family, line: SerialLine, series: dict[int, Series]) -> JointMap:
@@ -319,23 +298,22 @@ def default_map(family: Family, line: SerialLine, series: dict[int, Series]) -> 
 
 def refuse_other_servos(joint_map: JointMap, family: Family, one: Series, device: str) -> None:
     """Refuse a joint map that is not of these servos."""
-    name = joint_map.file.name
+    name, counts = joint_map.file.name, joint_map.file.counts
     if joint_map.frame != "raw":
         raise InputError(
-            f"the joint map {name} holds counts of the robot's proxy, and a direct "
-            "bus uses raw ones. Make a map with "
-            f"`pupper-sysid calibrate-joints --bus {family.name}:{device}`."
+            f"the joint map {name} holds counts of the robot's proxy, and a direct bus uses raw "
+            f"ones. Make a map with `pupper-sysid calibrate-joints --bus {family.name}:{device}`."
         )
-    if joint_map.file.counts != one.counts:
+    if counts != one.counts:
         raise InputError(
-            f"the joint map {name} is for servos of {joint_map.file.counts} "
-            f"counts; these {one.name} have {one.counts}. Choose another map."
+            f"the joint map {name} is for servos of {counts} counts; these {one.name} have "
+            f"{one.counts}. Choose another map."
         )
     named = data_sheet(joint_map.file.servo) if joint_map.file.servo else None
     if named and named.model_number != one.model:
         raise InputError(
-            f"the joint map {name} is for {named.name} servos; these are "
-            f"{one.name}. Choose another map."
+            f"the joint map {name} is for {named.name} servos; these are {one.name}. Choose "
+            "another map."
         )
 
 

@@ -73,13 +73,7 @@ class Series:
         return self.name_of(name) in self.registers
 
     def register(self, name: str) -> Register:
-        """Entry of a register.
-
-        Raises
-        ------
-        KeyError
-            If the series has none of this name.
-        """
+        """Entry of a register; `KeyError` if the series has none of this name."""
         return self.registers[self.name_of(name)]
 
     def word(self, value: int) -> bytes:
@@ -97,13 +91,7 @@ class Series:
         return signed(int.from_bytes(raw, order, signed=register.signed), register.sign_bit)
 
     def encode(self, name: str, value: int) -> bytes:
-        """Bytes of register `name`.
-
-        Raises
-        ------
-        OverflowError
-            If the value does not fit.
-        """
+        """Bytes of register `name`; `OverflowError` if the value does not fit."""
         register = self.register(name)
         if register.sign_bit is not None:
             if abs(value) >> register.sign_bit:

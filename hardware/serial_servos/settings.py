@@ -71,16 +71,9 @@ def registers_of(series: Series, memory: bytes) -> dict[str, int]:
 def setup_of(
     servo: int, family: Family, series: Series, registers: Mapping[str, int] | None
 ) -> dict[str, Any]:
-    """Entry of a servo in a recording's header (`sysid.recordings.table.ServoSetup`).
+    """Entry in a recording's header (`sysid.recordings.table.ServoSetup`) of one servo.
 
-    Parameters
-    ----------
-    servo : int
-        Its id.
-    family : Family
-    series : Series
-    registers : mapping of str to int, or None
-        From `registers_of`; without it only id and model are known.
+    Without the registers, which are those of `registers_of`, only id and model are known.
     """
     setup: dict[str, Any] = {"id": servo, "model": series.name}
     if registers is None:
@@ -135,17 +128,7 @@ def register_faults(
     registers: Mapping[str, int],
     limits: tuple[int, int],
 ) -> list[RegisterFault]:
-    """What is wrong with a servo's registers for driving it within `limits`.
-
-    Parameters
-    ----------
-    family : Family
-    series : Series
-    registers : mapping of str to int
-        From `registers_of`.
-    limits : (int, int)
-        Lowest and highest count that may be commanded.
-    """
+    """What is wrong with a servo's registers for driving it within `limits` [counts]."""
 
     def get(name: str, default: int = 0) -> int:
         return registers.get(series.name_of(name), default)
@@ -282,10 +265,12 @@ def _profile_remarks(
     ]
 
 
-def read_register(line: SerialLine, servo: int, series: Series, name: str) -> int | None:
+def read_register(
+    line: SerialLine, servo: int, series: Series, name: str, tries: int = _READ_TRIES
+) -> int | None:
     """Value of a register; None if it could not be read."""
     register = series.register(name)
-    for _ in range(_READ_TRIES):
+    for _ in range(tries):
         reply = line.read(servo, register.address, register.size)
         if reply:
             return series.decode(name, reply.frame.data, register.address)

@@ -35,19 +35,9 @@ _WARM_UP_ROUNDS = 64
 class PollSchedule:
     """Poll instants of all servos, drawn as time goes on.
 
-    Parameters
-    ----------
-    period_s : float
-        Mean length of a round [s], positive.
-    phase_s : ndarray, shape (servos,)
-        A poll instant of each servo on the lattice at time 0 [s].
-    loss : float
-        Probability that a poll fails.
-    jitter_s : float
-        Standard deviation of a single poll instant [s].
-    drift : float
-        Relative standard deviation of the round's length as it wanders.
-    rng : numpy.random.Generator
+    A round has the mean length `period_s`, which wanders by the relative standard deviation
+    `drift`; `phase_s`, shape (servos,), is a poll instant of each servo at time 0. A poll fails
+    with the probability `loss`, and comes early or late with the standard deviation `jitter_s`.
     """
 
     def __init__(
@@ -178,24 +168,12 @@ AMBIENT_C, SUPPLY_V = 27.0, 7.4
 class ServoBench:
     """The servos of a robot, by joint.
 
-    Parameters
-    ----------
-    robot : EmulatedRobot
-    joint_map : JointMap
-        What counts mean; used in servo coordinates, all joints of the robot.
-    rng : numpy.random.Generator
-        Reading noise.
-    keep_log : bool
-        Whether commands and readings are remembered: for tests, not for runs of days.
-    plant : ServoPlant, optional
-        What moves; by default the robot's servos in free air.
+    Counts are those of `joint_map`, in servo coordinates, which must have all joints of the robot.
+    With `keep_log` commands and readings are remembered: for tests, not for runs of days. What
+    moves is the `plant`, by default the robot's servos in free air.
 
-    Attributes
-    ----------
-    commands : list of (float, int, int)
-        Every command: time [s], servo index, count.
-    hand_rad : ndarray, shape (joints,)
-        How far each limp servo was moved by hand [rad], servo coordinates; see `move_by_hand`.
+    `commands` are all commands: time [s], servo index, count. `hand_rad`, shape (joints,), is how
+    far each limp servo was moved by hand (`move_by_hand`) [rad].
     """
 
     def __init__(

@@ -74,18 +74,9 @@ _IN_USE_S = 5.0
 class EmulatedBus:
     """A `hardware.bus.ServoBus` of emulated servos.
 
-    Parameters
-    ----------
-    robot : EmulatedRobot
-        The truth.
-    rng : numpy.random.Generator
-        Decides lost polls, noise and timing.
-    real_time : bool
-        Use the host's clock instead of virtual time.
-    plant : ServoPlant, optional
-        What moves; by default the robot's servos in free air.
-    keep_log : bool
-        Whether the truth of every read is remembered, for `truth_rows`; not for runs of days.
+    In `real_time` it uses the host's clock instead of virtual time. What moves is the `plant`, by
+    default the robot's servos in free air. With `keep_log` the truth of every read is remembered,
+    for `truth_rows`; not for runs of days.
     """
 
     name = "emulated"
@@ -154,13 +145,7 @@ class EmulatedBus:
         self._clock.sleep_until(time_s)
 
     def write(self, position_rad: NDArray[np.float64]) -> Sent:
-        """Send commands [rad], shape (12,).
-
-        Raises
-        ------
-        BusError
-            If the bus is closed or a command is not a number.
-        """
+        """Send commands [rad], shape (12,)."""
         self._refuse_closed()
         asked = finite_angles(position_rad, len(self.joint_names), self.name)
         sent, (goal, _) = self._clock.now(), self._quantised(asked, whole=np.trunc)
@@ -176,13 +161,7 @@ class EmulatedBus:
         return Sent(sent, asked)
 
     def read(self) -> BusSample:
-        """Read all joints once: the values of the last successful poll of each.
-
-        Raises
-        ------
-        BusError
-            If the bus is closed.
-        """
+        """Read all joints once: the values of the last successful poll of each."""
         self._refuse_closed()
         before = self._clock.now()
         self._clock.spend(self.robot.spec.read_duration_s)

@@ -11,25 +11,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 from pupper_sysid.hardware import dynamixel as table
-from pupper_sysid.hardware.dynamixel import (
-    ACTION,
-    ALERT,
-    BAUD_RATES,
-    BROADCAST_ID,
-    FAMILY,
-    FAST_SYNC_READ,
-    PING,
-    READ,
-    REBOOT,
-    REG_WRITE,
-    SYNC_READ,
-    SYNC_WRITE,
-    TRIGGERED,
-    WATCHDOG_UNIT_S,
-    WRITE,
-    Frame,
-    FrameReader,
-)
+from pupper_sysid.hardware.dynamixel import BROADCAST_ID, FAMILY, Frame, FrameReader
 from pupper_sysid.sim.emulator.pendulum import DYNAMIXEL_GAINS
 from pupper_sysid.sim.emulator.serial_line import LineEmulator, Pieces
 
@@ -58,7 +40,7 @@ def _factory(name: str) -> dict[str, int]:
 
 _CHOICES = {
     "operating_mode": {0, 1, 3, 4, 5, 16}, "status_return_level": {0, 1, 2},
-    "torque_enable": {0, 1}, "baud_rate": set(range(len(BAUD_RATES))),
+    "torque_enable": {0, 1}, "baud_rate": set(range(len(table.BAUD_RATES))),
 }  # fmt: skip
 _READ_ONLY = {
     "model_number", "firmware", "moving", "hardware_error_status", "present_pwm",
@@ -78,13 +60,13 @@ class DynamixelEmulator(LineEmulator):
         return FrameReader()
 
     def _baud_register(self, baud: int) -> dict[str, int]:
-        return {"baud_rate": BAUD_RATES.index(baud)}
+        return {"baud_rate": table.BAUD_RATES.index(baud)}
 
     def _status(self, servo_id: int, error: int, data: bytes) -> bytes:
         return Frame(servo_id, error, data, is_status=True).encode()
 
     def _write_request(self, servo_id: int, address: int, data: bytes) -> bytes:
-        return Frame(servo_id, WRITE, address.to_bytes(2, "little") + data).encode()
+        return Frame(servo_id, table.WRITE, address.to_bytes(2, "little") + data).encode()
 
     def receive(self, data: bytes, now: float, baud: int | None = None) -> Pieces:
         """See `LineEmulator.receive`; the pause since the last frame is counted first."""
@@ -93,29 +75,22 @@ class DynamixelEmulator(LineEmulator):
         pieces = super().receive(data, now, baud)
         for servo_id in self._reader.crc_errors:
             if servo_id in self.servos:
-                byte_s = 10.0 / (
-                    self.baud if baud is None or baud <= 0 else baud
-                )  # 0: without a name
-                pieces += self._answer(servo_id, 0, 0, byte_s, table.CRC)
+                pieces += self._answer(servo_id, 0, 0, self._byte_s(baud), table.CRC)
         self._reader.crc_errors.clear()
         return pieces
 
     def _execute(self, frame: Frame, byte_s: float) -> Pieces:
-        at, params = self._free_at, frame.data
-        for servo_id in self.servos if frame.id == BROADCAST_ID else (frame.id,):
-            if servo_id in self.servos:
-                self.servos[servo_id].heard_s = at
-        if frame.code in (SYNC_READ, SYNC_WRITE, FAST_SYNC_READ):
+        at, to_all = self._free_at, frame.id == BROADCAST_ID
+        heard = sorted(self.servos) if to_all else [frame.id] * (frame.id in self.servos)
+        for servo_id in heard:
+            self.servos[servo_id].heard_s = at
+        if frame.code in (table.SYNC_READ, table.SYNC_WRITE, table.FAST_SYNC_READ):
             return self._sync(frame, byte_s)
-        if frame.id == BROADCAST_ID:
-            pieces: Pieces = []
-            for servo_id in sorted(self.servos):
-                reply = self._instruct(servo_id, frame, at, byte_s)
-                pieces += reply if frame.code == PING else []
-            return pieces
-        if frame.id not in self.servos:
-            return []
-        return self._instruct(frame.id, Frame(frame.id, frame.code, params), at, byte_s)
+        pieces: Pieces = []
+        for servo_id in heard:
+            reply = self._instruct(servo_id, frame, at, byte_s)
+            pieces += [] if to_all and frame.code != table.PING else reply
+        return pieces
 
     def _sync(self, frame: Frame, byte_s: float) -> Pieces:
         params, pieces = frame.data, []
@@ -123,9 +98,9 @@ class DynamixelEmulator(LineEmulator):
             return []
         address, size = (int.from_bytes(params[k : k + 2], "little") for k in (0, 2))
         rest = params[4:]
-        if frame.code == FAST_SYNC_READ:
+        if frame.code == table.FAST_SYNC_READ:
             return self._fast(rest, address, size, byte_s)
-        if frame.code == SYNC_READ:
+        if frame.code == table.SYNC_READ:
             for servo_id in rest:
                 if servo_id in self.servos and self._level(servo_id) >= 1:
                     error = 0 if address + size <= self.memory_bytes else table.ACCESS
@@ -155,9 +130,7 @@ class DynamixelEmulator(LineEmulator):
                 or address + size > self.memory_bytes
             ):
                 break
-            added = self._answer(
-                servo_id, address, size, byte_s, encode=block, waits=not pieces
-            )  # fmt: skip
+            added = self._answer(servo_id, address, size, byte_s, encode=block, waits=not pieces)
             sent = b"".join(piece for _, piece in added)
             expected = size + table.FAST_BLOCK_BYTES + (0 if pieces else len(line))
             line = line + sent if pieces else sent
@@ -170,39 +143,36 @@ class DynamixelEmulator(LineEmulator):
         """Execute an instruction of one servo; its reply."""
         code, params, level = frame.code, frame.data, self._level(servo_id)
         servo = self.servos[servo_id]
-        answers = level >= 2
-        if code == PING:
+        if code == table.PING:
             model = self._get(servo_id, "model_number").to_bytes(2, "little")
             return self._reply(servo_id, model + bytes([self._get(servo_id, "firmware")]), byte_s)
-        if code == READ:
+        if code == table.READ:
             if len(params) != 4:
                 return self._answer(servo_id, 0, 0, byte_s, table.DATA_LENGTH) if level else []
             address, size = (int.from_bytes(params[k : k + 2], "little") for k in (0, 2))
             error = 0 if 0 < size and address + size <= self.memory_bytes else table.ACCESS
-            return self._answer(servo_id, address, 0 if error else size, byte_s, error) * bool(
-                level
-            )
+            pieces = self._answer(servo_id, address, 0 if error else size, byte_s, error)
+            return pieces if level else []
         error = table.INSTRUCTION
-        if code in (WRITE, REG_WRITE) and len(params) > 2:
+        if code in (table.WRITE, table.REG_WRITE) and len(params) > 2:
             address = int.from_bytes(params[:2], "little")
-            if code == WRITE:
+            if code == table.WRITE:
                 error = self._try_store(servo_id, address, params[2:], at)
             else:
                 servo.state["registered"] = (address, params[2:])
                 error = 0
-        elif code in (WRITE, REG_WRITE):
+        elif code in (table.WRITE, table.REG_WRITE):
             error = table.DATA_LENGTH
-        elif code == ACTION:
+        elif code == table.ACTION:
             kept = servo.state.pop("registered", None)
             error = self._try_store(servo_id, kept[0], kept[1], at) if kept else table.RESULT_FAIL
-        elif code == REBOOT:
+        elif code == table.REBOOT:
             error = 0
-            self._set(servo_id, "hardware_error_status", 0)
-            self._set(servo_id, "torque_enable", 0)
-            self._set(servo_id, "bus_watchdog", 0)
+            for name in ("hardware_error_status", "torque_enable", "bus_watchdog"):
+                self._set(servo_id, name, 0)
             servo.stopped = servo.overloaded = False
             self.bench.torque(self.bench.index_of_id[servo_id], at, False)
-        return self._answer(servo_id, 0, 0, byte_s, error) if answers else []
+        return self._answer(servo_id, 0, 0, byte_s, error) if level >= 2 else []
 
     def _reply(self, servo_id: int, data: bytes, byte_s: float) -> Pieces:
         """A reply whose data are not in the memory: those of a ping."""
@@ -254,9 +224,6 @@ class DynamixelEmulator(LineEmulator):
                 return table.DATA_LIMIT
         return 0
 
-    def _may_store(self, servo_id: int, address: int, at: float) -> bool:
-        return True  # `_try_store` has decided
-
     def _store(self, servo_id: int, address: int, data: bytes, at: float) -> None:
         super()._store(servo_id, address, data, at)
         where = self.series.register("bus_watchdog").address
@@ -268,11 +235,11 @@ class DynamixelEmulator(LineEmulator):
         """Stop a servo whose bus watchdog has run out."""
         servo = self.servos[servo_id]
         units = self._get(servo_id, "bus_watchdog")
-        ends = servo.heard_s + units * WATCHDOG_UNIT_S
+        ends = servo.heard_s + units * table.WATCHDOG_UNIT_S
         on = self._get(servo_id, "torque_enable")
-        if 0 < units < TRIGGERED and on and now > ends and not servo.stopped:
+        if 0 < units < table.TRIGGERED and on and now > ends and not servo.stopped:
             servo.stopped = True
-            self._set(servo_id, "bus_watchdog", TRIGGERED)
+            self._set(servo_id, "bus_watchdog", table.TRIGGERED)
             k = self.bench.index_of_id[servo_id]
             self.bench.command(k, ends, self.bench.count(k, ends))
 
@@ -284,7 +251,7 @@ class DynamixelEmulator(LineEmulator):
         if status & self._get(servo_id, "shutdown") and self._get(servo_id, "torque_enable"):
             self._set(servo_id, "torque_enable", 0)
             self.bench.torque(self.bench.index_of_id[servo_id], self._free_at, False)
-        return ALERT if status else 0
+        return table.ALERT if status else 0
 
     def _protect(self, servo_id: int, at: float) -> None:
         """Shutdown by overload, if its register asks for it."""

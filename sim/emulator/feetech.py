@@ -7,18 +7,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from pupper_sysid.hardware.feetech import (
-    BAUD_RATES,
-    BROADCAST_ID,
-    FAMILY,
-    PING,
-    READ,
-    SYNC_READ,
-    SYNC_WRITE,
-    WRITE,
-    Frame,
-    FrameReader,
-)
+from pupper_sysid.hardware import feetech as table
+from pupper_sysid.hardware.feetech import FAMILY, Frame, FrameReader
 from pupper_sysid.sim.emulator.serial_line import LineEmulator, Pieces
 
 _OVERLOAD = 32  # of `hardware.serial_servos.series.ERROR_BITS`
@@ -52,37 +42,37 @@ class FeetechEmulator(LineEmulator):
         return FrameReader()
 
     def _baud_register(self, baud: int) -> dict[str, int]:
-        return {"baud": BAUD_RATES.index(baud)}
+        return {"baud": table.BAUD_RATES.index(baud)}
 
     def _status(self, servo_id: int, error: int, data: bytes) -> bytes:
         return Frame(servo_id, error, data).encode()
 
     def _write_request(self, servo_id: int, address: int, data: bytes) -> bytes:
-        return Frame(servo_id, WRITE, bytes([address]) + data).encode()
+        return Frame(servo_id, table.WRITE, bytes([address]) + data).encode()
 
     def _execute(self, frame: Frame, byte_s: float) -> Pieces:
         at, params = self._free_at, frame.data
-        if frame.code == SYNC_WRITE and len(params) > 2:
+        if frame.code == table.SYNC_WRITE and len(params) > 2:
             address, size = params[0], params[1]
             for k in range(2, len(params) - size, size + 1):
                 self._store(params[k], address, params[k + 1 : k + 1 + size], at)
             return []
-        if frame.code == SYNC_READ and len(params) > 2 and self.series.has_sync_read:
+        if frame.code == table.SYNC_READ and len(params) > 2 and self.series.has_sync_read:
             address, size, ids = params[0], params[1], params[2:]
             pieces = []
             for servo_id in ids:
                 pieces += self._answer(servo_id, address, size, byte_s)
             return pieces
-        if frame.id == BROADCAST_ID:
-            if frame.code == WRITE and len(params) > 1:
+        if frame.id == table.BROADCAST_ID:
+            if frame.code == table.WRITE and len(params) > 1:
                 for servo_id in self.servos:
                     self._store(servo_id, params[0], params[1:], at)
             return []
-        if frame.code == PING:
+        if frame.code == table.PING:
             return self._answer(frame.id, 0, 0, byte_s)
-        if frame.code == READ and len(params) == 2:
+        if frame.code == table.READ and len(params) == 2:
             return self._answer(frame.id, params[0], params[1], byte_s)
-        if frame.code == WRITE and len(params) > 1 and frame.id in self.servos:
+        if frame.code == table.WRITE and len(params) > 1 and frame.id in self.servos:
             self._store(frame.id, params[0], params[1:], at)
             if self._get(frame.id, "response_level"):
                 return self._answer(frame.id, 0, 0, byte_s)

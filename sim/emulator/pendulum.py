@@ -38,10 +38,11 @@ from pupper_sysid.hardware.dynamixel import SERIES, profile
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.emulator.bench import AMBIENT_C, SUPPLY_V, ServosOnStand
-from pupper_sysid.sim.emulator.robot import EmulatedRobot, EmulatedServo, directly_read, draw_robot
+from pupper_sysid.sim.emulator.robot import EmulatedRobot, directly_read, draw_robot
 from pupper_sysid.sim.robot.servo_mjcf import (
     FRICTION_SOLIMP,
     INTEGRATOR,
+    MASSLESS,
     attributes,
     friction_solref,
 )
@@ -133,7 +134,6 @@ def dynamixel_registers(model: str) -> dict[str, int]:
 
 PHYSICS_STEP_S = 0.001
 GRAVITY_M_S2 = 9.81
-REGISTERS = FEETECH_REGISTERS
 
 _STILL_RAD_S, _STILL_RAD_S2, _STILL_STEPS = 1e-4, 1e-2, 50
 _HORN_KG_M2 = 1e-5  # output side without a load
@@ -192,17 +192,9 @@ class PendulumServoParameters:
 class PendulumServo:
     """A servo with its load; time starts at 0 and must not go backwards.
 
-    Parameters
-    ----------
-    parameters : PendulumServoParameters
-    position_rad : float
-        Where it rests at the start, commanded there for long.
-    registers : dict of str to int, optional
-        Other than the factory's.
-    factory : mapping of str to int
-        Registers that act on the motion, as the servo leaves the factory.
-    loop : callable
-        Constants of the position loop, from the registers and the parameters.
+    At the start it rests at `position_rad`, commanded there for long. `registers` are those that
+    differ from the `factory`'s, which act on the motion; `loop` gives the constants of the position
+    loop.
     """
 
     def __init__(
@@ -232,7 +224,7 @@ class PendulumServo:
         self._queue: deque[tuple[float, float]] = deque()
         self._limp = self._off = False
         self._switch: tuple[float, bool] | None = None
-        self._tune()
+        self._loop = loop(self._registers, parameters)
 
     def command(self, time_s: float, position_rad: float) -> None:
         """Set the command from `time_s` on; times must not go backwards."""
@@ -256,7 +248,7 @@ class PendulumServo:
         self.position_at(time_s)
         self._registers[name] = int(value)
         self._still = 0
-        self._tune()
+        self._loop = self._loop_of(self._registers, self.parameters)
 
     def position_at(self, time_s: float) -> float:
         """True position of the output [rad], at most one step before the latest asked."""
@@ -322,15 +314,16 @@ class PendulumServo:
 
     def _follow(self, goal: float) -> None:
         """Move the set-point to `goal`, on a ramp if the registers ask for one."""
-        if math.isinf(self._top_speed) and math.isinf(self._top_acceleration):
+        top_speed, acceleration = self._loop.top_speed_rad_s, self._loop.top_acceleration_rad_s2
+        if math.isinf(top_speed) and math.isinf(acceleration):
             self._setpoint = goal
             return
         way = goal - self._setpoint
-        wanted = min(self._top_speed, abs(way) / self._dt)
-        if not math.isinf(self._top_acceleration):
-            gain = self._top_acceleration * self._dt
+        wanted = min(top_speed, abs(way) / self._dt)
+        if not math.isinf(acceleration):
+            gain = acceleration * self._dt
             # the speed from which the rest of the way is enough to stop
-            wanted = min(wanted, math.sqrt(2 * self._top_acceleration * abs(way)))
+            wanted = min(wanted, math.sqrt(2 * acceleration * abs(way)))
             wanted = math.copysign(wanted, way)
             self._rate = min(max(wanted, self._rate - gain), self._rate + gain)
         else:
@@ -357,12 +350,6 @@ class PendulumServo:
             duty = math.copysign(loop.least, error)
         return min(max(duty, -loop.most), loop.most)
 
-    def _tune(self) -> None:
-        """Take the registers over into the loop."""
-        self._loop = self._loop_of(self._registers, self.parameters)
-        self._top_speed = self._loop.top_speed_rad_s
-        self._top_acceleration = self._loop.top_acceleration_rad_s2
-
 
 def _xml(p: PendulumServoParameters, time_step_s: float) -> str:
     """MJCF: a motor on a hinge about y, and its load, directly or through gears with play."""
@@ -376,7 +363,7 @@ def _xml(p: PendulumServoParameters, time_step_s: float) -> str:
         "frictionloss": _number(p.friction_nm),
     }  # fmt: skip
     total = p.mass_kg + p.arm_mass_kg
-    load = '<inertial pos="0 0 0" mass="1e-9" diaginertia="1e-15 1e-15 1e-15"/>'
+    load = MASSLESS
     if total > 0 and p.length_m > 0:
         below = (p.mass_kg + p.arm_mass_kg / 2) * p.length_m / total
         inertia = _number(max(p.load_inertia_kg_m2 - total * below**2, 1e-12))
@@ -395,8 +382,7 @@ def _xml(p: PendulumServoParameters, time_step_s: float) -> str:
                 "frictionloss": _number(p.output_friction_nm),
             }
         )  # fmt: skip
-        gears = '<inertial pos="0 0 0" mass="1e-9" diaginertia="1e-15 1e-15 1e-15"/>'
-        load = f"{gears}<body><joint {play}/>{load}</body>"
+        load = f"{MASSLESS}<body><joint {play}/>{load}</body>"
     return (
         f'<mujoco><compiler angle="radian"/><option timestep="{time_step_s}" '
         f'integrator="{INTEGRATOR}" gravity="0 0 {-GRAVITY_M_S2}"/>'
@@ -409,6 +395,8 @@ def _number(value: float) -> str:
     return repr(float(value))
 
 
+_SPREAD = ("torque_nm", "duty_per_rad", "back_emf_nm_s_rad", "friction_nm", "armature_kg_m2")
+"""What differs from servo to servo of a bench."""
 BENCH_MAP = "bench_sts3215"
 """Joint map of one STS3215 on a bench: joint `bench`, id 1, 0 rad at its centre count."""
 
@@ -583,38 +571,27 @@ def draw_bench(
     registers = spec.factory | dict(spec.registers)
     servos, loaded = [], []
     for servo in drawn.servos:
-        torque, duty, emf, friction, armature = np.exp(spec.spread * rng.standard_normal(5))
+        factors = np.exp(spec.spread * rng.standard_normal(len(_SPREAD)))
         late = spec.dead_time_s + spec.dead_time_sd_s * rng.standard_normal()
         own = PendulumServoParameters(
-            torque_nm=float(spec.torque_nm * torque),
-            duty_per_rad=float(spec.duty_per_rad * duty),
-            back_emf_nm_s_rad=float(spec.back_emf_nm_s_rad * emf),
-            friction_nm=float(spec.friction_nm * friction),
-            armature_kg_m2=float(spec.armature_kg_m2 * armature),
+            **{n: float(getattr(spec, n) * f) for n, f in zip(_SPREAD, factors, strict=True)},
+            **asdict(load),
             dead_time_s=float(max(late, 2 * PHYSICS_STEP_S)),
-            mass_kg=load.mass_kg,
-            length_m=load.length_m,
-            arm_mass_kg=load.arm_mass_kg,
-            hanging_rad=load.hanging_rad,
             count_rad=reading.quantum_rad,
             backlash_rad=spec.backlash_rad,
             output_friction_nm=spec.output_friction_nm,
         )
         loaded.append(own)
-        servos.append(_equivalent(servo, own, spec.loop(registers, own)))
+        loop = spec.loop(registers, own)
+        equivalent = DelayedPDParameters(  # moves alike for small errors
+            stiffness=own.torque_nm * loop.p,
+            damping=own.torque_nm * loop.d,
+            friction_loss=own.friction_nm,
+            armature=own.armature_kg_m2 + own.load_inertia_kg_m2,
+            effort_limit=own.torque_nm * loop.most,
+            velocity_limit=math.inf,
+            dead_time_s=own.dead_time_s,
+            back_emf=own.back_emf_nm_s_rad,
+        )
+        servos.append(replace(servo, actuator=equivalent))
     return BenchRobot(reading, tuple(servos), layout, tuple(loaded), spec)
-
-
-def _equivalent(servo: EmulatedServo, own: PendulumServoParameters, loop: Loop) -> EmulatedServo:
-    """`servo` with the DelayedPD servo that moves alike for small errors."""
-    actuator = DelayedPDParameters(
-        stiffness=own.torque_nm * loop.p,
-        damping=own.torque_nm * loop.d,
-        friction_loss=own.friction_nm,
-        armature=own.armature_kg_m2 + own.load_inertia_kg_m2,
-        effort_limit=own.torque_nm * loop.most,
-        velocity_limit=math.inf,
-        dead_time_s=own.dead_time_s,
-        back_emf=own.back_emf_nm_s_rad,
-    )
-    return replace(servo, actuator=actuator)

@@ -70,26 +70,11 @@ class EmulatedMemory:
 
 
 class LineEmulator(ABC):
-    """A line of servos.
+    """A line of servos of one series, at the ids of the bench's joint map (`ids`: only these).
 
-    Parameters
-    ----------
-    bench : ServoBench
-        The servos; ids are those of its joint map.
-    series : Series
-        Of all of them.
-    rng : numpy.random.Generator
-    ids : sequence of int, optional
-        Servos on the line; default all of the map.
-    baud : int
-        Rate at which the servos listen.
-    faults : BusFaults, optional
-    echo : bool
-        Whether the adapter returns the host's own bytes.
-    registers : mapping of int or None to mapping of str to int, optional
-        Registers that differ from the factory's, by id; of all servos under None.
-    doubled : sequence of int
-        Ids that two servos have: their answers destroy each other.
+    `baud` is the rate at which they listen. With `echo` the adapter returns the host's own bytes.
+    `registers` differ from the factory's, by id, of all servos under None. Each of the ids
+    `doubled` is that of two servos, whose answers destroy each other.
     """
 
     family: ClassVar[Family]
@@ -123,9 +108,9 @@ class LineEmulator(ABC):
         self._acting = [n for n in bench.acting_registers if series.has(n)]
         for servo_id in ids if ids is not None else bench.map.ids:
             self.servos[servo_id] = EmulatedMemory(bytearray(self.memory_bytes))
-            changed = dict((registers or {}).get(None, {})) | dict(
-                (registers or {}).get(servo_id, {})
-            )
+            changed: dict[str, int] = {}
+            for whose in (None, servo_id):
+                changed |= (registers or {}).get(whose, {})
             settings = dict(self.factory[series.name]) | {
                 "model": series.model, "id": servo_id, "torque_enable": 1,
             } | self._baud_register(baud)  # fmt: skip
@@ -171,35 +156,16 @@ class LineEmulator(ABC):
         """Error byte of a reply of a servo with these faults."""
         return bits
 
-    def _may_store(self, servo_id: int, address: int, at: float) -> bool:
-        """Whether a servo takes a write at this address."""
-        locked = self.series.lock_address
-        return not (
-            address < self.series.eeprom_end
-            and locked is not None
-            and self.servos[servo_id].memory[locked]
-        )
-
     # ----- what all share
 
     def receive(self, data: bytes, now: float, baud: int | None = None) -> Pieces:
-        """What comes back for `data`, which the host began to send at about `now`.
+        """What comes back, in order of time, for `data` that the host began to send at about `now`
+        [s].
 
-        Parameters
-        ----------
-        data : bytes
-        now : float
-            Seconds; must not go backwards.
-        baud : int, optional
-            Rate at which the host sends; at another than theirs the servos receive only noise.
-
-        Returns
-        -------
-        list of (time, bytes)
-            Pieces in order of the time at which they have arrived.
+        Time must not go backwards. At another rate than theirs, `baud`, the servos receive only
+        noise.
         """
-        byte_s = 10.0 / (self.baud if baud is None or baud <= 0 else baud)  # 0: without a name
-        self._free_at = max(now, self._free_at)
+        byte_s, self._free_at = self._byte_s(baud), max(now, self._free_at)
         pieces = [(self._free_at + len(data) * byte_s, data)] if self.echo else []
         for byte in data:  # a request acts at its own end, however many come at once
             self._free_at += byte_s
@@ -207,6 +173,9 @@ class LineEmulator(ABC):
                 for frame in self._reader.feed(bytes([byte])):
                     pieces += self._execute(frame, byte_s)
         return sorted(pieces, key=lambda p: p[0])
+
+    def _byte_s(self, baud: int | None) -> float:
+        return 10.0 / (self.baud if baud is None or baud <= 0 else baud)  # 0: without a name
 
     def _holds_position(self, servo_id: int) -> bool:
         """Whether a servo goes to the positions that it is commanded, by its mode."""
@@ -240,7 +209,8 @@ class LineEmulator(ABC):
         servo = self.servos.get(servo_id)
         if servo is None or address + len(data) > self.memory_bytes or at < self._brown_out_until:
             return
-        if not self._may_store(servo_id, address, at):
+        locked = self.series.lock_address  # without one the vendor's emulator has decided
+        if locked is not None and address < self.series.eeprom_end and servo.memory[locked]:
             return
         servo.memory[address : address + len(data)] = data
         touched = range(address, address + len(data))
@@ -393,21 +363,10 @@ class LineEmulator(ABC):
 _SPEEDS = {
     getattr(termios, f"B{rate}"): rate
     for rate in (
-        9_600,
-        19_200,
-        38_400,
-        57_600,
-        115_200,
-        230_400,
-        460_800,
-        500_000,
-        921_600,
-        1_000_000,
-        2_000_000,
-        3_000_000,
-        4_000_000,
+        9_600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 500_000, 921_600, 1_000_000,
+        2_000_000, 3_000_000, 4_000_000,
     )
-}
+}  # fmt: skip
 _IDLE_S = 0.05
 _TCGETS2, _TERMIOS2 = 0x802C542A, struct.Struct("=4IB19s2I")
 """Linux: request of a terminal's settings with its rates as numbers, and their layout."""

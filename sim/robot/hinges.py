@@ -45,13 +45,7 @@ class Hinge:
 
 
 def hinges_of(path: Path) -> list[Hinge]:
-    """All hinges of the model in `path`, in its order; meshes need not be there.
-
-    Raises
-    ------
-    InputError
-        If MuJoCo cannot read the file, or needs too much memory or time for it.
-    """
+    """All hinges of the model in `path`, in its order; meshes need not be there."""
     if not path.is_file():
         raise InputError(f"{path} is no file. Give your robot's MJCF or URDF.")
     if path.stat().st_size > _LARGEST_BYTES:

@@ -96,23 +96,11 @@ def robot_xml(
 ) -> str:
     """MJCF of the robot.
 
-    Parameters
-    ----------
-    servos : dict of str to DelayedPDParameters
-        One per joint, scalars; the joint's name is the actuator's, too. The dead time sets the
-        length of the delay line.
-    time_step_s : float
-        Physics step [s].
-    knee : {"linkage", "serial"}
-    ground : str
-        MJCF of the ground; its geoms need `conaffinity="1"`.
-    assets : str
-        MJCF inside `<asset>` that the ground needs.
-    physics : {"training", "evaluation"}
-        The model of training has nothing that it does not simulate: no geoms but feet and ground,
-        and no light.
-    imu : bool
-        Whether it has sensors `gyro` and `accelerometer`; `<leg>_foot_touch` [N] it always has.
+    `servos` are scalars, one per joint; the joint's name is the actuator's, too, and the dead time
+    sets the length of the delay line. Geoms of the `ground` need `conaffinity="1"`; `assets` is
+    what it needs inside `<asset>`. With the `physics` of training the model has nothing that it
+    does not simulate: no geoms but feet and ground, and no light. With `imu` it has the sensors
+    `gyro` and `accelerometer`; `<leg>_foot_touch` [N] it always has.
     """
     whole = physics == "evaluation"
     legs = "".join(_leg(leg, servos, time_step_s, knee, whole) for leg in LEGS)

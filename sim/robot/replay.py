@@ -65,27 +65,17 @@ def replay(
 ) -> Replayed:
     """Let copies of a robot move under commands.
 
-    Parameters
-    ----------
-    robot : ServoRobot
-    fixed : bool
-        Whether the trunk of a free robot is fixed in the air.
-    servos : mapping of str to ndarray, shape (n, joints)
-        By field of `DelayedPDParameters`.
-    commands : ndarray, shape (sequences, steps + 1, joints)
-        Set-points [rad], as recordings have them: those in force for long before, then those of
-        each physics step.
-    which : ndarray of int, shape (n,)
-        The sequence of each copy.
-    reach : ndarray, shape (rows, joints)
-        Servo angles at which the robot has been: limits of its description that are narrower are
-        widened to hold them.
-    friction, payload : ndarray, shape (n,)
-        Sliding friction of all its contacts; share of the robot's mass that is added to its trunk.
-    threads : int
-        0 for all cores.
-    progress : callable
-        Called with the share that is done.
+    The trunk of a free robot can be `fixed` in the air. `servos` are arrays of shape (n, joints) by
+    field of `DelayedPDParameters`.
+
+    `commands`, shape (sequences, steps + 1, joints), are set-points [rad] as recordings have them:
+    those in force for long before, then those of each physics step; `which`, shape (n,), is the
+    sequence of each copy. Limits of the robot's description that are narrower than the servo angles
+    at which it has been, `reach`, shape (rows, joints), are widened to hold them.
+
+    `friction` is the sliding friction of all contacts of a copy, `payload` the share of the robot's
+    mass that is added to its trunk, both shape (n,). `threads` are 0 for all cores; `progress` is
+    called with the share that is done.
     """
     from mujoco.batch import Batch  # needs mujoco 4; its message names the module
 

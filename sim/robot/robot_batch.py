@@ -50,33 +50,15 @@ _FIRST_PART = 0.625  # while the rest moves, there is time for what follows on t
 class RobotBatch:
     """Robots on one piece of ground.
 
-    Parameters
-    ----------
-    config : Walking
-    servos : ServoRanges
-    ground : Ground
-    environments : int
-    threads : int
-        0 for all cores.
-    servo_model : JointArrays, optional
-        See `sim.walking.env.PupperEnv`.
-    extra_dead_time_s : float or ndarray, shape (n,)
-        Added to every dead time of a robot [s].
-    extra_jitter_s : ndarray, shape (n,), optional
-        Added to the command jitter of a robot [s].
+    `threads` are 0 for all cores; `servo_model` is that of `sim.walking.env.PupperEnv`;
+    `extra_dead_time_s` and `extra_jitter_s`, shape (n,), are added to the dead times and to the
+    command jitter of each robot [s].
 
-    Attributes
-    ----------
-    qpos, qvel : ndarray, shape (n, 19), (n, 18)
-        MuJoCo's, live: root first, then the joints.
-    drawn : dict of str to ndarray, shape (n, 12)
-        The servos of each robot, by field of `DelayedPDParameters`.
-    friction, payload_kg : ndarray, shape (n,)
-        Of the feet on the ground; added to the trunk.
-    bodies : Bodies
-        What else differs from the model.
-    linked : tuple of int
-        Servos that turn their joint and the one before it.
+    `qpos`, shape (n, 19), and `qvel`, (n, 18), are MuJoCo's, live: root first, then the joints.
+    `drawn` holds the servos of each robot, shape (n, 12), by field of `DelayedPDParameters`;
+    `friction` that of the feet on the ground and `payload_kg` what is added to the trunk, shape
+    (n,); `bodies` what else differs from the model; `linked` the servos that turn their joint and
+    the one before it.
     """
 
     def __init__(
@@ -361,14 +343,9 @@ class RobotBatch:
         return found
 
     def restore(self, state: dict[str, Any]) -> bool:
-        """Go back to a `state`; whether what follows is exactly what would have followed.
+        """Go back to a `state` of as many such robots; whether what follows is exactly the same.
 
         It is not where the state is of another model of the robot, from an older version.
-
-        Raises
-        ------
-        InputError
-            If it is of another number of robots, or of another robot.
         """
         shape, own = state["batch.state"].shape, self.batch.state.shape
         if shape != own or state["knee"] != self.config.knee:

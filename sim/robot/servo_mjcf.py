@@ -24,6 +24,8 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.delayed_pd import FRICTION_IMPEDANCE, DelayedPDParameters
 
 INTEGRATOR = "implicitfast"
+MASSLESS = '<inertial pos="0 0 0" mass="1e-9" diaginertia="1e-15 1e-15 1e-15"/>'
+"""Of a body that moves by its joint's armature alone."""
 FRICTION_SOLIMP = (FRICTION_IMPEDANCE, FRICTION_IMPEDANCE, 0.001, 0.5, 2.0)
 BATCH_FIELDS = (
     "actuator_biasprm", "actuator_dynprm", "actuator_forcerange", "actuator_delay",
@@ -42,15 +44,7 @@ def friction_solref(time_step_s: float) -> tuple[float, float]:
 
 
 def joint_attributes(parameters: DelayedPDParameters, time_step_s: float) -> dict[str, str]:
-    """Attributes of the `<joint>` (or tendon) that the servo turns: inertia, friction, back-EMF.
-
-    Parameters
-    ----------
-    parameters : DelayedPDParameters
-        Of one servo (scalars).
-    time_step_s : float
-        Physics step of the model [s].
-    """
+    """Attributes of the `<joint>` (or tendon) that one servo turns: inertia, friction, back-EMF."""
     return {
         "armature": _number(parameters.armature),
         "frictionloss": _number(parameters.friction_loss),
@@ -100,10 +94,7 @@ def free_air_xml(servos: Sequence[DelayedPDParameters], time_step_s: float) -> s
     bodies, actuators = [], []
     for i, servo in enumerate(servos):
         joint = attributes({"name": f"joint{i}"} | joint_attributes(servo, time_step_s))
-        bodies.append(
-            f'<body><joint type="hinge" axis="0 1 0" {joint}/>'
-            '<inertial pos="0 0 0" mass="1e-9" diaginertia="1e-15 1e-15 1e-15"/></body>'
-        )
+        bodies.append(f'<body><joint type="hinge" axis="0 1 0" {joint}/>{MASSLESS}</body>')
         actuators.append(pid_element({"joint": f"joint{i}"}, servo, time_step_s))
     option = (
         f'<option timestep="{_number(time_step_s)}" integrator="{INTEGRATOR}" gravity="0 0 0"/>'
@@ -179,15 +170,9 @@ def write_servos(
 ) -> None:
     """Write servos into the expanded fields of a `mujoco.batch.Batch`, for environments `ids`.
 
-    Parameters
-    ----------
-    fields : mapping of str to ndarray
-        `BATCH_FIELDS`, and `TENDON_FIELDS` if a servo turns a tendon; environments first.
-    ids : ndarray of int
-    servos : mapping of str to ndarray, shape (len(ids), servos)
-        By field of `DelayedPDParameters`.
-    dof_of, tendon_of : mapping of int to int
-        The degree of freedom, or the tendon, that a servo turns.
+    `fields` are `BATCH_FIELDS`, and `TENDON_FIELDS` if a servo turns a tendon; environments first.
+    `servos` are arrays of shape (len(ids), servos) by field of `DelayedPDParameters`; `dof_of` and
+    `tendon_of` the degree of freedom, or the tendon, that a servo turns.
     """
     fields["actuator_biasprm"][ids, :, 1] = -servos["stiffness"]
     fields["actuator_biasprm"][ids, :, 2] = -servos["damping"]
@@ -218,11 +203,7 @@ def delay_lines(
 ) -> NDArray[np.float64]:
     """Delay lines after commands held for long, shape (n, actuators · length), for `history`.
 
-    Parameters
-    ----------
-    empty : ndarray, shape (actuators, length)
-        From `empty_delay_lines`.
-    position_rad : ndarray, shape (n, actuators)
+    `empty` is from `empty_delay_lines`; `position_rad` has the shape (n, actuators).
     """
     lines = np.repeat(empty[None], len(position_rad), axis=0)
     # a line is two numbers, the times and the values, as many of each

@@ -70,14 +70,9 @@ class Trot:
     ) -> NDArray[np.float64]:
         """Joint set-points [rad], shape (n, 12).
 
-        Parameters
-        ----------
-        phase : ndarray, shape (n,)
-            Of LF and RB [rad]; at 0 they touch down in front.
-        command : ndarray, shape (n, 3)
-            Forward and sideways speed [m/s], turn rate [rad/s]; 0, 0, 0 stands.
-        body : Body, optional
-            The Mini Pupper by default.
+        `phase`, shape (n,), is that of LF and RB [rad]: at 0 they touch down in front. `command`,
+        shape (n, 3), is forward and sideways speed [m/s] and turn rate [rad/s]; 0, 0, 0 stands. The
+        body is the Mini Pupper by default.
         """
         body = body or mini_pupper()
         along, up = self._cycle(phase, body)
@@ -100,18 +95,9 @@ class Trot:
     ) -> NDArray[np.float64]:
         """Phase [rad], shape (n,), of the point of the trot nearest to joint set-points.
 
-        The set-points before them distinguish feet that rise from feet that come down, which short
-        strokes alone do not.
-
-        Parameters
-        ----------
-        joints, earlier : ndarray, shape (n, 12)
-            Now and `between_s` before.
-        between_s : float
-        command : ndarray, shape (n, 3)
-            Not all 0: a standing robot has no phase.
-        body : Body, optional
-            The Mini Pupper by default.
+        The set-points `between_s` before them distinguish feet that rise from feet that come down,
+        which short strokes alone do not. Both have the shape (n, 12); `command`, shape (n, 3), is
+        not all 0: a standing robot has no phase. The body is the Mini Pupper by default.
         """
         body = body or mini_pupper()
         centre = feet_at(body, self.crouch_m, self.spread_m)

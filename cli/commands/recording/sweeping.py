@@ -251,22 +251,8 @@ def run_rounds(
 ) -> None:
     """Record the first sweep, or what is left of the last round, and go on to the goal.
 
-    Parameters
-    ----------
-    record : callable
-        See `Record`.
-    path : Path
-        The first recording, or the one that is continued.
-    request : dict
-        Of that recording.
-    resume : bool
-        Whether it is continued.
-    whole : bool
-        Whether it was recorded to its end already.
-    force : bool
-        Replace the rounds of an earlier sweep.
-    as_json : bool
-        Print one JSON object.
+    `path` is the first recording, or the one that is continued (`resume`), which may be `whole`
+    already; `request` is its. `force` replaces the rounds of an earlier sweep.
     """
     started = time.perf_counter()
     from pupper_sysid.sysid.doctor.checks import each_joint

@@ -140,15 +140,8 @@ class CalibrateJoints:
 class Guide:
     """The steps of a calibration, one method each.
 
-    Parameters
-    ----------
-    bus : ServoBus
-        Only read, and its torque switched off.
-    start : JointMap
-        The map to start from.
-    joints : list of str
-        Those to calibrate.
-    keyboard : Keyboard
+    The bus is only read, and its torque switched off; `joints` are those to calibrate, from the map
+    `start`.
     """
 
     def __init__(self, bus: ServoBus, start: JointMap, joints: list[str], keyboard: Keyboard):

@@ -35,7 +35,7 @@ from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.pendulum import (
     BENCH_MAP,
-    REGISTERS,
+    FEETECH_REGISTERS,
     BenchSpec,
     Pendulum,
     PendulumBench,
@@ -195,7 +195,7 @@ class Feetech(SerialLine):
             raise InputError("--backlash is of a bench: add --load (or --load none).")
         layout = load_joint_map(self.joint_map or preset)
         registers = parse_servo_registers(self.registers, series)
-        moves = any(name in REGISTERS for own in registers.values() for name in own)
+        moves = any(name in FEETECH_REGISTERS for own in registers.values() for name in own)
         loaded_servos = bool(
             self.load or (has_registers(layout) and (self.joint_map or moves) and not self.walking)
         )
@@ -209,7 +209,7 @@ class Feetech(SerialLine):
         self.refuse_outside(BAUD_RATES)
         refuse_outside("--backlash", self.backlash, 0, _MOST_BACKLASH_DEG, "degrees")
         if loaded_servos:
-            acting = tuple((k, v) for k, v in registers[None].items() if k in REGISTERS)
+            acting = tuple((k, v) for k, v in registers[None].items() if k in FEETECH_REGISTERS)
             spec = BenchSpec(backlash_rad=math.radians(self.backlash), registers=acting)
             bench = self.on_bench(rng, spec, layout)
         else:
@@ -387,12 +387,7 @@ def _parse_ids(text: str, known: tuple[int, ...]) -> list[int]:
 
 
 class Hand:
-    """Moves all joints, or one.
-
-    Parameters
-    ----------
-    bench : ServoBench
-    """
+    """Moves all joints of a bench, or one."""
 
     def __init__(self, bench: ServoBench):
         self._bench = bench

@@ -121,10 +121,7 @@ def _until_limp(
 ) -> list[str]:
     """Try for some seconds; joints that did not confirm.
 
-    Raises
-    ------
-    PupperError
-        If nothing was reached, and the joints are not known.
+    An error of the bus is raised if nothing was reached and the joints are not known.
     """
     until, left = time.monotonic() + seconds, list(joints or ())
     while True:

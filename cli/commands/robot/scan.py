@@ -129,13 +129,7 @@ class Scan:
 
 
 def serial_ports() -> list[str]:
-    """Serial ports to which a servo adapter may be connected.
-
-    Examples
-    --------
-    >>> isinstance(serial_ports(), list)
-    True
-    """
+    """Serial ports to which a servo adapter may be connected."""
     from serial.tools.list_ports import comports
 
     devices = sorted(port.device for port in comports())

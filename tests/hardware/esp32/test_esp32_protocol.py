@@ -73,8 +73,7 @@ def test_replies_have_26_26_and_10_bytes_and_are_little_endian():
     load = esp32.parse_load(bytes.fromhex("1a03" + "18fc" * 6 + "e803" * 6))
     assert load is not None and load.tolist() == [-1.0] * 6 + [1.0] * 6
     # 7.375 and 0.5 as IEEE 754 single, low byte first
-    power = esp32.parse_power(bytes.fromhex("0a05" + "0000ec40" + "0000003f"))
-    assert power == esp32.Power(7.375, 0.5)
+    assert esp32.parse_supply(bytes.fromhex("0a05" + "0000ec40" + "0000003f")) == 7.375
 
 
 def test_zeros_and_counts_beyond_1023_are_missing():
@@ -94,8 +93,8 @@ def test_an_impossible_load_is_missing():
 def test_a_voltage_that_is_none_or_beyond_the_divider_is_missing():
     # NaN, infinity, 11.0 (the largest that passes), -1
     for volts in ("0000c07f", "0000807f", "00003041", "000080bf"):
-        power = esp32.parse_power(bytes.fromhex("0a05" + volts + "0000003f"))
-        assert (power is not None) == (volts == "00003041")
+        supply_v = esp32.parse_supply(bytes.fromhex("0a05" + volts + "0000003f"))
+        assert (supply_v is not None) == (volts == "00003041")
 
 
 def test_the_byte_that_stores_a_calibration_is_never_packed_and_only_whole_counts_are():
