@@ -1,51 +1,58 @@
-"""`sweep`: move the joints, write down what happens."""
+"""`sweep`: move the joints, write down what happens.
+
+`--load` is one servo on a bench, with a bus and a plan of its own. `--until` records and fits in
+rounds (`rounds`).
+"""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.buses import JOINTS_FILE, joints_on, parse_registers
-from pupper_sysid.cli.commands.recording.sweeping import (
-    BENCH_MAP,
-    BENCH_RATE_HZ,
-    guard_warnings,
-    in_virtual_time,
-    loads_of,
-    open_bus_of,
-    plan_of,
-    priority_of,
-    run_rounds,
-    say_how_to_resume,
-    say_what_stays,
-    shown,
-)
-from pupper_sysid.cli.live_views import Wanted
+from pupper_sysid.cli.buses import JOINTS_FILE, connect, joints_on, parse_registers
+from pupper_sysid.cli.commands.recording.rounds import run_rounds, say_how_to_resume
+from pupper_sysid.cli.live_views import Wanted, live_views
 from pupper_sysid.common.errors import BusError, InputError, refuse_outside
-from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import select_joints
 from pupper_sysid.hardware.address import EMULATED, bus_name
+from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
 from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.hardware.safety.guard import guarded
-from pupper_sysid.sysid.sweep.bench import (
-    BENCH,
-    BENCH_KINDS,
-    FREQUENCIES_HZ,
-    parse_gains,
-    parse_load,
-)
+from pupper_sysid.hardware.loop import real_time_priority
+from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
+from pupper_sysid.hardware.safety.monitor import GuardLimits
+from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
+from pupper_sysid.sysid.sweep import bench
+from pupper_sysid.sysid.sweep.bench import bench_plan, parse_load
 from pupper_sysid.sysid.sweep.excitation import (
     LOOP_PERIOD_S,
     MOST_LOOPS,
+    POLL_RATE_HZ,
     RATES_HZ,
     TRIAL_S,
     Plan,
     check_amplitude,
     parse_frequencies,
+    plan,
 )
+
+if TYPE_CHECKING:
+    from pupper_sysid.sysid.sweep.recorder import Observe, Progress
+
+BENCH_MAP = "bench_sts3215"
+BENCH_RATE_HZ = 100.0
+"""One servo answers within a few milliseconds."""
+BENCH_LIMITS = GuardLimits(
+    speed_rad_s=6.0, acceleration_rad_s2=400.0, gentle_rad_s=0.6, park_within_s=6.0
+)
+"""Of a swinging mass: slower than a leg, and the way back takes its time."""
 
 
 @dataclass(frozen=True)
@@ -169,9 +176,9 @@ class Sweep:
         from pupper_sysid.sysid.sweep.recorder import record
         from pupper_sysid.sysid.sweep.resume import resume_point
 
-        bus = guarded(open_bus_of(request))
+        bus = guarded(_open_bus(request))
         try:
-            chosen = plan_of(request, bus)
+            chosen = _plan_of(request, bus)
             point = resume_point(path, chosen, request["loop_period_s"]) if resume else None
         except BaseException:
             bus.close()
@@ -184,24 +191,25 @@ class Sweep:
         existed = path.exists()
         try:
             with (
-                priority_of(request) as priority,
-                shown(bus, chosen, self._views, self.live, in_virtual_time(request)) as shows,
+                _priority_of(request) as priority,
+                _shown(bus, chosen, self._views, self.live, _in_virtual_time(request)) as shows,
             ):
+                about = {"seed": request["seed"], "sweep": request, "priority": priority}
+                if load := _load_of(request):
+                    about["loads"] = dict.fromkeys(request["joints"], load.model_dump())
                 record(
-                    bus, chosen, path, loop_period_s=request["loop_period_s"],
-                    metadata={"seed": request["seed"], "sweep": request, "priority": priority}
-                    | loads_of(request),
+                    bus, chosen, path, loop_period_s=request["loop_period_s"], metadata=about,
                     force=self.force, resume=point, progress=shows[0], observe=shows[1],
                 )  # fmt: skip
         except (BusError, KeyboardInterrupt):
-            say_what_stays(bus)
+            _say_what_stays(bus)
             if path.exists() and not existed and path.stat().st_size == 0:
                 path.unlink()  # stopped before its header
             elif path.exists() and (point or not existed or self.force):
                 say_how_to_resume(path)
             raise
-        say_what_stays(bus)
-        terminal.warn(*guard_warnings(path))
+        _say_what_stays(bus)
+        terminal.warn(*_guard_warnings(path))
         written = [path]
         if self.truth and isinstance(bus.bus, EmulatedBus):
             written += bus.bus.write_truth(path.with_suffix(""), self.force)
@@ -246,7 +254,7 @@ class Sweep:
                 "--joints."
             )
         if self.freqs is None and self.load is not None:
-            frequencies = list(FREQUENCIES_HZ)
+            frequencies = list(bench.FREQUENCIES_HZ)
         else:
             frequencies = parse_frequencies("1-10" if self.freqs is None else self.freqs)
         amplitude = self.amplitude
@@ -261,7 +269,7 @@ class Sweep:
             or (bus == EMULATED and self.live and terminal.err.is_terminal),
             "seed": self.seed,
             "loop_period_s": loop_period_s,
-            "kind": self.kind or ("sine" if self.load is None else BENCH),
+            "kind": self.kind or ("sine" if self.load is None else bench.BENCH),
             "joints": joints,
             "frequencies_hz": frequencies,
             "amplitude_rad": amplitude,
@@ -270,7 +278,7 @@ class Sweep:
             "loops": self.loops,
             "plan": str(self.plan) if self.plan else None,
             "load": self.load,
-            "gains": [] if self.gains is None else parse_gains(self.gains),
+            "gains": [] if self.gains is None else bench.parse_gains(self.gains),
             "until": self._series(joints) if self.until is not None else None,
             "registers": self._registers(bus),
         }
@@ -279,7 +287,7 @@ class Sweep:
         """Gains, drops and strokes are for a bench, and a bench has no plan or playback."""
         if self.load is None:
             alone = "--gains" if self.gains else f"--kind {self.kind}"
-            if self.gains or self.kind in BENCH_KINDS:
+            if self.gains or self.kind in bench.BENCH_KINDS:
                 raise InputError(
                     f"{alone} is for one servo on a bench, not for a robot's legs: add --load "
                     "pendulum:0.1kg@0.10m, or --load none for a servo in free air."
@@ -344,6 +352,153 @@ class Sweep:
         terminal.out.print("Next:")
         for words in following:
             terminal.out.print(f"  {terminal.command('pupper-sysid', *words)}")
+
+
+def _open_bus(request: dict[str, Any]) -> ServoBus:
+    """The bus that a request names; that of a bench is guarded with its limits."""
+    joint_map, load = request["joint_map"], request.get("load")
+    if request["bus"] != EMULATED:
+        limits = BENCH_LIMITS if load else None
+        return connect(request["bus"], joint_map, request["joints"], limits)
+    from pupper_sysid.sim.emulator import pendulum
+    from pupper_sysid.sim.emulator.bus import EmulatedBus
+    from pupper_sysid.sim.emulator.robot import draw_robot
+
+    rng, real_time = np.random.default_rng(request["seed"]), bool(request["real_time"])
+    if load:
+        terminal.err.print(f"No servo: using an emulated STS3215 on a bench, load {load}.")
+        swung = _load_of(request)
+        robot = pendulum.draw_bench(
+            rng, pendulum.Pendulum(**(swung.model_dump() if swung else {})),
+            joint_map=load_joint_map(joint_map or BENCH_MAP),
+        )  # fmt: skip
+        bus = EmulatedBus(robot, rng, real_time, pendulum.PendulumBench(robot))
+        return GuardedBus(bus, BENCH_LIMITS)
+    own = load_joint_map(joint_map) if joint_map else None
+    what = f"an emulated one with the servos of {own.file.name}" if own else "the emulated one"
+    terminal.err.print(f"No robot: using {what}{', in real time' * real_time}.")
+    registers = request.get("registers") or {}
+    if registers and not (own and pendulum.has_registers(own)):
+        raise InputError(
+            "--registers: the servos of this robot have none that act. Give a --joint-map whose "
+            "`servo` is STS3215."
+        )
+    drawn, plant = pendulum.draw_of_map(rng, own, registers) if own else (draw_robot(rng), None)
+    if request.get("plan"):  # the same robot, but not once more the same noise
+        noise = int(sha256(Path(request["plan"]))[:12], 16)
+        rng = np.random.default_rng([request["seed"], noise])
+    return EmulatedBus(drawn, rng, real_time, plant)
+
+
+def _load_of(request: dict[str, Any]) -> PendulumLoad | None:
+    return parse_load(request["load"]) if request.get("load") else None
+
+
+def _plan_of(request: dict[str, Any], bus: ServoBus) -> Plan:
+    """The plan that a request describes, within the limits of the bus."""
+    joints, load = request["joints"], _load_of(request)
+    if request["playback"]:
+        from pupper_sysid.sysid.sweep.resume import playback
+
+        chosen = playback(Path(request["playback"]), joints)
+        return replace(chosen, trials=chosen.trials * request.get("loops", 1))
+    pose = dict(bus.metadata["rest_pose_rad"])
+    if load:
+        pose[joints[0]] = load.hanging_rad
+    free = bus.limits.margin(np.array([pose[name] for name in bus.joint_names]))
+    margin = dict(zip(bus.joint_names, map(float, free), strict=True))
+    speed_limit = bus.metadata["speed_limit_rad_s"]
+    if request.get("load"):
+        (joint,) = joints
+        return bench_plan(
+            joint, load, request["gains"], request["kind"],
+            frequencies_hz=request["frequencies_hz"], amplitude_rad=request["amplitude_rad"],
+            duration_s=request["duration_s"], loop_period_s=request["loop_period_s"],
+            start_rad=pose[joint], margin_rad=margin[joint],
+        )  # fmt: skip
+    if request.get("plan"):
+        from pupper_sysid.sysid.plan.plan_file import executable, load_plan
+
+        path = Path(request["plan"])
+        return executable(load_plan(path), path, joints, margin, pose, speed_limit)
+    return plan(
+        request["kind"], joints, request["frequencies_hz"], request["amplitude_rad"],
+        request["duration_s"], request["loop_period_s"], speed_limit,
+        bus.metadata.get("poll_rate_hz", POLL_RATE_HZ), margin, pose,
+    )  # fmt: skip
+
+
+@contextmanager
+def _shown(
+    bus: GuardedBus, chosen: Plan, wanted: Wanted, live: bool, waits: bool
+) -> Iterator[tuple[Progress, Observe]]:
+    """What shows the progress, and each tick where live views are on."""
+    watchers: list[Observe] = []
+
+    def observe(number: int, sent: Sent, reading: BusSample, missed: int) -> None:
+        for watch in watchers:
+            watch(number, sent, reading, missed)
+
+    with ExitStack() as open_things:
+        if wanted:
+            views = open_things.enter_context(live_views(bus, wanted, waits))
+            watchers.append(lambda number, sent, reading, _: views.tick(number, sent, reading))
+        if live and terminal.err.is_terminal:
+            from pupper_sysid.cli.oscilloscope import Oscilloscope
+
+            scope = open_things.enter_context(Oscilloscope(bus.name, bus.joint_names))
+            watchers.append(
+                lambda _, sent, reading, missed: scope.tick(
+                    bus.now(), sent.position_rad, reading, missed
+                )
+            )
+            yield scope.stage, observe
+            return
+        if live:
+            terminal.warn("--live needs a terminal to draw in; it was left out.")
+        progress = terminal.seconds_progress("recording", chosen.duration_s)
+        yield open_things.enter_context(progress), observe
+
+
+def _in_virtual_time(request: dict[str, Any]) -> bool:
+    """Whether time passes only for the emulated robot, so that nothing is late."""
+    return request["bus"] == EMULATED and not request["real_time"]
+
+
+@contextmanager
+def _priority_of(request: dict[str, Any]) -> Iterator[str]:
+    """Real-time priority during the block, where time is real; yields it in words."""
+    if _in_virtual_time(request):
+        yield "none: virtual time"
+        return
+    with real_time_priority() as priority:
+        terminal.err.print(f"Control loop at {priority}.")
+        yield priority
+
+
+def _guard_warnings(path: Path) -> list[str]:
+    """Sentences on commands that the guard changed."""
+    from pupper_sysid.sysid.sweep.resume import footer
+
+    counts = footer(path).get("guard", {})
+    sentences = {
+        "clipped": "were outside the joints' limits and were held at them.",
+        "slowed": "were delayed by the guard's speed and acceleration limits; the recording holds "
+        "the commands that were sent.",
+        "unsent": "could not be sent; the servos kept the last set-point.",
+    }
+    return [f"{counts[k]} commands {text}" for k, text in sentences.items() if counts.get(k)]
+
+
+def _say_what_stays(bus: GuardedBus) -> None:
+    """Warn of registers that could not be set back."""
+    for joint, own in bus.registers.found.items():
+        for name, value in own.items():
+            terminal.warn(
+                f"{joint}: its register {name} could not be set back to {value}. Switch the "
+                f"servo's power off and on; if `scan` still shows another value, write {value} "
+                "yourself."
+            )
 
 
 def _counted(number: int, name: str) -> str:
