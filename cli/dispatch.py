@@ -83,7 +83,13 @@ def run_command(
             words = (Annotated[c.load(), tyro.conf.subcommand(w)] for w, c in commands.items())
             every: Any = functools.reduce(operator.or_, words)
             tyro.cli(every, prog=program, args=left, config=CONFIG)
-        chosen = _chosen(first, program, commands)
+        if first not in commands:
+            near = difflib.get_close_matches(first, commands, n=1, cutoff=0.5)
+            hint = f" Did you mean `{program} {near[0]}`?" if near else ""
+            raise InputError(
+                f"{program} has no command {first}.{hint} `{program} --help` lists all."
+            )
+        chosen = commands[first]
         kind = chosen.load()
         # a union has no docstring of its own, and Python's would be shown
         described = None if isinstance(kind, type) else chosen.summary
@@ -98,21 +104,18 @@ def run_command(
 def overview(program: str, description: str, commands: Mapping[str, Command]) -> str:
     """A program's help: its commands, by group, one line each."""
     group_width = 2 + max(len(c.group) for c in commands.values())
-    together: dict[str, str] = {}  # a command without summary is shown with the one before it
-    for word, command in commands.items():
-        if command.summary:
-            together[word] = word
+    rows: list[list[str]] = []  # a command without summary is shown with the one before it
+    for word, (group, summary, *_) in commands.items():
+        if summary:
+            rows.append([group, word, summary])
         else:
-            together[[*together][-1]] += f" / {word}"
-    width = 2 + max(map(len, together.values()))
-    usage = f"usage: {program} COMMAND [OPTIONS | --help]"
-    told = description.strip()
-    first = f"{usage}   {told}"
-    lines, last = ([first] if len(first) <= _SCREEN else [usage, told]), None
-    for word, shown_words in together.items():
-        group, summary, *_ = commands[word]
-        shown = "" if group == last else group
-        lines.append(f"{shown:{group_width}}{shown_words:{width}}{summary}")
+            rows[-1][1] += f" / {word}"
+    width = 2 + max(len(words) for _, words, _ in rows)
+    usage, what = f"usage: {program} COMMAND [OPTIONS | --help]", description.strip()
+    one_line = f"{usage}   {what}"
+    lines, last = ([one_line] if len(one_line) <= _SCREEN else [usage, what]), None
+    for group, words, summary in rows:
+        lines.append(f"{'' if group == last else group:{group_width}}{words:{width}}{summary}")
         last = group
     return "\n".join(lines)
 
@@ -124,12 +127,3 @@ def words(commands: Mapping[str, Command]) -> list[str]:
         inner = (get_args(one)[1].name for one in get_args(command.load()))
         found += [word, *(f"{word} {name}" for name in inner)]
     return found
-
-
-def _chosen(word: str, program: str, commands: Mapping[str, Command]) -> Command:
-    """The command of this name; refuses another with the nearest."""
-    if word not in commands:
-        near = difflib.get_close_matches(word, commands, n=1, cutoff=0.5)
-        hint = f" Did you mean `{program} {near[0]}`?" if near else ""
-        raise InputError(f"{program} has no command {word}.{hint} `{program} --help` lists all.")
-    return commands[word]

@@ -37,12 +37,11 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from pupper_sysid.common.errors import InputError, PupperError
+from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import select_joints, share_sentences
 from pupper_sysid.common.reading.dialect import whole
 
 if TYPE_CHECKING:
-    from pupper_sysid.sysid.fleet.calibration import Fleet
     from pupper_sysid.sysid.recordings.recording import Recording
 
 JOBS = (1, 1024)
@@ -174,70 +173,6 @@ def number(value: float | None, digits: int = 2) -> str:
 def command(*words: Any) -> str:
     """A command to copy: a name with a space, or with another sign of the shell, is in quotes."""
     return shlex.join(map(str, words))
-
-
-def spread(values: Any, digits: int) -> str:
-    """Median and middle 90 % of a pandas column; a single value as it is."""
-    if values.count() == 1:
-        return number(values.median(), digits)
-    return "{} ({} … {})".format(*(number(x, digits) for x in values.quantile([0.5, 0.05, 0.95])))
-
-
-def print_fleet(
-    fleet: Fleet,
-    folder: Path,
-    elapsed_s: float,
-    as_json: bool,
-    what: str,
-    columns: Mapping[str, tuple[str, int]],
-) -> None:
-    """Print a fleet's joints, outliers and failed recordings, and the files written.
-
-    `what` names the result per robot; `columns` gives title and digits by column of the table. A
-    recording that could not be used is a `PupperError` at the end: the exit code says so, too.
-    """
-    from pupper_sysid.sysid.fleet.calibration import TABLE
-
-    if as_json:
-        print_json(fleet.summary(folder, elapsed_s))
-    else:
-        _print_fleet_table(fleet, folder, elapsed_s, what, columns)
-    if fleet.failed:
-        raise PupperError(
-            f"{len(fleet.failed)} of {len(fleet.failed) + len(fleet.made) + len(fleet.kept)} "
-            f"recordings could not be used: {', '.join(sorted(fleet.failed)[:5])}"
-            f"{' …' if len(fleet.failed) > 5 else ''}. The others are done; {folder / TABLE} says "
-            "why."
-        )
-
-
-def _print_fleet_table(
-    fleet: Fleet,
-    folder: Path,
-    elapsed_s: float,
-    what: str,
-    columns: Mapping[str, tuple[str, int]],
-) -> None:
-    from pupper_sysid.sysid.fleet.calibration import TABLE
-
-    titles = [title for title, _ in columns.values()]
-    shown = table("Fleet: median and middle 90 % of the robots", "joint", "robots", *titles)
-    known = fleet.table.query("problem == ''")
-    for joint, rows in known.groupby("joint", sort=False):
-        cells = [spread(rows[key], digits) for key, (_, digits) in columns.items()]
-        shown.add_row(str(joint), str(len(rows)), *cells)
-    out.print(shown)
-    for _, row in known.query("outliers != ''").iterrows():
-        out.print(
-            f"{row['robot']} {row['joint']} is an outlier: "
-            f"{', '.join(str(row['outliers']).split(';'))}."
-        )
-    for name, problem in sorted(fleet.problems.items()):
-        warn(f"{name} was left out: {problem}")
-    err.print(
-        f"{len(fleet.made)} made, {len(fleet.kept)} kept, {len(fleet.failed)} failed in "
-        f"{elapsed_s:.0f} s. Wrote {folder / TABLE} and {what} per robot beside it."
-    )
 
 
 def cell(value: Any, digits: int) -> str:

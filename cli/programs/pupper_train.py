@@ -97,9 +97,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _parse(given: list[str]) -> Options:
     """Options; --preset, --policy and --start set the defaults of the others."""
-    start = _choice(given, "--start", Start)
-    robot, config = (_path(given, name) for name in ("--robot", "--robot-config"))
-    begun = preset(_choice(given, "--preset", Preset), _choice(given, "--policy", Kind), start)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    kinds = {"start": Start, "preset": Preset, "policy": Kind}
+    for name in (*kinds, "robot", "robot-config"):
+        parser.add_argument(f"--{name}", nargs="?")
+    typed = vars(parser.parse_known_args(given)[0])
+    # a wrong choice is refused by tyro, which then parses them all
+    choices = {n: typed[n] if typed[n] in get_args(k) else get_args(k)[0] for n, k in kinds.items()}
+    start: Any = choices["start"]
+    begun = preset(choices["preset"], choices["policy"], start)
+    robot, config = (typed[n] and Path(typed[n]) for n in ("robot", "robot_config"))
     if config is not None and robot is None:
         raise InputError("--robot-config describes the robot of --robot; give that, too.")
     if robot is not None:
@@ -108,22 +115,6 @@ def _parse(given: list[str]) -> Options:
         Options, given, "pupper-train", DESCRIPTION,
         default=Options(begun, start=start), config=(tyro.conf.FlagCreatePairsOff,),
     )  # fmt: skip
-
-
-def _path(given: list[str], flag: str) -> Path | None:
-    """Value of a flag that is a path; None without."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument(flag, nargs="?")
-    value = vars(parser.parse_known_args(given)[0]).popitem()[1]
-    return None if value is None else Path(value)
-
-
-def _choice(given: list[str], flag: str, kind: Any) -> Any:
-    """Value of a flag, or its default if it is wrong, which tyro reports."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument(flag, nargs="?")
-    value = vars(parser.parse_known_args(given)[0]).popitem()[1]
-    return value if value in get_args(kind) else get_args(kind)[0]
 
 
 def _run(options: Options, given: list[str]) -> None:
@@ -159,7 +150,8 @@ def _run(options: Options, given: list[str]) -> None:
         return
     begun = time.monotonic()
     ranks = Ranks.join()
-    folder = options.resume or Path("runs") / ranks.same(options.name or _name(options))
+    name = options.name or f"{options.policy}-{datetime.now():%Y%m%d-%H%M%S}"
+    folder = options.resume or Path("runs") / ranks.same(name)
     if options.resume is not None and not options.resume.is_dir():
         refuse_other_kind(options.resume, "pupper-run")
         raise InputError(f"{options.resume} does not exist. Give the folder of a run.")
@@ -175,8 +167,7 @@ def _run(options: Options, given: list[str]) -> None:
                 err.print(note)
         run = _with_first_gait(run, ranks)
     with _bar() as watch:
-        notice = (warn) if ranks.rank == 0 else (lambda text: None)
-        stopping = (lambda text: err.print(text)) if ranks.rank == 0 else (lambda text: None)
+        notice, stopping = (warn, err.print) if ranks.rank == 0 else (lambda text: None,) * 2
         if options.resume:
             learner = train(folder, None, watch, *_extension(options, given), notice, stopping)
         else:
@@ -206,11 +197,8 @@ def _with_first_gait(run: Run, ranks: Ranks) -> Run:
     task = run.task
     if ranks.rank == 0:
         with share_progress("first gait") as advance:
-
-            def say(text: str) -> None:
-                err.print(spell(text))
-
-            task = with_first_gait(run, say, partial(advance, "searching")).task
+            searching = partial(advance, "searching")
+            task = with_first_gait(run, lambda text: err.print(spell(text)), searching).task
     parts = json.loads(ranks.same(json.dumps(plain({"trot": task.trot, "rewards": task.rewards}))))
     trot, rewards = Trot(**parts["trot"]), Rewards(**parts["rewards"])
     return replace(run, task=replace(run.task, trot=trot, rewards=rewards))
@@ -229,10 +217,6 @@ def _extension(options: Options, given: list[str]) -> tuple[int | None, float | 
         options.run.iterations if "--iterations" in flags else None,
         options.run.minutes if "--minutes" in flags else None,
     )
-
-
-def _name(options: Options) -> str:
-    return f"{options.policy}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
 @contextlib.contextmanager

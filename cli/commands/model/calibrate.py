@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.common import OfRecordings
+from pupper_sysid.cli.commands.common import OfRecordings, each_robot
 from pupper_sysid.common.errors import InputError, refuse_outside
-from pupper_sysid.common.files import refuse_overwrite, resolved
+from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import (
     JOINT_NAMES,
     STALL_TORQUE_NM,
@@ -74,9 +74,8 @@ class Calibrate(OfRecordings):
         from pupper_sysid.sysid.fit.calibrate import STAGES, calibrate
         from pupper_sysid.sysid.recordings.importers.recognise import is_fleet
 
-        started = time.perf_counter()
         if len(self.recordings) == 1 and is_fleet(self.recordings[0]):
-            self._fleet(self.recordings[0], started)
+            self._fleet(self.recordings[0])
             return
         if self.cluster is not None:
             raise InputError("--cluster is for a fleet: give the folder of its recordings.")
@@ -84,6 +83,7 @@ class Calibrate(OfRecordings):
         refuse_overwrite(out, self.force)  # before the work, not after it
         if out.suffix.lower() not in (".yaml", ".yml"):
             raise InputError(f"--out {out}: a calibration is a .yaml file. Choose another name.")
+        started = time.perf_counter()
         recordings, joints = self.load()
         left = dict.fromkeys(joints, len(STAGES))
         with terminal.progress("calibrating", sum(left.values())) as advance:
@@ -111,30 +111,21 @@ class Calibrate(OfRecordings):
             )
             terminal.err.print(f"Wrote {out} in {elapsed:.1f} s. Next: {following}")
 
-    def _fleet(self, root: Path, started: float) -> None:
+    def _fleet(self, root: Path) -> None:
         """Many robots, one after the other or side by side."""
-        from pupper_sysid.sysid.fleet.calibration import (
-            Settings,
-            calibrate_fleet,
-            robots_in,
-            trust,
-        )
+        from pupper_sysid.sysid.fleet.calibration import Settings, calibrate_fleet
 
         if self.prior is not None:
             raise InputError("--from: a fleet is calibrated without a prior; leave it out.")
         if self.joints != "all":
             raise InputError("--joints: a fleet is calibrated with all its joints; leave it out.")
-        out = self.out or resolved(root).with_name(f"{resolved(root).name}_calibrated")
         settings = Settings(self.seed, self.stall_torque)
-        if self.cluster is not None:
-            terminal.warn(trust(self.cluster))
-        with terminal.progress("calibrating", len(robots_in(root))) as advance:
-            fleet = calibrate_fleet(
+        each_robot(
+            self, root, "calibrating", "calibrated", "a calibration", _SHOWN,
+            lambda out, advance: calibrate_fleet(
                 root, out, settings, self.jobs, self.cluster, self.force, advance
-            )
-        terminal.print_fleet(
-            fleet, out, time.perf_counter() - started, self.json, "a calibration", _SHOWN
-        )
+            ),
+        )  # fmt: skip
 
     def _print(self, result: CalibrationResult) -> None:
         table = terminal.table(

@@ -11,9 +11,9 @@ import tyro
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.common import OfRecordings
+from pupper_sysid.cli.commands.common import OfRecordings, each_robot
 from pupper_sysid.common.errors import InputError, refuse_outside
-from pupper_sysid.common.files import refuse_overwrite, resolved
+from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.sysid.sweep.excitation import TRIAL_S
 
 if TYPE_CHECKING:
@@ -99,7 +99,10 @@ class FitServo(OfRecordings):
             return
         if self.cluster is not None:
             raise InputError("--cluster is for a fleet: give the folder of its recordings.")
-        folder = self.out or _free_folder()
+        folder, number = self.out or Path("servo"), 2
+        # the next name that is free: trying another model must not cost the last one
+        while self.out is None and (folder / CONTRACT).exists():
+            folder, number = Path(f"servo-{number}"), number + 1
         refuse_overwrite(folder / CONTRACT, self.force)
         started = time.perf_counter()
         recordings, joints = self.load()
@@ -122,23 +125,17 @@ class FitServo(OfRecordings):
 
     def _fleet(self, root: Path, split: Split) -> None:
         """Many robots, one after the other or side by side."""
-        from pupper_sysid.sysid.fleet.calibration import robots_in, trust
         from pupper_sysid.sysid.fleet.servo_model import ServoSettings, fit_servo_fleet
 
         if self.joints != "all":
             raise InputError("--joints: a fleet is fitted with all its joints; leave it out.")
-        started = time.perf_counter()
-        out = self.out or resolved(root).with_name(f"{resolved(root).name}_servos")
-        if self.cluster is not None:
-            terminal.warn(trust(self.cluster))
         settings = ServoSettings(self.arch, self.preset, split, self.readings, self.seed)
-        with terminal.progress(f"fitting {self.arch}", len(robots_in(root))) as advance:
-            fleet = fit_servo_fleet(
+        each_robot(
+            self, root, f"fitting {self.arch}", "servos", "a servo model", _SHOWN,
+            lambda out, advance: fit_servo_fleet(
                 root, out, settings, self.jobs, self.cluster, self.force, advance
-            )
-        terminal.print_fleet(
-            fleet, out, time.perf_counter() - started, self.json, "a servo model", _SHOWN
-        )
+            ),
+        )  # fmt: skip
 
     def _split(self) -> Split:
         from pupper_sysid.sysid.servo_fit.fit import EACH_GROUP_IN_TURN, Split
@@ -179,16 +176,6 @@ class FitServo(OfRecordings):
             "ones."
         )
         terminal.out.print(Text(f"\n{fit.verdict}", "bold"))
-
-
-def _free_folder() -> Path:
-    """`servo`, or the next name that is free: trying another model must not cost the last one."""
-    from pupper_sysid.servo_models.servo_file import CONTRACT
-
-    n = 1
-    while (Path(f"servo-{n}" if n > 1 else "servo") / CONTRACT).exists():
-        n += 1
-    return Path(f"servo-{n}" if n > 1 else "servo")
 
 
 @dataclass(frozen=True)

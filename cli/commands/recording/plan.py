@@ -15,7 +15,7 @@ from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import select_joints
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
-from pupper_sysid.sysid.sweep.excitation import PLANS_S, RATES_HZ
+from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S, PLANS_S, RATES_HZ
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.plan.proposal import SweepPlan
@@ -76,61 +76,47 @@ class Plan:
             terminal.err.print("Nothing was written; --out plan.yaml keeps it.")
 
     def _made(self) -> SweepPlan:
-        if not self.source:
-            return self._first_sweep()
-        first, *more = self.source
-        if first.suffix in (".yaml", ".yml"):
-            if more:
-                raise InputError(f"{first} and {more[0]}: give recordings, or one calibration.")
-            return self._from_calibration(first)
-        return self._from_recordings()
-
-    def _first_sweep(self) -> SweepPlan:
+        """The plan from recordings or a calibration, or a first sweep without either."""
+        from pupper_sysid.servo_models.calibration.calibration import load_calibration
+        from pupper_sysid.sysid.plan import proposal
         from pupper_sysid.sysid.plan.candidates import Setup
-        from pupper_sysid.sysid.plan.proposal import SECONDS, plan_first_sweep
-        from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S
 
+        first, *more = self.source or (None,)
+        if first is not None and first.suffix not in (".yaml", ".yml"):
+            recordings = terminal.load_all(self.source)
+            joints = terminal.pick_joints(recordings, self.joints)
+            if self.rate is not None:
+                raise InputError("--rate: a plan from recordings keeps their rate; leave it out.")
+            with terminal.progress("fitting", len(joints)) as advance:
+                return proposal.plan_from_recordings(
+                    recordings, joints, seconds=self.seconds,
+                    margins=_some_margins(self._map(recordings[0]), joints), seed=self.seed,
+                    workers=2, progress=advance,
+                )  # fmt: skip
+        if more:
+            raise InputError(f"{first} and {more[0]}: give recordings, or one calibration.")
+        period_s = LOOP_PERIOD_S if self.rate is None else 1 / self.rate
+        seconds = proposal.SECONDS if self.seconds is None else self.seconds
+        if first is not None:
+            calibration = load_calibration(first)
+            joints = select_joints(self.joints, calibration.joint_names)
+            return proposal.plan_from_calibration(
+                calibration, proposal.Source(name=first.name, sha256=sha256(first)), joints,
+                seconds=seconds, loop_period_s=period_s,
+                margins=_some_margins(self._map(None), joints), seed=self.seed,
+            )  # fmt: skip
         joint_map = self._map(None)
-        joints = select_joints(self.joints, joint_map.joint_names)
         # the Mini Pupper's proxy polls; a serial line answers each read itself
         polled = joint_map.frame == "proxy"
         setup = Setup(
-            loop_period_s=LOOP_PERIOD_S if self.rate is None else 1 / self.rate,
+            loop_period_s=period_s,
             quantum_rad=float(1 / joint_map.counts_per_rad().min()),
             **({} if polled else {"poll_period_s": 0.0, "loss": 0.0}),
         )
-        return plan_first_sweep(
-            joints, setup=setup, seconds=SECONDS if self.seconds is None else self.seconds,
+        return proposal.plan_first_sweep(
+            select_joints(self.joints, joint_map.joint_names), setup=setup, seconds=seconds,
             margins=margins(joint_map), seed=self.seed,
         )  # fmt: skip
-
-    def _from_calibration(self, path: Path) -> SweepPlan:
-        from pupper_sysid.servo_models.calibration.calibration import load_calibration
-        from pupper_sysid.sysid.plan.proposal import SECONDS, Source, plan_from_calibration
-        from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S
-
-        calibration = load_calibration(path)
-        joints = select_joints(self.joints, calibration.joint_names)
-        return plan_from_calibration(
-            calibration, Source(name=path.name, sha256=sha256(path)), joints,
-            seconds=SECONDS if self.seconds is None else self.seconds,
-            loop_period_s=LOOP_PERIOD_S if self.rate is None else 1 / self.rate,
-            margins=_some_margins(self._map(None), joints), seed=self.seed,
-        )  # fmt: skip
-
-    def _from_recordings(self) -> SweepPlan:
-        from pupper_sysid.sysid.plan.proposal import plan_from_recordings
-
-        recordings = terminal.load_all(self.source)
-        joints = terminal.pick_joints(recordings, self.joints)
-        if self.rate is not None:
-            raise InputError("--rate: a plan from recordings keeps their rate; leave it out.")
-        with terminal.progress("fitting", len(joints)) as advance:
-            return plan_from_recordings(
-                recordings, joints, seconds=self.seconds,
-                margins=_some_margins(self._map(recordings[0]), joints), seed=self.seed,
-                workers=2, progress=advance,
-            )  # fmt: skip
 
     def _map(self, recording: Recording | None) -> JointMap:
         """The joint map that is named, the recording's, the one in this folder, or the standard."""
