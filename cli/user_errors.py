@@ -50,11 +50,9 @@ _OF_THE_SYSTEM = (
 
 _MAKE_ROOM = "Make room, or choose another file or folder."
 _CURES = {
-    errno.ENOSPC: "Make room there.",
-    errno.EDQUOT: "Make room there.",
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "Make room there."),
     errno.EROFS: "Make it writable.",
-    errno.EACCES: "Give this user the permission.",
-    errno.EPERM: "Give this user the permission.",
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "Give this user the permission."),
     errno.EMFILE: "Raise the limit of open files (`ulimit -n`).",
     errno.ENFILE: "Close other programs.",
     errno.ENOMEM: "Free memory.",
@@ -140,7 +138,10 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
 @contextmanager
 def _sentences(arguments: Sequence[str], program: str, stop: Stop) -> Iterator[list[str]]:
     debug = "--debug" in arguments
-    _open_closed()
+    # a stream that was closed before leads nowhere, or the next file would take its number
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))
     streams = sys.stdout, sys.stderr
     output: Any = _Stream(sys.stdout, _OUTPUT)
     errors: Any = _Stream(sys.stderr, _ERRORS)
@@ -148,7 +149,9 @@ def _sentences(arguments: Sequence[str], program: str, stop: Stop) -> Iterator[l
     try:
         try:
             if "--version" in arguments:
-                _print_version(program)
+                own, *rest = versions().items()
+                out.print(f"{program} {own[1]} ({', '.join(f'{k} {v}' for k, v in rest)})")
+                sys.exit(0)
             if "--install-completion" in arguments:
                 arguments = _completion(program)
             times, rest = _read_limit([a for a in arguments if a != "--debug"])
@@ -270,16 +273,6 @@ class _Stream:
             raise
 
 
-def _open_closed() -> None:
-    """Open streams that were closed before the program started, to nowhere.
-
-    Otherwise the next file that is opened takes the number of standard output.
-    """
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode))
-
-
 def _silence(stream: Any) -> None:
     """Send what a stream's buffer holds nowhere: it would fail once more at the exit."""
     with suppress(OSError, AttributeError, ValueError):
@@ -293,21 +286,14 @@ def _print_error(error: str) -> None:
         _silence(sys.stderr)
 
 
-def _print_version(program: str) -> None:
-    """Print the versions of the program and of the libraries behind its numbers; end."""
-    own, *rest = versions().items()
-    out.print(f"{program} {own[1]} ({', '.join(f'{k} {v}' for k, v in rest)})")
-    sys.exit(0)
-
-
 def _completion(program: str) -> list[str]:
     """Arguments with which tyro writes the completion file of the user's shell."""
-    shell = Path(os.environ.get("SHELL", "")).name
+    of_user = os.environ.get("SHELL", "")
+    shell = Path(of_user).name
     if shell not in _COMPLETIONS:
         raise InputError(
-            f"Completion is for {' and '.join(_COMPLETIONS)}; $SHELL is "
-            f"'{os.environ.get('SHELL', '')}'. `{program} --tyro-print-completion tcsh` prints "
-            "another one."
+            f"Completion is for {' and '.join(_COMPLETIONS)}; $SHELL is '{of_user}'. `{program} "
+            "--tyro-print-completion tcsh` prints another one."
         )
     path = Path.home() / _COMPLETIONS[shell].format(program)
     try:
@@ -331,14 +317,13 @@ def numeral(type_info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     if kind not in _READERS:
         return None
     return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=kind.__name__.upper(),
+        nargs=1, metavar=kind.__name__.upper(),
         instance_from_str=lambda words: _READERS[kind](words[0]),
         is_instance=lambda value: (
             isinstance(value, (int, kind)) and (not isinstance(value, bool) or kind is float)
         ),
         str_from_instance=lambda value: [str(value)],
-    )
+    )  # fmt: skip
 
 
 @NUMERALS.primitive_rule

@@ -16,20 +16,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import tyro
 
-from pupper_sysid.cli import terminal
+from pupper_sysid.cli import policy_choice, terminal
 from pupper_sysid.cli.buses import chosen_map
 from pupper_sysid.cli.commands.recording.sweep import Sweep
 from pupper_sysid.cli.live_views import Wanted, live_views
-from pupper_sysid.cli.policy_choice import (
-    body_at,
-    chosen_actuator,
-    policy_at,
-    show_match,
-    show_servos,
-    trained_actuator,
-    trained_commands,
-    warn_of_fallbacks,
-)
 from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.cli.user_errors import end_politely, run_program
 from pupper_sysid.common.errors import InputError
@@ -184,19 +174,19 @@ def _run(options: Deploy) -> None:
     torch.set_num_threads(1)
     from pupper_sysid.policies.deploy.assembly import assemble
 
-    policy, run = policy_at(options.policy)
-    body = body_at(options.policy, policy, run)
+    policy, run = policy_choice.policy_at(options.policy)
+    body = policy_choice.body_at(options.policy, policy, run)
     name, stack = _stack(options, policy.contract)
     if options.replay:
         _replay(options.replay, policy, body)
         return
-    trained = trained_commands(policy, run)
+    trained = policy_choice.trained_commands(policy, run)
     commands = _commands(options, trained)
     folder = Path("walks") / (options.name or time.strftime(f"{options.policy.name}-%H%M%S"))
     with ExitStack() as open_things:
-        actuator = chosen_actuator(options.policy, policy, run, options.actuator)
+        actuator = policy_choice.chosen_actuator(options.policy, policy, run, options.actuator)
         bus, imu, joint_map, truth = _open(options, open_things, body, actuator)
-        of_training, known = trained_actuator(options.policy, policy, run)
+        of_training, known = policy_choice.trained_actuator(options.policy, policy, run)
         parts = assemble(
             policy, stack, joint_map, actuator, options.servo, of_training if known else None, body
         )
@@ -211,10 +201,10 @@ def _run(options: Deploy) -> None:
                 "was not compared with it."
             )
         else:
-            show_match(parts.match)
+            policy_choice.show_match(parts.match)
         match = parts.servo_match if options.actuator else None
         if options.actuator:
-            show_servos(match, policy.contract.servo is not None)
+            policy_choice.show_servos(match, policy.contract.servo is not None)
         header = parts.header | header_entries(bus) | {
             "policy": str(options.policy), "stack_name": name, "seed": options.seed,
             "servo_match": match and match.to_dict(), "commands": trained.model_dump(mode="json"),
@@ -227,21 +217,17 @@ def _commands(options: Deploy, trained: CommandRanges) -> Commands:
     from pupper_sysid.cli.drive import Driver
     from pupper_sysid.policies.deploy.commands import constant, script
 
-    say = err.print
     if options.keyboard:
         return Driver(trained)
-    return (
-        script(options.script, trained, say)
-        if options.script
-        else constant(options.command, trained, say)
-    )
+    if options.script:
+        return script(options.script, trained, err.print)
+    return constant(options.command, trained, err.print)
 
 
 def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
     """The stack, with the user's changes."""
     name = suited(contract) if options.stack == "auto" else options.stack
-    stack = STACKS[name]
-    stack = replace(stack, **_changes(options))
+    stack = replace(STACKS[name], **_changes(options))
     own = 1 / contract.control_step_s
     if stack.rate_hz and abs(stack.rate_hz / own - 1) > 1e-6:
         warn(
@@ -342,7 +328,7 @@ def _emulated(options: Deploy, rng: np.random.Generator, body: Body, trained: st
             err.print(f"The emulated {body.name} has the servos of {trained}.")
         servos = servo_ranges(trained, body=body)
         if not is_card(trained):
-            warn_of_fallbacks([servos])
+            policy_choice.warn_of_fallbacks([servos])
         return calibrated_robot(servos, rng, body)
     if options.actuator is None:
         return draw_robot(rng)
@@ -373,17 +359,6 @@ def _replay(path: Path, policy: Any, body: Body) -> None:
     out.print(f"{len(walk.senses)} ticks repeated, every action equal bit for bit ({ended}).")
 
 
-def _live(open_things: ExitStack, bus: GuardedBus) -> list[Any]:
-    """What shows each tick in the terminal."""
-    from pupper_sysid.cli.oscilloscope import Oscilloscope
-
-    if not err.is_terminal:
-        warn("--live needs a terminal to draw in; it was left out.")
-        return []
-    scope = open_things.enter_context(Oscilloscope(bus.name, bus.joint_names))
-    return [lambda t: scope.tick(t.elapsed_s, t.sent, t.reading, t.missed_deadlines)]
-
-
 def _walk(
     options: Deploy, bus: GuardedBus, imu: Imu, parts: Assembly, commands: Commands,
     header: dict[str, Any], folder: Path, truth: Any,
@@ -406,25 +381,24 @@ def _walk(
         if isinstance(commands, Driver):
             open_things.enter_context(commands.driving())
             watchers.append(commands.watching(bus.joint_names))
-        if options.live:
-            watchers += _live(open_things, bus)
+        if options.live and err.is_terminal:
+            from pupper_sysid.cli.oscilloscope import Oscilloscope
+
+            scope = open_things.enter_context(Oscilloscope(bus.name, bus.joint_names))
+            watchers.append(
+                lambda t: scope.tick(t.elapsed_s, t.sent, t.reading, t.missed_deadlines)
+            )
+        elif options.live:
+            warn("--live needs a terminal to draw in; it was left out.")
         if options.views:
             waits = not options.in_real_time
             views = open_things.enter_context(live_views(bus, options.views, waits))
             watchers.append(partial(views.walk_tick, parts.controller.to_servo))
         rows = open_things.enter_context(RecordingWriter(table, about, options.force))
         outcome = deploy(
-            bus,
-            imu,
-            parts.controller,
-            commands,
-            options.seconds,
-            log,
-            header,
-            rows,
-            watchers,
+            bus, imu, parts.controller, commands, options.seconds, log, header, rows, watchers,
             options.force,
-        )
+        )  # fmt: skip
         if views:
             views.say(f"Walk: {outcome.stop_reason}")
         rows.close({"stop_reason": outcome.stop_reason} | bus.report.footer())

@@ -6,7 +6,6 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -130,9 +129,11 @@ class OfPolicies(Analysis):
         found = {}
         with terminal.share_progress("walking") as advance:
             for name, (policy, trial) in tries.items():
-                watch = partial(_share_of_all, advance, name, len(found), len(tries))
-                threads = self.threads
-                found[name] = analyse(policy, replace(trial, threads=threads, progress=watch))
+
+                def watch(share: float, name: str = name) -> None:
+                    advance(name, (len(found) + share) / len(tries))
+
+                found[name] = analyse(policy, replace(trial, threads=self.threads, progress=watch))
         return found
 
     def tries(self, command: tuple[float, float, float]) -> Tries:
@@ -172,10 +173,6 @@ class Commanded(OfPolicies):
         forward, left, turn = self.command
         commanded = f"{forward:g} m/s forward, {left:g} m/s left, {turn:g} rad/s"
         return f"{super().caption(title)}; command {commanded}"
-
-
-def _share_of_all(advance: Any, name: str, before: int, count: int, share: float) -> None:
-    advance(name, (before + share) / count)
 
 
 def tries_of(

@@ -16,7 +16,6 @@ from pupper_sysid.common.joints import share_sentences
 
 if TYPE_CHECKING:
     from pupper_sysid.common.interval import Interval
-    from pupper_sysid.sysid.fit.dead_time import LagBudgets
 
 
 @dataclass(frozen=True)
@@ -102,17 +101,6 @@ class Delay(OfRecordings):
                   if b.lag_range.startswith("mean")}  # fmt: skip
         for names, text in share_sentences(ranges):
             terminal.out.print(f"{names}: {text}")
-        self._print_frequencies(budgets)
-        first = next(iter(budgets.values()))
-        shown = terminal.table(f"Estimators on {first.joint}", "estimator", "lag ms")
-        for name, value in first.estimators_s.items():
-            shown.add_row(name, terminal.ms(value))
-        terminal.out.print()
-        terminal.out.print(shown)
-        by_joint = {n: [w.removeprefix(f"{n}: ") for w in b.warnings] for n, b in budgets.items()}
-        terminal.warn(*(f"{names}: {text}" for names, text in share_sentences(by_joint)))
-
-    def _print_frequencies(self, budgets: LagBudgets) -> None:
         shown = terminal.table(
             "Per frequency, fresh readings", "joint", "Hz", "gain", "phase °", "lag ms",
             "90 %", "raw lag ms", "raw gain",
@@ -127,6 +115,14 @@ class Delay(OfRecordings):
         if shown.row_count:
             terminal.out.print()
             terminal.out.print(shown)
+        first = next(iter(budgets.values()))
+        shown = terminal.table(f"Estimators on {first.joint}", "estimator", "lag ms")
+        for name, value in first.estimators_s.items():
+            shown.add_row(name, terminal.ms(value))
+        terminal.out.print()
+        terminal.out.print(shown)
+        by_joint = {n: [w.removeprefix(f"{n}: ") for w in b.warnings] for n, b in budgets.items()}
+        terminal.warn(*(f"{names}: {text}" for names, text in share_sentences(by_joint)))
 
 
 def _ends(interval: Interval) -> str:
@@ -154,8 +150,7 @@ class Bode(OfRecordings):
             from pupper_sysid.common.figure_style import refuse_picture
 
             refuse_picture(self.plot, self.force)
-        recordings, joints = self.load()
-        responses = frequency_response(recordings, joints, self.seed)
+        responses = frequency_response(*self.load(), self.seed)
         if self.plot:
             from pupper_sysid.common.figure_style import save
 

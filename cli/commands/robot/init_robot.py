@@ -68,13 +68,16 @@ class InitRobot:
         found.save(target, self.force)
         servos = found.per_servo()
         margin = servos.position_limits().margin(servos.rest_pose())
-        plan = _plan(found.joint_names, margin)
+        joints: dict[float, list[str]] = {}  # by amplitudes that leave a fifth of their margin
+        for name, free in zip(found.joint_names, margin, strict=True):
+            amplitude = max(min(_AMPLITUDE_RAD, np.floor(80 * free) / 100), _SMALLEST_RAD)
+            joints.setdefault(float(amplitude), []).append(name)
         sweeps = [
             terminal.command(
                 "pupper-sysid", "sweep", "--joint-map", target, "--joints", ",".join(names),
                 "--freqs", "1-6", "--amplitude", f"{amplitude:g}",
             )
-            for amplitude, names in plan
+            for amplitude, names in sorted(joints.items(), reverse=True)
         ]  # fmt: skip
         if left_out:
             terminal.warn(
@@ -95,16 +98,12 @@ class InitRobot:
         if self.json:
             terminal.print_json(
                 {
-                    "joint_map": str(target),
-                    "joints": list(found.joint_names),
-                    "ids": list(found.ids),
-                    "left_out": left_out,
-                    "following": robot.following,
-                    "doubts": robot.doubts,
-                    "margin_rad": dict(zip(found.joint_names, map(float, margin), strict=True)),
+                    "joint_map": target, "joints": found.joint_names, "ids": found.ids,
+                    "left_out": left_out, "following": robot.following, "doubts": robot.doubts,
+                    "margin_rad": dict(zip(found.joint_names, margin, strict=True)),
                     "sweeps": sweeps,
                 }
-            )
+            )  # fmt: skip
             return
         table = terminal.table(
             f"{target}, servos {self.servo}",
@@ -153,12 +152,3 @@ def _parse_ids(text: str) -> dict[str, int]:
             raise InputError(f"--joints: {name} is there twice.")
         ids[name] = whole(number)
     return ids
-
-
-def _plan(names: tuple[str, ...], margin: np.ndarray) -> list[tuple[float, list[str]]]:
-    """Amplitudes that leave a fifth of each joint's margin, and the joints of each."""
-    groups: dict[float, list[str]] = {}
-    for name, free in zip(names, margin, strict=True):
-        amplitude = max(min(_AMPLITUDE_RAD, np.floor(80 * free) / 100), _SMALLEST_RAD)
-        groups.setdefault(float(amplitude), []).append(name)
-    return sorted(groups.items(), reverse=True)

@@ -10,7 +10,7 @@ from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.address import KINDS, SOCKET, BusAddress, parse_address
 from pupper_sysid.hardware.esp32 import Esp32Bus
-from pupper_sysid.hardware.serial_servos.scan import LineReport, ServoReport
+from pupper_sysid.hardware.serial_servos.scan import LineReport
 
 _USB_PORTS = ("ttyUSB", "ttyACM", "ttyAMA", "ttySC", "cu.usb", "COM")
 
@@ -54,8 +54,15 @@ class Scan:
             f"{number} at {report.family}:{report.device}, {report.baud} baud",
             "id", "model", "firmware", "volt", "°C", "count", "limits", "P D I", "errors",
         )  # fmt: skip
+        n = terminal.number
         for servo in servos:
-            table.add_row(*_cells(servo))
+            table.add_row(
+                str(servo.id), servo.model, servo.firmware or "–", n(servo.voltage_v, 1),
+                n(servo.temperature_c, 0), n(servo.count, 0),
+                "–" if servo.limits is None else f"{servo.limits[0]}–{servo.limits[1]}",
+                "–" if servo.gains is None else " ".join(map(str, servo.gains)),
+                servo.errors or "none",
+            )  # fmt: skip
         terminal.out.print(table)
         terminal.warn(*(fault for servo in servos for fault in servo.faults))
         for remark in report.remarks:
@@ -64,22 +71,19 @@ class Scan:
     def _everywhere(self) -> None:
         """Try all serial ports, and the proxy's socket."""
         ports = serial_ports()
-        reports, silent = [], {}
         with terminal.progress("scanning", 0) as advance:
-            for device in ports:
-                answer = _tried(device, advance)
-                if isinstance(answer, LineReport):
-                    reports.append(answer)
-                else:
-                    silent[device] = answer
+            answers = {device: _tried(device, advance) for device in ports}
+        reports = [a for a in answers.values() if isinstance(a, LineReport)]
+        silent = {device: a for device, a in answers.items() if isinstance(a, str)}
         proxy = SOCKET.exists()
         if self.json:
+            lines = [_as_data(report) for report in reports]
             terminal.print_json(
                 {
                     "ports": ports,
-                    "lines": [_as_data(report) for report in reports],
+                    "lines": lines,
                     "silent": silent,
-                    "proxy": str(SOCKET) if proxy else None,
+                    "proxy": SOCKET if proxy else None,
                 }
             )
             return
@@ -138,17 +142,16 @@ def serial_ports() -> list[str]:
 
 def _tried(device: str, advance: Callable[[str], None]) -> LineReport | str:
     """What answers at a port, by any protocol; or why nothing does, in words."""
-    reasons = []
-    for kind in (k for k in KINDS.values() if k.is_serial):
+    serial = [kind for kind in KINDS.values() if kind.is_serial]
+    for kind in serial:
         try:
             return kind.bus_class().scan_address(
                 BusAddress(kind.name, device), lambda what: advance(f"{device}, {what}")
             )
         except (BusError, InputError) as error:
-            reasons.append(str(error))
             if "cannot be opened" in str(error):
                 return str(error)
-    names = " and ".join(k.servos for k in KINDS.values() if k.is_serial)
+    names = " and ".join(kind.servos for kind in serial)
     return f"nothing answers as {names} servos do, at any of their rates."
 
 
@@ -159,13 +162,3 @@ def _as_data(report: LineReport) -> dict[str, object]:
         "servos": [asdict(servo) for servo in report.servos],
         "remarks": report.remarks,
     }
-
-
-def _cells(servo: ServoReport) -> tuple[str, ...]:
-    return (
-        str(servo.id), servo.model, servo.firmware or "–", terminal.number(servo.voltage_v, 1),
-        terminal.number(servo.temperature_c, 0), "–" if servo.count is None else str(servo.count),
-        "–" if servo.limits is None else f"{servo.limits[0]}–{servo.limits[1]}",
-        "–" if servo.gains is None else " ".join(map(str, servo.gains)),
-        servo.errors or "none",
-    )  # fmt: skip
