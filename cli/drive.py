@@ -56,21 +56,17 @@ class Driver:
                 self._ended = True  # the terminal is gone
                 break
             for key in typed:
-                self._press(key)
+                self._ended |= key == "x"
+                if key == " ":
+                    self._command, self._clipped = np.zeros(3), False
+                elif key in KEYS:
+                    axis, sign = KEYS[key]
+                    wanted = self._command.copy()
+                    # rounded: steps back to standing end at 0
+                    wanted[axis] = np.round(wanted[axis] + sign * STEP[axis], 6)
+                    self._command = self._trained.clip(wanted)
+                    self._clipped = bool((self._command != wanted).any())
         return None if self._ended else self._command.copy()
-
-    def _press(self, key: str) -> None:
-        if key == "x":
-            self._ended = True
-        elif key == " ":
-            self._command, self._clipped = np.zeros(3), False
-        elif key in KEYS:
-            axis, sign = KEYS[key]
-            wanted = self._command.copy()
-            # rounded: steps back to standing end at 0
-            wanted[axis] = np.round(wanted[axis] + sign * STEP[axis], 6)
-            self._command = self._trained.clip(wanted)
-            self._clipped = bool((self._command != wanted).any())
 
     def watching(self, joints: Sequence[str]) -> Callable[[Tick], None]:
         """Watcher of a walk of these joints, for the table."""

@@ -40,11 +40,13 @@ _END_S = 30.0  # for what the writer is behind; the robot is parked by then
 _WAIT_S = 10.0  # in virtual time
 
 
-def refuse_file(option: str, path: Path, force: bool) -> None:
-    """Refuse a file for a viewer that is there, or has not the ending that the viewer knows."""
-    if path.suffix != _ENDINGS[option]:
-        raise InputError(f"--{option} {path}: its name must end in {_ENDINGS[option]}.")
-    refuse_overwrite(path, force)
+def refuse_files(force: bool, **files: Path | None) -> None:
+    """Refuse files for viewers that are there, or have not the ending that the viewer knows."""
+    for option, path in files.items():
+        if path is not None:
+            if path.suffix != _ENDINGS[option]:
+                raise InputError(f"--{option} {path}: its name must end in {_ENDINGS[option]}.")
+            refuse_overwrite(path, force)
 
 
 @dataclass(frozen=True)
@@ -72,8 +74,7 @@ class Wanted:
 
     def check(self) -> None:
         """Refuse files that are there or have another ending."""
-        if self.mcap is not None:
-            refuse_file("mcap", self.mcap, self.force)
+        refuse_files(self.force, mcap=self.mcap)
         if self.rerun_file is not None:
             if self.rerun_file.suffix != _ENDINGS["rerun"]:
                 raise InputError(
@@ -110,7 +111,7 @@ class LiveViews:
         self._packed = packed
         self._wanted, self._within_s = wanted, _WAIT_S if waits else 0.0
         self._report = bus.report if isinstance(bus, GuardedBus) else None
-        self._dropped = self._told = 0
+        self.dropped = self._told = 0
         self._last_s = 0.0
         joints = bus.joint_names
         knee = "serial" if bus.metadata.get("linkage") == "none" else "linkage"
@@ -134,11 +135,6 @@ class LiveViews:
             self._process.end(_END_S)
             raise InputError(refused)
 
-    @property
-    def dropped(self) -> int:
-        """Ticks that the writer had no time for."""
-        return self._dropped
-
     def tick(
         self,
         trial: int,
@@ -153,8 +149,8 @@ class LiveViews:
         """
         more = () if gravity is None else (gravity,)
         # a tick that was dropped may have held the first reading of a value
-        row = self._packed(trial + self._dropped, sent, reading, *more)
-        self._dropped += not self._process.send(TICK + row.tobytes(), self._within_s)
+        row = self._packed(trial + self.dropped, sent, reading, *more)
+        self.dropped += not self._process.send(TICK + row.tobytes(), self._within_s)
         self._last_s = float(np.nanmax([sent.time_s, self._last_s, reading.time_s.max()]))
         if self._report and len(self._report.events) > self._told:
             self._tell_events()
@@ -193,9 +189,9 @@ class LiveViews:
             return
         for path in filter(None, (wanted.rerun_file, wanted.mcap)):
             terminal.err.print(f"Wrote {path}.")
-        if self._dropped:
+        if self.dropped:
             terminal.warn(
-                f"{' and '.join(names)}: {self._dropped} ticks were dropped, for the writer was "
+                f"{' and '.join(names)}: {self.dropped} ticks were dropped, for the writer was "
                 "behind. Recordings of this command are whole."
             )
 

@@ -21,13 +21,8 @@ import numpy as np
 import tyro
 from numpy.typing import NDArray
 
-from pupper_sysid.cli.live_views import refuse_file
-from pupper_sysid.cli.policy_choice import (
-    policy_at,
-    simulator,
-    trained_commands,
-    warn_of_fallbacks,
-)
+from pupper_sysid.cli import policy_choice
+from pupper_sysid.cli.live_views import refuse_files
 from pupper_sysid.cli.terminal import err, need_positive, out, seconds_progress, warn
 from pupper_sysid.cli.user_errors import run_program
 from pupper_sysid.common.errors import InputError
@@ -85,9 +80,7 @@ def _run(options: Play) -> None:
         if options.video.suffix.lower() != ".mp4":
             raise InputError(f"--video {options.video}: give a name that ends in .mp4.")
         refuse_overwrite(options.video, options.force)
-    for option, path in (("rerun", options.rerun), ("mcap", options.mcap)):
-        if path is not None:
-            refuse_file(option, path, options.force)
+    refuse_files(options.force, rerun=options.rerun, mcap=options.mcap)
     import torch
 
     from pupper_sysid.policies.walks.conditions import evaluation_task
@@ -95,11 +88,12 @@ def _run(options: Play) -> None:
     from pupper_sysid.sim.walking.servo_ranges import servo_model_of
 
     torch.set_num_threads(1)
-    policy, run = policy_at(options.policy)
-    task, servos = simulator(options.policy, policy, run, options.actuator, options.feedback)
-    warn_of_fallbacks([servos])
-    say = err.print
-    command = trained_commands(policy, run).clipped(command[None], say)[0]
+    policy, run = policy_choice.policy_at(options.policy)
+    task, servos = policy_choice.simulator(
+        options.policy, policy, run, options.actuator, options.feedback
+    )
+    policy_choice.warn_of_fallbacks([servos])
+    command = policy_choice.trained_commands(policy, run).clipped(command[None], err.print)[0]
     task = replace(evaluation_task(task, options.seconds + 1.0), terrain=options.terrain)
     model = servo_model_of(servos.source, task.control_step_s)
     env = PupperEnv(task, servos, 1, options.seed, 1, model)
@@ -190,22 +184,19 @@ class _Screen:
         self._model = env.robots.batch.get_model(0)
         self._data: Any = None
         if options.viewer:
-            self._open_viewer()
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("error")  # without a display, a viewer ends the process
+                    importlib.import_module("glfw").init()
+                viewer = importlib.import_module("mujoco.viewer")
+                self._data = env.robots.batch.get_data(0)
+                self._viewer = viewer.launch_passive(self._model, self._data)
+            except Exception as error:  # whatever the window system raises
+                raise InputError(
+                    f"No window could be opened ({error}). Use --video walk.mp4 instead."
+                ) from error
         if options.video:
             self._open_video(options)
-
-    def _open_viewer(self) -> None:
-        try:
-            with warnings.catch_warnings():  # without a display, launch_passive ends the process
-                warnings.simplefilter("error")
-                importlib.import_module("glfw").init()
-            viewer = importlib.import_module("mujoco.viewer")
-            self._data = self._env.robots.batch.get_data(0)
-            self._viewer = viewer.launch_passive(self._model, self._data)
-        except Exception as error:  # whatever the window system raises
-            raise InputError(
-                f"No window could be opened ({error}). Use --video walk.mp4 instead."
-            ) from error
 
     def _open_video(self, options: Play) -> None:
         from pupper_sysid.policies.walks.film import Film

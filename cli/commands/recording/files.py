@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.live_views import refuse_file
+from pupper_sysid.cli.live_views import refuse_files
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, resolved
 from pupper_sysid.common.joints import JOINT_NAMES
@@ -70,11 +70,7 @@ class Import:
     def run(self) -> None:
         """Read, check, write."""
         from pupper_sysid.sysid.recordings.files import load, plain_stem
-        from pupper_sysid.sysid.recordings.importers.options import (
-            LogOptions,
-            merged,
-            read_mapping,
-        )
+        from pupper_sysid.sysid.recordings.importers import options as importing
 
         name = plain_stem(resolved(self.log))
         out = self.out or Path(f"{name}.csv")
@@ -83,14 +79,14 @@ class Import:
                 raise InputError(f"--out {out} is the log itself. Choose another name.")
             out = Path(f"{name}_recording.csv")
         refuse_overwrite(out, self.force)
-        options = LogOptions(
+        options = importing.LogOptions(
             self.time, self.command, self.position, self.trial,
             {} if self.joints is None else _names(self.joints),
             self.unit, {}, self.read_before_send or None, self.stamp, self.command_time,
             self.send_after, self.rate, self.readings,
         )  # fmt: skip
         if self.mapping:
-            options = merged(options, read_mapping(self.mapping))
+            options = importing.merged(options, importing.read_mapping(self.mapping))
         recording = load(self.log, options)
         recording.save(out, self.force)
         terminal.warn(*recording.warnings)
@@ -98,14 +94,11 @@ class Import:
         if self.json:
             terminal.print_json(
                 {
-                    "written": str(out),
-                    "imported_from": layout,
-                    "joints": recording.joints,
-                    "rows": len(recording.table),
-                    "loop_period_s": recording.loop_period_s,
-                    "warnings": list(recording.warnings),
+                    "written": out, "imported_from": layout, "joints": recording.joints,
+                    "rows": len(recording.table), "loop_period_s": recording.loop_period_s,
+                    "warnings": recording.warnings,
                 }
-            )
+            )  # fmt: skip
             return
         shown = terminal.table(f"{self.log}: {layout}", "joint", "trials", "rows", "s",
                                "command rad", "position rad")  # fmt: skip
@@ -157,14 +150,11 @@ class View:
         """Read and write."""
         from pupper_sysid.sysid.view.files import write_mcap, write_rerun
 
-        wanted = {"rerun": self.rerun, "mcap": self.mcap}
         if self.rerun is None and self.mcap is None:
             raise InputError("Nothing to write: give --rerun FILE.rrd, --mcap FILE.mcap or both.")
         if self.model is not None and self.rerun is None:
             raise InputError("--model: only a Rerun file shows the robot; add --rerun FILE.rrd.")
-        for option, path in wanted.items():
-            if path is not None:
-                refuse_file(option, path, self.force)
+        refuse_files(self.force, rerun=self.rerun, mcap=self.mcap)
         recordings = terminal.load_all(self.recordings)
         if len(recordings) != 1:
             raise InputError(f"view: {len(recordings)} recordings were given; give one.")
@@ -178,8 +168,7 @@ class View:
 
                 time_s, bodies = robot_over_time(recording, self.model)
             write_rerun(recording, self.rerun, time_s, bodies, self.force)
-        for path in wanted.values():
-            if path is not None:
-                terminal.out.print(f"Wrote {path}")
+        for path in filter(None, (self.rerun, self.mcap)):
+            terminal.out.print(f"Wrote {path}")
         if self.rerun is not None:
             terminal.out.print(f"Next:\n  {terminal.command('rerun', self.rerun)}")

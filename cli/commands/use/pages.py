@@ -50,14 +50,9 @@ class Report(OfRecordings):
                 seed=self.seed, workers=2, force=self.force, progress=advance,
             )  # fmt: skip
         if self.json:
-            terminal.print_json(
-                {
-                    "report": written.path,
-                    "figures": written.figures,
-                    "drawings": written.drawings,
-                    "tables": written.tables,
-                }
-            )
+            parts = ("figures", "drawings", "tables")
+            named = {name: getattr(written, name) for name in parts}
+            terminal.print_json({"report": written.path} | named)
         else:
             hint = "" if self.open else " Open it in a browser, or add --open."
             terminal.err.print(f"Wrote {written.path}.{hint}")

@@ -15,7 +15,6 @@ from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.servo_models.calibration.parts import ARMATURES, P_GAINS
 
 if TYPE_CHECKING:
-    from pupper_sysid.servo_models.calibration.calibration import InputFile
     from pupper_sysid.servo_models.calibration.quantity import Quantity
     from pupper_sysid.servo_models.cards.card import ServoCard
     from pupper_sysid.servo_models.cards.compare import Comparison, Difference
@@ -170,6 +169,10 @@ def _summary(card: ServoCard, gain: float | None = None) -> dict[str, Any]:
 
 def _head(card: ServoCard) -> list[str]:
     gains = {g.upper(): v for g, v in card.gains if v is not None}
+    files = "; ".join(f"{f.name} (sha256 {f.sha256[:12]}…)" for f in card.data)
+    if len(card.data) > 4:
+        first, last = card.data[0].name, card.data[-1].name
+        files = f"{len(card.data)} files, {first} to {last}; hashes with --yaml"
     rows: dict[str, str] = {
         "servo": card.servo + (f" ({card.sku})" if card.sku else ""),
         "set-up": ", ".join(
@@ -185,7 +188,7 @@ def _head(card: ServoCard) -> list[str]:
         " ": card.source.file or "",
         "  ": f"commit {card.source.commit}" if card.source.commit else "",
         "licence": card.source.licence,
-        "data": _files(card.data),
+        "data": files,
         "scores": "; ".join(f"{s.value:.4g} {s.unit}, {s.what}" for s in card.scores),
     }
     lines = [card.name]
@@ -193,12 +196,6 @@ def _head(card: ServoCard) -> list[str]:
         for n, line in enumerate(wrap(text, _WIDTH - 9, break_on_hyphens=False)):
             lines.append(f"{name.strip() if n == 0 else '':9}{line}")
     return lines
-
-
-def _files(data: Sequence[InputFile]) -> str:
-    if len(data) > 4:
-        return f"{len(data)} files, {data[0].name} to {data[-1].name}; hashes with --yaml"
-    return "; ".join(f"{f.name} (sha256 {f.sha256[:12]}…)" for f in data)
 
 
 def _numbers(card: ServoCard, name: str, gain: float | None) -> Any:
@@ -218,19 +215,17 @@ def _numbers(card: ServoCard, name: str, gain: float | None) -> Any:
         for key in type(part).model_fields:
             value: Any = getattr(part, key)
             if key != "model" and value is not None:
-                unit_text = unit(key)
-                table.add_row(f"  {words_of(key)}", _with_interval(value), unit_text)
+                table.add_row(f"  {words_of(key)}", _with_interval(value), unit(key))
     return table
 
 
 def _with_interval(quantity: Quantity | None) -> str:
     if quantity is None:
         return "–"
-    text = f"{quantity.value:.4g}"
-    if quantity.low is not None and quantity.high is not None:
-        if quantity.low < quantity.high:  # else known without error, such as a term left out
-            text += f" [{quantity.low:.3g}, {quantity.high:.3g}]"
-    return text
+    text, low, high = f"{quantity.value:.4g}", quantity.low, quantity.high
+    if low is None or high is None or low >= high:  # known without error, such as a term left out
+        return text
+    return f"{text} [{low:.3g}, {high:.3g}]"
 
 
 def _column(servo: Compared) -> str:
@@ -254,14 +249,12 @@ def _servo(source: str, part: str | None, gain: float | None) -> Compared:
 
 def _motion(found: Comparison) -> str:
     """Lags and distance of the two motions in words."""
-    motion, n = found.motion, terminal.number
-    lags = [n(None if lag is None else 1e3 * lag, 1) for lag in
-            (motion.first_lag_s, motion.second_lag_s)]  # fmt: skip
-    apart = n(None if motion.apart_rad is None else 1e3 * motion.apart_rad, 1)
+    motion = found.motion
+    numbers = map(terminal.ms, (motion.first_lag_s, motion.second_lag_s, motion.apart_rad))
     return (
-        f"On tones of 1, 2 and 4 Hz, 0.2 rad: lag {lags[0]} and {lags[1]} ms, {apart} mrad apart "
-        "(RMS), each as it stands, with the link that it is known to move."
-    )
+        "On tones of 1, 2 and 4 Hz, 0.2 rad: lag {} and {} ms, {} mrad apart (RMS), each as it "
+        "stands, with the link that it is known to move."
+    ).format(*numbers)
 
 
 def _verdict(found: Sequence[Difference]) -> str:
