@@ -29,31 +29,11 @@ from pupper_sysid.hardware.address import BusAddress
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.hardware.loop import HostClock
+from pupper_sysid.hardware.serial_servos import scan, settings
 from pupper_sysid.hardware.serial_servos.line import Reply, slow_adapter
-from pupper_sysid.hardware.serial_servos.scan import (
-    MINI_PUPPER_IDS,
-    LineReport,
-    answering_joints,
-    default_map,
-    known_series,
-    one_series,
-    open_line,
-    refuse_other_servos,
-    scan_line,
-    two_of_one_id,
-)
+from pupper_sysid.hardware.serial_servos.scan import LineReport
 from pupper_sysid.hardware.serial_servos.series import Family, Series
-from pupper_sysid.hardware.serial_servos.settings import (
-    RegisterFault,
-    memory_of,
-    read_register,
-    register_faults,
-    registers_of,
-    return_delay_s,
-    setup_of,
-    supply_band,
-    write_register,
-)
+from pupper_sysid.hardware.serial_servos.settings import RegisterFault
 
 SPEED_LIMIT_RAD_S = 7.5
 """Speed of a servo whose data sheet is not known, or states none [rad/s]."""
@@ -109,20 +89,22 @@ class SerialBus(HostClock):
         self.name = self.family.name
         self.error_bits = self.family.error_bits
         wanted = joint_map.select(joints) if joint_map and joints else joint_map
-        ids = wanted.ids if wanted else MINI_PUPPER_IDS
-        self.line, models = open_line(
+        ids = wanted.ids if wanted else scan.MINI_PUPPER_IDS
+        self.line, models = scan.open_line(
             self.family, device, baud, ids, exclusive, patiently=wanted is not None
         )
         try:
             named = wanted.file.servo if wanted else None
-            series = known_series(self.family, models, device, named)
+            series = scan.known_series(self.family, models, device, named)
             if wanted is None:
-                wanted = default_map(self.family, self.line, series)
+                wanted = scan.default_map(self.family, self.line, series)
                 wanted = wanted.select(joints) if joints else wanted
             else:
-                refuse_other_servos(wanted, self.family, one_series(series, device), device)
+                scan.refuse_other_servos(
+                    wanted, self.family, scan.one_series(series, device), device
+                )
             self.joint_map = wanted.select(
-                answering_joints(self.family, wanted, series, joints is not None, self.line)
+                scan.answering_joints(self.family, wanted, series, joints is not None, self.line)
             )
             self._servos = [LineServo(i, series[i]) for i in self.joint_map.ids]
             super().__init__()
@@ -137,9 +119,9 @@ class SerialBus(HostClock):
             if doubled := self.line.doubled(
                 [servo.id for servo in self._servos], self._first, self.family.reading_bytes[0]
             ):
-                raise BusError(" ".join(two_of_one_id(self.line, servo) for servo in doubled))
+                raise BusError(" ".join(scan.two_of_one_id(self.line, servo) for servo in doubled))
             self._setups = {
-                joint: setup_of(servo.id, self.family, servo.series, servo.registers)
+                joint: settings.setup_of(servo.id, self.family, servo.series, servo.registers)
                 for joint, servo in zip(self.joint_names, self._servos, strict=True)
             }
             self.metadata: dict[str, Any] = self._describe(device)
@@ -161,7 +143,7 @@ class SerialBus(HostClock):
     @classmethod
     def scan_address(cls, address: BusAddress, advance: Callable[[str], None]) -> LineReport:
         """Servos at an address; see `scan_line`."""
-        return scan_line(cls.family, address.where, address.baud, advance)
+        return scan.scan_line(cls.family, address.where, address.baud, advance)
 
     @classmethod
     def limp_address(cls, address: BusAddress, ids: Sequence[int] | None) -> None:
@@ -252,12 +234,12 @@ class SerialBus(HostClock):
     def has_lost_torque(self, joint: str) -> bool:
         """Whether a servo answers that its torque is off."""
         servo = self._servo(joint, "torque_enable")
-        return read_register(self.line, servo.id, servo.series, "torque_enable") == 0
+        return settings.read_register(self.line, servo.id, servo.series, "torque_enable") == 0
 
     def goals(self) -> NDArray[np.float64]:
         """Goal_Position of each servo as an angle, shape (joints,); NaN where the read failed."""
         goals = [
-            read_register(self.line, s.id, s.series, "goal_position", _GOAL_TRIES)
+            settings.read_register(self.line, s.id, s.series, "goal_position", _GOAL_TRIES)
             for s in self._servos
         ]
         return self.joint_map.to_angles(np.array([np.nan if x is None else x for x in goals]))
@@ -278,7 +260,7 @@ class SerialBus(HostClock):
     def register(self, joint: str, name: str) -> int:
         """Present value of a register; `BusError` if it cannot be read."""
         servo = self._servo(joint, name)
-        value = read_register(self.line, servo.id, servo.series, name)
+        value = settings.read_register(self.line, servo.id, servo.series, name)
         if value is None:
             raise BusError(f"{joint}: its register {name} could not be read. Check the cable.")
         return value
@@ -286,7 +268,7 @@ class SerialBus(HostClock):
     def set_register(self, joint: str, name: str, value: int) -> None:
         """Set a register; `BusError` if it is not read back with this value."""
         servo = self._servo(joint, name)
-        if not write_register(self.line, servo.id, servo.series, name, value):
+        if not settings.write_register(self.line, servo.id, servo.series, name, value):
             raise BusError(
                 f"{joint}: its register {name} did not take the value {value}. Check the cable, "
                 "and that no other program uses the line."
@@ -298,8 +280,8 @@ class SerialBus(HostClock):
 
     def _remember(self, servo: LineServo) -> None:
         """Read all registers of a servo."""
-        memory = memory_of(self.line, servo.id, self.family.memory_pieces)
-        servo.registers = None if memory is None else registers_of(servo.series, memory)
+        memory = settings.memory_of(self.line, servo.id, self.family.memory_pieces)
+        servo.registers = None if memory is None else settings.registers_of(servo.series, memory)
 
     def _faults(self) -> list[tuple[RegisterFault, str]]:
         """Faults of all servos' registers, each once with the joints that have it."""
@@ -308,7 +290,7 @@ class SerialBus(HostClock):
             if servo.registers is None:
                 continue
             entry = self.joint_map.file.joints[self.joint_names[k]]
-            faults = register_faults(
+            faults = settings.register_faults(
                 self.family, servo.series, servo.registers, entry.limits_counts
             )
             name, expected = servo.series.name_of("homing_offset"), entry.homing_offset
@@ -350,7 +332,9 @@ class SerialBus(HostClock):
         series = servo.series
         if on:
             # else it would jump to an old Goal_Position
-            present = read_register(self.line, servo.id, series, "present_position", tries=1)
+            present = settings.read_register(
+                self.line, servo.id, series, "present_position", tries=1
+            )
             if present is None:
                 return False
             goal = series.encode("goal_position", int(np.clip(present, 0, series.counts - 1)))
@@ -389,7 +373,7 @@ class SerialBus(HostClock):
         """
         turns = [reply.after_s - reply.before_s for reply in replies.values()]
         delays = [
-            return_delay_s(self.family, self._setups[joint])
+            settings.return_delay_s(self.family, self._setups[joint])
             for joint, servo in zip(self.joint_names, self._servos, strict=True)
             if servo.id in replies and servo.series.has_sync_read
         ]
@@ -426,7 +410,8 @@ class SerialBus(HostClock):
 
     def _describe(self, device: str) -> dict[str, Any]:
         bands = (
-            supply_band(self.family, servo.series, servo.registers or {}) for servo in self._servos
+            settings.supply_band(self.family, servo.series, servo.registers or {})
+            for servo in self._servos
         )
         supply = [band for band in bands if band]
         speeds = [  # by their data sheets, at their supply voltage

@@ -15,15 +15,9 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.sim.robot import servo_mjcf
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.motion import gravity_direction
-from pupper_sysid.sim.robot.servo_mjcf import (
-    BATCH_FIELDS,
-    TENDON_FIELDS,
-    delay_lines,
-    empty_delay_lines,
-    write_servos,
-)
 from pupper_sysid.sim.robot.servo_robot import ServoRobot, compiled
 
 Array = NDArray[np.float64]
@@ -103,7 +97,7 @@ def replay(
         qpos[:, root + 2] += _lift(model, trunk, qpos)
     before = _down(qpos, root)
     batch.bind("ctrl")[:] = batch.bind("act")[:] = held
-    batch.bind("history")[:] = delay_lines(empty_delay_lines(model), held)
+    batch.bind("history")[:] = servo_mjcf.delay_lines(servo_mjcf.empty_delay_lines(model), held)
     warned = batch.warning.copy()
     batch.step(None, round(SETTLE_S / TIME_STEP_S))
     found = np.empty((n, steps + 1, len(robot.joints)), np.float32)
@@ -153,9 +147,14 @@ def _equip(
     on_tendon = model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON
     tendon_of = {int(i): int(targets[i]) for i in np.flatnonzero(on_tendon)}
     dof_of = {int(i): int(model.jnt_dofadr[targets[i]]) for i in np.flatnonzero(~on_tendon)}
-    names = (*BATCH_FIELDS, "geom_friction", "body_mass", *(TENDON_FIELDS if tendon_of else ()))
+    names = (
+        *servo_mjcf.BATCH_FIELDS,
+        "geom_friction",
+        "body_mass",
+        *(servo_mjcf.TENDON_FIELDS if tendon_of else ()),
+    )
     fields = {name: batch.expand(name) for name in names}
-    write_servos(fields, np.arange(len(friction)), servos, dof_of, tendon_of)
+    servo_mjcf.write_servos(fields, np.arange(len(friction)), servos, dof_of, tendon_of)
     fields["geom_friction"][:, :, 0] = friction[:, None]
     fields["body_mass"][:, trunk] += payload * model.body_subtreemass[trunk]
     batch.set_const()

@@ -24,15 +24,9 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.networks import JointArrays, same_rate
+from pupper_sysid.sim.robot import servo_mjcf
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.motion import Moved
-from pupper_sysid.sim.robot.servo_mjcf import (
-    BATCH_FIELDS,
-    TENDON_FIELDS,
-    delay_lines,
-    empty_delay_lines,
-    write_servos,
-)
 from pupper_sysid.sim.robot.terrain import Ground
 from pupper_sysid.sim.walking.config import Randomisation, Walking
 from pupper_sysid.sim.walking.differences import Bodies
@@ -112,14 +106,14 @@ class RobotBatch:
         self._dof_of = {i: 6 + i for i in range(joints) if i not in self.linked}
         self._tendon_of = {i: k for k, i in enumerate(self.linked)}
         self._after, self._before = np.array(self.linked, int), np.array(self.linked, int) - 1
-        names = (*BATCH_FIELDS, "geom_friction", "body_mass", "body_ipos")
-        names += TENDON_FIELDS if self.linked else ()
+        names = (*servo_mjcf.BATCH_FIELDS, "geom_friction", "body_mass", "body_ipos")
+        names += servo_mjcf.TENDON_FIELDS if self.linked else ()
         self._fields = {name: self.batch.expand(name) for name in names}
         self.qpos, self.qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._control, self._activation = self.batch.bind("ctrl"), self.batch.bind("act")
         self._history = self.batch.bind("history")
         self._site_position = self.batch.bind("site_xpos")
-        self._empty_lines = empty_delay_lines(self.model)
+        self._empty_lines = servo_mjcf.empty_delay_lines(self.model)
         self._feet_geoms = np.array([self.model.geom(name).id for name in body.foot_geoms])
         self._touch = np.array([self.model.sensor(f"{foot}_touch").adr[0] for foot in body.feet])
         self._touch_steps = max(round(_TOUCH_S / config.physics_step_s), 1)
@@ -276,7 +270,7 @@ class RobotBatch:
     def write(self, ids: NDArray[np.intp]) -> None:
         """Give some robots what `drawn`, `friction`, `payload_kg` and `bodies` hold for them."""
         drawn, fields = {k: v[ids] for k, v in self.drawn.items()}, self._fields
-        write_servos(fields, ids, drawn, self._dof_of, self._tendon_of)
+        servo_mjcf.write_servos(fields, ids, drawn, self._dof_of, self._tendon_of)
         fields["geom_friction"][ids[:, None], self._feet_geoms, 0] = self.friction[ids, None]
         mass = self.model.body_mass[self._trunk] + self.payload_kg[ids]
         fields["body_mass"][ids, self._trunk] = mass
@@ -319,7 +313,7 @@ class RobotBatch:
         held = self.to_servo(joints)
         self._control[ids] = self._activation[ids] = held
         # MuJoCo empties delay lines to zeros, which would throw the robot on its back
-        self._history[ids] = delay_lines(self._empty_lines, held)
+        self._history[ids] = servo_mjcf.delay_lines(self._empty_lines, held)
         if self.servo_model is not None:
             self.servo_model.reset_some(ids, held - self._bend)
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS.value)

@@ -186,14 +186,7 @@ def tries_of(
 
     `other_robots` is whether the analysis is one for any robot's policy.
     """
-    from pupper_sysid.cli.policy_choice import (
-        policy_at,
-        refuse_other_robot,
-        run_folder,
-        simulator,
-        trained_commands,
-        warn_of_fallbacks,
-    )
+    from pupper_sysid.cli import policy_choice
     from pupper_sysid.policies.analysis.trial import Trial
     from pupper_sysid.policies.deploy.commands import checked_command
 
@@ -201,7 +194,7 @@ def tries_of(
         raise InputError(f"--robots is {robots}; it must be at least 1.")
     need_positive("--seconds", seconds)
     checked_command(command)
-    names = [run_folder(path).name for path in options.policies]
+    names = [policy_choice.run_folder(path).name for path in options.policies]
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:
         raise InputError(
@@ -210,17 +203,19 @@ def tries_of(
         )
     tries: dict[str, tuple[Policy, Trial]] = {}
     for name, path in zip(names, options.policies, strict=True):
-        policy, run = policy_at(path)
+        policy, run = policy_choice.policy_at(path)
         if not other_robots:
-            refuse_other_robot(policy)
-        task, servos = simulator(path, policy, run, options.actuator, options.feedback)
+            policy_choice.refuse_other_robot(policy)
+        task, servos = policy_choice.simulator(
+            path, policy, run, options.actuator, options.feedback
+        )
         wanted = np.array([command], float)
-        within = trained_commands(policy, run).clipped(wanted, warn)[0]
+        within = policy_choice.trained_commands(policy, run).clipped(wanted, warn)[0]
         tries[name] = (
             policy,
             Trial(task, servos, (within[0], within[1], within[2]), robots, seconds, options.seed),
         )
-    warn_of_fallbacks(trial.servos for _, trial in tries.values())
+    policy_choice.warn_of_fallbacks(trial.servos for _, trial in tries.values())
     return tries
 
 

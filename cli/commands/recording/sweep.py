@@ -29,19 +29,9 @@ from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
 from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
-from pupper_sysid.sysid.sweep import bench
+from pupper_sysid.sysid.sweep import bench, excitation
 from pupper_sysid.sysid.sweep.bench import bench_plan, parse_load
-from pupper_sysid.sysid.sweep.excitation import (
-    LOOP_PERIOD_S,
-    MOST_LOOPS,
-    POLL_RATE_HZ,
-    RATES_HZ,
-    TRIAL_S,
-    Plan,
-    check_amplitude,
-    parse_frequencies,
-    plan,
-)
+from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S, Plan
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.sweep.recorder import Observe, Progress
@@ -91,7 +81,7 @@ class Sweep:
     """Play the commands of this recording or command file instead."""
     loops: int = 1
     """How often to play them."""
-    plan: Path | None = None
+    excitation.plan: Path | None = None
     """Execute this plan (of `pupper-sysid plan`): its joints, motions, durations and rate."""
     until: str | None = None
     """Fit and go on with planned trials until an interval is narrow: dead_time:2ms until half of
@@ -224,13 +214,15 @@ class Sweep:
         rate = self.rate
         if rate is None:
             rate = BENCH_RATE_HZ if self.load else round(1 / LOOP_PERIOD_S, 2)
-        refuse_outside("--rate", rate, *RATES_HZ, "Hz")
-        refuse_outside("--most-seconds", self.most_seconds, *TRIAL_S, "s")
+        refuse_outside("--rate", rate, *excitation.RATES_HZ, "Hz")
+        refuse_outside("--most-seconds", self.most_seconds, *excitation.TRIAL_S, "s")
         if self.duration is not None:
-            refuse_outside("--duration", self.duration, *TRIAL_S, "s")
+            refuse_outside("--duration", self.duration, *excitation.TRIAL_S, "s")
         bus = bus_name(self.bus)
-        if not 1 <= self.loops <= MOST_LOOPS:
-            raise InputError(f"--loops is {self.loops}; it must be from 1 to {MOST_LOOPS}.")
+        if not 1 <= self.loops <= excitation.MOST_LOOPS:
+            raise InputError(
+                f"--loops is {self.loops}; it must be from 1 to {excitation.MOST_LOOPS}."
+            )
         if self.real_time and bus != EMULATED:
             raise InputError("--real-time: a real bus always runs in real time; leave it out.")
         loop_period_s = 1.0 / rate
@@ -256,10 +248,10 @@ class Sweep:
         if self.freqs is None and self.load is not None:
             frequencies = list(bench.FREQUENCIES_HZ)
         else:
-            frequencies = parse_frequencies("1-10" if self.freqs is None else self.freqs)
+            frequencies = excitation.parse_frequencies("1-10" if self.freqs is None else self.freqs)
         amplitude = self.amplitude
         if amplitude is not None:
-            check_amplitude(amplitude)
+            excitation.check_amplitude(amplitude)
         elif not self.load:  # a bench's kinds of motion have excursions of their own
             amplitude = 0.3
         return {
@@ -421,10 +413,10 @@ def _plan_of(request: dict[str, Any], bus: ServoBus) -> Plan:
 
         path = Path(request["plan"])
         return executable(load_plan(path), path, joints, margin, pose, speed_limit)
-    return plan(
+    return excitation.plan(
         request["kind"], joints, request["frequencies_hz"], request["amplitude_rad"],
         request["duration_s"], request["loop_period_s"], speed_limit,
-        bus.metadata.get("poll_rate_hz", POLL_RATE_HZ), margin, pose,
+        bus.metadata.get("poll_rate_hz", excitation.POLL_RATE_HZ), margin, pose,
     )  # fmt: skip
 
 

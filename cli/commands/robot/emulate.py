@@ -29,20 +29,11 @@ from pupper_sysid.hardware.feetech import BAUD_RATES, SCS0009, STS3215
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.serial_servos.series import Series
+from pupper_sysid.sim.emulator import pendulum
 from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator, ProxySocket
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.pendulum import (
-    BENCH_MAP,
-    FEETECH_REGISTERS,
-    BenchSpec,
-    Pendulum,
-    PendulumBench,
-    draw_bench,
-    dynamixel_bench,
-    has_registers,
-)
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sim.emulator.serial_line import LineEmulator, SerialPty
 from pupper_sysid.sysid.sweep.bench import parse_load
@@ -134,11 +125,15 @@ class SerialLine(Common):
         if self.baud is not None and self.baud not in rates:
             raise InputError(f"--baud {self.baud}: choose {', '.join(map(str, rates))}.")
 
-    def on_bench(self, rng: np.random.Generator, spec: BenchSpec, layout: JointMap) -> ServoBench:
+    def on_bench(
+        self, rng: np.random.Generator, spec: pendulum.BenchSpec, layout: JointMap
+    ) -> ServoBench:
         """Servos whose registers act on the motion, in free air or with the load."""
         load = parse_load(self.load) if self.load else None
-        robot = draw_bench(rng, Pendulum(**(load.model_dump() if load else {})), spec, layout)
-        plant = PendulumBench(robot)
+        robot = pendulum.draw_bench(
+            rng, pendulum.Pendulum(**(load.model_dump() if load else {})), spec, layout
+        )
+        plant = pendulum.PendulumBench(robot)
         bench = ServoBench(robot, layout, rng.spawn(1)[0], keep_log=False, plant=plant)
         bench.supply_v = spec.supply_v
         return bench
@@ -186,7 +181,7 @@ class Feetech(SerialLine):
         series = STS3215 if self.model == "sts3215" else SCS0009
         preset = "sts3215" if series is STS3215 else "mini_pupper_2_direct"
         if self.load:
-            preset = BENCH_MAP
+            preset = pendulum.BENCH_MAP
             if series is not STS3215 or self.walking:
                 raise InputError(
                     "--load is a bench with one STS3215: leave out --model, --walking."
@@ -195,9 +190,12 @@ class Feetech(SerialLine):
             raise InputError("--backlash is of a bench: add --load (or --load none).")
         layout = load_joint_map(self.joint_map or preset)
         registers = parse_servo_registers(self.registers, series)
-        moves = any(name in FEETECH_REGISTERS for own in registers.values() for name in own)
+        moves = any(
+            name in pendulum.FEETECH_REGISTERS for own in registers.values() for name in own
+        )
         loaded_servos = bool(
-            self.load or (has_registers(layout) and (self.joint_map or moves) and not self.walking)
+            self.load
+            or (pendulum.has_registers(layout) and (self.joint_map or moves) and not self.walking)
         )
         if moves and not loaded_servos:
             raise InputError(
@@ -209,8 +207,10 @@ class Feetech(SerialLine):
         self.refuse_outside(BAUD_RATES)
         refuse_outside("--backlash", self.backlash, 0, _MOST_BACKLASH_DEG, "degrees")
         if loaded_servos:
-            acting = tuple((k, v) for k, v in registers[None].items() if k in FEETECH_REGISTERS)
-            spec = BenchSpec(backlash_rad=math.radians(self.backlash), registers=acting)
+            acting = tuple(
+                (k, v) for k, v in registers[None].items() if k in pendulum.FEETECH_REGISTERS
+            )
+            spec = pendulum.BenchSpec(backlash_rad=math.radians(self.backlash), registers=acting)
             bench = self.on_bench(rng, spec, layout)
         else:
             # read directly, a servo answers with its present position: no polls, none lost
@@ -253,7 +253,7 @@ class Dynamixel(SerialLine):
         place, own_map = self.place(), self.joint_map
         if own_map is None:
             own_map = f"{place}.joints.yaml"
-            one = load_joint_map(BENCH_MAP).file.model_dump(by_alias=True)
+            one = load_joint_map(pendulum.BENCH_MAP).file.model_dump(by_alias=True)
             one |= {"servo": series.name, "name": f"one {series.name} on a bench"}
             joint_map_from(one, own_map).save(Path(own_map), force=True)
         layout = load_joint_map(own_map)
@@ -262,7 +262,7 @@ class Dynamixel(SerialLine):
                 f"--joint-map {own_map} is of {layout.file.servo or 'servos without a name'}; "
                 f"choose --model, or make one with `pupper-sysid init-robot --servo {self.model}`."
             )
-        spec = dynamixel_bench(series.name)
+        spec = pendulum.dynamixel_bench(series.name)
         bench = self.on_bench(rng, spec, layout)
         emulator = self.line(
             DynamixelEmulator, series, bench, rng, 1_000_000 if self.baud is None else self.baud
