@@ -233,7 +233,10 @@ class GuardedBus:
             self._present[self.bus.now() - self._present_s > _STALE_S] = np.nan
             self._home = None
         home = self._locate()
-        self._protect()
+        for joint, protections in getattr(self.bus, "protections_to_set", dict)().items():
+            for name, value in protections.items():  # the servos' own, until `close`
+                if name not in self.registers.found.get(joint, {}):
+                    self.set_register(joint, name, value)
         if self._watchdog:
             # before the first servo is on: a driver killed from here on leaves some that are
             self._watchdog.arm(self.joint_names, home)
@@ -338,14 +341,6 @@ class GuardedBus:
             self._watchdog.disarm()
         if interrupted:
             raise interrupted
-
-    def _protect(self) -> None:
-        """Switch on the servos' own protections that are off, until `close`."""
-        weak = getattr(self.bus, "protections_to_set", dict)()
-        for joint, own in weak.items():
-            for name, value in own.items():
-                if name not in self.registers.found.get(joint, {}):
-                    self.set_register(joint, name, value)
 
     def _beat(self) -> None:
         if self._watchdog:

@@ -114,7 +114,14 @@ def scan_line(
         remarks.append(
             f"At the other rates ({tried} baud) none of the ids {ids_in_words(_USUAL_IDS)} answers."
         )
-    remarks += _slow_returns(servos)
+    delay_us = {s.id: s.return_delay_us or 0 for s in servos}
+    if slow := [servo for servo, us in delay_us.items() if us > 1e6 * _SLOW_RETURN_S]:
+        whose, have = ("Servos", "have") if len(slow) > 1 else ("Servo", "has")
+        delays = " or ".join(map(str, sorted({delay_us[servo] for servo in slow})))
+        remarks.append(
+            f"{whose} {ids_in_words(slow)} {have} a return delay of {delays} µs; 0 would make "
+            "reading faster."
+        )
     return LineReport(family.name, device, first, servos, remarks)
 
 
@@ -174,20 +181,6 @@ def two_of_one_id(line: SerialLine, servo: int) -> str:
         f"{line.garbled[servo]} of {total} replies there were garbled, and those of other ids were "
         "not. Connect one of them alone and give it another id."
     )
-
-
-def _slow_returns(servos: list[ServoReport]) -> list[str]:
-    delay_us = {s.id: s.return_delay_us or 0 for s in servos}
-    slow = [servo for servo, us in delay_us.items() if us > 1e6 * _SLOW_RETURN_S]
-    if not slow:
-        return []
-    delays = sorted({delay_us[servo] for servo in slow})
-    many = len(slow) > 1
-    return [
-        f"{'Servos' if many else 'Servo'} {ids_in_words(slow)} "
-        f"{'have' if many else 'has'} a return delay of {' or '.join(map(str, delays))} µs; 0 "
-        "would make reading faster."
-    ]
 
 
 MINI_PUPPER_IDS = tuple(range(1, 13))

@@ -175,6 +175,16 @@ class Commanded(OfPolicies):
         return f"{super().caption(title)}; command {commanded}"
 
 
+def check_walk(command: tuple[float, float, float], robots: int, seconds: float) -> None:
+    """Refuse walks that cannot be."""
+    from pupper_sysid.policies.deploy.commands import checked_command
+
+    if robots < 1:
+        raise InputError(f"--robots is {robots}; it must be at least 1.")
+    need_positive("--seconds", seconds)
+    checked_command(command)
+
+
 def tries_of(
     options: Any,
     command: tuple[float, float, float],
@@ -188,12 +198,8 @@ def tries_of(
     """
     from pupper_sysid.cli import policy_choice
     from pupper_sysid.policies.analysis.trial import Trial
-    from pupper_sysid.policies.deploy.commands import checked_command
 
-    if robots < 1:
-        raise InputError(f"--robots is {robots}; it must be at least 1.")
-    need_positive("--seconds", seconds)
-    checked_command(command)
+    check_walk(command, robots, seconds)
     names = [policy_choice.run_folder(path).name for path in options.policies]
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:

@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.analyze.common import Analysis, Commanded, tries_of
+from pupper_sysid.cli.commands.analyze.common import Analysis, Commanded, check_walk, tries_of
 from pupper_sysid.cli.terminal import err, need_positive, number
 from pupper_sysid.common.errors import InputError
 
@@ -180,16 +180,11 @@ class ServoDemand(Commanded):
             return tries_of(self, command, *self.size, other_robots=True)
         from pupper_sysid.cli.policy_choice import warn_of_fallbacks
         from pupper_sysid.policies.analysis.trial import Trial
-        from pupper_sysid.policies.deploy.commands import checked_command
 
-        robots, seconds = self.size
-        if robots < 1:
-            raise InputError(f"--robots is {robots}; it must be at least 1.")
-        need_positive("--seconds", seconds)
-        checked_command(command)
+        check_walk(command, *self.size)
         policy, task, servos = self._of_onnx(path)
         warn_of_fallbacks([servos])
-        return {path.stem: (policy, Trial(task, servos, command, robots, seconds, self.seed))}
+        return {path.stem: (policy, Trial(task, servos, command, *self.size, self.seed))}
 
     def _of_onnx(self, path: Path) -> tuple[Any, Any, ServoRanges]:
         """Policy, task and servos of the walk."""

@@ -54,8 +54,12 @@ class Park:
             raise InputError("`park` without --bus needs Linux, whose /proc says what runs.")
         if self.supervise:
             self._supervise()
-        else:
-            self._left_on()
+            return
+        left = [note for note in notes() if not note.in_control()]
+        if not all([_take(note, self.seconds) for note in left]):
+            raise BusError("Not every robot that was left on could be switched off.")
+        if not left:
+            terminal.err.print("No driver that is gone left a robot on; --bus names another.")
 
     def _named(self, address: BusAddress) -> None:
         left = _until_limp(address, chosen_map(self.joint_map), None, self.seconds)
@@ -72,13 +76,6 @@ class Park:
                 )
             restore(note.address, note.joint_map, note.registers)
             note.remove()
-
-    def _left_on(self) -> None:
-        left = [note for note in notes() if not note.in_control()]
-        if not all([_take(note, self.seconds) for note in left]):
-            raise BusError("Not every robot that was left on could be switched off.")
-        if not left:
-            terminal.err.print("No driver that is gone left a robot on; --bus names another.")
 
     def _supervise(self) -> None:
         terminal.err.print("Watching over the robots of this user.")
