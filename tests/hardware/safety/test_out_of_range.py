@@ -177,11 +177,11 @@ def test_a_voltage_that_cannot_be_replaces_the_last_one_of_the_proxy(volts):
     HostClock.__init__(bus)
     bus.joint_map = load_joint_map("mini_pupper_2").per_servo()
     bus.joint_names, bus._by_id = bus.joint_map.joint_names, np.array(bus.joint_map.ids) - 1
-    bus._socket, bus._power, bus._power_s = None, None, -np.inf
+    bus._socket, bus._supply_v, bus._supply_s = None, None, -np.inf
     bus._exchange = lambda request: answers[request[1]]
 
     def voltage(present: float) -> np.ndarray:
-        bus._power_s = -np.inf  # it is asked for twice a second
+        bus._supply_s = -np.inf  # it is asked for twice a second
         answers[esp32.GET_POWER] = struct.pack("<BB2f", 10, esp32.GET_POWER, present, 0.5)
         return bus.read().voltage_v
 
