@@ -53,8 +53,6 @@ BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000
 """By the value of the servo's baud register."""
 
 POSITION_MODE, EXTENDED_POSITION_MODE, CURRENT_BASED_POSITION_MODE = 3, 4, 5
-MODES = {0: "current mode", 1: "velocity mode", 16: "PWM mode"}
-ACKNOWLEDGES = 2
 REVERSE, TIME_BASED = 1, 4
 """Bits of the drive mode: counts fall with the angle; profiles are durations."""
 FULL_PWM = 885
@@ -513,10 +511,10 @@ FAMILY = Family(
     reading_bytes=(12, 13, 14, 15, 16, 23),  # PWM, current, velocity, position; … voltage, heat
     memory_pieces=(40, 38, 37, 32),
     shaping=SHAPING,
-    modes=MODES,
+    modes={0: "current mode", 1: "velocity mode", 16: "PWM mode"},
     position_mode=POSITION_MODE,
     turns_freely=frozenset({EXTENDED_POSITION_MODE, CURRENT_BASED_POSITION_MODE}),
-    acknowledges=ACKNOWLEDGES,
+    acknowledges=2,
     profile=profile,
     own_faults=own_faults,
     protections=protections,

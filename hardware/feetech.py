@@ -36,10 +36,8 @@ HIGHEST_ID = 253
 
 BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
 """By the value of the servo's baud register."""
-RETURN_DELAY_UNIT_S = 2e-6
 
 MODEL_ADDRESS, TORQUE_ADDRESS = 3, 40
-MULTI_TURN_FEEDBACK = 16
 _SPEED_SIGN, _LOAD_SIGN, _OFFSET_SIGN = 15, 10, 11
 
 
@@ -98,7 +96,7 @@ STS3215 = Series(
         "current": Register(69, 2, 15),
     },
     # several turns are reported, instead of one (LeRobot clears it)
-    multi_turn_bit=MULTI_TURN_FEEDBACK,
+    multi_turn_bit=16,
 )  # fmt: skip
 HD1910 = replace(
     STS3215,
@@ -112,10 +110,6 @@ model number, so that a joint map has to name it."""
 SERIES = {int.from_bytes(s.word(s.model), "little"): s for s in (SCS0009, STS3215)}
 """By model number, its bytes as little endian."""
 
-POSITION_MODE = 0
-MODES = {1: "wheel mode", 2: "PWM mode", 3: "step mode"}
-ACKNOWLEDGES = 1
-
 SHAPING = (
     "return_delay", "response_level", "min_start_force", "dead_zone_cw", "dead_zone_ccw",
     "max_torque", "torque_limit", "max_temperature", "max_voltage", "min_voltage", "min_angle",
@@ -128,9 +122,6 @@ _HEAT, _OVERLOAD = 4, 32  # of ERROR_BITS
 _MOST = {"protective_torque": 20, "protection_time": 200, "overload_torque": 80}
 """Factory settings: share of the torque afterwards [%], duration [10 ms], share before [%]."""
 _OFF_AT_ZERO = ("protection_time", "overload_torque")
-
-PROTECTIONS = ("unload_condition", *_MOST)
-"""Registers of which a servo's protections consist, as far as its series has them."""
 
 
 def protections_to_set(series: Series, registers: Mapping[str, int]) -> dict[str, int]:
@@ -172,8 +163,7 @@ def profile(series: Series, registers: Mapping[str, int]) -> Profile:
 
 
 HEADER = b"\xff\xff"
-SHORTEST = 6
-_HIGHEST_LENGTH = 252
+_SHORTEST, _HIGHEST_LENGTH = 6, 252
 
 
 class Frame(LineFrame):
@@ -214,7 +204,7 @@ class FrameReader:
         self._buffer += data
         frames: list[Frame] = []
         buffer, start, end = self._buffer, 0, len(self._buffer)
-        while end - start >= SHORTEST:
+        while end - start >= _SHORTEST:
             if buffer[start] != 0xFF or buffer[start + 1] != 0xFF:
                 at = buffer.find(HEADER, start)
                 # the last byte may be the first of a header
@@ -313,16 +303,16 @@ FAMILY = Family(
     reading_bytes=(6, 7, 8, 9, 10, 11),  # position, speed, load; voltage; temperature; …
     memory_pieces=(16, 15, 14, 13, 9),  # registers 0 to 66
     shaping=SHAPING,
-    modes=MODES,
-    position_mode=POSITION_MODE,
+    modes={1: "wheel mode", 2: "PWM mode", 3: "step mode"},
+    position_mode=0,
     turns_freely=frozenset(),
-    acknowledges=ACKNOWLEDGES,
+    acknowledges=1,
     profile=profile,
     own_faults=lambda series, found: [],
     protections=protections_to_set,
     volt_scale=0.1,
     load=("present_load", 1e-3),
-    return_delay_unit_s=RETURN_DELAY_UNIT_S,
+    return_delay_unit_s=2e-6,
     tool="Feetech's FD program",
 )
 

@@ -83,11 +83,10 @@ class Esp32(Common):
         bench = _bench(self, draw_robot(rng), load_joint_map("mini_pupper_2"), rng)
         emulator = ProxyEmulator(bench, rng, BusFaults.parse(self.faults, rng))
         with closing(ProxySocket(emulator, self.socket)) as server:
-            _write_truth(self, bench)
             name = "esp32" if self.socket == SOCKET else f"esp32:{self.socket}"
             what = "Emulated Mini Pupper 2" + (", standing," if self.walking else "")
-            with keys_move(bench) if self.by_hand else nullcontext():
-                _serve(server, f"{what} at {self.socket}.", name, self.walking)
+            what += f" at {self.socket}."
+            _serve(self, server, bench, what, _commands(self, name))
 
 
 @dataclass(frozen=True)
@@ -317,51 +316,40 @@ def _serve_line(
     options: SerialLine, emulator: LineEmulator, bench: ServoBench, also: str, own_map: str | None
 ) -> None:
     """Serve a line of servos until Ctrl-C."""
-    with (
-        closing(SerialPty(emulator, options.place(), options.adapter_ms / 1e3)) as server,
-        keys_move(bench) if options.by_hand else nullcontext(),
-    ):
-        _write_truth(options, bench)
+    with closing(SerialPty(emulator, options.place(), options.adapter_ms / 1e3)) as server:
         what = f"{len(emulator.servos)} emulated {emulator.series.name} at {server.device}, "
         what += f"{emulator.baud} baud{also}"
         bus = f"{emulator.family.name}:{server.device}"
         if not options.load:
-            _serve(server, what, bus, options.walking, own_map)
+            _serve(options, server, bench, what, _commands(options, bus, own_map))
             return
         shown = f" --joint-map {own_map}" if own_map else ""
         kind = " --gains 8,16,32" if emulator.family.name == "feetech" else ""
         kind = kind if parse_load(options.load) else " --kind reversal"
-        _serve_with(
-            server, f"{what} Load: {options.load}.",
-            f"  pupper-sysid sweep --load {options.load}{kind}{shown} --bus {bus}\n",
-        )  # fmt: skip
+        sweep = f"  pupper-sysid sweep --load {options.load}{kind}{shown} --bus {bus}\n"
+        _serve(options, server, bench, f"{what} Load: {options.load}.", sweep)
 
 
-def _write_truth(options: Common, bench: ServoBench) -> None:
-    if options.truth:
-        text = yaml.safe_dump(bench.truth(seed=options.seed), sort_keys=False)
-        write_text(options.truth, text, options.force)
+def _commands(options: Common, name: str, own_map: str | None = None) -> str:
+    """What to type elsewhere while a robot is served at this bus."""
+    which, bus = ("", f"{name} --joint-map {own_map}") if own_map else (" --joints LF", name)
+    # a sweep is for legs in free air
+    sweep = "" if options.walking else f"  pupper-sysid sweep --freqs 1-10{which} --bus {bus}\n"
+    return f"{sweep}  pupper-sysid monitor --bus {bus}\n"
 
 
 def _serve(
-    server: ProxySocket | SerialPty,
-    what: str,
-    name: str,
-    walking: bool,
-    own_map: str | None = None,
+    options: Common, server: ProxySocket | SerialPty, bench: ServoBench, what: str, commands: str
 ) -> None:
-    which, bus = ("", f"{name} --joint-map {own_map}") if own_map else (" --joints LF", name)
-    # a sweep is for legs in free air
-    sweep = "" if walking else f"  pupper-sysid sweep --freqs 1-10{which} --bus {bus}\n"
-    _serve_with(server, what, f"{sweep}  pupper-sysid monitor --bus {bus}\n")
-
-
-def _serve_with(server: ProxySocket | SerialPty, what: str, commands: str) -> None:
-    """Serve until Ctrl-C; `commands` are what to type elsewhere."""
-    terminal.out.print(what)
-    terminal.out.print(f"In another terminal:\n{commands}Ctrl-C ends it.")
-    with real_time_priority():  # bytes that come late would look like a slow servo
-        server.serve()
+    """Serve until Ctrl-C, with keys that move joints if they are wanted."""
+    with keys_move(bench) if options.by_hand else nullcontext():
+        if options.truth:
+            text = yaml.safe_dump(bench.truth(seed=options.seed), sort_keys=False)
+            write_text(options.truth, text, options.force)
+        terminal.out.print(what)
+        terminal.out.print(f"In another terminal:\n{commands}Ctrl-C ends it.")
+        with real_time_priority():  # bytes that come late would look like a slow servo
+            server.serve()
 
 
 def _parse_ids(text: str, known: tuple[int, ...]) -> list[int]:

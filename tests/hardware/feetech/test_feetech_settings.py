@@ -14,7 +14,7 @@ import pytest
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.bus import header_entries
-from pupper_sysid.hardware.feetech import PROTECTIONS, SCS0009, STS3215, FeetechBus, FeetechLine
+from pupper_sysid.hardware.feetech import SCS0009, STS3215, FeetechBus, FeetechLine
 from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
@@ -111,7 +111,7 @@ def set_protection(server, **values: int) -> None:
 
 
 def protection(server) -> dict[str, int]:
-    return {name: server.emulator._get(1, name) for name in PROTECTIONS}
+    return {name: server.emulator._get(1, name) for name in FACTORY}
 
 
 FACTORY = {
