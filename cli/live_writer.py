@@ -61,7 +61,15 @@ class Writer:
             return
         self._rerun = RerunStream(uuid.uuid4().hex)
         if address:
-            _refuse_silent(address)
+            try:  # Rerun itself would wait for a viewer
+                parts = urlsplit(address)
+                where = parts.hostname or "", parts.port or _VIEWER_PORT
+                socket.create_connection(where, _VIEWER_S).close()
+            except (OSError, ValueError) as error:
+                raise InputError(
+                    f"No Rerun viewer answers at {address}: {error}. Start one by the command "
+                    "rerun, or give a file whose name ends in .rrd."
+                ) from error
             self._rerun.connect(address)
         else:
             self._new(Path(path), about["force"]).close()
@@ -126,19 +134,6 @@ class Writer:
     def _unmake(self) -> None:
         for path in self._made:
             path.unlink(missing_ok=True)
-
-
-def _refuse_silent(address: str) -> None:
-    """Refuse the address of a viewer where nothing listens: Rerun itself would wait for one."""
-    try:
-        parts = urlsplit(address)
-        where = parts.hostname or "", parts.port or _VIEWER_PORT
-        socket.create_connection(where, _VIEWER_S).close()
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"No Rerun viewer answers at {address}: {error}. Start one by the command rerun, or "
-            "give a file whose name ends in .rrd."
-        ) from error
 
 
 def main() -> None:

@@ -250,17 +250,14 @@ class _Stream:
         return getattr(self._stream, attribute)
 
     def write(self, text: str) -> int:
-        """As the stream's."""
         with self._named():
             return self._stream.write(text)
 
     def writelines(self, lines: Iterable[str]) -> None:
-        """As the stream's."""
         with self._named():
             self._stream.writelines(lines)
 
     def flush(self) -> None:
-        """As the stream's."""
         with self._named():
             self._stream.flush()
 
