@@ -24,7 +24,7 @@ from pupper_sysid.sim.robot.terrain import Terrain
 
 if TYPE_CHECKING:
     from pupper_sysid.common.interval import Interval
-    from pupper_sysid.policies.evaluation import evaluate as evaluation
+    from pupper_sysid.policies.evaluation.evaluate import Evaluation
 
 _FULL, _QUICK = (100, 20.0), (30, 10.0)  # episodes, seconds each
 _FULL_BATTERY, _QUICK_BATTERY = (40, 20.0), (10, 8.0)
@@ -141,7 +141,7 @@ def _run(options: Eval) -> None:
         err.print(f"Wrote {page}.")
 
 
-def _show(found: evaluation.Evaluation, quick: bool) -> None:
+def _show(found: Evaluation, quick: bool) -> None:
     first = found.conditions[0].policy
     err.print(
         f"{'Quick look: ' if quick else ''}{first.episodes} episodes of {found.episode_s:g} s, "
@@ -155,7 +155,7 @@ def _show(found: evaluation.Evaluation, quick: bool) -> None:
     _show_effort(found)
 
 
-def _show_falls(found: evaluation.Evaluation) -> None:
+def _show_falls(found: Evaluation) -> None:
     """Falls of all three, what the policy's feet do, and what came before the falls."""
     shown = terminal.table(
         "Falls, %, and what the policy's feet do", "", "policy", "trot", "standing", "duty",
@@ -189,7 +189,7 @@ def _show_falls(found: evaluation.Evaluation) -> None:
     out.print(shown)
 
 
-def _show_errors(found: evaluation.Evaluation, of_what: str, prefix: str) -> None:
+def _show_errors(found: Evaluation, of_what: str, prefix: str) -> None:
     shown = terminal.table(
         f"Mean absolute errors of {of_what}, mm/s and mrad/s: policy and trot", "",
         "vx", "vy", "yaw", "trot vx", "vy", "yaw",
@@ -205,7 +205,7 @@ def _show_errors(found: evaluation.Evaluation, of_what: str, prefix: str) -> Non
     out.print(shown)
 
 
-def _show_directions(found: evaluation.Evaluation) -> None:
+def _show_directions(found: Evaluation) -> None:
     rows = [row for row in found.conditions if row.group == "direction" and any(row.command or ())]
     if not rows:
         return
@@ -223,7 +223,7 @@ def _show_directions(found: evaluation.Evaluation) -> None:
     out.print(shown)
 
 
-def _show_effort(found: evaluation.Evaluation) -> None:
+def _show_effort(found: Evaluation) -> None:
     """Clearance of the swings and effort of the servos, of policy and trot."""
     kinds = [k for k in found.conditions[0].policy.torque_saturated_share if k != "hip"]
     shown = terminal.table(

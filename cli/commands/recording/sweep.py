@@ -81,7 +81,7 @@ class Sweep:
     """Play the commands of this recording or command file instead."""
     loops: int = 1
     """How often to play them."""
-    excitation.plan: Path | None = None
+    plan: Path | None = None
     """Execute this plan (of `pupper-sysid plan`): its joints, motions, durations and rate."""
     until: str | None = None
     """Fit and go on with planned trials until an interval is narrow: dead_time:2ms until half of
