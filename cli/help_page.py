@@ -28,11 +28,7 @@ _DEFAULT = re.compile(r"\s*(\(default: [^()]*(\([^()]*\)[^()]*)*\)|\(required\)|
 
 
 def help_page(
-    options: Any,
-    arguments: Sequence[str],
-    program: str,
-    description: str | None,
-    **keywords: Any,
+    options: Any, arguments: Sequence[str], program: str, description: str | None, **keywords: Any
 ) -> str:
     """Help of the command whose options are `options`, as wide as the terminal.
 

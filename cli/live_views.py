@@ -136,11 +136,7 @@ class LiveViews:
             raise InputError(refused)
 
     def tick(
-        self,
-        trial: int,
-        sent: Sent,
-        reading: BusSample,
-        gravity: Array | None = None,
+        self, trial: int, sent: Sent, reading: BusSample, gravity: Array | None = None
     ) -> None:
         """Show one tick; NaN where nothing was sent.
 

@@ -33,10 +33,7 @@ from pupper_sysid.common.processes.stop import end_politely as end_politely
 from pupper_sysid.common.reading.content import reading_up_to
 from pupper_sysid.common.reading.dialect import decimal, whole
 
-_COMPLETIONS = {
-    "bash": ".local/share/bash-completion/completions/{}",
-    "zsh": ".zfunc/_{}",
-}
+_COMPLETIONS = {"bash": ".local/share/bash-completion/completions/{}", "zsh": ".zfunc/_{}"}
 _READ_LIMIT = "--read-limit"
 LARGEST_SEED = 2**63 - 1
 """The largest that every generator takes: torch's are seeded with 64 bits."""

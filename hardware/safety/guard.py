@@ -128,10 +128,7 @@ class GuardedBus:
     """A guarded `ServoBus`; the watchdog is armed while the torque is on."""
 
     def __init__(
-        self,
-        bus: ServoBus,
-        limits: GuardLimits | None = None,
-        watchdog: Watchdog | None = None,
+        self, bus: ServoBus, limits: GuardLimits | None = None, watchdog: Watchdog | None = None
     ):
         self.bus = bus
         self.name, self.joint_names = bus.name, bus.joint_names

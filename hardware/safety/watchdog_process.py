@@ -163,8 +163,7 @@ def _go_home(orders: _Orders) -> list[str]:
     """Park all joints where they were found; those that did not confirm that they are limp."""
     joints = list(orders.pose_rad)
     guard = GuardedBus(
-        open_bus(orders.address, orders.joint_map, joints),
-        GuardLimits(park_within_s=PARK_WITHIN_S),
+        open_bus(orders.address, orders.joint_map, joints), GuardLimits(park_within_s=PARK_WITHIN_S)
     )
     try:
         guard.take_over()

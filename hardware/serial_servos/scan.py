@@ -237,11 +237,7 @@ def known_series(
 
 
 def answering_joints(
-    family: Family,
-    wanted: JointMap,
-    series: dict[int, Series],
-    all_of_them: bool,
-    line: SerialLine,
+    family: Family, wanted: JointMap, series: dict[int, Series], all_of_them: bool, line: SerialLine
 ) -> list[str]:
     """Joints of `wanted` whose servos answer."""
     servos = dict(zip(wanted.joint_names, wanted.ids, strict=True))

@@ -123,10 +123,7 @@ def supply_band(
 
 
 def register_faults(
-    family: Family,
-    series: Series,
-    registers: Mapping[str, int],
-    limits: tuple[int, int],
+    family: Family, series: Series, registers: Mapping[str, int], limits: tuple[int, int]
 ) -> list[RegisterFault]:
     """What is wrong with a servo's registers for driving it within `limits` [counts]."""
 

@@ -63,10 +63,7 @@ class Trot:
             )
 
     def joints(
-        self,
-        phase: NDArray[np.float64],
-        command: NDArray[np.float64],
-        body: Body | None = None,
+        self, phase: NDArray[np.float64], command: NDArray[np.float64], body: Body | None = None
     ) -> NDArray[np.float64]:
         """Joint set-points [rad], shape (n, 12).
 
