@@ -159,11 +159,10 @@ class LineEmulator(ABC):
     # ----- what all share
 
     def receive(self, data: bytes, now: float, baud: int | None = None) -> Pieces:
-        """What comes back, in order of time, for `data` that the host began to send at about `now`
-        [s].
+        """What comes back, in order of time, for `data` that the host began to send at `now`.
 
-        Time must not go backwards. At another rate than theirs, `baud`, the servos receive only
-        noise.
+        `now` [s] must not go backwards. At another rate than theirs, `baud`, the
+        servos receive only noise.
         """
         byte_s, self._free_at = self._byte_s(baud), max(now, self._free_at)
         pieces = [(self._free_at + len(data) * byte_s, data)] if self.echo else []
