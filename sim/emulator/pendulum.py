@@ -318,17 +318,20 @@ class PendulumServo:
         if math.isinf(top_speed) and math.isinf(acceleration):
             self._setpoint = goal
             return
-        way = goal - self._setpoint
+        way, before = goal - self._setpoint, self._rate
         wanted = min(top_speed, abs(way) / self._dt)
         if not math.isinf(acceleration):
+            # the rate at which a step may end for the rest of the way to be enough to stop
             gain = acceleration * self._dt
-            # the speed from which the rest of the way is enough to stop
-            wanted = min(wanted, math.sqrt(2 * acceleration * abs(way)))
+            toward = math.copysign(before, before * way)
+            room = gain**2 / 4 + 2 * acceleration * abs(way) - gain * toward
+            wanted = min(wanted, math.sqrt(max(room, gain**2 / 4)) - gain / 2)
             wanted = math.copysign(wanted, way)
-            self._rate = min(max(wanted, self._rate - gain), self._rate + gain)
+            self._rate = min(max(wanted, before - gain), before + gain)
+            step = (before + self._rate) / 2 * self._dt
         else:
             self._rate = math.copysign(wanted, way)
-        step = self._rate * self._dt
+            step = self._rate * self._dt
         if abs(way - step) < 1e-9 or (abs(way) < 1e-4 and abs(self._rate) < 2e-1):
             self._setpoint, self._rate = goal, 0.0
         else:
