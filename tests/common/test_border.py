@@ -2,88 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import os
 from typing import Annotated, Literal
 
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pupper_sysid.common.border import (
-    parse_json,
-    read_bytes,
-    read_json,
-    read_text,
     read_yaml,
     refuse_other_version,
     unit_of,
     validated,
 )
-from pupper_sysid.common.errors import InputError
-from support.refusals import assert_each_refused
-
-
-def refusal(function, *given, **options) -> str:
-    with pytest.raises(InputError) as caught:
-        function(*given, **options)
-    return str(caught.value)
-
-
-# ------------------------------------------------------------------------------------ reading
-
-
-def test_what_is_no_readable_file_is_refused_by_its_name(tmp_path):
-    assert (
-        refusal(read_bytes, tmp_path / "a") == f"{tmp_path / 'a'} does not exist. Check the name."
-    )
-    assert "is not a file" in refusal(read_bytes, tmp_path)
-    os.mkfifo(tmp_path / "pipe")
-    assert "is not a file" in refusal(read_bytes, tmp_path / "pipe")
-    for name in ("n" * 300, "a\0b"):
-        said = refusal(read_bytes, tmp_path / name, remedy="Copy it again.")
-        assert said.endswith("Copy it again.")
-    (tmp_path / "a.json").write_text("{")
-    said = refusal(read_json, tmp_path / "a.json", remedy="Fit it again.")
-    assert "a.json is not JSON: " in said and said.endswith("Fit it again.")
-    (tmp_path / "latin").write_bytes("Hüfte".encode("latin-1"))
-    assert "is not a text file (byte 1 is not UTF-8)" in refusal(read_text, tmp_path / "latin")
-
-
-def test_a_file_is_read_up_to_its_limit_and_not_beyond(tmp_path):
-    path = tmp_path / "a"
-    path.write_bytes(b"x" * 1000)
-    assert read_bytes(path, 1000) == b"x" * 1000
-    assert "has 1,000 bytes; at most 999 bytes are read" in refusal(read_bytes, path, 999)
-
-
-def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path):
-    (tmp_path / "a").write_bytes(b"\xef\xbb\xbfa: 1")
-    assert read_yaml(tmp_path / "a")[0] == {"a": 1}
-
-
-@settings(max_examples=100)
-@given(st.text() | st.sampled_from(["", "{", "9" * 5000, "nothing"]))
-def test_any_text_is_json_or_refused(text):
-    try:
-        expected = json.loads(text)
-    except (ValueError, RecursionError):
-        assert "x is not JSON: " in refusal(parse_json, text, "x")
-    else:
-        assert repr(parse_json(text, "x")) == repr(expected)
-
-
-@settings(max_examples=100)
-@given(content=st.binary(max_size=60))
-def test_any_bytes_are_yaml_or_refused(tmp_path_factory, content):
-    path = tmp_path_factory.getbasetemp() / "any.yaml"
-    path.write_bytes(content)
-    try:
-        read_yaml(path)
-    except InputError as error:
-        assert str(path) in str(error)
-
+from support.refusals import assert_each_refused, refusal
 
 # ----------------------------------------------------------------------------------- versions
 

@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import pytest
+
 from pupper_sysid.common.errors import InputError
+
+
+def refusal(use: Callable[..., object], *arguments: Any, **named: Any) -> str:
+    """What `use` says when it refuses its arguments."""
+    with pytest.raises(InputError) as refused:
+        use(*arguments, **named)
+    return str(refused.value)
 
 
 def assert_each_refused(

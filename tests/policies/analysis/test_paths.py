@@ -92,14 +92,6 @@ def test_a_push_changes_the_sideways_speed_at_its_step_only(walker):
 
 
 @pytest.mark.slow
-def test_a_push_shifts_the_phase_more_than_a_nudge(walker, monkeypatch):
-    monkeypatch.setattr("pupper_sysid.policies.analysis.autonomy._PUSHES", 1)
-    nudge, push = push_response(*walker)
-    assert push.survival == 1.0 and nudge.shift_early < push.shift_early
-    assert len(push.shifts) == len(push.phases) == 2
-
-
-@pytest.mark.slow
 def test_a_policy_walks_at_other_rates_with_other_scales_and_on_other_ground(walker, monkeypatch):
     policy, trial = walker
     monkeypatch.setattr("pupper_sysid.policies.analysis.autonomy.RATES_HZ", (50.0, 71.43))
