@@ -97,13 +97,6 @@ def test_an_observer_with_the_trained_parameters_fits_exactly_as_do_readings_of_
         assert "from 0.5 to 6 Hz: gain ratio 1.00" in match.sentence()
 
 
-def test_readings_are_those_of_the_robot_not_of_the_training():
-    late = replace(TRAINED, dead_time_s=0.024 + 2 * P)
-    match = compare(HeldEncoder(P, 4), TRAINED, P, late)
-    assert not match.fits and "40 ms later than the trained actuator" in match.sentence()
-    assert compare(HeldEncoder(P, 4), TRAINED, P, TRAINED).fits
-
-
 def test_the_papers_observer_does_not_fit_and_the_sentence_names_its_resonance():
     match = compare(SyntheticPD.paper(P), TRAINED, P)
     assert not match.fits
@@ -116,38 +109,32 @@ def test_the_papers_observer_does_not_fit_and_the_sentence_names_its_resonance()
     assert "resonance" in match.sentence()
 
 
-def test_a_delay_of_two_hundred_milliseconds_is_unwrapped_and_named():
-    late = replace(TRAINED, dead_time_s=0.024 + 0.2)
-    match = compare(SyntheticPD(late, P), TRAINED, P)
-    assert not match.fits
-    assert match.worst_gain_ratio == pytest.approx(1, abs=1e-3)
-    # 360° x 6 Hz x 0.2 s, beyond a whole turn
-    assert match.worst_phase_difference_deg == pytest.approx(-432, abs=0.5)
-    assert "200 ms later than the trained actuator at 6.0 Hz, 432°" in match.sentence()
+def late(seconds: float | np.ndarray) -> DelayedPDParameters:
+    """The servo of the training with a dead time that is longer by `seconds`."""
+    return replace(TRAINED, dead_time_s=0.024 + seconds)
 
 
-def test_an_early_observer_is_called_early_and_the_one_joint_is_named():
-    delays = np.full(12, 0.024)
-    delays[7] = 0.0
-    match = compare(SyntheticPD(replace(TRAINED, dead_time_s=delays), P), TRAINED, P)
-    assert not match.fits
-    assert match.worst_phase_difference_deg == pytest.approx(360 * 6 * 0.024, abs=0.5)
-    assert "24 ms earlier" in match.sentence()
-    assert "LB_thigh" in match.sentence()
-
-
-def test_twenty_degrees_at_six_hertz_are_the_border():
+def test_what_does_not_fit_is_named_by_its_time_or_its_swing_and_the_joint():
+    early = np.where(np.arange(12) == 7, -0.024, 0.0)
+    for observer, robot, gain, phase_deg, words in (
+        # 360° x 6 Hz x 0.2 s, beyond a whole turn
+        (SyntheticPD(late(0.2), P), TRAINED, 1, -432, "200 ms later than the trained actuator at"),
+        (SyntheticPD(late(early), P), TRAINED, None, 360 * 6 * 0.024, "24 ms earlier"),
+        (SyntheticPD(late(early), P), TRAINED, None, None, "LB_thigh"),
+        (Zero(P), TRAINED, 0, None, "swings 0.0 times"),
+        (Zero(P), TRAINED, 0, None, "not see"),
+        # readings are those of the robot, not of the training
+        (HeldEncoder(P, 4), late(2 * P), 1, None, "40 ms later"),
+    ):
+        match = compare(observer, TRAINED, P, robot)
+        assert not match.fits and words in match.sentence()
+        if gain is not None:
+            assert match.worst_gain_ratio == pytest.approx(gain, abs=1e-3)
+        if phase_deg is not None:
+            assert match.worst_phase_difference_deg == pytest.approx(phase_deg, abs=0.5)
+    # twenty degrees at six hertz are the border
     for shift_s, fits in ((0.008, True), (0.011, False)):
-        shifted = replace(TRAINED, dead_time_s=0.024 + shift_s)
-        assert compare(SyntheticPD(shifted, P), TRAINED, P).fits is fits
-
-
-def test_an_observer_that_stands_still_does_not_fit():
-    match = compare(Zero(P), TRAINED, P)
-    assert not match.fits
-    assert match.worst_gain_ratio == pytest.approx(0, abs=1e-12)
-    assert "swings 0.0 times" in match.sentence()
-    assert "would not see" in match.sentence()
+        assert compare(SyntheticPD(late(shift_s), P), TRAINED, P).fits is fits
 
 
 def test_table_has_a_row_for_every_kind_of_joint_and_frequency():

@@ -131,7 +131,7 @@ def test_with_the_trained_parameters_it_is_the_trained_servo(period_s):
     assert np.stack([e.velocity for e in estimates]) == pytest.approx(change, abs=1e-9)
 
 
-def test_effort_is_the_torque_within_its_limit():
+def test_effort_and_position_end_at_their_limits_and_come_back():
     stiff = replace(CALIBRATED, stiffness=10.0, friction_loss=0.35, dead_time_s=0.0)
     observer = SyntheticPD(stiff, P)
     # dry friction as large as the limit: the joint cannot move, so torque = stiffness * target
@@ -139,9 +139,6 @@ def test_effort_is_the_torque_within_its_limit():
     assert half.position == pytest.approx(np.zeros(12), abs=1e-4)
     assert half.effort == pytest.approx(np.full(12, 0.175), abs=0.0035)
     assert observer.step(np.full(12, -0.1), UNKNOWN).effort == pytest.approx(np.full(12, -0.35))
-
-
-def test_it_stops_at_a_limit_and_comes_back_from_it():
     low, high = np.full(12, -0.1), np.linspace(0.05, 0.2, 12)
     observer = SyntheticPD(CALIBRATED, P, limits_rad=(low, high))
     pushed = [observer.step(np.full(12, 0.5), UNKNOWN) for _ in range(40)]
@@ -205,6 +202,8 @@ def test_the_papers_preset_resonates_as_published():
 
 
 def test_a_servo_model_runs_freely_and_its_velocity_is_the_difference():
+    # a recorded rate is never quite the one that was asked for
+    assert ServoModelObserver(servo_model(period_s=1.0002 * P), P).period_s == P
     observer = ServoModelObserver(servo_model(), P)
     observer.reset(np.zeros(12))
     targets = [np.full(12, x) for x in (0.1, 0.3, 0.2)]
@@ -212,10 +211,6 @@ def test_a_servo_model_runs_freely_and_its_velocity_is_the_difference():
     assert [f.position[0] for f in found] == pytest.approx([0.0, 0.1, 0.3])
     assert [f.velocity[0] for f in found] == pytest.approx([0.0, 5.0, 10.0], rel=1e-5)
     assert all((f.effort == 0).all() for f in found)
-
-
-def test_a_recorded_rate_is_never_quite_the_one_that_was_asked_for():
-    assert ServoModelObserver(servo_model(period_s=1.0002 * P), P).period_s == P
 
 
 # ---------------------------------------------------------------------------------- held encoder
