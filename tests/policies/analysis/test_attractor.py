@@ -23,29 +23,17 @@ def somewhere(plane: np.ndarray, size: int, rng: np.random.Generator) -> np.ndar
     return plane @ frame.T + rng.standard_normal(size)
 
 
-def test_a_circle_in_twelve_dimensions_has_two_components_of_equal_variance():
-    found = principal_components([somewhere(loop(0.3, 0.3), 12, np.random.default_rng(0))], 2)
-    assert found.participation_ratio == pytest.approx(2.0)
-    np.testing.assert_allclose(found.explained, [0.5, 0.5])
-    np.testing.assert_allclose(found.variance[:2], 0.3**2 / 2)
-    np.testing.assert_allclose(found.axes @ found.axes.T, np.eye(2), atol=1e-12)
-
-
-def test_noise_of_twelve_dimensions_is_spread_over_twelve():
-    states = np.random.default_rng(1).standard_normal((50_000, 12))
-    found = principal_components([states], 3)
-    assert found.participation_ratio == pytest.approx(12.0, abs=0.05)
-    np.testing.assert_allclose(found.explained, 1 / 12, atol=0.005)
-
-
-def test_components_are_those_of_an_svd_of_all_states_about_their_common_mean():
+def test_components_are_those_of_an_svd_and_noise_of_twelve_dimensions_is_spread_over_twelve():
     rng = np.random.default_rng(2)
     parts = [rng.standard_normal((30, 2, 5)) @ rng.standard_normal((5, 5)), np.ones((20, 5))]
     found = principal_components(parts, 3)
-    states = np.concatenate([p.reshape(-1, 5) for p in parts])
+    states = np.concatenate([p.reshape(-1, 5) for p in parts])  # about their common mean
     _, singular, axes = np.linalg.svd(states - states.mean(axis=0))
     np.testing.assert_allclose(found.variance, singular**2 / len(states), atol=1e-12)
     np.testing.assert_allclose(np.abs((found.axes * axes[:3]).sum(axis=1)), 1.0)
+    noise = principal_components([rng.standard_normal((50_000, 12))], 3)
+    assert noise.participation_ratio == pytest.approx(12.0, abs=0.05)
+    np.testing.assert_allclose(noise.explained, 1 / 12, atol=0.005)
 
 
 def test_conditions_share_their_axes_so_orbits_keep_size_and_place():
@@ -90,22 +78,14 @@ def test_states_without_components_are_refused():
     assert_each_refused(cases, lambda measure: measure())
 
 
-def test_an_orbit_that_is_too_short_or_stands_still_has_no_measures():
-    assert np.isnan(closure(loop(1, 1, 30), STEP_S, HZ))
-    assert np.isnan(closure(np.ones((100, 2)), STEP_S, HZ))
-    assert np.isnan(area_ratio(loop(0.3, 0.3), np.zeros((100, 2))))
-
-
-def test_an_ellipse_has_its_area_wherever_it_lies():
+def test_an_ellipse_has_its_area_wherever_it_lies_and_a_band_is_what_is_left_of_a_circle():
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
     assert area(loop(0.4, 0.1) @ turn.T + [3.0, -1.0]) == pytest.approx(np.pi * 0.04)
     # robots with centres of their own are no wider for it
     apart = np.stack([loop(0.4, 0.1), loop(0.4, 0.1) + 5.0], axis=1)
     assert area(apart) == pytest.approx(np.pi * 0.04)
-
-
-def test_a_band_is_what_is_left_of_a_collapsed_orbit():
-    round_, band = loop(0.3, 0.3), loop(0.3, 0.003)
-    assert area_ratio(band, round_) == pytest.approx(0.01)
-    assert area_ratio(round_, round_) == pytest.approx(1.0)
-    assert area_ratio(np.zeros((100, 2)), round_) == 0.0
+    circle, still = loop(0.3, 0.3), np.zeros((100, 2))
+    assert area_ratio(loop(0.3, 0.003), circle) == pytest.approx(0.01)
+    assert area_ratio(still, circle) == 0.0 and np.isnan(area_ratio(circle, still))
+    for too_little in (loop(1, 1, 30), np.ones((100, 2))):
+        assert np.isnan(closure(too_little, STEP_S, HZ))

@@ -17,7 +17,6 @@ from pupper_sysid.policies.analysis.trial import moving_frequency
 from pupper_sysid.policies.walks import perturbations
 from pupper_sysid.policies.walks.perturbations import JOINTS
 from pupper_sysid.policies.walks.rollouts import Rollout
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 from support.walks import recorded
 
 STEPS, ROBOTS = 60, 3
@@ -27,10 +26,6 @@ def counting() -> np.ndarray:
     """Every number of step k is k."""
     seen = np.repeat(np.arange(STEPS, dtype=np.float32), ROBOTS * 60)
     return seen.reshape(STEPS, ROBOTS, 60)
-
-
-def test_the_parts_of_the_observation_are_where_the_paper_says():
-    assert JOINTS == slice(12, 48) and PARTS["last_action"] == slice(48, 60)
 
 
 def test_each_change_alters_the_joints_in_its_way_and_leaves_the_rest_alone():

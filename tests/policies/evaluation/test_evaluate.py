@@ -159,10 +159,17 @@ def test_the_battery_has_a_row_for_each_condition_and_its_falls_say_what_came_be
     assert sum(own.after_push for own in short) == len(pushed)
 
 
-def test_a_case_is_walked_on_its_own_ground_whatever_the_tasks():
+def test_an_evaluation_has_no_pushes_no_curriculum_gentle_starts_and_walks_of_its_seed():
     task = evaluation_task(Walking(terrain="rough"))
+    assert task.randomisation.push_m_s == 0 and task.randomisation.on_the_move == 0
+    assert task.curriculum == Curriculum() and task.commands == RANDOM
+    assert task.episode_s == Walking().episode_s and task.physics == "evaluation"
     assert Case("direction", "forward").condition(task, 1, "trot").task.terrain == "flat"
     assert Case("ground", "s", terrain="slopes").condition(task, 1, "trot").task.terrain == "slopes"
+    task, servos = evaluation_task(Walking(), 0.2), servo_ranges(CALIBRATION)
+    one, same, other = (walk(None, task, servos, 3, seed, threads=1).error for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert not np.array_equal(one, other)
 
 
 def test_intervals_are_over_episodes():
@@ -176,18 +183,3 @@ def test_intervals_are_over_episodes():
     half = abs(found.error[0, 2] - found.error[1, 2]) / 2
     assert own.value == pytest.approx(found.error[:, 2].mean())
     assert own.high - own.value == pytest.approx(6.3138 * half, rel=1e-4)
-
-
-def test_an_evaluation_has_no_pushes_no_curriculum_and_gentle_starts():
-    task = evaluation_task(Walking())
-    assert task.randomisation.push_m_s == 0 and task.randomisation.on_the_move == 0
-    assert task.curriculum == Curriculum() and task.commands == RANDOM
-    assert task.episode_s == Walking().episode_s
-    assert task.physics == "evaluation"
-
-
-def test_an_evaluation_is_the_same_for_the_same_seed_and_another_for_another():
-    task, servos = evaluation_task(Walking(), 0.2), servo_ranges(CALIBRATION)
-    one, same, other = (walk(None, task, servos, 3, seed, threads=1).error for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one, same)
-    assert not np.array_equal(one, other)
