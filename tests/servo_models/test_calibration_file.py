@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import asdict
 from pathlib import Path
 
@@ -39,19 +38,11 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_is_saved_reads_back_exactly(file):
-    saved = calibration()
-    loaded = load_calibration(file)
-    assert loaded.joints == saved.joints
-    assert (loaded.inputs, loaded.notes, loaded.seed) == (saved.inputs, saved.notes, saved.seed)
-    assert loaded.to_yaml() == file.read_text()
-
-
 def test_the_file_explains_itself_and_an_ordinary_yaml_reader_sees_the_same_data(file):
-    assert yaml.safe_load(file.read_text()) == load_calibration(file).model_dump(
-        mode="json", by_alias=True
-    )
-    lines = file.read_text().splitlines()
+    loaded, text = load_calibration(file), file.read_text()
+    assert loaded.to_yaml() == text
+    assert yaml.safe_load(text) == loaded.model_dump(mode="json", by_alias=True)
+    lines = text.splitlines()
     assert lines[0].startswith("# Calibration") and any("interval" in line for line in lines[:12])
     (delay,) = [line for line in lines if line.strip().startswith("dead_time_s:")]
     assert "value: 0.025" in delay and "identified:" in delay
@@ -158,16 +149,14 @@ def version_1(path: Path) -> Path:
     return path
 
 
-def test_a_file_of_version_1_is_read_and_saved_in_the_present_version(file, tmp_path):
+def test_a_file_of_version_1_is_read_saved_in_the_present_one_and_its_faults_are_named_as_in_it(
+    file, tmp_path
+):
     loaded = load_calibration(version_1(file))
     assert loaded.joints == calibration().joints and loaded.schema_version == 4
     loaded.save(tmp_path / "again.yaml")
     assert " delay_s:" not in (tmp_path / "again.yaml").read_text()
-    assert load_calibration("data/samples/calibrated.yaml").joint_names[0] == "LF_hip"
-
-
-def test_faults_of_a_version_1_file_are_named_in_its_own_words_and_lines(file):
-    text = version_1(file).read_text().replace("delay_s: {value: 0.025,", "delay_s: {value: 25.0,")
+    text = file.read_text().replace("delay_s: {value: 0.025,", "delay_s: {value: 25.0,")
     file.write_text(text)
     line = next(n for n, t in enumerate(text.splitlines(), 1) if "value: 25.0" in t)
     with pytest.raises(InputError, match=rf"line {line}: joints\.LF_hip\.actuator\.delay_s is not"):
@@ -287,52 +276,24 @@ def test_what_is_no_calibration_is_refused_with_what_is_wrong(file, tmp_path):
     assert_each_refused(names, load_calibration)
 
 
-def test_aliases_are_refused_before_anything_unfolds(tmp_path):
-    levels = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
-    levels += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 10)]
-    head = "schema: pupper-calibration\nschema_version: 1\n"
-    (tmp_path / "laughs.yaml").write_text(head + "\n".join(levels))
-    (tmp_path / "bomb.yaml").write_text("a: &a [x, x]\nb: [" + "*a, " * 2_500_000 + "*a]\n")
-    assert (tmp_path / "bomb.yaml").stat().st_size > 10_000_000
-    cases = [("bomb.yaml", "at most 2.0 MB are read"),
-             ("laughs.yaml", "line 3 uses a YAML alias or anchor")]  # fmt: skip
-    start = time.process_time()
-    assert_each_refused(cases, lambda name: load_calibration(tmp_path / name))
-    assert time.process_time() - start < 2.0
-
-
 def test_keys_that_are_unknown_missing_or_in_another_unit_are_refused_with_the_right_one(file):
     lines = file.read_text().splitlines()
     line = next(i for i, t in enumerate(lines, 1) if "stiffness_nm" in t)
     misspelt = replaced("stiffness_nm_per_rad", "stifness_nm_per_rad")
-    colour = edited(*HIP, "feedback", "colour", value="red")
     unitless = edited(*HIP, "selection", "candidate_models", 1, "rmse_fresh", value=0.1)
-    missing = replaced("      delay_steps_min: 10\n", "")
+    milliseconds = replaced("  dead_time_s:", "  dead_time_ms:")
     cases = [
         (misspelt, f"line {line}: joints.LF_hip.actuator.stifness_nm_per_rad"),
         (misspelt, "Did you mean stiffness_nm_per_rad?"),
-        (colour, "joints.LF_hip.feedback.colour is not a key"), (colour, "poll_period_s, loss"),
         (unitless, "joints.LF_hip.selection.candidate_models[1].rmse_fresh has no unit"),
-        (unitless, "name it rmse_fresh_rad"),
-        (missing, "joints.LF_hip.actuator.delay_steps_min is missing"),
-        (missing, "smallest dead time to train with"),
+        (unitless, "name it rmse_fresh_rad"), (milliseconds, "this file holds it in s"),
+        (replaced("      delay_steps_min: 10\n", ""), "smallest dead time to train with"),
         (replaced("LF_hip:", "LF_hipp:"), "LF_hipp is no joint; did you mean LF_hip"),
         (edited("joints", value={}), "joints"),
         (edited("inputs", 0, "sha256", value="abc"), "inputs[0].sha256"),
         *((edited("created", value=when), "no time in UTC")
           for when in ("yesterday", "2026-01-31T12:00:00", "2026-01-31T12:00+05:00")),
     ]  # fmt: skip
-    for part, right, wrong, unit in (
-        ("actuator", "dead_time_s", "dead_time_ms", "in s"),
-        ("actuator", "stiffness_nm_per_rad", "stiffness_nm_per_deg", "in N·m/rad"),
-        ("actuator", "velocity_limit_rad_s", "velocity_limit_rpm", "in rad/s"),
-        ("actuator", "effort_limit_nm", "effort_limit", "in N·m"),
-        ("feedback", "quantum_rad", "quantum_deg", "in rad"),
-    ):
-        change = replaced(f"  {right}:", f"  {wrong}:")
-        cases += [
-            (change, f"joints.LF_hip.{part}.{wrong}"), (change, f"name it {right}"), (change, unit)
-        ]  # fmt: skip
     assert_refused(file, cases)
 
 
@@ -375,34 +336,15 @@ def test_an_entry_of_the_wrong_kind_is_refused(file):
         (("actuator", "dead_time_s", "low"), 0.5, "low must not exceed high"),
         (("actuator", "velocity_limit_rad_s", "why"), None, "`why` must give the reason"),
         (("actuator", "delay_steps_min"), 20, "swap them"),
-        (("actuator", "delay_steps_min"), 10.5, "Write a whole number"),
         (("actuator", "delay_steps_min"), -1, "greater than or equal to 0"),
-        (("actuator", "model"), "spring", "'delayed_pd'"),
         (("actuator", "scale", "anchor"), "guess", "'loaded recording'"),
-        (("actuator",), None, "mapping of keys is expected"),
-        (("actuator", "scale", "source"), 0.35, "Write text"),
-        (("feedback",), [1, 2], "mapping of keys is expected"),
         (("feedback", "loss"), "much", "Write"),
         (("feedback", "loss"), True, "Write"),
         (("scores", "rmse_free_run_held_rad"), -0.1, "greater than or equal to 0"),
-        (("scores", "rmse_free_run_held_rad"), "13 mrad", "Write the number only, in rad"),
-        (("warnings",), "one sentence", "Write a list"),
     ):
         change = edited(*HIP, *place, value=value)
         cases += [(change, f"joints.LF_hip.{place[0]}"), (change, says)]
     assert_refused(file, cases)
-
-
-def test_a_refusal_is_one_printable_line_and_counts_further_faults(file):
-    data = yaml.safe_load(file.read_text())
-    hip = data["joints"]["LF_hip"]
-    hip["a\n\x1b[31mb"] = 1
-    for name in ("loss", "quantum_rad"):
-        hip["feedback"][name]["value"] = "x"
-    file.write_text(dump(data))
-    with pytest.raises(InputError, match=r"2 more faults in this file") as refused:
-        load_calibration(file)
-    assert str(refused.value).isprintable()
 
 
 # ----- calibration files under hypothesis: round trips, any text and any numbers

@@ -70,31 +70,6 @@ def test_numpy_servo_equals_mujocos_native_servo(servo):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 
 
-def test_mujoco_takes_a_delay_below_one_step_for_one_step():
-    short, one = replace(MEASURED, dead_time_s=0.3 * H), replace(MEASURED, dead_time_s=H)
-    np.testing.assert_allclose(native(short, STEPS), native(one, STEPS), atol=1e-9)
-
-
-def test_many_servos_in_one_mujoco_model_move_as_each_alone():
-    servos = [MEASURED, PAPER, SERVOS["fractional delay"]]
-    model = mujoco.MjModel.from_xml_string(free_air_xml(servos, H))
-    data = mujoco.MjData(model)
-    rest_at(model, data, [0.1, 0.0, -0.2])
-    together = []
-    for command in SINE:
-        data.ctrl[:] = command
-        mujoco.mj_step(model, data)
-        together.append(data.qpos.copy())
-    alone = [native(s, SINE, x) for s, x in zip(servos, (0.1, 0.0, -0.2), strict=True)]
-    np.testing.assert_allclose(together, np.stack(alone, axis=-1), atol=1e-9)
-
-
-def test_mujocos_delay_line_is_long_enough_for_the_delay():
-    for delay in (0.0, 0.0019, 0.002, 0.02, 0.0273, 0.1):
-        attributes = actuator_attributes(replace(MEASURED, dead_time_s=delay), H)
-        assert int(attributes["nsample"]) * H > float(attributes["delay"]) == delay
-
-
 def test_delay_between_two_steps_is_the_linear_mean_of_the_commands():
     linear = replace(MEASURED, friction_loss=0.0, effort_limit=np.inf, velocity_limit=np.inf)
     early, late, between = (

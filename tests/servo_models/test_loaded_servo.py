@@ -46,7 +46,7 @@ def test_without_load_and_its_friction_it_is_delayed_pd():
     assert np.abs(difference).max() < 1e-9
 
 
-def test_what_delayed_pd_lacks_is_named():
+def test_what_delayed_pd_lacks_is_named_and_a_negative_number_is_refused():
     assert SERVO.beyond_delayed_pd() == ()
     assert set(EXTENDED.beyond_delayed_pd()) == {
         "friction that grows with the motor's torque", "friction that grows with the load",
@@ -54,6 +54,8 @@ def test_what_delayed_pd_lacks_is_named():
         "the minimum start force", "the dead zone",
         "a torque limit below the stall torque at speed",
     }  # fmt: skip
+    cases = [({"stall_torque": -1.0}, "stall_torque is -1")]
+    assert_each_refused(cases, lambda change: LoadedServo(replace(SERVO, **change)))
 
 
 def test_mujoco_swings_the_same_pendulum():
@@ -117,8 +119,3 @@ def test_a_set_point_with_limited_acceleration_arrives_when_theory_says():
     found = own.rollout(np.full(500, 0.8))
     arrived = STEP_S * np.argmax(found > 0.99 * 0.8)
     assert arrived == pytest.approx(2 * np.sqrt(0.8 / 20.0), rel=0.1)
-
-
-def test_a_negative_number_is_refused():
-    cases = [({"stall_torque": -1.0}, "stall_torque is -1")]
-    assert_each_refused(cases, lambda change: LoadedServo(replace(SERVO, **change)))
