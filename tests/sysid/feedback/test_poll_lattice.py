@@ -48,24 +48,18 @@ def test_a_servo_that_sticks_is_not_mistaken_for_a_bus_that_holds():
     assert np.allclose(readings(asked, lattice).time_s, asked.read_time_s[rows])
 
 
-def test_a_header_that_says_polled_outweighs_motion_that_looks_live():
+def test_a_header_that_says_polled_outweighs_motion_that_looks_live_or_cannot_be_told():
     rng = np.random.default_rng(1)
     trials = tone_trials(0.04, rng, period_s=0.0)
-    asked = [replace(t, readings="polled") for t in trials]
     assert find_poll_lattice(trials, rng).readings == "live"
-    found = find_poll_lattice(asked, rng)
-    # the poll must be faster than the loop of 19 ms: dated to the middle between two reads
-    assert (found.kind, found.readings) == ("unresolved", "polled")
-    assert found.time_doubt_s == pytest.approx(LOOP_S / 2)
-
-
-def test_readings_that_cannot_be_told_are_in_doubt_by_half_a_loop():
-    rng = np.random.default_rng(2)
+    polled = [replace(t, readings="polled") for t in trials]
     # a second of a slow tone: too few steps for either
-    trials = tone_trials(0.04, rng, frequencies=(0.5,), duration_s=1.0, period_s=0.0)
-    found = find_poll_lattice(trials, rng)
-    assert (found.kind, found.readings) == ("unresolved", "cannot tell")
-    assert found.time_doubt_s == pytest.approx(LOOP_S / 2)
+    few = tone_trials(0.04, rng, frequencies=(0.5,), duration_s=1.0, period_s=0.0)
+    for asked, kind in ((polled, "polled"), (few, "cannot tell")):
+        found = find_poll_lattice(asked, rng)
+        # the poll must be faster than the loop of 19 ms: dated to the middle between two reads
+        assert (found.kind, found.readings) == ("unresolved", kind)
+        assert found.time_doubt_s == pytest.approx(LOOP_S / 2)
 
 
 def test_live_trials_beside_polled_ones_are_dated_at_their_reads():
@@ -104,23 +98,14 @@ def test_readings_within_a_stretch_are_dated_to_its_instants_and_others_to_the_m
     dated = times(Phase(0, 0.5, 1.0, 0.02, 0.009, 1e-4))
     inside = (READ >= 0.5) & (READ <= 1.0)
     np.testing.assert_allclose(dated, np.where(inside, MIDDLE - 0.002, MIDDLE)[1:], atol=1e-12)
-
-
-def test_a_reading_without_an_instant_between_two_reads_is_dated_to_the_middle():
     # instants at 0.013, 0.113, 0.213 …: in the rows 1, 6, 11 …, 2 ms after the middle
     dated = times(Phase(0, 0.0, 2.0, 0.1, 0.013, 1e-4))
-    polled = ROWS % 5 == 1
-    np.testing.assert_allclose(dated, np.where(polled, MIDDLE + 0.002, MIDDLE)[1:], atol=1e-12)
-
-
-def test_phases_of_another_trial_date_nothing():
-    np.testing.assert_allclose(times(Phase(1, 0.0, 2.0, 0.02, 0.009, 1e-4)), MIDDLE[1:])
-
-
-def test_the_mean_age_is_half_a_poll_and_one_more_for_each_that_is_lost_on_the_way():
-    # of polls that fail with 0.5, one is lost before a good one on average
-    lattice = PollLattice(kind="lattice", poll_period_s=0.02, loss=0.5, fresh_fraction=0.5)
-    assert lattice.mean_age_s == pytest.approx(0.03)
+    np.testing.assert_allclose(
+        dated, np.where(ROWS % 5 == 1, MIDDLE + 0.002, MIDDLE)[1:], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        times(Phase(1, 0.0, 2.0, 0.02, 0.009, 1e-4)), MIDDLE[1:], err_msg="of another trial"
+    )
 
 
 # ----------------------------------------------------- the compiled search
@@ -212,17 +197,10 @@ def test_the_error_of_the_period_is_scatter_shrunk_towards_the_usual_drift():
     # variance (2e-8 + 3 · (0.002 · 0.02)²) / (4 - 1 + 3); neighbours are alike: 3 / 4 of it
     variance = (2e-8 + 3 * 1.6e-9) / 6
     assert period == pytest.approx(0.02) and error == pytest.approx(math.sqrt(3 * variance / 4))
-
-
-def test_segments_of_one_stretch_are_one_measurement_of_the_period():
-    none = np.zeros(0)
-    whole = Stretch(0, 0.0, 3.0, np.zeros(50), np.zeros(50), none, none)
-    half = replace(whole, begin=np.zeros(25), end=np.zeros(25))
-    periods = (0.0201, 0.0199, 0.0200)
-    phases = [Phase(n, 0.0, 3.0, p, 0.0, 1e-4) for n, p in enumerate(periods)]
-    plain = common_period([whole] * 3, phases, range(3))
-    split = common_period([half] * 2 + [whole] * 2, [phases[0], *phases], (0, 0, 1, 2))
-    assert split == pytest.approx(plain)
+    # segments of one stretch are one measurement
+    half = replace(part, begin=np.zeros(25), end=np.zeros(25))
+    split = common_period([half] * 2 + [part] * 3, [phases[0], *phases], (0, 0, 1, 2, 3))
+    assert split == pytest.approx((period, error))
 
 
 def standing(rng):

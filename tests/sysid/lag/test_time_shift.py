@@ -148,13 +148,6 @@ def test_a_lag_beyond_the_search_range_is_said_to_be_at_its_end():
     assert any("end of its search range" in w for w in b.warnings)
 
 
-def test_a_slow_servo_of_700_ms_is_measured():
-    rng = np.random.default_rng(5)
-    trial = first_order_trial(random_levels(rng, 0.8), 0.4, 0.35, loop_s=0.02, duration_s=40.0)
-    b = lag_budget("LF_hip", [trial], rng)
-    assert 0.5 < b.lag_s.low < b.lag_s.high < 0.8
-
-
 def test_draws_that_begin_at_different_times_do_not_lose_the_lag_they_share():
     # each a jump with overshoot taken back; the median of every bin is another response
     edges = 0.01 * np.arange(121)

@@ -113,14 +113,6 @@ def test_joints_do_not_see_each_other():
         assert np.abs(after[:, 1] - before[:, 1]).max() > 0.1, kind
 
 
-def test_equal_weights_are_a_moving_average_with_the_newest_command_counted_at_once():
-    zero, one = np.zeros(1), np.ones(1)
-    p = {"command_center": zero, "command_scale": one, "position_center": zero}
-    p |= {"position_scale": one, "bound": one, "fir_bias": zero, "fir": np.full((1, 4), 0.25)}
-    steps = ran(CommandNetwork(HIP, P, p), np.full((5, 1), 1.2), [0.4])
-    np.testing.assert_allclose(steps[:, 0], [0.6, 0.8, 1.0, 1.2, 1.2], atol=1e-6)
-
-
 def test_the_filter_weighs_the_newest_command_first_in_normalised_units():
     p = linear_parameters()
     impulse = np.tile(p["command_center"], (TAPS + 2, 1))
@@ -359,25 +351,6 @@ def test_a_fit_of_a_network_repeats_bit_for_bit_under_its_seed(monkeypatch):
     assert network.choices == again.choices
     weights = (fit.model.parameters["weight_0"] for fit in (network, other))
     assert not np.array_equal(*weights)
-
-
-def test_a_filter_is_enough_for_a_linear_servo(quick):
-    """Where there is nothing more to learn, the network is about as good, not better than truth."""
-    command = smooth_commands(3, 600)
-    past = np.concatenate([np.full(5, command[0]), command])
-    noise = 0.005 * np.random.default_rng(8).normal(size=600)
-    position = np.convolve(past, np.full(4, 0.25), "valid")[1:601] + noise
-    parts = [
-        trial(n, n * 150 * P, command[r], position[r], period_s=P, read_after_s=0.0)
-        for n, r in enumerate(slice(150 * n, 150 * n + 150) for n in range(4))
-    ]
-    data = servo_data([recording(*parts, rest=None)], HIP, "all")
-    ready = samples(data, everything, past_ticks(P))
-    linear, network = (
-        held_out_rms(fit_network(kind, HIP, P, ready, 0), data)["LF_hip"] for kind in ("fir", "mlp")
-    )
-    assert linear == pytest.approx(0.005, rel=0.15)
-    assert network == pytest.approx(linear, rel=0.1)
 
 
 def test_a_nested_fit_of_a_group_does_not_depend_on_its_readings(monkeypatch):

@@ -16,6 +16,7 @@ from pupper_sysid.sim.emulator.pendulum import (
     PendulumBench,
     draw_bench,
 )
+from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
 from pupper_sysid.sysid.sweep import recorder
@@ -189,20 +190,13 @@ def test_a_register_that_cannot_be_set_back_is_kept_in_mind():
     assert guard.registers.found == {"bench": {"p": 32}}
 
 
-def test_a_load_that_does_not_hang_is_not_moved(tmp_path):
-    bus = bench()
-    made = trials("sine", start_rad=1.5, margin_rad=1.0)
+def test_a_load_that_does_not_hang_is_not_moved_and_a_bus_without_registers_has_no_gains(tmp_path):
+    bus, path = bench(), tmp_path / "a.csv"
     with pytest.raises(InputError, match="rad from where its load hangs"):
-        record(bus, made, tmp_path / "a.csv", loop_period_s=PERIOD)
-    assert bus._log and not (tmp_path / "a.csv").exists()
-
-
-def test_a_bus_without_registers_refuses_gains(tmp_path):
-    from pupper_sysid.sim.emulator.robot import draw_robot
-
+        record(bus, trials("sine", start_rad=1.5, margin_rad=1.0), path, loop_period_s=PERIOD)
+    assert bus._log and not path.exists()
     rng = np.random.default_rng(1)
-    bus = EmulatedBus(draw_robot(rng), rng)
     made = bench_plan("LF_hip", None, [8], "sine", loop_period_s=PERIOD, start_rad=0.0,
                       margin_rad=0.4)  # fmt: skip
     with pytest.raises(BusError, match="have no registers"):
-        record(bus, made, tmp_path / "a.csv", loop_period_s=PERIOD)
+        record(EmulatedBus(draw_robot(rng), rng), made, path, loop_period_s=PERIOD)
