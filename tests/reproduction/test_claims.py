@@ -240,6 +240,9 @@ def test_claims_about_training_are_judged_by_trainings_from_random_weights():
         ([*both, learned("transformer", steps_per_s=300.0)], "T4", "holds", ""),
         (both, "T4", untestable, "Transformer"),
     ]  # fmt: skip
+    several = [*both, learned("lstm", reward=6.0), gru]
+    first = next(c for c in judge(BOTH, {}, [], several) if c.id == "T1")
+    assert first.interval["LSTM"] == Interval(6.5, 6.0, 7.0)
     problems = []
     for trainings, id_, verdict, words in cases:
         row = next(c for c in judge(BOTH, {}, [], trainings) if c.id == id_)
@@ -286,29 +289,16 @@ def test_stacks_differ_only_if_the_interval_of_their_difference_says_so():
         assert verdicts(*BOTH, stacks=stacks)["D3"] == verdict
 
 
-def test_servos_that_make_a_saw_tooth_rounder_are_seen_in_the_sine_fit():
+def test_servos_that_make_a_saw_tooth_rounder_are_seen_and_drift_is_not_judged_as_a_gait():
     time = 0.02 * np.arange(500)
-    saw = 2 * (2.8 * time % 1.0) - 1
-    smooth = np.sin(2 * np.pi * 2.8 * time)
-    found = {c.id: c for c in judge(BOTH, {"LF_thigh": (time, saw, smooth)}, [])}
-    assert found["G1"].verdict == "holds partly" and "2.80 Hz" in found["G1"].ours
-
-
-def test_drift_is_not_judged_as_a_gait():
-    rng = np.random.default_rng(0)
-    time = 0.04 * np.arange(300)
-    walk = np.cumsum(rng.standard_normal((2, 300)), axis=1)
-    found = claims(*BOTH, played={"LF_thigh": (time, walk[0], walk[1])})["G1"]
-    assert found.verdict == "not testable here" and "of noise" in found.how
-    unread = np.full(300, np.nan)
-    found = claims(*BOTH, played={"LF_thigh": (time, walk[0], unread)})["G1"]
-    assert found.verdict == "not testable here" and "nothing was read" in found.how
-
-
-def test_several_of_a_kind_have_their_range():
-    trainings = [learned("lstm"), learned("lstm", reward=6.0), learned("gru")]
-    claim = next(c for c in judge(BOTH, {}, [], trainings) if c.id == "T1")
-    assert claim.interval == {"LSTM": Interval(6.5, 6.0, 7.0)}
+    saw, smooth = 2 * (2.8 * time % 1.0) - 1, np.sin(2 * np.pi * 2.8 * time)
+    drift = np.cumsum(np.random.default_rng(0).standard_normal((2, 500)), axis=1)
+    for command, reading, verdict, words in (
+        (saw, smooth, "holds partly", "2.80 Hz"), (*drift, "not testable here", "of noise"),
+        (drift[0], np.full(500, np.nan), "not testable here", "nothing was read"),
+    ):  # fmt: skip
+        found = claims(*BOTH, played={"LF_thigh": (time, command, reading)})["G1"]
+        assert found.verdict == verdict and words in found.ours + found.how
 
 
 def test_the_page_says_what_imitation_decides_and_what_was_not_tested():
@@ -442,28 +432,21 @@ def test_claims_that_another_page_judges_otherwise_are_listed_beside(capsys, gat
     assert "Judged otherwise" in Path("c/claims.html").read_text()
 
 
-def test_what_is_no_table_of_claims_is_refused_before_any_walk(capsys, tmp_path):
-    table, policy = tmp_path / "table.csv", SAMPLES / "policies/lstm"
+def test_tables_that_are_none_and_policies_of_an_unpublished_kind_are_refused_before_any_walk(
+    capsys, tmp_path
+):
+    table, policy, out = tmp_path / "table.csv", SAMPLES / "policies/lstm", tmp_path / "out"
     for text, words in (
         ("id,claim\nA1,x\n", "has no column `ours`"),
         ("id,ours,verdict\nA1,x,perhaps\n", "verdict of A1 is 'perhaps'"),
     ):
         table.write_text(text)
-        answer = refused(capsys, program, policy, "--beside", table, "--out", tmp_path / "out")
-        assert words in answer
-
-
-def test_a_kind_of_policy_about_which_nothing_was_published_is_refused(capsys, tmp_path):
+        assert words in refused(capsys, program, policy, "--beside", table, "--out", out)
     contract = tmp_path / "more/contract.json"
     shutil.copytree(SAMPLES / "policies/mlp", contract.parent)
     contract.write_text(contract.read_text().replace('"kind": "mlp"', '"kind": "mlp-actions"'))
-    said = refused(
-        capsys, program, contract.parent, "--actuator",
-        SAMPLES / "calibrated.yaml", "--out", tmp_path / "out",
-    )  # fmt: skip
+    servos = ("--actuator", SAMPLES / "calibrated.yaml")
+    said = refused(capsys, program, contract.parent, *servos, "--out", out)
     assert "of the kind mlp-actions" in said
-
-
-def test_the_tool_names_the_command_that_tests_the_claims(capsys):
     answer = refused(capsys, pupper_analyze, "claims", "runs/A", "--robots", "2")
     assert "`python -m reproduction runs/A --robots 2`" in answer

@@ -37,9 +37,7 @@ def test_rate_steadiness_and_tilt_are_found(tmp_path):
     assert moved.verdict == "holds partly" and "within 5° of upright" in moved.ours
     rate, steady, moved = judge(gather([f"mlp={lstm}", f"lstm={mlp}"]))
     assert rate.verdict == steady.verdict == "does not hold here"
-
-
-def test_a_robot_on_its_side_does_not_transfer(tmp_path):
+    # a robot on its side does not transfer
     fell = log(tmp_path / "fell.csv", 2.8, 0.2, 80.0)
     assert judge(gather([f"lstm={fell}"]))[2].verdict == "does not hold here"
 
@@ -50,8 +48,5 @@ def test_without_logs_or_accelerations_nothing_is_claimed(tmp_path):
     rate, steady, moved = judge(gather([f"lstm={still}"]))
     assert rate.verdict == "holds"
     assert steady.verdict == moved.verdict == "not testable here"
-
-
-def test_a_log_of_an_unknown_policy_is_refused():
-    cases = [(log, "Write KIND=FILE") for log in ("walk.csv", "cnn=walk.csv")]
-    assert_each_refused(cases, lambda log: gather([log]))
+    cases = [(name, "Write KIND=FILE") for name in ("walk.csv", "cnn=walk.csv")]
+    assert_each_refused(cases, lambda name: gather([name]))

@@ -62,14 +62,11 @@ def test_what_a_training_draws_widens_the_ranges():
     assert ends(own.command_jitter_s) == (0, 0.004, 0.008)
 
 
-def test_servos_without_a_file_have_a_name_and_no_hash():
+def test_servos_without_a_file_have_a_name_and_a_learned_model_its_weights_and_no_numbers(tmp_path):
     for name, kind in (("ideal", "ideal"), ("paper", "calibration")):
         own = trained_servo(name, "ideal", Walking(), servo_ranges(name, "ideal"))
         assert (own.actuator, own.actuator_sha256, own.kind) == (name, None, kind)
         assert own.joints is not None and own.joints["LF_hip"].feedback.poll_period_s == 0
-
-
-def test_a_learned_model_is_known_by_its_weights_and_has_no_numbers(tmp_path):
     (tmp_path / "weights.safetensors").write_bytes(b"weights")
     own = trained_servo(str(tmp_path), "held", Walking(), servo_ranges("ideal"))
     assert own.kind == "learned" and own.joints is None and own.dead_times_s is None
@@ -107,25 +104,16 @@ def with_another_joint(servo):
 
 WRONG = {
     "another schema": lambda s: s.update(schema="pupper-servo"),
-    "no schema": lambda s: s.pop("schema"),
     "a newer version": lambda s: s.update(schema_version=2),
-    "version of words": lambda s: s.update(schema_version="1"),
-    "version 1.0": lambda s: s.update(schema_version=1.0),
     "a missing joint": lambda s: s["joints"].pop("RB_calf"),
     "another joint": with_another_joint,
     "joints in another order": with_order_reversed,
-    "joints in a list": lambda s: s.update(joints=list(s["joints"].values())),
     "no joints": lambda s: s.update(joints=None),
     "joints of a learned model": lambda s: s.update(kind="learned"),
-    "an unknown key": lambda s: first(s).update(colour="red"),
     "a missing number": lambda s: first(s).pop("damping"),
     "a number as text": lambda s: first(s)["stiffness"].update(value="1.0"),
-    "a number as truth": lambda s: first(s)["stiffness"].update(low=True),
-    "a list for a number": lambda s: first(s)["stiffness"].update(low=[0.0] * 100_000),
     "NaN": lambda s: first(s)["stiffness"].update(value=float("nan")),
-    "infinity": lambda s: first(s)["effort_limit"].update(high=float("inf")),
     "a huge number": lambda s: first(s)["effort_limit"].update(high=1e300),
-    "a huge integer": lambda s: first(s)["effort_limit"].update(high=10**400),
     "a negative number": lambda s: first(s)["friction_loss"].update(low=-1.0),
     "a range upside down": lambda s: first(s)["armature"].update(low=1.0),
     "a dead time of a minute": lambda s: first(s)["dead_time_s"].update(high=60.0),
@@ -133,12 +121,10 @@ WRONG = {
         j["dead_time_s"].update(high=1.0) for j in s["joints"].values()
     ],
     "a loss of one": lambda s: first(s)["feedback"].update(loss=1.0),
-    "a poll period that is no number": lambda s: first(s)["feedback"].update(poll_period_s=None),
     "an offset of many turns": lambda s: first(s)["feedback"].update(offset_rad=1e6),
     "another actuator": lambda s: s.update(actuator="another.yaml"),
     "a name of a million letters": lambda s: s.update(actuator="x" * 10**6),
     "another hash": lambda s: s.update(actuator_sha256="0" * 64),
-    "a hash that is none": lambda s: s.update(actuator_sha256="0" * 63),
     "no hash": lambda s: s.update(actuator_sha256=None),
     "another feedback": lambda s: s.update(feedback="ideal"),
 }

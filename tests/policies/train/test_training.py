@@ -157,16 +157,6 @@ def test_after_a_power_cut_nothing_is_repeated_in_the_curves_and_the_best_stays_
     assert [row["update"] for row in rows(cut / "imitation.csv")] == ["1", "2"]
 
 
-@pytest.mark.slow
-def test_a_run_that_dies_in_its_first_round_can_be_resumed(tmp_path, uninterrupted):
-    with pytest.raises(PowerCut):
-        train(tmp_path, tiny_run("lstm"), cut_power_after("imitation", 1))
-    assert read_checkpoint(tmp_path / LAST)["more"]["imitated"] == 0
-    train(tmp_path, None)
-    straight = read_checkpoint(uninterrupted("lstm") / LAST)
-    assert different(straight, read_checkpoint(tmp_path / LAST)) == []
-
-
 def test_resuming_a_finished_run_changes_nothing_and_none_is_begun_over_it(finished):
     before = (finished / LAST).read_bytes()
     with pytest.raises(InputError, match="holds a run already"):
@@ -237,12 +227,16 @@ def test_a_termination_signal_ends_a_long_update_within_a_second(tmp_path):
 
 
 def test_time_that_is_up_ends_a_run_within_its_first_gait_with_a_policy_that_plays(tmp_path):
-    train(tmp_path, tiny_run(minutes=0.001))
-    found = read_checkpoint(tmp_path / LAST)
+    train(tmp_path / "short", tiny_run(minutes=0.001))
+    found = read_checkpoint(tmp_path / "short" / LAST)
     assert found["iteration"] == 0 and found["more"]["imitated"] < 2
-    policy, _ = policy_at(tmp_path)
+    policy, _ = policy_at(tmp_path / "short")
     policy.reset(np.zeros((1, 12)))
     assert np.isfinite(policy.act(np.zeros((1, 60)))).all()
+    # the time before a run counts
+    train(tmp_path / "late", tiny_run(minutes=60.0), spent_s=3600.0)
+    late = read_checkpoint(tmp_path / "late" / LAST)["more"]
+    assert late["imitated"] == 0 and late["elapsed_s"] > 3600.0
 
 
 def test_a_round_that_was_left_is_repeated_and_the_run_is_that_without_a_stop(
@@ -286,13 +280,6 @@ def test_rounds_that_do_not_fit_the_time_are_left_out_and_the_rate_falls_to_zero
     assert len(said) == 1 and "4 of 40 are made within 1 minutes" in said[0]
     train(tmp_path, None, stop_after("imitation", 4), minutes=60.0)
     assert rates == [40, 4, 4, 4]
-
-
-def test_time_before_a_run_counts(tmp_path):
-    train(tmp_path, tiny_run(minutes=60.0), stop_after("imitation", 1), spent_s=100.0)
-    assert read_checkpoint(tmp_path / LAST)["more"]["elapsed_s"] > 100.0
-    train(tmp_path / "late", tiny_run(minutes=60.0), spent_s=3600.0)
-    assert read_checkpoint(tmp_path / "late" / LAST)["more"]["imitated"] == 0
 
 
 def test_updates_that_are_all_taken_back_are_said_and_end_the_run_with_what_helps(
