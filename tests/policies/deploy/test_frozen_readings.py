@@ -112,22 +112,14 @@ def watched(made: list[Tick]) -> bool:
 TIME = PERIOD_S * np.arange(200)
 
 
-def test_less_than_the_guard_sees_is_found_and_friction_is_allowed_for():
-    still = np.zeros(len(TIME))
-    for swing, found in ((0.045, True), (0.012, False)):  # below the guard's 0.1 rad, both
-        goals = swing * np.sin(2 * np.pi * 1.5 * TIME)
-        assert watched(ticks(goals, still)) is found
-
-
-def test_one_step_of_the_encoder_in_two_seconds_is_a_live_reading():
-    goals = 0.045 * np.sin(2 * np.pi * 1.5 * TIME)
-    alive = 0.0057 * (np.arange(len(TIME)) // 90 % 2)
-    assert not watched(ticks(goals, alive))
-    missing = np.where(np.arange(len(TIME)) % 3, np.nan, alive)
-    assert not watched(ticks(goals, missing))
-    assert not watched(ticks(goals, np.full(len(TIME), np.nan))), "silence is the guard's business"
-
-
-def test_a_command_that_has_just_moved_is_given_time():
-    goals = np.where(np.arange(len(TIME)) < len(TIME) - 12, 0.0, 0.09)
-    assert not watched(ticks(goals, np.zeros(len(TIME))))
+def test_less_than_the_guard_sees_is_found_and_friction_counts_and_late_commands_are_allowed_for():
+    still, rows, nothing = np.zeros(len(TIME)), np.arange(len(TIME)), np.full(len(TIME), np.nan)
+    goals = 0.045 * np.sin(2 * np.pi * 1.5 * TIME)  # below the guard's 0.1 rad
+    alive = 0.0057 * (rows // 90 % 2)  # one step of the encoder in two seconds
+    for asked, readings, found in (
+        (goals, still, True), (0.012 / 0.045 * goals, still, False), (goals, alive, False),
+        (goals, np.where(rows % 3, np.nan, alive), False),
+        (goals, nothing, False),  # silence is the guard's business
+        (np.where(rows < len(TIME) - 12, 0.0, 0.09), still, False),
+    ):  # fmt: skip
+        assert watched(ticks(asked, readings)) is found

@@ -7,16 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.policies.deploy.observer_match import FREQUENCIES_HZ, compare
 from pupper_sysid.policies.deploy.observers import (
     HeldEncoder,
-    ServoModelObserver,
     SyntheticPD,
     Zero,
 )
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-from pupper_sysid.servo_models.networks import CommandNetwork
 from support.observer_response import response
 from support.refusals import assert_each_refused
 
@@ -51,22 +48,6 @@ def test_response_of_a_linear_servo_is_its_transfer_function():
         assert swing.shape == (5, 12)
         expected = theory(LINEAR, frequencies, period_s)
         assert np.abs(swing - expected[:, None]).max() < 0.01
-
-
-def test_response_of_a_pure_delay_is_its_phase():
-    n = 12
-    values = {
-        "command_center": np.zeros(n), "command_scale": np.ones(n), "position_center": np.zeros(n),
-        "position_scale": np.ones(n), "bound": np.full(n, np.inf), "fir_bias": np.zeros(n),
-        "fir": np.tile([0.0, 0.8, 0.0], (n, 1)),
-    }  # fmt: skip
-    observer = ServoModelObserver(CommandNetwork(JOINT_NAMES, P, values), P)
-    frequencies = np.array([0.5, 3.1, 12.5])
-    # one command ago, and the estimate is of the period's end: two periods behind the command
-    expected = 0.8 * np.exp(-2j * np.pi * frequencies * 2 * P)
-    assert response(observer, frequencies, 0.1, P) == pytest.approx(
-        np.repeat(expected[:, None], 12, axis=1), abs=1e-5
-    )
 
 
 def test_frequencies_and_rates_that_do_not_fit_the_controller_are_refused():

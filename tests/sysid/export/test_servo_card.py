@@ -175,16 +175,6 @@ def test_the_table_of_a_calibration_says_where_it_comes_from():
     assert said["notes"] == list(paper.notes)
 
 
-def test_a_table_is_written_only_where_nothing_stands_unless_forced(tmp_path: Path):
-    path = tmp_path / "table.csv"
-    path.write_text("mine")
-    with pytest.raises(FileExistsRefusal, match="force=True"):
-        to_csv(load_calibration("paper"), path)
-    assert path.read_text() == "mine"
-    text = to_csv(load_calibration("paper"), path, force=True)
-    assert path.read_text() == text
-
-
 def sweep_file(folder: Path) -> Path:
     """Two frequencies of the thigh in the single-joint layout: relative angles, times restart."""
     rows = ["time_s,phase,amp_rad,freq_hz,motor_idx,signal,command_rad,actual_rad"]

@@ -24,7 +24,6 @@ from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, Plan, plan
 from pupper_sysid.sysid.sweep.recorder import REST_S, record
-from pupper_sysid.sysid.sweep.resume import playback
 from support.command_line import refused
 from support.virtual_time import VirtualTime
 
@@ -191,24 +190,6 @@ def test_progress_runs_from_nothing_to_the_whole(tmp_path):
     assert done[-1] == pytest.approx(made.duration_s, abs=0.03)
     assert {total for _, total, _ in seen} == {made.duration_s}
     assert "LF_hip at 3 Hz" in {what for _, _, what in seen}
-
-
-def test_a_played_back_file_moves_all_its_joints_at_once(tmp_path):
-    commands = pd.DataFrame(
-        {
-            "time_s": 0.04 * np.arange(10),
-            "LF_hip_command_rad": np.linspace(0.1, 0.2, 10),
-            "LF_calf_command_rad": np.linspace(-1.4, -1.6, 10),
-        }
-    )
-    commands.to_csv(tmp_path / "gait.csv", index=False)
-    bus = ScriptedBus(POSE)
-    recording = load(record(bus, playback(tmp_path / "gait.csv"), tmp_path / "a.csv"))
-    for joint in ("LF_hip", "LF_calf"):
-        (trial,) = recording.trials(joint)
-        wanted = commands[f"{joint}_command_rad"].to_numpy()
-        assert trial.initial_command_rad == pytest.approx(wanted[0])
-        np.testing.assert_allclose(np.unique(trial.command_rad), np.sort(wanted), atol=1e-7)
 
 
 def test_each_recorded_row_has_its_truth_and_the_file_does_not_tell_it(tmp_path):

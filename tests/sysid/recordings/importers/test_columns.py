@@ -209,12 +209,6 @@ def test_rows_of_several_joints_are_told_apart_by_the_columns_that_name_them(tmp
     holds(Recording.from_frame(frame("time=t|cmd=c|pos=p").assign(id=np.arange(100))), ["joint"])
 
 
-def test_a_table_with_one_value_a_row_is_read(tmp_path):
-    long = frame("time=t|knee_cmd=c|knee_pos=p|bus_voltage=x").melt("time", var_name="signal")
-    long.sort_values("time", kind="stable").to_csv(tmp_path / "log.csv", index=False)
-    holds(load(tmp_path / "log.csv"), ["knee"])
-
-
 def test_labels_number_trials_and_a_change_of_frequency_begins_one(tmp_path):
     table = frame("time=t|cmd=c|pos=p").assign(phase=np.repeat(["a", "rest", "b", "rest"], 25))
     table.to_csv(tmp_path / "log.csv", index=False)
@@ -339,9 +333,3 @@ def test_names_in_the_last_comment_of_savetxt_are_read():
     recording = load(path, LogOptions(unit="deg"))
     assert recording.metadata["columns"]["joint"]["command"] == "u"
     assert "theta" in recording.metadata["columns"]["joint"]["position"]
-
-
-def test_tones_without_a_trial_column_are_trials():
-    recording = load(case("made/L5_freq_no_trial.csv"))
-    found = [trial.frequency_hz for trial in recording.trials("knee")]
-    assert found == sorted(set(found)) and len(found) > 2

@@ -18,7 +18,6 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import reading_up_to
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.recording import Recording
 from support.real_recordings import case
 from support.refusals import assert_each_refused
 
@@ -382,9 +381,3 @@ def test_the_log_of_the_forms_without_names_counts_its_repeated_rows_once():
     (trial,) = recording.trials("joint")
     (form,) = load(case("real/forms_of_one_log/tab.txt")).trials("joint")
     np.testing.assert_allclose(trial.position_rad, form.position_rad[:501], atol=1e-9)
-
-
-def test_frames_in_memory_have_the_doubt_of_files():
-    frame = pd.DataFrame({"time": TIME, "cmd": COMMAND, "pos": POSITION})
-    (trial,) = Recording.from_frame(frame).trials("joint")
-    assert trial.read_time_doubt_s == pytest.approx(0.0025, rel=0.05)

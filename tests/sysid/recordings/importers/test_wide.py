@@ -66,16 +66,6 @@ def test_times_are_seconds_by_their_ending_or_their_distance():
         assert guessed == any("names no unit" in text for text in recording.warnings), name
 
 
-def test_a_table_with_a_row_per_joint_is_read(tmp_path):
-    parts = [
-        pd.DataFrame({"time": TIME, "joint": f"my {j}", "goal": COMMAND[j], "present": POSITION[j],
-                      "note": "x"})
-        for j in COMMAND
-    ]  # fmt: skip
-    pd.concat(parts).sort_values("time").to_csv(tmp_path / "log.csv", index=False)
-    agrees(load(tmp_path / "log.csv"), ("my_knee", "my_ankle"))
-
-
 def test_a_log_of_one_nameless_joint_is_read_and_trials_are_kept(tmp_path):
     made = pd.DataFrame({"time": np.tile(TIME, 2), "episode": np.repeat([3, 4], 60),
                          "command": np.tile(COMMAND["knee"], 2),
@@ -165,20 +155,6 @@ def test_a_mapping_file_says_the_same_and_an_option_goes_first(tmp_path):
     (tmp_path / "map.yaml").write_text("unit: furlong\n")
     with pytest.raises(InputError, match="Write rad, deg"):
         read_mapping(tmp_path / "map.yaml")
-
-
-def test_a_frame_in_memory_takes_the_same_way(tmp_path):
-    agrees(Recording.from_frame(table("action.{joint}", "observation.state.{joint}")))
-    made = table("u_{joint}", "y_{joint}")
-    agrees(
-        Recording.from_frame(made, options=LogOptions(command="u_{joint}", position="y_{joint}"))
-    )
-
-
-def test_a_pandas_parquet_file_is_read(tmp_path):
-    pytest.importorskip("pyarrow")
-    table("{joint}_command", "{joint}_position").to_parquet(tmp_path / "log.parquet")
-    agrees(load(tmp_path / "log.parquet"))
 
 
 def test_a_numpy_archive_is_read_and_pickles_are_not(tmp_path):
