@@ -81,27 +81,21 @@ def test_a_policy_that_was_written_is_read_back_bit_for_bit(saved_policies):
         assert contract.actuator_sha256 == sha256(Path(CALIBRATION))
 
 
-def test_a_policy_keeps_a_memory_and_forgets_it_at_a_reset(saved_policies):
+def test_a_policy_keeps_its_memory_and_its_past_actions_and_forgets_them_at_a_reset(saved_policies):
     policy, fresh = (load_policy(saved_policies["lstm"]) for _ in range(2))
-    start = np.zeros((2, 12))
+    start, seen = np.zeros((2, 12)), np.random.default_rng(0).normal(size=(6, 2, 60))
     for one in (policy, fresh):
         one.reset(start)
-    seen = np.random.default_rng(0).normal(size=(6, 2, 60))
     for row in seen[:5]:
         policy.act(row)
     assert np.abs(policy.act(seen[5]) - fresh.act(seen[5])).max() > 1e-3
     for one in (policy, fresh):
         one.reset(start)
     np.testing.assert_array_equal(policy.act(seen[5]), fresh.act(seen[5]))
-
-
-def test_a_policy_with_past_actions_remembers_its_own(saved_policies):
     policy = load_policy(saved_policies["mlp-actions"])
-    rng = np.random.default_rng(0)
-    start = rng.normal(size=(2, 12))
-    policy.reset(start)
-    past = [start.astype(np.float32)] * HISTORY
-    for row in rng.normal(size=(5, 2, 60)).astype(np.float32):
+    policy.reset(start + 0.5)
+    past = [(start + 0.5).astype(np.float32)] * HISTORY
+    for row in seen.astype(np.float32):
         flat = torch.from_numpy(np.concatenate([row, *past], axis=1))
         with torch.inference_mode():
             expected = policy.network(flat)[0].numpy()

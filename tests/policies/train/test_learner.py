@@ -78,22 +78,17 @@ def test_after_a_time_out_past_actions_begin_anew_but_the_terminal_ones_are_thos
         assert abs(own[0] - 0.04) > 1e-3  # the start action, not the last one taken
 
 
-def test_noise_is_observed_and_a_new_episode_begins_without():
-    env = walkers(episode_steps=2, history=0)
+def test_noise_is_observed_a_new_episode_begins_without_and_what_was_handed_out_does_not_change():
+    env = walkers(episode_steps=2, history=2)
+    first = env.get_observations()
+    kept = first.clone()
     env.noise = torch.full((3, 12), 0.3)
-    assert act(env, 0.0)[0]["noise"].eq(0.3).all()
+    assert act(env, 0.3)[0]["noise"].eq(0.3).all()
+    assert all(torch.equal(first[k], kept[k]) for k in ("policy", "privileged", "actions"))
     env.noise = torch.full((3, 12), 0.2)
     seen, _, dones, extras = act(env, 0.0)
     assert dones.all() and seen["noise"].eq(0.0).all()
     assert extras["terminal_observations"]["noise"].eq(0.2).all()
-
-
-def test_observations_that_were_handed_out_do_not_change_with_the_next_step():
-    env = walkers(episode_steps=100, history=2)
-    first = env.get_observations()
-    kept = first.clone()
-    act(env, 0.3)
-    assert all(torch.equal(first[k], kept[k]) for k in ("policy", "privileged", "actions"))
 
 
 def test_the_learner_sees_the_rewards_and_ends_that_the_environment_gave():
@@ -331,8 +326,19 @@ def test_what_is_no_checkpoint_or_of_another_version_or_incomplete_is_refused(ch
     assert_each_refused(cases, load, names=path)
 
 
-def test_a_checkpoint_that_unpacks_to_gigabytes_is_not_unpacked(tmp_path):
-    path = tmp_path / "last.pt"
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
+def test_code_in_a_checkpoint_is_not_run_and_gigabytes_are_not_unpacked(tmp_path):
+    path, made = tmp_path / "last.pt", tmp_path / "made"
+    for save in (
+        lambda: torch.save({"schema": "pupper-checkpoint", "more": Runs(str(made))}, path),
+        lambda: path.write_bytes(pickle.dumps(Runs(str(made)))),
+    ):
+        save()
+        with pytest.raises(InputError, match="damaged"):
+            read_checkpoint(path)
+        assert not made.exists()
+    pickle.loads(pickle.dumps(Runs(str(made))))
+    assert made.exists(), "or the test would prove nothing"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("last/data/0", bytes(100_000_000))
     with pytest.raises(InputError, match="is compressed, which torch's files are not"):
@@ -347,21 +353,6 @@ class Runs:
 
     def __reduce__(self):
         return os.mkdir, (self.folder,)
-
-
-@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
-def test_code_in_a_checkpoint_is_not_run(tmp_path):
-    path, made = tmp_path / "last.pt", tmp_path / "made"
-    for save in (
-        lambda: torch.save({"schema": "pupper-checkpoint", "more": Runs(str(made))}, path),
-        lambda: path.write_bytes(pickle.dumps(Runs(str(made)))),
-    ):
-        save()
-        with pytest.raises(InputError, match="damaged"):
-            read_checkpoint(path)
-        assert not made.exists()
-    pickle.loads(pickle.dumps(Runs(str(made))))
-    assert made.exists(), "or the test would prove nothing"
 
 
 def test_a_recurrent_policy_needs_an_environment_per_minibatch():

@@ -123,8 +123,3 @@ def test_missing_settings_take_their_defaults_and_older_ones_are_passed_over(tmp
         ("task", "curriculum", "stage_steps", 2400), ("learner", "initial_std", 0.015),
     ):  # fmt: skip
         assert load_run(with_settings(tmp_path, *older)) == tiny_run()
-
-
-def test_the_critic_sees_the_truth_in_the_presets_that_say_so():
-    for name, sees in (("fast", True), ("paper", False), ("release", False)):
-        assert preset(name, "mlp").architecture.privileged_critic is sees

@@ -167,7 +167,7 @@ class Counting:
         return np.repeat(self.count[:, None], 12, axis=1) / 1000
 
 
-def test_in_a_missed_tick_set_points_stay_and_the_policy_does_not_run():
+def test_in_a_missed_tick_set_points_stay_the_policy_does_not_run_and_the_trot_keeps_its_clock():
     late = Handicap(missed_ticks=0.3)
     _, actions = watched(late, Handicap(), seconds=2.0, policy=Counting())
     actions = 1000 * actions[..., 0]
@@ -176,15 +176,11 @@ def test_in_a_missed_tick_set_points_stay_and_the_policy_does_not_run():
     np.testing.assert_allclose(actions[:, :2], expected, rtol=1e-5)
     np.testing.assert_allclose(actions[:, 2:], np.arange(1, 101)[:, None] * np.ones(2), rtol=1e-5)
     assert missed.mean() == pytest.approx(0.3, abs=0.1)
-
-
-def test_in_a_missed_tick_the_trot_keeps_its_clock():
-    _, actions = watched(Handicap(missed_ticks=0.3), Handicap(), seconds=0.8, walker="trot")
+    _, actions = watched(late, Handicap(), seconds=0.8, walker="trot")
     missed = missed_ticks(2, 40, 3) < 0.3
     for robot in range(2):
-        runs = ~missed[:, robot]
+        runs, held = ~missed[:, robot], np.flatnonzero(missed[:, robot])
         np.testing.assert_array_equal(actions[runs, robot], actions[runs, 2 + robot])
-        held = np.flatnonzero(missed[:, robot])
         np.testing.assert_array_equal(actions[held, robot], actions[held - 1, robot])
 
 

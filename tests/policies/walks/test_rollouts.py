@@ -50,9 +50,7 @@ def test_a_replay_of_what_a_policy_saw_is_what_it_did_and_had_in_mind(policies, 
         width = {"lstm": 24, "gru": 24, "transformer": WIDTH}.get(kind, 16)
         assert rollout.hidden.shape == (STEPS, ROBOTS, width)
         assert np.ptp(rollout.hidden, axis=0).max() > 0
-
-
-def test_hidden_states_are_a_cell_a_state_or_what_the_head_makes_actions_of(policies):
+    # hidden is a cell, a state, or what the head makes actions of
     for kind, part in (("lstm", 1), ("gru", 0)):
         network = policies[kind].network
         state = network.initial_state(2)
@@ -216,23 +214,17 @@ def test_over_a_stride_a_sway_of_its_frequency_averages_to_nothing_and_an_offset
     np.testing.assert_allclose(slow, exact, rtol=0.05)
 
 
-def test_robots_that_take_no_strides_are_averaged_over_a_usual_one_and_none_over_too_long_a_one():
-    sway = of_sway(2.0, 0.3)
-    for stride, used in ((np.inf, 0.3), (np.nan, 0.3), (7.0, 1.0), (0.01, 0.2)):
-        found, same = (
-            stride_errors(sway, np.zeros(3), UP, NONE, np.array([s]), STEP_S)
-            for s in (stride, used)
-        )
-        np.testing.assert_array_equal(found, same)
-
-
-def test_each_robot_has_its_own_stride():
+def test_each_robot_has_its_own_stride_or_a_usual_one_and_none_too_long_a_one():
     sways = np.concatenate([of_sway(2.5, 0.3), of_sway(2.0, 0.3)], axis=1)
     up, fell = np.ones((STEPS_TRACKING, 2), bool), np.zeros(2, bool)
-    own = stride_errors(sways, np.zeros(3), up, fell, np.array([0.4, 0.5]), STEP_S)
-    np.testing.assert_allclose(own, 0.0, atol=1e-12)
-    swapped = stride_errors(sways, np.zeros(3), up, fell, np.array([0.5, 0.4]), STEP_S)
-    assert (swapped > 0.02).all()
+
+    def errors(*strides):
+        return stride_errors(sways, np.zeros(3), up, fell, np.array(strides), STEP_S)
+
+    np.testing.assert_allclose(errors(0.4, 0.5), 0.0, atol=1e-12)
+    assert (errors(0.5, 0.4) > 0.02).all()
+    for stride, used in ((np.inf, 0.3), (np.nan, 0.3), (7.0, 1.0), (0.01, 0.2)):
+        np.testing.assert_array_equal(errors(stride, 0.4), errors(used, 0.4))
 
 
 def test_a_robot_that_fell_stands_and_one_that_left_the_ground_is_not_counted_any_more():
@@ -253,20 +245,16 @@ def test_a_robot_that_fell_stands_and_one_that_left_the_ground_is_not_counted_an
     assert not shown[100:, 1:].any() and counts.sum(axis=0).tolist() == [500, 500, 100]
 
 
-def test_falling_early_is_never_better_than_standing_and_never_better_than_walking_on():
+def test_falling_early_is_never_better_than_walking_on_and_pooled_errors_count_all_to_the_end():
     rng = np.random.default_rng(0)
     command = np.array([0.15, 0.0, 0.0])
     velocity = command + 0.02 * rng.standard_normal((STEPS_TRACKING, 1, 3))
     errors = []
     for last in (500, 400, 250, 100, 1):
         alive = (np.arange(STEPS_TRACKING) < last)[:, None]
-        errors.append(
-            tracking_errors(velocity, command, alive, np.array([last < STEPS_TRACKING]))[0, 0]
-        )
+        fell = np.array([last < STEPS_TRACKING])
+        errors.append(tracking_errors(velocity, command, alive, fell)[0, 0])
     assert errors == sorted(errors) and errors[-1] == pytest.approx(0.15, rel=0.01)
-
-
-def test_pooled_errors_count_what_was_not_simulated_after_the_last_fall():
     velocity, alive = np.full((100, 2, 3), 0.1), np.ones((100, 2), bool)
     alive[50:, 0] = alive[-1:, 1] = False
     command = np.array([0.3, 0.1, 0.0])
