@@ -103,9 +103,9 @@ def test_a_task_of_slower_commands_is_judged_by_slower_walks_with_the_same_relat
 
 @pytest.mark.slow
 def test_a_trot_is_fitted_to_servos_of_two_thirds_of_the_stiffness_and_torque(monkeypatch):
-    monkeypatch.setattr(first_gait, "_CANDIDATES", 16)
-    monkeypatch.setattr(first_gait, "_GENERATIONS", 1)
-    monkeypatch.setattr(first_gait, "_SECONDS", 2.0)
+    monkeypatch.setattr(first_gait, "_CANDIDATES", 24)
+    monkeypatch.setattr(first_gait, "_GENERATIONS", 2)
+    monkeypatch.setattr(first_gait, "_SECONDS", 3.0)
     monkeypatch.setattr(first_gait, "_EACH", 1)
     servos = servo_ranges(CALIBRATION)
     factors = {"stiffness": 0.65, "effort_limit": 0.8}

@@ -45,15 +45,12 @@ def test_a_calf_in_joint_coordinates_is_its_servos_motion_again(bus):
         assert found.initial_command_rad == pytest.approx(expected.initial_command_rad)
 
 
-@pytest.mark.parametrize("bus", [{"linkage": "none"}, {"joint_map": "mine"}])
-def test_a_robot_without_a_linkage_is_left_alone(bus):
-    (calf,) = recorded("joint", **bus).trials("LF_calf")
-    own = recorded("joint").table.query("joint == 'LF_calf'")["command_rad"]
-    np.testing.assert_array_equal(calf.command_rad, own)
-
-
-def test_a_calf_alone_keeps_its_angles():
-    (calf,) = recorded("joint", ["LF_calf"]).trials("LF_calf")
+@pytest.mark.parametrize(
+    ("joints", "bus"),
+    [(JOINTS, {"linkage": "none"}), (JOINTS, {"joint_map": "mine"}), (["LF_calf"], {})],
+)
+def test_a_calf_without_a_linkage_or_without_its_thigh_keeps_its_angles(joints, bus):
+    (calf,) = recorded("joint", joints, **bus).trials("LF_calf")
     own = recorded("joint").table.query("joint == 'LF_calf'")["command_rad"]
     np.testing.assert_array_equal(calf.command_rad, own)
 

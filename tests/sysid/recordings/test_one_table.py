@@ -214,13 +214,10 @@ def test_messages_may_name_different_joints():
     np.testing.assert_array_equal(found["b"], [np.nan, 2.0])
 
 
-def test_columns_of_a_frame_may_be_numbers():
+def test_columns_of_a_frame_may_be_numbers_but_not_without_a_name():
     table = frame(TWO_COMMANDS).iloc[:, [0, 1, 3, 4]]
     table.columns = ["time", "knee_command", "knee_position", 7]
     assert Recording.from_frame(table).joints == ["knee"]
-
-
-def test_columns_without_a_name_are_refused():
     distinct("log", ["a", "b", "A"])
     with pytest.raises(InputError, match="two columns have no name"):
         distinct("log", ["a", "", ""])

@@ -174,12 +174,18 @@ def test_bad_input_is_refused_in_a_sentence_that_names_the_file(tmp_path):
     assert_each_refused([(tmp_path, "pupper-sysid sweep")], newest_recording)
 
 
-def test_a_trial_that_was_resumed_counts_from_there(tmp_path):
+def test_trials_that_were_resumed_or_hardly_begun_and_missing_readings_are_said(tmp_path):
     path = write(tmp_path, [*rows(), *rows(30, trial=1), '# resumed: {"trial": 1}',
                             *rows(25, trial=1)])  # fmt: skip
     recording = load(path)
     assert [len(t.send_time_s) for t in recording.trials("LF_hip")] == [40, 25]
     assert sum("trial 1 was interrupted" in w for w in recording.warnings) == 1
+    recording = load(write(tmp_path, [*rows(), "2.0,2.0005,1,LF_hip,2.0,0.0,0.0"]))
+    assert len(recording.trials("LF_hip")) == 1
+    assert any("trial 1 of LF_hip is too short" in w for w in recording.warnings)
+    recording = load(write(tmp_path, changed(3, "position_rad", "")))
+    assert any("missing" in w for w in recording.warnings)
+    assert np.isnan(recording.trials("LF_hip")[0].position_rad[3])
 
 
 def test_very_many_trials_are_answered_at_once(tmp_path):
@@ -198,44 +204,29 @@ def test_very_many_trials_are_answered_at_once(tmp_path):
         assert time.process_time() - started < 4
 
 
-def test_a_trial_that_had_hardly_begun_is_left_out(tmp_path):
-    last = "2.0,2.0005,1,LF_hip,2.0,0.0,0.0"
-    recording = load(write(tmp_path, [*rows(), last]))
-    assert len(recording.trials("LF_hip")) == 1
-    assert any("trial 1 of LF_hip is too short" in w for w in recording.warnings)
-
-
-def test_the_hash_is_that_of_the_bytes_whatever_wrote_them(tmp_path):
+def test_the_hash_is_that_of_the_bytes_and_in_memory_that_of_the_numbers(tmp_path):
     path = write(tmp_path, rows(), top=())
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())  # as spreadsheets save UTF-8
     recording = load(path)
     assert recording.sha256 == sha256(path)
     # a table that this program did not write has no end to miss
     assert recording.warnings == ()
+    assert from_arrays().sha256 == from_arrays(name="other").sha256
+    moved = {"LF_hip": POSITION + 1e-6, "RB_calf": -POSITION}
+    assert from_arrays().sha256 != from_arrays(position_rad=moved).sha256
 
 
-def test_each_trial_knows_how_its_bus_cut_commands(tmp_path):
-    cuts = {"command_quantum_rad": {"LF_hip": 0.0057}, "command_rounding": {"LF_hip": "up"}}
-    top = (MARK, f"# bus: {json.dumps(cuts)}")
-    (cut,) = load(write(tmp_path, rows(), top=top)).trials("LF_hip")
-    assert cut.truncation == Truncation(0.0057, "up")
-
-
-def test_the_header_says_whether_readings_are_live_and_the_kind_of_bus_does_not(tmp_path):
+def test_the_header_says_whether_readings_are_live_and_how_commands_were_cut(tmp_path):
     for readings in ("live", "polled"):
         top = (MARK, f'# readings: "{readings}"')
         recording = load(write(tmp_path, rows(), top=top))
         assert {t.readings for t in recording.trials("LF_hip")} == {readings}
         recording.save(tmp_path / "again.csv", force=True)
         assert load(tmp_path / "again.csv").trials("LF_hip")[0].readings == readings
-    top = (MARK, '# bus: {"kind": "feetech"}')
-    assert load(write(tmp_path, rows(), top=top)).trials("LF_hip")[0].readings is None
-
-
-def test_rows_without_a_reading_are_kept_and_said(tmp_path):
-    recording = load(write(tmp_path, changed(3, "position_rad", "")))
-    assert any("missing" in w for w in recording.warnings)
-    assert np.isnan(recording.trials("LF_hip")[0].position_rad[3])
+    cuts = {"command_quantum_rad": {"LF_hip": 0.0057}, "command_rounding": {"LF_hip": "up"}}
+    top = (MARK, f"# bus: {json.dumps(cuts | {'kind': 'feetech'})}")
+    (cut,) = load(write(tmp_path, rows(), top=top)).trials("LF_hip")
+    assert cut.truncation == Truncation(0.0057, "up") and cut.readings is None
 
 
 def test_the_sweep_layout_is_recognised_by_its_columns(tmp_path):
@@ -309,18 +300,7 @@ def test_what_is_saved_is_read_back_and_nothing_is_overwritten(tmp_path):
     assert again.metadata["exported_from"]["sha256"] == made.sha256
     with pytest.raises(FileExistsRefusal):
         made.save(tmp_path / "a.csv")
-
-
-def test_a_frame_of_a_file_is_the_same_recording(tmp_path):
-    recording = load(write(tmp_path, rows()))
-    again = Recording.from_frame(recording.to_frame())
-    pd.testing.assert_frame_equal(again.table, recording.table)
-
-
-def test_the_hash_of_a_recording_in_memory_is_that_of_its_numbers():
-    assert from_arrays().sha256 == from_arrays(name="other").sha256
-    moved = {"LF_hip": POSITION + 1e-6, "RB_calf": -POSITION}
-    assert from_arrays().sha256 != from_arrays(position_rad=moved).sha256
+    pd.testing.assert_frame_equal(Recording.from_frame(again.to_frame()).table, again.table)
 
 
 def test_arrays_are_refused_for_the_same_reasons_as_files():

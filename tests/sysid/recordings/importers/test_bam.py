@@ -37,22 +37,20 @@ def test_mass_length_gain_and_voltages_come_from_the_file(tmp_path):
     np.testing.assert_allclose(trial.command_rad - trial.position_rad, 0.05)
 
 
-def test_the_stamp_is_the_middle_of_the_read_and_the_goal_is_older(tmp_path):
-    """A turn of 5 ms: write w, sleep 1.06 ms, read w, so w = 1.97 ms; a block read is one read."""
-    (trial,) = load(saved(tmp_path, log())).trials("sts3215")
-    np.testing.assert_allclose(trial.read_time_s, 0.005 * np.arange(50), atol=1e-12)
-    np.testing.assert_allclose(trial.read_time_s - trial.send_time_s, 0.00106 + 0.00197, atol=1e-12)
-    assert trial.read_time_doubt_s == pytest.approx(0.00197)
+def test_the_stamp_is_the_middle_of_the_reads_and_the_goal_is_older(tmp_path):
+    """A turn of 5 ms: write w, sleep 1.06 ms, read w, so w = 1.97 ms; a block read is one read.
 
-
-def test_an_xl330s_position_is_the_first_of_five_reads(tmp_path):
-    """Write w, sleep 1.06 ms, five reads: w = 0.6567 ms; the first is 2 w before the middle."""
-    (trial,) = load(saved(tmp_path, log("xl330"))).trials("xl330")
-    each = (0.005 - 0.00106) / 6
-    np.testing.assert_allclose(
-        trial.read_time_s, 0.005 * np.arange(50) - 2 * each, atol=1e-12
-    )  # fmt: skip
-    np.testing.assert_allclose(trial.read_time_s - trial.send_time_s, 0.00106 + each, atol=1e-12)
+    An XL330 is read five times, the position first: w = 0.6567 ms, the first 2 w before the middle.
+    """
+    for motor, reads in (("sts3215", 1), ("xl330", 5)):
+        (trial,) = load(saved(tmp_path, log(motor))).trials(motor)
+        each = (0.005 - 0.00106) / (1 + reads)
+        middle = 0.005 * np.arange(50)
+        early = (reads - 1) / 2 * each
+        np.testing.assert_allclose(trial.read_time_s, middle - early, atol=1e-12)
+        apart = trial.read_time_s - trial.send_time_s
+        np.testing.assert_allclose(apart, 0.00106 + each, atol=1e-12)
+        assert trial.read_time_doubt_s == pytest.approx(each)
 
 
 def test_logs_without_load_or_voltage_are_read(tmp_path):

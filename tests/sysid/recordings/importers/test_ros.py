@@ -171,11 +171,6 @@ def test_commands_as_joint_states_are_told_by_their_topic_and_matched_by_name(tm
         load(path, LogOptions(command="/cmd", position="/joint_states"))
 
 
-def test_a_header_of_zero_is_none(tmp_path):
-    recording = load(written(tmp_path / "a.mcap", messages(stamps=False)))
-    assert recording.metadata["times"] == ["/joint_commands: log", "/joint_states: header"]
-
-
 def simulated(found):
     """The same messages with headers of a clock that starts at 0."""
     for topic, kind, log_ns, content in found:
@@ -188,16 +183,16 @@ def simulated(found):
 
 def test_headers_of_another_clock_are_believed_if_all_topics_have_them(tmp_path):
     (trial,) = load(written(tmp_path / "a.mcap", simulated(messages()))).trials("pan")
-    np.testing.assert_allclose(
-        trial.read_time_s - trial.send_time_s, 1e-9 * READ_LATE_NS, atol=1e-9
-    )
+    apart = 1e-9 * READ_LATE_NS
+    np.testing.assert_allclose(trial.read_time_s - trial.send_time_s, apart, atol=1e-9)
     arrays = simulated(messages("std_msgs/msg/Float64MultiArray"))
     recording = load(written(tmp_path / "b.mcap", arrays))
     assert recording.metadata["times"] == ["/joint_commands: log", "/joint_states: log"]
     (trial,) = recording.trials("pan")
-    np.testing.assert_allclose(
-        trial.read_time_s - trial.send_time_s, 1e-9 * READ_LATE_NS, atol=1e-9
-    )
+    np.testing.assert_allclose(trial.read_time_s - trial.send_time_s, apart, atol=1e-9)
+    # a header of zero is none
+    recording = load(written(tmp_path / "c.mcap", messages(stamps=False)))
+    assert recording.metadata["times"] == ["/joint_commands: log", "/joint_states: header"]
 
 
 def test_each_reading_gets_the_command_in_force_and_none_is_interpolated(tmp_path):
@@ -258,20 +253,16 @@ def test_a_bag_in_sqlite_is_read_like_mcap(tmp_path):
                 np.testing.assert_array_equal(ours.read_time_s, wanted.read_time_s)
 
 
-def test_a_bag_of_mcap_files_is_one_log(tmp_path):
-    found = list(messages())
-    folder = tmp_path / "bag"
+def test_a_bag_of_mcap_files_is_one_log_and_a_file_cut_short_is_read_up_to_there(tmp_path):
+    found, folder = list(messages()), tmp_path / "bag"
     folder.mkdir()
     (folder / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 9}\n")
     written(folder / "bag_0.mcap", found[:100])
     written(folder / "bag_1.mcap", found[100:])
     (trial,) = load(folder).trials("pan")
     np.testing.assert_allclose(trial.command_rad, COMMANDS[:, 0])
-
-
-def test_a_file_that_was_cut_short_is_read_up_to_there(tmp_path):
-    path = written(tmp_path / "a.mcap", messages())
-    path.write_bytes(path.read_bytes()[: len(path.read_bytes()) // 2])
+    path = written(tmp_path / "a.mcap", found)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     recording = load(path)
     assert 20 < len(recording.trials("pan")[0].send_time_s) < COUNT
     assert any("cut short" in text for text in recording.warnings)
@@ -303,19 +294,16 @@ def test_logs_that_are_damaged_too_large_or_without_joints_are_refused(tmp_path,
     assert_each_refused([(whole, "Install pupper-sysid[logs]")], load)
 
 
-def test_no_length_in_a_message_is_believed_beyond_its_bytes():
+def test_big_endian_messages_are_read_and_no_length_is_believed_beyond_the_bytes():
+    data = b"\x00\x00\x00\x00" + struct.pack(">II", 0, 0) + struct.pack(">I", 2)
+    data += b"\0" * (-(len(data) - 4) % 8) + struct.pack(">dd", 1.5, -2.5)
+    assert decode("std_msgs/Float64MultiArray", data).positions == (1.5, -2.5)
     start = b"\x00\x01\x00\x00" + struct.pack("<iII", 1, 2, 1) + b"\0" + b"\0" * 3
     for count in (5, 2**31, 2**32 - 1):
         with pytest.raises(ValueError, match="larger than the message|cut short"):
             decode("sensor_msgs/JointState", start + struct.pack("<I", count))
     with pytest.raises(ValueError, match="header"):
         decode("sensor_msgs/JointState", b"\x07")
-
-
-def test_big_endian_messages_are_read():
-    data = b"\x00\x00\x00\x00" + struct.pack(">II", 0, 0) + struct.pack(">I", 2)
-    data += b"\0" * (-(len(data) - 4) % 8) + struct.pack(">dd", 1.5, -2.5)
-    assert decode("std_msgs/Float64MultiArray", data).positions == (1.5, -2.5)
 
 
 TOPICS = """CREATE TABLE topics(id INTEGER, name TEXT, type TEXT);

@@ -41,17 +41,14 @@ def test_joint_after_joint_is_written_and_then_read(tmp_path):
         assert trial.read_time_doubt_s == 0.0015 and trial.servo.p_gain == 16
 
 
-def test_another_robots_common_stamp_is_in_doubt_by_half_a_turn(tmp_path):
+def test_another_robots_stamp_is_in_doubt_by_half_a_turn_and_two_clocks_are_joined(tmp_path):
     recording = load(folder(tmp_path, ("hip_yaw", "knee")))
     (trial,) = recording.trials("knee")
     assert trial.read_time_doubt_s == pytest.approx(0.01) and trial.servo.model is None
     np.testing.assert_array_equal(trial.read_time_s, trial.send_time_s)
     assert any("one time stamp" in text for text in recording.warnings)
-
-
-def test_two_clocks_are_joined_by_the_command_in_force(tmp_path):
-    recording = load(folder(tmp_path, ("hip_yaw", "knee"), late_us=3000.0))
-    (trial,) = recording.trials("knee")
+    # by the command in force
+    (trial,) = load(folder(tmp_path, ("hip_yaw", "knee"), late_us=3000.0)).trials("knee")
     np.testing.assert_allclose(trial.read_time_s - trial.send_time_s, 0.003)
     np.testing.assert_allclose(trial.command_rad - trial.position_rad, 0.01)
 

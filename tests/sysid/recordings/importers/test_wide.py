@@ -138,25 +138,6 @@ def test_columns_units_and_names_come_from_options(tmp_path):
         load(tmp_path / "log.csv", LogOptions("then", "u_{joint}", "y_{joint}"))
 
 
-def test_a_mapping_file_says_the_same_and_an_option_goes_first(tmp_path):
-    (tmp_path / "map.yaml").write_text(
-        "time: when\ncommand: u_{joint}\nposition: y_{joint}\nunits: {ankle: deg}\n"
-        "joints: {knee: a, ankle: b}\nread_before_send: true\n"
-    )
-    made = table("u_{joint}", "y_{joint}", "when")
-    made[["u_ankle", "y_ankle"]] *= 180 / np.pi
-    made.to_csv(tmp_path / "log.csv", index=False)
-    options = read_mapping(tmp_path / "map.yaml")
-    agrees(load(tmp_path / "log.csv", options), ("a", "b"))
-    assert merged(LogOptions(unit="deg"), options).unit == "deg"
-    (tmp_path / "map.yaml").write_text("tme: when\n")
-    with pytest.raises(InputError, match="Did you mean time"):
-        read_mapping(tmp_path / "map.yaml")
-    (tmp_path / "map.yaml").write_text("unit: furlong\n")
-    with pytest.raises(InputError, match="Write rad, deg"):
-        read_mapping(tmp_path / "map.yaml")
-
-
 def test_a_numpy_archive_is_read_and_pickles_are_not(tmp_path):
     arrays = {
         "command": np.array([*COMMAND.values()]).T,
@@ -212,10 +193,24 @@ def test_tables_that_are_no_log_are_refused_with_the_way_out(tmp_path):
     agrees(load(degrees, LogOptions(unit="deg")))
 
 
-def test_the_mapping_file_of_the_documentation_is_one(tmp_path):
+def test_a_mapping_file_says_the_same_and_an_option_goes_first(tmp_path):
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text(
+        "time: when\ncommand: u_{joint}\nposition: y_{joint}\nunits: {ankle: deg}\n"
+        "joints: {knee: a, ankle: b}\nread_before_send: true\n"
+    )
+    made = table("u_{joint}", "y_{joint}", "when")
+    made[["u_ankle", "y_ankle"]] *= 180 / np.pi
+    made.to_csv(tmp_path / "log.csv", index=False)
+    options = read_mapping(mapping)
+    agrees(load(tmp_path / "log.csv", options), ("a", "b"))
+    assert merged(LogOptions(unit="deg"), options).unit == "deg"
     page = (ROOT / "docs/formats.md").read_text()
-    (tmp_path / "arm.yaml").write_text(page.split("```yaml\n# arm.yaml\n")[1].split("```")[0])
-    options = read_mapping(tmp_path / "arm.yaml")
+    mapping.write_text(page.split("```yaml\n# arm.yaml\n")[1].split("```")[0])
+    options = read_mapping(mapping)
     assert options.joints == {"shoulder pan": "pan", "6": "gripper"}
     assert options.unit_of("pan").scale == pytest.approx(np.pi / 180)
     assert options.unit_of("gripper").scale == pytest.approx(1.9 / 200)
+    for text, says in (("tme: when\n", "Did you mean time"), ("unit: furlong\n", "Write rad, deg")):
+        mapping.write_text(text)
+        assert_each_refused([(mapping, says)], read_mapping)
