@@ -61,25 +61,23 @@ def waves(hz: float, ahead: float, steps: int) -> np.ndarray:
     return np.sin(2 * np.pi * (phase + np.linspace(0, 0.5, 12)))[:, None, :].astype(np.float32)
 
 
-def test_the_shift_that_a_push_leaves_is_that_of_the_phases():
+@pytest.mark.parametrize(
+    ("hz", "nudged", "pushed", "tolerance"),
+    # of 0.6 Hz the window of the last push would end after the walk
+    [(3.1, 0.0, 0.1, 0.01), (3.1, -0.3, 0.45, 0.01), (0.6, 0.0, 0.1, 0.05)],
+)
+def test_the_shift_that_a_push_leaves_is_that_of_the_phases(hz, nudged, pushed, tolerance):
     """Walks of 10 s: a plain one, and for each speed of a push one that is ahead of it."""
-    steps = round(10.0 / STEP)
-    for hz, nudged, pushed, tolerance in (
-        (3.1, 0.0, 0.1, 0.01), (3.1, -0.3, 0.45, 0.01),
-        (0.6, 0.0, 0.1, 0.05),  # the window of its last push would end after the walk
-    ):  # fmt: skip
-        plain, nudge, push = (
-            walked((0.1, 0, 0), 0.1, 0, 0, 10.0, 1, waves(hz, ahead, steps))
-            for ahead in (0.0, nudged, pushed)
-        )
-
-        trial = recorded(plain, nudge, push)
-        small, large = push_response(None, trial)  # pyright: ignore[reportArgumentType]
-        assert (small.push_m_s, large.push_m_s) == (NUDGE_M_S, PUSH_M_S)
-        assert small.shift_early == pytest.approx(abs(nudged), abs=tolerance)
-        assert large.shift_late == pytest.approx(abs(pushed), abs=tolerance)
-        assert large.shifts == pytest.approx([pushed] * len(large.shifts), abs=tolerance)
-        assert large.kept == pytest.approx(1.0, abs=0.1), "the phase stays where it was pushed"
+    plain, nudge, push = (
+        walked((0.1, 0, 0), 0.1, 0, 0, 10.0, 1, waves(hz, ahead, round(10.0 / STEP)))
+        for ahead in (0.0, nudged, pushed)
+    )
+    small, large = push_response(None, recorded(plain, nudge, push))  # type: ignore[arg-type]
+    assert (small.push_m_s, large.push_m_s) == (NUDGE_M_S, PUSH_M_S)
+    assert small.shift_early == pytest.approx(abs(nudged), abs=tolerance)
+    assert large.shift_late == pytest.approx(abs(pushed), abs=tolerance)
+    assert large.shifts == pytest.approx([pushed] * len(large.shifts), abs=tolerance)
+    assert large.kept == pytest.approx(1.0, abs=0.1), "the phase stays where it was pushed"
 
 
 def test_a_push_changes_the_sideways_speed_at_its_step_only(walker):

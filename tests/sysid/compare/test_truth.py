@@ -153,7 +153,10 @@ def test_the_truth_is_read_beside_its_recording_and_refused_in_a_sentence(swept,
     robot, _, recording = swept
     assert recording.path is not None
     assert read_truth(recording.path)["joints"].keys() == robot.truth()["joints"].keys()
-    (tmp_path / "b.truth.yaml").write_text(yaml.safe_dump({"joints": {JOINT: {"actuator": 3}}}))
+    for name, truth in (("b", {"actuator": 3}), ("bench", BENCH)):
+        (tmp_path / f"{name}.truth.yaml").write_text(yaml.safe_dump({"joints": {JOINT: truth}}))
+    read = read_truth(tmp_path / "bench.truth.yaml")["joints"][JOINT]
+    assert read["registers"]["p"] == 32 and read["loaded_servo"]["armature_kg_m2"] == 0.011
     cases = [
         ("a.csv", "a.truth.yaml does not exist"), ("a.csv", "sweep --truth"),
         ("b.csv", "b.truth.yaml"), ("b.csv", "actuator"),
@@ -205,10 +208,3 @@ def test_both_sides_have_the_calibrations_gain_and_armature(p_gain, armature, st
     assert rows["effort_limit"].truth == pytest.approx(1.6 / 8.0 * at_p_32)
     (definition,) = found.definitions
     assert point.gain_text in definition and ARMATURES[armature] in definition
-
-
-def test_registers_and_load_of_a_bench_are_read_from_its_file(tmp_path):
-    path = tmp_path / "a.truth.yaml"
-    path.write_text(yaml.safe_dump({"joints": {JOINT: BENCH}}))
-    read = read_truth(path)["joints"][JOINT]
-    assert read["registers"]["p"] == 32 and read["loaded_servo"]["armature_kg_m2"] == 0.011

@@ -79,10 +79,14 @@ def test_a_slip_back_and_forth_is_two():
     assert date_error(trials[2], true[2], again) < 0.002
 
 
-def test_a_steady_poll_has_no_slip():
+def test_a_steady_poll_has_no_slip_and_live_feedback_is_left_as_it_is():
     trials, _, motions = sweep(20)
     lattice = find_poll_lattice(trials, np.random.default_rng(0))
     assert lattice.slips == () and redate(trials, lattice, motions).slips == ()
+    live = find_poll_lattice(
+        [replace(t, readings="live") for t in trials], np.random.default_rng(0)
+    )
+    assert redate(trials, live, motions) is live
 
 
 def test_a_model_that_moves_too_early_does_not_move_the_dates():
@@ -93,14 +97,6 @@ def test_a_model_that_moves_too_early_does_not_move_the_dates():
     for trial, own in zip(trials, true, strict=True):
         found = readings(trial, again)
         assert abs(np.mean(found.time_s - own[found.rows])) < 0.0008
-
-
-def test_live_and_unresolved_feedback_is_left_as_it_is():
-    trials, _, motions = sweep(1)
-    live = find_poll_lattice(
-        [replace(t, readings="live") for t in trials], np.random.default_rng(0)
-    )
-    assert redate(trials, live, motions) is live
 
 
 def jumped_polls(jump):
@@ -133,16 +129,12 @@ def test_residuals_that_a_slip_has_widened_do_not_hide_it():
         assert len(find_segments(stretch(), steady, 0.0613, 0.0025, np.nan, track, scale)) == 1
 
 
-def test_segments_meet_at_the_jump_and_one_lattice_suffices_without():
+def test_segments_meet_at_the_jump_and_one_lattice_of_the_true_period_suffices_without():
     steady, jumped = stretch(), stretch(0.03)
     (only,) = find_segments(steady, np.zeros(len(steady.end)), 0.0613, 0.0025, np.nan)
     assert (only.start_s, only.stop_s, only.nats) == (0.0, 3.0, 0.0)
     first, second = find_segments(jumped, np.zeros(len(jumped.end)), 0.0613, 0.0025, np.nan)
     assert first.stop_s == second.start_s == pytest.approx(1.5, abs=0.1)
     assert second.nats > NATS
-
-
-def test_the_true_period_has_more_evidence_than_half_of_it():
-    # each second poll of the shorter one would have to fail every time
-    steady = stretch()
+    # each second poll of half the period would have to fail every time
     assert evidence(steady, 0.0613, 0.0025, 0.02) > evidence(steady, 0.03065, 0.0025, 0.5) + 20

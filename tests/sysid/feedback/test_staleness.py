@@ -75,24 +75,16 @@ def test_a_servo_polled_every_third_row_is_stale_and_two_of_three_readings_repea
     assert found.repeat_share == pytest.approx(2 / 3)
 
 
-def test_a_constant_reading_and_a_few_rows_tell_nothing():
+def test_constant_or_few_readings_tell_nothing_and_missing_ones_and_an_offset_change_nothing():
     few = trial(WAVE[:12], WAVE[:12] - 0.1, TIME[:12])
-    for trials in ([trial(WAVE, np.full(600, 0.3))], [few], []):
-        assert staleness(trials).kind == "cannot tell"
-
-
-def test_missing_readings_are_no_repeats():
-    rng = np.random.default_rng(0)
-    gone = rng.random(600) < 0.1
-    stuck = np.where(gone, np.nan, whole(sticking(WAVE)))
-    assert staleness([trial(WAVE, stuck)]).kind == "live"
-    assert staleness([trial(WAVE, np.full(600, np.nan))]).kind == "cannot tell"
-    held = np.where(gone, np.nan, polled(whole(sticking(WAVE))))
-    assert staleness([trial(WAVE, held)]).kind == "stale"
-
-
-def test_an_offset_between_command_and_reading_changes_nothing():
-    stuck = whole(sticking(WAVE))
+    gone, stuck = np.random.default_rng(0).random(600) < 0.1, whole(sticking(WAVE))
+    for trials, kind in (
+        ([trial(WAVE, np.full(600, 0.3))], "cannot tell"), ([few], "cannot tell"),
+        ([], "cannot tell"), ([trial(WAVE, np.full(600, np.nan))], "cannot tell"),
+        ([trial(WAVE, np.where(gone, np.nan, stuck))], "live"),
+        ([trial(WAVE, np.where(gone, np.nan, polled(stuck)))], "stale"),
+    ):  # fmt: skip
+        assert staleness(trials).kind == kind
     here, there = staleness([trial(WAVE, stuck)]), staleness([trial(WAVE, stuck + 0.8)])
     assert (there.kind, there.repeat_share) == (here.kind, here.repeat_share)
     assert there.episodes == pytest.approx(here.episodes, rel=0.05)

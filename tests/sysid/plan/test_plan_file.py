@@ -148,11 +148,22 @@ class Robot:
         )  # fmt: skip
 
 
-def test_a_sweep_that_is_narrow_enough_is_not_extended(tmp_path):
-    robot = Robot(tmp_path, {"LF_hip": [2.0]})
-    outcome = robot.run(2.0)
-    assert outcome.reached and outcome.recordings == (robot.first,) and robot.plans == []
-    assert outcome.to_dict()["joints"]["LF_hip"]["reached"] is True
+LEAST_MS = 1e3 * LEAST_HALF_WIDTH_S
+
+
+@pytest.mark.parametrize(
+    ("widths", "goal_ms", "plans", "why"),
+    [([2.0], 2.0, 0, ""), ([5.0, 5.1, 4.95, 1.0], 2.0, 2, "did not narrow it"),
+     ([1.02 * LEAST_MS], 1.01 * LEAST_MS, 0, "no trial within the limits")],
+)  # fmt: skip
+def test_rounds_end_where_it_is_narrow_enough_or_where_the_last_or_the_next_ones_do_not_help(
+    tmp_path, widths, goal_ms, plans, why
+):
+    robot = Robot(tmp_path, {"LF_hip": widths})
+    outcome = robot.run(goal_ms)
+    assert len(robot.plans) == plans and why in (outcome.joints["LF_hip"].why or "")
+    assert outcome.reached is (not why) and outcome.recordings[0] == robot.first
+    assert outcome.to_dict()["joints"]["LF_hip"]["reached"] is outcome.reached
 
 
 def test_only_joints_that_are_still_wide_are_recorded_again(tmp_path):
@@ -175,19 +186,6 @@ def test_the_limit_of_seconds_is_kept_and_named(tmp_path):
     planned = sum(t.duration_s + 0.2 for t in robot.plans[0].trials)
     assert planned <= 8.0 - SECONDS + 0.1
     assert "`most_seconds` is 8" in outcome.joints["LF_hip"].why
-
-
-def test_rounds_end_when_two_of_them_did_not_help(tmp_path):
-    robot = Robot(tmp_path, {"LF_hip": [5.0, 5.1, 4.95, 1.0]})
-    outcome = robot.run(2.0)
-    assert len(robot.plans) == 2 and "did not narrow it" in outcome.joints["LF_hip"].why
-
-
-def test_rounds_end_where_a_plan_promises_nothing(tmp_path):
-    least_ms = 1e3 * LEAST_HALF_WIDTH_S
-    robot = Robot(tmp_path, {"LF_hip": [1.02 * least_ms]})
-    outcome = robot.run(1.01 * least_ms)
-    assert robot.plans == [] and "no trial within the limits" in outcome.joints["LF_hip"].why
 
 
 def test_a_goal_is_half_of_an_interval():

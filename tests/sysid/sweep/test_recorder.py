@@ -317,23 +317,24 @@ def test_a_clock_that_was_set_during_the_interruption_does_not_move_the_recordin
     assert (np.diff(times) > 0).all() and times[-1] - times[0] < 2 * 86_400
 
 
-def test_a_finished_recording_is_not_continued(whole, capsys):
-    before = whole.read_bytes()
+def test_a_finished_recording_is_not_continued_and_one_without_its_footer_only_gets_that(
+    whole, capsys
+):
+    before, rows = whole.read_bytes(), len(load(whole).table)
     assert "nothing to continue" in refused(capsys, pupper_sysid, "sweep", "--resume", whole)
     assert whole.read_bytes() == before
     asked = load(whole).metadata["sweep"]  # the header holds all options of the sweep
     assert asked["frequencies_hz"] == [2, 3, 5] and asked["joints"] == ["LF_hip"]
-
-
-def test_a_recording_killed_between_the_last_row_and_the_footer_only_gets_its_footer(whole):
-    rows = len(load(whole).table)
     cut(whole, 9, 0)
     run("sweep", "--resume", str(whole))
     assert len(load(whole).table) == rows == load(whole).metadata["completed"]["rows"]
 
 
-def test_what_cannot_be_continued_is_refused_in_a_sentence(tmp_path, capsys):
-    path = tmp_path / "b.csv"
+def test_what_cannot_be_continued_or_was_played_from_a_file_that_changed_is_refused(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    path = Path("b.csv")
     for text, says in (
         ("time_s,x\n1,2\n", "not a recording of pupper-sysid"),
         ("# pupper-sysid recording\n# schema_version: 1\n", "does not hold its plan"),
@@ -342,14 +343,9 @@ def test_what_cannot_be_continued_is_refused_in_a_sentence(tmp_path, capsys):
         path.write_text(text)
         assert says in refused(capsys, pupper_sysid, "sweep", "--resume", path)
         assert path.read_text() == text
-
-
-def test_a_played_file_that_has_changed_is_not_played_on(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
     rows = [f"{0.05 * k},{0.01 * (k % 5)}" for k in range(60)]
     Path("gait.csv").write_text("time_s,LF_hip\n" + "\n".join(rows) + "\n")
-    play = ("sweep", "--playback", "gait.csv", "--joints", "LF_hip", "--out", "a.csv")
-    run(*play)
+    run("sweep", "--playback", "gait.csv", "--joints", "LF_hip", "--out", "a.csv")
     cut(Path("a.csv"), 0, 40)
     Path("gait.csv").write_text("time_s,LF_hip\n" + "\n".join(rows[:-1]) + "\n")
     capsys.readouterr()
