@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 
-import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.strict_yaml import MAX_DEPTH, StrictLoader, dump, load
+from pupper_sysid.common.strict_yaml import MAX_DEPTH, dump, load
 from support.refusals import assert_each_refused
 
 SCALARS = (
@@ -82,12 +81,6 @@ def test_each_place_has_its_line():
     assert lines == {
         (): 1, ("a",): 1, ("b",): 3, ("b", 0): 3, ("b", 1): 4, ("b", 1, "c"): 4, ("b", 1, "d"): 5,
     }  # fmt: skip
-
-
-def test_the_loader_serves_pyyaml_s_own_functions():
-    assert yaml.load("{legs: 4, names: [yes]}", StrictLoader) == {"legs": 4, "names": ["yes"]}
-    with pytest.raises(InputError, match="line 2, legs stands in the file twice"):
-        yaml.load("legs: 4\nlegs: 6", StrictLoader)
 
 
 def test_nesting_is_refused_from_the_first_level_that_is_too_deep():

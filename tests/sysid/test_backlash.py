@@ -74,14 +74,11 @@ def test_one_gain_cannot_tell_friction_from_a_dead_zone_and_says_so():
     assert found.backlash_rad.low < true.backlash_rad < found.backlash_rad.high
 
 
-def test_without_a_load_backlash_is_not_given():
+def test_without_a_load_backlash_is_not_given_and_other_recordings_are_refused(hip):
     recording, _ = stroked(5, 1.0, 1, gains=(32,), mass_kg=0.0)
     found = backlash(recording)["bench"]
     assert found.backlash_rad is None and found.gains[0].hysteresis_rad.value > 0
     assert any("cannot be separated from friction" in note for note in found.notes)
-
-
-def test_other_recordings_are_refused(hip):
     assert_each_refused([(load(hip), "no slow strokes at two speeds")], backlash)
 
 

@@ -303,41 +303,31 @@ def test_a_stack_that_cannot_be_is_refused(policy):
     assert_each_refused(cases, lambda make: make())
 
 
-def test_the_published_observer_does_not_fit_and_that_is_said(policy):
+def test_a_policy_gets_the_stack_of_its_training_and_the_published_observer_does_not_fit(policy):
+    assert suited(policy.contract) == "closed-loop"
+    ideal = policy.contract.model_copy(update={"feedback": "ideal"})
+    assert suited(ideal) == "lstm-servo"
+    assert suited(ideal.model_copy(update={"kind": "mlp"})) == "mlp-observer"
     parts = assemble(policy, Stack("published-pd"), JOINTS, CALIBRATION, None)
     assert not parts.match.fits and "Hz" in parts.match.sentence()
     assert assemble(policy, STACKS["closed-loop"], JOINTS, CALIBRATION, None).match.fits
 
 
-def test_a_policy_gets_the_stack_of_its_training(policy):
-    assert suited(policy.contract) == "closed-loop"
-    ideal = policy.contract.model_copy(update={"feedback": "ideal"})
-    assert suited(ideal) == "lstm-servo"
-    assert suited(ideal.model_copy(update={"kind": "mlp"})) == "mlp-observer"
-
-
 # --------------------------------------------------------------------------------- commands
-
-
-def test_a_script_gives_one_command_after_the_other_and_then_stops(tmp_path):
-    path = tmp_path / "s.csv"
-    path.write_text("seconds,forward_m_s,left_m_s,turn_rad_s\n2,0.1,0,0\n1,0,0,0.4\n")
-    told = script(path)
-    np.testing.assert_array_equal(told(1.99), [0.1, 0, 0])
-    np.testing.assert_array_equal(told(2.0), [0, 0, 0.4])
-    assert told(3.0) is None
 
 
 TRAINED = CommandRanges(forward_m_s=[-0.2, 0.2], sideways_m_s=[-0.1, 0.1], yaw_rad_s=[-0.5, 0.5])
 
 
-def test_commands_beyond_the_training_are_clipped_and_one_sentence_says_so(tmp_path):
+def test_a_script_gives_one_command_after_the_other_clipped_to_the_training_and_says_so(tmp_path):
     path, said = tmp_path / "s.csv", []
     path.write_text("seconds,forward_m_s,left_m_s,turn_rad_s\n2,0.4,0,0\n1,0,0,-2\n1,0.2,0.1,0\n")
     command = script(path, TRAINED, said.append)
-    np.testing.assert_array_equal(command(0.0), [0.2, 0, 0])
-    np.testing.assert_array_equal(command(2.5), [0, 0, -0.5])
+    np.testing.assert_array_equal(command(1.99), [0.2, 0, 0])
+    np.testing.assert_array_equal(command(2.0), [0, 0, -0.5])
     np.testing.assert_array_equal(command(3.5), [0.2, 0.1, 0])
+    assert command(4.0) is None
+    np.testing.assert_array_equal(script(path)(0.0), [0.4, 0, 0])
     np.testing.assert_array_equal(constant((-0.3, 0, 0), TRAINED, said.append)(9.0), [-0.2, 0, 0])
     assert len(said) == 2 and "2 of 3 commands were clipped to what the policy was" in said[0]
     assert "-0.3 0 0 was clipped to -0.2 0 0" in said[1] and "forward -0.2 to 0.2 m/s" in said[1]

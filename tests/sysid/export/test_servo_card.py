@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from benchmarks.card_of_fits import to_card, to_drive_card
-from pupper_sysid.common.errors import FileExistsRefusal, InputError
+from pupper_sysid.common.errors import FileExistsRefusal
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
@@ -26,6 +26,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
 from pupper_sysid.sysid.fit.joint_fit import LoadedFit, StructureFit
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
+from support.refusals import assert_each_refused
 
 SOURCE = Source(title="a bench", url="https://example.org/bench", licence="MIT")
 PER_INERTIA = {
@@ -60,7 +61,10 @@ def fit() -> LoadedFit:
 
 
 def test_the_stall_torque_of_the_data_sheet_sets_the_scale_where_the_load_is_unknown():
-    card = to_card("mine", "Feetech STS3215", {"j": fit()}, [], SOURCE, "an arm", supply_v=12.0)
+    def made(fits, **more):
+        return to_card("mine", "Feetech STS3215", fits, [], SOURCE, "an arm", **more)
+
+    card = made({"j": fit()}, supply_v=12.0)
     numbers = card.numbers
     assert isinstance(numbers, LoadedLoop)
     stall = 30 * 0.0980665  # kg·cm of its data sheet
@@ -71,6 +75,7 @@ def test_the_stall_torque_of_the_data_sheet_sets_the_scale_where_the_load_is_unk
     assert numbers.back_emf_nm_s_per_rad.value == pytest.approx(25.0 * stall / 100.0)
     assert numbers.duty_per_rad.value == 0.2  # no torque: no scale
     assert card.gains.p == 16.0 and not card.published
+    assert_each_refused([({}, "needs a fit"), ({"j": fit()}, "no supply voltage")], made)
 
 
 def test_gains_in_newton_metres_set_the_scale_of_a_drive(tmp_path):
@@ -86,13 +91,6 @@ def test_gains_in_newton_metres_set_the_scale_of_a_drive(tmp_path):
     assert damping.low == pytest.approx(0.9 * damping.value) and damping.identified == "yes"
     assert numbers.friction_loss_nm.why == "it cannot be distinguished from none"
     assert numbers.effort_limit_nm.value == 60.0 and numbers.effort_limit_nm.identified == "no"
-
-
-def test_a_card_without_a_fit_or_a_voltage_is_refused():
-    with pytest.raises(InputError, match="needs a fit"):
-        to_card("mine", "Feetech STS3215", {}, [], SOURCE, "an arm")
-    with pytest.raises(InputError, match="no supply voltage"):
-        to_card("mine", "Feetech STS3215", {"j": fit()}, [], SOURCE, "an arm")
 
 
 def test_the_drives_measured_damping_agrees_with_the_gain_that_was_set():
@@ -133,22 +131,6 @@ def with_one_measurement() -> Calibration:
     return paper.model_copy(update={"joints": {**paper.joints, "LF_hip": measured}})
 
 
-def test_a_calibration_becomes_one_row_per_joint_and_quantity_with_its_unit():
-    table = table_of(to_csv(load_calibration("paper")))
-    assert tuple(table.columns) == CALIBRATION_COLUMNS
-    assert not table.duplicated(["joint", "part", "quantity"]).any()
-    quantities = table[table.identified.notna()]
-    assert quantities.groupby("joint", sort=False).size().to_dict() == dict.fromkeys(
-        JOINT_NAMES, QUANTITIES_PER_JOINT
-    )
-    assert set(table[table.identified.isna()].quantity) == PLAIN_NUMBERS
-    # the same quantity over and not over the armature are kept apart
-    table = table_of(to_csv(load_calibration("release"))).set_index(["joint", "part", "quantity"])
-    assert table.loc[("RB_calf", "actuator", "stiffness_nm_per_rad"), "unit"] == "N·m/rad"
-    ratio = table.loc[("RB_calf", "ratios_to_armature", "stiffness")]
-    assert (ratio["value"], ratio["unit"]) == (80.0 / 0.005, "1/s²")
-
-
 def test_a_number_keeps_its_value_interval_and_reason_exactly():
     table = table_of(to_csv(with_one_measurement()))
     row = table[(table.joint == "LF_hip") & (table.quantity == "dead_time_s")].iloc[0].to_dict()
@@ -165,14 +147,27 @@ def test_a_number_keeps_its_value_interval_and_reason_exactly():
     ]
 
 
-def test_the_table_of_a_calibration_says_where_it_comes_from():
+def test_a_calibration_becomes_one_row_per_joint_and_quantity_with_its_unit_and_source():
     paper = load_calibration("paper")
+    table = table_of(to_csv(paper))
+    assert tuple(table.columns) == CALIBRATION_COLUMNS
+    assert not table.duplicated(["joint", "part", "quantity"]).any()
+    quantities = table[table.identified.notna()]
+    assert quantities.groupby("joint", sort=False).size().to_dict() == dict.fromkeys(
+        JOINT_NAMES, QUANTITIES_PER_JOINT
+    )
+    assert set(table[table.identified.isna()].quantity) == PLAIN_NUMBERS
     lines = [line[2:] for line in to_csv(paper).splitlines() if line.startswith("# ")]
     assert lines[0] == "pupper-sysid calibration table"
     said = {key: json.loads(value) for key, _, value in (s.partition(": ") for s in lines[1:])}
     assert said["schema"] == "pupper-calibration" and said["schema_version"] == 4
     assert said["created"] == paper.created and said["units"] == paper.units
     assert said["notes"] == list(paper.notes)
+    # the same quantity over and not over the armature are kept apart
+    table = table_of(to_csv(load_calibration("release"))).set_index(["joint", "part", "quantity"])
+    assert table.loc[("RB_calf", "actuator", "stiffness_nm_per_rad"), "unit"] == "N·m/rad"
+    ratio = table.loc[("RB_calf", "ratios_to_armature", "stiffness")]
+    assert (ratio["value"], ratio["unit"]) == (80.0 / 0.005, "1/s²")
 
 
 def sweep_file(folder: Path) -> Path:

@@ -352,17 +352,13 @@ def test_advice_says_what_to_record_next_and_why():
     assert gap.startswith("LF_hip, LF_thigh: only 2 frequencies (1, 2 Hz)")
 
 
-def test_a_reading_that_is_late_is_wrong_by_speed_times_age():
+def test_a_late_reading_is_wrong_by_speed_times_age_and_a_window_holds_whole_periods_of_its_trial():
     for track in tracks(result_of()):
         assert np.max(np.abs(track.fresh_error_rad)) < 1e-12
         moving = np.abs(track.row_speed_rad_s) > 0.5 * np.max(np.abs(track.row_speed_rad_s))
         slope = track.row_error_rad[moving] / track.row_speed_rad_s[moving]
         # the joint turns within the reading's age, so only the average is the age
         assert np.mean(slope) == pytest.approx(-AGE_S, rel=0.15)
-
-
-def test_a_window_lies_inside_its_trial_and_holds_whole_periods():
-    for track in tracks(result_of()):
         start, stop = window(track, periods=1.5)
         assert 0 <= start < stop <= track.time_s[-1] + 1e-9
         assert (stop - start) * track.frequency_hz == pytest.approx(1.5)
@@ -382,7 +378,7 @@ def test_predicted_hold_runs_follow_from_poll_and_loss():
     assert runs.count.tolist() == [6, 2] + [0] * (LONGEST_RUN - 3) + [4]
 
 
-def test_letters_in_figures_are_nine_points_or_more():
+def test_letters_in_figures_are_nine_points_or_more_and_the_parts_of_a_lag_are_end_to_end():
     drawn = [
         figures.lag_budget_figure({"LF_thigh": result_of().lag}),
         figures.overlay_figure(result_of()),
@@ -392,6 +388,9 @@ def test_letters_in_figures_are_nine_points_or_more():
     for figure in drawn:
         sizes = [t.get_fontsize() for t in figure.findobj(Text) if t.get_text()]
         assert sizes and min(sizes) >= 9.0
+    bars = [p for p in drawn[0].axes[0].patches if p.get_width() > 0]
+    ends = [(b.get_x(), b.get_x() + b.get_width()) for b in bars]
+    assert np.ravel(ends) == pytest.approx([0, 9.5, 9.5, 33.5, 33.5, 53.5, 53.5, 81.0])
 
 
 @pytest.mark.parametrize("joints", (2, 4))
@@ -401,13 +400,6 @@ def test_a_legend_lies_within_its_figure(joints):
         FigureCanvasAgg(figure).draw()
         (legend,) = figure.legends
         assert legend.get_window_extent().width < figure.bbox.width
-
-
-def test_the_lag_figure_draws_the_parts_end_to_end():
-    figure = figures.lag_budget_figure({"LF_thigh": result_of().lag})
-    bars = [p for p in figure.axes[0].patches if p.get_width() > 0]
-    ends = [(b.get_x(), b.get_x() + b.get_width()) for b in bars]
-    assert np.ravel(ends) == pytest.approx([0, 9.5, 9.5, 33.5, 33.5, 53.5, 53.5, 81.0])
 
 
 def response_of() -> FrequencyResponse:
