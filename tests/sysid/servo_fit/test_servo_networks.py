@@ -19,60 +19,25 @@ from pupper_sysid.sysid.servo_fit.scores import tracks
 from pupper_sysid.sysid.servo_fit.training import Checkpoint, Recipe, train
 from pupper_sysid.sysid.servo_fit.windows import Samples, fit_linear, samples, training_sets
 from support.refusals import assert_each_refused
+from support.saved_servo_models import KINDS, MEMBERS, TAPS, UNITS, arrays
 from support.servo_recordings import everything, recording, trial
 
 P = 0.04  # with fewer taps than at 50 Hz, the same claims cost less
 JOINTS = ("LF_hip", "RB_calf")
 HIP = JOINTS[:1]
-TAPS = 6
+LEARNED = KINDS[:5]
 
 # ------------------------------------------------------------------------------- models
 
 
-def linear_parameters() -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(0)
-    return {
-        "command_center": rng.normal(size=2), "command_scale": rng.uniform(0.2, 0.6, 2),
-        "position_center": rng.normal(size=2), "position_scale": rng.uniform(0.2, 0.6, 2),
-        "bound": rng.uniform(0.2, 0.4, 2), "fir": 0.3 * rng.normal(size=(2, TAPS)),
-        "fir_bias": 0.1 * rng.normal(size=2),
-    }  # fmt: skip
-
-
-def mlp(feedback: bool = False, gain: float = 0.5, units: int = 9) -> CommandNetwork:
-    rng = np.random.default_rng(1)
-    network = {}
-    for n, (a, b) in enumerate([(TAPS + feedback, units), (units, units), (units, 1)]):
-        network |= {f"weight_{n}": gain * rng.normal(size=(2, a, b))}
-        network |= {f"bias_{n}": gain * rng.normal(size=(2, b))}
-    return CommandNetwork(JOINTS, P, linear_parameters() | network, feedback)
-
-
-def lstm(
-    feedback: bool = False, gain: float = 0.5, members: int = 3, **changes
-) -> RecurrentNetwork:
-    rng = np.random.default_rng(2)
-    network = {
-        "weight_input": gain * rng.normal(size=(2, members, 1 + feedback, 20)),
-        "weight_hidden": gain * rng.normal(size=(2, members, 5, 20)),
-        "bias": gain * rng.normal(size=(2, members, 20)),
-        "weight_out": gain * rng.normal(size=(2, members, 5)),
-        "bias_out": gain * rng.normal(size=(2, members)),
+def network(kind: str, gain: float = 1.0, **changes) -> CommandNetwork | RecurrentNetwork:
+    """A model of two joints with random weights, those of its network times `gain`."""
+    own = {
+        name: values[:2] * (gain if name.startswith(("weight", "bias")) else 1.0)
+        for name, values in arrays(kind).items()
     }
-    return RecurrentNetwork(JOINTS, P, linear_parameters() | network | changes, feedback)
-
-
-def fir() -> CommandNetwork:
-    return CommandNetwork(JOINTS, P, linear_parameters())
-
-
-MODELS = {
-    "fir": fir,
-    "mlp": mlp,
-    "mlp with feedback": lambda: mlp(feedback=True),
-    "lstm": lstm,
-    "lstm with feedback": lambda: lstm(feedback=True),
-}
+    make = RecurrentNetwork if kind.startswith("lstm") else CommandNetwork
+    return make(JOINTS, P, own | changes, "feedback" in kind)
 
 
 def commands(*shape: int) -> np.ndarray:
@@ -87,8 +52,8 @@ def ran(model, moves, start) -> np.ndarray:
 
 def test_environments_steps_and_pieces_of_a_rollout_are_one_motion_and_a_reset_forgets_it():
     moves, start = commands(30, 3, 4), commands(3, 4)
-    for kind, make in MODELS.items():
-        model = make()
+    for kind in LEARNED:
+        model = network(kind)
         together = ran(model, moves, start)
         assert together.shape == (30, 3, 4, 2), kind
         for place in ((0, 0), (2, 3)):
@@ -107,32 +72,34 @@ def test_environments_steps_and_pieces_of_a_rollout_are_one_motion_and_a_reset_f
 def test_joints_do_not_see_each_other():
     moves, other = commands(20), commands(20)
     other[:, 1] = 5.0
-    for kind, make in MODELS.items():
-        before, after = (ran(make(), m, np.zeros(2)) for m in (moves, other))
+    for kind in LEARNED:
+        before, after = (ran(network(kind), m, np.zeros(2)) for m in (moves, other))
         np.testing.assert_allclose(after[:, 0], before[:, 0], atol=1e-6, err_msg=kind)
         assert np.abs(after[:, 1] - before[:, 1]).max() > 0.1, kind
 
 
 def test_the_filter_weighs_the_newest_command_first_in_normalised_units():
-    p = linear_parameters()
+    model = network("fir")
+    p = model.parameters
     impulse = np.tile(p["command_center"], (TAPS + 2, 1))
     impulse[0] += p["command_scale"]
-    answer = (ran(fir(), impulse, p["command_center"]) - p["position_center"]) / p["position_scale"]
+    answer = (ran(model, impulse, p["command_center"]) - p["position_center"]) / p["position_scale"]
     np.testing.assert_allclose(answer[:TAPS] - p["fir_bias"], p["fir"].T, atol=1e-6)
     np.testing.assert_allclose(answer[TAPS:], np.tile(p["fir_bias"], (2, 1)), atol=1e-6)
 
 
-@pytest.mark.parametrize("make", [mlp, lstm])
-def test_a_network_gone_wild_moves_the_position_by_no_more_than_its_bound(make):
-    p, moves = linear_parameters(), 10 * commands(40)
-    moved = np.abs(ran(make(gain=1e4), moves, np.zeros(2)) - ran(fir(), moves, np.zeros(2)))
+@pytest.mark.parametrize("kind", ["mlp", "lstm"])
+def test_a_network_gone_wild_moves_the_position_by_no_more_than_its_bound(kind):
+    wild, linear, moves = network(kind, 1e4), network(kind, 0.0), 10 * commands(40)
+    p = wild.parameters
+    moved = np.abs(ran(wild, moves, np.zeros(2)) - ran(linear, moves, np.zeros(2)))
     assert (moved <= p["bound"] * p["position_scale"] * (1 + 1e-4) + 1e-5).all()
     assert moved.max() > 0.05  # it does try
 
 
-@pytest.mark.parametrize("make", [mlp, lstm])
-def test_one_step_from_its_own_predictions_is_the_free_run(make):
-    model, moves, start = make(feedback=True), commands(25), np.array([0.1, -0.4])
+@pytest.mark.parametrize("kind", ["mlp", "lstm"])
+def test_one_step_from_its_own_predictions_is_the_free_run(kind):
+    model, moves, start = network(f"{kind} with feedback"), commands(25), np.array([0.1, -0.4])
     free = ran(model, moves, start)
     own = np.concatenate([start[None], free[:-1]])
     model.reset(start)
@@ -142,13 +109,19 @@ def test_one_step_from_its_own_predictions_is_the_free_run(make):
 
 
 def test_the_lstm_is_that_of_torch():
-    ours = lstm(members=1, bound=np.full(2, np.inf), fir=np.zeros((2, 1)), fir_bias=np.zeros(2))
+    one = {
+        name: values[:2, :1]
+        for name, values in arrays("lstm").items()
+        if name.startswith(("weight", "bias"))
+    }
+    flat = {"bound": np.full(2, np.inf), "fir": np.zeros((2, 1)), "fir_bias": np.zeros(2)}
+    ours = network("lstm", **one, **flat)
     ours.warm_up = 0
     moves = commands(50)
     motion = ran(ours, moves, np.zeros(2))
     p = ours.parameters
     for j in range(2):
-        theirs = torch.nn.LSTM(1, 5)
+        theirs = torch.nn.LSTM(1, UNITS)
         with torch.no_grad():  # torch's gates are i, f, g, o as well, with two biases
             theirs.weight_ih_l0.copy_(torch.from_numpy(p["weight_input"][j, 0].T))
             theirs.weight_hh_l0.copy_(torch.from_numpy(p["weight_hidden"][j, 0].T))
@@ -162,48 +135,49 @@ def test_the_lstm_is_that_of_torch():
 
 
 def test_members_are_averaged_and_silent_ones_leave_the_filter():
-    moves, p = commands(20), lstm(members=3).parameters
+    moves, p = commands(20), network("lstm").parameters
     parts = []
-    for m in range(3):
+    for m in range(MEMBERS):
         one = {k: v[:, m : m + 1] if k.startswith(("weight", "bias")) else v for k, v in p.items()}
         parts.append(ran(RecurrentNetwork(JOINTS, P, one), moves, np.zeros(2)))
     np.testing.assert_allclose(
-        ran(lstm(members=3), moves, np.zeros(2)), np.mean(parts, axis=0), atol=2e-6
+        ran(network("lstm"), moves, np.zeros(2)), np.mean(parts, axis=0), atol=2e-6
     )
-    silent, linear = (ran(model, moves, np.full(2, 0.2)) for model in (lstm(gain=0.0), fir()))
+    ends = network("lstm", 0.0), network("fir")
+    silent, linear = (ran(model, moves, np.full(2, 0.2)) for model in ends)
     np.testing.assert_allclose(silent, linear, atol=1e-6)
 
 
 def test_damaged_parameters_are_refused_by_name():
-    def changed(make, **change):
-        return lambda: type(make())(JOINTS, P, make().parameters | change)
+    def changed(kind, **change):
+        return lambda: network(kind, **change)
 
-    p, cases = linear_parameters(), []
-    for make in (mlp, lstm):
+    p, cases = network("fir").parameters, []
+    for kind in ("mlp", "lstm"):
         cases += [
-            (changed(make, fir=p["fir"] * np.nan), "fir holds NaN"),
-            (changed(make, fir_bias=np.full(2, np.inf)), "fir_bias holds NaN or infinite"),
-            (changed(make, bound=np.full(2, np.nan)), "bound holds NaN"),
-            (changed(make, bound=np.zeros(2)), "bound must be positive"),
-            (changed(make, command_scale=np.array([1.0, 0.0])), "command_scale must be positive"),
-            (changed(make, position_center=np.zeros(3)), "position_center"),
-            (changed(make, fir=p["fir"][0]), "fir"),
-            (changed(make, **{k: v[:1] for k, v in make().parameters.items()}), "2 joints"),
+            (changed(kind, fir=p["fir"] * np.nan), "fir holds NaN"),
+            (changed(kind, fir_bias=np.full(2, np.inf)), "fir_bias holds NaN or infinite"),
+            (changed(kind, bound=np.full(2, np.nan)), "bound holds NaN"),
+            (changed(kind, bound=np.zeros(2)), "bound must be positive"),
+            (changed(kind, command_scale=np.array([1.0, 0.0])), "command_scale must be positive"),
+            (changed(kind, position_center=np.zeros(3)), "position_center"),
+            (changed(kind, fir=p["fir"][0]), "fir"),
+            (changed(kind, **{k: v[:1] for k, v in network(kind).parameters.items()}), "2 joints"),
         ]
     for missing in ("fir", "bound", "position_scale", "bias_0"):
-        rest = {k: v for k, v in mlp().parameters.items() if k != missing}
+        rest = {k: v for k, v in network("mlp").parameters.items() if k != missing}
         cases.append((lambda rest=rest: CommandNetwork(JOINTS, P, rest), missing))
-    for make in MODELS.values():
-        own, kind = make().parameters, type(make())
+    for one in map(network, LEARNED):
+        own, make = one.parameters, type(one)
         cases += [
-            (lambda make=make: make().reset(np.zeros(3)), "last axis must be the joints"),
-            (lambda own=own, kind=kind: kind(JOINTS, 0.0, own), "time_step_s"),
-            (lambda own=own, kind=kind: kind((*JOINTS, "LB_hip"), P, own), "3 joints"),
+            (lambda one=one: one.reset(np.zeros(3)), "last axis must be the joints"),
+            (lambda own=own, make=make: make(JOINTS, 0.0, own), "time_step_s"),
+            (lambda own=own, make=make: make((*JOINTS, "LB_hip"), P, own), "3 joints"),
         ]
-    narrow = mlp().parameters["weight_1"][..., :-1]
-    cases.append((changed(mlp, weight_1=narrow), "bias_1"))
-    narrow = lstm().parameters["weight_hidden"][..., :-1]
-    cases.append((changed(lstm, weight_hidden=narrow), "weight_hidden"))
+    narrow = network("mlp").parameters["weight_1"][..., :-1]
+    cases.append((changed("mlp", weight_1=narrow), "bias_1"))
+    narrow = network("lstm").parameters["weight_hidden"][..., :-1]
+    cases.append((changed("lstm", weight_hidden=narrow), "weight_hidden"))
     assert_each_refused(cases, lambda make: make())
 
 
