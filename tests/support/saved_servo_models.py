@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.servo_models.networks import CommandNetwork
 from pupper_sysid.servo_models.servo_file import (
     SavedModel,
     input_names,
@@ -94,3 +95,23 @@ def saved(folder: Path, kind: str = "mlp", seed: int = 0) -> SavedModel:
 
 def commands(steps: int = 40, joints: int = len(JOINTS)) -> NDArray:
     return 0.4 * np.random.default_rng(9).normal(size=(steps, joints)).cumsum(0) / 4
+
+
+def linear_filter(
+    joints: tuple[str, ...], period_s: float, *fir: float, center: Any = 0.0,
+    feedback: float | None = None,
+) -> CommandNetwork:  # fmt: skip
+    """position = fir · last commands about `center` [rad]; with `feedback`, times the last position
+    besides.
+    """
+    n = len(joints)
+    own: Arrays = {
+        "command_center": np.zeros(n) + center, "command_scale": np.ones(n),
+        "position_center": np.zeros(n) + center, "position_scale": np.ones(n),
+        "bound": np.full(n, np.inf), "fir_bias": np.zeros(n), "fir": np.tile(fir, (n, 1)),
+    }  # fmt: skip
+    if feedback is not None:
+        weight = np.zeros((n, len(fir) + 1, 1))
+        weight[:, -1] = feedback
+        own |= {"weight_0": weight, "bias_0": np.zeros((n, 1))}
+    return CommandNetwork(joints, period_s, own, feedback is not None)

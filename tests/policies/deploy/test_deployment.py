@@ -26,12 +26,12 @@ from pupper_sysid.policies.deploy.observers import ServoModelObserver
 from pupper_sysid.policies.deploy.stacks import STACKS, Stack, suited
 from pupper_sysid.policies.deploy.walk_log import read_walk, replay
 from pupper_sysid.policies.network.policy_file import CommandRanges, Policy
-from pupper_sysid.servo_models.networks import CommandNetwork
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.bus import WalkingBus
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 from support.refusals import assert_each_refused
+from support.saved_servo_models import linear_filter
 from support.tiny_training import CALIBRATION
 
 JOINTS = load_joint_map("mini_pupper_2")
@@ -260,16 +260,9 @@ def test_what_is_sent_grows_over_the_fade_in(policy, tmp_path):
 
 
 def test_the_policy_is_shown_a_servo_model_in_place_of_readings(policy):
-    pose, ones = np.array(list(policy.contract.default_pose_rad.values())), np.ones(12)
+    pose = np.array(list(policy.contract.default_pose_rad.values()))
     bent = JOINTS.per_servo().to_angles(JOINTS.to_counts(pose))
-    model = CommandNetwork(
-        JOINTS.joint_names, 0.02,
-        {
-            "command_center": bent, "command_scale": ones, "position_center": bent,
-            "position_scale": ones, "bound": np.full(12, np.inf), "fir_bias": 0 * ones,
-            "fir": 0.5 * ones[:, None],
-        },
-    )  # fmt: skip
+    model = linear_filter(JOINTS.joint_names, 0.02, 0.5, center=bent)
     trotting = Trotting(policy.network, policy.contract)
     stack = Stack("servo-model", fade_in_s=0.0)
     controller = Controller(trotting, stack, ServoModelObserver(model, 0.02), JOINTS)

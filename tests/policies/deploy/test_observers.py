@@ -22,6 +22,7 @@ from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.networks import CommandNetwork
 from support.observer_response import response
 from support.refusals import assert_each_refused
+from support.saved_servo_models import linear_filter
 
 P = 0.02
 CALIBRATED = DelayedPDParameters(
@@ -36,21 +37,15 @@ CALIBRATED = DelayedPDParameters(
 UNKNOWN = np.full(12, np.nan)
 
 
-def servo_model(period_s: float = P, joints: tuple[str, ...] = JOINT_NAMES) -> CommandNetwork:
+def one_period_late(period_s: float = P) -> CommandNetwork:
     """Each joint is where it was told to be one period ago."""
-    n = len(joints)
-    values = {
-        "command_center": np.zeros(n), "command_scale": np.ones(n), "position_center": np.zeros(n),
-        "position_scale": np.ones(n), "bound": np.full(n, np.inf), "fir_bias": np.zeros(n),
-        "fir": np.tile([0.0, 1.0, 0.0], (n, 1)),
-    }  # fmt: skip
-    return CommandNetwork(joints, period_s, values)
+    return linear_filter(JOINT_NAMES, period_s, 0.0, 1.0, 0.0)
 
 
 OBSERVERS: dict[str, Callable[[], Observer]] = {
     "synthetic PD": lambda: SyntheticPD(CALIBRATED, P),
     "paper PD": lambda: SyntheticPD.paper(P),
-    "servo model": lambda: ServoModelObserver(servo_model(), P),
+    "servo model": lambda: ServoModelObserver(one_period_late(), P),
     "held encoder": lambda: HeldEncoder(P, 4),
     "zero": lambda: Zero(P),
 }
@@ -203,8 +198,8 @@ def test_the_papers_preset_resonates_as_published():
 
 def test_a_servo_model_runs_freely_and_its_velocity_is_the_difference():
     # a recorded rate is never quite the one that was asked for
-    assert ServoModelObserver(servo_model(period_s=1.0002 * P), P).period_s == P
-    observer = ServoModelObserver(servo_model(), P)
+    assert ServoModelObserver(one_period_late(1.0002 * P), P).period_s == P
+    observer = ServoModelObserver(one_period_late(), P)
     observer.reset(np.zeros(12))
     targets = [np.full(12, x) for x in (0.1, 0.3, 0.2)]
     found = [observer.step(t, np.full(12, 99.0)) for t in targets]

@@ -29,6 +29,7 @@ from pupper_sysid.sysid.servo_fit.scores import (
     rms,
     tracks,
 )
+from support.saved_servo_models import linear_filter
 from support.servo_recordings import JOINT, P, everything, ramp, recording, sine, trial
 
 ROWS = 120
@@ -105,21 +106,10 @@ def test_splits_that_would_test_on_seen_data_are_refused():
 
 # ----- scores of servo models, worked out by hand or known from theory
 
-ONE, ZERO = np.ones(1), np.zeros(1)
 
-
-def follower(*fir: float, feedback: float | None = None, joints=(JOINT,)) -> CommandNetwork:
-    """position = fir · last commands, in rad; with `feedback`, times the last position besides."""
-    count = len(joints)
-    p = {"command_center": ZERO, "command_scale": ONE, "position_center": ZERO}
-    p |= {"position_scale": ONE, "bound": np.full(1, np.inf), "fir_bias": ZERO}
-    p |= {"fir": np.array([fir])}
-    if feedback is not None:
-        weight = np.zeros((1, len(fir) + 1, 1))
-        weight[0, -1, 0] = feedback
-        p |= {"weight_0": weight, "bias_0": np.zeros((1, 1))}
-    wide = {k: np.repeat(v, count, axis=0) for k, v in p.items()}
-    return CommandNetwork(joints, P, wide, feedback is not None)
+def follower(*fir: float, joints=(JOINT,), **feedback: float) -> CommandNetwork:
+    """position = fir · last commands, in rad."""
+    return linear_filter(joints, P, *fir, **feedback)
 
 
 def made(**arrays) -> Errors:
