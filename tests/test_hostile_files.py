@@ -28,6 +28,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.io import savemat
 
 from pupper_sysid.common.errors import PupperError
 from pupper_sysid.hardware.feetech import SERIES, Frame, FrameReader, Series
@@ -123,6 +124,10 @@ def ktune(folder: Path) -> None:
 
 def npz(folder: Path) -> None:
     np.savez_compressed(folder / "log.npz", time=TIME, command=WAVE, position=LATE)
+
+
+def matlab(folder: Path) -> None:
+    savemat(folder / "log.mat", {"t": TIME, "cmd": WAVE, "pos": WAVE}, do_compression=True)
 
 
 def npy(folder: Path) -> None:
@@ -277,6 +282,7 @@ KINDS = {
     "BAM": Kind(bam, "bam.json", load),
     "ktune": Kind(ktune, "ktune.json", load),
     "npz": Kind(npz, "log.npz", load),
+    "MATLAB": Kind(matlab, "log.mat", load),
     "parquet": Kind(parquet, "log.parquet", load, "pyarrow"),
     "SAGE": Kind(sage, "control.csv", lambda path: load(path.parent)),
     "LeRobot": Kind(lerobot, "meta/info.json", lambda path: load(path.parents[1]), "pyarrow"),
