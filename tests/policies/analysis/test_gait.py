@@ -99,12 +99,15 @@ def test_an_interval_grows_with_the_wandering_of_the_rhythm():
     assert np.median(width) > 0.5 / (2 * np.pi * np.sqrt(10.0))
 
 
-def test_a_strong_drift_and_a_still_joint_do_not_hide_the_gait():
+def test_a_strong_drift_and_a_still_joint_do_not_hide_the_gait_and_are_none():
     joints, _ = trot(10.0)
     time = STEP_S * np.arange(len(joints))
     joints[:, 0] = 0.4
     joints[:, 1] += 0.5 * np.sin(2 * np.pi * 0.1 * time)
     assert frequency(joints, STEP_S).value == pytest.approx(3.25, abs=0.01)
+    # drift has its best sine below 0.5 Hz, which is no gait
+    assert sine_frequency((time[:, None] / 10) ** 2, STEP_S) >= 0.5
+    assert sine_frequency(np.sin(2 * np.pi * 12.6 * time)[:, None], STEP_S) <= 12.5
 
 
 def test_signals_that_are_short_still_or_of_other_shapes_are_refused():
@@ -177,7 +180,7 @@ def test_phases_are_shares_of_a_cycle_behind_the_first_even_if_the_rhythm_wander
     np.testing.assert_allclose(phases(np.cos(angle), STEP_S, 3.0), late, atol=0.01)
 
 
-def test_feet_that_take_turns_count_against_and_independent_ones_not_at_all():
+def test_feet_that_take_turns_count_against_and_stances_are_where_the_foot_changes():
     rng = np.random.default_rng(7)
     beat = np.arange(1000) % 10 < 5
     # LF with LB, RF with RB: a pace
@@ -185,9 +188,6 @@ def test_feet_that_take_turns_count_against_and_independent_ones_not_at_all():
     for stands in (0.5, 0.9):
         found = diagonal_coordination(rng.random((20_000, 4)) < stands)
         assert found == pytest.approx(0.0, abs=0.02)
-
-
-def test_stances_and_swings_are_where_the_foot_changes():
     down = np.array([0, 1, 1, 1, 0, 0, 1], bool)
     np.testing.assert_allclose(intervals(down, 0.02), [[0.02, 0.06], [0.12, 0.02]])
     np.testing.assert_allclose(intervals(~down, 0.02), [[0.0, 0.02], [0.08, 0.04]])
@@ -292,11 +292,3 @@ def test_one_robot_has_only_its_own_interval_and_robots_that_stand_have_no_rhyth
     assert np.isnan(found.frequency_hz.value) and np.isnan(found.phase[0].value)
     assert found.rhythmic == 0.0 and found.action_r2.value == 0.0 and found.jitter_rad.value == 0.0
     assert found.duty[0].value == 1.0
-
-
-def test_the_search_for_a_sine_keeps_to_its_band():
-    """Drift has its best sine below 0.5 Hz, which is no gait."""
-    drift = np.linspace(0.0, 1.0, 500)[:, None] ** 2
-    assert sine_frequency(drift, STEP_S) >= 0.5
-    fast = np.sin(2 * np.pi * 12.6 * STEP_S * np.arange(500))[:, None]
-    assert sine_frequency(fast, STEP_S) <= 12.5

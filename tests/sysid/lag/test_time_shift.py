@@ -1,7 +1,6 @@
 """Lag of recordings without tones: the staircase, its impulse response and the time shift."""
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from scipy.signal import lfilter
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
 from pupper_sysid.sysid.lag.held_command import HeldCommand, Stretch, past_tones
-from pupper_sysid.sysid.lag.lag_budget import LagBudget, command_hold, lag_budget, shift_draws
+from pupper_sysid.sysid.lag.lag_budget import command_hold, lag_budget, shift_draws
 from pupper_sysid.sysid.lag.step_response import _SIZES, ImpulseResponse, _evidence
 from pupper_sysid.sysid.recordings.recording import Trial
 from support.refusals import assert_each_refused
@@ -35,12 +34,15 @@ def minimum_jerk(rng, count=60):
     return command
 
 
-def test_means_of_the_staircase_are_exact_between_its_edges():
+def test_means_of_the_staircase_are_exact_and_its_hold_weighs_loops_by_their_motion():
     held = HeldCommand.of(rows([0.0, 1.0, 3.0], [2.0, 4.0, 0.0]))
     # of the last second before 1.5: half at 2, half at 4; of the one before: half before the start
     means = held.means(np.array([1.5]), np.array([0.0, 1.0, 2.0]))
     np.testing.assert_allclose(means, [[3.0, 1.0]])
     np.testing.assert_allclose(held.levels(0.0, 3.01, 1.0)[1], [2.0, 4.0, 4.0])
+    assert command_hold([rows([0.0, 0.02, 0.04], [0.0, 1.0, 3.0])]) == pytest.approx(0.01)
+    # all the motion is in the long loop
+    assert command_hold([rows([0.0, 0.02, 0.06], [1.0, 1.0, 3.0])]) == pytest.approx(0.02)
 
 
 def test_means_of_a_tone_are_those_of_its_integral():
@@ -60,12 +62,6 @@ def test_likelihoods_are_those_of_the_eigenvalues():
     np.testing.assert_allclose(complexity, np.log(grown).sum(axis=1), rtol=1e-9)
     expected = np.sum((vector.T @ moment) ** 2 * _SIZES[:, None] / grown, axis=1)
     np.testing.assert_allclose(fitted, expected, rtol=1e-9)
-
-
-def test_the_hold_is_half_a_loop_and_weighs_loops_by_their_motion():
-    assert command_hold([rows([0.0, 0.02, 0.04], [0.0, 1.0, 3.0])]) == pytest.approx(0.01)
-    # all the motion is in the long loop
-    assert command_hold([rows([0.0, 0.02, 0.06], [1.0, 1.0, 3.0])]) == pytest.approx(0.02)
 
 
 def test_a_jump_between_two_readings_leaves_the_lag_open_to_a_loop():
@@ -112,20 +108,21 @@ def test_slow_motion_of_coarse_counts_behind_a_poll_is_not_taken_for_a_leading_j
     assert b.lag_s.high - b.lag_s.low < 0.03
 
 
-@cache
-def fast_loop() -> LagBudget:
-    """Of a slow servo without tones, read live every 10 ms."""
+def test_parts_without_tones_add_up_live_readings_add_nothing_and_dynamics_below_zero_are_said():
     rng = np.random.default_rng(1)
     trial = first_order_trial(minimum_jerk(rng), 0.02, 0.05, loop_s=0.01)
-    return lag_budget("LF_hip", [trial], rng)
-
-
-def test_parts_without_tones_add_up_and_live_readings_add_nothing():
-    b = fast_loop()
+    b = lag_budget("LF_hip", [trial], rng)
     assert b.feedback.readings == "live"
     assert b.stale_lag_s == pytest.approx(0.0, abs=1e-9)
     assert b.command_hold_s == pytest.approx(0.005, abs=1e-6)
     assert b.raw_lag_s.value == pytest.approx(b.lag_s.value + b.command_hold_s + b.stale_lag_s)
+    fits = b.with_dead_time(Interval(0.02, 0.018, 0.022), 0.0)
+    assert fits.warnings == b.warnings
+    late = b.lag_s.value + 0.01
+    apart = b.with_dead_time(Interval(late, b.lag_s.high + 0.001, late + 0.01), 0.0)
+    assert "is longer than the lag" in apart.warnings[-1] and "wrong" in apart.warnings[-1]
+    near = b.with_dead_time(Interval(late, b.lag_s.low, late + 0.01), 0.0)
+    assert "within their intervals" in near.warnings[-1]
 
 
 def test_motion_that_is_no_answer_to_its_command_is_refused():
@@ -160,14 +157,3 @@ def test_draws_that_begin_at_different_times_do_not_lose_the_lag_they_share():
     response = ImpulseResponse(edges, masses, np.ones((30, 8)), (stretch,), 1.0)
     # 1.6 · 65 - 0.6 · 95 ms in the middle of the three
     assert np.median(shift_draws(response, rng)) == pytest.approx(0.047, abs=0.01)
-
-
-def test_dynamics_below_zero_are_said_to_be_so():
-    b = fast_loop()
-    fits = b.with_dead_time(Interval(0.02, 0.018, 0.022), 0.0)
-    assert fits.warnings == b.warnings
-    late = b.lag_s.value + 0.01
-    apart = b.with_dead_time(Interval(late, b.lag_s.high + 0.001, late + 0.01), 0.0)
-    assert "is longer than the lag" in apart.warnings[-1] and "wrong" in apart.warnings[-1]
-    near = b.with_dead_time(Interval(late, b.lag_s.low, late + 0.01), 0.0)
-    assert "within their intervals" in near.warnings[-1]

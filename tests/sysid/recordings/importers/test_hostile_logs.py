@@ -1,4 +1,4 @@
-"""Oversized logs and strange names in them: refused before they are unpacked, or called otherwise."""
+"""Oversized logs are refused before they are unpacked, and strange names are called otherwise."""
 
 import sys
 import tracemalloc
