@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -43,27 +42,30 @@ observation:
 """The observation of this project's own policies."""
 
 
-def linear(weights: np.ndarray, path: Path, metadata: dict[str, str] | None = None) -> Path:
-    """A file of the policy `actions = weights @ observation`."""
-    helper, numpy_helper, kinds = onnx.helper, onnx.numpy_helper, onnx.TensorProto
-    actions, size = weights.shape
+def exported_by(
+    path: Path, nodes: Sequence[tuple], sizes: tuple[int, int],
+    metadata: dict[str, str] | None = None, **weights: np.ndarray,
+) -> Path:  # fmt: skip
+    """A file of a policy of `nodes` (operator, inputs, outputs, attributes), and its weights."""
+    helper, kinds = onnx.helper, onnx.TensorProto
+    ends = [
+        helper.make_tensor_value_info(name, kinds.FLOAT, [1, size])
+        for name, size in zip(("obs", "actions"), sizes, strict=True)
+    ]
     graph = helper.make_graph(
-        [helper.make_node("Gemm", ["obs", "w"], ["actions"], transB=1)], "policy",
-        [helper.make_tensor_value_info("obs", kinds.FLOAT, [1, size])],
-        [helper.make_tensor_value_info("actions", kinds.FLOAT, [1, actions])],
-        [numpy_helper.from_array(weights.astype(np.float32), "w")],
+        [helper.make_node(*node[:3], **dict(*node[3:])) for node in nodes], "policy",
+        ends[:1], ends[1:], [onnx.numpy_helper.from_array(w, name) for name, w in weights.items()],
     )  # fmt: skip
-    return saved(graph, path, metadata)
-
-
-def saved(graph: Any, path: Path, metadata: dict[str, str] | None = None) -> Path:
-    """A graph as a file."""
-    model = onnx.helper.make_model(
-        graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8
-    )
-    onnx.helper.set_model_props(model, metadata or {})
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    helper.set_model_props(model, metadata or {})
     onnx.save(model, str(path))
     return path
+
+
+def linear(weights: np.ndarray, path: Path, metadata: dict[str, str] | None = None) -> Path:
+    """A file of the policy `actions = weights @ observation`."""
+    gemm = ("Gemm", ["obs", "w"], ["actions"], {"transB": 1})
+    return exported_by(path, [gemm], weights.shape[::-1], metadata, w=weights.astype(np.float32))
 
 
 def as_mjlab(names: Sequence[str], pose: Sequence[float], terms: str = "") -> dict[str, str]:
@@ -261,19 +263,15 @@ def test_metadata_of_mjlabs_exporter_are_read(tmp_path):
 
 
 def test_a_network_for_one_robot_only_walks_robots_one_by_one(tmp_path):
-    helper, kinds = onnx.helper, onnx.TensorProto
     weights = np.arange(6, dtype=np.float32).reshape(2, 3)
-    graph = helper.make_graph(
-        [helper.make_node("Reshape", ["obs", "shape"], ["flat"]),
-         helper.make_node("MatMul", ["w", "flat"], ["y"]),
-         helper.make_node("Reshape", ["y", "back"], ["actions"])], "policy",
-        [helper.make_tensor_value_info("obs", kinds.FLOAT, [1, 3])],
-        [helper.make_tensor_value_info("actions", kinds.FLOAT, [1, 2])],
-        [onnx.numpy_helper.from_array(weights, "w"),
-         onnx.numpy_helper.from_array(np.array([3]), "shape"),
-         onnx.numpy_helper.from_array(np.array([1, 2]), "back")],
+    nodes = [
+        ("Reshape", ["obs", "shape"], ["flat"]), ("MatMul", ["w", "flat"], ["y"]),
+        ("Reshape", ["y", "back"], ["actions"]),
+    ]  # fmt: skip
+    network = OnnxNetwork(
+        exported_by(tmp_path / "one.onnx", nodes, (3, 2), w=weights, shape=np.array([3]),
+                    back=np.array([1, 2]))
     )  # fmt: skip
-    network = OnnxNetwork(saved(graph, tmp_path / "one.onnx"))
     given = np.eye(3, dtype=np.float32)
     np.testing.assert_allclose(network.run([given])[0], given @ weights.T)
 
@@ -312,35 +310,28 @@ def test_what_is_missing_or_does_not_fit_is_named_with_the_line_that_the_yaml_ne
 
 def _looping(tmp_path) -> Path:
     helper, kinds = onnx.helper, onnx.TensorProto
-    body = helper.make_graph(
-        [helper.make_node("Identity", ["go"], ["again"])], "body",
-        [helper.make_tensor_value_info("i", kinds.INT64, []),
-         helper.make_tensor_value_info("go", kinds.BOOL, [])],
-        [helper.make_tensor_value_info("again", kinds.BOOL, [])],
-    )  # fmt: skip
-    graph = helper.make_graph(
-        [helper.make_node("Loop", ["", "yes"], [], body=body),
-         helper.make_node("Identity", ["obs"], ["actions"])], "policy",
-        [helper.make_tensor_value_info("obs", kinds.FLOAT, [1, 2])],
-        [helper.make_tensor_value_info("actions", kinds.FLOAT, [1, 2])],
-        [onnx.numpy_helper.from_array(np.array(True), "yes")],
-    )  # fmt: skip
-    return saved(graph, tmp_path / "loop.onnx")
+    go, again = (helper.make_tensor_value_info(n, kinds.BOOL, []) for n in ("go", "again"))
+    count = helper.make_tensor_value_info("i", kinds.INT64, [])
+    same = helper.make_node("Identity", ["go"], ["again"])
+    body = helper.make_graph([same], "body", [count, go], [again])
+    nodes = [("Loop", ["", "yes"], [], {"body": body}), ("Identity", ["obs"], ["actions"])]
+    return exported_by(tmp_path / "loop.onnx", nodes, (2, 2), yes=np.array(True))
 
 
 def _huge(tmp_path) -> Path:
     """An outer product of 10¹⁰ numbers from a file of 800 kB."""
-    helper, kinds = onnx.helper, onnx.TensorProto
-    graph = helper.make_graph(
-        [helper.make_node("MatMul", ["a", "b"], ["ab"]),
-         helper.make_node("ReduceMean", ["ab"], ["mean"], keepdims=1),
-         helper.make_node("Add", ["obs", "mean"], ["actions"])], "policy",
-        [helper.make_tensor_value_info("obs", kinds.FLOAT, [1, 2])],
-        [helper.make_tensor_value_info("actions", kinds.FLOAT, [1, 2])],
-        [onnx.numpy_helper.from_array(np.ones((100_000, 1), np.float32), "a"),
-         onnx.numpy_helper.from_array(np.ones((1, 100_000), np.float32), "b")],
-    )  # fmt: skip
-    return saved(graph, tmp_path / "huge.onnx")
+    nodes = [
+        ("MatMul", ["a", "b"], ["ab"]), ("ReduceMean", ["ab"], ["mean"], {"keepdims": 1}),
+        ("Add", ["obs", "mean"], ["actions"]),
+    ]  # fmt: skip
+    ones = np.ones(100_000, np.float32)
+    return exported_by(tmp_path / "huge.onnx", nodes, (2, 2), a=ones[:, None], b=ones[None])
+
+
+def _not_onnx(tmp_path) -> Path:
+    path = tmp_path / "text.onnx"
+    path.write_text("hello")
+    return path
 
 
 def _outside(tmp_path) -> Path:
@@ -352,21 +343,13 @@ def _outside(tmp_path) -> Path:
     return path
 
 
-def _not_onnx(tmp_path) -> Path:
-    path = tmp_path / "text.onnx"
-    path.write_text("hello")
-    return path
-
-
-def _long(tmp_path) -> Path:
-    return linear(np.eye(2), tmp_path / "long.onnx", {"joint_names": "x," * 200_000})
-
-
 def test_hostile_files_are_refused_before_they_are_run(tmp_path):
+    long = {"joint_names": "x," * 200_000}
     assert_each_refused(
         [
             (_looping, "operator Loop"), (_huge, "1.0e+10 numbers"), (_outside, "another file"),
-            (_not_onnx, "no ONNX file"), (_long, "too long"),
+            (_not_onnx, "no ONNX file"),
+            (lambda t: linear(np.eye(2), t / "long.onnx", long), "too long"),
             (lambda t: linear(np.full((2, 2), np.nan), t / "nan.onnx"), "not numbers"),
             (lambda t: linear(np.zeros((2, 2)), t / "zero.onnx"), "constant"),
         ],
