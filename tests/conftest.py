@@ -2,6 +2,7 @@
 
 import gc
 import os
+import signal
 import sys
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from support.package import ROOT
 from support.real_recordings import real_recording
 
 sys.dont_write_bytecode = False
+# a shell lets what runs in its background ignore Ctrl-C, which tests press
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # the same examples on every machine; `--hypothesis-profile search` looks for new ones
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True, database=None)
