@@ -144,20 +144,19 @@ def test_a_child_process_neither_keeps_nor_removes_the_lock(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_thread_writes_what_its_process_holds(tmp_path):
-    path = tmp_path / "out.csv"
+def test_a_thread_writes_what_its_process_holds_and_a_folder_is_held_beside_it(tmp_path):
+    path, folder = tmp_path / "out.csv", tmp_path / "runs" / "a"
     with holding_outputs(), ThreadPoolExecutor(1) as pool:
         refuse_overwrite(path)
         pool.submit(write_text, path, "from a thread").result()
-    assert path.read_text() == "from a thread"
-
-
-def test_a_folder_is_held_beside_it(tmp_path):
-    folder = tmp_path / "runs" / "a"
-    with holding_outputs():
         hold_output(folder)
         assert not folder.exists()
-    assert not list(tmp_path.iterdir())  # also the folders that were made for the lock are gone
+    assert path.read_text() == "from a thread"
+    assert list(tmp_path.iterdir()) == [
+        path
+    ]  # also the folders that were made for the lock are gone
+    with holding_outputs(), pytest.raises(InputError, match="cannot be written"):
+        refuse_overwrite(path / "out.csv")
 
 
 @pytest.mark.parametrize("ends", ["refused", "written"])
@@ -168,9 +167,3 @@ def test_nothing_but_the_output_stays_after_a_command(capsys, tmp_path, ends):
     assert code == (0 if ends == "written" else 2), said
     expected = [out.parent.parent, out.parent, out] if ends == "written" else []
     assert sorted(tmp_path.rglob("*")) == expected
-
-
-def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path):
-    (tmp_path / "file").write_text("")
-    with holding_outputs(), pytest.raises(InputError, match="cannot be written"):
-        refuse_overwrite(tmp_path / "file" / "out.csv")

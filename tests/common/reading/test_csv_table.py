@@ -99,19 +99,19 @@ def test_a_fault_in_a_late_block_is_named_with_its_line_and_column(monkeypatch):
         read_table("log", "\n".join(["a,b", *lines]))
 
 
-def test_a_last_line_without_its_end_is_left_out_where_the_writer_ends_lines():
+def test_lines_end_as_on_other_systems_and_one_without_its_end_is_left_out_where_asked():
+    for end in ("\r\n", "\r"):
+        table = read_table("log", end.join(["# x", "a,b", "1,2", "3,4", ""]))
+        assert table.numbers["b"].tolist() == [2, 4] and table.line.tolist() == [3, 4]
     text = "a,b\n1,2\n3,4"
     assert len(read_table("log", text)) == 2
     cut = read_table("log", text, whole_lines=True)
     assert len(cut) == 1 and cut.cut
     short = read_table("log", "a,b\n1,2\n3")
     assert len(short) == 1 and short.cut
-
-
-def test_line_ends_of_other_systems_are_line_ends():
-    for end in ("\r\n", "\r"):
-        table = read_table("log", end.join(["# x", "a,b", "1,2", "3,4", ""]))
-        assert table.numbers["b"].tolist() == [2, 4] and table.line.tolist() == [3, 4]
+    # names of columns are found behind comments and blank lines
+    assert column_names("log", "# a\n\n  \n a , b\n1,2\n") == ["a", "b"]
+    assert column_names("log", "# a\n\n") == [] and column_names("log", "") == []
 
 
 def test_limits_are_said_with_the_way_to_raise_them(monkeypatch):
@@ -135,11 +135,6 @@ def test_a_raised_limit_reads_what_was_refused():
         assert len(read_table("log", text).numbers) == 3000
         long = "joint\n" + "x" * 150_000 + "\n"
         assert read_table("log", long, ("joint",)).texts["joint"] == ["x" * 150_000]
-
-
-def test_names_of_columns_are_found_behind_comments_and_blank_lines():
-    assert column_names("log", "# a\n\n  \n a , b\n1,2\n") == ["a", "b"]
-    assert column_names("log", "# a\n\n") == [] and column_names("log", "") == []
 
 
 @given(st.text(max_size=12))

@@ -149,12 +149,6 @@ def lattice(**numbers) -> PollLattice:
     return PollLattice(kind="lattice", readings="polled", fresh_fraction=0.5, **numbers)
 
 
-def test_a_reading_is_infinitely_old_where_every_poll_seems_lost():
-    found = lattice(poll_period_s=0.02, loss=1.0, polls=40)
-    assert math.isinf(found.mean_age_s)
-    assert json.loads(json.dumps(found.to_dict()))["mean_age_s"] is None
-
-
 def test_the_interval_of_the_loss_is_jeffreys_and_that_of_the_age_follows():
     found = lattice(poll_period_s=0.02, loss=0.25, polls=80.0)
     low, high = beta(20.5, 60.5).ppf([0.05, 0.95])
@@ -164,6 +158,10 @@ def test_the_interval_of_the_loss_is_jeffreys_and_that_of_the_age_follows():
     # without a lost poll the value stays inside
     none = lattice(poll_period_s=0.02, loss=0.0, polls=80.0).loss_interval
     assert none.low == none.value == 0.0 and none.high == pytest.approx(beta(0.5, 80.5).ppf(0.95))
+    # where every poll seems lost a reading is infinitely old
+    lost = lattice(poll_period_s=0.02, loss=1.0, polls=40)
+    assert math.isinf(lost.mean_age_s)
+    assert json.loads(json.dumps(lost.to_dict()))["mean_age_s"] is None
 
 
 def test_loss_and_age_cover_the_periods_that_are_not_ruled_out():

@@ -318,15 +318,12 @@ def test_radians_of_a_telemetry_with_ticks_are_taken_and_labels_number_its_trial
     assert 1e3 * np.median(trial.read_time_s - trial.send_time_s) == pytest.approx(3.47, abs=0.05)
 
 
-def test_the_reading_is_taken_rather_than_the_models_of_an_analysis():
+def test_readings_go_before_models_and_names_in_the_last_comment_of_savetxt_are_read():
     path = case("real/c13_command_real_and_models.csv")
     table, _, _ = convert(path, parse(path, path.read_text()))
     raw = pd.read_csv(path)
     np.testing.assert_allclose(table["command_rad"], raw["goal_position_rad"])
     np.testing.assert_allclose(table["position_rad"], raw["real_position_rad"])
-
-
-def test_names_in_the_last_comment_of_savetxt_are_read():
     path = case("real/c11_savetxt_tabs_names_in_comment.txt")
     with pytest.raises(InputError, match=r"column u \(the command of joint\): values reach 100"):
         load(path)
