@@ -232,9 +232,6 @@ def test_a_run_with_the_torque_off_is_noted_where_braking_then_is_unknown(off_st
     made = [n for n in notes({"a.yaml": model(known)}, runs) if "torque is off" in n]
     assert len(made) == count
     assert all("off for 0.2 s" in note and "`off_brake`" in note for note in made)
-
-
-def test_a_model_in_torque_has_no_such_number_and_the_comparison_says_so():
-    runs = {"knee": [bench(100)]}
+    # a model in torque has no such number
     fixed = load_card("sts3215-soarm100").calibration()
-    assert any("`off_brake`" in note for note in notes({"card": fixed}, runs))
+    assert any("`off_brake`" in note for note in notes({"card": fixed}, runs)) is bool(off_steps)

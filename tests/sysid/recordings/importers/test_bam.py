@@ -27,16 +27,6 @@ def saved(tmp_path, data):
     return path
 
 
-def test_mass_length_gain_and_voltages_come_from_the_file(tmp_path):
-    (trial,) = load(saved(tmp_path, log())).trials("sts3215")
-    assert (trial.load.mass_kg, trial.load.length_m, trial.load.arm_mass_kg) == (0.2, 0.15, 0.03)
-    assert trial.load.hanging_rad == 0 and trial.p_gain == 32
-    assert trial.servo.model == "sts3215" and trial.servo.supply_voltage_v == 7.4
-    assert (trial.voltage_v == 7.3).all()
-    assert trial.torque_enabled.sum() == 40 and not trial.torque_enabled[40:].any()
-    np.testing.assert_allclose(trial.command_rad - trial.position_rad, 0.05)
-
-
 def test_the_stamp_is_the_middle_of_the_reads_and_the_goal_is_older(tmp_path):
     """A turn of 5 ms: write w, sleep 1.06 ms, read w, so w = 1.97 ms; a block read is one read.
 
@@ -53,7 +43,14 @@ def test_the_stamp_is_the_middle_of_the_reads_and_the_goal_is_older(tmp_path):
         assert trial.read_time_doubt_s == pytest.approx(each)
 
 
-def test_logs_without_load_or_voltage_are_read(tmp_path):
+def test_mass_length_gain_and_voltages_come_from_the_file_if_it_has_them(tmp_path):
+    (trial,) = load(saved(tmp_path, log())).trials("sts3215")
+    assert (trial.load.mass_kg, trial.load.length_m, trial.load.arm_mass_kg) == (0.2, 0.15, 0.03)
+    assert trial.load.hanging_rad == 0 and trial.p_gain == 32
+    assert trial.servo.model == "sts3215" and trial.servo.supply_voltage_v == 7.4
+    assert (trial.voltage_v == 7.3).all()
+    assert trial.torque_enabled.sum() == 40 and not trial.torque_enabled[40:].any()
+    np.testing.assert_allclose(trial.command_rad - trial.position_rad, 0.05)
     data = log()
     for key in ("mass", "length", "kp", "vin"):
         del data[key]

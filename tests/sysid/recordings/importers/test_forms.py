@@ -252,24 +252,20 @@ def test_columns_without_names_have_numbers_and_the_refusal_has_the_line_that_ta
     same(load(tmp_path / "log.npy", COLUMNS))
 
 
-def test_seconds_and_nanoseconds_without_names_are_offered_as_one_time(tmp_path):
-    rows = [(t + 0.8, c, p) for t, c, p in ROWS_OF]
-    lines = [f"{1_700_000_000 + int(t)},{1e9 * (t % 1):.0f},base,{c},{p}\n" for t, c, p in rows]
-    (tmp_path / "log.txt").write_text("".join(lines))
-    with pytest.raises(InputError, match="log.txt --time 0,1 --command 3 --position 4 --out"):
-        load(tmp_path / "log.txt")
-    same(load(tmp_path / "log.txt", LogOptions("0,1", "3", "4")))
-
-
-def test_columns_without_names_are_offered_in_the_pairs_that_go_together(tmp_path):
-    rows = [f"{c},{50 * c},{p},{p - c},{c * c},{p * p}\n" for _, c, p in ROWS_OF]
-    (tmp_path / "log.txt").write_text("".join(rows))
-    with pytest.raises(InputError, match="log.txt --rate 50 --command 0,4 --position 2,5 --out"):
-        load(tmp_path / "log.txt")
+def test_columns_without_names_are_offered_in_the_pairs_and_as_the_times_that_go_together(tmp_path):
+    path = tmp_path / "log.txt"
+    later = [(t + 0.8, c, p) for t, c, p in ROWS_OF]
+    stamps = [f"{1_700_000_000 + int(t)},{1e9 * (t % 1):.0f},base,{c},{p}\n" for t, c, p in later]
+    squares = [f"{c},{50 * c},{p},{p - c},{c * c},{p * p}\n" for _, c, p in ROWS_OF]
     tuples = [f"({t}, [{c}, {c * c}], [{p}, {p * p}])\n" for t, c, p in ROWS_OF]
-    (tmp_path / "log.txt").write_text("".join(tuples))
-    with pytest.raises(InputError, match="log.txt --time 0 --command 1,2 --position 3,4 --out"):
-        load(tmp_path / "log.txt")
+    for lines, line in (
+        (squares, "--rate 50 --command 0,4 --position 2,5"),
+        (tuples, "--time 0 --command 1,2 --position 3,4"),
+        (stamps, "--time 0,1 --command 3 --position 4"),
+    ):
+        path.write_text("".join(lines))
+        assert_each_refused([(path, f"log.txt {line} --out")], load)
+    same(load(path, LogOptions("0,1", "3", "4")))
 
 
 def test_an_archive_without_times_takes_its_time_step_for_the_rate(tmp_path):
