@@ -192,6 +192,8 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "a record a servo": (each(
         '{{"t": {t}, "servo": "knee", "cmd": {c}, "pos": {p}}}\n'
         '{{"t": {t}, "servo": "hip", "cmd": {d}, "pos": {q}}}', BOTH), "knee hip"),
+    "a line that was cut": (each('{{"t": {t}, "cmd": {c}, "pos": {p}}}') + '{"t": 0.8, "c',
+                            "joint"),
     "numbers in quotes": (json.dumps([{"t": f"{t}", "cmd": f"{c}", "pos": f"{p}"}
                                       for t, c, p in LOG]), "joint"),
     "dates in JSON": (json.dumps([{"time": f"2026-05-04T12:30:{t:09.6f}Z", "cmd": c, "pos": p}
