@@ -26,7 +26,6 @@ from hashlib import blake2b
 from typing import TypeVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import sine_design
@@ -380,44 +379,30 @@ def _sine(
     return frequency, solution, amplitude
 
 
-@njit(cache=True)
-def _sine_fit(time, value, frequency):
+def _sine_fit(
+    time: NDArray, value: NDArray, frequency: float
+) -> tuple[float, NDArray[np.float64], float]:
     """Least-squares frequency near a first guess, coefficients as of `sine_design`, variance left.
 
     Gauss-Newton steps by normal equations, which serve for a few columns over a period or more.
     """
-    middle, solution = time.mean(), np.zeros(3)
+    centred = time - time.mean()
     for _ in range(4):
-        solution = _solved(time - middle, value, frequency, solution, 3)
-        step = _solved(time - middle, value, frequency, solution, 4)[3]
-        frequency += min(max(step, -0.1 * frequency), 0.1 * frequency)
+        design = sine_design(2 * np.pi * frequency * centred)
+        _, cosine, sine = _solved(design, value)
+        slope = 2 * np.pi * centred * (sine * design[:, 1] - cosine * design[:, 2])
+        step = _solved(np.column_stack([design, slope]), value)[3]
+        frequency += float(np.clip(step, -0.1 * frequency, 0.1 * frequency))
         if abs(step) < 1e-5 * frequency:
             break
-    solution = _solved(time, value, frequency, solution, 3)
-    total = square = 0.0
-    for k in range(len(time)):
-        angle = 2 * np.pi * frequency * time[k]
-        rest = value[k] - solution[0] - solution[1] * np.cos(angle) - solution[2] * np.sin(angle)
-        total += rest
-        square += rest * rest
-    return frequency, solution, square / len(time) - (total / len(time)) ** 2
+    design = sine_design(2 * np.pi * frequency * time)
+    solution = _solved(design, value)
+    return frequency, solution, float(np.var(value - design @ solution))
 
 
-@njit(cache=True)
-def _solved(time, value, frequency, sine, columns):
-    """Coefficients of one, cosine, sine and, as a fourth, the slope of `sine` by frequency."""
-    gram, right, row = np.zeros((columns, columns)), np.zeros(columns), np.ones(4)
-    for k in range(len(time)):
-        angle = 2 * np.pi * frequency * time[k]
-        row[1], row[2] = np.cos(angle), np.sin(angle)
-        row[3] = 2 * np.pi * time[k] * (sine[2] * row[1] - sine[1] * row[2])
-        for i in range(columns):
-            right[i] += row[i] * value[k]
-            for j in range(columns):
-                gram[i, j] += row[i] * row[j]
-    for i in range(columns):
-        gram[i, i] *= 1 + 1e-12
-    return np.linalg.solve(gram, right)
+def _solved(design: NDArray, value: NDArray) -> NDArray[np.float64]:
+    gram = design.T @ design
+    return np.linalg.solve(gram + np.diag(1e-12 * np.diagonal(gram)), design.T @ value)
 
 
 def _away(
