@@ -76,15 +76,9 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 
 def read_bytes(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> bytes:
-    """Content of a regular file of limited size.
+    """Content of a regular file of limited size; a larger one is refused without being read.
 
-    Parameters
-    ----------
-    path : Path
-    largest_bytes : float
-        Larger files are refused without being read (`common.reading.content` raises it).
-    remedy : str
-        What to do, as a sentence; by default, to check the file's name.
+    `remedy` is what to do, as a sentence; by default, to check the file's name.
     """
     return content(path, largest_bytes, remedy)
 
@@ -101,14 +95,7 @@ def read_text(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = ""
 
 
 def read_yaml(path: Path) -> tuple[Any, dict[Place, int]]:
-    """Data of a YAML file, read strictly (see `common.strict_yaml`).
-
-    Returns
-    -------
-    data : dict, list, str, int, float, bool or None
-    lines : dict
-        The line (from 1) of every place in the file.
-    """
+    """Data of a YAML file, read strictly (`common.strict_yaml`), and every place's line."""
     return load(read_text(path), str(path))
 
 
@@ -151,16 +138,7 @@ def _levels(text: str) -> int:
 
 
 def refuse_other_version(path: Path | str, found: Any, known: int, oldest: int = 1) -> None:
-    """Refuse a file of a version that this code does not read.
-
-    Parameters
-    ----------
-    path : Path or str
-    found : object
-        `schema_version` as the file gives it.
-    known, oldest : int
-        The newest and the oldest version that are read.
-    """
+    """Refuse a file whose `schema_version` is none that this code reads, `oldest` to `known`."""
     if type(found) is int and found > known:
         raise InputError(
             f"{path} was written by a newer version of pupper-sysid (schema_version {found}; "
@@ -183,19 +161,10 @@ def validated(
     lines: Mapping[Place, int] | None = None,
     remedy: str = "",
 ) -> _Model:
-    """`data` as a pydantic model.
+    """`data`, plain data from the file `name`, as a pydantic model.
 
-    Parameters
-    ----------
-    model : type of pydantic.BaseModel
-    data : object
-        Plain data from a file.
-    name : Path or str
-        The file, as the user named it.
-    lines : mapping, optional
-        The line of every place of the file, from `read_yaml`.
-    remedy : str
-        What to do instead of editing the file, such as "fit the model again".
+    `lines` has the line of every place of the file, from `read_yaml`; `remedy` is what to do
+    instead of editing the file, such as "fit the model again".
 
     Examples
     --------

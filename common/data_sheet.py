@@ -51,12 +51,9 @@ class DataSheet:
     """Lowest and highest supply of all variants [V]; None where it is not known."""
 
     def at(self, supply_v: float | None = None) -> Rating:
-        """Rating at a supply voltage, in proportion to the nearest that is stated.
+        """Rating at a supply voltage [V], in proportion to the nearest that is stated.
 
-        Parameters
-        ----------
-        supply_v : float, optional
-            [V]; without one the lowest stated rating, whose source then says so.
+        Without one it is the lowest stated rating, whose source then says so.
         """
         if supply_v is None:
             lowest = self.ratings[0]
@@ -241,13 +238,6 @@ def stall_torque(model: str | int, supply_v: float | None = None) -> tuple[float
 def no_load_speed(model: str | int, supply_v: float | None = None) -> float | None:
     """Speed without load [rad/s] of a servo model at a supply voltage; None if it is not known.
 
-    Parameters
-    ----------
-    model : str or int
-        Name or number.
-    supply_v : float, optional
-        [V]; without one the lowest stated rating.
-
     Examples
     --------
     >>> round(no_load_speed("STS3215", 12.0), 2), no_load_speed("SCS0009")
@@ -272,16 +262,8 @@ def supply_range(model: str | int) -> tuple[float, float] | None:
 def recorded_stall_torque(servos: Iterable[Mapping[str, Any]]) -> tuple[float, str] | None:
     """Stall torque [N·m] of a joint's servo by what its recordings say of it, and the source.
 
-    Parameters
-    ----------
-    servos : iterable of mapping
-        Set-up of the joint's servo in each recording's header (`servos`): `model` and
-        `supply_voltage_v`, where they are known.
-
-    Returns
-    -------
-    (float, str) or None
-        None where no recording names a model whose data sheet is known.
+    `servos` are its set-ups in the recordings' headers: `model` and `supply_voltage_v`, where they
+    are known. None where no recording names a model whose data sheet is known.
 
     Examples
     --------

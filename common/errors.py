@@ -40,14 +40,6 @@ class SafetyStop(BusError):
 def refuse_outside(name: str, value: float, low: float, high: float, unit: str = "") -> None:
     """Refuse a number that is not between two others, which are included; NaN is not.
 
-    Parameters
-    ----------
-    name : str
-        Of the option, or of the argument in back-quotes.
-    value, low, high : float
-    unit : str
-        Of all three; empty for none.
-
     Examples
     --------
     >>> refuse_outside("`seconds`", 1e9, 0.1, 600, "s")

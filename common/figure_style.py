@@ -102,21 +102,11 @@ def svg(figure: Figure) -> bytes:
 
 
 def inline_svg(drawing: bytes, words: str) -> str:
-    """A drawing of `svg` as an element of an HTML page.
+    """A drawing of `svg` as an element of an HTML page; `words` are for screen readers.
 
-    Parameters
-    ----------
-    drawing : bytes
-        From `svg`.
-    words : str
-        What it shows, for screen readers.
-
-    Returns
-    -------
-    str
-        An `<svg>` of class `drawing`, as wide as its parent. Colours of this style are the CSS
-        variables `--ink`, `--drawing-blue` and so on, so that a page can change them. What was
-        drawn with the `gid` "part:NAME" has the class `part-NAME`. Its ids occur once on a page.
+    It is an `<svg>` of class `drawing`, as wide as its parent. Colours of this style are the CSS
+    variables `--ink`, `--drawing-blue` and so on, so that a page can change them. What was drawn
+    with the `gid` "part:NAME" has the class `part-NAME`. Its ids occur once on a page.
     """
     text = drawing.decode()
     text = re.sub(r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.DOTALL)

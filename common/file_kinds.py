@@ -36,19 +36,10 @@ _EMULATED = re.compile(r"spec:\s+dead_time_s:")
 
 
 def refuse_other_kind(path: Path, wanted: str) -> None:
-    """Refuse what is another kind of file, or folder, of this project.
+    """Refuse what is another kind of file, or folder, of this project, and name what reads it.
 
-    Parameters
-    ----------
-    path : Path
-        Anything; what is no file of this project, or cannot be read, is left to its reader.
-    wanted : str
-        `RECORDING`, or the schema that the expected kind states.
-
-    Raises
-    ------
-    InputError
-        With what the file is and what reads it.
+    What is no file of this project, or cannot be read, is left to its reader. `wanted` is
+    `RECORDING`, or the schema that the expected kind states.
     """
     kind = _kind_of(path)
     if kind not in (None, wanted):

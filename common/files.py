@@ -64,14 +64,7 @@ def _refuse_existing(path: Path, force: bool) -> None:
 
 
 def as_path(value: object, what: str) -> Path:
-    """`value` as a path.
-
-    Parameters
-    ----------
-    value : Path or str
-    what : str
-        What it leads to, for the message.
-    """
+    """`value` as a path; `what` says for the message what it leads to."""
     if not isinstance(value, str | os.PathLike):
         raise InputError(f"{what} is named by a path or a str, not by a {type(value).__name__}.")
     return Path(os.fspath(value))
@@ -104,15 +97,8 @@ def write_bytes(path: Path, data: bytes, force: bool = False) -> None:
 def replacing(path: Path, force: bool = False, hold: bool = True) -> Iterator[Path]:
     """Yield the name of a temporary file that takes the place of `path` after the block.
 
-    It is beside `path`, has the same ending, and is removed after an error or a stop.
-
-    Parameters
-    ----------
-    path : Path
-    force : bool
-        Replace an existing file.
-    hold : bool
-        Whether a stop waits for the block; not for one that takes long.
+    It is beside `path`, has the same ending, and is removed after an error or a stop. With `hold` a
+    stop waits for the block; not for one that takes long.
     """
     _refuse_existing(path, force)
     _refuse_held(path)
@@ -137,17 +123,9 @@ def replacing(path: Path, force: bool = False, hold: bool = True) -> Iterator[Pa
 class SyncedText:
     """A text file that grows line by line; what was written is on the disk within a second.
 
-    Syncing is done in a thread, because a memory card can take seconds.
-
-    Parameters
-    ----------
-    path : Path
-    force : bool
-        Replace an existing file.
-    append_at : int, optional
-        Go on writing an existing file from this byte on instead; what follows it is cut off.
-    advice : str
-        What to do when it can no longer be written, for the error's sentence.
+    Syncing is done in a thread, because a memory card can take seconds. With `append_at` an
+    existing file is written on from this byte; what follows it is cut off. `advice` is what to do
+    when it can no longer be written, for the error's sentence.
     """
 
     def __init__(

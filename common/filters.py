@@ -13,15 +13,8 @@ def filtered(
 ) -> NDArray[np.float64]:
     """A signal behind a filter at rest, as `scipy.signal.lfilter` (direct form II, transposed).
 
-    Parameters
-    ----------
-    numerator, denominator : ndarray, shape (order + 1,)
-        In rising powers of the delay, `denominator[0] == 1`.
-    signal : ndarray, shape (samples,)
-
-    Returns
-    -------
-    ndarray, shape (samples,)
+    Numerator and denominator, of equal length, are in rising powers of the delay; `denominator[0]`
+    is 1.
     """
     order = len(denominator) - 1
     state = np.zeros(order + 1)

@@ -124,12 +124,7 @@ def _value(number: str) -> float:
 def select_joints(text: str, available: Sequence[str] = JOINT_NAMES) -> list[str]:
     """Joints named by `text`: names, legs (`LF`), kinds (`hip`), mixed with commas, or `all`.
 
-    Parameters
-    ----------
-    text : str
-        For example `"LF_hip"`, `"LF,RB_calf"`, `"hip"`, `"all"`. Case does not matter.
-    available : sequence of str
-        The joints to choose from; the answer keeps their order.
+    Case does not matter; the answer keeps the order of `available`.
 
     Examples
     --------

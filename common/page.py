@@ -151,17 +151,7 @@ class WrittenPage:
 def write_page(
     path: Path, title: str, subtitle: str, sections: Sequence[Section], force: bool = False
 ) -> WrittenPage:
-    """Write a page, and beside it its figures and tables.
-
-    Parameters
-    ----------
-    path : Path
-        Of the page; its folder gets `figures/*.png`, `figures/*.svg` and `tables/*.csv`.
-    title, subtitle : str
-    sections : sequence of Section
-    force : bool
-        Replace files that exist.
-    """
+    """Write a page, and in its folder `figures/*.png`, `figures/*.svg` and `tables/*.csv`."""
     drawn = [(path.parent / "figures" / p.name, p) for s in sections for p in s.pictures]
     tables = {
         path.parent / "tables" / f"{t.name}.csv": t

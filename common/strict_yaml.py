@@ -41,21 +41,10 @@ else:
 
 
 class StrictLoader(_Loader):
-    """Loader of plain data: dict, list, str, int, float, bool and None.
+    """Loader of plain data: dict, list, str, int, float, bool and None, of one YAML document.
 
-    Data are made of the parser's events, without nodes and tags between them.
-
-    Parameters
-    ----------
-    text : str
-        One YAML document.
-    name : str
-        Name of the file, for messages.
-
-    Attributes
-    ----------
-    lines : dict
-        The line (from 1) of every place, filled by `get_single_data`.
+    Data are made of the parser's events, without nodes and tags between them. `get_single_data`
+    fills `lines`, the line (from 1) of every place.
     """
 
     def __init__(self, text: str, name: str = "the text"):

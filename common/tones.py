@@ -15,17 +15,7 @@ from numpy.typing import NDArray
 
 
 def sine_design(*angles_rad: NDArray) -> NDArray[np.float64]:
-    """Columns of a least-squares fit: one, then cosine and sine of each angle.
-
-    Parameters
-    ----------
-    *angles_rad : ndarray, shape (rows,)
-        One per tone: `2π f t` [rad].
-
-    Returns
-    -------
-    ndarray, shape (rows, 1 + 2 tones)
-    """
+    """Columns of a least-squares fit: one, then cosine and sine of each tone's angles [rad]."""
     columns = [np.ones_like(angles_rad[0])]
     for angle in angles_rad:
         columns += [np.cos(angle), np.sin(angle)]
@@ -33,13 +23,7 @@ def sine_design(*angles_rad: NDArray) -> NDArray[np.float64]:
 
 
 def least_squares(design: NDArray, value: NDArray) -> NDArray[np.float64]:
-    """Coefficients of `design` that fit `value`; a column of `value` is a fit of its own.
-
-    Parameters
-    ----------
-    design : ndarray, shape (rows, columns)
-    value : ndarray, shape (rows,) or (rows, channels)
-    """
+    """Coefficients of `design` that fit `value`; a column of `value` is a fit of its own."""
     return np.linalg.lstsq(design, value, rcond=None)[0]
 
 
@@ -56,12 +40,7 @@ class Sine(NamedTuple):
 
 
 def fit_sine(angle_rad: NDArray, value: NDArray) -> Sine:
-    """Sine and offset that fit `value` best.
-
-    Parameters
-    ----------
-    angle_rad : ndarray, shape (rows,)
-    value : ndarray, shape (rows,) or (rows, channels)
+    """Sine and offset that fit `value`, shape (rows,) or (rows, channels), best.
 
     Examples
     --------
@@ -99,16 +78,8 @@ def block_bootstrap(
 ) -> BlockFit:
     """Least squares, repeated with exponential random weights of the blocks (Bayesian bootstrap).
 
-    Parameters
-    ----------
-    design : ndarray, shape (rows, columns)
-    value : ndarray, shape (rows,)
-    block : ndarray of int, shape (rows,)
-        Label of each row's block: rows of one block keep together.
-    rng : numpy.random.Generator
-    draws : int
-    fewest : int
-        Fewer blocks are replaced by this many runs of neighbouring rows.
+    `block` labels each row's block: rows of one block keep together. Fewer than `fewest` blocks are
+    replaced by this many runs of neighbouring rows.
 
     References
     ----------

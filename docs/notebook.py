@@ -16,21 +16,10 @@ _CELL = re.compile(r"^# %%(?P<kind>.*)\n", re.MULTILINE)
 
 
 def page(script: Path, pictures: Path) -> str:
-    """Markdown of a script that has been run.
+    """Markdown of a script that has been run; its cells share one name space.
 
     A figure is shown where it is drawn with pyplot, or where it is the last value of a cell.
-
-    Parameters
-    ----------
-    script : Path
-        Its cells share one name space.
-    pictures : Path
-        Folder, beside the page, for the figures.
-
-    Returns
-    -------
-    str
-        The page.
+    Figures go into the folder `pictures`, beside the page.
     """
     import matplotlib
 

@@ -193,20 +193,11 @@ def fit_equations(
     workers: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, EquationResult]:
-    """An equation of motion for every joint.
+    """An equation of motion for every joint of runs that a caller has prepared.
 
-    Parameters
-    ----------
-    runs : mapping of str to tuple of Run
-        Per joint; only the fresh samples in it are fitted, so a caller may leave some out.
-    noise_rad : mapping of str to (float or tuple of float)
-        Per joint, the size of ordinary residuals [rad], of all trials or of each.
-    seed : int
-        A joint's result depends on the seed and its name alone.
-    workers : int
-        Processes; joints are independent.
-    progress : callable, optional
-        Called with a joint's name when it is done.
+    Only the fresh samples in `runs` are fitted, so a caller may leave some out. `noise_rad` is the
+    size of ordinary residuals [rad], of all trials or of each. A joint's result depends on the seed
+    and its name alone; `progress` is called with its name when it is done.
     """
     tasks = {joint: (data, noise_rad[joint]) for joint, data in runs.items()}
     return map_joints(partial(_fit_joint, seed=seed), tasks, workers, progress)
@@ -410,16 +401,8 @@ _LEAST_PER_PERIOD = 4.0  # fresh readings per period, below which a spline inven
 def propose(data: Sequence[Run], delayed_pd: Mapping[str, float]) -> list[Support]:
     """Structures that pysindy finds in the derivatives, those found most often first.
 
-    Parameters
-    ----------
-    data : sequence of Run
-    delayed_pd : mapping of str to float
-        Values of the fitted `DelayedPD`: its delay, offset, and the error at which it saturates.
-
-    Returns
-    -------
-    list of tuple of str
-        At most `_MOST_SUPPORTS`, and among them the linear one, to compare with.
+    `delayed_pd` has the values of the fitted `DelayedPD`: its delay, offset, and the error at which
+    it saturates. At most `_MOST_SUPPORTS`, and among them the linear one, to compare with.
     """
     usable = [d for d in data if _dense(d)] or data
     splines = [s for d in usable for s in _motion(d, delayed_pd["offset_rad"])]

@@ -49,11 +49,8 @@ _SWALLOWED_S = 0.01
 class Stop:
     """Handlers of the three signals, and what the first of them was.
 
-    Parameters
-    ----------
-    ends_process : bool
-        Whether this process is a program of its own, which may be ended; else only
-        KeyboardInterrupt is raised.
+    `ends_process` says whether this process is a program of its own, which may be ended; else only
+    KeyboardInterrupt is raised.
     """
 
     def __init__(self, ends_process: bool):

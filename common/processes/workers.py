@@ -75,14 +75,9 @@ _STOP_S = 0.05  # for the signal that ended it, sent to a group of processes, to
 class Workers:
     """Processes that do what is submitted; leaving the context ends them.
 
-    Parameters
-    ----------
-    count : int
-        Processes. With one, or where processes cannot be forked, the work is done in this one.
-    *modules : str
-        Modules to import once, in the server; those of what is submitted first are as well.
-    option : str
-        Argument of the caller that set `count`, for messages.
+    With a `count` of one, or where processes cannot be forked, the work is done in this one.
+    `modules` are imported once, in the server; those of what is submitted first are as well.
+    `option` is the caller's argument that set `count`, for messages.
     """
 
     def __init__(self, count: int, *modules: str, option: str = "workers"):
@@ -214,13 +209,7 @@ class _Server:
                 self._process.wait(_DEATH_S)
 
     def order(self, modules: Any, *descriptors: int) -> None:
-        """Have modules imported, and a worker forked if there is a descriptor of its socket.
-
-        Raises
-        ------
-        PupperError
-            If the server has ended.
-        """
+        """Have modules imported, and a worker forked if there is a descriptor of its socket."""
         text = json.dumps(
             {"modules": sorted(modules), "folder": _folder(), "fork": len(descriptors)}
         )
@@ -308,12 +297,7 @@ def _ending(number: int) -> str:
 def serve(descriptor: int, parent: int) -> None:
     """Import modules and fork workers, as ordered through a socket, until it closes.
 
-    Parameters
-    ----------
-    descriptor : int
-        Of the socket.
-    parent : int
-        Process with which this one ends, at once where the kernel does it; 0 for none.
+    This process ends with its parent, at once where the kernel does it, if there is one (not 0).
     """
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)

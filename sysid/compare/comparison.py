@@ -178,15 +178,8 @@ def four_way(
     Each runs free and one step ahead, on readings that none was fitted to: the last loop, or the
     last third of a recording without loops. (The published networks were scored on commands that
     they had been trained on.) The published model gets the offset of the readings that the others
-    were fitted to, and predicts readings as `compare` does.
-
-    Parameters
-    ----------
-    recording : Recording
-    joints : sequence of str
-    seed : int
-    progress : callable, optional
-        Called with what is being done and the share of it that is done.
+    were fitted to, and predicts readings as `compare` does. `progress` is called with what is being
+    done and the share of it that is done.
     """
     split = _split(recording)
     fits: dict[str, ServoFit] = {}

@@ -156,24 +156,11 @@ def truth_table(
     seed: int = 0,
     joints: Sequence[str] | None = None,
 ) -> TruthTable:
-    """Each quantity of a calibration beside the true one.
+    """Each quantity of a calibration beside the true one, of all joints that both have, or some.
 
-    Parameters
-    ----------
-    calibration : Calibration or CalibrationResult
-    truth : mapping
-        As `EmulatedRobot.truth()` gives it and `read_truth` reads it.
-    recordings : Recording or sequence of Recording, optional
-        What the calibration was made from: with them the lag is compared, too, because it depends
-        on the commands.
-    seed : int
-        Of the calibration; the search for the poll uses it.
-    joints : sequence of str, optional
-        By default all that both have.
-
-    Returns
-    -------
-    TruthTable
+    `truth` is as `EmulatedRobot.truth()` gives it and `read_truth` reads it. With the `recordings`
+    that the calibration was made from the lag is compared, too, because it depends on the commands;
+    `seed` is the calibration's, for the search for the poll.
     """
     if isinstance(calibration, CalibrationResult):
         calibration = calibration.calibration
@@ -207,13 +194,7 @@ def truth_table(
 
 
 def read_truth(recording: Path) -> dict[str, Any]:
-    """True parameters beside the file of an emulated recording.
-
-    Parameters
-    ----------
-    recording : Path
-        The recording's `.csv`, or the `.truth.yaml` itself.
-    """
+    """True parameters of an emulated recording (`.csv`), from the `.truth.yaml` beside it."""
     path = recording
     if not recording.name.endswith(ENDING):
         path = recording.with_name(recording.name.removesuffix(".csv") + ENDING)
@@ -230,14 +211,8 @@ def read_truth(recording: Path) -> dict[str, Any]:
 def true_lag_s(trials: Sequence[Trial], truth: Mapping[str, Any], seed: int = 0) -> float:
     """Lag of the true servo's motion behind the held command, under the trials' commands [s].
 
-    Parameters
-    ----------
-    trials : sequence of Trial
-        All of one joint.
-    truth : mapping
-        Of that joint: `actuator`, and `physics_step_s` if the emulator gives it.
-    seed : int
-        Of the search for the poll, on which the weights of the tones depend.
+    `trials` and `truth` are of one joint. The weights of the tones depend on the search for the
+    poll, and so on `seed`.
     """
     joint = trials[0].joint
     rng = joint_rng(seed, joint)
@@ -293,19 +268,10 @@ def _parameters(actuator: _Numbers) -> DelayedPDParameters:
 def defined_as(
     point: OperatingPoint, truth: Mapping[str, Any], fitted_step_s: float
 ) -> dict[str, float]:
-    """Numbers of the true actuator by the definitions of a calibration.
+    """Numbers of the true actuator by the definitions of a calibration, at its operating point.
 
-    They are those with which a servo in the calibration's steps moves like the emulated one in its
-    own, with the load.
-
-    Parameters
-    ----------
-    point : OperatingPoint
-        Of the calibration.
-    truth : mapping
-        Of the joint.
-    fitted_step_s : float
-        In which the calibration's numbers hold.
+    They are those with which a servo in the calibration's steps, `fitted_step_s`, moves like the
+    emulated one in its own, with the load.
     """
     actuator = _at_gain(truth, math.nan if point.p_gain is None else point.p_gain)
     step = truth.get("physics_step_s", _EMULATOR_STEP_S)

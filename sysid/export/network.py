@@ -62,35 +62,15 @@ def export_module(
     opset: int = 18,
     force: bool = False,
 ) -> float:
-    """Write a module as one file that other runtimes read.
+    """Write a module as one file that other runtimes read, and return its largest difference.
 
-    Parameters
-    ----------
-    module : torch.nn.Module
-        Returns a tensor or a tuple of tensors.
-    example_inputs : sequence of Tensor
-        The module is traced with them: its control flow must not depend on their values.
-    names : (sequence of str, sequence of str)
-        Of inputs and outputs. Inputs are passed by name if `forward` has parameters of these
-        names, else by position.
-    path : Path
-    to : {"onnx", "torchscript"}
-    difference : callable
-        Given the loaded file (`Run`), returns the largest difference from the model's outputs.
-    metadata : mapping of str to str, optional
-        Properties of the ONNX file; in TorchScript, the extra files `metadata.json` (all) and
-        `contract.json` (the entry `contract`).
-    batch : str, optional
-        Name of the first axis if its size is free (ONNX); by default it is that of the examples.
-    opset : int
-        ONNX operator set.
-    force : bool
-        Replace `path` if it exists.
-
-    Returns
-    -------
-    float
-        The largest difference.
+    The module returns a tensor or a tuple of tensors. It is traced with `example_inputs`: its
+    control flow must not depend on their values. `names` are of inputs and outputs; inputs are
+    passed by name if `forward` has parameters of these names, else by position. `difference`
+    compares the loaded file (`Run`) with the model's outputs. `metadata` becomes properties of the
+    ONNX file; in TorchScript, the extra files `metadata.json` (all) and `contract.json` (the entry
+    `contract`). `batch` names the first axis if its size is free (ONNX); `opset` is ONNX's operator
+    set.
     """
     refuse_overwrite(path, force)
     module = module.eval()
@@ -190,21 +170,11 @@ class ServoStep(nn.Module):
         cell: Tensor | None = None,
         position_rad: Tensor | None = None,
     ) -> Tensor | tuple[Tensor, Tensor, Tensor]:
-        """One step.
+        """Position after the step [rad], (N, joints); of an LSTM also `hidden` and `cell`.
 
-        Parameters
-        ----------
-        command_history_rad : Tensor, shape (N, joints, taps)
-            Newest first [rad].
-        hidden, cell : Tensor, shape (N, joints, members, units), optional
-            Memory of an LSTM.
-        position_rad : Tensor, shape (N, joints), optional
-            Position predicted last [rad], of a model with feedback.
-
-        Returns
-        -------
-        Tensor, shape (N, joints)
-            Position after the step [rad]; of an LSTM, followed by the next `hidden` and `cell`.
+        `command_history_rad` (N, joints, taps) is newest first; `hidden` and `cell` (N, joints,
+        members, units) are an LSTM's memory; `position_rad` (N, joints) was predicted last, for a
+        model with feedback.
         """
         p = dict(self.named_buffers())
         history = command_history_rad - p["command_center"][:, None]
@@ -242,16 +212,7 @@ _ENVIRONMENTS, _STEPS = 3, 20  # of the free run in which a file is compared wit
 def export_servo_model(
     saved: SavedModel, to: Literal["csv", "onnx", "torchscript"], path: Path, force: bool = False
 ) -> None:
-    """Write a servo model in a form that other programs read.
-
-    Parameters
-    ----------
-    saved : SavedModel
-    to : {"csv", "onnx", "torchscript"}
-    path : Path
-    force : bool
-        Replace `path` if it exists.
-    """
+    """Write a servo model in a form that other programs read."""
     if to == "csv":
         write_text(path, parameter_table(saved), force)
     else:

@@ -30,18 +30,11 @@ CALIBRATION_COLUMNS = (
 def to_csv(source: Calibration | Recording, path: Path | None = None, force: bool = False) -> str:
     """`source` as CSV text, written to `path` if one is given.
 
-    Parameters
-    ----------
-    source : Calibration or Recording
-        A calibration gives the columns `CALIBRATION_COLUMNS`: `part` is where the quantity stands
-        in the calibration file (`actuator`, `feedback`, `lag`, `scores`, …), `low` and `high` are
-        the ends of its 90 % interval, and a number that is not a measured quantity (a score, a
-        count of steps) leaves the last four empty. What the calibration does not hold has no row.
-        A recording gives its rows with the columns of `sysid.recordings.recording`.
-    path : Path, optional
-        Where to write; nothing is written without it.
-    force : bool
-        Replace `path` if it exists.
+    A calibration gives the columns `CALIBRATION_COLUMNS`: `part` is where the quantity stands in
+    the calibration file (`actuator`, `feedback`, `lag`, `scores`, …), `low` and `high` are the ends
+    of its 90 % interval, and a number that is not a measured quantity (a score, a count of steps)
+    leaves the last four empty. What the calibration does not hold has no row. A recording gives its
+    rows with the columns of `sysid.recordings.recording`.
     """
     text = _calibration(source) if isinstance(source, Calibration) else source.to_csv()
     if path is not None:

@@ -113,15 +113,8 @@ def common_period(
 ) -> tuple[float, float]:
     """Mean period over the stretches of a lattice, and its standard error [s].
 
-    Parameters
-    ----------
-    parts : sequence of Stretch
-        Segments between slips.
-    phases : sequence of Phase
-        Lattice of each segment.
-    stretch : sequence of int
-        Which stretch each segment is of. Segments of one see the same wandering period: they count
-        as one measurement of it.
+    `parts` are segments between slips, `stretch` says which stretch each is of. Segments of one
+    stretch see the same wandering period: they count as one measurement of it.
     """
     size, of = np.array([len(s.begin) for s in parts], float), np.array(stretch)
     weights = np.bincount(of, size)
@@ -262,18 +255,9 @@ class Readings:
 
 
 def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> PollLattice:
-    """Period, loss and phases of the poll behind one joint's readings.
+    """Period, loss and phases of the poll behind one joint's readings, from all of its trials.
 
-    Parameters
-    ----------
-    trials : sequence of Trial
-        All of one joint.
-    rng : numpy.random.Generator
-        Shuffles the gaps between changes: a lattice must explain them better than that.
-
-    Returns
-    -------
-    PollLattice
+    `rng` shuffles the gaps between changes: a lattice must explain them better than that.
     """
     rows = sum(len(t.read_time_s) for t in trials)
     fresh = sum(len(fresh_rows(t)) for t in trials)
@@ -336,27 +320,8 @@ def redate(trials: Sequence[Trial], lattice: PollLattice, motions: Sequence[Moti
 
     The motion settles where a slip is, and which of two phases is right; within an eighth of a
     period the times of changes alone settle the phase, so that an error of the model's dead time
-    does not enter the dates.
-
-    Parameters
-    ----------
-    trials : sequence of Trial
-        Those of `find_poll_lattice`.
-    lattice : PollLattice
-    motions : sequence of callable, one per trial
-        Position that a reading is expected to show [rad, offset included] at times [s] on the
-        recording's clock, from a first fit.
-
-    Returns
-    -------
-    PollLattice
-        `lattice` itself where its kind is not "lattice".
-
-    Examples
-    --------
-    >>> data = find_poll_lattice([], np.random.default_rng(0))
-    >>> redate([], data, []).kind
-    'every read'
+    does not enter the dates. `motions`, one per trial, give the position that a reading is expected
+    to show [rad, offset included]. A lattice of another kind than "lattice" comes back as it is.
     """
     if lattice.kind != "lattice":
         return lattice

@@ -23,20 +23,10 @@ from numpy.typing import NDArray
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def most_hits(begin, end, periods, bins):
-    """Largest number of intervals that hold an instant of one lattice, over its phases.
+    """Most intervals that hold an instant of one lattice over `bins` phases, per period.
 
-    Parameters
-    ----------
-    begin, end : ndarray, shape (intervals,)
-        In seconds.
-    periods : ndarray, shape (periods,)
-        In seconds.
-    bins : int
-        Phases tried per period.
-
-    Returns
-    -------
-    ndarray of int, shape (periods,)
+    `begin` and `end` have shape (intervals,), `periods` and the result (periods,); times are in
+    seconds.
     """
     found, edges = np.zeros(len(periods), np.int64), np.zeros(2 * bins + 1, np.int64)
     for i in range(len(periods)):
@@ -55,27 +45,12 @@ def most_hits(begin, end, periods, bins):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def log_likelihood(begin, end, periods, phases, blur, inside, outside):
-    """Log-likelihood of intervals for every period and phase of a lattice.
+    """Log-likelihood of intervals for every period and phase of a lattice, shape (periods, phases).
 
-    An interval holds an instant with probability w, which falls linearly from 1 to 0 over the
-    width `blur`; its likelihood is `inside * w + outside`.
-
-    Parameters
-    ----------
-    begin, end : ndarray, shape (intervals,)
-        In seconds, relative to the instant of phase 0.
-    periods : ndarray, shape (periods,)
-        In seconds.
-    phases : ndarray, shape (phases,)
-        In periods.
-    blur : float
-        In seconds.
-    inside : float
-    outside : ndarray, shape (intervals,)
-
-    Returns
-    -------
-    ndarray, shape (periods, phases)
+    An interval holds an instant with probability w, which falls linearly from 1 to 0 over the width
+    `blur` [s]; its likelihood is `inside * w + outside`. `begin` and `end` [s], shape (intervals,),
+    are relative to the instant of phase 0; `phases` are in periods; `outside` has shape
+    (intervals,).
     """
     total = np.zeros((len(periods), len(phases)))
     for n in range(len(begin)):
@@ -100,38 +75,17 @@ def summed_scores(
     begin, end, changed, value, stops, periods, phases, blur, outliers, success, track,
     track_start, track_step, scale,
 ):  # fmt: skip
-    """Scores of every lattice, summed over the rows before each stop.
+    """Scores of every lattice, summed over the rows before each stop: (stops, periods * phases).
 
     A changed row scores `log((1 - outliers) * w + outliers * chance)`, w as in `log_likelihood`,
-    less the soft-L1 cost of its value against the track at the instant it is dated to. A row that
-    stayed the same scores `log(1 - (1 - outliers) * success * w)`.
+    less the soft-L1 cost of its `value` [rad] against the track at the instant it is dated to. A
+    row that stayed the same scores `log(1 - (1 - outliers) * success * w)`.
 
-    Parameters
-    ----------
-    begin, end : ndarray, shape (rows,)
-        Previous read and read of each row [s], relative to the instant of phase 0.
-    changed : ndarray of bool, shape (rows,)
-    value : ndarray, shape (rows,)
-        Reading of each changed row [rad].
-    stops : ndarray of int, shape (stops,)
-        Increasing, from 0 to the number of rows.
-    periods : ndarray, shape (periods,)
-        In seconds.
-    phases : ndarray, shape (phases,)
-        In periods.
-    blur : float
-        In seconds.
-    outliers, success : float
-        Share of changed rows that may contradict the lattice; probability that a poll succeeds.
-    track : ndarray, shape (times,)
-        Expected motion [rad] at `track_start + n * track_step` [s]; empty if there is none.
-    track_start, track_step : float
-    scale : float
-        Of the residuals [rad].
-
-    Returns
-    -------
-    ndarray, shape (stops, periods * phases)
+    `begin`, `end` (previous read and read [s], relative to the instant of phase 0), `changed` and
+    `value` are over rows; `stops` increase from 0 to the number of rows. `outliers` is the share of
+    changed rows that may contradict the lattice, `success` the probability that a poll succeeds,
+    `scale` the residuals' [rad]. `track` is the expected motion [rad] at `track_start + n *
+    track_step` [s]; empty if there is none.
     """
     count = len(periods) * len(phases)
     found, total = np.zeros((len(stops), count)), np.zeros(count)
@@ -180,20 +134,9 @@ def summed_scores(
 def best_segments(summed, prior, least):
     """Best score of every segment between two stops, and the lattice that has it.
 
-    Parameters
-    ----------
-    summed : ndarray, shape (stops, lattices)
-        From `summed_scores`.
-    prior : ndarray, shape (lattices,)
-        Log-prior, counted once per segment.
-    least : int
-        Stops between the ends of a segment, at least.
-
-    Returns
-    -------
-    score : ndarray, shape (stops, stops)
-        From stop to stop; -inf where a segment is too short.
-    lattice : ndarray of int, shape (stops, stops)
+    Both have shape (stops, stops). `summed` is from `summed_scores`; `prior`, shape (lattices,),
+    counts once per segment; a segment has at least `least` stops between its ends, or its score is
+    -inf.
     """
     count = len(summed)
     score, lattice = np.full((count, count), -np.inf), np.zeros((count, count), np.int64)
@@ -270,19 +213,10 @@ class Phase:
 def best_periods(
     stretches: Sequence[Stretch], grid: NDArray[np.float64]
 ) -> list[tuple[float, float]]:
-    """Common periods and their scores: a quick search, its best peaks scored with care.
+    """Common periods [s] and their scores, the best first: the peaks of a quick search.
 
-    Parameters
-    ----------
-    stretches : sequence of Stretch
-    grid : ndarray, shape (periods,)
-        Trial periods [s], evenly spaced in their logarithm.
-
-    Returns
-    -------
-    list of tuple of float
-        Period [s] and log-likelihood against intervals placed at random; the best first. NaN if
-        no period is possible.
+    Scores are log-likelihoods against intervals placed at random. `grid` has trial periods [s],
+    evenly spaced in their logarithm. The period is NaN if none is possible.
     """
     pooled = _pool([_score(s.begin, s.end, grid) for s in stretches], grid)
     found = []
@@ -303,16 +237,7 @@ def shuffled(stretch: Stretch, rng: np.random.Generator) -> Stretch:
 
 
 def best_blur(stretches: Sequence[Stretch], period_s: float, loss: float) -> float:
-    """Which of `BLURS_S` explains best which rows changed and which did not [s].
-
-    Parameters
-    ----------
-    stretches : sequence of Stretch
-    period_s : float
-        Common period.
-    loss : float
-        Probability that a poll fails.
-    """
+    """Which of `BLURS_S` explains best which rows changed and which did not [s]."""
     evidence = [_evidence(stretches, period_s, blur, loss) for blur in BLURS_S]
     return BLURS_S[int(np.argmax(evidence))]
 
@@ -326,17 +251,8 @@ def refine(
 ) -> Phase:
     """Posterior mean of a stretch's period and phase near the common period.
 
-    Parameters
-    ----------
-    stretch : Stretch
-    period_s : float
-        Common period.
-    blur_s : float
-        Full width of the uncertainty of one poll instant.
-    loss : float or None
-        Probability that a poll fails; with None only rows that changed count.
-    near_s : float, optional
-        An instant of the lattice, to within an eighth of a period.
+    `loss` is the probability that a poll fails; with None only rows that changed count. `near_s` is
+    an instant of the lattice, to within an eighth of a period.
     """
     posterior, periods, steps, _ = _posterior(stretch, period_s, blur_s, loss, 61, 128)
     reference = 0.5 * (stretch.start_s + stretch.stop_s)

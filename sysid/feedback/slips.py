@@ -101,31 +101,12 @@ def find_segments(
     scale_rad: float = 1.0,
     near_s: float | None = None,
 ) -> list[Segment]:
-    """Split a stretch where the poll's phase jumps.
+    """Split a stretch where the poll's phase jumps: one, two or three segments, in time order.
 
-    Parameters
-    ----------
-    stretch : Stretch
-    value : ndarray, shape (changed,)
-        Reading of each changed row [rad].
-    period_s : float
-        Common period of the lattice.
-    blur_s : float
-        Full width of the uncertainty of one poll instant.
-    loss : float
-        Probability that a poll fails; NaN if unknown.
-    motion : callable, optional
-        Expected motion; without it only the times of changes count.
-    scale_rad : float
-        Size of the residuals of `motion` on this tone, any slip included. Each number of change
-        points is judged at its likeliest scale of the residuals, up to half of this.
-    near_s : float, optional
-        An instant of the present lattice: another phase must gain `NATS`, too.
-
-    Returns
-    -------
-    list of Segment
-        One, two or three, in time order.
+    `value` is the reading of each changed row [rad]; `loss` is NaN if unknown. Without the expected
+    `motion` only the times of changes count. `scale_rad` is the size of its residuals on this tone,
+    any slip included; each number of change points is judged at its likeliest scale, up to half of
+    this. `near_s` is an instant of the present lattice: another phase must gain `NATS`, too.
     """
     reference = 0.5 * (stretch.start_s + stretch.stop_s)
     grids = [
@@ -162,14 +143,8 @@ def find_segments(
 def evidence(stretch: Stretch, period_s: float, blur_s: float, loss: float) -> float:
     """Log-likelihood of when rows changed, for the best segments of a period.
 
-    Unlike the score of one period's phases it compares periods: a shorter one explains more
-    changes by more polls, of which more must have failed.
-
-    Parameters
-    ----------
-    stretch : Stretch
-    period_s, blur_s, loss : float
-        See `find_segments`.
+    Unlike the score of one period's phases it compares periods: a shorter one explains more changes
+    by more polls, of which more must have failed.
     """
     score = _scored(stretch, np.zeros(len(stretch.end)), period_s, blur_s, loss, None, 1.0).score
     one = float(np.max(score[0] + score[:, -1]))
@@ -285,14 +260,7 @@ def count_loss(
 ) -> tuple[float, float]:
     """Share of failed polls, and the number of independent polls that this was counted from.
 
-    Parameters
-    ----------
-    trials : sequence of Trial
-    phases : sequence of Phase
-    sure : sequence of callable, one per trial
-        From `moves` or `fast`.
-    known : bool
-        Whether it is from `moves`.
+    `sure`, one per trial, is from `moves` (then the motion is `known`) or from `fast`.
     """
     successes, polls = _count(trials, phases, sure)
     if not polls:
@@ -442,22 +410,11 @@ def without_commands(trial: Trial, first: int, rows: int) -> NDArray[np.float64]
 def find_upsets(
     trial: Trial, time_s: NDArray[np.float64], scale_rad: float, simulate: Simulate
 ) -> list[Upset]:
-    """Find commands of a trial that never reached the servo.
+    """Find commands of a trial that never reached the servo, in time order; most trials have none.
 
-    Parameters
-    ----------
-    trial : Trial
-    time_s : ndarray, shape (fresh,)
-        When each fresh reading was measured, on the recording's clock.
-    scale_rad : float
-        Noise of the trial's tone; where the bulk of the residuals is smaller, that counts.
-    simulate : callable
-        See `Simulate`; its residuals are those of `time_s`.
-
-    Returns
-    -------
-    list of Upset
-        In time order; empty for most trials.
+    `time_s` is when each fresh reading was measured, on the recording's clock, and `simulate` gives
+    residuals at these times. `scale_rad` is the noise of the trial's tone; where the bulk of the
+    residuals is smaller, that counts.
     """
     found: list[Upset] = []
     given = trial.command_rad

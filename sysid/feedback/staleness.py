@@ -98,16 +98,11 @@ _FIRST_MULTIPLES = 4  # the smallest frequent difference may be several steps
 
 
 def quantum(trials: Sequence[Trial]) -> float:
-    """Find the quantisation step of readings.
+    """Quantisation step of readings [rad]; 0 if their differences are no multiples of one.
 
     Differences of quantised readings gather at multiples of the step. The smallest frequent one
     gives a first guess, and least squares over all of them the step; a file's decimals only blur
     it.
-
-    Returns
-    -------
-    float
-        The step [rad]; 0 if the differences are no multiples of one.
     """
     given = [t.position_rad for t in trials]
     steps = np.concatenate([np.zeros(0), *(np.abs(np.diff(p)) for p in given)])
@@ -182,13 +177,9 @@ _Rows = tuple[NDArray[np.float64], NDArray[np.float64]]
 def staleness(trials: Sequence[Trial]) -> Staleness:
     """Decide whether readings are live, from motion and command alone.
 
-    A joint that moves less than a count per row shows no episode at the rows' own rate, so the
-    rule is tried on every second, third, fifth … row as well. There, a poll may hide between two
-    rows: only changes in quick succession then prove readings live.
-
-    Returns
-    -------
-    Staleness
+    A joint that moves less than a count per row shows no episode at the rows' own rate, so the rule
+    is tried on every second, third, fifth … row as well. There, a poll may hide between two rows:
+    only changes in quick succession then prove readings live.
 
     Examples
     --------
@@ -278,21 +269,11 @@ def _count(rows: Sequence[_Rows], offset: float, least: float) -> NDArray[np.int
 def episodes(
     command_rad: NDArray[np.float64], position_rad: NDArray[np.float64], least_rad: float
 ) -> NDArray[np.int64]:
-    """Count the repeats of each episode in the midst of motion.
+    """Count how often the older value was read again in each episode in the midst of motion.
 
-    An episode lasts from the row of one new value to the row of the next.
-
-    Parameters
-    ----------
-    command_rad, position_rad : ndarray, shape (rows,)
-        The command plus the offset of the readings, and the reading; a missing one is NaN.
-    least_rad : float
-        Smallest step, and smallest rate per row beside it, that are motion.
-
-    Returns
-    -------
-    ndarray of int, shape (episodes,)
-        How often the older value was read again.
+    An episode lasts from the row of one new value to the row of the next. The command has the
+    offset of the readings added; a missing reading is NaN. `least_rad` is the smallest step, and
+    the smallest rate per row beside it, that are motion.
     """
     here = np.flatnonzero(np.isfinite(position_rad))
     position, command = position_rad[here], command_rad[here]

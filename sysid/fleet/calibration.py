@@ -141,24 +141,12 @@ def calibrate_fleet(
     force: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Fleet:
-    """Calibrate every recording in `root`.
+    """Calibrate every recording in `root`; a `<robot>.yaml` each in `out`, and the table.
 
-    Parameters
-    ----------
-    root : Path
-        Folder of recordings.
-    out : Path
-        Folder for `<robot>.yaml` and the table.
-    settings : Settings
-    jobs : int
-        Processes here; joints of one robot then run one after the other.
-    cluster : str, optional
-        Address of a Dask scheduler, `tls://HOST:PORT` or `tcp://HOST:PORT`, whose workers see the
-        same folders. See `trust`.
-    force : bool
-        Make calibrations anew that another recording or other settings made.
-    progress : callable, optional
-        Called with each robot that is done.
+    Joints of one robot run one after the other, robots in `jobs` processes here, or on the workers
+    of a Dask scheduler (`cluster`, `tls://HOST:PORT` or `tcp://HOST:PORT`, see `trust`) that see
+    the same folders. `force` makes calibrations anew that another recording or other settings made.
+    `progress` is called with each robot that is done.
     """
     targets = {path: out / f"{name}.yaml" for path, name in robots_in(root).items()}
     return run_fleet(
@@ -182,26 +170,10 @@ def run_fleet(
 ) -> Fleet:
     """Make what is missing of `targets`, here or on a cluster, and the table of all.
 
-    Problems of single robots are listed in it, not raised.
-
-    Parameters
-    ----------
-    targets : dict of Path to Path
-        By recording: what is made of it, called as its robot is.
-    is_of : callable
-        `(target, path) -> bool`: whether an existing target was made so from this recording.
-    make : callable
-        `(path, target) -> None`; must be picklable.
-    numbers : callable
-        By joint of a target: what the table has of it, by `quantities`.
-    quantities : sequence of str
-    out : Path
-        Folder for the table.
-    jobs : int
-    cluster : str, optional
-    force : bool
-    progress : callable, optional
-        These four as for `calibrate_fleet`.
+    Problems of single robots are listed in it, not raised. `targets` has by recording what is made
+    of it, called as its robot is. `is_of(target, path)` says whether an existing target was made so
+    from this recording; `make(path, target)` makes it, and must be picklable; `numbers(target)` has
+    by joint what the table shows, by `quantities`. `out` is the table's folder.
     """
     if jobs < 1:
         raise InputError(f"`jobs` is {jobs}; it must be at least 1.")
@@ -296,13 +268,7 @@ def _one(
 
 
 def trust(cluster: str) -> str:
-    """What is risked by computing on a cluster, as a sentence.
-
-    Parameters
-    ----------
-    cluster : str
-        Address of a Dask scheduler.
-    """
+    """What is risked by computing on a cluster (address of a Dask scheduler), as a sentence."""
     found = _ADDRESS.fullmatch(cluster)
     if found is None:
         raise InputError(

@@ -280,18 +280,7 @@ def joint_response(
     rng: np.random.Generator,
     lattice: PollLattice | None = None,
 ) -> FrequencyResponse:
-    """Measure the frequency response of one joint.
-
-    Parameters
-    ----------
-    joint : str
-    trials : sequence of Trial
-        All of this joint.
-    rng : numpy.random.Generator
-        For the bootstrap.
-    lattice : PollLattice, optional
-        If it has been found already.
-    """
+    """Measure the frequency response of one joint from all of its trials."""
     lattice = lattice or find_poll_lattice(trials, rng.spawn(1)[0])
     tones: list[ToneResponse] = []
     read = [readings(trial, lattice) for trial in trials]

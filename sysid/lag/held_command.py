@@ -60,18 +60,7 @@ class HeldCommand:
     def means(
         self, time_s: NDArray[np.float64], edges_s: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Means of the staircase over bins of the past.
-
-        Parameters
-        ----------
-        time_s : ndarray, shape (times,)
-        edges_s : ndarray, shape (bins + 1,)
-            Of the bins, how long ago [s], rising.
-
-        Returns
-        -------
-        ndarray, shape (times, bins)
-        """
+        """Means over bins of the past, shape (times, bins), `edges_s` [s] ago (rising)."""
         past = self.integral(time_s[:, None] - edges_s)
         return (past[:, :-1] - past[:, 1:]) / np.diff(edges_s)
 
@@ -82,18 +71,7 @@ def past_tones(
     frequency_hz: NDArray[np.float64],
     phasor: NDArray[np.complex128],
 ) -> NDArray[np.float64]:
-    """Means over bins of the past of a sum of tones `Re(P exp(2πj f t))`.
-
-    Parameters
-    ----------
-    time_s : ndarray, shape (times,)
-    edges_s : ndarray, shape (bins + 1,)
-    frequency_hz, phasor : ndarray, shape (tones,)
-
-    Returns
-    -------
-    ndarray, shape (times, bins)
-    """
+    """Means over bins of the past of a sum of tones `Re(P exp(2πj f t))`, shape (times, bins)."""
     turn = 2j * np.pi * frequency_hz
     now = phasor / turn * np.exp(np.outer(time_s, turn))
     past = np.exp(-np.outer(turn, edges_s))
@@ -160,12 +138,8 @@ class Stretch:
     def autocorrelation(self, longest_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Products of the staircase with itself, shifted; the mean is removed.
 
-        Returns
-        -------
-        shift : ndarray, shape (shifts,)
-            From `-longest_s` to `longest_s` [s].
-        product : ndarray, shape (blocks, shifts)
-            Sum over each block's time; even in the shift.
+        Returns the shifts, `-longest_s` to `longest_s`, and the sums over each block's time, shape
+        (blocks, shifts), even in the shift.
         """
         span = float(self.time_s[-1] - self.time_s[0])
         step = max(_GRID_S, span / _MOST_POINTS)

@@ -194,23 +194,7 @@ def lag_budget(
     rng: np.random.Generator,
     lattice: PollLattice | None = None,
 ) -> LagBudget:
-    """Measure the lag of one joint and what the bus adds to it.
-
-    Parameters
-    ----------
-    joint : str
-    trials : sequence of Trial
-        All of this joint.
-    rng : numpy.random.Generator
-        For the bootstrap.
-    lattice : PollLattice, optional
-        If it has been found already.
-
-    Raises
-    ------
-    InputError
-        If nothing moves, or there are too few fresh readings to say anything.
-    """
+    """Measure the lag of one joint from all of its trials, and what the bus adds to it."""
     trials = [t.powered() for t in trials]
     lattice = lattice or find_poll_lattice(trials, rng.spawn(1)[0])
     read = [readings(t, lattice) for t in trials]
@@ -401,18 +385,7 @@ def _at_frequency(tone: ToneResponse, lag: float) -> FrequencyLag:
 def estimators(
     trials: Sequence[Trial], read: Sequence[Readings], tones: Sequence[ToneResponse], lag_s: float
 ) -> dict[str, float]:
-    """All estimators side by side, each the mean over trials [s].
-
-    Parameters
-    ----------
-    trials : sequence of Trial
-    read : sequence of Readings
-        Of each trial.
-    tones : sequence of ToneResponse
-        Empty if there are none.
-    lag_s : float
-        The lag budget's own, to stand beside them.
-    """
+    """All estimators side by side, each the mean over trials [s]; `lag_s` is the budget's."""
     pairs = list(zip(trials, read, strict=True))
     found = {
         "integer cross-correlation, all rows": [_integer(t, None) for t in trials],
@@ -468,15 +441,7 @@ _Product = tuple[NDArray[np.float64], NDArray[np.float64]]
 def shift_draws(response: ImpulseResponse, rng: np.random.Generator) -> NDArray[np.float64]:
     """Draws of the lag that impulse responses and the recording's own command give [s].
 
-    Parameters
-    ----------
-    response : ImpulseResponse
-    rng : numpy.random.Generator
-        Where the mass within a bin sits.
-
-    Returns
-    -------
-    ndarray, shape (draws,)
+    `rng` draws where the mass within a bin sits.
     """
     edges, masses = response.edges_s, response.masses
     gain = -1.0 if response.gain < 0 else 1.0
@@ -543,18 +508,7 @@ def row_shift(
 ) -> float:
     """Shift at which readings correlate best with the line through the rows' commands [s].
 
-    Parameters
-    ----------
-    trial : Trial
-    time_s, position_rad : ndarray, shape (readings,)
-        NaN where a reading is missing.
-    earliest_s, latest_s : float
-        Search range.
-
-    Returns
-    -------
-    float
-        NaN if there are fewer than 8 readings.
+    Readings may be NaN; with fewer than 8 others the shift is NaN.
     """
     here = np.flatnonzero(np.isfinite(position_rad))
     if len(here) < 8:

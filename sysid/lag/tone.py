@@ -111,14 +111,7 @@ def tone_response(
 ) -> ToneResponse | None:
     """Fit the tone of `trial`; None if it is no tone or has fewer than two steady periods.
 
-    Parameters
-    ----------
-    trial : Trial
-    reading : Readings
-        Of the same trial: when its fresh rows were measured.
-    rng : numpy.random.Generator
-        Weights the periods.
-    draws : int
+    `reading` says when its fresh rows were measured; `rng` weights the periods.
     """
     if not trial.frequency_hz > 0 or len(reading.rows) < 8:
         return None
@@ -227,19 +220,7 @@ def without_ripple(
     rng: np.random.Generator,
     near_s: float | None = None,
 ) -> list[ToneResponse]:
-    """The tones with their ripple, which `ToneResponse.response` leaves out.
-
-    Parameters
-    ----------
-    trials : sequence of Trial
-    read : sequence of Readings
-        Of each trial.
-    tones : sequence of ToneResponse
-        Found in these trials, at least one.
-    rng : numpy.random.Generator
-    near_s : float, optional
-        As in `phase_slope.tone_lags`.
-    """
+    """The tones with the ripple that `response` leaves out; `near_s` as in `tone_lags`."""
     loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
     frequency = np.array([t.frequency_hz for t in tones])
     lags = tone_lags(np.array([t.response for t in tones]), frequency, near_s)
@@ -345,14 +326,8 @@ FOLLOWS = 0.5  # of the largest gain: below, a tone says nothing about the delay
 def slope(tones: Sequence[ToneResponse], pair: str, near_s: float | None = None) -> Interval:
     """Lag common to all tones: the slope of the phase through the origin, with its interval.
 
-    Parameters
-    ----------
-    tones : sequence of ToneResponse
-    pair : {"raw_rows", "fresh_rows", "fresh_held"}
-        All rows or fresh readings against the rows' commands; fresh readings without the
-        staircase's ripple against the held command.
-    near_s : float, optional
-        As in `tone_lags`.
+    `pair` is "raw_rows" or "fresh_rows" (all rows, or fresh readings, against the rows' commands)
+    or "fresh_held" (fresh readings without the staircase's ripple against the held command).
     """
     frequency = np.array([t.frequency_hz for t in tones])
     response, draws = responses(tones, pair)
@@ -394,18 +369,13 @@ def tone_lags(
 ) -> NDArray[np.float64]:
     """Lag of every tone [s], the right whole period of each included.
 
-    A phase leaves the lag open to whole periods. The lowest tone has the longest period and
-    settles itself below 2 Hz; above, the lag on which all tones agree best settles it. From there
-    each tone takes the period nearest to the lag of the tone below it, for a servo's lag changes
-    by far less than half a period from one tone to the next.
+    A phase leaves the lag open to whole periods. The lowest tone has the longest period and settles
+    itself below 2 Hz; above, the lag on which all tones agree best settles it. From there each tone
+    takes the period nearest to the lag of the tone below it, for a servo's lag changes by far less
+    than half a period from one tone to the next.
 
-    Parameters
-    ----------
-    response : ndarray of complex, shape (tones,)
-    frequency_hz : ndarray, shape (tones,)
-    near_s : float, optional
-        The lag as other than phases show it, the start of the motion for one: it settles the
-        period of a lowest tone above 2 Hz, and of a lag that is longer than the lowest tone allows.
+    `near_s` is the lag as other than phases show it, the start of the motion for one: it settles
+    the period of a lowest tone above 2 Hz, and of a lag that is longer than the lowest tone allows.
     """
     order = np.argsort(frequency_hz, kind="stable")
     lowest = frequency_hz[order[0]]
@@ -455,16 +425,7 @@ _LINES_GRID_S = 1e-3
 
 
 def line_responses(trial: Trial, reading: Readings, rng: np.random.Generator) -> list[ToneResponse]:
-    """Response at every frequency that the command of `trial` is made of; empty if it is of none.
-
-    Parameters
-    ----------
-    trial : Trial
-    reading : Readings
-        Of the same trial: when its fresh rows were measured.
-    rng : numpy.random.Generator
-        Weights the periods.
-    """
+    """Response at every frequency that the command of `trial` is made of; may be empty."""
     parts = split_tones(trial)
     if not parts[0].frequency_hz > 0:
         return multisine_responses(trial, reading, rng)
@@ -475,16 +436,7 @@ def line_responses(trial: Trial, reading: Readings, rng: np.random.Generator) ->
 def multisine_responses(
     trial: Trial, reading: Readings, rng: np.random.Generator
 ) -> list[ToneResponse]:
-    """Response at each line of the command of `trial`; empty if it is no multisine.
-
-    Parameters
-    ----------
-    trial : Trial
-    reading : Readings
-        Of the same trial: when its fresh rows were measured.
-    rng : numpy.random.Generator
-        Weights stretches of half a second for the draws.
-    """
+    """Response at each line of the command of `trial`; empty if it is no multisine."""
     send = trial.send_time_s
     if len(send) < 100 or np.ptp(trial.command_rad) < 1e-3:
         return []

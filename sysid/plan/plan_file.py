@@ -182,18 +182,8 @@ def executable(
 ) -> Plan:
     """The plan in the form that the recorder executes, within the limits of a bus.
 
-    Parameters
-    ----------
-    proposal : SweepPlan
-    path : Path
-        Its file; name and hash go into the recording's header.
-    joints : sequence of str
-        Those of the plan that move.
-    margin_rad : mapping of joint to float
-        Largest excursion of each joint to either side of its start pose.
-    start_pose_rad : mapping of joint to float
-    speed_limit_rad_s : float
-        Of the bus.
+    Name and hash of its file, `path`, go into the recording's header. `joints` are those of the
+    plan that move, `margin_rad` the largest excursion of each to either side of its start pose.
     """
     chosen = [t for t in proposal.trials if t.joint in joints]
     parts = [

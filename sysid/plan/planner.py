@@ -117,16 +117,9 @@ class JointPlan(Result):
 
 
 def propose(joint: str, servos: Sequence[Servo], setup: Setup, seconds: float) -> JointPlan:
-    """Trials of one joint, `seconds` long in all, and the intervals to expect.
+    """Trials of one joint, `seconds` long in all (lead-ins too), and the intervals to expect.
 
-    Parameters
-    ----------
-    joint : str
-    servos : sequence of Servo
-        What it may be: one fitted servo, or several drawn from the prior.
-    setup : Setup
-    seconds : float
-        Recorded time, lead-ins included.
+    `servos` is what the joint may be: one fitted servo, or several drawn from the prior.
     """
     count = max(1, int(seconds / trial_seconds(SHORTEST_S) + 1e-9))
     duration = round(seconds / count - trial_seconds(0.0), 3)
@@ -421,14 +414,8 @@ def prior_information(model: Structure) -> NDArray[np.float64]:
 def respond(hypothesis: Hypothesis, trial: Run, noise: Noise, seen: float = 1.0) -> Response:
     """Simulate one trial and its sensitivities.
 
-    Parameters
-    ----------
-    hypothesis : Hypothesis
-    trial : Run
-        Command, and the times of the readings; their positions are ignored.
-    noise : Noise
-    seen : float
-        Share of the readings that arrive.
+    `trial` has the command and the times of the readings; their positions are ignored. `seen` is
+    the share of the readings that arrive.
     """
     model, values = hypothesis.model, hypothesis.values
     par = model.parameters
@@ -451,18 +438,10 @@ def respond(hypothesis: Hypothesis, trial: Run, noise: Noise, seen: float = 1.0)
 def fitted_noise(
     model: Structure, values: NDArray, trials: Sequence[Run], least_rad: float
 ) -> Noise:
-    """Noise that explains the residuals of a fit, tone by tone.
+    """Noise that explains the residuals of a fit, tone by tone; its floor is at least `least_rad`.
 
     Least squares of each trial's mean squared residual over floor² + jitter² · mean squared speed,
     relative to the former; both not negative.
-
-    Parameters
-    ----------
-    model : Structure
-    values : ndarray, shape (parameters,)
-    trials : sequence of Run
-    least_rad : float
-        Smallest floor.
     """
     from scipy.optimize import nnls
 
@@ -482,12 +461,8 @@ def separation(
 ) -> float:
     """Nats by which trials are expected to prefer the true model to a rival that is fitted again.
 
-    Parameters
-    ----------
-    truth, rival : sequence of Response
-        The same trials under both.
-    known : ndarray, shape (parameters, parameters)
-        Information about the rival's coordinates so far.
+    Both have responses to the same trials; `known` is the information about the rival's coordinates
+    so far, shape (parameters, parameters).
     """
     total, pull, curvature = 0.0, np.zeros(len(known)), known.copy()
     for true, wrong in zip(truth, rival, strict=True):

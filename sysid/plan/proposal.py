@@ -99,22 +99,10 @@ def plan_from_recordings(
     workers: int = 1,
     progress: Callable[[str], None] | None = None,
 ) -> SweepPlan:
-    """Fit the joints of recordings, and plan what narrows their intervals most.
+    """Fit the joints of recordings, pooled per joint, and plan what narrows their intervals most.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Trials of one joint are pooled.
-    joints : sequence of str
-    seconds : float, optional
-        Recorded time per joint [s]; by default as long as the recordings.
-    margins : mapping of joint to float, optional
-        Largest excursions [rad]; by default those of the recordings.
-    seed : int
-    workers : int
-        Processes.
-    progress : callable, optional
-        Called with a joint's name when it is done.
+    Defaults are those of `plan_from_fits`. `progress` is called with a joint's name when it is
+    done.
     """
     if seconds is not None:
         _checked(seconds)  # before the work, not after it
@@ -131,18 +119,9 @@ def plan_from_fits(
     margins: Margins | None = None,
     seed: int = 0,
 ) -> SweepPlan:
-    """Plan what narrows the intervals of fitted joints most; parameters as above.
+    """Plan what narrows the intervals of joints fitted to `recordings` most.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        The fits' own.
-    fits : mapping of joint to JointCalibrationResult
-    seconds : float, optional
-        Recorded time per joint [s]; by default as long as the recordings.
-    margins : mapping of joint to float, optional
-        Largest excursions [rad]; by default those of the recordings.
-    seed : int
+    By default as long per joint [s] as the recordings, and within their excursions [rad].
     """
     limits = [(r.metadata.get("bus") or {}).get("speed_limit_rad_s") for r in recordings]
     base = Setup(
@@ -176,20 +155,7 @@ def plan_from_calibration(
     """Plan what narrows the intervals of a calibration most.
 
     A calibration holds no readings: what it knows is taken from its intervals, as if they were
-    independent.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    source : Source
-        Its file.
-    joints : sequence of str
-    seconds : float
-        Recorded time per joint [s].
-    loop_period_s : float
-    margins : mapping of joint to float, optional
-        Largest excursions [rad].
-    seed : int
+    independent. `source` is its file; `seconds` is recorded time per joint [s].
     """
     base = Setup(loop_period_s=loop_period_s)
     plans, polls = [], []
@@ -213,21 +179,9 @@ def plan_first_sweep(
     margins: Margins | None = None,
     seed: int = 0,
 ) -> SweepPlan:
-    """Plan a first sweep of servos of which nothing is known.
+    """Plan a first sweep of servos of which nothing is known, `seconds` of each joint.
 
-    The trials are the best on average over servos drawn from the prior of
-    `sysid.fit.structure`.
-
-    Parameters
-    ----------
-    joints : sequence of str
-    setup : Setup
-        Of the bus.
-    seconds : float
-        Recorded time per joint [s].
-    margins : mapping of joint to float, optional
-        Largest excursions [rad].
-    seed : int
+    The trials are the best on average over servos drawn from the prior of `sysid.fit.structure`.
     """
     servos, made, plans = unknown_servos(seed), dict[float, JointPlan](), []
     for joint in joints:

@@ -130,22 +130,9 @@ def record_until(
 ) -> Outcome:
     """Fit, plan and record until every joint has reached a goal or cannot.
 
-    Parameters
-    ----------
-    goal : Goal
-    paths : sequence of Path
-        Recordings that there are: the first sweep, and rounds of an earlier call.
-    joints : sequence of str
-    fit : callable
-        See `Fit`.
-    record_next : callable
-        See `RecordNext`.
-    most_seconds : float
-        Most recorded time of a joint, the first sweep included [s].
-    seed : int
-        For the plans' record.
-    report : callable, optional
-        Called with the joints' state after every round of fits.
+    `paths` are the recordings that there are: the first sweep, and rounds of an earlier call.
+    `most_seconds` is the most recorded time of a joint, the first sweep included [s]. `report` is
+    called with the joints' state after every round of fits.
     """
     files, found, widths = list(paths), dict[str, JointOutcome](), dict[str, list[float]]()
     left = list(joints)

@@ -259,14 +259,9 @@ class Track:
 
 
 def tracks(result: JointCalibrationResult, model: str | None = None) -> list[Track]:
-    """Free run of a fitted model on every trial of its joint.
+    """Free run of a fitted model on every trial of its joint, by default the one simulators run.
 
-    Parameters
-    ----------
-    result : JointCalibrationResult
-    model : str, optional
-        Name of a candidate model; by default the one that simulators run. A joint under load has
-        one.
+    A joint under load has one model.
     """
     if not result.runs:
         return []
@@ -365,13 +360,7 @@ def hold_runs(
 ) -> HoldRuns:
     """Hold runs of one joint, counted by the doctor and predicted by its poll lattice.
 
-    Parameters
-    ----------
-    histograms : sequence of tuple of int
-        Runs of 1, 2, … rows in each recording; they are added.
-    loop_periods_s : sequence of float
-        Of each recording.
-    lattice : PollLattice
+    `histograms` has runs of 1, 2, … rows in each recording; they are added.
     """
     count = np.zeros(LONGEST_RUN, dtype=np.int64)
     for histogram in histograms:
@@ -400,14 +389,7 @@ def _expected(period_rows: float, loss: float) -> NDArray[np.float64]:
 
 @styled
 def overlay_figure(result: JointCalibrationResult, found: list[Track] | None = None) -> Figure:
-    """Command, model and readings, the fresh ones at the time they were measured.
-
-    Parameters
-    ----------
-    result : JointCalibrationResult
-    found : list of Track, optional
-        From `sysid.report.figures.tracks`, if they have been computed.
-    """
+    """Command, model and readings, the fresh ones at the time they were measured."""
     shown = some_tracks(tracks(result) if found is None else found)
     figure, grid = axes_column(len(shown), 1.2 + 1.75 * len(shown))
     for axes, track in zip(grid, shown, strict=True):
@@ -420,13 +402,7 @@ def overlay_figure(result: JointCalibrationResult, found: list[Track] | None = N
 
 @styled
 def overlay_grid(found: Mapping[str, list[Track]]) -> Figure:
-    """The same of every joint beside the others, one frequency each.
-
-    Parameters
-    ----------
-    found : dict of joint to list of Track
-        From `sysid.report.figures.tracks`; none of them empty.
-    """
+    """The same of every joint beside the others, one frequency each; no joint without tracks."""
     figure, grid = axes_grid(len(found), 3, 1.75)
     for n, (axes, (joint, own)) in enumerate(zip(grid, found.items(), strict=True)):
         spread = some_tracks(own, 3)
@@ -474,14 +450,7 @@ OVERLAY_PARTS = {
 
 @styled
 def residual_figure(result: JointCalibrationResult, found: list[Track] | None = None) -> Figure:
-    """Residuals of the model: over speed, fresh and raw; and over time.
-
-    Parameters
-    ----------
-    result : JointCalibrationResult
-    found : list of Track, optional
-        From `sysid.report.figures.tracks`, if they have been computed.
-    """
+    """Residuals of the model: over speed, fresh and raw; and over time."""
     found = tracks(result) if found is None else found
     figure, (over_speed, over_time) = axes_column(2, 6.0)
     lattice = result.lag.feedback

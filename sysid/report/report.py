@@ -192,20 +192,10 @@ def recall(
     joints: Sequence[str],
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, JointCalibrationResult]:
-    """Results by joint, as `sysid.fit.calibrate.calibrate` made them.
+    """Results by joint, as `sysid.fit.calibrate.calibrate` made them from these recordings.
 
-    Intervals are those of the file: of the model that simulators run. Errors by left-out frequency
-    are not in the file; the error over all of them is.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    recordings : Recording or sequence of Recording
-        What it was made from.
-    joints : sequence of str
-        For which `can_recall` holds.
-    progress : callable, optional
-        Called with a joint's name when it is done.
+    `can_recall` holds for all `joints`. Intervals are those of the file: of the model that
+    simulators run. Errors by left-out frequency are not in the file; the error over all of them is.
     """
     found = {}
     for name, trials in usable_trials(recordings, joints).items():

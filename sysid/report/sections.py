@@ -340,13 +340,8 @@ def advice(
 ) -> list[str]:
     """What to record next, most useful first; one sentence each.
 
-    Parameters
-    ----------
-    results : dict of joint to JointCalibrationResult
-    calibration : Calibration
-        Of those; it says what was identified.
-    examinations : sequence of (str, pupper_sysid.sysid.doctor.examination.Examination)
-        Name of the recording and what the doctor found.
+    The calibration says what was identified; `examinations` has by the recording's name what the
+    doctor found.
     """
     again: dict[str, list[str]] = {joint: [] for joint in results}
     for recording, examination in examinations:

@@ -266,15 +266,7 @@ _ENDS = ("value", "low", "high")
 
 
 def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str]) -> Table:
-    """The doctor's verdict per recording and joint.
-
-    Parameters
-    ----------
-    examinations : sequence of (str, pupper_sysid.sysid.doctor.examination.Examination)
-        Name of the recording and what the doctor found.
-    joints : sequence of str
-        Which joints to show.
-    """
+    """The doctor's verdict per recording and joint; `examinations` are by its name."""
     rows = tuple(
         {"recording": recording, "joint": joint}
         | flat(plain(found))

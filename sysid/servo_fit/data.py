@@ -129,16 +129,9 @@ def servo_data(
 ) -> ServoData:
     """Arrange recordings for fitting or scoring servo models.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-    joints : sequence of str
-    mode : {"auto", "fresh", "all"}
-        Which readings count; `auto` decides per joint, as the module's text describes.
-    seed : int
-        Of the search for the poll.
-    lattices : mapping of joint to PollLattice, optional
-        Of the joints whose poll has been found already.
+    `mode` ("auto", "fresh" or "all") says which readings count; `auto` decides per joint, as the
+    module's text describes. `seed` is of the search for the poll of those joints that `lattices`
+    lacks.
     """
     periods = sorted((r.loop_period_s, r.name) for r in recordings)
     (shortest, fast), (longest, slow) = periods[0], periods[-1]
@@ -166,13 +159,9 @@ def servo_data(
 def look_up_weights(
     tick: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Ticks and weights of a value between ticks (Catmull-Rom cubic).
+    """Tick before each of `tick`, shape (n,), and weights of a Catmull-Rom cubic, shape (n, 4).
 
-    Returns
-    -------
-    index : ndarray of int, shape (n,)
-        The tick before; the four are `index - 1` to `index + 2`.
-    weight : ndarray, shape (n, 4)
+    The weights are of the ticks `index - 1` to `index + 2`.
     """
     index = np.floor(tick).astype(int)
     t = tick - index

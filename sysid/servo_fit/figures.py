@@ -43,17 +43,7 @@ def free_run_figure(
 ) -> Figure:
     """One panel per joint: the seconds in which its command moves most.
 
-    Parameters
-    ----------
-    data : ServoData
-    tracks : dict of str to Tracks
-        Free run of each model.
-    errors : dict of str to (dict of str to Errors)
-        By model, then joint.
-    bands : dict of str to (dict of str to Band)
-        By model, then joint; drawn for the first model.
-    joints : sequence of str, optional
-        Which; by default all.
+    All mappings are by model; errors and bands then by joint. Bands are drawn for the first model.
     """
     shown = list(data.joints if joints is None else joints)
     figure, panels = axes_column(len(shown), 0.7 + 1.75 * len(shown))

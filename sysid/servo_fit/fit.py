@@ -68,13 +68,7 @@ class Split:
 
     @classmethod
     def by_trials(cls, train_loops: Sequence[int], test_loops: Sequence[int]) -> Split:
-        """Whole trials (loops of a playback).
-
-        Parameters
-        ----------
-        train_loops, test_loops : sequence of int
-            Numbers of trials.
-        """
+        """Whole trials (loops of a playback), by their numbers."""
         for name, numbers in (("train_loops", train_loops), ("test_loops", test_loops)):
             for number in numbers:
                 refuse_outside(f"`{name}`", number, -LARGEST_COUNT, LARGEST_COUNT)
@@ -92,13 +86,7 @@ class Split:
 
     @classmethod
     def by_time(cls, train_before_s: float, test_after_s: float) -> Split:
-        """The beginning of each trial for training, its end for testing.
-
-        Parameters
-        ----------
-        train_before_s, test_after_s : float
-            Since the start of the trial [s].
-        """
+        """The beginning of each trial for training, its end for testing [s since its start]."""
         if not 0 < train_before_s <= test_after_s < np.inf:
             raise InputError(
                 f"`train_before_s` is {train_before_s:g} and `test_after_s` {test_after_s:g}; "
@@ -375,10 +363,8 @@ def delayed_pd_fits(
 ) -> list[dict[str, NDArray[np.float64]]]:
     """One DelayedPD per joint for each part of the data.
 
-    Returns
-    -------
-    list of dict of str to ndarray, shape (joints,)
-        Fields of `DelayedPDParameters` for an armature of 1, and `offset_rad`.
+    Each has the fields of `DelayedPDParameters` for an armature of 1, and `offset_rad`, shape
+    (joints,).
     """
     model = candidate(PREFERRED)
     keep, final = (12, 3) if len(parts) * len(data.joints) <= _MANY else (6, 2)
@@ -406,10 +392,8 @@ def sindy_fits(
 ) -> list[dict[str, NDArray[np.float64]]]:
     """One sparse equation per joint for each part of the data.
 
-    Returns
-    -------
-    list of dict of str to ndarray, shape (joints,)
-        Every name of `COEFFICIENTS` that some joint has, `dead_time_s` and `offset_rad`.
+    Each has every name of `COEFFICIENTS` that some joint has, `dead_time_s` and `offset_rad`, shape
+    (joints,).
     """
     from pupper_sysid.sysid.sparse import fit_equations
 

@@ -59,21 +59,11 @@ def fit_network(
     nested: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> NetworkFit:
-    """Fit one kind of model.
+    """Fit one kind of model ("fir", "mlp" or "lstm") to all joints.
 
-    Parameters
-    ----------
-    kind : {"fir", "mlp", "lstm"}
-    joints : sequence of str
-    period_s : float
-        Time between commands [s].
-    data : Samples
-        With `past_ticks(period_s)` commands before each window.
-    seed : int
-    nested : bool
-        Choose the hyper-parameters of each held-out model without its group, too.
-    progress : callable, optional
-        Called with steps done and steps in all.
+    `data` has `past_ticks(period_s)` commands before each window. With `nested` the
+    hyper-parameters of each held-out model are chosen without its group, too. `progress` is called
+    with steps done and steps in all.
     """
     groups = [int(g) for g in np.unique(data.group[data.used]) if g >= 0]
     nested = nested and len(groups) > 2  # a pair of two would leave nothing to learn from

@@ -110,15 +110,9 @@ included."""
 
 
 def tracks(model: ServoModel, data: ServoData, start: NDArray | None = None) -> Tracks:
-    """Free run of a model over every run.
+    """Free run of a model, whose last axis is the joints of `data`, over every run.
 
-    Parameters
-    ----------
-    model : ServoModel
-        Its last axis is the joints of `data`.
-    data : ServoData
-    start : ndarray, shape (runs, joints), optional
-        Where each run starts [rad]; by default as recorded.
+    `start` [rad], shape (runs, joints), is where each run starts; by default as recorded.
     """
     commands, recorded, _ = stacked(data)
     start = recorded if start is None else start
@@ -131,16 +125,9 @@ def tracks(model: ServoModel, data: ServoData, start: NDArray | None = None) -> 
 
 
 def by_run(data: ServoData, start: NDArray, positions: ArrayLike, per_tick: int = 1) -> Tracks:
-    """Tracks of positions.
+    """Tracks of positions after each step, shape (steps, runs, joints), the shorter runs padded.
 
-    Parameters
-    ----------
-    data : ServoData
-    start : ndarray, shape (runs, joints)
-    positions : array_like, shape (steps, runs, joints)
-        After each step, the shorter runs padded.
-    per_tick : int
-        Steps per command.
+    `start` has shape (runs, joints); `per_tick` is the number of steps per command.
     """
     out = np.concatenate([start[None], np.asarray(positions, float)])
     return {
@@ -157,14 +144,9 @@ def steps_per_tick(track: NDArray, run: Run) -> int:
 
 
 def predicted(track: NDArray, run: Run, tick: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Readings that a track predicts: its mean over equally probable instants.
+    """Readings that a track of `run` predicts: its mean over equally probable instants.
 
-    Parameters
-    ----------
-    track : ndarray
-        Of `run`.
-    run : Run
-    tick : ndarray, shape (readings, instants)
+    `tick` has shape (readings, instants).
     """
     at = look_up(track, steps_per_tick(track, run) * tick.ravel())
     return at.reshape(tick.shape).mean(axis=1)
@@ -340,13 +322,7 @@ def _alone(data: ServoData) -> bool:
 
 
 def stacked(data: ServoData) -> tuple[NDArray, NDArray, NDArray]:
-    """Commands and where each run starts, and readings, all padded to the longest run.
-
-    Returns
-    -------
-    commands, position : ndarray, shape (steps, runs, joints)
-    start : ndarray, shape (runs, joints)
-    """
+    """Commands, starts (runs, joints) and readings (steps, runs, joints), all padded."""
     most = max(len(found) for found in data.runs.values())
     steps = max(len(r.command_rad) for found in data.runs.values() for r in found)
     commands = np.zeros((steps, most, len(data.joints)))
@@ -408,20 +384,10 @@ def learned_run(model: ServoModel, data: ServoData) -> FreeRun:
 def run_with_offset(
     run: FreeRun, data: ServoData, part: Part = everything
 ) -> tuple[Tracks, dict[str, float]]:
-    """Free run of a model, shifted by the offset of each recording.
+    """Free run of a model, shifted by the offset of each recording, and the offsets.
 
-    Parameters
-    ----------
-    run : FreeRun
-    data : ServoData
-    part : Part
-        Which readings the offset is estimated from.
-
-    Returns
-    -------
-    tracks : Tracks
-    offset_rad : dict of str to float
-        By joint; the mean over recordings.
+    The offset is estimated from the readings of `part`; returned is the mean over recordings [rad],
+    by joint.
     """
     offset = np.zeros(stacked(data)[1].shape)
     tracks = run(offset)
@@ -463,14 +429,7 @@ def offsets(tracks: Tracks, data: ServoData, part: Part) -> dict[str, dict[int, 
 
 
 def received(run: Run, period_s: float) -> NDArray[np.float64]:
-    """Commands of a run as the bus sent them, averaged over physics steps, to beyond its last tick.
-
-    Parameters
-    ----------
-    run : Run
-    period_s : float
-        Between ticks.
-    """
+    """Commands of a run as the bus sent them, by physics steps, to beyond its last tick."""
     trial = run.on_physics(np.ones(len(run.tick), bool))
     tail = math.ceil(period_s / TIME_STEP_S) + 1
     return np.pad(trial.command, (0, tail), mode="edge")
@@ -479,13 +438,7 @@ def received(run: Run, period_s: float) -> NDArray[np.float64]:
 def on_ticks(positions: NDArray[np.float64], run: Run, period_s: float) -> NDArray[np.float64]:
     """Positions at physics steps as a track: several times per tick, at the run's own times.
 
-    Parameters
-    ----------
-    positions : ndarray, shape (steps + 1,)
-        From the run's first command on, beyond its last tick.
-    run : Run
-    period_s : float
-        Between ticks; the last one has no other.
+    `positions`, shape (steps + 1,), are from the run's first command to beyond its last tick.
     """
     per_tick = max(1, math.ceil(period_s / TIME_STEP_S))
     send = run.trial.send_time_s - run.trial.send_time_s[0]

@@ -336,29 +336,11 @@ def train(
     watch: Callable[[Checkpoint], bool],
     progress: Callable[[int], None] | None = None,
 ) -> bool:
-    """Train until `watch` returns True, the steps are used up, or Ctrl-C.
+    """Train an "mlp" or "lstm" until `watch` returns True, the steps are used up, or Ctrl-C.
 
-    Parameters
-    ----------
-    kind : {"mlp", "lstm"}
-    recipe : Recipe
-    period_s : float
-        Time between commands [s].
-    data : Samples
-    linear : LinearFits
-        Of the same training sets.
-    sets : sequence of frozenset of int
-        Groups that each network leaves out.
-    seed : int
-    watch : callable
-        Called with each `Checkpoint`; True stops.
-    progress : callable, optional
-        Called with the number of steps done.
-
-    Returns
-    -------
-    bool
-        Whether it was interrupted.
+    `linear` is of the same training `sets`, each the groups that a network leaves out. `watch` is
+    called with each `Checkpoint`, `progress` with the number of steps done. Returns whether it was
+    interrupted.
     """
     torch.set_num_threads(1)
     keep_freed_memory()

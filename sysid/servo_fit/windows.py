@@ -92,12 +92,7 @@ class Samples:
         return self.command.shape[1]
 
     def at_readings(self, taps: int) -> NDArray[np.float64]:
-        """Last `taps` commands, newest first, looked up at each reading.
-
-        Returns
-        -------
-        ndarray, shape (joints, windows, readings, taps)
-        """
+        """Last `taps` commands, newest first, at readings (joints, windows, readings, taps)."""
         view = np.lib.stride_tricks.sliding_window_view(self.command, taps, axis=-1)
         # output k has newest command past - 1 + k: the window of taps that ends there
         history = view[:, :, self.past - taps :, ::-1]
@@ -291,15 +286,8 @@ def fit_linear(
 ) -> LinearFits:
     """Fit every joint on every training set.
 
-    Parameters
-    ----------
-    data : Samples
-    sets : sequence of frozenset of int
-        Groups that each fit leaves out.
-    period_s : float
-        Time between commands [s].
-    ridge : float
-        In units of the number of readings; commands and positions have unit variance.
+    Each of `sets` is the groups that a fit leaves out. `ridge` is in units of the number of
+    readings; commands and positions have unit variance.
     """
     count = taps(period_s)
     fade = fading(count, period_s)

@@ -135,28 +135,12 @@ def bench_plan(
     start_rad: float,
     margin_rad: float,
 ) -> Plan:
-    """The trials of a bench, gain by gain.
+    """The trials of a bench, gain by gain; empty `gains` leave the servo's own.
 
-    Parameters
-    ----------
-    joint : str
-    load : PendulumLoad or None
-        None is a servo in free air: no drops.
-    gains : sequence of int
-        P gains; empty leaves the servo's own.
-    kind : str
-        `bench`, `drop`, `reversal`, or a kind of `sysid.sweep.excitation.plan`.
-    frequencies_hz : sequence of float
-        Of tones; a chirp has its own.
-    amplitude_rad : float, optional
-        Default: `AMPLITUDE_RAD`, or `STROKE_RAD` for `reversal` and `LIFT_RAD` for lifts.
-    duration_s : float, optional
-        Of each trial, as in `excitation.plan`.
-    loop_period_s : float
-    start_rad : float
-        Where the mass hangs, or the joint's rest.
-    margin_rad : float
-        Travel to both sides of it.
+    A `load` of None is a servo in free air: no drops. `kind` is one of `BENCH_KINDS` or of
+    `sysid.sweep.excitation.plan`; a chirp has frequencies of its own. The amplitude is by default
+    `AMPLITUDE_RAD`, or `STROKE_RAD` for `reversal` and `LIFT_RAD` for lifts. The mass hangs (or the
+    joint rests) at `start_rad`, with `margin_rad` of travel to both sides.
     """
     if amplitude_rad is not None:
         check_amplitude(amplitude_rad)

@@ -242,32 +242,17 @@ def plan(
 ) -> Plan:
     """The trials of an excitation, one joint after the other.
 
-    Parameters
-    ----------
-    kind : str
-        "sine": one trial per frequency; "chirp": one from the lowest to the highest frequency,
-        logarithmic; "multisine": one with all frequencies at once, Schroeder phases; "steps": one
-        with steps of a third, two thirds and all of the amplitude; "square": one per frequency;
-        "prbs": a pseudo-random binary sequence.
-    joints : sequence of str
-    frequencies_hz : sequence of float
-        Ignored by "steps" and "prbs".
-    amplitude_rad : float
-        Largest excursion from the start pose. It is not reduced for steps, square waves and PRBS,
-        which are meant to reach the speed limit.
-    duration_s : float, optional
-        Of each trial without its lead-in. Default: for tones 5 s or 5 periods, whichever is
-        longer; 20 s for a chirp, a multisine or a PRBS; one pass for steps.
-    loop_period_s : float
-        Time between commands.
-    speed_limit_rad_s : float
-        Of the servo.
-    poll_rate_hz : float
-        Feedback polls per second, 0 if there are none.
-    margin_rad : mapping of joint to float, optional
-        Largest excursion of each joint to both sides of its start pose.
-    start_pose_rad : mapping of joint to float, optional
-        Default: the Mini Pupper's standing pose.
+    The kinds: "sine", one trial per frequency; "chirp", one from the lowest to the highest
+    frequency, logarithmic; "multisine", one with all frequencies at once, Schroeder phases;
+    "steps", one with steps of a third, two thirds and all of the amplitude; "square", one per
+    frequency; "prbs", a pseudo-random binary sequence. The amplitude [rad], the largest excursion
+    from the start pose, is not reduced for steps, square waves and PRBS, which are meant to reach
+    the speed limit.
+
+    `duration_s` is of each trial without its lead-in; by default for tones 5 s or 5 periods,
+    whichever is longer; 20 s for a chirp, a multisine or a PRBS; one pass for steps. `poll_rate_hz`
+    is 0 if there are no polls. `margin_rad` is the largest excursion of each joint to both sides of
+    its start pose, which is by default the Mini Pupper's standing pose.
     """
     if kind not in KINDS:
         raise InputError(f"excitation '{kind}' is unknown; choose from {', '.join(KINDS)}.")

@@ -64,32 +64,11 @@ def record(
     progress: Progress | None = None,
     observe: Observe | None = None,
 ) -> Path:
-    """Execute `plan` on `bus` and write the recording to `path`.
+    """Execute `plan` on `bus` and write the recording to `path`, whose footer says it is complete.
 
-    Parameters
-    ----------
-    bus : ServoBus
-        Wrapped in a guard if it is not yet. Always closed at the end.
-    plan : Plan
-    path : Path
-        CSV file to write.
-    loop_period_s : float
-        Time between commands [s].
-    metadata : dict, optional
-        More keys for the recording's header, such as the seed.
-    force : bool
-        Replace an existing file.
-    resume : Resume, optional
-        Continue the unfinished recording at `path` instead.
-    progress : callable, optional
-        See `Progress`.
-    observe : callable, optional
-        See `Observe`; it must not wait.
-
-    Returns
-    -------
-    Path
-        The file. It has a footer only if the plan was completed.
+    The bus is wrapped in a guard if it is not yet, and always closed at the end. `metadata` has
+    more keys for the recording's header. `resume` continues the unfinished recording at `path`.
+    `observe` must not wait.
 
     Raises
     ------

@@ -157,13 +157,9 @@ _LARGEST_BYTES = 100e6
 
 
 def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
-    """Plan that repeats the commands in `path`; each joint starts at its first command.
+    """Plan that repeats the commands in `path`, of all joints that it commands or of some.
 
-    Parameters
-    ----------
-    path : Path
-    joints : sequence of str, optional
-        Joints to move; by default all that the file commands.
+    Each joint starts at its first command.
     """
     table = read_table(path, read_text(path, _LARGEST_BYTES), strict=False)
     named = [str(c).removesuffix(_ENDING) for c in table.columns if str(c).endswith(_ENDING)]

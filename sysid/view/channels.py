@@ -89,14 +89,9 @@ def guard_counts(counts: Mapping[str, int]) -> list[str]:
 
 
 def poses(recording: Recording, rate_hz: float) -> tuple[Array, dict[str, Array]]:
-    """Latest reading of each joint, held, at most `rate_hz` times a second.
+    """Times of readings [s], at most `rate_hz` a second, and the latest readings [rad].
 
-    Returns
-    -------
-    time_s : ndarray, shape (n,)
-        Times of readings [s].
-    position_rad : dict of joint to ndarray, shape (n,)
-        Servo angles; before the first reading of a joint its start pose.
+    They are by joint; before its first reading its start pose.
     """
     every = np.unique(recording.table["read_time_s"].to_numpy(float))
     time_s = every[np.unique(np.floor((every - every[0]) * rate_hz), return_index=True)[1]]
@@ -133,22 +128,11 @@ _LEVEL = np.full(3, np.nan)
 
 
 def packed(stretch: int, sent: Sent, reading: BusSample, gravity: Array = _LEVEL) -> Array:
-    """One tick as a row of numbers.
+    """One tick as a row of numbers, shape (5 + 6 * joints,).
 
-    Parameters
-    ----------
-    stretch : int
-        Another number wherever readings before this one were not seen: only within a stretch can a
-        repeated value be stale.
-    sent : Sent
-        NaN where no command is known.
-    reading : BusSample
-    gravity : ndarray, shape (3,), optional
-        Its direction in the trunk's frame; NaN where it was not measured.
-
-    Returns
-    -------
-    ndarray, shape (5 + 6 * joints,)
+    `stretch` is another number wherever readings before this one were not seen: only within a
+    stretch can a repeated value be stale. What was sent is NaN where no command is known;
+    `gravity`, shape (3,), is its direction in the trunk's frame, NaN where it was not measured.
     """
     nothing = np.full(len(reading.position_rad), np.nan)
     optional = (getattr(reading, name) for name in READ)
@@ -158,13 +142,9 @@ def packed(stretch: int, sent: Sent, reading: BusSample, gravity: Array = _LEVEL
 
 
 class TickChannels:
-    """Channels of ticks that come in parts.
+    """Channels of ticks that come in parts, as rows of `packed`.
 
-    Parameters
-    ----------
-    joints : sequence of str
-    live : bool
-        Whether every reading is the servo's present position, and so fresh.
+    `live` says whether every reading is the servo's present position, and so fresh.
     """
 
     def __init__(self, joints: Sequence[str], live: bool):
@@ -173,13 +153,7 @@ class TickChannels:
         self._last, self._fresh_s, self._held = np.full((3, len(joints)), np.nan)
 
     def take(self, rows: Array) -> list[Channel]:
-        """Channels of the next ticks; those without a value are left out.
-
-        Parameters
-        ----------
-        rows : ndarray, shape (n, 5 + 6 * joints)
-            As of `packed`.
-        """
+        """Channels of the next ticks; those without a value are left out."""
         values = self._values(rows)
         age = self._ages(rows[:, 0], values["read_time_s"], values["position_rad"])
         sent = rows[:, 1]
@@ -199,17 +173,8 @@ class TickChannels:
     def poses(self, rows: Array) -> tuple[Array, Array, Array]:
         """Latest reading of each joint at each tick, held; NaN before the first.
 
-        Parameters
-        ----------
-        rows : ndarray, shape (n, 5 + 6 * joints)
-            As of `packed`.
-
-        Returns
-        -------
-        time_s : ndarray, shape (n,)
-            Latest read of each tick [s].
-        position_rad : ndarray, shape (n, joints)
-        gravity : ndarray, shape (n, 3)
+        Returns the latest read of each tick [s], shape (n,), positions [rad], shape (n, joints),
+        and gravity, shape (n, 3).
         """
         values = self._values(rows)
         position = np.concatenate([self._held[None], values["position_rad"]])

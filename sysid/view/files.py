@@ -51,19 +51,7 @@ def write_rerun(
     bodies: Sequence[Body] = (),
     force: bool = False,
 ) -> None:
-    """Write a recording as a Rerun file.
-
-    Parameters
-    ----------
-    recording : Recording
-    path : Path
-    time_s : ndarray, shape (n,), optional
-        Times of the bodies' poses [s].
-    bodies : sequence of Body
-        The robot; none leaves it out.
-    force : bool
-        Replace an existing file.
-    """
+    """Write a recording as a Rerun file, with the robot's `bodies` at times `time_s` [s]."""
     refuse_overwrite(path, force)
     stream = RerunStream(recording.sha256)
     found = channels(recording)
@@ -79,10 +67,7 @@ def write_rerun(
 class RerunStream:
     """Channels and a robot for Rerun, in a file or in a viewer.
 
-    Parameters
-    ----------
-    name : str
-        Different for every recording: a viewer joins those of one name.
+    `name` is another one for every recording: a viewer joins those of one name.
     """
 
     def __init__(self, name: str):
@@ -134,13 +119,7 @@ class RerunStream:
             self._send(f"robot/{body.name}", time_s, columns)
 
     def close(self, within_s: float | None = None) -> None:
-        """Send the rest and end.
-
-        Parameters
-        ----------
-        within_s : float, optional
-            Longest wait for a viewer [s].
-        """
+        """Send the rest and end; a viewer is waited for by at most `within_s` [s]."""
         try:
             self._stream.flush(**({} if within_s is None else {"timeout_sec": within_s}))
         except (RuntimeError, ValueError) as error:
