@@ -179,7 +179,24 @@ this file holds it in s. Convert it and name it lag_s. (1 more fault in this fil
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise InputError(_explain(error, model, data, name, lines or {}, remedy)) from error
+        invalid = error
+    # the sentence on the first fault, and how many more there are
+    faults = sorted(
+        invalid.errors(include_url=False),
+        key=lambda f: (
+            f["type"] == "missing",
+            _FIRST.index(f["type"]) if f["type"] in _FIRST else len(_FIRST),
+        ),
+    )
+    place = known = _place(faults[0], data)
+    while known and known not in (lines or {}):
+        known = known[:-1]
+    at = f", line {lines[known]}" if lines and known else ""
+    where = f"{name}{at}: {place_text(place)}" if place else f"{name}{at}"
+    more = len({_place(f, data) for f in faults}) - 1
+    rest = f" Or {remedy}." if remedy else ""
+    rest += f" ({more} more fault{'s' if more > 1 else ''} in this file.)" if more else ""
+    raise InputError(printable(f"{where} {_fault(faults[0], model, place)}{rest}")) from invalid
 
 
 def unit_of(name: str) -> str:
@@ -191,31 +208,6 @@ def unit_of(name: str) -> str:
     ('N·m·s/rad', 's', '')
     """
     return next((u for end, u in UNIT_OF_SUFFIX.items() if f"_{name}".endswith(f"_{end}")), "")
-
-
-def _explain(
-    error: ValidationError, top: type[BaseModel], data: Any, name: Path | str,
-    lines: Mapping[Place, int], remedy: str,
-) -> str:  # fmt: skip
-    """The sentence on the first fault, and how many more there are."""
-    faults = sorted(
-        error.errors(include_url=False),
-        key=lambda f: (
-            f["type"] == "missing",
-            _FIRST.index(f["type"]) if f["type"] in _FIRST else len(_FIRST),
-        ),
-    )
-    fault = faults[0]
-    place = _place(fault, data)
-    known = place
-    while known and known not in lines:
-        known = known[:-1]
-    at = f", line {lines[known]}" if known in lines and known else ""
-    where = f"{name}{at}: {place_text(place)}" if place else f"{name}{at}"
-    more = len({_place(f, data) for f in faults}) - 1
-    rest = f" Or {remedy}." if remedy else ""
-    rest += f" ({more} more fault{'s' if more > 1 else ''} in this file.)" if more else ""
-    return printable(f"{where} {_fault(fault, top, place)}{rest}")
 
 
 def _place(fault: ErrorDetails, data: Any) -> Place:

@@ -26,11 +26,9 @@ class Rating:
     """What a data sheet states at one supply voltage."""
 
     supply_v: float
-    """Supply voltage [V]."""
     stall_torque_nm: float
-    """Torque at standstill [N·m]."""
     no_load_speed_rad_s: float | None
-    """Speed without load [rad/s]; None where it is not stated."""
+    """None where it is not stated."""
     source: str
     """Where it is stated."""
 
@@ -77,97 +75,77 @@ class DataSheet:
         )  # fmt: skip
 
 
-_STS_12 = (
-    "Feetech data sheet of the 12 V variant (C018), 30 kg·cm and 45 rpm, as quoted in "
-    "TheRobotStudio/SO-ARM100 issue 134"
-)
-_STS_7 = "data sheet of the 7.4 V variant, 19.5 kg·cm and 52 rpm, as quoted by DFRobot for SER0069"
-_XL330 = "Robotis e-Manual of the XL330-M288-T"
+_Stated = tuple[float, float, float | None]
+"""Supply [V], stall torque [N·m], no-load speed [rpm]."""
+
+
+def _sheet(
+    name: str, number: int, counts: float, supply_v: tuple[float, float] | None,
+    source: str, *stated: _Stated,
+) -> DataSheet:  # fmt: skip
+    ratings = [
+        Rating(supply, torque, None if rpm is None else rpm * _RPM, source)
+        for supply, torque, rpm in stated
+    ]
+    return DataSheet(name, number, counts, tuple(ratings), supply_v)
+
+
 _EMANUAL = "Robotis e-Manual of the {}"
 _SHEETS = (
     DataSheet(
         "STS3215", 777, 4096,
         (
-            Rating(7.4, 19.5 * _KG_CM, 52 * _RPM, _STS_7),
-            Rating(12.0, 30 * _KG_CM, 45 * _RPM, _STS_12),
+            Rating(
+                7.4, 19.5 * _KG_CM, 52 * _RPM,
+                "data sheet of the 7.4 V variant, 19.5 kg·cm and 52 rpm, as quoted by DFRobot for "
+                "SER0069",
+            ),
+            Rating(
+                12.0, 30 * _KG_CM, 45 * _RPM,
+                "Feetech data sheet of the 12 V variant (C018), 30 kg·cm and 45 rpm, as quoted in "
+                "TheRobotStudio/SO-ARM100 issue 134",
+            ),
         ),
         (4.0, 14.0),  # factory registers: 4.0 V, and 14.0 V of the 12 V variant
     ),
-    DataSheet(
-        "STS3250", 2825, 4096,
-        (
-            Rating(
-                12.0, 50 * _KG_CM, 3.141592653589793 / 3 / 0.133,
-                "Feetech specification of 2024-01-16, 50 kg·cm and 0.133 s/60°, as quoted by "
-                "robonine.com",
-            ),
-        ),
+    _sheet(
+        "STS3250", 2825, 4096, None,
+        "Feetech specification of 2024-01-16, 50 kg·cm and 0.133 s/60°, as quoted by robonine.com",
+        (12.0, 50 * _KG_CM, 10 / 0.133),
     ),
-    DataSheet(
-        "HD-1910", 0, 4096,  # its model number is not published
-        (
-            Rating(
-                7.4, 10 * _KG_CM, 110 * _RPM,
-                "vendor's sheet of the HD-1910-C001, 10 kg·cm and 0.09 s/60°, as quoted by "
-                "Microduck's builders, of whom others state 12 kg·cm",
-            ),
-        ),
-        (4.0, 8.4),
+    _sheet(
+        "HD-1910", 0, 4096, (4.0, 8.4),  # its model number is not published
+        "vendor's sheet of the HD-1910-C001, 10 kg·cm and 0.09 s/60°, as quoted by Microduck's "
+        "builders, of whom others state 12 kg·cm",
+        (7.4, 10 * _KG_CM, 110),
     ),
-    DataSheet(
-        "SCS0009", 1284, 1024 * 1.2,
-        (
-            Rating(
-                6.0, 2.3 * _KG_CM, None,
-                "vendor's page, 2.3 kg·cm at 6 V; the shop of the Mini Pupper states 3.5 kg·cm "
-                "for its servo of this class",
-            ),
-        ),
-        (4.0, 8.7),  # a Mini Pupper switches them off at 4.0 V; two lithium cells, freshly charged
+    _sheet(
+        # a Mini Pupper switches them off at 4.0 V; two lithium cells, freshly charged
+        "SCS0009", 1284, 1024 * 1.2, (4.0, 8.7),
+        "vendor's page, 2.3 kg·cm at 6 V; the shop of the Mini Pupper states 3.5 kg·cm for its "
+        "servo of this class",
+        (6.0, 2.3 * _KG_CM, None),
     ),
-    DataSheet(
-        "XL330-M288", 1200, 4096,
-        (
-            Rating(3.7, 0.42, 76 * _RPM, _XL330),
-            Rating(5.0, 0.52, 103 * _RPM, _XL330),
-            Rating(6.0, 0.60, 123 * _RPM, _XL330),
-        ),
-        (3.7, 6.0),  # e-Manual, input voltage
+    _sheet(
+        "XL330-M288", 1200, 4096, (3.7, 6.0), _EMANUAL.format("XL330-M288-T"),
+        (3.7, 0.42, 76), (5.0, 0.52, 103), (6.0, 0.60, 123),
     ),
-    DataSheet(
-        "XL430-W250", 1060, 4096,
-        (
-            Rating(9.0, 1.0, 47 * _RPM, _EMANUAL.format("XL430-W250")),
-            Rating(11.1, 1.4, 57 * _RPM, _EMANUAL.format("XL430-W250")),
-            Rating(12.0, 1.5, 61 * _RPM, _EMANUAL.format("XL430-W250")),
-        ),
-        (6.0, 14.0),  # factory registers; 6.5 to 12.0 V are recommended
+    _sheet(
+        # factory registers; 6.5 to 12.0 V are recommended
+        "XL430-W250", 1060, 4096, (6.0, 14.0), _EMANUAL.format("XL430-W250"),
+        (9.0, 1.0, 47), (11.1, 1.4, 57), (12.0, 1.5, 61),
     ),
-    DataSheet(
-        "XM430-W350", 1020, 4096,
-        (
-            Rating(11.1, 3.8, 43 * _RPM, _EMANUAL.format("XM430-W350")),
-            Rating(12.0, 4.1, 46 * _RPM, _EMANUAL.format("XM430-W350")),
-            Rating(14.8, 4.8, 57 * _RPM, _EMANUAL.format("XM430-W350")),
-        ),
-        (9.5, 16.0),
+    _sheet(
+        "XM430-W350", 1020, 4096, (9.5, 16.0), _EMANUAL.format("XM430-W350"),
+        (11.1, 3.8, 43), (12.0, 4.1, 46), (14.8, 4.8, 57),
     ),
-    DataSheet(
-        "XM430-W210", 1030, 4096,
-        (
-            Rating(11.1, 2.7, 70 * _RPM, _EMANUAL.format("XM430-W210")),
-            Rating(12.0, 3.0, 77 * _RPM, _EMANUAL.format("XM430-W210")),
-            Rating(14.8, 3.7, 95 * _RPM, _EMANUAL.format("XM430-W210")),
-        ),
-        (9.5, 16.0),
+    _sheet(
+        "XM430-W210", 1030, 4096, (9.5, 16.0), _EMANUAL.format("XM430-W210"),
+        (11.1, 2.7, 70), (12.0, 3.0, 77), (14.8, 3.7, 95),
     ),
-    DataSheet(
-        "MX-28", 30, 4096,
-        (
-            Rating(12.0, 2.5, 55 * _RPM, _EMANUAL.format("MX-28")),
-            Rating(14.8, 3.1, 67 * _RPM, _EMANUAL.format("MX-28")),
-        ),
-        (9.5, 16.0),
+    _sheet(
+        "MX-28", 30, 4096, (9.5, 16.0), _EMANUAL.format("MX-28"),
+        (12.0, 2.5, 55), (14.8, 3.1, 67),
     ),
 )  # fmt: skip
 

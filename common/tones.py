@@ -85,7 +85,12 @@ def block_bootstrap(
     ----------
     D. Rubin, "The Bayesian bootstrap", Annals of Statistics 9 (1981).
     """
-    gram, moment = _normal_equations(design, value, block)
+    names, block = np.unique(block, return_inverse=True)
+    columns = design.shape[1]
+    # Gram matrix and right-hand side of every block
+    gram, moment = np.zeros((len(names), columns, columns)), np.zeros((len(names), columns))
+    np.add.at(gram, block, design[:, :, None] * design[:, None, :])
+    np.add.at(moment, block, design * value[:, None])
     solution = np.linalg.solve(gram.sum(0), moment.sum(0))
     if len(gram) < fewest:
         runs = np.array_split(np.arange(len(value)), fewest)
@@ -94,13 +99,3 @@ def block_bootstrap(
     weights = rng.exponential(size=(draws, len(gram)))
     drawn = np.linalg.solve(np.tensordot(weights, gram, axes=1), (weights @ moment)[..., None])
     return BlockFit(solution, np.asarray(drawn[..., 0], np.float64), len(gram))
-
-
-def _normal_equations(design: NDArray, value: NDArray, block: NDArray) -> tuple[NDArray, NDArray]:
-    """Gram matrix and right-hand side of every block."""
-    names, block = np.unique(block, return_inverse=True)
-    gram = np.zeros((len(names), design.shape[1], design.shape[1]))
-    moment = np.zeros((len(names), design.shape[1]))
-    np.add.at(gram, block, design[:, :, None] * design[:, None, :])
-    np.add.at(moment, block, design * value[:, None])
-    return gram, moment

@@ -19,7 +19,6 @@ ignore the signals of a terminal: what they mean is decided here.
 from __future__ import annotations
 
 import atexit
-import contextlib
 import ctypes
 import json
 import os
@@ -49,7 +48,7 @@ _NEVER = 2**31 - 1
 def keep_freed_memory() -> None:
     """Let this process keep what it frees, for its next request; does nothing without glibc."""
     if sys.platform == "linux":
-        with contextlib.suppress(OSError, AttributeError):
+        with suppress(OSError, AttributeError):
             mallopt = ctypes.CDLL("libc.so.6").mallopt
             mallopt(_MMAP_MAX, 0)
             mallopt(_TRIM_THRESHOLD, _NEVER)
@@ -104,7 +103,9 @@ class Workers:
         More can be submitted meanwhile. What `work` raises is raised here, and the rest is left.
         """
         if min(self._count, len(self._tasks)) <= 1 and not self._streams:
-            yield from self._here()
+            while self._tasks:
+                key, work, arguments = self._tasks.popleft()
+                yield key, work(*arguments)
             return
         busy: dict[socket.socket, Any] = {}
         with selectors.DefaultSelector() as answers:
@@ -121,11 +122,6 @@ class Workers:
                     if error is not None:
                         raise error
                     yield key, result
-
-    def _here(self) -> Iterator[tuple[Any, Any]]:
-        while self._tasks:
-            key, work, arguments = self._tasks.popleft()
-            yield key, work(*arguments)
 
     def _idle(self, busy: dict[socket.socket, Any]) -> socket.socket | None:
         """A worker without work, perhaps a new one."""
@@ -158,14 +154,15 @@ class Workers:
         """Why a worker has ended by itself."""
         time.sleep(_STOP_S)
         ended = self._server.death() if self._server else ""
+        what = f"A process that computed was ended by {ended}."
         if ended.startswith("cannot"):
-            return PupperError(f"Another process {ended}. {self._cure}")
-        likely = " Most likely the memory ran out." if "SIGKILL" in ended else ""
-        return PupperError(f"A process that computed was ended by {ended}.{likely} {self._cure}")
-
-    @property
-    def _cure(self) -> str:
-        return f"Use fewer processes (`{self._option}`), or end other programs, then run it again."
+            what = f"Another process {ended}."
+        elif "SIGKILL" in ended:
+            what += " Most likely the memory ran out."
+        return PupperError(
+            f"{what} Use fewer processes (`{self._option}`), or end other programs, then run it "
+            "again."
+        )
 
 
 def prepare(*modules: str) -> None:

@@ -20,9 +20,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaincinv, ndtri
+from scipy.special import betaincinv
 
-from pupper_sysid.common.interval import LEVEL, Interval
+from pupper_sysid.common.interval import HALF_WIDTH_SD, LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, internal
 from pupper_sysid.sysid.feedback.poll_search import (
     BLUR_S,
@@ -39,7 +39,6 @@ from pupper_sysid.sysid.feedback.poll_search import (
 from pupper_sysid.sysid.feedback.slips import (
     SMALLEST_JUMP,
     Motion,
-    Segment,
     Slip,
     Sure,
     count_loss,
@@ -135,7 +134,6 @@ NO_LOSS = (
 """Why the loss of a lattice is NaN."""
 
 _UNKNOWN_LOSS = 0.5
-_Z = float(ndtri((1 + LEVEL) / 2))
 _SIGNIFICANT = 4.0  # standard deviations above shuffled rows
 _SIGNIFICANT_ALONE = 8.0  # the same where the motion does not show that there is a slow poll
 _NEAR_LOOP = 1.3  # loops: regular reversals look like a poll that is hardly slower than the loop
@@ -198,7 +196,7 @@ class PollLattice(Result):
     @property
     def poll_period_interval(self) -> Interval:
         """Poll period with its 90 % interval [s]."""
-        reach = _Z * self.poll_period_sd_s
+        reach = HALF_WIDTH_SD * self.poll_period_sd_s
         near = [self.poll_period_s, *self.rivals_s]
         return Interval(self.poll_period_s, min(near) - reach, max(near) + reach)
 
@@ -252,6 +250,11 @@ class Readings:
     the first fresh row."""
     time_sd_s: float
     """Standard error of a shift common to all these times."""
+
+    def only(self, used: NDArray[np.bool_]) -> Readings:
+        """Some of the fresh rows, by a mask of shape (fresh,)."""
+        rows, time_s, position_rad = (x[used] for x in (self.rows, self.time_s, self.position_rad))
+        return replace(self, rows=rows, time_s=time_s, position_rad=position_rad)
 
 
 def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> PollLattice:
@@ -372,10 +375,19 @@ def _with_segments(
             near = segment.phase_s if motion is not None or len(segments) > 1 else None
             phase = refine(part, lattice.poll_period_s, lattice.blur_s, loss, near)
             if n:
-                slip = _slip(trial, phases[-1], phase, segment)
+                # from one phase to the next, at the border between the two
+                at, period = segment.start_s, phase.period_s
+                here, there = (
+                    p.phase_s + p.period_s * np.round((at - p.phase_s) / p.period_s)
+                    for p in (phases[-1], phase)
+                )
+                jump_s = float((there - here + period / 2) % period - period / 2)
                 # less is drift: the segments follow it, but nothing slipped
-                if abs(slip.jump_s) > max(SMALLEST_JUMP * phase.period_s, lattice.blur_s):
-                    slips.append(slip)
+                if abs(jump_s) > max(SMALLEST_JUMP * period, lattice.blur_s):
+                    time_s = float(at - trial.read_time_s[0])
+                    slips.append(
+                        Slip(trial=trial.number, time_s=time_s, jump_s=jump_s, nats=segment.nats)
+                    )
             parts.append(part)
             phases.append(phase)
             of.append(number)
@@ -409,21 +421,6 @@ def _instants(stretch: Stretch, phases: Sequence[Phase]) -> NDArray[np.float64]:
         own = (stretch.end >= p.start_s) & (stretch.end <= p.stop_s)
         time = np.where(own, np.clip(near, stretch.begin, stretch.end), time)
     return time
-
-
-def _slip(trial: Trial, before: Phase, after: Phase, segment: Segment) -> Slip:
-    """The jump from one phase to the next, at the border between the two."""
-    at = segment.start_s
-    here, there = (
-        p.phase_s + p.period_s * np.round((at - p.phase_s) / p.period_s) for p in (before, after)
-    )
-    period = after.period_s
-    return Slip(
-        trial=trial.number,
-        time_s=float(at - trial.read_time_s[0]),
-        jump_s=float((there - here + period / 2) % period - period / 2),
-        nats=segment.nats,
-    )
 
 
 def readings(trial: Trial, lattice: PollLattice) -> Readings:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,8 @@ from pupper_sysid.sysid.sweep.excitation import (
 
 LARGEST_RAD = 0.3
 """Largest excursion of a plan by default [rad]."""
+
+Kind = Literal["sine", "square"]
 
 _TONES_HZ = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 12.0)
 _TONES_RAD = (0.05, 0.08, 0.12, 0.2, 0.3)
@@ -81,7 +84,7 @@ class Setup:
 class Candidate:
     """A trial to choose."""
 
-    kind: str
+    kind: Kind
     frequency_hz: float
     amplitude_rad: float
     duration_s: float
@@ -122,7 +125,7 @@ def recorded(trial: TrialPlan, setup: Setup) -> Run:
     )
 
 
-def _choices(setup: Setup, duration_s: float) -> Iterator[tuple[str, float, float]]:
+def _choices(setup: Setup, duration_s: float) -> Iterator[tuple[Kind, float, float]]:
     """Kind, frequency [Hz] and amplitude [rad]."""
     rates = (1 / setup.loop_period_s, setup.poll_rate_hz)
     highest = min(HIGHEST_HZ, 1 / (_COMMANDS_A_PERIOD * setup.loop_period_s))

@@ -11,7 +11,6 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field, field_validator
 
 from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
@@ -22,11 +21,11 @@ from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.results import plain
 from pupper_sysid.common.strict_yaml import dump
-from pupper_sysid.servo_models.calibration.calibration import utc_now
+from pupper_sysid.servo_models.calibration.calibration import InputFile, utc_now
 from pupper_sysid.servo_models.calibration.quantity import Number, Part, Whole
 from pupper_sysid.sysid.plan.planner import PlannedTrial, Prediction
-from pupper_sysid.sysid.plan.proposal import Source, SweepPlan
-from pupper_sysid.sysid.sweep.excitation import HIGHEST_HZ, PLANS_S, Plan, plan
+from pupper_sysid.sysid.plan.proposal import SweepPlan
+from pupper_sysid.sysid.sweep.excitation import Plan, plan
 
 SCHEMA = "pupper-sysid plan"
 SCHEMA_VERSION = 1
@@ -38,32 +37,6 @@ _HEADER = """\
 # `trials` may be edited: excursions from the start pose in radians, durations in seconds without
 # the lead-in at rest. `predictions` are the 90 % intervals now and those to expect afterwards.
 """
-
-
-class SourceEntry(Part):
-    """A file the plan was made from."""
-
-    name: str
-    """File name, without folders."""
-    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-    """SHA-256 of the file, 64 hexadecimal digits."""
-
-
-class TrialEntry(Part):
-    """One trial."""
-
-    joint: str
-    """Joint that moves."""
-    kind: Literal["sine", "square"]
-    """Shape of the motion."""
-    frequency_hz: Annotated[Number, Field(gt=0, le=HIGHEST_HZ)]
-    """Frequency [Hz]."""
-    amplitude_rad: Annotated[Number, Field(gt=0, le=float(np.pi))]
-    """Largest excursion from the start pose [rad]."""
-    duration_s: Annotated[Number, Field(gt=0, le=PLANS_S[1])]
-    """Duration without the lead-in [s]."""
-    purpose: str = ""
-    """What it is for."""
 
 
 class IntervalEntry(Part):
@@ -99,7 +72,7 @@ class PlanFile(Part):
     """Version of the file's format."""
     created: str
     """Time of the plan, in UTC and ISO 8601."""
-    made_from: Annotated[tuple[SourceEntry, ...], Field(strict=False)] = ()
+    made_from: Annotated[tuple[InputFile, ...], Field(strict=False)] = ()
     """Recordings or calibration it was made from; empty for an unknown servo."""
     seed: Whole = 0
     """Seed of its random numbers."""
@@ -112,7 +85,7 @@ class PlanFile(Part):
     speed_limit_rad_s: Annotated[Number, Field(gt=0, le=1000)]
     """Speed limit of the servos [rad/s]."""
     trials: Annotated[
-        tuple[TrialEntry, ...], Field(strict=False, min_length=1, max_length=_MOST_TRIALS)
+        tuple[PlannedTrial, ...], Field(strict=False, min_length=1, max_length=_MOST_TRIALS)
     ]
     """Trials, in the order of their execution."""
     predictions: Annotated[tuple[PredictionEntry, ...], Field(strict=False)] = ()
@@ -122,7 +95,7 @@ class PlanFile(Part):
 
     @field_validator("trials")
     @classmethod
-    def _check_joints(cls, trials: tuple[TrialEntry, ...]) -> tuple[TrialEntry, ...]:
+    def _check_joints(cls, trials: tuple[PlannedTrial, ...]) -> tuple[PlannedTrial, ...]:
         if strange := strange_joint(t.joint for t in trials):
             raise ValueError(f"{strange[0]} is no joint; {strange[1].rstrip('.?')}")
         return trials
@@ -157,8 +130,6 @@ def load_plan(path: Path) -> SweepPlan:
     return SweepPlan(
         **values
         | {
-            "made_from": tuple(Source(**s.model_dump()) for s in file.made_from),
-            "trials": tuple(PlannedTrial(**t.model_dump()) for t in file.trials),
             "predictions": tuple(
                 Prediction(
                     joint=p.joint,

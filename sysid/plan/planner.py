@@ -22,17 +22,20 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
+from pydantic import Field
 
-from pupper_sysid.common.interval import LEVEL, Interval
+from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.common.results import Result
+from pupper_sysid.servo_models.calibration.quantity import Number, Part
 from pupper_sysid.sysid.fit.posterior import PHASE_SD_S, STEPPING_SD_S
 from pupper_sysid.sysid.fit.run import Run, at_steps, free_run, residuals
 from pupper_sysid.sysid.fit.structure import Structure
-from pupper_sysid.sysid.plan.candidates import Candidate, Setup, candidates, trial_seconds
+from pupper_sysid.sysid.plan.candidates import Candidate, Kind, Setup, candidates, trial_seconds
+from pupper_sysid.sysid.sweep.excitation import HIGHEST_HZ, PLANS_S
 
 CLEAR_NATS = 5.0
 """Difference in log-likelihood from which two models count as told apart."""
@@ -48,12 +51,13 @@ SHORTEST_S = 3.0
 _OTHERS = 0.25  # weight of the other parameters' mean logarithm beside the dead time's
 _FOLLOWED = 0.6  # of the command; `sysid.lag.lag_budget` leaves out what is below half
 _MOST_OF_A_TONE = 2  # no model is right at every tone: a plan does not rest on one
-_Z = float(ndtri((1 + LEVEL) / 2))
 
-LEAST_HALF_WIDTH_S = _Z * STEPPING_SD_S
+LEAST_HALF_WIDTH_S = HALF_WIDTH_SD * STEPPING_SD_S
 """Half of a dead time's interval that no number of readings narrows [s]: the model's time step."""
 
-_UNSEEN_SD = float(np.log(2)) / _Z  # of a logarithm: an interval from half to twice the value
+_UNSEEN_SD = (
+    float(np.log(2)) / HALF_WIDTH_SD
+)  # of a logarithm: an interval from half to twice the value
 _PRIOR_SHARE = 0.7  # of the prior's standard deviation: beyond, the prior decides
 _TELLS = 0.1  # share of `CLEAR_NATS` that makes telling models apart a trial's purpose
 _WORDS = {
@@ -80,17 +84,20 @@ class Servo:
     """By how much all readings may be dated wrong: no trial reduces it."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlannedTrial(Result):
-    """One trial of a plan."""
+class PlannedTrial(Part):
+    """One trial of a plan, as its file has it."""
 
     joint: str
-    kind: str
-    frequency_hz: float
-    amplitude_rad: float
-    duration_s: float
-    """Without the lead-in."""
-    purpose: str
+    """Joint that moves."""
+    kind: Kind
+    """Shape of the motion."""
+    frequency_hz: Annotated[Number, Field(gt=0, le=HIGHEST_HZ)]
+    """Frequency [Hz]."""
+    amplitude_rad: Annotated[Number, Field(gt=0, le=float(np.pi))]
+    """Largest excursion from the start pose [rad]."""
+    duration_s: Annotated[Number, Field(gt=0, le=PLANS_S[1])]
+    """Duration without the lead-in [s]."""
+    purpose: str = ""
     """What it narrows most, or "structure" if it tells two candidate models apart."""
 
 
@@ -133,22 +140,25 @@ def propose(joint: str, servos: Sequence[Servo], setup: Setup, seconds: float) -
         left = [k for k in usable if used.count(tones[k]) < _MOST_OF_A_TONE] or usable
         chosen.append(min(left, key=lambda k: _criterion(worlds, [*chosen, k])))
     purposes = [_purpose(worlds, chosen[:n], chosen[n]) for n in range(count)]
-    trials = tuple(
+    trials = [
         PlannedTrial(
-            joint=joint,
-            kind=choice[k].kind,
-            frequency_hz=choice[k].frequency_hz,
-            amplitude_rad=choice[k].amplitude_rad,
-            duration_s=choice[k].duration_s,
-            purpose=purpose,
+            joint=joint, kind=c.kind, frequency_hz=c.frequency_hz, amplitude_rad=c.amplitude_rad,
+            duration_s=c.duration_s, purpose=purpose,
         )
-        for k, purpose in sorted(
-            zip(chosen, purposes, strict=True),
-            key=lambda pair: (choice[pair[0]].kind != "sine", choice[pair[0]].frequency_hz),
-        )
+        for c, purpose in zip([choice[k] for k in chosen], purposes, strict=True)
+    ]  # fmt: skip
+    trials = tuple(sorted(trials, key=lambda t: (t.kind != "sine", t.frequency_hz)))
+    if len(worlds) > 1:
+        return JointPlan(trials=trials, predictions=(), notes=())
+    (world,) = worlds
+    expected = {DEAD_TIME: (world.dead_time_s([]), world.dead_time_s(chosen))}
+    for k, parameter in enumerate(servos[0].hypotheses[0].model.parameters[1:-1], 1):
+        expected[parameter.name] = world.interval(0, k, []), world.interval(0, k, chosen)
+    predictions = tuple(
+        Prediction(joint=joint, quantity=name, now=now, after=after)
+        for name, (now, after) in expected.items()
     )
-    predictions = tuple(_predictions(joint, worlds[0], chosen)) if len(worlds) == 1 else ()
-    notes = tuple(_notes(joint, worlds[0], choice, chosen)) if len(worlds) == 1 else ()
+    notes = tuple(_notes(joint, world, choice, chosen))
     return JointPlan(trials=trials, predictions=predictions, notes=notes)
 
 
@@ -179,7 +189,7 @@ class _World:
         """Expected preference for the first hypothesis to `which` after `chosen`."""
         if which == 0 or not chosen:
             return self.servo.nats[which]
-        pair = [self._picked(0, chosen), self._picked(which, chosen)]
+        pair = [[self.responses[n][k] for k in chosen] for n in (0, which)]
         known = [self.servo.hypotheses[k].known for k in (0, which)]
         ways = separation(pair[0], pair[1], known[1]), separation(pair[1], pair[0], known[0])
         return abs(self.servo.nats[which] - self.servo.nats[0]) + min(ways) / self.servo.inflation
@@ -209,15 +219,12 @@ class _World:
         sd = float(np.sqrt(self.covariance(which, chosen)[coordinate, coordinate]))
         value = float(hypothesis.values[coordinate])
         if coordinate == 0:  # in seconds, with the error that no reading reduces
-            reach = _Z * float(np.hypot(value * sd, STEPPING_SD_S))
+            reach = HALF_WIDTH_SD * float(np.hypot(value * sd, STEPPING_SD_S))
             return Interval(value, max(value - reach, 0.0), value + reach)
         centre = float(parameter.encode(value))
         box = float(parameter.encode(parameter.low)), float(parameter.encode(parameter.high))
-        ends = np.clip([centre - _Z * sd, centre + _Z * sd], *box)
+        ends = np.clip([centre - HALF_WIDTH_SD * sd, centre + HALF_WIDTH_SD * sd], *box)
         return Interval(value, *(float(parameter.decode(e)) for e in ends))
-
-    def _picked(self, which: int, chosen: Sequence[int]) -> list[Response]:
-        return [self.responses[which][k] for k in chosen]
 
 
 def _followed(worlds: Sequence[_World], candidate: Candidate, number: int) -> bool:
@@ -275,19 +282,6 @@ def word(parameter: str) -> str:
     return _WORDS.get(parameter, parameter.split("_")[0])
 
 
-def _predictions(joint: str, world: _World, chosen: Sequence[int]) -> list[Prediction]:
-    found = [
-        Prediction(
-            joint=joint, quantity=DEAD_TIME, now=world.dead_time_s([]),
-            after=world.dead_time_s(chosen),
-        )
-    ]  # fmt: skip
-    for k, parameter in enumerate(world.servo.hypotheses[0].model.parameters[1:-1], 1):
-        now, after = world.interval(0, k, []), world.interval(0, k, chosen)
-        found.append(Prediction(joint=joint, quantity=parameter.name, now=now, after=after))
-    return found
-
-
 def _notes(
     joint: str, world: _World, choice: Sequence[Candidate], chosen: Sequence[int]
 ) -> list[str]:
@@ -305,12 +299,12 @@ def _notes(
             found.append(
                 f"{joint}: {name} cannot be seen at any amplitude within the limits "
                 f"(excursion {max(c.amplitude_rad for c in choice):g} rad): its interval would "
-                f"span a factor of {np.exp(2 * _Z * best[k]):.1f} at best."
+                f"span a factor of {np.exp(2 * HALF_WIDTH_SD * best[k]):.1f} at best."
             )
         elif sd[k] > most:
             found.append(
-                f"{joint}: {name} would still span a factor of {np.exp(2 * _Z * sd[k]):.1f}; more "
-                "seconds would narrow it."
+                f"{joint}: {name} would still span a factor of "
+                f"{np.exp(2 * HALF_WIDTH_SD * sd[k]):.1f}; more seconds would narrow it."
             )
     for which in range(1, len(world.servo.hypotheses)):
         nats = world.nats(which, chosen)

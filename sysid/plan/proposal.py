@@ -13,12 +13,11 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
-from pupper_sysid.common.errors import InputError, refuse_outside
-from pupper_sysid.common.interval import LEVEL, Interval
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.common.results import Result
-from pupper_sysid.servo_models.calibration.calibration import Calibration
+from pupper_sysid.servo_models.calibration.calibration import Calibration, InputFile
 from pupper_sysid.servo_models.calibration.parts import Actuator, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.sysid.doctor.checks import each_joint, joint_trials
@@ -58,18 +57,10 @@ Margins = Mapping[str, float]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source(Result):
-    """A file that a plan was made from."""
-
-    name: str
-    sha256: str
-
-
-@dataclass(frozen=True, kw_only=True)
 class SweepPlan(Result):
     """What to record next."""
 
-    made_from: tuple[Source, ...]
+    made_from: tuple[InputFile, ...]
     """Empty for an unknown servo."""
     seed: int
     loop_period_s: float
@@ -104,8 +95,6 @@ def plan_from_recordings(
     Defaults are those of `plan_from_fits`. `progress` is called with a joint's name when it is
     done.
     """
-    if seconds is not None:
-        _checked(seconds)  # before the work, not after it
     work = partial(fit_joint, seed=seed)
     fits = each_joint(work, recordings, list(joints), workers, progress)
     return plan_from_fits(recordings, fits, seconds=seconds, margins=margins, seed=seed)
@@ -133,18 +122,18 @@ def plan_from_fits(
         trials = joint_trials(recordings, joint)
         moved = (np.max(np.abs(t.command_rad - t.initial_command_rad)) for t in trials)
         setup = feedback_setup(fit.lag, _within(base, joint, margins, float(max(moved))))
-        length = min(recorded_s(trials), PLANS_S[1]) if seconds is None else _checked(seconds)
+        length = min(recorded_s(trials), PLANS_S[1]) if seconds is None else seconds
         plans.append(propose(joint, [fitted_servo(fit)], setup, length))
         polls.append(setup.poll_rate_hz)
     sources = tuple(
-        Source(name=r.path.name if r.path else r.name, sha256=r.sha256) for r in recordings
+        InputFile(name=r.path.name if r.path else r.name, sha256=r.sha256) for r in recordings
     )
     return _pooled(plans, sources, seed, replace(base, poll_period_s=_period(polls)))
 
 
 def plan_from_calibration(
     calibration: Calibration,
-    source: Source,
+    source: InputFile,
     joints: Sequence[str],
     *,
     seconds: float = SECONDS,
@@ -166,7 +155,7 @@ def plan_from_calibration(
             _within(base, joint, margins, LARGEST_RAD), poll_period_s=poll.poll_period_s.value,
             loss=poll.loss.value, quantum_rad=poll.quantum_rad.value,
         )  # fmt: skip
-        plans.append(propose(joint, [calibrated_servo(own)], setup, _checked(seconds)))
+        plans.append(propose(joint, [calibrated_servo(own)], setup, seconds))
         polls.append(setup.poll_rate_hz)
     return _pooled(plans, (source,), seed, replace(base, poll_period_s=_period(polls)))
 
@@ -188,14 +177,14 @@ def plan_first_sweep(
         own = _within(setup, joint, margins, LARGEST_RAD)
         reach = min(own.margin_rad, LARGEST_RAD)
         if reach not in made:  # joints with the same margin get the same trials
-            made[reach] = propose(joint, servos, own, _checked(seconds))
-        trials = tuple(replace(t, joint=joint) for t in made[reach].trials)
+            made[reach] = propose(joint, servos, own, seconds)
+        trials = tuple(t.model_copy(update={"joint": joint}) for t in made[reach].trials)
         plans.append(replace(made[reach], trials=trials))
     return _pooled(plans, (), seed, setup)
 
 
 def _pooled(
-    plans: Sequence[JointPlan], sources: tuple[Source, ...], seed: int, setup: Setup
+    plans: Sequence[JointPlan], sources: tuple[InputFile, ...], seed: int, setup: Setup
 ) -> SweepPlan:
     return SweepPlan(
         made_from=sources,
@@ -226,18 +215,12 @@ def _within(setup: Setup, joint: str, margins: Margins | None, usual_rad: float)
     return replace(setup, margin_rad=margin)
 
 
-def _checked(seconds: float) -> float:
-    refuse_outside("`seconds`", seconds, *PLANS_S, "s")
-    return seconds
-
-
 def recorded_s(trials: Sequence[Trial]) -> float:
     """Recorded time of all trials [s]."""
     return float(sum(t.send_time_s[-1] - t.send_time_s[0] for t in trials))
 
 
 _MOST_INFLATION = 100.0
-_Z = float(ndtri((1 + LEVEL) / 2))
 
 _DRAWS = 6
 _DEAD_TIMES_S = (0.008, 0.06)
@@ -287,9 +270,9 @@ def _sd(parameter: Parameter, interval: Interval) -> float:
     if parameter.name == DEAD_TIME:
         half = (interval.high - interval.low) / 2
         own = math.sqrt(max(half**2 - LEAST_HALF_WIDTH_S**2, (0.05 * half) ** 2))
-        return own / (_Z * interval.value)
+        return own / (HALF_WIDTH_SD * interval.value)
     low, high = (float(parameter.encode(end)) for end in (interval.low, interval.high))
-    return (high - low) / (2 * _Z)
+    return (high - low) / (2 * HALF_WIDTH_SD)
 
 
 def calibrated_servo(joint: JointCalibration) -> Servo:

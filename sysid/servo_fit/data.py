@@ -97,11 +97,7 @@ class Run:
 
     def on_physics(self, used: NDArray[np.bool_]) -> PhysicsRun:
         """The run on the clock of physics, with only the readings of `used`, shape (fresh,)."""
-        r = self.readings
-        kept = replace(
-            r, rows=r.rows[used], time_s=r.time_s[used], position_rad=r.position_rad[used]
-        )
-        return prepare(self.trial, kept).in_free_air()
+        return prepare(self.trial, self.readings.only(used)).in_free_air()
 
 
 @dataclass(frozen=True)
@@ -211,7 +207,7 @@ def _joint_runs(
         own = recording.trials(joint)
         known = joint in (recording.metadata.get("start_pose_rad") or {})
         prefix = f"{recording.name}, " if len(recordings) > 1 else ""
-        parts = []
+        joined: list[list[_Part]] = []
         for trial in own:
             tone = np.isfinite(trial.frequency_hz) and trial.frequency_hz > 0
             name = f"{trial.frequency_hz:g} Hz" if tone else f"{prefix}loop {trial.number}"
@@ -225,9 +221,15 @@ def _joint_runs(
                 first = trial.position_rad[np.isfinite(trial.position_rad)][:1]
                 rest = float(first[0]) if len(first) else trial.initial_command_rad
                 trial = replace(trial, initial_command_rad=rest)
-            parts += _without_pauses(trial, counted, group, period)
+            for part in _without_pauses(trial, counted, group, period):
+                begins = part[0].send_time_s[0]
+                gap = begins - joined[-1][-1][0].send_time_s[-1] if joined else np.inf
+                if 0 < gap < _PAUSE * period:
+                    joined[-1].append(part)
+                else:
+                    joined.append([part])
         dated = lattice.kind == "lattice"
-        runs += [_run(p, period, place, dated, known) for p in _joined(parts, period)]
+        runs += [_run(parts, period, place, dated, known) for parts in joined]
     return runs, mode, lattice
 
 
@@ -253,26 +255,12 @@ def _without_pauses(trial: Trial, r: Readings, group: int, period: float) -> lis
     parts, rest = [], trial.initial_command_rad
     for low, high in zip([0, *gaps], [*gaps, len(trial.send_time_s)], strict=True):
         rows = {name: getattr(trial, name)[low:high] for name in _ROWS}
-        inside = (r.rows >= low) & (r.rows < high)
-        own = replace(
-            r, rows=r.rows[inside] - low, time_s=r.time_s[inside],
-            position_rad=r.position_rad[inside], held_time_s=r.held_time_s[low:high],
-        )  # fmt: skip
+        own = r.only((r.rows >= low) & (r.rows < high))
+        own = replace(own, rows=own.rows - low, held_time_s=r.held_time_s[low:high])
         cut = replace(trial, **rows, position_count=None, initial_command_rad=rest)
         parts.append((cut, own, group, start))
         rest = float(trial.command_rad[high - 1])
     return parts
-
-
-def _joined(parts: list[_Part], period: float) -> list[list[_Part]]:
-    joined: list[list[_Part]] = []
-    for part in parts:
-        gap = part[0].send_time_s[0] - joined[-1][-1][0].send_time_s[-1] if joined else np.inf
-        if 0 < gap < _PAUSE * period:
-            joined[-1].append(part)
-        else:
-            joined.append([part])
-    return joined
 
 
 def _run(parts: list[_Part], period: float, recording: int, dated: bool, pose_known: bool) -> Run:
@@ -289,10 +277,7 @@ def _run(parts: list[_Part], period: float, recording: int, dated: bool, pose_kn
         np.concatenate([p[1].held_time_s for p in parts]),
         parts[0][1].time_sd_s,
     )
-    inside = r.time_s >= merged.send_time_s[0]
-    r = replace(
-        r, rows=r.rows[inside], time_s=r.time_s[inside], position_rad=r.position_rad[inside]
-    )
+    r = r.only(r.time_s >= merged.send_time_s[0])
     edges = np.append(merged.send_time_s, merged.send_time_s[-1] + period)
     ticks = np.arange(len(edges), dtype=float)
 

@@ -40,7 +40,7 @@ from pupper_sysid.sysid.fit.structure import PREFERRED, candidate
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
-from pupper_sysid.sysid.servo_fit.networks import Learned, fit_network, past_ticks
+from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
 from pupper_sysid.sysid.servo_fit.published import fit_published
 from pupper_sysid.sysid.servo_fit.result import FitScores, ServoFit, verdict
 from pupper_sysid.sysid.servo_fit.scores import ModelScores
@@ -186,8 +186,8 @@ def fit_servo(
         linear = _fold_models(fir, folds, split)
     if arch != "delayed-pd":
         say("DelayedPD", 0.0)
-        found = _physics("delayed-pd", data, folds, seed)
-        physics = [physical_model("delayed-pd", v, data.period_s) for v in found]
+        values = delayed_pd_fits(data, [train for train, _ in folds], seed)
+        physics = [physical_model("delayed-pd", v, data.period_s) for v in values]
     if ours.interrupted:
         notes.append("Training was stopped early; the best so far was kept.")
     few = ours.weights_per_joint
@@ -197,10 +197,19 @@ def fit_servo(
             "rests on weight decay, chosen by held-out groups."
         )
     models = {"linear": linear, "delayed-pd": physics, arch: ours.folds}
-    scored = {name: _score(own, folds, data, seed) for name, own in models.items()}
+    scored = {}
+    for name, own in models.items():
+        parts = [
+            scores.errors(model, scores.tracks(model, data), data, test)
+            for model, (_, test) in zip(own, folds, strict=True)
+        ]
+        scored[name] = ModelScores.of(scores.pooled(parts), seed)
     errors = scored[arch].errors
     bands = {j: scores.band(e) for j, e in (ours.held_out or errors).items()}
     test: Part = split.test or (lambda number, elapsed, group: group >= 0)
+    covered = np.concatenate([
+        np.abs(e.free_run) <= scores.band_half_width(bands[j], e.speed) for j, e in errors.items()
+    ])  # fmt: skip
     persistence = scores.persistence(data, test)
     repeatability = scores.repeatability(data, test)
     by_joint = {
@@ -221,7 +230,7 @@ def fit_servo(
         choices={k: float(v) for k, v in ours.choices.items()}, joints=by_joint, mean=mean,
         rmse_free_run_rad=scored[arch].rmse_free_run_rad,
         linear_rmse_rad=scored["linear"].rmse_free_run_rad, difference_to_linear_rad=difference,
-        coverage_of_90_percent_band=_coverage(errors, bands), readings=count,
+        coverage_of_90_percent_band=float(covered.sum() / max(covered.size, 1)), readings=count,
         recordings=tuple({"name": r.name, "sha256": r.sha256} for r in recordings),
         verdict=verdict(arch, scored, difference, mean.repeatability_rad), notes=tuple(notes),
         interrupted=ours.interrupted, model=ours.model, parameters=ours.parameters,
@@ -280,8 +289,9 @@ def _fit(
 ) -> _Fitted:
     if arch in ("delayed-pd", "sindy"):
         same = split.test is not None  # the one fold is the whole training part
-        parts = folds if same else [(whole, whole), *folds]
-        values = _physics(arch, data, parts, seed)
+        parts = [train for train, _ in folds]
+        fits = delayed_pd_fits if arch == "delayed-pd" else sindy_fits
+        values = fits(data, parts if same else [whole, *parts], seed)
         models: list[ServoModel] = [physical_model(arch, v, data.period_s) for v in values]
         return _Fitted(models[0], values[0], models if same else models[1:], {}, None, 0)
     if preset == "paper":
@@ -318,34 +328,6 @@ def _fold_models(fit: Any, folds: list[tuple[Part, Part]], split: Split) -> list
     if split.test is not None:
         return [fit.model]
     return [fit.held_out[g] for g in range(len(folds))]
-
-
-def _physics(
-    arch: str, data: ServoData, folds: list[tuple[Part, Part]], seed: int
-) -> list[dict[str, NDArray[np.float64]]]:
-    fits = delayed_pd_fits if arch == "delayed-pd" else sindy_fits
-    return fits(data, [train for train, _ in folds], seed)
-
-
-def _score(
-    models: Sequence[ServoModel | Learned],
-    folds: list[tuple[Part, Part]],
-    data: ServoData,
-    seed: int,
-) -> ModelScores:
-    parts = [
-        scores.errors(model, scores.tracks(model, data), data, test)
-        for model, (_, test) in zip(models, folds, strict=True)
-    ]
-    return ModelScores.of(scores.pooled(parts), seed)
-
-
-def _coverage(found: dict[str, scores.Errors], bands: dict[str, scores.Band]) -> float:
-    inside, total = 0, 0
-    for joint, e in found.items():
-        half = scores.band_half_width(bands[joint], e.speed)
-        inside, total = inside + int(np.sum(np.abs(e.free_run) <= half)), total + len(half)
-    return inside / max(total, 1)
 
 
 def _both(a: Part, b: Part) -> Part:

@@ -23,7 +23,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.common.results import internal
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.interface import AtControlRate, ServoModel
@@ -310,7 +310,7 @@ def band(found: Errors) -> Band:
 
 def band_half_width(found: Band, speed: NDArray[np.float64]) -> NDArray[np.float64]:
     """Half of the 90 % band about a free run [rad], at a speed [rad/s]."""
-    return 1.645 * np.sqrt(found[0] ** 2 + (found[1] * speed) ** 2)
+    return HALF_WIDTH_SD * np.sqrt(found[0] ** 2 + (found[1] * speed) ** 2)
 
 
 def _alone(data: ServoData) -> bool:
@@ -341,30 +341,24 @@ def stacked(data: ServoData) -> tuple[NDArray, NDArray, NDArray]:
 
 def with_ages(data: ServoData, rules: Mapping[str, ReadingRule]) -> ServoData:
     """The same data, the readings of `expected` joints at the ages that they may have."""
-
-    def aged(run: Run, rule: ReadingRule) -> Run:
-        if rule.rule != "expected":
-            return run
-        old = ages(rule.poll_period_s, rule.loss) / data.period_s
-        return replace(run, reading_tick=np.maximum(run.row_tick[:, None] - old, 0.0))
-
-    return replace(
-        data, runs={j: tuple(aged(r, rules[j]) for r in runs) for j, runs in data.runs.items()}
-    )
+    aged = dict(data.runs)
+    for joint in (j for j in data.runs if rules[j].rule == "expected"):
+        old = ages(rules[joint].poll_period_s, rules[joint].loss) / data.period_s
+        aged[joint] = tuple(
+            replace(r, reading_tick=np.maximum(r.row_tick[:, None] - old, 0.0))
+            for r in data.runs[joint]
+        )
+    return replace(data, runs=aged)
 
 
 def as_rows(data: ServoData, joints: Sequence[str]) -> ServoData:
     """The same data for a model that was fitted to rows: it predicts readings, age and all."""
-
-    def logged(run: Run) -> Run:
-        return replace(run, reading_tick=run.row_tick[:, None], held_tick=run.row_tick)
-
-    return replace(
-        data,
-        runs={
-            j: tuple(map(logged, runs)) if j in joints else runs for j, runs in data.runs.items()
-        },
-    )
+    logged = {
+        j: tuple(replace(r, reading_tick=r.row_tick[:, None], held_tick=r.row_tick) for r in runs)
+        for j, runs in data.runs.items()
+        if j in joints
+    }
+    return replace(data, runs=data.runs | logged)
 
 
 FreeRun = Callable[[NDArray[np.float64]], Tracks]

@@ -174,7 +174,16 @@ def samples(data: ServoData, part: Part, past: int) -> Samples:
         command = np.concatenate(
             [r.command_rad for r, u in zip(data.runs[joint], uses, strict=True) if u.any()] or [[]]
         )
-        _check(joint, command, position)
+        if len(position) < _FEWEST:
+            raise InputError(
+                f"{joint}: only {len(position)} readings to learn from; even a linear model needs "
+                f"{_FEWEST}. Record longer, or train on more of it."
+            )
+        if np.std(command) < 1e-3:
+            raise InputError(
+                f"{joint}: its commands hardly change (by {1e3 * np.ptp(command):.1f} mrad), so no "
+                "model can be fitted. Leave it out of `joints`, or record a sweep."
+            )
         norm["command_center"][n], norm["command_scale"][n] = command.mean(), command.std()
         norm["position_center"][n] = position.mean()
         norm["position_scale"][n] = max(position.std(), 1e-4)
@@ -195,19 +204,6 @@ def samples(data: ServoData, part: Part, past: int) -> Samples:
             group[n, here, :width], used[n, here, :width] = g, u
             at += len(c)
     return Samples(command, index, weight, target, group, used, norm, past)
-
-
-def _check(joint: str, command: NDArray, position: NDArray) -> None:
-    if len(position) < _FEWEST:
-        raise InputError(
-            f"{joint}: only {len(position)} readings to learn from; even a linear model needs "
-            f"{_FEWEST}. Record longer, or train on more of it."
-        )
-    if np.std(command) < 1e-3:
-        raise InputError(
-            f"{joint}: its commands hardly change (by {1e3 * np.ptp(command):.1f} mrad), so no "
-            "model can be fitted. Leave it out of `joints`, or record a sweep."
-        )
 
 
 def _windows(run: Run, use: NDArray[np.bool_], past: int) -> tuple[NDArray, ...]:

@@ -77,7 +77,7 @@ class Plan:
 
     def _made(self) -> SweepPlan:
         """The plan from recordings or a calibration, or a first sweep without either."""
-        from pupper_sysid.servo_models.calibration.calibration import load_calibration
+        from pupper_sysid.servo_models.calibration.calibration import InputFile, load_calibration
         from pupper_sysid.sysid.plan import proposal
         from pupper_sysid.sysid.plan.candidates import Setup
 
@@ -101,7 +101,7 @@ class Plan:
             calibration = load_calibration(first)
             joints = select_joints(self.joints, calibration.joint_names)
             return proposal.plan_from_calibration(
-                calibration, proposal.Source(name=first.name, sha256=sha256(first)), joints,
+                calibration, InputFile(name=first.name, sha256=sha256(first)), joints,
                 seconds=seconds, loop_period_s=period_s,
                 margins=_some_margins(self._map(None), joints), seed=self.seed,
             )  # fmt: skip

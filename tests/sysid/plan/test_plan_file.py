@@ -7,9 +7,10 @@ import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
+from pupper_sysid.servo_models.calibration.calibration import InputFile
 from pupper_sysid.sysid.plan.plan_file import executable, load_plan, save_plan
 from pupper_sysid.sysid.plan.planner import LEAST_HALF_WIDTH_S, PlannedTrial, Prediction
-from pupper_sysid.sysid.plan.proposal import Source, SweepPlan
+from pupper_sysid.sysid.plan.proposal import SweepPlan
 from pupper_sysid.sysid.plan.until import Goal, half_width, parse_goal, record_until
 from pupper_sysid.sysid.recordings.recording import Recording
 from support.planned_servos import SECONDS, fit_of_half_width, two_joints
@@ -26,7 +27,7 @@ def trial(joint: str, frequency_hz: float, amplitude_rad: float, kind: str = "si
 
 
 PROPOSAL = SweepPlan(
-    made_from=(Source(name="sweep.csv", sha256="0" * 64),),
+    made_from=(InputFile(name="sweep.csv", sha256="0" * 64),),
     seed=3,
     loop_period_s=0.019,
     poll_rate_hz=37.2,

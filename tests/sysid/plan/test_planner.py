@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.interval import Interval
-from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.servo_models.calibration.calibration import InputFile, load_calibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.sysid.fit.posterior import PHASE_SD_S
 from pupper_sysid.sysid.fit.run import at_steps, free_run
@@ -27,7 +27,6 @@ from pupper_sysid.sysid.plan.planner import (
     without_shift,
 )
 from pupper_sysid.sysid.plan.proposal import (
-    Source,
     calibrated_servo,
     feedback_setup,
     fitted_servo,
@@ -249,7 +248,7 @@ def test_a_calibration_is_planned_from_its_intervals():
         interval = now(replace(servo, hypotheses=servo.hypotheses[:1], nats=(0.0,)))
         # the prior adds a little to what the interval says
         assert (interval.high - interval.low) / 2 == pytest.approx(half, rel=0.05)
-    plan = plan_from_calibration(calibration, Source(name="c.yaml", sha256="0" * 64), ["LF_hip"])
+    plan = plan_from_calibration(calibration, InputFile(name="c.yaml", sha256="0" * 64), ["LF_hip"])
     assert plan.joints == ["LF_hip"] and plan.predictions
 
 
