@@ -31,8 +31,7 @@ from pupper_sysid.common.reading.content import allowed, content, refuse_more
 from pupper_sysid.common.strict_yaml import MAX_DEPTH, Place, load, place_text, printable
 
 LARGEST_BYTES = 2_000_000
-MOST_VALUES = 5_000_000
-"""Of a JSON text: values, names and brackets."""
+MOST_VALUES = 5_000_000  # of a JSON text: values, names and brackets
 
 UNIT_OF_SUFFIX = {
     "counts_per_rad": "counts/rad",

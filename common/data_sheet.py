@@ -75,8 +75,7 @@ class DataSheet:
         )  # fmt: skip
 
 
-_Stated = tuple[float, float, float | None]
-"""Supply [V], stall torque [N·m], no-load speed [rpm]."""
+_Stated = tuple[float, float, float | None]  # supply [V], stall torque [N·m], no-load speed [rpm]
 
 
 def _sheet(

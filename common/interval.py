@@ -8,8 +8,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-LEVEL = 0.90
-"""Coverage of every interval of this project."""
+LEVEL = 0.90  # coverage of every interval of this project
 HALF_WIDTH_SD = NormalDist().inv_cdf((1 + LEVEL) / 2)
 """Half the width of such an interval of a normal number, in standard deviations: 1.645."""
 

@@ -21,8 +21,7 @@ MAX_DEPTH = 20
 MOST_NODES = 100_000
 _DEEPEST = 1000  # libyaml's own limit of nesting, since PyYAML 6.0.4
 
-Place = tuple[str | int, ...]
-"""Where a value stands in a file: keys and list indices from the top."""
+Place = tuple[str | int, ...]  # where a value stands in a file: keys and list indices from the top
 
 _INTEGER = re.compile(r"[-+]?[0-9]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")

@@ -93,11 +93,8 @@ def _degrees(value: Interval) -> str:
     return f"{best:.2f}° [{low:.2f}, {high:.2f}]"
 
 
-FASTEST_RAD_S = 0.5
-"""Faster strokes are no test of hysteresis: inertia counts."""
-LONGEST_DEAD_TIME_S = 0.03
-"""With a single gain the dead time is taken to be anything up to this."""
-
+FASTEST_RAD_S = 0.5  # faster strokes are no test of hysteresis: inertia counts
+LONGEST_DEAD_TIME_S = 0.03  # with a single gain the dead time is taken to be anything up to this
 _BEFORE_RAD, _AFTER_RAD = 0.03, 0.12  # of the hanging position: the play opens and closes in here
 _SETTLED_RAD = 0.04  # travel after a reversal from which a stroke is steady
 _CALM_S = 0.5  # after that: transients of a low gain are over

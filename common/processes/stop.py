@@ -37,13 +37,11 @@ FINISHING = "finishing this iteration; again ends at once"
 _UNWIND_S = 0.5
 """Longest time from a signal to the end of a process that holds no robot [s], of the second that a
 user waits at most."""
-_FINISH_S = 0.7
-"""Longest time that an iteration may take after SIGTERM or SIGHUP [s]."""
+_FINISH_S = 0.7  # longest time that an iteration may take after SIGTERM or SIGHUP [s]
 _REPEAT_S = 0.3
 """Signals that follow each other faster [s] are one: `torchrun`, `make` and others pass on to a
 process what the terminal has sent it already."""
-_SWALLOWED_S = 0.01
-"""Time for a callback that swallowed a KeyboardInterrupt to return [s]."""
+_SWALLOWED_S = 0.01  # time for a callback that swallowed a KeyboardInterrupt to return [s]
 
 
 class Stop:
@@ -239,8 +237,7 @@ class Stop:
         return max(pressed_s[0], self._begun_s) + _UNWIND_S
 
 
-_current: Stop | None = None
-"""The Stop in force. Signals are a process's, so this is, too."""
+_current: Stop | None = None  # the Stop in force. Signals are a process's, so this is, too
 
 
 def stop_process() -> None:

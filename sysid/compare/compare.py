@@ -31,7 +31,7 @@ from pupper_sysid.servo_models.calibration.calibration import (
 from pupper_sysid.servo_models.cards.card import CardCalibration
 from pupper_sysid.servo_models.cards.files import card_names
 from pupper_sysid.servo_models.interface import ServoModel
-from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model
+from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.compare.comparison import ComparedModel, Comparison
 from pupper_sysid.sysid.doctor.checks import (
     Joints,
@@ -42,32 +42,14 @@ from pupper_sysid.sysid.doctor.checks import (
     usable_trials,
 )
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
+from pupper_sysid.sysid.fit import predict
 from pupper_sysid.sysid.fit.calibrate import CalibrationResult
-from pupper_sysid.sysid.fit.predict import (
-    ComparedRun,
-    Prediction,
-    compared_runs,
-    persistence,
-    poll_of,
-    predict,
-    rule_of,
-)
-from pupper_sysid.sysid.fit.predict import (
-    notes as run_notes,
-)
 from pupper_sysid.sysid.fit.run import at_steps
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
 from pupper_sysid.sysid.servo_fit.result import ServoFit
-from pupper_sysid.sysid.servo_fit.scores import (
-    LINEAR,
-    ModelScores,
-    as_rows,
-    learned_run,
-    run_with_offset,
-)
 from pupper_sysid.sysid.servo_fit.windows import everything, grouped, merged_groups, only, samples
 
 Model = str | Path | Calibration | CalibrationResult | ServoFit
@@ -118,19 +100,21 @@ def compare(
     trials = usable_trials(recordings, names)
     learned = [m for m in models if isinstance(m, ServoFit) or _is_folder(m)]
     notes = [text for joint in names for text in cautions(joint, trials[joint])]
-    polls = {joint: poll_of(recordings, joint, seed, lattices) for joint in names}
-    runs = {joint: compared_runs(recordings, joint, polls[joint]) for joint in names}
+    polls = {joint: predict.poll_of(recordings, joint, seed, lattices) for joint in names}
+    runs = {joint: predict.compared_runs(recordings, joint, polls[joint]) for joint in names}
     source = ", ".join(r.name for r in recordings)
-    predictions: dict[str, dict[str, Prediction]] = {}
+    predictions: dict[str, dict[str, predict.Prediction]] = {}
     for name, calibration in calibrations.items():
         predictions[name] = {
-            joint: predict(
+            joint: predict.predict(
                 calibration, joint, runs[joint],
-                rule_of(joint, polls[joint], source, {name: calibration}), readings,
+                predict.rule_of(joint, polls[joint], source, {name: calibration}), readings,
             )
             for joint in names
         }  # fmt: skip
-    notes += [*_fitted_here(calibrations, recordings), *run_notes(calibrations, runs)]
+    for name, calibration in calibrations.items():
+        notes += _fitted_here(name, [file.sha256 for file in calibration.inputs], recordings)
+    notes += predict.notes(calibrations, runs)
     made = {name: _scored(own, seed) for name, own in predictions.items()}
     data, tracks, bands = None, {}, {}
     try:
@@ -138,14 +122,14 @@ def compare(
         opened, fitted_to = _opened(learned, data, recordings)
         notes += fitted_to
         for name, own in opened.items():
-            rows = as_rows(data, own.of_rows)
-            track, offset = run_with_offset(learned_run(own.model, rows), rows)
+            rows = scores.as_rows(data, own.of_rows)
+            track, offset = scores.run_with_offset(scores.learned_run(own.model, rows), rows)
             errors = scores.errors(own.model, track, rows, everything)
-            made[name] = ComparedModel.scored(ModelScores.of(errors, seed), offset, {})
+            made[name] = ComparedModel.scored(scores.ModelScores.of(errors, seed), offset, {})
             tracks[name] = track
         bands = {name: own.band for name, own in opened.items() if own.band}
-        tracks[LINEAR], errors = _linear(data, seed)
-        made[LINEAR] = ComparedModel.scored(ModelScores.of(errors, seed), {}, {})
+        tracks[scores.LINEAR], errors = _linear(data, seed)
+        made[scores.LINEAR] = ComparedModel.scored(scores.ModelScores.of(errors, seed), {}, {})
         for name, own in predictions.items():
             tracks[name] = {j: _on_ticks(data, j, runs[j], p.tracks) for j, p in own.items()}
     except InputError as error:
@@ -153,24 +137,26 @@ def compare(
             raise
         notes.append(f"No linear filter beside, it cannot be fitted to these runs: {error}")
     if learned and _loaded(runs):
-        folders = ", ".join(n for n in made if n not in predictions and n != LINEAR)
+        folders = ", ".join(n for n in made if n not in predictions and n != scores.LINEAR)
         notes.append(f"{folders}: knows neither the load nor the P gain of a run.")
     if presets := [str(m) for m in models if str(m) in PRESETS]:
         notes.append(
             f"{', '.join(presets)}: published with ideal feedback. Where its delay stands for the "
             "age of readings, too, that age counts twice here."
         )
-    shown = iter(n for n in made if n not in predictions and n != LINEAR)
+    shown = iter(n for n in made if n not in predictions and n != scores.LINEAR)
     named = iter(predictions)
     order = [next(shown if any(m is one for one in learned) else named) for m in models]  # as given
-    made = {name: made[name] for name in (*order, *([LINEAR] if LINEAR in made else []))}
+    made = {
+        name: made[name] for name in (*order, *([scores.LINEAR] if scores.LINEAR in made else []))
+    }
     nan, period = float("nan"), float(np.median([r.loop_period_s for r in recordings]))
-    rules = {joint: rule_of(joint, polls[joint], source) for joint in names}
+    rules = {joint: predict.rule_of(joint, polls[joint], source) for joint in names}
     return Comparison(
         models=made,
         readings=rules,
         persistence_rmse_rad=scores.persistence(data, everything) if data is not None else {
-            joint: persistence(own) for joint, own in runs.items()
+            joint: predict.persistence(own) for joint, own in runs.items()
         },
         repeatability_rad=scores.repeatability(data, everything) if data is not None else (
             dict.fromkeys(names, nan)
@@ -188,7 +174,7 @@ def compare(
     )  # fmt: skip
 
 
-def _scored(predictions: Mapping[str, Prediction], seed: int) -> ComparedModel:
+def _scored(predictions: Mapping[str, predict.Prediction], seed: int) -> ComparedModel:
     """Scores of a calibration's predictions by joint."""
     errors = {}
     for joint, own in predictions.items():
@@ -198,30 +184,25 @@ def _scored(predictions: Mapping[str, Prediction], seed: int) -> ComparedModel:
             e["counted"], own.one_step(), nothing, own.blocks(), e["held"], e["raw"]
         )
     return ComparedModel.scored(
-        ModelScores.of(errors, seed),
+        scores.ModelScores.of(errors, seed),
         {joint: own.offset_rad for joint, own in predictions.items()},
         {joint: own.age_spread_rad() for joint, own in predictions.items()},
         {joint: own.rule for joint, own in predictions.items()},
     )
 
 
-def _fitted_here(
-    calibrations: Mapping[str, Calibration], recordings: Sequence[Recording]
-) -> list[str]:
-    """Which calibrations were fitted to one of the recordings, in sentences."""
-    inputs, sentences = {r.sha256: r.name for r in recordings}, []
-    for name, calibration in calibrations.items():
-        fitted = [inputs[f.sha256] for f in calibration.inputs if f.sha256 in inputs]
-        if fitted:
-            which = ", ".join(fitted) if len(fitted) < 4 else f"{len(fitted)} of these recordings"
-            sentences.append(
-                f"{name} was fitted to {which}: its errors here are too small. Its file holds "
-                "those on unseen data."
-            )
-    return sentences
+def _fitted_here(name: str, hashes: Sequence[str], recordings: Sequence[Recording]) -> list[str]:
+    """A sentence if a model was fitted to some of the recordings."""
+    fitted = [r.name for r in recordings if r.sha256 in hashes]
+    which = ", ".join(fitted) if len(fitted) < 4 else f"{len(fitted)} of these recordings"
+    sentence = (
+        f"{name} was fitted to {which}: its errors here are too small. Its file holds those on "
+        "unseen data."
+    )
+    return [sentence] if fitted else []
 
 
-def _loaded(runs: Mapping[str, Sequence[ComparedRun]]) -> bool:
+def _loaded(runs: Mapping[str, Sequence[predict.ComparedRun]]) -> bool:
     """Whether runs differ in gain, or carry a load."""
     return any(
         own.trial.load is not None or own.run.p_gain != every[0].run.p_gain
@@ -233,7 +214,7 @@ def _loaded(runs: Mapping[str, Sequence[ComparedRun]]) -> bool:
 def _on_ticks(
     data: ServoData,
     joint: str,
-    runs: Sequence[ComparedRun],
+    runs: Sequence[predict.ComparedRun],
     tracks: Sequence[NDArray[np.float64]],
 ) -> list[NDArray[np.float64]]:
     """Tracks of physics steps at the ticks of the data's runs, which may join trials."""
@@ -288,7 +269,6 @@ def _opened(
     """Models by label, and which of them were fitted to one of the recordings."""
     opened: dict[str, _Opened] = {}
     notes = []
-    inputs = {r.sha256: r.name for r in recordings}
     for given in models:
         found = _open(given, data)
         called = given if isinstance(given, str | Path) else found.name
@@ -296,12 +276,7 @@ def _opened(
         if name in opened:
             name = f"{name} ({called if called != name else len(opened) + 1})"
         opened[name] = found
-        notes += [
-            f"{called} was fitted to {inputs[h]}: its errors here are too small. Its file "
-            "holds those on unseen data."
-            for h in found.fitted_to
-            if h in inputs
-        ]
+        notes += _fitted_here(str(called), found.fitted_to, recordings)
     return opened, notes
 
 
@@ -353,7 +328,7 @@ def _open(given: str | Path | ServoFit, data: ServoData) -> _Opened:
         with TemporaryDirectory() as folder:
             given.save(folder, force=True)
             return _open(folder, data)
-    saved: SavedModel = load_servo_model(Path(given), data.joints, data.period_s)
+    saved = load_servo_model(Path(given), data.joints, data.period_s)
     contract = saved.contract
     name = contract.arch.upper() if contract.arch in ("mlp", "lstm", "fir") else contract.arch
     name += " (paper)" if contract.preset == "paper" else ""
@@ -367,7 +342,7 @@ def _open(given: str | Path | ServoFit, data: ServoData) -> _Opened:
 def _linear(data: ServoData, seed: int) -> tuple[scores.Tracks, dict[str, scores.Errors]]:
     """The linear baseline, each group by a filter fitted to the others."""
     # where all rows count it is fitted to them as logged, their age included
-    own = as_rows(data, [j for j in data.joints if data.modes[j] == "all"])
+    own = scores.as_rows(data, [j for j in data.joints if data.modes[j] == "all"])
     cut, _ = grouped(own, everything)
     ready = samples(cut, everything, past_ticks(data.period_s))
     fit = fit_network("fir", data.joints, data.period_s, ready, seed)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING
@@ -24,13 +23,12 @@ from pupper_sysid.sysid.fit.predict import (
     run_figure,
     track_of,
 )
-from pupper_sysid.sysid.fit.run import at_steps
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData
 from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
 from pupper_sysid.sysid.servo_fit.result import ServoFit
-from pupper_sysid.sysid.servo_fit.scores import LINEAR, FreeRun, ModelScores, run_with_offset
+from pupper_sysid.sysid.servo_fit.scores import LINEAR, ModelScores
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -193,7 +191,7 @@ def four_way(
     data = mlp.data
     rules = {j: rule_of(j, data.lattices[j], recording.name) for j in data.joints}
     run = calibrated_run(load_calibration("paper"), data)
-    track, offset = run_with_offset(run, data, split.train)
+    track, offset = scores.run_with_offset(run, data, split.train)
     errors = scores.errors(None, track, data, split.test)
     published = scores.ModelScores.of(errors, seed)
     fitted = {FITTED: mlp.scored["delayed-pd"], LINEAR: mlp.scored["linear"]}
@@ -212,7 +210,7 @@ def four_way(
     )
 
 
-def calibrated_run(calibration: Calibration, data: ServoData) -> FreeRun:
+def calibrated_run(calibration: Calibration, data: ServoData) -> scores.FreeRun:
     """Free run of a calibration's servos on the runs of learned models, several times per tick."""
 
     def run(offset: NDArray[np.float64]) -> scores.Tracks:
@@ -222,12 +220,7 @@ def calibrated_run(calibration: Calibration, data: ServoData) -> FreeRun:
             for e, own in enumerate(data.runs[joint]):
                 physics = own.on_physics(np.ones(len(own.tick), bool))
                 track = track_of(calibration, joint, physics, offset[e, n]) - offset[e, n]
-                per_tick = max(1, math.ceil(data.period_s / physics.step_s))
-                send = own.trial.send_time_s - own.trial.send_time_s[0]
-                edges = np.append(send, send[-1] + data.period_s)
-                ticks = np.arange(per_tick * len(send) + 1) / per_tick
-                step = np.interp(ticks, np.arange(len(edges)), edges) / physics.step_s
-                tracks[joint].append(at_steps(track, step))
+                tracks[joint].append(scores.on_ticks(track, own, data.period_s))
         return tracks
 
     return run

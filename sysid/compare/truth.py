@@ -14,7 +14,7 @@ the true lag in its physics steps.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -112,41 +112,24 @@ class TruthTable(Result):
         return [row.rows()[0] for row in self.quantities]
 
 
-_Numbers = Mapping[str, float]
+_RATIOS = ("stiffness", "damping", "friction_loss", "effort_limit", "back_emf")
+"""Torques, of which a recording in free air determines the ratios to the armature."""
+_READINGS = ("poll_period_s", "loss", "mean_age_s", "quantum_rad", "offset_rad")
 
 
-def _ratio(name: str) -> Callable[[_Numbers, _Numbers], float]:
-    """Truth of a torque, over the armature."""
-    return lambda actuator, _: actuator.get(name, 0.0) / actuator["armature"]
-
-
-def _of(name: str, part: int) -> Callable[[_Numbers, _Numbers], float]:
-    """Truth of the number `name` of the actuator (0) or the feedback (1)."""
-    return lambda *parts: parts[part].get(name, math.nan)
-
-
-QUANTITIES: dict[
-    str, tuple[Callable[[JointCalibration], Quantity], Callable[[_Numbers, _Numbers], float]]
-] = {
-    "dead_time_s": (lambda j: j.actuator.dead_time_s, _of("dead_time_s", 0)),
-    "stiffness": (lambda j: j.actuator.ratios_to_armature.stiffness, _ratio("stiffness")),
-    "damping": (lambda j: j.actuator.ratios_to_armature.damping, _ratio("damping")),
-    "friction_loss": (
-        lambda j: j.actuator.ratios_to_armature.friction_loss,
-        _ratio("friction_loss"),
-    ),
-    "effort_limit": (lambda j: j.actuator.ratios_to_armature.effort_limit, _ratio("effort_limit")),
-    "back_emf": (lambda j: j.actuator.ratios_to_armature.back_emf, _ratio("back_emf")),
-    "velocity_limit_rad_s": (lambda j: j.actuator.velocity_limit_rad_s, _of("velocity_limit", 0)),
-    "command_jitter_s": (lambda j: j.actuator.command_jitter_s, _of("command_jitter_s", 0)),
-    "poll_period_s": (lambda j: j.feedback.poll_period_s, _of("poll_period_s", 1)),
-    "loss": (lambda j: j.feedback.loss, _of("loss", 1)),
-    "mean_age_s": (lambda j: j.feedback.mean_age_s, _of("mean_age_s", 1)),
-    "quantum_rad": (lambda j: j.feedback.quantum_rad, _of("quantum_rad", 1)),
-    "offset_rad": (lambda j: j.feedback.offset_rad, _of("offset_rad", 1)),
-}
-"""By name, where the calibration has a quantity and how it follows from the truth's actuator and
-feedback."""
+def _pairs(
+    joint: JointCalibration, actuator: Mapping[str, float], feedback: Mapping[str, float]
+) -> dict[str, tuple[Quantity, float]]:
+    """Quantities of a calibration by name, each with the truth's number (NaN where it has none)."""
+    a, ratios = joint.actuator, joint.actuator.ratios_to_armature
+    inertia = actuator["armature"]
+    return {
+        "dead_time_s": (a.dead_time_s, actuator.get("dead_time_s", math.nan)),
+        **{n: (getattr(ratios, n), actuator.get(n, 0.0) / inertia) for n in _RATIOS},
+        "velocity_limit_rad_s": (a.velocity_limit_rad_s, actuator.get("velocity_limit", math.nan)),
+        "command_jitter_s": (a.command_jitter_s, actuator.get("command_jitter_s", math.nan)),
+        **{n: (getattr(joint.feedback, n), feedback.get(n, math.nan)) for n in _READINGS},
+    }
 
 
 def truth_table(
@@ -185,8 +168,7 @@ def truth_table(
             trials = joint_trials(recordings, joint)
             moved = true | {"actuator": _at_gain(true, trials[0].p_gain)}
             rows.append(_row(joint, "lag_s", found.lag.lag_s, true_lag_s(trials, moved, seed)))
-        for name, (where, value) in QUANTITIES.items():
-            quantity, known = where(found), value(stepped, feedback)
+        for name, (quantity, known) in _pairs(found, stepped, feedback).items():
             # a part that neither servo has, and a limit that is infinite, are nothing to find
             if np.isfinite(known) and (known or quantity.value):
                 rows.append(_row(joint, name, quantity, known))
@@ -259,7 +241,7 @@ def _true_motion(trial: Trial, truth: Mapping[str, Any]) -> Trial:
     )  # fmt: skip
 
 
-def _parameters(actuator: _Numbers) -> DelayedPDParameters:
+def _parameters(actuator: Mapping[str, float]) -> DelayedPDParameters:
     """The true servo; parameters that the truth's emulator has not are left at their defaults."""
     known = {f.name for f in fields(DelayedPDParameters)}
     return DelayedPDParameters(**{k: v for k, v in actuator.items() if k in known})
@@ -296,9 +278,8 @@ def _at_gain(truth: Mapping[str, Any], p_gain: float) -> dict[str, float]:
 
 
 def _row(joint: str, name: str, found: Quantity, truth: float) -> TruthRow:
-    low = math.nan if found.low is None else found.low
-    high = math.nan if found.high is None else found.high
-    known = found.low is not None and found.high is not None
+    low, high = (math.nan if end is None else end for end in (found.low, found.high))
+    known = not math.isnan(low + high)
     rounding = _ROUNDING * abs(truth)
     return TruthRow(
         joint=joint, quantity=name, found=Interval(found.value, low, high),

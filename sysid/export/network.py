@@ -39,11 +39,10 @@ from torch import Tensor, nn
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import refuse_overwrite, versions, write_bytes, write_text
 from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
-from pupper_sysid.servo_models.servo_file import Contract, SavedModel
+from pupper_sysid.servo_models.servo_file import SavedModel
 from pupper_sysid.sysid.recordings.table import comments
 
-CLOSE = 1e-5
-"""Largest difference between a file's outputs and the model's [unit of the output]."""
+CLOSE = 1e-5  # largest difference between a file's outputs and the model's [unit of the output]
 
 Run = Callable[..., Sequence[Tensor]]
 """The exported file, loaded: tensors in the order of its inputs to tensors of its outputs."""
@@ -74,11 +73,9 @@ def export_module(
     """
     refuse_overwrite(path, force)
     module = module.eval()
-    by_name = set(names[0]) <= set(inspect.signature(module.forward).parameters)
-    examples = dict(zip(names[0], example_inputs, strict=True))
-    given: dict[str, Any] = {"args": (), "kwargs": examples}
-    if not by_name:
-        given = {"args": tuple(example_inputs), "kwargs": {}}
+    given: dict[str, Any] = {"args": tuple(example_inputs), "kwargs": {}}
+    if set(names[0]) <= set(inspect.signature(module.forward).parameters):
+        given = {"args": (), "kwargs": dict(zip(names[0], example_inputs, strict=True))}
     with warnings.catch_warnings(), torch.inference_mode():
         # both are deprecated in favour of torch.export, whose files older runtimes cannot load
         warnings.filterwarnings("ignore", category=DeprecationWarning)
@@ -233,12 +230,10 @@ def parameter_table(saved: SavedModel) -> str:
             for place, value in np.ndenumerate(array[j]):
                 cells = [*(str(i) for i in place), *[""] * (axes - len(place))]
                 lines.append(",".join((joint, name, *cells, str(value))))
-    header = {"versions_when_exported": versions()} | _contract_json(saved.contract)
+    header = {"versions_when_exported": versions()} | saved.contract.model_dump(
+        mode="json", by_alias=True
+    )
     return comments("pupper-sysid servo model table", header) + "\n".join(lines) + "\n"
-
-
-def _contract_json(contract: Contract) -> dict[str, Any]:
-    return contract.model_dump(mode="json", by_alias=True)
 
 
 def _metadata(
@@ -259,7 +254,7 @@ def _metadata(
         "output": contract.output,
         "units": contract.units,
         "reset": rest + ".",
-        "contract": json.dumps(_contract_json(contract), ensure_ascii=False),
+        "contract": json.dumps(contract.model_dump(mode="json", by_alias=True), ensure_ascii=False),
     }
 
 

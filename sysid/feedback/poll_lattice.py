@@ -60,9 +60,7 @@ from pupper_sysid.sysid.feedback.staleness import (
 )
 from pupper_sysid.sysid.recordings.recording import Trial
 
-LONGEST_S = 0.12
-"""Longest poll period that is searched for [s]."""
-
+LONGEST_S = 0.12  # longest poll period that is searched for [s]
 _RIVAL = 5.0  # nats: a period that explains the readings by less worse is not ruled out
 _ALTERNATIVES = 4  # periods of the search that are compared in full
 # of the period from stretch to stretch: usual size, and the stretches that this is worth

@@ -155,16 +155,13 @@ OUTLIERS = 0.03
 BLURS_S = (0.0012, 0.0025, 0.005)
 """Full widths of the uncertainty of one poll instant, to choose from [s]."""
 
-BLUR_S = BLURS_S[1]
-"""The width before it is estimated [s]."""
+BLUR_S = BLURS_S[1]  # the width before it is estimated [s]
 
 DRIFT = 0.0045
 """Relative standard deviation of the period between stretches, measured on a Mini Pupper 2."""
 
 _BINS = 64
-LOCK = 0.125
-"""How far a phase may be from the one that it refines, in periods."""
-
+LOCK = 0.125  # how far a phase may be from the one that it refines, in periods
 _PEAKS, _APART = 12, 0.02  # best periods of the search, and how far apart
 _MOST_OUTLIERS = 0.4
 

@@ -23,9 +23,7 @@ from pupper_sysid.common.results import Result
 from pupper_sysid.sysid.feedback.poll_search import Stretch
 from pupper_sysid.sysid.recordings.recording import Trial
 
-STRETCH_S = 4.0
-"""Longest stretch [s]; longer ones would need the poll to keep its phase to 1e-4."""
-
+STRETCH_S = 4.0  # longest stretch [s]; longer ones would need the poll to keep its phase to 1e-4
 _MOVING_QUANTA = 1.0  # a servo that moves by one count must change the reading
 
 

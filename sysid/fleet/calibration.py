@@ -20,6 +20,7 @@ from __future__ import annotations
 import re
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -43,8 +44,7 @@ TABLE = "fleet.csv"
 OUTLIER = 5.0
 """Distance of an outlier from the median of the same joint on all robots, in robust standard
 deviations."""
-FEWEST = 5
-"""Robots needed to mark outliers."""
+FEWEST = 5  # robots needed to mark outliers
 
 _CONNECT_S = 10
 _ADDRESS = re.compile(r"(tls|tcp)://[A-Za-z0-9_.:\[\]-]+:[0-9]{1,5}")
@@ -182,7 +182,11 @@ def run_fleet(
     hold_output(out / TABLE)
     fleet, todo = Fleet(), []
     for path, target in targets.items():
-        if target.exists() and _same(is_of, target, path):
+        same = False
+        if target.exists():
+            with suppress(PupperError):  # one that cannot be read is left to `make`
+                same = is_of(target, path)
+        if same:
             fleet.kept.append(_called(target))
         elif target.exists() and not force:
             raise InputError(
@@ -219,10 +223,7 @@ def _called(target: Path) -> str:
 
 def _is_of(target: Path, path: Path, settings: Settings) -> bool:
     """Whether a calibration was made from these bytes with these settings."""
-    try:
-        made = load_calibration(target)
-    except InputError:
-        return False
+    made = load_calibration(target)
     scales = [j.actuator.scale for j in made.joints.values()]
     given = {s.value_nm if s.source == GIVEN_TORQUE else None for s in scales}
     return (
@@ -242,14 +243,6 @@ def _calibrated(path: Path, target: Path, settings: Settings) -> None:
     """Calibrate one robot."""
     made = calibrate(load(path), None, settings.seed, settings.stall_torque_nm, workers=1)
     made.save(target, force=True)
-
-
-def _same(is_of: Callable[[Path, Path], bool], target: Path, path: Path) -> bool:
-    """Whether a target was made from a recording; one that cannot be read is left to `make`."""
-    try:
-        return is_of(target, path)
-    except PupperError:
-        return False
 
 
 def _one(

@@ -6,12 +6,11 @@ with the same settings are kept; a recording that cannot be used does not stop t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.fleet.calibration import Fleet, robots_in, run_fleet
@@ -72,21 +71,14 @@ def _numbers(target: Path) -> dict[str, dict[str, float]]:
 
 def _is_of(target: Path, path: Path, settings: ServoSettings) -> bool:
     """Whether a model was fitted to this file with these settings."""
-    try:
-        made = load_servo_model(target).contract
-    except InputError:
-        return False
+    made = load_servo_model(target).contract
     return (
         [r.sha256 for r in made.recordings] == [sha256(path)]
         and (made.arch, made.preset, made.seed) == (settings.arch, settings.preset, settings.seed)
         and made.split == settings.split.name
-        and made.readings_counted == _modes(path, made.joints, settings)
+        and made.readings_counted
+        == servo_data([load(path)], list(made.joints), settings.readings, settings.seed).modes
     )
-
-
-def _modes(path: Path, joints: Iterable[str], settings: ServoSettings) -> dict[str, str]:
-    """Which readings of a recording count, per joint."""
-    return servo_data([load(path)], list(joints), settings.readings, settings.seed).modes
 
 
 def _fitted(path: Path, target: Path, settings: ServoSettings) -> None:

@@ -428,8 +428,7 @@ def _integer(trial: Trial, rows: NDArray | None) -> float:
     return float(shifts[int(np.argmax([np.sum(y * c[rows - s]) for s in shifts]))] * loop)
 
 
-EARLIEST_S = -0.05
-"""Search range of a lag: from here to `LONGEST_S`."""
+EARLIEST_S = -0.05  # search range of a lag: from here to `LONGEST_S`
 
 _STEP_S = 0.002
 _NEAR_S = 0.2

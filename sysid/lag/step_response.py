@@ -32,8 +32,7 @@ from pupper_sysid.sysid.feedback.staleness import quantum
 from pupper_sysid.sysid.lag.held_command import HeldCommand, Stretch, Sums
 from pupper_sysid.sysid.recordings.recording import Trial
 
-LONGEST_S = 1.2
-"""Length of the impulse response."""
+LONGEST_S = 1.2  # length of the impulse response
 
 _BLOCKS = 16
 _FEWEST_BLOCKS = 8

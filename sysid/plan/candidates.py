@@ -29,8 +29,7 @@ from pupper_sysid.sysid.sweep.excitation import (
     plan,
 )
 
-LARGEST_RAD = 0.3
-"""Largest excursion of a plan by default [rad]."""
+LARGEST_RAD = 0.3  # largest excursion of a plan by default [rad]
 
 Kind = Literal["sine", "square"]
 

@@ -37,17 +37,12 @@ from pupper_sysid.sysid.fit.structure import Structure
 from pupper_sysid.sysid.plan.candidates import Candidate, Kind, Setup, candidates, trial_seconds
 from pupper_sysid.sysid.sweep.excitation import HIGHEST_HZ, PLANS_S
 
-CLEAR_NATS = 5.0
-"""Difference in log-likelihood from which two models count as told apart."""
-
-SURE_NATS = 2 * CLEAR_NATS
-"""What a plan aims at: the nats of a fit change with the next recording."""
+CLEAR_NATS = 5.0  # difference in log-likelihood from which two models count as told apart
+SURE_NATS = 2 * CLEAR_NATS  # what a plan aims at: the nats of a fit change with the next recording
 
 DEAD_TIME = "dead_time_s"
 
-SHORTEST_S = 3.0
-"""Shortest trial without its lead-in [s]: a poll's phase needs as long."""
-
+SHORTEST_S = 3.0  # shortest trial without its lead-in [s]: a poll's phase needs as long
 _OTHERS = 0.25  # weight of the other parameters' mean logarithm beside the dead time's
 _FOLLOWED = 0.6  # of the command; `sysid.lag.lag_budget` leaves out what is below half
 _MOST_OF_A_TONE = 2  # no model is right at every tone: a plan does not rest on one

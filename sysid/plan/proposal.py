@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.common.results import Result
 from pupper_sysid.servo_models.calibration.calibration import Calibration, InputFile
@@ -47,8 +47,7 @@ from pupper_sysid.sysid.plan.planner import (
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 from pupper_sysid.sysid.sweep.excitation import LEAST_MARGIN_RAD, LOOP_PERIOD_S, PLANS_S
 
-SECONDS = 20.0
-"""Recorded seconds per joint of a plan without a recording to go by."""
+SECONDS = 20.0  # recorded seconds per joint of a plan without a recording to go by
 
 _SPEED_LIMIT_RAD_S = 7.5
 
@@ -95,6 +94,8 @@ def plan_from_recordings(
     Defaults are those of `plan_from_fits`. `progress` is called with a joint's name when it is
     done.
     """
+    if seconds is not None:  # before the work, not after it
+        refuse_outside("`seconds`", seconds, *PLANS_S, "s")
     work = partial(fit_joint, seed=seed)
     fits = each_joint(work, recordings, list(joints), workers, progress)
     return plan_from_fits(recordings, fits, seconds=seconds, margins=margins, seed=seed)

@@ -26,8 +26,7 @@ from pupper_sysid.sysid.plan.proposal import SweepPlan, plan_from_fits, recorded
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
 
-ROUND_S = 20.0
-"""Most recorded seconds per joint between two fits."""
+ROUND_S = 20.0  # most recorded seconds per joint between two fits
 
 _QUANTITIES = ("dead_time",)
 _UNITS = {"ms": 1e-3, "s": 1.0}

@@ -10,7 +10,7 @@ Hysteresis of a servo over its P gain, with what explains it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from pupper_sysid.common.figure_style import (
     BLUE,
@@ -32,17 +31,16 @@ from pupper_sysid.common.figure_style import (
     ORANGE,
     RED,
     SKY,
-    WIDTH_IN,
     axes_column,
     axes_grid,
     styled,
 )
-from pupper_sysid.common.interval import LEVEL, Interval
+from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.backlash import JointBacklash
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit.kernel import COLUMNS
-from pupper_sysid.sysid.fit.results import JointCalibrationResult, LoadedFit
+from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.fit.run import Run, at_steps, free_run, simulate
 from pupper_sysid.sysid.fit.structure import candidate, loaded_columns
 from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
@@ -82,8 +80,7 @@ _LAG_KINDS = (
 )
 
 
-_LIGHT, _DARK = "#fdfdfd", "#111111"
-"""Letters on bars, which stay light or dark on a dark page."""
+_LIGHT, _DARK = "#fdfdfd", "#111111"  # letters on bars, which stay so on a dark page
 
 
 def _lag_bar(axes: Axes, row: int, part: LagBudget) -> float:
@@ -154,10 +151,7 @@ def hold_histogram_figure(found: Mapping[str, HoldRuns]) -> Figure:
     return figure
 
 
-_SINGLE = 3
-"""Up to so many joints have a panel of full width each."""
-
-
+_SINGLE = 3  # up to so many joints have a panel of full width each
 _LATTICE_WORDS = {
     "every read": "live: each read shows the present position",
     "unresolved": "held, but no poll period found",
@@ -227,8 +221,7 @@ def sweep_figure(trials: Sequence[Trial]) -> Figure:
     return figure
 
 
-LONGEST_RUN = 12
-"""Hold runs of this many rows and more share the last bar."""
+LONGEST_RUN = 12  # hold runs of this many rows and more share the last bar
 
 
 @dataclass(frozen=True)
@@ -265,22 +258,18 @@ def tracks(result: JointCalibrationResult, model: str | None = None) -> list[Tra
     """
     if not result.runs:
         return []
-    if result.loaded is not None:
-        simulated = [_under_load(result.loaded, run) for run in result.runs]
-        return [_track(*pair) for pair in zip(result.runs, simulated, strict=True)]
-    model = model or result.simulated_model
-    fitted = candidate(model)
-    values = np.array([result.candidate_models[model].values[name] for name in fitted.names])
-    simulated = free_run(fitted, values, result.runs)
+    if (loaded := result.loaded) is not None:
+        columns = loaded_columns(loaded.servo)
+        for name in {"gravity_nm", "hanging_rad", "offset_rad"} & loaded.numbers.keys():
+            columns[COLUMNS.index(name)] = loaded.numbers[name].value
+        dead_time_s = np.array([float(np.asarray(loaded.servo.dead_time_s))])
+        simulated = [simulate(columns[None], dead_time_s, run)[:, 0] for run in result.runs]
+    else:
+        model = model or result.simulated_model
+        fitted = candidate(model)
+        values = np.array([result.candidate_models[model].values[name] for name in fitted.names])
+        simulated = free_run(fitted, values, result.runs)
     return [_track(*pair) for pair in zip(result.runs, simulated, strict=True)]
-
-
-def _under_load(loaded: LoadedFit, run: Run) -> NDArray[np.float64]:
-    columns = loaded_columns(loaded.servo)
-    for name in {"gravity_nm", "hanging_rad", "offset_rad"} & loaded.numbers.keys():
-        columns[COLUMNS.index(name)] = loaded.numbers[name].value
-    dead_time_s = np.array([float(np.asarray(loaded.servo.dead_time_s))])
-    return simulate(columns[None], dead_time_s, run)[:, 0]
 
 
 def _track(run: Run, simulated: NDArray) -> Track:
@@ -339,7 +328,7 @@ def response_errors(response: FrequencyResponse) -> tuple[NDArray, NDArray]:
     for direction in (along, 1j * along):
         u = np.stack([direction.real, direction.imag], axis=-1)
         sd.append(np.sqrt(np.einsum("ni,nij,nj->n", u, response.covariance, u)))
-    relative = ndtri((1 + LEVEL) / 2) * np.array(sd) / np.abs(response.response)
+    relative = HALF_WIDTH_SD * np.array(sd) / np.abs(response.response)
     return 20 / np.log(10) * relative[0], np.degrees(relative[1])
 
 
@@ -368,23 +357,15 @@ def hold_runs(
         np.add.at(count, length, np.array(histogram, dtype=np.int64))
     if lattice.kind != "lattice" or not count.any() or not np.isfinite(lattice.loss):
         return HoldRuns(lattice, count, None)
-    rows = lattice.poll_period_s / float(np.median(loop_periods_s))
-    return HoldRuns(lattice, count, count.sum() * _expected(rows, lattice.loss))
-
-
-def _expected(period_rows: float, loss: float) -> NDArray[np.float64]:
-    """Share of runs of 1, 2, … rows when each poll, `period_rows` apart, fails with `loss`.
-
-    Between two good polls lie k periods with probability (1 - loss) loss^(k-1). A gap of x rows,
-    at a random phase of the loop, is seen as floor(x) or ceil(x) rows, on average as x.
-    """
-    share = np.zeros(LONGEST_RUN + 1)
-    k = np.arange(1, 200)
-    weight = (1 - loss) * loss ** (k - 1)
-    gap = k * period_rows
+    # between two good polls lie k periods with probability (1 - loss) loss^(k-1); a gap of x rows,
+    # at a random phase of the loop, is seen as floor(x) or ceil(x) rows, on average as x
+    share, k = np.zeros(LONGEST_RUN + 1), np.arange(1, 200)
+    weight = (1 - lattice.loss) * lattice.loss ** (k - 1)
+    gap = k * lattice.poll_period_s / float(np.median(loop_periods_s))
     for rows, chance in ((np.floor(gap), 1 - gap % 1), (np.floor(gap) + 1, gap % 1)):
         np.add.at(share, np.clip(rows, 0, LONGEST_RUN).astype(int), weight * chance)
-    return share[1:] / max(share[1:].sum(), 1e-12)  # several polls within a row leave one run
+    share = share[1:] / max(share[1:].sum(), 1e-12)  # several polls within a row leave one run
+    return HoldRuns(lattice, count, count.sum() * share)
 
 
 @styled
@@ -403,15 +384,27 @@ def overlay_figure(result: JointCalibrationResult, found: list[Track] | None = N
 @styled
 def overlay_grid(found: Mapping[str, list[Track]]) -> Figure:
     """The same of every joint beside the others, one frequency each; no joint without tracks."""
-    figure, grid = axes_grid(len(found), 3, 1.75)
-    for n, (axes, (joint, own)) in enumerate(zip(grid, found.items(), strict=True)):
+
+    def draw(axes: Axes, joint: str, own: list[Track]) -> None:
         spread = some_tracks(own, 3)
         _overlay(axes, spread[len(spread) // 2], joint, 0.7)
-        if n % 3 == 0:
-            axes.set_ylabel("from rest [rad]")
-        if n >= len(grid) - 3:
-            axes.set_xlabel("time in the trial [s]")
+
     columns = 2 if len(found) < 3 else 4  # of a narrow and of a wide figure
+    return _small_multiples(found, draw, "time in the trial [s]", "from rest [rad]", columns)
+
+
+def _small_multiples(
+    found: Mapping[str, list[Track]], draw: Callable[[Axes, str, list[Track]], None],
+    below: str, beside: str, columns: int,
+) -> Figure:  # fmt: skip
+    """A panel per joint, three in a row, with one legend of `columns`."""
+    figure, grid = axes_grid(len(found), 3, 1.75)
+    for n, (axes, (joint, own)) in enumerate(zip(grid, found.items(), strict=True)):
+        draw(axes, joint, own)
+        if n % 3 == 0:
+            axes.set_ylabel(beside)
+        if n >= len(grid) - 3:
+            axes.set_xlabel(below)
     figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=columns)
     return figure
 
@@ -487,17 +480,13 @@ def residual_figure(result: JointCalibrationResult, found: list[Track] | None = 
 @styled
 def residual_grid(found: Mapping[str, list[Track]]) -> Figure:
     """Fresh and raw residuals over speed, of every joint beside the others."""
-    figure, grid = axes_grid(len(found), 3, 1.75)
-    for n, (axes, (joint, own)) in enumerate(zip(grid, found.items(), strict=True)):
+
+    def draw(axes: Axes, joint: str, own: list[Track]) -> None:
         _residuals_over_speed(axes, own, 0.7, "all rows at their own time")
         axes.set_title(joint)
-        if n % 3 == 0:
-            axes.set_ylabel("reading − model [mrad]")
-        if n >= len(grid) - 3:
-            axes.set_xlabel("speed of the model [rad/s]")
-    columns = 1 if len(found) < 3 else 2
-    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=columns)
-    return figure
+
+    speed, error = "speed of the model [rad/s]", "reading − model [mrad]"
+    return _small_multiples(found, draw, speed, error, 1 if len(found) < 3 else 2)
 
 
 def _residuals_over_speed(axes: Axes, found: list[Track], size: float, rows: str) -> None:
@@ -521,10 +510,8 @@ _PANEL_IN = 2.8
 @styled
 def hysteresis_figure(joints: Mapping[str, JointBacklash]) -> Figure:
     """Hysteresis with its 90 % interval over the P gain, a panel per joint."""
-    drawn = Figure(figsize=(WIDTH_IN, _PANEL_IN * len(joints)), layout="constrained")
-    for axes, (joint, backlash) in zip(
-        drawn.subplots(len(joints), squeeze=False)[:, 0], joints.items(), strict=True
-    ):
+    figure, panels = axes_column(len(joints), _PANEL_IN * len(joints))
+    for axes, (joint, backlash) in zip(panels, joints.items(), strict=True):
         gains = np.array([g.p_gain for g in backlash.gains])
         known = np.isfinite(gains).all()
         place = gains if known else np.arange(len(gains), dtype=float)
@@ -555,7 +542,7 @@ def hysteresis_figure(joints: Mapping[str, JointBacklash]) -> Figure:
         )
         axes.set_title(f"{joint}: backlash {verdict}")
         axes.legend()
-    return drawn
+    return figure
 
 
 def _ends(interval: Interval) -> tuple[float, float, float]:

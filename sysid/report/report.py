@@ -45,7 +45,7 @@ from pupper_sysid.sysid.fit.scores import Scores, score
 from pupper_sysid.sysid.fit.structure import SIMULATED
 from pupper_sysid.sysid.fit.structure import candidate as structure
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
-from pupper_sysid.sysid.recordings.recording import Recording, Trial
+from pupper_sysid.sysid.recordings.recording import Trial
 from pupper_sysid.sysid.report.sections import Findings, sections
 
 if TYPE_CHECKING:
@@ -110,7 +110,15 @@ def write_report(
     if calibration is not None:
         if joints in (None, "all"):
             names = [name for name in names if name in calibration.joints] or names
-        _refuse_foreign(calibration, recordings, names)
+        if {i.sha256 for i in calibration.inputs} != {r.sha256 for r in recordings}:
+            made_from = ", ".join(i.name for i in calibration.inputs) or "no recording"
+            raise InputError(
+                f"The calibration was made from {made_from}, which is not, byte for byte, "
+                f"{', '.join(r.name for r in recordings)}. Give its own recordings, or leave "
+                "`calibration` out."
+            )
+        for name in names:
+            calibration.joint(name)  # refuses one that it does not have
         seed = seed if calibration.seed is None else calibration.seed
     steps, done = 2 * len(names), 0
 
@@ -164,21 +172,6 @@ def write_findings(found: Findings, folder: Path, force: bool = False) -> Writte
     return write_page(folder / PAGE, title, subtitle, sections(found), force)
 
 
-def _refuse_foreign(
-    calibration: Calibration, recordings: Sequence[Recording], joints: Sequence[str]
-) -> None:
-    """Refuse a calibration of other recordings or without one of the joints."""
-    if {i.sha256 for i in calibration.inputs} != {r.sha256 for r in recordings}:
-        made_from = ", ".join(i.name for i in calibration.inputs) or "no recording"
-        raise InputError(
-            f"The calibration was made from {made_from}, which is not, byte for byte, "
-            f"{', '.join(r.name for r in recordings)}. Give its own recordings, or leave "
-            "`calibration` out."
-        )
-    for joint in joints:
-        calibration.joint(joint)
-
-
 def can_recall(joint: JointCalibration) -> bool:
     """Whether the file holds all of a joint's fits: those of servos under load it does not."""
     return joint.under_load is None and _carried(joint) in {
@@ -208,7 +201,10 @@ def recall(
 def _joint(
     name: str, known: JointCalibration, trials: tuple[Trial, ...], seed: int
 ) -> JointCalibrationResult:
-    values = {c.model: _values(c) for c in known.selection.candidate_models}
+    values = {
+        c.model: np.array([c.parameters[parameter] for parameter in structure(c.model).names])
+        for c in known.selection.candidate_models
+    }
     carried, a = _carried(known), known.actuator
     ready = prepare_joint(name, trials, seed, True, {carried: values[carried]})
     fits = {
@@ -234,12 +230,8 @@ def _lag(measured: LagBudget, known: JointCalibration) -> LagBudget:
     """The lag budget with the numbers of the file: other dates move the last digits."""
     own = known.lag
     lags = {
-        name: measured_lag if quantity is None else _interval(quantity)
-        for name, quantity, measured_lag in (
-            ("lag_s", own.lag_s, measured.lag_s),
-            ("raw_lag_s", own.raw_lag_s, measured.raw_lag_s),
-            ("fresh_lag_s", own.fresh_lag_s, measured.fresh_lag_s),
-        )
+        name: getattr(measured, name) if (q := getattr(own, name)) is None else _interval(q)
+        for name in ("lag_s", "raw_lag_s", "fresh_lag_s")
     }
     lattice = measured.feedback
     if lattice.kind == "lattice":
@@ -262,11 +254,6 @@ def _lag(measured: LagBudget, known: JointCalibration) -> LagBudget:
 def _carried(joint: JointCalibration) -> str:
     """The model that simulators run: DelayedPD by either limit of its speed."""
     return SIMULATED[joint.actuator.back_emf_nm_s_per_rad.value > 0]
-
-
-def _values(candidate: CandidateModel) -> np.ndarray:
-    names = structure(candidate.model).names
-    return np.array([candidate.parameters[name] for name in names])
 
 
 def _fit(

@@ -447,6 +447,11 @@ def servo_section(found: Comparison) -> Section:
         for joint in found.data.joints
     ]
     curve = measured()
+    samples = tuple(curve.add_suffix("_rad").reset_index().to_dict("records"))
+    by_samples = (
+        Column("samples per joint", lambda row: f"{row['samples_per_joint']:,}", "key"),
+        *(number(f"{MODELS[m][0]}, mrad", f"{m}_rad", 1, 1e3) for m in map(str, curve)),
+    )
     runs = found.data.runs.values()
     own = int(np.median([sum(len(r.readings.rows) for r in joint) for joint in runs]))
     pictures.append(
@@ -469,19 +474,10 @@ def servo_section(found: Comparison) -> Section:
         figures=pictures,
         tables=[
             Table("servo_models", "Error of the servo models", columns, rows),
-            _curve_table(curve),
+            Table("servo_data_curve", "Error against samples, emulated robot", by_samples, samples),
         ],
         notes=[*found.reading_notes(), *found.notes],
     )
-
-
-def _curve_table(curve: pd.DataFrame) -> Table:
-    rows = curve.add_suffix("_rad").reset_index().to_dict("records")
-    columns = (
-        Column("samples per joint", lambda row: f"{row['samples_per_joint']:,}", "key"),
-        *(number(f"{MODELS[m][0]}, mrad", f"{m}_rad", 1, 1e3) for m in map(str, curve)),
-    )
-    return Table("servo_data_curve", "Error against samples, emulated robot", columns, tuple(rows))
 
 
 FILE = "servo_data_curve.csv"

@@ -37,9 +37,7 @@ _MS = 1e3
 
 def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
     """The lag budget per joint."""
-    rows = []
-    for result in results.values():
-        rows += result.lag.rows()
+    rows = tuple(row for result in results.values() for row in result.lag.rows())
     columns = (
         KEY,
         number("raw, ms", "raw_lag_s", 1, _MS),
@@ -52,7 +50,7 @@ def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
         number("lost polls, %", "feedback_loss", 0, 100.0),
         number("mean feedback age, ms", "feedback_mean_age_s", 1, _MS),
     )
-    return Table("lag_budget", "Lag budget", columns, tuple(rows))
+    return Table("lag_budget", "Lag budget", columns, rows)
 
 
 def estimator_table(results: Mapping[str, JointCalibrationResult]) -> Table:

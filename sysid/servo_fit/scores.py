@@ -32,8 +32,7 @@ from pupper_sysid.sysid.fit.predict import ReadingRule, ages
 from pupper_sysid.sysid.servo_fit.data import Run, ServoData, look_up
 from pupper_sysid.sysid.servo_fit.windows import Part, chosen, chosen_rows, everything
 
-LINEAR = "linear, fitted here"
-"""Name of the linear filter that stands beside compared models."""
+LINEAR = "linear, fitted here"  # name of the linear filter that stands beside compared models
 
 _BLOCK_S = 0.5
 _DRAWS = 1000
@@ -101,8 +100,7 @@ def mean(joints: Mapping[str, _S]) -> _S:
     )
 
 
-Band = tuple[float, float]
-"""Noise [rad] and timing [s] of a predictive band."""
+Band = tuple[float, float]  # noise [rad] and timing [s] of a predictive band
 
 Tracks = dict[str, list[NDArray[np.float64]]]
 """Per joint and run, positions [rad] at the ticks, or a whole number of times per tick, the start

@@ -43,17 +43,13 @@ CHIRP_HZ = (0.3, 6.0)
 AMPLITUDE_RAD = 0.5
 SPEED_LIMIT_RAD_S = 5.0
 """Highest speed of a command: less than of a free servo, since a mass hangs on it."""
-REACH_RAD = 1.6
-"""Farthest from the hanging position that a mass is moved, by default."""
+REACH_RAD = 1.6  # farthest from the hanging position that a mass is moved, by default
 LIFT_RAD = 1.4
-LIFT_RAD_S = 0.8
-"""Highest speed of a lift."""
+LIFT_RAD_S = 0.8  # highest speed of a lift
 STROKE_RAD = 0.25
 STROKE_SPEEDS_RAD_S = (0.04, 0.08, 0.12)
-STROKES = 3
-"""Strokes up and down at each speed."""
-NEAREST_START_RAD = 1.0
-"""A pendulum that is found farther from its hanging position is not hanging."""
+STROKES = 3  # strokes up and down at each speed
+NEAREST_START_RAD = 1.0  # a pendulum that is found farther from its hanging position is not hanging
 
 _HOLD_S, _DROP_S = 0.5, 3.0
 _GAINS = (1, 254)

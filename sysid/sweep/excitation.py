@@ -26,8 +26,7 @@ from pupper_sysid.hardware.loop import minimum_jerk, raised_cosine
 
 Offset = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
-PRBS_CLOCK_S = 0.11
-"""Time between possible changes of a pseudo-random binary sequence [s]."""
+PRBS_CLOCK_S = 0.11  # time between possible changes of a pseudo-random binary sequence [s]
 
 FASTEST_OF_MINIMUM_JERK = 1.875
 """Highest speed of a minimum-jerk motion, as a multiple of its mean speed."""
@@ -145,41 +144,24 @@ def lift(height: float, duration_s: float) -> Offset:
 
 KINDS = ("sine", "chirp", "multisine", "steps", "square", "prbs")
 
-HIGHEST_HZ = 25.0
-"""Half of the usual 52 Hz command rate: a faster tone cannot be commanded."""
-
-LEAD_IN_S = 0.2
-"""Rest at the start pose, recorded at the head of every trial [s]."""
-
-SPEED_MARGIN = 0.9
-"""Largest speed of an excitation, as a share of the speed limit."""
+HIGHEST_HZ = 25.0  # half of the usual 52 Hz command rate: a faster tone cannot be commanded
+LEAD_IN_S = 0.2  # rest at the start pose, recorded at the head of every trial [s]
+SPEED_MARGIN = 0.9  # largest speed of an excitation, as a share of the speed limit
 
 LOOP_PERIOD_S = 0.019
 """Default time between commands [s]: the rate of the recordings this project starts from."""
 
-RATES_HZ = (1.0, 1000.0)
-"""Slowest and fastest control loop [Hz]."""
-
-TRIAL_S = (0.1, 86_400.0)
-"""Shortest and longest trial [s]."""
-
-PLANS_S = (0.1, 600.0)
-"""Fewest and most recorded seconds per joint of a plan."""
+RATES_HZ = (1.0, 1000.0)  # slowest and fastest control loop [Hz]
+TRIAL_S = (0.1, 86_400.0)  # shortest and longest trial [s]
+PLANS_S = (0.1, 600.0)  # fewest and most recorded seconds per joint of a plan
 
 LARGEST_AMPLITUDE_RAD = np.pi
 """Largest excursion from a start pose: half a turn to either side. More was meant in degrees."""
 
-MOST_LOOPS = 1000
-"""Largest number of loops of a file of commands, and of times to play it."""
-
-LOWEST_HZ = 0.01
-"""Slowest tone: five periods take more than eight minutes."""
-
-POLL_RATE_HZ = 1 / 0.02685
-"""Feedback polls of a Mini Pupper 2 [Hz], assumed before a recording."""
-
-LEAST_MARGIN_RAD = 0.03
-"""Smallest margin of a joint in which a measurement is worth it."""
+MOST_LOOPS = 1000  # largest number of loops of a file of commands, and of times to play it
+LOWEST_HZ = 0.01  # slowest tone: five periods take more than eight minutes
+POLL_RATE_HZ = 1 / 0.02685  # feedback polls of a Mini Pupper 2 [Hz], assumed before a recording
+LEAST_MARGIN_RAD = 0.03  # smallest margin of a joint in which a measurement is worth it
 
 _RATIOS = 12
 _NUDGE_STEP_HZ = 0.01

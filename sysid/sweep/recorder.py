@@ -30,15 +30,13 @@ from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
 from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S, Plan, TrialPlan
 from pupper_sysid.sysid.sweep.resume import Resume
 
-REST_S = 0.5
-"""Rest at the start pose before every trial [s], not recorded: servo and bus settle."""
+REST_S = 0.5  # rest at the start pose before every trial [s], not recorded: servo and bus settle
 
 REST_SPREAD_RAD, REST_FOR_S, REST_WITHIN_S = 0.02, 0.6, 20.0
 """After a drop: joints whose readings vary by less than this, for so long, are at rest; the longest
 wait for that [s]."""
 
-RETURN_S = 0.4
-"""Shortest duration of the return to the start pose after a trial [s]."""
+RETURN_S = 0.4  # shortest duration of the return to the start pose after a trial [s]
 
 P_REGISTER = "p"
 

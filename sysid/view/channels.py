@@ -23,8 +23,7 @@ from pupper_sysid.sysid.recordings.recording import Recording
 
 Array = NDArray[np.float64]
 
-READ = ("voltage_v", "temperature_c", "load")
-"""Channels that some buses have."""
+READ = ("voltage_v", "temperature_c", "load")  # channels that some buses have
 
 _GUARD = {"clipped": "held at the limits", "slowed": "delayed by the speed limit", "unsent": "lost"}
 

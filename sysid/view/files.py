@@ -150,8 +150,7 @@ _DEFINITIONS = {
 _TOPICS = {"command_rad": "/joint_commands", "position_rad": "/joint_states"}
 _WARN = 30  # level of rcl_interfaces/Log
 
-_Message = tuple[int, str, str, dict[str, Any]]
-"""Time [ns], topic, type and content."""
+_Message = tuple[int, str, str, dict[str, Any]]  # time [ns], topic, type and content
 
 
 def write_mcap(recording: Recording, path: Path, force: bool = False) -> None:

@@ -12,7 +12,7 @@ from pupper_sysid.servo_models.calibration.calibration import Calibration, load_
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.sysid.compare import comparison as four_way_module
-from pupper_sysid.sysid.compare.compare import LINEAR, compare
+from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.compare.comparison import Comparison, calibrated_run
 from pupper_sysid.sysid.fit.predict import ComparedRun, ReadingRule, ages, notes
 from pupper_sysid.sysid.recordings.files import load
@@ -20,7 +20,7 @@ from pupper_sysid.sysid.recordings.recording import Recording, Trial
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import servo_data
 from pupper_sysid.sysid.servo_fit.fit import ServoFit, Split, fit_servo
-from pupper_sysid.sysid.servo_fit.scores import run_with_offset, with_ages
+from pupper_sysid.sysid.servo_fit.scores import LINEAR, run_with_offset, with_ages
 from support.package import ROOT
 from support.runs import PAD, run_of
 from support.servo_recordings import JOINT, recording, trial
