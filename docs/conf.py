@@ -149,7 +149,13 @@ def write_api_pages() -> None:
             (REFERENCE / f"{title}.rst").write_text(_api_page(package, modules))
             pages.append(title)
     (REFERENCE / "index.rst").write_text(_front_door())
-    (REFERENCE / "internals.rst").write_text(_internals(pages))
+    lines = [
+        ":nosearch:", "", *_titled("Internals, by folder", "="),
+        "Every module of the package, for those who change it. Programs that use it need "
+        ":doc:`index` alone.", "", ".. toctree::", "   :maxdepth: 1", "",
+        *(f"   {page}" for page in pages), "",
+    ]  # fmt: skip
+    (REFERENCE / "internals.rst").write_text("\n".join(lines))
 
 
 def _titled(text: str, line: str) -> list[str]:
@@ -189,16 +195,6 @@ def _front_door() -> str:
             lines += [f".. auto{kind}:: pupper_sysid.{name}"]
             lines += ["   :members:"] * (kind == "class") + [""]
     return "\n".join(lines)
-
-
-def _internals(pages: list[str]) -> str:
-    """Table of contents of everything else."""
-    lines = [
-        ":nosearch:", "", *_titled("Internals, by folder", "="),
-        "Every module of the package, for those who change it. Programs that use it need "
-        ":doc:`index` alone.", "", ".. toctree::", "   :maxdepth: 1", "",
-    ]  # fmt: skip
-    return "\n".join([*lines, *(f"   {page}" for page in pages), ""])
 
 
 class _Names(PythonDomain):

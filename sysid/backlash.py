@@ -206,8 +206,18 @@ def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> J
             GainHysteresis(p_gain=gain, hysteresis_rad=width, lag_s=lag, strokes=fit.count)
         )
     zone = None
-    if several:
-        zone = _dead_zone(measured[-1], bool(limited[-1]), quantum, notes)
+    if several:  # from the highest gain, where friction holds back least
+        top = measured[-1]
+        half = Interval(*(x / 2 for x in vars(top.hysteresis_rad).values()))
+        # the servo moves on when the error exceeds the zone: by up to a whole count
+        low, value = max(half.low - quantum, 0.0), max(half.value - quantum / 2, 0.0)
+        zone = Interval(value, low, half.high)
+        if limited[-1]:
+            zone = Interval(0.0, 0.0, half.high)
+            notes.append(
+                f"the hysteresis shrinks as 1/P up to P {top.p_gain:g}: it is friction over "
+                "stiffness, and a dead zone is at most half of what is left there."
+            )
     else:
         notes.append(
             "one P gain: friction and dead zone together make the hysteresis. Strokes at two or "
@@ -225,10 +235,7 @@ def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> J
             "pendulum:0.1kg@0.10m."
         )
     return JointBacklash(
-        gains=tuple(measured),
-        dead_zone_rad=zone,
-        backlash_rad=play,
-        notes=tuple(notes),
+        gains=tuple(measured), dead_zone_rad=zone, backlash_rad=play, notes=tuple(notes)
     )
 
 
@@ -341,21 +348,6 @@ def _interval(value: float, draws: _Array, count: int) -> Interval:
     freedom = max(count // 2 - 4, 2)
     half = float(stdtrit(freedom, (1 + LEVEL) / 2)) * spread * np.sqrt(count / (count - 6))
     return Interval(centre, centre - half, centre + half)
-
-
-def _dead_zone(
-    top: GainHysteresis, by_friction: bool, quantum: float, notes: list[str]
-) -> Interval:
-    """Dead zone from the highest gain, where friction holds back least."""
-    half = Interval(*(x / 2 for x in vars(top.hysteresis_rad).values()))
-    if by_friction:
-        notes.append(
-            f"the hysteresis shrinks as 1/P up to P {top.p_gain:g}: it is friction over stiffness, "
-            "and a dead zone is at most half of what is left there."
-        )
-        return Interval(0.0, 0.0, half.high)
-    # the servo moves on when the error exceeds the zone: by up to a whole count
-    return Interval(max(half.value - quantum / 2, 0.0), max(half.low - quantum, 0.0), half.high)
 
 
 def _play(

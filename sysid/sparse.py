@@ -171,19 +171,14 @@ def sparse_equations(
         If a joint has too little motion.
     """
     ready = each_joint(partial(prepare_joint, seed=seed), recordings, joints, workers)
-    found = fit_equations(
-        {joint: r.runs for joint, r in ready.items()},
-        {joint: r.noise_rad for joint, r in ready.items()},
-        seed,
-        workers,
-        progress,
-    )
-    return Equations(
-        joints={
-            joint: replace(result, warnings=(*ready[joint].lag.warnings, *result.warnings))
-            for joint, result in found.items()
-        }
-    )
+    runs = {joint: r.runs for joint, r in ready.items()}
+    noise_rad = {joint: r.noise_rad for joint, r in ready.items()}
+    found = fit_equations(runs, noise_rad, seed, workers, progress)
+    equations = {
+        joint: replace(result, warnings=(*ready[joint].lag.warnings, *result.warnings))
+        for joint, result in found.items()
+    }
+    return Equations(joints=equations)
 
 
 def fit_equations(
@@ -229,12 +224,11 @@ def _fit_joint(
             samples = problem.samples
             bic = 2 * samples * np.log(max(scores.rmse_fresh_rad, 1e-9))
             bic += len(model.parameters) * np.log(samples)
+            unseen = scores.rmse_unseen_rad
             candidate = Candidate(
-                terms=support,
-                rmse_fresh_rad=scores.rmse_fresh_rad,
-                rmse_leave_one_frequency_out_rad=scores.rmse_unseen_rad,
-                bic=float(bic),
-            )
+                terms=support, rmse_fresh_rad=scores.rmse_fresh_rad,
+                rmse_leave_one_frequency_out_rad=unseen, bic=float(bic),
+            )  # fmt: skip
             tried[support] = candidate, fits
         candidates = sorted((c for c, _ in tried.values()), key=Candidate.error)
         chosen = _choose(candidates).terms
@@ -258,16 +252,10 @@ def _fit_joint(
     }
     ranges.pop("offset_rad", None)
     result = EquationResult(
-        joint=joint,
-        dead_time_s=values.pop("dead_time_s"),
-        offset_rad=values.pop("offset_rad"),
-        coefficients=values,
-        leave_one_out_ranges=ranges,
-        scores=scores,
-        delayed_pd=_scores(pd, pd_fits, folds, runs),
-        candidates=tuple(candidates),
-        warnings=(),
-    )
+        joint=joint, dead_time_s=values.pop("dead_time_s"), offset_rad=values.pop("offset_rad"),
+        coefficients=values, leave_one_out_ranges=ranges, scores=scores,
+        delayed_pd=_scores(pd, pd_fits, folds, runs), candidates=tuple(candidates), warnings=(),
+    )  # fmt: skip
     return replace(result, warnings=tuple(_warnings(result)))
 
 
@@ -465,6 +453,11 @@ def _regress(trials: Sequence[tuple[NDArray, NDArray, NDArray]], limit: float) -
         "drag_per_rad": lambda v, e: -v * np.abs(v),
         "friction_rad_s2": lambda v, e: -np.sign(v),
     }
+
+    def divided(function: Callable[[NDArray, NDArray], NDArray], by: float):
+        # pysindy counts arguments: a lambda with defaults would be taken for one of four variables
+        return lambda v, e: function(v, e) / by
+
     error, speed, acceleration = (np.concatenate(parts) for parts in zip(*trials, strict=True))
     scale = {n: max(float(np.sqrt(np.mean(f(speed, error) ** 2))), 1e-9) for n, f in terms.items()}
     unit = max(float(np.sqrt(np.mean(acceleration**2))), 1e-9)
@@ -477,7 +470,7 @@ def _regress(trials: Sequence[tuple[NDArray, NDArray, NDArray]], limit: float) -
             model = pysindy.SINDy(
                 optimizer=pysindy.STLSQ(threshold=threshold, alpha=1e-3),
                 feature_library=pysindy.CustomLibrary(
-                    [_divided(f, scale[n]) for n, f in terms.items()]
+                    [divided(f, scale[n]) for n, f in terms.items()]
                 ),
             )
             model.fit(
@@ -493,8 +486,3 @@ def _regress(trials: Sequence[tuple[NDArray, NDArray, NDArray]], limit: float) -
             if kept & set(PULLS):  # without a pull toward the command it is no servo
                 found.add(ordered(kept))
     return found
-
-
-def _divided(function: Callable[[NDArray, NDArray], NDArray], scale: float):
-    # pysindy counts arguments: a lambda with defaults would be taken for one of four variables
-    return lambda v, e: function(v, e) / scale

@@ -265,13 +265,9 @@ def refine(
     marginal = weight.sum(axis=0)
     mean = float(np.sum(marginal * near))
     sd = float(np.sqrt(np.sum(marginal * (near - mean) ** 2)))
+    instant = reference + (peak + mean) * best_period
     return Phase(
-        stretch.trial,
-        stretch.start_s,
-        stretch.stop_s,
-        best_period,
-        reference + (peak + mean) * best_period,
-        sd * best_period,
+        stretch.trial, stretch.start_s, stretch.stop_s, best_period, instant, sd * best_period
     )
 
 

@@ -122,12 +122,8 @@ def find_segments(
         if grid.score[0, -1] - present.max() < NATS:
             lattice[0, -1] = int(np.argmax(present))
 
-    read = grid.read
-    borders = [
-        stretch.start_s,
-        *(0.5 * (read[stops[c] - 1] + read[stops[c]]) for c in cuts),
-        stretch.stop_s,
-    ]
+    inner = (0.5 * (grid.read[stops[c] - 1] + grid.read[stops[c]]) for c in cuts)
+    borders = [stretch.start_s, *inner, stretch.stop_s]
     chosen = [0, *cuts, len(stops) - 1]
     found = []
     for n in range(len(chosen) - 1):
@@ -372,7 +368,6 @@ def _expected_speed(
 Simulate = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Model minus fresh readings [rad] of a trial, had its rows carried these commands [rad]."""
 
-"""Gain in log-likelihood that lost commands need."""
 
 _FAR = 5.0  # standard deviations
 _IN_A_ROW = 2
@@ -417,32 +412,33 @@ def find_upsets(
     residuals is smaller, that counts.
     """
     found: list[Upset] = []
-    given = trial.command_rad
-    rest = simulate(given)
+    rest = simulate(trial.command_rad)
     # an upset is part of the tone's noise, unless that is taken from the bulk
     bulk = 1.4826 * float(np.median(np.abs(rest))) if len(rest) else 0.0
     scale_rad = float(np.clip(bulk, _LEAST_BULK * scale_rad, scale_rad))
     rest = rest / scale_rad
     left = np.ones(len(rest), bool)
     for _ in range(_MOST_UPSETS):
-        first = _first_far(np.abs(rest), left)
-        if first is None:
+        far = (np.abs(rest) > _FAR) & left
+        runs = np.lib.stride_tricks.sliding_window_view(far, _IN_A_ROW).all(axis=1)
+        if not runs.any():
             break
-        best: tuple[float, int, int, NDArray[np.float64]] | None = None
+        first = int(np.argmax(runs))
+        best: tuple[float, int, int, NDArray[np.float64]] = (-np.inf, 0, 0, rest)
         sent = trial.send_time_s
         for row in np.flatnonzero((sent < time_s[first]) & (sent > time_s[first] - _LONGEST_S)):
             for rows in range(1, _MOST_LOST + 1):
                 without = simulate(without_commands(trial, int(row), rows)) / scale_rad
                 gain = float(np.sum((_cost(rest) - _cost(without))[left]))
-                if best is None or gain > best[0]:
+                if gain > best[0]:
                     best = gain, int(row), rows, without
         run = [first]
         while run[-1] + 1 < len(rest) and abs(rest[run[-1] + 1]) > _FAR:
             run.append(run[-1] + 1)
-        if best is None or best[0] < max(NATS, _EXPLAINED * float(np.sum(_cost(rest[run])))):
+        gain, row, rows, without = best
+        if gain < max(NATS, _EXPLAINED * float(np.sum(_cost(rest[run])))):
             left[run] = False  # something else: look on behind it
             continue
-        gain, row, rows, without = best
         touched = left & (np.abs(without - rest) > _TOUCHED)
         left &= ~touched
         found.append(
@@ -457,10 +453,3 @@ def find_upsets(
 def _cost(residual: NDArray[np.float64]) -> NDArray[np.float64]:
     """Soft-L1 cost of residuals in standard deviations."""
     return np.sqrt(1.0 + residual**2) - 1.0
-
-
-def _first_far(size: NDArray[np.float64], left: NDArray[np.bool_]) -> int | None:
-    """The first of several readings in a row that are far off; None without."""
-    far = (size > _FAR) & left
-    runs = np.lib.stride_tricks.sliding_window_view(far, _IN_A_ROW).all(axis=1)
-    return int(np.argmax(runs)) if runs.any() else None

@@ -238,12 +238,10 @@ def _new_in_motion(trials: Sequence[Trial], step: float) -> bool:
 
 
 def _verdict(kind: str, repeats: NDArray[np.int64]) -> Staleness:
-    total = int(repeats.sum())
+    total, with_repeat = int(repeats.sum()), int(np.sum(repeats > 0))
+    share = total / (total + len(repeats)) if len(repeats) else math.nan
     return Staleness(
-        kind=kind,
-        episodes=len(repeats),
-        episodes_with_repeat=int(np.sum(repeats > 0)),
-        repeat_share=total / (total + len(repeats)) if len(repeats) else math.nan,
+        kind=kind, episodes=len(repeats), episodes_with_repeat=with_repeat, repeat_share=share
     )
 
 
@@ -337,7 +335,8 @@ def _shortest(values: Sequence[NDArray[np.float64]]) -> float:
     for value in values:
         new = np.concatenate([[0], np.flatnonzero(np.diff(value)) + 1])
         sign, length = np.sign(np.diff(value[new])), np.diff(new)
-        one = (sign[:-2] == sign[1:-1]) & (sign[1:-1] == sign[2:]) if len(sign) > 2 else []
-        gaps.append(length[1:-1][one] if len(sign) > 2 else np.zeros(0))
+        if len(sign) > 2:
+            one = (sign[:-2] == sign[1:-1]) & (sign[1:-1] == sign[2:])
+            gaps.append(length[1:-1][one])
     found = np.concatenate(gaps)
     return float(np.quantile(found, 0.1)) if len(found) else math.inf

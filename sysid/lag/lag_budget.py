@@ -10,7 +10,7 @@ amplitude and load.
 * Tones (`sysid.lag.tone`), named, found in the command, or the lines of a multisine: the phase
   slope of fresh rows at their measurement times, against the zero-order-held command, without the
   staircase's ripple. Intervals are from a bootstrap over periods.
-* Any other motion : the time shift of the held command that resembles the
+* Any other motion: the time shift of the held command that resembles the
   motion best, through an impulse response fitted to the readings.
 
 The usual estimators stand beside it, for comparison:
@@ -215,8 +215,7 @@ def lag_budget(
         if other is None:
             raise
         seen = other  # too few readings that changed, and nothing else is wrong with them
-    tones, raw, fresh, lag = seen.tones, seen.raw, seen.fresh, seen.lag
-    by_frequency = seen.by_frequency()
+    tones, raw = seen.tones, seen.raw
     uneven = [f"{joint}: {f.text}" for f in scatter_findings(trials, lattice)]
     warnings = [*cautions(joint, trials), *uneven, *_warnings(joint, seen)]
     doubt = max(t.read_time_doubt_s for t in trials)
@@ -232,8 +231,8 @@ def lag_budget(
             f"{joint}: the share of lost polls is not identified: {NO_LOSS}. Record a faster "
             "motion."
         )
-    fresh, lag = fresh.widened(doubt), lag.widened(doubt)
-    by_frequency = tuple(replace(f, lag_s=f.lag_s.widened(doubt)) for f in by_frequency)
+    fresh, lag = seen.fresh.widened(doubt), seen.lag.widened(doubt)
+    by_frequency = tuple(replace(f, lag_s=f.lag_s.widened(doubt)) for f in seen.by_frequency())
     if other is not None:
         fresh, lag = _hull(fresh, other.fresh), _hull(lag, other.lag)
         if len(other.tones) == len(tones):
@@ -241,22 +240,14 @@ def lag_budget(
                 replace(a, lag_s=_hull(a.lag_s, b.lag_s))
                 for a, b in zip(by_frequency, other.by_frequency(), strict=True)
             )
+    noise = float(np.sqrt(np.mean([t.residual_rad**2 for t in tones]))) if tones else math.nan
     return LagBudget(
-        joint=joint,
-        raw_lag_s=raw,
-        fresh_lag_s=fresh,
-        lag_s=lag,
-        stale_lag_s=raw.value - fresh.value,
-        command_hold_s=fresh.value - lag.value,
-        feedback=lattice,
-        quantum_rad=quantum(trials),
-        by_frequency=by_frequency,
-        estimators_s=estimators(trials, read, tones, lag.value),
-        noise_rad=float(np.sqrt(np.mean([t.residual_rad**2 for t in tones])))
-        if tones
-        else math.nan,
+        joint=joint, raw_lag_s=raw, fresh_lag_s=fresh, lag_s=lag,
+        stale_lag_s=raw.value - fresh.value, command_hold_s=fresh.value - lag.value,
+        feedback=lattice, quantum_rad=quantum(trials), by_frequency=by_frequency,
+        estimators_s=estimators(trials, read, tones, lag.value), noise_rad=noise,
         warnings=tuple(warnings),
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -274,8 +265,18 @@ class _Seen:
             return ()
         frequency = np.array([t.frequency_hz for t in self.tones])
         lags = tone_lags(np.array([t.response for t in self.tones]), frequency, self.near_s)
-        pairs = zip(self.tones, lags, strict=True)
-        return tuple(_at_frequency(t, float(own)) for t, own in pairs)
+        found = []
+        for t, lag in zip(self.tones, map(float, lags), strict=True):
+            f, raw = t.frequency_hz, t.raw / t.command_rows
+            own = Interval.of_draws(lag, lag_near(t.response_draws, f, lag))
+            found.append(
+                FrequencyLag(
+                    frequency_hz=f, gain=abs(t.response), phase_deg=-360.0 * f * lag, lag_s=own,
+                    raw_lag_s=float(lag_near(raw, f, lag + _USUAL_AGE_S)), raw_gain=abs(raw),
+                    trial=t.trial,
+                )
+            )  # fmt: skip
+        return tuple(found)
 
 
 def _seen(
@@ -301,7 +302,18 @@ def _seen(
         raw, fresh, lag = (slope(tones, p, near) for p in ("raw_rows", "fresh_rows", "fresh_held"))
         return _Seen(tones, near, raw, fresh, lag)
     impulse = joint_impulse_response(joint, trials, read, rng)
-    _check(joint, impulse)
+    # motion that is no answer to the command
+    if impulse.explained < _EXPLAINED:
+        raise InputError(
+            f"{joint}: the command explains {100 * max(impulse.explained, 0):.0f} % of the motion, "
+            "so there is no lag to measure. Was its torque on, and do commands and positions "
+            "belong to one joint? See `pupper-sysid doctor`."
+        )
+    if np.mean(impulse.masses.sum(axis=1) < 0) > 0.95:
+        raise InputError(
+            f"{joint}: it moves against its command (gain {impulse.gain:.2f}), so there is no lag "
+            "to measure. Turn the sign of its position or of its command."
+        )
     drawn = shift_draws(impulse, rng)
     near = float(np.median(drawn))
     sd = max(r.time_sd_s for r in read)
@@ -315,21 +327,6 @@ def _seen(
     ]  # fmt: skip
     count, age = np.array([s for s in shifts if np.isfinite(s[1])] or [(1.0, 0.0)]).T
     return _Seen([], near, _later(fresh, float(np.average(age, weights=count))), fresh, lag)
-
-
-def _check(joint: str, impulse: ImpulseResponse) -> None:
-    """Refuse motion that is no answer to the command."""
-    if impulse.explained < _EXPLAINED:
-        raise InputError(
-            f"{joint}: the command explains {100 * max(impulse.explained, 0):.0f} % of the motion, "
-            "so there is no lag to measure. Was its torque on, and do commands and positions "
-            "belong to one joint? See `pupper-sysid doctor`."
-        )
-    if np.mean(impulse.masses.sum(axis=1) < 0) > 0.95:
-        raise InputError(
-            f"{joint}: it moves against its command (gain {impulse.gain:.2f}), so there is no lag "
-            "to measure. Turn the sign of its position or of its command."
-        )
 
 
 def _warnings(joint: str, seen: _Seen) -> list[str]:
@@ -365,21 +362,6 @@ def _later(interval: Interval, by: float) -> Interval:
 
 def _hull(one: Interval, other: Interval) -> Interval:
     return Interval(one.value, min(one.low, other.low), max(one.high, other.high))
-
-
-def _at_frequency(tone: ToneResponse, lag: float) -> FrequencyLag:
-    f, response = tone.frequency_hz, tone.response
-    draws = lag_near(tone.response_draws, f, lag)
-    raw = tone.raw / tone.command_rows
-    return FrequencyLag(
-        frequency_hz=f,
-        gain=abs(response),
-        phase_deg=-360.0 * f * lag,
-        lag_s=Interval.of_draws(lag, draws),
-        raw_lag_s=float(lag_near(raw, f, lag + _USUAL_AGE_S)),
-        raw_gain=abs(raw),
-        trial=tone.trial,
-    )
 
 
 def estimators(

@@ -17,7 +17,7 @@ tones as they were read, ripple included. What the tones leave open becomes the 
 Lags follow from phases (`slope`): whole periods settled, tones weighted, one lag for a joint.
 
 `line_responses` fits the tones that a log names or that are found in its command, one after the
-other and else the lines of a multisine (`multisine_responses`). Those lines are
+other, and else the lines of a multisine. Those lines are
 found in the command: the strongest is fitted and subtracted until next to nothing is left. A chirp,
 steps or a walk leave too much and are no multisine. Enough lines fit any motion within its own
 time, so those of a multisine must also predict each half of the command from the other half, and
@@ -234,13 +234,18 @@ def without_ripple(
     held_means: dict[tuple[float, ...], NDArray[np.float64]] = {}  # of the tones of one trial
 
     def row(tone: ToneResponse) -> NDArray[np.complex128]:
+        """Phasor that the tone's fit finds in the images, per unit of mass in each bin."""
         trial, reading = by_number[tone.trial]
         window = tone.trial, tone.start_s, tone.stop_s
         time = reading.time_s[(reading.time_s >= tone.start_s) & (reading.time_s <= tone.stop_s)]
         if window not in held_means:
             held_means.clear()
             held_means[window] = HeldCommand.of(trial).means(time, edges)
-        return _ripple_row(held_means[window], time, tone, edges)
+        one = np.array([tone.frequency_hz]), np.array([tone.command_held])
+        images = held_means[window] - past_tones(time, edges, *one)
+        # before the tone was steady the command was no tone
+        images = np.where(time[:, None] - edges[1:] >= tone.steady_s, images, 0.0)
+        return phasors(least_squares(tone_design(time, tone.frequency_hz), images).T)[:, 0]
 
     ripple = np.stack([row(t) for t in tones])
     held = np.array([t.command_held for t in tones])
@@ -289,17 +294,6 @@ def _second_order(past: NDArray, damping: float) -> NDArray[np.float64]:
     slow, fast = -damping + root, -damping - root
     step = 1 + (fast * np.exp(slow * past) - slow * np.exp(fast * past)) / (slow - fast)
     return np.real(step)
-
-
-def _ripple_row(
-    means: NDArray, time: NDArray, tone: ToneResponse, edges: NDArray
-) -> NDArray[np.complex128]:
-    """Phasor that the tone's fit finds in the images, per unit of mass in each bin."""
-    one = np.array([tone.frequency_hz]), np.array([tone.command_held])
-    images = means - past_tones(time, edges, *one)
-    # before the tone was steady the command was no tone
-    images = np.where(time[:, None] - edges[1:] >= tone.steady_s, images, 0.0)
-    return phasors(least_squares(tone_design(time, tone.frequency_hz), images).T)[:, 0]
 
 
 def _chances(
@@ -427,17 +421,10 @@ _LINES_GRID_S = 1e-3
 def line_responses(trial: Trial, reading: Readings, rng: np.random.Generator) -> list[ToneResponse]:
     """Response at every frequency that the command of `trial` is made of; may be empty."""
     parts = split_tones(trial)
-    if not parts[0].frequency_hz > 0:
-        return multisine_responses(trial, reading, rng)
-    tones = [tone_response(part, reading, rng) for part in parts]
-    return [tone for tone in tones if tone is not None]
-
-
-def multisine_responses(
-    trial: Trial, reading: Readings, rng: np.random.Generator
-) -> list[ToneResponse]:
-    """Response at each line of the command of `trial`; empty if it is no multisine."""
-    send = trial.send_time_s
+    if parts[0].frequency_hz > 0:
+        tones = [tone_response(part, reading, rng) for part in parts]
+        return [tone for tone in tones if tone is not None]
+    send = trial.send_time_s  # else the lines of a multisine
     if len(send) < 100 or np.ptp(trial.command_rad) < 1e-3:
         return []
     first = send[0] + 0.15 * (send[-1] - send[0])

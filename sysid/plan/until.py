@@ -172,9 +172,7 @@ def _judged(
     rounds = sum(bool(r.trials(fit.joint)) for r in recordings)
 
     def state(why: str = "") -> JointOutcome:
-        return JointOutcome(
-            dead_time_s=fit.dead_time_s, recorded_s=done, rounds=rounds, why=why
-        )  # fmt: skip
+        return JointOutcome(dead_time_s=fit.dead_time_s, recorded_s=done, rounds=rounds, why=why)
 
     if goal.reached(fit.dead_time_s):
         return state(), None

@@ -42,11 +42,6 @@ def after(lead_in_s: float, offset: Offset) -> Offset:
     return shifted
 
 
-def scaled(offset: Offset, factor: float) -> Offset:
-    """`factor` times `offset`."""
-    return lambda t: factor * offset(t)
-
-
 def sine(frequency_hz: float, amplitude: float) -> Offset:
     """Tone that grows over its first half period."""
     # full amplitude after half a period: smooth, and still an onset that excites the dynamics
@@ -84,13 +79,6 @@ def multisine(frequencies: Sequence[float]) -> Offset:
         return raised_cosine(2 * f.min() * np.asarray(t)) * tones.sum(axis=-1)
 
     return offset
-
-
-def peaks(offset: Offset, lowest_hz: float) -> tuple[float, float]:
-    """Largest excursion and speed of `offset` over 20 of its longest periods."""
-    t = np.arange(0.0, 20.0 / lowest_hz, 0.001)
-    value = offset(t)
-    return float(np.abs(value).max()), float(np.abs(np.diff(value)).max() / 0.001)
 
 
 def steps(amplitude: float) -> tuple[Offset, float]:
@@ -279,9 +267,11 @@ def plan(
         shapes = [(np.nan, span, chirp(low, high, span, amplitude_rad, top_speed))]
     elif kind == "multisine":
         shape = multisine(frequencies)
-        peak, speed = peaks(shape, min(frequencies))
+        # largest excursion and speed over 20 of its longest periods
+        value = shape(np.arange(0.0, 20.0 / min(frequencies), 0.001))
+        peak, speed = float(np.abs(value).max()), float(np.abs(np.diff(value)).max() / 0.001)
         amplitude = _bounded(amplitude_rad, speed / peak, top_speed, "multisine", warnings)
-        shapes = [(np.nan, span, scaled(shape, amplitude / peak))]
+        shapes = [(np.nan, span, lambda t: amplitude / peak * shape(t))]
     elif kind == "prbs":
         shapes = [(np.nan, span, prbs(amplitude_rad))]
     else:
@@ -293,13 +283,10 @@ def plan(
         for f, time, offset in shapes
     )
     description = {
-        "kind": kind,
-        "amplitude_rad": amplitude_rad,
-        "frequencies_hz": [] if kind in ("steps", "prbs") else frequencies,
-        "lead_in_s": LEAD_IN_S,
-        "speed_limit_rad_s": speed_limit_rad_s,
-        "warnings": list(dict.fromkeys(warnings)),
-    }
+        "kind": kind, "amplitude_rad": amplitude_rad,
+        "frequencies_hz": [] if kind in ("steps", "prbs") else frequencies, "lead_in_s": LEAD_IN_S,
+        "speed_limit_rad_s": speed_limit_rad_s, "warnings": list(dict.fromkeys(warnings)),
+    }  # fmt: skip
     pose = dict(DEFAULT_POSE if start_pose_rad is None else start_pose_rad)
     return Plan(trials, pose, description, tuple(dict.fromkeys(warnings)))
 

@@ -282,15 +282,11 @@ def _rows(
     rows = []
     for joint, i in zip(trial.joints, index, strict=True):
         row: dict[str, Any] = {
-            "send_time_s": sent_s + shift_s,
-            "read_time_s": float(sample.time_s[i]) + shift_s,
-            "trial": number,
-            "joint": joint,
-            "frequency_hz": trial.frequency_hz,
-            "command_rad": float(goal[i]),
-            "position_rad": float(sample.position_rad[i]),
+            "send_time_s": sent_s + shift_s, "read_time_s": float(sample.time_s[i]) + shift_s,
+            "trial": number, "joint": joint, "frequency_hz": trial.frequency_hz,
+            "command_rad": float(goal[i]), "position_rad": float(sample.position_rad[i]),
             "position_count": int(sample.position_count[i]),
-        }
+        }  # fmt: skip
         for name in ("voltage_v", "temperature_c", "load"):
             values = getattr(sample, name)
             if values is not None:

@@ -159,8 +159,7 @@ def write_mcap(recording: Recording, path: Path, force: bool = False) -> None:
     file = io.BytesIO()
     stream = McapStream(file)
     found = channels(recording)
-    events = guard_events(recording, max(channel.time_s[-1] for channel in found))
-    stream.add(found, events)
+    stream.add(found, guard_events(recording, max(channel.time_s[-1] for channel in found)))
     stream.close()
     write_bytes(path, file.getvalue(), force)
 
