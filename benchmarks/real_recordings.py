@@ -29,8 +29,7 @@ import tyro
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
-from pupper_sysid.sysid.compare.compare import compare
-from pupper_sysid.sysid.compare.comparison import calibrated_run
+from pupper_sysid.sysid.compare.compare import calibrated_run, compare
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.fit.joint_fit import fit_joint
 from pupper_sysid.sysid.fit.kernel import COLUMNS

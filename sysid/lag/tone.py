@@ -36,8 +36,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.tones import block_bootstrap, least_squares, phasors, sine_design
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
-from pupper_sysid.sysid.lag.held_command import HeldCommand, past_tones
-from pupper_sysid.sysid.lag.step_response import LONGEST_S
+from pupper_sysid.sysid.lag.step_response import LONGEST_S, HeldCommand, past_bins, past_tones
 from pupper_sysid.sysid.recordings.excitation import split_tones
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -224,7 +223,8 @@ def without_ripple(
     loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
     frequency = np.array([t.frequency_hz for t in tones])
     lags = tone_lags(np.array([t.response for t in tones]), frequency, near_s)
-    edges = _edges(max(float(lags.max()), 0.0), loop)
+    latest = max(float(lags.max()), 0.0) + _BEYOND_S
+    edges = past_bins(max(loop / _PER_LOOP, _FINEST_S), latest, _GROWTH)
     masses = _servos(edges, frequency, lags)
     if not len(masses):
         return list(tones)  # a position that precedes its command: the lags as they are
@@ -258,16 +258,6 @@ def without_ripple(
         replace(t, ripple=complex(chance @ seen[:, k]), ripple_draws=drawn[picked[0], k])
         for k, t in enumerate(tones)
     ]
-
-
-def _edges(lag_s: float, loop_s: float) -> NDArray[np.float64]:
-    """Bins of past time: fine up to beyond the lag, then growing."""
-    width = max(loop_s / _PER_LOOP, _FINEST_S)
-    edges = list(np.arange(0.0, lag_s + _BEYOND_S, width))
-    while edges[-1] < LONGEST_S:
-        width *= _GROWTH
-        edges.append(edges[-1] + width)
-    return np.array(edges)
 
 
 def _servos(edges: NDArray, frequency: NDArray, lags: NDArray) -> NDArray[np.float64]:

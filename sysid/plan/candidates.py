@@ -18,16 +18,7 @@ from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
 from pupper_sysid.sysid.fit.run import Run, prepare
 from pupper_sysid.sysid.recordings.recording import Trial
-from pupper_sysid.sysid.sweep.excitation import (
-    HIGHEST_HZ,
-    LEAD_IN_S,
-    LOOP_PERIOD_S,
-    POLL_RATE_HZ,
-    SPEED_MARGIN,
-    TrialPlan,
-    off_harmonics,
-    plan,
-)
+from pupper_sysid.sysid.sweep import excitation
 
 LARGEST_RAD = 0.3  # largest excursion of a plan by default [rad]
 
@@ -47,9 +38,9 @@ _POLL_PHASE = 0.3
 class Setup:
     """What a joint is recorded with."""
 
-    loop_period_s: float = LOOP_PERIOD_S
+    loop_period_s: float = excitation.LOOP_PERIOD_S
     """Time between commands."""
-    poll_period_s: float = 1 / POLL_RATE_HZ
+    poll_period_s: float = 1 / excitation.POLL_RATE_HZ
     """Time between two polls of the servo; 0 where readings are live."""
     loss: float = 0.42
     """Share of the polls that fail."""
@@ -96,7 +87,7 @@ def candidates(setup: Setup, duration_s: float) -> list[Candidate]:
     """Trials of `duration_s` without the lead-in [s] that a joint may execute."""
     found = []
     for kind, frequency, amplitude in _choices(setup, duration_s):
-        made = plan(
+        made = excitation.plan(
             kind, ["joint"], [frequency], amplitude, duration_s, setup.loop_period_s,
             setup.speed_limit_rad_s, setup.poll_rate_hz,
         )  # fmt: skip
@@ -105,7 +96,7 @@ def candidates(setup: Setup, duration_s: float) -> list[Candidate]:
     return found
 
 
-def recorded(trial: TrialPlan, setup: Setup) -> Run:
+def recorded(trial: excitation.TrialPlan, setup: Setup) -> Run:
     """A trial on the physics clock, as the recorder and the guard would send it; it reads zeros."""
     sent_s = np.arange(0.0, trial.duration_s, setup.loop_period_s)
     wanted = trial.offset(sent_s)
@@ -127,19 +118,19 @@ def recorded(trial: TrialPlan, setup: Setup) -> Run:
 def _choices(setup: Setup, duration_s: float) -> Iterator[tuple[Kind, float, float]]:
     """Kind, frequency [Hz] and amplitude [rad]."""
     rates = (1 / setup.loop_period_s, setup.poll_rate_hz)
-    highest = min(HIGHEST_HZ, 1 / (_COMMANDS_A_PERIOD * setup.loop_period_s))
+    highest = min(excitation.HIGHEST_HZ, 1 / (_COMMANDS_A_PERIOD * setup.loop_period_s))
     largest = min(setup.margin_rad, LARGEST_RAD)
     least = _STEPS_OF_A_READING * setup.quantum_rad
     for wanted in _TONES_HZ:
-        frequency = off_harmonics(wanted, rates, duration_s)
+        frequency = excitation.off_harmonics(wanted, rates, duration_s)
         if frequency > highest or frequency * duration_s < 1:
             continue
-        fastest = SPEED_MARGIN * setup.speed_limit_rad_s / (2 * np.pi * frequency)
+        fastest = excitation.SPEED_MARGIN * setup.speed_limit_rad_s / (2 * np.pi * frequency)
         most = _rounded_down(min(largest, fastest))
         amplitudes = {a for a in _TONES_RAD if a < 0.9 * most} | {most}
         yield from (("sine", frequency, a) for a in sorted(amplitudes) if a >= least)
     for wanted in _SQUARES_HZ:
-        frequency = off_harmonics(wanted, rates, duration_s)
+        frequency = excitation.off_harmonics(wanted, rates, duration_s)
         most = _rounded_down(min(largest, _HARDEST_SQUARE_RAD_HZ / frequency))
         if frequency <= highest and frequency * duration_s >= 1:
             amplitudes = {a for a in _SQUARES_RAD if a < 0.9 * most} | {most}
@@ -152,4 +143,4 @@ def _rounded_down(angle_rad: float) -> float:
 
 def trial_seconds(duration_s: float) -> float:
     """Recorded seconds of a trial of `duration_s`: with its lead-in."""
-    return LEAD_IN_S + duration_s
+    return excitation.LEAD_IN_S + duration_s

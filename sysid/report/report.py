@@ -49,7 +49,7 @@ from pupper_sysid.sysid.recordings.recording import Trial
 from pupper_sysid.sysid.report.sections import Findings, sections
 
 if TYPE_CHECKING:
-    from pupper_sysid.sysid.servo_fit.result import ServoFit
+    from pupper_sysid.sysid.servo_fit.fit import ServoFit
 
 PAGE = "report.html"
 

@@ -35,7 +35,7 @@ from pupper_sysid.sysid.report.tables import KEY, MODEL_NAMES, number, text
 from pupper_sysid.sysid.servo_fit.scores import LINEAR
 
 if TYPE_CHECKING:
-    from pupper_sysid.sysid.compare.comparison import Comparison
+    from pupper_sysid.sysid.compare.compare import Comparison
     from pupper_sysid.sysid.doctor.examination import Examination
     from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
 

@@ -18,15 +18,8 @@ from pupper_sysid.common.figure_style import (
     axes_column,
     styled,
 )
+from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData
-from pupper_sysid.sysid.servo_fit.scores import (
-    Band,
-    Errors,
-    Tracks,
-    band_half_width,
-    rms,
-    steps_per_tick,
-)
 
 _LONGEST_S = 3.0
 _COLOURS = (BLUE, RED, GREEN, ORANGE, PINK)
@@ -36,9 +29,9 @@ _LINES = ("-", "--", "-.", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))
 @styled
 def free_run_figure(
     data: ServoData,
-    tracks: Mapping[str, Tracks],
-    errors: Mapping[str, Mapping[str, Errors]],
-    bands: Mapping[str, Mapping[str, Band]],
+    tracks: Mapping[str, scores.Tracks],
+    errors: Mapping[str, Mapping[str, scores.Errors]],
+    bands: Mapping[str, Mapping[str, scores.Band]],
     joints: Sequence[str] | None = None,
 ) -> Figure:
     """One panel per joint: the seconds in which its command moves most.
@@ -60,16 +53,16 @@ def free_run_figure(
         axes.plot(when, run.position_rad[inside], "o", ms=3.2, color=INK, label="reading")
         for n, (name, found) in enumerate(tracks.items()):
             track = found[joint][index]
-            track = track[:: steps_per_tick(track, run)]
+            track = track[:: scores.steps_per_tick(track, run)]
             colour = _COLOURS[n % len(_COLOURS)]
-            error = 1e3 * rms(errors[name][joint].free_run)
+            error = 1e3 * scores.rms(errors[name][joint].free_run)
             label = f"{name}, {error:.1f} mrad"
             axes.plot(
                 time, track[low:high], ls=_LINES[n % len(_LINES)], color=colour, lw=1.5, label=label
             )
             band = bands.get(name, {}).get(joint)
             if band and n == 0:
-                half = band_half_width(band, np.gradient(track) / data.period_s)[low:high]
+                half = scores.band_half_width(band, np.gradient(track) / data.period_s)[low:high]
                 middle = track[low:high]
                 axes.fill_between(
                     time, middle - half, middle + half, color=colour, alpha=0.15, lw=0

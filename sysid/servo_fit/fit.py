@@ -12,17 +12,29 @@ first reading to the part's readings at their own times (`sysid.fit.search`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError, refuse_outside
+from pupper_sysid.common.files import versions
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import DEFAULT_POSE
+from pupper_sysid.common.results import Result, internal, plain
+from pupper_sysid.servo_models.calibration.calibration import utc_now
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.servo_models.interface import ServoModel
-from pupper_sysid.servo_models.servo_file import ARCHITECTURES, physical_model
+from pupper_sysid.servo_models.networks import RecurrentNetwork
+from pupper_sysid.servo_models.servo_file import (
+    ARCHITECTURES,
+    input_names,
+    physical_model,
+    save_servo_model,
+)
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS
 from pupper_sysid.servo_models.step_size import at_step
 from pupper_sysid.sysid.doctor.checks import (
@@ -38,23 +50,14 @@ from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.search import Problem, search
 from pupper_sysid.sysid.fit.structure import PREFERRED, candidate
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT
-from pupper_sysid.sysid.servo_fit import scores
+from pupper_sysid.sysid.servo_fit import scores, windows
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
-from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
+from pupper_sysid.sysid.servo_fit.networks import Learned, fit_network, past_ticks
 from pupper_sysid.sysid.servo_fit.published import fit_published
-from pupper_sysid.sysid.servo_fit.result import FitScores, ServoFit, verdict
-from pupper_sysid.sysid.servo_fit.scores import ModelScores
-from pupper_sysid.sysid.servo_fit.windows import (
-    Part,
-    Samples,
-    chosen,
-    everything,
-    grouped,
-    merged_groups,
-    only,
-    samples,
-    without,
-)
+from pupper_sysid.sysid.servo_fit.scores import ModelScores, Scores, Tracks
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -63,8 +66,8 @@ class Split:
 
     name: str
     """In words."""
-    train: Part | None = None
-    test: Part | None = None
+    train: windows.Part | None = None
+    test: windows.Part | None = None
 
     @classmethod
     def by_trials(cls, train_loops: Sequence[int], test_loops: Sequence[int]) -> Split:
@@ -101,6 +104,118 @@ class Split:
 
 
 EACH_GROUP_IN_TURN = Split("each group left out in turn")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitScores(Scores):
+    """Scores of a fitted model on one joint, or their means, beside the baselines."""
+
+    linear_rmse_rad: float
+    delayed_pd_rmse_rad: float
+    """`linear_rmse_rad` and `delayed_pd_rmse_rad`: free run of a linear filter and of DelayedPD
+    fitted to the same readings [rad]."""
+    persistence_rmse_rad: float
+    """The last reading as the prediction of the next [rad]."""
+    repeatability_rad: float
+    """RMS difference of repetitions over √2 [rad]; NaN if no command was repeated."""
+    band_noise_rad: float
+    band_timing_s: float
+    """`band_noise_rad` and `band_timing_s`: standard deviation of the error at speed v: sqrt(noise²
+    + (timing · v)²)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServoFit(Result):
+    """A fitted servo model and its scores on readings it was not fitted to."""
+
+    arch: str
+    preset: str
+    seed: int
+    split: str
+    """What was for training and what for testing."""
+    readings_counted: dict[str, str]
+    """Per joint, "fresh" or "all"."""
+    groups: tuple[str, ...]
+    """What could be held out."""
+    time_step_s: float
+    """Time between commands."""
+    choices: dict[str, float]
+    """Hyper-parameters chosen by held-out groups."""
+    joints: dict[str, FitScores]
+    mean: FitScores
+    """Over joints."""
+    rmse_free_run_rad: Interval
+    linear_rmse_rad: Interval
+    difference_to_linear_rad: Interval
+    """`rmse_free_run_rad`, `linear_rmse_rad` and `difference_to_linear_rad`: means over joints of
+    the model, of the linear filter, and their difference."""
+    coverage_of_90_percent_band: float
+    """Share of the test readings inside the predictive band."""
+    readings: dict[str, int]
+    """Per joint, that the model was fitted to."""
+    recordings: tuple[dict[str, str], ...]
+    """Name and SHA-256 of each."""
+    verdict: str
+    """Whether the model is better than the linear filter."""
+    notes: tuple[str, ...]
+    interrupted: bool
+    """Whether Ctrl-C ended the training; the best model so far was kept."""
+    model: ServoModel = internal()
+    """Fitted to the whole training part (to everything, where groups were left out in turn)."""
+    parameters: Mapping[str, NDArray[np.floating]] = internal()
+    """Its arrays, for a model file."""
+    scored: dict[str, ModelScores] = internal()
+    """Under the name of the architecture, "linear" and "delayed-pd"."""
+    data: ServoData = internal()
+    tracks: Tracks = internal()
+    """Free run of the model."""
+
+    def to_frame(self) -> pd.DataFrame:
+        """Scores, one row per joint."""
+        rows = [{"joint": joint} | asdict(s) for joint, s in self.joints.items()]
+        return pd.DataFrame(rows).set_index("joint")
+
+    def plot(self, joints: Sequence[str] | None = None) -> Figure:
+        """Figure of the model in free run beside commands and readings, a panel per joint."""
+        from pupper_sysid.sysid.servo_fit.figures import free_run_figure
+
+        bands = {j: (s.band_noise_rad, s.band_timing_s) for j, s in self.joints.items()}
+        return free_run_figure(
+            self.data, {self.arch: self.tracks}, {self.arch: self.scored[self.arch].errors},
+            {self.arch: bands}, joints,
+        )  # fmt: skip
+
+    def save(self, folder: Path | str, force: bool = False) -> None:
+        """Save the model with its contract: what it was fitted to, how, and how good it is.
+
+        Parameters
+        ----------
+        folder : Path or str
+            Made if missing.
+        force : bool
+            Replace a model that is there.
+        """
+        feedback = isinstance(self.model, Learned) and self.model.feedback
+        warm_up = self.model.warm_up if isinstance(self.model, RecurrentNetwork) else 0
+        contract = {
+            "arch": self.arch, "preset": self.preset, "created": utc_now(),
+            "time_step_s": self.time_step_s, "inputs": input_names(self.parameters, feedback),
+            "feedback": feedback, "warm_up": warm_up,
+            "joints": {joint: self._joint(joint) for joint in self.joints},
+            "readings_counted": self.readings_counted, "split": self.split,
+            "choices": self.choices, "recordings": self.recordings, "seed": self.seed,
+            "versions": versions("torch", "safetensors"), "notes": [self.verdict, *self.notes],
+        }  # fmt: skip
+        save_servo_model(Path(folder), self.parameters, contract, force)
+
+    def _joint(self, joint: str) -> dict[str, Any]:
+        known = plain(self.joints[joint])
+        return {
+            "scores": {k: v for k, v in known.items() if k.endswith("_rad")},
+            "band_noise_rad": known["band_noise_rad"] or 0.0,
+            "band_timing_s": known["band_timing_s"] or 0.0,
+            "readings": self.readings[joint],
+        }
 
 
 def fit_servo(
@@ -161,22 +276,22 @@ def fit_servo(
     data = servo_data(recordings, joints, readings, seed)
     recorded = ", ".join(data.groups)
     notes = [text for j in joints for text in cautions(j, trials[j])]
-    whole = split.train or everything
-    data, note = grouped(data, whole)
+    whole = split.train or windows.everything
+    data, note = windows.grouped(data, whole)
     notes += [note] if note else []
-    data = merged_groups(data)
+    data = windows.merged_groups(data)
     if split.test is None:
         data = _with_two_groups(data, whole)
-        folds = [(without(g), only(g)) for g in range(len(data.groups))]
+        folds = [(windows.without(g), windows.only(g)) for g in range(len(data.groups))]
     else:
         folds = [(whole, split.test)]
-        if not any(chosen(r, split.test).any() for j in joints for r in data.runs[j]):
+        if not any(windows.chosen(r, split.test).any() for j in joints for r in data.runs[j]):
             raise InputError(
                 f"There is nothing to test on: {split.name}. What was recorded: {recorded}. "
                 "Without a split every part is predicted by a model fitted to the others."
             )
     say = progress or (lambda what, share: None)
-    ready = samples(data, whole, past_ticks(data.period_s))
+    ready = windows.samples(data, whole, past_ticks(data.period_s))
     count = dict(zip(joints, (int(n) for n in ready.used.sum((1, 2))), strict=True))
 
     ours = _fit(arch, preset, data, ready, whole, folds, split, seed, say, keep_unfinished)
@@ -206,7 +321,7 @@ def fit_servo(
         scored[name] = ModelScores.of(scores.pooled(parts), seed)
     errors = scored[arch].errors
     bands = {j: scores.band(e) for j, e in (ours.held_out or errors).items()}
-    test: Part = split.test or (lambda number, elapsed, group: group >= 0)
+    test: windows.Part = split.test or (lambda number, elapsed, group: group >= 0)
     covered = np.concatenate([
         np.abs(e.free_run) <= scores.band_half_width(bands[j], e.speed) for j, e in errors.items()
     ])  # fmt: skip
@@ -238,10 +353,36 @@ def fit_servo(
     )  # fmt: skip
 
 
-def _with_two_groups(data: ServoData, part: Part) -> ServoData:
+def verdict(
+    arch: str, scores: Mapping[str, ModelScores], difference: Interval, repeatability_rad: float
+) -> str:
+    """Comparison with the linear filter and with the robot's repeatability, in words."""
+    if arch == "fir":
+        return "This is the linear model itself."
+    name = {"delayed-pd": "DelayedPD", "sindy": "sparse equation"}.get(arch, arch.upper())
+    linear = scores["linear"].mean.rmse_free_run_rad
+    gain, low, high = (
+        100 * x / linear for x in (difference.value, difference.low, difference.high)
+    )
+    how = "better" if high < 0 else "worse" if low > 0 else "not better"
+    text = (
+        f"The {name} is {how} than the linear model on this data "
+        f"({gain:+.0f} %, 90 % interval {low:+.0f} to {high:+.0f} %)."
+    )
+    if np.isfinite(repeatability_rad):
+        above = scores[arch].mean.rmse_free_run_rad - repeatability_rad
+        text += (
+            f" The robot's repeatability is {1e3 * repeatability_rad:.1f} mrad; the model is "
+            f"{1e3 * above:.1f} mrad above it."
+        )
+    return text
+
+
+def _with_two_groups(data: ServoData, part: windows.Part) -> ServoData:
     """The data without groups that have no readings, such as a tone cut short."""
     present = {
-        j: {int(g) for r in data.runs[j] for g in r.group[r.readings.rows][chosen(r, part)]} - {-1}
+        j: {int(g) for r in data.runs[j] for g in r.group[r.readings.rows][windows.chosen(r, part)]}
+        - {-1}
         for j in data.joints
     }
     for joint, own in present.items():
@@ -279,9 +420,9 @@ def _fit(
     arch: str,
     preset: str,
     data: ServoData,
-    ready: Samples,
-    whole: Part,
-    folds: list[tuple[Part, Part]],
+    ready: windows.Samples,
+    whole: windows.Part,
+    folds: list[tuple[windows.Part, windows.Part]],
     split: Split,
     seed: int,
     say: Callable[[str, float], None],
@@ -310,7 +451,7 @@ def _fit(
     if fit.interrupted and not keep_unfinished:
         raise KeyboardInterrupt
     held = [
-        scores.errors(m, scores.tracks(m, data), data, _both(whole, only(g)))
+        scores.errors(m, scores.tracks(m, data), data, _both(whole, windows.only(g)))
         for g, m in fit.held_out.items()
     ]
     size = sum(
@@ -324,13 +465,15 @@ def _fit(
     )  # fmt: skip
 
 
-def _fold_models(fit: Any, folds: list[tuple[Part, Part]], split: Split) -> list[ServoModel]:
+def _fold_models(
+    fit: Any, folds: list[tuple[windows.Part, windows.Part]], split: Split
+) -> list[ServoModel]:
     if split.test is not None:
         return [fit.model]
     return [fit.held_out[g] for g in range(len(folds))]
 
 
-def _both(a: Part, b: Part) -> Part:
+def _both(a: windows.Part, b: windows.Part) -> windows.Part:
     return lambda number, elapsed, group: a(number, elapsed, group) & b(number, elapsed, group)
 
 
@@ -341,7 +484,7 @@ _MANY = 10  # problems; fewer get more starts, since few tones have many local o
 
 
 def delayed_pd_fits(
-    data: ServoData, parts: Sequence[Part], seed: int
+    data: ServoData, parts: Sequence[windows.Part], seed: int
 ) -> list[dict[str, NDArray[np.float64]]]:
     """One DelayedPD per joint for each part of the data.
 
@@ -370,7 +513,7 @@ def delayed_pd_fits(
 
 
 def sindy_fits(
-    data: ServoData, parts: Sequence[Part], seed: int
+    data: ServoData, parts: Sequence[windows.Part], seed: int
 ) -> list[dict[str, NDArray[np.float64]]]:
     """One sparse equation per joint for each part of the data.
 
@@ -397,9 +540,9 @@ def sindy_fits(
     return found
 
 
-def part_runs(data: ServoData, joint: str, part: Part) -> tuple[Run, ...]:
+def part_runs(data: ServoData, joint: str, part: windows.Part) -> tuple[Run, ...]:
     """Runs of a joint on the clock of physics, with only the part's readings."""
-    found = [(run, chosen(run, part)) for run in data.runs[joint]]
+    found = [(run, windows.chosen(run, part)) for run in data.runs[joint]]
     return tuple(run.on_physics(use) for run, use in found if use.any())
 
 

@@ -15,16 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
+from pupper_sysid.sysid.servo_fit import windows
 from pupper_sysid.sysid.servo_fit.training import LSTM, MLP, Checkpoint, train
-from pupper_sysid.sysid.servo_fit.windows import (
-    RIDGES,
-    LinearFits,
-    Samples,
-    fading,
-    fit_linear,
-    taps,
-    training_sets,
-)
 
 Learned = CommandNetwork | RecurrentNetwork
 _LSTM_MEMORY_S = 1.5
@@ -47,14 +39,14 @@ class NetworkFit:
 
 def past_ticks(period_s: float) -> int:
     """Commands before a window that the models of this module need."""
-    return max(taps(period_s), round(_LSTM_MEMORY_S / period_s))
+    return max(windows.taps(period_s), round(_LSTM_MEMORY_S / period_s))
 
 
 def fit_network(
     kind: str,
     joints: Sequence[str],
     period_s: float,
-    data: Samples,
+    data: windows.Samples,
     seed: int,
     nested: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -67,7 +59,7 @@ def fit_network(
     """
     groups = [int(g) for g in np.unique(data.group[data.used]) if g >= 0]
     nested = nested and len(groups) > 2  # a pair of two would leave nothing to learn from
-    sets = training_sets(groups, nested and kind != "fir")
+    sets = windows.training_sets(groups, nested and kind != "fir")
     linear, ridge = _best_linear(data, groups, sets, period_s)
     choices: dict[str, float] = {"ridge": ridge}
     if kind == "fir":
@@ -143,23 +135,25 @@ def _choose(judged: list[NDArray]) -> tuple[int, int]:
 
 
 def _best_linear(
-    data: Samples, groups: list[int], sets: list[frozenset[int]], period_s: float
-) -> tuple[LinearFits, float]:
+    data: windows.Samples, groups: list[int], sets: list[frozenset[int]], period_s: float
+) -> tuple[windows.LinearFits, float]:
     """Linear models with the ridge that predicts held-out groups best."""
     singles = sets[: len(groups) + 1]
     scored = []
-    for ridge in RIDGES:
-        fits = fit_linear(data, singles, period_s, ridge)
+    for ridge in windows.RIDGES:
+        fits = windows.fit_linear(data, singles, period_s, ridge)
         errors = [
             np.log(_group_rms(fits.residual[..., n + 1, None], data, g))
             for n, g in enumerate(groups)
         ]
         scored.append((float(np.nanmean(np.stack(errors))), ridge, fits))
     _, ridge, fits = min(scored, key=lambda s: s[0])
-    return (fits if len(sets) == len(singles) else fit_linear(data, sets, period_s, ridge)), ridge
+    return (
+        fits if len(sets) == len(singles) else windows.fit_linear(data, sets, period_s, ridge)
+    ), ridge
 
 
-def _group_rms(error: NDArray, data: Samples, group: int) -> NDArray[np.float64]:
+def _group_rms(error: NDArray, data: windows.Samples, group: int) -> NDArray[np.float64]:
     """RMS over a group's readings, shape (joints, candidates); NaN where a joint has none."""
     seen = data.used & (data.group == group)
     count = seen.sum((1, 2)).astype(float)
@@ -171,8 +165,8 @@ def _group_rms(error: NDArray, data: Samples, group: int) -> NDArray[np.float64]
 def _build(
     joints: Sequence[str],
     period_s: float,
-    data: Samples,
-    linear: LinearFits,
+    data: windows.Samples,
+    linear: windows.LinearFits,
     n: int,
     weights: dict[str, NDArray],
 ) -> Learned:
@@ -189,7 +183,7 @@ def _build(
         count = linear.fir.shape[-1]
         first = np.moveaxis(weights["weight_0"], 1, 2).reshape(len(joints), count, members * units)
         parameters |= {
-            "weight_0": first * fading(count, period_s)[:, None],
+            "weight_0": first * windows.fading(count, period_s)[:, None],
             "bias_0": weights["bias_0"].reshape(len(joints), members * units),
             "weight_1": weights["weight_1"].reshape(len(joints), members * units, 1) / members,
             "bias_1": weights["bias_1"].mean(1)[:, None],

@@ -38,7 +38,7 @@ from pupper_sysid.policies.analysis.robustness import (
 )
 from pupper_sysid.policies.network.hyperparameters import Imitation
 from pupper_sysid.policies.train.run_file import Run, preset, save_run
-from pupper_sysid.sysid.compare.comparison import FITTED, PUBLISHED, four_way
+from pupper_sysid.sysid.compare.compare import FITTED, PUBLISHED, four_way
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.servo_fit import networks
 from pupper_sysid.sysid.servo_fit.training import Recipe

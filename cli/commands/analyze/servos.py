@@ -48,7 +48,7 @@ class Servo(Analysis):
 
     def analyse(self) -> Found:
         """Fit and compare the models."""
-        from pupper_sysid.sysid.compare.comparison import four_way
+        from pupper_sysid.sysid.compare.compare import four_way
 
         need_positive("--seconds", self.seconds)
         if len(self.policies) != 1:

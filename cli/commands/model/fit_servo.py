@@ -17,8 +17,7 @@ from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.sysid.sweep.excitation import TRIAL_S
 
 if TYPE_CHECKING:
-    from pupper_sysid.sysid.servo_fit.fit import Split
-    from pupper_sysid.sysid.servo_fit.result import ServoFit
+    from pupper_sysid.sysid.servo_fit.fit import ServoFit, Split
     from pupper_sysid.sysid.sparse import Equations
 
 _SHOWN = {

@@ -11,9 +11,8 @@ import pytest
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
-from pupper_sysid.sysid.compare import comparison as four_way_module
-from pupper_sysid.sysid.compare.compare import compare
-from pupper_sysid.sysid.compare.comparison import Comparison, calibrated_run
+from pupper_sysid.sysid.compare import compare as four_way_module
+from pupper_sysid.sysid.compare.compare import Comparison, calibrated_run, compare
 from pupper_sysid.sysid.fit.predict import ComparedRun, ReadingRule, ages, notes
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording, Trial

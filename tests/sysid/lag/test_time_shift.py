@@ -8,9 +8,15 @@ from scipy.signal import lfilter
 
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
-from pupper_sysid.sysid.lag.held_command import HeldCommand, Stretch, past_tones
 from pupper_sysid.sysid.lag.lag_budget import command_hold, lag_budget, shift_draws
-from pupper_sysid.sysid.lag.step_response import _SIZES, ImpulseResponse, _evidence
+from pupper_sysid.sysid.lag.step_response import (
+    _SIZES,
+    HeldCommand,
+    ImpulseResponse,
+    Stretch,
+    _evidence,
+    past_tones,
+)
 from pupper_sysid.sysid.recordings.recording import Trial
 from support.refusals import assert_each_refused
 from support.synthetic import first_order_trial, held_trial, random_levels

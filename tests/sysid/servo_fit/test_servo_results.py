@@ -16,8 +16,7 @@ from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit.data import servo_data
-from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
-from pupper_sysid.sysid.servo_fit.result import ServoFit
+from pupper_sysid.sysid.servo_fit.fit import ServoFit, Split, fit_servo
 from pupper_sysid.sysid.servo_fit.scores import (
     LINEAR,
     Errors,
