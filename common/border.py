@@ -237,7 +237,11 @@ def _fault(fault: ErrorDetails, top: type[BaseModel], place: Place) -> str:
         return _not_a_mapping(given, field, meaning)
     if kind == "value_error":
         return f"is not usable: {fault['msg'].removeprefix('Value error, ')}."
-    unit = _unit_in_words(place)
+    # of the quantity at `place`, whose last part may be value, low or high
+    names = [part for part in place if isinstance(part, str)]
+    if len(names) > 1 and names[-1] in ("value", "low", "high"):
+        names.pop()
+    unit = f", in {unit_of(names[-1])}" if names and unit_of(names[-1]) else ""
     if kind in ("float_type", "int_type", "int_from_float"):
         whole = "a whole number" if kind.startswith("int") else "a number"
         if isinstance(given, str) and given.strip().lower().lstrip("+-.") in ("nan", "inf"):
@@ -283,15 +287,6 @@ def _not_a_mapping(given: Any, field: FieldInfo | None, meaning: str) -> str:
     checks = (getattr(getattr(entry, "func", None), "problem", None) for entry in field.metadata)
     problem = next((said for check in checks if check and (said := check(given))), "")
     return f"is a bare number{f' ({problem})' if problem else ''}. Write {example}{meaning}."
-
-
-def _unit_in_words(place: Place) -> str:
-    """The unit of the quantity at `place`, whose last part may be value, low or high."""
-    names = [part for part in place if isinstance(part, str)]
-    if len(names) > 1 and names[-1] in ("value", "low", "high"):
-        names.pop()
-    unit = unit_of(names[-1]) if names else ""
-    return f", in {unit}" if unit else ""
 
 
 def _short(given: Any) -> str:

@@ -231,7 +231,11 @@ def _fit_joint(
             )  # fmt: skip
             tried[support] = candidate, fits
         candidates = sorted((c for c, _ in tried.values()), key=Candidate.error)
-        chosen = _choose(candidates).terms
+        # the sparsest within 5 % of the best on unseen frequencies; with one frequency, by BIC
+        close = [c for c in candidates if c.error() <= _WITHIN * candidates[0].error()]
+        chosen = candidates[0].terms
+        if np.isfinite(candidates[0].rmse_leave_one_frequency_out_rad):
+            chosen = min(close, key=lambda c: (len(c.terms), c.error())).terms
         around = _neighbours(chosen) + _neighbours(candidates[0].terms)
         wanted = [s for s in dict.fromkeys(around) if s not in tried]
     model, fits = equation_model(chosen), tried[chosen][1]
@@ -330,14 +334,6 @@ def _scores(
 ) -> Scores:
     track = free_run(model, model.decode(fits[0].point), runs)
     return score(track, runs, held_out_residuals(model, fits[1:], folds, runs))
-
-
-def _choose(ranked: Sequence[Candidate]) -> Candidate:
-    """The sparsest within 5 % of the best on unseen frequencies; with one frequency, by BIC."""
-    if not np.isfinite(ranked[0].rmse_leave_one_frequency_out_rad):
-        return ranked[0]
-    near = [c for c in ranked if c.error() <= _WITHIN * ranked[0].error()]
-    return min(near, key=lambda c: (len(c.terms), c.error()))
 
 
 def _neighbours(support: Support) -> list[Support]:

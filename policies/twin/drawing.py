@@ -30,8 +30,7 @@ from pupper_sysid.sim.walking.servo_ranges import (
     servo_ranges,
 )
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.view.channels import poses
-from pupper_sysid.sysid.view.files import Body
+from pupper_sysid.sysid.view.channels import Body, poses
 
 if TYPE_CHECKING:
     from pupper_sysid.sim.robot.servo_robot import ServoRobot

@@ -230,7 +230,14 @@ def compare(
     models = _each(models)
     calibrations = _calibrations(models)
     for name, calibration in calibrations.items():  # before the work, not after it
-        _refuse_missing_joints(calibration, name, names)
+        missing = [j for j in names if j not in calibration.joints]
+        if missing and not isinstance(calibration, CardCalibration):  # which has every joint
+            common = [j for j in names if j not in missing]
+            advice = f" Compare on {', '.join(common)} only (`joints`)." if common else ""
+            raise InputError(
+                f"{name} has no joint {', '.join(missing)}; it has "
+                f"{', '.join(calibration.joints)}.{advice}"
+            )
     trials = usable_trials(recordings, names)
     learned = [m for m in models if isinstance(m, ServoFit) or _is_folder(m)]
     notes = [text for joint in names for text in cautions(joint, trials[joint])]
@@ -369,18 +376,6 @@ def _on_ticks(
     return made
 
 
-def _refuse_missing_joints(calibration: Calibration, name: str, joints: Sequence[str]) -> None:
-    """Refuse to compare on joints that a calibration does not have."""
-    missing = [j for j in joints if j not in calibration.joints]
-    if missing and not isinstance(calibration, CardCalibration):  # which has every joint
-        common = [j for j in joints if j not in missing]
-        advice = f" Compare on {', '.join(common)} only (`joints`)." if common else ""
-        raise InputError(
-            f"{name} has no joint {', '.join(missing)}; it has "
-            f"{', '.join(calibration.joints)}.{advice}"
-        )
-
-
 def _each(models: Model | Sequence[Model]) -> Sequence[str | Path | Calibration | ServoFit]:
     """The models one by one, those of `calibrate` as calibrations."""
     several = [models] if isinstance(models, str) or not isinstance(models, Sequence) else models
@@ -506,7 +501,12 @@ def four_way(
     were fitted to, and predicts readings as `compare` does. `progress` is called with what is being
     done and the share of it that is done.
     """
-    split = _split(recording)
+    numbers = sorted(int(n) for n in recording.table["trial"].unique())
+    if len(numbers) > 1:
+        split = Split.by_trials(numbers[:-1], numbers[-1:])
+    else:
+        end = _TRAIN_SHARE * float(np.ptp(recording.table["send_time_s"]))
+        split = Split.by_time(end, end)
     fits: dict[str, ServoFit] = {}
     for arch, part in _PARTS.items():
         say = _part_of(progress, part) if progress else None
@@ -566,11 +566,3 @@ def _part_of(
         progress(what, furthest)
 
     return say
-
-
-def _split(recording: Recording) -> Split:
-    numbers = sorted(int(n) for n in recording.table["trial"].unique())
-    if len(numbers) > 1:
-        return Split.by_trials(numbers[:-1], numbers[-1:])
-    end = _TRAIN_SHARE * float(np.ptp(recording.table["send_time_s"]))
-    return Split.by_time(end, end)

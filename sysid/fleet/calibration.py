@@ -91,22 +91,6 @@ class Fleet:
     problems: dict[str, str] = field(default_factory=dict)
     """Why, by robot."""
 
-    def tabulate(
-        self, rows: Sequence[dict[str, Any]], quantities: Sequence[str], out: Path
-    ) -> None:
-        """Make the table of `rows` (`robot`, `joint`, `quantities`), and write it to `out`.
-
-        Outliers are named, and robots that failed stand at the end with their problem.
-        """
-        table = pd.DataFrame(rows, columns=["robot", "joint", *quantities])
-        table["outliers"] = _outliers(table, quantities)
-        table["problem"] = ""
-        lost = pd.DataFrame([{"robot": n, "problem": p} for n, p in sorted(self.problems.items())])
-        self.table = pd.concat([table, lost], ignore_index=True) if len(lost) else table
-        # it says nothing that the robots' own files do not, so it is made anew with each run
-        text = self.table.to_csv(index=False, lineterminator="\n")
-        write_text(out / TABLE, text, force=True)
-
     def summary(self, out: Path, elapsed_s: float) -> dict[str, Any]:
         """Object of `--json`."""
         return {
@@ -204,15 +188,19 @@ def run_fleet(
             progress(name)
     # a robot that failed may have an older target: its numbers would not be this recording's
     usable = [t for t in targets.values() if _called(t) in {*fleet.kept, *fleet.made}]
-    fleet.tabulate(
-        [
-            {"robot": _called(target), "joint": joint} | row
-            for target in usable
-            for joint, row in numbers(target).items()
-        ],
-        quantities,
-        out,
-    )
+    rows = [
+        {"robot": _called(target), "joint": joint} | row
+        for target in usable
+        for joint, row in numbers(target).items()
+    ]
+    table = pd.DataFrame(rows, columns=["robot", "joint", *quantities])
+    table["outliers"] = _outliers(table, quantities)
+    table["problem"] = ""
+    lost = pd.DataFrame([{"robot": n, "problem": p} for n, p in sorted(fleet.problems.items())])
+    fleet.table = pd.concat([table, lost], ignore_index=True) if len(lost) else table
+    # it says nothing that the robots' own files do not, so it is made anew with each run
+    text = fleet.table.to_csv(index=False, lineterminator="\n")
+    write_text(out / TABLE, text, force=True)
     return fleet
 
 

@@ -348,11 +348,11 @@ def _preset(actuator: Actuator) -> dict[str, float]:
     one = actuator.parameters.per_inertia()
     numbers = (one.dead_time_s, one.stiffness, one.damping, one.friction_loss, one.effort_limit,
                one.velocity_limit, 0.0)  # fmt: skip
-    model = candidate(SIMULATED[0])
-    boxed = []
-    for p, number in zip(model.parameters, numbers, strict=True):
-        boxed.append(float(np.clip(np.asarray(number, float), p.low, p.high)))
-    return dict(zip(model.names, boxed, strict=True))
+    parameters = candidate(SIMULATED[0]).parameters
+    return {
+        p.name: float(np.clip(np.asarray(number, float), p.low, p.high))
+        for p, number in zip(parameters, numbers, strict=True)
+    }
 
 
 _QUANTITIES = {

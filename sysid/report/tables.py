@@ -33,6 +33,7 @@ MODEL_NAMES = {
 _LEVEL = "(90\N{NO-BREAK SPACE}%)"
 KEY = Column("joint", lambda row: row["joint"], "key")
 _MS = 1e3
+_DELAY = ("dead time", "delay of the form")
 
 
 def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
@@ -104,18 +105,13 @@ def transfer_table(responses: Mapping[str, FrequencyResponse]) -> Table:
     columns = (
         KEY,
         text("form", "transfer_function"),
-        Column("parameter", _of_form, "words"),
+        # a form's delay is not the servo's dead time
+        Column("parameter", lambda r: words_of(r["parameter"]).replace(*_DELAY), "words"),
         Column(f"value {_LEVEL}", _value_cell),
         text("unit", "unit"),
         number("misfit, χ²/dof", "chi2_per_dof"),
     )
     return Table("transfer_functions", "Fitted transfer functions", columns, tuple(rows))
-
-
-def _of_form(row: Row) -> str:
-    """A transfer function's parameter; its delay is not the servo's dead time."""
-    name = _readable(row["parameter"], "")
-    return "delay of the form" if name == "dead time" else name
 
 
 def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:

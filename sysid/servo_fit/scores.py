@@ -164,9 +164,12 @@ def errors(
         commands, start, position = stacked(data)
         model.reset(start)
         ahead = by_run(data, start, model.one_step(commands, position))
+    firsts = [data.runs[joint][0].trial.send_time_s for joint in data.joints[:2]]
+    # of joints that were recorded one at a time the stretches are independent
+    apart = len(firsts) == 2 and not np.array_equal(*firsts)
     made = {}
     for joint in data.joints:
-        parts = []
+        parts, alone = [], joint if apart else ""
         for n, run in enumerate(data.runs[joint]):
             track = found[joint][n]
             when = counted_ticks(run, data.modes[joint])
@@ -177,7 +180,6 @@ def errors(
             else:
                 step = look_up(ahead[joint][n], np.round(run.tick)) - run.position_rad
             speed = np.gradient(track) * steps_per_tick(track, run) / data.period_s
-            alone = joint if _alone(data) else ""
             times = zip(run.number[run.readings.rows], run.reading_elapsed_s, use, strict=True)
             held = predicted(track, run, run.held_tick[:, None]) - run.trial.position_rad
             raw = predicted(track, run, run.reading_tick) - run.trial.position_rad
@@ -309,14 +311,6 @@ def band(found: Errors) -> Band:
 def band_half_width(found: Band, speed: NDArray[np.float64]) -> NDArray[np.float64]:
     """Half of the 90 % band about a free run [rad], at a speed [rad/s]."""
     return HALF_WIDTH_SD * np.sqrt(found[0] ** 2 + (found[1] * speed) ** 2)
-
-
-def _alone(data: ServoData) -> bool:
-    """Whether the joints were recorded one at a time: their stretches are then independent."""
-    if len(data.joints) < 2:
-        return False
-    first, second = (data.runs[j][0].trial for j in data.joints[:2])
-    return not np.array_equal(first.send_time_s, second.send_time_s)
 
 
 def stacked(data: ServoData) -> tuple[NDArray, NDArray, NDArray]:

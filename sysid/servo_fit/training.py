@@ -355,7 +355,16 @@ def train(
         k: w.expand(*shape, *w.shape[4:]).clone().requires_grad_(True) for k, w in start.items()
     }
     adam = _Adam(list(weights.values()))
-    every = _tensors(data, linear, sets)
+    learns = np.stack([learns_from(data, s) for s in sets], axis=1)
+    arrays = {
+        "command": data.command, "index": data.index, "weight": data.weight,
+        "residual": np.moveaxis(linear.residual, -1, 1), "learns": learns,
+        "bound": linear.scale, "spread": linear.spread,
+    }  # fmt: skip
+    every = {
+        k: torch.from_numpy(np.ascontiguousarray(v, np.int64 if k == "index" else np.float32))
+        for k, v in arrays.items()
+    }
     readings = every["learns"].sum((-1, -2)).clamp(min=1)[:, :, None, None]  # per joint and set
     decay = torch.tensor(recipe.decays)[:, None] / (recipe.units * readings)
     per_step = max(1, _ROWS_PER_STEP // WINDOW)
@@ -408,21 +417,6 @@ def train(
     except KeyboardInterrupt:
         return True
     return False
-
-
-def _tensors(
-    data: Samples, linear: LinearFits, sets: Sequence[frozenset[int]]
-) -> dict[str, torch.Tensor]:
-    learns = np.stack([learns_from(data, s) for s in sets], axis=1)
-    arrays = {
-        "command": data.command, "index": data.index, "weight": data.weight,
-        "residual": np.moveaxis(linear.residual, -1, 1), "learns": learns,
-        "bound": linear.scale, "spread": linear.spread,
-    }  # fmt: skip
-    return {
-        k: torch.from_numpy(np.ascontiguousarray(v, np.int64 if k == "index" else np.float32))
-        for k, v in arrays.items()
-    }
 
 
 def _some(every: dict[str, torch.Tensor], chosen) -> dict[str, torch.Tensor]:

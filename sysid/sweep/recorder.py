@@ -131,7 +131,15 @@ class _Session:
         present = first_pose(bus, self._loop.period_s)
         self._start = np.where(np.isfinite(self._start), self._start, present)
         self._sent = present
-        self._refuse_far(present)
+        moving = {joint for trial in self._plan.trials for joint in trial.joints}
+        for k, joint in enumerate(bus.joint_names):  # where a load cannot be hanging
+            away = abs(present[k] - self._start[k])
+            if joint in moving and away > self._plan.nearest_start_rad:
+                raise InputError(
+                    f"{joint} was found {away:.2f} rad from where its load hangs "
+                    f"({self._start[k]:.2f} rad). Let it hang freely; if it does, give the reading "
+                    "there as hanging=…rad of the load, or measure the joint map's zero."
+                )
         first, rows = 0, 0
         if resume is None:
             writer = RecordingWriter(path, self._header(metadata), force)
@@ -146,8 +154,14 @@ class _Session:
                 self._move_to_start()
                 done = sum(trial.duration_s for trial in self._plan.trials[:first])
                 for number, trial in enumerate(self._plan.trials[first:], first):
-                    self._set_gain(trial)
-                    self._hold(REST_S)
+                    for joint in trial.joints if np.isfinite(trial.p_gain) else ():
+                        if self._gains.get(joint) != trial.p_gain:
+                            bus.set_register(joint, P_REGISTER, int(trial.p_gain))
+                            self._gains[joint] = trial.p_gain
+                    until = bus.now() + REST_S
+                    for _ in self._between.ticks(REST_S):
+                        self._command(self._start)
+                    bus.sleep_until(until)
                     rows += self._trial(number, trial, writer, done)
                     done += trial.duration_s
                     if np.isfinite(trial.release_s):
@@ -200,9 +214,23 @@ class _Session:
                     raise BusError(f"{what}: the torque could not be switched off. {_CHECK_LINE}")
             on = held
             sample = bus.read()
-            made = _rows(number, trial, index, sent_s, self._sent, sample, self._shift_s)
-            if self._on_a_bench:
-                made = [r | {"p_gain": trial.p_gain, "torque_enabled": float(on)} for r in made]
+            made: list[dict[str, Any]] = []
+            for joint, i in zip(trial.joints, index, strict=True):
+                row = {
+                    "send_time_s": sent_s + self._shift_s,
+                    "read_time_s": float(sample.time_s[i]) + self._shift_s,
+                    "trial": number, "joint": joint, "frequency_hz": trial.frequency_hz,
+                    "command_rad": float(self._sent[i]),
+                    "position_rad": float(sample.position_rad[i]),
+                    "position_count": int(sample.position_count[i]),
+                }  # fmt: skip
+                for name in ("voltage_v", "temperature_c", "load"):
+                    values = getattr(sample, name)
+                    if values is not None:
+                        row[name] = float(values[i])
+                if self._on_a_bench:
+                    row |= {"p_gain": trial.p_gain, "torque_enabled": float(on)}
+                made.append(row)
             with self._loop.spent.on(LOG):
                 writer.append(made)
             shown = self._sent if on else np.full(len(goal), np.nan)
@@ -211,27 +239,6 @@ class _Session:
                 self._progress(done + min(elapsed, trial.duration_s), self._total_s, what)
             rows += len(index)
         return rows
-
-    def _refuse_far(self, present: NDArray[np.float64]) -> None:
-        """Refuse to begin where a load cannot be hanging."""
-        moving = {joint for trial in self._plan.trials for joint in trial.joints}
-        for k, joint in enumerate(self._bus.joint_names):
-            away = abs(present[k] - self._start[k])
-            if joint in moving and away > self._plan.nearest_start_rad:
-                raise InputError(
-                    f"{joint} was found {away:.2f} rad from where its load hangs "
-                    f"({self._start[k]:.2f} rad). Let it hang freely; if it does, give the reading "
-                    "there as hanging=…rad of the load, or measure the joint map's zero."
-                )
-
-    def _set_gain(self, trial: TrialPlan) -> None:
-        """Set the trial's P gain at its joints, read back, if it is not set yet."""
-        if not np.isfinite(trial.p_gain):
-            return
-        for joint in trial.joints:
-            if self._gains.get(joint) != trial.p_gain:
-                self._bus.set_register(joint, P_REGISTER, int(trial.p_gain))
-                self._gains[joint] = trial.p_gain
 
     def _catch(self, done: float) -> None:
         """Wait until the limp joints are at rest; then hold them where they are."""
@@ -256,40 +263,7 @@ class _Session:
         """Move from the last command to the start pose on a raised cosine."""
         glide(self._between, self._command, self._sent.copy(), self._start, RETURN_S)
 
-    def _hold(self, duration_s: float) -> None:
-        """Rest at the start pose."""
-        until = self._bus.now() + duration_s
-        for _ in self._between.ticks(duration_s):
-            self._command(self._start)
-        self._bus.sleep_until(until)
-
     def _command(self, goal: NDArray[np.float64]) -> None:
         """Command and read without recording; the guard monitors the readings."""
         self._sent = self._bus.write(goal).position_rad
         self._bus.read()
-
-
-def _rows(
-    number: int,
-    trial: TrialPlan,
-    index: list[int],
-    sent_s: float,
-    goal: NDArray[np.float64],
-    sample: BusSample,
-    shift_s: float,
-) -> list[dict[str, Any]]:
-    """One row per moving joint."""
-    rows = []
-    for joint, i in zip(trial.joints, index, strict=True):
-        row: dict[str, Any] = {
-            "send_time_s": sent_s + shift_s, "read_time_s": float(sample.time_s[i]) + shift_s,
-            "trial": number, "joint": joint, "frequency_hz": trial.frequency_hz,
-            "command_rad": float(goal[i]), "position_rad": float(sample.position_rad[i]),
-            "position_count": int(sample.position_count[i]),
-        }  # fmt: skip
-        for name in ("voltage_v", "temperature_c", "load"):
-            values = getattr(sample, name)
-            if values is not None:
-                row[name] = float(values[i])
-        rows.append(row)
-    return rows

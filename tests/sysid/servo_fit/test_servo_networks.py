@@ -329,7 +329,7 @@ def test_a_fit_of_a_network_repeats_bit_for_bit_under_its_seed(monkeypatch):
 
 def test_a_nested_fit_of_a_group_does_not_depend_on_its_readings(monkeypatch):
     monkeypatch.setattr(network_fit, "MLP", Recipe(8, 2, (0.1, 1.0), 40, 1e-2, 20, 9))
-    monkeypatch.setattr(network_fit, "RIDGES", (1e-3,))
+    monkeypatch.setattr(network_fit.windows, "RIDGES", (1e-3,))
     _, ready = loops(HIP, 3, 100)
     other = np.where(ready.group == 1, 1.0 - 2 * ready.target, ready.target).astype(np.float32)
     first, second = (
