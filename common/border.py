@@ -71,9 +71,6 @@ _FIRST = ("extra_forbidden", *_NOT_A_MAPPING)
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
-# ------------------------------------------------------------------------------------ reading
-
-
 def read_bytes(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> bytes:
     """Content of a regular file of limited size; a larger one is refused without being read.
 
@@ -133,9 +130,6 @@ def _levels(text: str) -> int:
     return int(np.cumsum(steps).max(initial=0))
 
 
-# --------------------------------------------------------------------------- schema and version
-
-
 def refuse_other_version(path: Path | str, found: Any, known: int, oldest: int = 1) -> None:
     """Refuse a file whose `schema_version` is none that this code reads, `oldest` to `known`."""
     if type(found) is int and found > known:
@@ -148,9 +142,6 @@ def refuse_other_version(path: Path | str, found: Any, known: int, oldest: int =
             f"{path}: schema_version is {_short(found)}; this version reads {known}. Put the file "
             "back as it was written."
         )
-
-
-# --------------------------------------------------------------------------------- validation
 
 
 def validated(

@@ -198,9 +198,6 @@ def fit_equations(
     return map_joints(partial(_fit_joint, seed=seed), tasks, workers, progress)
 
 
-# ------------------------------------------------------------------------------- one joint
-
-
 def _fit_joint(
     joint: str, task: tuple[tuple[Run, ...], float | tuple[float, ...]], seed: int
 ) -> EquationResult:

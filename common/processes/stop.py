@@ -24,7 +24,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import Any, Literal, NoReturn
 
 Phase = Literal["start", "work", "robot", "finish"]
@@ -274,14 +274,9 @@ def end_politely() -> None:
         _current.hold_robot()
 
 
-@contextmanager
-def held() -> Iterator[None]:
+def held() -> AbstractContextManager[None]:
     """Have a stop wait for the block, at most `_UNWIND_S`: for files that belong together."""
-    if _current is None:
-        yield
-        return
-    with _current.held():
-        yield
+    return _current.held() if _current else nullcontext()
 
 
 @contextmanager

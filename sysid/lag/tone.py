@@ -129,7 +129,15 @@ def tone_response(
         return None
 
     def fitted(time: NDArray, value: NDArray) -> tuple[complex, NDArray, float]:
-        return _fit(time, value, frequency, start, rng, draws)
+        """Phasor, its draws, and the RMS about the fit; blocks are periods."""
+        design = tone_design(time, frequency)
+        period = np.floor((time - start) * frequency).astype(int)
+        # rows that stand alone in a period carry no spread of their own: never fewer than 8 blocks
+        fit = block_bootstrap(design, value, period, rng, draws, fewest=8)
+        residual = float(np.sqrt(np.mean((design @ fit.solution - value) ** 2)))
+        # the spread of few blocks around their own fit lacks their lost degrees of freedom
+        drawn = fit.inflated(np.sqrt(fit.blocks / max(fit.blocks - design.shape[1] / 2, 1.0)))
+        return complex(phasors(fit.solution)[0]), phasors(drawn)[:, 0], residual
 
     raw, raw_draws, _ = fitted(trial.read_time_s[rows], trial.position_rad[rows])
     result, fresh_draws, residual = fitted(reading.time_s[fresh], reading.position_rad[fresh])
@@ -153,25 +161,6 @@ def tone_design(time_s: NDArray, frequency_hz: float) -> NDArray[np.float64]:
 
 def _phasor(time_s: NDArray, value: NDArray, frequency_hz: float) -> complex:
     return complex(phasors(least_squares(tone_design(time_s, frequency_hz), value))[0])
-
-
-def _fit(
-    time: NDArray,
-    value: NDArray,
-    frequency: float,
-    start: float,
-    rng: np.random.Generator,
-    draws: int,
-) -> tuple[complex, NDArray[np.complex128], float]:
-    """Phasor, its draws, and the RMS about the fit; blocks are periods."""
-    design = tone_design(time, frequency)
-    period = np.floor((time - start) * frequency).astype(int)
-    # rows that stand alone in a period carry no spread of their own: never fewer than 8 blocks
-    fit = block_bootstrap(design, value, period, rng, draws, fewest=8)
-    residual = float(np.sqrt(np.mean((design @ fit.solution - value) ** 2)))
-    # the spread of few blocks around their own fit is too small by their lost degrees of freedom
-    drawn = fit.inflated(np.sqrt(fit.blocks / max(fit.blocks - design.shape[1] / 2, 1.0)))
-    return complex(phasors(fit.solution)[0]), phasors(drawn)[:, 0], residual
 
 
 def _command_frequency(trial: Trial) -> float:
@@ -429,8 +418,19 @@ def line_responses(trial: Trial, reading: Readings, rng: np.random.Generator) ->
         return []
     command_held = _phasors(*HeldCommand.of(trial).levels(start, send[-1], _LINES_GRID_S), lines)
     command_rows = _phasors(send[rows], trial.command_rad[rows], lines)
-    raw = _draw(trial.read_time_s[rows], trial.position_rad[rows], lines, rng, _TONE_DRAWS)
-    measured = _draw(reading.time_s[fresh], reading.position_rad[fresh], lines, rng, _TONE_DRAWS)
+
+    def drawn(time: NDArray, value: NDArray) -> tuple[NDArray, NDArray, float]:
+        """Phasors at all lines, draws of them, and the RMS about the fit."""
+        design = _design(time, lines)
+        block = np.floor((time - time[0]) / _BLOCK_S).astype(int)
+        fit = block_bootstrap(design, value, block, rng, _TONE_DRAWS)
+        # what was fitted away from the residuals is missing from their spread
+        inflate = np.sqrt(len(value) / (len(value) - design.shape[1]))
+        residual = float(inflate * np.sqrt(np.mean((design @ fit.solution - value) ** 2)))
+        return phasors(fit.solution), phasors(fit.inflated(inflate)), residual
+
+    raw = drawn(trial.read_time_s[rows], trial.position_rad[rows])
+    measured = drawn(reading.time_s[fresh], reading.position_rad[fresh])
     if measured[2] ** 2 > _INCOHERENT * float(np.var(reading.position_rad[fresh])):
         return []
     shift = rng.normal(0.0, reading.time_sd_s, _TONE_DRAWS)
@@ -498,21 +498,3 @@ def _design(time: NDArray, lines: NDArray) -> NDArray[np.float64]:
 
 def _phasors(time: NDArray, value: NDArray, lines: NDArray) -> NDArray[np.complex128]:
     return phasors(least_squares(_design(time, lines), value))
-
-
-def _draw(
-    time: NDArray, value: NDArray, lines: NDArray, rng: np.random.Generator, draws: int
-) -> tuple[NDArray[np.complex128], NDArray[np.complex128], float]:
-    """Phasors at all lines, draws of them, and the RMS about the fit."""
-    design = _design(time, lines)
-    fit = block_bootstrap(
-        design, value, np.floor((time - time[0]) / _BLOCK_S).astype(int), rng, draws
-    )
-    left = design @ fit.solution - value
-    # what was fitted away from the residuals is missing from their spread
-    inflate = np.sqrt(len(value) / (len(value) - design.shape[1]))
-    return (
-        phasors(fit.solution),
-        phasors(fit.inflated(inflate)),
-        float(inflate * np.sqrt(np.mean(left**2))),
-    )

@@ -7,9 +7,8 @@ executable(load_plan(path), path, joints, …)      # what the recorder takes
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
@@ -17,20 +16,17 @@ from pupper_sysid.common.border import read_yaml, refuse_other_version, validate
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import sha256, versions, write_text
-from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.results import plain
 from pupper_sysid.common.strict_yaml import dump
-from pupper_sysid.servo_models.calibration.calibration import InputFile, utc_now
-from pupper_sysid.servo_models.calibration.quantity import Number, Part, Whole
-from pupper_sysid.sysid.plan.planner import PlannedTrial, Prediction
+from pupper_sysid.servo_models.calibration.calibration import utc_now
+from pupper_sysid.sysid.plan.planner import PlannedTrial
 from pupper_sysid.sysid.plan.proposal import SweepPlan
 from pupper_sysid.sysid.sweep.excitation import Plan, plan
 
 SCHEMA = "pupper-sysid plan"
 SCHEMA_VERSION = 1
 
-_MOST_TRIALS = 2000
 _HEADER = """\
 # Plan of a sweep, written by `pupper-sysid plan`; `pupper-sysid sweep --plan` executes it.
 #
@@ -39,31 +35,7 @@ _HEADER = """\
 """
 
 
-class IntervalEntry(Part):
-    """A value with its 90 % interval."""
-
-    value: Number
-    """The number, in the unit at the end of the quantity's name."""
-    low: Number
-    """Lower end."""
-    high: Number
-    """Upper end."""
-
-
-class PredictionEntry(Part):
-    """Interval of one quantity, now and after the sweep."""
-
-    joint: str
-    """Its joint."""
-    quantity: str
-    """Its name, which ends in the unit."""
-    now: IntervalEntry
-    """Interval at present."""
-    after: IntervalEntry
-    """Interval to expect."""
-
-
-class PlanFile(Part):
+class PlanFile(SweepPlan):
     """The whole file."""
 
     schema_name: Annotated[Literal["pupper-sysid plan"], Field(alias="schema")]
@@ -72,26 +44,8 @@ class PlanFile(Part):
     """Version of the file's format."""
     created: str
     """Time of the plan, in UTC and ISO 8601."""
-    made_from: Annotated[tuple[InputFile, ...], Field(strict=False)] = ()
-    """Recordings or calibration it was made from; empty for an unknown servo."""
-    seed: Whole = 0
-    """Seed of its random numbers."""
     versions: dict[str, str] = Field(default_factory=dict)
     """Versions of this project and of the libraries that shape its numbers."""
-    loop_period_s: Annotated[Number, Field(gt=0, le=1)]
-    """Time between commands [s]."""
-    poll_rate_hz: Annotated[Number, Field(ge=0, le=1e5)]
-    """Polls of a servo per second; 0 where readings are live."""
-    speed_limit_rad_s: Annotated[Number, Field(gt=0, le=1000)]
-    """Speed limit of the servos [rad/s]."""
-    trials: Annotated[
-        tuple[PlannedTrial, ...], Field(strict=False, min_length=1, max_length=_MOST_TRIALS)
-    ]
-    """Trials, in the order of their execution."""
-    predictions: Annotated[tuple[PredictionEntry, ...], Field(strict=False)] = ()
-    """Intervals now and after the sweep."""
-    notes: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    """What no trial within the limits can show."""
 
     @field_validator("trials")
     @classmethod
@@ -103,15 +57,9 @@ class PlanFile(Part):
 
 def save_plan(proposal: SweepPlan, path: Path, force: bool = False) -> None:
     """Write a plan file, in one atomic step."""
-    data = {
-        "schema": SCHEMA,
-        "schema_version": SCHEMA_VERSION,
-        "created": utc_now(),
-        "versions": versions(),
-        **plain(proposal),
-    }
-    order = [f.alias or name for name, f in PlanFile.model_fields.items()]
-    write_text(path, f"{_HEADER}\n{dump({name: data[name] for name in order})}", force)
+    head = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "created": utc_now()}
+    data = head | {"versions": versions()} | plain(proposal)
+    write_text(path, f"{_HEADER}\n{dump(data)}", force)
 
 
 def load_plan(path: Path) -> SweepPlan:
@@ -125,22 +73,7 @@ def load_plan(path: Path) -> SweepPlan:
         )
     refuse_other_version(path, data.get("schema_version"), SCHEMA_VERSION)
     file = validated(PlanFile, data, path, lines)
-    shared = {f.name for f in fields(SweepPlan)} & set(PlanFile.model_fields)
-    values: dict[str, Any] = {name: getattr(file, name) for name in shared}
-    return SweepPlan(
-        **values
-        | {
-            "predictions": tuple(
-                Prediction(
-                    joint=p.joint,
-                    quantity=p.quantity,
-                    now=Interval(**p.now.model_dump()),
-                    after=Interval(**p.after.model_dump()),
-                )
-                for p in file.predictions
-            ),
-        }
-    )
+    return SweepPlan(**{name: getattr(file, name) for name in SweepPlan.model_fields})
 
 
 def executable(

@@ -26,7 +26,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.common.results import Result
@@ -96,15 +96,30 @@ class PlannedTrial(Part):
     """What it narrows most, or "structure" if it tells two candidate models apart."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Prediction(Result):
-    """Interval of one quantity of a joint, now and after the planned sweep."""
+class Ends(Part):
+    """A value with its 90 % interval, from an `Interval` or from a file."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    value: Number
+    """The number, in the unit at the end of the quantity's name."""
+    low: Number
+    """Lower end."""
+    high: Number
+    """Upper end."""
+
+
+class Prediction(Part):
+    """Interval of one quantity, now and after the sweep, as the plan's file has it."""
 
     joint: str
+    """Its joint."""
     quantity: str
-    now: Interval
-    after: Interval
-    """`now` and `after`: the value stays; the ends are the expected ones."""
+    """Its name, which ends in the unit."""
+    now: Ends
+    """Interval at present."""
+    after: Ends
+    """Interval to expect: the value stays."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,7 +165,12 @@ def propose(joint: str, servos: Sequence[Servo], setup: Setup, seconds: float) -
     for k, parameter in enumerate(servos[0].hypotheses[0].model.parameters[1:-1], 1):
         expected[parameter.name] = world.interval(0, k, []), world.interval(0, k, chosen)
     predictions = tuple(
-        Prediction(joint=joint, quantity=name, now=now, after=after)
+        Prediction(
+            joint=joint,
+            quantity=name,
+            now=Ends.model_validate(now),
+            after=Ends.model_validate(after),
+        )
         for name, (now, after) in expected.items()
     )
     notes = tuple(_notes(joint, world, choice, chosen))

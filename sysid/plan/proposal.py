@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
-from pupper_sysid.common.results import Result
 from pupper_sysid.servo_models.calibration.calibration import Calibration, InputFile
 from pupper_sysid.servo_models.calibration.parts import Actuator, JointCalibration
-from pupper_sysid.servo_models.calibration.quantity import Quantity
+from pupper_sysid.servo_models.calibration.quantity import Number, Part, Quantity, Whole
 from pupper_sysid.sysid.doctor.checks import each_joint, joint_trials
 from pupper_sysid.sysid.fit.goodness import LEAST_NOISE_RAD
 from pupper_sysid.sysid.fit.joint_fit import fit_joint
@@ -50,27 +51,32 @@ from pupper_sysid.sysid.sweep.excitation import LEAST_MARGIN_RAD, LOOP_PERIOD_S,
 SECONDS = 20.0  # recorded seconds per joint of a plan without a recording to go by
 
 _SPEED_LIMIT_RAD_S = 7.5
+_MOST_TRIALS = 2000
 
 Margins = Mapping[str, float]
 """Largest excursion of each joint to either side of its start pose [rad]."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SweepPlan(Result):
-    """What to record next."""
+class SweepPlan(Part):
+    """What to record next, as the plan's file has it."""
 
-    made_from: tuple[InputFile, ...]
-    """Empty for an unknown servo."""
-    seed: int
-    loop_period_s: float
-    poll_rate_hz: float
-    speed_limit_rad_s: float
-    """`loop_period_s`, `poll_rate_hz` and `speed_limit_rad_s`: what the trials were chosen for."""
-    trials: tuple[PlannedTrial, ...]
-    """One joint after the other."""
-    predictions: tuple[Prediction, ...]
-    """Empty for an unknown servo."""
-    notes: tuple[str, ...]
+    made_from: Annotated[tuple[InputFile, ...], Field(strict=False)] = ()
+    """Recordings or calibration it was made from; empty for an unknown servo."""
+    seed: Whole = 0
+    """Seed of its random numbers."""
+    loop_period_s: Annotated[Number, Field(gt=0, le=1)]
+    """Time between commands [s]."""
+    poll_rate_hz: Annotated[Number, Field(ge=0, le=1e5)]
+    """Polls of a servo per second; 0 where readings are live."""
+    speed_limit_rad_s: Annotated[Number, Field(gt=0, le=1000)]
+    """Speed limit of the servos [rad/s]."""
+    trials: Annotated[
+        tuple[PlannedTrial, ...], Field(strict=False, min_length=1, max_length=_MOST_TRIALS)
+    ]
+    """Trials, in the order of their execution."""
+    predictions: Annotated[tuple[Prediction, ...], Field(strict=False)] = ()
+    """Intervals now and after the sweep; empty for an unknown servo."""
+    notes: Annotated[tuple[str, ...], Field(strict=False)] = ()
     """What no trial within the limits can show."""
 
     @property

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from pupper_sysid.common.errors import InputError
@@ -21,7 +21,7 @@ from pupper_sysid.common.results import Result, derived
 from pupper_sysid.sysid.doctor.checks import joint_trials
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.plan.candidates import trial_seconds
-from pupper_sysid.sysid.plan.planner import DEAD_TIME, LEAST_HALF_WIDTH_S, SHORTEST_S
+from pupper_sysid.sysid.plan.planner import DEAD_TIME, LEAST_HALF_WIDTH_S, SHORTEST_S, Ends
 from pupper_sysid.sysid.plan.proposal import SweepPlan, plan_from_fits, recorded_s
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
@@ -85,7 +85,7 @@ RecordNext = Callable[[SweepPlan, int], Path]
 """Records a plan as the round of this number, from 2, and returns the recording's file."""
 
 
-def half_width(interval: Interval) -> float:
+def half_width(interval: Interval | Ends) -> float:
     """Half of an interval's width."""
     return (interval.high - interval.low) / 2
 
@@ -149,12 +149,11 @@ def record_until(
         if not left:
             ordered = {joint: found[joint] for joint in joints}
             return Outcome(joints=ordered, recordings=tuple(files))
-        planned = replace(
-            next(iter(plans.values())),
-            trials=tuple(t for p in plans.values() for t in p.trials),
-            predictions=tuple(x for p in plans.values() for x in p.predictions),
-            notes=tuple(n for p in plans.values() for n in p.notes),
-        )
+        joined = {
+            name: tuple(entry for p in plans.values() for entry in getattr(p, name))
+            for name in ("trials", "predictions", "notes")
+        }
+        planned = next(iter(plans.values())).model_copy(update=joined)
         files.append(record_next(planned, len(files) + 1))
 
 

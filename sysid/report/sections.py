@@ -75,9 +75,6 @@ def sections(found: Findings) -> list[Section]:
     return [s for s in made if s.text or s.findings or s.figures or s.tables or s.folds]
 
 
-# --------------------------------------------------------------------------------- sections
-
-
 def _summary(results: Mapping[str, JointCalibrationResult]) -> Section:
     return Section(
         "found",

@@ -282,9 +282,6 @@ def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str])
     return Table("doctor", "The recordings' health", columns, rows)
 
 
-# ------------------------------------------------------------------------------ how to show
-
-
 def text(heading: str, key: str) -> Column:
     """Column of words."""
     return Column(heading, lambda row: str(row[key]), "words")

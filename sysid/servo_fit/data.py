@@ -182,9 +182,6 @@ def look_up(track: NDArray[np.floating], tick: NDArray[np.float64]) -> NDArray[n
     )
 
 
-# ------------------------------------------------------------------------------- runs
-
-
 def _joint_runs(
     recordings: Sequence[Recording],
     joint: str,

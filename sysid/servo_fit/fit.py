@@ -400,9 +400,6 @@ def _with_two_groups(data: ServoData, part: windows.Part) -> ServoData:
     return replace(data, runs=runs, groups=tuple(data.groups[g] for g in used))
 
 
-# ------------------------------------------------------------------------------- fitting
-
-
 @dataclass(frozen=True)
 class _Fitted:
     """The model, one per fold, and errors on held-out groups."""

@@ -9,7 +9,8 @@ group, too.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,10 +62,12 @@ def fit_network(
     nested = nested and len(groups) > 2  # a pair of two would leave nothing to learn from
     sets = windows.training_sets(groups, nested and kind != "fir")
     linear, ridge = _best_linear(data, groups, sets, period_s)
+    build = partial(_build, joints, period_s, data, linear)
     choices: dict[str, float] = {"ridge": ridge}
+    filters = {g: build(1 + n, {}) for n, g in enumerate(groups)}
+    linear_fit = NetworkFit(build(0, {}), filters, choices, False)
     if kind == "fir":
-        built = [_build(joints, period_s, data, linear, n, {}) for n in range(len(groups) + 1)]
-        return NetworkFit(built[0], dict(zip(groups, built[1:], strict=True)), choices, False)
+        return linear_fit
 
     recipe = MLP if kind == "mlp" else LSTM
     # groups that choose a model: for the final one all, for a group's own model the others
@@ -105,16 +108,12 @@ def fit_network(
         (lambda done: progress(done, recipe.steps)) if progress else None,
     )  # fmt: skip
     if not checkpoints:  # interrupted before the first comparison: the linear part is the best
-        return NetworkFit(
-            _build(joints, period_s, data, linear, 0, {}),
-            {g: _build(joints, period_s, data, linear, 1 + n, {}) for n, g in enumerate(groups)},
-            choices, True,
-        )  # fmt: skip
+        return replace(linear_fit, interrupted=True)
 
     def kept(purpose: int | None, n: int) -> Learned:
         when, decay = _choose(judged[purpose])
         weights = {k: w[:, n, decay] for k, w in checkpoints[when].items()}
-        return _build(joints, period_s, data, linear, n, weights)
+        return build(n, weights)
 
     when, decay = _choose(judged[None])
     choices |= {"weight_decay": recipe.decays[decay], "steps": steps_done[when]}

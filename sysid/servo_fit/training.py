@@ -461,9 +461,6 @@ class _Adam:
                            value=-rate / whole)  # fmt: skip
 
 
-# ------------------------------------------------------------------------------- networks
-
-
 def _mlp(
     shape, units: int, fade: torch.Tensor, generator: torch.Generator
 ) -> dict[str, torch.Tensor]:

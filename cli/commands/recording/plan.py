@@ -14,6 +14,7 @@ from pupper_sysid.cli.buses import JOINTS_FILE
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import select_joints
+from pupper_sysid.common.results import plain
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S, PLANS_S, RATES_HZ
 
@@ -66,7 +67,7 @@ class Plan:
         if self.out is not None:
             save_plan(made, self.out, self.force)
         if self.json:
-            terminal.print_json(made.to_dict() | {"written": self.out})
+            terminal.print_json(plain(made) | {"written": self.out})
             return
         show(made)
         if self.out is not None:
