@@ -33,14 +33,8 @@ from scipy.special import stdtrit
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.common.results import JointResults, Result, flat, plain
-from pupper_sysid.sysid.doctor.checks import (
-    Joints,
-    Recordings,
-    as_sequence,
-    chosen_joints,
-    joint_rng,
-    recorded_trials,
-)
+from pupper_sysid.sysid.doctor import checks
+from pupper_sysid.sysid.doctor.checks import Joints, Recordings
 from pupper_sysid.sysid.recordings.recording import Trial
 
 if TYPE_CHECKING:
@@ -162,10 +156,10 @@ def backlash(recordings: Recordings, joints: Joints = None, seed: int = 0) -> Ba
     >>> print(found)  # doctest: +SKIP
     bench: hysteresis 1.50° [1.48, 1.51] at P 8, …, backlash 1.92° [1.83, 2.00]
     """
-    given = as_sequence(recordings)
+    given = checks.as_sequence(recordings)
     found = {
-        joint: _measure(joint, recorded_trials(given, joint), joint_rng(seed, joint))
-        for joint in chosen_joints(given, joints)
+        joint: _measure(joint, checks.recorded_trials(given, joint), checks.joint_rng(seed, joint))
+        for joint in checks.chosen_joints(given, joints)
     }
     return Backlash(joints=found)
 

@@ -40,13 +40,8 @@ from pupper_sysid.servo_models.sparse_equation import (
     equation,
     explain,
 )
-from pupper_sysid.sysid.doctor.checks import (
-    Joints,
-    Recordings,
-    each_joint,
-    joint_rng,
-    map_joints,
-)
+from pupper_sysid.sysid.doctor import checks
+from pupper_sysid.sysid.doctor.checks import Joints, Recordings
 from pupper_sysid.sysid.fit.kernel import SPARSE
 from pupper_sysid.sysid.fit.preparation import prepare_joint
 from pupper_sysid.sysid.fit.run import Run, free_run
@@ -170,7 +165,7 @@ def sparse_equations(
     InputError
         If a joint has too little motion.
     """
-    ready = each_joint(partial(prepare_joint, seed=seed), recordings, joints, workers)
+    ready = checks.each_joint(partial(prepare_joint, seed=seed), recordings, joints, workers)
     runs = {joint: r.runs for joint, r in ready.items()}
     noise_rad = {joint: r.noise_rad for joint, r in ready.items()}
     found = fit_equations(runs, noise_rad, seed, workers, progress)
@@ -195,7 +190,7 @@ def fit_equations(
     and its name alone; `progress` is called with its name when it is done.
     """
     tasks = {joint: (data, noise_rad[joint]) for joint, data in runs.items()}
-    return map_joints(partial(_fit_joint, seed=seed), tasks, workers, progress)
+    return checks.map_joints(partial(_fit_joint, seed=seed), tasks, workers, progress)
 
 
 def _fit_joint(
@@ -205,7 +200,7 @@ def _fit_joint(
     noise = noise if isinstance(noise, tuple) else (noise,) * len(runs)
     folds = folds_of(runs)
     pd = structure_called(PREFERRED)
-    pd_fits = _with_folds(Problem(pd, runs, noise), folds, joint_rng(seed, joint))
+    pd_fits = _with_folds(Problem(pd, runs, noise), folds, checks.joint_rng(seed, joint))
     tried: dict[Support, tuple[Candidate, list[Fit]]] = {}
     candidates: list[Candidate] = []
     chosen: Support = ()
@@ -216,7 +211,7 @@ def _fit_joint(
             model = equation_model(support)
             near = [model.encode(np.array(_starts(model, pd.decode(f.point)))) for f in pd_fits]
             problem = Problem(model, runs, noise)
-            fits = _with_folds(problem, folds, joint_rng(seed, joint), near)
+            fits = _with_folds(problem, folds, checks.joint_rng(seed, joint), near)
             scores = _scores(model, fits, folds, runs)
             samples = problem.samples
             bic = 2 * samples * np.log(max(scores.rmse_fresh_rad, 1e-9))

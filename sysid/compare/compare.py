@@ -35,14 +35,8 @@ from pupper_sysid.servo_models.cards.card import CardCalibration
 from pupper_sysid.servo_models.cards.files import card_names
 from pupper_sysid.servo_models.interface import ServoModel
 from pupper_sysid.servo_models.servo_file import load_servo_model
-from pupper_sysid.sysid.doctor.checks import (
-    Joints,
-    Recordings,
-    as_sequence,
-    cautions,
-    chosen_joints,
-    usable_trials,
-)
+from pupper_sysid.sysid.doctor import checks
+from pupper_sysid.sysid.doctor.checks import Joints, Recordings
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit import predict
 from pupper_sysid.sysid.fit.calibrate import CalibrationResult
@@ -226,7 +220,7 @@ def compare(
     InputError
         If a model cannot be read, or is for another rate or other joints.
     """
-    recordings, names = as_sequence(recordings), chosen_joints(recordings, joints)
+    recordings, names = checks.as_sequence(recordings), checks.chosen_joints(recordings, joints)
     models = _each(models)
     calibrations = _calibrations(models)
     for name, calibration in calibrations.items():  # before the work, not after it
@@ -238,9 +232,9 @@ def compare(
                 f"{name} has no joint {', '.join(missing)}; it has "
                 f"{', '.join(calibration.joints)}.{advice}"
             )
-    trials = usable_trials(recordings, names)
+    trials = checks.usable_trials(recordings, names)
     learned = [m for m in models if isinstance(m, ServoFit) or _is_folder(m)]
-    notes = [text for joint in names for text in cautions(joint, trials[joint])]
+    notes = [text for joint in names for text in checks.cautions(joint, trials[joint])]
     polls = {joint: predict.poll_of(recordings, joint, seed, lattices) for joint in names}
     runs = {joint: predict.compared_runs(recordings, joint, polls[joint]) for joint in names}
     source = ", ".join(r.name for r in recordings)

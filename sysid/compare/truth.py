@@ -32,12 +32,8 @@ from pupper_sysid.servo_models.calibration.parts import JointCalibration, Operat
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import at_step
-from pupper_sysid.sysid.doctor.checks import (
-    Recordings,
-    as_sequence,
-    joint_rng,
-    joint_trials,
-)
+from pupper_sysid.sysid.doctor import checks
+from pupper_sysid.sysid.doctor.checks import Recordings
 from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice, readings
 from pupper_sysid.sysid.fit.calibrate import CalibrationResult
 from pupper_sysid.sysid.fit.run import whole_counts
@@ -165,7 +161,7 @@ def truth_table(
         stepped = defined_as(point, true, found.actuator.fitted_step_s)
         definitions.append(f"{joint}: {point}.")
         if recordings is not None and found.lag.lag_s is not None:
-            trials = joint_trials(recordings, joint)
+            trials = checks.joint_trials(recordings, joint)
             moved = true | {"actuator": _at_gain(true, trials[0].p_gain)}
             rows.append(_row(joint, "lag_s", found.lag.lag_s, true_lag_s(trials, moved, seed)))
         for name, (quantity, known) in _pairs(found, stepped, feedback).items():
@@ -197,7 +193,7 @@ def true_lag_s(trials: Sequence[Trial], truth: Mapping[str, Any], seed: int = 0)
     poll, and so on `seed`.
     """
     joint = trials[0].joint
-    rng = joint_rng(seed, joint)
+    rng = checks.joint_rng(seed, joint)
     lattice = find_poll_lattice(trials, rng.spawn(1)[0])
     measured, clean, dense = [], [], []
     for trial in trials:
@@ -297,7 +293,7 @@ def compared_with_truth(
     """`truth_table` with the lag where the recordings are the calibration's own, else a note."""
     seed = calibration.seed or 0
     made_from = {i.sha256 for i in calibration.inputs}
-    if {r.sha256 for r in as_sequence(recordings)} == made_from:
+    if {r.sha256 for r in checks.as_sequence(recordings)} == made_from:
         return truth_table(calibration, truth, recordings, seed, joints)
     table = truth_table(calibration, truth, None, seed, joints)
     names = ", ".join(i.name for i in calibration.inputs) or "no recording"

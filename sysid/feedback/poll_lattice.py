@@ -24,18 +24,8 @@ from scipy.special import betaincinv
 
 from pupper_sysid.common.interval import HALF_WIDTH_SD, LEVEL, Interval
 from pupper_sysid.common.results import Result, derived, internal
-from pupper_sysid.sysid.feedback.poll_search import (
-    BLUR_S,
-    BLURS_S,
-    DRIFT,
-    Phase,
-    Stretch,
-    best_blur,
-    best_periods,
-    contains,
-    refine,
-    shuffled,
-)
+from pupper_sysid.sysid.feedback import poll_search
+from pupper_sysid.sysid.feedback.poll_search import Phase, Stretch
 from pupper_sysid.sysid.feedback.slips import (
     SMALLEST_JUMP,
     Motion,
@@ -89,20 +79,20 @@ def likeliest_periods(
     for period in tried:
         if not 1.02 * loop < period < LONGEST_S:
             continue
-        phases = tuple(refine(s, period, BLUR_S, None) for s in stretches)
+        phases = tuple(poll_search.refine(s, period, poll_search.BLUR_S, None) for s in stretches)
         if more_changes_than_polls(trials, phases, sure):
             continue
         loss = count_loss(trials, phases, sure)[0]
         loss = float(np.clip(loss, 0.02, 0.98)) if np.isfinite(loss) else 0.5
         # a period may not win by the width of its instants
         found[period] = max(
-            sum(evidence(s, period, blur, loss) for s in stretches) for blur in BLURS_S
+            sum(evidence(s, period, blur, loss) for s in stretches) for blur in poll_search.BLURS_S
         )
     if not found:
         return (best,)
     order = sorted(found, key=lambda p: -found[p])
     close = [p for p in order if found[order[0]] - found[p] < _RIVAL]
-    return (order[0], *(p for p in close[1:] if abs(p / order[0] - 1) > 2 * DRIFT))
+    return (order[0], *(p for p in close[1:] if abs(p / order[0] - 1) > 2 * poll_search.DRIFT))
 
 
 def common_period(
@@ -173,7 +163,7 @@ class PollLattice(Result):
     rivals_s: tuple[float, ...] = internal(default=())
     """Periods that explain the readings about as well [s]: reads meet their instants in the same
     rows."""
-    blur_s: float = internal(default=BLUR_S)
+    blur_s: float = internal(default=poll_search.BLUR_S)
     """Full width of the uncertainty of one poll instant."""
     phases: tuple[Phase, ...] = internal(default=())
     """Lattice of each stretch, in time order within a trial."""
@@ -282,14 +272,20 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
         return nothing
 
     # ln T, spaced so that the last poll of a stretch moves by half of the blur
-    grid = np.exp(np.arange(np.log(loop * 1.02), np.log(LONGEST_S), 0.4 * BLUR_S / STRETCH_S))
+    grid = np.exp(
+        np.arange(np.log(loop * 1.02), np.log(LONGEST_S), 0.4 * poll_search.BLUR_S / STRETCH_S)
+    )
     informative = sorted(stretches, key=lambda s: -len(s.begin))[:8]
-    periods = best_periods(informative, grid)
+    periods = poll_search.best_periods(informative, grid)
     score = periods[0][1]
     null: list[float] = []
     z_score = 0.0
     for _ in range(_SHUFFLES):
-        null.append(best_periods([shuffled(s, rng) for s in informative], grid)[0][1])
+        null.append(
+            poll_search.best_periods([poll_search.shuffled(s, rng) for s in informative], grid)[0][
+                1
+            ]
+        )
         if len(null) >= _FEWEST_SHUFFLES:
             z_score = float((score - np.mean(null)) / max(np.std(null, ddof=1), 1e-9))
             if not 0 <= z_score <= _CLEAR:
@@ -298,13 +294,13 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     sure = fast(trials)
     likely = likeliest_periods(trials, informative, [p for p, _ in periods], loop, sure)
     period = likely[0]
-    phases = tuple(refine(s, period, BLUR_S, None) for s in stretches)
+    phases = tuple(poll_search.refine(s, period, poll_search.BLUR_S, None) for s in stretches)
     loss = count_loss(trials, phases, sure)[0]
-    blur, possible = BLUR_S, _possible(loss)
+    blur, possible = poll_search.BLUR_S, _possible(loss)
     if possible is not None:
         # second pass: rows that did not change count, too, and the blur is what fits best
-        blur = best_blur(informative, period, possible)
-        phases = tuple(refine(s, period, blur, possible) for s in stretches)
+        blur = poll_search.best_blur(informative, period, possible)
+        phases = tuple(poll_search.refine(s, period, blur, possible) for s in stretches)
     found = replace(
         nothing, kind="lattice", readings="polled", time_doubt_s=0.0, poll_period_s=period,
         rivals_s=likely[1:], loss=loss, blur_s=blur, phases=phases,
@@ -371,7 +367,7 @@ def _with_segments(
         for n, segment in enumerate(segments):
             part = stretch.between(segment.start_s, segment.stop_s)
             near = segment.phase_s if motion is not None or len(segments) > 1 else None
-            phase = refine(part, lattice.poll_period_s, lattice.blur_s, loss, near)
+            phase = poll_search.refine(part, lattice.poll_period_s, lattice.blur_s, loss, near)
             if n:
                 # from one phase to the next, at the border between the two
                 at, period = segment.start_s, phase.period_s
@@ -389,7 +385,7 @@ def _with_segments(
             parts.append(part)
             phases.append(phase)
             of.append(number)
-    hits = np.concatenate([contains(s, p) for s, p in zip(parts, phases, strict=True)])
+    hits = np.concatenate([poll_search.contains(s, p) for s, p in zip(parts, phases, strict=True)])
     period, error = common_period(parts, phases, of)
     if sure is None and motions is not None:
         sure = moves(trials, motions, noise)
@@ -440,7 +436,7 @@ def readings(trial: Trial, lattice: PollLattice) -> Readings:
         inside = (read[rows] >= phase.start_s) & (read[rows] <= phase.stop_s)
         count = np.round((time - phase.phase_s) / phase.period_s)
         instant = phase.phase_s + count * phase.period_s
-        slack = 0.5 * BLURS_S[-1]
+        slack = 0.5 * poll_search.BLURS_S[-1]
         hit = inside & (instant >= before - slack) & (instant <= read[rows] + slack)
         time = np.where(hit, np.minimum(instant, read[rows]), time)
     if own:

@@ -26,15 +26,8 @@ from pupper_sysid.common.page import WrittenPage, write_page
 from pupper_sysid.servo_models.calibration.calibration import Calibration, is_shipped
 from pupper_sysid.servo_models.calibration.parts import CandidateModel, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
-from pupper_sysid.sysid.doctor.checks import (
-    Joints,
-    Recordings,
-    as_sequence,
-    chosen_joints,
-    joint_rng,
-    joint_trials,
-    usable_trials,
-)
+from pupper_sysid.sysid.doctor import checks
+from pupper_sysid.sysid.doctor.checks import Joints, Recordings
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.fit.calibration_file import preset_parameters
 from pupper_sysid.sysid.fit.joint_fit import score_preset
@@ -106,7 +99,7 @@ def write_report(
     from pupper_sysid.sysid.lag.frequency_response import joint_response
 
     refuse_overwrite(Path(folder) / PAGE, force)  # before the work, not after it
-    recordings, names = as_sequence(recordings), chosen_joints(recordings, joints)
+    recordings, names = checks.as_sequence(recordings), checks.chosen_joints(recordings, joints)
     if calibration is not None:
         if joints in (None, "all"):
             names = [name for name in names if name in calibration.joints] or names
@@ -147,7 +140,7 @@ def write_report(
     examined = examine(recordings, names, seed=seed, lags=lags)
     for joint, result in results.items():
         if result.lag.by_frequency:
-            trials, rng = joint_trials(recordings, joint), joint_rng(seed, joint)
+            trials, rng = checks.joint_trials(recordings, joint), checks.joint_rng(seed, joint)
             responses[joint] = joint_response(joint, trials, rng, result.lag.feedback)
         advance(joint)
     comparison = None
@@ -191,7 +184,7 @@ def recall(
     simulators run. Errors by left-out frequency are not in the file; the error over all of them is.
     """
     found = {}
-    for name, trials in usable_trials(recordings, joints).items():
+    for name, trials in checks.usable_trials(recordings, joints).items():
         found[name] = _joint(name, calibration.joint(name), trials, calibration.seed or 0)
         if progress:
             progress(name)

@@ -37,14 +37,8 @@ from pupper_sysid.servo_models.servo_file import (
 )
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS
 from pupper_sysid.servo_models.step_size import at_step
-from pupper_sysid.sysid.doctor.checks import (
-    Joints,
-    Recordings,
-    as_sequence,
-    cautions,
-    chosen_joints,
-    usable_trials,
-)
+from pupper_sysid.sysid.doctor import checks
+from pupper_sysid.sysid.doctor.checks import Joints, Recordings
 from pupper_sysid.sysid.feedback.poll_lattice import quantum
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.search import Problem, search
@@ -262,7 +256,7 @@ def fit_servo(
     InputError
         If the data cannot support a fit.
     """
-    recordings, joints = as_sequence(recordings), chosen_joints(recordings, joints)
+    recordings, joints = checks.as_sequence(recordings), checks.chosen_joints(recordings, joints)
     if arch not in ARCHITECTURES:
         raise InputError(f"`arch` is {arch}; it must be one of {', '.join(ARCHITECTURES)}.")
     if preset == "paper" and arch not in ("mlp", "lstm"):
@@ -272,10 +266,10 @@ def fit_servo(
             f"`preset='paper'` is for the joints of a Mini Pupper; {other[0]} is none. "
             "Leave it out."
         )
-    trials = usable_trials(recordings, joints)
+    trials = checks.usable_trials(recordings, joints)
     data = servo_data(recordings, joints, readings, seed)
     recorded = ", ".join(data.groups)
-    notes = [text for j in joints for text in cautions(j, trials[j])]
+    notes = [text for j in joints for text in checks.cautions(j, trials[j])]
     whole = split.train or windows.everything
     data, note = windows.grouped(data, whole)
     notes += [note] if note else []
