@@ -285,20 +285,23 @@ def compare(
     made = {
         name: made[name] for name in (*order, *([scores.LINEAR] if scores.LINEAR in made else []))
     }
-    nan, period = float("nan"), float(np.median([r.loop_period_s for r in recordings]))
+    period = float(np.median([r.loop_period_s for r in recordings]))
+    if data is None:
+        data = ServoData(tuple(names), period, {}, (), {}, polls)
+        persistence = {joint: predict.persistence(own) for joint, own in runs.items()}
+        repeatability = dict.fromkeys(names, float("nan"))
+    else:
+        persistence = scores.persistence(data, everything)
+        repeatability = scores.repeatability(data, everything)
     rules = {joint: predict.rule_of(joint, polls[joint], source) for joint in names}
     return Comparison(
         models=made,
         readings=rules,
-        persistence_rmse_rad=scores.persistence(data, everything) if data is not None else {
-            joint: predict.persistence(own) for joint, own in runs.items()
-        },
-        repeatability_rad=scores.repeatability(data, everything) if data is not None else (
-            dict.fromkeys(names, nan)
-        ),
+        persistence_rmse_rad=persistence,
+        repeatability_rad=repeatability,
         time_step_s=period,
         notes=tuple(notes),
-        data=data if data is not None else ServoData(tuple(names), period, {}, (), {}, polls),
+        data=data,
         tracks=tracks,
         bands=bands,
         runs=runs,

@@ -13,11 +13,9 @@ amplitude and load.
 * Any other motion: the time shift of the held command that resembles the
   motion best, through an impulse response fitted to the readings.
 
-The usual estimators stand beside it, for comparison:
-
-* integer cross-correlation, which resolves whole loop periods only;
-* sub-sample cross-correlation, bounded to one period of the tone;
-* sine phase per trial, and the phase slope over all tones, on all rows and on fresh rows.
+The usual `estimators` stand beside it, on all rows and on fresh rows: integer cross-correlation,
+which resolves whole loop periods only; sub-sample cross-correlation, bounded to one period of the
+tone; sine phase per trial, and the phase slope over all tones.
 
 The lag of a motion of any kind is the shift τ at which the correlation of y(t) and c(t - τ) over
 continuous time is largest; y is the joint's motion, c the command as the bus holds it. For one tone
