@@ -28,14 +28,7 @@ from pupper_sysid.policies.deploy.stacks import STACKS
 from pupper_sysid.policies.walks.tracking import ERRORS
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from reproduction.claims import Claim, Finding, NotTestable, Verdict, claim, holds
-from reproduction.evidence import (
-    PolicyEvidence,
-    Training,
-    bounds,
-    of_kind,
-    of_kinds,
-    several,
-)
+from reproduction.evidence import PolicyEvidence, Training, bounds, of_kind, of_kinds, several
 
 Policies = Sequence[PolicyEvidence]
 Trainings = Sequence[Training]

@@ -209,10 +209,7 @@ class LoadedServo(DelayedServo):
         super().__init__(shapes, self._values["dead_time_s"], time_step_s)
 
     def rollout(
-        self,
-        commands: ArrayLike,
-        torque_on: ArrayLike = 1.0,
-        voltage_ratio: ArrayLike = 1.0,
+        self, commands: ArrayLike, torque_on: ArrayLike = 1.0, voltage_ratio: ArrayLike = 1.0
     ) -> NDArray[np.float64]:
         """Positions [rad] after each command, shape (steps, *batch); continues from the state.
 

@@ -23,12 +23,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from pupper_sysid.common.border import (
-    read_bytes,
-    read_json,
-    refuse_other_version,
-    validated,
-)
+from pupper_sysid.common.border import read_bytes, read_json, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import as_path, refuse_overwrite, write_bytes, write_text

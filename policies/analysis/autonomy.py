@@ -237,12 +237,7 @@ def _pusher(at: int, speed: float) -> Disturb:
 
 
 def _shift(
-    plain: Rollout,
-    pushed: Rollout,
-    at: int,
-    window_s: tuple[float, float],
-    robot: int,
-    rate: float,
+    plain: Rollout, pushed: Rollout, at: int, window_s: tuple[float, float], robot: int, rate: float
 ) -> float:
     """Phase of the pushed walk ahead of the plain one [cycles], -0.5 to 0.5."""
     begin, end = (at + round(s / plain.step_s) for s in window_s)

@@ -39,12 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pupper_sysid.common.border import (
-    parse_json,
-    read_yaml,
-    refuse_other_version,
-    validated,
-)
+from pupper_sysid.common.border import parse_json, read_yaml, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import dump, printable
 from pupper_sysid.policies.network.onnx_network import OnnxNetwork

@@ -13,12 +13,7 @@ from pupper_sysid.common.results import Result
 from pupper_sysid.policies.analysis.gait import amplitude, jitter, steady
 from pupper_sysid.policies.analysis.rhythm import frequency, mean_of
 from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.walks.conditions import (
-    Change,
-    Condition,
-    Disturb,
-    evaluation_task,
-)
+from pupper_sysid.policies.walks.conditions import Change, Condition, Disturb, evaluation_task
 from pupper_sysid.policies.walks.rollouts import Rollout, collect
 from pupper_sysid.policies.walks.tracking import pooled_errors
 from pupper_sysid.sim.walking.config import Walking

@@ -53,9 +53,7 @@ def checked_command(command: tuple[float, float, float]) -> NDArray[np.float64]:
 
 
 def script(
-    path: Path,
-    trained: CommandRanges | None = None,
-    say: Callable[[str], None] = lambda text: None,
+    path: Path, trained: CommandRanges | None = None, say: Callable[[str], None] = lambda text: None
 ) -> Commands:
     """Commands of a CSV file with `COLUMNS`, one row after another, then a stop.
 

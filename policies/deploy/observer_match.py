@@ -219,12 +219,7 @@ def _sines(
     return swing[..., None] + np.array([*pose.values()])
 
 
-def _drive(
-    observer: Observer,
-    targets: Array,
-    readings: Array,
-    period_s: float,
-) -> Array:
+def _drive(observer: Observer, targets: Array, readings: Array, period_s: float) -> Array:
     """Positions [rad] at the end of each control period, shape (steps, frequencies, 12)."""
     if abs(observer.period_s - period_s) > 1e-9:
         raise InputError(

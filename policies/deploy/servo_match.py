@@ -12,12 +12,7 @@ from dataclasses import dataclass
 
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import Result
-from pupper_sysid.policies.network.policy_file import (
-    Range,
-    ServoNumbers,
-    TrainedServo,
-    joints_of,
-)
+from pupper_sysid.policies.network.policy_file import Range, ServoNumbers, TrainedServo, joints_of
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
 _NOTHING = Range(low=1.0, value=1.0, high=1.0)

@@ -25,13 +25,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from pupper_sysid.common.results import Result
-from pupper_sysid.policies.evaluation.figures import (
-    Fall,
-    Figures,
-    Recorder,
-    falls_of,
-    figures_of,
-)
+from pupper_sysid.policies.evaluation.figures import Fall, Figures, Recorder, falls_of, figures_of
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.conditions import (
     DIRECTIONS,

@@ -29,12 +29,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 
-from pupper_sysid.common.border import (
-    read_bytes,
-    read_json,
-    refuse_other_version,
-    validated,
-)
+from pupper_sysid.common.border import read_bytes, read_json, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import (

@@ -151,10 +151,7 @@ class LearnedTeacher(Teacher):
     """
 
     def __init__(
-        self,
-        env: WalkingVecEnv,
-        network: MLPModel,
-        state: dict[str, torch.Tensor] | None = None,
+        self, env: WalkingVecEnv, network: MLPModel, state: dict[str, torch.Tensor] | None = None
     ):
         super().__init__(env, state)
         self._network = network.to(env.device)

@@ -232,11 +232,7 @@ class TerminalPPO(PPO):
     """
 
     def process_env_step(
-        self,
-        obs: TensorDict,
-        rewards: torch.Tensor,
-        dones: torch.Tensor,
-        extras: dict[str, Any],
+        self, obs: TensorDict, rewards: torch.Tensor, dones: torch.Tensor, extras: dict[str, Any]
     ) -> None:
         """Record one step; `extras` as `WalkingVecEnv.step` gives them."""
         late = extras["terminal_ids"]

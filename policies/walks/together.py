@@ -32,12 +32,7 @@ from pupper_sysid.policies.walks.conditions import (
     Recorder,
     random_commands,
 )
-from pupper_sysid.policies.walks.handicaps import (
-    impose,
-    missed_ticks,
-    push_directions,
-    see_slope,
-)
+from pupper_sysid.policies.walks.handicaps import impose, missed_ticks, push_directions, see_slope
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import PRESETS, Walking
 from pupper_sysid.sim.walking.draws import Twins, at_rest

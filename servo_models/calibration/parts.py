@@ -468,8 +468,7 @@ class JointCalibration(Part):
         if block is None:
             return OperatingPoint(armature="servo and load")
         return OperatingPoint(
-            p_gain=block.p_gain,
-            armature="servo" if block.known_load else "servo and load",
+            p_gain=block.p_gain, armature="servo" if block.known_load else "servo and load"
         )
 
     def at_p_gain(self, p_gain: float) -> JointCalibration:

@@ -75,12 +75,7 @@ NotNegative = Annotated[Number, Field(ge=0)]
 class Part(BaseModel):
     """Strict, frozen part of a file: no unknown key, no conversion, no NaN, no infinity."""
 
-    model_config = ConfigDict(
-        extra="forbid",
-        strict=True,
-        frozen=True,
-        allow_inf_nan=False,
-    )
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
 _Part = TypeVar("_Part", bound=Part)

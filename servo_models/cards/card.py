@@ -37,12 +37,7 @@ from pupper_sysid.servo_models.calibration.parts import (
     Selection,
     UnderLoad,
 )
-from pupper_sysid.servo_models.calibration.quantity import (
-    NotNegative,
-    Number,
-    Part,
-    Quantity,
-)
+from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number, Part, Quantity
 from pupper_sysid.servo_models.cards.numbers import (
     LOADED_KEYS,
     LoadedLoop,

@@ -30,12 +30,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer
 
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
-from pupper_sysid.servo_models.calibration.quantity import (
-    Part,
-    PlausibleRange,
-    Quantity,
-    unit_of,
-)
+from pupper_sysid.servo_models.calibration.quantity import Part, PlausibleRange, Quantity, unit_of
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 

@@ -21,12 +21,7 @@ from pupper_sysid.sim.export.isaaclab import to_isaaclab, to_isaaclab_bam
 from pupper_sysid.sim.export.mjcf import to_mjcf, to_model
 from pupper_sysid.sim.export.mjlab import to_mjlab
 from pupper_sysid.sim.export.newton import to_newton
-from pupper_sysid.sim.export.shared import (
-    FEEDBACK_KEYS,
-    MUJOCO,
-    TORQUE_KEYS,
-    ExportedServos,
-)
+from pupper_sysid.sim.export.shared import FEEDBACK_KEYS, MUJOCO, TORQUE_KEYS, ExportedServos
 
 SCHEMA = "pupper-actuators"
 SCHEMA_VERSION = 3

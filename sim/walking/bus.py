@@ -20,12 +20,7 @@ from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.imu import ImuSample
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.robot import (
-    SHORTEST_DELAY_S,
-    EmulatedRobot,
-    RobotSpec,
-    draw_robot,
-)
+from pupper_sysid.sim.emulator.robot import SHORTEST_DELAY_S, EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.walking.robot import PHYSICS_STEP_S, WalkingRobot, body_joint_map
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges

@@ -271,11 +271,7 @@ PROGRESS = ("progress", "turn_progress")
 
 
 def weighted(
-    step: Step,
-    rewards: Rewards,
-    penalties: float = 1.0,
-    guides: float = 1.0,
-    progress: float = 1.0,
+    step: Step, rewards: Rewards, penalties: float = 1.0, guides: float = 1.0, progress: float = 1.0
 ) -> dict[str, Array]:
     """Every term that counts, times its weight.
 
