@@ -143,13 +143,7 @@ def gather(
 
 
 def training(folder: Path) -> Training:
-    """The training in a run's folder.
-
-    Raises
-    ------
-    InputError
-        If there is no run, or it began with the imitation of a gait.
-    """
+    """The training in a run's folder, which must not have begun with the imitation of a gait."""
     run = load_run(folder)
     if first := imitated(run):
         raise InputError(

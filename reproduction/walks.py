@@ -166,25 +166,10 @@ def compare_stacks(
 ) -> list[dict[str, Any]]:
     """Walk each robot with each stack.
 
-    Parameters
-    ----------
-    policy : Policy
-    stacks : dict of str to Stack
-    walkers : sequence of Walker
-    commands : sequence of (float, float, float)
-        One after the other, a walk each; a walker's errors are means over them.
-    seconds : float
-        Of each walk.
-    actuator : str
-    progress : callable
-        Called with the name of the next walk.
-
-    Returns
-    -------
-    list of dict
-        `stack`, `falls` (share of walks), `mae_vx_m_s`, `mae_vy_m_s`, `mae_yaw_rad_s` as Interval
-        over walkers, and from the second stack on `less_...`: this stack's error less the first
-        one's, walker by walker.
+    The commands are walked one after the other for `seconds` each, and a walker's errors are means
+    over them. Rows have `stack`, `falls` (share of walks), `mae_vx_m_s`, `mae_vy_m_s`,
+    `mae_yaw_rad_s` as Interval over walkers, and from the second stack on `less_...`: this stack's
+    error less the first one's, walker by walker.
     """
     found: list[dict[str, Any]] = []
     first: np.ndarray | None = None

@@ -45,14 +45,9 @@ from pupper_sysid.common.errors import InputError
 class DelayedServo(ABC):
     """A `ServoModel` that integrates an equation of motion under delayed commands.
 
-    Parameters
-    ----------
-    values : iterable of ndarray
-        All its numbers; their broadcast shape is the batch until `reset` widens it.
-    dead_time_s : ndarray
-        From a command's arrival to its first effect [s].
-    time_step_s : float
-        Time step [s]; commands and positions are at this step.
+    `values` are all its numbers, whose broadcast shape is the batch until `reset` widens it; the
+    dead time [s] is from a command's arrival to its first effect. Commands and positions are at the
+    time step.
     """
 
     def __init__(
@@ -109,12 +104,7 @@ def refuse_time_step(model: str, time_step_s: float) -> None:
 class DelayLine:
     """Commands on their way to the servos of a batch; starts when `reset` is called.
 
-    Parameters
-    ----------
-    delay_s : ndarray
-        Not negative, and finite [s].
-    time_step_s : float
-        Time between commands [s].
+    The delay [s] is not negative, and finite; commands are a time step apart.
 
     Examples
     --------
@@ -263,21 +253,11 @@ def integrate(
 ) -> tuple[NDArray[np.float64], tuple[NDArray, NDArray, NDArray]]:
     """Step the servo through commands that have already been delayed.
 
-    Parameters
-    ----------
-    delayed : ndarray, shape (steps, *batch)
-        Commands as they take effect [rad].
-    state : (position, velocity, setpoint), each of shape batch
-    values : dict
-        Fields of `DelayedPDParameters` but the dead time, each broadcastable to batch.
-    time_step_s : float
-    implicit : bool
-        Brake with the velocity at the step's end, as MuJoCo does, instead of the present one.
-
-    Returns
-    -------
-    positions : ndarray, shape (steps, *batch)
-    state : the state after the last step
+    Commands as they take effect [rad] and positions have the shape (steps, *batch); the state is
+    (position, velocity, setpoint), each of shape batch; values are the fields of
+    `DelayedPDParameters` but the dead time, each broadcastable to batch. `implicit` brakes with the
+    velocity at the step's end, as MuJoCo does, instead of the present one. Gives positions and the
+    state after the last step.
     """
     numbers = _per_step(values, delayed.shape[1:], time_step_s, implicit)
     return _moved(delayed, state, numbers, time_step_s)

@@ -45,13 +45,7 @@ def substeps(time_step_s: float) -> int:
 class AtControlRate:
     """`model`, stepped `count` times per command, each command held for all of them.
 
-    Parameters
-    ----------
-    model : ServoModel
-    count : int
-        Steps of the model per command.
-    offset_rad : array_like
-        Added to its positions [rad]: bias of the readings.
+    `offset_rad`, the bias of the readings, is added to its positions.
     """
 
     def __init__(self, model: ServoModel, count: int, offset_rad: ArrayLike = 0.0):

@@ -108,16 +108,9 @@ class LoadedServoParameters:
         """DelayedPD at one P gain: the same servo without what simulators' actuators lack.
 
         Gravity is the simulator's. The effort limit is the smaller of stall torque and torque
-        limit; the friction does not grow with the load.
-
-        Parameters
-        ----------
-        p_gain : array_like
-            P gain of the position loop, the register's value.
-        load_inertia_kg_m2 : array_like
-            Inertia to add to the armature [kg·m²], where no body of the simulator has it.
-        torque_nm : array_like
-            Torque of motor and load for which the friction holds [N·m].
+        limit; the friction does not grow with the load: it is that for a torque of motor and load
+        of `torque_nm`. `load_inertia_kg_m2` is added to the armature, where no body of the
+        simulator has it.
         """
         own, torque = self.arrays(), np.asarray(torque_nm, float)
         friction = own["friction_loss"] + own["load_friction_quadratic"] * torque**2
@@ -163,14 +156,8 @@ class Load:
 class LoadedServo(DelayedServo):
     """The servo model that is fitted to recordings under load. See the module's text.
 
-    Parameters
-    ----------
-    parameters : LoadedServoParameters
-    p_gain : array_like
-        P gain of the position loop, the register's value.
-    load : Load
-    time_step_s : float
-        Time step [s]; commands and positions are at this step.
+    `p_gain` is that of the position loop, the register's value; commands and positions are at the
+    time step.
 
     Examples
     --------
@@ -213,11 +200,8 @@ class LoadedServo(DelayedServo):
     ) -> NDArray[np.float64]:
         """Positions [rad] after each command, shape (steps, *batch); continues from the state.
 
-        Parameters
-        ----------
-        commands : array_like, shape (steps,) or (steps, *batch)
-        torque_on, voltage_ratio : array_like, shape () or (steps,)
-            Share of each step for which the torque is on; supply voltage over the reference.
+        `torque_on`, one number or one per step, is the share of each step for which the torque is
+        on, `voltage_ratio` the supply voltage over the reference.
         """
         commands = np.asarray(commands, float)
         steps = len(commands)

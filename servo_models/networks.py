@@ -48,16 +48,10 @@ def same_rate(one_s: float, other_s: float) -> bool:
 class JointArrays(ABC):
     """A learned `ServoModel`; see the module's text.
 
-    Parameters
-    ----------
-    joints : sequence of str
-    time_step_s : float
-    parameters : mapping of str to ndarray
-        Each with the joints on its first axis: `command_center`, `command_scale`,
-        `position_center`, `position_scale`, `bound`, `fir_bias`, each (joints,); `fir` (joints,
-        taps), newest command first; and those of the subclass. All but `bound` are finite.
-    feedback : bool
-        Whether the network's last input is the position predicted last.
+    Parameters are arrays with the joints on the first axis: `command_center`, `command_scale`,
+    `position_center`, `position_scale`, `bound`, `fir_bias`, each (joints,); `fir` (joints, taps),
+    newest command first; and those of the subclass. All but `bound` are finite. With `feedback` the
+    network's last input is the position predicted last.
     """
 
     def __init__(
@@ -128,15 +122,8 @@ class JointArrays(ABC):
     ) -> NDArray[np.float32]:
         """Positions after each command, each from the measured position before it (one-step).
 
-        Parameters
-        ----------
-        commands : ndarray, shape (steps, joints)
-        position : ndarray, shape (steps, joints)
-            Measured when each command was given [rad].
-
-        Returns
-        -------
-        ndarray, shape (steps, joints)
+        `position` was measured when each command was given [rad]; all have the shape (steps,
+        joints).
         """
         out = []
         for command, here in zip(commands, position, strict=True):
@@ -207,17 +194,8 @@ Parameters = Mapping[str, NDArray[np.floating]]
 class CommandNetwork(JointArrays):
     """FIR filter and bounded network, per joint. See the module's text.
 
-    Parameters
-    ----------
-    joints : sequence of str
-        Their order is that of the last axis of commands and positions.
-    time_step_s : float
-        Time between commands [s].
-    parameters : mapping of str to ndarray
-        Those of `JointArrays` and, with a network, `weight_0` (joints, inputs, units), `bias_0`
-        (joints, units), `weight_1`, … to one output.
-    feedback : bool
-        Whether the network's last input is the position predicted last.
+    With a network, parameters beyond those of `JointArrays` are `weight_0` (joints, inputs, units),
+    `bias_0` (joints, units), `weight_1`, … to one output.
     """
 
     def _prepare(self) -> None:
@@ -323,19 +301,10 @@ def bounded(value: NDArray, bound: NDArray) -> NDArray:
 class RecurrentNetwork(JointArrays):
     """FIR filter and bounded LSTM, per joint. See the module's text.
 
-    Parameters
-    ----------
-    joints : sequence of str
-    time_step_s : float
-    parameters : mapping of str to ndarray
-        Those of `JointArrays` and, with members m, inputs n and hidden units h:
-        `weight_input` (joints, m, n, 4 h), `weight_hidden` (joints, m, h, 4 h), `bias`
-        (joints, m, 4 h) for the gates i, f, g, o; `weight_out` (joints, m, h), `bias_out`
-        (joints, m).
-    feedback : bool
-        Whether the network's last input is the position predicted last.
-    warm_up : int
-        Steps at rest that fill the memory after a reset.
+    With members m, inputs n and hidden units h, parameters beyond those of `JointArrays` are
+    `weight_input` (joints, m, n, 4 h), `weight_hidden` (joints, m, h, 4 h) and `bias` (joints, m, 4
+    h) for the gates i, f, g, o; `weight_out` (joints, m, h), `bias_out` (joints, m). `warm_up`
+    steps at rest fill the memory after a reset.
     """
 
     def __init__(

@@ -135,18 +135,10 @@ def input_names(parameters: Mapping[str, NDArray], feedback: bool) -> tuple[str,
 def save_servo_model(
     folder: Path, parameters: Mapping[str, NDArray], contract: dict[str, Any], force: bool = False
 ) -> Contract:
-    """Write a model.
+    """Write a model into a folder, which is created if missing.
 
-    Parameters
-    ----------
-    folder : Path
-        Created if missing.
-    parameters : dict of str to ndarray
-        The joints are the first axis, in the contract's order.
-    contract : dict
-        Fields of `Contract` without the weights' hash.
-    force : bool
-        Replace an existing model.
+    The joints are the first axis of the arrays, in the contract's order; `contract` has the fields
+    of `Contract` without the weights' hash.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file; a servo model is a folder. Choose another name.")
@@ -269,13 +261,7 @@ def physical_model(
 ) -> AtControlRate:
     """DelayedPD ("delayed-pd") or sparse equation ("sindy"), one step per command.
 
-    Parameters
-    ----------
-    arch : {"delayed-pd", "sindy"}
-    parameters : mapping of str to ndarray, shape (joints,)
-        As in the model's file.
-    time_step_s : float
-        Time between commands [s].
+    Parameters are as in the model's file, each of shape (joints,).
     """
     values, count = dict(parameters), substeps(time_step_s)
     offset, step = values.pop("offset_rad"), time_step_s / count

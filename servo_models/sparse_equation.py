@@ -140,19 +140,10 @@ def integrate(
 ) -> tuple[NDArray[np.float64], tuple[NDArray, NDArray]]:
     """Step the equation through commands that have already been delayed.
 
-    Parameters
-    ----------
-    delayed : ndarray, shape (steps, *batch)
-        Commands as they take effect [rad].
-    state : (position, velocity), each of shape batch
-    coefficients : mapping of str to ndarray
-        Names of `COEFFICIENTS`, each broadcastable to batch; those left out cost no time.
-    time_step_s : float
-
-    Returns
-    -------
-    positions : ndarray, shape (steps, *batch)
-    state : the state after the last step
+    Commands as they take effect [rad] and positions have the shape (steps, *batch); the state is
+    (position, velocity), each of shape batch. Coefficients have names of `COEFFICIENTS`, each
+    broadcastable to batch; those left out cost no time. Gives positions and the state after the
+    last step.
     """
     h, batch = time_step_s, delayed.shape[1:]
 

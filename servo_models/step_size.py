@@ -76,20 +76,9 @@ def tones_in_steps_of(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lag of servos in such steps behind slow tones, without their dead time.
 
-    Parameters
-    ----------
-    parameters : DelayedPDParameters
-        Numbers, or arrays of shape (servos,).
-    time_step_s : float
-    engine : Engine
-
-    Returns
-    -------
-    lag : ndarray, shape (servos,)
-        Mean over the tones [s].
-    rest : ndarray, shape (servos,)
-        Root mean square of the motion that is no tone, relative to the tone's amplitude; of the
-        worst tone. An unstable servo oscillates between the limits of its torque.
+    The lag is the mean over the tones [s], shape (servos,). Beside it stands the motion that is no
+    tone: its root mean square relative to the tone's amplitude, of the worst tone. An unstable
+    servo oscillates between the limits of its torque.
     """
     count = round(_LENGTH_S / time_step_s)
     edge = time_step_s * np.arange(count + 1)
@@ -129,18 +118,11 @@ def at_step(
     """Numbers with which servos in steps of `time_step_s` move as in those of `fitted_step_s`.
 
     Back-EMF of d over the inertia slows a servo by exp(-h d) in a time h; a step of MuJoCo slows it
-    by 1 / (1 + h d'), one with the torque from before by 1 - h d'. The drive of a step acts over
-    h / (1 + h d') or h instead of (1 - exp(-h d)) / d. Back-EMF and all torques of steps follow
-    from these. The loop's damping does the same only while its torque is not clipped; no number
-    makes up for that in both states, and motions differ least without a change. The dead time is
-    that of `delay_at_step`.
-
-    Parameters and errors as for `delay_at_step`.
-
-    Returns
-    -------
-    DelayedPDParameters
-        Arrays of shape (servos,); no dead time is below 0.
+    by 1 / (1 + h d'), one with the torque from before by 1 - h d'. The drive of a step acts over h
+    / (1 + h d') or h instead of (1 - exp(-h d)) / d. Back-EMF and all torques of steps follow from
+    these. The loop's damping does the same only while its torque is not clipped; no number makes up
+    for that in both states, and motions differ least without a change. The dead time is that of
+    `delay_at_step`, and never below 0. Numbers are arrays of shape (servos,).
     """
     if time_step_s == fitted_step_s and engine == MUJOCO:
         return parameters
@@ -221,22 +203,9 @@ def in_loop(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Motion of servos under a control loop of 50 Hz, whose commands come at steps' beginnings.
 
-    Parameters
-    ----------
-    parameters : DelayedPDParameters
-        Numbers, or arrays that broadcast.
-    time_step_s : float
-    commands : ndarray, shape (n,)
-        [rad].
-    engine : Engine
-        One that limits the speed of set-points.
-
-    Returns
-    -------
-    times : ndarray, shape (steps + 1,)
-        From 0 [s].
-    positions : ndarray, shape (steps + 1, *servos)
-        From rest at the first command [rad].
+    Numbers of the servos are arrays that broadcast; commands have the shape (n,) [rad], and the
+    engine limits the speed of set-points. Gives times from 0 on, shape (steps + 1,), and positions
+    from rest at the first command, shape (steps + 1, *servos).
     """
     values = {name: np.atleast_1d(value) for name, value in parameters.arrays().items()}
     batch = np.broadcast_shapes(*(value.shape for value in values.values()))
@@ -286,27 +255,15 @@ def delay_at_step(
     parameters: DelayedPDParameters,
     time_step_s: float,
     fitted_step_s: float = TIME_STEP_S,
-    engine: Engine = MUJOCO,
 ) -> NDArray[np.float64]:
     """Dead time [s] with which servos in steps of `time_step_s` lag as in `fitted_step_s`.
 
-    Parameters
-    ----------
-    parameters : DelayedPDParameters
-        Numbers, or arrays of shape (servos,); found in steps of `fitted_step_s`.
-    time_step_s, fitted_step_s : float
-    engine : Engine
-        What takes the steps of `time_step_s`.
-
-    Returns
-    -------
-    ndarray, shape (servos,)
-        May be negative, where the step alone is more than the whole lag.
+    Shape (servos,). It may be negative, where the step alone is more than the whole lag.
     """
     delay = np.atleast_1d(parameters.dead_time_s)
-    if time_step_s == fitted_step_s and engine == MUJOCO:
+    if time_step_s == fitted_step_s:
         return delay
-    change = lag_of_steps(parameters, time_step_s, fitted_step_s, engine)
+    change = lag_of_steps(parameters, time_step_s, fitted_step_s)
     if not np.isfinite(change).all():
         raise InputError(_UNSTABLE_STEP.format(1e3 * time_step_s))
     return delay - change
@@ -316,18 +273,12 @@ def lag_of_steps(
     parameters: DelayedPDParameters,
     time_step_s: float,
     fitted_step_s: float = TIME_STEP_S,
-    engine: Engine = MUJOCO,
 ) -> NDArray[np.float64]:
-    """Lag that steps of `time_step_s` have more than those of `fitted_step_s` [s].
+    """Lag that steps of `time_step_s` have more than those of `fitted_step_s` [s], shape (servos,).
 
-    Parameters as for `delay_at_step`.
-
-    Returns
-    -------
-    ndarray, shape (servos,)
-        NaN where the motion in those steps is not the tones': the servo is not stable, or hardly
-        moves at their frequencies.
+    NaN where the motion in those steps is not the tones': the servo is not stable, or hardly moves
+    at their frequencies.
     """
     fitted, usual = tones_in_steps_of(parameters, fitted_step_s)
-    there, rest = tones_in_steps_of(parameters, time_step_s, engine)
+    there, rest = tones_in_steps_of(parameters, time_step_s)
     return np.where(rest - usual < _UNSTABLE, there - fitted, np.nan)

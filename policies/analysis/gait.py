@@ -98,12 +98,8 @@ def steady(rollout: Rollout) -> dict[int, slice]:
 def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
     """Describe the gait in a rollout, from two seconds after its start.
 
-    A robot that fell counts up to half a second before its fall, if enough is left.
-
-    Raises
-    ------
-    InputError
-        If no robot walked for long enough.
+    A robot that fell counts up to half a second before its fall, if enough is left; it is an error
+    if no robot walked for long enough.
     """
     step_s = rollout.step_s
     walked = steady(rollout)
@@ -223,14 +219,8 @@ def fast_share(signal: Signal, step_s: float, frequency_hz: float) -> float:
 def amplitude(signal: Signal) -> tuple[Array, Array]:
     """Half of the range between the 5 % and 95 % quantiles, and standard deviation.
 
-    Of a sine of amplitude A they are 0.988 A and 0.707 A.
-
-    The signal has the shape (steps, …).
-
-    Returns
-    -------
-    half_range : ndarray, shape (…)
-    deviation : ndarray, shape (…)
+    Of a sine of amplitude A they are 0.988 A and 0.707 A. The signal has the shape (steps, …), both
+    results have the shape (…).
     """
     y = np.asarray(signal, float)
     low, high = np.quantile(y, [0.05, 0.95], axis=0)

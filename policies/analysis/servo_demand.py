@@ -155,17 +155,9 @@ def servo_demand(
 ) -> ServoDemand:
     """Let a policy walk and compare what it needs with what a servo has.
 
-    Parameters
-    ----------
-    policy : Policy or ForeignPolicy
-    trial : Trial
-        Its task, servos and command.
-    candidate : ServoRanges
-        The servo in question, for all joints of the task's robot.
-    dead_time_known : bool
-        Whether its dead time is a number rather than missing.
-    extra_dead_times_s : sequence of float
-        Dead times to add to those of the walk [s], beginning with 0.
+    The candidate is the servo in question, for all joints of the trial's robot, and
+    `dead_time_known` whether its dead time is a number rather than missing. The dead times added to
+    those of the walk [s] begin with 0.
     """
     # a gait that drives strong servos into their limits would seem to need more than the servo has
     drawn = replace(trial.task.randomisation, torque_scale=(1.0, 1.0))

@@ -68,20 +68,10 @@ def assemble(
 ) -> Assembly:
     """Make a controller.
 
-    Parameters
-    ----------
-    policy : Policy
-    stack : Stack
-    joint_map : JointMap
-        Of the bus, in joint coordinates.
-    actuator : str
-        Calibration or preset of the robot, for a simulated PD.
-    servo : Path or None
-        A learned servo model's folder.
-    trained : str, optional
-        Calibration or preset with which the policy was trained, if not with `actuator`.
-    body : Body, optional
-        The robot; the Mini Pupper 2 by default.
+    `joint_map` is that of the bus, in joint coordinates; `actuator` the calibration or preset of
+    the robot, for a simulated PD; `servo` the folder of a learned servo model; `trained` the
+    calibration or preset of the training, if it is another. The robot is the Mini Pupper 2 by
+    default.
     """
     contract = policy.contract
     period = stack.period_s(contract)
@@ -203,11 +193,8 @@ class FrozenReadings:
     def __call__(self, tick: Tick) -> None:
         """Take a tick.
 
-        Raises
-        ------
-        SafetyStop
-            If a reading has not changed in the last two seconds, but for noise, in which the model
-            moved.
+        A `SafetyStop` is raised where a reading has not changed, but for noise, in the last two
+        seconds, in which the model moved.
         """
         sent = self._to_servo(tick.sent)
         if not self._ticks:  # after standing still: at rest where it was commanded to be

@@ -62,16 +62,9 @@ class Decision:
 class Controller:
     """A policy with its observer and filters.
 
-    Parameters
-    ----------
-    policy : Policy
-    stack : Stack
-    observer : Observer
-        In servo coordinates, at the loop's period.
-    joint_map : JointMap
-        Of the bus, in joint coordinates: limits, and the linkage of the knees.
-    stall_torque_nm : float
-        Torque at a reported load of 1 [N·m].
+    The observer is in servo coordinates and at the loop's period; `joint_map` is that of the bus,
+    in joint coordinates: limits, and the linkage of the knees; `stall_torque_nm` is the torque at a
+    reported load of 1 [N·m].
     """
 
     def __init__(
@@ -124,13 +117,7 @@ class Controller:
         self._rate = rest.bias_rad_s
 
     def step(self, senses: Senses) -> Decision:
-        """One tick.
-
-        Raises
-        ------
-        SafetyStop
-            If the policy's output is not a number.
-        """
+        """One tick; a `SafetyStop` if the policy's output is not a number."""
         since = self.period_s if self._last_s is None else senses.elapsed_s - self._last_s
         self._last_s = senses.elapsed_s
         answered = np.isfinite(senses.rate).all() and np.isfinite(senses.acceleration).all()

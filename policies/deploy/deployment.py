@@ -103,38 +103,13 @@ def deploy(
 ) -> Outcome:
     """Walk for `seconds`, or until `commands` ends or a fault occurs.
 
-    The bus is parked at the end; closing it is the caller's.
+    The bus, in joint coordinates, is parked at the end; closing it is the caller's. `log` is the
+    CSV file to write (`policies.deploy.walk_log`), `header` more keys for its header; `rows` takes
+    the servos' rows of each tick, as of a recording, and each watcher each tick.
 
-    Parameters
-    ----------
-    bus : GuardedBus
-        In joint coordinates.
-    imu : Imu
-    controller : Controller
-    commands : Commands
-    seconds : float
-    log : Path
-        CSV file to write, see `policies.deploy.walk_log`.
-    header : dict
-        More keys for its header.
-    rows : Rows, optional
-        Takes the servos' rows of each tick, as of a recording.
-    watchers : sequence of callable
-        Each called with each tick.
-    force : bool
-        Replace an existing log.
-
-    Returns
-    -------
-    Outcome
-        Also of a walk that a fault ended; `stop_reason` names it.
-
-    Raises
-    ------
-    BusError
-        If the robot's position cannot be read, or torque not be enabled.
-    InputError
-        If it moves when it should stand still, or the log cannot be written.
+    A walk that a fault ended has an outcome, too: `stop_reason` names the fault. It is an error if
+    the robot's position cannot be read, torque not be enabled, or the log not be written, or if the
+    robot moves when it should stand still.
     """
     outcome = Outcome()
     position = first_pose(bus, controller.period_s)

@@ -67,23 +67,9 @@ def walk_once(
 ) -> tuple[Outcome, WalkScore]:
     """One walk of one emulated robot; its log is discarded.
 
-    Parameters
-    ----------
-    policy : Policy
-    stack : Stack
-    command : (float, float, float)
-        Forward and sideways speed [m/s], turn rate [rad/s].
-    seconds : float
-    seed : int
-        Of the robot.
-    actuator : str
-        Calibration of a simulated PD; see `policies.deploy.assembly.assemble`.
-    servo : Path, optional
-        Servo model's folder.
-    rows : Rows, optional
-        Takes the servos' rows, as of a recording.
-    noise : int
-        Seed of what is not the robot: lost polls, noise, timing.
+    The command is forward and sideways speed [m/s] and turn rate [rad/s]; `seed` is that of the
+    robot, `noise` of all else: lost polls, noise, timing. `actuator` and `servo` are as for
+    `policies.deploy.assembly.assemble`; `rows` takes the servos' rows, as of a recording.
     """
     truth = draw_robot(np.random.default_rng(seed))
     joint_map = load_joint_map("mini_pupper_2")

@@ -166,18 +166,9 @@ def compare(
 ) -> Match:
     """Compare an observer with the actuator a policy was trained with.
 
-    Parameters
-    ----------
-    observer : Observer
-        Its state changes: reset it before use. Its readings are those of `robot`.
-    actuator : DelayedPDParameters
-        Scalars or arrays of 12: the middle of what training drew from.
-    period_s : float
-        Control period of the controller [s].
-    robot : DelayedPDParameters, optional
-        Of the robot; by default that of the training.
-    pose : mapping of str to float
-        Default pose by joint [rad], about which they swing.
+    Its state changes: reset it before use. `actuator` (scalars or arrays of 12) is the middle of
+    what the training drew from; the observer's readings are those of `robot`, by default the same.
+    Joints swing about their default `pose` [rad] at the controller's period [s].
 
     Examples
     --------

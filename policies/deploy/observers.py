@@ -49,15 +49,7 @@ class JointEstimate:
 
 
 class Observer(ABC):
-    """Source of a policy's joint observation; see the module's docstring.
-
-    Parameters
-    ----------
-    period_s : float
-        Control period [s].
-    joints : int
-        Number of joints.
-    """
+    """Source of a policy's joint observation; see the module's docstring."""
 
     name: str
 
@@ -73,12 +65,8 @@ class Observer(ABC):
     def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
         """Estimate the joints at the end of one more control period.
 
-        Parameters
-        ----------
-        target : array_like, shape (..., 12)
-            Command of this period [rad].
-        reading : array_like, shape (..., 12)
-            Reading at its end [rad]; NaN where there is none.
+        `target` is the command of this period, `reading` what was read at its end, NaN where
+        nothing was; both [rad], shape (..., 12).
         """
 
     def _target(self, target: ArrayLike) -> Array:
@@ -92,20 +80,9 @@ class Observer(ABC):
 class SyntheticPD(Observer):
     """A `DelayedPD` per joint, stopped at joint limits, in free run on targets.
 
-    With the parameters of the training, it is the trained actuator in free air.
-
-    Parameters
-    ----------
-    parameters : DelayedPDParameters
-        Scalars or arrays of 12.
-    period_s : float
-        Control period [s].
-    substeps : int, optional
-        Time steps per period; by default those of training, 2 ms each.
-    limits_rad : (array_like, array_like)
-        Lowest and highest position, scalars or arrays of 12 [rad]. A joint that reaches one stops.
-    joints : int
-        Number of joints, where they are not twelve.
+    With the parameters of the training, it is the trained actuator in free air. A period has as
+    many substeps as in training, of 2 ms each, by default; a joint that reaches one of its limits
+    (lowest and highest position, scalars or arrays of 12 [rad]) stops.
     """
 
     name = "synthetic-pd"
@@ -293,24 +270,11 @@ def make_observer(
     servo_model: JointArrays | None,
     joints: int = _JOINTS,
 ) -> Observer:
-    """The observer of a stack.
+    """The observer of a stack, of the kinds of `policies.deploy.stacks.Stack`.
 
-    Parameters
-    ----------
-    kind : str
-        See `policies.deploy.stacks.Stack`.
-    period_s : float
-        Control period [s].
-    velocity_steps : int
-        Of the policy's contract, for `readings`.
-    actuator : DelayedPDParameters
-        Each (12,), for `synthetic-pd`.
-    limits_rad : tuple of ndarray, shape (12,)
-        Limits of the servos' angles, for a simulated servo.
-    servo_model : JointArrays or None
-        For `servo-model`.
-    joints : int
-        Number of joints.
+    Velocities of `readings` are over `velocity_steps` control periods, as the policy's contract
+    says. `actuator` and the limits of the servos' angles, arrays of (12,), are those of a simulated
+    servo; `servo_model` is needed for the kind of that name only.
     """
     if kind == "readings":
         return HeldEncoder(period_s, velocity_steps, joints)

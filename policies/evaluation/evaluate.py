@@ -145,22 +145,9 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a policy, an open-loop trot and standing under random commands and `cases`.
 
-    Parameters
-    ----------
-    policy : Policy or None
-        None stands still.
-    task : Walking
-        Its ground is that of the cases.
-    servos : ServoRanges
-    cases : sequence of Case
-        After `RANDOM`; see `table` and `policies.evaluation.evaluate`.
-    robots : callable
-        Episodes of a case and a walker; see `usual_robots`.
-    seed, threads : int
-    feedback : str
-        Name of the feedback in `servos`, for the result.
-    progress : callable
-        Called with the share of the work that is done.
+    The ground is that of the cases (see `table` and `BATTERY`), not of the task; `robots` gives the
+    episodes of a case and a walker (see `usual_robots`). No policy stands still. `feedback` names
+    that of the servos in the result; `progress` is called with the share of the work that is done.
     """
     plain = evaluation_task(task)
     cases = (RANDOM, *cases)

@@ -41,14 +41,8 @@ class PersistentGaussian(GaussianDistribution):
     """Gaussian of an action, given the noise of the step before.
 
     `correlation` is that of the noise from one step to the next, 0 for white noise; `least_std` is
-    the floor of the standard deviation.
-
-    Attributes
-    ----------
-    centre : Tensor, shape (…, output_dim)
-        Output of the network, m.
-    noise_before : Tensor, shape (…, output_dim)
-        To be set before `update`.
+    the floor of the standard deviation. `centre` is the network's output m, and `noise_before`, of
+    the same shape (…, output_dim), is to be set before `update`.
     """
 
     def __init__(

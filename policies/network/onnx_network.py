@@ -45,13 +45,8 @@ OPERATORS = frozenset(
 class OnnxNetwork:
     """A network that acts for many robots at once, with the interface of `PolicyNetwork`.
 
-    Attributes
-    ----------
-    observation_size, actions : int
-    state_names : tuple of str
-        Parts of the state of a recurrent network.
-    metadata : dict of str to str
-        The file's own properties.
+    `metadata` are the file's own properties, `state_names` the parts of a recurrent network's
+    state.
     """
 
     def __init__(self, path: Path):

@@ -43,19 +43,10 @@ class CausalAttention(nn.Module):
         self.final = nn.LayerNorm(width)
 
     def forward(self, tokens: torch.Tensor, present: torch.Tensor, last: int) -> torch.Tensor:
-        """Latents of the last `last` steps.
+        """Latents of the last `last` steps, shape (batch, last, width).
 
-        Parameters
-        ----------
-        tokens : tensor, shape (batch, steps, size)
-            Normalised observations, oldest first.
-        present : tensor of bool, shape (batch, steps)
-            Which of them belong to the episode.
-        last : int
-
-        Returns
-        -------
-        tensor, shape (batch, last, width)
+        `tokens` are normalised observations, oldest first, shape (batch, steps, size); `present`,
+        shape (batch, steps), says which of them belong to the episode.
         """
         batch, steps, _ = tokens.shape
         x = self.embed(tokens)
@@ -114,18 +105,8 @@ class Normaliser(nn.Module):
 class PolicyNetwork(nn.Module):
     """A policy of one of the kinds of `policies.network.actor_critic`.
 
-    Parameters
-    ----------
-    kind : str
-    observation_size : int
-        Length of the observation, past actions included.
-    hidden : sequence of int
-        Units of the head's layers.
-    memory : int
-        Units of an LSTM or GRU.
-    normalise : bool
-    actions : int
-        Joints with a servo.
+    `observation_size` includes past actions; `hidden` are the units of the head's layers, `memory`
+    those of an LSTM or GRU, `actions` the joints with a servo.
     """
 
     def __init__(
@@ -167,13 +148,7 @@ class PolicyNetwork(nn.Module):
         return tuple(torch.zeros(1, count, self.memory) for _ in self.state_names)
 
     def forward(self, observation: torch.Tensor, *state: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """One step.
-
-        Returns
-        -------
-        action : tensor, shape (n, 12)
-        *state : tensors
-        """
+        """One step: actions, shape (n, 12), and the parts of the next state."""
         if self.kind == "transformer":
             latent, context = step(self.attention, self.obs_normalizer, observation, state[0])
             return self.mlp(latent), context
@@ -189,10 +164,7 @@ class PolicyNetwork(nn.Module):
     def take(self, weights: Mapping[str, torch.Tensor]) -> None:
         """Use the weights of an rsl_rl actor (its `state_dict`).
 
-        Raises
-        ------
-        KeyError, RuntimeError
-            If one is missing, or of another shape.
+        A missing one is a KeyError, one of another shape a RuntimeError.
         """
         self.load_state_dict({name: weights[name] for name in self.state_dict()})
         self.eval()

@@ -266,16 +266,8 @@ def judge_trots(
 ) -> list[GaitScore]:
     """Let trots walk on the same robots under the judge's commands for 4 s.
 
-    Parameters
-    ----------
-    trots : sequence of Trot
-    task : Walking
-        Of the training.
-    servos : ServoRanges
-    seed, threads : int
-    changes : sequence of dict of str to float
-        For each trot, factors on numbers of its robots' servos, by field of
-        `DelayedPDParameters`; none by default.
+    `changes` are, for each trot, factors on numbers of its robots' servos, by field of
+    `DelayedPDParameters`.
     """
     return [_score(one) for one in _judged(trots, task, servos, seed, threads, changes)]
 

@@ -59,14 +59,9 @@ _PER_STEP = 4  # phases of a learned gait that are compared, per control step
 class Teacher(ABC):
     """Shows actions for commands that are corrected by how the policy walks.
 
-    The policy acts in `env`; `state` is that of a teacher before, to go on from.
-
-    Attributes
-    ----------
-    quiet : ndarray of bool, shape (n,)
-        Robots that are to act without noise, whose speeds count.
-    correction : ndarray, shape (3, 6)
-        Coefficients of the correction, in shares of the largest commands.
+    The policy acts in `env`; `state` is that of a teacher before, to go on from. Robots of the mask
+    `quiet`, shape (n,), are to act without noise: their speeds count. `correction`, shape (3, 6),
+    has the coefficients of the correction, in shares of the largest commands.
     """
 
     def __init__(self, env: WalkingVecEnv, state: dict[str, torch.Tensor] | None = None):

@@ -290,12 +290,8 @@ class _Probe:
 class Learner:
     """An environment, a policy, a critic and PPO.
 
-    Attributes
-    ----------
-    exact : bool
-        Whether a loaded checkpoint goes on exactly; see `PupperEnv.restore`.
-    taken_back : bool
-        Whether the last update was undone, because it changed the actions too much.
+    `exact` says whether a loaded checkpoint goes on exactly (`PupperEnv.restore`), `taken_back`
+    whether the last update was undone, because it changed the actions too much.
     """
 
     def __init__(

@@ -64,16 +64,13 @@ class Judge:
     def __call__(self, actor: MLPModel) -> dict[str, float]:
         """Walk for 5 s (at most an episode) with the mean of the policy's actions.
 
-        Returns
-        -------
-        dict of str to float
-            `score`: 1 without errors, 0 for a robot that stands, less with falls. It is 1 minus the
-            errors relative to standing (mean of those at each instant and of those of the mean
-            velocity) minus the share of falls. Beside it `score_falls`, the mean absolute errors
-            `score_vx_m_s`, `score_vy_m_s` and `score_yaw_rad_s`, and `score_turn`, the turn rate
-            over the commanded one where robots are to turn on the spot; of those that are to move,
-            `score_steps_hz`, how often each foot comes down per second, bounces included, and
-            `score_duty`, the share of the time that it is on the ground.
+        The `score` is 1 without errors, 0 for a robot that stands, less with falls: 1 minus the
+        errors relative to standing (mean of those at each instant and of those of the mean
+        velocity) minus the share of falls. Beside it `score_falls`, the mean absolute errors
+        `score_vx_m_s`, `score_vy_m_s` and `score_yaw_rad_s`, and `score_turn`, the turn rate over
+        the commanded one where robots are to turn on the spot; of those that are to move,
+        `score_steps_hz`, how often each foot comes down per second, bounces included, and
+        `score_duty`, the share of the time that it is on the ground.
         """
         env = self._env
         env.restore(self._start)

@@ -138,30 +138,16 @@ def train(
     Ctrl-C, and the end of the run's minutes, end it after the present update, with everything
     saved; a second Ctrl-C ends it at once (KeyboardInterrupt). So does a termination signal if the
     update ends in time; else the process ends within a second. A round of imitation is left at
-    once, and repeated when the run is resumed. The run can be resumed from its last checkpoint,
-    and its last policy can be played.
+    once, and repeated when the run is resumed. The run can be resumed from its last checkpoint, and
+    its last policy can be played.
 
-    Parameters
-    ----------
-    folder : Path
-    run : Run or None
-    watch : callable, optional
-        Called after each update.
-    iterations, minutes : optional
-        New end of a resumed run.
-    notice : callable
-        Called with a sentence where a run does not go on exactly, or its time is short.
-    stopping : callable
-        Called after the first Ctrl-C with what it does.
-    spent_s : float
-        Time that counts towards the minutes of a run that begins [s].
+    `iterations` and `minutes` are a new end of a resumed run; `spent_s` counts towards the minutes
+    of one that begins. `watch` is called after each update, `notice` with a sentence where a run
+    does not go on exactly or its time is short, `stopping` after the first Ctrl-C with what it
+    does.
 
-    Raises
-    ------
-    InputError
-        If the folder is in use, or holds no run to resume.
-    PupperError
-        If a value is no longer finite; the networks before are saved.
+    It is an error if the folder is in use or holds no run to resume, and if a value is no longer
+    finite; the networks before are then saved.
     """
     resumed = run is None
     settings = resume_run(folder, iterations, minutes) if run is None else run

@@ -22,12 +22,8 @@ class WalkingVecEnv:
     """Adapter; `env` is the environment itself.
 
     `action_history` is how many past actions the group `actions` holds, 0 leaves the group out;
-    `device` is torch's name of where the learner wants its tensors.
-
-    Attributes
-    ----------
-    noise : Tensor, shape (n, 12)
-        Of the last action; to be set before `step`. An episode begins with none.
+    `device` is torch's name of where the learner wants its tensors. `noise`, shape (n, 12), is that
+    of the last action, to be set before `step`; an episode begins with none.
     """
 
     def __init__(self, env: PupperEnv, action_history: int = 0, device: str = "cpu"):
@@ -55,14 +51,11 @@ class WalkingVecEnv:
     def step(
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """One control step; see `PupperEnv.step`.
+        """One control step: observations, rewards, dones and extras; see `PupperEnv.step`.
 
-        Returns
-        -------
-        observations, rewards, dones, extras
-            `extras` has `terminal_ids` and `terminal_observations` of the environments whose time
-            was up, `unforeseen_ids` and `unforeseen_observations` (see `StepResult.unforeseen`),
-            `terms`, the reward terms, and `facts`, what happened.
+        `extras` has `terminal_ids` and `terminal_observations` of the environments whose time was
+        up, `unforeseen_ids` and `unforeseen_observations` (see `StepResult.unforeseen`), `terms`,
+        the reward terms, and `facts`, what happened.
         """
         found = self.env.step(actions.detach().cpu().numpy())
         ended = self._past
@@ -103,13 +96,7 @@ class WalkingVecEnv:
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> bool:
-        """Go back to a `state`; whether exactly, see `PupperEnv.restore`.
-
-        Raises
-        ------
-        InputError
-            If it is of another number of environments, or of other ones.
-        """
+        """Go back to a `state`; whether exactly, see `PupperEnv.restore`."""
         own = dict(state)
         past = own.pop("past_actions", self._past)
         noise = own.pop("noise", self.noise.cpu().numpy())

@@ -146,20 +146,9 @@ def play(
 ) -> list[Played]:
     """Let copies of the robot do what was commanded, with each of several actuators.
 
-    Parameters
-    ----------
-    robot : ServoRobot
-    fixed : bool
-        In the air, where one copy per actuator is enough: nothing is drawn.
-    servos : sequence of mapping of str to ndarray, shape (joints,)
-        Of each actuator, by field of `DelayedPDParameters`.
-    given : Sequences
-    data : ServoData
-    copies : int
-        On the ground; each with a friction and a payload of its own, the same for every actuator.
-    seed, threads : int
-    progress : callable
-        Called with the share that is done.
+    In the air (`fixed`) one copy per actuator is enough: nothing is drawn. On the ground each of
+    the `copies` has a friction and a payload of its own, the same for every actuator. Servos are by
+    field of `DelayedPDParameters`, shape (joints,), of each actuator.
     """
     count, rng = 1 if fixed else copies, np.random.default_rng(seed)
     friction = rng.uniform(*Randomisation().friction, count)

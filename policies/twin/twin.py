@@ -145,23 +145,10 @@ def twin(
 ) -> Twin:
     """Give a recording's commands to the whole simulated robot and compare the readings.
 
-    Parameters
-    ----------
-    recording : Recording
-    actuators : mapping of str to Actuator
-        By name; see `actuator_of`.
-    robot : ServoRobot
-        `robot_for` the recording.
-    feedback : mapping of str to Calibration, optional
-        Calibrations of the same bus, by name, whose poll is used where the recording does not show
-        its own and no actuator has one.
-    test_loops : sequence of int
-        Score on these loops alone, with the offsets of the others; by default on all.
-    copies : int
-        Robots on the ground per actuator.
-    seed, threads : int
-    progress : callable
-        Called with the share that is done.
+    Actuators are by name (see `actuator_of`), the robot is that of `robot_for` the recording.
+    `feedback` are calibrations of the same bus, by name, whose poll is used where the recording
+    does not show its own and no actuator has one. With `test_loops` only these loops are scored,
+    with the offsets of the others. `copies` are the robots on the ground per actuator.
     """
     if copies < 1:
         raise InputError(f"{copies} robots; at least 1 is needed.")

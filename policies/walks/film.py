@@ -28,21 +28,12 @@ _TEXT, _EDGE = (30, 34, 40), (255, 255, 255)
 
 
 class Film:
-    """An .mp4 file of one simulated robot.
+    """An .mp4 file of one simulated robot, which runs as fast as the robot.
 
-    Parameters
-    ----------
-    path : Path
-    model : mujoco.MjModel
-        Of `physics="evaluation"`, which has shapes, a light and a floor.
-    step_s : float
-        Time between pictures: the video runs as fast as the robot.
-    lines : sequence of str
-        Said in every picture: policy, servos.
-    command : sequence of float, length 3
-        Forward and sideways speed [m/s], turn rate [rad/s].
-    scale : float
-        Size of the robot over the Mini Pupper's (`sim.robot.body.Body.scale`).
+    The model is one of `physics="evaluation"`, which has shapes, a light and a floor; `step_s` is
+    the time between pictures. Lines (policy, servos) and the command (forward and sideways speed
+    [m/s], turn rate [rad/s]) are written into every picture; `scale` is the size of the robot over
+    the Mini Pupper's (`sim.robot.body.Body.scale`).
     """
 
     def __init__(

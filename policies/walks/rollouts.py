@@ -91,23 +91,9 @@ def collect(
 ) -> list[Rollout]:
     """Walk from a gentle start under every condition, without pushes but those of a condition.
 
-    Robot k of every rollout of one seed has the same servos, start and noise until one falls.
-
-    Parameters
-    ----------
-    policy : Policy
-        Keeps its own state.
-    servos : ServoRanges
-    conditions : sequence of Condition
-        Each with a command.
-    seconds : float
-        Duration; a rollout ends sooner when no robot is up any more.
-    seed, threads : int
-    progress : callable
-        Called with the share of the work that is done.
-    lean : bool
-        Whether to leave out observations and hidden states of altered walks: of 16 robots over
-        10 s, 4 MB or more.
+    Robot k of every rollout of one seed has the same servos, start and noise until one falls. Each
+    condition has a command; a rollout ends sooner when no robot is up any more. Lean rollouts of
+    altered walks lack observations and hidden states: of 16 robots over 10 s, 4 MB or more.
     """
     recorder = partial(_Recorder, lean=lean)
     return walk_together(policy, servos, conditions, seconds, seed, threads, recorder, progress)

@@ -61,35 +61,14 @@ def walk_together(
     recorder: Callable[[PupperEnv, PolicyT | None, Sequence[Condition]], Recorder[T]],
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[T]:
-    """Walk from a gentle start under every condition.
+    """Walk from a gentle start under every condition; what the recorders kept, by condition.
 
-    Parameters
-    ----------
-    policy : Policy, another Actor, or None
-        Keeps its own state; None stands still.
-    servos : ServoRanges
-    conditions : sequence of Condition
-    seconds : float
-        Duration; a walk ends sooner when no robot of the condition is up any more.
-    seed : int
-        Of servos, friction, start, noise and random commands.
-    threads : int
-        Of the physics; 0 for all cores. Results do not depend on it.
-    recorder : callable
-        Makes the recorder of an environment, with its conditions in the order of its robots and
-        its policy, which acts there alone.
-    progress : callable
-        Called with the share of the work that is done, from any thread.
-
-    Returns
-    -------
-    list
-        What the recorders kept, by condition.
-
-    Raises
-    ------
-    InputError
-        If `seconds` is shorter than a step, or an environment cannot be made.
+    The policy keeps its own state; None stands still. A walk ends sooner when no robot of the
+    condition is up any more. The seed is that of servos, friction, start, noise and random
+    commands; results do not depend on `threads` (of the physics; 0 for all cores). `recorder` makes
+    the recorder of an environment, with its conditions in the order of its robots and its policy,
+    which acts there alone; `progress` is called with the share of the work that is done, from any
+    thread.
     """
     _refuse_impossible(conditions, seconds, threads)
     step_s = max(c.task.control_step_s for c in conditions)

@@ -57,18 +57,9 @@ def stride_errors(
     """Mean absolute error of each robot's velocity over its stride, shape (n, 3).
 
     The mean over a stride of velocity minus command, its size then averaged over all strides that
-    begin at some step of the walk.
-
-    Parameters
-    ----------
-    velocity : ndarray, shape (steps, n, 3)
-    command : ndarray, shape (3,) or (steps, n, 3)
-    alive, fell : ndarray of bool, shapes (steps, n) and (n,)
-        See `counted`.
-    stride_s : ndarray, shape (n,)
-        Duration of each robot's stride, used within 0.2 to 1 s; where it is not finite, 0.3 s.
-    step_s : float
-        Control step [s].
+    begin at some step of the walk. Velocity (steps, n, 3), command (3,) or (steps, n, 3), `alive`
+    and `fell` are as `counted` takes them; the stride of each robot, shape (n,), is used within 0.2
+    to 1 s, and is 0.3 s where it is not finite.
     """
     shown, counts = counted(velocity, alive, fell)
     error = counts[..., None] * (shown - command)

@@ -472,13 +472,7 @@ class JointCalibration(Part):
         )
 
     def at_p_gain(self, p_gain: float) -> JointCalibration:
-        """The same servo at another P gain: its stiffness is in proportion.
-
-        Parameters
-        ----------
-        p_gain : float
-            The register's value, > 0.
-        """
+        """The same servo at another P gain, the register's value, with stiffness in proportion."""
         if self.under_load is None:
             raise InputError(
                 "This calibration holds at the P gain that it was recorded with. Record several "

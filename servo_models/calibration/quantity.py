@@ -122,14 +122,8 @@ class Quantity(Part):
 class PlausibleRange:
     """Values that a quantity can plausibly have; beyond them the unit is wrong.
 
-    Attributes
-    ----------
-    low, high : float
-        Smallest and largest value, in the quantity's unit.
-    looks_like : str
-        Probable unit of a larger number, for example "milliseconds".
-    factor : float
-        From that unit to the quantity's; 0 if unknown.
+    Low and high are in the quantity's unit; `looks_like` is the probable unit of a larger number,
+    such as "milliseconds", and `factor` leads from that to the quantity's, 0 if unknown.
     """
 
     low: float
@@ -178,15 +172,7 @@ def quantity_of(
     """A measured interval as a quantity; its ends are never inside of its value.
 
     A value that is not finite becomes 0 and is not identified; an end that is not finite is left
-    out.
-
-    Parameters
-    ----------
-    interval : Interval
-    known : {"yes", "ratio only"}
-        What the data identified, unless there is a reason why not.
-    why : str, optional
-        That reason; with "ratio only" one is given if there is none.
+    out. `known` is what the data identified, unless there is a reason `why` not.
 
     Examples
     --------
@@ -212,13 +198,7 @@ def measured(kind: type[_Part], **entries: Any) -> _Part:
     """A part of a calibration with numbers of a fit, each cut to its plausible range.
 
     A file with other numbers is refused; a fit that ends there is a finding: the quantity is not
-    identified, and says so.
-
-    Parameters
-    ----------
-    kind : type
-    **entries : Any
-        The part's fields, some of them a `Quantity`.
+    identified, and says so. Entries are the part's fields, some of them a `Quantity`.
     """
     for name, entry in entries.items():
         if not isinstance(entry, Quantity):

@@ -158,14 +158,9 @@ class ServoCard(Part):
         return self.specimens[self.default]
 
     def pd(self, joint: str | None = None, p_gain: float | None = None) -> TorquePD:
-        """The servo as a PD in torque.
+        """The servo as a PD in torque, perhaps at another P gain than the card's.
 
-        Parameters
-        ----------
-        joint : str, optional
-            A specimen's name; that of any other joint means the default's.
-        p_gain : float, optional
-            Another P gain than the card's.
+        A joint with the name of a specimen is that; any other means the default.
         """
         numbers = self.specimens.get(joint or self.default, self.numbers)
         if not isinstance(numbers, TorquePD):
@@ -181,19 +176,10 @@ class ServoCard(Part):
         return numbers
 
     def loaded(self, joint: str | None = None) -> tuple[LoadedServoParameters, float]:
-        """The servo as a position loop with motor and friction, and its P gain.
+        """The servo as a position loop with motor and friction, for `LoadedServo`, and its P gain.
 
-        Parameters
-        ----------
-        joint : str, optional
-            A specimen's name; that of any other joint means the default's.
-
-        Returns
-        -------
-        parameters : LoadedServoParameters
-            For `servo_models.loaded_servo.LoadedServo`, which adds a load.
-        p_gain : float
-            P gain at which they are the card's; 1 where the card states torques without one.
+        Joints are as for `pd`. The gain is that at which the numbers are the card's; 1 where the
+        card states torques without one.
         """
         numbers = self.specimens.get(joint or self.default, self.numbers)
         gain = self.gains.p

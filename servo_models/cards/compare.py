@@ -120,14 +120,8 @@ class Comparison(Result):
 def servo_of(path_or_name: str, part: str | None = None, p_gain: float | None = None) -> Servo:
     """One servo of a card, a calibration file, a preset or a parameter file of BAM.
 
-    Parameters
-    ----------
-    path_or_name : str
-    part : str, optional
-        Joint of a calibration or specimen of a card; by default the first of the one, the default
-        of the other.
-    p_gain : float, optional
-        Another P gain than the numbers' own.
+    `part` is a joint of a calibration or specimen of a card; by default the first of the one, the
+    default of the other. `p_gain` is another P gain than the numbers' own.
     """
     name = Path(path_or_name).name
     if is_card(path_or_name):
@@ -166,21 +160,11 @@ def compared(
     p_gain: float | None = None,
     read: Callable[[str, str | None, float | None], Servo] = servo_of,
 ) -> Comparison:
-    """Two servos at equal P gain, number by number.
+    """Two servos at equal P gain, number by number, read by name or file with `read`.
 
     The gain is `p_gain`; else that of a servo whose numbers hold at no other; else the first's own.
     Where one does not state its gain, or two fixed ones differ, each stays as it is, and numbers
     that depend on the gain are not compared.
-
-    Parameters
-    ----------
-    first, second : str
-        As for `servo_of`.
-    part : str, optional
-        As for `servo_of`, of both.
-    p_gain : float, optional
-    read : callable
-        Reads a servo from its name or file; by default `servo_of`.
     """
     names, notes = (first, second), []
     servos = [read(name, part, None) for name in names]

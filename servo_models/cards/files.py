@@ -195,14 +195,7 @@ def from_bam(
 
 
 def to_bam(card: ServoCard, specimen: str | None = None) -> dict[str, Any]:
-    """Content of a BAM parameter file with a card's numbers.
-
-    Parameters
-    ----------
-    card : ServoCard
-    specimen : str, optional
-        Which of its numbers; by default the card's default.
-    """
+    """Content of a BAM parameter file with a card's numbers; by default the default specimen's."""
     numbers = card.specimens.get(specimen or card.default)
     if numbers is None:
         raise InputError(f"{card.name} has no specimen {specimen}: {', '.join(card.specimens)}.")
@@ -292,13 +285,8 @@ def motor_of(servo: UnderLoad) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Motor and friction of a servo fitted under load, by the names of Isaac Lab's `BamMotorCfg`.
 
     BAM's friction at standstill decays as exp(-(v / v0)^a), ours as 1 / (1 + (v / v1)^2); v0 is
-    such that half of it is left at the same speed.
-
-    Returns
-    -------
-    motor : dict
-    lost : tuple of str
-        What BAM's models do not have, in words.
+    such that half of it is left at the same speed. The second value is what BAM's models do not
+    have, in words.
     """
     value = {
         key: quantity.value if (quantity := getattr(servo, key)) is not None else 0.0
@@ -413,14 +401,7 @@ def is_card(path: Path | str) -> bool:
 def load_card(path_or_name: Path | str) -> ServoCard:
     """Read a servo card from a file, a shipped one by its name, or a parameter file of BAM.
 
-    Parameters
-    ----------
-    path_or_name : Path or str
-        A YAML file, one of `card_names()`, or a JSON file that BAM's `fit` wrote (`cards.bam`).
-
-    Returns
-    -------
-    ServoCard
+    It is a YAML file, one of `card_names()`, or a JSON file that BAM's `fit` wrote.
 
     Examples
     --------

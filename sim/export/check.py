@@ -80,15 +80,7 @@ class JointCheck(Result):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Check(JointResults[JointCheck]):
-    """How far an export is from its calibration.
-
-    Attributes
-    ----------
-    joints : dict of str to JointCheck
-    physics_step_s : float
-    notes : tuple of str
-        What the numbers mean, in sentences.
-    """
+    """How far an export is from its calibration; `notes` say what the numbers mean."""
 
     physics_step_s: float
     notes: tuple[str, ...]

@@ -139,31 +139,13 @@ def to_model(
     link_inertia: Mapping[str, float] | None = None,
     sha256: str | None = None,
 ) -> tuple[str, ExportedServos]:
-    """A user's MJCF with these servos, in one file.
+    """A user's MJCF with these servos, in one file, and what it holds of them.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Of joints that the model has; a servo card is of all hinges that the model drives.
-    model : Path
-        Includes are resolved; assets stay where they are.
-    out : Path
-        Where the text will be written: paths to assets are relative to it.
-    physics_step_s : float, optional
-        By default the model's own.
-    gain : float, optional
-        As of `ExportedServos.of`.
-    link_inertia : dict of str to float, optional
-        The same; by default what the model's bodies put on the joint in its reference pose, of
-        armatures that hold it.
-    sha256 : str, optional
-        As of `ExportedServos.of`.
-
-    Returns
-    -------
-    text : str
-    servos : ExportedServos
-        What it holds.
+    The calibration is of joints that the model has; a servo card is of all hinges that the model
+    drives. Includes of the model are resolved; its assets stay where they are, and paths to them
+    are relative to `out`, where the text will be written. The physics step is the model's own by
+    default; so are the links' inertias: what its bodies put on the joint in its reference pose, of
+    armatures that hold it. Other parameters are those of `ExportedServos.of`.
     """
     from pupper_sysid.sim.robot.engine import mujoco
 

@@ -83,17 +83,10 @@ class ExportedServos:
     ) -> ExportedServos:
         """The servos of a calibration, ready to be written.
 
-        Parameters
-        ----------
-        calibration : Calibration
-        physics_step_s : float
-        gain : float, optional
-            P gain, the register's value; by default that of the calibration, which is the servo's
-            own when it was recorded.
-        link_inertia : dict of str to float, optional
-            By joint, the inertia of link and load to take off the armature [kg·m²].
-        sha256 : str, optional
-            Of the calibration's file; by default of the text that it would be saved as.
+        `gain` is a P gain, the register's value; by default that of the calibration, which is the
+        servo's own when it was recorded. `link_inertia` is, by joint, the inertia of link and load
+        to take off the armature [kg·m²]. `sha256` is that of the calibration's file; by default of
+        the text that it would be saved as.
         """
         if not 0 < physics_step_s <= _LONGEST_STEP_S:
             raise InputError(
@@ -397,19 +390,8 @@ def torch_module(
 ) -> str:
     """A Python module: what it is, its numbers, the classes that apply them, the target's own part.
 
-    Parameters
-    ----------
-    servos : ExportedServos
-    engine : Engine
-        What integrates the servos.
-    target : str
-        Name of the simulator.
-    notes : sequence of str
-        What the target carries and does not, in sentences.
-    imports : str
-        Lines that import its names.
-    actuators : str
-        Code that stands behind the numbers and the classes.
+    `notes` say in sentences what the target carries and does not, `imports` are the lines that
+    import its names, and `actuators` is code that stands behind the numbers and the classes.
     """
     # read, not imported: that would load torch
     code = (resources.files("pupper_sysid.sim.export") / "torch_servos.py").read_text()

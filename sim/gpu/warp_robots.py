@@ -31,20 +31,9 @@ _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_inv
 
 
 class WarpRobots(RobotBatch):
-    """Robots on one piece of ground, stepped by mujoco-warp.
+    """Robots on one piece of ground, stepped by mujoco-warp; see `RobotBatch`.
 
-    Parameters
-    ----------
-    config : Walking
-    servos : ServoRanges
-    ground : Ground
-    environments : int
-    device : str
-        Warp's name: `cuda`, `cuda:1`, or `cpu` to try it.
-    servo_model : JointArrays, optional
-    extra_dead_time_s : float or ndarray, shape (n,)
-    extra_jitter_s : ndarray, shape (n,), optional
-        As `RobotBatch`.
+    `device` has Warp's name: `cuda`, `cuda:1`, or `cpu` to try it.
     """
 
     def __init__(

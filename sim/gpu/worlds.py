@@ -102,16 +102,8 @@ def device_of(name: str) -> Any:
 class Worlds:
     """State and model of many robots on a device.
 
-    Parameters
-    ----------
-    model : mujoco.MjModel
-        With `<pid>` servos.
-    fields : mapping of str to ndarray, shape (n, …)
-        Model fields that differ between worlds.
-    worlds, substeps : int
-        How many robots, and physics steps in a call of `advance`.
-    device : str
-        Warp's name of it.
+    The model has `<pid>` servos; `fields` are those of the model that differ between worlds, shape
+    (n, …). A call of `advance` takes `substeps` physics steps.
     """
 
     def __init__(
@@ -167,13 +159,9 @@ class Worlds:
         """Let all worlds take the physics steps of one control step.
 
         Positions and speeds are (n, 19) and (n, 18), commands set-points [rad], held, (n,
-        actuators), or of each physics step, (n, substeps, actuators).
-
-        Returns
-        -------
-        dict of str to ndarray
-            `qpos`, `actuator_force` and `sensordata` of each physics step, (n, substeps, …);
-            `qvel`, `act` and `site_xpos` at its end.
+        actuators), or of each physics step, (n, substeps, actuators). Gives `qpos`,
+        `actuator_force` and `sensordata` of each physics step, (n, substeps, …); `qvel`, `act` and
+        `site_xpos` at its end.
         """
         data = self._data
         held = commands if commands.ndim == 3 else commands[:, None]

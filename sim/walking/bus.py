@@ -29,21 +29,12 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 def calibrated_robot(
     servos: ServoRanges, rng: np.random.Generator, body: Body | None = None
 ) -> EmulatedRobot:
-    """An emulated robot with the servos of a calibration.
+    """An emulated robot with the servos of a calibration or preset.
 
     Its servos have the calibration's values and lag; the shortest dead time that can be emulated is
     2 ms. The bus polls all of them with the median of their periods and losses. Counts, offsets of
-    the readings and the host's timing are those of `draw_robot`.
-
-    Parameters
-    ----------
-    servos : ServoRanges
-        Of a calibration or preset; a learned model has no such numbers.
-    rng : numpy.random.Generator
-        Draws offsets and phases.
-    body : Body, optional
-        The robot, of which the servos are; the Mini Pupper 2 by default. Others read as fine as the
-        calibration's servos.
+    the readings and the host's timing are those of `draw_robot`; another robot than the Mini Pupper
+    2 reads as fine as the calibration's servos.
     """
     feedback = servos.feedback
     spec = RobotSpec(
@@ -71,21 +62,8 @@ def calibrated_robot(
 class WalkingBus:
     """A `hardware.bus.ServoBus` with an IMU (`hardware.imu.Imu`) of an emulated robot that walks.
 
-    Parameters
-    ----------
-    truth : EmulatedRobot
-        Its servos and their feedback.
-    rng : numpy.random.Generator
-        Decides lost polls, noise and timing.
-    real_time : bool
-        Use the host's clock instead of virtual time.
-    body : Body, optional
-        The robot; the Mini Pupper 2 by default.
-
-    Attributes
-    ----------
-    robot : WalkingRobot
-        The robot behind the bus.
+    `truth` are its servos and their feedback; `rng` decides lost polls, noise and timing. Time is
+    virtual, or the host's. `robot` is the robot behind the bus.
     """
 
     name = "emulated"
@@ -117,25 +95,13 @@ class WalkingBus:
         self._bus.sleep_until(time_s)
 
     def write(self, position_rad: NDArray[np.float64]) -> Sent:
-        """Send commands of the joints [rad], shape (12,).
-
-        Raises
-        ------
-        BusError
-            If the bus is closed or a command is not a number.
-        """
+        """Send commands of the joints [rad], shape (12,)."""
         goal = finite_angles(position_rad, len(self.joint_names), self.name)
         sent = self._bus.write(self._servo_map.to_angles(self._map.to_counts(goal)))
         return Sent(sent.time_s, goal)
 
     def read(self) -> BusSample:
-        """Read all joints once: the values of the last successful poll of each servo.
-
-        Raises
-        ------
-        BusError
-            If the bus is closed.
-        """
+        """Read all joints once: the values of the last successful poll of each servo."""
         sample = self._bus.read()
         joints = self._map.to_angles(self._servo_map.to_counts(sample.position_rad))
         return replace(sample, position_rad=joints)

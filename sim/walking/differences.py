@@ -125,18 +125,10 @@ TYPICAL = Differences(
 class Bodies:
     """What was drawn for the bodies of n robots.
 
-    Attributes
-    ----------
-    zero_rad : ndarray, shape (n, 12)
-        True servo angle where a servo reports 0.
-    centre_m : ndarray, shape (n, 3)
-        Shift of the trunk's centre of mass.
-    jitter, poll : ndarray, shape (n,)
-        Factors on the commands' jitter and on the period of the readings.
-    effort : ndarray, shape (n,)
-        1 with effort readings, 0 without.
-    as_calibrated : ndarray of bool, shape (n,)
-        Robots without differences.
+    `zero_rad`, shape (n, 12), is the true servo angle where a servo reports 0; `centre_m`, shape
+    (n, 3), the shift of the trunk's centre of mass; `jitter` and `poll`, shape (n,), factors on the
+    commands' jitter and on the period of the readings; `effort` 1 with effort readings, 0 without.
+    The mask `as_calibrated` has the robots without differences.
     """
 
     def __init__(self, settings: Differences, robots: int, body: Body):

@@ -113,20 +113,15 @@ def privileged_of(
 ) -> NDArray[np.float32]:
     """What a critic in the simulator may know of n robots, shape (n, 106).
 
-    Parameters
-    ----------
-    parts : sequence of ndarray, each of shape (n, k)
-        Velocity of the trunk in its own frame [m/s], joint angles from the default pose [rad] and
-        velocities [rad/s], height above the ground [m], times of each foot in the air and on the
-        ground [s], friction, dead times [s], added mass [kg], shift of the centre of mass [m],
-        strength of the legs and of the battery relative to the model, errors of the joints' zeros
-        [rad], rotation of the IMU [rad], errors of its rates [rad/s], its latency and period [s],
-        factors on the readings' periods and on the commands' jitter with whether efforts are read,
-        rates [rad/s] and direction of gravity as they are, speeds over about a stride [m/s, rad/s],
-        the action before the last, clock of a trot (see `Strides`), share of the episode that is
-        left: the parts of `PRIVILEGED`.
-    out : ndarray of float32, shape (n, 106), optional
-        Where to write it.
+    Parts are those of `PRIVILEGED`, each of shape (n, k): velocity of the trunk in its own frame
+    [m/s], joint angles from the default pose [rad] and velocities [rad/s], height above the ground
+    [m], times of each foot in the air and on the ground [s], friction, dead times [s], added mass
+    [kg], shift of the centre of mass [m], strength of the legs and of the battery relative to the
+    model, errors of the joints' zeros [rad], rotation of the IMU [rad], errors of its rates
+    [rad/s], its latency and period [s], factors on the readings' periods and on the commands'
+    jitter with whether efforts are read, rates [rad/s] and direction of gravity as they are, speeds
+    over about a stride [m/s, rad/s], the action before the last, clock of a trot (see `Strides`),
+    share of the episode that is left. They are written to `out`, where it is given.
     """
     velocity, angle, speed, height, air, stance, friction, dead_time, *differs = parts
     mass, centre, legs, battery, zero, turn, bias, age, factors, *more = differs

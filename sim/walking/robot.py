@@ -70,16 +70,8 @@ class Trunk:
 class WalkingRobot:
     """A robot that walks: a `ServoPlant`, for any number of threads.
 
-    Parameters
-    ----------
-    robot : EmulatedRobot
-        Its servos; every dead time at least two physics steps.
-    rng : numpy.random.Generator
-        The IMU's noise.
-    time_step_s : float
-        Physics step [s].
-    body : Body, optional
-        The Mini Pupper 2 by default; the servos are in the order of its joints.
+    Every dead time of its servos is at least two physics steps; `rng` draws the IMU's noise. `body`
+    is the Mini Pupper 2 by default; the servos are in the order of its joints.
     """
 
     def __init__(

@@ -35,27 +35,12 @@ _JITTER_S, _DRIFT = RobotSpec.poll_jitter_s, RobotSpec.poll_drift
 class HeldReadings:
     """Readings of all servos of `environments` robots.
 
-    Parameters
-    ----------
-    feedback : sequence of HeldFeedback
-        Of each servo.
-    environments : int
-    physics_step_s : float
-        Time between the positions that `advance` is given [s].
-    rng : numpy.random.Generator
-    linked : sequence of int
-        Servos that turn their joint and the one before it, so that they read the sum of both.
-    shortest_period : float
-        Least factor on a robot's periods that `reset` is given.
+    `advance` is given positions that are `physics_step_s` apart. Servos that are `linked` turn
+    their joint and the one before it, so that they read the sum of both. `shortest_period` is the
+    least factor on a robot's periods that `reset` is given.
 
-    Attributes
-    ----------
-    position, load : ndarray, shape (environments, servos)
-        Readings: angle [rad] and torque [N·m] at the last successful poll.
-    age_s : ndarray, shape (environments, servos)
-        Age of the readings [s].
-    rng : numpy.random.Generator
-        Draws phases, drift, jitter and lost polls.
+    `position` and `load`, shape (environments, servos): angle [rad] and torque [N·m] at the last
+    successful poll, `age_s` the age of that. `rng` draws phases, drift, jitter and lost polls.
     """
 
     def __init__(
@@ -135,17 +120,10 @@ class HeldReadings:
     ) -> None:
         """Let one control step pass for the robots `rows`, n of them.
 
-        Parameters
-        ----------
-        start : ndarray, shape (n, servos)
-            Joint angles [rad] before.
-        position : ndarray, shape (n, physics steps, servos or more)
-            After each physics step; the last columns are the joint angles. C-contiguous, as `load`.
-        load : ndarray, shape (n, physics steps, servos)
-            Servo torque [N·m] in each physics step.
-        chances : ndarray, shape (environments, rounds, 2, servos)
-            See `chances`.
-        rows : slice
+        `start` are the joint angles before [rad], shape (n, servos); `position` those after each
+        physics step, the last columns of (n, physics steps, servos or more); `load` the servo
+        torque in each physics step [N·m], shape (n, physics steps, servos), both C-contiguous;
+        `chances` as drawn by the method of that name.
         """
         count, steps, width = position.shape
         span, servos = steps * self._step, len(self._period)
@@ -207,12 +185,8 @@ def _between(
 class Imu:
     """Rates and direction of gravity as n robots measure them.
 
-    Attributes
-    ----------
-    mounting_rad, bias_rad_s : ndarray, shape (n, 3)
-        Rotation vector of the IMU, constant error of its rates.
-    latency_s, period_s : ndarray, shape (n,)
-        Age of the newest sample, time between samples.
+    `mounting_rad` and `bias_rad_s`, shape (n, 3): rotation vector of the IMU, constant error of its
+    rates; `latency_s` and `period_s`, shape (n,): age of the newest sample, time between samples.
     """
 
     def __init__(self, settings: Differences, robots: int, span_s: float):
@@ -292,26 +266,10 @@ Rows = slice | NDArray[np.intp]
 
 
 class Senses:
-    """Readings and IMU of n robots.
+    """Readings and IMU of n robots, whose joints and trunks are measured.
 
-    Parameters
-    ----------
-    config : Walking
-    servos : ServoRanges
-    robots : RobotBatch
-        Whose joints and trunks are measured.
-    environments : int
-        How many robots, n.
-    rng : numpy.random.Generator
-        Of the readings.
-
-    Attributes
-    ----------
-    readings : HeldReadings
-        Of the servos.
-    imu : Imu
-    kept : ndarray, shape (VELOCITY_STEPS + 1, n, 12)
-        Joint angles [rad] as read at the last control steps, in turn.
+    `rng` is that of the readings. `kept`, shape (VELOCITY_STEPS + 1, n, 12), has the joint angles
+    [rad] as read at the last control steps, in turn.
     """
 
     def __init__(

@@ -84,13 +84,7 @@ class ServoRanges:
         return replace(self, **moved)
 
     def in_steps_of(self, time_step_s: float) -> ServoRanges:
-        """The same servos for a simulation in other steps, with the lag that was measured.
-
-        Raises
-        ------
-        InputError
-            If a servo is not stable in such steps.
-        """
+        """The same servos for a simulation in other steps, with the lag that was measured."""
         middle = DelayedPDParameters(**self.value)
         return self.later(delay_at_step(middle, time_step_s) - self.value["dead_time_s"])
 
@@ -125,16 +119,10 @@ def servo_ranges(
 ) -> ServoRanges:
     """Ranges of the servos of an actuator, and its feedback or another.
 
-    Parameters
-    ----------
-    actuator : str or Path
-        A calibration file, a preset, or `ideal`: no delay, no friction, no limits. The folder of a
-        learned servo model gives the same: that model predicts the position itself.
-    feedback : str or Path
-        `held`: the calibration's own; `ideal`: every reading fresh and exact; or another
-        calibration, whose feedback is taken.
-    body : Body, optional
-        The robot; the Mini Pupper 2 by default.
+    An actuator is a calibration file, a preset, or `ideal`: no delay, no friction, no limits. The
+    folder of a learned servo model gives the same: that model predicts the position itself.
+    Feedback is `held`: the calibration's own; `ideal`: every reading fresh and exact; or another
+    calibration, whose feedback is taken. The robot is the Mini Pupper 2 by default.
     """
     joints = JOINT_NAMES if body is None else body.joints
     servo_of = {} if body is None else body.servo_of

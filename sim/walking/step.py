@@ -151,18 +151,10 @@ def empty_facts(
 def unforeseen_of(
     now: Unfinished, command: Array, done: NDArray[np.bool_], base_velocity: str
 ) -> dict[str, NDArray]:
-    """`StepResult.unforeseen` of a step.
+    """`StepResult.unforeseen` of a step, with everything filled in.
 
-    Parameters
-    ----------
-    now : Unfinished
-        The step, with everything filled in.
-    command : ndarray, shape (n, 3)
-        After the step.
-    done : ndarray of bool, shape (n,)
-        Episodes that are over.
-    base_velocity : str
-        As in `Observation`.
+    `command`, shape (n, 3), is that after the step, `done`, shape (n,), says which episodes are
+    over, `base_velocity` is as in `Observation`.
     """
     before, velocity = now.facts["command"], now.facts["linear_velocity"]
     changed = (before != command).any(axis=1)

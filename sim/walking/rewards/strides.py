@@ -19,32 +19,18 @@ _STRIDE_S = 0.2  # time constant of the average over a stride
 
 
 class Strides:
-    """Counters of n robots.
+    """Counters of n robots, of control steps of `span_s`.
 
-    Parameters
-    ----------
-    body : Body
-    robots : int
-    span_s : float
-        Control step [s].
-    rewards : Rewards
-        Whose `clock_hz`, `clock_pull_hz` and `clock_height` count.
+    `air_s` and `stance_s`, shape (n, 4): time that each foot has been in the air, on the ground; 0
+    if it is not. `velocity`, shape (n, 3): forward and sideways speed and turn rate, averaged over
+    about a stride [m/s, rad/s].
 
-    Attributes
-    ----------
-    air_s, stance_s : ndarray, shape (n, 4)
-        Time that each foot has been in the air, on the ground; 0 if it is not.
-    velocity : ndarray, shape (n, 3)
-        Forward and sideways speed and turn rate, averaged over about a stride [m/s, rad/s].
-    phase : ndarray, shape (n,)
-        φ, of the gait's clock, from 0 to 1: of a trot, left front and right rear are to be up in
-        its first half, the others in its second. A phase-locked loop: it runs at `clock_hz` and
-        follows what feet do in turn, x, the difference of the pairs' heights as shares of
-        `clock_height` (-1 to 1), by 2·`clock_pull_hz`·x·cos 2πφ.
-        Feet that step as x = sin 2πft draw it along for
-        f within `clock_pull_hz` of `clock_hz`; at other rates it passes them by.
-    in_time : ndarray, shape (n,)
-        2x·sin 2πφ, averaged over about a stride: 1 for such feet.
+    `phase`, shape (n,): φ, of the gait's clock, from 0 to 1: of a trot, left front and right rear
+    are to be up in its first half, the others in its second. A phase-locked loop: it runs at
+    `clock_hz` and follows what feet do in turn, x, the difference of the pairs' heights as shares
+    of `clock_height` (-1 to 1), by 2·`clock_pull_hz`·x·cos 2πφ. Feet that step as x = sin 2πft draw
+    it along for f within `clock_pull_hz` of `clock_hz`; at other rates it passes them by.
+    `in_time`, shape (n,): 2x·sin 2πφ, averaged over about a stride: 1 for such feet.
     """
 
     def __init__(self, body: Body, robots: int, span_s: float, rewards: Rewards):
@@ -88,19 +74,12 @@ class Strides:
         velocity: Array,
         facts: dict[str, Any],
     ) -> None:
-        """Let one control step pass for robots `rows`, and write what happened into `facts`.
+        """Let one control step pass for k robots `rows`, and write what happened into `facts`.
 
-        Parameters
-        ----------
-        rows : slice
-        touch : ndarray, shape (k, 4)
-            Forces of the ground on the feet at the end of the step [N].
-        feet : (ndarray, ndarray), shapes (k, 4, 2) and (k, 4)
-            Places of the soles, heights above the ground [m].
-        velocity : ndarray, shape (k, 3)
-            Forward and sideways speed and turn rate of the trunk [m/s, rad/s].
-        facts : dict of str to ndarray
-            Of a `Step`, for these robots.
+        `touch`, shape (k, 4), are the forces of the ground on the feet at the end of the step [N];
+        `feet` the places of the soles, shape (k, 4, 2), and their heights above the ground, shape
+        (k, 4) [m]; `velocity`, shape (k, 3), forward and sideways speed and turn rate of the trunk
+        [m/s, rad/s].
         """
         span, (at, height) = self._span, feet
         np.greater(touch, self._touch_n, out=facts["contact"])
