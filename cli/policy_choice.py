@@ -20,8 +20,7 @@ from pupper_sysid.sim.walking.config import Walking, for_robot
 from pupper_sysid.sim.walking.servo_ranges import IDEAL, ServoRanges, check_actuator, servo_ranges
 
 if TYPE_CHECKING:
-    from pupper_sysid.policies.deploy.observer_match import Match
-    from pupper_sysid.policies.deploy.servo_match import ServoMatch
+    from pupper_sysid.policies.deploy.matches import Match, ServoMatch
     from pupper_sysid.policies.network.policy_file import CommandRanges, Policy
     from pupper_sysid.sim.robot.body import Body
 

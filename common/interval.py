@@ -41,3 +41,26 @@ class Interval:
     def widened(self, by: float) -> Interval:
         """The interval with `by` added on either side."""
         return Interval(self.value, self.low - by, self.high + by)
+
+
+UNKNOWN = Interval(float("nan"), float("nan"), float("nan"))
+"""Of a quantity without a value."""
+
+
+def t_quantile(freedom: int) -> float:
+    """Half width of a 90 % interval in standard errors, by Student's t."""
+    from scipy.stats import t as student_t  # slow to import
+
+    return float(student_t.ppf((1 + LEVEL) / 2, freedom))
+
+
+def mean_of(values: NDArray[np.float64]) -> Interval:
+    """Mean of the finite values, with its 90 % interval by Student's t."""
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return UNKNOWN
+    mean = float(values.mean())
+    half = float("nan")
+    if len(values) > 1:
+        half = t_quantile(len(values) - 1) * float(values.std(ddof=1) / np.sqrt(len(values)))
+    return Interval(mean, mean - half, mean + half)

@@ -14,16 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.interval import Interval, mean_of
 from pupper_sysid.policies.analysis.attractor import DELAYS_MS
 from pupper_sysid.policies.analysis.autonomy import NUDGE_M_S, PUSH_M_S
-from pupper_sysid.policies.analysis.rhythm import (
-    SHORTEST_S,
-    mean_of,
-    null_r2,
-    sine_fit_r2,
-    sine_frequency,
-)
+from pupper_sysid.policies.analysis.gait import SHORTEST_S, null_r2, sine_fit_r2, sine_frequency
 from pupper_sysid.policies.deploy.stacks import STACKS
 from pupper_sysid.policies.walks.tracking import ERRORS
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters

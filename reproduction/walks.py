@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.policies.analysis.rhythm import mean_of
+from pupper_sysid.common.interval import mean_of
 from pupper_sysid.policies.deploy.emulated_walk import walk_once
 from pupper_sysid.policies.deploy.stacks import Stack
 from pupper_sysid.policies.network.policy_file import Policy

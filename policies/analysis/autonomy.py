@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.interval import mean_of
 from pupper_sysid.common.results import Result
-from pupper_sysid.policies.analysis.gait import SETTLE_S
-from pupper_sysid.policies.analysis.rhythm import mean_of, sine_frequency
+from pupper_sysid.policies.analysis.gait import SETTLE_S, sine_frequency
 from pupper_sysid.policies.analysis.trial import (
     NAN,
     STILL_RAD,

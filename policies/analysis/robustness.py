@@ -20,10 +20,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.interval import UNKNOWN, Interval, mean_of
 from pupper_sysid.common.results import Result, internal
 from pupper_sysid.policies.analysis.gait import SETTLE_S, correlation, steady
-from pupper_sysid.policies.analysis.rhythm import UNKNOWN, mean_of
 from pupper_sysid.policies.analysis.trial import (
     NAN,
     Outcome,

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.interval import mean_of
 from pupper_sysid.common.results import Result
-from pupper_sysid.policies.analysis.gait import amplitude, jitter, steady
-from pupper_sysid.policies.analysis.rhythm import frequency, mean_of
+from pupper_sysid.policies.analysis.gait import amplitude, frequency, jitter, steady
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.conditions import Change, Condition, Disturb, evaluation_task
 from pupper_sysid.policies.walks.rollouts import Rollout, collect

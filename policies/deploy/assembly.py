@@ -21,10 +21,8 @@ from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.policies.deploy.controller import Controller
-from pupper_sysid.policies.deploy.observer_match import Match, compare
-from pupper_sysid.policies.deploy.observers import Observer, SyntheticPD, make_observer
-from pupper_sysid.policies.deploy.servo_match import ServoMatch, servo_match
-from pupper_sysid.policies.deploy.stacks import Stack
+from pupper_sysid.policies.deploy.matches import Match, ServoMatch, compare, servo_match
+from pupper_sysid.policies.deploy.stacks import Observer, Stack, SyntheticPD, make_observer
 from pupper_sysid.policies.network.policy_file import Policy, trained_servo
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.servo_file import WEIGHTS

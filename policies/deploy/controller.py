@@ -7,23 +7,224 @@ same actions again, bit for bit (`policies.deploy.walk_log`).
     controller.reset(position, rest)          # standing, at rest
     for senses in ...:
         decision = controller.step(senses)    # decision.target goes to the servos
+
+Its filters: `LowPass` smooths the joint targets before they reach the servos. `ComplementaryFilter`
+estimates the trunk's rate and the direction of gravity from an IMU: the gyro turns the last
+estimate of gravity, and the accelerometer slowly corrects it towards the mean force. `at_rest`
+determines the filter's start from samples of a robot that stands still. The body's frame is the
+simulator's: x forward, y left, z up. Rates are radians per second, right handed. Accelerations are
+what an ideal accelerometer measures, the specific force: +9.81 m/s² on z at rest. Gravity is its
+direction in the trunk's frame, (0, 0, -1) when level.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy import signal
+from scipy.constants import g as STANDARD_GRAVITY
 
 from pupper_sysid.common.errors import InputError, SafetyStop
 from pupper_sysid.hardware.joint_map import JointMap
-from pupper_sysid.policies.deploy.filters import ComplementaryFilter, LowPass, Rest
-from pupper_sysid.policies.deploy.observers import Observer
-from pupper_sysid.policies.deploy.stacks import Stack
+from pupper_sysid.policies.deploy.stacks import Observer, Stack
 from pupper_sysid.policies.network.policy_file import Policy, refuse_other_observation
 
 Array = NDArray[np.float64]
+
+_SHORTEST_S = 1e-3  # least time between samples
+_NO_FORCE_M_S2 = 0.1  # below: free fall, or a failed read of zeros
+_FULL_SCALE = 0.999  # the highest positive code is one short of the range's end
+
+_FEWEST_SAMPLES = 20
+_MOST_GYRO_SPREAD_RAD_S = 0.03  # 27 counts of the robot's gyro
+_MOST_GYRO_BIAS_RAD_S = 0.3  # 17°/s without spread is an even turn, not a bias
+_MOST_FORCE_ERROR_M_S2 = 1.0
+_MOST_TILT_DEG = 30.0
+
+
+class LowPass:
+    """Butterworth low-pass filter of second order, one per channel, sample by sample.
+
+    Starts in the steady state of zeros. At `cutoff_hz`, below half of the rate, the gain is 1/√2.
+    It delays: at 25 Hz and a cut-off of 8 Hz, a gait of 2.8 Hz comes 19 ms later.
+
+    Examples
+    --------
+    >>> smooth = LowPass(cutoff_hz=8.0, rate_hz=25.0, channels=2)
+    >>> smooth.reset([0.5, -1.0])
+    >>> smooth([0.5, -1.0]).round(12).tolist()
+    [0.5, -1.0]
+    """
+
+    def __init__(self, cutoff_hz: float, rate_hz: float, channels: int):
+        if not 0 < cutoff_hz < rate_hz / 2:
+            raise InputError(
+                f"The cut-off of the low-pass filter is {cutoff_hz:g} Hz at {rate_hz:g} samples "
+                f"per second; it must be below half the rate, {rate_hz / 2:g} Hz."
+            )
+        self._sos = np.asarray(signal.butter(2, cutoff_hz, fs=rate_hz, output="sos"))
+        self._shape = (channels,)
+        self.reset(np.zeros(channels))
+
+    def reset(self, value: ArrayLike) -> None:
+        """Set the steady state of the constant input `value`, shape (channels,)."""
+        value = _finite(value, self._shape, "A low-pass filter's value")
+        self._state = signal.sosfilt_zi(self._sos)[0][:, None] * value
+
+    def __call__(self, value: ArrayLike) -> Array:
+        """The next filtered sample, for the next sample; both shape (channels,)."""
+        value = _finite(value, self._shape, "A low-pass filter's value")
+        # transposed direct form II, as scipy's sosfilt, whose checks cost more than a tick has
+        b0, b1, b2, _, a1, a2 = self._sos[0]
+        near, far = self._state
+        filtered = b0 * value + near
+        self._state = np.stack([b1 * value - a1 * filtered + far, b2 * value - a2 * filtered])
+        return filtered
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """The trunk's motion from an IMU."""
+
+    rate_rad_s: Array
+    """Angular velocity in the trunk's frame, without the gyro's bias; shape (3,)."""
+    gravity: Array
+    """Unit vector, the direction of gravity in the trunk's frame: (0, 0, -1) when level; shape
+    (3,)."""
+    clipped: bool
+    """Whether the accelerometer was at its limit, and so was ignored."""
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Start of a `ComplementaryFilter`."""
+
+    gravity: Array
+    """Unit vector in the trunk's frame; shape (3,)."""
+    bias_rad_s: Array
+    """Gyro reading of a robot that does not turn; shape (3,)."""
+
+
+class ComplementaryFilter:
+    """Rate and gravity from gyro and accelerometer; frames and signs as in the module's docstring.
+
+    Gravity is fixed in the world; in a frame that turns with rate ω, dg/dt = -ω × g, which is
+    integrated exactly over each sample. Then it moves towards the accelerometer's -a / |a| by
+    `weight` (0 ≤ weight < 0.5), with a time constant of period / weight (2 s at 25 Hz), so that the
+    accelerations of single steps hardly tilt it. Footfalls of small robots exceed ±2 g; a sample
+    that is clipped at the accelerometer's full scale, `limit_m_s2`, has lost its direction.
+    """
+
+    def __init__(self, weight: float = 0.02, limit_m_s2: float = 2 * STANDARD_GRAVITY):
+        if not 0 <= weight < 0.5:  # above, gravity of an upside-down robot could cancel out
+            raise InputError(
+                f"A complementary filter's weight is {weight:g}; it must be in [0, 0.5)."
+            )
+        if not limit_m_s2 > STANDARD_GRAVITY:
+            raise InputError(
+                f"`limit_m_s2` of a complementary filter is {limit_m_s2:g}; below 1 g the "
+                "accelerometer could not measure gravity."
+            )
+        self.weight, self.limit_m_s2 = weight, limit_m_s2
+        self.reset(Rest(gravity=np.array([0.0, 0.0, -1.0]), bias_rad_s=np.zeros(3)))
+
+    def reset(self, rest: Rest) -> None:
+        """Start from rest; see `at_rest`."""
+        gravity = _finite(rest.gravity, (3,), "The direction of gravity")
+        length = np.linalg.norm(gravity)
+        if length == 0:
+            raise InputError("The direction of gravity is (0, 0, 0), which is no direction.")
+        self._gravity = gravity / length
+        self._bias = _finite(rest.bias_rad_s, (3,), "The gyro's bias")
+
+    def step(self, gyro_rad_s: ArrayLike, acceleration_m_s2: ArrayLike, dt_s: float) -> Attitude:
+        """Rate and gravity after one more sample.
+
+        The rate has the gyro's bias, the acceleration is the specific force, shape (3,) each;
+        `dt_s` is the measured time since the last sample, at least 1 ms.
+        """
+        rate = _finite(gyro_rad_s, (3,), "A gyro's sample") - self._bias
+        force = _finite(acceleration_m_s2, (3,), "An accelerometer's sample")
+        span = max(float(_finite(dt_s, (), "The time between IMU samples")), _SHORTEST_S)
+        # seen from the body, the world turns backwards
+        gravity = _turned(self._gravity, -rate * span)
+        clipped = bool((np.abs(force) >= _FULL_SCALE * self.limit_m_s2).any())
+        size = np.linalg.norm(force)
+        if not clipped and size > _NO_FORCE_M_S2:
+            gravity = (1 - self.weight) * gravity - self.weight * force / size
+        self._gravity = gravity / np.linalg.norm(gravity)
+        return Attitude(rate, self._gravity.copy(), clipped)
+
+
+def at_rest(gyro_rad_s: ArrayLike, acceleration_m_s2: ArrayLike) -> Rest:
+    """The gyro's bias and the first direction of gravity, from samples of a robot at rest.
+
+    About a second of samples, 50 or so, in the trunk's frame, shape (samples, 3).
+    """
+    rates = np.asarray(gyro_rad_s, float)
+    forces = np.asarray(acceleration_m_s2, float)
+    if rates.ndim != 2 or rates.shape[1] != 3 or rates.shape != forces.shape:
+        raise InputError(
+            f"IMU samples at rest have shapes {rates.shape} and {forces.shape}; both must be "
+            "(samples, 3)."
+        )
+    if len(rates) < _FEWEST_SAMPLES:
+        raise InputError(
+            f"There are {len(rates)} IMU samples at rest; {_FEWEST_SAMPLES} are needed, 50 good."
+        )
+    if not (np.isfinite(rates).all() and np.isfinite(forces).all()):
+        raise InputError("IMU samples at rest hold numbers that are not finite. Read them again.")
+    bias, force = rates.mean(axis=0), forces.mean(axis=0)
+    size = float(np.linalg.norm(force))
+    if abs(size - STANDARD_GRAVITY) > _MOST_FORCE_ERROR_M_S2:
+        raise InputError(
+            f"The accelerometer measures {size:.2f} m/s² at rest, not {STANDARD_GRAVITY:.2f}: the "
+            "robot is being moved, the unit is not m/s², or the IMU does not answer."
+        )
+    spread = float(rates.std(axis=0).max())
+    if spread > _MOST_GYRO_SPREAD_RAD_S or np.abs(bias).max() > _MOST_GYRO_BIAS_RAD_S:
+        raise InputError(
+            f"The robot moved while its gyro was calibrated (rate {np.abs(bias).max():.2f} rad/s, "
+            f"spread {spread:.3f} rad/s). Put it down, leave it alone and try again."
+        )
+    gravity = -force / size
+    tilt = float(np.degrees(np.arccos(np.clip(-gravity[2], -1, 1))))
+    if tilt > _MOST_TILT_DEG:
+        raise InputError(
+            f"The robot stands tilted by {tilt:.0f}°; it must stand level to start. Near 180° the "
+            "samples are in the frame of a chip that is mounted upside down."
+        )
+    return Rest(gravity, bias)
+
+
+def _turned(vector: Array, rotation: Array) -> Array:
+    """`vector` turned by the rotation vector `rotation` [rad] (Rodrigues' formula)."""
+    angle = math.hypot(*rotation.tolist())
+    if angle == 0:
+        return vector
+    across = _cross(rotation, vector)
+    half = math.sin(angle / 2) / (angle / 2)
+    return vector + math.sin(angle) / angle * across + 0.5 * half**2 * _cross(rotation, across)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """The cross product; NumPy's takes ten times as long for a single one."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def _finite(value: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
+    """A copy of `value`, refused if of another shape or not finite: NaN would stay in a filter."""
+    array = np.array(value, float)
+    if array.shape != shape:
+        raise InputError(f"{name} has shape {array.shape}; it must be {shape}.")
+    if not np.isfinite(array).all():
+        raise InputError(f"{name} is not finite: {array.tolist()}.")
+    return array
+
 
 _PUBLISHED_SPEED_SHARE = 0.7
 

@@ -32,8 +32,7 @@ from pupper_sysid.hardware.loop import (
 )
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy.commands import Commands
-from pupper_sysid.policies.deploy.controller import Controller, Decision, Senses
-from pupper_sysid.policies.deploy.filters import Rest, at_rest
+from pupper_sysid.policies.deploy.controller import Controller, Decision, Rest, Senses, at_rest
 from pupper_sysid.policies.deploy.walk_log import WalkLog, start_header
 from pupper_sysid.sim.walking.observation import FALLEN_TILT, OBSERVATION_PARTS
 

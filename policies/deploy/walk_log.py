@@ -28,8 +28,7 @@ from pupper_sysid.common.reading.csv_table import (
     one_line_end,
     read_table,
 )
-from pupper_sysid.policies.deploy.controller import Controller, Decision, Senses
-from pupper_sysid.policies.deploy.filters import Rest
+from pupper_sysid.policies.deploy.controller import Controller, Decision, Rest, Senses
 from pupper_sysid.sim.walking.observation import observation_of
 
 TITLE = "# pupper-sysid walk"

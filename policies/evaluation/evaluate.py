@@ -30,11 +30,11 @@ from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.conditions import (
     DIRECTIONS,
     Condition,
+    Handicap,
     Walker,
     evaluation_task,
     share_of_usual,
 )
-from pupper_sysid.policies.walks.handicaps import Handicap
 from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.terrain import STAIRS_M, Terrain
 from pupper_sysid.sim.walking.config import Walking

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import beta
 
-from pupper_sysid.common.interval import LEVEL, Interval
+from pupper_sysid.common.interval import LEVEL, Interval, mean_of
 from pupper_sysid.common.results import Result
-from pupper_sysid.policies.analysis.rhythm import mean_of
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.conditions import Condition, Moment, Walker
 from pupper_sysid.policies.walks.rollouts import heading
@@ -24,9 +23,9 @@ from pupper_sysid.policies.walks.tracking import (
     stride_errors,
     tracking_errors,
 )
-from pupper_sysid.sim.walking.effort import LOW_SWING_M, by_kind
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.observation import FALLEN_TILT
+from pupper_sysid.sim.walking.rewards.strides import LOW_SWING_M, by_kind
 
 Array = NDArray[np.float64]
 
@@ -173,7 +172,7 @@ class Figures(Result):
     """Mean speed of feet on the ground."""
     clearance_p10_m: float
     """Tenth percentile of the clearance over all swings: the largest height of the sole over the
-    ground in a swing (`sim.walking.effort`); NaN without a swing, as the next two."""
+    ground in a swing (`sim.walking.rewards.strides`); NaN without a swing, as the next two."""
     clearance_p50_m: float
     """Its median."""
     low_swing_share: float

@@ -39,9 +39,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.interval import Interval, t_quantile
 from pupper_sysid.common.results import Result
-from pupper_sysid.policies.analysis.rhythm import t_quantile
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sim.robot.replay import Replayed, replay
 from pupper_sysid.sim.walking.config import Randomisation

@@ -30,9 +30,12 @@ from pupper_sysid.policies.walks.conditions import (
     Condition,
     Moment,
     Recorder,
+    impose,
+    missed_ticks,
+    push_directions,
     random_commands,
+    see_slope,
 )
-from pupper_sysid.policies.walks.handicaps import impose, missed_ticks, push_directions, see_slope
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import PRESETS, Walking
 from pupper_sysid.sim.walking.draws import Twins, at_rest

@@ -24,7 +24,6 @@ from pupper_sysid.sim.robot.robot_batch import RobotBatch
 from pupper_sysid.sim.robot.terrain import make_ground
 from pupper_sysid.sim.walking.config import PRESETS, Walking, for_robot
 from pupper_sysid.sim.walking.draws import Twins, at_rest, draw_commands, draw_pose, generator
-from pupper_sysid.sim.walking.effort import EffortMeter
 from pupper_sysid.sim.walking.observation import (
     FALLEN_TILT,
     noise_of,
@@ -33,7 +32,7 @@ from pupper_sysid.sim.walking.observation import (
     privileged_of,
     privileged_parts,
 )
-from pupper_sysid.sim.walking.rewards.strides import Strides
+from pupper_sysid.sim.walking.rewards.strides import EffortMeter, Strides
 from pupper_sysid.sim.walking.rewards.terms import TERMS, weighted
 from pupper_sysid.sim.walking.rewards.weights import Rewards, narrowed
 from pupper_sysid.sim.walking.senses import Rows, Senses

@@ -73,8 +73,7 @@ class Step:
     """Cosine and sine of a trot's clock that follows the feet, and how well they keep to it, -1 to
     1; see `Strides`; shape (n, 3)."""
     swing_ended: NDArray[np.bool_]
-    """Feet that came down after a swing; see `sim.walking.effort`, as for all that follow; shape
-    (n, 4)."""
+    """Feet that came down after a swing; see `EffortMeter`, as all that follow; shape (n, 4)."""
     clearance_m: Array
     """Of the swings that ended; NaN of other feet; shape (n, 4)."""
     saturated: Array

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pupper_sysid.policies.deploy.observer_match import _drive, _phasors, _sines
+from pupper_sysid.policies.deploy.matches import _drive, _phasors, _sines
 
 
 def response(observer, frequencies_hz, amplitude_rad: float, period_s: float) -> np.ndarray:

@@ -56,8 +56,7 @@ class Attractor(Commanded):
         """Orbits of each policy."""
         from pupper_sysid.policies.analysis.attractor import DELAYS_MS, orbits
         from pupper_sysid.policies.analysis.figures import orbit_figure
-        from pupper_sysid.policies.analysis.gait import SETTLE_S
-        from pupper_sysid.policies.analysis.rhythm import SHORTEST_S
+        from pupper_sysid.policies.analysis.gait import SETTLE_S, SHORTEST_S
 
         found = {name: one for name, one in self.each(orbits, self.command).items() if one}
         if not found:

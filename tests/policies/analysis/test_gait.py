@@ -16,11 +16,14 @@ from pupper_sysid.policies.analysis.gait import (
     describe,
     diagonal_coordination,
     fast_share,
+    frequency,
     intervals,
     jitter,
+    null_r2,
     phases,
+    sine_fit_r2,
+    sine_frequency,
 )
-from pupper_sysid.policies.analysis.rhythm import frequency, null_r2, sine_fit_r2, sine_frequency
 from pupper_sysid.policies.walks.rollouts import Rollout
 from pupper_sysid.sim.robot.mini_pupper import default_pose, foot_position
 from pupper_sysid.sim.robot.trot import Trot

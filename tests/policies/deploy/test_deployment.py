@@ -18,12 +18,10 @@ from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy.assembly import assemble, reassemble
 from pupper_sysid.policies.deploy.commands import constant, script
-from pupper_sysid.policies.deploy.controller import Controller, Senses
+from pupper_sysid.policies.deploy.controller import Controller, Rest, Senses
 from pupper_sysid.policies.deploy.deployment import IMU_SILENT_S, Outcome, deploy
 from pupper_sysid.policies.deploy.emulated_walk import WalkScore
-from pupper_sysid.policies.deploy.filters import Rest
-from pupper_sysid.policies.deploy.observers import ServoModelObserver
-from pupper_sysid.policies.deploy.stacks import STACKS, Stack, suited
+from pupper_sysid.policies.deploy.stacks import STACKS, ServoModelObserver, Stack, suited
 from pupper_sysid.policies.deploy.walk_log import read_walk, replay
 from pupper_sysid.policies.network.policy_file import CommandRanges, Policy
 from pupper_sysid.sim.emulator.robot import draw_robot

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pupper_sysid.policies.deploy.filters import ComplementaryFilter, LowPass, Rest, at_rest
+from pupper_sysid.policies.deploy.controller import ComplementaryFilter, LowPass, Rest, at_rest
 from support.refusals import assert_each_refused
 
 G = 9.80665

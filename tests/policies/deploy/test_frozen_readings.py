@@ -18,8 +18,7 @@ from pupper_sysid.policies.deploy.assembly import WINDOW_S, FrozenReadings, asse
 from pupper_sysid.policies.deploy.commands import constant
 from pupper_sysid.policies.deploy.controller import Decision, Senses
 from pupper_sysid.policies.deploy.deployment import Outcome, Tick, deploy
-from pupper_sysid.policies.deploy.observers import SyntheticPD
-from pupper_sysid.policies.deploy.stacks import STACKS, suited
+from pupper_sysid.policies.deploy.stacks import STACKS, SyntheticPD, suited
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.emulator.robot import draw_robot

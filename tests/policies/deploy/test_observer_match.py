@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pupper_sysid.policies.deploy.observer_match import FREQUENCIES_HZ, compare
-from pupper_sysid.policies.deploy.observers import (
+from pupper_sysid.policies.deploy.matches import FREQUENCIES_HZ, compare
+from pupper_sysid.policies.deploy.stacks import (
     HeldEncoder,
     SyntheticPD,
     Zero,

@@ -10,7 +10,7 @@ import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.policies.deploy.observers import (
+from pupper_sysid.policies.deploy.stacks import (
     HeldEncoder,
     JointEstimate,
     Observer,

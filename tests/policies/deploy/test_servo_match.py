@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.policies.deploy.servo_match import servo_match
+from pupper_sysid.policies.deploy.matches import servo_match
 from pupper_sysid.policies.network.policy_file import trained_servo
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.differences import Differences

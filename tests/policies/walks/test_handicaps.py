@@ -11,8 +11,14 @@ import pytest
 
 from pupper_sysid.policies.evaluation.figures import Recorder
 from pupper_sysid.policies.walks import together
-from pupper_sysid.policies.walks.conditions import Condition, evaluation_task
-from pupper_sysid.policies.walks.handicaps import Handicap, impose, missed_ticks, push_directions
+from pupper_sysid.policies.walks.conditions import (
+    Condition,
+    Handicap,
+    evaluation_task,
+    impose,
+    missed_ticks,
+    push_directions,
+)
 from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import robot_xml
