@@ -23,11 +23,16 @@ from pydantic import AfterValidator, Field, model_validator
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.servo_models.calibration.quantity import (
     AGE,
+    ARMATURE,
+    DAMPING,
     LAG,
+    LARGE,
     OFFSET,
     RATIO,
     SHARE,
     SMALL_ANGLE,
+    SPEED,
+    STIFFNESS,
     TIME,
     TORQUE,
     NotNegative,
@@ -75,9 +80,9 @@ class UnderLoad(Part):
     """Duty per velocity, inside of the limit on the duty [s/rad]."""
     stall_torque_nm: Annotated[Quantity, AfterValidator(PlausibleRange(0, 1000, "N·mm", 1e-3))]
     """Torque at full duty and standstill [N·m]."""
-    back_emf_nm_s_per_rad: Annotated[Quantity, AfterValidator(PlausibleRange(0, 1e4))]
+    back_emf_nm_s_per_rad: Annotated[Quantity, DAMPING]
     """Torque lost per velocity [N·m·s/rad]."""
-    armature_kg_m2: Annotated[Quantity, AfterValidator(PlausibleRange(1e-12, 10, "g·cm²", 1e-7))]
+    armature_kg_m2: Annotated[Quantity, ARMATURE]
     """Reflected inertia of motor and gears, with the load's where that is unknown [kg·m²]."""
     friction_loss_nm: Annotated[Quantity, TORQUE]
     """Dry friction at speed without load [N·m]."""
@@ -89,9 +94,7 @@ class UnderLoad(Part):
     """Dry friction per torque of the motor."""
     load_friction_load: Annotated[Quantity | None, SHARE] = None
     """Dry friction per torque of the load's weight."""
-    load_friction_quadratic_per_nm: Annotated[
-        Quantity | None, AfterValidator(PlausibleRange(0, 1e6))
-    ] = None
+    load_friction_quadratic_per_nm: Annotated[Quantity | None, LARGE] = None
     """Dry friction per squared torque of the motor [1/(N·m)]."""
     load_friction_static: Annotated[Quantity | None, SHARE] = None
     """By what share friction per torque is larger at standstill."""
@@ -103,9 +106,7 @@ class UnderLoad(Part):
     """Error that the position loop ignores [rad]."""
     start_duty: Annotated[Quantity | None, SHARE] = None
     """Duty added wherever there is an error."""
-    acceleration_limit_rad_s2: Annotated[
-        Quantity | None, AfterValidator(PlausibleRange(0, 1e6))
-    ] = None
+    acceleration_limit_rad_s2: Annotated[Quantity | None, LARGE] = None
     """Largest acceleration of the set-point [rad/s²]; null where it follows commands at once."""
     gravity_nm: Annotated[Quantity | None, TORQUE] = None
     """Largest torque of gravity of an unknown load [N·m]; null where the load was known."""
@@ -201,9 +202,7 @@ class OperatingPoint(Part):
         """The same at another P gain."""
         if p_gain == self.p_gain:
             return self
-        source = "predicted"
-        if self.p_gain is not None:
-            source = f"predicted from {self.p_gain:g}"
+        source = "predicted" + ("" if self.p_gain is None else f" from {self.p_gain:g}")
         return self.model_copy(update={"p_gain": float(p_gain), "p_gain_source": source})
 
 
@@ -261,26 +260,22 @@ class Actuator(Part):
 
     model: Literal["delayed_pd"]
     """Servo model of these numbers."""
-    stiffness_nm_per_rad: Annotated[Quantity, AfterValidator(PlausibleRange(0, 1e5))]
+    stiffness_nm_per_rad: Annotated[Quantity, STIFFNESS]
     """Torque per position error [N·m/rad]."""
-    damping_nm_s_per_rad: Annotated[Quantity, AfterValidator(PlausibleRange(0, 1e4))]
+    damping_nm_s_per_rad: Annotated[Quantity, DAMPING]
     """Torque per velocity [N·m·s/rad]."""
     friction_loss_nm: Annotated[Quantity, TORQUE]
     """Dry (Coulomb) friction [N·m]."""
-    armature_kg_m2: Annotated[Quantity, AfterValidator(PlausibleRange(1e-12, 10, "g·cm²", 1e-7))]
+    armature_kg_m2: Annotated[Quantity, ARMATURE]
     """Reflected inertia at the joint [kg·m²]; `operating_point.armature` says whether with the
     load."""
     effort_limit_nm: Annotated[Quantity, TORQUE]
     """Largest torque [N·m]."""
-    velocity_limit_rad_s: Annotated[
-        Quantity, AfterValidator(PlausibleRange(0, 1000, "degrees per second"))
-    ]
+    velocity_limit_rad_s: Annotated[Quantity, SPEED]
     """Largest rate of the set-point [rad/s]; 1000 where it is not limited."""
     dead_time_s: Annotated[Quantity, TIME]
     """Dead time from a command's arrival to its first effect on the torque [s]."""
-    back_emf_nm_s_per_rad: Annotated[Quantity, AfterValidator(PlausibleRange(0, 1e4))] = (
-        _NO_BACK_EMF
-    )
+    back_emf_nm_s_per_rad: Annotated[Quantity, DAMPING] = _NO_BACK_EMF
     """Torque lost per velocity outside of the effort limit [N·m·s/rad]."""
     command_jitter_s: Annotated[Quantity, TIME] = Quantity(
         value=0.0, identified="no", why="not measured"
@@ -322,18 +317,14 @@ class Actuator(Part):
         """Dead times to train with [s]: the interval, or whole steps, as presets publish."""
         if self.dead_time_s.low is not None and self.dead_time_s.high is not None:
             return self.dead_time_s.low, self.dead_time_s.high
-        return (
-            self.delay_steps_min * self.physics_step_s,
-            self.delay_steps_max * self.physics_step_s,
-        )
+        step_s = self.physics_step_s
+        return self.delay_steps_min * step_s, self.delay_steps_max * step_s
 
     @model_validator(mode="after")
     def _check(self) -> Actuator:
-        if self.delay_steps_min > self.delay_steps_max:
-            raise ValueError(
-                f"delay_steps_min is {self.delay_steps_min} and delay_steps_max is "
-                f"{self.delay_steps_max}; swap them"
-            )
+        low, high = self.delay_steps_min, self.delay_steps_max
+        if low > high:
+            raise ValueError(f"delay_steps_min is {low} and delay_steps_max is {high}; swap them")
         return self
 
 

@@ -66,9 +66,7 @@ def _python_number(value: Any) -> Any:
 
 
 Number = Annotated[float, BeforeValidator(_python_number)]
-
 Whole = Annotated[int, BeforeValidator(_python_number)]
-
 NotNegative = Annotated[Number, Field(ge=0)]
 
 
@@ -209,20 +207,17 @@ def measured(kind: type[_Part], **entries: Any) -> _Part:
     return kind(**entries)
 
 
+_DEGREES = "degrees", float(np.pi / 180)
 TIME = AfterValidator(PlausibleRange(0, 1, "milliseconds", 1e-3))
-
 AGE = AfterValidator(PlausibleRange(0, 10, "milliseconds", 1e-3))
-
 LAG = AfterValidator(PlausibleRange(-2, 2, "milliseconds", 1e-3))
-
 TORQUE = AfterValidator(PlausibleRange(0, 100, "N·mm", 1e-3))
-
+STIFFNESS = AfterValidator(PlausibleRange(0, 1e5))
+DAMPING = AfterValidator(PlausibleRange(0, 1e4))
+ARMATURE = AfterValidator(PlausibleRange(1e-12, 10, "g·cm²", 1e-7))
+SPEED = AfterValidator(PlausibleRange(0, 1000, "degrees per second"))
+LARGE = AfterValidator(PlausibleRange(0, 1e6))
 RATIO = AfterValidator(PlausibleRange(0, 1e9))
-
-SMALL_ANGLE = AfterValidator(PlausibleRange(0, 0.1, "degrees", float(np.pi / 180)))
-
-OFFSET = AfterValidator(
-    PlausibleRange(-2 * float(np.pi), 2 * float(np.pi), "degrees", float(np.pi / 180))
-)
-
+SMALL_ANGLE = AfterValidator(PlausibleRange(0, 0.1, *_DEGREES))
+OFFSET = AfterValidator(PlausibleRange(-2 * float(np.pi), 2 * float(np.pi), *_DEGREES))
 SHARE = AfterValidator(PlausibleRange(0, 100))

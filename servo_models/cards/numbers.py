@@ -24,36 +24,38 @@ an interval may be written as the bare number.
 from __future__ import annotations
 
 import math
-from dataclasses import fields
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer
 
+from pupper_sysid.servo_models.calibration import parts
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
-from pupper_sysid.servo_models.calibration.quantity import Part, PlausibleRange, Quantity, unit_of
+from pupper_sysid.servo_models.calibration.quantity import (
+    ARMATURE,
+    DAMPING,
+    SHARE,
+    SPEED,
+    STIFFNESS,
+    TIME,
+    TORQUE,
+    Part,
+    PlausibleRange,
+    Quantity,
+    unit_of,
+)
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 
 UNSTATED = "stated without an interval"
 """Why a bare number of a card is not identified."""
 
-_ENDINGS = ("_nm", "_nm_s_per_rad", "_kg_m2", "_rad_s", "_rad_s2", "_per_nm")
-_UNITS = {
-    "duty_s_per_rad": "s/rad",
-    "load_friction_quadratic_per_nm": "1/(N·m)",
-    "load_friction_static": "1",
-    "off_brake": "1",
-    "start_duty": "1",
-    "duty_per_rad": "1/rad",
-    "duty_limit": "1",
-    "stribeck_exponent": "1",
-    "load_friction_motor": "1",
-    "load_friction_load": "1",
-    "load_stribeck_motor": "1",
-    "load_stribeck_load": "1",
-    "load_quadratic_motor": "1/(N·m)",
-    "load_quadratic_load": "1/(N·m)",
-}
+_SHARES = (
+    "load_friction_static", "off_brake", "start_duty", "duty_limit", "stribeck_exponent",
+    "load_friction_motor", "load_friction_load", "load_stribeck_motor", "load_stribeck_load",
+)  # fmt: skip
+_UNITS = dict.fromkeys(_SHARES, "1") | dict.fromkeys(
+    ("load_quadratic_motor", "load_quadratic_load"), "1/(N·m)"
+)
 
 
 def unit(name: str) -> str:
@@ -88,14 +90,7 @@ def stated(value: float) -> Quantity:
 Cited = Annotated[Quantity, BeforeValidator(_bare), PlainSerializer(_plainest)]
 """A quantity that a file may state as the bare number."""
 
-_TORQUE = AfterValidator(PlausibleRange(0, 100, "N·mm", 1e-3))
-_DAMPING = AfterValidator(PlausibleRange(0, 1e4))
-_STIFFNESS = AfterValidator(PlausibleRange(0, 1e5))
-_ARMATURE = AfterValidator(PlausibleRange(1e-12, 10, "g·cm²", 1e-7))
-_SPEED = AfterValidator(PlausibleRange(0, 1000, "degrees per second"))
-_TIME = AfterValidator(PlausibleRange(0, 1, "milliseconds", 1e-3))
-_SHARE = AfterValidator(PlausibleRange(0, 1, "percent", 1e-2))
-_FACTOR = AfterValidator(PlausibleRange(0, 100))
+_SHARE_OF_1 = AfterValidator(PlausibleRange(0, 1, "percent", 1e-2))
 
 
 def _or(quantity: Quantity | None, absent: float = 0.0) -> float:
@@ -107,21 +102,21 @@ class TorquePD(Part):
 
     model: Literal["delayed_pd"]
     """Kind of these numbers."""
-    stiffness_nm_per_rad: Annotated[Cited, _STIFFNESS]
+    stiffness_nm_per_rad: Annotated[Cited, STIFFNESS]
     """Torque per position error [N·m/rad]."""
-    damping_nm_s_per_rad: Annotated[Cited | None, _DAMPING] = None
+    damping_nm_s_per_rad: Annotated[Cited | None, DAMPING] = None
     """Torque per velocity inside of the effort limit (MuJoCo's kv) [N·m·s/rad]."""
-    friction_loss_nm: Annotated[Cited, _TORQUE]
+    friction_loss_nm: Annotated[Cited, TORQUE]
     """Dry (Coulomb) friction [N·m]."""
-    armature_kg_m2: Annotated[Cited, _ARMATURE]
+    armature_kg_m2: Annotated[Cited, ARMATURE]
     """Reflected inertia of motor and gears at the joint [kg·m²]."""
-    effort_limit_nm: Annotated[Cited, _TORQUE]
+    effort_limit_nm: Annotated[Cited, TORQUE]
     """Largest torque [N·m]."""
-    velocity_limit_rad_s: Annotated[Cited | None, _SPEED] = None
+    velocity_limit_rad_s: Annotated[Cited | None, SPEED] = None
     """Largest rate of the set-point [rad/s]; null where it is not limited."""
-    back_emf_nm_s_per_rad: Annotated[Cited | None, _DAMPING] = None
+    back_emf_nm_s_per_rad: Annotated[Cited | None, DAMPING] = None
     """Torque lost per velocity outside of the effort limit (MuJoCo's joint damping) [N·m·s/rad]."""
-    dead_time_s: Annotated[Cited | None, _TIME] = None
+    dead_time_s: Annotated[Cited | None, TIME] = None
     """From a command's arrival to its first effect [s]; null where the source has none."""
 
     @property
@@ -177,59 +172,49 @@ class PositionLoop(Part):
 
     model: Literal["position_loop"]
     """Kind of these numbers."""
-    duty_per_rad: Annotated[Cited, _FACTOR]
+    duty_per_rad: Annotated[Cited, SHARE]
     """Duty per unit of the P register and radian of position error [1/rad]."""
-    duty_limit: Annotated[Cited, _SHARE]
+    duty_limit: Annotated[Cited, _SHARE_OF_1]
     """Largest duty, as a fraction of 1."""
-    stall_torque_nm: Annotated[Cited, _TORQUE]
+    stall_torque_nm: Annotated[Cited, TORQUE]
     """Torque at full duty and the card's supply voltage, at standstill [N·m]."""
-    back_emf_nm_s_per_rad: Annotated[Cited, _DAMPING]
+    back_emf_nm_s_per_rad: Annotated[Cited, DAMPING]
     """Torque lost per velocity by the motor's back-EMF [N·m·s/rad]."""
-    armature_kg_m2: Annotated[Cited, _ARMATURE]
+    armature_kg_m2: Annotated[Cited, ARMATURE]
     """Reflected inertia of motor and gears at the joint [kg·m²]."""
-    friction_loss_nm: Annotated[Cited, _TORQUE]
+    friction_loss_nm: Annotated[Cited, TORQUE]
     """Dry (Coulomb) friction [N·m]."""
-    viscous_friction_nm_s_per_rad: Annotated[Cited | None, _DAMPING] = None
+    viscous_friction_nm_s_per_rad: Annotated[Cited | None, DAMPING] = None
     """Torque lost per velocity in the gears [N·m·s/rad]."""
-    stribeck_friction_nm: Annotated[Cited | None, _TORQUE] = None
+    stribeck_friction_nm: Annotated[Cited | None, TORQUE] = None
     """Dry friction that is added at standstill [N·m]."""
-    stribeck_speed_rad_s: Annotated[Cited | None, _SPEED] = None
+    stribeck_speed_rad_s: Annotated[Cited | None, SPEED] = None
     """Speed over which it fades [rad/s]."""
-    stribeck_exponent: Annotated[Cited | None, _FACTOR] = None
+    stribeck_exponent: Annotated[Cited | None, SHARE] = None
     """Its decay is exp(-(speed / stribeck_speed)^exponent)."""
-    load_friction_motor: Annotated[Cited | None, _FACTOR] = None
+    load_friction_motor: Annotated[Cited | None, SHARE] = None
     """Friction per torque of the motor."""
-    load_friction_load: Annotated[Cited | None, _FACTOR] = None
+    load_friction_load: Annotated[Cited | None, SHARE] = None
     """Friction per torque of the load."""
-    load_stribeck_motor: Annotated[Cited | None, _FACTOR] = None
+    load_stribeck_motor: Annotated[Cited | None, SHARE] = None
     """Friction per torque of the motor that is added at standstill."""
-    load_stribeck_load: Annotated[Cited | None, _FACTOR] = None
+    load_stribeck_load: Annotated[Cited | None, SHARE] = None
     """Friction per torque of the load that is added at standstill."""
-    load_quadratic_motor: Annotated[Cited | None, _FACTOR] = None
+    load_quadratic_motor: Annotated[Cited | None, SHARE] = None
     """Friction per squared torque of the motor that is added at standstill [1/(N·m)]."""
-    load_quadratic_load: Annotated[Cited | None, _FACTOR] = None
+    load_quadratic_load: Annotated[Cited | None, SHARE] = None
     """Friction per squared torque of the load that is added at standstill [1/(N·m)]."""
-    velocity_limit_rad_s: Annotated[Cited | None, _SPEED] = None
+    velocity_limit_rad_s: Annotated[Cited | None, SPEED] = None
     """Largest rate of the set-point [rad/s]; null where it is not limited."""
-    dead_time_s: Annotated[Cited | None, _TIME] = None
+    dead_time_s: Annotated[Cited | None, TIME] = None
     """From a command's arrival to its first effect [s]; null where the source has none."""
 
-    def as_pd(self, p_gain: float, voltage_share: float = 1.0) -> TorquePD:
-        """The same servo as a PD in torque; see the module's text.
+    def as_pd(self, p_gain: float) -> TorquePD:
+        """The same servo as a PD in torque at one P gain; see the module's text.
 
-        Parameters
-        ----------
-        p_gain : float
-            P gain, the register's value.
-        voltage_share : float
-            Supply voltage over that of the card.
-
-        Returns
-        -------
-        TorquePD
-            A number that is a product of several has no interval.
+        A number that is a product of several has no interval.
         """
-        stall = self.stall_torque_nm.value * voltage_share
+        stall = self.stall_torque_nm.value
         velocity = self.back_emf_nm_s_per_rad.value + _or(self.viscous_friction_nm_s_per_rad)
         return TorquePD(
             model="delayed_pd",
@@ -255,7 +240,7 @@ class PositionLoop(Part):
         limit = self.duty_limit.value
         viscous = _or(self.viscous_friction_nm_s_per_rad)
         brake = self.back_emf_nm_s_per_rad.value + viscous
-        per_torque = _or(self.load_friction_motor), _or(self.load_friction_load)
+        motor, load = _or(self.load_friction_motor), _or(self.load_friction_load)
         at_rest = _or(self.load_stribeck_motor) + _or(self.load_stribeck_load)
         half = math.log(2) ** (1 / max(_or(self.stribeck_exponent, 2.0), 1e-3))
         return LoadedServoParameters(
@@ -268,9 +253,9 @@ class PositionLoop(Part):
             dead_time_s=_or(self.dead_time_s),
             stribeck_friction=_or(self.stribeck_friction_nm),
             stribeck_speed=max(_or(self.stribeck_speed_rad_s, 0.1) * half, 1e-6),
-            load_friction_motor=per_torque[0],
-            load_friction_load=per_torque[1],
-            load_friction_static=at_rest / sum(per_torque) if sum(per_torque) else 0.0,
+            load_friction_motor=motor,
+            load_friction_load=load,
+            load_friction_static=at_rest / (motor + load) if motor + load else 0.0,
             off_brake=viscous / brake if brake else 0.0,
         )
 
@@ -290,39 +275,39 @@ class LoadedLoop(Part):
 
     model: Literal["loaded_servo"]
     """Kind of these numbers."""
-    duty_per_rad: Annotated[Cited, _FACTOR]
+    duty_per_rad: Annotated[Cited, SHARE]
     """Duty per unit of the P register and radian of position error [1/rad]."""
-    stall_torque_nm: Annotated[Cited, _TORQUE]
+    stall_torque_nm: Annotated[Cited, TORQUE]
     """Torque at full duty and the card's supply voltage, at standstill [N·m]."""
-    back_emf_nm_s_per_rad: Annotated[Cited, _DAMPING]
+    back_emf_nm_s_per_rad: Annotated[Cited, DAMPING]
     """Torque lost per velocity: back-EMF of motor, viscous friction of gears [N·m·s/rad]."""
-    armature_kg_m2: Annotated[Cited, _ARMATURE]
+    armature_kg_m2: Annotated[Cited, ARMATURE]
     """Reflected inertia of motor and gears at the joint [kg·m²]."""
-    friction_loss_nm: Annotated[Cited, _TORQUE]
+    friction_loss_nm: Annotated[Cited, TORQUE]
     """Dry friction at speed without load [N·m]."""
-    dead_time_s: Annotated[Cited | None, _TIME] = None
+    dead_time_s: Annotated[Cited | None, TIME] = None
     """From a command's arrival to its first effect [s]."""
-    duty_s_per_rad: Annotated[Cited | None, _FACTOR] = None
+    duty_s_per_rad: Annotated[Cited | None, SHARE] = None
     """Duty per velocity, inside of the limit on the duty [s/rad]."""
-    stribeck_friction_nm: Annotated[Cited | None, _TORQUE] = None
+    stribeck_friction_nm: Annotated[Cited | None, TORQUE] = None
     """Dry friction at standstill beyond `friction_loss_nm` [N·m]."""
-    stribeck_speed_rad_s: Annotated[Cited | None, _SPEED] = None
+    stribeck_speed_rad_s: Annotated[Cited | None, SPEED] = None
     """Speed at which half of it is left [rad/s]."""
-    load_friction_motor: Annotated[Cited | None, _FACTOR] = None
+    load_friction_motor: Annotated[Cited | None, SHARE] = None
     """Dry friction per torque of the motor."""
-    load_friction_load: Annotated[Cited | None, _FACTOR] = None
+    load_friction_load: Annotated[Cited | None, SHARE] = None
     """Dry friction per torque of the load's weight."""
-    load_friction_quadratic_per_nm: Annotated[Cited | None, _FACTOR] = None
+    load_friction_quadratic_per_nm: Annotated[Cited | None, SHARE] = None
     """Dry friction per squared torque of the motor [1/(N·m)]."""
-    load_friction_static: Annotated[Cited | None, _FACTOR] = None
+    load_friction_static: Annotated[Cited | None, SHARE] = None
     """By what share friction per torque is larger at standstill."""
-    torque_limit_nm: Annotated[Cited | None, _TORQUE] = None
+    torque_limit_nm: Annotated[Cited | None, TORQUE] = None
     """Largest torque of the motor, a limit on its current [N·m]."""
-    off_brake: Annotated[Cited | None, _SHARE] = None
+    off_brake: Annotated[Cited | None, _SHARE_OF_1] = None
     """Share of the back-EMF that remains with the torque off."""
-    dead_zone_rad: Annotated[Cited | None, _FACTOR] = None
+    dead_zone_rad: Annotated[Cited | None, SHARE] = None
     """Half-width of the error that the loop ignores [rad]."""
-    start_duty: Annotated[Cited | None, _SHARE] = None
+    start_duty: Annotated[Cited | None, _SHARE_OF_1] = None
     """Duty added wherever there is an error."""
     acceleration_limit_rad_s2: Cited | None = None
     """Largest acceleration of the set-point [rad/s²]."""
@@ -336,17 +321,9 @@ class LoadedLoop(Part):
         }
         return LoadedServoParameters(**{"duty_s_per_rad": 0.0, "dead_time_s": 0.0} | given)
 
-    def as_pd(self, p_gain: float, voltage_share: float = 1.0) -> TorquePD:
-        """The same servo as a PD in torque; see `LoadedServoParameters.delayed_pd`.
-
-        Parameters
-        ----------
-        p_gain : float
-            P gain, the register's value.
-        voltage_share : float
-            Supply voltage over that of the card.
-        """
-        stall = self.stall_torque_nm.value * voltage_share
+    def as_pd(self, p_gain: float) -> TorquePD:
+        """The same servo as a PD in torque; see `LoadedServoParameters.delayed_pd`."""
+        stall = self.stall_torque_nm.value
         damping = _or(self.duty_s_per_rad) * stall
         return TorquePD(
             model="delayed_pd",
@@ -373,10 +350,7 @@ class LoadedLoop(Part):
         return f"Left out of the PD: {', '.join(left)}." if left else ""
 
 
-LOADED_KEYS = {
-    name: next(k for k in LoadedLoop.model_fields if k in (name, *(name + u for u in _ENDINGS)))
-    for name in (f.name for f in fields(LoadedServoParameters))
-}
+LOADED_KEYS = parts.LOADED_KEYS | {"dead_time_s": "dead_time_s"}
 """Fields of `LoadedServoParameters` and their names in `LoadedLoop`."""
 
 ServoNumbers = Annotated[PositionLoop | LoadedLoop | TorquePD, Field(discriminator="model")]
