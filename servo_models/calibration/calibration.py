@@ -216,7 +216,6 @@ class Calibration(Part):
         actuators = [self.joint(name).actuator for name in wanted]
         if not actuators:
             raise InputError("No joint was named. Name at least one.")
-
         parameters = DelayedPDParameters(
             **{
                 field: np.array([getattr(actuator, key).value for actuator in actuators])
@@ -368,8 +367,8 @@ def _load(path: Path) -> Calibration:
         if version == 3:
             data = data | {"joints": _with_unseen_runs(data.get("joints"))}
         return validated(Calibration, data | {"schema_version": SCHEMA_VERSION}, path, lines)
-    data = _renamed(data) | {"schema_version": SCHEMA_VERSION}
-    lines = {tuple(map(_new_name, place)): n for place, n in lines.items()}
+    data = _renamed(data, _RENAMED) | {"schema_version": SCHEMA_VERSION}
+    lines = {tuple(_RENAMED.get(p, p) for p in place): n for place, n in lines.items()}
     try:
         return validated(Calibration, data, path, lines)
     except InputError as error:
@@ -383,42 +382,23 @@ def _with_unseen_runs(joints: Any) -> Any:
     """Joints of a version 3 file, whose fits under load had errors under another's name."""
     if not isinstance(joints, dict):
         return joints
-    return {
-        name: _of_unseen_runs(joint)
-        if isinstance(joint, dict) and joint.get("under_load") is not None
-        else joint
-        for name, joint in joints.items()
-    }
-
-
-def _of_unseen_runs(joint: dict) -> dict:
-    """A joint's scores, RMS, and its candidates', mean absolute errors, by their present names."""
-    old, found = "rmse_leave_one_frequency_out_rad", dict(joint)
-    if isinstance(scores := joint.get("scores"), dict):
-        found["scores"] = {"rmse_unseen_runs_rad" if k == old else k: v for k, v in scores.items()}
-    selection = joint.get("selection")
-    if isinstance(selection, dict) and isinstance(selection.get("candidate_models"), list):
-        models = [
-            {"mae_unseen_runs_rad" if k == old else k: v for k, v in model.items()}
-            if isinstance(model, dict)
-            else model
-            for model in selection["candidate_models"]
-        ]
-        found["selection"] = selection | {"candidate_models": models}
+    found, old = dict(joints), "rmse_leave_one_frequency_out_rad"
+    for name, joint in joints.items():
+        if isinstance(joint, dict) and joint.get("under_load") is not None:
+            # root mean square errors of the model, mean absolute ones of the candidates
+            new = {"scores": "rmse_unseen_runs_rad", "selection": "mae_unseen_runs_rad"}
+            parts = {p: _renamed(joint[p], {old: new[p]}) for p in new.keys() & joint.keys()}
+            found[name] = joint | parts
     return found
 
 
-def _new_name(name: str | int) -> str | int:
-    return _RENAMED.get(name, name) if isinstance(name, str) else name
-
-
-def _renamed(data: Any) -> Any:
-    """`data` of a version 1 file with the present names; one that is there twice stays."""
+def _renamed(data: Any, names: dict[str, str]) -> Any:
+    """`data` with the present names of keys; one that is there twice stays."""
     if isinstance(data, list):
-        return [_renamed(entry) for entry in data]
+        return [_renamed(entry, names) for entry in data]
     if not isinstance(data, dict):
         return data
     return {
-        key if _new_name(key) in data else _new_name(key): _renamed(entry)
+        key if names.get(key) in data else names.get(key, key): _renamed(entry, names)
         for key, entry in data.items()
     }

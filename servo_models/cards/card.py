@@ -27,6 +27,7 @@ from pupper_sysid.servo_models.calibration.parts import (
     NO_SPEED_LIMIT_RAD_S,
     NOT_STATED,
     P_GAINS,
+    PARAMETER_KEYS,
     Actuator,
     Armature,
     Feedback,
@@ -143,10 +144,8 @@ class ServoCard(Part):
     @model_validator(mode="after")
     def _check(self) -> ServoCard:
         if self.default not in self.specimens:
-            raise ValueError(
-                f"default is {self.default}, which is no specimen of it "
-                f"({', '.join(self.specimens)})"
-            )
+            known = ", ".join(self.specimens)
+            raise ValueError(f"default is {self.default}, which is no specimen of it ({known})")
         loops = any(not isinstance(n, TorquePD) for n in self.specimens.values())
         if loops and (self.gains.p is None or self.supply_v is None):
             raise ValueError("numbers of a position loop need gains.p and supply_v")
@@ -227,11 +226,10 @@ class ServoCard(Part):
             f"Servo card {self.name}: {kind} {self.source.title}, {self.source.url}.",
             "A card has no bus: its feedback is ideal, every reading fresh and on time.",
         ]
-        pd = self.pd()
         numbers = self.numbers
         if not isinstance(numbers, TorquePD) and numbers.left_out_of_pd:
             told.append(numbers.left_out_of_pd)
-        if pd.dead_time_s is None:
+        if self.pd().dead_time_s is None:
             told.append("The source has no dead time; 0 stands for it.")
         return [*told, *self.notes]
 
@@ -256,17 +254,13 @@ class ServoCard(Part):
             operating_point=self.operating_point,
             actuator=Actuator(
                 model="delayed_pd",
-                stiffness_nm_per_rad=torques["stiffness"],
-                damping_nm_s_per_rad=torques["damping"],
-                friction_loss_nm=torques["friction_loss"],
                 armature_kg_m2=pd.armature_kg_m2,
-                effort_limit_nm=torques["effort_limit"],
                 velocity_limit_rad_s=pd.velocity_limit_rad_s or _absent(NO_SPEED_LIMIT_RAD_S),
-                back_emf_nm_s_per_rad=torques["back_emf"],
                 dead_time_s=dead,
                 delay_steps_min=low,
                 delay_steps_max=high,
                 physics_step_s=TIME_STEP_S,
+                **{PARAMETER_KEYS[n]: q for n, q in torques.items()},
                 ratios_to_armature=RatiosToArmature(
                     **{n: stated(q.value / armature) for n, q in torques.items()}
                 ),

@@ -288,16 +288,11 @@ def motor_of(servo: UnderLoad) -> tuple[dict[str, Any], tuple[str, ...]]:
     such that half of it is left at the same speed. The second value is what BAM's models do not
     have, in words.
     """
-    value = {
-        key: quantity.value if (quantity := getattr(servo, key)) is not None else 0.0
-        for key in (*LOADED_KEYS.values(),)
-        if hasattr(servo, key)
-    }
+    quantities = {key: getattr(servo, key) for key in LOADED_KEYS.values()}
+    value = {key: 0.0 if q is None else q.value for key, q in quantities.items()}
     viscous = value["off_brake"] * value["back_emf_nm_s_per_rad"]
-    emf, per_volt = (
-        value["back_emf_nm_s_per_rad"] - viscous,
-        value["stall_torque_nm"] / (servo.reference_voltage_v or 1.0),
-    )
+    emf = value["back_emf_nm_s_per_rad"] - viscous
+    per_volt = value["stall_torque_nm"] / (servo.reference_voltage_v or 1.0)
     if not emf > 0:
         raise InputError(
             "This servo was fitted without a back-EMF, so its kt is unknown. Export it to isaaclab."

@@ -152,12 +152,12 @@ def to_model(
     hinges = hinges_of(model)
     root = _inlined(model)
     theirs = mujoco.MjModel.from_xml_path(str(model))
-    names = [h.name for h in hinges if h.name]
-    if isinstance(calibration, CardCalibration):
+    names, card = [h.name for h in hinges if h.name], isinstance(calibration, CardCalibration)
+    if card:
         wanted = [h.name for h in hinges if h.name and h.driven]
     else:
         wanted = [name for name in calibration.joint_names if name in names]
-    if not wanted and isinstance(calibration, CardCalibration):
+    if not wanted and card:
         raise InputError(
             f"{model} drives none of its hinges ({', '.join(names) or 'it has none'}), and a card "
             "goes into every hinge that is driven. Give the servo's hinge an actuator, such as "
@@ -169,7 +169,6 @@ def to_model(
             f"({', '.join(calibration.joint_names)}); it has {', '.join(names) or 'none'}. Rename "
             "the joints of one of them."
         )
-    card = isinstance(calibration, CardCalibration)
     absent = [] if card else [n for n in calibration.joint_names if n not in wanted]
     calibration = calibration.model_copy(
         update={"joints": {name: calibration.joint(name) for name in wanted}}
@@ -320,12 +319,7 @@ def _put_servos(root: Element, servos: ExportedServos, model: Path, group: str) 
         for tendon in root.iter("fixed")
         if any(j.get("joint") in counts for j in tendon.iter("joint"))
     }
-    driven = [
-        e.get("name") or e.tag
-        for s in root.iter("actuator")
-        for e in s
-        if e.get("tendon") in tendons
-    ]
+    driven = [e.get("name") or e.tag for e in _actuators(root) if e.get("tendon") in tendons]
     if tendons and driven:
         yield f"Actuators on tendons drive these joints, too, and were left: {', '.join(driven)}."
 

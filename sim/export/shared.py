@@ -101,10 +101,8 @@ class ExportedServos:
         joints = dict(moving.joints)
         for name, inertia in links.items():
             joints[name] = without_link(name, moving.joint(name), inertia)
-        return cls(
-            moving.model_copy(update={"joints": joints}), physics_step_s,
-            sha256, moving, links,
-        )  # fmt: skip
+        written = moving.model_copy(update={"joints": joints})
+        return cls(written, physics_step_s, sha256, moving, links)
 
     def actuators(self, engine: Engine = MUJOCO) -> dict[str, Actuator]:
         """Actuators with which joints in the simulator's steps and engine move like the servos.
@@ -176,8 +174,7 @@ class ExportedServos:
         RMS of the worst joint at 4 Hz and 0.3 rad, of the motion by the nearest whole number of
         steps beside the motion by the delay itself.
         """
-        costs = self.whole_step_costs(engine)
-        return max(costs.values())
+        return max(self.whole_step_costs(engine).values())
 
     def whole_step_costs(self, engine: Engine = EXPLICIT_PD) -> dict[str, float]:
         """The same of each joint [rad]."""
@@ -262,8 +259,8 @@ def _changed(actuator: Actuator, old: Mapping[str, float], new: Mapping[str, flo
     later = new["dead_time_s"] - old["dead_time_s"]
     ends = (actuator.dead_time_s.value, *actuator.dead_time_interval_s)
     value, low, high = (max(end + later, 0.0) for end in ends)
-    ends_of = {"value": value, "low": low, "high": high}
-    numbers["dead_time_s"] = actuator.dead_time_s.model_copy(update=ends_of)
+    shifted = {"value": value, "low": low, "high": high}
+    numbers["dead_time_s"] = actuator.dead_time_s.model_copy(update=shifted)
     return actuator.model_copy(update=numbers)
 
 
@@ -357,25 +354,18 @@ def feedback_block(calibration: Calibration) -> str:
 
 def servos_block(servos: ExportedServos, engine: Engine) -> str:
     """`SERVOS = {…}`: the numbers of each joint's actuator, its dead time for this engine."""
+    torques = ("stiffness", "damping", "effort_limit", "armature", "friction_loss", "back_emf")
+    keys = {name: PARAMETER_KEYS[name] for name in torques} | {
+        "velocity_limit_rad_s": "velocity_limit_rad_s", "jitter_s": "command_jitter_s",
+        "dead_time_s": "dead_time_s",
+    }  # fmt: skip
     rows = []
-    for name, a in servos.actuators(engine).items():
-        numbers = {
-            "stiffness": (a.stiffness_nm_per_rad, "stiffness_nm_per_rad"),
-            "damping": (a.damping_nm_s_per_rad, "damping_nm_s_per_rad"),
-            "effort_limit": (a.effort_limit_nm, "effort_limit_nm"),
-            "armature": (a.armature_kg_m2, "armature_kg_m2"),
-            "friction_loss": (a.friction_loss_nm, "friction_loss_nm"),
-            "back_emf": (a.back_emf_nm_s_per_rad, "back_emf_nm_s_per_rad"),
-            "velocity_limit_rad_s": (a.velocity_limit_rad_s, "velocity_limit_rad_s"),
-            "jitter_s": (a.command_jitter_s, "command_jitter_s"),
-        }
+    for name, actuator in servos.actuators(engine).items():
+        quantities = {shown: getattr(actuator, key) for shown, key in keys.items()}
         lines = [
-            f'    "{key}": {quantity.value!r},  # {unit_of(unit)}, {known_text(quantity)}'
-            for key, (quantity, unit) in numbers.items()
+            f'    "{shown}": {q.value!r},  # {unit_of(keys[shown])}, {known_text(q)}'
+            for shown, q in quantities.items()
         ]
-        lines.append(
-            f'    "dead_time_s": {a.dead_time_s.value!r},  # s, {known_text(a.dead_time_s)}'
-        )
         rows.append("\n".join([f'"{name}": {{', *lines, "},"]))
     return block("SERVOS", rows) + '"""The servos by joint."""\n'
 

@@ -31,19 +31,9 @@ class SetPoint:
     commands over that step. With a jitter every command has a latency of its own, and none
     overtakes the one before it.
 
-    Parameters
-    ----------
-    servos : dict of str to dict
-        `dead_time_s`, `jitter_s` (standard deviation of the latency, part of the dead time) and
-        `velocity_limit_rad_s` of each joint.
-    joint_names : sequence of str
-        Order of the columns of what `step` is given.
-    num_envs : int
-    physics_dt : float
-        Time between two calls of `step` [s].
-    device : str
-    generator : torch.Generator, optional
-        Decides the latencies.
+    `servos` has, by joint, `dead_time_s`, `jitter_s` (standard deviation of the latency, part of
+    the dead time) and `velocity_limit_rad_s`; `joint_names` is the order of the columns of what
+    `step` is given, every `physics_dt` [s]; `generator` decides the latencies.
     """
 
     def __init__(
@@ -104,24 +94,11 @@ class SetPoint:
 class HeldFeedback:
     """Held readings of many robots at once.
 
-    Parameters
-    ----------
-    feedback : dict of joint name to dict
-        `poll_period_s`, `loss`, `quantum_rad` and `offset_rad` of each joint. The offset, an error
-        of the joint's zero, is 0 unless you give one: that of a recording is not the servo's.
-    joint_names : sequence of str
-        Order of the columns of what `step` is given.
-    num_envs : int
-    physics_dt : float
-        Time between two calls of `step` [s].
-    device : str
-    generator : torch.Generator, optional
-        Decides phases and lost polls.
-
-    Attributes
-    ----------
-    reading, age : Tensor, shape (environments, joints)
-        What the host reads after the last step [rad], and since when that has been so [s].
+    `feedback` has `poll_period_s`, `loss`, `quantum_rad` and `offset_rad` of each joint. The
+    offset, an error of the joint's zero, is 0 unless you give one: that of a recording is not the
+    servo's. `generator` decides phases and lost polls, other parameters are those of `SetPoint`.
+    `reading` and `age`, shape (environments, joints), are what the host reads after the last step
+    [rad], and since when that has been so [s].
     """
 
     def __init__(
@@ -145,10 +122,7 @@ class HeldFeedback:
         shape = (num_envs, len(joint_names))
         self.until = torch.zeros(shape, device=device)  # the next poll [s]
         self.before = torch.zeros(shape, device=device)
-        self.reading, self.age = (
-            torch.zeros(shape, device=device),
-            torch.zeros(shape, device=device),
-        )
+        self.reading, self.age = torch.zeros((2, *shape), device=device)
 
     def reset(self, position: torch.Tensor, env_ids: torch.Tensor | slice = slice(None)) -> None:
         """Begin at rest at `position`, shape (all environments, joints), with a new phase."""
@@ -190,14 +164,7 @@ class HeldFeedback:
 class ServoBank:
     """Commands and readings of a group of servos, in the order in which simulators call for them.
 
-    Parameters
-    ----------
-    servos, feedback : dict of str to dict
-        As of `SetPoint` and `HeldFeedback`.
-    joint_names : sequence of str
-    num_envs : int
-    physics_dt : float
-    device : str
+    Parameters are those of `SetPoint` and `HeldFeedback`.
     """
 
     def __init__(
