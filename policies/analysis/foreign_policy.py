@@ -33,7 +33,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self, cast
+from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,7 +51,7 @@ from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.robot_file import RobotFile
 from pupper_sysid.sim.walking.config import EVALUATION_STEP_S, Walking, for_robot
 from pupper_sysid.sim.walking.differences import Differences
-from pupper_sysid.sim.walking.observation import VELOCITY_STEPS, observation_of
+from pupper_sysid.sim.walking.observation import VELOCITY_STEPS, observation_of, places
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
 Array = NDArray[np.float64]
@@ -331,13 +331,7 @@ class ForeignPolicy:
         self._ratio = (self.scale / task.action_scale).astype(np.float32)
         self._shift = ((self.pose - body.pose[at]) / task.action_scale).astype(np.float32)
         self._step_s = task.control_step_s
-        ends = np.cumsum([0, *(size for _, size, _ in observation_of(len(body.joints)))])
-        self._places = {
-            name: slice(int(a), int(b))
-            for (name, _, _), a, b in zip(
-                observation_of(len(body.joints)), ends[:-1], ends[1:], strict=True
-            )
-        }
+        self._places = places((name, n) for name, n, _ in observation_of(len(body.joints)))
 
     # ------------------------------------------------------------------------- walking
 
@@ -473,13 +467,6 @@ def servos_of_training(policy: ForeignPolicy, task: Walking, robot: Path | None)
 # --------------------------------------------------------------------------------- metadata
 
 
-class _Terms(NamedTuple):
-    scale: Any
-    clip: Any
-    history: Any
-    flat: Any
-
-
 def _of_metadata(network: OnnxNetwork, stated: PolicyYaml) -> tuple[dict[str, Any], list[str]]:
     """What the metadata say of the keys that the YAML does not, and what was assumed."""
     metadata, path, notes = network.metadata, network.path, []
@@ -511,18 +498,16 @@ def _of_metadata(network: OnnxNetwork, stated: PolicyYaml) -> tuple[dict[str, An
 def _metadata_terms(network: OnnxNetwork, names: list[str]) -> list[dict[str, Any]]:
     """Terms of an observation as mjlab's exporter states them."""
     metadata, path = network.metadata, network.path
-    lists = _Terms(
-        *(
-            _listed(metadata.get(f"observation_terms_{key}"), f"observation_terms_{key}", path)
-            for key in ("scale", "clip", "history_length", "flatten_history_dim")
-        )
-    )
-    for key, values in zip(lists._fields, lists, strict=True):
+    lists = {}
+    for key in ("scale", "clip", "history_length", "flatten_history_dim"):
+        whole = f"observation_terms_{key}"
+        values = lists[key] = _listed(metadata.get(whole), whole, path)
         if values is not None and len(values) != len(names):
             raise InputError(
                 f"{path}: its metadata have {len(names)} observation_names and {len(values)} "
                 f"values of {key}. State `observation` in the YAML."
             )
+    scales, clips, histories, flat = lists.values()
     terms = []
     for i, name in enumerate(names):
         if _ALIASES.get(name, name) not in TERMS:
@@ -533,15 +518,14 @@ def _metadata_terms(network: OnnxNetwork, names: list[str]) -> list[dict[str, An
                 "is a {term: constant, values: […]}."
             )
         term: dict[str, Any] = {"term": name}
-        if lists.scale is not None:
-            term["scale"] = lists.scale[i]
-        if lists.history is not None:
-            term["history"] = max(int(np.max(lists.history[i])), 1)
-        if lists.clip is not None:
-            ends = [lists.clip[i]] if isinstance(lists.clip[i], float) else lists.clip[i]
-            if len(ends) == 2 and np.isfinite(ends).any():
-                term["clip"] = np.clip(ends, -1e6, 1e6).tolist()
-        if term.get("history", 1) > 1 and lists.flat is not None and not np.any(lists.flat[i]):
+        if scales is not None:
+            term["scale"] = scales[i]
+        if histories is not None:
+            term["history"] = max(int(np.max(histories[i])), 1)
+        ends = None if clips is None else clips[i]
+        if isinstance(ends, list) and len(ends) == 2 and np.isfinite(ends).any():
+            term["clip"] = np.clip(ends, -1e6, 1e6).tolist()
+        if term.get("history", 1) > 1 and flat is not None and not np.any(flat[i]):
             raise InputError(
                 f"{path}: the history of {printable(name)} is not flattened, so it is no vector. "
                 "State `observation` in the YAML as the network takes it."
@@ -554,10 +538,9 @@ def _listed(text: str | None, key: str, path: Path) -> list[float | list[float]]
     """Numbers, or lists of numbers, between commas; None where there is no text."""
     if text is None:
         return None
-    words = {"inf": "1e999", "-inf": "-1e999", "true": "1", "false": "0", "none": "1"}
-    plain = text.lower().replace("-inf", "-1e999").replace("inf", "1e999")
-    for word in ("true", "false", "none"):
-        plain = plain.replace(word, words[word])
+    plain = text.lower()
+    for word, number in (("inf", "1e999"), ("true", "1"), ("false", "0"), ("none", "1")):
+        plain = plain.replace(word, number)
     try:
         values = json.loads(f"[{plain}]")
         return [[float(x) for x in v] if isinstance(v, list) else float(v) for v in values]

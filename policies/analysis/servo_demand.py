@@ -32,7 +32,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result, internal
 from pupper_sysid.policies.analysis.gait import SETTLE_S
 from pupper_sysid.policies.analysis.trial import Trial
-from pupper_sysid.policies.walks.conditions import Actor, Condition, Moment
+from pupper_sysid.policies.walks.conditions import Actor, Condition, Moment, StepRecorder
 from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.policies.walks.tracking import planar_velocity
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
@@ -310,33 +310,27 @@ class _Kept:
         return found
 
 
-class _Recorder:
+class _Recorder(StepRecorder):
     """Keeps `_Kept` of one environment."""
 
     def __init__(self, env: PupperEnv, policy: Actor | None, conditions: Sequence[Condition]):
-        self._env = env
+        super().__init__(env, policy, conditions)
         self._servos = {name: x.copy() for name, x in env.robots.drawn.items()}
-        self._fell = np.zeros(env.environments, bool)
-        self._steps: list[tuple[NDArray, ...]] = []
 
-    def keep(self, now: Moment) -> None:
-        to_servo, facts = self._env.robots.to_servo, now.facts
-        self._fell |= now.fell
+    def arrays(self, now: Moment) -> dict[str, NDArray]:
+        to_servo, facts = self.env.robots.to_servo, now.facts
         wanted = now.command[:, :2]
         size = np.linalg.norm(wanted, axis=1)
         along = (planar_velocity(facts)[:, :2] * wanted).sum(axis=1) / np.maximum(size, 1e-9)
-        self._steps.append(
-            (
-                facts.torque.copy(), to_servo(facts.velocity).copy(),
-                to_servo(facts.acceleration).copy(), along, now.alive.copy(),
-            )
-        )  # fmt: skip
+        return {
+            "force": facts.torque.copy(), "speed": to_servo(facts.velocity).copy(),
+            "acceleration": to_servo(facts.acceleration).copy(), "along": along,
+            "alive": now.alive.copy(),
+        }  # fmt: skip
 
     def of(self, condition: Condition, robots: slice, steps: int, commands: Array) -> _Kept:
-        force, speed, acceleration, along, alive = (
-            np.stack([step[i][robots] for step in self._steps[:steps]]) for i in range(5)
-        )
         return _Kept(
-            condition.task.control_step_s, force, speed, acceleration, along, alive.astype(bool),
-            1.0 - float(self._fell[robots].mean()), {n: x[robots] for n, x in self._servos.items()},
+            condition.task.control_step_s, **self.stacked(robots, steps),
+            survival=1.0 - float(self.fell[robots].mean()),
+            servos={n: x[robots] for n, x in self._servos.items()},
         )  # fmt: skip

@@ -25,10 +25,6 @@ STILL_RAD = 1e-3
 """Smaller deviations move no servo by a count [rad]."""
 
 
-def _silent(share: float) -> None:
-    """Show no progress."""
-
-
 @dataclass(frozen=True)
 class Trial:
     """Task, servos, command, number of robots and duration in which a policy is tried."""
@@ -40,7 +36,7 @@ class Trial:
     seconds: float = 10.0
     seed: int = 0
     threads: int = 0
-    progress: Callable[[float], None] = field(default=_silent, compare=False)
+    progress: Callable[[float], None] = field(default=lambda share: None, compare=False)
     """Called with the share of an analysis that is done."""
     _plain: list[tuple[Policy, Rollout]] = field(
         init=False, repr=False, compare=False, default_factory=list
@@ -115,27 +111,13 @@ class Outcome(Result):
 
 def outcome(rollout: Rollout) -> dict[str, float]:
     """Values of an `Outcome` by field; those of the gait are NaN if no robot walked long enough."""
-    gaits = [
-        (
-            frequency(action, rollout.step_s).value,
-            float(amplitude(action)[0].mean()),
-            jitter(action),
-        )
-        for i, now in steady(rollout).items()
-        if not still(action := rollout.action_rad[now, i])
-    ]
-    means = np.mean(np.array(gaits), axis=0).tolist() if gaits else [NAN] * 3
-    return {
-        "survival": 1.0 - float(rollout.fell.mean()),
-        **pooled_errors(
-            rollout.velocity,
-            np.array(rollout.command),
-            rollout.alive,
-            rollout.fell,
-            rollout.whole_steps,
-        ),
-        **dict(zip(("frequency_hz", "amplitude_rad", "jitter_rad"), means, strict=True)),
-    }
+    walked = [rollout.action_rad[now, i] for i, now in walking(rollout).items()]
+    errors = pooled_errors(
+        rollout.velocity, np.array(rollout.command), rollout.alive, rollout.fell,
+        rollout.whole_steps,
+    )  # fmt: skip
+    survival = 1.0 - float(rollout.fell.mean())
+    return {"survival": survival, **errors, **_gait_of(walked, rollout.step_s)}
 
 
 def gait_of_actions(plain: Rollout, actions: NDArray[np.floating]) -> dict[str, float]:
@@ -145,9 +127,13 @@ def gait_of_actions(plain: Rollout, actions: NDArray[np.floating]) -> dict[str, 
     the frequency: none that moves in the replay).
     """
     radians = plain.action_scale * actions.astype(float)
-    walked = [radians[now, i] for i, now in steady(plain).items()]
+    return _gait_of([radians[now, i] for i, now in steady(plain).items()], plain.step_s)
+
+
+def _gait_of(walked: Sequence[Array], step_s: float) -> dict[str, float]:
+    """Means over robots, whose actions [rad] have the shape (steps, 12)."""
     return {
-        "frequency_hz": mean([moving_frequency(x, plain.step_s) for x in walked]),
+        "frequency_hz": mean([moving_frequency(x, step_s) for x in walked]),
         "amplitude_rad": mean([float(amplitude(x)[0].mean()) for x in walked]),
         "jitter_rad": mean([jitter(x) for x in walked]),
     }

@@ -200,10 +200,8 @@ class FrozenReadings:
         self._ticks += 1
         self._read.append(self._to_servo(tick.reading.position_rad))
         self._moved.append(self._servos.step(sent, self._read[-1]).position)
-        if len(self._read) == self._read.maxlen and self._ticks % _CHECK_EVERY_TICKS == 0:
-            self._check()
-
-    def _check(self) -> None:
+        if len(self._read) != self._read.maxlen or self._ticks % _CHECK_EVERY_TICKS:
+            return
         moved = np.ptp(np.array(self._moved)[: -self._late], axis=0)
         read = np.array(self._read)
         # a joint without any reading is the guard's business

@@ -349,7 +349,6 @@ def _outside(
 
 
 def _sentence(quantity: str, own: Sequence[Outside]) -> str:
-
     def distance(one: Outside) -> float:
         return abs(one.beyond) / max(abs(one.trained_low), abs(one.trained_high), 1e-12)
 
@@ -361,13 +360,6 @@ def _sentence(quantity: str, own: Sequence[Outside]) -> str:
         f"{quantity.capitalize()}{joint}: {worst.here.value:.3g}{unit}, {worst.amount()} "
         f"({worst.trained_low:.3g} to {worst.trained_high:.3g}{unit}){among}."
     )
-
-
-# ---------------------------------------------------------------------------------- quantities
-
-
-def _dead_time(own: ServoNumbers, voltage: Range, poll: Range) -> Interval:
-    return _times(own.dead_time_s, 1e3)
 
 
 def _per_inertia(field: str, with_voltage: bool) -> Quantity:
@@ -416,24 +408,24 @@ def _age(own: ServoNumbers, voltage: Range, poll: Range) -> Interval:
     return _times(poll, 1e3 * feedback.poll_period_s * periods)
 
 
-def _quantum(own: ServoNumbers, voltage: Range, poll: Range) -> Interval:
-    step = 1e3 * own.feedback.quantum_rad
-    return Interval(step, step, step)
-
-
 def _times(own: Range, factor: float) -> Interval:
     return Interval(factor * own.value, factor * own.low, factor * own.high)
 
 
 Quantity = Callable[[ServoNumbers, Range, Range], Interval | None]
 _QUANTITIES: tuple[tuple[str, str, bool, Quantity], ...] = (
-    ("dead time", "ms", False, _dead_time),
+    ("dead time", "ms", False, lambda own, voltage, poll: _times(own.dead_time_s, 1e3)),
     ("stiffness per inertia", "1/s²", True, _per_inertia("stiffness", True)),
     ("damping per inertia", "1/s", True, _per_inertia("damping", False)),
     ("effort limit per inertia", "rad/s²", True, _per_inertia("effort_limit", True)),
     ("dead band", "mrad", False, _dead_band),
     ("top speed", "rad/s", True, _top_speed),
     ("mean age of readings", "ms", False, _age),
-    ("quantisation step", "mrad", False, _quantum),
+    (
+        "quantisation step",
+        "mrad",
+        False,
+        lambda own, voltage, poll: Interval(*[1e3 * own.feedback.quantum_rad] * 3),
+    ),
 )
 """Name, unit, whether differences are factors, and the number of a servo in that unit."""

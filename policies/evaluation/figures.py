@@ -12,8 +12,7 @@ from scipy.stats import beta
 
 from pupper_sysid.common.interval import LEVEL, Interval, mean_of
 from pupper_sysid.common.results import Result
-from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.walks.conditions import Condition, Moment, Walker
+from pupper_sysid.policies.walks.conditions import Condition, Moment, StepRecorder, Walker
 from pupper_sysid.policies.walks.rollouts import heading
 from pupper_sysid.policies.walks.tracking import (
     ERRORS,
@@ -23,7 +22,6 @@ from pupper_sysid.policies.walks.tracking import (
     stride_errors,
     tracking_errors,
 )
-from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.observation import FALLEN_TILT
 from pupper_sysid.sim.walking.rewards.strides import LOW_SWING_M, by_kind
 
@@ -112,14 +110,9 @@ class Walk:
 
     def first(self, episodes: int) -> Walk:
         """The same of the first episodes."""
-        given = {
-            f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("step_s", "kinds")
-        }
-        return Walk(
-            step_s=self.step_s,
-            kinds=self.kinds,
-            **{k: v[:episodes] if k == "fell" else v[:, :episodes] for k, v in given.items()},
-        )
+        arrays = {f.name: getattr(self, f.name) for f in fields(self)[3:]}
+        first = {name: array[:, :episodes] for name, array in arrays.items()}
+        return Walk(self.step_s, self.kinds, self.fell[:episodes], **first)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,51 +183,40 @@ class Figures(Result):
     intervals: Intervals
 
 
-class Recorder:
+class Recorder(StepRecorder):
     """What figures are made of, for the robots of one environment."""
 
-    def __init__(self, env: PupperEnv, policy: Policy | None, conditions: Sequence[Condition]):
-        self._env = env
-        self._step_s = env.config.control_step_s
-        self._fell = np.zeros(env.environments, bool)
-        self._steps: list[dict[str, NDArray]] = []
-
-    def keep(self, now: Moment) -> None:
-        """Take the next control step."""
-        facts = now.facts
-        self._fell |= now.fell
+    def arrays(self, now: Moment) -> dict[str, NDArray]:
+        """Columns of a `Walk`."""
+        facts, step_s = now.facts, self.env.config.control_step_s
         standing = facts.contact & now.alive[:, None]
         ended = facts.swing_ended & now.alive[:, None]
         # of the mean motion over a stride
-        travelled = self._step_s * np.linalg.norm(facts.stride_velocity[:, :2], axis=1)
+        travelled = step_s * np.linalg.norm(facts.stride_velocity[:, :2], axis=1)
         # before the first step a foot may have been elsewhere: its speed is not known
-        slip = facts.foot_speed_m_s * standing if self._steps else np.zeros(standing.shape)
-        self._steps.append(
-            {
-                "velocity": planar_velocity(facts), "contact": facts.contact, "alive": now.alive,
-                "gravity": facts.gravity.astype(np.float32),
-                "heading": heading(self._env.robots.qpos), "slip_m_s": slip.sum(axis=1),
-                "swing_s": (facts.last_air_s * ended).sum(axis=1), "swings": ended.sum(axis=1),
-                "clearance_m": np.where(ended, facts.clearance_m, np.nan).astype(np.float32),
-                "saturated": by_kind(facts.body, facts.saturated).astype(np.float32),
-                "torque_square": by_kind(facts.body, facts.torque_square).astype(np.float32),
-                "work_j": self._step_s * facts.power_w, "carried_j": facts.weight_n * travelled,
-            }
-        )  # fmt: skip
+        slip = facts.foot_speed_m_s * standing if self.steps else np.zeros(standing.shape)
+        return {
+            "velocity": planar_velocity(facts), "contact": facts.contact, "alive": now.alive,
+            "gravity": facts.gravity.astype(np.float32),
+            "heading": heading(self.env.robots.qpos), "slip_m_s": slip.sum(axis=1),
+            "swing_s": (facts.last_air_s * ended).sum(axis=1), "swings": ended.sum(axis=1),
+            "clearance_m": np.where(ended, facts.clearance_m, np.nan).astype(np.float32),
+            "saturated": by_kind(facts.body, facts.saturated).astype(np.float32),
+            "torque_square": by_kind(facts.body, facts.torque_square).astype(np.float32),
+            "work_j": step_s * facts.power_w, "carried_j": facts.weight_n * travelled,
+        }  # fmt: skip
 
     def of(self, condition: Condition, robots: slice, steps: int, commands: Array) -> Walk:
         """The walk of a condition's robots."""
-        kept = self._steps[:steps]
-        arrays = {name: np.stack([step[name][robots] for step in kept]) for name in kept[0]}
+        arrays = self.stacked(robots, steps)
         arrays["heading"] = np.unwrap(arrays["heading"], axis=0)
         rest = len(commands) - steps
         padded = {
             name: np.concatenate([x, np.zeros((rest, *x.shape[1:]), x.dtype)])
             for name, x in arrays.items()
         }
-        return Walk(
-            self._step_s, tuple(self._env.body.kinds), self._fell[robots], commands, **padded
-        )
+        step_s, kinds = condition.task.control_step_s, tuple(self.env.body.kinds)
+        return Walk(step_s, kinds, self.fell[robots], commands, **padded)
 
 
 def figures_of(found: Walk, command: tuple[float, float, float] | None = None) -> Figures:
@@ -244,7 +226,8 @@ def figures_of(found: Walk, command: tuple[float, float, float] | None = None) -
     each = dict(zip(ERRORS, found.error.T, strict=True))
     each |= dict(zip(STRIDE_ERRORS, found.stride_error.T, strict=True))
     nothing = np.full(len(found.fell), np.nan)
-    each["speed_share"] = nothing if command is None else _share(found, np.array(command))
+    size = 0.0 if command is None else float(np.dot(command, command))
+    each["speed_share"] = found.mean_velocity @ np.array(command) / size if size else nothing
     drifts = command is not None and command[2] == 0
     each["heading_drift_deg"] = found.drift_deg if drifts else nothing
     intervals = {name: mean_of(values) for name, values in each.items()}
@@ -288,14 +271,6 @@ def _effort(found: Walk, travels: bool) -> dict[str, Any]:
         "mechanical_power_w": float(work / up_s) if up_s else nothing,
         "cost_of_transport": float(work / carried) if travels and carried else nothing,
     }
-
-
-def _share(found: Walk, command: Array) -> Array:
-    """Speed of each robot along a command, over the commanded one; NaN of a command to stand."""
-    size = float(command @ command)
-    if not size:
-        return np.full(len(found.fell), np.nan)
-    return found.mean_velocity @ command / size
 
 
 def share_interval(some: int, of: int) -> Interval:

@@ -298,15 +298,9 @@ def fit_trot(
             drawn[half:] = low + (strata + rng.random(strata.shape)) / half * (high - low)
         trots = [_trot(task.trot, values) for values in drawn]
         walked = _walk(
-            trots,
-            quick,
-            servos,
-            _within(task, _SEARCH_COMMANDS),
-            _SEARCH_S,
-            _SEARCH_IGNORED_S,
-            seed,
-            threads,
-        )
+            trots, quick, servos, _SEARCH_COMMANDS * _scale(task), _SEARCH_S, _SEARCH_IGNORED_S,
+            seed, threads,
+        )  # fmt: skip
         costs = [_cost(one) for one in walked]
         order = np.argsort(costs, kind="stable")[:_ELITE]
         elite = [_corrected(trots[i], walked[i]) for i in order]
@@ -339,20 +333,15 @@ def _judged(
     trots: Sequence[Trot], task: Walking, servos: ServoRanges, seed: int, threads: int,
     changes: Sequence[dict[str, float]] = (),
 ) -> list[_Walked]:  # fmt: skip
-    command = _within(task, np.repeat(COMMANDS, _EACH, axis=0))
+    command = np.repeat(COMMANDS, _EACH, axis=0) * _scale(task)
     return _walk(
         trots, _gentle(task, _SECONDS), servos, command, _SECONDS, _IGNORED_S, seed, threads,
         changes,
     )  # fmt: skip
 
 
-def _within(task: Walking, commands: Array) -> Array:
-    """Commands as far within the ranges of a task as they are within usual ones."""
-    return commands * _scale(task)
-
-
 def _scale(task: Walking) -> Array:
-    """Largest commands of a task over usual ones, at most 1, of each part."""
+    """Largest commands of a task over usual ones, at most 1, of each part: by which to scale."""
     own = task.commands
     ends = np.abs([own.forward_m_s, own.sideways_m_s, own.yaw_rad_s]).max(axis=1)
     # those of another robot are its own, as large as they are

@@ -42,13 +42,8 @@ RUN_SCHEMA = "pupper-run"
 RUN_VERSION = 2
 RUN_FILE = "run.yaml"
 _OF_TEACHER = (*CLOCK, "clock_duty", "crouch", "spread")  # parameters of its rewards
-_OF_ACTIONS = (
-    "action_scale",
-    "control_step_s",
-    "knee",
-    "robot",
-    "robot_config",
-)  # settings that say what actions mean
+# settings that say what actions mean
+_OF_ACTIONS = ("action_scale", "control_step_s", "knee", "robot", "robot_config")
 _TEACHING = 0.6  # of a run's time: the most that its own teacher may take
 _DROPPED: dict[type, set[str]] = {
     Observation: {"privileged_critic"},

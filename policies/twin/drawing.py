@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,12 @@ from pupper_sysid.servo_models.calibration.calibration import Calibration, load_
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, JointCalibration
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.robot.engine import mujoco
-from pupper_sysid.sim.robot.servo_robot import compiled
+from pupper_sysid.sim.robot.servo_robot import (
+    ServoRobot,
+    compiled,
+    mini_pupper_robot,
+    robot_of,
+)
 from pupper_sysid.sim.walking.servo_ranges import (
     IDEAL,
     check_actuator,
@@ -31,10 +36,6 @@ from pupper_sysid.sim.walking.servo_ranges import (
 )
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.view.channels import Body, poses
-
-if TYPE_CHECKING:
-    from pupper_sysid.sim.robot.servo_robot import ServoRobot
-    from pupper_sysid.sysid.recordings.recording import Recording
 
 Array = NDArray[np.float64]
 
@@ -63,10 +64,8 @@ def actuator_of(name: str, robot: ServoRobot, recording: Recording) -> Actuator:
             "`pupper-sysid compare` takes it; give a calibration here."
         )
     if name == IDEAL:
-        count = len(robot.joints)
-        return Actuator(
-            {f: np.full(count, x[0]) for f, x in servo_ranges(IDEAL).value.items()}, None, {}
-        )
+        ideal = servo_ranges(IDEAL).value.items()
+        return Actuator({f: np.full(len(robot.joints), x[0]) for f, x in ideal}, None, {})
     return of_calibration(load_calibration(name), robot, recording)
 
 
@@ -96,8 +95,7 @@ def stronger(values: dict[str, Array], factor: float) -> dict[str, Array]:
 
     `values` are by field of `DelayedPDParameters`, shape (joints,).
     """
-    servo = DelayedPDParameters(**values)
-    scaled = servo.scaled(factor * values["armature"])
+    scaled = DelayedPDParameters(**values).scaled(factor * values["armature"])
     return {name: np.asarray(getattr(scaled, name)) for name in values}
 
 
@@ -116,8 +114,6 @@ def robot_for(recording: Recording, model: Path | None = None) -> ServoRobot:
 
     `model` is its MJCF or URDF; by default it is the Mini Pupper, if the joints are its.
     """
-    from pupper_sysid.sim.robot.servo_robot import mini_pupper_robot, robot_of
-
     joints = recording.joints
     if model is not None:
         return robot_of(model, joints)
@@ -247,14 +243,12 @@ def _surface_of(model: Any, body: int) -> Surface | None:
     for geom in range(first, first + int(model.body_geomnum[body])):
         if model.geom_group[geom] >= _VISIBLE_GROUPS:
             continue
-        shape = _shape(model, geom)
-        if shape is None:
-            continue
-        turn = np.empty(9)
-        mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-        vertices.append(shape[0] @ turn.reshape(3, 3).T + model.geom_pos[geom])
-        triangles.append(shape[1] + count)
-        count += len(shape[0])
+        if (shape := _shape(model, geom)) is not None:
+            turn = np.empty(9)
+            mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+            vertices.append(shape[0] @ turn.reshape(3, 3).T + model.geom_pos[geom])
+            triangles.append(shape[1] + count)
+            count += len(shape[0])
     return (np.concatenate(vertices), np.concatenate(triangles)) if vertices else None
 
 
@@ -276,6 +270,4 @@ def _shape(model: Any, geom: int) -> Surface | None:
         mujoco.mjtGeom.mjGEOM_CYLINDER: np.concatenate([_RING * size[0] + s * up for s in (-1, 1)]),
         mujoco.mjtGeom.mjGEOM_CAPSULE: np.concatenate([_BALL * size[0] + s * up for s in (-1, 1)]),
     }.get(kind)
-    if points is None:
-        return None
-    return points, ConvexHull(points).simplices.astype(np.int64)
+    return None if points is None else (points, ConvexHull(points).simplices.astype(np.int64))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -50,9 +52,7 @@ def draw_bars(axes: Axes, found: Twin) -> None:
             own: Condition | None = getattr(found.models[name], place)
             if own is None:
                 continue
-            value, low, high = (
-                1e3 * x for x in (own.rmse_rad.value, own.rmse_rad.low, own.rmse_rad.high)
-            )
+            value, low, high = (1e3 * x for x in astuple(own.rmse_rad))
             axes.barh(
                 k + shift, value, _BAR, color=colour, label=words if k == 0 else None,
                 xerr=[[value - low], [high - value]], ecolor=INK, capsize=2,

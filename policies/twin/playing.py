@@ -33,7 +33,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ from pupper_sysid.common.interval import Interval, t_quantile
 from pupper_sysid.common.results import Result
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sim.robot.replay import Replayed, replay
+from pupper_sysid.sim.robot.servo_robot import ServoRobot
 from pupper_sysid.sim.walking.config import Randomisation
 from pupper_sysid.sysid.servo_fit.data import Run, ServoData
 from pupper_sysid.sysid.servo_fit.scores import (
@@ -56,9 +57,6 @@ from pupper_sysid.sysid.servo_fit.scores import (
     steps_per_tick,
 )
 from pupper_sysid.sysid.servo_fit.windows import Part, chosen
-
-if TYPE_CHECKING:
-    from pupper_sysid.sim.robot.servo_robot import ServoRobot
 
 Array = NDArray[np.float64]
 
@@ -191,9 +189,7 @@ def _played(
             tracks[joint][place] = on_ticks(angle, data.runs[joint][place], data.period_s)
     upright = ~np.isfinite(moved.fell_s)
     gyro = () if fixed else tuple(moved.gyro_rad_s[:count][upright[:count]])
-    return Played(
-        tracks, len(upright), int(upright.sum()), float(moved.fell_s.min()), gyro
-    )  # fmt: skip
+    return Played(tracks, len(upright), int(upright.sum()), float(moved.fell_s.min()), gyro)
 
 
 def _too_much(robots: int, steps: int) -> InputError:
@@ -277,7 +273,14 @@ def evidence(cases: Sequence[Case], data: ServoData, part: Part, seed: int) -> E
     motion = [_motion(case, data, part, seed) for case in cases]
     load = [_load_share(case.offsets) for case in cases]
     first = cases[0]
-    verdict = _verdict(motion)
+    nothing = [
+        one is not None and -_NONE < one.share.low and one.share.high < _NONE
+        and one.correlation.high < _UNCORRELATED
+        for one in motion
+    ]  # fmt: skip
+    verdict: Verdict = "air" if all(nothing) else "cannot tell"
+    if any(one is not None and one.correlation.low > _CORRELATED for one in motion):
+        verdict = "ground"
     return Evidence(
         verdict=verdict, motion=motion, load_share=load, why=_WHY[verdict],
         difference_rad=interval(dict(first.ground_errors), seed, dict(first.errors)),
@@ -317,16 +320,12 @@ def _unexplained(case: Case, joint: str, data: ServoData, part: Part) -> tuple[A
         when = counted_ticks(run, data.modes[joint])
         seen = np.stack([predicted(track, run, when) for track in
                          (air, speed, np.gradient(speed) * rate, ground)])  # fmt: skip
-        rows.append(np.vstack([seen, run.position_rad])[:, _counts(run, part, seen[0])])
+        counts = chosen(run, part) & np.isfinite(seen[0] - run.position_rad)  # as `scores.errors`
+        rows.append(np.vstack([seen, run.position_rad])[:, counts])
     air, speed, acceleration, ground, reading = np.concatenate(rows, axis=1)
     servo, _ = np.linalg.qr(np.stack([np.ones(len(air)), air, speed, acceleration], axis=1))
     moved, left = ground - air, reading - air
     return moved - servo @ (servo.T @ moved), left - servo @ (servo.T @ left)
-
-
-def _counts(run: Run, part: Part, track: Array) -> NDArray[np.bool_]:
-    """The readings that `scores.errors` counts."""
-    return chosen(run, part) & np.isfinite(track - run.position_rad)
 
 
 def _load_share(offsets: Mapping[str, tuple[float, float]]) -> Interval | None:
@@ -343,14 +342,3 @@ def _load_share(offsets: Mapping[str, tuple[float, float]]) -> Interval | None:
     variance = np.linalg.inv(design.T @ design)[0, 0] * float(left @ left) / free
     half = t_quantile(int(free)) * float(np.sqrt(variance))
     return Interval(float(found[0]), float(found[0]) - half, float(found[0]) + half)
-
-
-def _verdict(found: Sequence[Motion | None]) -> Verdict:
-    if any(one is not None and one.correlation.low > _CORRELATED for one in found):
-        return "ground"
-    nothing = [
-        one is not None and -_NONE < one.share.low and one.share.high < _NONE
-        and one.correlation.high < _UNCORRELATED
-        for one in found
-    ]  # fmt: skip
-    return "air" if all(nothing) else "cannot tell"

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -35,6 +34,7 @@ from pupper_sysid.policies.twin.playing import (
     sequences,
 )
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration
+from pupper_sysid.sim.robot.servo_robot import ServoRobot
 from pupper_sysid.sysid.doctor.checks import chosen_joints
 from pupper_sysid.sysid.fit.predict import ReadingRule, in_words, rule_of
 from pupper_sysid.sysid.recordings.recording import Recording
@@ -42,9 +42,6 @@ from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.scores import Errors, Tracks, offsets, with_ages
 from pupper_sysid.sysid.servo_fit.windows import Part, everything
-
-if TYPE_CHECKING:
-    from pupper_sysid.sim.robot.servo_robot import ServoRobot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,12 +224,10 @@ def _condition(own: Played, data: ServoData, test: Part, rest: Part, seed: int) 
         )
         for joint, e in errors.items()
     }  # fmt: skip
-    mean = TwinErrors(
-        mae_rad=scores.mean_known([j.mae_rad for j in joints.values()]),
-        rmse_rad=scores.mean_known([j.rmse_rad for j in joints.values()]),
-        rmse_raw_rad=scores.mean_known([j.rmse_raw_rad for j in joints.values()]),
-        offset_rad=float(np.mean(np.abs([j.offset_rad for j in joints.values()]))),
-    )
+    names = ("mae_rad", "rmse_rad", "rmse_raw_rad")
+    means = {n: scores.mean_known([getattr(j, n) for j in joints.values()]) for n in names}
+    offset = float(np.mean(np.abs([j.offset_rad for j in joints.values()])))
+    mean = TwinErrors(**means, offset_rad=offset)
     times = STEP_S * np.arange(len(own.gyro[0]) if own.gyro else 0, dtype=float)
     return Condition(
         joints=joints, mean=mean, rmse_rad=scores.interval(errors, seed), copies=own.copies,

@@ -14,7 +14,7 @@ under every condition and by whatever it walks.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, TypeVar
 
@@ -249,6 +249,28 @@ class Recorder(Protocol[Kept]):
         were not taken because no robot was up.
         """
         ...
+
+
+class StepRecorder:
+    """A `Recorder` of arrays by name, (n, …) of each control step, and of who fell."""
+
+    def __init__(self, env: PupperEnv, policy: Actor | None, conditions: Sequence[Condition]):
+        self.env, self.fell = env, np.zeros(env.environments, bool)
+        self.steps: list[dict[str, NDArray]] = []
+
+    def keep(self, now: Moment) -> None:
+        """Take the next control step."""
+        self.fell |= now.fell
+        self.steps.append(self.arrays(now))
+
+    def arrays(self, now: Moment) -> dict[str, NDArray]:
+        """What is kept of a step, not to be overwritten."""
+        raise NotImplementedError
+
+    def stacked(self, robots: slice, steps: int) -> dict[str, NDArray]:
+        """Arrays of some robots over the first steps, (steps, k, …)."""
+        kept = self.steps[:steps]
+        return {name: np.stack([step[name][robots] for step in kept]) for name in kept[0]}
 
 
 def evaluation_task(task: Walking, seconds: float | None = None) -> Walking:

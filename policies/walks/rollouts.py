@@ -24,7 +24,7 @@ from torch.utils.hooks import RemovableHandle
 
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
-from pupper_sysid.policies.walks.conditions import Condition, Moment
+from pupper_sysid.policies.walks.conditions import Condition, Moment, StepRecorder
 from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.policies.walks.tracking import planar_velocity
 from pupper_sysid.sim.walking.env import PupperEnv
@@ -99,51 +99,41 @@ def collect(
     return walk_together(policy, servos, conditions, seconds, seed, threads, recorder, progress)
 
 
-class _Recorder:
+class _Recorder(StepRecorder):
     """Rollouts of one environment."""
 
     def __init__(
         self, env: PupperEnv, policy: Policy | None, conditions: Sequence[Condition], lean: bool
     ):
         assert policy is not None
-        self._env = env
+        super().__init__(env, policy, conditions)
         whole = [not (lean and (c.change or c.disturb)) for c in conditions]
         self._whole = np.flatnonzero(np.repeat(whole, [c.robots for c in conditions]))
-        self._fell = np.zeros(env.environments, bool)
-        self._steps: list[dict[str, NDArray]] = []
-        self._inside: list[dict[str, NDArray]] = []
+        self._seen: list[NDArray[np.float32]] = []
         self._hidden: list[NDArray[np.float32]] = []
         _listen(policy.network, lambda state: self._hidden.append(state.numpy()[self._whole]))
 
-    def keep(self, now: Moment) -> None:
-        qpos = self._env.robots.qpos
-        self._fell |= now.fell
-        seen = now.observation[self._whole].astype(np.float32)
-        self._inside.append({"observation": seen, "hidden": self._hidden.pop()})
-        self._steps.append(
-            {
-                "action": now.action, "contact": now.facts.contact, "alive": now.alive,
-                "joint_position": now.facts.position_relative + self._env.default,
-                "velocity": planar_velocity(now.facts),
-                "position": np.column_stack([qpos[:, :2], heading(qpos)]),
-            }
-        )  # fmt: skip
+    def arrays(self, now: Moment) -> dict[str, NDArray]:
+        qpos = self.env.robots.qpos
+        self._seen.append(now.observation[self._whole].astype(np.float32))
+        return {
+            "action": now.action, "contact": now.facts.contact, "alive": now.alive,
+            "joint_position": now.facts.position_relative + self.env.default,
+            "velocity": planar_velocity(now.facts),
+            "position": np.column_stack([qpos[:, :2], heading(qpos)]),
+        }  # fmt: skip
 
     def of(self, condition: Condition, robots: slice, steps: int, commands: Array) -> Rollout:
-        found = _stacked(self._steps[:steps], np.arange(robots.start, robots.stop))
+        found = self.stacked(robots, steps)
         found["position"][..., 2] = np.unwrap(found["position"][..., 2], axis=0)
         inside = np.flatnonzero((self._whole >= robots.start) & (self._whole < robots.stop))
-        found |= _stacked(self._inside[:steps], inside)
+        for name, kept in (("observation", self._seen), ("hidden", self._hidden)):
+            found[name] = np.stack([step[inside] for step in kept[:steps]])
         task, command = condition.task, condition.command
         assert command is not None
-        found["fell"] = self._fell[robots]
+        found["fell"] = self.fell[robots]
         whole = len(commands)
         return Rollout(task.control_step_s, command, task.action_scale, **found, whole_steps=whole)
-
-
-def _stacked(steps: Sequence[dict[str, NDArray]], robots: NDArray[np.intp]) -> dict[str, NDArray]:
-    """Arrays of some robots over all steps, by name."""
-    return {name: np.stack([step[name][robots] for step in steps]) for name in steps[0]}
 
 
 def replay(

@@ -30,7 +30,7 @@ OBSERVATION = observation_of(len(JOINT_NAMES))
 OBSERVATION_SIZE = sum(size for _, size, _ in OBSERVATION)
 
 
-def _places(parts: Iterable[tuple[str, int]]) -> dict[str, slice]:
+def places(parts: Iterable[tuple[str, int]]) -> dict[str, slice]:
     """Where each of several parts is in a row of them."""
     names, sizes = zip(*parts, strict=True)
     ends = np.cumsum(sizes)
@@ -40,7 +40,7 @@ def _places(parts: Iterable[tuple[str, int]]) -> dict[str, slice]:
     }
 
 
-OBSERVATION_PARTS = _places((name, size) for name, size, _ in OBSERVATION)
+OBSERVATION_PARTS = places((name, size) for name, size, _ in OBSERVATION)
 """Where each part of an observation is; up to the command, of any robot's."""
 
 FALLEN_TILT = 0.6
@@ -101,7 +101,7 @@ def privileged_parts(joints: int, feet: int) -> tuple[tuple[str, int], ...]:
 
 PRIVILEGED = privileged_parts(len(JOINT_NAMES), len(LEGS))
 """That of the Mini Pupper."""
-PRIVILEGED_PARTS = _places(PRIVILEGED)
+PRIVILEGED_PARTS = places(PRIVILEGED)
 """Where each of them is."""
 PRIVILEGED_SIZE = sum(size for _, size in PRIVILEGED)
 CLOCK_SEEN = slice(-4, -1)
