@@ -195,7 +195,7 @@ def test_jitter_leaves_the_mean_latency_and_no_command_comes_before_an_earlier_o
 
     class Delays(Recorder):
         def keep(self, now):
-            delays.append(self._env.robots.field("actuator_delay").copy())
+            delays.append(self.env.robots.field("actuator_delay").copy())
             super().keep(now)
 
     plain, jittered = walked(
