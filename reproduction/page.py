@@ -126,13 +126,10 @@ def write_claims(options: Options, tries: Tries) -> None:
     pictures = _draw(evidence, robot, trainings)
     inputs = _inputs(options, tries)
     summary = _summary(found, evidence, trainings)
-    text = _page(found, other, (evidence, trainings), pictures, inputs, options, summary)
-    write_text(page, text, options.force)
-    write_page(
-        report, _TITLE, summary[0],
-        _sections(found, other, (evidence, trainings), pictures, inputs, options, summary),
-        options.force,
-    )  # fmt: skip
+    both = (evidence, trainings)
+    sections = _sections(found, other, both, pictures, inputs, options, summary[1:])
+    write_text(page, _markdown(_TITLE, summary[0], sections), options.force)
+    write_page(report, _TITLE, summary[0], sections, options.force)
     if options.json:
         print_json(
             {
@@ -186,8 +183,6 @@ def _draw(
     evidence: list[PolicyEvidence], robot: ServoEvidence, trainings: list[Training]
 ) -> list[Picture]:
     """What can be shown of the evidence."""
-    from pupper_sysid.common.page import Picture
-
     made: list[Picture] = []
     if trainings:
         caption = "Trainings from random weights in the published task, each a line."
@@ -219,30 +214,17 @@ def _draw(
             ),
         ]
     every = _one_per_kind(evidence)
-    made += [
-        Picture(
-            "ablation",
+    captions = {
+        "ablation":
             "As figure 7a: correlation of actions against noise in all that comes from the joints.",
-            figures.ablation_figure({e.name: e.ablation for e in every}),
-        ),
-        Picture(
-            "delay",
-            "Closed loop and replay against more delay, which the paper shows in replay only.",
-            figures.delay_figure({e.name: e.delay for e in every}),
-        ),
-        Picture(
-            "autonomy",
-            "Tests that the paper lacks: frozen inputs, pushes, other control rates.",
-            figures.autonomy_figure({e.name: e.autonomy for e in every}),
-        ),
-        Picture("terrain", "Other ground.",
-                figures.terrain_figure({e.name: e.terrain for e in every})),
-        Picture(
-            "compliance",
-            "As figure 7b: where one robot goes in six directions in ten seconds.",
-            figures.compliance_figure({e.name: e.compliance for e in every}),
-        ),
-    ]  # fmt: skip
+        "delay": "Closed loop and replay against more delay, which the paper shows in replay only.",
+        "autonomy": "Tests that the paper lacks: frozen inputs, pushes, other control rates.",
+        "terrain": "Other ground.",
+        "compliance": "As figure 7b: where one robot goes in six directions in ten seconds.",
+    }  # fmt: skip
+    for name, caption in captions.items():  # each is an analysis, with a figure of its name
+        drawn = getattr(figures, f"{name}_figure")({e.name: getattr(e, name) for e in every})
+        made.append(Picture(name, caption, drawn))
     if robot.servos is not None:
         caption = "As the extension's figure: four servo models on an unseen loop."
         made.append(Picture("servos", caption, robot.servos.plot()))
@@ -259,54 +241,25 @@ def _one_per_kind(evidence: list[PolicyEvidence]) -> list[PolicyEvidence]:
     return list({e.kind: e for e in reversed(evidence)}.values())[::-1]
 
 
-def _page(
-    found: list[Claim], other: list[dict[str, str]] | None, evidence: Evidence,
-    pictures: list[Picture], inputs: dict[str, str], options: Options, summary: list[str],
-) -> str:  # fmt: skip
-    """The report as Markdown."""
-    lines = [
-        f"# {_TITLE}", "", *(line for text in summary for line in (text, "")), _ABOUT, "",
-        "| | claim | paper | here | interval | verdict | how |", "|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
-    for c in found:
-        lines.append(
-            f"| {_id(c, evidence[0])} | {c.claim} | {c.paper} | {c.ours} | {_bounds(c)} | "
-            f"**{c.verdict}** | "
-            f"{c.how} |"
-        )
-    if other is not None:
-        lines += ["", f"## {_BESIDE}", "", _other(other), ""]
-        if other:
-            lines += ["| " + " | ".join(h for h, _ in _OTHER) + " |", "|---" * len(_OTHER) + "|"]
-        lines += ["| " + " | ".join(row[key] for _, key in _OTHER) + " |" for row in other]
-    kinds, rows = _table_one(evidence)
-    lines += ["", f"## {_TABLE_ONE}", "", "| | " + " | ".join(kinds) + " |"]
-    lines += ["|---|" + "---|" * len(kinds)]
-    lines += [f"| {title} | " + " | ".join(cells) + " |" for title, cells in rows]
-    lines += ["", "## Pictures", ""]
-    for picture in pictures:
-        lines += [f"![{picture.caption}]({_file(picture)})", "", picture.caption, ""]
-    lines += [
-        f"## {_MADE}",
-        "",
-        "```",
-        _command(options),
-        "```",
-        "",
-        f"{_versions()}.",
-        "",
-        "| input | SHA-256 |",
-        "|---|---|",
-    ]
-    lines += [f"| {name} | `{digest}` |" for name, digest in inputs.items()]
-    return "\n".join([*lines, ""])
+def _markdown(title: str, answer: str, sections: list[Section]) -> str:
+    """The same page as Markdown."""
+    blocks = [f"# {title}", answer]
+    for section in sections:
+        blocks += [f"## {section.title}", *section.text]
+        for picture in section.figures:
+            blocks += [f"![{picture.caption}]({_file(picture)})", picture.caption]
+        for table in section.tables:
+            cells = [[column.heading for column in table.columns], ["---"] * len(table.columns)]
+            cells += [[column.show(row) for column in table.columns] for row in table.rows]
+            blocks.append("\n".join(f"| {' | '.join(row)} |" for row in cells))
+    return "\n\n".join(blocks) + "\n"
 
 
 def _sections(
     found: list[Claim], other: list[dict[str, str]] | None, evidence: Evidence,
     pictures: list[Picture], inputs: dict[str, str], options: Options, summary: list[str],
 ) -> list[Section]:  # fmt: skip
-    """The report as a page in the style of the others."""
+    """The parts of the page."""
     claims = tuple(
         {
             **c.to_dict(), "id": _id(c, evidence[0]),
@@ -337,7 +290,7 @@ def _sections(
         compared = [Section("beside", _BESIDE, [_other(other)], tables=tables)]
     return [
         Section(
-            "claims", "Claims", [*summary[1:], _ABOUT],
+            "claims", "Claims", [*summary, _ABOUT],
             tables=[Table("claims", "What the paper says, and what is found here",
                           columns, claims)],
         ),
@@ -347,12 +300,9 @@ def _sections(
             tables=[Table("table_one", "Architectures, means and ranges",
                           (first, *(Column(k, lambda row, k=k: row[k]) for k in kinds)), one)],
         ),
+        Section("pictures", "Pictures", figures=pictures),
         Section(
-            "pictures", "Pictures",
-            figures=pictures,
-        ),
-        Section(
-            "made", _MADE, [f"Made by: {_command(options)}", f"{_versions()}."],
+            "made", _MADE, [f"Made by: `{_command(options)}`", f"{_versions()}."],
             tables=[Table("inputs", "What it was made from", (
                 Column("input", lambda row: row["input"], "words"),
                 Column("SHA-256", lambda row: row["digest"], "prose"),
