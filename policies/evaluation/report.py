@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -87,23 +87,11 @@ def walking_sections(
             ],
         ),
     ]
-    curves = _curves(folder / PROGRESS)
-    if curves is not None:
-        sections.append(
-            Section(
-                "training",
-                "How it was trained",
-                figures=[
-                    Picture(
-                        "training",
-                        "Training, by samples: reward, falls, and the noise of exploration.",
-                        _training_figure(curves),
-                    )
-                ],
-            )
-        )
-    sections.append(_settings(policy, run))
-    return sections
+    if (folder / PROGRESS).exists():
+        caption = "Training, by samples: reward, falls, and the noise of exploration."
+        picture = Picture("training", caption, _training_figure(_curves(folder / PROGRESS)))
+        sections.append(Section("training", "How it was trained", figures=[picture]))
+    return [*sections, _settings(policy, run)]
 
 
 def _findings(found: Evaluation) -> list[tuple[str, str]]:
@@ -153,34 +141,28 @@ def _cells(row: Row) -> dict[str, Any]:
 
 
 def _columns() -> tuple[Column, ...]:
-    def share(key: str) -> Callable[[Mapping[str, Any]], str]:
-        return lambda row: f"{100 * row[key]:.0f}" if np.isfinite(row[key]) else "–"
-
     found = [Column("", lambda row: row["walk"], "key")]
     for walker in ("policy", "trot"):
-        found.append(Column(f"{walker}: fell, %", share(f"{walker}.fall_rate")))
+        found.append(_number(f"{walker}: fell, %", f"{walker}.fall_rate", 100))
         for key, (name, unit) in zip(STRIDE_ERRORS, ERRORS.values(), strict=True):
-            at = f"{walker}.{key}"
-            found.append(Column(f"{name}, {unit}", lambda row, at=at: f"{row[at]:.3f}"))
-        found.append(Column("speed, %", share(f"{walker}.speed_share")))
-    return (
-        *found,
-        Column("duty", lambda row: f"{row['duty']:.2f}"),
-        Column("strides/s", lambda row: f"{row['stride_hz']:.1f}"),
-        Column("slip, m/s", lambda row: f"{row['slip']:.3f}"),
-    )
+            found.append(_number(f"{name}, {unit}", f"{walker}.{key}", 1, 3))
+        found.append(_number("speed, %", f"{walker}.speed_share", 100))
+    feet = ("duty", "duty", 2), ("strides/s", "stride_hz", 1), ("slip, m/s", "slip", 3)
+    return (*found, *(_number(title, key, 1, digits) for title, key, digits in feet))
+
+
+def _number(title: str, key: str, scale: float = 1.0, digits: int = 0) -> Column:
+    """A column of numbers, a dash where there is none."""
+
+    def text(row: Mapping[str, Any]) -> str:
+        known = row[key] is not None and np.isfinite(row[key])
+        return f"{scale * row[key]:.{digits}f}" if known else "–"
+
+    return Column(title, text)
 
 
 def _table_of_effort(found: Evaluation) -> Table:
     """Clearance of the swings and effort of the servos, of policy and trot."""
-
-    def column(title: str, key: str, scale: float, digits: int) -> Column:
-        def text(row: Mapping[str, Any]) -> str:
-            value = row[key]
-            return f"{scale * value:.{digits}f}" if value is not None else "–"
-
-        return Column(title, text)
-
     rows = tuple(
         {"walk": row.name, "walker": walker} | own.rows()[0]
         for row in found.conditions
@@ -190,13 +172,13 @@ def _table_of_effort(found: Evaluation) -> Table:
     columns = (
         Column("", lambda row: row["walk"], "key"),
         Column("walker", lambda row: row["walker"]),
-        column("clearance p10, mm", "clearance_p10_m", 1e3, 1),
-        column("p50, mm", "clearance_p50_m", 1e3, 1),
-        column("low swings, %", "low_swing_share", 100, 0),
-        *(column(f"{k} at limit, %", f"torque_saturated_share_{k}", 100, 0) for k in kinds),
-        *(column(f"{k} rms, % of limit", f"rms_torque_share_{k}", 100, 0) for k in kinds),
-        column("power, W", "mechanical_power_w", 1, 1),
-        column("cost of transport", "cost_of_transport", 1, 1),
+        _number("clearance p10, mm", "clearance_p10_m", 1e3, 1),
+        _number("p50, mm", "clearance_p50_m", 1e3, 1),
+        _number("low swings, %", "low_swing_share", 100),
+        *(_number(f"{k} at limit, %", f"torque_saturated_share_{k}", 100) for k in kinds),
+        *(_number(f"{k} rms, % of limit", f"rms_torque_share_{k}", 100) for k in kinds),
+        _number("power, W", "mechanical_power_w", 1, 1),
+        _number("cost of transport", "cost_of_transport", 1, 1),
     )
     return Table("effort", "Clearance of the swings, and effort of the servos", columns, rows)
 
@@ -207,21 +189,19 @@ def _table_of_falls(found: Evaluation) -> list[Table]:
     columns = (
         Column("", lambda row: row["row"], "key"),
         Column("walker", lambda row: row["walker"]),
-        Column("falls", lambda row: str(row["falls"])),
-        Column("time, s", lambda row: f"{row['time_s']:.1f}"),
-        Column("tilt 0.2 s before, °", lambda row: f"{row['tilt_before_deg']:.0f}"),
+        _number("falls", "falls"),
+        _number("time, s", "time_s", 1, 1),
+        _number("tilt 0.2 s before, °", "tilt_before_deg"),
         Column("toward", lambda row: row["toward"]),
-        Column("tipped over", lambda row: str(row["tipped"])),
-        Column("within 1 s of a push", lambda row: str(row["after_push"])),
+        _number("tipped over", "tipped"),
+        _number("within 1 s of a push", "after_push"),
     )
     title = "Before falls: medians of time and tilt, most frequent direction"
     return [Table("falls", title, columns, rows)] if rows else []
 
 
-def _curves(path: Path) -> dict[str, np.ndarray] | None:
-    """Columns of `progress.csv`; None if there is none."""
-    if not path.exists():
-        return None
+def _curves(path: Path) -> dict[str, np.ndarray]:
+    """Columns of `progress.csv`."""
     remedy = "Move it away for a page without the training."
     found = read_table(path, read_text(path, LARGEST_BYTES, remedy), strict=False).numbers
     lacking = [name for name in ("samples", *_CURVES) if name not in found]

@@ -16,7 +16,7 @@ from pupper_sysid.sim.robot.body import Body, body_of
 from pupper_sysid.sim.robot.mini_pupper import MASS_KG, Knee, Physics
 from pupper_sysid.sim.robot.terrain import Terrain
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.differences import TYPICAL, Differences
+from pupper_sysid.sim.walking.differences import TYPICAL, Differences, check_range
 from pupper_sysid.sim.walking.rewards.weights import DEFAULT, PAPER, RELEASE, Rewards
 
 EVALUATION_STEP_S = 0.002
@@ -46,7 +46,7 @@ class Commands:
         if not min(self.dead_band) >= 0:
             raise InputError("commands.dead_band must be 0 or more.")
         for name in ("forward_m_s", "sideways_m_s", "yaw_rad_s"):
-            _check_range("commands", name, getattr(self, name))
+            check_range("commands", name, getattr(self, name))
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Randomisation:
             ("friction", 0.0), ("payload_kg", -math.inf), ("torque_scale", 0.0),
             ("push_every_s", 0.0),
         ):  # fmt: skip
-            _check_range("randomisation", name, getattr(self, name), least)
+            check_range("randomisation", name, getattr(self, name), least)
 
 
 @dataclass(frozen=True)
@@ -223,16 +223,6 @@ class Walking:
         return round(self.episode_s / self.control_step_s)
 
 
-def _check_range(part: str, name: str, ends: tuple[float, float], least: float = -math.inf) -> None:
-    """Refuse a range that cannot be drawn from."""
-    low, high = ends
-    if not (least <= low <= high and math.isfinite(high - low)):
-        above = f" from {least:g} on" if math.isfinite(least) else ""
-        raise InputError(
-            f"{part}.{name} is {low:g} to {high:g}; give the lower end, then the upper one{above}."
-        )
-
-
 _PUBLISHED = Walking(
     commands=Commands(
         (-0.35, 0.35), (-0.35, 0.35), (-0.30, 0.30), 0.25, 0.0, 10.0, dead_band=(0.0, 0.0)
@@ -282,21 +272,14 @@ PRESETS = {
         # `policies.train.first_gait`): feet rise 7 mm instead of 2 at 0.15 m/s. PPO makes up for
         # the sway that longer swings cost
         trot=Trot(
-            frequency_hz=3.02,
-            lift_m=0.0142,
-            duty=0.692,
-            crouch_m=0.017,
-            spread_m=0.0073,
-            even_swing=1.0,
-            gain=0.892,
-            side_gain=0.98,
-            turn_gain=0.756,
+            frequency_hz=3.02, lift_m=0.0142, duty=0.692, crouch_m=0.017, spread_m=0.0073,
+            even_swing=1.0, gain=0.892, side_gain=0.98, turn_gain=0.756,
         ),
     ),
     "scratch": _SCRATCH,
     "paper": replace(_PUBLISHED, rewards=PAPER),
     "release": _PUBLISHED,
-}
+}  # fmt: skip
 """Complete settings by name."""
 
 
@@ -319,10 +302,8 @@ def for_robot(task: Walking, robot: str | Path, robot_config: str | Path | None)
     task, found on the Mini Pupper, are multiplied by the scale of `Body`, weights of rewards that
     have a unit divided by it. What the robot's YAML gives stays as it is.
     """
-    task = replace(
-        task, robot=str(Path(robot).resolve()),
-        robot_config=str(Path(robot_config).resolve()) if robot_config else "",
-    )  # fmt: skip
+    config = str(Path(robot_config).resolve()) if robot_config else ""
+    task = replace(task, robot=str(Path(robot).resolve()), robot_config=config)
     body = task.body
     length, mass = body.scale, body.mass_kg / MASS_KG
     speed, rate = float(body.command_scale[0]), float(body.command_scale[2])
@@ -349,14 +330,13 @@ def for_robot(task: Walking, robot: str | Path, robot_config: str | Path | None)
 
 
 def _commands(own: Commands, body: Body) -> Commands:
-    found = {}
-    for name, size in zip(
-        ("forward_m_s", "sideways_m_s", "yaw_rad_s"), body.command_scale.tolist(), strict=True
-    ):
-        low, high = getattr(own, name)
-        found[name] = body.commands.get(name, (size * low, size * high))
-    speed, _, rate = body.command_scale.tolist()
-    return replace(own, dead_band=(speed * own.dead_band[0], rate * own.dead_band[1]), **found)
+    names, sizes = ("forward_m_s", "sideways_m_s", "yaw_rad_s"), body.command_scale.tolist()
+    found = {
+        n: tuple(s * end for end in getattr(own, n)) for n, s in zip(names, sizes, strict=True)
+    }
+    speed, _, rate = sizes
+    dead_band = (speed * own.dead_band[0], rate * own.dead_band[1])
+    return replace(own, dead_band=dead_band, **found | body.commands)
 
 
 def _rewards(own: Rewards, body: Body) -> Rewards:

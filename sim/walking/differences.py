@@ -24,6 +24,16 @@ OF_UNIT = ("stiffness", "damping", "friction_loss", "effort_limit", "velocity_li
 """Numbers of a servo in which units of one type differ."""
 
 
+def check_range(part: str, name: str, ends: tuple[float, float], least: float = -np.inf) -> None:
+    """Refuse a range of a setting that cannot be drawn from."""
+    low, high = ends
+    if not (least <= low <= high and np.isfinite(high - low)):
+        above = f" from {least:g} on" if np.isfinite(least) else ""
+        raise InputError(
+            f"{part}.{name} is {low:g} to {high:g}; give the lower end, then the upper one{above}."
+        )
+
+
 @dataclass(frozen=True)
 class Differences:
     """Ranges of what differs from the model; the default is nothing.
@@ -74,12 +84,7 @@ class Differences:
             ("command_jitter", 0.0), ("poll_period", 0.1), ("imu_latency_s", 0.0),
             ("imu_period_s", 0.0), ("battery", 0.1), ("weak_leg", 0.0),
         ):  # fmt: skip
-            low, high = getattr(self, name)
-            if not least <= low <= high < np.inf:
-                raise InputError(
-                    f"differences.{name} is {low:g} to {high:g}; give the lower end, then the "
-                    f"upper one, from {least:g} on."
-                )
+            check_range("differences", name, getattr(self, name), least)
 
     @property
     def imu_late(self) -> bool:

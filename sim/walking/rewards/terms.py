@@ -8,6 +8,8 @@ terms use the foot, not the knee, whose frame the published robot model calls a 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,11 +76,6 @@ def short_stance(s: Step, p: Rewards) -> Array:
     """Share of `shortest_stance` that was missing, summed over feet that have just left."""
     missing = np.maximum(1.0 - s.last_contact_s / p.shortest_stance, 0.0)
     return (s.lifted * missing).sum(axis=1)
-
-
-def alive(s: Step, p: Rewards) -> Array:
-    """1."""
-    return np.ones(len(s.command))
 
 
 def air_time(s: Step, p: Rewards) -> Array:
@@ -166,36 +163,6 @@ def low_swing(s: Step, p: Rewards) -> Array:
     return np.where(s.swing_ended, missing, 0.0).sum(axis=1)
 
 
-def torque_saturation(s: Step, p: Rewards) -> Array:
-    """Share of the time at the torque limit, 0 to 1: the mean of all servos."""
-    return s.saturated.mean(axis=1)
-
-
-def torque_share(s: Step, p: Rewards) -> Array:
-    """Mean square of torque over its limit, 0 to 1, of all servos."""
-    return s.torque_square.mean(axis=1)
-
-
-def mechanical_power(s: Step, p: Rewards) -> Array:
-    """Positive mechanical power of all servos over the robot's weight [m/s]."""
-    return s.power_w / s.weight_n
-
-
-def action_smoothness(s: Step, p: Rewards) -> Array:
-    """Norm of the change of the action."""
-    return np.linalg.norm(s.action - s.last_action, axis=1)
-
-
-def action_rate(s: Step, p: Rewards) -> Array:
-    """Squared change of the action."""
-    return ((s.action - s.last_action) ** 2).sum(axis=1)
-
-
-def action_jerk(s: Step, p: Rewards) -> Array:
-    """Squared change of the change of the action."""
-    return ((s.action - 2 * s.last_action + s.earlier_action) ** 2).sum(axis=1)
-
-
 def air_time_variance(s: Step, p: Rewards) -> Array:
     """Variance over feet of their last swings and stances, up to half a second [s²]."""
     swings, stances = np.minimum(s.last_air_s, 0.5), np.minimum(s.last_contact_s, 0.5)
@@ -208,60 +175,48 @@ def base_motion(s: Step, p: Rewards) -> Array:
     return 0.8 * s.linear_velocity[:, 2] ** 2 + 0.2 * rocking
 
 
-def bounce(s: Step, p: Rewards) -> Array:
-    """Speed at which the trunk rises or falls [m/s]."""
-    return np.abs(s.linear_velocity[:, 2])
-
-
-def base_orientation(s: Step, p: Rewards) -> Array:
-    """Horizontal part of gravity in the trunk's frame: sine of the tilt."""
-    return np.linalg.norm(s.gravity[:, :2], axis=1)
-
-
-def foot_slip(s: Step, p: Rewards) -> Array:
-    """Speed of the feet that are on the ground, summed [m/s]."""
-    return (s.contact * s.foot_speed_m_s).sum(axis=1)
-
-
 def joint_position(s: Step, p: Rewards) -> Array:
     """Norm of the distance from the default pose [rad], more while standing."""
     factor = np.where(s.moving(p.moving_threshold), 1.0, p.standing_factor)
     return np.linalg.norm(s.position_relative, axis=1) * factor
 
 
-def hip_abduction(s: Step, p: Rewards) -> Array:
-    """Norm of the hips' distance from the default pose [rad]."""
-    return np.linalg.norm(s.position_relative[:, s.body.hips], axis=1)
-
-
-def joint_torques(s: Step, p: Rewards) -> Array:
-    """Norm of the torques [N·m]."""
-    return np.linalg.norm(s.torque, axis=1)
-
-
-def joint_acceleration(s: Step, p: Rewards) -> Array:
-    """Norm of the joint accelerations [rad/s²]."""
-    return np.linalg.norm(s.acceleration, axis=1)
-
-
-def joint_velocity(s: Step, p: Rewards) -> Array:
-    """Norm of the joint velocities [rad/s]."""
-    return np.linalg.norm(s.velocity, axis=1)
-
-
-TERMS = {
-    f.__name__: f
-    for f in (
-        base_linear_velocity, base_angular_velocity, stride_linear_velocity,
-        stride_angular_velocity, progress, turn_progress, alive, unsupported, short_swing,
-        short_stance, air_time, foot_paths, stance, gait, foot_clearance, swing_height,
-        low_swing, torque_saturation, torque_share, mechanical_power,
-        action_smoothness, action_rate, action_jerk, air_time_variance, base_motion, bounce,
-        base_orientation, foot_slip, joint_position, hip_abduction, joint_torques,
-        joint_acceleration, joint_velocity,
-    )
-}  # fmt: skip
-"""All terms by the name of their weight."""
+TERMS: dict[str, Callable[[Step, Rewards], Array]] = {
+    "base_linear_velocity": base_linear_velocity,
+    "base_angular_velocity": base_angular_velocity,
+    "stride_linear_velocity": stride_linear_velocity,
+    "stride_angular_velocity": stride_angular_velocity,
+    "progress": progress,
+    "turn_progress": turn_progress,
+    "alive": lambda s, p: np.ones(len(s.command)),
+    "unsupported": unsupported,
+    "short_swing": short_swing,
+    "short_stance": short_stance,
+    "air_time": air_time,
+    "foot_paths": foot_paths,
+    "stance": stance,
+    "gait": gait,
+    "foot_clearance": foot_clearance,
+    "swing_height": swing_height,
+    "low_swing": low_swing,
+    "torque_saturation": lambda s, p: s.saturated.mean(axis=1),
+    "torque_share": lambda s, p: s.torque_square.mean(axis=1),
+    "mechanical_power": lambda s, p: s.power_w / s.weight_n,  # m/s
+    "action_smoothness": lambda s, p: _norm(s.action - s.last_action),
+    "action_rate": lambda s, p: _square(s.action - s.last_action),
+    "action_jerk": lambda s, p: _square(s.action - 2 * s.last_action + s.earlier_action),
+    "air_time_variance": air_time_variance,
+    "base_motion": base_motion,
+    "bounce": lambda s, p: np.abs(s.linear_velocity[:, 2]),  # m/s
+    "base_orientation": lambda s, p: _norm(s.gravity[:, :2]),  # sine of the tilt
+    "foot_slip": lambda s, p: (s.contact * s.foot_speed_m_s).sum(axis=1),  # m/s
+    "joint_position": joint_position,
+    "hip_abduction": lambda s, p: _norm(s.position_relative[:, s.body.hips]),  # rad
+    "joint_torques": lambda s, p: _norm(s.torque),  # N·m
+    "joint_acceleration": lambda s, p: _norm(s.acceleration),  # rad/s²
+    "joint_velocity": lambda s, p: _norm(s.velocity),  # rad/s
+}
+"""All terms by the name of their weight; those of a line are as `Rewards` says."""
 
 
 GUIDES = ("foot_paths", "gait")
@@ -288,6 +243,14 @@ def weighted(
         if weight:
             found[name] = weight * factor * term(step, rewards)
     return found
+
+
+def _norm(values: Array) -> Array:
+    return np.linalg.norm(values, axis=1)
+
+
+def _square(values: Array) -> Array:
+    return (values**2).sum(axis=1)
 
 
 def _tracking(error: Array, sigma: float, p: Rewards) -> Array:
