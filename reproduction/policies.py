@@ -112,16 +112,12 @@ def _learned(trainings: Trainings, holds_: bool) -> Verdict:
 
 def _progress(trainings: Trainings) -> str:
     """How far trainings came."""
-    samples = [t.million_samples for t in trainings]
+    samples = _range(np.array([t.million_samples for t in trainings]), 1)
     longest = max(t.lasted_s for t in trainings)
     return (
-        f"After {_ends(samples, 1)} million samples robots stay up for {longest:.1f} s of "
+        f"After {samples} million samples robots stay up for {longest:.1f} s of "
         f"{trainings[0].episode_s:g} s at most."
     )
-
-
-def _ends(values: Sequence[float], digits: int) -> str:
-    return _range(np.array(values), digits)
 
 
 def _lstm_and_newer(values: dict[str, Interval]) -> tuple[float, list[float]]:

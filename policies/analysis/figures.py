@@ -164,14 +164,8 @@ def terrain_figure(tables: Mapping[str, Sequence[GroundPoint]]) -> Figure:
     for one, (key, title) in zip(axes, names.items(), strict=True):
         for k, (policy, rows) in enumerate(tables.items()):
             places = np.arange(len(rows)) + 0.8 * k / len(tables)
-            colour = _colour(k)
-            one.bar(
-                places,
-                [getattr(r, key) for r in rows],
-                0.8 / len(tables),
-                color=colour,
-                label=policy,
-            )
+            heights, width = [getattr(r, key) for r in rows], 0.8 / len(tables)
+            one.bar(places, heights, width, color=_colour(k), label=policy)
         grounds = [r.ground for r in next(iter(tables.values()))]
         one.set_xticks(np.arange(len(grounds)) + 0.4 * (len(tables) - 1) / len(tables), grounds)
         one.set_ylabel(title)

@@ -131,7 +131,10 @@ def ablation(
     rows: list[dict[str, Any]] = []
     changes: list[Callable[[np.random.Generator], Change]] = []
     for name in channels:
-        part, spread = CHANNELS[name], _spread(plain, CHANNELS[name])
+        part = CHANNELS[name]
+        walked = [plain.observation[now, i, part] for i, now in steady(plain).items()]
+        unknown = np.full(part.stop - part.start, np.nan)
+        spread = np.concatenate(walked).std(axis=0) if walked else unknown
         sigma = float(spread.mean()) if name != "all joints" else NAN
         for share in NOISE_SHARES:
             rows.append({"kind": "noise", "level": share, "sigma": share * sigma})
@@ -145,11 +148,11 @@ def ablation(
     channel = [name for name in channels for _ in range(len(rows) // len(channels))]
     known = [i for i, row in enumerate(rows) if row["kind"] != "noise" or steady(plain)]
     # a change keeps a memory: one for the walk, one for the replay
-    walked, replayed = (
+    altered, replayed = (
         [changes[i](rng) for i, rng in zip(known, rngs, strict=True)]
         for rngs in (_generators(trial, len(known), k) for k in (0, 1))
     )
-    walks = trial.walks(policy, [trial.condition(change) for change in walked], (0.02, 1.0))
+    walks = trial.walks(policy, [trial.condition(change) for change in altered], (0.02, 1.0))
     outcomes: dict[int, dict[str, Any]] = dict(zip(known, map(outcome, walks), strict=True))
     agreements = dict(zip(known, _agreements(policy, plain, replayed), strict=True))
     return [
@@ -173,12 +176,6 @@ def terrain(policy: Policy, trial: Trial) -> list[GroundPoint]:
 def _generators(trial: Trial, count: int, which: int = 0) -> list[np.random.Generator]:
     """One for each condition: conditions may run side by side."""
     return np.random.default_rng([trial.seed, which]).spawn(count)
-
-
-def _spread(plain: Rollout, part: slice) -> Array:
-    """Standard deviation of a channel's numbers while walking; NaN if no robot walked."""
-    shown = [plain.observation[now, i, part] for i, now in steady(plain).items()]
-    return np.concatenate(shown).std(axis=0) if shown else np.full(part.stop - part.start, np.nan)
 
 
 def _replayed(

@@ -115,16 +115,13 @@ def reassemble(
         if header["policy_sha256"] != policy.contract.weights_sha256:
             raise InputError(f"{log} was made with another policy. Give that one.")
         stack = Stack(**header["stack"])
-        joint_map = (
-            body_joint_map(body)
-            if body is not None and header["joint_map"] == body_joint_map(body).file.name
-            else load_joint_map(header["joint_map"])
-        )
+        joint_map = None if body is None else body_joint_map(body)
+        if joint_map is None or header["joint_map"] != joint_map.file.name:
+            joint_map = load_joint_map(header["joint_map"])
         servo = Path(header["servo"]) if header["servo"] else None
         found = assemble(policy, stack, joint_map, header["actuator"], servo, body=body)
-        changed = [
-            key for key in ("actuator_sha256", "servo_sha256") if header[key] != found.header[key]
-        ]
+        hashes = ("actuator_sha256", "servo_sha256")
+        changed = [key for key in hashes if header[key] != found.header[key]]
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{log}: its header is damaged: {error}.") from error
     if changed:

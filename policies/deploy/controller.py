@@ -291,11 +291,9 @@ class Controller:
         self._limits = joint_map.position_limits()
         self.default = np.array([*contract.default_pose_rad.values()])
         self._scale = contract.action_scale_rad if stack.scale_rad is None else stack.scale_rad
-        self._smooth = (
-            LowPass(stack.lowpass_hz, 1 / self.period_s, len(self.joints))
-            if stack.lowpass_hz is not None
-            else None
-        )
+        self._smooth = None
+        if stack.lowpass_hz is not None:
+            self._smooth = LowPass(stack.lowpass_hz, 1 / self.period_s, len(self.joints))
         self._attitude = ComplementaryFilter()
         self._target = self.default.copy()
         self._action = np.zeros(len(self.joints), np.float32)

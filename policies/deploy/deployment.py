@@ -186,9 +186,9 @@ def _walk(
                 outcome.missing_imu_samples += 1
             if reading.load is not None:
                 load_nm = np.nan_to_num(reading.load) * controller.stall_torque_nm
-            unknown = np.full(3, np.nan)
-            rate = unknown if sample is None else sample.rate_rad_s
-            force = unknown if sample is None else sample.acceleration_m_s2
+            rate = force = np.full(3, np.nan)
+            if sample is not None:
+                rate, force = sample.rate_rad_s, sample.acceleration_m_s2
             senses = Senses(elapsed, command, reading.position_rad, load_nm, rate, force)
             begun = time.perf_counter()
             with spent.on(POLICY):
@@ -254,11 +254,8 @@ def _rows(controller: Controller, sent: Sent, reading: BusSample) -> list[dict[s
     """One row per joint, as in a recording, in servo coordinates."""
     command = controller.to_servo(sent.position_rad)
     position = controller.to_servo(reading.position_rad)
-    optional = {
-        name: values
-        for name in ("voltage_v", "temperature_c", "load")
-        if (values := getattr(reading, name)) is not None
-    }
+    names = ("voltage_v", "temperature_c", "load")
+    optional = {n: values for n in names if (values := getattr(reading, n)) is not None}
     return [
         {
             "send_time_s": sent.time_s, "read_time_s": float(reading.time_s[i]), "trial": 0,

@@ -63,6 +63,13 @@ def write_policy(
     servo = trained_servo(run.actuator, run.feedback, task, servos)
     source = Path(run.actuator)
     delays = np.concatenate([servos.low["dead_time_s"], servos.high["dead_time_s"]])
+    robot = None
+    if not body.is_mini_pupper:
+        robot = {
+            "name": body.name, "mjcf": task.robot, "mjcf_sha256": body.hashes["robot"],
+            "config": task.robot_config or None,
+            "config_sha256": body.hashes.get("robot_config"),
+        }  # fmt: skip
     about = {
         "kind": shape.kind,
         "hidden": list(shape.hidden),
@@ -76,15 +83,7 @@ def write_policy(
         "action_history": action_history,
         "action_scale_rad": task.action_scale,
         "default_pose_rad": dict(zip(body.joints, body.pose.tolist(), strict=True)),
-        "robot": None
-        if body.is_mini_pupper
-        else {
-            "name": body.name,
-            "mjcf": task.robot,
-            "mjcf_sha256": body.hashes["robot"],
-            "config": task.robot_config or None,
-            "config_sha256": body.hashes.get("robot_config"),
-        },
+        "robot": robot,
         "control_step_s": task.control_step_s,
         "physics_step_s": task.physics_step_s,
         "knee": task.knee,

@@ -178,9 +178,8 @@ class _Session:
         self.notice, self.undone = notice, 0  # updates in a row that were taken back
         begun = time.monotonic()
         self.ranks = Ranks.join()
-        self.folder, self.watch = folder, watch
-        self.run = run
-        self.learner = make_learner(self.run, self.ranks)
+        self.folder, self.run, self.watch = folder, run, watch
+        self.learner = make_learner(run, self.ranks)
         env = self.learner.env.env
         self.judge = Judge(
             run.task, env.servos, run.seed, threads_of(run, self.ranks),
@@ -227,7 +226,9 @@ class _Session:
         if self.learn_first_gait(ends):
             self.improve(ends)
             self.save(LAST)
-        self.finish()
+        self.write_policy(_POLICY_LAST)
+        if self.writer:
+            self.writer.close()
 
     def learn_first_gait(self, ends: Callable[[], bool]) -> bool:
         """The remaining rounds of imitation; whether all that was learned is in a checkpoint."""
@@ -297,7 +298,9 @@ class _Session:
         folder = self.folder / _TEACHER
         begun = (folder / RUN_FILE).is_file()
         own = resume_run(folder, None, None) if begun else teacher_of(self.run)
-        session = _Session(folder, own, begun, self._watch_teacher)
+        watch = self.watch
+        shown = watch and (lambda progress: watch(replace(progress, phase="teacher")))
+        session = _Session(folder, own, begun, shown)
         session.go(ends)
         self.ranks.any(False)  # the first has written it
         # its time is this run's, also where that was killed meanwhile
@@ -306,17 +309,11 @@ class _Session:
         self.counters["elapsed_s"], self.started = elapsed, now - elapsed
         return folder
 
-    def _watch_teacher(self, progress: Progress) -> None:
-        if self.watch:
-            self.watch(replace(progress, phase="teacher"))
-
     def improve(self, ends: Callable[[], bool]) -> None:
         """Updates of PPO, until they are done, time is up or a stop is requested."""
-        if self.counters["imitated"] < self.rounds:
+        if self.counters["imitated"] < self.rounds or ends():
             return
         learner, episodes = self.learner, EpisodeMeans(self.learner.env.num_envs)
-        if ends():
-            return
         if not self.counters["scores"]:
             self.counters["scores"] = self.judge(learner.averaged)
             self.keep_best()  # of imitation alone, so that PPO must be better
@@ -333,8 +330,7 @@ class _Session:
             self.refuse_nan(before, losses.values())
             row = episodes.row() | {
                 "value_loss": losses["value"],
-                "kl": losses["kl"],
-                "clip_fraction": losses["clip_fraction"],
+                **{name: losses[name] for name in ("kl", "clip_fraction")},
                 "std": learner.std,
                 "learning_rate": learner.ppo.learning_rate,
                 "nan_resets": learner.env.env.nan_resets,
@@ -382,12 +378,6 @@ class _Session:
             self.counters["best"] = score
             self.save(BEST)
             self.write_policy("policy_best")
-
-    def finish(self) -> None:
-        """Write the last policy, and end the curves."""
-        self.write_policy(_POLICY_LAST)
-        if self.writer:
-            self.writer.close()
 
     def save(self, name: str) -> None:
         """Write a checkpoint."""

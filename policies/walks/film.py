@@ -97,11 +97,9 @@ class Film:
         from PIL import Image, ImageDraw, ImageFont
 
         if not hasattr(self, "_font"):
-            own = font_manager.findfont("DejaVu Sans Mono")
-            self._font = ImageFont.truetype(own, 20)
+            self._font = ImageFont.truetype(font_manager.findfont("DejaVu Sans Mono"), 20)
         image = Image.fromarray(picture)
-        drawn = ImageDraw.Draw(image)
-        mean = np.mean(self._velocity, axis=0)
+        drawn, mean = ImageDraw.Draw(image), np.mean(self._velocity, axis=0)
         speeds = "{:+9.2f} m/s {:+9.2f} m/s {:+9.2f} rad/s"
         rows = [
             *self._lines,

@@ -151,19 +151,11 @@ def _shares(conditions: Sequence[Condition]) -> list[list[list[int]]]:
 
     for i in sorted(range(len(conditions)), key=lambda i: -conditions[i].robots):
         min(shares, key=work).append(i)
-    return [_by_task(conditions, sorted(share)) for share in shares if share]
-
-
-def _by_task(conditions: Sequence[Condition], chosen: Sequence[int]) -> list[list[int]]:
-    groups: list[list[int]] = []
-    for i in chosen:
-        same = (g for g in groups if conditions[g[0]].task == conditions[i].task)
-        group = next(same, None)
-        if group is None:
-            groups.append([i])
-        else:
-            group.append(i)
-    return groups
+    by_task: list[dict[Walking, list[int]]] = [{} for _ in shares]
+    for groups, share in zip(by_task, shares, strict=True):
+        for i in sorted(share):
+            groups.setdefault(conditions[i].task, []).append(i)
+    return [list(groups.values()) for groups in by_task if groups]
 
 
 class _Group:

@@ -81,10 +81,8 @@ class WalkingBus:
         self._map = body_joint_map(self.robot.body)
         self._servo_map = self._map.per_servo()
         self.limits = self._map.position_limits()
-        self.metadata: dict[str, Any] = self._bus.metadata | {
-            "kind": "emulated walking robot",
-            "coordinates": "joint",
-        }
+        about = {"kind": "emulated walking robot", "coordinates": "joint"}
+        self.metadata: dict[str, Any] = self._bus.metadata | about
 
     def now(self) -> float:
         """Time of the bus's clock [s], from 0 at construction."""

@@ -170,14 +170,9 @@ class WalkingRobot:
             axes = np.empty(9)
             mujoco.mju_quat2Mat(axes, self._data.qpos[3:7])
             axes = axes.reshape(3, 3)  # columns: the trunk's axes in the world
-            return Trunk(
-                self._step * self._dt,
-                position,
-                float(np.arctan2(axes[1, 0], axes[0, 0])),
-                axes.T @ velocity,
-                float(self._data.qvel[5]),
-                float(axes[2, 2]),
-            )
+            heading = float(np.arctan2(axes[1, 0], axes[0, 0]))
+            rate, upright = float(self._data.qvel[5]), float(axes[2, 2])
+            return Trunk(self._step * self._dt, position, heading, axes.T @ velocity, rate, upright)
 
     def push(self, velocity_m_s: NDArray[np.float64]) -> None:
         """Give the trunk a horizontal velocity, shape (2,), in the world's axes, now."""

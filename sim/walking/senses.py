@@ -28,6 +28,9 @@ from pupper_sysid.sim.walking.differences import Differences
 from pupper_sysid.sim.walking.observation import VELOCITY_STEPS
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
+Array = NDArray[np.float64]
+Rows = slice | NDArray[np.intp]
+
 # as of the emulated bus
 _JITTER_S, _DRIFT = RobotSpec.poll_jitter_s, RobotSpec.poll_drift
 
@@ -259,10 +262,6 @@ class Imu:
         if own.imu_late or own.imu_askew:
             gravity = gravity / np.linalg.norm(gravity, axis=1, keepdims=True)
         return rate, gravity
-
-
-Array = NDArray[np.float64]
-Rows = slice | NDArray[np.intp]
 
 
 class Senses:
