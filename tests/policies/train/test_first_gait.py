@@ -92,7 +92,7 @@ def test_a_task_of_slower_commands_is_judged_by_slower_walks_with_the_same_relat
     np.testing.assert_allclose(first_gait._scale(task), [0.5, 0.0, 1.0])
     assert (first_gait._scale(Walking(commands=Commands((-9, 9), (-9, 9), (-9, 9)))) == 1).all()
     usual = walked(COMMANDS, np.full((len(COMMANDS), 3), 0.8))
-    slower = walked(first_gait._within(task, COMMANDS), np.full((len(COMMANDS), 3), 0.8))
+    slower = walked(COMMANDS * first_gait._scale(task), np.full((len(COMMANDS), 3), 0.8))
     slower = replace(slower, scale=first_gait._scale(task))
     a, b = first_gait._score(usual), first_gait._score(slower)
     assert (b.forward_m_s, b.turn_rad_s) == (0.075, 0.4) and "of 0.075 m/s forward" in str(b)
