@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware import joint_calibration as jc
 from pupper_sysid.hardware.joint_map import joint_map_from, load_joint_map
 
@@ -24,22 +23,6 @@ def travel_of(*counts, encoder=1024):
 
 def refusal(travel):
     return travel.refusals(("LF_hip",)).get("LF_hip", "")
-
-
-def test_an_offset_is_the_middle_pose_less_the_centre_of_the_encoder():
-    assert jc.offset_counts(500.0, 1024) == -12 and jc.offset_counts(2148.4, 4096) == 100
-
-
-def test_limits_stay_two_percent_of_the_travel_inside_both_ends():
-    assert jc.limits_within(200, 800) == (212, 788)
-    # 2 % of 333 counts are 6.66: rounded to the inside
-    assert jc.limits_within(300, 633) == (307, 626)
-
-
-def test_a_right_angle_in_275_counts_is_the_vendors_scale_whichever_way_it_was_turned():
-    vendor = 550 / np.pi
-    assert jc.counts_per_rad(400, 675, 90) == pytest.approx(vendor)
-    assert jc.counts_per_rad(675, 400, 90) == pytest.approx(vendor)
 
 
 def test_the_two_published_scales_do_not_agree_but_two_degrees_of_error_do():
@@ -161,11 +144,3 @@ def test_the_middle_pose_of_another_robot_is_told_joint_by_joint_in_degrees():
     words = jc.middle_pose_in_words(joint_map_from(data, "arm").file, ("elbow", "left_hip"))
     assert "elbow: 45 degrees\n" in words and "left_hip: 0 degrees\n" in words
     assert "the robot's model" in words and "straight down" not in words
-
-
-def test_the_middle_pose_is_told_as_the_map_has_it():
-    for preset in ("mini_pupper_2", "sts3215"):
-        words = jc.middle_pose_in_words(load_joint_map(preset).file, JOINT_NAMES)
-        assert "every hip: straight down" in words
-        assert "every thigh: 45 degrees from straight down, knee behind the hip" in words
-        assert "every calf: 45 degrees from straight down, foot ahead of the knee" in words

@@ -26,7 +26,6 @@ from support.servo_servers import (
 )
 
 IDS = (4, 5)
-JOINTS = {4: "LF_hip", 5: "LF_thigh"}
 
 
 @pytest.fixture(autouse=True)
@@ -180,14 +179,6 @@ def test_two_servos_of_one_id_are_named_instead_of_the_cables(series):
     servos = still_servos(series, (4, 5, 6), doubled=[5])
     with on_a_port(servos) as server, pytest.raises(BusError, match="two servos") as refused:
         FeetechBus(server.device, 1_000_000, map_of(4, 5, 6, series=series))
-    assert "id 5 (register id)" in str(refused.value) and "another id" in str(refused.value)
-    assert (5, True) not in bench_of(servos).torques
-
-
-def test_two_dynamixels_of_one_id_are_named():
-    servos = still_dynamixels((4, 5, 6), doubled=[5])
-    with on_a_port(servos) as server, pytest.raises(BusError, match="two servos") as refused:
-        DynamixelBus(server.device, 1_000_000, dynamixel_map(4, 5, 6))
     assert "id 5 (register id)" in str(refused.value) and "another id" in str(refused.value)
     assert (5, True) not in bench_of(servos).torques
 

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +18,6 @@ from pupper_sysid.hardware.safety.notes import notes, write_note
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.dynamixel import DynamixelEmulator
 from pupper_sysid.sim.emulator.serial_line import SerialPty
-from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
 from support.servo_servers import (
     bench_of,
@@ -31,10 +25,7 @@ from support.servo_servers import (
     moving_dynamixel,
     on_a_port,
     still_dynamixels,
-    wait_until,
 )
-
-ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture(autouse=True)
@@ -212,21 +203,6 @@ def test_a_servo_that_a_moment_without_supply_left_limp_is_named_as_limp():
         bus.close()
 
 
-DRIVER = """
-import sys, time
-from pupper_sysid.hardware.address import parse_address
-from pupper_sysid.hardware.safety.guard import open_guarded
-from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.hardware.serial_servos import line
-line.REPLY_TIMEOUT_S = 0.1  # the servos share a busy machine with their driver
-bus = open_guarded(parse_address(sys.argv[1]), load_joint_map(sys.argv[2]).per_servo())
-bus.set_register("LF_hip", "p", 300)
-bus.torque(True)
-print("on", flush=True)
-time.sleep(60)
-"""
-
-
 @contextmanager
 def served(**registers: int) -> Iterator[tuple[DynamixelEmulator, SerialPty]]:
     """Three servos; the last with these registers."""
@@ -282,65 +258,3 @@ def test_a_servo_that_falls_silent_costs_one_reading_of_those_behind_it_and_come
         bus.close()
     assert silent == [[True, False, False], [True, False, True], [True, False, True]]
     assert fast and np.isfinite(back.position_rad).all()
-
-
-@pytest.mark.wall_clock
-def test_a_killed_driver_leaves_limp_servos_with_their_own_registers(line, tmp_path):
-    servos, device = line
-    chosen = tmp_path / "map.yaml"
-    dynamixel_map(4, 5).save(chosen)
-    process = subprocess.Popen(
-        [sys.executable, "-c", DRIVER, f"dynamixel:{device}@1000000", str(chosen)],
-        stdout=subprocess.PIPE, cwd=ROOT,
-    )  # fmt: skip
-    assert process.stdout is not None and process.stdout.readline() == b"on\n"
-    assert servos._get(4, "position_p_gain") == 300 and servos._get(4, "torque_enable") == 1
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    assert wait_until(lambda: not servos._get(4, "torque_enable"))
-    assert wait_until(
-        lambda: (servos._get(4, "bus_watchdog"), servos._get(4, "position_p_gain")) == (0, 400)
-    )
-    time.sleep(0.2)
-
-
-SWEEP = """
-from pupper_sysid.hardware.serial_servos import line
-line.REPLY_TIMEOUT_S = 0.1
-from pupper_sysid.cli.programs.pupper_sysid import main
-main()
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.wall_clock
-@pytest.mark.parametrize(("model", "number"), [(1200, signal.SIGINT), (1020, signal.SIGTERM)])
-def test_a_sweep_that_is_cut_parks_sets_registers_back_and_is_resumed(
-    capsys, tmp_path, model, number
-):
-    servos = moving_dynamixel(model)
-    chosen, path = tmp_path / "map.yaml", tmp_path / "a.csv"
-    servos.bench.map.save(chosen)
-    servos._set(1, "torque_enable", 0)
-    servos.bench.torque(0, 0.0, False)
-    with on_a_port(servos) as server:
-        words = (
-            "sweep", "--freqs", "2,3", "--duration", "2", "--bus",
-            f"dynamixel:{server.device}@1000000", "--joint-map", str(chosen),
-        )  # fmt: skip
-        process = subprocess.Popen(
-            [sys.executable, "-c", SWEEP, *words, "--out", str(path)], cwd=ROOT,
-            stderr=subprocess.PIPE,
-        )  # fmt: skip
-        assert wait_until(lambda: path.exists() and path.read_text().count("bench,") > 25, 30.0)
-        assert servos._get(1, "bus_watchdog") == WATCHDOG_UNITS
-        process.send_signal(number)
-        said = process.communicate(timeout=60)[1].decode()
-        assert process.returncode == 128 + number and "Stopped." in said
-        for name, value in (("torque_enable", 0), ("bus_watchdog", 0), ("shutdown", 52)):
-            assert servos._get(1, name) == value, name
-        assert "completed" not in load(path).metadata
-        code, _, err = run(capsys, *words, "--resume", path)
-        assert code == 0, err
-        assert "completed" in load(path).metadata
-        assert servos._get(1, "torque_enable") == servos._get(1, "bus_watchdog") == 0

@@ -14,7 +14,6 @@ from pupper_sysid.hardware.dynamixel import (
     CRC,
     DATA_LIMIT,
     INSTRUCTION,
-    DynamixelLine,
     Frame,
     FrameReader,
     crc16,
@@ -141,14 +140,6 @@ def test_of_a_damaged_fast_answer_only_the_blocks_before_the_damage_are_taken(bi
     assert frames == fast_replies(FAST_ANSWER, [3, 7, 4], 4)[: len(frames)]
 
 
-@pytest.mark.parametrize("registers", [{4: {"firmware": 44}}, {4: {"status_return_level": 0}}])
-def test_a_servo_that_does_not_answer_a_fast_sync_read_silences_those_behind_it(registers):
-    servos = still_dynamixels([3, 4, 7], model=1030, registers=registers)
-    request = Frame(254, 0x8A, b"\x84\x00\x04\x00\x03\x04\x07").encode()
-    answer = b"".join(piece for _, piece in servos.receive(request, 0.0))
-    assert [frame.id for frame in fast_replies(answer, [3, 4, 7], 4)] == [3]
-
-
 def test_a_header_inside_the_data_is_stuffed_and_comes_out_again():
     data = bytes.fromhex("ff ff fd 00 ff ff fd fd ff ff")
     frame = Frame(7, 0, data, True)
@@ -254,13 +245,3 @@ def test_wrong_frames_are_answered_by_their_error_number():
     assert errors(Frame(1, 0x42, b"").encode()) == [INSTRUCTION]
     servos._set(1, "hardware_error_status", 32)
     assert errors(wire("ping")) == [ALERT]
-
-
-def test_our_line_reads_what_the_servos_hold(served):
-    _, device = served
-    line = DynamixelLine(device, 1_000_000)
-    line.detect_echo()
-    assert line.find([1, 2, 3]) == {1: 1030, 2: 1030}
-    replies = line.sync_read([1, 2], 132, 4)
-    line.close()
-    assert set(replies) == {1, 2} and replies[1].after_s <= replies[2].after_s

@@ -122,19 +122,6 @@ OFF = {
 }  # fmt: skip
 
 
-def test_protections_that_are_off_are_on_while_the_torque_is_and_off_again_at_the_end(sts):
-    set_protection(sts, **OFF)
-    guard = GuardedBus(FeetechBus(sts.device, joint_map=map_of(1)))
-    assert protection(sts) == OFF, "nothing is written before the torque is switched on"
-    guard.torque(True)
-    assert protection(sts) == FACTORY
-    assert sts.emulator.servos[1].memory[STS3215.lock_address] == 1
-    guard.torque(False)
-    guard.torque(True)
-    guard.close()
-    assert protection(sts) == OFF
-
-
 def test_protections_of_the_factory_or_stronger_are_left_alone(sts):
     own = FACTORY | {"overload_torque": 25, "protective_torque": 10}
     set_protection(sts, **own)

@@ -18,8 +18,6 @@ from pupper_sysid.sim.emulator.pendulum import (
     draw_bench,
 )
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sysid.sweep.excitation import plan
-from pupper_sysid.sysid.sweep.recorder import record
 from support.virtual_time import VirtualTime
 
 PERIOD_S = 0.02
@@ -118,27 +116,6 @@ def test_a_bus_that_dates_a_reading_at_no_time_is_monitored_all_the_same():
     bus.read = lambda: replace(read(), time_s=np.full(1, np.nan))
     with pytest.raises(SafetyStop, match=STOPS):
         sweep_of(bus, 0.3, 1.0)
-
-
-def test_a_sweep_of_an_emulated_robot_ends_when_a_reading_sticks_but_for_a_count(tmp_path):
-    class Stuck(EmulatedBus):
-        last, rng = 0.0, np.random.default_rng(1)
-
-        def read(self) -> BusSample:
-            sample = super().read()
-            position, k = sample.position_rad.copy(), self.joint_names.index("LF_thigh")
-            if self.now() < 6.0:
-                self.last = position[k]
-            else:
-                step = self.robot.spec.quantum_rad
-                position[k] = self.last + step * self.rng.integers(-1, 2)
-            return replace(sample, position_rad=position)
-
-    rng = np.random.default_rng(0)
-    bus = Stuck(draw_robot(rng), rng, keep_log=False)
-    with pytest.raises(SafetyStop, match=f"LF_thigh was commanded .* {STOPS}"):
-        record(bus, plan("sine", ["LF_thigh"], [2.0], duration_s=8.0), tmp_path / "sweep.csv")
-    assert bus.now() - 6.0 < 3.0
 
 
 def emulated(kind: str) -> EmulatedBus:
