@@ -31,7 +31,6 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from pupper_sysid.common.errors import PupperError
-from pupper_sysid.hardware.feetech import SERIES, Frame, FrameReader, Series
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.policies.deploy.commands import COLUMNS as SCRIPT_COLUMNS
 from pupper_sysid.policies.deploy.commands import script
@@ -43,10 +42,6 @@ from pupper_sysid.policies.train.run_file import load_run
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.servo_file import load_servo_model
-from pupper_sysid.sim.emulator.bench import ServoBench
-from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
-from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sysid.plan.plan_file import load_plan, save_plan
 from pupper_sysid.sysid.plan.planner import PlannedTrial
 from pupper_sysid.sysid.plan.proposal import SweepPlan
@@ -452,98 +447,3 @@ def test_control_characters_of_names_are_not_in_the_refusal(good_files, name, go
 
 
 # ------------------------------------------------------------------------------------------ frames
-
-
-class WatchedServos(ServoBench):
-    """A bench that logs what reaches its servos; without physics they stand still."""
-
-    def __init__(self, layout: str, spec: RobotSpec):
-        rng = np.random.default_rng(0)
-        super().__init__(draw_robot(rng, spec), load_joint_map(layout), rng, keep_log=False)
-        self.goals: list[tuple[int, int]] = []
-
-    def command(self, index: int, time_s: float, count: int) -> None:
-        self.goals.append((self.map.ids[index], int(count)))
-
-    def torque(self, index: int, time_s: float, on: bool) -> None:
-        pass
-
-    def count(self, index: int, time_s: float) -> int:
-        return 500 + index
-
-    def load(self, index: int) -> int:
-        return 10 * index - 50
-
-
-DIRECT = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
-requests = st.one_of(
-    st.builds(
-        lambda servo, address, data: Frame(servo, 3, bytes([address]) + data).encode(),
-        st.integers(0, 14), st.sampled_from([0, 9, 11, 40, 42, 48, 56, 79]),
-        st.binary(max_size=6),
-    ),
-    st.builds(
-        lambda servo, address, size: Frame(servo, 2, bytes([address, size])).encode(),
-        st.integers(1, 13), st.sampled_from([0, 42, 56, 79]), st.integers(0, 255),
-    ),
-    st.builds(
-        lambda code, data: Frame(254, code, data).encode(),
-        st.sampled_from([1, 5, 6, 0x82, 0x83]), st.binary(max_size=40),
-    ),
-    st.binary(max_size=40),
-)  # fmt: skip
-
-
-@pytest.mark.parametrize("series", SERIES.values(), ids=lambda s: s.name)
-@SOME
-@given(stream=st.lists(st.tuples(requests, damages() | st.none()), max_size=8))
-def test_damaged_requests_move_no_emulated_servo_beyond_its_limits(series: Series, stream):
-    layout = {"STS3215": "sts3215", "SCS0009": "mini_pupper_2_direct"}[series.name]
-    bench, now = WatchedServos(layout, DIRECT), 0.0
-    emulator = FeetechEmulator(bench, series, np.random.default_rng(1))
-    order = "big" if series.big_endian else "little"
-
-    def ends(servo: int) -> list[int]:
-        memory = emulator.servos[servo].memory
-        return [int.from_bytes(memory[at : at + 2], order) for at in (9, 11)]
-
-    for request, damage in stream:
-        data = damage(request)[:600] if damage else request
-        # a write may reach limits and goal: both the limits before and those after it hold
-        before = {servo: ends(servo) for servo in emulator.servos}
-        bench.goals.clear()
-        answers = emulator.receive(data, now)
-        now = max([now, *(at for at, _ in answers)]) + 1e-3
-        for servo, goal in bench.goals:
-            bounds = [*before[servo], *ends(servo)]
-            assert min(bounds) <= goal <= max(bounds)
-        for _, answer in answers:  # each is one whole frame of a servo that exists
-            (frame,) = FrameReader().feed(answer)
-            assert frame.encode() == answer and frame.id in emulator.servos
-
-
-counts = st.lists(st.sampled_from([0, 1, 512, 1023, 1024, 65_535]), min_size=12, max_size=12)
-setpoints = st.builds(
-    lambda on, words: bytes([38, 1, *on]) + np.array(words, "<u2").tobytes(),
-    st.lists(st.sampled_from([0, 1, 1, 2, 99, 255]), min_size=12, max_size=12), counts,
-)  # fmt: skip
-questions = st.sampled_from([2, 3, 4, 5, 6, 255]).map(lambda opcode: bytes([2, opcode]))
-ANSWER_BYTES = {2: 26, 3: 26, 4: 26, 5: 10}
-
-
-@SOME
-@given(stream=st.lists(setpoints | questions | st.binary(max_size=38), max_size=12))
-def test_any_datagrams_get_answers_of_their_kind_and_goals_within_the_encoder(stream):
-    bench, previous = WatchedServos("mini_pupper_2", RobotSpec()), b""
-    emulator = ProxyEmulator(bench, np.random.default_rng(1))
-    for k, data in enumerate(stream):
-        answer = emulator.answer(data, previous, 0.02 * k)
-        if len(data) == 38 and data[:2] == b"\x26\x01":
-            assert answer == b"\x02\x01"
-        elif len(data) == 2 and data[0] == 2 and data[1] in ANSWER_BYTES:
-            assert answer[:2] == bytes([ANSWER_BYTES[data[1]], data[1]])
-            assert len(answer) == ANSWER_BYTES[data[1]]
-        else:  # what is no question repeats the last answer
-            assert answer == previous if previous else len(answer) == 2
-        previous = answer
-    assert all(0 <= goal <= 1023 for _, goal in bench.goals)

@@ -79,45 +79,6 @@ def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     assert np.nanmax(abs(trial.position_rad - 0.785)) > 0.2
 
 
-@pytest.mark.slow
-def test_a_calf_can_be_swept_without_its_thigh(capsys):
-    with on_a_port(moving_servos(ids=[6])) as port:
-        code, _, err = run(
-            capsys, "sweep", *SHORT, "--joints", "LF_calf", "--bus", f"feetech:{port.device}",
-            "--out", "a.csv", "--joint-map", "sts3215",
-        )  # fmt: skip
-    assert code == 0, err
-    assert load(Path("a.csv")).metadata["bus"]["count_zero_rad"]["LF_calf"] == pytest.approx(
-        -1.5708, abs=1e-4
-    )
-
-
-def test_a_joint_whose_servo_is_not_there_is_named_with_its_id(capsys):
-    with on_a_port(still_servos(ids=[4])) as port:
-        code, _, err = run(
-            capsys,
-            "sweep",
-            *SHORT,
-            "--joints",
-            "LF",
-            "--bus",
-            f"feetech:{port.device}",
-            "--joint-map",
-            "sts3215",
-        )
-    assert code == 1 and "LF_thigh (id 5), LF_calf (id 6) does not answer" in err
-    assert not list(Path().glob("recordings/*"))
-
-
-def test_a_map_of_the_other_frame_is_refused(capsys):
-    with on_a_port(still_servos()) as port:
-        code, _, err = run(
-            capsys, "sweep", *SHORT, "--bus", f"feetech:{port.device}",
-            "--joint-map", "mini_pupper_2",
-        )  # fmt: skip
-    assert code == 2 and "a direct bus uses raw ones" in err and "calibrate-joints" in err
-
-
 @pytest.mark.parametrize("kind", [pytest.param("feetech", marks=pytest.mark.slow), "esp32"])
 def test_an_emulator_prints_the_next_command_and_ends_on_request(tmp_path, kind):
     place = ("--link", "s") if kind == "feetech" else ("--socket", "s")

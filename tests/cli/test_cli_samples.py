@@ -11,14 +11,8 @@ import yaml
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.data_sheet import data_sheet
 from pupper_sysid.data import SAMPLES
-from pupper_sysid.hardware.feetech import STS3215
-from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.sim.emulator.bench import ServoBench
-from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.pendulum import draw_of_map
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run_program
-from support.servo_servers import on_a_port
 
 
 def test_the_samples_are_copied_whole_and_never_over_other_files(tmp_path, monkeypatch, capsys):
@@ -77,23 +71,3 @@ def test_an_arm_of_sts3215_is_emulated_by_its_servos_data_sheet_and_registers(ar
     assert truth["actuator"]["stiffness"] == pytest.approx(
         16 * loaded["duty_per_rad"] * loaded["torque_nm"]
     )
-
-
-@pytest.mark.wall_clock
-def test_an_arm_on_a_line_of_sts3215_is_swept_at_the_gain_it_has(arm, capsys):
-    rng, layout = np.random.default_rng(1), load_joint_map(arm)
-    robot, plant = draw_of_map(rng, layout, {"p": 16})
-    servos = FeetechEmulator(ServoBench(robot, layout, rng, plant=plant), STS3215, rng)
-    with on_a_port(servos) as port:
-        code, _, err = run_program(
-            capsys, pupper_sysid, "sweep", "--joint-map", arm, *SHORT[:-2], "--bus",
-            f"feetech:{port.device}", "--out", "line.csv",
-        )  # fmt: skip
-    assert code == 0, err
-    recording = load("line.csv")
-    servo = recording.trials("wrist_roll")[0].servo
-    assert (servo.model, servo.p_gain, servo.d_gain) == ("STS3215", 16, 32)
-    assert recording.trials("wrist_roll")[0].readings == "live"
-    assert recording.metadata["bus"]["speed_limit_rad_s"] == pytest.approx(5.445, abs=1e-3)
-    # a loaded machine may miss a reading
-    assert np.nanmax(recording.table.position_rad.abs()) > 0.2

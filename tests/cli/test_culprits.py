@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ import pytest
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.cli.user_errors import _is_interrupt, user_errors
 from pupper_sysid.common.errors import SafetyStop
-from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent
+from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import BUS, GUARD, IMU, LOG, POLICY, VIEWS, FixedRateLoop
 from pupper_sysid.hardware.safety.guard import GuardedBus
@@ -29,7 +29,7 @@ from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.walking.bus import WalkingBus
 from support.command_line import refused
-from support.virtual_time import VirtualTime
+from support.following_bus import FollowingBus
 
 SAMPLES = Path(__file__).parents[2] / "data/samples"
 PERIOD_S, LATE_S = 0.02, 0.055
@@ -104,33 +104,16 @@ def test_a_reader_that_has_gone_ends_the_program_and_a_broken_pipe_elsewhere_is_
     assert said(capsys, lambda: print("x")) == (0, "")
 
 
-@dataclass
-class _Bus(VirtualTime):
+class _Bus(FollowingBus):
     """One joint that is where it is commanded; an exchange takes as long as it is set to."""
 
-    exchange_s: float = 0.0
-    time: float = 0.0
-    name: str = "plain"
-    joint_names: tuple[str, ...] = ("LF_hip",)
-
-    def __post_init__(self):
-        self.limits = PositionLimits(np.full(1, -2.0), np.full(1, 2.0))
-        self.metadata: dict = {}
-        self.goal = np.zeros(1)
-
-    def write(self, position_rad) -> Sent:
-        self.goal = position_rad
-        return Sent(self.time, position_rad)
+    def __init__(self, exchange_s: float):
+        super().__init__()
+        self.exchange_s = exchange_s
 
     def read(self) -> BusSample:
         self.time += self.exchange_s
-        return BusSample(np.full(1, self.time), self.goal, np.zeros(1, int))
-
-    def torque(self, on: bool) -> bool:
-        return True
-
-    def close(self) -> None:
-        pass
+        return super().read()
 
 
 CULPRITS = {

@@ -25,7 +25,6 @@ from pupper_sysid.cli.terminal import remember, spell
 from pupper_sysid.cli.user_errors import parse
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import select_joints
-from pupper_sysid.sysid.fit import calibrate as module
 from support.command_line import refused, run, run_program
 from support.json_keys import DOCUMENTED, key_line
 from support.package import FOLDERS, ROOT
@@ -77,12 +76,6 @@ def test_commands_are_grouped_as_their_folders():
         assert command.where.startswith(f"{command.group}.")
     groups = dict.fromkeys(c.group for c in pupper_sysid.COMMANDS.values())
     assert list(groups) == ["robot", "recording", "model", "use"]
-
-
-@pytest.mark.parametrize("arguments", [(), ("-h",), ("--help",)])
-def test_the_overview_is_what_help_prints(capsys, arguments):
-    code, out, _ = run(capsys, *arguments)
-    assert code == 0 and "calibrate-joints" in out
 
 
 # ----- help of every command: one screen, options by their types, everything behind `--help-all`
@@ -184,19 +177,6 @@ def test_without_a_terminal_there_is_a_line_each_ten_seconds(lines):
     ]  # fmt: skip
 
 
-def test_a_joint_is_done_after_all_its_stages(monkeypatch):
-    monkeypatch.setattr(
-        module, "prepare_joint", lambda joint, trials, seed, free_air, prior: "ready"
-    )
-    monkeypatch.setattr(module, "stages", lambda ready: module.STAGES[1:-1])
-    monkeypatch.setattr(module, "fit_structures", lambda ready, name: name)
-    monkeypatch.setattr(module, "conclude", lambda ready, fitted, presets: list(fitted))
-    told = []
-    made = module._one_by_one("LF_hip", (), True, 0, {}, lambda *stage: told.append(stage))
-    assert told == [("LF_hip", stage) for stage in module.STAGES]
-    assert made == list(module.STAGES[1:-1])
-
-
 # ----- text from files reaches the terminal without its control characters
 
 ESCAPES = ["\x1b[31m", "\x1b]0;title\x07", "\x9b2J", "\u202e", "\r"]
@@ -242,12 +222,6 @@ def test_a_command_to_run_next_can_be_copied(capsys, tmp_path):
     code, _, err = run(capsys, "import", ROOT / "data/samples/sweep.csv", "--out", recording)
     assert code == 0
     assert shlex.split(err.split("Next: ")[1]) == ["pupper-sysid", "doctor", str(recording)]
-
-
-def test_an_example_begins_a_line_of_the_help(capsys):
-    for command in ("monitor", "plan", "init-robot"):
-        _, out, _ = run(capsys, command, "--help")
-        assert f"\nExample: pupper-sysid {command} " in out
 
 
 # ----- messages of the library name arguments; at the command line they name its options

@@ -18,12 +18,7 @@ from pupper_sysid.hardware.feetech import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.pendulum import (
-    BENCH_MAP,
-    Pendulum,
-    PendulumBench,
-    draw_bench,
-)
+from pupper_sysid.sim.emulator.pendulum import BENCH_MAP, Pendulum, PendulumBench, draw_bench
 from pupper_sysid.sysid.doctor import checks as joints
 from pupper_sysid.sysid.plan.plan_file import load_plan
 from pupper_sysid.sysid.recordings.files import load

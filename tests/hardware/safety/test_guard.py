@@ -9,37 +9,29 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import BusError, SafetyStop
-from pupper_sysid.hardware.bus import BusSample, Coupling, PositionLimits, Sent
+from pupper_sysid.hardware.bus import Coupling, PositionLimits, Sent
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits, guarded
 from pupper_sysid.hardware.safety.watchdog import Watchdog
-from support.virtual_time import VirtualTime
+from support.following_bus import FollowingBus
 
 PERIOD = 0.02
 NOTHING_CHANGED = {"clipped": 0, "slowed": 0, "unsent": 0, "missing": 0}
 
 
-class PlainBus(VirtualTime):
-    """Two servos in virtual time that follow at once, until a fault is set."""
+class PlainBus(FollowingBus):
+    """Two servos that follow at once, until a fault is set."""
 
-    name = "plain"
-    joint_names = ("LF_thigh", "LF_calf")
-
-    def __init__(self, low=-2.0, high=2.0):
-        self.limits = PositionLimits(np.full(2, low), np.full(2, high))
+    def __init__(self, high=2.0):
+        super().__init__(("LF_thigh", "LF_calf"))
+        self.limits.high_rad[:] = high
         self.metadata = {"voltage_band_v": [4.2, 8.7]}
-        self.time, self.goal, self.log = 0.0, np.zeros(2), []
-        self.written: list[np.ndarray] = []
         self.frozen = self.blocked = self.deaf = False
         self.silent = np.zeros(2, bool)
         self.load, self.volts, self.heat, self.status = np.zeros(2), 7.4, 30.0, np.zeros(2, int)
         self.ticks = 0
 
     def write(self, position_rad):
-        if self.deaf:
-            return Sent(float("nan"), position_rad)
-        self.goal = position_rad.copy()
-        self.written.append(self.goal)
-        return Sent(self.time, self.goal)
+        return Sent(float("nan"), position_rad) if self.deaf else super().write(position_rad)
 
     def read(self):
         self.ticks += 1
@@ -47,19 +39,10 @@ class PlainBus(VirtualTime):
         position = self.goal + 0.0015 * (self.ticks % 2)
         if self.frozen or self.blocked:
             position = np.zeros(2) + (0.0015 * (self.ticks % 2) if self.blocked else 0.0)
-        position = np.where(self.silent, np.nan, position)
-        full = np.ones(2)
-        return BusSample(
-            np.full(2, self.time), position, np.where(self.silent, -1, 500),
-            self.volts * full, self.heat * full, self.load, self.status,
+        return self.sample(
+            np.where(self.silent, np.nan, position), voltage_v=np.full(2, self.volts),
+            temperature_c=np.full(2, self.heat), load=self.load, status=self.status,
         )  # fmt: skip
-
-    def torque(self, on):
-        self.log.append(f"torque {on}")
-        return True
-
-    def close(self):
-        self.log.append("close")
 
 
 class RecordingWatchdog(Watchdog):

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pupper_sysid.common.errors import BusError, SafetyStop
-from pupper_sysid.hardware.bus import BusSample, Coupling, PositionLimits, Sent
+from pupper_sysid.hardware.bus import Coupling, PositionLimits
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
-from support.virtual_time import VirtualTime
+from support.following_bus import FollowingBus
 
 FEW = settings(max_examples=60, deadline=None)
 MAPS = {
@@ -26,39 +26,18 @@ LONGEST_TICK_S = 0.06
 NEAR = 1e-9
 
 
-class Follower(VirtualTime):
-    """A bus in virtual time whose servos are where they are commanded to be."""
-
-    name = "follower"
-
-    def __init__(self, coordinates: str):
-        chosen = MAPS[coordinates]
-        self.joint_names, self.limits = chosen.joint_names, chosen.position_limits()
-        self.metadata: dict = {}
-        self.time, self.position = 0.0, self.limits.clip(chosen.rest_pose())
-        self.received: list[tuple[float, np.ndarray]] = []
-
-    def write(self, position_rad):
-        self.received.append((self.time, position_rad.copy()))
-        self.position = position_rad
-        return Sent(self.time, position_rad)
-
-    def read(self):
-        count = np.full(JOINTS, 500)
-        return BusSample(np.full(JOINTS, self.time), self.position.copy(), count)
-
-    def torque(self, on):
-        return True
-
-    def close(self):
-        pass
+def follower(coordinates: str) -> FollowingBus:
+    chosen = MAPS[coordinates]
+    bus = FollowingBus(chosen.joint_names, chosen.position_limits())
+    bus.goal = bus.limits.clip(chosen.rest_pose())
+    return bus
 
 
-def switched_on(coordinates: str) -> tuple[GuardedBus, Follower]:
-    bus = Follower(coordinates)
+def switched_on(coordinates: str) -> tuple[GuardedBus, FollowingBus]:
+    bus = follower(coordinates)
     guard = GuardedBus(bus)
     guard.torque(True)
-    guard.write(bus.position)
+    guard.write(bus.goal)
     return guard, bus
 
 
@@ -80,13 +59,12 @@ def test_whatever_is_commanded_what_reaches_the_bus_is_within_limits_and_speed(c
         bus.time += pause_s
         guard.write(np.array(goal))
     limits = bus.limits
-    sent = np.array([x for _, x in bus.received])
+    sent = np.array(bus.written)
     assert np.isfinite(sent).all()
     # inside the box, and inside the coupled bounds wherever the box leaves them a solution
     assert (sent >= limits.low_rad - NEAR).all() and (sent <= limits.high_rad + NEAR).all()
     np.testing.assert_allclose([limits.clip(x) for x in sent], sent, atol=NEAR)
-    times = np.array([t for t, _ in bus.received])
-    dt = np.clip(np.diff(times), 1e-4, LONGEST_TICK_S)[:, None]
+    dt = np.clip(np.diff(bus.written_s), 1e-4, LONGEST_TICK_S)[:, None]
     servo = np.array([limits.servo_angles(x) for x in sent])
     speed = np.abs(np.diff(servo, axis=0)) / dt
     assert (speed <= SPEED_RAD_S + 1e-6).all()
@@ -105,15 +83,15 @@ def test_a_command_that_is_not_one_number_per_joint_is_refused_and_changes_nothi
     coordinates, goal, nan, shape
 ):
     guard, bus = switched_on(coordinates)
-    holes, before = np.array(goal), len(bus.received)
+    holes, before = np.array(goal), len(bus.written)
     holes[list(nan)] = np.nan
     bus.time += 0.02
     for bad in (holes, np.zeros(shape)):
         with pytest.raises(BusError, match="must be 12 numbers"):
             guard.write(bad)
-    assert len(bus.received) == before
-    guard.write(bus.position)
-    assert np.isfinite(bus.received[-1][1]).all()
+    assert len(bus.written) == before
+    guard.write(bus.goal)
+    assert np.isfinite(bus.written[-1]).all()
 
 
 @FEW
@@ -124,17 +102,17 @@ def test_a_command_that_is_not_one_number_per_joint_is_refused_and_changes_nothi
 def test_a_first_command_is_refused_exactly_when_it_would_move_a_joint_too_far(
     coordinates, away, share
 ):
-    bus = Follower(coordinates)
+    bus = follower(coordinates)
     guard = GuardedBus(bus)
     guard.torque(True)
-    start = bus.position.copy()
+    start = bus.goal.copy()
     goal = start + share * np.array(away)
     far = np.abs(bus.limits.clip(goal) - start).max()
     try:
         guard.write(goal)
-        assert far <= FIRST_RAD and len(bus.received) == 1
+        assert far <= FIRST_RAD and len(bus.written) == 1
     except SafetyStop:
-        assert far > FIRST_RAD and not bus.received
+        assert far > FIRST_RAD and not bus.written
 
 
 # ---- limits ----

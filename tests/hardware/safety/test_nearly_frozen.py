@@ -8,50 +8,32 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import InputError, SafetyStop
-from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent
+from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
 from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.pendulum import (
-    BenchSpec,
-    Pendulum,
-    PendulumBench,
-    draw_bench,
-)
+from pupper_sysid.sim.emulator.pendulum import BenchSpec, Pendulum, PendulumBench, draw_bench
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from support.virtual_time import VirtualTime
+from support.following_bus import FollowingBus
 
 PERIOD_S = 0.02
 COARSE, FINE = 2 * np.pi / 1024, 2 * np.pi / 4096
 STOPS = "its reading stayed within"
 
 
-class Following(VirtualTime):
+class Following(FollowingBus):
     """One servo that moves by a share of its command; its reading is noisy by whole steps."""
 
-    name, joint_names = "following", ("LF_hip",)
-
     def __init__(self, quantum: float | None, share: float, noise_steps: int):
-        self.limits = PositionLimits(np.full(1, -3.0), np.full(1, 3.0))
+        super().__init__(reach_rad=3.0)
         self.metadata = {} if quantum is None else {"command_quantum_rad": {"LF_hip": quantum}}
         self.quantum, self.share, self.noise = quantum or COARSE, share, noise_steps
-        self.time, self.goal, self.rng = 0.0, np.zeros(1), np.random.default_rng(0)
-        self.silent_from_s = np.inf
-
-    def write(self, position_rad) -> Sent:
-        self.goal = position_rad.copy()
-        return Sent(self.time, self.goal)
+        self.rng, self.silent_from_s = np.random.default_rng(0), np.inf
 
     def read(self) -> BusSample:
         noise = self.rng.integers(-self.noise, self.noise + 1)
         count = np.round(self.share * self.goal / self.quantum) + noise
-        position = np.where(self.time < self.silent_from_s, count * self.quantum, np.nan)
-        return BusSample(np.full(1, self.time), position, np.zeros(1, int))
-
-    def torque(self, on: bool) -> bool:
-        return True
-
-    def close(self) -> None:
-        pass
+        silent = self.time >= self.silent_from_s
+        return self.sample(np.where(silent, np.nan, count * self.quantum))
 
 
 def sweep_of(bus: Following, amplitude: float, hz: float, seconds: float = 4.5) -> None:

@@ -194,25 +194,6 @@ def test_without_faults_a_reading_is_the_true_position_at_the_read():
     assert (ticks[-1][2].position_count == -1).all()
 
 
-def test_counts_and_angles_of_a_reading_say_the_same():
-    bus = make_bus(RobotSpec())
-    sample = swing(bus, 1.0)[-1][2]
-    for i, servo in enumerate(bus.robot.servos):
-        angle = servo.zero_rad + servo.count_sign * (sample.position_count[i] - 512) * np.pi / 550
-        assert sample.position_rad[i] == pytest.approx(angle, abs=1e-12)
-
-
-def test_the_same_seed_gives_the_same_robot_and_the_same_readings():
-    first, second, other = (swing(make_bus(RobotSpec(), seed), 1.0) for seed in (7, 7, 8))
-    for (t1, g1, s1), (t2, g2, s2) in zip(first, second, strict=True):
-        assert (t1, *s1.time_s) == (t2, *s2.time_s)
-        np.testing.assert_array_equal(g1, g2)
-        np.testing.assert_array_equal(s1.position_rad, s2.position_rad)
-    assert any(
-        (a[2].position_rad != b[2].position_rad).any() for a, b in zip(first, other, strict=True)
-    )
-
-
 def test_the_mean_servo_is_the_published_one():
     rng = np.random.default_rng(11)
     servos = [s.actuator for _ in range(40) for s in draw_robot(rng).servos]

@@ -13,22 +13,16 @@ import yaml
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.hardware.feetech import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.servo_file import load_servo_model
-from pupper_sysid.sim.emulator.bench import ServoBench
-from pupper_sysid.sim.emulator.feetech import FeetechEmulator
-from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sim.robot import hinges, robot_map
 from pupper_sysid.sim.robot.mini_pupper import robot_xml
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from pupper_sysid.sysid.recordings.files import load
-from support.command_line import refused, run, run_program
+from support.command_line import refused, run
 from support.exported_servos import in_free_air
 from support.refusals import assert_each_refused
-from support.servo_servers import on_a_port
 
 ARM = """<mujoco><worldbody>
 <body><joint name="base_yaw" type="hinge" axis="0 0 1" range="-110 110"/><geom size=".02"/>
@@ -150,30 +144,6 @@ def test_an_arm_goes_from_its_model_to_a_calibration_networks_and_exports(capsys
     assert float(model.step([start])[0]) == pytest.approx(start, abs=0.02)
     arm = in_free_air(Path("servos.xml").read_text(), found.joint_names)
     assert arm.nu == 1 and arm.nsensor == 1
-
-
-@pytest.mark.slow
-@pytest.mark.wall_clock
-def test_one_servo_on_a_bench_is_swept_over_a_line_and_calibrated(capsys, read_here, monkeypatch):
-    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.04)  # they share this process
-    code, _, err = run(capsys, "init-robot", "bench.xml")
-    assert code == 0, err
-    layout = load_joint_map(Path("bench.joints.yaml"))
-    rng = np.random.default_rng(2)
-    robot = draw_robot(rng, RobotSpec(poll_period_s=0, loss=0, quantum_rad=0), layout)
-    bench = ServoBench(robot, layout, rng.spawn(1)[0])
-    with on_a_port(FeetechEmulator(bench, STS3215, rng)) as server:
-        arguments = (
-            "sweep", "--bus", f"feetech:{server.device}", "--joint-map", "bench.joints.yaml",
-            "--freqs", "2,4", "--duration", "2", "--rate", "50", "--out", "bench.csv",
-        )  # fmt: skip
-        code, _, err = run_program(capsys, pupper_sysid, *arguments)
-    assert code == 0, err
-    code, _, err = run(capsys, "calibrate", "bench.csv", "--out", "bench.yaml")
-    assert code == 0, err
-    own = load_calibration(Path("bench.yaml")).joint("bench").actuator
-    true = float(np.asarray(robot.servos[0].actuator.dead_time_s))
-    assert own.dead_time_s.value == pytest.approx(true, abs=8e-3)
 
 
 def read(text: str) -> None:

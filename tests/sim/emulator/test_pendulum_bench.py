@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from pupper_sysid.hardware.feetech import STS3215, FeetechBus
-from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.hardware.serial_servos import line as serial_line
-from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.pendulum import (
-    BENCH_MAP,
     BenchSpec,
     Pendulum,
     PendulumBench,
@@ -23,7 +17,6 @@ from pupper_sysid.sim.emulator.pendulum import (
     PendulumServoParameters,
     draw_bench,
 )
-from support.servo_servers import on_a_port
 
 COUNT = 2 * np.pi / 4096
 EXACT = PendulumServoParameters(
@@ -143,18 +136,3 @@ def test_the_truth_beside_a_recording_has_the_numbers_of_servo_and_load(tmp_path
     own = robot.loaded[0]
     assert truth["actuator"]["stiffness"] == pytest.approx(16 * own.torque_nm * own.duty_per_rad)
     assert truth["actuator"]["armature"] == pytest.approx(own.armature_kg_m2 + 0.1 * 0.12**2)
-
-
-def test_registers_that_arrive_over_the_protocol_act(monkeypatch):
-    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.04)
-    rng = np.random.default_rng(1)
-    robot = draw_bench(rng, Pendulum(0.1, 0.1), BenchSpec(registers=(("goal_speed", 300),)))
-    plant = PendulumBench(robot)
-    bench = ServoBench(robot, load_joint_map(BENCH_MAP), rng, plant=plant)
-    with on_a_port(FeetechEmulator(bench, STS3215, rng)) as server:
-        bus = FeetechBus(server.device, joint_map=load_joint_map(BENCH_MAP))
-        assert bus.servo_setups()["bench"]["registers"]["goal_speed"] == 300
-        bus.set_register("bench", "p", 12)
-        bus.set_register("bench", "goal_speed", 0)
-        bus.close()
-    assert plant.register(0, "p") == 12 and plant.register(0, "goal_speed") == 0

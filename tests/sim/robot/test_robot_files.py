@@ -17,12 +17,9 @@ from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
-from pupper_sysid.sim.robot import hinges, robot_map
+from pupper_sysid.sim.robot import robot_map
 from support.command_line import run
-from support.real_recordings import FOLDER
 from support.servo_servers import on_a_port
-
-CASES = FOLDER.parent / "cases" / "made"
 
 LINK = """<link name="{0}"><inertial><mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4"
  ixy="0" ixz="0" iyz="0"/></inertial>{1}</link>"""
@@ -43,11 +40,9 @@ def urdf(*joints: tuple, mesh: str = "") -> str:
 
 
 @pytest.fixture(autouse=True)
-def read_here(tmp_path, monkeypatch):
+def here(tmp_path, monkeypatch, read_here):
     """Models are read in this process, which has MuJoCo already."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(hinges, "_limit_this_process", lambda: None)
-    monkeypatch.setattr(robot_map, "hinges_of", lambda path: hinges._read(str(path)))
 
 
 def robot_of(text: str, name: str = "arm.urdf") -> robot_map.RobotMap:
@@ -126,21 +121,6 @@ def test_names_that_no_file_or_column_can_have_are_changed_and_said():
     robot = robot_of(urdf(("left/waist", -1, 1, ""), ("8", -1, 1, ""), ("left_waist", -1, 1, "")))
     assert robot.joint_map.joint_names == ("left_waist_", "joint_8", "left_waist")
     assert "left/waist is left_waist_, 8 is joint_8" in robot.doubts[0]
-
-
-@pytest.mark.skipif(not CASES.exists(), reason="the shared cases are not here")
-@pytest.mark.parametrize(
-    ("case", "words"),
-    [
-        ("U1_gripper_mimic.urdf", "finger_right (follows finger_left)"),
-        ("U3_degree_limits.urdf", "shoulder (-90 to 90) cannot be radians"),
-    ],
-)
-def test_a_strangers_urdf_is_questioned_by_the_command(capsys, case, words):
-    code, out, err = run(capsys, "init-robot", str(CASES / case), "--out", "map.yaml")
-    assert code == 0 and words in " ".join(err.split())
-    names = load_joint_map(Path("map.yaml")).joint_names
-    assert names == ("shoulder", "wrist", "finger_left") and "finger_right" not in out
 
 
 FOLLOWER = {

@@ -118,12 +118,6 @@ def test_flat_ground_never_ends_and_other_ground_goes_on_as_at_its_edge():
     np.testing.assert_array_equal(beyond, inside)
 
 
-def test_the_same_random_numbers_give_the_same_ground_and_others_another():
-    np.testing.assert_array_equal(heights_of(ground_of("mixed")), heights_of(ground_of("mixed")))
-    other = heights_of(make_ground("mixed", np.random.default_rng(4)))
-    assert (other != heights_of(ground_of("mixed"))).any()
-
-
 def test_stairs_are_where_rays_hit_them_and_rise_by_their_steps_over_nothing():
     ground = ground_of("stairs")
     model = simulated(ground)
@@ -146,14 +140,6 @@ def test_stairs_are_where_rays_hit_them_and_rise_by_their_steps_over_nothing():
 
 
 # ----- a fall from kinematics is what MuJoCo's contacts of the whole robot would say
-
-
-def model_on(ground: Ground) -> Any:
-    servos = servo_ranges("ideal").nominal()
-    xml = robot_xml(servos, 0.002, "linkage", ground.xml, ground.assets)
-    model = mujoco.MjModel.from_xml_string(xml)
-    ground.fill(model)
-    return model
 
 
 def random_robots(ground: Ground, count: int) -> np.ndarray:
@@ -198,7 +184,7 @@ def test_on_flat_ground_a_fall_is_any_contact_but_of_the_feet():
     ground = ground_of("flat")
     qpos = random_robots(ground, 2000)
     touching = touches_ground(qpos, gravity(qpos), ground)
-    depth = depth_of_contact(model_on(ground), qpos)
+    depth = depth_of_contact(simulated(ground), qpos)
     assert 0.2 < (depth > 0).mean() < 0.9
     np.testing.assert_array_equal(touching, depth > 0)
 
@@ -207,7 +193,7 @@ def test_on_other_ground_corners_and_knees_are_compared_with_the_ground_below_th
     for kind in ("rough", "slopes", "steps"):
         ground = ground_of(kind)
         qpos = random_robots(ground, 1000)
-        depth = depth_of_contact(model_on(ground), qpos)
+        depth = depth_of_contact(simulated(ground), qpos)
         touching = touches_ground(qpos, gravity(qpos), ground)
         # between its corners a box can be on a bump, of 2 cm at most
         assert touching[depth > 0.02].all() and not touching[depth == 0].any()

@@ -7,13 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from pupper_sysid.sim.walking.config import (
-    PRESETS,
-    Commands,
-    Curriculum,
-    Observation,
-    Walking,
-)
+from pupper_sysid.sim.walking.config import PRESETS, Commands, Curriculum, Observation, Walking
 from pupper_sysid.sim.walking.differences import TYPICAL, Differences
 from pupper_sysid.sim.walking.draws import Twins, at_rest, generator
 from pupper_sysid.sim.walking.env import PupperEnv

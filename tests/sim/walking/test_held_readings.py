@@ -158,20 +158,6 @@ def test_resetting_some_robots_leaves_the_others_alone():
         np.testing.assert_array_equal(value[[0, 2]], before[name][[0, 2]])
 
 
-def test_a_copied_state_reads_on_as_the_original():
-    bus = settled(MEASURED, environments=3)
-    saved = {k: v.copy() for k, v in bus.readings.state.items()}
-    random, time = dict(bus.readings.rng.bit_generator.state), bus.time
-    bus.step()
-    first = bus.readings.position.copy()
-    bus.step()
-    for name, value in bus.readings.state.items():
-        value[:] = saved[name]
-    bus.readings.rng.bit_generator.state, bus.time = random, time
-    bus.step()
-    np.testing.assert_array_equal(bus.readings.position, first)
-
-
 def test_a_linked_servo_reads_the_sum_of_its_joint_and_the_one_before():
     feedback, rng = HeldFeedback(poll_period_s=0.006), np.random.default_rng(0)
     for each in (feedback, HeldFeedback()):
@@ -186,19 +172,3 @@ def test_a_linked_servo_reads_the_sum_of_its_joint_and_the_one_before():
             advance(servos, servo, servo)
             advance(joints, joint, servo)
         np.testing.assert_allclose(joints.position, servos.position, atol=1e-12)
-
-
-def test_robots_that_are_advanced_one_after_the_other_read_as_those_advanced_at_once():
-    rng, found = np.random.default_rng(0), []
-    position, load = rng.standard_normal((2, 3, 9, SUBSTEPS, 12))
-    for parts in ([slice(None)], [slice(0, 5), slice(5, 9)], [slice(5, 9), slice(0, 5)]):
-        readings = HeldReadings((MEASURED,) * 12, 9, H, np.random.default_rng(1))
-        for i in range(3):
-            chances, start = readings.chances(SUBSTEPS), position[i - 1][:, -1]
-            for part in parts:
-                own = (start[part], position[i][part], load[i][part])
-                readings.advance(*own, chances, part)
-        found.append({k: v.copy() for k, v in readings.state.items()})
-    for other in found[1:]:
-        for name, value in found[0].items():
-            np.testing.assert_array_equal(other[name], value)

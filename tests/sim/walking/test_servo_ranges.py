@@ -7,14 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.sim.walking.servo_ranges import (
     ServoRanges,
-    check_actuator,
-    servo_model_of,
     servo_ranges,
 )
 from support.calibration_examples import calibration, joint_calibration
@@ -151,20 +148,3 @@ def test_the_nominal_servo_of_a_joint_is_the_middle_of_its_intervals(tmp_path):
     for i, name in enumerate(JOINT_NAMES):
         assert nominal[name].stiffness == 5.0 + i
         assert nominal[name].dead_time_s == 0.025
-
-
-def test_presets_and_calibrations_are_accepted_and_are_no_learned_servo_models():
-    for actuator in ("paper", "release", "ideal", "data/samples/calibrated.yaml"):
-        check_actuator(actuator)
-        assert servo_model_of(actuator, 0.02) is None
-
-
-def test_an_unknown_file_or_folder_is_refused_with_what_can_be_used(tmp_path):
-    with pytest.raises(InputError, match=r"nowhere\.yaml.*no such file.*paper, release, ideal"):
-        check_actuator("nowhere.yaml")
-    with pytest.raises(InputError, match="does not exist"):
-        servo_ranges("nowhere.yaml")
-    with pytest.raises(InputError, match="does not exist"):
-        servo_ranges("paper", feedback="nowhere.yaml")
-    with pytest.raises(InputError, match=tmp_path.name):
-        servo_model_of(tmp_path, 0.02)

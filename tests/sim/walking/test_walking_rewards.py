@@ -20,8 +20,9 @@ from pupper_sysid.sim.robot.mini_pupper import (
 )
 from pupper_sysid.sim.robot.motion import Moved
 from pupper_sysid.sim.walking.config import PRESETS
+from pupper_sysid.sim.walking.effort import EffortMeter, by_kind
 from pupper_sysid.sim.walking.rewards import terms as wr
-from pupper_sysid.sim.walking.rewards.strides import EffortMeter, Strides, by_kind
+from pupper_sysid.sim.walking.rewards.strides import Strides
 from pupper_sysid.sim.walking.rewards.terms import TERMS, weighted
 from pupper_sysid.sim.walking.rewards.weights import DEFAULT, PAPER, RELEASE, Rewards, narrowed
 from pupper_sysid.sim.walking.step import Step, empty_facts
@@ -57,21 +58,122 @@ def joints(**known: float) -> np.ndarray:
 
 
 FORWARD = (0.2, 0.0, 0.0)
-EXPONENTIAL = replace(
-    P, tracking_shape="exponential", linear_sigma=0.1, angular_sigma=0.2, fast_bonus=0.0
-)
-GAUSSIAN = replace(EXPONENTIAL, tracking_shape="gaussian")
+EXPONENTIAL = {
+    "tracking_shape": "exponential", "linear_sigma": 0.1, "angular_sigma": 0.2, "fast_bonus": 0.0
+}  # fmt: skip
+GAUSSIAN = EXPONENTIAL | {"tracking_shape": "gaussian"}
+GAIT = {"gait_sigma": 0.08, "gait_most": 0.15}
+F, T = False, True
+TROT = {"air_s": (0.1, 0, 0, 0.1), "contact_s": (0, 0.1, 0.1, 0)}
+POSE = joints(j1=0.3, j2=-0.4)
+ACTIONS = {"action": joints(j0=3.0, j5=4.0), "earlier_action": joints(j0=1.0)}
+STEADY = {"action": 3.0, "last_action": 2.0, "earlier_action": 1.0}
+STRIDE = {"stride_velocity": (0.17, 0.04, 0.2), "linear_velocity": (9.0, 9.0, 9.0)}
+BY_HAND = [
+    # nearer to the command than standing
+    ("progress", {}, {"command": (0.12, -0.16, 0), "stride_velocity": (0.06, -0.08, 9)},
+     0.1 / np.hypot(0.2, 0.05)),
+    ("progress", {}, {"command": FORWARD, "stride_velocity": (-1.0, 0, 0)}, -1.0),
+    ("progress", {}, {"command": FORWARD}, 0.0),
+    ("progress", {}, {"stride_velocity": (1.0, 0, 0)}, 0.0),
+    ("turn_progress", {}, {"command": (0, 0, -0.4), "stride_velocity": (0, 0, -0.1)},
+     0.1 / np.hypot(0.4, 0.15)),
+    ("turn_progress", {}, {"stride_velocity": (0, 0, 1.0)}, 0.0),
+    # fewer than two feet on the ground, short swings, short stances
+    ("unsupported", {}, {}, 1.0),
+    ("unsupported", {}, {"contact": (F, T, F, F)}, 0.5),
+    ("unsupported", {}, {"contact": (F, T, T, F)}, 0.0),
+    ("unsupported", {}, {"contact": True}, 0.0),
+    ("short_swing", {"shortest_swing": 0.1},
+     {"landed": (T, T, F, T), "last_air_s": (0.025, 0.2, 0.0, 0.05)}, 0.75 + 0.5),
+    ("short_stance", {"shortest_stance": 0.2},
+     {"lifted": (T, T, F, F), "last_contact_s": (0.05, 0.3, 0.0, 0.05)}, 0.75),
+    # speed by its horizontal error (0.06, 0.08) → 0.1 = σ; the vertical speed does not count
+    ("base_linear_velocity", EXPONENTIAL,
+     {"command": FORWARD, "linear_velocity": (0.14, -0.08, 5.0)}, E1),
+    ("base_linear_velocity", EXPONENTIAL, {"command": FORWARD}, np.exp(-2)),
+    ("base_linear_velocity", GAUSSIAN, {"command": FORWARD}, np.exp(-4)),
+    # linear: falls by the error over its width down to minus one
+    *(("base_linear_velocity", {"tracking_shape": "linear", "linear_sigma": 0.1},
+       {"command": FORWARD, "linear_velocity": (speed, 0, 0)}, earns)
+      for speed, earns in ((0.2, 1.0), (0.15, 0.5), (0.1, 0.0), (0.05, -0.5), (-0.3, -1.0))),
+    # a bonus for fast commands, nothing less for slow ones
+    *(("base_linear_velocity", EXPONENTIAL | {"fast_bonus": 0.5, "fast_above": 0.15},
+       {"command": (speed, 0, 0), "linear_velocity": (speed, 0, 0)}, earns)
+      for speed, earns in ((0.35, 1 + 0.5 * 0.2), (0.05, 1.0))),
+    # turning about the vertical; strides look at the average
+    *(("base_angular_velocity", shape,
+       {"command": (0, 0, 0.3), "angular_velocity": (9.0, 9.0, 0.5)}, E1)
+      for shape in (EXPONENTIAL, GAUSSIAN)),
+    ("stride_linear_velocity", EXPONENTIAL | {"stride_linear_sigma": 0.05},
+     {"command": (0.2, 0, 0.4), **STRIDE}, E1),
+    ("stride_angular_velocity", EXPONENTIAL | {"stride_angular_sigma": 0.2},
+     {"command": (0.2, 0, 0.4), **STRIDE}, E1),
+    # 0.1 + 0.2; a swing of 0.3 and a stance of 0.25 are too long to count
+    ("air_time", {"air_time_most": 0.25},
+     {"command": FORWARD, "air_s": (0.1, 0, 0.3, 0), "contact_s": (0, 0.2, 0, 0.25)}, 0.3),
+    ("air_time", {"air_time_most": 0.25},
+     {"air_s": (0.1, 0, 0.9, 0), "contact_s": (0, 0.2, 0, 5.0)}, -0.1 + 0.2 - 0.25 + 0.25),
+    ("alive", {}, {}, 1.0),
+    # LF and RB in the air for as long as RF and LB have been on the ground
+    ("gait", {}, {"command": FORWARD, **TROT}, 1.0),
+    # a bound: two pairs that should be together: (0.1² + 0.1²) each; of the four that should
+    # alternate, the two sides do, the two ends (LF-RF, RB-LB) differ by 0.1² + 0.1² each
+    ("gait", GAIT, {"command": FORWARD, "air_s": (0.1, 0.1, 0, 0), "contact_s": (0, 0, 0.1, 0.1)},
+     np.exp(-4 * 0.02 / 0.08)),
+    # times beyond the longest do not count more: LF against RB, RF and LB: 0.15² in each pair
+    ("gait", GAIT, {"command": FORWARD, "air_s": (9.0, 0, 0, 0)}, np.exp(-3 * 0.15**2 / 0.08)),
+    # a robot that stands as commanded earns nothing, one that moves without a command does
+    ("gait", {}, TROT, 0.0),
+    ("gait", {"gait_threshold": 0.1}, {**TROT, "linear_velocity": (0.0, 0.16, 0.0)}, 1.0),
+    # the error of moving feet; what a swing lacks
+    ("foot_clearance", {"clearance_height": 0.03, "clearance_sigma": 0.05, "clearance_speed": 2.0},
+     {"foot_height_m": (0.03, 0.0, 0.0, 0.13), "foot_speed_m_s": (9.0, 0.0, 0.5, 1e6)},
+     np.exp(-(0.03**2 * np.tanh(1.0) + 0.1**2) / 0.05)),
+    ("swing_height", {"clearance_height": 0.015},
+     {"foot_height_m": (0.005, 0.015, 0.1, 0.0), "foot_speed_m_s": (0.5, 1.0, 1.0, 2.0)},
+     0.01**2 * 0.5 + 0.015**2 * 2.0),
+    # changes of the action: norm, square, second difference
+    ("action_smoothness", {}, ACTIONS, 5.0),
+    ("action_rate", {}, ACTIONS, 25.0),
+    ("action_jerk", {}, ACTIONS, (3 + 1) ** 2 + 4**2),
+    ("action_jerk", {}, STEADY, 0.0),
+    ("action_rate", {}, STEADY, 12.0),
+    # of times up to 0.5 s: mean 0.2, four deviations of 0.1, divided by three (sample variance)
+    ("air_time_variance", {},
+     {"last_air_s": (0.1, 0.3, 0.1, 0.3), "last_contact_s": (0.5, 9.0, 0.5, 0.5)}, 4 * 0.1**2 / 3),
+    # bouncing and rocking; the sine of the tilt; the speed of rise or fall
+    ("base_motion", {}, {"linear_velocity": (9.0, 9.0, 0.5), "angular_velocity": (1.0, -2.0, 9.0)},
+     0.8 * 0.25 + 0.2 * 3.0),
+    ("base_orientation", {}, {"gravity": (0.5, 0.0, -np.cos(np.radians(30)))}, 0.5),
+    *(("bounce", {}, {"linear_velocity": (0.3, 0.2, rise)}, 0.05) for rise in (-0.05, 0.05)),
+    # only feet on the ground slip
+    ("foot_slip", {}, {"contact": (T, F, T, F), "foot_speed_m_s": (0.1, 0.2, 0.4, 0.8)}, 0.5),
+    ("joint_position", {"standing_factor": 10.0}, {"position_relative": POSE}, 5.0),
+    ("joint_position", {"standing_factor": 10.0},
+     {"position_relative": POSE, "command": FORWARD}, 0.5),
+    ("hip_abduction", {}, {"position_relative": joints(j0=0.3, j9=0.4, j1=9.0, j11=9.0)}, 0.5),
+    *((term, {}, {name: joints(j2=6.0, j7=-8.0)}, 10.0)
+      for term, name in (("joint_torques", "torque"), ("joint_acceleration", "acceleration"),
+                         ("joint_velocity", "velocity"))),
+    # what the highest point of a swing lacked, once, when it ends
+    ("low_swing", {"least_clearance": 0.008},
+     {"swing_ended": (T, T, T, F), "clearance_m": (0.006, 0.020, -0.004, np.nan)}, 0.25 + 1.5),
+    ("low_swing", {}, {"clearance_m": np.nan}, 0.0),
+    # means of all servos; power over the weight
+    ("torque_saturation", {}, {"saturated": joints(j2=0.6, j5=0.6)}, 0.1),
+    ("torque_share", {}, {"torque_square": joints(j2=1.0, j3=0.2)}, 0.1),
+    ("mechanical_power", {}, {"power_w": 4.0}, 0.8),
+]  # fmt: skip
 
 
-def test_progress_is_how_much_nearer_to_the_command_than_standing():
-    s = step(command=(0.12, -0.16, 0.0), stride_velocity=(0.06, -0.08, 9.0))
-    assert wr.progress(s, P)[0] == pytest.approx(0.1 / np.hypot(0.2, 0.05))
-    assert wr.progress(step(command=FORWARD, stride_velocity=(-1.0, 0, 0)), P)[0] == -1.0
-    assert wr.progress(step(command=FORWARD), P)[0] == 0.0
-    assert wr.progress(step(stride_velocity=(1.0, 0, 0)), P)[0] == 0.0
-    turning = step(command=(0, 0, -0.4), stride_velocity=(0, 0, -0.1))
-    assert wr.turn_progress(turning, P)[0] == pytest.approx(0.1 / np.hypot(0.4, 0.15))
-    assert wr.turn_progress(step(stride_velocity=(0, 0, 1.0)), P)[0] == 0.0
+def test_terms_are_those_worked_out_by_hand():
+    wrong = []
+    for term, rewards, known, expected in BY_HAND:
+        earned = TERMS[term](step(**known), replace(P, **rewards))[0]
+        if earned != pytest.approx(expected, abs=1e-12):
+            wrong.append(f"{term} {rewards} {known}: {earned}, by hand {expected}")
+    assert not wrong, "\n".join(wrong)
 
 
 def test_going_too_fast_pays_no_more_than_going_too_slow():
@@ -153,19 +255,6 @@ def test_a_stance_costs_as_far_as_it_is_from_a_crouch_and_a_spread():
     assert wr.stance(on_paths((0, 0, 0), 0.25), p)[0] == 0.0
 
 
-def test_fewer_than_two_feet_on_the_ground_and_short_swings_and_stances_cost():
-    assert wr.unsupported(step(), P)[0] == 1.0
-    assert wr.unsupported(step(contact=(False, True, False, False)), P)[0] == 0.5
-    assert wr.unsupported(step(contact=(False, True, True, False)), P)[0] == 0.0
-    assert wr.unsupported(step(contact=(True, True, True, True)), P)[0] == 0.0
-    p = replace(P, shortest_swing=0.1)
-    s = step(landed=(True, True, False, True), last_air_s=(0.025, 0.2, 0.0, 0.05))
-    assert wr.short_swing(s, p)[0] == pytest.approx(0.75 + 0.5)
-    p = replace(P, shortest_stance=0.2)
-    s = step(lifted=(True, True, False, False), last_contact_s=(0.05, 0.3, 0.0, 0.05))
-    assert wr.short_stance(s, p)[0] == pytest.approx(0.75)
-
-
 def test_a_curriculum_fades_guides_and_progress_and_widens_what_tracks():
     s = step(command=FORWARD, stride_velocity=(0.2, 0, 0), action=1.0, clock=(0.0, 1.0, 0.0))
     s = replace(s, foot_height_m=np.array([[0.01, 0.0, 0.0, 0.0]]))
@@ -183,144 +272,6 @@ def test_a_curriculum_fades_guides_and_progress_and_widens_what_tracks():
         2 * p.linear_sigma, 2 * p.stride_linear_sigma
     )  # fmt: skip
     assert wide.angular_sigma == 3 * p.angular_sigma and wide.progress == p.progress
-
-
-def test_speed_is_tracked_by_the_horizontal_error_in_each_of_the_three_shapes():
-    # error (0.06, 0.08) → 0.1 = σ; the vertical speed does not count
-    s = step(command=FORWARD, linear_velocity=(0.14, -0.08, 5.0))
-    assert wr.base_linear_velocity(s, EXPONENTIAL)[0] == pytest.approx(E1)
-    far = step(command=FORWARD, linear_velocity=(0.0, 0.0, 0.0))
-    assert wr.base_linear_velocity(far, EXPONENTIAL)[0] == pytest.approx(np.exp(-2))
-    assert wr.base_linear_velocity(far, GAUSSIAN)[0] == pytest.approx(np.exp(-4))
-    # linear: falls by the error over its width down to minus one
-    p = replace(P, tracking_shape="linear", linear_sigma=0.1)
-    for speed, earns in ((0.2, 1.0), (0.15, 0.5), (0.1, 0.0), (0.05, -0.5), (-0.3, -1.0)):
-        s = step(command=FORWARD, linear_velocity=(speed, 0, 0))
-        assert wr.base_linear_velocity(s, p)[0] == pytest.approx(earns)
-
-
-def test_fast_commands_earn_more_by_the_bonus_and_slow_ones_do_not_earn_less():
-    p = replace(EXPONENTIAL, fast_bonus=0.5, fast_above=0.15)
-    perfect = step(command=(0.35, 0, 0), linear_velocity=(0.35, 0, 0))
-    assert wr.base_linear_velocity(perfect, p)[0] == pytest.approx(1 + 0.5 * 0.2)
-    slow = step(command=(0.05, 0, 0), linear_velocity=(0.05, 0, 0))
-    assert wr.base_linear_velocity(slow, p)[0] == 1.0
-
-
-def test_turn_rate_is_tracked_about_the_vertical_and_stride_terms_look_at_the_average():
-    s = step(command=(0, 0, 0.3), angular_velocity=(9.0, 9.0, 0.5))
-    assert wr.base_angular_velocity(s, EXPONENTIAL)[0] == pytest.approx(E1)
-    assert wr.base_angular_velocity(s, GAUSSIAN)[0] == pytest.approx(E1)
-    p = replace(EXPONENTIAL, stride_linear_sigma=0.05, stride_angular_sigma=0.2)
-    moved = {"stride_velocity": (0.17, 0.04, 0.2), "linear_velocity": (9.0, 9.0, 9.0)}
-    s = step(command=(0.2, 0, 0.4), **moved)
-    assert wr.stride_linear_velocity(s, p)[0] == pytest.approx(E1)
-    assert wr.stride_angular_velocity(s, p)[0] == pytest.approx(E1)
-
-
-def test_air_time_pays_for_steps_while_moving_and_for_feet_on_the_ground_while_standing():
-    p = replace(P, air_time_most=0.25)
-    s = step(command=FORWARD, air_s=(0.1, 0, 0.3, 0), contact_s=(0, 0.2, 0, 0.25))
-    # 0.1 + 0.2; a swing of 0.3 and a stance of 0.25 are too long to count
-    assert wr.air_time(s, p)[0] == pytest.approx(0.3)
-    s = step(air_s=(0.1, 0, 0.9, 0), contact_s=(0, 0.2, 0, 5.0))
-    assert wr.air_time(s, p)[0] == pytest.approx(-0.1 + 0.2 - 0.25 + 0.25)
-    assert TERMS["alive"](s, p)[0] == 1.0
-
-
-def test_gait_pays_for_a_trot_and_falls_by_the_differences_of_the_feets_times():
-    trot = {"air_s": (0.1, 0, 0, 0.1), "contact_s": (0, 0.1, 0.1, 0)}
-    # LF and RB in the air for as long as RF and LB have been on the ground
-    assert wr.gait(step(command=FORWARD, **trot), P)[0] == pytest.approx(1.0)
-    p = replace(P, gait_sigma=0.08, gait_most=0.15)
-    s = step(command=FORWARD, air_s=(0.1, 0.1, 0, 0), contact_s=(0, 0, 0.1, 0.1))
-    # a bound: two pairs that should be together: (0.1² + 0.1²) each; of the four that should
-    # alternate, the two sides do, the two ends (LF-RF, RB-LB) differ by 0.1² + 0.1² each
-    assert wr.gait(s, p)[0] == pytest.approx(np.exp(-4 * 0.02 / 0.08))
-    # times beyond the longest do not count more: LF against RB, RF and LB: 0.15² in each pair
-    s = step(command=FORWARD, air_s=(9.0, 0, 0, 0))
-    assert wr.gait(s, p)[0] == pytest.approx(np.exp(-3 * 0.15**2 / 0.08))
-    # a robot that stands as commanded earns nothing, one that moves without a command does
-    assert wr.gait(step(**trot), P)[0] == 0.0
-    moving = step(**trot, linear_velocity=(0.0, 0.16, 0.0))
-    assert wr.gait(moving, replace(P, gait_threshold=0.1))[0] == pytest.approx(1.0)
-
-
-def test_foot_clearance_counts_the_error_of_moving_feet_and_swing_height_what_is_missing():
-    p = replace(P, clearance_height=0.03, clearance_sigma=0.05, clearance_speed=2.0)
-    s = step(foot_height_m=(0.03, 0.0, 0.0, 0.13), foot_speed_m_s=(9.0, 0.0, 0.5, 1e6))
-    error = 0.03**2 * np.tanh(1.0) + 0.1**2
-    assert wr.foot_clearance(s, p)[0] == pytest.approx(np.exp(-error / 0.05))
-    p = replace(P, clearance_height=0.015)
-    s = step(foot_height_m=(0.005, 0.015, 0.1, 0.0), foot_speed_m_s=(0.5, 1.0, 1.0, 2.0))
-    assert wr.swing_height(s, p)[0] == pytest.approx(0.01**2 * 0.5 + 0.015**2 * 2.0)
-
-
-def test_changes_of_the_action_are_counted_as_norm_square_and_second_difference():
-    s = step(
-        action=joints(j0=3.0, j5=4.0), last_action=joints(j11=0.0), earlier_action=joints(j0=1.0)
-    )
-    assert TERMS["action_smoothness"](s, P)[0] == pytest.approx(5.0)
-    assert TERMS["action_rate"](s, P)[0] == pytest.approx(25.0)
-    assert TERMS["action_jerk"](s, P)[0] == pytest.approx((3 + 1) ** 2 + 4**2)
-    steady = step(action=3.0, last_action=2.0, earlier_action=1.0)
-    assert TERMS["action_jerk"](steady, P)[0] == 0.0
-    assert TERMS["action_rate"](steady, P)[0] == pytest.approx(12.0)
-
-
-def test_air_time_variance_is_over_feet_of_times_up_to_half_a_second():
-    s = step(last_air_s=(0.1, 0.3, 0.1, 0.3), last_contact_s=(0.5, 9.0, 0.5, 0.5))
-    # mean 0.2, four deviations of 0.1, divided by three: the sample variance
-    assert wr.air_time_variance(s, P)[0] == pytest.approx(4 * 0.1**2 / 3)
-
-
-def test_base_motion_is_bouncing_and_rocking_and_orientation_the_sine_of_the_tilt():
-    s = step(linear_velocity=(9.0, 9.0, 0.5), angular_velocity=(1.0, -2.0, 9.0))
-    assert wr.base_motion(s, P)[0] == pytest.approx(0.8 * 0.25 + 0.2 * 3.0)
-    tilt = np.radians(30)
-    s = step(gravity=(np.sin(tilt), 0.0, -np.cos(tilt)))
-    assert TERMS["base_orientation"](s, P)[0] == pytest.approx(0.5)
-    # a trunk that rises or falls costs its speed
-    for rise in (-0.05, 0.05):
-        assert TERMS["bounce"](step(linear_velocity=(0.3, 0.2, rise)), P)[0] == pytest.approx(0.05)
-
-
-def test_only_feet_on_the_ground_slip():
-    s = step(contact=(True, False, True, False), foot_speed_m_s=(0.1, 0.2, 0.4, 0.8))
-    assert TERMS["foot_slip"](s, P)[0] == pytest.approx(0.5)
-
-
-def test_the_distance_from_the_default_pose_counts_more_while_standing_or_of_the_hips_only():
-    p, pose = replace(P, standing_factor=10.0), joints(j1=0.3, j2=-0.4)
-    assert wr.joint_position(step(position_relative=pose), p)[0] == pytest.approx(5.0)
-    moving = step(position_relative=pose, command=FORWARD)
-    assert wr.joint_position(moving, p)[0] == pytest.approx(0.5)
-    s = step(position_relative=joints(j0=0.3, j9=0.4, j1=9.0, j11=9.0))
-    assert TERMS["hip_abduction"](s, P)[0] == pytest.approx(0.5)
-
-
-def test_effort_terms_are_norms_over_all_joints():
-    for term, field in (
-        ("joint_torques", "torque"), ("joint_acceleration", "acceleration"),
-        ("joint_velocity", "velocity"),
-    ):  # fmt: skip
-        s = step(**{field: joints(j2=6.0, j7=-8.0)})
-        assert TERMS[term](s, P)[0] == pytest.approx(10.0), term
-
-
-def test_a_swing_costs_what_its_highest_point_lacked_once_when_it_ends():
-    p = replace(P, least_clearance=0.008)
-    ended = np.array([True, True, True, False])
-    s = step(swing_ended=ended, clearance_m=(0.006, 0.020, -0.004, np.nan))
-    assert wr.low_swing(s, p)[0] == pytest.approx(0.25 + 0.0 + 1.5)
-    assert wr.low_swing(step(clearance_m=np.nan), p)[0] == 0.0
-
-
-def test_effort_relative_to_limits_is_a_mean_of_all_servos_and_power_is_over_the_weight():
-    s = step(saturated=joints(j2=0.6, j5=0.6), torque_square=joints(j2=1.0, j3=0.2))
-    assert TERMS["torque_saturation"](s, P)[0] == pytest.approx(0.1)
-    assert TERMS["torque_share"](s, P)[0] == pytest.approx(0.1)
-    assert TERMS["mechanical_power"](step(power_w=4.0), P)[0] == pytest.approx(0.8)
 
 
 def test_every_robot_is_judged_by_its_own_numbers():
