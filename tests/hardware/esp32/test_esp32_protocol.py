@@ -4,6 +4,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,14 @@ def patient(monkeypatch):
 
 def still_proxy() -> ProxyEmulator:
     return ProxyEmulator(StillBench("mini_pupper_2"), np.random.default_rng(0))
+
+
+@contextmanager
+def bus_of(proxy: ProxyEmulator, path: Path) -> Iterator[Esp32Bus]:
+    with on_a_socket(proxy, path):
+        bus = Esp32Bus(path)
+        yield bus
+        bus.close()
 
 
 def counts_reply(counts) -> bytes:
@@ -102,10 +111,8 @@ def test_the_byte_that_stores_a_calibration_is_never_packed_and_only_whole_count
 
 
 def test_readings_are_those_of_their_joint(path, patient):
-    with on_a_socket(ScriptedProxy(answers), path):
-        bus = Esp32Bus(path)
+    with bus_of(ScriptedProxy(answers), path) as bus:
         sample = bus.read()
-        bus.close()
     assert sample.position_count.tolist() == [500 + i for i in IDS]
     assert sample.load is not None and sample.load.tolist() == [0.01] * 12
     assert sample.voltage_v is not None and sample.voltage_v.tolist() == [7.375] * 12
@@ -120,22 +127,18 @@ def test_a_count_on_which_no_two_answers_agree_is_missing(path, patient):
         counts = [*range(501, 512), next(third) % 900] if request[1] == 2 else []
         return counts_reply(counts) if counts else answers(request)
 
-    with on_a_socket(ScriptedProxy(torn), path):
-        bus = Esp32Bus(path)
+    with bus_of(ScriptedProxy(torn), path) as bus:
         count = dict(zip(IDS, bus.read().position_count.tolist(), strict=True))
-        bus.close()
     assert count == {i: 500 + i for i in range(1, 12)} | {12: -1}
 
 
 def test_no_write_or_torque_of_the_bus_sends_the_byte_that_stores_a_calibration(path, patient):
     proxy = ScriptedProxy(answers)
     rng = np.random.default_rng(3)
-    with on_a_socket(proxy, path):
-        bus = Esp32Bus(path)
+    with bus_of(proxy, path) as bus:
         for scale in (0.1, 1.0, 10.0, 99.0, 1e9):
             bus.write(scale * rng.standard_normal(12))
             bus.torque(bool(rng.random() < 0.5))
-        bus.close()
     sent = [r for r in proxy.requests if r[1] == 1]
     assert len(sent) >= 10
     assert all(len(r) == 38 and set(r[2:14]) <= {0, 1} for r in sent)
@@ -150,10 +153,8 @@ def test_an_unanswered_question_does_not_make_the_servos_jump_when_they_go_on(pa
         return lost.pop() if request[1] == 2 and lost else answers(request)
 
     proxy = ScriptedProxy(answer)
-    with on_a_socket(proxy, path):
-        bus = Esp32Bus(path)
+    with bus_of(proxy, path) as bus:
         assert bus.torque(True)
-        bus.close()
     on = next(r for r in proxy.requests if r[1] == 1)
     assert np.frombuffer(on[14:], "<u2").tolist() == list(range(501, 513))
 
@@ -163,10 +164,8 @@ def test_nothing_is_sent_while_a_servo_does_not_say_where_it_is(path, patient):
         return counts_reply([*range(501, 512), 0]) if request[1] == 2 else answers(request)
 
     proxy = ScriptedProxy(without_the_last)
-    with on_a_socket(proxy, path):
-        bus = Esp32Bus(path)
+    with bus_of(proxy, path) as bus:
         assert not bus.torque(True)
-        bus.close()
     assert all(r[1] != 1 for r in proxy.requests)
 
 
@@ -174,8 +173,7 @@ def test_nothing_is_sent_while_a_servo_does_not_say_where_it_is(path, patient):
 def test_a_hung_server_costs_a_bounded_time_and_everything_is_missing(path):
     hung = False
     proxy = ScriptedProxy(lambda request: None if hung else answers(request))
-    with on_a_socket(proxy, path):
-        bus = Esp32Bus(path)
+    with bus_of(proxy, path) as bus:
         hung = True
         took = []
         for _ in range(5):
@@ -186,7 +184,6 @@ def test_a_hung_server_costs_a_bounded_time_and_everything_is_missing(path):
             assert np.isnan(sample.position_rad).all() and np.isnan(sent.time_s)
         hung = False
         assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
-        bus.close()
     # position, load, supply, goals: one time-out each
     assert min(took) < 4 * esp32.TIMEOUT_S + 0.05  # the others on a busy machine
 
@@ -202,15 +199,13 @@ def test_an_answer_that_belongs_to_an_earlier_question_is_not_taken(path, monkey
             return [(0.1, reply)] if self.slow else [(0.0, reply)]
 
     proxy = Late(answers)
-    with on_a_socket(proxy, path):
-        bus = Esp32Bus(path)
+    with bus_of(proxy, path) as bus:
         proxy.slow = True
         assert np.isnan(bus.read().position_rad).all()
         proxy.slow = False
         time.sleep(0.15)
         proxy.answers = lambda r: counts_reply([700] * 12) if r[1] == 2 else answers(r)
         assert wait_until(lambda: bus.read().position_count.tolist() == [700] * 12)
-        bus.close()
 
 
 def test_the_emulator_refuses_a_path_where_a_proxy_lives_or_another_file_stands(path, tmp_path):

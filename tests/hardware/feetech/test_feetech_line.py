@@ -1,6 +1,8 @@
 """Our line and bus have none of the SDK's faults (facts/hardware.md B5, one test per row)."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.hardware.serial_servos.settings import memory_of
 from pupper_sysid.sim.emulator.bench import ServoBench
+from pupper_sysid.sim.emulator.serial_line import LineEmulator
 from support.servo_servers import (
     Scripted,
     StillBench,
@@ -38,6 +41,23 @@ def patience(monkeypatch):
 def position(line: FeetechLine, servo: int, series=STS3215) -> int | None:
     reply = line.read(servo, POSITION, 2)
     return series.decode("present_position", reply.frame.data, POSITION) if reply else None
+
+
+@contextmanager
+def line_of(servos: LineEmulator, patience_s: float | None = None) -> Iterator[FeetechLine]:
+    with on_a_port(servos) as server:
+        line = FeetechLine(server.device, 1_000_000)
+        line.patience_s = patience_s or line.patience_s
+        yield line
+        line.close()
+
+
+@contextmanager
+def bus_of(servos: LineEmulator, *layout: JointMap) -> Iterator[FeetechBus]:
+    with on_a_port(servos) as server:
+        bus = FeetechBus(server.device, 1_000_000, *layout)
+        yield bus
+        bus.close()
 
 
 def raw(servo: int, data: bytes, code: int = 0) -> bytes:
@@ -76,12 +96,10 @@ def test_b5_2_a_missing_servo_costs_less_than_10_ms(monkeypatch):
             took.append(time.perf_counter() - start)
         return min(took)  # a busy machine makes some last longer, none shorter
 
-    with on_a_port(still_servos(ids=[1])) as server:
-        line = FeetechLine(server.device, 1_000_000)
+    with line_of(still_servos(ids=[1])) as line:
         assert cost_s(line) < 0.010
         line.patience_s = 0.034  # what the SDK adds to every exchange: the limit would show it
         assert cost_s(line) > 0.030
-        line.close()
 
 
 @pytest.mark.wall_clock
@@ -92,25 +110,20 @@ def test_b5_3_a_late_reply_is_not_the_answer_to_the_next_read():
         delay = next(late, 0.0)
         return [(delay, raw(1, STS3215.word(900 if delay else 123)))]
 
-    with on_a_port(Scripted(answer)) as server:
-        line = FeetechLine(server.device, 1_000_000)
-        line.patience_s = 0.02
+    with line_of(Scripted(answer), 0.02) as line:
         assert position(line, 1) is None
         reply = raw(1, STS3215.word(900))
         assert wait_until(lambda: line._port.ser.in_waiting == len(reply))
         line.patience_s = 5.0
         assert position(line, 1) == 123
-        line.close()
 
 
 def test_b5_3_successive_readings_of_the_bus_ask_for_different_lengths():
     servos = still_servos(ids=[4])
-    with on_a_port(servos) as server:
-        bus = FeetechBus(server.device, 1_000_000, map_of(4))
+    with bus_of(servos, map_of(4)) as bus:
         servos.heard = b""
         for _ in range(7):
             bus.read()
-        bus.close()
     requests = [servos.heard[k : k + 9] for k in range(0, len(servos.heard), 9)]
     # a sync read of one id: FF FF FE LEN 82 address size id CHK
     assert [r[6] for r in requests] == [6, 7, 8, 9, 10, 11, 6]
@@ -119,12 +132,9 @@ def test_b5_3_successive_readings_of_the_bus_ask_for_different_lengths():
 def test_b5_4_a_reply_of_another_length_or_of_another_servo_is_no_answer():
     replies = [raw(1, bytes([1] * size)) for size in (0, 1, 3, 8)] + [raw(7, b"\x01\x02")]
     unsent = list(replies)
-    with on_a_port(Scripted(lambda request: [(0.0, unsent.pop(0))])) as server:
-        line = FeetechLine(server.device, 1_000_000)
-        line.patience_s = 0.05
+    with line_of(Scripted(lambda request: [(0.0, unsent.pop(0))]), 0.05) as line:
         assert [line.read(1, POSITION, 2) for _ in replies] == [None] * len(replies)
         assert wait_until(lambda: not unsent)
-        line.close()
 
 
 @pytest.mark.wall_clock
@@ -137,25 +147,20 @@ def test_b5_3_late_replies_do_not_shift_the_registers_that_a_recording_keeps():
         address, size = request.data
         return [(next(late), raw(1, memory[address : address + size]))]
 
-    with on_a_port(Scripted(answer)) as server:
-        line = FeetechLine(server.device, 1_000_000)
-        line.patience_s = 0.08
+    with line_of(Scripted(answer), 0.08) as line:
         for _ in range(3):
             assert memory_of(line, 1) in (None, memory)
         line.patience_s = 5.0
         assert memory_of(line, 1) == memory
-        line.close()
 
 
 def test_b5_5_a_silent_servo_in_a_sync_read_is_missing_and_hides_nobody():
     servos = still_servos(ids=[1, 2, 3])
-    with on_a_port(servos) as server:
-        line = FeetechLine(server.device, 1_000_000)
+    with line_of(servos) as line:
         assert set(line.sync_read([1, 2, 3], POSITION, 2)) == {1, 2, 3}
         del servos.servos[1]
         bench_of(servos).counts |= {2: 1111, 3: 2222}
         replies = line.sync_read([1, 2, 3], POSITION, 2)
-        line.close()
     counts = {
         i: STS3215.decode("present_position", r.frame.data, POSITION) for i, r in replies.items()
     }
@@ -163,8 +168,7 @@ def test_b5_5_a_silent_servo_in_a_sync_read_is_missing_and_hides_nobody():
 
 
 def test_b5_6_after_an_error_in_the_port_the_next_calls_work(monkeypatch):
-    with on_a_port(still_servos()) as server:
-        line = FeetechLine(server.device, 1_000_000)
+    with line_of(still_servos()) as line:
         first = line._port.ser
 
         def fails(data):
@@ -175,16 +179,13 @@ def test_b5_6_after_an_error_in_the_port_the_next_calls_work(monkeypatch):
         assert not line._port.is_using
         assert wait_until(lambda: position(line, 1) == 2048)
         assert line._port.ser is not first
-        line.close()
 
 
 def test_b5_7_uneven_sync_write_data_is_refused_and_the_line_goes_on_working():
-    with on_a_port(still_servos()) as server:
-        line = FeetechLine(server.device, 1_000_000)
+    with line_of(still_servos()) as line:
         with pytest.raises(ValueError, match=r"1, 2\] bytes; all must be as long"):
             line.sync_write(42, {1: b"\x00\x08", 2: b"\x08"})
         assert position(line, 1) == 2048
-        line.close()
 
 
 def test_b5_9_only_the_requested_baud_rate_is_ever_used_and_closing_twice_is_fine():
@@ -201,8 +202,7 @@ def test_b5_9_only_the_requested_baud_rate_is_ever_used_and_closing_twice_is_fin
 @pytest.mark.parametrize("series", [STS3215, SCS0009])
 def test_b5_10_an_echoing_adapter_is_recognised_and_its_echo_is_no_answer(series):
     servos = still_servos(series, ids=range(1, 13), echo=True)
-    with on_a_port(servos) as server:
-        bus = FeetechBus(server.device, 1_000_000)
+    with bus_of(servos) as bus:
         assert bus.metadata["echo"] is True
         for count in (500, 510):
             bench_of(servos).counts = dict.fromkeys(range(1, 13), count)
@@ -210,27 +210,21 @@ def test_b5_10_an_echoing_adapter_is_recognised_and_its_echo_is_no_answer(series
             assert bus.read().position_count.tolist() == [count] * 12
         assert bus.line.ping(1) == Frame(1, 0, b"")
         assert bus.line.ping(99) is None
-        bus.close()
 
 
 def test_b5_11_an_error_byte_above_7f_is_read():
     answer = raw(1, STS3215.word(123), code=0xA1)
-    with on_a_port(Scripted(lambda request: [(0.0, answer)])) as server:
-        line = FeetechLine(server.device, 1_000_000)
+    with line_of(Scripted(lambda request: [(0.0, answer)])) as line:
         reply = line.read(1, POSITION, 2)
-        line.close()
     assert reply and reply.frame.code == 0xA1
 
 
 @pytest.mark.wall_clock
 def test_b5_13_waiting_does_not_keep_the_processor_busy():
-    with on_a_port(still_servos(ids=[1])) as server:
-        line = FeetechLine(server.device, 1_000_000)
-        line.patience_s = 0.5
+    with line_of(still_servos(ids=[1]), 0.5) as line:
         wall, cpu = time.perf_counter(), time.thread_time()
         assert line.read(2, POSITION, 2) is None
         wall, cpu = time.perf_counter() - wall, time.thread_time() - cpu
-        line.close()
     assert wall > 0.45 and cpu < 0.3 * wall
 
 
@@ -241,10 +235,8 @@ def test_two_different_answers_of_one_servo_in_a_sync_read_are_none():
     def answer(request: Frame) -> list[tuple[float, bytes]]:
         return [(0.0, raw(1, b"\x01\x02") + raw(1, b"\x03\x04") + raw(2, b"\x05\x06"))]
 
-    with on_a_port(Scripted(answer)) as server:
-        line = FeetechLine(server.device, 1_000_000)
+    with line_of(Scripted(answer)) as line:
         replies = line.sync_read([1, 2], POSITION, 2)
-        line.close()
     assert {i: r.frame.data for i, r in replies.items()} == {2: b"\x05\x06"}
 
 
@@ -293,10 +285,8 @@ def test_a_map_may_give_a_servo_any_id():
     data["joints"] = {"LF_hip": data["joints"]["LF_hip"] | {"id": 9}}
     chosen: JointMap = joint_map_from(data, "mine")
     bench_of(servos).counts[9] = 1948
-    with on_a_port(servos) as server:
-        bus = FeetechBus(server.device, 1_000_000, chosen)
+    with bus_of(servos, chosen) as bus:
         sample = bus.read()
-        bus.close()
     # the sign of a left hip is -1, and 4096 counts are a turn
     assert sample.position_rad == pytest.approx([100 * 2 * np.pi / 4096])
 
@@ -306,15 +296,13 @@ def test_a_map_may_give_a_servo_any_id():
 def test_what_is_written_is_read_back_within_friction_and_rounding(series):
     servos = moving_servos(series)
     bench = servos.bench
-    with on_a_port(servos) as server:
-        bus = FeetechBus(server.device, 1_000_000)
+    with bus_of(servos) as bus:
         start = bus.read().position_rad
         goal = bus.limits.clip(start + 0.1)
         sent = bus.write(goal)
         assert np.isfinite(sent.time_s)
         bus.sleep_until(sent.time_s + 0.7)
         sample = bus.read()
-        bus.close()
     assert isinstance(bench, ServoBench)
     # dry friction holds a servo at most friction / stiffness off its goal
     truth = [s.actuator for s in bench.robot.servos]
@@ -326,23 +314,19 @@ def test_what_is_written_is_read_back_within_friction_and_rounding(series):
 
 def test_torque_says_so_when_one_servo_did_not_confirm():
     servos = still_servos()
-    with on_a_port(servos) as server:
-        bus = FeetechBus(server.device, 1_000_000)
+    with bus_of(servos) as bus:
         bus.line.patience_s = 0.1
         del servos.servos[5]
         assert not bus.torque(False)
-        bus.close()
     assert {i for i, _ in bench_of(servos).torques} == set(range(1, 13)) - {5}
 
 
 def test_the_goals_that_stand_in_the_servos_can_be_read():
     servos = still_servos()
-    with on_a_port(servos) as server:
-        bus = FeetechBus(server.device, 1_000_000)
+    with bus_of(servos) as bus:
         goal = bus.limits.clip(bus.read().position_rad + 0.05)
         bus.write(goal)
         stand = bus.goals()
-        bus.close()
     assert np.abs(stand - goal).max() <= 0.5001 * 2 * np.pi / 4096
 
 
@@ -350,22 +334,18 @@ def test_a_count_no_servo_can_have_reached_is_no_reading_unless_it_is_told_twice
     servos = still_servos(ids=[4])
     bench: StillBench = bench_of(servos)
     bench.counts[4] = 10
-    with on_a_port(servos) as server:
-        bus = FeetechBus(server.device, 1_000_000, map_of(4))
+    with bus_of(servos, map_of(4)) as bus:
         assert bus.read().position_count.tolist() == [10]
         bench.counts[4] = 4090
         counts = [int(bus.read().position_count[0]) for _ in range(2)]
-        bus.close()
     # 4080 counts are 6.3 rad, and no servo turns them within the milliseconds between two reads
     assert counts == [-1, 4090]
 
 
 def test_error_bits_come_with_the_reading():
     servos = still_servos(ids=[4])
-    with on_a_port(servos) as server:
-        bus = FeetechBus(server.device, 1_000_000, map_of(4))
+    with bus_of(servos, map_of(4)) as bus:
         servos.servos[4].error, servos.servos[4].faulty_until = 33, np.inf
         sample = bus.read()
-        bus.close()
     assert sample.status is not None and sample.status.tolist() == [33]
     assert np.isfinite(sample.position_rad).all()
