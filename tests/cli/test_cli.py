@@ -18,7 +18,7 @@ from pupper_sysid.common.results import plain
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.report import report
-from support.command_line import refused, run, run_program
+from support.command_line import json_of, ran, refused, run
 
 ROOT = Path(__file__).resolve().parents[2]
 SWEEP = ROOT / "data" / "samples" / "sweep.csv"
@@ -29,9 +29,8 @@ pytestmark = pytest.mark.usefixtures("here")
 
 def asked(capsys, *arguments) -> dict:
     """JSON object of a command."""
-    code, out, err = run(capsys, *arguments, "--json")
-    assert code == 0, err
-    return json.loads(out)
+    found = json_of(capsys, *arguments)
+    return found
 
 
 def test_calibrate_writes_what_it_prints_and_never_over_something_else(capsys, hip):
@@ -57,9 +56,9 @@ def test_calibrate_writes_what_it_prints_and_never_over_something_else(capsys, h
 
 def test_a_sweep_repeats_under_its_seed(capsys):
     for name in ("a.csv", "b.csv"):
-        code, _, err = run(capsys, "sweep", "--freqs", "1,3", "--joints", "RB_calf", "--duration",
+        _, err = ran(capsys, "sweep", "--freqs", "1,3", "--joints", "RB_calf", "--duration",
                            "2", "--seed", "4", "--out", name)  # fmt: skip
-        assert code == 0 and "No robot: using the emulated one" in err
+        assert "No robot: using the emulated one" in err
     first, second = (load(Path(n)).table for n in ("a.csv", "b.csv"))
     assert first.equals(second)
     assert load(Path("a.csv")).joints == ["RB_calf"]
@@ -67,14 +66,14 @@ def test_a_sweep_repeats_under_its_seed(capsys):
 
 def test_a_command_without_a_recording_takes_the_newest(capsys):
     run(capsys, "sweep", "--freqs", "2", "--joints", "LF_hip", "--duration", "2")
-    code, out, err = run(capsys, "doctor", "--json")
-    assert code == 0 and "Taking the newest recording" in err and "LF_hip" in out
+    out, err = ran(capsys, "doctor", "--json")
+    assert "Taking the newest recording" in err and "LF_hip" in out
 
 
 def test_export_of_presets_calibrations_and_recordings(capsys):
     for source, expected in (("paper", "paper.csv"), (SWEEP, "sweep.tidy.csv")):
-        code, out, _ = run(capsys, "export", source, "--to", "csv", "--json")
-        assert code == 0 and json.loads(out)["written"] == expected
+        found = json_of(capsys, "export", source, "--to", "csv")
+        assert found["written"] == expected
     assert len(load(Path("sweep.tidy.csv")).table) == len(load(SWEEP).table)
     code, _, err = run(capsys, "export", "paper", "--to", "csv")
     assert code == 2 and "--force" in err
@@ -138,16 +137,14 @@ PROGRAMS = ("pupper_sysid", "pupper_train", "pupper_play", "pupper_eval", "puppe
 def test_every_program_prints_its_version(capsys):
     for name in PROGRAMS:
         module = importlib.import_module(f"pupper_sysid.cli.programs.{name}")
-        code, out, _ = run_program(capsys, module, "--version")
-        assert code == 0
+        out, _ = ran(capsys, "--version", program=module)
         assert out.startswith(f"{name.replace('_', '-')} {version('pupper-sysid')} (numpy ")
 
 
 def test_completion_is_written_where_bash_looks_for_it(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("SHELL", "/bin/bash")
-    code, _, err = run_program(capsys, pupper_sysid, "--install-completion")
-    assert code == 0, err
+    _, err = ran(capsys, "--install-completion")
     script = tmp_path / ".local/share/bash-completion/completions/pupper-sysid"
     assert "fit-servo" in script.read_text() and str(script) in err
     monkeypatch.setenv("SHELL", "/usr/bin/fish")
@@ -158,8 +155,8 @@ def test_a_report_opens_in_the_browser_that_there_is(capsys, tmp_path, monkeypat
     opened, page = [], tmp_path / "page/report.html"
     monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or False)
     monkeypatch.setattr(report, "write_report", lambda *_, **__: SimpleNamespace(path=page))
-    code, _, err = run(capsys, "report", hip, "--out", page.parent, "--open")
-    assert code == 0 and "No browser could be started" in err
+    _, err = ran(capsys, "report", hip, "--out", page.parent, "--open")
+    assert "No browser could be started" in err
     assert opened == [page.resolve().as_uri()]
 
 

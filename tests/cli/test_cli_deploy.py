@@ -16,7 +16,7 @@ from pupper_sysid.cli.programs import pupper_analyze, pupper_deploy
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.policies.deploy.walk_log import read_walk
 from pupper_sysid.sysid.recordings.files import load
-from support.command_line import refused, run_program
+from support.command_line import json_of, ran, refused, run_program
 from support.json_keys import DOCUMENTED, key_line
 from support.package import ROOT
 from support.undrawn import stand_soon
@@ -31,11 +31,8 @@ def standing(monkeypatch):
 
 
 def deploy(capsys, *arguments) -> dict:
-    code, out, err = run_program(
-        capsys, pupper_deploy, POLICY, "--actuator", CALIBRATION, "--json", *arguments
-    )
-    assert code == 0, err
-    return json.loads(out)
+    found = json_of(capsys, POLICY, "--actuator", CALIBRATION, *arguments, program=pupper_deploy)
+    return found
 
 
 def test_the_shipped_policy_walks_on_the_emulated_robot_and_its_log_repeats(capsys, here):
@@ -45,10 +42,8 @@ def test_the_shipped_policy_walks_on_the_emulated_robot_and_its_log_repeats(caps
     assert found["mae_vx_m_s"] < 0.06 and found["mae_vy_m_s"] < 0.035
     assert found["mae_yaw_rad_s"] < 0.15 and set(found["step_ms"]) == {"p50", "p99", "max"}
     log = Path(found["log"])
-    code, out, _ = run_program(
-        capsys, pupper_deploy, POLICY, "--replay", log, "--actuator", CALIBRATION
-    )
-    assert code == 0 and "200 ticks repeated" in out
+    out, _ = ran(capsys, POLICY, "--replay", log, "--actuator", CALIBRATION, program=pupper_deploy)
+    assert "200 ticks repeated" in out
     assert len(read_walk(log).senses) == 200
     # the servos' side of it is a recording like any other
     recording = load(log.with_name("recording.csv"))
@@ -60,11 +55,11 @@ def test_the_emulated_robot_has_the_servos_of_the_calibration_and_commands_are_c
 ):
     moved = {}
     for actuator in (CALIBRATION, "ideal"):
-        code, out, err = run_program(
-            capsys, pupper_deploy, POLICY, "--actuator", actuator, "--seconds", 0.4, "--name",
-            Path(actuator).stem, "--json", "--command", 0.4, 0, 0,
+        out, err = ran(
+            capsys, POLICY, "--actuator", actuator, "--seconds", 0.4, "--name",
+            Path(actuator).stem, "--json", "--command", 0.4, 0, 0, program=pupper_deploy
         )  # fmt: skip
-        assert code == 0 and f"has the servos of {actuator}" in " ".join(err.split())
+        assert f"has the servos of {actuator}" in " ".join(err.split())
         assert "0.4 0 0 was clipped to 0.2 0 0" in " ".join(err.split())
         found = json.loads(out)
         assert found["commands"]["forward_m_s"] == [-0.2, 0.2]
@@ -82,20 +77,20 @@ def test_a_script_is_followed(capsys, here):
 
 
 def test_another_rate_is_said_to_change_the_policys_time(capsys, here):
-    code, _, err = run_program(
-        capsys, pupper_deploy, POLICY, "--actuator", CALIBRATION, "--rate", 25, "--seconds", 0.1,
-        "--name", "slow",
+    _, err = ran(
+        capsys, POLICY, "--actuator", CALIBRATION, "--rate", 25, "--seconds", 0.1,
+        "--name", "slow", program=pupper_deploy
     )  # fmt: skip
-    assert code == 0 and "0.50 times as fast" in err
+    assert "0.50 times as fast" in err
 
 
 @pytest.mark.slow
 def test_the_published_observer_is_said_to_swing_otherwise_than_the_actuator(capsys, here):
-    code, _, err = run_program(
-        capsys, pupper_deploy, POLICY, "--actuator", CALIBRATION, "--observer",
-        "published-pd", "--seconds", 0.1, "--name", "paper",
+    _, err = ran(
+        capsys, POLICY, "--actuator", CALIBRATION, "--observer",
+        "published-pd", "--seconds", 0.1, "--name", "paper", program=pupper_deploy
     )  # fmt: skip
-    assert code == 0 and "warning" in err and "Hz" in err
+    assert "warning" in err and "Hz" in err
     # a row per kind of joint and whole hertz, rounded; the published resonance is in it
     assert "hip 3.00 2.80 0.98 -276.31" in err and err.count("thigh ") == 6
 
@@ -120,8 +115,8 @@ def test_the_servos_at_hand_are_compared_with_those_of_the_training(capsys, here
     found = json.loads(out)
     assert code == 0 and found["servo_match"]["outside"] == []
     assert "within the ranges that the policy was trained for" in err
-    code, out, err = run_program(capsys, pupper_deploy, *arguments, "--actuator", late)
-    assert code == 0 and "60 ms later than the trained actuator" in err
+    out, err = ran(capsys, *arguments, "--actuator", late, program=pupper_deploy)
+    assert "60 ms later than the trained actuator" in err
     assert "late.yaml is not what the policy was trained for" in err
     assert re.search(
         r"Dead time \(\w+\): [\d.]+ ms, [5-6]\d(\.\d)? ms more than in the training", err
@@ -131,8 +126,8 @@ def test_the_servos_at_hand_are_compared_with_those_of_the_training(capsys, here
     assert {one["quantity"] for one in worst} == {"dead time"} and len(worst) == 12
     assert all(50 < one["beyond"] <= 61 and one["unit"] == "ms" for one in worst)
     assert read_walk(Path(found["log"])).header["servo_match"] == found["servo_match"]
-    code, out, err = run_program(capsys, pupper_deploy, *arguments)
-    assert code == 0 and json.loads(out)["servo_match"] is None  # no robot was named
+    out, err = ran(capsys, *arguments, program=pupper_deploy)
+    assert json.loads(out)["servo_match"] is None
     assert "warning" not in err and "the servos' own readings" in err
 
 
@@ -142,11 +137,11 @@ def test_a_calibration_that_only_has_the_name_of_the_trained_one_is_told(capsys,
     late.rename("calibrated.yaml")
     run_file = alone / "run.yaml"
     run_file.write_text(run_file.read_text().replace("data/samples/calibrated", "calibrated"))
-    code, _, err = run_program(
-        capsys, pupper_deploy, alone, "--stack", "mlp-observer", "--seconds", 0.1,
-        "--name", "swapped",
+    _, err = ran(
+        capsys, alone, "--stack", "mlp-observer", "--seconds", 0.1,
+        "--name", "swapped", program=pupper_deploy
     )  # fmt: skip
-    assert code == 0 and "calibrated.yaml is not the file with which alone was trained" in err
+    assert "calibrated.yaml is not the file with which alone was trained" in err
     assert "was not compared with it" in err and "moves like the trained" not in err
 
 
@@ -154,12 +149,10 @@ def test_a_calibration_that_only_has_the_name_of_the_trained_one_is_told(capsys,
 
 
 def analyze(capsys, what, *arguments) -> dict:
-    code, out, err = run_program(
-        capsys, pupper_analyze, what, POLICY, "--actuator", CALIBRATION, "--json",
-        "--robots", 2, "--seconds", 8, *arguments,
+    found = json_of(
+        capsys, what, POLICY, "--actuator", CALIBRATION,
+        "--robots", 2, "--seconds", 8, *arguments, program=pupper_analyze
     )  # fmt: skip
-    assert code == 0, err
-    found = json.loads(out)
     assert Path(found["picture"]).stat().st_size > 5_000
     return found
 
@@ -237,9 +230,7 @@ def test_the_twin_of_a_walk_is_drawn_and_has_the_documented_keys(
         "--imu",
         imu,
     )
-    code, out, err = run_program(capsys, pupper_analyze, *given, "--json")
-    assert code == 0, err
-    found = json.loads(out)
+    found = json_of(capsys, *given, program=pupper_analyze)
     assert key_line(found) == DOCUMENTED["pupper-analyze twin"]
     model = found["models"]["calibrated.yaml"]
     still = sum(found["persistence_rmse_rad"].values()) / 12

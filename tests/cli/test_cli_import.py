@@ -11,7 +11,7 @@ import pytest
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.importers.recognise import is_fleet
-from support.command_line import refused, run
+from support.command_line import json_of, ran, refused, run
 from support.real_recordings import real_folder
 
 TIME = 0.02 * np.arange(200)
@@ -34,8 +34,8 @@ COLUMNS = ("--time", "t_ms", "--command", "u {joint}", "--position", "y {joint}"
 
 
 def test_a_log_is_imported_by_its_columns_and_says_what_was_assumed(capsys, arm):
-    code, out, err = run(capsys, "import", arm, *COLUMNS, "--out", "rec.csv")
-    assert code == 0 and "pan" in out and "Wrote rec.csv" in err and "half a turn" in err
+    out, err = ran(capsys, "import", arm, *COLUMNS, "--out", "rec.csv")
+    assert "pan" in out and "Wrote rec.csv" in err and "half a turn" in err
     (trial,) = load("rec.csv").trials("tilt")
     np.testing.assert_allclose(trial.command_rad, 0.4 * np.sin(2 * np.pi * TIME), atol=1e-9)
     assert "exists already" in refused(
@@ -74,9 +74,8 @@ def test_doctor_takes_several_logs_and_folders_of_logs(capsys, arm):
     for name in ("a.csv", "b.csv"):
         assert run(capsys, "import", arm, *COLUMNS, "--out", f"logs/{name}")[0] == 0
     for given in (("logs/a.csv", "logs/b.csv"), ("logs",)):
-        code, out, err = run(capsys, "doctor", *given, "--json")
-        assert code == 0, err
-        assert json.loads(out)["recording"] == "a, b"
+        found = json_of(capsys, "doctor", *given)
+        assert found["recording"] == "a, b"
 
 
 def test_a_folder_of_another_projects_logs_is_one_robot(tmp_path):
@@ -97,9 +96,8 @@ def test_a_folder_of_another_projects_logs_is_one_robot(tmp_path):
     ],
 )
 def test_folders_of_real_logs_are_examined_without_renaming_anything(capsys, folder):
-    code, out, err = run(capsys, "doctor", real_folder(folder), "--json")
-    assert code == 0, err
-    assert all(j["verdict"] != "do not use" for j in json.loads(out)["joints"].values())
+    found = json_of(capsys, "doctor", real_folder(folder))
+    assert all(j["verdict"] != "do not use" for j in found["joints"].values())
 
 
 def test_a_folder_of_imu_logs_is_answered_in_a_sentence(capsys):
@@ -109,8 +107,8 @@ def test_a_folder_of_imu_logs_is_answered_in_a_sentence(capsys):
 def test_the_log_itself_is_never_written_over(capsys, arm):
     log = arm.rename(arm.with_suffix(".csv"))
     before = log.read_bytes()
-    code, _, err = run(capsys, "import", log.name, *COLUMNS)
-    assert code == 0 and "Wrote arm_recording.csv" in err
+    _, err = ran(capsys, "import", log.name, *COLUMNS)
+    assert "Wrote arm_recording.csv" in err
     assert "is the log itself" in refused(
         capsys, pupper_sysid, "import", log, *COLUMNS, "--out", "arm.csv", "--force"
     )

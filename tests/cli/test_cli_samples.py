@@ -12,13 +12,12 @@ from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.data_sheet import data_sheet
 from pupper_sysid.data import SAMPLES
 from pupper_sysid.sysid.recordings.files import load
-from support.command_line import refused, run_program
+from support.command_line import ran, refused
 
 
 def test_the_samples_are_copied_whole_and_never_over_other_files(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    code, out, _ = run_program(capsys, pupper_sysid, "samples")
-    assert code == 0
+    out, _ = ran(capsys, "samples")
     made = {p.relative_to("samples") for p in Path("samples").rglob("*") if p.is_file()}
     assert made == {p.relative_to(SAMPLES) for p in SAMPLES.rglob("*") if p.is_file()}
     assert all((SAMPLES / p).read_bytes() == (Path("samples") / p).read_bytes() for p in made)
@@ -35,8 +34,7 @@ def arm(tmp_path, monkeypatch, capsys) -> str:
     """Joint map of the sample arm, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     model = SAMPLES / "so101.xml"
-    code, _, err = run_program(capsys, pupper_sysid, "init-robot", model, "--out", "arm.yaml")
-    assert code == 0, err
+    ran(capsys, "init-robot", model, "--out", "arm.yaml")
     assert yaml.safe_load(Path("arm.yaml").read_text())["servo"] == "STS3215"
     return "arm.yaml"
 
@@ -48,13 +46,10 @@ def test_an_arm_of_sts3215_is_emulated_by_its_servos_data_sheet_and_registers(ar
     found = data_sheet("STS3215")
     assert found
     sheet = found.at(7.4)
-    code, _, err = run_program(
-        capsys, pupper_sysid, "sweep", "--joint-map", arm, *SHORT, "--registers", "p=16",
-        "--truth", "--out", "sweep.csv",
+    ran(
+        capsys, "sweep", "--joint-map", arm, *SHORT, "--registers", "p=16",
+        "--truth", "--out", "sweep.csv"
     )  # fmt: skip
-    assert code == 0, err
-    wrong = refused(capsys, pupper_sysid, "sweep", "--joint-map", arm, "--registers", "q=16")
-    assert "'q=16' sets no register" in wrong
     recording = load("sweep.csv")
     servo = recording.trials("wrist_roll")[0].servo
     assert (servo.model, servo.p_gain, servo.d_gain, servo.supply_voltage_v) == (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import pytest
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.servo_fit import networks
 from pupper_sysid.sysid.servo_fit.training import Recipe
-from support.command_line import run
+from support.command_line import json_of, ran, run
 
 SAMPLE = Path(__file__).parents[2] / "data" / "samples"
 
@@ -47,11 +46,9 @@ def playback(path: str, loops: int = 3, rows: int = 60, step_s: float = 0.04, st
 
 @pytest.mark.slow
 def test_the_mlp_on_the_real_walk_keeps_what_was_reached(capsys, real_playback):
-    code, out, err = run(
-        capsys, "fit-servo", real_playback, "--train-loops", "0,1", "--test-loops", "2", "--json",
+    found = json_of(
+        capsys, "fit-servo", real_playback, "--train-loops", "0,1", "--test-loops", "2"
     )  # fmt: skip
-    assert code == 0, err
-    found = json.loads(out)
     mean, joints = found["mean"], found["joints"]
     assert mean["rmse_free_run_rad"] <= 0.0275 and len(joints) == 12
     assert max(j["rmse_free_run_rad"] for j in joints.values()) <= 0.037
@@ -70,12 +67,11 @@ def test_the_mlp_on_the_real_walk_keeps_what_was_reached(capsys, real_playback):
 
 @pytest.mark.slow
 def test_hold_aware_scores_on_the_real_sweeps_keep_what_was_reached(capsys, real_sweeps):
-    code, out, err = run(
+    found = json_of(
         capsys, "fit-servo", *real_sweeps, "--train-before", "2",
-        "--test-after", "2", "--json",
+        "--test-after", "2",
     )  # fmt: skip
-    assert code == 0, err
-    mean = json.loads(out)["mean"]
+    mean = found["mean"]
     assert mean["rmse_free_run_rad"] <= 0.0155 and mean["rmse_held_rad"] <= 0.0175
     # rows as logged are predicted at the dates of their own poll
     assert mean["rmse_raw_rad"] == pytest.approx(mean["rmse_held_rad"])
@@ -87,13 +83,8 @@ def test_hold_aware_scores_on_the_real_sweeps_keep_what_was_reached(capsys, real
 def test_what_was_fitted_is_saved_and_compared_with_a_calibration(capsys, quick, kinds):
     sample = (SAMPLE / "playback.csv", "--joints", "LF_calf")
     for kind in kinds:
-        code, _, err = run(capsys, "fit-servo", *sample, "--arch", kind, "--out", kind)
-        assert code == 0, err
-    code, out, err = run(
-        capsys, "compare", *sample, "--json", "--models", *kinds, SAMPLE / "calibrated.yaml"
-    )
-    assert code == 0, err
-    found = json.loads(out)
+        ran(capsys, "fit-servo", *sample, "--arch", kind, "--out", kind)
+    found = json_of(capsys, "compare", *sample, "--models", *kinds, SAMPLE / "calibrated.yaml")
     assert len(found["models"]) == len(kinds) + 2 and Path("compare.png").exists()
     assert "too small" in " ".join(found["notes"])
     for model in list(found["models"].values())[: len(kinds)]:
@@ -132,8 +123,8 @@ def test_data_that_cannot_teach_is_answered_in_a_sentence(capsys, quick):
     slow = playback("slow.csv", step_s=0.08)
     code, _, err = run(capsys, "fit-servo", playback("log.csv"), slow)
     assert code == 2 and "different rates" in err
-    code, _, err = run(capsys, "fit-servo", playback("one.csv", loops=1, rows=200), "--arch", "fir")
-    assert code == 0 and "one group to learn from" in err
+    _, err = ran(capsys, "fit-servo", playback("one.csv", loops=1, rows=200), "--arch", "fir")
+    assert "one group to learn from" in err
 
 
 def test_a_model_for_another_rate_or_joint_is_refused_where_it_would_be_used(capsys, quick):

@@ -22,7 +22,7 @@ from pupper_sysid.policies.train.learner import read_checkpoint
 from pupper_sysid.policies.train.run_file import load_run, preset
 from pupper_sysid.policies.walks.film import SIZE, Film
 from pupper_sysid.sim.walking import env
-from support.command_line import refused
+from support.command_line import json_of, ran, refused
 from support.command_line import run_program as run
 from support.json_keys import DOCUMENTED, key_line
 from support.tiny_training import CALIBRATION
@@ -80,13 +80,12 @@ def test_printed_settings_are_not_wrapped_or_coloured(capsys, monkeypatch):
 
 
 def test_a_teacher_is_trained_and_then_learned_from(capsys, here):
-    code, _, err = run(capsys, pupper_train, *TINY, "--start", "teacher", "--name", "t")
-    assert code == 0
+    _, err = ran(capsys, *TINY, "--start", "teacher", "--name", "t", program=pupper_train)
     assert "pupper-train --start scratch --imitation.teacher runs/t" in " ".join(err.split())
     assert "has no RF_hip, " in err and "take the numbers of" in err  # its servos are those of LF
     taught = (*TINY, "--start", "scratch", "--imitation.teacher", "runs/t", "--name", "s")
-    code, _, err = run(capsys, pupper_train, *taught)
-    assert code == 0 and "pupper-eval runs/s" in " ".join(err.split())
+    _, err = ran(capsys, *taught, program=pupper_train)
+    assert "pupper-eval runs/s" in " ".join(err.split())
     assert (here / "runs/s/policy_best").is_dir()
 
 
@@ -99,8 +98,8 @@ def test_a_run_is_not_begun_in_the_folder_of_another(capsys, trained, monkeypatc
 
 
 def test_a_finished_run_can_be_resumed_and_stays_as_it_is(capsys, trained):
-    code, _, err = run(capsys, pupper_train, "--resume", trained)
-    assert code == 0 and f"Going on with {trained}".replace(" ", "") in err.replace(" ", "")
+    _, err = ran(capsys, "--resume", trained, program=pupper_train)
+    assert f"Going on with {trained}".replace(" ", "") in err.replace(" ", "")
     assert read_checkpoint(trained / "last.pt")["iteration"] == 2
 
 
@@ -136,12 +135,10 @@ def test_ctrl_c_saves_and_ends_well(tmp_path):
 
 
 def test_an_evaluation_is_one_json_object_with_all_figures(capsys, trained):
-    code, out, _ = run(
-        capsys, pupper_eval, trained, "--json", "--episodes", "5", "--threads", "1",
-        "--seconds", "0.5", "--terrain", "flat", "--extra-delay-ms", "0", "20",
+    found = json_of(
+        capsys, trained, "--episodes", "5", "--threads", "1",
+        "--seconds", "0.5", "--terrain", "flat", "--extra-delay-ms", "0", "20", program=pupper_eval
     )  # fmt: skip
-    assert code == 0
-    found = json.loads(out)
     assert found["actuator"] == CALIBRATION and found["feedback"] == "held"
     assert not found["quick"] and not found["battery"] and found["episode_s"] == 0.5
     names = [row["name"] for row in found["conditions"]]
@@ -190,10 +187,9 @@ def test_the_battery_fits_a_terminal_of_80_columns_and_its_falls_say_what_came_b
     capsys, trained, monkeypatch
 ):
     monkeypatch.setattr(pupper_eval.out, "_width", 80)
-    code, out, err = run(
-        capsys, pupper_eval, trained, "--battery", "--episodes", "2", "--seconds", "0.5"
+    out, _ = ran(
+        capsys, trained, "--battery", "--episodes", "2", "--seconds", "0.5", program=pupper_eval
     )
-    assert code == 0, err
     lines = out.splitlines()
     assert max(map(len, lines)) <= 80
     for case in BATTERY:
@@ -231,8 +227,7 @@ def test_an_evaluation_is_a_table_and_a_page_with_every_direction(capsys, traine
         trained, "--episodes", "1", "--terrain", "rough", "--extra-delay-ms", "0", "--threads", "1",
         "--seconds", "0.1", "--report", tmp_path / "report",
     )  # fmt: skip
-    code, out, err = run(capsys, pupper_eval, *arguments)
-    assert code == 0, err
+    out, _ = ran(capsys, *arguments, program=pupper_eval)
     page = tmp_path / "report" / "walking.html"
     text = page.read_text()
     for name in ("random commands", "forward", "turn right", "ground: rough"):
@@ -250,11 +245,12 @@ def test_the_feedback_of_a_policy_without_its_run_is_that_of_its_contract(
     shutil.copytree(trained / "policy_last", alone)
     contract = alone / "contract.json"
     contract.write_text(contract.read_text().replace('"feedback": "held"', '"feedback": "ideal"'))
-    code, out, _ = run(
-        capsys, pupper_eval, alone, "--json", "--episodes", "1", "--actuator", CALIBRATION,
+    found = json_of(
+        capsys, alone, "--episodes", "1", "--actuator", CALIBRATION,
         "--seconds", "0.2", "--terrain", "flat", "--extra-delay-ms", "0", "--threads", "1",
+        program=pupper_eval,
     )  # fmt: skip
-    assert code == 0 and json.loads(out)["feedback"] == "ideal"
+    assert found["feedback"] == "ideal"
 
 
 # ------------------------------------------------------------------------------ pupper-play
@@ -262,8 +258,7 @@ def test_the_feedback_of_a_policy_without_its_run_is_that_of_its_contract(
 
 def test_a_walk_is_told_in_numbers(capsys, trained):
     arguments = ("--seconds", "0.2", "--command", "0.1", "0", "0.3")
-    code, out, _ = run(capsys, pupper_play, trained, *arguments)
-    assert code == 0
+    out, _ = ran(capsys, trained, *arguments, program=pupper_play)
     assert "command 0.10 m/s forward, 0.00 m/s left, 0.30 rad/s" in " ".join(out.split())
 
 
@@ -274,8 +269,7 @@ def test_a_fall_is_told_with_its_time(capsys, trained, monkeypatch):
     from pupper_sysid.policies.network.policy_file import Policy
 
     monkeypatch.setattr(Policy, "act", lambda *_: np.array([[0.0, 4.0, -4.0] * 4]))
-    code, out, _ = run(capsys, pupper_play, trained, "--seconds", "2")
-    assert code == 0
+    out, _ = ran(capsys, trained, "--seconds", "2", program=pupper_play)
     time = float(out.split("Fell after ")[1].split(" s.")[0])
     assert 0.02 < time < 0.6
 
@@ -290,8 +284,8 @@ def test_where_nothing_can_be_drawn_the_walk_goes_on_without_a_video(
 
     monkeypatch.setattr(mujoco, "Renderer", no_gl)
     arguments = ("--seconds", "0.2", "--video", here / "walk.mp4")
-    code, out, err = run(capsys, pupper_play, trained, *arguments)
-    assert code == 0 and "command 0.15 m/s" in out
+    out, err = ran(capsys, trained, *arguments, program=pupper_play)
+    assert "command 0.15 m/s" in out
     assert "No frames can be drawn here (RuntimeError: no EGL display)" in err
     assert not (here / "walk.mp4").exists()
 
@@ -326,8 +320,7 @@ def test_a_video_runs_as_fast_as_the_robot_at_any_control_rate(capsys, trained, 
     monkeypatch.setattr(mujoco, "Renderer", Screen)
     monkeypatch.setattr(imageio, "get_writer", Film)
     arguments = ("--seconds", "0.4", "--video", here / "walk.mp4")
-    code, _, err = run(capsys, pupper_play, here / "slow", *arguments)
-    assert code == 0, err
+    ran(capsys, here / "slow", *arguments, program=pupper_play)
     assert told["fps"] == pytest.approx(25) and told["pictures"] == 10
     # policy, speeds and time stand at the top of each picture
     assert told["written"][:160].sum() > 500 and not told["written"][200:].any()

@@ -25,7 +25,7 @@ from pupper_sysid.cli.terminal import remember, spell
 from pupper_sysid.cli.user_errors import parse
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import select_joints
-from support.command_line import refused, run, run_program
+from support.command_line import json_of, ran, refused
 from support.json_keys import DOCUMENTED, key_line
 from support.package import FOLDERS, ROOT
 
@@ -94,8 +94,7 @@ def of_80_columns(monkeypatch):
 
 def shown(capsys, command, option: str) -> str:
     module = importlib.import_module(f"pupper_sysid.cli.programs.{command[0]}")
-    code, out, err = run_program(capsys, module, *command[1:], option)
-    assert code == 0, err
+    out, _ = ran(capsys, *command[1:], option, program=module)
     return out
 
 
@@ -219,8 +218,7 @@ def test_sentences_are_broken_between_words_on_a_terminal_and_commands_are_not(o
 
 def test_a_command_to_run_next_can_be_copied(capsys, tmp_path):
     recording = tmp_path / "my log.csv"
-    code, _, err = run(capsys, "import", ROOT / "data/samples/sweep.csv", "--out", recording)
-    assert code == 0
+    _, err = ran(capsys, "import", ROOT / "data/samples/sweep.csv", "--out", recording)
     assert shlex.split(err.split("Next: ")[1]) == ["pupper-sysid", "doctor", str(recording)]
 
 
@@ -330,6 +328,5 @@ def test_keys_of_an_object_are_the_documented_ones(capsys, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     for command, given in WITH_JSON.items():
         typed = [hip if word is HIP else word for word in given]
-        code, out, err = run(capsys, command, *typed, "--json")
-        assert code == 0, f"{command}: {err}"
-        assert key_line(json.loads(out)) == DOCUMENTED[command], command
+        found = json_of(capsys, command, *typed)
+        assert key_line(found) == DOCUMENTED[command], command

@@ -15,7 +15,7 @@ from pupper_sysid.hardware.feetech import PING, SYNC_READ, FrameReader
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
 from pupper_sysid.sim.emulator.faults import BusFaults
-from support.command_line import run
+from support.command_line import json_of, ran, run
 from support.servo_servers import StillBench, bench_of, on_a_port, on_a_socket, still_servos
 
 _READ = 2
@@ -148,8 +148,8 @@ def test_monitoring_the_proxy_only_asks_and_says_what_it_cannot_tell(capsys, tmp
 
 
 def test_without_a_terminal_a_plain_table_comes_once_a_second(capsys):
-    code, out, _ = run(capsys, "monitor", "--bus", "emulated", "--seconds", "1.3")
-    assert code == 0 and len(re.findall("^LF_hip", out, re.MULTILINE)) == 2
+    out, _ = ran(capsys, "monitor", "--bus", "emulated", "--seconds", "1.3")
+    assert len(re.findall("^LF_hip", out, re.MULTILINE)) == 2
     assert "\x1b[" not in out
 
 
@@ -170,6 +170,5 @@ def test_a_monitored_emulated_robot_does_not_remember_its_readings():
 
 
 def test_the_older_word_for_the_emulated_bus_is_taken_and_answered_with_the_new_one(capsys):
-    code, out, err = run(capsys, "monitor", "--bus", "sim", "--json")
-    assert code == 0, err
-    assert json.loads(out)["bus"] == "emulated"
+    found = json_of(capsys, "monitor", "--bus", "sim")
+    assert found["bus"] == "emulated"

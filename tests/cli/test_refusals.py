@@ -91,6 +91,20 @@ export loop.csv --to json | loop.csv
 export nowhere.csv --gain [0 -16 nan 1e308] | --gain is
 export nowhere.csv --physics-step [0 nan 1 1e308] | --physics-step is
 servo diff paper release --gain 1e308 | --gain is
+export log.csv --to mjcf | pupper-sysid calibrate
+export policy --to mjlab | --to onnx
+export cal.yaml --to isaaclab-bam | not fitted under load
+export cal.yaml --to [mjcf isaaclab mjlab newton] --out x --physics-step 0.05 | steps of 50 ms; take
+export cal.yaml --to mjcf --link-inertia LF_hip=0.01 | cannot be taken off
+export cal.yaml --to mjcf --link-inertia LF_hip | LF_thigh=0.0012
+export cal.yaml --to mjcf --link-inertia arm=0.1 | the calibration has LF_hip
+export sts3215-bam-m1 --to mjcf --out a.xml --link-inertia servo=0.001 | no link to take off
+init-robot | needs the robot's MJCF or URDF
+init-robot robot.xml --joints pan=1 | needs the robot's MJCF or URDF
+init-robot --joints pan | 'pan' is not NAME=ID
+init-robot --joints pan=1,tilt=1 | have the same id 1
+init-robot --joints pan=1,pan=2 | pan is there twice
+init-robot robot.xml | no hinge joint
 plan --seconds [-1 0 nan 1e6 1e308] | --seconds is
 plan --rate [0 inf] | --rate is
 plan --joints LF_knee | LF_knee
@@ -124,6 +138,7 @@ sweep --bus esp32 --out a.csv --truth | only a new recording of the emulated rob
 sweep --bus esp32 --real-time | always runs in real time
 sweep --bus feetech:nowhere --registers p=16 | A real one's are recorded
 sweep --registers p=16 | have none that act
+sweep --joint-map bench_sts3215 --registers q=16 | 'q=16' sets no register
 sweep --load none --registers p=16 | on a bench --gains
 sweep --joint-map nowhere.yaml | does not exist
 sweep --resume nothing.csv | does not exist
@@ -146,6 +161,7 @@ sweep --mcap b.mcap --until dead_time:2ms | --until makes several recordings
 monitor --bus emulated --seconds [0 -1] | --seconds is
 monitor --bus emulated --rate [0 1e9] | --rate is
 monitor --bus emulated --joint-map sts3215 | has its own
+monitor --bus emulated --seconds 1 --mcap m.mcap --once | Give one of the two
 monitor --bus usb | write emulated, esp32
 emulate feetech --ids [1-999999999999 5-1 ٣ "" 1, 0 1-20] | --ids
 emulate feetech --baud [0 7] | --baud

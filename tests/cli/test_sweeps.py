@@ -22,7 +22,7 @@ from pupper_sysid.sim.emulator.pendulum import BENCH_MAP, Pendulum, PendulumBenc
 from pupper_sysid.sysid.doctor import checks as joints
 from pupper_sysid.sysid.plan.plan_file import load_plan
 from pupper_sysid.sysid.recordings.files import load
-from support.command_line import run
+from support.command_line import json_of, ran, run
 from support.json_keys import key_line
 from support.package import ROOT
 from support.planned_servos import fit_of_half_width
@@ -99,8 +99,7 @@ def test_a_first_sweep_is_planned_and_executed_trial_by_trial(planned):
 def test_a_planned_sweep_that_was_cut_short_is_continued(capsys, planned):
     whole = load("a.csv").table.groupby(["joint", "trial"]).size()
     cut(Path("a.csv"), 0.6)
-    code, _, err = run(capsys, "sweep", "--resume", "a.csv")
-    assert code == 0, err
+    ran(capsys, "sweep", "--resume", "a.csv")
     again = load("a.csv")
     assert (again.table.groupby(["joint", "trial"]).size() - whole).abs().max() <= 1
     assert "completed" in again.metadata
@@ -126,8 +125,7 @@ SHORT = ("--joints", "LF_hip,LF_thigh", "--freqs", "4", "--duration", "2", "--ou
 @pytest.mark.slow
 def test_a_sweep_goes_on_with_planned_rounds_until_the_goal(capsys, widths):
     widths |= {"LF_hip": [1.9], "LF_thigh": [5.0, 1.9]}
-    code, out, err = run(capsys, "sweep", *SHORT, "--until", "dead_time:2ms", "--json")
-    assert code == 0, err
+    out, err = ran(capsys, "sweep", *SHORT, "--until", "dead_time:2ms", "--json")
     found = json.loads(out)
     assert key_line(found) == documented("sweep --until")
     assert found["reached"] and found["recordings"] == ["a.csv", "a_2.csv"]
@@ -143,17 +141,15 @@ def test_rounds_that_were_cut_short_are_continued(capsys, widths):
     first = Path("a.csv").read_bytes()
     cut(Path("a_2.csv"), 0.5)
     widths |= {"LF_hip": [1.9], "LF_thigh": [5.0, 1.9]}
-    code, out, err = run(capsys, "sweep", "--resume", "a.csv", "--json")
-    assert code == 0, err
-    # the second round is finished, and both joints are fitted to both: one more round
-    assert json.loads(out)["recordings"] == ["a.csv", "a_2.csv", "a_3.csv"]
+    found = json_of(capsys, "sweep", "--resume", "a.csv")
+    assert found["recordings"] == ["a.csv", "a_2.csv", "a_3.csv"]
     assert "completed" in load("a_2.csv").metadata and Path("a.csv").read_bytes() == first
 
 
 def test_a_goal_out_of_reach_is_said_with_its_reason(capsys, widths):
     widths |= {"LF_hip": [1.9], "LF_thigh": [5.0]}
-    code, out, err = run(capsys, "sweep", *SHORT, "--until", "dead_time:2ms", "--most-seconds", "4")
-    assert code == 0 and "not reached" in out
+    out, err = ran(capsys, "sweep", *SHORT, "--until", "dead_time:2ms", "--most-seconds", "4")
+    assert "not reached" in out
     assert "LF_thigh: the goal was not reached: 2 s are recorded and --most-seconds is 4" in err
 
 
@@ -188,8 +184,8 @@ def test_an_interrupted_bench_is_continued_at_its_gain(capsys, tmp_path):
     body = [k for k, line in enumerate(lines) if line and line[0] != "#"]
     cut = body[0] + (len(body) * 3) // 4  # within the second trial
     (tmp_path / "a.csv").write_text("\n".join(lines[:cut]) + "\n")
-    code, _, err = run(capsys, "sweep", "--resume", "a.csv")
-    assert code == 0 and "trial 2 of 2" in err
+    _, err = ran(capsys, "sweep", "--resume", "a.csv")
+    assert "trial 2 of 2" in err
     gains = [t.p_gain for t in load(tmp_path / "a.csv").trials("bench")]
     assert gains == [8.0, 32.0]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,7 +18,7 @@ from pupper_sysid.hardware.feetech import FAMILY, FeetechBus
 from pupper_sysid.hardware.serial_servos.line import slow_adapter
 from pupper_sysid.hardware.serial_servos.scan import scan_line
 from pupper_sysid.sim.emulator.serial_line import SerialPty
-from support.command_line import run
+from support.command_line import json_of, run
 from support.servo_servers import map_of, on_a_port, still_dynamixels, still_servos, wait_until
 from support.stopwatch import Stopwatch
 
@@ -92,9 +91,7 @@ def test_scan_without_a_bus_tries_every_port_and_says_what_answers_where(capsys,
                 cls = kind.bus_class()
                 small = replace(cls.family, highest_id=4, rates=cls.family.rates[:1])
                 monkeypatch.setattr(cls, "family", small)
-        code, out, err = run(capsys, "scan", "--json")
-        assert code == 0, err
-        report = json.loads(out)
+        report = json_of(capsys, "scan")
         code, out, err = run(capsys, "scan")
     assert report["ports"] == ports and list(report["silent"]) == [empty.device]
     line = report["lines"][0]

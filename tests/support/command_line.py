@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from types import ModuleType
+from typing import Any
 
 from pupper_sysid.cli.programs import pupper_sysid
 
@@ -29,3 +31,15 @@ def refused(capsys, module: ModuleType, *arguments) -> str:
     assert code == 2, err
     assert out == "" and "Traceback" not in err and "defect" not in err
     return err
+
+
+def ran(capsys, *arguments, program: ModuleType = pupper_sysid) -> tuple[str, str]:
+    """Stdout, and stderr on one line, of a command that ends well."""
+    code, out, err = run_program(capsys, program, *arguments)
+    assert code == 0, err
+    return out, err
+
+
+def json_of(capsys, *arguments, program: ModuleType = pupper_sysid) -> Any:
+    """What a command prints with `--json`."""
+    return json.loads(ran(capsys, *arguments, "--json", program=program)[0])

@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sim.emulator.serial_line import SerialPty
 from pupper_sysid.sysid.recordings.files import load
-from support.command_line import run
+from support.command_line import ran, run
 from support.servo_servers import moving_dynamixel, on_a_port
 
 TONES_HZ = (2.0, 4.0)
@@ -107,10 +107,8 @@ def test_a_sweep_shows_the_emulated_servos_lag_and_leaves_its_registers(
         nearest = np.abs(measured[:, :1] - reads).argmin(axis=0)
         true = lag_s(moving[:, 0], moving[:, 1], *measured[nearest].T, tone)
         assert abs(recorded - true) < 3e-4, f"{tone} Hz: {1e3 * (recorded - true):.2f} ms"
-    code, _, err = run(capsys, "doctor", "a.csv")
-    assert code == 0, err
-    code, _, err = run(capsys, "calibrate", "a.csv", "--out", "c.yaml")
-    assert code == 0, err
+    ran(capsys, "doctor", "a.csv")
+    ran(capsys, "calibrate", "a.csv", "--out", "c.yaml")
     fitted = load_calibration(Path("c.yaml")).joint("bench").actuator.dead_time_s
     truth = float(np.asarray(servos.bench.robot.servos[0].actuator.dead_time_s))
     assert fitted.low <= truth <= fitted.high

@@ -18,7 +18,7 @@ from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sim.robot import robot_map
-from support.command_line import run
+from support.command_line import ran, run
 from support.servo_servers import on_a_port
 
 LINK = """<link name="{0}"><inertial><mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4"
@@ -136,7 +136,7 @@ def lerobot_files() -> None:
 
 def test_lerobots_calibration_goes_in_and_comes_out_again(capsys):
     lerobot_files()
-    code, _, err = run(
+    ran(
         capsys,
         "init-robot",
         "arm.urdf",
@@ -145,7 +145,6 @@ def test_lerobots_calibration_goes_in_and_comes_out_again(capsys):
         "--out",
         "m.yaml",
     )
-    assert code == 0, err
     chosen = load_joint_map(Path("m.yaml"))
     pan, tilt = chosen.file.joints["pan"], chosen.file.joints["tilt"]
     assert (pan.id, pan.sign, pan.limits_counts, pan.homing_offset) == (3, 1, (900, 3100), -120)
