@@ -80,16 +80,9 @@ def test_every_example_of_a_page_runs_in_an_empty_folder(page, tmp_path, monkeyp
 def test_the_tutorial_leads_from_a_sweep_to_a_servo_model_and_is_run_as_it_stands():
     steps = [words[1] for words in EXAMPLES[DOCS / "tutorial.md"]]
     order = [
-        "sweep",
-        "doctor",
-        "delay",
-        "calibrate",
-        "compare-truth",
-        "compare",
-        "report",
-        "export",
+        "sweep", "doctor", "delay", "calibrate", "compare-truth", "compare", "report", "export",
         "fit-servo",
-    ]
+    ]  # fmt: skip
     assert list(dict.fromkeys(steps)) == order
     for page in EXAMPLES:
         unrun = [line for line in console(page) if "pupper-" in line and line[:2] != "$ "]

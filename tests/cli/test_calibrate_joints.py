@@ -247,16 +247,9 @@ def test_a_whole_calibration_over_a_port_writes_what_was_done_by_hand(
 
     with on_a_port(servos) as port:
         code, said, err = run(
-            monkeypatch,
-            capsys,
-            person,
-            "--bus",
-            f"feetech:{port.device}@1000000",
-            "--out",
-            out,
-            "--joint-map",
-            "sts3215",
-        )
+            monkeypatch, capsys, person, "--bus", f"feetech:{port.device}@1000000", "--out", out,
+            "--joint-map", "sts3215",
+        )  # fmt: skip
     assert code == 0, err
     new = load_joint_map(out)
     thigh, hip = new.file.joints["LF_thigh"], new.file.joints["LF_hip"]

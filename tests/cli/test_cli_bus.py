@@ -47,18 +47,9 @@ def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     with on_a_port(moving_servos(ids=[5])) as port:
         bus = f"feetech:{port.device}"
         code, _, err = run(
-            capsys,
-            "sweep",
-            *SHORT,
-            "--joints",
-            "LF_thigh",
-            "--bus",
-            bus,
-            "--out",
-            "a.csv",
-            "--joint-map",
-            "sts3215",
-        )
+            capsys, "sweep", *SHORT, "--joints", "LF_thigh", "--bus", bus, "--out", "a.csv",
+            "--joint-map", "sts3215",
+        )  # fmt: skip
     assert code == 0, err
     recording = load(Path("a.csv"))
     bus = recording.metadata["bus"]

@@ -219,17 +219,8 @@ def test_the_twin_of_a_walk_is_drawn_and_has_the_documented_keys(
 ):
     monkeypatch.chdir(tmp_path)
     given = (
-        "twin",
-        walk,
-        "--actuator",
-        CALIBRATION_TWIN,
-        "--robots",
-        1,
-        "--threads",
-        1,
-        "--imu",
-        imu,
-    )
+        "twin", walk, "--actuator", CALIBRATION_TWIN, "--robots", 1, "--threads", 1, "--imu", imu,
+    )  # fmt: skip
     found = json_of(capsys, *given, program=pupper_analyze)
     assert key_line(found) == DOCUMENTED["pupper-analyze twin"]
     model = found["models"]["calibrated.yaml"]

@@ -370,16 +370,8 @@ def test_a_drawing_process_that_died_ends_nothing():
 
 
 SWEEP_OSCILLOSCOPE = (
-    "sweep",
-    "--joints",
-    "LF_hip",
-    "--freqs",
-    "2",
-    "--duration",
-    "1.5",
-    "--out",
-    "a.csv",
-)
+    "sweep", "--joints", "LF_hip", "--freqs", "2", "--duration", "1.5", "--out", "a.csv",
+)  # fmt: skip
 
 
 def in_a_terminal(folder, *words: str) -> tuple[int, str]:

@@ -137,14 +137,9 @@ def lerobot_files() -> None:
 def test_lerobots_calibration_goes_in_and_comes_out_again(capsys):
     lerobot_files()
     ran(
-        capsys,
-        "init-robot",
-        "arm.urdf",
-        "--lerobot-calibration",
-        "follower.json",
-        "--out",
+        capsys, "init-robot", "arm.urdf", "--lerobot-calibration", "follower.json", "--out",
         "m.yaml",
-    )
+    )  # fmt: skip
     chosen = load_joint_map(Path("m.yaml"))
     pan, tilt = chosen.file.joints["pan"], chosen.file.joints["tilt"]
     assert (pan.id, pan.sign, pan.limits_counts, pan.homing_offset) == (3, 1, (900, 3100), -120)
