@@ -43,11 +43,10 @@ from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.plan.plan_file import load_plan, save_plan
-from pupper_sysid.sysid.plan.planner import PlannedTrial
-from pupper_sysid.sysid.plan.proposal import SweepPlan
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.importers.options import LogOptions, read_mapping
 from pupper_sysid.sysid.sweep.resume import playback
+from support.planned_servos import small_plan
 from support.saved_servo_models import saved
 
 SAMPLES = Path(__file__).parents[1] / "data" / "samples"
@@ -217,18 +216,6 @@ def bag(folder: Path) -> None:
         database.executemany("INSERT INTO messages VALUES (?, ?, ?)", every)
 
 
-def proposal(folder: Path) -> None:
-    trial = PlannedTrial(
-        joint="LF_hip", kind="sine", frequency_hz=7.0, amplitude_rad=0.12, duration_s=3.0,
-        purpose="dead time",
-    )  # fmt: skip
-    plan = SweepPlan(
-        made_from=(), seed=3, loop_period_s=0.019, poll_rate_hz=37.2, speed_limit_rad_s=7.5,
-        trials=(trial,), predictions=(), notes=(),
-    )  # fmt: skip
-    save_plan(plan, folder / "plan.yaml")
-
-
 def walk(folder: Path) -> None:
     header = {"schema_version": 1, "start_rad": [0.0] * 12,
               "rest": {"gravity": [0.0, 0.0, -1.0], "bias_rad_s": [0.0, 0.0, 0.0]}}  # fmt: skip
@@ -292,7 +279,9 @@ KINDS = {
         lambda folder: load_joint_map("mini_pupper_2").save(folder / "joints.yaml"),
         "joints.yaml", load_joint_map,
     ),
-    "plan": Kind(proposal, "plan.yaml", load_plan),
+    "plan": Kind(
+        lambda folder: save_plan(small_plan(), folder / "plan.yaml"), "plan.yaml", load_plan
+    ),
     "servo card": Kind(
         copied(CARDS / "sts3215-bam-m6.yaml"), "sts3215-bam-m6.yaml", load_card
     ),

@@ -12,7 +12,6 @@ import struct
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from fcntl import ioctl
 from pathlib import Path
 from termios import TIOCSWINSZ
@@ -136,21 +135,6 @@ def test_what_the_guard_changed_and_why_it_stopped_is_shown(tmp_path):
     _, texts = topics_of(tmp_path / "a.mcap")
     assert texts[0] == "Guard: a command held at the limits."
     assert "Guard: 1 commands held at the limits." in texts and texts[-1] == "LF_hip: it burns."
-
-
-@pytest.mark.slow
-def test_unknown_commands_and_silent_servos_are_left_out(tmp_path):
-    bus = emulated()
-    with live_views(bus, Wanted(None, tmp_path / "a.mcap"), waits=True) as views:
-        bus.torque(True)
-        sent, reading = bus.write(bus.read().position_rad), bus.read()
-        limp = replace(sent, position_rad=np.full(12, np.nan))
-        silent = replace(reading, position_rad=np.where(np.arange(12), 0.1, np.nan))
-        views.tick(0, limp, silent)
-    topics, _ = topics_of(tmp_path / "a.mcap")
-    assert not any(name == "command_rad" for _, name in topics)
-    assert np.isnan(topics["LF_hip", "position_rad"][1]).all()
-    assert topics["LF_thigh", "position_rad"][1] == [0.1]
 
 
 @pytest.mark.slow

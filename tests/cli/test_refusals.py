@@ -33,8 +33,7 @@ from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.fleet.calibration import Settings
 from pupper_sysid.sysid.plan.plan_file import save_plan
-from pupper_sysid.sysid.plan.planner import PlannedTrial
-from pupper_sysid.sysid.plan.proposal import SweepPlan, plan_from_recordings
+from pupper_sysid.sysid.plan.proposal import plan_from_recordings
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.report.report import write_report
 from pupper_sysid.sysid.servo_fit.fit import Split
@@ -42,6 +41,7 @@ from pupper_sysid.sysid.sweep.bench import BENCH, BENCH_KINDS, bench_plan, parse
 from pupper_sysid.sysid.sweep.excitation import KINDS, LARGEST_AMPLITUDE_RAD, plan
 from support.command_line import refused
 from support.package import ROOT
+from support.planned_servos import small_plan
 from support.refusals import assert_each_refused
 
 SAMPLES = ROOT / "data/samples"
@@ -298,11 +298,7 @@ def stocked(here) -> Path:
     (here / "empty").mkdir()
     save_run(here / "begun", preset("fast", "mlp"))
     save_run(here / "teacher", preset("fast", "mlp", "teacher"))
-    trial = PlannedTrial(joint="LF_hip", kind="sine", frequency_hz=7.0, amplitude_rad=0.1,
-                         duration_s=3.0, purpose="dead time")  # fmt: skip
-    made = SweepPlan(made_from=(), seed=3, loop_period_s=0.019, poll_rate_hz=37.2,
-                     speed_limit_rad_s=7.5, trials=(trial,), predictions=(), notes=())  # fmt: skip
-    save_plan(made, here / "plan.yaml")
+    save_plan(small_plan(), here / "plan.yaml")
     return here
 
 

@@ -174,11 +174,15 @@ def test_ramps_are_said_and_are_in_the_header(lines):
     assert setup["registers"]["acceleration"] == 254
 
 
-@pytest.mark.parametrize("series", [STS3215, SCS0009])
+@pytest.mark.parametrize("series", [STS3215, SCS0009, None])
 def test_two_servos_of_one_id_are_named_instead_of_the_cables(series):
-    servos = still_servos(series, (4, 5, 6), doubled=[5])
+    ids, bus = (4, 5, 6), FeetechBus if series else DynamixelBus
+    if series:
+        servos, layout = still_servos(series, ids, doubled=[5]), map_of(*ids, series=series)
+    else:
+        servos, layout = still_dynamixels(ids, doubled=[5]), dynamixel_map(*ids)
     with on_a_port(servos) as server, pytest.raises(BusError, match="two servos") as refused:
-        FeetechBus(server.device, 1_000_000, map_of(4, 5, 6, series=series))
+        bus(server.device, 1_000_000, layout)
     assert "id 5 (register id)" in str(refused.value) and "another id" in str(refused.value)
     assert (5, True) not in bench_of(servos).torques
 

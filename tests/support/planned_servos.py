@@ -17,11 +17,13 @@ from pupper_sysid.sysid.plan.candidates import Setup, recorded
 from pupper_sysid.sysid.plan.planner import (
     Hypothesis,
     Noise,
+    PlannedTrial,
     Servo,
     pooled,
     prior_information,
     respond,
 )
+from pupper_sysid.sysid.plan.proposal import SweepPlan
 from pupper_sysid.sysid.recordings.importers.times import READ_AFTER_SEND_S
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.sweep.excitation import plan
@@ -32,6 +34,18 @@ SECONDS = 3.0
 """Recorded of each joint by `two_joints`."""
 
 PD = (0.025, 12000.0, 100.0, 200.0, 430.0)
+
+
+def small_plan() -> SweepPlan:
+    """One tone of the hip."""
+    trial = PlannedTrial(
+        joint="LF_hip", kind="sine", frequency_hz=7.0, amplitude_rad=0.12, duration_s=3.0,
+        purpose="dead time",
+    )  # fmt: skip
+    return SweepPlan(
+        made_from=(), seed=3, loop_period_s=0.019, poll_rate_hz=37.2, speed_limit_rad_s=7.5,
+        trials=(trial,), predictions=(), notes=(),
+    )  # fmt: skip
 
 
 def tones(

@@ -240,16 +240,6 @@ def test_two_different_answers_of_one_servo_in_a_sync_read_are_none():
     assert {i: r.frame.data for i, r in replies.items()} == {2: b"\x05\x06"}
 
 
-def test_emulated_servos_hear_a_rate_without_a_name_only_if_theirs_has_none():
-    for baud, rate, hears in ((57_600, 250_000, False), (57_600, 57_600, True),
-                              (250_000, 250_000, True)):  # fmt: skip
-        with on_a_port(still_servos(baud=baud)) as server:
-            line = FeetechLine(server.device, rate)
-            line.patience_s = 0.4 if hears else 0.05
-            assert (line.ping(1) is not None) is hears
-            line.close()
-
-
 def test_servos_that_cannot_be_driven_are_left_alone_and_the_refusal_says_which(monkeypatch):
     def model(*number: int):
         servos = still_servos()

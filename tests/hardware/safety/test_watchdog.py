@@ -334,23 +334,6 @@ def test_servos_that_do_not_say_that_they_are_limp_are_asked_until_they_do(monke
     assert len(asked) > 45 and not asked[-1]
 
 
-def test_a_lack_of_memory_does_not_end_the_tries(monkeypatch):
-    rng, tries = np.random.default_rng(0), []
-    last = EmulatedBus(draw_robot(rng), rng)
-
-    def open_bus(*of, **how):
-        tries.append(how)
-        if len(tries) < 4:
-            raise MemoryError
-        return last
-
-    for module in (limp_module, watchdog_process):
-        monkeypatch.setattr(module, "open_bus", open_bus)
-    orders = orders_for()
-    watchdog_process.park(orders)
-    assert len(tries) == 4
-
-
 def test_half_a_message_is_no_reason_to_leave_a_robot():
     orders = orders_for()
     orders.take(b'{"arm": {"LF_hip": 0.1}}')

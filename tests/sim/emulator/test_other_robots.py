@@ -1,4 +1,4 @@
-"""Robots that are no Mini Pupper: an arm of six servos, and one servo on a bench."""
+"""Robots that are no Mini Pupper: an arm of six servos."""
 
 from __future__ import annotations
 
@@ -32,11 +32,6 @@ ARM = """<mujoco><worldbody>
 <body><joint name="wrist_roll" type="hinge" axis="0 0 1"/><geom size=".02"/>
 <body><joint name="gripper" type="hinge" axis="0 1 0" range="-10 100"/><geom size=".02"/>
 </body></body></body></body></body></body></worldbody></mujoco>"""
-BENCH = """<mujoco><worldbody>
-<body><joint name="bench" type="hinge" axis="0 1 0" range="-80 80"/><geom size=".02"/></body>
-<body><freejoint/><geom size=".01"/></body>
-</worldbody></mujoco>"""
-
 BODY = (
     "<mujoco>{}<worldbody><body>"
     '<joint name="k" axis="0 0 1" range="{}"/>{}</body>{}</worldbody></mujoco>'
@@ -48,7 +43,6 @@ GEOM = '<geom size=".02"/>'
 def in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("arm.xml").write_text(ARM)
-    Path("bench.xml").write_text(BENCH)
 
 
 def test_a_joint_map_has_the_model_s_joints_limits_and_the_servos_counts(capsys):

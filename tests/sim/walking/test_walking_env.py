@@ -502,18 +502,6 @@ def test_a_time_out_hands_over_the_last_observation_of_the_old_episode():
     assert (result.observation != expected.observation).any(axis=1).all()
 
 
-def test_only_those_whose_time_is_up_hand_over_a_last_observation():
-    env = make()
-    walk_about(env, 2)
-    throw(env, [0])
-    time_out(env, [2])
-    result = env.step(still(env))
-    np.testing.assert_array_equal(result.done, [True, False, True, False])
-    np.testing.assert_array_equal(result.timed_out, [False, False, True, False])
-    np.testing.assert_array_equal(result.terminal["ids"], [2])
-    assert len(result.terminal["observation"]) == 1
-
-
 def test_what_chance_did_after_a_step_is_handed_over_undone():
     """Robot 0 gets a new command, 1 a push, 2 both and falls, 3 neither."""
     for true in (False, True):

@@ -16,12 +16,10 @@ from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.esp32 import Esp32Bus
-from pupper_sysid.hardware.feetech import BROADCAST_ID, READ, STS3215, SYNC_WRITE, Frame
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
-from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.trot import Trot
@@ -232,15 +230,6 @@ def test_readings_and_goals_are_joint_angles_a_calf_relative_to_its_thigh():
     assert bus.metadata["coordinates"] == "joint"
 
 
-def test_readings_are_held_between_polls_and_whole_counts():
-    bus = make_bus()
-    readings = []
-    walk(bus, 2.0, look=lambda: readings.append(bus._bus._reading.copy()))
-    changed = np.diff(np.array(readings[25:]), axis=0) != 0
-    # a poll every 26.85 ms of which 42 % fail, read every 20 ms
-    assert 0.25 < changed.mean() < 0.6
-
-
 def test_impossible_goals_and_a_closed_bus_are_refused():
     bus = make_bus()
     for goal in (np.zeros(3), np.full(12, np.nan)):
@@ -317,35 +306,6 @@ def walks_behind_the_proxy(path: Path) -> None:
     read = [s for s in samples if s]
     assert len(read) > 0.9 * len(samples)
     assert max(abs(s.rate_rad_s).max() for s in read) > 0.3
-
-
-def test_it_walks_on_a_line_of_feetech_servos():
-    rng = np.random.default_rng(0)
-    truth, layout = draw_robot(rng, exact_spec()), load_joint_map("sts3215")
-    robot = WalkingRobot(truth, rng)
-    line = FeetechEmulator(
-        ServoBench(truth, layout, rng, keep_log=False, plant=robot), STS3215, rng
-    )
-    answers = []
-    goal, position = (
-        STS3215.registers[name].address for name in ("goal_position", "present_position")
-    )
-    for k in range(150):
-        now = k * PERIOD_S
-        counts = layout.clip_counts(layout.to_counts(trot(now, FORWARD)))
-        words = b"".join(
-            bytes([i]) + STS3215.encode("goal_position", int(c))
-            for i, c in zip(layout.ids, counts, strict=True)
-        )
-        line.receive(Frame(BROADCAST_ID, SYNC_WRITE, bytes([goal, 2]) + words).encode(), now)
-        answers = line.receive(Frame(4, READ, bytes([position, 2])).encode(), now + 0.005)
-        assert len(answers) == 1
-    trunk = robot.trunk(3.0)
-    assert trunk.upright > 0.98 and trunk.position_m[0] > 0.25
-    reply = answers[0][1]
-    there = int.from_bytes(reply[5:7], "little")
-    expected = layout.per_servo().to_counts(np.array([robot.angle(i, 3.0) for i in range(12)]))[HIP]
-    assert there == pytest.approx(expected, abs=40)
 
 
 def test_the_proxy_without_a_host_tells_of_a_standing_robot():
