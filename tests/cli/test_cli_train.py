@@ -212,16 +212,6 @@ def test_the_battery_fits_a_terminal_of_80_columns_and_its_falls_say_what_came_b
         }
 
 
-def test_an_evaluation_elsewhere_says_where(capsys, trained):
-    code, out, _ = run(
-        capsys, pupper_eval, trained / "policy_last", "--json", "--episodes", "1",
-        "--actuator", "ideal", "--feedback", "ideal", "--terrain", "flat", "--extra-delay-ms", "0",
-        "--threads", "1", "--seconds", "0.2",
-    )  # fmt: skip
-    found = json.loads(out)
-    assert code == 0 and (found["actuator"], found["feedback"]) == ("ideal", "ideal")
-
-
 def test_an_evaluation_is_a_table_and_a_page_with_every_direction(capsys, trained, tmp_path):
     arguments = (
         trained, "--episodes", "1", "--terrain", "rough", "--extra-delay-ms", "0", "--threads", "1",

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from pupper_sysid.cli import live_views as module
 from pupper_sysid.cli.live_views import Wanted, live_views
-from pupper_sysid.cli.oscilloscope import Oscilloscope, Screen, braille, lag_s
+from pupper_sysid.cli.oscilloscope import Oscilloscope, Screen, lag_s
 from pupper_sysid.cli.programs import pupper_deploy, pupper_sysid
 from pupper_sysid.common.errors import InputError, SafetyStop
 from pupper_sysid.common.joints import JOINT_NAMES
@@ -300,10 +300,6 @@ def test_still_joints_are_a_line_each_beside_one_that_moves():
     assert "lag 67 ms overload" in lines[first]  # 0.4 rad at 6 rad/s
 
 
-def test_before_the_first_reading_the_screen_says_what_it_waits_for():
-    assert "waiting for the servos" in Screen(("a",)).frame(60, 10).plain
-
-
 @pytest.mark.parametrize("late_s", [0.02, 0.075, 0.21])
 def test_the_lag_of_noisy_and_missing_readings(late_s):
     rng = np.random.default_rng(1)
@@ -322,11 +318,6 @@ def test_a_joint_at_rest_has_no_lag():
     noise = np.random.default_rng(0).normal(0, 0.002, 300)
     assert np.isnan(lag_s(time_s, np.zeros(300), noise))
     assert np.isnan(lag_s(time_s[:3], np.zeros(3), noise[:3]))
-
-
-def test_dots_are_where_the_points_are():
-    cells = braille(np.array([0.0, 1.0, 2.0, np.nan]), np.array([0.0, 1.0, 0.5, 0.5]), 4, 2)
-    assert cells[1, 0] == 0x40 and cells[0, 3] == 0x08 and np.count_nonzero(cells) == 2
 
 
 def test_a_drawing_process_that_stands_still_delays_no_tick():

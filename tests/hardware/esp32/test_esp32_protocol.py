@@ -14,7 +14,6 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator, ProxySocket
-from pupper_sysid.sim.emulator.faults import BusFaults
 from support.servo_servers import ScriptedProxy, StillBench, bench_of, on_a_socket, wait_until
 
 IDS = [4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9]
@@ -257,47 +256,3 @@ def test_torque_byte_1_drives_0_lets_go_and_others_leave_a_servo_alone():
     assert sorted(bench.torques) == sorted(
         [(i, True) for i in (1, 5, 9)] + [(i, False) for i in (2, 6, 10)]
     )
-
-
-def test_a_count_beyond_the_encoder_is_clamped_by_the_firmware():
-    proxy = still_proxy()
-    proxy.answer(setpoint([1] * 12, [1024, 65_535] * 6), b"", 1.0)
-    assert {count for _, count in bench_of(proxy).goals} == {1023}
-
-
-def test_99_as_first_torque_byte_stores_a_calibration_and_makes_it_deaf_for_four_seconds():
-    proxy = still_proxy()
-    bench = bench_of(proxy)
-    # elsewhere than first it is just another byte that leaves a servo alone
-    proxy.answer(setpoint([2, *[99] * 11], [500] * 12), b"", 0.5)
-    assert bench.torques == [] and bench.goals == []
-    assert proxy.answer(setpoint([99] * 12, [500] * 12), b"", 1.0) == b"\x02\x01"
-    assert bench.torques == [(i, False) for i in range(1, 13)]
-    bench.torques.clear()
-    # it acknowledges all the same
-    assert proxy.answer(setpoint([1] * 12, [500] * 12), b"", 4.9) == b"\x02\x01"
-    assert bench.goals == [] and bench.torques == []
-    proxy.answer(setpoint([1] * 12, [500] * 12), b"", 5.1)
-    assert len(bench.goals) == 12
-
-
-def test_servos_come_limp_out_of_a_brown_out_and_then_get_the_last_order_as_the_proxy_resends_it():
-    proxy = still_proxy()
-    proxy.faults = BusFaults({"brown-out": 1.0}, np.random.default_rng(0))
-    bench = bench_of(proxy)
-    proxy.answer(setpoint([1] * 12, [500] * 12), b"", 0.5)
-    bench.goals.clear()
-    bench.torques.clear()
-    proxy.inject_fault(1.0)
-    assert sorted(bench.torques) == [(i, False) for i in range(1, 13)]
-    # let go, asked for once, while nobody could hear it
-    assert proxy.answer(setpoint([0] * 12, [500] * 12), b"", 1.05) == b"\x02\x01"
-    bench.torques.clear()
-    proxy.resend(1.1)
-    assert bench.torques == []
-    proxy.resend(1.0 + proxy.faults.lasts_s)
-    assert sorted(bench.torques) == [(i, False) for i in range(1, 13)]
-    assert bench.goals == []
-    bench.torques.clear()
-    proxy.resend(2.0)
-    assert bench.torques == []

@@ -262,13 +262,6 @@ def test_an_answer_comes_after_the_wire_time_and_the_return_delay():
     assert at == pytest.approx(1.0 + 80e-6 + 500e-6 + 80e-6, abs=1e-9)
 
 
-def test_the_factory_reset_is_not_obeyed():
-    servos = still_servos(STS3215)
-    before = bytes(servos.servos[1].memory)
-    assert servos.receive(Frame(1, 6, b"").encode(), 0.0) == []
-    assert bytes(servos.servos[1].memory) == before
-
-
 def test_a_goal_outside_the_servos_own_limits_clips_there():
     servos = still_servos(SCS0009)
     servos.receive(Frame(1, 3, bytes([42, 0, 5])).encode(), 0.0)

@@ -11,7 +11,7 @@ import pytest
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
-from pupper_sysid.servo_models.cards.compare import differences, implausible, motion_of, servo_of
+from pupper_sysid.servo_models.cards.compare import differences, implausible, servo_of
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.sim.export.export import exported_text
 from pupper_sysid.sim.export.foreign import foreign_servo
@@ -161,15 +161,6 @@ def test_a_difference_says_what_differs_in_lag_and_motion(tmp_path, capsys):
     assert found["differences"][0]["ratio"] == pytest.approx(20 / 8.4, rel=1e-3)
     moved = {d["quantity"]: d for d in found["differences"]}["armature and link"]
     assert moved["second"]["value"] == pytest.approx(0.015)
-
-
-def test_a_servo_lags_later_by_its_dead_time_and_moves_as_itself():
-    servo = servo_of(str(CALIBRATED), "LF_hip")
-    motion = motion_of(servo, servo)
-    assert motion.apart_rad == 0 and motion.first_lag_s == motion.second_lag_s
-    dead_time = servo.pd.dead_time_s
-    assert dead_time is not None and motion.first_lag_s is not None
-    assert motion.first_lag_s > dead_time.value
 
 
 def test_files_without_a_servo_are_refused_with_the_way_out(tmp_path, capsys):

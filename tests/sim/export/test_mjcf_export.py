@@ -13,7 +13,7 @@ from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import CONTROL_S
 from pupper_sysid.sim.export.check import compiled, held, moved_by
-from pupper_sysid.sim.export.mjcf import compiled_numbers, link_inertias, to_mjcf, to_model
+from pupper_sysid.sim.export.mjcf import compiled_numbers, link_inertias, to_model
 from pupper_sysid.sim.export.shared import ExportedServos
 from pupper_sysid.sim.robot.engine import mujoco
 from support.command_line import ran, refused
@@ -91,21 +91,6 @@ def test_a_models_default_class_changes_nothing_of_the_servos(defaults, servos, 
     there = moved_by(compiled(servos, defaults), names, STEP_RAD, TIME_STEP_S)
     wanted = rise_s(own_step(servos.calibration, names), TIME_STEP_S)
     np.testing.assert_allclose(rise_s(there, TIME_STEP_S), wanted, atol=1e-4)
-
-
-def test_all_of_them_together_before_and_after_the_include_change_nothing(servos):
-    defaults = "".join(f"<default>{d}</default>" for d in HOSTILE.values())
-    bodies = "".join(
-        f'<body><joint name="{n}" class="servo_{n}" range="-1 1"/><geom size="0.01"/></body>'
-        for n in servos.calibration.joint_names
-    )
-    text = (
-        f'<mujoco>{defaults}<include file="a.xml"/>{defaults}<worldbody>{bodies}</worldbody>'
-        "</mujoco>"
-    )
-    model = mujoco.MjModel.from_xml_string(text, {"a.xml": to_mjcf(servos).encode()})
-    for name, (found, wanted) in compiled_numbers(model, servos).items():
-        np.testing.assert_array_equal(found, wanted, err_msg=name)
 
 
 def robot(links: dict[str, float], settings: str = "", joint: str = "", actuators: str = "") -> str:

@@ -23,7 +23,7 @@ from pupper_sysid.sim.robot.mini_pupper import (
     robot_xml,
 )
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
-from support.robot_in_air import error_in_air, in_free_space, standing
+from support.robot_in_air import error_in_air, standing
 
 H = 0.002
 STIFF = DelayedPDParameters(
@@ -188,21 +188,6 @@ def test_a_positive_hip_angle_swings_the_left_foot_outward_and_the_right_one_inw
 
 
 # ----------------------------------------------------------------------------------------- knee
-
-
-def test_moving_the_thigh_alone_keeps_the_calfs_absolute_angle_only_behind_a_linkage():
-    for knee in KNEES:
-        model = model_of(knee)
-        data = standing(model)
-        in_free_space(model, data)
-        data.ctrl[model.actuator("LF_thigh").id] += 0.3
-        mujoco.mj_step(model, data, 400)
-        thigh, calf = data.joint("LF_thigh").qpos[0], data.joint("LF_calf").qpos[0]
-        assert thigh == pytest.approx(0.785 + 0.3, abs=1e-3)
-        if knee == "linkage":
-            assert thigh + calf == pytest.approx(0.785 - 1.57, abs=1e-3)
-        else:
-            assert calf == pytest.approx(-1.57, abs=1e-3)
 
 
 # ------------------------------------------------------------------------------------------ IMU

@@ -129,12 +129,6 @@ def test_an_even_swing_brings_a_foot_back_at_constant_speed():
     assert np.diff(half).max() > 1.4 * np.diff(half).mean()
 
 
-def test_feet_do_not_jump_at_touch_down_or_lift_off():
-    phase = np.linspace(0, 2 * np.pi, 2001)
-    path = feet(TROT.joints(phase, along((0.2, 0.1, 0.3), 2001)))
-    assert np.abs(np.diff(path, axis=0)).max() < 2e-4
-
-
 def test_a_duty_that_cannot_be_is_refused():
     refused = [(duty, "trot.duty") for duty in (0.0, 1.0, 1.2, -0.1)]
     assert_each_refused(refused, lambda duty: Trot(duty=duty))
@@ -151,14 +145,6 @@ def test_a_turn_gets_the_dead_band_on_top_unless_feet_step_sideways():
     assert stroke((0.0, 0.0, 0.4)) == pytest.approx(1 + 0.13 / 0.4, rel=1e-3)
     assert stroke((0.15, 0.0, -0.2)) == pytest.approx(1 + 0.13 / 0.2, rel=1e-2)
     assert stroke((0.0, 0.08, 0.4)) == pytest.approx(1.0)
-
-
-def test_gain_lengthens_the_stroke_in_proportion():
-    command, phase = along((0.1, 0.0, 0.0), 1), np.zeros(1)
-    one, more = (
-        feet(replace(TROT, gain=g).joints(phase, command))[0, 0] - NEUTRAL[0] for g in (1, 1.5)
-    )
-    assert more[0] == pytest.approx(1.5 * one[0], rel=1e-6)
 
 
 def test_a_command_of_zero_stands_in_the_default_pose_at_any_phase():

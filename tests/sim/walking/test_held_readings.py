@@ -83,34 +83,6 @@ def test_a_reading_is_the_position_at_the_instant_of_its_poll():
     np.testing.assert_allclose(bus.time * 3.0 - bus.readings.position, 3.0 * age, atol=1e-9)
 
 
-def test_between_polls_a_reading_stays_and_ages_with_the_clock():
-    bus = settled(MEASURED)
-    before, age = bus.readings.position.copy(), bus.readings.age_s.copy()
-    bus.step()
-    same = bus.readings.position == before
-    assert 0.3 < same.mean() < 0.8
-    np.testing.assert_allclose(bus.readings.age_s[same], age[same] + SPAN, atol=1e-12)
-    assert bus.readings.age_s[~same].max() <= SPAN
-
-
-def test_if_almost_every_poll_is_lost_the_old_reading_stays():
-    bus = Bus(HeldFeedback(poll_period_s=0.0268, loss=1 - 1e-12))
-    first = bus.readings.age_s.copy()
-    for _ in range(20):
-        bus.step()
-    assert not bus.readings.position.any()
-    np.testing.assert_allclose(bus.readings.age_s, first + 20 * SPAN)
-
-
-def test_a_direct_bus_reads_the_present():
-    bus = Bus(HeldFeedback(), environments=2)
-    for _ in range(3):
-        bus.step()
-        np.testing.assert_allclose(bus.readings.position, bus.time)
-        np.testing.assert_allclose(bus.readings.load, 10 * bus.time)
-        assert not bus.readings.age_s.any()
-
-
 def test_readings_are_whole_counts_of_the_offset_position():
     feedback = HeldFeedback(quantum_rad=0.01, offset_rad=0.003)
     readings = HeldReadings((feedback,), 1, H, np.random.default_rng(0))
@@ -122,30 +94,12 @@ def test_readings_are_whole_counts_of_the_offset_position():
     assert readings.position[0, 0] == pytest.approx(0.06)  # 0.055 rounds to the even count
 
 
-def test_each_servo_has_its_own_feedback():
-    direct, slow = HeldFeedback(offset_rad=0.5), HeldFeedback(poll_period_s=10.0)
-    readings = HeldReadings((direct, slow), 50, H, np.random.default_rng(0))
-    readings.reset(np.arange(50), np.zeros((50, 2)))
-    advance(readings, np.full((50, SUBSTEPS + 1, 2), 1.0), np.zeros((50, SUBSTEPS + 1, 2)))
-    np.testing.assert_allclose(readings.position[:, 0], 1.5)
-    # of 50 robots polled every 10 s, hardly any in 20 ms
-    assert (readings.position[:, 1] == 0.0).mean() > 0.9
-
-
 def test_servos_are_polled_in_turn_a_twelfth_of_a_round_apart():
     bus = settled(HeldFeedback(poll_period_s=0.0268), environments=300)
     at = bus.time - bus.readings.age_s
     round_ = np.angle(np.exp(2j * np.pi * np.diff(at, axis=1) / 0.0268)) / (2 * np.pi)
     assert round_.mean() == pytest.approx(1 / 12, abs=0.005)
     assert np.abs(round_ - 1 / 12).max() < (2 * JITTER_S + 12e-5) / 0.0268
-
-
-def test_robots_are_polled_at_their_own_times():
-    bus = settled(HeldFeedback(poll_period_s=0.0268), environments=500)
-    phase = bus.readings.age_s[:, 0] / 0.0268
-    # uniform over the round: mean 1/2, standard deviation 1/√12, five standard errors
-    assert phase.mean() == pytest.approx(0.5, abs=5 / np.sqrt(12 * 500))
-    assert phase.std() == pytest.approx(1 / np.sqrt(12), rel=0.1)
 
 
 def test_resetting_some_robots_leaves_the_others_alone():

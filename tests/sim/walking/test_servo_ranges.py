@@ -37,15 +37,6 @@ def test_an_interval_of_the_calibration_is_the_range_and_a_number_without_one_is
             np.testing.assert_array_equal(end[field], value)
 
 
-def test_the_measured_sample_gives_its_own_intervals():
-    ranges = servo_ranges("data/samples/calibrated.yaml")
-    for field in ("stiffness", "damping", "friction_loss", "dead_time_s"):
-        assert (ranges.low[field] < ranges.value[field]).all()
-        assert (ranges.value[field] < ranges.high[field]).all()
-    # the armature is the scale that torque_scale draws, not a range of its own
-    np.testing.assert_array_equal(ranges.low["armature"], ranges.high["armature"])
-
-
 def test_presets_delays_are_their_whole_physics_steps():
     # facts/paper.md 2: 76 ms as 33 to 43 steps of 2 ms; released: 26 to 31 steps
     for preset, steps, stiffness, effort in (
@@ -91,15 +82,6 @@ def test_feedback_comes_with_the_calibration_and_can_be_exchanged(tmp_path):
     np.testing.assert_array_equal(servo_ranges("paper", feedback=path).value["stiffness"], 70.0)
 
 
-def test_ideal_servos_are_immediate_and_free_of_friction_with_exact_feedback():
-    ranges = servo_ranges("ideal")
-    for end in (ranges.low, ranges.value, ranges.high):
-        assert not end["dead_time_s"].any()
-        assert not end["friction_loss"].any()
-    assert ranges.longest_dead_time_s == 0.0
-    assert set(ranges.feedback) == {HeldFeedback()}
-
-
 def test_later_moves_every_delay_and_nothing_else_and_none_becomes_negative():
     for actuator in ("paper", "ideal"):
         before = servo_ranges(actuator)
@@ -139,12 +121,3 @@ def test_the_torque_scale_is_one_factor_per_robot_on_all_torques_and_the_armatur
     # drawing leaves the ranges as they were
     np.testing.assert_array_equal(ranges.value["stiffness"], 70.0)
     np.testing.assert_array_equal(ranges.high["armature"], 0.005)
-
-
-def test_the_nominal_servo_of_a_joint_is_the_middle_of_its_intervals(tmp_path):
-    joints = {name: joint_calibration(5.0 + i) for i, name in enumerate(JOINT_NAMES)}
-    nominal = ranges_of(tmp_path, calibration(**joints)).nominal()
-    assert tuple(nominal) == JOINT_NAMES
-    for i, name in enumerate(JOINT_NAMES):
-        assert nominal[name].stiffness == 5.0 + i
-        assert nominal[name].dead_time_s == 0.025

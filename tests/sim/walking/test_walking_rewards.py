@@ -438,12 +438,6 @@ def test_feet_of_other_rates_are_not_in_time():
     assert (in_time.mean(axis=0) < 0.45).all()
 
 
-def test_a_mirrored_trot_keeps_the_mirrored_clock():
-    plain, _ = steps_of(np.array([3.6]), 8.0)
-    image, _ = steps_of(np.array([3.6]), 8.0, 0.5)
-    np.testing.assert_allclose(plain.clock(WHOLE) * [-1, -1, 1], image.clock(WHOLE), atol=0.05)
-
-
 def test_swings_and_stances_are_counted_and_begin_anew_with_an_episode():
     strides, _ = steps_of(np.array([2.5, 2.5]), 1.0)
     assert strides.air_s.max() <= 0.2 and strides.stance_s.max() <= 0.22

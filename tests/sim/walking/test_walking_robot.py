@@ -100,14 +100,6 @@ def test_a_robot_left_alone_for_a_day_is_not_stepped_and_answers_on_time():
 # ---- commands ----
 
 
-def test_a_servo_begins_to_move_one_dead_time_after_its_command():
-    robot = make_robot(spec=RobotSpec(dead_time_s=0.025, dead_time_sd_s=0.0))
-    start = robot.angle(HIP, 0.1)
-    robot.command(HIP, 0.1, 0.3)
-    assert robot.angle(HIP, 0.1245) == pytest.approx(start, abs=1e-6)
-    assert robot.angle(HIP, 0.131) > start + 2e-4
-
-
 def test_a_command_between_physics_steps_keeps_its_timing():
     # a step that neither the speed nor the torque limit swallows
     linear = RobotSpec(velocity_limit_rad_s=1e3, friction_per_inertia=0.0)
@@ -177,13 +169,6 @@ def test_standing_the_imu_reads_one_g_up_with_the_noise_it_says_in_whole_counts(
     np.testing.assert_allclose(rate.std(axis=0), np.radians(0.15), rtol=0.08)
     counts = np.degrees(rate) * 16
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
-
-
-def test_between_two_conversions_the_imu_says_the_same():
-    robot = make_robot()
-    times = np.arange(0.0, 1.0, 0.0005)
-    seen = {tuple(s.rate_rad_s) + tuple(s.acceleration_m_s2) for s in map(robot.imu, times) if s}
-    assert len(seen) == 235
 
 
 def test_a_robot_pushed_onto_its_back_says_so():
@@ -308,18 +293,6 @@ def walks_behind_the_proxy(path: Path) -> None:
     assert max(abs(s.rate_rad_s).max() for s in read) > 0.3
 
 
-def test_the_proxy_without_a_host_tells_of_a_standing_robot():
-    rng = np.random.default_rng(0)
-    truth = draw_robot(rng)
-    bench = ServoBench(truth, load_joint_map("mini_pupper_2"), rng, plant=WalkingRobot(truth, rng))
-    proxy = ProxyEmulator(bench, rng)
-    counts = esp32.parse_counts(proxy.answer(b"\x02\x02", b"", 1000.0))
-    assert counts is not None and np.abs(counts - 512).max() <= 4
-    raw = esp32.parse_imu(proxy.answer(b"\x02\x04", b"", 1000.0))
-    assert raw is not None
-    np.testing.assert_allclose(raw[:3], [0.0, 0.0, -1.0], atol=0.012)
-
-
 def test_an_emulated_robot_has_the_servos_and_the_polls_of_a_calibration():
     servos = servo_ranges(CALIBRATION)
     robot = calibrated_robot(servos, np.random.default_rng(0))
@@ -331,14 +304,6 @@ def test_an_emulated_robot_has_the_servos_and_the_polls_of_a_calibration():
             assert getattr(servo.actuator, name) == pytest.approx(expected), name
     assert robot.spec.poll_period_s == pytest.approx(0.0268, abs=1e-4)
     assert robot.spec.loss == pytest.approx(np.median([f.loss for f in servos.feedback]))
-
-
-def test_servos_without_a_delay_get_the_shortest_that_can_be_emulated_and_readings_are_live():
-    robot = calibrated_robot(servo_ranges("ideal", "ideal"), np.random.default_rng(0))
-    assert {s.actuator.dead_time_s for s in robot.servos} == {0.002}
-    assert robot.spec.poll_period_s == 0.0 and robot.spec.loss == 0.0
-    bus = WalkingBus(robot, np.random.default_rng(0))
-    bus.close()
 
 
 def test_the_jitter_of_commands_is_a_part_of_the_dead_time():
