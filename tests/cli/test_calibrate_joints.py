@@ -141,7 +141,7 @@ def by(bus, counts):
 def test_a_scale_within_three_percent_keeps_the_maps_number(capsys):
     person = ScriptedPerson()
     steps, bus = guide(person)
-    person.script = [("first position", ""), ("by 90 degrees", "", by(bus, 270))]
+    person.script = [("first position", ""), ("by 90 degrees", "", by(bus, -270))]
     measured, use = steps.scale("LF_hip", 90.0)
     assert measured == pytest.approx(270 / (np.pi / 2)) and not use
     assert "within 3 % of the map's 175.1, which is kept" in _flat(capsys.readouterr().err)

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -280,72 +279,62 @@ def test_where_nothing_can_be_drawn_the_walk_goes_on_without_a_video(
     assert not (here / "walk.mp4").exists()
 
 
-def test_a_video_runs_as_fast_as_the_robot_at_any_control_rate(capsys, trained, here, monkeypatch):
-    import mujoco
-
-    imageio = pytest.importorskip("imageio.v2")
-
-    class Screen:
-        def __init__(self, *_): ...
-        def update_scene(self, *_, **__): ...
-        def render(self):
-            return np.zeros((*SIZE, 3), np.uint8)
-
-    told = {}
-
-    class Film:
-        def __init__(self, path, **how):
-            told.update(how)
-
-        def append_data(self, picture):
-            told["pictures"] = told.get("pictures", 0) + 1
-            told["written"] = picture.any(axis=2).sum(axis=1)
-
-        def close(self): ...
-
-    settings = trained / "run.yaml"
-    slow = settings.read_text().replace("control_step_s: 0.02", "control_step_s: 0.04")
-    shutil.copytree(trained, here / "slow")
-    (here / "slow/run.yaml").write_text(slow)
-    monkeypatch.setattr(mujoco, "Renderer", Screen)
-    monkeypatch.setattr(imageio, "get_writer", Film)
-    arguments = ("--seconds", "0.4", "--video", here / "walk.mp4")
-    ran(capsys, here / "slow", *arguments, program=pupper_play)
-    assert told["fps"] == pytest.approx(25) and told["pictures"] == 10
-    # policy, speeds and time stand at the top of each picture
-    assert told["written"][:160].sum() > 500 and not told["written"][200:].any()
-
-
-def test_a_robot_of_another_size_whose_shapes_are_hidden_is_drawn(tmp_path, monkeypatch):
-    import mujoco
-
-    imageio = pytest.importorskip("imageio.v2")
-    shown = {}
+@pytest.fixture
+def film(monkeypatch) -> dict:
+    """What is drawn and written, by a renderer and a writer that stand in for the real ones."""
+    mujoco, imageio = pytest.importorskip("mujoco"), pytest.importorskip("imageio.v2")
+    seen: dict = {"pictures": 0}
 
     class Screen:
         def __init__(self, model, height, width):
             assert model.vis.global_.offheight >= height and model.vis.global_.offwidth >= width
 
         def update_scene(self, data, camera, scene_option):
-            shown.update(groups=scene_option.geomgroup.tolist(), distance_m=camera.distance)
+            seen.update(groups=scene_option.geomgroup.tolist(), distance_m=camera.distance)
 
         def render(self):
             return np.zeros((*SIZE, 3), np.uint8)
 
+    class Writer:
+        def __init__(self, path, fps, **how):
+            seen["fps"] = fps
+
+        def append_data(self, picture):
+            seen["pictures"] += 1
+            seen["written"] = picture.any(axis=2).sum(axis=1)
+
+        def close(self): ...
+
     monkeypatch.setattr(mujoco, "Renderer", Screen)
-    monkeypatch.setattr(imageio, "get_writer", lambda *_, **__: SimpleNamespace(
-        append_data=lambda picture: None
-    ))  # fmt: skip
+    monkeypatch.setattr(imageio, "get_writer", Writer)
+    return seen
+
+
+def test_a_video_runs_as_fast_as_the_robot_at_any_control_rate(capsys, trained, here, film):
+    settings = (trained / "run.yaml").read_text()
+    shutil.copytree(trained, here / "slow")
+    slow = settings.replace("control_step_s: 0.02", "control_step_s: 0.04")
+    (here / "slow/run.yaml").write_text(slow)
+    arguments = ("--seconds", "0.4", "--video", here / "walk.mp4")
+    ran(capsys, here / "slow", *arguments, program=pupper_play)
+    assert film["fps"] == pytest.approx(25) and film["pictures"] == 10
+    # policy, speeds and time stand at the top of each picture
+    assert film["written"][:160].sum() > 500 and not film["written"][200:].any()
+
+
+def test_a_robot_of_another_size_whose_shapes_are_hidden_is_drawn(tmp_path, film):
+    import mujoco
+
     distances = []
     for group, scale in ((3, 4.0), (0, 1.0)):
         model = mujoco.MjModel.from_xml_string(
             '<mujoco><worldbody><geom type="plane" size="1 1 1"/><body><freejoint/>'
             f'<geom size="0.1" group="{group}"/></body></worldbody></mujoco>'
         )
-        film = Film(tmp_path / "walk.mp4", model, 0.02, ("a",), (0.1, 0.0, 0.0), scale)
-        film.add(mujoco.MjData(model), np.zeros(3))
-        assert shown["groups"][3] == (group == 3) and shown["groups"][0] == 1
-        distances.append(shown["distance_m"])
+        made = Film(tmp_path / "walk.mp4", model, 0.02, ("a",), (0.1, 0.0, 0.0), scale)
+        made.add(mujoco.MjData(model), np.zeros(3))
+        assert film["groups"][3] == (group == 3) and film["groups"][0] == 1
+        distances.append(film["distance_m"])
     assert distances[0] == pytest.approx(4 * distances[1])
 
 

@@ -20,13 +20,12 @@ from pupper_sysid.cli.programs.pupper_sysid import COMMANDS
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.hardware import loop as clock
 from pupper_sysid.hardware.address import parse_address
-from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lock import runtime_folder
 from pupper_sysid.hardware.safety import watchdog
 from pupper_sysid.hardware.safety.guard import open_guarded
 from pupper_sysid.hardware.safety.notes import notes, remove_note, write_note
 from pupper_sysid.hardware.serial_servos import line as serial_line
-from support.servo_servers import limp, robot_behind, wait_until
+from support.servo_servers import driver_orders, limp, robot_behind, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENT = """
@@ -194,14 +193,14 @@ def test_the_clock_of_the_watchdog_counts_while_the_machine_is_suspended(monkeyp
 
 def test_a_robot_that_is_gone_for_good_is_settled(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    write_note(orders("/dev/pts/99999", 0), ["LF_hip"], 0)
+    write_note(driver_orders("feetech", "/dev/pts/99999", "sts3215", 0), ["LF_hip"], 0)
     Park(seconds=0.1).run()
     assert notes() == [] and "gone for good; the torque of LF_hip" in capsys.readouterr().err
 
 
 def test_a_supervisor_that_is_ended_has_said_what_it_switched_off(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    write_note(orders("/dev/pts/99999", 0), ["LF_hip"], 0)
+    write_note(driver_orders("feetech", "/dev/pts/99999", "sts3215", 0), ["LF_hip"], 0)
 
     def ended(text, **_):
         assert "the torque of LF_hip" in text
@@ -217,21 +216,12 @@ def test_a_note_is_removed_after_its_device_was_unplugged(tmp_path, monkeypatch)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     link, device = tmp_path / "by-id", tmp_path / "ttyUSB0"
     link.symlink_to(device)
-    write_note(orders(str(link), os.getpid()), ["LF_hip"], os.getpid())
+    write_note(driver_orders("feetech", str(link), "sts3215", os.getpid()), ["LF_hip"], os.getpid())
     (note,) = notes()
     assert note.in_control() and note.robot == str(device)
     link.unlink()
     remove_note(str(link))
     assert notes() == []
-
-
-def orders(where: str, driver: int) -> dict:
-    """First message of a driver to its watchdog."""
-    return {
-        "kind": "feetech", "where": where, "baud": 1_000_000, "coordinates": "joint",
-        "map": load_joint_map("sts3215").file.model_dump(mode="json", by_alias=True),
-        "driver": driver,
-    }  # fmt: skip
 
 
 def test_a_note_that_cannot_be_read_is_left_out(tmp_path, monkeypatch):

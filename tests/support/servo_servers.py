@@ -236,6 +236,14 @@ def robot_behind(kind: str, folder: Path) -> Iterator[tuple[SerialPty | ProxySoc
         yield server, f"esp32:{folder / 's'}"
 
 
+def driver_orders(kind: str, where: str, preset: str, driver: int = 0) -> dict:
+    """First message of a driver to its watchdog."""
+    return {
+        "kind": kind, "where": where, "baud": 1_000_000, "driver": driver, "coordinates": "joint",
+        "map": load_joint_map(preset).file.model_dump(mode="json", by_alias=True),
+    }  # fmt: skip
+
+
 def spare_this_process(patch: pytest.MonkeyPatch) -> None:
     """Have watchdogs kill no driver: where a test is the driver, a busy machine can hold it up."""
     unused_id = 2**22 + 1  # above the largest process id of Linux

@@ -32,6 +32,7 @@ from pupper_sysid.sysid.recordings.files import load
 from support.command_line import ran
 from support.servo_servers import (
     bench_of,
+    driver_orders,
     limp,
     moving_servos,
     on_a_port,
@@ -96,12 +97,7 @@ def on_bus(*kinds: str):
 
 def orders_for(kind: str = "esp32", where: str = "", preset: str = "mini_pupper_2"):
     """Orders of a driver that has switched all servos on."""
-    layout = load_joint_map(preset)
-    message = {
-        "kind": kind, "where": where, "baud": 1_000_000, "driver": 0, "coordinates": "joint",
-        "map": layout.file.model_dump(mode="json", by_alias=True),
-    }  # fmt: skip
-    orders = watchdog_process.first_orders(message)
+    orders = watchdog_process.first_orders(driver_orders(kind, where, preset))
     orders.pose_rad = dict(DEFAULT_POSE)
     return orders
 

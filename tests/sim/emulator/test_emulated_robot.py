@@ -77,6 +77,13 @@ def test_a_command_between_physics_steps_keeps_its_timing():
     np.testing.assert_allclose(got, expected, atol=1e-5)
 
 
+def test_position_inside_a_physics_step_lies_on_the_line_between_its_ends():
+    servo = FreeAirServo(MEASURED, 0.0, 0.001)
+    servo.command(0.0, 0.3)
+    left, inside, right = (servo.position_at(t) for t in (0.05, 0.05025, 0.051))
+    assert left < inside == pytest.approx(0.75 * left + 0.25 * right, abs=1e-12)
+
+
 def test_a_servo_that_was_left_alone_for_long_still_answers_on_time():
     rested, fresh = FreeAirServo(MEASURED, 0.1), FreeAirServo(MEASURED, 0.1)
     for k in range(40):
