@@ -28,7 +28,6 @@ _OPTIONAL_NUMBER = re.compile(r"(float|int) \| None")
 def test_a_smaller_amplitude_makes_a_smaller_motion_on_a_bench():
     def largest(amplitude: float, kind: str) -> float:
         load = None if kind == "sine" else parse_load("pendulum:0.1kg@0.10m")
-        load = None if kind == "sine" else parse_load("pendulum:0.1kg@0.10m")
         made = bench_plan("knee", load, kind=kind, amplitude_rad=amplitude, loop_period_s=0.01,
                           start_rad=0.0, margin_rad=2.0)  # fmt: skip
         times = np.linspace(0, made.trials[0].duration_s, 2000)

@@ -14,7 +14,7 @@ from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.imu import ImuSample, as_words, from_chip, to_chip
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator
+from pupper_sysid.sim.emulator.esp32 import ImuProxy
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import default_pose, robot_xml
 from support.servo_servers import ScriptedProxy, StillBench, on_a_socket
@@ -118,14 +118,6 @@ def test_a_reading_counts_exactly_when_two_answers_agree(path):
     none, failed = (None,), (imu_reply(*[0.0] * 6),) * 2
     for replies in ((GOOD, OTHER, THIRD), failed, none, (GOOD, b"\x1a\x04\x00")):
         assert read_imu(path, *replies) is None, replies
-
-
-def test_a_robot_on_a_stand_reports_gravity_and_nothing_else():
-    still = StillBench("mini_pupper_2")
-    for proxy in (ProxyEmulator, ImuProxy):
-        emulator = proxy(still, np.random.default_rng(0))
-        reply = emulator.answer(esp32.request(esp32.GET_IMU), b"", 1.0)
-        assert struct.unpack("<BB6f", reply) == (26, 4, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0)
 
 
 def test_a_proxy_for_the_imu_alone_does_not_move_the_servos_or_tell_of_them():

@@ -90,21 +90,6 @@ def test_a_servo_whose_watchdog_acted_is_cleared_before_it_is_driven(line):
     assert servos._get(4, "bus_watchdog") == 0
 
 
-def test_a_servo_stops_by_itself_if_no_program_talks_to_it():
-    servos = moving_dynamixel()
-    servos._set(1, "bus_watchdog", 10)  # 0.2 s
-    goal = servos.series.register("goal_position").address
-    servos.servos[1].heard_s = 0.0
-    servos._try_store(1, goal, servos.series.encode("goal_position", 2400), 0.01)
-    servos.receive(b"\x00", 1.0)
-    assert servos.servos[1].stopped and servos._get(1, "bus_watchdog") == TRIGGERED
-    refused = servos._try_store(1, goal, servos.series.encode("goal_position", 2100), 1.1)
-    assert refused == 4, "a data range error until the watchdog is cleared"
-    where = servos.series.register("bus_watchdog").address
-    assert servos._try_store(1, where, b"\0", 1.2) == 0
-    assert servos._try_store(1, goal, servos.series.encode("goal_position", 2100), 1.3) == 0
-
-
 def test_a_servo_that_has_shut_down_is_refused_and_an_alert_is_named(line):
     servos, device = line
     servos._set(4, "hardware_error_status", 33)
@@ -117,24 +102,6 @@ def test_a_servo_that_has_shut_down_is_refused_and_an_alert_is_named(line):
         guard.close()
         servos._set(4, "hardware_error_status", 0)
     assert sample.status is not None and sample.status.tolist() == [33, 0]
-
-
-def test_an_error_that_its_shutdown_register_names_switches_a_servo_off(line):
-    servos, device = line
-    bus = opened(device)
-    try:
-        for bits, shutdown, on in ((4, 52, 0), (8, 52, 1)):
-            servos._set(4, "shutdown", shutdown)
-            servos._set(4, "torque_enable", 1)
-            servos.fail(4, servos._free_at, bits, 0.3)
-            sample = bus.read()
-            assert sample.status is not None and sample.status[0] == bits
-            assert servos._get(4, "torque_enable") == on
-            servos.fail(4, servos._free_at, 0, 0.0)
-            servos._set(4, "hardware_error_status", 0)
-    finally:
-        servos._set(4, "torque_enable", 0)
-        bus.close()
 
 
 def test_park_sets_registers_back_of_a_robot_whose_driver_and_watchdog_are_gone(

@@ -10,10 +10,7 @@ import pytest
 
 from pupper_sysid.hardware.dynamixel import (
     ACCESS,
-    ALERT,
-    CRC,
     DATA_LIMIT,
-    INSTRUCTION,
     Frame,
     FrameReader,
     crc16,
@@ -229,19 +226,3 @@ def test_the_vendors_sdk_reads_writes_and_groups(served, monkeypatch):
     finally:
         port.closePort()
     assert bench_of(servos).goals[-2:] == [(1, 2000), (2, 2200)]
-
-
-def test_wrong_frames_are_answered_by_their_error_number():
-    servos = still_dynamixels([1])
-
-    def errors(data: bytes) -> list[int]:
-        pieces = servos.receive(data, servos._free_at)
-        frames = FrameReader(status=True).feed(b"".join(piece for _, piece in pieces))
-        return [frame.code for frame in frames]
-
-    spoiled = bytearray(wire("read"))
-    spoiled[-1] ^= 1
-    assert errors(bytes(spoiled)) == [CRC]
-    assert errors(Frame(1, 0x42, b"").encode()) == [INSTRUCTION]
-    servos._set(1, "hardware_error_status", 32)
-    assert errors(wire("ping")) == [ALERT]

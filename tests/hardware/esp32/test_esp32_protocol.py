@@ -14,7 +14,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator, ProxySocket
-from support.servo_servers import ScriptedProxy, StillBench, bench_of, on_a_socket, wait_until
+from support.servo_servers import ScriptedProxy, StillBench, on_a_socket, wait_until
 
 IDS = [4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9]
 """Servo ids in the order of the joints (facts/hardware.md D1)."""
@@ -47,10 +47,6 @@ def bus_of(proxy: ProxyEmulator, path: Path) -> Iterator[Esp32Bus]:
 
 def counts_reply(counts) -> bytes:
     return bytes([26, 2]) + b"".join(int(c).to_bytes(2, "little") for c in counts)
-
-
-def setpoint(torque: list[int], counts: list[int]) -> bytes:
-    return bytes([38, 1, *torque]) + b"".join(c.to_bytes(2, "little") for c in counts)
 
 
 def answers(request: bytes) -> bytes:
@@ -233,26 +229,3 @@ def test_an_unknown_request_is_answered_with_the_previous_reply(path):
         for unknown in ("0209", "0303", "02", "26010101", "0b02" + "00" * 9):
             client.send(bytes.fromhex(unknown))
             assert client.recv(64) == power and len(power) == 10
-
-
-def test_the_last_request_is_carried_out_once_more_when_a_client_leaves(path):
-    proxy = still_proxy()
-    goals = bench_of(proxy).goals
-    with on_a_socket(proxy, path):
-        with connect(path) as client:
-            client.send(setpoint([1] * 12, [500] * 12))
-            assert client.recv(64) == b"\x02\x01"
-            assert len(goals) == 12
-        assert wait_until(lambda: len(goals) == 24)
-    assert set(goals) == {(i, 500) for i in range(1, 13)}
-
-
-def test_torque_byte_1_drives_0_lets_go_and_others_leave_a_servo_alone():
-    proxy = still_proxy()
-    bench = bench_of(proxy)
-    reply = proxy.answer(setpoint([1, 0, 2, 255] * 3, [500] * 12), b"", 1.0)
-    assert reply == b"\x02\x01"
-    assert bench.goals == [(i, 500) for i in (1, 5, 9)]
-    assert sorted(bench.torques) == sorted(
-        [(i, True) for i in (1, 5, 9)] + [(i, False) for i in (2, 6, 10)]
-    )

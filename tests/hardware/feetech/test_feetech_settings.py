@@ -14,7 +14,7 @@ import pytest
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.bus import header_entries
-from pupper_sysid.hardware.feetech import SCS0009, STS3215, FeetechBus, FeetechLine
+from pupper_sysid.hardware.feetech import SCS0009, STS3215, FeetechBus
 from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
@@ -177,14 +177,3 @@ def test_the_watchdog_sets_registers_and_protections_back_if_the_driver_is_kille
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     assert wait_until(lambda: protection(sts) == OFF and p_of(sts) == 32)
-
-
-def test_an_emulated_servo_that_is_blocked_reports_overload_after_its_protection_time(sts):
-    line = FeetechLine(sts.device, 1_000_000)
-    bench_of(sts.emulator).loads[1] = 900
-    set_protection(sts, protection_time=20)
-    began = time.monotonic()
-    while not (reply := line.read(1, 56, 6)) or not reply.frame.code & 32:
-        assert time.monotonic() - began < 30.0
-    assert time.monotonic() - began > 0.19
-    line.close()

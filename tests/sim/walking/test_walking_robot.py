@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pupper_sysid.common.errors import BusError, InputError, SafetyStop
+from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.bus import ServoBus
@@ -124,16 +124,6 @@ def test_each_servo_executes_its_own_command():
     np.testing.assert_allclose(np.delete(moved, [THIGH, 3]), 0.0, atol=0.03)
 
 
-def test_a_position_asked_for_late_is_the_one_asked_for_in_time():
-    prompt, late = make_robot(), make_robot()
-    for robot in (prompt, late):
-        robot.command(HIP, 0.0, 0.3)
-    times = np.arange(0.03, 0.1, 0.00315)
-    expected = [prompt.angle(HIP, t) for t in times]
-    late.angle(THIGH, 0.5)
-    assert [late.angle(HIP, t) for t in times] == pytest.approx(expected, abs=1e-12)
-
-
 def test_a_limp_servo_ignores_goals_and_holds_where_it_is_when_switched_on_again():
     robot = make_robot()
     robot.torque(HIP, 0.1, False)
@@ -145,14 +135,6 @@ def test_a_limp_servo_ignores_goals_and_holds_where_it_is_when_switched_on_again
     assert robot.angle(HIP, 2.0) == pytest.approx(held, abs=0.02)
     robot.command(HIP, 2.0, 0.3)
     assert robot.angle(HIP, 3.0) > 0.25
-
-
-def test_a_delay_too_short_for_the_emulator_is_refused_with_the_joint():
-    drawn = draw_robot(np.random.default_rng(0))
-    servos = list(drawn.servos)
-    servos[4] = replace(servos[4], actuator=replace(servos[4].actuator, dead_time_s=0.0015))
-    with pytest.raises(InputError, match="RF_thigh: dead_time_s"):
-        WalkingRobot(replace(drawn, servos=tuple(servos)), np.random.default_rng(0))
 
 
 # ---- the IMU ----
