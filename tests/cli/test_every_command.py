@@ -71,13 +71,6 @@ def test_the_overview_fits_a_screen_of_24_times_80(program):
     assert all(any(f" {word} " in line for line in lines) for word in program.COMMANDS)
 
 
-def test_commands_are_grouped_as_their_folders():
-    for command in pupper_sysid.COMMANDS.values():
-        assert command.where.startswith(f"{command.group}.")
-    groups = dict.fromkeys(c.group for c in pupper_sysid.COMMANDS.values())
-    assert list(groups) == ["robot", "recording", "model", "use"]
-
-
 # ----- help of every command: one screen, options by their types, everything behind `--help-all`
 
 COMMANDS = [

@@ -225,14 +225,3 @@ def test_the_header_of_a_recording_names_the_bus_its_map_and_how_it_reads(line):
     assert about["name"] == bus.name and about["joint_map"] == line.layout.file.name
     assert about["speed_limit_rad_s"] > 0 and about["real_time"] is True
     assert not about.get("echo"), "no adapter here echoes"
-
-
-def test_a_line_that_is_not_there_is_refused_with_what_to_check_and_keeps_no_lock(tmp_path):
-    for opened, words in (
-        (lambda: FeetechBus(str(tmp_path / "nothing"), 1_000_000), "no such device: check"),
-        (lambda: Esp32Bus(tmp_path / "nothing"), "no answer. On the robot, check"),
-    ):
-        for _ in range(2):
-            with pytest.raises(BusError) as refused:
-                opened()
-            assert "nothing" in str(refused.value) and words in str(refused.value)

@@ -10,10 +10,7 @@ import pytest
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
-from pupper_sysid.sim.walking.servo_ranges import (
-    ServoRanges,
-    servo_ranges,
-)
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_ranges
 from support.calibration_examples import calibration, joint_calibration
 
 TORQUES = ("stiffness", "damping", "friction_loss", "armature", "effort_limit")
