@@ -147,6 +147,14 @@ def test_a_turn_gets_the_dead_band_on_top_unless_feet_step_sideways():
     assert stroke((0.0, 0.08, 0.4)) == pytest.approx(1.0)
 
 
+def test_gain_lengthens_the_strokes_in_proportion():
+    command, phase = along((0.1, 0.05, 0.0), 1), np.zeros(1)
+    one, more = (
+        feet(replace(TROT, gain=g).joints(phase, command))[0, 0] - NEUTRAL[0] for g in (1, 1.5)
+    )
+    np.testing.assert_allclose(more[:2], 1.5 * one[:2], rtol=1e-6)
+
+
 def test_a_command_of_zero_stands_in_the_default_pose_at_any_phase():
     phase = np.linspace(0, 2 * np.pi, 9)
     joints = TROT.joints(phase, along((0.0, 0.0, 0.0), 9))
