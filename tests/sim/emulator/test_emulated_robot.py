@@ -141,6 +141,15 @@ def test_age_and_loss_of_the_readings_are_those_of_held_feedback():
     assert abs(seen.sum() - 12 * polls * (1 - loss)) < 4 * sd + drift + 12
 
 
+def test_servos_are_polled_in_turn_by_their_id():
+    spec = RobotSpec(loss=0.0, poll_jitter_s=0.0, poll_drift=0.0)
+    servos = draw_robot(np.random.default_rng(3), spec).servos
+    by_id = sorted(servos, key=lambda s: s.poll_phase_s)
+    assert [s.joint for s in by_id[:4]] == ["RF_hip", "RF_thigh", "RF_calf", "LF_hip"]
+    gaps = np.diff([s.poll_phase_s for s in by_id])
+    np.testing.assert_allclose(gaps, spec.poll_period_s / 12)
+
+
 def test_polls_lie_on_their_lattice_within_jitter_and_drift():
     rng = np.random.default_rng(5)
     still = PollSchedule(0.02685, np.array([0.004]), 0.0, 0.0, 0.0, rng)

@@ -53,6 +53,15 @@ def test_heights_are_where_rays_hit_mujocos_ground():
         np.testing.assert_allclose(ground.height(points[:, 0], points[:, 1]), below, atol=1e-6)
 
 
+def test_slopes_are_at_most_eight_and_a_half_degrees():
+    for kind in ("slopes", "troughs"):
+        heights = heights_of(ground_of(kind))
+        # the last row and column repeat their neighbours; between tiles there is a step of one edge
+        inside = heights[: len(heights) // 2, : len(heights) // 2]
+        steepest = max(np.abs(np.diff(inside, axis=axis)).max() for axis in (0, 1)) / SPACING_M
+        assert 2.0 < np.degrees(np.arctan(steepest)) <= 8.531
+
+
 def test_hills_rise_and_troughs_fall_to_a_flat_platform_of_60_centimetres():
     for kind, sign in (("slopes", 1), ("troughs", -1)):
         heights = heights_of(ground_of(kind))

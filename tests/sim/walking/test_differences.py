@@ -77,6 +77,33 @@ def test_a_late_imu_reports_what_was_so_much_earlier():
             np.testing.assert_allclose(gravity, ramp(0.0)[1])
 
 
+def test_samples_of_a_slow_imu_are_a_period_apart():
+    own, rng = imu(imu_period_s=(0.03, 0.03)), np.random.default_rng(1)
+    own.reset(np.arange(3), *ramp(0.0), rng)
+    sampled = []
+    for k in range(1, 40):
+        own.advance(slice(0, 3), *ramp(k * SPAN))
+        rate = own.read(slice(None), *ramp(k * SPAN))[0][:, 0]
+        sampled.append(rate.copy())
+        assert ((rate > k * SPAN - 0.03 - 1e-9) & (rate <= k * SPAN + 1e-9)).all()
+    steps = np.diff(np.array(sampled[3:]), axis=0)
+    whole = np.round(steps / 0.03)
+    np.testing.assert_allclose(steps, 0.03 * whole, atol=1e-9)
+    assert set(whole.ravel()) == {0.0, 1.0}  # 20 ms per step: every third step has no new sample
+
+
+def test_an_imu_mounted_askew_sees_tilted_gravity_and_biased_rates():
+    own = imu(imu_mounting_rad=0.05, gyro_bias_rad_s=0.03)
+    own.reset(np.arange(3), *ramp(0.0), np.random.default_rng(2))
+    rate, gravity = own.read(slice(None), *ramp(0.0))
+    np.testing.assert_array_equal(rate, own.bias_rad_s)
+    assert (own.bias_rad_s != 0).all() and np.abs(own.bias_rad_s).max() <= 0.03
+    # a pitch of +θ of the IMU brings its x axis down: gravity has a part along it
+    expected = np.stack([-own.mounting_rad[:, 1] * -1.0, own.mounting_rad[:, 0] * -1.0], axis=1)
+    np.testing.assert_allclose(gravity[:, :2], expected, atol=2e-4)  # θ³/6 and cos θ
+    np.testing.assert_allclose(np.linalg.norm(gravity, axis=1), 1.0)
+
+
 def test_the_observation_has_the_imu_s_readings():
     env = make(imu_mounting_rad=0.1)
     seen = stand(env, 30)

@@ -231,6 +231,12 @@ def test_speed_and_gravity_are_seen_in_the_trunks_frame():
         np.testing.assert_allclose(observation[i, PARTS["base_angular_velocity"]], rate[i], 1e-5)
 
 
+def test_a_robot_that_cannot_measure_its_speed_sees_zeros_without_noise():
+    env = make(config=replace(QUIET, observation=Observation(noise=True, base_velocity="zero")))
+    env.robots.qvel[:, :3] = 1.0
+    assert not env.observe()[0][:, PARTS["base_linear_velocity"]].any()
+
+
 def test_noise_stays_within_the_published_bounds_and_fills_them():
     env = make(config=replace(QUIET, observation=replace(SEEN, noise=True)), count=16)
     noisy = np.stack([env.observe()[0] for _ in range(40)])
