@@ -27,12 +27,6 @@ SWEEP = ROOT / "data" / "samples" / "sweep.csv"
 pytestmark = pytest.mark.usefixtures("here")
 
 
-def asked(capsys, *arguments) -> dict:
-    """JSON object of a command."""
-    found = json_of(capsys, *arguments)
-    return found
-
-
 def test_calibrate_writes_what_it_prints_and_never_over_something_else(capsys, hip):
     arguments = ("calibrate", hip, "--out", "c.yaml", "--json")
     code, out, _ = run(capsys, *arguments)
@@ -87,21 +81,6 @@ def table_with(tmp_path, change):
     path.write_text('# pupper-sysid recording\n# completed: {"rows": 1}\n')
     table.to_csv(path, mode="a", index=False)
     return path
-
-
-def swap(table):
-    return table.assign(command_rad=table.position_rad, position_rad=table.command_rad)
-
-
-def test_doctor_refuses_logs_that_cannot_be_used_and_says_why(capsys, tmp_path):
-    for change, expected in (
-        (lambda t: t.assign(position_rad=0.1), "reading does not"),
-        (lambda t: t.assign(command_rad=0.1), "command never changes"),
-        (swap, "swapped"),
-    ):
-        joint = asked(capsys, "doctor", table_with(tmp_path, change))["joints"]["LF_hip"]
-        assert joint["verdict"] == "do not use"
-        assert any(expected in reason for reason in joint["reasons"]), expected
 
 
 def test_constant_feedback_is_answered_in_a_sentence_by_every_command(capsys, tmp_path):
