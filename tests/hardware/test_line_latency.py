@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,12 +15,14 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.dynamixel import FAMILY as DYNAMIXEL_FAMILY
 from pupper_sysid.hardware.feetech import FAMILY, FeetechBus
+from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.hardware.serial_servos.line import slow_adapter
 from pupper_sysid.hardware.serial_servos.scan import scan_line
 from pupper_sysid.sim.emulator.serial_line import SerialPty
 from support.command_line import json_of, run
 from support.servo_servers import map_of, on_a_port, still_dynamixels, still_servos, wait_until
 from support.stopwatch import Stopwatch
+from support.virtual_time import VirtualTime
 
 
 @contextmanager
@@ -59,9 +61,16 @@ def test_a_fast_adapter_is_not_called_slow():
 def test_one_reply_that_a_busy_host_took_late_is_no_slow_adapter(monkeypatch):
     with on_a_port(still_servos(ids=[4])) as server:
         bus = FeetechBus(server.device, 1_000_000, map_of(4))
-        late_s = iter([0.02])
-        monkeypatch.setattr(bus.line, "model", lambda servo: time.sleep(next(late_s, 0)) or 777)
-        bus.line._measure_latency([4])
+        clock = VirtualTime()
+        took_s = iter([0.02])
+        monkeypatch.setattr(
+            bus.line,
+            "model",
+            lambda servo: clock.sleep_until(clock.time + next(took_s, 0.0)) or 777,
+        )
+        with monkeypatch.context() as patch:
+            patch.setattr(serial_line, "time", SimpleNamespace(monotonic=clock.now))
+            bus.line._measure_latency([4])
         assert slow_adapter(bus.line) is None and bus.line.patience_s > 0.02
         bus.close()
 

@@ -511,6 +511,12 @@ def test_a_dead_time_below_one_step_is_written_as_mujoco_takes_it(card, step_s):
     assert "no delay between 0 and one step" in " ".join(to_mjcf(servos).split())
 
 
+def test_whole_steps_cost_what_a_shift_of_the_tone_costs(calibration):
+    # half a step of 5 ms at most: 2.5 ms at 4 Hz are 63 mrad of phase of at most 0.3 rad
+    costs = ExportedServos.of(calibration, 0.005).whole_step_costs()
+    assert 0 < max(costs.values()) < 2 * np.pi * 4 * 0.0025 * 0.3 / np.sqrt(2)
+
+
 def test_servos_under_load_become_isaac_labs_bam_models(monkeypatch):
     card = load_calibration("sts3215-bam-m5")
     cfg = _Recorder(
