@@ -174,6 +174,10 @@ def test_a_calf_without_its_thigh_has_the_bounds_it_has_while_the_thigh_rests(pu
         assert some.to_angles(np.full(len(joints), 512.0))[0] == pytest.approx(-2 * QUARTER)
 
 
+def test_the_zero_of_a_map_is_the_angle_of_its_centre_counts(pupper):
+    assert pupper.zero_rad() == pytest.approx(np.tile([0.0, QUARTER, -2 * QUARTER], 4))
+
+
 def test_another_robot_with_the_same_names_rests_within_its_own_limits():
     def other(data: dict) -> None:
         data["linkage"] = "none"
