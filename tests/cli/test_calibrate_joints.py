@@ -1,4 +1,4 @@
-"""The guided calibration of joints: with a scripted person, over a port, and rehearsed."""
+"""The guided calibration of joints: with a scripted person, and over a port."""
 
 from __future__ import annotations
 

@@ -77,27 +77,18 @@ def cell(seen, column):
     return next(iter(seen.table("x").renderables[0].columns[column].cells))
 
 
-def test_a_serial_reading_is_as_old_as_the_last_answer():
+def test_what_is_known_of_a_reading_is_its_age_on_a_line_and_that_it_is_unchanged_on_the_proxy():
     # the same value again is a new answer; two seconds of silence make it two seconds old
     row = watched("feetech", 0.1, 0.1, np.nan, np.nan).rows()[0]
     assert (row["age_s"], row["unchanged_s"]) == (2.0, None)
     assert (row["answers"], row["position_rad"], row["count"]) == (False, 0.1, 522)
-
-
-def test_a_reading_of_the_proxy_is_told_to_be_unchanged_not_to_be_old():
+    silent = watched("feetech", np.nan, np.nan)
+    assert "silent" in cell(silent, 8) and cell(silent, 4) == "–" and cell(silent, 3) == "–"
     seen = watched("esp32 proxy", 0.1, 0.2, 0.2, 0.2)
     row = seen.rows()[0]
-    assert (row["age_s"], row["unchanged_s"]) == (None, 2.0)
-    assert cell(seen, 4) == "2.0 s"
-
-
-def test_a_value_that_never_changed_has_stood_there_for_at_least_so_long():
+    assert (row["age_s"], row["unchanged_s"], cell(seen, 4)) == (None, 2.0, "2.0 s")
+    # one that never changed has stood there for at least so long
     assert cell(watched("esp32 proxy", 0.1, 0.1, 0.1), 4) == "≥2.0 s"
-
-
-def test_silence_is_told_as_silence():
-    seen = watched("feetech", np.nan, np.nan)
-    assert "silent" in cell(seen, 8) and cell(seen, 4) == "–" and cell(seen, 3) == "–"
 
 
 def test_one_json_object_tells_goal_volts_heat_and_errors_of_serial_servos(capsys):

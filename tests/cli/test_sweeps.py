@@ -198,7 +198,7 @@ def test_a_bench_over_a_serial_line_is_swept_and_its_gain_set_back(capsys, tmp_p
     bench = ServoBench(robot, load_joint_map(BENCH_MAP), rng.spawn(1)[0], plant=plant)
     with on_a_port(FeetechEmulator(bench, STS3215, rng)) as server:
         code, _, err = sweep(
-            capsys, "--gains", "8,16", "--kind", "steps", "--duration", "2", "--rate", "40",
+            capsys, "--gains", "8,16", "--kind", "steps", "--duration", "1", "--rate", "40",
             "--bus", f"feetech:{server.device}", "--out", "a.csv",
         )  # fmt: skip
     assert code == 0, err
