@@ -25,34 +25,12 @@ from pupper_sysid.hardware.safety import watchdog
 from pupper_sysid.hardware.safety.guard import open_guarded
 from pupper_sysid.hardware.safety.notes import notes, remove_note, write_note
 from pupper_sysid.hardware.serial_servos import line as serial_line
+from support.served_driver import PATIENT, drive
 from support.servo_servers import driver_orders, limp, robot_behind, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
-PATIENT = """
-from pupper_sysid.hardware.serial_servos import line
-line.REPLY_TIMEOUT_S = 0.1
-"""
-"""Servos that share a busy machine with what asks them answer too late."""
 PROGRAM = f"{PATIENT}from pupper_sysid.cli.programs.pupper_sysid import main; main()"
 PARK = [sys.executable, "-c", PROGRAM, "park"]
-
-DRIVER = f"""{PATIENT}
-import os, sys
-from pupper_sysid.common.errors import BusError
-from pupper_sysid.hardware.address import parse_address
-from pupper_sysid.hardware.safety.guard import open_guarded
-bus = open_guarded(parse_address(sys.argv[1]))
-for _ in range(20):
-    try:
-        bus.torque(True)
-        break
-    except BusError:
-        pass
-print(bus._watchdog._process.pid, flush=True)
-while True:
-    bus.write(bus.sent)
-    bus.sleep_until(bus.now() + 0.02)
-"""
 
 
 @pytest.fixture(params=["feetech", "esp32"])
@@ -71,11 +49,8 @@ on_esp32 = pytest.mark.parametrize(
 
 def driven(address: str) -> tuple[int, int]:
     """Process ids of a driver and its watchdog."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", DRIVER, address], stdout=subprocess.PIPE, cwd=ROOT
-    )
-    assert process.stdout is not None
-    return process.pid, int(process.stdout.readline())
+    process, watchdog_id = drive(address, "hold")
+    return process.pid, watchdog_id
 
 
 def end(processes: tuple[int, int]) -> None:

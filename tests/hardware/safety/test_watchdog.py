@@ -30,6 +30,7 @@ from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import ran
+from support.served_driver import PATIENT, drive
 from support.servo_servers import (
     bench_of,
     driver_orders,
@@ -45,33 +46,6 @@ from support.stopwatch import Stopwatch
 pytestmark = pytest.mark.wall_clock  # what the watchdog does within a second
 
 ROOT = Path(__file__).resolve().parents[3]
-
-PATIENT = """
-from pupper_sysid.hardware.serial_servos import line
-line.REPLY_TIMEOUT_S = 0.1
-"""
-"""Servos that share a busy machine with their driver answer too late."""
-DRIVER = f"""{PATIENT}
-import sys, time
-import numpy as np
-from pupper_sysid.hardware.address import parse_address
-from pupper_sysid.hardware.safety.guard import open_guarded
-bus = open_guarded(parse_address(sys.argv[1]))
-pose = bus.read().position_rad
-while not np.isfinite(pose).all():
-    pose = bus.read().position_rad
-bus.torque(True)
-start = bus.now()
-print("driving", bus._watchdog._process.pid, flush=True)
-while True:
-    goal = pose + 0.3 * np.sin(2 * np.pi * 0.5 * (bus.now() - start))
-    bus.write(goal)
-    bus.read()
-    bus.sleep_until(bus.now() + 0.02)
-    if len(sys.argv) > 2 and bus.now() - start > 0.5:  # farthest out
-        bus.bus.torque = lambda on: time.sleep(100)
-        bus.limp()
-"""
 
 
 @pytest.fixture(autouse=True)
@@ -116,17 +90,6 @@ def wait_for(condition, *processes: int) -> float:
         time.sleep(0.005)
         took = watch.seconds()
     return took
-
-
-def drive(address: str, *hang: str) -> tuple[subprocess.Popen, int]:
-    """A driver that moves the robot, and the process id of its watchdog."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", DRIVER, address, *hang], stdout=subprocess.PIPE, cwd=ROOT
-    )
-    assert process.stdout is not None
-    word, watchdog = process.stdout.readline().split()
-    assert word == b"driving"
-    return process, int(watchdog)
 
 
 def switched_on(address: str) -> GuardedBus:
@@ -175,7 +138,7 @@ def test_a_hung_driver_is_ended_and_its_robot_parked(robot):
 def test_a_driver_that_hangs_after_a_stop_for_safety_leaves_its_robot_limp_where_it_is(robot):
     server, address = robot
     found = angles(server)
-    process, _ = drive(address, "hang when it should go limp")
+    process, _ = drive(address, "hang")
     wait_for(lambda: limp(server))
     assert np.abs(angles(server) - found).max() > 0.15
     assert process.wait(20.0) == -signal.SIGKILL
