@@ -131,7 +131,7 @@ def test_a_sweep_goes_on_with_planned_rounds_until_the_goal(capsys, widths):
     assert found["reached"] and found["recordings"] == ["a.csv", "a_2.csv"]
     assert load("a_2.csv").joints == ["LF_thigh"]
     assert load_plan(Path("a_2.plan.yaml")).joints == ["LF_thigh"]
-    assert "5.0 (dead_time:2ms): more is to be recorded" in err
+    assert "5.0 (dead_time:2ms)" in err and "1.9 (dead_time:2ms): reached" in err
 
 
 @pytest.mark.slow
