@@ -114,7 +114,7 @@ def scan_line(
         remarks.append(
             f"At the other rates ({tried} baud) none of the ids {ids_in_words(_USUAL_IDS)} answers."
         )
-    delay_us = {s.id: s.return_delay_us or 0 for s in servos}
+    delay_us = {s.id: s.return_delay_us for s in servos if s.return_delay_us is not None}
     if slow := [servo for servo, us in delay_us.items() if us > 1e6 * _SLOW_RETURN_S]:
         whose, have = ("Servos", "have") if len(slow) > 1 else ("Servo", "has")
         delays = " or ".join(map(str, sorted({delay_us[servo] for servo in slow})))

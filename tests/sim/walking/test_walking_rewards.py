@@ -20,9 +20,8 @@ from pupper_sysid.sim.robot.mini_pupper import (
 )
 from pupper_sysid.sim.robot.motion import Moved
 from pupper_sysid.sim.walking.config import PRESETS
-from pupper_sysid.sim.walking.effort import EffortMeter, by_kind
 from pupper_sysid.sim.walking.rewards import terms as wr
-from pupper_sysid.sim.walking.rewards.strides import Strides
+from pupper_sysid.sim.walking.rewards.strides import EffortMeter, Strides, by_kind
 from pupper_sysid.sim.walking.rewards.terms import TERMS, weighted
 from pupper_sysid.sim.walking.rewards.weights import DEFAULT, PAPER, RELEASE, Rewards, narrowed
 from pupper_sysid.sim.walking.step import Step, empty_facts
