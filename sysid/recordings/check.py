@@ -18,7 +18,7 @@ from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
 from pupper_sysid.sysid.recordings.importers.options import (
     LARGEST_RAD,
     LogOptions,
-    likely_units,
+    likely_of_pair,
 )
 from pupper_sysid.sysid.recordings.importers.tables import import_line
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT
@@ -174,15 +174,18 @@ def _refuse_degrees(
             f"{path}, column {place}: values reach {largest:.4g} rad, more than a hundred turns. "
             "Check the unit, or take the start's angle off."
         )
-    both = table[["command_rad", "position_rad"]].to_numpy(float)
-    units = likely_units(both[np.isfinite(both)])
+    own = table.loc[table["joint"] == joint, ["command_rad", "position_rad"]].to_numpy(float)
+    units = likely_of_pair(*(values[np.isfinite(values)] for values in own.T))
     if units == ["deg"] and str(source).endswith(".pos") and largest <= 100:
         units.append("percent:3.5")  # LeRobot's, of a range that it does not log
-    kind = units[0].replace("deg", "degrees").replace(":", " of an encoder with ")
-    kind += " a turn" if kind != "degrees" else ""
+    word, _, of_position = units[0].partition(",")
+    beside = ""
+    if of_position:
+        word, other = (word, of_position) if kind == "command" else (of_position, word)
+        beside = f" beside {_words(other)}"
     text = (
         f"{path}, column {place}: values reach {largest:.4g}, more than a turn, which looks like "
-        f"{kind}. Angles must be radians: multiply degrees by 0.0174533"
+        f"{_words(word)}{beside}. Angles must be radians: multiply degrees by 0.0174533"
     )
     if not isinstance(path, Path):  # arrays in memory
         raise InputError(f"{text}.")
@@ -191,6 +194,15 @@ def _refuse_degrees(
         f"{text}, or convert the log with {lines} (or turns, counts:4096, scale:…; rad if the "
         "joint turns so far)."
     )
+
+
+def _words(unit: str) -> str:
+    """A unit in words."""
+    name, _, turn = unit.partition(":")
+    if name != "counts":
+        return {"deg": "degrees", "rad": "radians"}.get(name, name)
+    counts, _, zero = turn.partition(":")
+    return f"counts of an encoder with {counts} a turn" + (", 0 rad at count 0" if zero else "")
 
 
 def _in_two_places(values: NDArray[np.float64]) -> bool:

@@ -95,7 +95,7 @@ def _table(parsed: Parsed) -> Table:
         else:
             numbers[str(name)] = values.to_numpy(float)
     return Table(numbers, texts, parsed.faults, numbered=parsed.numbered, rate=parsed.rate,
-                 unit=parsed.unit)  # fmt: skip
+                 tick_s=parsed.tick_s, units=parsed.units)  # fmt: skip
 
 
 def _metadata(layout: str, joints: list[str], pose: dict[str, float] | None) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.columns import time_columns
 from pupper_sysid.sysid.recordings.importers.options import LARGEST_RAD, LogOptions
 from pupper_sysid.sysid.recordings.importers.tables import LABELS, has_time
-from pupper_sysid.sysid.recordings.importers.times import angle_unit_in, rate_in
+from pupper_sysid.sysid.recordings.importers.times import rate_in, tick_in, units_in
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 
 SCHEMA_VERSION = 1
@@ -105,8 +105,10 @@ class Parsed:
     """Whether the file names no columns, so that they have their numbers as names."""
     rate: float | None = None
     """Rows a second by the lines above the table."""
-    unit: str = ""
-    """Unit of angles by the same."""
+    units: dict[str, str] = field(default_factory=dict)
+    """Units of angles by the same, by column, or by "" for all."""
+    tick_s: float | None = None
+    """Unit of times by the same."""
 
 
 def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
@@ -160,10 +162,10 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
             data[name] = _numbered(path, name, found)
         elif name in found.numbers:
             data[name] = found.numbers[name]
-    table = pd.DataFrame(data)
+    table, head = pd.DataFrame(data), text[:_HEAD]
     return Parsed(
         metadata, table if keep.all() else table.loc[keep], warnings, found.faults, opened.numbered,
-        rate_in(text[:_HEAD].split("\n")), angle_unit_in(text[:_HEAD]),
+        rate_in(head.split("\n")), units_in(head, columns), tick_in(head),
     )  # fmt: skip
 
 

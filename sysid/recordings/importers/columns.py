@@ -24,23 +24,47 @@ COMMAND, STATE, ANGLE, OTHER = "command", "state", "angle", "other"
 MAYBE_COMMAND, MAYBE_STATE = "command, perhaps", "state, perhaps"
 TIME, UNIT, JOINT, DERIVED = "time", "unit", "joint", "derived"
 
+UNITS: dict[str, str] = {
+    word: unit
+    for unit, words in (
+        ("rad", "rad rads radian radians 弧度 рад 라디안"),
+        ("mrad", "mrad"),
+        ("deg", "deg degs degree degrees ° grad grados gradi graus graden degré degrés degres "
+                "stopnie stopni 度 도 град градусы градусов"),
+        ("turns", "turn turns rev revs revolution revolutions umdrehungen"),
+        ("percent", "percent pct"),
+        ("counts", "count counts tick ticks pulse pulses"),
+        ("steps", "steps microsteps qc inc incs increments lsb"),
+        ("scale:1e-06", "urad µrad"),
+        (f"scale:{np.pi / 18e3!r}", "cdeg centideg centidegree centidegrees"),
+        (f"scale:{np.pi / 18e4!r}", "mdeg millideg millidegree millidegrees"),
+        (f"scale:{np.pi / 200!r}", "gon gons gradian gradians"),
+        (f"scale:{np.pi / 10800!r}", "arcmin"),
+    )
+    for word in words.split()
+}  # fmt: skip
+"""Words of units, and the unit as options write it; of counts and steps the log does not say how
+many make a turn."""
+
 WORDS: dict[str, str] = {
     word: kind
     for kind, words in (
         (COMMAND, "command commands commanded cmd cmds goal goals target targets tgt desired des "
                   "setpoint setpoints set sp reference references ref refs demand demanded "
                   "requested action actions soll sollwert sv consigne consigna riferimento "
-                  "referencia börvärde 目标 目標 指令 给定 设定"),
+                  "referencia börvärde 目标 目標 指令 给定 设定 목표 명령 "
+                  "zadana zadany referência"),
         (MAYBE_COMMAND, "u r ctrl control input inputs send sent tx request planned plan "
                         "expected trajectory traj leader nominal wanted write written order"),
         (STATE, "actual act present pres measured measurement measurements meas msr feedback fb "
                 "fbk observed observation observations obs state states estimate estimated est "
                 "real encoder enc reading readings sensed sensor response resp "
                 "potentiometer pot resolver pv ist istwert ärvärde mesure misura medida "
-                "实际 当前 実測 反馈"),
+                "实际 当前 実測 反馈 現在 測定 测量 현재 측정 "
+                "zmierzona zmierzony medido gemeten"),
         (MAYBE_STATE, "y output outputs read rx follower receive received recv rcv process"),
         (ANGLE, "position positions pos posn angle angles ang qpos q p theta θ winkel "
-                "角度 位置"),
+                "角度 位置 각도 위치"),
         (OTHER, "v w velocity velocities vel vels speed speeds omega qd dq qdot qvel rate accel "
                 "acceleration accelerations acc qdd ddq torque torques tau effort efforts load "
                 "current currents curr cur amps ampere voltage volt volts temperature temperatures "
@@ -54,10 +78,9 @@ WORDS: dict[str, str] = {
         (TIME, "time times timestamp timestamps t ts stamp stamps clock elapsed seconds secs sec "
                "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
                "nanosec nanosecs nsecs usec usecs tout minutes days datenum zeit temps tiempo "
-               "tempo tid datum fecha uhrzeit hora heure 时间 時間"),
-        (UNIT, "rad rads radian radians deg degs degree degrees ° count counts tick ticks pulse "
-               "pulses turn cdeg centideg centidegree centidegrees "
-               "turns rev revs revolution revolutions mrad percent pct"),
+               "tempo tid datum fecha uhrzeit hora heure 时间 時間 "
+               "時刻 시간 秒 毫秒 초 czas tijd"),
+        (UNIT, " ".join(UNITS)),
         (JOINT, "joint joints dof dofs motor motors servo servos actuator actuators axis axes dxl "
                 "group controller controllers data value values val field name names msg body "
                 "header array low point"),
@@ -72,16 +95,19 @@ TIMES = ("time", "timestamp", "t", "stamp", "time_since_start", "ts", "elapsed",
          "uhrzeit", "hora", "heure")  # fmt: skip
 """Names of times, the likeliest first."""
 
-UNITS = {"rad": "rad", "rads": "rad", "radian": "rad", "radians": "rad", "mrad": "mrad",
-         "deg": "deg", "degs": "deg", "degree": "deg", "degrees": "deg", "°": "deg",
-         "turn": "turns", "turns": "turns", "rev": "turns", "revs": "turns",
-         "revolution": "turns", "revolutions": "turns", "percent": "percent",
-         "pct": "percent"}  # fmt: skip
-UNITS |= dict.fromkeys(("cdeg", "centideg", "centidegree", "centidegrees"),
-                       f"scale:{np.pi / 18000:.9g}")  # fmt: skip
-_UNIT_RANK = {"rad": 0, "": 1, "mrad": 2, "deg": 3, "turns": 4, "counts": 5, "percent": 6}
-_SEPARATORS = re.compile(r"[\s_./:\\\[\](){}<>$%#*,;|='\"-]+")
-_CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-zµθ°]+|\d+|[^A-Za-z\d]+")
+_UNIT_RANK = {
+    "rad": 0,
+    "": 1,
+    "mrad": 2,
+    "deg": 3,
+    "turns": 4,
+    "counts": 5,
+    "steps": 5,
+    "percent": 6,
+}
+_SEPARATORS = re.compile(r"[\s_./:\\\[\](){}<>$%#*,;|='\"（）［］【】：，-]+")
+_CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?(?:[^\W\dA-Z_]|°)+|\d+|[^\w°]+")
+_IN_UNIT = re.compile(r"\s+(?:in|en)\s+(?=\S+$)", re.IGNORECASE)  # Winkel in Grad
 _SOLE_LETTERS = frozenset("ury")  # that mean something where no other word does
 _LETTERS = frozenset("qput")  # that begin a word such as qdes or tcmd
 _LONGEST = 200
@@ -101,7 +127,7 @@ class Column:
     key: str
     """The same without words such as `joint`, to be compared."""
     unit: str
-    """"rad", "mrad", "deg", "turns", "counts", "percent", "scale:0.01" (rad), or empty."""
+    """"rad", "mrad", "deg", "turns", "counts", "steps", "percent", "scale:0.01" (rad), or empty."""
     rank: tuple[int, ...]
     """Smaller for the better of two columns for one purpose."""
     words: frozenset[str]
@@ -123,7 +149,8 @@ def column(name: str) -> Column:
 
 @lru_cache(4096)
 def _column(name: str) -> Column:
-    parts = [part for word in _SEPARATORS.split(name.strip()) if word for part in _parts(word)]
+    bare_name = _IN_UNIT.sub(" ", name.strip()).replace("μ", "µ")  # the Greek letter
+    parts = [part for word in _SEPARATORS.split(bare_name) if word for part in _parts(word)]
     known = [WORDS.get(p.lower(), "") for p in parts]
     kinds = set(known)
     lower = [p.lower() for p in parts]
@@ -142,7 +169,7 @@ def _column(name: str) -> Column:
             for w, k in zip(lower, known, strict=True)
         ]
         kinds = set(known)
-    unit = next((UNITS.get(w, "counts") for w, k in zip(lower[::-1], known[::-1], strict=True)
+    unit = next((UNITS[w] for w, k in zip(lower[::-1], known[::-1], strict=True)
                  if k == UNIT), "")  # fmt: skip
     if lower[-1:] == ["raw"]:
         unit = unit or "counts"

@@ -78,10 +78,12 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
         if not np.isfinite(columns[key]).all():
             raise InputError(f"{folder}, column {key}: a value is missing. Mend the dataset.")
     episode, time_s = one_after_another(columns["frame_index"] / fps, columns["episode_index"])
-    scales, texts = _scales(positions, joints)
+    one_scale, texts = _scales(positions, joints)
+    scales = np.column_stack([one_scale, one_scale])  # of commands, of positions
     for k, joint in enumerate(joints):
         if given := options.unit_of(names["joints"][k], joint):
-            scales[k], texts[joint] = given.scale, f"{given.scale:.5f} (given)"
+            scales[k] = [unit.scale for unit in given]
+            texts[joint] = f"{scales[k, 1]:.5f} (given)"
     metadata: dict[str, Any] = {
         "imported_from": LAYOUT,
         "codebase_version": str(info.get("codebase_version"))[:20],
@@ -97,8 +99,8 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
     table = pd.concat(
         [
             rows(
-                joint, time_s + _SENT_AFTER / fps, time_s, scales[k] * commands[:, k],
-                scales[k] * positions[:, k], episode,
+                joint, time_s + _SENT_AFTER / fps, time_s, scales[k, 0] * commands[:, k],
+                scales[k, 1] * positions[:, k], episode,
             )
             for k, joint in enumerate(joints)
         ],

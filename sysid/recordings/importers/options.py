@@ -20,6 +20,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_type_hints
 
@@ -38,8 +39,11 @@ COUNT_RAD = 2 * np.pi / 4096
 LARGEST_RAD = 2 * np.pi + 0.5
 """Largest angle: no joint of a legged robot turns further."""
 _COUNTS, _FEWEST_COUNTS = (1024, 4096, 16384, 65536), 100  # a turn
-_OF_300_DEGREES = "scale:0.005113"  # of 1,024 counts, as of AX-12 and SCS servos
+_OF_PART = {1024: "scale:0.005113", 1001: "scale:0.0041888"}
+"""Of 1,024 counts in 300 degrees (AX-12 and SCS servos), of 1,000 in 240 (LX-16A)."""
 _MOST_DEGREES = 360.0  # of whole numbers that may be degrees
+_FARTHEST_DEGREES = 180.0  # from 0, of the same
+_ALIKE = 2.5  # factor by which a position may move more or less than its command
 _ANGLE_SCALES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turns": 2 * np.pi}
 _NARROWEST_RAD, _WIDEST_RAD = 0.2, 2 * np.pi  # range of a joint
 
@@ -111,6 +115,10 @@ class Unit:
     zero: float = 0.0
     counts: bool = False
 
+    def radians(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The values in radians."""
+        return (values - self.zero) * self.scale
+
 
 def unit(text: str, name: str = "`unit`") -> Unit:
     """The unit that `text` names.
@@ -119,7 +127,8 @@ def unit(text: str, name: str = "`unit`") -> Unit:
     ----------
     text : str
         `rad`, `mrad`, `deg` or `turns`; `counts:4096` with the counts of a turn, half of which is
-        0 rad; `percent:RANGE_RAD` of −100 … 100 over a range; `scale:RAD_PER_UNIT`.
+        0 rad, or `counts:4096:0` with the count that is; `percent:RANGE_RAD` of −100 … 100 over a
+        range; `scale:RAD_PER_UNIT`.
     name : str
         Where it was given, for messages.
 
@@ -131,28 +140,58 @@ def unit(text: str, name: str = "`unit`") -> Unit:
     word, _, value = text.strip().partition(":")
     if word in _ANGLE_SCALES and not value:
         return Unit(_ANGLE_SCALES[word])
+    number, _, middle = value.partition(":")
     try:
-        size = decimal(value)
+        size = decimal(number)
+        zero = decimal(middle) if middle else size / 2
     except ValueError:
-        size = 0.0
-    if word == "counts" and 2 <= size <= 2**31:
-        return Unit(2 * np.pi / size, size / 2, counts=True)
-    if word in ("percent", "scale") and 1e-9 <= abs(size) <= 1e3:
+        size = zero = 0.0
+    if word == "counts" and 2 <= size <= 2**31 and abs(zero) <= 2**31:
+        return Unit(2 * np.pi / size, zero, counts=True)
+    if word in ("percent", "scale") and not middle and 1e-9 <= abs(size) <= 1e3:
         return Unit(size / 200 if word == "percent" else size)
     raise InputError(
         f"{name} is {printable(text)[:40]}. Write rad, deg, turns, counts:4096 (counts of a turn), "
-        "percent:3.5 (rad that −100 … 100 span) or scale:0.01 (rad per unit of the log)."
+        "counts:4096:0 (0 rad at count 0), percent:3.5 (rad that −100 … 100 span) or scale:0.01 "
+        "(rad per unit of the log); deg,rad for commands in deg and positions in rad."
     )
 
 
 def likely_units(values: NDArray[np.float64]) -> list[str]:
-    """What commands and positions beyond a turn may be in, the likeliest unit first."""
+    """What angles beyond a turn may be in, the likeliest unit first."""
     largest = float(np.abs(values).max())
-    if (values < 0).any() or (values % 1 != 0).any() or largest <= _FEWEST_COUNTS:
+    if (values % 1 != 0).any() or largest <= _FEWEST_COUNTS:
         return ["deg"]
+    if (values < 0).any():
+        turns = [f"counts:{n}:0" for n in (*_COUNTS[1:], _COUNTS[0]) if largest < n / 2][:2]
+        return [*turns, "deg"] if largest > _FARTHEST_DEGREES else ["deg", *turns[:1]]
     turns = [f"counts:{n}" for n in _COUNTS if largest < n][:2]
     units = turns if turns and largest > _MOST_DEGREES else ["deg", *turns[:1]]
-    return [*units, _OF_300_DEGREES] if largest < 1024 else units
+    return [*units, *(scale for most, scale in _OF_PART.items() if largest < most)]
+
+
+def likely_of_pair(command: NDArray[np.float64], position: NDArray[np.float64]) -> list[str]:
+    """What a command and its position, one of them beyond a turn, may be in.
+
+    Where one moves many times as far as the other they are in different units, which are those by
+    which they move as far.
+    """
+    spread = float(np.ptp(command)), float(np.ptp(position))
+    together = likely_units(np.concatenate([command, position]))
+    if not min(spread) > 0 or 1 / _ALIKE < spread[0] / spread[1] < _ALIKE:
+        return together
+    ranked = []
+    choices = (
+        ["rad"] if np.abs(values).max() <= LARGEST_RAD else [*likely_units(values), "mrad"]
+        for values in (command, position)
+    )
+    for texts in product(*choices):
+        c, p = map(unit, texts)
+        ratio = spread[0] * c.scale / (spread[1] * p.scale)
+        apart = (np.mean(command) - c.zero) * c.scale - (np.mean(position) - p.zero) * p.scale
+        if 1 / _ALIKE < ratio < _ALIKE:
+            ranked.append((abs(np.log(ratio)) + abs(float(apart)), ",".join(texts)))
+    return [text for _, text in sorted(ranked)][:2] or together
 
 
 Stamp = Literal["start", "middle", "end"]
@@ -180,7 +219,7 @@ class LogOptions:
     joints: Mapping[str, str] = field(default_factory=dict)
     """Joints to read, by the log's name, and what to call them; empty for all."""
     unit: str | None = None
-    """See `units.unit`."""
+    """See `options.unit`; one of commands and one of positions with a comma: `deg,rad`."""
     units: Mapping[str, str] = field(default_factory=dict)
     """The same for single joints, by the log's name or the new one."""
     read_before_send: bool | None = None
@@ -199,7 +238,7 @@ class LogOptions:
     def __post_init__(self) -> None:
         for text in [self.unit, *self.units.values()]:
             if text is not None:
-                unit(text)
+                _units(text)
         if self.stamp not in (None, "start", "middle", "end"):
             raise InputError(f"`stamp` is {self.stamp}; it must be start, middle or end.")
         if bool(self.command) != bool(self.position):
@@ -220,10 +259,10 @@ class LogOptions:
             if (text := getattr(self, name)) and text.count("{joint}") > 1:
                 raise InputError(f"`{name}` has {{joint}} twice; write it once.")
 
-    def unit_of(self, *names: str) -> Unit | None:
-        """Unit of a joint under any of its names, if one was given."""
+    def unit_of(self, *names: str) -> tuple[Unit, Unit] | None:
+        """Units of a joint's commands and positions under any of its names, if they were given."""
         text = next((self.units[n] for n in names if n in self.units), self.unit)
-        return None if text is None else unit(text)
+        return None if text is None else _units(text)
 
     @property
     def send_after_s(self) -> float | None:
@@ -259,6 +298,11 @@ class LogOptions:
                 f"This is a {layout}, which says itself what `{useless[0]}` would say. Leave it "
                 "out."
             )
+
+
+def _units(text: str) -> tuple[Unit, Unit]:
+    command, comma, position = text.partition(",")
+    return unit(command), unit(position if comma else command)
 
 
 _KEYS: dict[str, Any] = {name: (kind, None) for name, kind in get_type_hints(LogOptions).items()}

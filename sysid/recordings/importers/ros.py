@@ -41,7 +41,7 @@ from pupper_sysid.sysid.recordings.importers.log import (
     read_files,
     rows,
 )
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.options import LogOptions, Unit
 
 LAYOUT = "ROS 2 log"
 
@@ -163,11 +163,9 @@ def _log(path: Path, raw: Sequence[Raw], options: LogOptions) -> Log:
         send, command, kept = held_commands(times[held], values[held], read_s)
         inside = (times[held] >= read_s[0]) & (times[held] <= read_s[-1])
         lost = max(lost, 1 - np.sum(send != read_s[kept]) / max(int(inside.sum()), 1))
-        given = options.unit_of(theirs, name)
-        scale, zero = (given.scale, given.zero) if given else (1.0, 0.0)
-        parts.append(
-            rows(name, send, read_s[kept], (command - zero) * scale, (read[kept] - zero) * scale)
-        )  # fmt: skip
+        of_command, of_position = options.unit_of(theirs, name) or (Unit(), Unit())
+        angles = of_command.radians(command), of_position.radians(read[kept])
+        parts.append(rows(name, send, read_s[kept], *angles))
     if lost > _MANY_LOST:
         warnings.append(
             f"{100 * lost:.0f} % of the commands were replaced before the next reading and have no "

@@ -48,7 +48,7 @@ from pupper_sysid.sysid.recordings.importers.options import (
     LARGEST_RAD,
     LogOptions,
     Unit,
-    likely_units,
+    likely_of_pair,
     unit,
 )
 from pupper_sysid.sysid.recordings.importers.times import (
@@ -77,7 +77,7 @@ GROUPS = ("leg", "limb", "arm", "side", "joint", "joint_name", "motor", "motor_n
            "node_id", "id")  # fmt: skip
 LABELS = frozenset((*SERIES, *GROUPS, *_TRIALS))
 """Columns that may hold text, in lower case."""
-_SUBSECONDS = ("nanosec", "nanosecs", "nsec", "nsecs", "usec", "usecs")
+_SUBSECONDS = ("nanosec", "nanosecs", "nsec", "nsecs", "usec", "usecs", "msec", "ms")
 _KEPT = ("p_gain", "torque_enabled", "voltage_v", "temperature_c", "load")
 _SOLE = "joint"  # of a log that names none
 _MOST_GROUPS = 1000
@@ -89,6 +89,7 @@ _MOST_CHOICES = 4  # that a message lists
 _COMPARED = 8  # columns for one purpose
 _COMPARED_BY_VALUE, _ALIKE = 12, 0.7  # columns; concordance of a command and its position
 _MOSTLY_BLANK, _ONE_STAMP = 0.3, 0.9  # shares of positions without a command, with its time
+_TIMER = re.compile(r"ticks?|timer|cycles?|counter", re.IGNORECASE)
 _TIME_STEP = re.compile(r"(d_?t|delta_?t(ime)?|time_?(step|delta))([_ (\[].*)?", re.IGNORECASE)
 _WIDEST_ANGLE = 1e6  # of a joint, in any unit
 _ORDERED = 100_000  # rows
@@ -101,6 +102,18 @@ _OF_TURNS = {
     "moteus's telemetry": ({"control_position", "q_current"}, "control_position and q_current"),
 }
 """Programs that count turns and do not say so, and what gives their logs away."""
+_DRIVES = re.compile(r"axis\d|odrv|moteus|servo_stats|Register\.|q_current|(^|[_.])iq(_|$)|"
+                     r"input_pos|vel_(estimate|setpoint)", re.IGNORECASE)  # fmt: skip
+"""Names that only those programs have: with one of them the angles are turns without doubt."""
+
+
+_LACKING = {
+    "percent": ("percent of a range of motion that the log does not say. Give it, as of 3.5 rad",
+                "percent:3.5"),
+    "steps": ("the log does not say how many steps make a turn. Give them, as of 3200",
+              "counts:3200:0"),
+}  # fmt: skip
+"""Units that a name does not say whole, what to do, and an example."""
 
 
 @dataclass(frozen=True)
@@ -123,8 +136,10 @@ class Table:
     """What was assumed, in sentences."""
     rate: float | None = None
     """Rows a second that the log states beside its columns."""
-    unit: str = ""
-    """Unit of its angles that the log states beside its columns."""
+    tick_s: float | None = None
+    """Of its times, as the log states beside its columns."""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Units of angles that the log states beside its columns; of the name "" those of all."""
 
     @cached_property
     def names(self) -> list[str]:
@@ -145,6 +160,10 @@ class Table:
     def first(self, names: Sequence[str]) -> str | None:
         """The first of these names, in any case, that a column of numbers has."""
         return next((self._lower[n] for n in names if n in self._lower), None)
+
+    def stated_unit(self, name: str) -> str:
+        """The unit that the log states for a column beside it; empty for none."""
+        return self.units.get(name, self.units.get("", ""))
 
     @cached_property
     def _lower(self) -> dict[str, str]:
@@ -319,6 +338,7 @@ def _pairs_by_words(
     marked = {
         program: (marks - {*table.names}, shown) for program, (marks, shown) in _OF_TURNS.items()
     }
+    of_drive = any(map(_DRIVES.search, table.names))
     for key in (key for key in commands if key in positions):
         ranked = [
             sorted(own[key], key=lambda c: (c.rank, -used[c.template]))[:_COMPARED]
@@ -345,10 +365,15 @@ def _pairs_by_words(
         for program, (marks, shown) in marked.items():
             unnamed = not pair.command.unit + pair.position.unit and not options.unit
             if unnamed and marks <= words:
+                taken, other = ("turns", "rad") if of_drive else ("rad", "turns")
                 notes.append(
                     f"{shown} are names of {program}, which counts turns; the values were taken as "
-                    "rad. If they are turns, give `unit='turns'`; lag and dead time are the same."
+                    f"{taken}. If they are {other}, give `unit='{other}'`; lag and dead time are "
+                    "the same."
                 )
+                if of_drive:
+                    pairs[key] = _Pair(*(replace(c, unit="turns") for c in
+                                         (pair.command, pair.position)))  # fmt: skip
     distinct(path, names, "joints")
     kinds = dict(zip((note[:12] for note in reversed(notes)), reversed(notes), strict=True))
     return dict(zip(names, pairs.values(), strict=True)), [*kinds.values()][::-1]
@@ -545,12 +570,19 @@ def lines_by_value(path: Path | str, table: Table) -> list[str]:
 
 
 def unit_of(table: Table, names: Iterable[str]) -> dict[str, str]:
-    """The option for columns whose values, in radians, are no angles of a joint."""
-    values = np.concatenate(
-        [known(table, name) for name in names if name in table.columns] or [[0]]
-    )
-    units = [] if any(column(n).unit for n in names) else likely_units(values)
-    return {"unit": units[0]} if units and np.abs(values).max() > LARGEST_RAD else {}
+    """The option for a command and a position whose values, in radians, are no angles of a joint.
+
+    `names` may hold `{joint}`.
+    """
+    pair = []
+    for name in names:
+        pattern = re.escape(name).replace(re.escape("{joint}"), ".+")
+        own = next((n for n in table.columns if re.fullmatch(pattern, n)), name.split(",")[0])
+        if column(own).unit:
+            return {}
+        pair.append(known(table, own))
+    largest = max(float(np.abs(values).max()) for values in pair)
+    return {"unit": likely_of_pair(*pair)[0]} if largest > LARGEST_RAD else {}
 
 
 def rate_note(line: str | Mapping[str, str], table: Table) -> str:
@@ -634,6 +666,8 @@ def _times(
     names = moving if has_time(moving) else names
     steps = next((n for n in names if _TIME_STEP.fullmatch(n)), None)
     found = [n for n in time_columns(names) if n != steps]
+    if not found and table.tick_s:
+        found = [n for n in names if _TIMER.search(n)]
     sent = [n for n in names if (c := column(n)).kind == "time" and c.words & _SENT]
     read = [n for n in names if (c := column(n)).kind == "time" and c.words and n not in sent]
     time, command_time, notes = options.time, options.command_time, []
@@ -690,11 +724,11 @@ def _seconds(
         return seconds, 0.0, []
     values = unwrapped(table.numbers(path, name))
     lower = {n.lower(): n for n in table.columns}
-    whole = re.fullmatch(r"(.*?)secs?", name.lower())
+    whole = re.fullmatch(r"(.*?)(?:secs?|seconds?)", name.lower())
     rest = [lower[n] for end in _SUBSECONDS if whole and (n := whole[1] + end) in lower]
     if rest:
         return *_of_two(path, table, name, rest[0]), []
-    found = clock(name, values)
+    found = clock(name, values, table.tick_s)
     return found.seconds(values), found.zero * found.scale, found.notes
 
 
@@ -704,7 +738,8 @@ def _of_two(
     """Times in seconds and what is below one in a column of its own, as stamps of ROS have them."""
     values, below = table.numbers(path, name), table.numbers(path, rest)
     zero = float(np.nanmin(values))
-    return values - zero + (1e-6 if np.nanmax(below) < 1e6 else 1e-9) * below, zero
+    part = 1e-3 if rest.lower().endswith("ms") else 1e-6 if np.nanmax(below) < 1e6 else 1e-9
+    return values - zero + part * below, zero
 
 
 # ---------------------------------------------------------------------------------------- rows
@@ -827,17 +862,21 @@ def _joint(
         values = table.numbers(path, source.name)[own]
         if held is not None and key == "command_rad":
             values = held[1]
-        factor = stated or _of_name(path, source, measured)
-        if factor is None and not source.unit and table.unit:
-            factor = unit(table.unit)
+        factor = stated[key == "position_rad"] if stated else None
+        if stated is None:
+            factor = _of_name(path, source, measured, table.numbers(path, pair.command.name)[own])
+        if factor is None and not source.unit and (word := table.stated_unit(source.name)):
+            factor = unit(word)
             metadata["angle_unit"] = "stated"
-            warnings.append(f"{source.name} was taken as {table.unit}, as a remark above says.")
+            warnings.append(f"{source.name} was taken as {word}, as the log says beside it.")
         factor = factor or Unit()
-        columns[key] = (values - factor.zero) * factor.scale
+        columns[key] = factor.radians(values)
         if factor.counts and stated is None:
+            turn = round(2 * np.pi / factor.scale)
+            zero = "half of them 0 rad" if factor.zero else "0 rad at count 0"
             warnings.append(
-                f"columns in counts were taken as {round(2 * factor.zero)} counts a turn, half of "
-                "them 0 rad. If that is wrong, give `unit`, such as counts:1024."
+                f"columns in counts were taken as {turn} counts a turn, {zero}. If that is wrong, "
+                "give `unit`, such as counts:1024."
             )
         if key == "position_rad" and factor.counts:
             columns["position_count"] = values
@@ -925,19 +964,30 @@ def _trials(
     return trial, tone, notes
 
 
-def _of_name(path: Path | str, source: Column, positions: NDArray[np.float64]) -> Unit | None:
-    """The unit that a column's name ends in; counts are of a usual turn that holds `positions`."""
+def _of_name(
+    path: Path | str,
+    source: Column,
+    positions: NDArray[np.float64],
+    commands: NDArray[np.float64],
+) -> Unit | None:
+    """The unit that a column's name ends in; counts are of a usual turn that holds `positions`.
+
+    Commands below 0 are counted from 0 rad; a position below 0 may be a failed reading.
+    """
     if source.unit in ("", "rad"):
         return None
-    if source.unit == "percent":
+    if source.unit in _LACKING:
+        text, example = _LACKING[source.unit]
         raise InputError(
-            f"{path}, column {printable(source.name)[:60]}: percent of a range of motion that the "
-            f"log does not say. Give it, as of 3.5 rad: {import_line(path, unit='percent:3.5')}."
+            f"{path}, column {printable(source.name)[:60]}: {text}: "
+            f"{import_line(path, unit=example)}."
         )
     if source.unit == "counts":
         known = positions[np.isfinite(positions)]
         if (known % 1 != 0).any():  # a raw angle
             return None
+        if (commands < 0).any() and (commands[np.isfinite(commands)] % 1 == 0).all():
+            return unit("counts:4096:0")
         fine = len(known) > 0 and float(np.median(known)) > 4096 and known.max() < 16384
         return unit(f"counts:{16384 if fine else 4096}")
     return unit(source.unit)

@@ -29,8 +29,12 @@ _KNOWN_ORDER_DOUBT_S = 0.001
 _SCALES = {"ns": 1e-9, "nsec": 1e-9, "nanosec": 1e-9, "nsecs": 1e-9, "usec": 1e-6, "us": 1e-6,
             "µs": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0,
            "secs": 1.0, "seconds": 1.0, "nanos": 1e-9, "micros": 1e-6, "millis": 1e-3, "min": 60.0,
-           "minutes": 60.0}  # fmt: skip
+           "minutes": 60.0, "秒": 1.0, "毫秒": 1e-3, "초": 1.0}  # fmt: skip
 _UNIT = re.compile(rf"(?:^|[_\s.(\[])({'|'.join(_SCALES)})[)\]]*$", re.IGNORECASE)
+_TICKS_OF = re.compile(
+    rf"(?:^|[_(\[]| in )(\d+(?:\.\d+)?) ?({'|'.join(_SCALES)})[)\]]*$", re.IGNORECASE
+)
+_OF_100_NS = ((6.2e17, 6.8e17), (1.25e17, 1.5e17))  # .NET's from year 1, Windows' from 1601
 _LOOP_S = (2e-5, 0.5)  # fastest and slowest loop of a servo
 _GUESSED = (("s", 1.0), ("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9),
             ("days", 86_400.0))  # fmt: skip
@@ -45,15 +49,26 @@ _PERIODS = ("dt", "ts", "timestep", "time_step", "sample_time", "sampling_time",
             "sampling_period", "period", "delta_x", "delta_t", "wf_increment")  # fmt: skip
 _RATES = ("fs", "fps", "rate", "rate_hz", "hz", "frequency_hz", "sample_rate", "sample_rate_hz",
           "sampling_rate", "sampling_rate_hz", "sampling_frequency")  # fmt: skip
+_EVERY = re.compile(
+    r"(?<![\w.])(?:every|alle) +([\d.]+) *(ms|us|µs|s)\b|(?<![\w.])([\d.]+) *(fps|hz|khz)\b",
+    re.IGNORECASE,
+)
 _STATED = re.compile(
     r"(?<![\w-])([a-z]\w*(?:[ _]\w+)?)\s*[\s:=,;]\s*[\"']?(\d[\d.]*(?:e[-+]?\d+)?)"
     r"\s*(khz|hz|s|ms|us|µs)?(?![\w.])", re.IGNORECASE,
 )  # fmt: skip
 _STATED_IN = {"khz": 1e3, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
+_UNIT_WORD = rf"({'|'.join(sorted(map(re.escape, UNITS), key=len, reverse=True))})(?!\w)"
+_SAYS = r"[\"']? *(?:(?:are |is )?in|are|is|[:=(\[<]) *[\[(<\"']? *"
 _ANGLES_IN = re.compile(
-    r"\b(?:angles|positions|values|units?)\b *(?:(?:are )?in|are|[:=]) *"
-    r"(deg|degs|degrees?|rad|radians?|turns|revolutions)\b", re.IGNORECASE,
+    rf"\b(?:angles?|positions|values|(?:angle[ _])?units?|winkel|angoli|ángulos){_SAYS}{_UNIT_WORD}",
+    re.IGNORECASE,
+)
+_TICK = re.compile(
+    r"(?:(?<![\w-])(?:\w*ticks?|timer(?: clock)?|clock|time units?)\b *(?:=|:|is|are|of)|"
+    r"\btime in (?:units of)?) *([\d.]+) *(ns|us|µs|ms|khz|mhz)\b", re.IGNORECASE,
 )  # fmt: skip
+_TICK_S = {"khz": lambda n: 1e-3 / n, "mhz": lambda n: 1e-6 / n}
 _NUMBER = re.compile(r"[-+]?[\d.]+(?:[eE][-+]?\d+)?")
 
 
@@ -70,13 +85,26 @@ class Clock:
         return (values - self.zero) * self.scale
 
 
-def clock(name: str, values: NDArray[np.float64]) -> Clock:
-    """Unit of the times in the column `name`, by its ending, else by their distance."""
+def clock(name: str, values: NDArray[np.float64], tick_s: float | None = None) -> Clock:
+    """Unit of the times in the column `name`, by its ending, else by their distance.
+
+    `tick_s` is that of a tick by a remark of the log.
+    """
     shown = printable(name)[:60]
     steps = np.diff(np.sort(values) if scrambled(values) else values)
     steps = steps[steps > 0]
     found = _UNIT.search(name)
     stated = _SCALES[found[1].lower()] if found else 0.0
+    loop = float(np.median(steps)) if len(steps) else 0.0
+    if (several := _TICKS_OF.search(name)) is not None:  # t_100us
+        stated = float(several[1]) * _SCALES[several[2].lower()]
+        if _LOOP_S[0] < loop * stated <= _LOOP_S[1]:
+            return Clock(stated, float(values[0]))
+    if not found and tick_s and _LOOP_S[0] < loop * tick_s <= _LOOP_S[1]:
+        text = f"ticks of {tick_s:.4g} s were taken for the times in {shown}, as a remark says."
+        return Clock(tick_s, float(values[0]), [text])
+    if len(values) and any(low < values[0] < high for low, high in _OF_100_NS):
+        return Clock(1e-7, float(values[0]), [f"{shown} counts steps of 100 ns, as Windows does."])
     usual = [float(of(steps)) * stated for of in (np.median, np.mean)] if len(steps) else [1.0]
     if found and any(_LOOP_S[0] <= step < _SLOW_S for step in usual):
         return Clock(stated)
@@ -85,7 +113,6 @@ def clock(name: str, values: NDArray[np.float64]) -> Clock:
             f"column {shown}: its values do not increase, so they are no times. Give the rows a "
             "second with `rate`, or another column with `time`."
         )
-    loop = float(np.median(steps))
     for unit, scale in _GUESSED[: 4 if found else None]:
         if found and _LOOP_S[0] < loop * scale <= _LOOP_S[1]:
             return Clock(scale, float(values[0]), [
@@ -148,9 +175,16 @@ def stated_rate(values: Mapping[str, float]) -> float | None:
 
 def rate_in(lines: Iterable[str]) -> float | None:
     """Rows a second by the remarks above a table: `# fs = 100 Hz`, `dt: 10 ms`, `Rate,100`."""
-    found = (m for line in lines for m in _STATED.finditer(line[:200]))
-    return stated_rate({m[1]: float(m[2]) * _STATED_IN.get((m[3] or "").lower(), 1.0)
-                        for m in found if m[2].count(".") < 2})  # fmt: skip
+    heads = [line[:200] for line in lines]
+    found = (m for line in heads for m in _STATED.finditer(line))
+    stated = {m[1]: float(m[2]) * _STATED_IN.get((m[3] or "").lower(), 1.0)
+              for m in found if m[2].count(".") < 2}  # fmt: skip
+    for m in (m for line in heads if line[:1] in "#%/!;" for m in _EVERY.finditer(line)):
+        name, value, word = ("period", m[1], m[2]) if m[1] else ("fps", m[3], m[4])
+        if value.strip(".") and value.count(".") < 2:
+            scale = 1e3 if word.lower() == "khz" else _STATED_IN.get(word.lower(), 1.0)
+            stated.setdefault(name, float(value) * scale)
+    return stated_rate(stated)
 
 
 def unwrapped(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -172,10 +206,28 @@ def scrambled(stamp: NDArray[np.float64]) -> bool:
     return bool((steps < 0).sum() > _SCRAMBLED * max((steps != 0).sum(), 1))
 
 
-def angle_unit_in(text: str) -> str:
-    """The unit that remarks such as `angles in degrees` say; empty without, or with several."""
-    units = {UNITS[word.lower()] for word in _ANGLES_IN.findall(text)}
-    return units.pop() if len(units) == 1 else ""
+def units_in(text: str, names: Iterable[str]) -> dict[str, str]:
+    """Units of angles that remarks such as `angles in degrees` or `cmd: deg` say.
+
+    By the column's name, or by "" for all; without those of which there are several.
+    """
+    found: dict[str, set[str]] = {"": {UNITS[w.lower()] for w in _ANGLES_IN.findall(text)}}
+    for name in names:
+        if len(name) > 1 and name in text:
+            pattern = rf"(?<![\w.]){re.escape(name)}{_SAYS}{_UNIT_WORD}"
+            said = re.findall(pattern, text, re.IGNORECASE)
+            found[name] = {UNITS[word.lower()] for word in said}
+    return {name: units.pop() for name, units in found.items() if len(units) == 1}
+
+
+def tick_in(text: str) -> float | None:
+    """Seconds of a tick by remarks such as `tick = 0.5 us` or `timer clock: 2 MHz`."""
+    for number, word in _TICK.findall(text):
+        if number.count(".") < 2 and float(f"0{number}") > 0:
+            unit = word.lower()
+            of = _TICK_S.get(unit, lambda n, unit=unit: n * _SCALES[unit])
+            return of(float(f"0{number}"))
+    return None
 
 
 def loop_period_s(stamp: NDArray[np.float64]) -> float:
