@@ -100,7 +100,7 @@ _SPLIT = "Split it by joint or by time."
 _BLOCK, _TAIL, _FEW_LINES = 4_000_000, 20_000, 20  # characters, the last of them; lines
 _FEW_BROKEN = 0.01  # of the lines: a serial line lost characters
 _NOTHING = re.compile(
-    r"[\W_]*(\d\.#([qs]?nan|ind)\d*|nan(\(\w+\))?|none|null|nil|n/?a|div/0|num|value|ref|missing|"
+    r"[\W_]*(\d\.#([qs]?nan|ind)\d*|nan(\(\w+\))?|none|null|nil|n\.?/?a|div/0|num|value|ref|missing|"
     r"invalid|lost|failed|err|error|timeout)?[\W_]*"
 )
 _LONGEST_WORD = 30
@@ -387,7 +387,7 @@ def numbers_of(
     for k, cell in enumerate(cells):
         if not (text := cell.strip()):
             continue
-        if words and len(text) < _LONGEST_WORD and _NOTHING.fullmatch(text.lower()):
+        if words and is_failure(text):
             continue
         try:
             values[k] = decimal(text)
@@ -399,6 +399,12 @@ def numbers_of(
         if np.isinf(values[k]):
             raise InputError(f"{path}, line {lines[k]}, column {shown}: the value is infinite.")
     return values
+
+
+def is_failure(word: str) -> bool:
+    """Whether a word, such as `timeout`, stands for a reading that failed."""
+    text = word.strip().lower()
+    return len(text) < _LONGEST_WORD and _NOTHING.fullmatch(text) is not None
 
 
 def _numeric(row: Sequence[str]) -> bool:

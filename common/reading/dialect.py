@@ -82,6 +82,7 @@ def whole(text: str) -> int:
 
 _SAMPLE = 500_000  # characters that are looked at
 _SAMPLE_LINES = 400
+_LABELS = 8  # values of a column of labels, at most
 _ROWS = 100  # of the table, from which its shape is taken
 _SEPARATORS = ("\t", ";", ",", "|", " ")
 _NAMES_OF = {"\t": "tabs", ";": "semicolons", "|": "bars", " ": "spaces", ",": "commas"}
@@ -91,8 +92,9 @@ _SAME_SHAPE, _NUMERIC = 0.9, 0.9  # shares of rows, of cells
 _COMMENT = re.compile(r"[ \t]*(#|%|//|!)")
 _COMMA_NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:,[0-9]*)?|,[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _CLOCK = re.compile(
-    r"(\d{4}-\d\d-\d\d[T ]|\d{1,4}([-/.])\d{1,2}\2\d{1,4} |\d+ days? )?"
+    r"(\d{4}-\d\d-\d\d[T ]|\d{1,4}([-/.])(?:\d{1,2}|[A-Z][a-z]{2})\2\d{1,4} |\d+ days? )?"
     r"(\d{1,2}:\d\d:\d\d([.,]\d+|:\d{3})?(Z|[+-]\d\d:?\d\d| ?[AP]M)?|\d{1,3}:\d\d[.,]\d+)"
+    r"|\d{8}T\d{6}([.,]\d+)?Z?"
 )
 _EXPONENT = re.compile(r"(?<=[\d.])(?:[dD](?=[+-]\d{2,3}(?![\w.]))|\*\^(?=-?\d))")  # Mathematica's
 _GROUP_MARKS = "['’\u00a0\u2009\u202f]"
@@ -129,7 +131,7 @@ _PAIR, _LONG_PAIR = (  # with names of a word, or of two
     )
     for more in ("", r"(?: [A-Za-z_]\w*)?")
 )
-_AHEAD = re.compile(r"[ \t]*(\d+(?:\.\d+)?)[ \t]*[,;|:>]?[ \t]+(?=[\[(A-Za-z])")
+_AHEAD = re.compile(r"[ \t]*[\[(]?(\d+(?:\.\d+)?)[\])]?[ \t]*[,;|:>]?[ \t]+(?=[\[(A-Za-z])")
 _STAMPED = re.compile(
     r"^[ \t]*(?:\[[A-Za-z]+\][ \t]*)?(?:[A-Z][a-z]{2} +\d{1,2} )?"  # [INFO], May 04
     r"(?:\[?((?:\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d:\d\d(?:[.,]\d+)?)\]?|"
@@ -146,6 +148,9 @@ _BRACKETED = re.compile(
     re.MULTILINE,
 )
 _BRACKETS = re.compile(r"[\[\]()]")
+_HEX_CELL = re.compile(r"([0-9a-f]{2,8})(h?)", re.IGNORECASE)
+_REST = re.compile(r"(?<=[\w.\"])[ \t]+(?:#|//)[^\n]*$", re.MULTILINE)  # a remark behind a row
+_DOUBLED = re.compile(r"([+-]?\d+),(\d+)(,|$)", re.MULTILINE)  # 0,1,0,2 of decimal commas
 _HEX = re.compile(r"(?<![\w.])0x[0-9a-f]{1,8}(?![\w.])", re.IGNORECASE)
 _TELEPLOT = re.compile(
     r"^>([\w./ \[\]-]+):(?:(\d+(?:\.\d+)?):)?([-+]?[\d.]+(?:e[-+]?\d+)?)(?:[§|].*)?$",
@@ -162,8 +167,8 @@ class Plain:
     """With as many lines as before."""
     columns: list[str] | None = None
     """Names of the columns where no row of `text` has them."""
-    numbered: bool = False
-    """Whether the file names no columns, so that they are numbered from 0."""
+    numbered: str = ""
+    """Why the columns have no names but their numbers from 0, as a clause; empty if they do."""
     notes: list[str] = field(default_factory=list)
     """What was assumed, as sentences."""
 
@@ -177,6 +182,7 @@ class _Shape:
     columns: int
     numeric: tuple[bool, ...]  # by column
     units: dict[int, str]  # of columns in whose cells one stands behind the number
+    hexed: dict[int, int]  # columns of hexadecimal numbers; see `_hexadecimal`
     counted: bool  # whether the first column counts the rows
     clocked: bool  # whether the first column holds times of day
     blank: tuple[bool, ...]  # by column
@@ -199,6 +205,10 @@ def plain(text: str) -> Plain:
     rows = [lines[n] for n in bare[len(bare) // 2 :][:_ROWS]]
     if (usual := _usual_numbers(text, [*rows, *text[-2000:].split("\n")[1:-1]])) != text:
         return plain(usual)
+    doubled = 2 * lines[bare[0]].count(",") + 1
+    if all(row.count(",") == doubled and not _DOUBLED.sub("", row) for row in rows):
+        halved = plain(_DOUBLED.sub(r"\1.\2\3", text))
+        return replace(halved, notes=[*halved.notes, "its numbers have decimal commas."])
     if all(_TELEPLOT.match(row) for row in rows):
         return _teleplot(text)
     if all(_NAMED_LIST.search(row) for row in rows):
@@ -249,6 +259,8 @@ def _usual_numbers(text: str, rows: Sequence[str]) -> str:
         text = _BOX.sub("-", re.sub("[│┃]", "|", text))
     if all(_COLON.match(row) for row in rows):
         text = _COLON.sub(r"\1", text)
+    if all(_REST.search(row) for row in rows):
+        text = _REST.sub("", text)
     if all(_CHECKSUM.search(row) for row in rows):
         text = _CHECKSUM.sub("", text)
     if "---" in text[:_SAMPLE] or "===" in text[:_SAMPLE]:
@@ -317,14 +329,17 @@ def _shape(rows: Sequence[str]) -> _Shape | None:
             ]
             full = tuple(any(row[k] for row in cells) for k in range(columns))
             units = {} if separator == " " else _units_of(cells, shares, comma)
-            shares = [1.0 if k in units else share for k, share in enumerate(shares)]
+            hexed = _hexadecimal(cells)
+            shares = [1.0 if k in units or k in hexed else s for k, s in enumerate(shares)]
             if sum(shares) > most * columns:
                 most = sum(shares) / columns
                 numeric = tuple(s >= _NUMERIC and f for s, f in zip(shares, full, strict=True))
                 counted = _counted([row[0] for row in cells])
                 clocked = all(is_clock(row[0]) for row in cells)
                 blank = tuple(not f for f in full)
-                best = _Shape(separator, comma, columns, numeric, units, counted, clocked, blank)
+                best = _Shape(
+                    separator, comma, columns, numeric, units, hexed, counted, clocked, blank
+                )
     return best if best is not None and any(best.numeric) else None
 
 
@@ -343,6 +358,41 @@ def _units_of(
     return units
 
 
+def _hexadecimal(cells: Sequence[Sequence[str]]) -> dict[int, int]:
+    """Columns of hexadecimal numbers; of signed ones the numbers of their bits, else 0.
+
+    They are of one width, or of many values, and some have a letter; without one in these rows a
+    column is hexadecimal where its cells are as wide as those of another that is, and do not rise
+    as times do. `1E05` is no such number by itself, nor are a few labels such as `a1`.
+    """
+    columns: dict[int, list[str]] = {}
+    marked = set()
+    for k, column in enumerate(zip(*cells, strict=True)):
+        found = [_HEX_CELL.fullmatch(cell) for cell in column if cell]
+        if found and all(found):
+            columns[k] = [m[1].lower() for m in found if m]
+            if all(m and m[2] for m in found):
+                marked.add(k)
+    widths = {k: {*map(len, own)} for k, own in columns.items()}
+    sure = {
+        k for k, own in columns.items()
+        if (k in marked or any({*cell} & {*"abcdf"} for cell in own))
+        and 2 * sum(map(str.isalpha, own)) < len(own)
+        and ((len(widths[k]) == 1 and min(widths[k]) > 2) or len({*own}) > _LABELS)
+    }  # fmt: skip
+    wide = [widths[k] for k in sure if len(widths[k]) == 1]
+    signed = {}
+    for k, own in columns.items():
+        like = len(widths[k]) == 1 and widths[k] in wide and own != sorted(own)
+        if k in sure or like:
+            turn = 16 ** len(own[0])
+            numbers = [int(cell, 16) for cell in own]
+            near = all(min(n, turn - n) < turn / 4 for n in numbers)
+            below = len(widths[k]) == 1 and len(own[0]) in (4, 8) and max(numbers) >= turn / 2
+            signed[k] = turn if near and below else 0
+    return signed
+
+
 def _counted(cells: Sequence[str]) -> bool:
     """Whether cells are whole numbers, each greater by one than the one before."""
     numbers = [int(cell) for cell in cells if _WHOLE.fullmatch(cell)]
@@ -358,7 +408,7 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
     if any(_wordy(lines[n], shape) for n in bare if first < n < whole):
         first = whole  # lines above the names have as many cells, some of them numbers
     before = [n for n in bare if n < first]
-    notes, columns, units = [], None, []
+    notes, columns, units, numbered = [], None, [], ""
     if before and (cells := _units(lines[before[-1]], shape)) and len(before) > 1:
         units = cells
         before.pop()
@@ -386,19 +436,32 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
         above = (_units_above(line, shape) for line in lines[:first])
         units = units or next(filter(None, above), [])
         columns = _once(columns, [_split(row, shape.separator) for row in lines[first:]])
+        unnamed = [k for k, name in enumerate(columns) if not name and shape.numeric[k] and k]
+        named = [name for name in columns if name]
+        if "send_time_s" not in named and (unnamed or len({*named}) < len(named)):
+            twice = next((n for n in named if named.count(n) > 1), "")
+            columns, numbered = (
+                None,
+                f"two columns would be called {twice}. Rename one of them"
+                if twice
+                else ("some columns have no names"),
+            )
     plain_names = (
         shape.separator == "," and len(before) == 1 and not units and not shape.comma
-        and not shape.units and columns == _split(lines[before[0]], ",")
+        and not shape.units and not shape.hexed and columns == _split(lines[before[0]], ",")
         and not any(_COMMENT.match(line) and line[:1] != "#" for line in lines)
     )  # fmt: skip
     if plain_names and columns and columns[-1]:
         name = lines[before[-1]]
         again = text.find(f"\n{name}\n", sum(len(line) + 1 for line in lines[:first]) - 1)
         return Plain(text if again < 0 else text[:again] + _unnamed(text[again:], name))
-    numbered = columns is None
+    if columns is None and not numbered:
+        numbered = "its columns have no names"
     if columns is None:
         columns = [str(k) for k in range(shape.columns)]
         columns[0] = "time_of_day" if shape.clocked else "0"
+        if shape.numeric == (True, False, True):  # 0.01 CMD 0.3
+            columns, numbered = [columns[0].replace("0", "time"), "name", "value"], ""
     for k, word in enumerate(units):
         if word and word not in ("-", "1"):
             columns[k] = f"{columns[k]} [{_WORD_OF.get(word, word)}]"
@@ -411,6 +474,8 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
         notes.append(f"{above} line{'s' if above > 1 else ''} above {what} left out")
     if shape.separator != ",":
         notes.append(f"cells are separated by {_NAMES_OF[shape.separator]}")
+    if shape.hexed:
+        notes.append("numbers of some columns are hexadecimal")
     if shape.comma:
         notes.append("numbers have decimal commas")
     start = sum(len(line) + 1 for line in text[:_SAMPLE].split("\n")[:first])
@@ -434,7 +499,12 @@ def _cells(body: str, shape: _Shape, trailing: int) -> str:
     """Rows with commas between cells and points in numbers."""
     body = re.sub(r"^[ \t]*(?:%|//|!).*$", "", body, flags=re.MULTILINE)
     quoted = '"' in body and (shape.separator != "," or shape.comma)
-    if quoted or shape.units or (shape.separator != "," and "," in body and not shape.comma):
+    if (
+        quoted
+        or shape.units
+        or shape.hexed
+        or (shape.separator != "," and "," in body and not shape.comma)
+    ):
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         for line in body.split("\n"):
@@ -445,6 +515,10 @@ def _cells(body: str, shape: _Shape, trailing: int) -> str:
             for k in shape.units:
                 if k < len(cells) and (found := _WITH_UNIT.fullmatch(cells[k])):
                     cells[k] = found[1]
+            for k, turn in shape.hexed.items():
+                if k < len(cells) and (found := _HEX_CELL.fullmatch(cells[k])):
+                    number = int(found[1], 16)
+                    cells[k] = str(number - turn if turn and 2 * number >= turn else number)
             writer.writerow([c.replace(",", ".") if _number(c, shape.comma) else c for c in cells])
         body = out.getvalue().removesuffix("\n")
     elif shape.separator != ",":
@@ -606,6 +680,7 @@ def _is_row(line: str, shape: _Shape, whole: bool = False) -> bool:
     numbers = [
         c for k, c in full
         if _number(c, shape.comma) or (k in shape.units and _WITH_UNIT.fullmatch(c))
+        or (k in shape.hexed and _HEX_CELL.fullmatch(c))
     ]  # fmt: skip
     return len(numbers) > (len(full) - 1 if whole else len(full) / 2)
 

@@ -26,9 +26,9 @@ from pupper_sysid.common.reading.csv_table import (
 )
 from pupper_sysid.common.reading.dialect import plain
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.columns import time_columns
+from pupper_sysid.sysid.recordings.importers.columns import column, time_columns
 from pupper_sysid.sysid.recordings.importers.options import LARGEST_RAD, LogOptions
-from pupper_sysid.sysid.recordings.importers.tables import LABELS, has_time
+from pupper_sysid.sysid.recordings.importers.tables import LABELS, has_time, is_flag
 from pupper_sysid.sysid.recordings.importers.times import rate_in, tick_in, units_in
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 
@@ -46,6 +46,7 @@ LARGEST_COUNT = 2**31
 _FINEST_RAD, _COARSEST_RAD = 1e-7, 0.2  # of a count
 _FARTHEST_ZERO_RAD = 100.0  # angle of count 0: a servo of several turns
 _HEAD = 4000  # characters in which a log may state its rate
+_FEW_BROKEN = 100  # lines
 TEXT_COLUMNS = ("joint", "signal")
 
 
@@ -101,8 +102,8 @@ class Parsed:
     faults: dict[str, str] = field(default_factory=dict)
     """Columns of other projects' logs that are not in the table, for they hold text, and the
     sentence on the first such cell."""
-    numbered: bool = False
-    """Whether the file names no columns, so that they have their numbers as names."""
+    numbered: str = ""
+    """Why the columns have their numbers as names, as a clause; empty if they have others."""
     rate: float | None = None
     """Rows a second by the lines above the table."""
     units: dict[str, str] = field(default_factory=dict)
@@ -147,6 +148,8 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
         keep[rows] = False
     if found.cut:
         warnings.append("its last line was cut short and has been left out.")
+    if not ours:
+        _refuse_other_names(path, opened.text, columns, found.broken)
     if found.broken:
         warnings.append(
             f"{len(found.broken)} lines that are no rows of the table were left out, the first of "
@@ -169,10 +172,33 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
     )  # fmt: skip
 
 
+def _refuse_other_names(path: Path, text: str, columns: list[str], broken: list[int]) -> None:
+    """Refuse a file whose columns are named again, and differently, in a line between the rows."""
+    lines = text.split("\n")
+    for n in broken[:_FEW_BROKEN]:
+        cells = [cell.strip(" \"'") for cell in lines[n - 1].split(",")]
+        both = list(zip(map(column, columns), map(column, cells), strict=False))
+        telling = sum(new.kind in ("time", "command", "position") for _, new in both)
+        if (
+            len(cells) == len(columns)
+            and telling > 1
+            and any(
+                (old.kind, old.key, old.unit) != (new.kind, new.key, new.unit) for old, new in both
+            )
+        ):
+            raise InputError(
+                f"{path}, line {n}: the columns are named again, and differently "
+                f"({printable(', '.join(cells))[:80]}). Split the file there."
+            )
+
+
 def _may_be_text(name: str, options: LogOptions) -> bool:
     """Whether a column of another project's log may hold names, labels or times of day."""
     chosen = (options.trial, options.time, options.command_time)
-    return name in chosen or name.lower() in LABELS or bool(time_columns([name]))
+    return (
+        name in chosen or name.lower() in LABELS or bool(time_columns([name]))
+        or is_flag(name) is not None
+    )  # fmt: skip
 
 
 def require(path: Path | str, table: pd.DataFrame, columns: tuple[str, ...]) -> None:

@@ -36,7 +36,7 @@ from pupper_sysid.sysid.recordings.importers.tables import (
     read_numbered,
     read_table,
 )
-from pupper_sysid.sysid.recordings.importers.times import stated_rate
+from pupper_sysid.sysid.recordings.importers.times import stated_rate, units_in
 
 ZIP, NPY, MAT = b"PK\x03\x04", b"\x93NUMPY", b"MATLAB 5.0"
 
@@ -84,7 +84,11 @@ def read_arrays(path: Path, data: bytes, options: LogOptions) -> Log:
         wide = values.ndim == 2 and len(values) < values.shape[1]
         return read_numbered(path, np.atleast_2d(values.T if wide else values), options, layout)
     scalars = {k: float(v) for k, v in arrays.items() if v.dtype.kind in "iuf" and not v.ndim}
-    return read_table(path, replace(table, rate=stated_rate(scalars)), options, layout)
+    remarks = "\n".join(
+        f"{k}: {v}" for k, v in arrays.items() if v.dtype.kind == "U" and v.size == 1
+    )
+    units = units_in(remarks[:4000], table.names)
+    return read_table(path, replace(table, rate=stated_rate(scalars), units=units), options, layout)
 
 
 def _with_names(

@@ -163,7 +163,9 @@ def _column(name: str) -> Column:
     angle = ANGLE in kinds and (lower.count("p") == 0 or kinds & {COMMAND, STATE, UNIT}
                                 or "pos" in "".join(lower))  # fmt: skip
     long_angle = any(k == ANGLE and len(w) > 1 for w, k in zip(lower, known, strict=True))
-    if long_angle and lower[-1:] != ["current"]:  # current position, not a current of an axis
+    if (long_angle or UNIT in kinds) and lower[-1:] != [
+        "current"
+    ]:  # current position, not a current of an axis
         known = [
             STATE if w in ("current", "curr", "cur") else k
             for w, k in zip(lower, known, strict=True)

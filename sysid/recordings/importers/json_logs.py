@@ -56,13 +56,14 @@ from pupper_sysid.sysid.recordings.importers.tables import (
     read_numbered,
     read_table,
 )
-from pupper_sysid.sysid.recordings.importers.times import doubt_of_a_turn, stated_rate
+from pupper_sysid.sysid.recordings.importers.times import doubt_of_a_turn, stated_rate, units_in
 
 BAM, KTUNE = "BAM JSON", "ktune JSON"
 
 _SLEEP_S = 0.00106  # sleep(0.001) as Linux keeps it
 _REGISTERS = {"xl330": 5}  # reads of one register each, the position first
 _FAR, _LONGEST_NUMBER = 1e9, 40
+_FEW_REMARKS = 4000  # characters
 _LONGER = 10  # times as many values over time as joints
 _NUMBERS = ("mass", "length", "kp", "vin")
 
@@ -208,7 +209,8 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     }
     scalars = {k: float(v) for k, v in _scalars(data).items()}
     table = expanded(path, arrays, list(options.joints))
-    table = replace(table, texts=texts, rate=stated_rate(scalars))
+    units = units_in(_remarks(data), table.names)
+    table = replace(table, texts=texts, rate=stated_rate(scalars), units=units)
     if not arrays or (missing(table.names) and not options.command):
         return None
     return read_table(path, table, options, "JSON table")
@@ -221,6 +223,13 @@ def _scalars(data: Any) -> dict[str, float]:
     levels = [data, *(v for v in data.values() if isinstance(v, Mapping))]
     return {k: v for level in levels for k, v in level.items()
             if isinstance(v, int | float) and abs(v) < _FAR}  # fmt: skip
+
+
+def _remarks(data: Any) -> str:
+    """Texts beside the lists of JSON, also those a level below, as remarks: `unit: deg`."""
+    levels = [data, *data.values()] if isinstance(data, Mapping) else []
+    return "\n".join(f"{k}: {v}" for level in levels if isinstance(level, Mapping)
+                     for k, v in level.items() if isinstance(v, str))[:_FEW_REMARKS]  # fmt: skip
 
 
 def _of_frame(data: Any) -> Any:

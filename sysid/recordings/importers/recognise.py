@@ -6,12 +6,14 @@ import hashlib
 import re
 from dataclasses import replace
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import RECORDING, refuse_other_kind
 from pupper_sysid.common.reading.dialect import decoded, without_numpy
+from pupper_sysid.common.strict_yaml import load
 from pupper_sysid.sysid.recordings.importers import (
     arrays,
     json_logs,
@@ -29,6 +31,13 @@ _PACKED = (".gz", ".bz2", ".xz")
 _STAMP = re.compile(rb"\[[^\[\]{}\"\n]*\][ \t:]*[A-Za-z(\[\d]")  # before a message: a line of text
 _JSON = re.compile(rb"(?:#[^\n]*\n\s*)*(?:\{|\[[\s\[]*(?:[\"{\d\]-]|true|false|null|NaN|Inf))")
 _YAML = re.compile(rb"(?:---\s*\n)?(?:- \w+:|\w+:[ \t]*\r?\n[ \t]+\w+:)")
+_DOCUMENT = re.compile(r"^---[ \t]*\r?$", re.MULTILINE)
+_CAN = re.compile(  # candump's, PEAK's, Vector's
+    rb"^[ \t]*(?:\([\d. :-]+\)[ \t]+)?v?can\d+[ \t]+[0-9A-F]{3,8}(?:#|[ \t]+\[\d+\][ \t])|"
+    rb"\A;\$FILEVERSION|^[ \t]*[\d.]+[ \t]+\d[ \t]+[0-9A-F]+x?[ \t]+[RT]x[ \t]+d[ \t]",
+    re.MULTILINE | re.IGNORECASE,
+)
+_HEAD = 2000  # bytes in which a kind of text is looked for
 _MARKUP = re.compile(rb"<[?!A-Za-z]")
 _ROW = re.compile(rb"\[[-+\d.eE, \t\[\]()]+\][ \t]*\r?\n")  # numbers, a whole line
 
@@ -101,7 +110,19 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
     start = data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")
     if _MARKUP.match(start):
         raise InputError(f"{path} is XML or HTML, such as a robot's model or a page, not a log.")
+    if _CAN.search(data[:_HEAD]):
+        raise InputError(
+            f"{path} holds raw frames of a CAN bus, whose bytes mean what the motor's manual says. "
+            "Decode them (python-can, cantools) into columns of time, command and position."
+        )
+    documents = None
     if _YAML.match(start) or path.suffix.lower() in (".yaml", ".yml"):
+        documents = _documents(path, decoded(path, data))
+    if documents is not None:
+        log = json_logs.read_json_table(path, documents, options)
+        if log is not None:
+            return replace(log, sha256=digest)
+    if documents is not None or _YAML.match(start) or path.suffix.lower() in (".yaml", ".yml"):
         raise InputError(
             f"{path} is YAML, which is not read: write rows as CSV, or record messages with "
             "`ros2 bag record`."
@@ -120,6 +141,17 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
     if log is None:
         raise InputError(f"{path}: {unknown_json(found if isinstance(found, dict) else [])}")
     return replace(log, sha256=digest)
+
+
+def _documents(path: Path, text: str) -> list[Any] | None:
+    """YAML documents one behind the other, as `ros2 topic echo` prints messages, or one list."""
+    parts = [part.strip("\n") for part in _DOCUMENT.split(text) if part.strip()]
+    if len(parts) > 1:
+        text = "\n".join(f"-{indent(part, '  ')[1:]}" for part in parts)
+    elif not text.lstrip().startswith("- "):
+        return None
+    rows = load(text, str(path))[0]
+    return rows if isinstance(rows, list) else None
 
 
 def _whole_json(text: str) -> str:

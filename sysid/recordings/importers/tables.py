@@ -27,7 +27,13 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
-from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS, distinct, one_each
+from pupper_sysid.common.reading.csv_table import (
+    MOST_CELLS,
+    MOST_COLUMNS,
+    distinct,
+    is_failure,
+    one_each,
+)
 from pupper_sysid.common.reading.dialect import is_clock
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.columns import (
@@ -116,6 +122,15 @@ _LACKING = {
 """Units that a name does not say whole, what to do, and an example."""
 
 
+_FLAG = re.compile(
+    r"(.*?)[_. ]?(?:is|read|pos|rx)?[_. ]?"
+    r"(?:(valid|ok|success|status|result)|invalid|timeout|timed_?out|lost|failed|"
+    r"(?:comm|crc|read|rx)[_. ]?(?:error|result|err))",
+    re.IGNORECASE,
+)  # fmt: skip
+_MOST_FAILED = 0.5  # of the rows: more are another meaning
+
+
 @dataclass(frozen=True)
 class Table:
     """Columns of a log."""
@@ -130,8 +145,8 @@ class Table:
     """Arrays with a column per joint, and how many; their columns are `<array>.<joint>`."""
     joint_names: tuple[str, int] | None = None
     """What names those joints, and how many."""
-    numbered: bool = False
-    """Whether the columns have no names but their numbers."""
+    numbered: str = ""
+    """Why the columns have no names but their numbers, as a clause; empty if they have."""
     notes: tuple[str, ...] = ()
     """What was assumed, in sentences."""
     rate: float | None = None
@@ -235,7 +250,8 @@ def read_numbered(
     """The columns of one array, shape (rows, columns), by their numbers."""
     refuse_more(path, values.shape[1], MOST_COLUMNS, "columns", "Split it by joint.")
     table = Table(
-        {str(k): column.astype(float) for k, column in enumerate(values.T)}, numbered=True
+        {str(k): column.astype(float) for k, column in enumerate(values.T)},
+        numbered="its columns have no names",
     )
     if not options.command:
         raise InputError(f"{path}: {unknown_numbers(path, table)}")
@@ -252,6 +268,8 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
         options = replace(options, rate=table.rate)
     notes = list(table.notes)
     pairs, texts = _pairs(path, table, options)
+    notes += texts
+    table, texts = _without_failed(path, table, pairs)
     notes += texts
     read_s, send_s, texts = _times(path, table, options)
     notes += texts
@@ -291,6 +309,45 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
         parts.append(part)
         notes += [text for text in texts if text not in notes]
     return Log(pd.concat(parts, ignore_index=True), metadata, notes)
+
+
+def is_flag(name: str) -> tuple[str, bool] | None:
+    """Whose readings a column says to be good or failed, and whether 1 is good; None for others."""
+    found = _FLAG.fullmatch(name[:100])
+    return None if found is None else (column(found[1]).key, bool(found[2]))
+
+
+def _without_failed(
+    path: Path | str, table: Table, pairs: Mapping[str, _Pair]
+) -> tuple[Table, list[str]]:
+    """The table without the positions of rows that a column says to have failed, and notes."""
+    columns, notes = dict(table.columns), []
+    for name in table.names:
+        if (flag := is_flag(name)) is None:
+            continue
+        if name in table.texts:
+            words = [word.strip().lower() for word in table.texts[name]]
+            good = "true" if flag[1] else "false"
+            failed = np.array([(w in ("true", "false") and w != good) or is_failure(w)
+                               for w in words])  # fmt: skip
+        elif name in table.columns and not name.lower().endswith("status"):
+            values = table.columns[name]
+            two = flag[1] and not name.lower().endswith("result")
+            failed = (values == 0) if two else (values != 0) & np.isfinite(values)
+            if (values % 1 != 0).any() or (two and np.unique(values).size > 2):
+                continue
+        else:
+            continue
+        own = [pair for pair in pairs.values() if flag[0] in ("", pair.position.key)]
+        if not own or not failed.any() or failed.mean() > _MOST_FAILED:
+            continue
+        for position in {pair.position.name for pair in own}:
+            columns[position] = np.where(failed, np.nan, table.numbers(path, position))
+        notes.append(
+            f"{int(failed.sum())} readings failed by the column {printable(name)[:40]}, and were "
+            "left out."
+        )
+    return (replace(table, columns=columns) if notes else table), notes
 
 
 # ------------------------------------------------------------------------------- which columns
@@ -533,7 +590,7 @@ def unknown_numbers(path: Path | str, table: Table) -> str:
         if len(known):
             up = ", increasing" if name in table.increasing else ""
             shown.append(f"{name} ({known.min():.4g} … {known.max():.4g}{up})")
-    text = f"its columns have no names. By their numbers, from 0, they are {'; '.join(shown)}. "
+    text = f"{table.numbered}. By their numbers, from 0, they are {'; '.join(shown)}. "
     if lines := lines_by_value(path, table):
         note = rate_note(lines[0], table)
         return f"{text}Say which is which: {', '.join(lines)}, or others{note}."
@@ -626,6 +683,12 @@ def known(table: Table, name: str) -> NDArray[np.float64]:
     values = table.columns.get(name, np.zeros(0))
     known = values[np.isfinite(values)]
     return known if len(known) else np.zeros(2)
+
+
+def is_timed(table: Table) -> bool:
+    """Whether a table has times, or states its rate."""
+    timer = table.tick_s and any(map(_TIMER.search, table.names))
+    return bool(table.rate or timer or has_time(table.names))
 
 
 def has_time(names: Sequence[str]) -> bool:

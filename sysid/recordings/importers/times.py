@@ -43,7 +43,8 @@ _NEAR_STEPS = 3  # by which the step over a counter's end may differ from the ot
 _SCRAMBLED = 0.25  # share of steps back in time
 _SLOW_S = 2.0  # no loop of a servo is slower
 _CLOCK_SET_S = 3600.0  # a step forward between two trials
-_OTHER_DATE = re.compile(r"^(?!\d{4}-)\d{1,4}([-/.])\d{1,2}\1\d{1,4} ")
+_OTHER_DATE = re.compile(r"^(?!\d{4}-\d)\d{1,4}([-/.])(?:\d{1,2}|[A-Z][a-z]{2})\1\d{1,4} ")
+_COMPACT = re.compile(r"^(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(?=\d\d)")  # of ISO 8601
 _HALF_DAY = re.compile(r" ?([AP])M$")
 _PERIODS = ("dt", "ts", "timestep", "time_step", "sample_time", "sampling_time", "sample_period",
             "sampling_period", "period", "delta_x", "delta_t", "wf_increment")  # fmt: skip
@@ -61,7 +62,7 @@ _STATED_IN = {"khz": 1e3, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 _UNIT_WORD = rf"({'|'.join(sorted(map(re.escape, UNITS), key=len, reverse=True))})(?!\w)"
 _SAYS = r"[\"']? *(?:(?:are |is )?in|are|is|[:=(\[<]) *[\[(<\"']? *"
 _ANGLES_IN = re.compile(
-    rf"\b(?:angles?|positions|values|(?:angle[ _])?units?|winkel|angoli|ángulos){_SAYS}{_UNIT_WORD}",
+    rf"\b(?:angles?|positions|values|(?:angle[ _])?units?|winkel){_SAYS}{_UNIT_WORD}",
     re.IGNORECASE,
 )
 _TICK = re.compile(
@@ -139,6 +140,7 @@ def times_of_day(path: object, name: str, cells: Sequence[str]) -> NDArray[np.fl
         (k for k in others if not _NUMBER.fullmatch(cells[k])), others[0] if others else None
     )
     bare = [_OTHER_DATE.sub("", cell.strip()) for cell in cells]
+    bare = [_COMPACT.sub(r"\1-\2-\3T\4:\5:", cell) for cell in bare]
     bare = [f"00:{cell}" if cell.count(":") == 1 else cell for cell in bare]  # minutes and seconds
     bare = [f"{cell[:-4]}.{cell[-3:]}" if cell.count(":") == 3 and cell[-4] == ":" else cell
             for cell in bare]  # fmt: skip

@@ -15,8 +15,8 @@ from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.columns import column, columns_of, time_columns
 from pupper_sysid.sysid.recordings.importers.tables import (
     Table,
-    has_time,
     import_line,
+    is_timed,
     known,
     lines_by_value,
     missing,
@@ -53,7 +53,7 @@ def unknown_columns(path: Path | str, table: Table, timed: bool = False) -> str:
     names = table.names
     own = set(names)
     lacks_pair = missing(names)
-    timed = timed or bool(table.rate) or has_time(names)
+    timed = timed or is_timed(table)
     if lacks_pair == "" and timed:
         return ""
     if {n.lower() for n in own} >= _IMU and lacks_pair.startswith("no column"):

@@ -49,8 +49,8 @@ def holds(recording, joints):
 LAYOUTS = {
     # drives and servos
     "time=t|p_des=c|v_des|kp|kd|t_ff|p_act=p|v_act=x|t_act=x": "joint",
-    "time=t|pos_setpoint=c|pos_estimate=p|vel_estimate=x|iq_measured=x": "joint",
-    "t=t|axis0.controller.pos_setpoint=c|axis0.encoder.pos_estimate=p": "axis_0",
+    "time=t|pos_setpoint=ct|pos_estimate=pt|vel_estimate=x|iq_measured=x": "joint",
+    "t=t|axis0.controller.pos_setpoint=ct|axis0.encoder.pos_estimate=pt": "axis_0",
     "t=t|axis1.pos_setpoint_turns=ct|axis1.pos_estimate_turns=pt": "axis_1",
     "time_ms=tms|goal_position_tick=cc|q_cmd_rad=c|q_present_rad=p|present_position_tick=pc":
         "joint",

@@ -61,6 +61,7 @@ STACKED = {"q": np.column_stack([POSITION, SECOND[1]]),
            "q_des": np.column_stack([COMMAND, SECOND[0]])}  # fmt: skip
 INFLUX = "#group,false,false,false,true,true\n#datatype,string,long,dateTime:RFC3339,double,string"
 
+TURNS = [(t, c / (2 * np.pi), p / (2 * np.pi)) for t, c, p in LOG]
 DEGREES = [(t, *np.degrees((c, p)).tolist()) for t, c, p in LOG]
 GERMAN = "".join(f"{t:.2f}\t{c!r}\t{t:.2f}\t{p!r}\n" for t, c, p in DEGREES).replace(".", ",")
 KEYED = [f"{t},{name},{c},{p}\n" for name, (commands, positions) in zip("ab", JOINTS, strict=True)
@@ -178,7 +179,7 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "SimpleFOC": ("time,target,voltage.q,current.q,current.d,angle\n"
                   + each("{t},{c},{p},{p},{c},{p}"), "joint"),
     "ODrive's current": ("time,input_pos,pos_estimate,Iq_setpoint,Iq_measured\n"
-                         + each("{t},{c},{p},0,0"), "joint"),
+                         + each("{t},{c!r},{p!r},0,0", TURNS), "joint"),
     "MIT's letters": ("t,p_des,v_des,p,v,t_ff\n" + each("{t},{c},0,{p},1,0"), "joint"),
     "d behind a number": ("t,q1,q2,q1d,q2d\n" + each("{t},{p},{q},{c},{d}", BOTH),
                           "joint_1 joint_2"),
