@@ -46,8 +46,8 @@ class Import:
     joints: str | None = None
     """Joints to read, with commas, by the log's names: a,b; by default all."""
     unit: str | None = None
-    """Of angles: rad, deg, counts:4096 (of a turn), percent:3.5 (rad that −100 … 100 span) or
-    scale:0.01 (rad per unit)."""
+    """Of angles: rad, deg, counts:4096 (of a turn; counts:4096:0 around 0), percent:3.5 (rad that
+    −100 … 100 span) or scale:0.01 (rad per unit); deg,rad of commands and positions."""
     read_before_send: bool = False
     """A turn reads the position before it sends the command."""
     stamp: Literal["start", "middle", "end"] | None = None

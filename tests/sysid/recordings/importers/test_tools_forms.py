@@ -32,10 +32,10 @@ BOTH = [(*row, c, p) for row, c, p in zip(LOG, *map(np.ndarray.tolist, SECOND), 
 JOINTS = (COMMAND, POSITION), SECOND
 
 
-def each(pattern, rows=LOG):
+def each(pattern, rows=LOG, head=""):
     """A line a row: `t` or `m` (milliseconds), `c`, `p`; of a second joint `d` and `q`."""
     names = "tcpdq"[: len(rows[0])]
-    return "".join(
+    return f"{head}\n" * bool(head) + "".join(
         pattern.format(**dict(zip(names, row, strict=True)), m=round(1e3 * row[0]), n=n) + "\n"
         for n, row in enumerate(rows)
     )
@@ -66,6 +66,7 @@ DEGREES = [(t, *np.degrees((c, p)).tolist()) for t, c, p in LOG]
 GERMAN = "".join(f"{t:.2f}\t{c!r}\t{t:.2f}\t{p!r}\n" for t, c, p in DEGREES).replace(".", ",")
 KEYED = [f"{t},{name},{c},{p}\n" for name, (commands, positions) in zip("ab", JOINTS, strict=True)
          for t, c, p in zip(TIME, commands, positions, strict=True)]  # fmt: skip
+SIGNED = [(t, *(round(652 * v) for v in (c, p))) for t, c, p in LOG]
 COUNTS = [(t, *(round(2048 + 652 * v) for v in (c, p))) for t, c, p in LOG]
 
 READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
@@ -184,6 +185,48 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "d behind a number": ("t,q1,q2,q1d,q2d\n" + each("{t},{p},{q},{c},{d}", BOTH),
                           "joint_1 joint_2"),
     "a raw angle": ("time,cmd,pos_raw\n" + each("{t},{c},{p}"), "joint"),
+    "ODrive's tree": ("t,axis0.controller.input_pos,axis0.encoder.pos_estimate\n"
+                      + each("{t},{c!r},{p!r}", TURNS), "axis_0"),
+    # units: small angles, which a unit that is not understood would leave as they are
+    "German degrees": (each("{t};{c!r};{p!r}", DEGREES, "Zeit;Sollwinkel in Grad;Istwinkel [Grad]"),
+                       "joint"),
+    "French degrees": (each("{t};{c!r};{p!r}", DEGREES, "temps;consigne (degrés);mesure (degrés)"),
+                       "joint"),
+    "Chinese degrees": (each("{m},{c!r},{p!r}", DEGREES, "时间(ms),目标角度（度）,实际角度(度)"),
+                        "joint"),
+    "Korean degrees": (each("{m},{c!r},{p!r}", DEGREES, "시간(ms),목표각도(도),현재각도(도)"),
+                       "joint"),
+    "a unit by column above": (each("{t},{c!r},{p}", [(t, d[1], p) for (t, _, p), d in
+                               zip(LOG, DEGREES, strict=True)], "# cmd in deg, pos in rad\n"
+                               "time,cmd,pos"), "joint"),
+    "a unit in JSON": (json.dumps({"angle_unit": "deg", "t": TIME.tolist(),
+                                   "cmd": np.degrees(COMMAND).tolist(),
+                                   "pos": np.degrees(POSITION).tolist()}), "joint"),
+    "a unit beside arrays": (saved(np.savez, time=TIME, cmd=np.degrees(COMMAND),
+                                   pos=np.degrees(POSITION), unit="deg"), "joint"),
+    # times
+    "ticks of a remark": ("# tick = 0.5 us\nticks,cmd,pos\n" + "".join(
+        f"{2e6 * t:.0f},{c},{p}\n" for t, c, p in LOG), "joint"),
+    "a timer's clock": ("# timer clock: 2 MHz\ntimer,cmd,pos\n" + "".join(
+        f"{2e6 * t:.0f},{c},{p}\n" for t, c, p in LOG), "joint"),
+    "tens of microseconds": ("time (10us),cmd,pos\n" + "".join(
+        f"{1e5 * t:.0f},{c},{p}\n" for t, c, p in LOG), "joint"),
+    "100 ns of Windows": ("time_100ns,cmd,pos\n" + "".join(
+        f"{134 * 10**15 + round(1e7 * t)},{c},{p}\n" for t, c, p in LOG), "joint"),
+    "frames and their rate": ("# 100 fps\nframe,cmd,pos\n" + each("{n},{c},{p}"), "joint"),
+    "MATLAB's dates": ("Time,ref,theta\n" + each("04-May-2026 12:30:{t:06.3f},{c},{p}"), "joint"),
+    "seconds and milliseconds": ("sec,ms,cmd,pos\n" + "".join(
+        f"{int(100 * t + 50) // 100},{10 * (round(100 * t + 50) % 100)},{c},{p}\n"
+        for t, c, p in LOG), "joint"),
+    # cells
+    "remarks behind rows": (NAMED.split("\n", 1)[0] + "\n" + each("{t},{c},{p}  # ok"), "joint"),
+    "decimal commas between commas": ("time,cmd,pos\n" + each("{t:.3f},{c:.6f},{p:.6f}").replace(
+        ",", ";").replace(".", ",").replace(";", ","), "joint"),
+    "commands and positions by word": (each("{t} CMD {c}\n{t} POS {p}"), "joint"),
+    # messages
+    "rostopic's messages": (each("header: \n  stamp: \n    secs: 100\n    nsecs: {n}0000000\n"
+                                 "set_point: {c}\nprocess_value: {p}\n---"), "joint"),
+    "YAML by rows": (each("- {{t: {t}, cmd: {c}, pos: {p}}}"), "joint"),
     # JSON and arrays
     "rows by number": (pd.DataFrame({"t": TIME, "cmd": COMMAND, "pos": POSITION}).to_json(
         orient="index", double_precision=12), "joint"),
@@ -238,6 +281,15 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
                 "--time time_of_day --unit deg --command T --position A"),
     "a percent sign": ("time,cmd,pos\n" + "".join(
         f"{t},{60 * c:.2f}%,{60 * p:.2f}%\n" for t, c, p in LOG), "--unit percent:3.5"),
+    "counts around 0": (each("{t},{c},{p}", SIGNED, "time,goal,pos"), "--unit counts:4096:0"),
+    "degrees beside radians": ("time,goal,pos\n" + "".join(
+        f"{t},{np.degrees(c)},{p}\n" for t, c, p in LOG), "--unit deg,rad"),
+    "counts beside radians": ("time,goal,pos\n" + "".join(
+        f"{t},{2048 + 652 * c:.0f},{p}\n" for t, c, p in LOG), "--unit counts:4096,rad"),
+    "hexadecimal cells": (each("{m},{c:04X},{p:04X}", COUNTS, "time_ms,goal,pos"),
+                          "--unit counts:4096"),
+    "one name twice": ("time,angle,angle\n" + CSV, "--time 0 --command 1 --position 2"),
+    "steps": (each("{t},{c},{p}", SIGNED, "t,target_steps,actual_steps"), "--unit counts:3200:0"),
     "whole seconds": ("time,cmd,pos\n" + "".join(
         f"12:30:{int(2.5 * t):02d},{c},{p}\n" for t, c, p in LOG), "--rate 40"),
 }  # fmt: skip
@@ -248,6 +300,9 @@ WRONG: dict[str, tuple[str | bytes, str]] = {
     "a bag of ROS 1": (b"#ROSBAG V2.0\n" + bytes(50), "rosbags-convert"),
     "several robots": (saved(np.savez, dof_pos=np.zeros((90, 2, 3)), dt=0.01),
                        "90 × 2 × 3 values, of several robots"),
+    "candump": (each("(17000.{n:06d}) can0 001#8C2D7FF0333"), "raw frames of a CAN bus"),
+    "candump on a screen": (each("  can0  141   [8]  A4 00 F4 01 1C 00 00 00"), "raw frames"),
+    "columns named anew": (NAMED + "time,pos,cmd\n" + CSV, "named again, and differently"),
     "servo's answers alone": (each("ID 1 at {p}"), "no names"),
 }  # fmt: skip
 
@@ -285,8 +340,38 @@ def test_the_first_line_of_a_refusal_reads_the_log(tmp_path, form):
     rate = {"rate": float(stated.pop("rate"))} if "rate" in stated else {}
     recording = load(tmp_path / "log.txt", LogOptions(**stated, **rate))
     (trial, *_) = recording.trials(recording.joints[0])
-    assert np.corrcoef(trial.command_rad, COMMAND)[0, 1] > 0.9999
-    assert np.corrcoef(trial.position_rad, POSITION)[0, 1] > 0.9999
+    for read, true in ((trial.command_rad, COMMAND), (trial.position_rad, POSITION)):
+        assert np.corrcoef(read, true)[0, 1] > 0.9999
+        if form not in ("a percent sign", "steps"):  # of ranges that the log does not say
+            assert np.std(read) == pytest.approx(np.std(true), rel=0.01), line
+
+
+FAILED = range(11, ROWS, 20)
+FLAGS = {
+    "valid": lambda bad: int(not bad), "read_ok": lambda bad: not bad, "timeout": int,
+    "status": lambda bad: "TIMEOUT" if bad else "OK", "comm_result": lambda bad: -3001 * bad,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("flag", FLAGS)
+def test_readings_that_a_column_calls_failed_are_left_out(tmp_path, flag):
+    rows = [(*row[:2], 0.0 if n in FAILED else row[2], FLAGS[flag](n in FAILED))
+            for n, row in enumerate(LOG)]  # fmt: skip
+    lines = "".join(",".join(map(str, row)) + "\n" for row in rows)
+    recording = load(written(tmp_path, f"time,cmd,pos,{flag}\n{lines}"))
+    (trial,) = recording.trials("joint")
+    assert np.flatnonzero(np.isnan(trial.position_rad)).tolist() == [*FAILED]
+    assert any(f"4 readings failed by the column {flag}" in text for text in recording.warnings)
+
+
+def test_a_flag_of_one_joint_says_nothing_of_another(tmp_path):
+    lines = each("{t},{c},{p},{n},{d},{q}", BOTH).replace(",11,", ",0,").splitlines()
+    lines = [",".join([*cells[:3], "0" if n == 11 else "1", *cells[4:]])
+             for n, cells in enumerate(line.split(",") for line in lines)]  # fmt: skip
+    names = "time,hip_cmd,hip_pos,hip_valid,knee_cmd,knee_pos\n"
+    recording = load(written(tmp_path, names + "\n".join(lines)))
+    lost = {j: int(np.isnan(recording.trials(j)[0].position_rad).sum()) for j in recording.joints}
+    assert lost == {"hip": 1, "knee": 0}
 
 
 def test_what_is_no_table_is_called_by_its_name(tmp_path):
