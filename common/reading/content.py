@@ -42,10 +42,7 @@ _times: ContextVar[float] = ContextVar("read_limit", default=1.0)
 def reading_up_to(times: float) -> Iterator[None]:
     """Within the block, read files up to `times` the usual limits.
 
-    Parameters
-    ----------
-    times : float
-        1 to 1000.
+    `times`: 1 to 1000.
     """
     if not 1 <= times <= MOST_TIMES:
         raise InputError(
@@ -74,20 +71,10 @@ def refuse_more(
 ) -> None:
     """Refuse what is beyond a limit.
 
-    Parameters
-    ----------
-    name : Path or str
-        The file, and the place in it where that helps.
-    found : float
-        How much it has.
-    most : float
-        The limit, before it is raised.
-    unit : str
-        Such as "rows" or "bytes".
-    remedy : str
-        What to do, as a sentence.
-    exact : bool
-        Whether `found` is all, rather than what was counted until the limit was passed.
+    `name`: the file, and the place in it where that helps. `found`: how much it has. `most`: the
+    limit, before it is raised. `unit`: such as "rows" or "bytes". `remedy`: what to do, as a
+    sentence. `exact`: whether `found` is all, rather than what was counted until the limit was
+    passed.
     """
     bound = allowed(most)
     if found <= bound:
@@ -115,11 +102,7 @@ _PIECE = 1 << 20
 def open_regular(path: Path | str, remedy: str = "") -> BufferedReader:
     """Open a regular file for reading.
 
-    Parameters
-    ----------
-    path : Path or str
-    remedy : str
-        What to do, as a sentence; by default, to check the file's name.
+    `remedy`: what to do, as a sentence; by default, to check the file's name.
     """
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):  # opening a device may already do something
@@ -139,13 +122,8 @@ def open_regular(path: Path | str, remedy: str = "") -> BufferedReader:
 def content(path: Path | str, most_bytes: float, remedy: str = "") -> bytes:
     """Content of a regular file of limited size.
 
-    Parameters
-    ----------
-    path : Path or str
-    most_bytes : float
-        Larger files are refused without being read; `budget.reading_up_to` raises it.
-    remedy : str
-        What to do, as a sentence.
+    `most_bytes`: larger files are refused without being read; `budget.reading_up_to` raises it.
+    `remedy`: what to do, as a sentence.
     """
     try:
         with open_regular(path, remedy) as file:
@@ -176,14 +154,8 @@ def unpacked(path: Path | str, data: bytes, most_bytes: float) -> bytes:
 
     Other content comes back as it is, also archives of arrays (`.npz`, `.pt`).
 
-    Parameters
-    ----------
-    path : Path or str
-        For messages.
-    data : bytes
-        Content of the file: its first bytes tell the compression, not its name.
-    most_bytes : float
-        Content that is larger is refused; `budget.reading_up_to` raises it.
+    `path`: for messages. `data`: content of the file: its first bytes tell the compression, not its
+    name. `most_bytes`: content that is larger is refused; `budget.reading_up_to` raises it.
     """
     kind = next((k for mark, k in _PACKED.items() if data.startswith(mark)), None)
     foreign = next((k for mark, k in _FOREIGN.items() if data.startswith(mark)), None)
@@ -273,14 +245,7 @@ def refuse_large_header(path: Path | str, data: bytes) -> None:
 def refuse_bomb(path: Path | str, data: bytes, remedy: str) -> None:
     """Refuse a torch file that is no zip archive, or unpacks to more than a checkpoint has.
 
-    Parameters
-    ----------
-    path : Path or str
-        For the message.
-    data : bytes
-        Content of the file.
-    remedy : str
-        What to do, as a sentence.
+    `path`: for the message. `data`: content of the file. `remedy`: what to do, as a sentence.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:

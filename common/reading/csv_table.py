@@ -147,20 +147,10 @@ def read_table(
 
     A last row with too few cells is left out, since its writer was interrupted.
 
-    Parameters
-    ----------
-    path : Path or str
-        For messages.
-    text : str
-    texts : collection of str
-        Columns that hold text.
-    strict : bool
-        Refuse text in other columns, rather than name it in `faults`, and each line with another
-        number of cells, rather than leave a few out.
-    whole_lines : bool
-        Leave a last line out, too, that does not end.
-    columns : sequence of str, optional
-        Names of the columns where no line has them.
+    `path`: for messages. `texts`: columns that hold text. `strict`: refuse text in other columns,
+    rather than name it in `faults`, and each line with another number of cells, rather than leave a
+    few out. `whole_lines`: leave a last line out, too, that does not end. `columns`: names of the
+    columns where no line has them.
     """
     text = one_line_end(text)
     refuse_more(path, text.count("\n"), MOST_ROWS + 2 * MOST_COMMENTS, "lines", _SPLIT)
@@ -372,16 +362,8 @@ def numbers_of(
 ) -> NDArray[np.float64]:
     """Numbers of a column's cells; an empty one is NaN.
 
-    Parameters
-    ----------
-    path : Path or str
-    name : str
-        Of the column.
-    cells : sequence of str
-    lines : sequence of int
-        Of the cells, for messages.
-    words : bool
-        Whether a word for a reading that failed, such as `timeout`, stands for an empty cell.
+    `name`: of the column. `lines`: of the cells, for messages. `words`: whether a word for a
+    reading that failed, such as `timeout`, stands for an empty cell.
     """
     values, shown = np.full(len(cells), np.nan), printable(name)[:60]
     for k, cell in enumerate(cells):

@@ -67,11 +67,7 @@ def setup_findings(setup: ServoSetup, speed_rad_s: float = _SERVO_RAD_S) -> list
     A set-point that must be able to stop on the command follows a speed v at a distance of v² over
     twice its acceleration limit, which is a lag of v over twice the limit.
 
-    Parameters
-    ----------
-    setup : ServoSetup
-    speed_rad_s : float
-        Speed of the fast parts of the motion [rad/s].
+    `speed_rad_s`: speed of the fast parts of the motion [rad/s].
     """
     found, registers = [], setup.registers
     count_rad = _COUNT_RAD.get(setup.model or "", _COUNT_RAD["STS3215"])
@@ -273,11 +269,7 @@ def joint_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
 def usable_trials(recordings: Recordings, joints: Joints = None) -> dict[str, tuple[Trial, ...]]:
     """All trials by joint, in joint order.
 
-    Parameters
-    ----------
-    recordings : Recording or sequence of Recording
-    joints : str or sequence of str, optional
-        Which joints; by default all that were recorded.
+    `joints`: which joints; by default all that were recorded.
     """
     chosen = chosen_joints(recordings, joints)
     refuse_unusable({j: recorded_trials(recordings, j) for j in chosen})
@@ -299,17 +291,9 @@ def each_joint(
 ) -> dict[str, Found]:
     """`work(joint, trials)` of every joint, in joint order; none if one cannot be used.
 
-    Parameters
-    ----------
-    work : callable
-        Must be picklable if there are several workers.
-    recordings : Recording or sequence of Recording
-    joints : str or sequence of str, optional
-        Which joints; by default all that were recorded.
-    workers : int
-        Processes.
-    progress : callable, optional
-        Called with a joint's name when it is done.
+    `work`: must be picklable if there are several workers. `joints`: which joints; by default all
+    that were recorded. `workers`: processes. `progress`: called with a joint's name when it is
+    done.
     """
     if workers > 1:  # imports what it needs beside the look at the recordings
         prepare(getattr(work, "func", work).__module__)

@@ -136,13 +136,7 @@ class Explanation:
     ) -> list[NDArray[np.float64]]:
         """The command of each trial as `servo` filters and delays it, at each reading.
 
-        Parameters
-        ----------
-        servo : Servo
-        changed : callable, optional
-            What becomes of the command before.
-        lag_s : float, optional
-            Instead of the servo's.
+        `changed`: what becomes of the command before. `lag_s`: instead of the servo's.
         """
         lag = servo.lag_s if lag_s is None else lag_s
         return [
@@ -200,19 +194,9 @@ def servo_delay(number: int) -> float:
 def explain(trials: Sequence[Trial], step: float, exchanged: bool = False) -> Explanation | None:
     """Explain the position of one joint by its command.
 
-    Parameters
-    ----------
-    trials : sequence of Trial
-        All of this joint, three rows or more each, with sound time stamps.
-    step : float
-        Quantisation step [rad]: trials that move by little more weigh little.
-    exchanged : bool
-        Explain the command by the position.
-
-    Returns
-    -------
-    Explanation or None
-        None if no trial has enough motion of both.
+    `trials`: all of this joint, three rows or more each, with sound time stamps. `step`:
+    quantisation step [rad]: trials that move by little more weigh little. `exchanged`: explain the
+    command by the position. Returns None if no trial has enough motion of both.
     """
     if exchanged:
         trials = [_exchanged(t) for t in trials if np.isfinite(t.position_rad).sum() > 8]

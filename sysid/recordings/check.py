@@ -43,26 +43,10 @@ def check(
 ) -> tuple[pd.DataFrame, list[str]]:
     """Refuse or repair a tidy table.
 
-    Parameters
-    ----------
-    path : Path or str
-        Name of the source, for messages.
-    table : pandas.DataFrame
-    metadata : mapping
-        Header entries: angles whose unit was stated may be of several turns.
-    options : LogOptions, optional
-        What was stated of the log.
-
-    Returns
-    -------
-    table : pandas.DataFrame
-    warnings : list of str
-        One sentence per repair.
-
-    Raises
-    ------
-    InputError
-        If a joint is unknown, times run backwards, angles cannot be radians, or too little is left.
+    `path`: name of the source, for messages. `metadata`: header entries: angles whose unit was
+    stated may be of several turns. `options`: what was stated of the log. Returns the table and one
+    sentence per repair. Raises InputError if a joint is unknown, times run backwards, angles cannot
+    be radians, or too little is left.
     """
     warnings: list[str] = []
     options = options or LogOptions()

@@ -138,13 +138,9 @@ def split_tones(trial: Trial, at_rests: bool = False) -> list[Trial]:
 
     Rests and other motion between tones are left out, but for a rest in front of each.
 
-    Parameters
-    ----------
-    trial : Trial
-        One that a frequency is known of is left as it is.
-    at_rests : bool
-        Cut only where the joint can have come to rest, which a simulation must start from; tones
-        that follow one another directly stay together, without a frequency.
+    `trial`: one that a frequency is known of is left as it is. `at_rests`: cut only where the joint
+    can have come to rest, which a simulation must start from; tones that follow one another
+    directly stay together, without a frequency.
     """
     if trial.frequency_hz > 0:
         return [trial]

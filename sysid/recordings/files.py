@@ -167,12 +167,8 @@ class RecordingWriter:
     def resumed(cls, path: Path, trial: int) -> RecordingWriter:
         """Writer that continues an unfinished recording.
 
-        Parameters
-        ----------
-        path : Path
-        trial : int
-            First trial to write. Its rows that are in the file stay and are cancelled by a comment
-            line; an incomplete last line is removed.
+        `trial`: first trial to write. Its rows that are in the file stay and are cancelled by a
+        comment line; an incomplete last line is removed.
         """
         text = as_text(path, read_bytes(path))
         whole = text[: text.rfind("\n") + 1]

@@ -261,25 +261,14 @@ class Recording:
     ) -> Recording:
         """A recording from a table, validated like a file.
 
-        Parameters
-        ----------
-        table : pandas.DataFrame
-            Columns of a recording file or of another layout that `load` reads. Of the former,
-            `read_time_s`, `trial` and `frequency_hz` may be absent: reads then follow
-            `READ_AFTER_SEND_S` after the command, in doubt by half a turn (unless `metadata` has
-            `read_after_send_s`), all rows are one trial, and no tone is assumed.
-        metadata : mapping, optional
-            Header entries, such as `bus` and `start_pose_rad`.
-        name : str
-            For messages, tables and figures.
-        options : LogOptions, optional
-            Columns, units and joint names of a table of other columns.
-
-        Raises
-        ------
-        InputError
-            If a column is missing or is not numeric, times run backwards, angles cannot be
-            radians, or too few rows are left.
+        `table`: columns of a recording file or of another layout that `load` reads. Of the former,
+        `read_time_s`, `trial` and `frequency_hz` may be absent: reads then follow
+        `READ_AFTER_SEND_S` after the command, in doubt by half a turn (unless `metadata` has
+        `read_after_send_s`), all rows are one trial, and no tone is assumed. `metadata`: header
+        entries, such as `bus` and `start_pose_rad`. `name`: for messages, tables and figures.
+        `options`: columns, units and joint names of a table of other columns. Raises InputError if
+        a column is missing or is not numeric, times run backwards, angles cannot be radians, or too
+        few rows are left.
         """
         if not isinstance(table, pd.DataFrame):
             raise InputError(
@@ -362,16 +351,8 @@ class Recording:
     def save(self, path: Path | str, force: bool = False) -> None:
         """Write a recording file, which `load` reads back.
 
-        Parameters
-        ----------
-        path : Path or str
-        force : bool
-            Replace an existing file.
-
-        Raises
-        ------
-        InputError
-            If the file exists and `force` is not given, or if it cannot be written.
+        `force`: replace an existing file. Raises InputError if the file exists and `force` is not
+        given, or if it cannot be written.
         """
         write_text(Path(path), self.to_csv(), force)
 
@@ -446,10 +427,6 @@ def on_one_clock(trials: Mapping[str, list[Trial]]) -> dict[str, list[Trial]]:
     clocks agree at the end of the recording at which readings follow commands within a turn of
     the loop, to about a turn. Where they do so at both ends, commands and readings may as well be
     of two loops at slightly different rates: nothing is changed, but the growth is in doubt.
-
-    Parameters
-    ----------
-    trials : mapping of joint to list of Trial
     """
     every = [t for of_joint in trials.values() for t in of_joint]
     time = np.concatenate([np.empty(0), *(t.send_time_s for t in every)])
@@ -505,17 +482,9 @@ def in_servo_coordinates(
 ) -> dict[str, list[Trial]]:
     """Trials by joint, each calf on a linkage as its servo moves it.
 
-    Parameters
-    ----------
-    trials : mapping of joint to list of Trial
-    bus : mapping
-        Entry of the recording's header: `coordinates`, and `linkage` or the name of a joint map.
-
-    Returns
-    -------
-    dict of joint to list of Trial
-        A calf that was recorded without its thigh stays as it is: a thigh that does not move
-        changes its offset only. Rows without one of the thigh at the same time are left out.
+    `bus`: entry of the recording's header: `coordinates`, and `linkage` or the name of a joint map.
+    Returns a calf that was recorded without its thigh stays as it is: a thigh that does not move
+    changes its offset only. Rows without one of the thigh at the same time are left out.
     """
     if bus.get("coordinates") != "joint":
         return dict(trials)

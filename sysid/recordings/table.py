@@ -115,11 +115,8 @@ class Parsed:
 def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
     """Cells of a table of text (`common.reading.dialect`) with a comment header, as numbers.
 
-    Raises
-    ------
-    InputError
-        For ragged rows, text where a number belongs, a broken or newer header, or more than is
-        read (`common.reading.content`).
+    Raises InputError for ragged rows, text where a number belongs, a broken or newer header, or
+    more than is read (`common.reading.content`).
     """
     options = options or LogOptions()
     text = one_line_end(text)

@@ -51,19 +51,8 @@ _NARROWEST_RAD, _WIDEST_RAD = 0.2, 2 * np.pi  # range of a joint
 def scale_by_step(positions: ArrayLike, nominal: float, span: float = 1.0) -> tuple[float, str]:
     """Radians per unit of readings whose smallest step is one count of 4,096 a turn.
 
-    Parameters
-    ----------
-    positions : array_like
-    nominal : float
-        Range in rad to assume where the readings show no step.
-    span : float
-        Range in the log's unit: 1 for shares, 200 for −100 … 100.
-
-    Returns
-    -------
-    scale : float
-    text : str
-        What was assumed, for a warning.
+    `nominal`: range in rad to assume where the readings show no step. `span`: range in the log's
+    unit: 1 for shares, 200 for −100 … 100. Returns the scale and what was assumed, for a warning.
     """
     step = smallest_step(np.asarray(positions, float))
     found = span * COUNT_RAD / step if step > 0 else 0.0

@@ -322,13 +322,7 @@ def bounded(path: Path, messages: Iterator[Raw]) -> list[Raw]:
 def mcap_messages(path: Path, data: bytes, warnings: list[str]) -> Iterator[Raw]:
     """Yield the messages of an MCAP file; one that is cut off gives what there is.
 
-    Parameters
-    ----------
-    path : Path
-        For messages to the user.
-    data : bytes
-    warnings : list of str
-        Gets a sentence if the file is cut off.
+    `path`: for messages to the user. `warnings`: gets a sentence if the file is cut off.
     """
     try:
         from mcap.exceptions import EndOfFile, McapError
@@ -473,10 +467,7 @@ def plain_type(name: str) -> str:
 def decode(kind: str, data: bytes) -> Message:
     """A message of type `kind`, one of this module's.
 
-    Raises
-    ------
-    ValueError
-        If the bytes are too short, or no such message.
+    Raises ValueError if the bytes are too short, or no such message.
     """
     return _DECODERS[kind](_Cdr(data))
 

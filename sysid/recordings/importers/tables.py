@@ -214,15 +214,9 @@ def expanded(
 ) -> Table:
     """Table of arrays of which some have a number per joint: `action` becomes `action.<name>`.
 
-    Parameters
-    ----------
-    path : Path or str
-        For messages.
-    arrays : mapping of str to ndarray, shape (rows,) or (rows, joints)
-    names : sequence of str
-        Of the joints; arrays of another width get `joint_0`, `joint_1` and so on.
-    named : str, optional
-        What in the log holds these names; None if it does not name its joints.
+    `path`: for messages. `arrays` of shape (rows,) or (rows. `names`: of the joints; arrays of
+    another width get `joint_0`, `joint_1` and so on. `named`: what in the log holds these names;
+    None if it does not name its joints.
     """
     distinct(path if named is None else f"{path}, {named}", names, "joints")
     lengths = [len(values) for values in arrays.values()]
