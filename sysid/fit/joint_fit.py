@@ -528,9 +528,10 @@ def _settled(
     enough = -TELLING_NATS if stated else _PROFILE_NATS  # a register is believed unless refuted
     if gained > enough and not stated:  # it was searched for, so what else there may be is, too
         plain = _explained(ready, choice, anew=True)
-    rival = -np.inf if plain.misfit is None else plain.misfit.nats
+    # in cost, because likelihoods are counted at temperatures of their own
+    rival = -np.inf if plain.misfit is None else plain.misfit.nats * plain.misfit.temperature
     most = _DESCRIBES_BETTER * overall(goodness)
-    if gained < max(enough, rival):
+    if gained < enough or choice.carried.fit.cost - profiled.fit.cost < rival:
         plain, profiled = _perhaps_profiled(ready, plain, profiled, gained), None
     elif stated or not undescribed(_goodness(ready, profiled)):
         most = np.inf
@@ -545,8 +546,7 @@ def _settled(
             plain = _perhaps_profiled(ready, plain, profiled, gained)
         return ready, every, plain
     wider = _choice(any_servo, ladder)
-    better = (choice.carried.fit.cost - wider.carried.fit.cost) / choice.carried.temperature
-    if profiled is None and plain.misfit is not None and better < plain.misfit.nats:
+    if profiled is None and choice.carried.fit.cost - wider.carried.fit.cost < rival:
         return ready, every, plain  # that is no term of a servo
     # the noise that `most` is relative to is an upper bound, which a worse fit finds larger
     smaller = _DESCRIBES_BETTER * _error_rad(ready, choice.carried)
@@ -558,7 +558,7 @@ def _settled(
 def _explained(ready: PreparedJoint, choice: _Choice, anew: bool = False) -> _Choice:
     """The choice with what a misfit looks like; `anew` searches for it far from the fit."""
     carried = choice.carried
-    anew = anew or carried.temperature > _CORRELATED
+    anew = anew or (ready.scales.free_air and carried.temperature > _CORRELATED)
     anew = anew or bool(undescribed(_goodness(ready, carried)))
     if not (anew or ready.scales.free_air):
         return choice  # a motor under load has enough terms to imitate a filter
