@@ -681,8 +681,8 @@ def known(table: Table, name: str) -> NDArray[np.float64]:
 
 def is_timed(table: Table) -> bool:
     """Whether a table has times, or states its rate."""
-    timer = table.tick_s and any(map(_TIMER.search, table.names))
-    return bool(table.rate or timer or has_time(table.names))
+    timer = table.tick_s is not None and any(map(_TIMER.search, table.names))
+    return table.rate is not None or timer or has_time(table.names)
 
 
 def has_time(names: Sequence[str]) -> bool:
@@ -723,7 +723,7 @@ def _times(
     names = moving if has_time(moving) else names
     steps = next((n for n in names if _TIME_STEP.fullmatch(n)), None)
     found = [n for n in time_columns(names) if n != steps]
-    if not found and table.tick_s:
+    if not found and table.tick_s is not None:
         found = [n for n in names if _TIMER.search(n)]
     sent = [n for n in names if (c := column(n)).kind == "time" and c.words & _SENT]
     read = [n for n in names if (c := column(n)).kind == "time" and c.words and n not in sent]

@@ -101,7 +101,7 @@ def clock(name: str, values: NDArray[np.float64], tick_s: float | None = None) -
         stated = float(several[1]) * _SCALES[several[2].lower()]
         if _LOOP_S[0] < loop * stated <= _LOOP_S[1]:
             return Clock(stated, float(values[0]))
-    if not found and tick_s and _LOOP_S[0] < loop * tick_s <= _LOOP_S[1]:
+    if not found and tick_s is not None and _LOOP_S[0] < loop * tick_s <= _LOOP_S[1]:
         text = f"ticks of {tick_s:.4g} s were taken for the times in {shown}, as a remark says."
         return Clock(tick_s, float(values[0]), [text])
     if len(values) and any(low < values[0] < high for low, high in _OF_100_NS):
