@@ -138,10 +138,26 @@ def examine(
 ) -> Examination:
     """Examine every joint of a recording.
 
-    `recordings`: trials of one joint are pooled. `joints`: which joints; by default all that were
-    recorded. `seed`: shuffles rows for the poll's z-score. `lags`: of the same recordings, if they
-    have been measured already: the poll and the lag are theirs. Returns verdict and numbers by
-    joint. Raises InputError if a joint is not recorded.
+    Parameters
+    ----------
+    recordings : Recording or sequence of Recording
+        Trials of one joint are pooled.
+    joints : str or sequence of str, optional
+        Which joints; by default all that were recorded.
+    seed : int or numpy.random.Generator
+        Shuffles rows for the poll's z-score.
+    lags : mapping of joint to LagBudget, optional
+        Of the same recordings, if they have been measured already: the poll and the lag are theirs.
+
+    Returns
+    -------
+    Examination
+        Verdict and numbers by joint.
+
+    Raises
+    ------
+    InputError
+        If a joint is not recorded.
     """
     given = as_sequence(recordings)
     rng = np.random.default_rng(seed)
