@@ -243,11 +243,20 @@ def _low_pass(
     """The likeliest filter, and those that are about as likely."""
     structure = problem.structure
     anew = anew and structure.scales.free_air  # under load a search takes minutes
-    behind = {t: _behind(problem, t) for t in (_CLOSER_S if anew else _LOW_PASS_S)}
-    fits = {t: refine(p, _earlier(structure, best.point, t)) for t, p in behind.items()}
+    fits = {}
     if anew:
-        for t in sorted(fits, key=lambda t: fits[t].cost)[:_SEARCHED]:
-            wide = search_widely(behind[t], rng, fits[t].point[None], short=True)
+        rough = problem.coarse
+        for t in _CLOSER_S:
+            fits[t] = refine(_behind(rough, t), _earlier(structure, best.point, t))
+        likeliest = sorted(fits, key=lambda t: fits[t].cost)[:_SEARCHED]
+        starts = {t: fits[t].point[None] for t in likeliest}
+    else:
+        starts = {t: _earlier(structure, best.point, t) for t in _LOW_PASS_S}
+    behind = {t: _behind(problem, t) for t in starts}
+    fits = {t: refine(behind[t], points) for t, points in starts.items()}
+    if anew:
+        for t, points in starts.items():
+            wide = search_widely(behind[t], rng, points, short=True)
             fits[t] = min(wide, fits[t], key=lambda f: f.cost)
     middle = min(fits, key=lambda t: fits[t].cost)
     # gains make up for a part of a filter, so that its own lie along a ridge

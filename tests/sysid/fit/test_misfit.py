@@ -130,23 +130,19 @@ def test_a_small_dead_zone_that_does_not_show_leaves_the_friction_open():
     assert all(0.0 < r.weight <= 1.0 for r in rivals)
 
 
-def test_a_low_pass_filter_is_named_and_its_dead_time_is_the_true_one():
-    named = explanation(candidate(SIMULATED[0]), NUMBERS, 0.016, undescribed=False)
-    assert named is not None
+def test_a_low_pass_filter_is_named_and_gains_make_up_for_a_part_of_it():
+    _, rivals = found(candidate(SIMULATED[0]), NUMBERS, 0.016, undescribed=False)
+    named = decided(rivals)
+    assert named is rivals[0]
     constant = re.fullmatch(r"a low-pass filter of about (\d+) ms in front of it", named.words)
     assert constant is not None and 13 <= int(constant[1]) <= 19
-    assert named.dead_time_s == pytest.approx(0.015, abs=1e-3)
-
-
-def test_gains_make_up_for_a_part_of_a_filter_so_that_its_dead_time_is_a_range():
-    _, rivals = found(candidate(SIMULATED[0]), NUMBERS, 0.016, undescribed=False)
-    named = with_delays(rivals[0], rivals)
-    shortest, longest = named.delays_s
+    shortest, longest = with_delays(named, rivals).delays_s
     assert shortest < named.dead_time_s < longest
-    doubtful = with_delays(replace(rivals[0], temperature=9.0), rivals)  # a ninth of the readings
     width = longest - shortest
-    assert shortest - width < 0.015 < longest + width
-    assert doubtful.delays_s[1] - doubtful.delays_s[0] > 2.0 * width
+    assert shortest - width < 0.015 < longest + width < 0.016
+    a_ninth_of_the_readings = replace(named, temperature=9.0)
+    doubtful = with_delays(a_ninth_of_the_readings, rivals).delays_s
+    assert doubtful[1] - doubtful[0] > 2.0 * width
 
 
 @pytest.mark.parametrize(
