@@ -368,7 +368,7 @@ def _load(path: Path) -> Calibration:
             data = data | {"joints": _with_unseen_runs(data.get("joints"))}
         return validated(Calibration, data | {"schema_version": SCHEMA_VERSION}, path, lines)
     data = _renamed(data, _RENAMED) | {"schema_version": SCHEMA_VERSION}
-    lines = {tuple(_RENAMED.get(p, p) for p in place): n for place, n in lines.items()}
+    lines = {tuple(_RENAMED.get(str(p), p) for p in place): n for place, n in lines.items()}
     try:
         return validated(Calibration, data, path, lines)
     except InputError as error:

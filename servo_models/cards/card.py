@@ -27,7 +27,6 @@ from pupper_sysid.servo_models.calibration.parts import (
     NO_SPEED_LIMIT_RAD_S,
     NOT_STATED,
     P_GAINS,
-    PARAMETER_KEYS,
     Actuator,
     Armature,
     Feedback,
@@ -260,7 +259,11 @@ class ServoCard(Part):
                 delay_steps_min=low,
                 delay_steps_max=high,
                 physics_step_s=TIME_STEP_S,
-                **{PARAMETER_KEYS[n]: q for n, q in torques.items()},
+                stiffness_nm_per_rad=torques["stiffness"],
+                damping_nm_s_per_rad=torques["damping"],
+                friction_loss_nm=torques["friction_loss"],
+                effort_limit_nm=torques["effort_limit"],
+                back_emf_nm_s_per_rad=torques["back_emf"],
                 ratios_to_armature=RatiosToArmature(
                     **{n: stated(q.value / armature) for n, q in torques.items()}
                 ),

@@ -53,7 +53,7 @@ _SHARES = (
     "load_friction_static", "off_brake", "start_duty", "duty_limit", "stribeck_exponent",
     "load_friction_motor", "load_friction_load", "load_stribeck_motor", "load_stribeck_load",
 )  # fmt: skip
-_UNITS = dict.fromkeys(_SHARES, "1") | dict.fromkeys(
+_UNITS: dict[str, str] = dict.fromkeys(_SHARES, "1") | dict.fromkeys(
     ("load_quadratic_motor", "load_quadratic_load"), "1/(N·m)"
 )
 

@@ -168,13 +168,14 @@ def _explanation(
     """What was tried beside the carried fit; None if it is less likely than counts."""
     fit, behind = tried.fit, tried.problem
     better = _tempered(problem, best, temperature) - _tempered(behind, fit, temperature)
+    counted = better
     if tried.of_readings:
-        read = (_unlikely(problem, best) - _unlikely(behind, fit)) / temperature
-    if (read if tried.of_readings else better) < _POSSIBLE_NATS:
+        counted = (_unlikely(problem, best) - _unlikely(behind, fit)) / temperature
+    if counted < _POSSIBLE_NATS:
         return None
     return Explanation(
         tried.words, better - tried.price, float(behind.structure.decode(fit.point)[0]),
-        float(np.exp(min(read if tried.of_readings else better, 0.0))),
+        float(np.exp(min(counted, 0.0))),
         fit.point[list(tried.shared)], (behind, fit), temperature,
     )  # fmt: skip
 

@@ -128,13 +128,15 @@ def _choices(setup: Setup, duration_s: float) -> Iterator[tuple[Kind, float, flo
         fastest = excitation.SPEED_MARGIN * setup.speed_limit_rad_s / (2 * np.pi * frequency)
         most = _rounded_down(min(largest, fastest))
         amplitudes = {a for a in _TONES_RAD if a < 0.9 * most} | {most}
-        yield from (("sine", frequency, a) for a in sorted(amplitudes) if a >= least)
+        for amplitude in sorted(a for a in amplitudes if a >= least):
+            yield "sine", frequency, amplitude
     for wanted in _SQUARES_HZ:
         frequency = excitation.off_harmonics(wanted, rates, duration_s)
         most = _rounded_down(min(largest, _HARDEST_SQUARE_RAD_HZ / frequency))
         if frequency <= highest and frequency * duration_s >= 1:
             amplitudes = {a for a in _SQUARES_RAD if a < 0.9 * most} | {most}
-            yield from (("square", frequency, a) for a in sorted(amplitudes) if a >= least)
+            for amplitude in sorted(a for a in amplitudes if a >= least):
+                yield "square", frequency, amplitude
 
 
 def _rounded_down(angle_rad: float) -> float:

@@ -396,9 +396,10 @@ def _sine_fit(
     return frequency, solution, float(np.var(value - design @ solution))
 
 
-def _solved(design: NDArray, value: NDArray) -> NDArray[np.float64]:
+def _solved(design: NDArray[np.float64], value: NDArray[np.float64]) -> NDArray[np.float64]:
     gram = design.T @ design
-    return np.linalg.solve(gram + np.diag(1e-12 * np.diagonal(gram)), design.T @ value)
+    regular = gram + np.diag(1e-12 * np.diagonal(gram))
+    return np.asarray(np.linalg.solve(regular, design.T @ value), np.float64)
 
 
 def _away(

@@ -166,7 +166,7 @@ def errors(
         ahead = by_run(data, start, model.one_step(commands, position))
     firsts = [data.runs[joint][0].trial.send_time_s for joint in data.joints[:2]]
     # of joints that were recorded one at a time the stretches are independent
-    apart = len(firsts) == 2 and not np.array_equal(*firsts)
+    apart = len(firsts) == 2 and not np.array_equal(firsts[0], firsts[1])
     made = {}
     for joint in data.joints:
         parts, alone = [], joint if apart else ""
