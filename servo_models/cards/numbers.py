@@ -53,9 +53,10 @@ _SHARES = (
     "load_friction_static", "off_brake", "start_duty", "duty_limit", "stribeck_exponent",
     "load_friction_motor", "load_friction_load", "load_stribeck_motor", "load_stribeck_load",
 )  # fmt: skip
-_UNITS: dict[str, str] = dict.fromkeys(_SHARES, "1") | dict.fromkeys(
-    ("load_quadratic_motor", "load_quadratic_load"), "1/(N·m)"
-)
+_UNITS: dict[str, str] = {
+    "load_quadratic_motor": "1/(N·m)", "load_quadratic_load": "1/(N·m)",
+    **dict.fromkeys(_SHARES, "1"),
+}  # fmt: skip
 
 
 def unit(name: str) -> str:
