@@ -345,7 +345,7 @@ def test_a_drawing_process_that_died_ends_nothing():
 
 
 SWEEP_OSCILLOSCOPE = (
-    "sweep", "--joints", "LF_hip", "--freqs", "2", "--duration", "1.5", "--out", "a.csv",
+    "sweep", "--joints", "LF_hip", "--freqs", "2", "--duration", "3", "--out", "a.csv",
 )  # fmt: skip
 
 
