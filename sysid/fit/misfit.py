@@ -26,10 +26,9 @@ from pupper_sysid.sysid.fit.structure import Structure, servo_structure
 
 _LOW_PASS_S = (0.004, 0.008, 0.016, 0.032, 0.064)
 """Time constants that are tried: below the first a filter is a delay, above the last a slow one."""
-_CLOSER_S = tuple(np.geomspace(0.004, 0.064, 17))
+_CLOSER_S, _SEARCHED = tuple(np.geomspace(0.004, 0.064, 17)), 2
 """The same where errors are larger than noise, and how many of them are searched widely: of many
 exact readings a constant that is off by a tenth makes no sense."""
-_SEARCHED = 2
 _BETWEEN, _NEAR_BY = (0.71, 1.41, 0.84, 1.19), (0.92, 1.09, 0.96, 1.04)
 """Factors about the likeliest: all between two that were tried, then more closely."""
 _NATS = 10.0
@@ -244,13 +243,13 @@ def _low_pass(
     """The likeliest filter, and those that are about as likely."""
     structure = problem.structure
     anew = anew and structure.scales.free_air  # under load a search takes minutes
-    fits = {}
     if anew:
-        rough = problem.coarse
-        for t in _CLOSER_S:
-            fits[t] = refine(_behind(rough, t), _earlier(structure, best.point, t))
-        likeliest = sorted(fits, key=lambda t: fits[t].cost)[:_SEARCHED]
-        starts = {t: fits[t].point[None] for t in likeliest}
+        coarse = {
+            t: refine(_behind(problem.coarse, t), _earlier(structure, best.point, t))
+            for t in _CLOSER_S
+        }
+        likeliest = sorted(coarse, key=lambda t: coarse[t].cost)[:_SEARCHED]
+        starts = {t: coarse[t].point[None] for t in likeliest}
     else:
         starts = {t: _earlier(structure, best.point, t) for t in _LOW_PASS_S}
     behind = {t: _behind(problem, t) for t in starts}

@@ -224,6 +224,8 @@ def _rest_rad(trial: Trial) -> float:
     rest = trial.position_rad[known & (trial.read_time_s <= moved_s)]
     if len(rest) < _LEAST_AT_REST:
         return float(trial.position_rad[known][0])
+    away = np.abs(rest - np.median(rest))
+    rest = rest[away <= 5.0 * max(float(np.mean(away)), 1e-9)]  # without single bad readings
     early, late = np.array_split(rest, 2)
     error = np.std(rest) / np.sqrt(len(early))
     settles = abs(early.mean() - late.mean()) > _SETTLES * error

@@ -32,7 +32,7 @@ from pupper_sysid.sysid.fit.predict import ReadingRule, ages
 from pupper_sysid.sysid.servo_fit.data import Run, ServoData, look_up
 from pupper_sysid.sysid.servo_fit.windows import Part, chosen, chosen_rows, everything
 
-LINEAR = "linear, fitted here"  # name of the linear filter that stands beside compared models
+LINEAR = "linear, fitted here"  # name of the linear filter among compared models
 
 _BLOCK_S = 0.5
 _DRAWS = 1000

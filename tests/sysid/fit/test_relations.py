@@ -188,6 +188,8 @@ def test_a_run_starts_where_the_joint_rested():
         return prepare(rested, lattice).start_rad
 
     assert start_rad(noisy) == pytest.approx(0.1, abs=4 * 2e-3 / np.sqrt(40))
+    spiked = np.where(count == 20, 1.5, noisy)
+    assert start_rad(spiked) == pytest.approx(start_rad(noisy), abs=1e-3)
     settling = noisy - 0.1 * np.exp(-count / 10)
     assert start_rad(settling) == settling[0]
 
