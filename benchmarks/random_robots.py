@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,19 +18,12 @@ from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
-from pupper_sysid.sysid.sweep.excitation import Plan, parse_frequencies, plan
+from pupper_sysid.sysid.sweep.excitation import parse_frequencies, plan
 from pupper_sysid.sysid.sweep.recorder import record
 
 
 def random_spec(rng: np.random.Generator, **chosen: float) -> RobotSpec:
-    """Draw a spec, for benchmarks over many robots.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    **chosen : float
-        Fields of `RobotSpec` to fix instead of drawing (`loss=0.3`).
-    """
+    """Draw a spec; `chosen` fixes fields of `RobotSpec` instead (`loss=0.3`)."""
     base = RobotSpec()
 
     def around(value: float, spread: float) -> float:
@@ -71,27 +63,13 @@ class SweptRobot:
         return float(delay_at_step(self.servo, step_s, PHYSICS_STEP_S)[0])
 
 
-def sweep_random_robot(
-    rng: np.random.Generator, excitation: str | Callable[[list[str]], Plan], **chosen: float
-) -> SweptRobot:
-    """Draw a robot and record one of its joints, chosen at random.
-
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    excitation : str or callable
-        Tones such as "1-10" [Hz], or the plan of a list of joints.
-    **chosen : float
-        Fields of `RobotSpec` to fix instead of drawing.
-    """
+def sweep_random_robot(rng: np.random.Generator, tones: str, **chosen: float) -> SweptRobot:
+    """Draw a robot and sweep one of its joints, chosen at random, by tones such as "1-10" [Hz]."""
     spec = random_spec(rng, **chosen)
     joint = JOINT_NAMES[int(rng.integers(len(JOINT_NAMES)))]
     robot = draw_robot(rng, spec)
     bus = WitnessedBus(robot, rng, joint)
-    if isinstance(excitation, str):
-        trials = plan("sine", [joint], parse_frequencies(excitation))
-    else:
-        trials = excitation([joint])
+    trials = plan("sine", [joint], parse_frequencies(tones))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "sweep.csv"
         record(bus, trials, path)

@@ -1,6 +1,6 @@
 """Servo models on recordings of real servos: motions and gains that were not fitted.
 
-    .venv/bin/python benchmarks/real_recordings.py walk sweep xl330 so101 [--bam PYTHON]
+    .venv/bin/python benchmarks/real_recordings.py walk sweep xl330 [--bam PYTHON]
 
 Recordings are found in `$PUPPER_REAL_DATA`, else in `../shared/real`. All errors are of free runs.
 
@@ -8,8 +8,7 @@ Recordings are found in `$PUPPER_REAL_DATA`, else in `../shared/real`. All error
 loop 2. `sweep`: the sweeps of its hip and thigh are calibrated, and predict the same joints of that
 walk, as positions and as readings of the sweep's poll. `xl330`: a Dynamixel XL330 with a pendulum,
 fitted at P 100, 400 and 800, scored at P 200; with `--bam`, the Python of BAM's environment
-(`peers/install.sh`), BAM's models are fitted to the same. `so101`: the STS3215 of an arm,
-fitted to the first 40 s of three motions, scored on the rest and on a fourth motion.
+(`peers/install.sh`), BAM's models are fitted to the same. An SO-101: `which_sts3215.py`.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ import subprocess
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -39,19 +39,9 @@ from pupper_sysid.sysid.fit.run import Run, at_steps, prepare, simulate
 from pupper_sysid.sysid.fit.structure import loaded_columns
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.fit import Split, fit_servo
-from pupper_sysid.sysid.servo_fit.scores import (
-    LINEAR,
-    FreeRun,
-    Tracks,
-    as_rows,
-    errors,
-    rms,
-    run_with_offset,
-    stacked,
-    with_ages,
-)
 from pupper_sysid.sysid.servo_fit.windows import everything
 
 SWEEPS = ("real_motor_0_LF_hip_amp0.3.csv", "real_motor_1_LF_thigh_amp0.3.csv")
@@ -66,6 +56,7 @@ MODELS = (("fir", "default"), ("delayed-pd", "default"), ("mlp", "paper"), ("lst
 """Architecture and preset of `fit-servo`."""
 JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll")
 MOTIONS = ("chirp_sweep", "prbs_excitation", "step_response", "frequency_sweep")
+BAM_TRIALS = 2500
 FITTED_S = 40.0
 """Of each motion of the SO-101 but the last, of which nothing is fitted."""
 
@@ -101,12 +92,14 @@ def sweep(seed: int) -> None:
     recording = load(REAL / WALK)
     result = calibrate([load(REAL / name) for name in SWEEPS], seed=seed)
     joints = list(result.joints)
-    data = as_rows(servo_data([recording], joints, "all"), joints)
+    data = scores.as_rows(servo_data([recording], joints, "all"), joints)
     known = {"the sweeps": result.calibration}
-    aged = with_ages(data, {j: rule_of(j, data.lattices[j], "the walk", known) for j in joints})
+    aged = scores.with_ages(
+        data, {j: rule_of(j, data.lattices[j], "the walk", known) for j in joints}
+    )
     offset = [result.calibration.joint(j).feedback.offset_rad.value for j in data.joints]
     calibrated = calibrated_run(result.calibration, data)
-    tracks = calibrated(np.zeros(stacked(data)[1].shape) + offset)
+    tracks = calibrated(np.zeros(scores.stacked(data)[1].shape) + offset)
     moved = {j: [t + own for t in tracks[j]] for j, own in zip(data.joints, offset, strict=True)}
     lines = {
         "calibration: position, offset of the sweep": rows_error(moved, data),
@@ -114,8 +107,8 @@ def sweep(seed: int) -> None:
     }
     for preset in PRESETS:
         lines |= by_rule(preset, calibrated_run(load_calibration(preset), data), data, aged)
-    scored = compare(recording, [result.calibration], joints).models[LINEAR]
-    name = f"{LINEAR} to the walk's other loops"
+    scored = compare(recording, [result.calibration], joints).models[scores.LINEAR]
+    name = f"{scores.LINEAR} to the walk's other loops"
     lines[name] = {j: s.rmse_raw_rad for j, s in scored.joints.items()}
     print_rows(
         ("mrad", *joints, "mean"),
@@ -126,18 +119,22 @@ def sweep(seed: int) -> None:
     )
 
 
-def rows_error(tracks: Tracks, data: ServoData) -> dict[str, float]:
+def rows_error(tracks: scores.Tracks, data: ServoData) -> dict[str, float]:
     """RMS of all rows as logged against the predicted readings, by joint [rad]."""
-    return {j: rms(e.raw) for j, e in errors(None, tracks, data, everything).items()}
+    return {j: scores.rms(e.raw) for j, e in scores.errors(None, tracks, data, everything).items()}
 
 
 def by_rule(
-    name: str, run: FreeRun, data: ServoData, aged: ServoData
+    name: str, run: scores.FreeRun, data: ServoData, aged: ServoData
 ) -> dict[str, dict[str, float]]:
     """Errors with the walk's offset, of positions and of readings with their age."""
     return {
-        f"{name}: position, offset of the walk": rows_error(run_with_offset(run, data)[0], data),
-        f"{name}: reading, offset of the walk": rows_error(run_with_offset(run, aged)[0], aged),
+        f"{name}: position, offset of the walk": rows_error(
+            scores.run_with_offset(run, data)[0], data
+        ),
+        f"{name}: reading, offset of the walk": rows_error(
+            scores.run_with_offset(run, aged)[0], aged
+        ),
     }
 
 
@@ -151,12 +148,6 @@ def loaded_fit(joint: str, trials: Sequence[Trial], seed: int) -> LoadedFit:
     return fit
 
 
-def row_errors(fit: LoadedFit, trial: Trial) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Model minus reading of every row [rad], and its time [s]."""
-    run = prepare(trial, fit.lattice, fit.reference_voltage_v)
-    return at_steps(track(fit, run), run.row_step) - run.row_rad, run.row_step * run.step_s
-
-
 def track(fit: LoadedFit, run: Run) -> NDArray[np.float64]:
     """Readings that a fitted servo predicts at the edges of the steps of a run [rad]."""
     columns = loaded_columns(fit.servo)
@@ -166,13 +157,7 @@ def track(fit: LoadedFit, run: Run) -> NDArray[np.float64]:
     return simulate(columns[None], np.array([fit.numbers["dead_time_s"].value]), run)[:, 0]
 
 
-def dead_time(fit: LoadedFit) -> str:
-    """With its interval, in ms."""
-    d = fit.numbers["dead_time_s"]
-    return f"{1e3 * d.value:.1f} [{1e3 * d.low:.1f}, {1e3 * d.high:.1f}]"
-
-
-def xl330(seed: int, bam: str, bam_trials: int) -> None:
+def xl330(seed: int, bam: str) -> None:
     """Mean absolute error at the gain that was not fitted, by trajectory."""
     files = sorted((REAL / "bam_xl330").glob("*.json"))
     gain = {f: json.loads(f.read_text())["kp"] for f in files}
@@ -181,13 +166,17 @@ def xl330(seed: int, bam: str, bam_trials: int) -> None:
     def rows() -> Iterable[list[str]]:
         fit = loaded_fit("xl330", [t for f in fitted for t in load(f).trials("xl330")], seed)
         trials = [load(f).trials("xl330")[0] for f in scored]
-        values = {f"pupper-sysid, dead time {dead_time(fit)} ms": [
-            float(np.mean(np.abs(row_errors(fit, trial)[0]))) for trial in trials
-        ]}  # fmt: skip
+        dead = fit.numbers["dead_time_s"]
+        ends = "{:.1f} [{:.1f}, {:.1f}]".format(
+            *(1e3 * x for x in (dead.value, dead.low, dead.high))
+        )
+        runs = [prepare(t, fit.lattice, fit.reference_voltage_v) for t in trials]
+        errors = [at_steps(track(fit, run), run.row_step) - run.row_rad for run in runs]
+        mean = [float(np.mean(np.abs(e))) for e in errors]
+        values = {f"pupper-sysid, dead time {ends} ms": mean}
         for model in ("m4", "m6") if bam else ():
             script = Path(__file__).parent / "peers" / "bam_pendulum.py"
-            command = [bam, script, model, bam_trials, seed, "xl330",
-                       *fitted, "--", *scored]  # fmt: skip
+            command = [bam, script, model, BAM_TRIALS, seed, "xl330", *fitted, "--", *scored]
             answer = subprocess.run(
                 [*map(str, command)], check=True, capture_output=True, text=True
             )
@@ -196,27 +185,6 @@ def xl330(seed: int, bam: str, bam_trials: int) -> None:
             yield [name, *map(mrad, by_file), mrad(float(np.mean(by_file)))]
 
     print_rows(("mean absolute error, mrad", *(f.stem for f in scored), "mean"), rows())
-
-
-def so101(seed: int) -> None:
-    """RMS errors of what was not fitted, by joint and motion."""
-    recordings = {m: load(REAL / "sage_so101" / m) for m in MOTIONS}
-    every: list[list[float]] = []
-
-    def rows() -> Iterable[list[str]]:
-        for joint in JOINTS:
-            trials = {m: r.trials(joint)[0] for m, r in recordings.items()}
-            fit = loaded_fit(joint, [first(trials[m]) for m in MOTIONS[:3]], seed)
-            values = []
-            for motion, trial in trials.items():
-                error, time_s = row_errors(fit, trial)
-                counted = (time_s > FITTED_S) | (motion == MOTIONS[3])
-                values.append(float(np.sqrt(np.nanmean(error[counted] ** 2))))
-            every.append(values)
-            yield [joint, fit.structure, *map(mrad, values), dead_time(fit)]
-        yield ["mean", "", *map(mrad, np.mean(every, axis=0)), ""]
-
-    print_rows(("RMS, mrad", "structure", *MOTIONS, "dead time, ms"), rows())
 
 
 def first(trial: Trial) -> Trial:
@@ -230,17 +198,13 @@ def first(trial: Trial) -> Trial:
 
 
 def main(
-    parts: tyro.conf.Positional[tuple[Literal["walk", "sweep", "xl330", "so101"], ...]],
+    parts: tyro.conf.Positional[tuple[Literal["walk", "sweep", "xl330"], ...]],
     seed: int = 0,
     bam: str = "",
-    bam_trials: int = 2500,
 ) -> None:
     """Print the tables of the parts; `bam` is the Python of BAM's environment."""
     for part in parts:
-        if part == "xl330":
-            xl330(seed, bam, bam_trials)
-        else:
-            {"walk": walk, "sweep": sweep, "so101": so101}[part](seed)
+        {"walk": walk, "sweep": sweep, "xl330": partial(xl330, bam=bam)}[part](seed)
 
 
 if __name__ == "__main__":

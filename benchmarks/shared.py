@@ -26,3 +26,8 @@ def print_rows(head: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
 def mrad(value_rad: float) -> str:
     """An error in mrad."""
     return f"{1e3 * value_rad:.1f}"
+
+
+def share(part: int, whole: int) -> str:
+    """Counts, with the percentage."""
+    return f"{part} of {whole} ({100 * part / whole:.0f} %)" if whole else "–"

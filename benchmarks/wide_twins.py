@@ -1,13 +1,12 @@
 """Do the numbers of `calibrate` hold on servos of any kind? Twins from an independent simulator.
 
-`wide_servo.py` draws servos, motions and buses from wide ranges and simulates them at 0.1 ms, with
-no code of the package. Here recordings of them go through `calibrate`, and each number that the
-calibration file calls identified is compared with the truth.
+`tests/support/wide_servo.py` draws servos, motions and buses from wide ranges and simulates them
+at 0.1 ms, with no code of the package. Here recordings of them go through `calibrate`, and each
+number that the calibration file calls identified is compared with the truth.
 
     .venv/bin/python benchmarks/wide_twins.py --kinds profile gravity --motions tones walk \
         --count 4 --seed 1 --out twins.json
     .venv/bin/python benchmarks/wide_twins.py --tables before.json after.json
-    .venv/bin/python benchmarks/wide_twins.py --self-test
 
 `--out` is a file of JSON lines, one twin each, written as they end; a file that is there goes on.
 Of several files in `--tables` the twins count that all have. Definitions: a number *holds* where
@@ -22,7 +21,6 @@ from __future__ import annotations
 import json
 import math
 import resource
-import sys
 import tempfile
 import warnings
 from collections import defaultdict
@@ -32,27 +30,14 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from shared import print_rows  # isort: skip
+from shared import print_rows, share  # isort: skip
 
 import numpy as np
 import pandas as pd
 import tyro
-from wide_servo import (
-    IN_CLASS,
-    KINDS,
-    MOTIONS,
-    Rows,
-    Servo,
-    Twin,
-    draw_twin,
-    lag_truth,
-    readings,
-    simulate,
-    tone_truths,
-    truths,
-)
 
 import pupper_sysid as ps
+from support import wide_servo as wide
 
 JOINT = "knee"
 RATIOS = ("stiffness", "damping", "back_emf", "damping_sum", "friction_loss", "effort_limit")
@@ -69,7 +54,7 @@ NO_LIMIT = 300.0
 # -------------------------------------------------------------------------------------- one twin
 
 
-def recording(twin: Twin, rows: Rows, folder: Path) -> ps.Recording:
+def recording(twin: wide.Twin, rows: wide.Rows, folder: Path) -> ps.Recording:
     """The rows as a user has them: arrays with true times, or a table with one time per row."""
     bus = twin.bus
     if bus.stamps == "end":
@@ -93,8 +78,8 @@ def recording(twin: Twin, rows: Rows, folder: Path) -> ps.Recording:
 def measured(kind: str, motion: str, number: int, seed: int) -> dict[str, Any]:
     """Calibrate one twin: truth, answers, processor time."""
     warnings.simplefilter("ignore")
-    twin, path, sent, commands = draw_twin(kind, motion, number, seed)
-    rows = readings(twin, path)
+    twin, path, sent, commands = wide.draw_twin(kind, motion, number, seed)
+    rows = wide.readings(twin, path)
     record: dict[str, Any] = {
         "kind": kind, "motion": motion, "number": number, "seed": seed,
         "servo": twin.servo._asdict(), "rows": len(rows.sent_s), "refused": None,
@@ -108,13 +93,13 @@ def measured(kind: str, motion: str, number: int, seed: int) -> dict[str, Any]:
     else:
         joint = result.calibration.joints[JOINT].model_dump(mode="json")
         lag = result.joints[JOINT].to_dict()["lag"]
-        truth = truths(twin, path)
+        truth = wide.truths(twin, path)
         record["answers"] = [(q, a, truth[q]) for q, a in answered(joint).items()]
         by_trial = {t["trial"]: t["lag_s"] for t in lag["by_frequency"]}
         lags = [(LAGS[0], by_trial.get(t["trial"]), [t["truth"]] * 2)
-                for t in tone_truths(twin, path, sent, commands)]  # fmt: skip
+                for t in wide.tone_truths(twin, path, sent, commands)]  # fmt: skip
         if not any(answer for _, answer, _ in lags):
-            lags = [(LAGS[1], lag["lag_s"], [lag_truth(twin, path, sent, commands)] * 2)]
+            lags = [(LAGS[1], lag["lag_s"], [wide.lag_truth(twin, path, sent, commands)] * 2)]
         record["answers"] += [(q, a | {"identified": "yes"}, t) for q, a, t in lags if a]
         record["calibration"] = joint
     record["processor_s"] = _processor_s() - begun
@@ -221,11 +206,6 @@ def answers(records: Iterable[dict[str, Any]]) -> list[Answer]:
     ]
 
 
-def share(part: int, whole: int) -> str:
-    """Counts, with the percentage."""
-    return f"{part} of {whole} ({100 * part / whole:.0f} %)" if whole else "–"
-
-
 def size(value: float, unit: str = "") -> str:
     """A width or a miss with its unit, or as a factor."""
     digits = f"{value:.3g}" if unit or not 1 < value < 1.1 else f"{value:.4f}"
@@ -267,7 +247,9 @@ def print_tables(records: list[dict[str, Any]]) -> None:
         if record["refused"]:
             print(f"refused: {record['kind']}, {record['motion']}: {record['refused']}")
     for title, in_class in (("in class", True), ("out of class", False)):
-        part = grouped((r for r in every if (r[3]["kind"] in IN_CLASS) is in_class), lambda r: r[0])
+        part = grouped(
+            (r for r in every if (r[3]["kind"] in wide.IN_CLASS) is in_class), lambda r: r[0]
+        )
         print(f"\n{title}")
         print_rows(
             ("quantity", "identified", "holds", "beyond a factor 2", "worst miss", "median width",
@@ -275,7 +257,7 @@ def print_tables(records: list[dict[str, Any]]) -> None:
         )  # fmt: skip
     both = [
         (name, rows)
-        for label, names in (("kind", KINDS), ("motion", MOTIONS))
+        for label, names in (("kind", wide.KINDS), ("motion", wide.MOTIONS))
         for name, rows in ((n, [r for r in every if r[3][label] == n]) for n in names)
         if rows
     ]
@@ -296,82 +278,6 @@ def grouped(rows: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[An
     return groups
 
 
-# -------------------------------------------------------------------------------------- self-test
-
-
-def check_simulator() -> None:
-    """Compare the simulator with closed forms, and 0.2 ms with 0.05 ms steps."""
-    rng, checks = np.random.default_rng(0), []
-    hard = {"dead_time_s": 0.0, "friction": 0.0, "effort": 1e9}
-
-    def moved(servo: Servo, size: float, stop: float, step: float = 1e-4):
-        path = simulate(servo, np.array([0.0, 0.1]), np.array([0.0, size]), stop, rng, step)
-        return path.time_s - 0.1, path
-
-    time_s, path = moved(Servo(stiffness=2500, damping=100, **hard), 0.5, 0.6)
-    after = np.maximum(time_s, 0)
-    exact = 0.5 * (1 - (1 + 50 * after) * np.exp(-50 * after))
-    checks.append(("critically damped step [rad]", np.abs(path.angle - exact).max(), 1e-3))
-
-    time_s, path = moved(Servo(dead_time_s=0.0203, effort=200, friction=50, damping=0), 9.0, 0.2)
-    after = np.clip(time_s - 0.0203, 0, None)
-    checks.append(("full effort against friction [rad]",
-                   np.abs(path.angle - 0.5 * 150 * after**2).max(), 2e-3))  # fmt: skip
-
-    for speed, duration in ((np.inf, 2 * np.sqrt(0.5 / 40)), (2.0, 0.5 / 2 + 2 / 40)):
-        time_s, path = moved(Servo(acceleration_limit=40, speed_limit=speed, **hard), 0.5, 1.0)
-        there = time_s[np.argmax(path.set_point > 0.5 - 1e-5)]
-        checks.append((f"end of the profile, {speed:g} rad/s [s]", abs(there - duration), 2e-3))
-    time_s, path = moved(Servo(speed_limit=5, **hard), 0.5, 1.0)
-    exact = np.clip(5 * time_s, 0, 0.5)
-    checks.append(("slew [rad]", np.abs(path.set_point - exact).max(), 1e-3))
-
-    swing = Servo(stiffness=1e-9, damping=0, gravity=30, gravity_phase=0.01, friction=0)
-    path = simulate(swing, np.array([0.0]), np.array([0.0]), 5.0, rng)
-    exact = -0.01 + 0.01 * np.cos(np.sqrt(30) * (path.time_s + 1.5))
-    checks.append(("small swing, 6.5 s [rad]", np.abs(path.angle - exact).max(), 3e-5))
-    still = Servo(stiffness=100, friction=20, gravity=15, gravity_phase=np.pi / 2)
-    path = simulate(still, np.array([0.0]), np.array([0.0]), 2.0, rng)
-    checks.append(("stick below friction [rad]", np.abs(path.angle).max(), 1e-12))
-
-    emf = Servo(stiffness=1e6, effort=100, back_emf=20, damping=0, friction=0, dead_time_s=0)
-    time_s, path = moved(emf, 100.0, 0.5)
-    after = np.clip(time_s, 0, None)
-    exact = 5 * (after - (1 - np.exp(-20 * after)) / 20)
-    checks.append(("no-load speed [rad]", np.abs(path.angle - exact).max(), 2e-3))
-
-    # two masses joined by a stiff spring move as one
-    one = Servo(stiffness=2500, damping=60, **hard)
-    two = one._replace(motor_share=0.6, link_stiffness=0.4 * 800.0**2, link_damping=100)
-    paths = [moved(s, 0.3, 0.8)[1].angle for s in (one, two)]
-    checks.append(("stiff link [rad]", np.abs(paths[0] - paths[1]).max(), 3e-3))
-    low = one._replace(low_pass_s=0.05, stiffness=1e5, damping=600)
-    time_s, path = moved(low, 0.3, 0.8)
-    exact = 0.3 * (1 - np.exp(-np.clip(time_s, 0, None) / 0.05))
-    checks.append(("low-pass [rad]", np.abs(path.set_point - exact).max(), 1e-3))
-    droop = Servo(stiffness=1000, damping=60, friction=0, gravity=50, gravity_phase=np.pi / 2)
-    path = simulate(droop, np.array([0.0]), np.array([0.0]), 3.0, rng)
-    end = path.angle[-1]
-    checks.append(("droop balances gravity", abs(1000 * end + 50 * np.cos(end)), 1e-2))
-    path = simulate(droop._replace(integral=5e3, integral_clamp=200), np.array([0.0]),
-                    np.array([0.0]), 8.0, rng)  # fmt: skip
-    checks.append(("an integral term removes it [rad]", abs(path.angle[-1]), 1e-4))
-
-    for kind in KINDS:
-        twin, _, sent, commands = draw_twin(kind, "tones", 0, 3)
-        plain = twin.servo._replace(dead_time_jitter_s=0.0)
-        stop = twin.stretches[0].duration_s  # later, play and profiles amplify any difference
-        rough, fine = (simulate(plain, sent, commands, stop, rng, step) for step in (2e-4, 5e-5))
-        difference = rough.angle - np.interp(rough.time_s, fine.time_s, fine.angle)
-        name = f"0.2 against 0.05 ms, {kind} [share of the motion]"
-        most = max(0.005, twin.servo.play / fine.angle.std())
-        checks.append((name, difference.std() / fine.angle.std(), most))
-    for name, error, most in checks:
-        print(f"{'ok  ' if error <= most else 'FAIL'} {name}: {error:.2g} (at most {most:g})")
-    if any(error > most for _, error, most in checks):
-        sys.exit("The simulator is wrong.")
-
-
 # -------------------------------------------------------------------------------------------- main
 
 
@@ -387,18 +293,15 @@ def read_records(path: Path) -> dict[tuple[str, str, int, int], dict[str, Any]]:
 
 
 def main(
-    kinds: tuple[str, ...] = KINDS,
-    motions: tuple[str, ...] = tuple(MOTIONS),
+    kinds: tuple[str, ...] = wide.KINDS,
+    motions: tuple[str, ...] = tuple(wide.MOTIONS),
     count: int = 2,
     seed: int = 1,
     jobs: int = 1,
     out: Path = Path("twins.json"),
     tables: tuple[Path, ...] = (),
-    self_test: bool = False,
 ) -> None:
     """Run `count` twins of each kind and motion, or print the tables of finished ones."""
-    if self_test:
-        return check_simulator()
     if tables:
         files = [read_records(path) for path in tables]
         common = set.intersection(*map(set, files))

@@ -34,7 +34,7 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.doctor.checks import joint_trials
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
-from pupper_sysid.sysid.fit.scores import rms, score
+from pupper_sysid.sysid.fit.scores import Scores, rms, score
 from pupper_sysid.sysid.fit.search import folds_of
 from pupper_sysid.sysid.fit.structure import PREFERRED, candidate
 from pupper_sysid.sysid.recordings.files import load
@@ -44,17 +44,14 @@ HERE = Path(__file__).parent
 if STEP_S != TIME_STEP_S:
     raise SystemExit("the peers' grid is not the calibration's any more: change exchange.STEP_S.")
 
-PEERS = {
-    "cross-correlation, paper's gains": ("naive.py", ".venv"),
-    "python-control and SciPy by hand": ("control_by_hand.py", ".venv"),
-    "PACE's fit (CMA-ES)": ("pace_style.py", ".venv"),
-    "BAM 1.0.2, M4": ("bam_fit.py", ".venv-bam"),
-    "mujoco.sysid 4.0.0": ("mujoco_sysid.py", ".venv"),
-}
 RETIMED = "mujoco.sysid, times by pupper-sysid"
+PEERS = {
+    "cross-correlation, paper's gains": "naive.py",
+    "mujoco.sysid 4.0.0": "mujoco_sysid.py",
+    RETIMED: "mujoco_sysid.py",
+}
 OURS = "pupper-sysid calibrate"
 ERRORS = ("held", "unseen", "raw", "true")
-SLOW = {"BAM 1.0.2, M4", "PACE's fit (CMA-ES)"}
 
 
 @dataclass(frozen=True)
@@ -66,10 +63,6 @@ class Case:
     joint: str
     motion: list[NDArray] | None = None
     robot: SweptRobot | None = None
-
-    def dead_time_s(self, step_s: float) -> float:
-        """True dead time, for a simulation in steps of `step_s`; NaN if unknown."""
-        return float("nan") if self.robot is None else self.robot.dead_time_s(step_s)
 
 
 @dataclass(frozen=True)
@@ -86,6 +79,21 @@ class Outcome:
     covered: bool | None
     width_s: float
     seconds: float
+
+
+def outcome(
+    method: str, case: Case, scores: Scores, tracks: list[NDArray], dead_time_s: float | None,
+    ends_s: tuple[float, float] | None, step_s: float, seconds: float,
+) -> Outcome:  # fmt: skip
+    """What one method came to: its scores, its tracks and dead time against the truth."""
+    true = case.robot.dead_time_s(step_s) if case.robot else np.nan
+    return Outcome(
+        method, case.name, scores.rmse_raw_rad, scores.rmse_held_rad,
+        scores.rmse_leave_one_frequency_out_rad, off_truth(tracks, case),
+        np.nan if dead_time_s is None else dead_time_s - true,
+        bool(ends_s[0] <= true <= ends_s[1]) if ends_s and case.motion else None,
+        ends_s[1] - ends_s[0] if ends_s else np.nan, seconds,
+    )  # fmt: skip
 
 
 def emulated(seed: int) -> Case:
@@ -111,14 +119,9 @@ def ours(case: Case) -> tuple[Outcome, tuple[Run, ...]]:
     structure = candidate(PREFERRED)
     values = np.array([pd.values[name] for name in structure.names])
     tracks = free_run(structure, values, result.runs)
-    true = case.dead_time_s(TIME_STEP_S)
-    outcome = Outcome(
-        OURS, case.name, pd.scores.rmse_raw_rad, pd.scores.rmse_held_rad,
-        pd.scores.rmse_leave_one_frequency_out_rad,
-        off_truth(tracks, case), dead.value - true,
-        dead.low <= true <= dead.high if case.motion else None, dead.high - dead.low, seconds,
-    )  # fmt: skip
-    return outcome, result.runs
+    ends = (dead.low, dead.high)
+    mine = outcome(OURS, case, pd.scores, tracks, dead.value, ends, TIME_STEP_S, seconds)
+    return mine, result.runs
 
 
 def off_truth(tracks: list[NDArray], case: Case) -> float:
@@ -151,15 +154,13 @@ def peer_trials(case: Case, data: tuple[Run, ...], retimed: bool) -> list[PeerTr
     return given
 
 
-def theirs(
-    method: str, script: str, environment: str, case: Case, data: tuple[Run, ...]
-) -> Outcome:
+def theirs(method: str, script: str, case: Case, data: tuple[Run, ...]) -> Outcome:
     """Through a peer, in its own environment."""
     folds = folds_of(data)
     fits = [list(range(len(data)))]
     fits += [np.flatnonzero(~out).tolist() for out in folds.values()]
     answer = subprocess.run(
-        [HERE / environment / "bin" / "python", HERE / script],
+        [HERE / ".venv/bin/python", HERE / script],
         input=dump(peer_trials(case, data, method == RETIMED), fits),
         capture_output=True, text=True, check=False,
     )  # fmt: skip
@@ -174,15 +175,10 @@ def theirs(
             [at_steps(p, one.sample_step) - one.sample_rad for p, one, gone in rows if gone]
         )
     scores = score(tracks[0], data, held_out)
-    whole, span = answers[0], answers[0]["dead_time_interval_s"]
-    true = case.dead_time_s(whole["step_s"])
-    off = float("nan") if whole["dead_time_s"] is None else whole["dead_time_s"] - true
-    return Outcome(
-        method, case.name, scores.rmse_raw_rad, scores.rmse_held_rad,
-        scores.rmse_leave_one_frequency_out_rad,
-        off_truth(tracks[0], case), off,
-        bool(span[0] <= true <= span[1]) if span and case.motion else None,
-        span[1] - span[0] if span else float("nan"), sum(a["seconds"] for a in answers),
+    whole, seconds = answers[0], sum(a["seconds"] for a in answers)
+    return outcome(
+        method, case, scores, tracks[0], whole["dead_time_s"], whole["dead_time_interval_s"],
+        whole["step_s"], seconds,
     )  # fmt: skip
 
 
@@ -195,29 +191,26 @@ def track_of(positions_rad: list[list[float]], data: tuple[Run, ...]) -> list[ND
 
 
 def print_table(outcomes: list[Outcome], names: list[str]) -> None:
-    """Print medians over the cases that every method of the table has seen."""
-    by_method = {n: [o for o in outcomes if o.method == n] for n in names}
-    shared = set.intersection(*({o.case for o in own} for own in by_method.values()))
+    """Print medians over the recordings."""
 
     def shown(value: float) -> str:
         return f"{1e3 * value:.1f}" if np.isfinite(value) else "–"
 
     def cells(name: str) -> list[str]:
-        own = [o for o in by_method[name] if o.case in shared]
-        known = [o for o in by_method[name] if np.isfinite(o.true)]
-        spans = [o for o in known if o.covered is not None]
-        errors = [shown(float(np.median([getattr(o, k) for o in own]))) for k in ERRORS]
-        off = np.median([abs(o.delay_error_s) for o in known]) if known else np.nan
+        every = [o for o in outcomes if o.method == name]
+        spans = [o for o in every if o.covered is not None]
+        errors = [shown(float(np.median([getattr(o, k) for o in every]))) for k in ERRORS]
+        off = np.median([abs(o.delay_error_s) for o in every])
         covered = f"{sum(bool(o.covered) for o in spans)} of {len(spans)}" if spans else ""
         width = np.median([o.width_s for o in spans]) if spans else np.nan
-        seconds = f"{np.median([o.seconds for o in own]):.1f}"
+        seconds = f"{np.median([o.seconds for o in every]):.1f}"
         return [name, *errors, shown(off), covered or "none stated", shown(width), seconds]
 
     print_rows(
         ("method", "held", "unseen tone", "raw", "true motion", "dead time off, ms",
          "90 % interval holds it", "its width ms", "s per joint"), map(cells, names),
     )  # fmt: skip
-    print(f"\nErrors in mrad, medians of {len(shared)} recordings.\n")
+    print("\nErrors in mrad, medians of the recordings.\n")
 
 
 def real_cases(folder: Path) -> list[Case]:
@@ -226,28 +219,16 @@ def real_cases(folder: Path) -> list[Case]:
     return [Case(f"real {joint}", r, joint) for r in recordings for joint in r.joints]
 
 
-def main(robots: int = 12, slow: int = 2, real: Path | None = None, only: str = "") -> None:
-    """Print the tables: of `robots`, `slow` of them given to BAM and PACE, too, and of a folder.
-
-    `only` is a part of a method's name: that one and ours.
-    """
+def main(robots: int = 12, real: Path | None = None, only: str = "") -> None:
+    """Print the tables of `robots` and of a folder; `only`: a part of a method's name, and ours."""
     methods = {k: v for k, v in PEERS.items() if only in k}
-    if any("mujoco" in name for name in methods):
-        methods[RETIMED] = PEERS["mujoco.sysid 4.0.0"]
-    groups = {
-        "Real recordings": real_cases(real) if real else [],
-        "Emulated robots": range(robots),
-    }
-    for title, members in groups.items():
+    groups = {"Real recordings": real_cases(real) if real else [],
+              "Emulated robots": map(emulated, range(robots))}  # fmt: skip
+    for title, cases in groups.items():
         outcomes: list[Outcome] = []
-        for number, member in enumerate(members):
-            case = emulated(member) if isinstance(member, int) else member
+        for case in cases:
             mine, data = ours(case)
-            outcomes.append(mine)
-            for name, (script, environment) in methods.items():
-                if name in SLOW and isinstance(member, int) and number >= slow:
-                    continue
-                outcomes.append(theirs(name, script, environment, case, data))
+            outcomes += [mine, *(theirs(*method, case, data) for method in methods.items())]
             print(case.name, file=sys.stderr, flush=True)
         if outcomes:
             print(title)

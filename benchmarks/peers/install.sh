@@ -1,12 +1,12 @@
 #!/bin/sh
-# Environments for compare.py: one for the peers that run on this Python, one for BAM, which asks
-# for Python 3.12 (give another with PYTHON312=...). PyTorch and hardware drivers are left out.
+# Environments: one for compare.py; one for BAM (real_recordings.py --bam), which asks for Python
+# 3.12 (give another with PYTHON312=...). PyTorch and hardware drivers are left out.
 # Three more for check_exports.py: Newton, mjlab and Isaac Lab's actuators (Isaac Sim is left out),
 # which run their exports.
 set -eu
 cd "$(dirname "$0")"
 python3 -m venv .venv
-.venv/bin/pip install --quiet "mujoco[sysid]==4.0.0" "cmaes==0.13.1" "control==0.10.2" "scipy==1.17.1"
+.venv/bin/pip install --quiet "mujoco[sysid]==4.0.0"
 "${PYTHON312:-python3.12}" -m venv .venv-bam
 .venv-bam/bin/pip install --quiet "better-actuator-models==1.0.2" "optuna==5.0.0" "cmaes==0.13.1" wandb
 python3 -m venv .venv-newton

@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 
 from pupper_sysid.servo_models.calibration.quantity import Quantity
-from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
 from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
 from pupper_sysid.sysid.fit.calibrate import CalibrationResult, calibrate
@@ -21,8 +20,9 @@ from pupper_sysid.sysid.fit.run import prepare, simulate
 from pupper_sysid.sysid.fit.search import Problem, folds_of
 from pupper_sysid.sysid.fit.structure import CANDIDATES, candidate, servo_structure
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
+from support import wide_servo
 
-JOINT, STEP_S, COUNT_RAD = "knee", 0.001, 2 * np.pi / 4096
+JOINT, COUNT_RAD = "knee", 2 * np.pi / 4096
 # per inertia: an SCS0009, an STS3215 (hardly damped inside of its loop) and an XL330
 SERVOS = {
     "SCS0009": (9000.0, 90.0, 450.0, 52.0, 120.0, 0.025),
@@ -34,15 +34,10 @@ time [s]."""
 
 
 @cache
-def recording(servo: str, motion: str, sign: int = 1, load: bool = False) -> Recording:
-    """A servo of the table at 100 Hz, read live in counts."""
+def recording(servo: str, motion: str, sign: int = 1) -> Recording:
+    """A servo of the table at 100 Hz, read live in counts, moved without code of the package."""
     stiffness, damping, effort, brake, friction, dead_time = SERVOS[servo]
-    inertia = 0.002
-    own = LoadedServoParameters(
-        duty_per_rad=stiffness / effort, duty_s_per_rad=damping / effort,
-        stall_torque=effort * inertia, back_emf=brake * inertia, armature=inertia,
-        friction_loss=friction * inertia, dead_time_s=dead_time,
-    )  # fmt: skip
+    moving = wide_servo.Servo(dead_time, stiffness, damping, brake, friction, effort)
     rng, parts, start = np.random.default_rng(3), [], 0.0
     tones = (1.0, 2.5, 5.0) if motion == "tones" else (np.nan,)
     for number, tone in enumerate(tones):
@@ -54,14 +49,13 @@ def recording(servo: str, motion: str, sign: int = 1, load: bool = False) -> Rec
             command -= command[0]
         else:
             command = 0.2 * np.sin(2 * np.pi * 1.8 * time) + 0.1 * np.sin(2 * np.pi * 3.7 * time)
-        command = sign * command
-        model = LoadedServo(own, 1.0, Load(0.002, 0.25, 0.0) if load else None, STEP_S)
-        model.reset(0.0)
-        moved = np.concatenate([[0.0], model.rollout(np.repeat(command, 10))])[1::10][: len(time)]
+        command, read = sign * command, time + 0.001
+        path = wide_servo.simulate(moving, time, command, read[-1] + 0.01, np.random.default_rng(0))
+        moved = np.interp(read, path.time_s, path.angle)
         parts.append(
             pd.DataFrame(
                 {
-                    "send_time_s": start + time, "read_time_s": start + time + STEP_S,
+                    "send_time_s": start + time, "read_time_s": start + read,
                     "trial": number, "joint": JOINT, "frequency_hz": tone,
                     "command_rad": command, "position_rad": np.round(moved / COUNT_RAD) * COUNT_RAD,
                 }

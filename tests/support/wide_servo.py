@@ -28,7 +28,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 STEP_S = 1e-4
-"""Length of a step [s]; `wide_twins.py --self-test` compares 0.2 and 0.05 ms."""
+"""Length of a step [s]; `tests/sysid/fit/test_wide_servo.py` compares 0.2 and 0.05 ms."""
 SETTLE_S = 1.5
 """Rest at the first command before the first row [s]."""
 COUNT_RAD = 2 * np.pi / 4096
@@ -230,7 +230,8 @@ def simulate(
         at = np.array(angle)
         angle -= float((servo.measured(at) - commands[0]) / servo.slope(at))
     motor, link, set_point = np.empty((3, steps))
-    _run(servo, held, step_s, angle, motor, link, set_point)
+    floats = Servo(*map(float, servo))  # compiled once, whatever was given
+    _run(floats, held, step_s, angle, motor, link, set_point)
     part = motor if servo.read_on_motor > 0.5 else link
     slopes = servo.slope(part)
     ends = (float(slopes.min()), float(slopes.max()))
