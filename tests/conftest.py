@@ -15,8 +15,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import hypothesis
 import pytest
 
-import support.avx2
-import support.compiled_once  # noqa: F401
+import support.avx2  # noqa: F401
+from support.compiled_once import compile_kernel
 from support.package import ROOT
 from support.real_recordings import real_recording
 
@@ -28,6 +28,12 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 hypothesis.settings.register_profile("repeatable", deadline=None, derandomize=True, database=None)
 hypothesis.settings.register_profile("search", deadline=None, max_examples=1000)
 hypothesis.settings.load_profile("repeatable")
+
+
+def pytest_sessionstart() -> None:
+    """The first worker compiles while the others collect: no test begins before both are done."""
+    if os.environ.get("PYTEST_XDIST_WORKER") == "gw0":
+        compile_kernel()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
