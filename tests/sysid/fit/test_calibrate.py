@@ -70,9 +70,9 @@ def exact_recording(
 ) -> Recording:  # fmt: skip
     """Live readings of a servo that chirps at its torque limit."""
     rng, step_s = np.random.default_rng(2), CONTINUOUS_S
-    time = step_s * np.arange(int(6.0 / step_s))
-    sent = np.arange(0.0, 6.0, loop_s)
-    command = 0.5 * np.sin(2 * np.pi * (0.5 * sent + 0.15 * sent**2))
+    time = step_s * np.arange(int(3.5 / step_s))
+    sent = np.arange(0.0, 3.5, loop_s)
+    command = 0.5 * np.sin(2 * np.pi * (0.5 * sent + 0.25 * sent**2))
     servo = replace(TRUE, effort_limit=effort, velocity_limit=np.inf, dead_time_s=dead_time_s)
     motion = DelayedPD(servo, step_s).rollout(command[(time / loop_s + 1e-9).astype(int)])
     position = np.interp(sent + 0.002, time + step_s, motion)

@@ -31,7 +31,7 @@ from pupper_sysid.sysid.fit.structure import (
 from support.runs import fine_run, run_of
 
 NOISE_RAD = 5e-4
-STEP_S = 5e-4
+STEP_S = 1e-3
 NUMBERS = {
     "dead_time_s": 0.015, "stiffness_per_s2": 4000.0, "damping_per_s": 80.0,
     "friction_rad_s2": 20.0, "effort_rad_s2": 1500.0, "velocity_limit_rad_s": 20.0,
@@ -40,7 +40,7 @@ NUMBERS = {
 
 
 def stepped_run(command: np.ndarray) -> Run:
-    """A run under `command`, one a step of half a millisecond, read every 10 ms from 0.1 s on."""
+    """A run under `command`, one a millisecond, read every 10 ms from 0.1 s on."""
     sample = np.arange(0.1 / STEP_S, len(command) - 1, 0.01 / STEP_S)
     rest = int(LONGEST_DEAD_TIME_S / STEP_S) + 4
     held = np.concatenate([np.full(rest, command[0]), command])
