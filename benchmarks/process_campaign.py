@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from shared import print_rows  # isort: skip
 
@@ -47,6 +47,7 @@ from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sim.emulator.serial_line import LineEmulator, SerialPty
 from pupper_sysid.sim.robot.robot_map import joint_map_of_servos
+from support.servo_servers import let_go, limp
 
 Server = SerialPty | ProxySocket
 PARK = [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid", "park"]
@@ -64,7 +65,7 @@ OVERLOAD = 32
 HEADROOM = 2 << 20
 """Memory that a starved process may still take [bytes]."""
 
-DRIVER = """
+PROGRAM = """
 import fcntl, os, signal, sys, termios, time
 from pathlib import Path
 import numpy as np
@@ -270,43 +271,39 @@ UNPLUGGED = on_the_line(lambda line, now: setattr(line, "unplug_for_s", 1.5))
 BROWN_OUT = on_the_line(lambda line, now: line.brown_out(now, 1.0))
 OVERLOADED = on_the_line(lambda line, now: line.fail(min(line.servos), now, OVERLOAD, 60.0))
 
+DRIVER, WATCHDOG, BOTH = "driver", "watchdog", "both"
 SCENARIOS = (
-    Scenario("driver", "SIGINT (Ctrl-C)", to_driver(signal.SIGINT)),
-    Scenario("driver", "SIGTERM", to_driver(signal.SIGTERM)),
-    Scenario("driver", "SIGKILL", to_driver(KILL)),
-    Scenario("driver", "SIGSTOP", to_driver(STOP)),
-    Scenario("driver", "SIGSTOP, SIGCONT after 0.2 s", short(to_driver, 0.2), GOES_ON),
-    Scenario("driver", "SIGSTOP, SIGCONT after 2 s", short(to_driver, 2.0)),
-    Scenario("driver", "SIGKILL, lock taken", lock_wanted(to_driver(KILL))),
-    Scenario("driver", "SIGSTOP, lock taken", lock_wanted(to_driver(STOP))),
-    Scenario("driver", "standard output full", to_driver(TALK)),
-    Scenario("driver", "out of memory", starved(to_driver(HOARD), True, False)),
-    Scenario("driver", "terminal closed", hang_up, terminal=True),
-    Scenario("driver", "its machine was suspended: clock + 1 h", to_driver(HOUR)),
-    Scenario("watchdog", "SIGKILL", to_watchdog(KILL)),
-    Scenario("watchdog", "SIGSTOP", to_watchdog(STOP)),
-    Scenario("watchdog", "SIGSTOP, SIGCONT after 0.2 s", short(to_watchdog, 0.2), GOES_ON),
-    Scenario("watchdog", "SIGSTOP, SIGCONT after 2 s", short(to_watchdog, 2.0)),
-    Scenario("watchdog", "SIGKILL, lock taken", lock_wanted(to_watchdog(KILL))),
-    Scenario("watchdog", "SIGSTOP, pipe full", in_turn(to_watchdog(STOP), 0.0, to_driver(FILL))),
-    Scenario("watchdog", "out of memory, driver SIGKILL", starved(to_driver(KILL), False, True)),
-    Scenario(
-        "watchdog",
-        "SIGSTOP for 2 s, driver SIGKILL",
-        in_turn(to_driver(KILL), 0.05, short(to_watchdog, 2.0)),
-    ),
-    Scenario("both", "SIGSTOP for 3 s (machine suspended)", short(to_both, 3.0)),
-    Scenario("both", "out of memory", starved(to_driver(HOARD), True, True)),
-    Scenario("both", "SIGKILL, supervised", to_both(KILL), supervised=True),
-    Scenario("both", "SIGSTOP, supervised", to_both(STOP), supervised=True),
-    Scenario(
-        "both", "SIGKILL, lock taken, supervised", lock_wanted(to_both(KILL)), supervised=True
-    ),
-    Scenario("both", "SIGKILL, then `park`", parked_by_hand),
+    Scenario(DRIVER, "SIGINT (Ctrl-C)", to_driver(signal.SIGINT)),
+    Scenario(DRIVER, "SIGTERM", to_driver(signal.SIGTERM)),
+    Scenario(DRIVER, "SIGKILL", to_driver(KILL)),
+    Scenario(DRIVER, "SIGSTOP", to_driver(STOP)),
+    Scenario(DRIVER, "SIGSTOP, SIGCONT after 0.2 s", short(to_driver, 0.2), GOES_ON),
+    Scenario(DRIVER, "SIGSTOP, SIGCONT after 2 s", short(to_driver, 2.0)),
+    Scenario(DRIVER, "SIGKILL, lock taken", lock_wanted(to_driver(KILL))),
+    Scenario(DRIVER, "SIGSTOP, lock taken", lock_wanted(to_driver(STOP))),
+    Scenario(DRIVER, "standard output full", to_driver(TALK)),
+    Scenario(DRIVER, "out of memory", starved(to_driver(HOARD), True, False)),
+    Scenario(DRIVER, "terminal closed", hang_up, terminal=True),
+    Scenario(DRIVER, "its machine was suspended: clock + 1 h", to_driver(HOUR)),
+    Scenario(WATCHDOG, "SIGKILL", to_watchdog(KILL)),
+    Scenario(WATCHDOG, "SIGSTOP", to_watchdog(STOP)),
+    Scenario(WATCHDOG, "SIGSTOP, SIGCONT after 0.2 s", short(to_watchdog, 0.2), GOES_ON),
+    Scenario(WATCHDOG, "SIGSTOP, SIGCONT after 2 s", short(to_watchdog, 2.0)),
+    Scenario(WATCHDOG, "SIGKILL, lock taken", lock_wanted(to_watchdog(KILL))),
+    Scenario(WATCHDOG, "SIGSTOP, pipe full", in_turn(to_watchdog(STOP), 0.0, to_driver(FILL))),
+    Scenario(WATCHDOG, "out of memory, driver SIGKILL", starved(to_driver(KILL), False, True)),
+    Scenario(WATCHDOG, "SIGSTOP for 2 s, driver SIGKILL",
+             in_turn(to_driver(KILL), 0.05, short(to_watchdog, 2.0))),
+    Scenario(BOTH, "SIGSTOP for 3 s (machine suspended)", short(to_both, 3.0)),
+    Scenario(BOTH, "out of memory", starved(to_driver(HOARD), True, True)),
+    Scenario(BOTH, "SIGKILL, supervised", to_both(KILL), supervised=True),
+    Scenario(BOTH, "SIGSTOP, supervised", to_both(STOP), supervised=True),
+    Scenario(BOTH, "SIGKILL, lock taken, supervised", lock_wanted(to_both(KILL)), supervised=True),
+    Scenario(BOTH, "SIGKILL, then `park`", parked_by_hand),
     Scenario("line", "cable pulled for 1.5 s", UNPLUGGED, serial=True),
     Scenario("line", "brown-out of 1 s", BROWN_OUT, serial=True),
     Scenario("servo", "overload, reported by one", OVERLOADED, serial=True),
-)
+)  # fmt: skip
 
 
 @contextmanager
@@ -322,7 +319,7 @@ def driven(server: Server, where: str, layout: str, scenario: Scenario) -> Itera
             held.callback(supervisor.wait)
             held.callback(supervisor.kill)
         driver = subprocess.Popen(
-            [sys.executable, "-c", DRIVER, where, layout, str(writes),
+            [sys.executable, "-c", PROGRAM, where, layout, str(writes),
              os.ttyname(tty) if tty >= 0 else ""],
             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, pass_fds=[writes],
             start_new_session=True,
@@ -389,12 +386,6 @@ def served(kind: str, seed: int) -> Iterator[tuple[Server, str, str]]:
             server.close()
 
 
-def limp(server) -> bool:
-    """Whether no servo has torque."""
-    bench = server.emulator.bench
-    return not any(bench.is_on(k) for k in bench.index_of_id.values())
-
-
 def registers(server) -> dict[tuple[int, str], int]:
     """Registers of all servos that a drive must leave as they were; none behind the proxy."""
     emulator = server.emulator
@@ -411,8 +402,7 @@ def registers(server) -> dict[tuple[int, str], int]:
 def repaired(server, found: dict[tuple[int, str], int]) -> None:
     """Servos that are limp, without errors, and have these registers."""
     emulator = server.emulator
-    for k in emulator.bench.index_of_id.values():
-        emulator.bench.torque(k, server.now(), False)
+    let_go(server)
     if isinstance(emulator, LineEmulator):
         for (servo, name), value in found.items():
             emulator._set(servo, name, value)
@@ -423,10 +413,7 @@ def repaired(server, found: dict[tuple[int, str], int]) -> None:
                 emulator._set(servo, "hardware_error_status", 0)
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What one repeat came to."""
-
+class Outcome(NamedTuple):
     limp_s: float  # from the fault to the last torque; infinite where the drive goes on
     on_again: bool
     restored: bool

@@ -48,6 +48,14 @@ def pytest_collection_finish() -> None:
     gc.unfreeze = lambda: None  # the end of a walk would undo it
 
 
+@pytest.fixture
+def fitted_once(monkeypatch) -> None:
+    """Recordings that were fitted before in this process are not fitted again."""
+    from support.fitted_once import fit_once
+
+    fit_once(monkeypatch)
+
+
 @pytest.fixture(scope="session")
 def real_sweeps() -> list[Path]:
     """The hip and thigh sweeps of a Mini Pupper 2."""

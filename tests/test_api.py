@@ -20,6 +20,7 @@ from support.command_line import run
 from support.json_keys import DOCUMENTED, key_line
 
 SWEEP = Path("data/samples/sweep.csv")
+pytestmark = pytest.mark.usefixtures("fitted_once")
 
 
 def python(code: str, folder: Path) -> str:

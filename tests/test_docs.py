@@ -47,6 +47,7 @@ EXAMPLES = {
 }
 
 
+@pytest.mark.usefixtures("fitted_once")
 @pytest.mark.parametrize(
     "page",
     [p if p.stem == "tutorial" else pytest.param(p, marks=pytest.mark.slow) for p in EXAMPLES],
@@ -109,6 +110,7 @@ def test_python_examples_of_a_page_run_in_the_repository(page, tmp_path, monkeyp
     execute(page)
 
 
+@pytest.mark.usefixtures("fitted_once")
 def test_the_readmes_example_runs_on_a_part_of_its_sample(hip, tmp_path, monkeypatch):
     (tmp_path / "data/samples").mkdir(parents=True)
     shutil.copy(hip, tmp_path / "data/samples/sweep.csv")
