@@ -9,7 +9,7 @@ import numpy as np
 
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
-from pupper_sysid.sysid.fit.joint_fit import fit_joint
+from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
 from pupper_sysid.sysid.fit.structure import candidate
@@ -27,9 +27,11 @@ from pupper_sysid.sysid.plan.proposal import SweepPlan
 from pupper_sysid.sysid.recordings.importers.times import READ_AFTER_SEND_S
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.sweep.excitation import plan
+from support.joint_results import result_of
 from support.servo_parameters import MEASURED
 
 NOISE = Noise(0.004, 0.001)
+LIVE = PollLattice(kind="every read", readings="live", fresh_fraction=1.0)
 SECONDS = 3.0
 """Recorded of each joint by `two_joints`."""
 
@@ -106,18 +108,13 @@ def two_joints() -> Recording:
     )  # fmt: skip
 
 
-@cache
-def _fit() -> JointCalibrationResult:
-    return fit_joint("LF_hip", tuple(two_joints().trials("LF_hip")))
-
-
 def fit_of_half_width(joint: str, half_width_ms: float) -> JointCalibrationResult:
-    """A fit whose dead time is 25 ms, known as well as that."""
-    half, fit = 1e-3 * half_width_ms, _fit()
+    """Live readings of a servo whose dead time is 25 ms, known as well as that."""
+    half, fit = 1e-3 * half_width_ms, result_of(joint)
     dead = Interval(0.025, 0.025 - half, 0.025 + half)
     candidates = {
         name: replace(c, parameters=c.parameters | {"dead_time_s": dead})
         for name, c in fit.candidate_models.items()
     }
-    lag = replace(fit.lag, joint=joint, dead_time_s=dead)
-    return replace(fit, joint=joint, lag=lag, candidate_models=candidates)
+    lag = replace(fit.lag, dead_time_s=dead, feedback=LIVE)
+    return replace(fit, lag=lag, candidate_models=candidates)
