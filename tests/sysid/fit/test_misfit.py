@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.joint_fit import undescribed, unidentified
-from pupper_sysid.sysid.fit.kernel import edges_of
 from pupper_sysid.sysid.fit.misfit import (
     Explanation,
     decided,
@@ -22,7 +22,6 @@ from pupper_sysid.sysid.fit.misfit import (
 from pupper_sysid.sysid.fit.run import Run, free_run
 from pupper_sysid.sysid.fit.search import Problem, refine
 from pupper_sysid.sysid.fit.structure import (
-    LONGEST_DEAD_TIME_S,
     SIMULATED,
     Structure,
     candidate,
@@ -31,7 +30,7 @@ from pupper_sysid.sysid.fit.structure import (
 from support.runs import fine_run, run_of
 
 NOISE_RAD = 5e-4
-STEP_S = 1e-3
+STEP_S = TIME_STEP_S
 NUMBERS = {
     "dead_time_s": 0.015, "stiffness_per_s2": 4000.0, "damping_per_s": 80.0,
     "friction_rad_s2": 20.0, "effort_rad_s2": 1500.0, "velocity_limit_rad_s": 20.0,
@@ -40,12 +39,9 @@ NUMBERS = {
 
 
 def stepped_run(command: np.ndarray) -> Run:
-    """A run under `command`, one a millisecond, read every 10 ms from 0.1 s on."""
+    """A run under `command`, one a step, read every 10 ms from 0.1 s on."""
     sample = np.arange(0.1 / STEP_S, len(command) - 1, 0.01 / STEP_S)
-    rest = int(LONGEST_DEAD_TIME_S / STEP_S) + 4
-    held = np.concatenate([np.full(rest, command[0]), command])
-    run = run_of(command, sample_step=sample, sample_rad=np.zeros(len(sample)))
-    return replace(run, held=held[None], edges=edges_of(held), pad=rest, step_s=STEP_S)
+    return run_of(command, sample_step=sample, sample_rad=np.zeros(len(sample)))
 
 
 def found(
