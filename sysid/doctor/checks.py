@@ -242,15 +242,28 @@ def chosen_joints(recordings: Recordings, joints: Joints = None) -> list[str]:
 
 
 def recorded_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
-    """All trials of `joint` as they were recorded, renumbered."""
+    """All trials of `joint` as they were recorded, renumbered.
+
+    Raises InputError where two recordings hold the same trial, whose readings would count twice.
+    """
     several = as_sequence(recordings)
     names = _told_apart([recording.name for recording in several])
-    trials = [
-        replace(trial, source=name)
-        for name, recording in zip(names, several, strict=True)
-        for trial in recording.trials(joint)
-    ]
+    trials: list[Trial] = []
+    for name, recording in zip(names, several, strict=True):
+        for trial in recording.trials(joint):
+            if same := next((t for t in trials if t.source != name and _same(t, trial)), None):
+                raise InputError(
+                    f"{joint}: {same.source} and {name} hold the same readings, which would count "
+                    "twice. Give each recording once."
+                )
+            trials.append(replace(trial, source=name))
     return tuple(replace(trial, number=n) for n, trial in enumerate(trials))
+
+
+def _same(one: Trial, other: Trial) -> bool:
+    return np.array_equal(one.command_rad, other.command_rad) and np.array_equal(
+        one.position_rad, other.position_rad, equal_nan=True
+    )
 
 
 def _told_apart(names: Sequence[str]) -> list[str]:

@@ -183,3 +183,8 @@ def test_the_bend_of_a_loaded_joint_on_a_single_way_is_no_motion_before_the_comm
     rows = pd.DataFrame({"send_time_s": time, "command_rad": command, "position_rad": sagging})
     trials = made(rows).trials(JOINT)
     assert [f for f in findings(trials) if f.verdict == "do not use"] == []
+
+
+def test_a_recording_that_is_given_twice_is_refused():
+    with pytest.raises(InputError, match="same readings, which would count twice"):
+        ps.calibrate([made(good("teleoperation")) for _ in range(2)])
