@@ -764,8 +764,11 @@ def _phasor(time: Array, value: Array, hz: float) -> complex:
 
 
 def lag_truth(twin: Twin, path: Path, sent: Array, commands: Array) -> float:
-    """Time shift at which the motion and the held command correlate best [s]."""
-    grid = np.arange(sent[0] - 0.6, path.time_s[-1], SHIFT_S)
+    """Time shift at which the motion and the held command correlate best while recorded [s].
+
+    What comes after the last command is not recorded: after a jump it moves the lag by 20 ms.
+    """
+    grid = np.arange(sent[0] - 0.6, sent[-1], SHIFT_S)
     held = commands[np.maximum(np.searchsorted(sent, grid, "right") - 1, 0)]
     moved = np.interp(grid, path.time_s, path.angle)
     return best_shift_s(held, moved, SHIFT_S, 0.6) + age_s(twin.bus)
