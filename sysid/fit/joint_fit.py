@@ -13,6 +13,7 @@ the same: `prepare_joint`, `fit_structures`, `conclude`.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -120,6 +121,8 @@ _WIDE = 4.0
 _REACHED = 1.25
 """Ends of the effort limit's interval, up to which a motion at that limit tells back-EMF from
 damping. Wider ones gave wrong parts of a right sum on twins (`benchmarks/wide_twins.py`)."""
+_QUIETER = 0.7
+"""Noise after a profile over that before it, below which the profile is fitted anew."""
 _FOREIGN = 3.0
 """Standard deviations of a prior from another unit, beyond which it is of another servo."""
 _SHARP_DEAD_TIME_S = 0.015
@@ -539,7 +542,8 @@ def _settled(
         most = DESCRIBED
     if profiled is None and not undescribed(goodness):
         return ready, every, plain
-    any_servo = ready.as_any_servo()
+    any_servo = ready if profiled is None else ready.with_noise_of(profiled.structure, profiled.fit)
+    any_servo = any_servo.as_any_servo()
     ladder = _ladder(any_servo, any_servo.fit_rng(), SHORT_LADDER, most, profiled)
     if not ladder:
         if profiled is not None:
@@ -639,6 +643,13 @@ def _with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]
     structure = servo_structure((*carried.structure.features, "acceleration"), ready.scales)
     tried = {carried.structure.features: carried}
     fitted = _fitted(ready, structure, tried, ready.fit_rng(), short=True)
+    quieter = ready.with_noise_of(structure, fitted.fit)
+    if max(map(operator.truediv, quieter.noise_rad, ready.noise_rad)) < _QUIETER:
+        # the noise was the motion that the carried one cannot make
+        tried[structure.features] = fitted
+        point = _fitted(quieter, structure, tried, ready.fit_rng(), short=True).fit.point
+        cost = float(ready.searched(structure).costs(point[None])[0])
+        fitted = replace(fitted, fit=Fit(point, cost))
     nats = _nats(ready, (carried, fitted))
     return fitted, nats[carried.structure.name] - nats[structure.name]
 
@@ -1231,6 +1242,8 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice) 
             why = "it cannot be distinguished from none"
         if why:
             undecided[name] = why
+    if why := undecided.get("no_load_speed_rad_s"):
+        undecided["back_emf"] = why  # a speed on its bound stands for none
     if "stall_torque" in undecided and "damping" not in structure.features:
         # back-EMF stands for both: what tells them apart is a motor at its limit
         both = _only_the_sum(numbers["braking"], "N·m·s/rad" if scales.known_load else "1/s")

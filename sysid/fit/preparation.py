@@ -122,6 +122,16 @@ class PreparedJoint:
         first = _first_fits(scales, self.runs, self.noise_rad, self.fit_rng())
         return replace(self, scales=scales, first=first, reference_voltage_v=float("nan"))
 
+    def with_noise_of(self, structure: Structure, fit: Fit) -> PreparedJoint:
+        """The joint with the noise that a fit leaves, where that is smaller.
+
+        A noise that is many times too large leaves a fit to its prior.
+        """
+        residuals = fresh_residuals(structure, structure.decode(fit.point), self.runs)
+        noise = noise_by_run(residuals, self.runs, self.least_rad)
+        smaller = tuple(map(min, noise, self.noise_rad))
+        return replace(self, noise_rad=smaller)
+
     def problem(self, structure: Structure) -> Problem:
         """The fit of a structure to all runs."""
         return Problem(structure, self.runs, self.noise_rad)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.fit.run import Run, costs, moments_if_later, residuals
-from pupper_sysid.sysid.fit.structure import Structure
+from pupper_sysid.sysid.fit.structure import LIMITS, Structure
 
 _CANDIDATES, _KEEP, _FINAL = 512, 12, 4
 _REFINED = 2  # of the fits in coarse steps, those that are fitted in fine ones
@@ -32,6 +32,7 @@ _WIDE_STEP, _STEP = 0.05, 0.01
 smaller than the second drowns in friction's stick-slip."""
 _POPULATION, _GENERATIONS, _SHORT_GENERATIONS = 48, 60, 20
 _NEAR, _NEAR_ROUNDS, _NEAR_ITERATIONS = 12, 12, 12
+_FALLS, _CUT_STARTS = -np.linspace(0.0, np.log(30.0), 15), 3  # of the logarithm of a limit
 _NEAR_SD, _NEAR_STEP = (0.02, 0.5), 0.02
 """Of the local fits about the best one: how many in a round, rounds at most, iterations, standard
 deviation of their starts and step of the Jacobian in fitted coordinates."""
@@ -205,14 +206,36 @@ def from_about(problem: Problem, best: Fit, rng: np.random.Generator) -> Fit:
         return best
     low, high = problem.structure.box
     shape, (least, most) = (_NEAR, len(best.point)), np.log(_NEAR_SD)
-    for _ in range(_NEAR_ROUNDS):
+    for turn in range(_NEAR_ROUNDS):
         sd = np.exp(rng.uniform(least, most, (_NEAR, 1))) * problem.structure.scale
         near = np.clip(best.point + sd * rng.standard_normal(shape), low, high)
+        if not turn:
+            near = np.concatenate([near, _where_limits_cut(problem, best.point)])
         fits = local(problem, near, _NEAR_ITERATIONS, _NEAR_STEP)
         before, best = best.cost, min(best, *fits, key=lambda f: f.cost)
         if before - best.cost < 1.0:  # one more number's worth
             break
     return best
+
+
+def _where_limits_cut(problem: Problem, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points where a limit that the motion does not reach would begin to cut it.
+
+    Such a limit has no slope, so that no local fit finds a servo at its limit. Shape (points,
+    parameters): none of limits that the motion reaches.
+    """
+    names = problem.structure.names
+    limits = [names.index(name) for name in LIMITS if name in names]
+    points = np.tile(point, (len(limits), len(_FALLS), 1))
+    for n, limit in enumerate(limits):
+        points[n, :, limit] += _FALLS
+    points = np.clip(points, *problem.structure.box)
+    every = points.reshape(-1, len(point))
+    costs = (problem.costs(every) - problem.prior(every)).reshape(len(limits), -1)
+    cut = costs > costs[:, :1] + 1.0
+    first = np.where(cut.any(axis=1), cut.argmax(axis=1), 0)
+    starts = [points[n, k : k + _CUT_STARTS] for n, k in enumerate(first) if k > 1]
+    return np.concatenate([points[:0, 0], *starts])
 
 
 def refined(problem: Problem, starts: NDArray[np.float64], final: int = _FINAL) -> list[Fit]:

@@ -214,6 +214,11 @@ SERVO_TERMS = {t.name: t for t in (
 )}  # fmt: skip
 """Numbers of a servo, by name, in the order in which they are fitted."""
 
+LIMITS = (
+    "effort_rad_s2", "stall_torque", "velocity_limit_rad_s", "no_load_speed_rad_s",
+    "acceleration_limit",
+)  # fmt: skip
+"""Numbers that do nothing where the motion does not reach them."""
 _LEAST_SCALE = 0.02  # of angles [rad]
 _STATED_SD = 0.03  # of the logarithm of a limit that a register states
 _SPEEDS = ("velocity_limit_rad_s", "no_load_speed_rad_s")
