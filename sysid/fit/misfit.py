@@ -69,7 +69,7 @@ _FEATURES = {
     ),
     "integral": _Feature(
         "an integral term in its controller, of {:.2g}/s times the proportional one",
-        {"integral_per_s": (0.5, 2.0, 8.0)},
+        {"integral_per_s": (0.5, 4.0, 32.0)},
     ),
     "stribeck": _Feature(
         "more friction at rest than in motion",
