@@ -123,14 +123,21 @@ class PreparedJoint:
         return replace(self, scales=scales, first=first, reference_voltage_v=float("nan"))
 
     def with_noise_of(self, structure: Structure, fit: Fit) -> PreparedJoint:
-        """The joint with the noise that a fit leaves, where that is smaller.
+        """The joint in free air with the noise that a fit leaves, where that is smaller.
 
-        A noise that is many times too large leaves a fit to its prior.
+        A noise that is many times too large leaves a fit to its prior, and hides what a physics
+        step moves.
         """
         residuals = fresh_residuals(structure, structure.decode(fit.point), self.runs)
         noise = noise_by_run(residuals, self.runs, self.least_rad)
         smaller = tuple(map(min, noise, self.noise_rad))
-        return replace(self, noise_rad=smaller)
+        problem = replace(self.problem(structure), noise_rad=smaller)
+        dated = self.recorded, self.lag.feedback, self.reference_voltage_v
+        step_s = _step_for(problem, fit, *dated)
+        runs = self.runs
+        if step_s < runs[0].step_s:
+            _, runs = _dated(*dated, True, step_s, self.upsets)
+        return replace(self, runs=runs, noise_rad=smaller)
 
     def problem(self, structure: Structure) -> Problem:
         """The fit of a structure to all runs."""
