@@ -143,3 +143,25 @@ def test_delay_and_calibrate_have_one_dead_time_where_a_profile_is_found():
     jumps = recording(JUMPS, LIMIT_RAD_S2, 5)
     dead_time = lag(jumps)["j"].dead_time_s
     assert dead_time == calibrate(jumps)["j"].lag.dead_time_s
+
+
+def test_the_noise_is_that_of_the_fit_which_explains_the_motion():
+    """A noise that is a motion leaves fits to their priors, and finds coarse steps fine enough."""
+    trials = usable_trials([recording(JUMPS, LIMIT_RAD_S2, 5)])["j"]
+    ready = joint_fit.prepare_joint("j", trials, 0, free_air=True)
+    servo = random_servo(LIMIT_RAD_S2, 5).arrays()
+    inertia = float(servo["armature"])
+    numbers = {
+        "dead_time_s": servo["dead_time_s"],
+        "stiffness_per_s2": 16.0 * servo["duty_per_rad"] * servo["stall_torque"] / inertia,
+        "friction_rad_s2": servo["friction_loss"] / inertia,
+        "effort_rad_s2": servo["stall_torque"] / inertia,
+        "no_load_speed_rad_s": servo["stall_torque"] / servo["back_emf"],
+        "acceleration_limit": LIMIT_RAD_S2, "offset_rad": 0.0,
+    }  # fmt: skip
+    structure = servo_structure(("back-EMF", "acceleration"))
+    point = structure.encode(np.array([float(numbers[name]) for name in structure.names]))
+    quieter = ready.with_noise_of(structure, Fit(point, 0.0))
+    assert max(quieter.noise_rad) < 0.7 * min(ready.noise_rad)
+    assert quieter.runs[0].step_s <= ready.runs[0].step_s
+    assert quieter.with_noise_of(*ready.first["delayed_pd"]).noise_rad == quieter.noise_rad

@@ -1,4 +1,4 @@
-"""Search: local fits from points about a fit leave the dents of a ridge."""
+"""Search: local fits leave the dents of a ridge, and find limits that have no slope."""
 
 from __future__ import annotations
 
@@ -46,3 +46,21 @@ def test_local_fits_from_points_about_a_fit_find_the_way_along_a_ridge():
         stuck.append(near.cost > best + 100)
         assert from_about(problem, near, rng).cost < best + 1
     assert any(stuck), "the ridge has no dent, so this proves nothing"
+
+
+def test_a_limit_that_the_fitted_motion_does_not_reach_is_found_where_it_cuts():
+    """Above the largest torque of the motion the cost is flat: no slope leads to the limit."""
+    structure = candidate("delayed_pd")
+    truth = np.array([0.03, 1650.0, 40.0, 30.0, 73.0, 200.0, 0.0])
+    time = CONTINUOUS_S * np.arange(int(3.0 / CONTINUOUS_S))
+    run = fine_run(0.25 * np.sin(2 * np.pi * (0.5 * time + 0.6 * time**2)), 0.01)
+    (track,) = free_run(structure, truth, (run,))
+    rng = np.random.default_rng(0)
+    read = np.interp(run.sample_step, np.arange(len(track)), track)
+    read += NOISE_RAD * rng.standard_normal(len(read))
+    problem = Problem(structure, (replace(run, sample_rad=read),), (NOISE_RAD,))
+    best = refine(problem, structure.encode(truth)[None]).cost
+    unlimited = truth * np.array([1.0, 1.0, 1.0, 1.0, 40.0, 1.0, 1.0])
+    flat = refine(problem, structure.encode(unlimited)[None])
+    assert flat.cost > 10 * best, "the slope leads there, so this proves nothing"
+    assert from_about(problem, flat, rng).cost < best + 1
