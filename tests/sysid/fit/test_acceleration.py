@@ -147,9 +147,9 @@ def test_delay_and_calibrate_have_one_dead_time_where_a_profile_is_found():
 
 def test_the_noise_is_that_of_the_fit_which_explains_the_motion():
     """A noise that is a motion leaves fits to their priors, and finds coarse steps fine enough."""
-    trials = usable_trials([recording(JUMPS, LIMIT_RAD_S2, 5)])["j"]
+    trials = usable_trials([recording(CHIRP, 8.0, 5)])["j"]
     ready = joint_fit.prepare_joint("j", trials, 0, free_air=True)
-    servo = random_servo(LIMIT_RAD_S2, 5).arrays()
+    servo = random_servo(8.0, 5).arrays()
     inertia = float(servo["armature"])
     numbers = {
         "dead_time_s": servo["dead_time_s"],
@@ -157,7 +157,7 @@ def test_the_noise_is_that_of_the_fit_which_explains_the_motion():
         "friction_rad_s2": servo["friction_loss"] / inertia,
         "effort_rad_s2": servo["stall_torque"] / inertia,
         "no_load_speed_rad_s": servo["stall_torque"] / servo["back_emf"],
-        "acceleration_limit": LIMIT_RAD_S2, "offset_rad": 0.0,
+        "acceleration_limit": 8.0, "offset_rad": 0.0,
     }  # fmt: skip
     structure = servo_structure(("back-EMF", "acceleration"))
     point = structure.encode(np.array([float(numbers[name]) for name in structure.names]))
