@@ -13,7 +13,7 @@ from pupper_sysid.servo_models.calibration.calibration import InputFile, utc_now
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.cards.card import Gains, Score, ServoCard, Source
 from pupper_sysid.servo_models.cards.numbers import LOADED_KEYS, LoadedLoop, TorquePD
-from pupper_sysid.sysid.fit.joint_fit import LoadedFit
+from pupper_sysid.sysid.fit.results import LoadedFit
 from pupper_sysid.sysid.recordings.recording import Recording
 
 _TORQUES = (

@@ -21,13 +21,8 @@ from pupper_sysid.common.results import JointResults
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.sysid.doctor.checks import Joints, Recordings, as_sequence, usable_trials
 from pupper_sysid.sysid.fit.calibration_file import preset_parameters, to_calibration
-from pupper_sysid.sysid.fit.joint_fit import (
-    Fitted,
-    Presets,
-    conclude,
-    fit_structures,
-    stages,
-)
+from pupper_sysid.sysid.fit.choice import Fitted, fit_structures, stages
+from pupper_sysid.sysid.fit.joint_fit import Presets, conclude
 from pupper_sysid.sysid.fit.loads import loaded_joints
 from pupper_sysid.sysid.fit.operating_point import reference_gain, with_operating_points
 from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint

@@ -1,75 +1,64 @@
-"""Fit the servo of one joint: its structures, the choice between them, and what stays open.
+"""Fit the servo of one joint, and say what its numbers are, and which of them are known.
 
-Every structure is fitted to the readings that count by output error, from seeded global starts and
-from the fits of simpler structures, and scored on what was left out of the fit: a tone, or runs.
-Its numbers are drawn from their posterior. Of the structures that the likelihood does not rule out,
-the simplest whose error on unseen motion is about the smallest is carried; the intervals of its
-numbers cover all of them.
-
-A joint in free air has the candidates of `sysid.fit.structure`; simulators run two of them. Under a
-load or at several gains it is a motor with a ladder of friction terms (`LADDER`). All stages are
-the same: `prepare_joint`, `fit_structures`, `conclude`.
+`fit_joint` prepares the trials (`sysid.fit.preparation`), fits structures and chooses among them
+(`sysid.fit.choice`), and states the result: intervals, why a number is not identified, how well the
+model describes the servo, and warnings in sentences.
 """
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
-from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.calibration.quantity import words_of
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit import kernel
-from pupper_sysid.sysid.fit.goodness import DESCRIBED, DESCRIBED_ONE, goodness_of_fit, overall
-from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, with_delays
-from pupper_sysid.sysid.fit.noise import command_jitter, noise_by_run
+from pupper_sysid.sysid.fit.choice import (
+    Choice,
+    Fitted,
+    fit_structures,
+    goodness_of,
+    intervals,
+    joined,
+    less_age,
+    settled,
+    stages,
+    undescribed,
+)
+from pupper_sysid.sysid.fit.goodness import DESCRIBED, overall
+from pupper_sysid.sysid.fit.noise import command_jitter
 from pupper_sysid.sysid.fit.posterior import (
     EFFECTIVE,
-    FEW_ROUNDS,
     HARDLY_CONVERGED,
-    LEAST_FOLDS,
     R_HAT,
-    ROUNDS,
-    as_wide_as_folds,
     interval_of,
-    sample,
     temperature_at,
-    with_date_errors,
 )
 from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
-from pupper_sysid.sysid.fit.repeats import Repeats, by_number, compare_repeats
+from pupper_sysid.sysid.fit.repeats import by_number
 from pupper_sysid.sysid.fit.results import (
     RATIO_SOURCES,
-    TELLING_NATS,
     UNTOLD,
     CandidateFit,
     JointCalibrationResult,
     LoadedFit,
     StructureFit,
-    plausible,
 )
 from pupper_sysid.sysid.fit.run import Run, free_run, fresh_residuals
 from pupper_sysid.sysid.fit.scores import Scores, held_out_residuals, rms, score
 from pupper_sysid.sysid.fit.search import (
-    Fit,
     curvature,
-    evolved,
     fit_folds,
     folds_of,
-    group_count,
-    in_blocks,
-    refine,
     search,
-    search_widely,
 )
 from pupper_sysid.sysid.fit.servo_prior import ServoPrior
 from pupper_sysid.sysid.fit.structure import (
@@ -79,50 +68,18 @@ from pupper_sysid.sysid.fit.structure import (
     Parameter,
     Structure,
     candidate,
-    servo_structure,
 )
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Trial
 
 Presets = Mapping[str, Mapping[str, DelayedPDParameters]]
 """Published settings by name, then by joint."""
-
-LADDER = (
-    (),
-    ("stribeck",),
-    ("load friction",),
-    ("load friction", "static"),
-    ("load friction", "quadratic"),
-    ("load friction", "torque limit"),
-    ("load friction", "quadratic", "static"),
-    ("load friction", "quadratic", "torque limit"),
-)
-"""Friction of a motor under load, simplest first; then `ADDITIONS` to the best of them."""
-SHORT_LADDER = ((), ("load friction",))
-"""For a joint in free air that DelayedPD does not describe."""
-_PROFILE_NATS = 10.0
-"""Log-likelihood by which a limited acceleration is better, from which on all rungs have it."""
-_CORRELATED = 4.0
-"""Temperature above which residuals are a motion, not noise, however small they are beside it: of
-recordings of the fitted structure (`benchmarks/wide_twins.py`, seed 170) none is above 1.2."""
-_DESCRIBES_BETTER = 0.75
-"""Errors over those of DelayedPD, below which a servo with more terms is carried."""
-ADDITIONS = ("damping", "acceleration", "slew", "dead zone", "stribeck", "start duty")
-
-_ACCELERATIONS_RAD_S2 = (6.0, 15.0, 40.0, 110.0)
-"""Starts of a limit on the set-point's acceleration: its cost has many minima. A Feetech servo's
-register counts 0.153 rad/s² from 1 to 254, whose largest is 39."""
-_MOST_COMPARED = 3
 _NEAR = 64  # starts about a fit without draws, for its fits without a part
-_PREFERENCE = 1.02
-"""Error on unseen motion, over the smallest, up to which a simpler structure is carried."""
 _REPORTED_PREFERENCE = 1.05
 _WIDE = 4.0
 _REACHED = 1.25
 """Ends of the effort limit's interval, up to which a motion at that limit tells back-EMF from
 damping. Wider ones gave wrong parts of a right sum on twins (`benchmarks/wide_twins.py`)."""
-_QUIETER = 0.7
-"""Noise after a profile over that before it, below which the profile is fitted anew."""
 _FOREIGN = 3.0
 """Standard deviations of a prior from another unit, beyond which it is of another servo."""
 _SHARP_DEAD_TIME_S = 0.015
@@ -134,39 +91,6 @@ _CUT_SHARE = 0.1
 """The same as a share of a 90 % interval: a bound within two standard deviations cuts the draws."""
 _COMMAND_WINDOW_S = 0.05
 _COVARIANCE_STEP = 0.03  # the slope over a likely error, not of one kink
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """One structure, fitted to one joint.
-
-    Attributes
-    ----------
-    structure : Structure
-    fit : Fit
-        To all runs.
-    draws : ndarray, shape (draws, parameters), or None
-        From the posterior, in fitted coordinates.
-    temperature : float
-        How many readings count as one.
-    folds : list of Fit or None
-        Without the runs of each of `folds_of`; None where it was not compared.
-    r_hat, effective : float
-        Of the draws: see `sysid.fit.posterior.Posterior`.
-    """
-
-    structure: Structure
-    fit: Fit
-    draws: NDArray[np.float64] | None = None
-    temperature: float = 1.0
-    folds: list[Fit] | None = None
-    r_hat: float = float("nan")
-    effective: float = float("nan")
-
-    @property
-    def values(self) -> NDArray[np.float64]:
-        """The fitted numbers, shape (parameters,)."""
-        return self.structure.decode(self.fit.point)
 
 
 def fit_joint(
@@ -193,307 +117,8 @@ def joint_lag(joint: str, trials: Sequence[Trial], seed: int = 0) -> LagBudget:
     """Lag budget of one joint, its dead time that of `fit_joint`."""
     ready = prepare_joint(joint, trials, seed)
     fitted = {stage: fit_structures(ready, stage) for stage in stages(ready)}
-    ready, _, choice = _settled(ready, _joined(fitted))
-    return _lag(ready, choice, _goodness(ready, choice.carried))
-
-
-def stages(ready: PreparedJoint) -> tuple[str, ...]:
-    """Fits of a joint that can be made side by side, for `fit_structures`."""
-    return SIMULATED if ready.scales.free_air else ("ladder",)
-
-
-def fit_structures(ready: PreparedJoint, stage: str) -> list[Fitted]:
-    """Fit one of `SIMULATED` in free air, or the ladder of structures under load."""
-    rng = ready.fit_rng()
-    if not ready.scales.free_air:
-        return _ladder(ready, rng)
-    structure = candidate(stage, ready.scales)
-    tried = {s.features: Fitted(s, fit) for s, fit in ready.first.values() if structure.contains(s)}
-    fitted = _fitted(ready, structure, tried, rng, ready.first[stage][1])
-    return [*tried.values(), _compared(ready, fitted, tried, rng)]
-
-
-def _fitted(
-    ready: PreparedJoint,
-    structure: Structure,
-    tried: Mapping[tuple[str, ...], Fitted],
-    rng: np.random.Generator,
-    first: Fit | None = None,
-    short: bool = False,
-) -> Fitted:
-    """The best fit to all runs; structures that this one contains are among its starts."""
-    problem = ready.searched(structure)
-    near = [f for f in tried.values() if structure.contains(f.structure)] or [*tried.values()]
-    more = [structure.adopt(f.structure, f.fit.point) for f in near]
-    if first is not None:
-        more.append(first.point)
-    elif structure.features in tried:
-        more.append(tried[structure.features].fit.point)
-    if "acceleration_limit" in structure.names and not np.isfinite(
-        ready.scales.acceleration_rad_s2
-    ):
-        place = structure.names.index("acceleration_limit")
-        for start in list(more):
-            for limit in _ACCELERATIONS_RAD_S2:
-                more.append(np.where(np.arange(len(start)) == place, np.log(limit), start))
-    if ready.scales.free_air:
-        best = search_widely(problem, rng, np.array(more), short)
-    else:  # the first structure was searched for
-        best = evolved(problem, np.array(more), rng, short)
-    return Fitted(structure, best)
-
-
-def _ladder(
-    ready: PreparedJoint,
-    rng: np.random.Generator,
-    ladder: Sequence[tuple[str, ...]] = LADDER,
-    most: float = float("inf"),
-    profiled: Fitted | None = None,
-) -> list[Fitted]:
-    """Structures of a motor, those with draws that the likelihood does not rule out.
-
-    None of them if the best one leaves more than `most` of residual over noise. All have a limit on
-    the set-point's acceleration if there is a fit in free air that has one (`profiled`), or if that
-    is better.
-    """
-    scales = ready.scales
-    stated: tuple[str, ...] = ("acceleration",) if np.isfinite(scales.acceleration_rad_s2) else ()
-    plain, first = next(iter(ready.first.values()))
-    tried = {plain.features: Fitted(plain, first)}
-
-    def try_out(*features: str, short: bool = False) -> None:
-        structure = servo_structure(("back-EMF", *features), scales)
-        tried[structure.features] = _fitted(ready, structure, tried, rng, short=short)
-
-    if profiled is not None:
-        features = [f for f in profiled.structure.features if f != "back-EMF"]
-        structure = servo_structure(("back-EMF", *features), scales)
-        near = structure.adopt(profiled.structure, profiled.fit.point)
-        fit = refine(ready.searched(structure), near[None])
-        tried[structure.features] = Fitted(structure, fit)
-        stated = ("acceleration",)
-    elif not stated:  # first, because friction that grows with the load imitates a profile
-        try_out()
-        try_out("acceleration")
-        nats = _nats(ready, tried.values())
-        if nats["base"] - nats["acceleration"] > _PROFILE_NATS:
-            stated = ("acceleration",)
-    for features in ladder:
-        if servo_structure(("back-EMF", *features, *stated), scales).features not in tried:
-            try_out(*features, *stated)
-    for addition in ADDITIONS:
-        best = min(tried.values(), key=lambda f: f.fit.cost).structure.features[1:]
-        if addition not in best:
-            try_out(*best, addition, short=True)
-    best = min(tried.values(), key=lambda f: f.fit.cost)
-    if overall(_goodness(ready, best)) > most:
-        return []
-    nats = _nats(ready, tried.values())
-    likely = sorted(plausible(nats), key=lambda name: nats[name])[:_MOST_COMPARED]
-    return [
-        _compared(ready, f, tried, rng) if f.structure.name in likely else f for f in tried.values()
-    ]
-
-
-def _compared(
-    ready: PreparedJoint,
-    fitted: Fitted,
-    tried: Mapping[tuple[str, ...], Fitted],
-    rng: np.random.Generator,
-) -> Fitted:
-    """The fit with draws from its posterior, and with the fits to what is left of each fold."""
-    structure, problem = fitted.structure, ready.searched(fitted.structure)
-    best = refine(problem, fitted.fit.point[None])
-    temperature = temperature_at(problem, best)
-    misfit = overall(_goodness(ready, replace(fitted, fit=best)))
-    rounds = FEW_ROUNDS if misfit > DESCRIBED else ROUNDS
-    posterior = sample(problem, best, temperature, rng, rounds)
-    points = posterior.points
-    best = min(best, refine(problem, posterior.best.point[None]), key=lambda f: f.cost)
-    parents = [
-        (f.structure, f.folds)
-        for f in tried.values()
-        if f.folds and structure.contains(f.structure)
-    ]
-    parts = folds_of(problem.runs)
-    folds = fit_folds(problem, parts, rng, points, parents)
-    if ready.lag.feedback.kind == "lattice":
-        points = with_date_errors(points, problem, best, rng)
-    left_out, groups = folds, group_count(problem.runs)
-    if len(parts) < LEAST_FOLDS:
-        blocks, apart = in_blocks(problem)
-        left_out, groups = fit_folds(blocks, apart, rng, points), len(apart)
-    points = as_wide_as_folds(points, structure, best, left_out, groups)
-    points = np.clip(points, *structure.box)
-    return replace(
-        fitted, fit=best, draws=points, temperature=temperature, folds=folds,
-        r_hat=posterior.r_hat, effective=posterior.effective,
-    )  # fmt: skip
-
-
-def _nats(ready: PreparedJoint, fitted: Iterable[Fitted]) -> dict[str, float]:
-    """Log-likelihood below the best by name, one more per feature (Akaike's price of a number).
-
-    All are counted at the temperature of the best one, or a worse fit would excuse itself.
-    """
-    fitted = [*fitted]
-    best = min(fitted, key=lambda f: f.fit.cost)
-    temperature = temperature_at(ready.searched(best.structure), best.fit)
-    count = {f.structure.name: len(f.structure.parameters) for f in fitted}
-    least = {f.structure.name: f.fit.cost / temperature + count[f.structure.name] for f in fitted}
-    lowest = min(least.values())
-    return {name: value - lowest for name, value in least.items()}
-
-
-def _joined(stages: Mapping[str, Sequence[Fitted]]) -> list[Fitted]:
-    """The fits of all stages, each structure once."""
-    return list({f.structure.name: f for own in stages.values() for f in own}.values())
-
-
-# ------------------------------------------------------------------------------- choice
-
-
-@dataclass(frozen=True)
-class _Choice:
-    """The structure that is carried, and those that the data do not tell from it.
-
-    Attributes
-    ----------
-    carried : Fitted
-        Fitted to all readings.
-    likely : tuple of Fitted
-        With draws, the carried one among them.
-    nats : dict of str to float
-        By how much the log-likelihood of each is below that of the best.
-    unseen_rad : dict of str to float
-        RMS error on unseen motion of those that were compared.
-    noise_rad : tuple of float
-    lag : LagBudget
-        With dead time and offset.
-    repeats : Repeats or None
-        What several recordings in free air say of one another; the draws are widened by it.
-    misfit : Explanation or None
-        One thing more that describes the servo decidedly better.
-    """
-
-    carried: Fitted
-    likely: tuple[Fitted, ...]
-    nats: dict[str, float]
-    unseen_rad: dict[str, float]
-    noise_rad: tuple[float, ...]
-    lag: LagBudget
-    repeats: Repeats | None = None
-    misfit: Explanation | None = None
-
-
-def _choice(ready: PreparedJoint, fitted: Sequence[Fitted]) -> _Choice:
-    simulated = [f for f in fitted if not ready.scales.free_air or f.structure.name in SIMULATED]
-    nats = _nats(ready, simulated)
-    compared = [f for f in simulated if f.draws is not None]
-    unseen = {f.structure.name: _unseen(ready, f) for f in compared}
-    likely = [f for f in compared if f.structure.name in plausible(nats)]
-    if not likely:
-        likely = [min(compared, key=lambda f: nats[f.structure.name])]
-    carried = _simplest(likely, nats, unseen)
-    noise = ready.noise_rad
-    if not ready.scales.free_air:  # the noise of the first structure was that of a worse one
-        for _ in range(2):
-            structure, values = carried.structure, carried.values
-            parts = fresh_residuals(structure, values, ready.runs)
-            noise = noise_by_run(parts, ready.runs, ready.least_rad)
-            problem = replace(ready.problem(structure), noise_rad=noise)
-            carried = replace(carried, fit=refine(problem, carried.fit.point[None]))
-    likely = [carried if f.structure.name == carried.structure.name else f for f in likely]
-    repeats = None
-    if not ready.scales.known_load and len({r.p_gain for r in ready.runs}) == 1:
-        quantum_rad = ready.lag.quantum_rad
-        repeats = compare_repeats(
-            ready.problem(carried.structure), carried.fit, ready.least_rad,
-            quantum_rad if np.isfinite(quantum_rad) else 0.0,
-        )  # fmt: skip
-    if repeats is not None:
-        likely = [_as_repeats(f, repeats, ready.fit_rng()) for f in likely]
-        carried = next(f for f in likely if f.structure.name == carried.structure.name)
-    lag = ready.lag.with_dead_time(_dead_time(ready, carried, likely), float(carried.values[-1]))
-    return _Choice(carried, tuple(likely), nats, unseen, noise, lag, repeats)
-
-
-def _as_repeats(fitted: Fitted, repeats: Repeats, rng: np.random.Generator) -> Fitted:
-    """The fit with draws as wide as recordings differ, in the numbers that it has, too."""
-    assert fitted.draws is not None
-    spread = dict(zip(repeats.names, repeats.for_the_next, strict=True))
-    sd = np.array([spread.get(name, 0.0) for name in fitted.structure.names])
-    if not sd.any():
-        return fitted
-    draws = fitted.draws + sd * rng.standard_normal(fitted.draws.shape)
-    return replace(fitted, draws=np.clip(draws, *fitted.structure.box))
-
-
-def _simplest(
-    likely: Sequence[Fitted], nats: Mapping[str, float], unseen_rad: Mapping[str, float]
-) -> Fitted:
-    """The structure of fewest parameters that predicts unseen motion about as well as any.
-
-    Structures of as many parameters cannot overfit one another: between them the likelihood
-    decides, whose scatter over searches is far below that of the fits without a part.
-    """
-    by_count: dict[int, Fitted] = {}
-    for f in sorted(likely, key=lambda f: nats[f.structure.name]):
-        by_count.setdefault(len(f.structure.parameters), f)
-    lowest = min(unseen_rad[f.structure.name] for f in by_count.values())
-    if not np.isfinite(lowest):  # no folds
-        return min(likely, key=lambda f: nats[f.structure.name])
-    return next(
-        f for _, f in sorted(by_count.items())
-        if unseen_rad[f.structure.name] <= _PREFERENCE * lowest
-    )  # fmt: skip
-
-
-def _unseen(ready: PreparedJoint, fitted: Fitted) -> float:
-    """RMS error on what was left out [rad]; NaN without folds."""
-    runs = ready.runs
-    folds = folds_of(runs)
-    left_out = held_out_residuals(fitted.structure, fitted.folds or [], folds, runs)
-    return rms(list(left_out.values()))
-
-
-def _dead_time(ready: PreparedJoint, carried: Fitted, likely: Sequence[Fitted]) -> Interval:
-    """Dead time, the interval over all structures that the data allow and the dates' doubt."""
-    value = float(carried.values[0])
-    ends = [_intervals(f, value)["dead_time_s"] for f in likely]
-    # readings that were taken later than dated lengthen the dead time, as they do the lag
-    doubt = max(t.read_time_doubt_s for t in ready.recorded)
-    hull = Interval(value, min(e.low for e in ends), max(e.high for e in ends))
-    return _less_age(hull, ready, doubt)
-
-
-def _less_age(dead_time_s: Interval, ready: PreparedJoint, doubt_s: float = 0.0) -> Interval:
-    """A fitted dead time without the age of readings whose poll is unresolved: up to a loop."""
-    fitted, age = dead_time_s, ready.lag.feedback.time_doubt_s
-    low = max(fitted.low - 2 * age - doubt_s, 0.0)
-    # readings are no older than the fitted dead time is long
-    return Interval(max(fitted.value - age, fitted.value / 2), low, fitted.high + doubt_s)
-
-
-def _intervals(fitted: Fitted, dead_time_s: float | None = None) -> dict[str, Interval]:
-    """Interval of each fitted number, and of the back-EMF where the structure has one."""
-    structure, values = fitted.structure, fitted.values.copy()
-    assert fitted.draws is not None
-    draws = structure.decode(fitted.draws)
-    if dead_time_s is not None:
-        values[0] = dead_time_s
-    found = {
-        name: interval_of(name, float(v), own)
-        for name, v, own in zip(structure.names, values, draws.T, strict=True)
-    }
-    if {"no_load_speed_rad_s", "effort_rad_s2"} <= found.keys():
-        at = [structure.names.index(n) for n in ("effort_rad_s2", "no_load_speed_rad_s")]
-        value = float(values[at[0]] / values[at[1]])
-        own = draws[:, at[0]] / draws[:, at[1]]
-        found["back_emf_per_s"] = interval_of("back_emf_per_s", value, own)
-    if fitted.structure.scales.free_air and fitted.structure.kind == kernel.SERVO:
-        found["braking_per_s"] = _braking(fitted)
-    return found
+    ready, _, choice = settled(ready, joined(fitted))
+    return _lag(ready, choice, goodness_of(ready, choice.carried))
 
 
 # ------------------------------------------------------------------------------- results
@@ -508,171 +133,14 @@ def conclude(
 
     `fitted`: by stage (`stages`), from `fit_structures`. `presets`: as for `fit_joint`.
     """
-    ready, every, choice = _settled(ready, _joined(fitted))
+    ready, every, choice = settled(ready, joined(fitted))
     if not ready.scales.free_air:
         return _under_load(ready, every, choice)
     return _in_free_air(ready, every, choice, presets)
 
 
-def _settled(
-    ready: PreparedJoint, every: list[Fitted]
-) -> tuple[PreparedJoint, list[Fitted], _Choice]:
-    """The joint, its fits and the choice among them.
-
-    A joint in free air is taken for any servo, with an unknown load, where a profile of the
-    set-point describes it better, or DelayedPD does not and such a servo may.
-    """
-    choice = _choice(ready, every)
-    if not ready.scales.free_air:
-        return ready, every, _explained(ready, choice)
-    goodness, plain = _goodness(ready, choice.carried), _explained(ready, choice)
-    profiled, gained = _with_profile(ready, choice.carried)
-    stated = bool(np.isfinite(ready.scales.acceleration_rad_s2))
-    enough = -TELLING_NATS if stated else _PROFILE_NATS  # a register is believed unless refuted
-    if gained > enough and not stated:  # it was searched for, so what else there may be is, too
-        plain = _explained(ready, choice, anew=True)
-    # in cost, because likelihoods are counted at temperatures of their own
-    rival = -np.inf if plain.misfit is None else plain.misfit.nats * plain.misfit.temperature
-    most = _DESCRIBES_BETTER * overall(goodness)
-    if gained < enough or choice.carried.fit.cost - profiled.fit.cost < rival:
-        plain, profiled = _perhaps_profiled(ready, plain, profiled, gained), None
-    elif stated or not undescribed(_goodness(ready, profiled)):
-        most = np.inf
-    else:  # a motor's friction beside it may describe it
-        most = DESCRIBED
-    if profiled is None and not undescribed(goodness):
-        return ready, every, plain
-    any_servo = ready if profiled is None else ready.with_noise_of(profiled.structure, profiled.fit)
-    any_servo = any_servo.as_any_servo()
-    ladder = _ladder(any_servo, any_servo.fit_rng(), SHORT_LADDER, most, profiled)
-    if not ladder:
-        if profiled is not None:
-            plain = _perhaps_profiled(ready, plain, profiled, gained)
-        return ready, every, plain
-    wider = _choice(any_servo, ladder)
-    if profiled is None and choice.carried.fit.cost - wider.carried.fit.cost < rival:
-        return ready, every, plain  # that is no term of a servo
-    # the noise that `most` is relative to is an upper bound, which a worse fit finds larger
-    smaller = _DESCRIBES_BETTER * _error_rad(ready, choice.carried)
-    if profiled is None and _error_rad(any_servo, wider.carried) > smaller:
-        return ready, every, plain
-    return any_servo, ladder, _explained(any_servo, wider)
-
-
-def _explained(ready: PreparedJoint, choice: _Choice, anew: bool = False) -> _Choice:
-    """The choice with what a misfit looks like; `anew` searches for it far from the fit."""
-    carried = choice.carried
-    anew = anew or (ready.scales.free_air and carried.temperature > _CORRELATED)
-    anew = anew or bool(undescribed(_goodness(ready, carried)))
-    if not (anew or ready.scales.free_air):
-        return choice  # a motor under load has enough terms to imitate a filter
-    likely = []
-    for fitted in choice.likely:
-        if fitted is carried or ready.scales.free_air:
-            likely += _rivals(ready, fitted, carried, choice.nats, anew and fitted is carried)
-    likely.sort(key=lambda one: -one.nats)
-    named = decided(likely)
-    if named is not None:
-        named = with_delays(named, likely)
-        age = ready.lag.feedback.time_doubt_s
-        dead, *ends = (max(t - age, 0.0) for t in (named.dead_time_s, *named.delays_s))
-        named = replace(named, dead_time_s=dead, delays_s=(ends[0], ends[1]))
-    elif likely and carried.draws is not None and ready.scales.free_air:
-        choice = _stacked(ready, choice, likely)
-    return replace(choice, misfit=named)
-
-
-def _rivals(
-    ready: PreparedJoint, fitted: Fitted, carried: Fitted, nats: Mapping[str, float], anew: bool
-) -> list[Explanation]:
-    """What explains the servo beside a likely structure, in the carried one's numbers."""
-    problem = ready.searched(fitted.structure)
-    best = replace(fitted.fit, cost=float(problem.costs(fitted.fit.point[None])[0]))
-    tried = explanations(problem, best, carried.temperature, anew, ready.fit_rng())
-    if fitted is carried:
-        return tried
-    below = nats[fitted.structure.name] - nats[carried.structure.name]
-    shared = [
-        (carried.structure.names.index(name), k)
-        for k, name in enumerate(fitted.structure.names) if name in carried.structure.names
-    ]  # fmt: skip
-    found = []
-    for one in tried:
-        assert one.point is not None
-        point = carried.fit.point.copy()
-        for place, k in shared:
-            point[place] = one.point[k]
-        weight = min(one.weight * float(np.exp(-below)), 1.0)
-        found.append(replace(one, nats=one.nats - below, weight=weight, point=point))
-    return found
-
-
-def _stacked(ready: PreparedJoint, choice: _Choice, rivals: Sequence[Explanation]) -> _Choice:
-    """The choice with draws of the carried servo about what its numbers are in each rival, too.
-
-    The data do not tell the servo from its rivals: each has draws in proportion to its likelihood.
-    """
-    carried = choice.carried
-    assert carried.draws is not None
-    apart, weights = [np.zeros_like(carried.fit.point)], [1.0]
-    for one in rivals:
-        if one.point is not None:
-            apart.append(one.point - carried.fit.point)
-            weights.append(one.weight)
-    ends = np.cumsum(weights) / np.sum(weights)
-    places = (np.arange(len(carried.draws)) + 0.5) / len(carried.draws)
-    turn = ready.fit_rng().permutation(np.searchsorted(ends, places))
-    draws = np.clip(carried.draws + np.array(apart)[turn], *carried.structure.box)
-    wider = replace(carried, draws=draws)
-    likely = tuple(wider if f is carried else f for f in choice.likely)
-    lag = replace(choice.lag, dead_time_s=_dead_time(ready, wider, likely))
-    return replace(choice, carried=wider, likely=likely, lag=lag)
-
-
-def _with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]:
-    """The carried servo with a limit on its set-point's acceleration, and its gain in likelihood.
-
-    Damping imitates such a profile within the noise, at a dead time that is wrong by tens of
-    milliseconds, so that goodness of fit does not show it. The limit is off in the Mini Pupper's
-    servos, which have none, and where the header says so.
-    """
-    unlimited = [t.servo.set_point_acceleration_rad_s2 == np.inf for t in ready.recorded]
-    unnamed = all(t.servo.model is None for t in ready.recorded)
-    if all(unlimited) or (unnamed and ready.joint in JOINT_NAMES):
-        return carried, -np.inf
-    structure = servo_structure((*carried.structure.features, "acceleration"), ready.scales)
-    tried = {carried.structure.features: carried}
-    fitted = _fitted(ready, structure, tried, ready.fit_rng(), short=True)
-    quieter = ready.with_noise_of(structure, fitted.fit)
-    if max(map(operator.truediv, quieter.noise_rad, ready.noise_rad)) < _QUIETER:
-        # the noise was the motion that the carried one cannot make
-        tried[structure.features] = fitted
-        point = _fitted(quieter, structure, tried, ready.fit_rng(), short=True).fit.point
-        cost = float(ready.searched(structure).costs(point[None])[0])
-        fitted = replace(fitted, fit=Fit(point, cost))
-    nats = _nats(ready, (carried, fitted))
-    return fitted, nats[carried.structure.name] - nats[structure.name]
-
-
-def _perhaps_profiled(
-    ready: PreparedJoint, choice: _Choice, profiled: Fitted, gained: float
-) -> _Choice:
-    """The choice with a profile as its explanation, where the data allow one as well.
-
-    One that leaves the dead time where it is changes nothing.
-    """
-    dead = choice.lag.dead_time_s
-    assert dead is not None
-    delay = max(float(profiled.values[0]) - ready.lag.feedback.time_doubt_s, 0.0)
-    if choice.misfit is not None or gained < -TELLING_NATS or dead.low <= delay <= dead.high:
-        return choice
-    limit = float(profiled.values[profiled.structure.names.index("acceleration_limit")])
-    words = f"a profile whose acceleration is limited to about {limit:.0f} rad/s²"
-    return replace(choice, misfit=Explanation(words, gained, delay))
-
-
 def _in_free_air(
-    ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice, presets: Presets | None
+    ready: PreparedJoint, every: Sequence[Fitted], choice: Choice, presets: Presets | None
 ) -> JointCalibrationResult:
     runs, folds = ready.runs, folds_of(ready.runs)
     by_name = {f.structure.name: f for f in (*every, *choice.likely)}
@@ -702,7 +170,7 @@ def _in_free_air(
         results[structure.name] = _candidate_fit(ready, fitted, folds)
     results = {name: results[name] for name in CANDIDATES}
     carried = choice.carried.structure
-    goodness = _goodness(ready, choice.carried)
+    goodness = goodness_of(ready, choice.carried)
     lag = choice.lag
     if why := _doubt(choice, goodness):
         kept = _kept(choice)
@@ -753,53 +221,7 @@ def _in_free_air(
     )  # fmt: skip
 
 
-def _braking(fitted: Fitted) -> Interval:
-    """Damping and back-EMF together, per inertia [1/s]."""
-    names = fitted.structure.names
-
-    def total(values: NDArray) -> NDArray:
-        effort, speed, damping = (
-            values[..., names.index(n)] if n in names else np.asarray(absent)
-            for n, absent in (
-                ("effort_rad_s2", 0.0), ("no_load_speed_rad_s", np.inf), ("damping_per_s", 0.0)
-            )
-        )  # fmt: skip
-        return damping + effort / speed
-
-    value = float(total(fitted.values))
-    if fitted.draws is None:
-        return Interval(value, value, value)
-    return interval_of("damping", value, total(fitted.structure.decode(fitted.draws)))
-
-
-def _goodness(ready: PreparedJoint, fitted: Fitted) -> dict[str, float]:
-    quantum_rad = ready.lag.quantum_rad
-    return goodness_of_fit(
-        fitted.structure, fitted.values, ready.runs,
-        quantum_rad if np.isfinite(quantum_rad) else 0.0,
-    )  # fmt: skip
-
-
-def _error_rad(ready: PreparedJoint, fitted: Fitted) -> float:
-    """RMS error on fresh readings [rad]."""
-    return rms(fresh_residuals(fitted.structure, fitted.values, ready.runs))
-
-
-def undescribed(goodness: Mapping[str, float]) -> str | None:
-    """Why the model's gains mean little; None if it describes the servo, as far as is known."""
-    ratio = overall(goodness)
-    if ratio > DESCRIBED:
-        return f"the model does not describe this servo: its errors are {ratio:.1f} times the noise"
-    motion = max(goodness, key=lambda name: np.nan_to_num(goodness[name]), default=None)
-    if motion is None or not goodness[motion] > DESCRIBED_ONE:
-        return None
-    return (
-        f"the model does not describe this servo in the motion {motion}: its errors are "
-        f"{goodness[motion]:.1f} times the noise there"
-    )
-
-
-def _doubt(choice: _Choice, goodness: Mapping[str, float]) -> str | None:
+def _doubt(choice: Choice, goodness: Mapping[str, float]) -> str | None:
     """Why the gains mean little: errors above the noise, or an explanation that is better."""
     if why := undescribed(goodness):
         return why
@@ -808,7 +230,7 @@ def _doubt(choice: _Choice, goodness: Mapping[str, float]) -> str | None:
     return choice.misfit.claim
 
 
-def _kept(choice: _Choice) -> tuple[str, ...]:
+def _kept(choice: Choice) -> tuple[str, ...]:
     """Numbers that are known, though the model is in doubt: what was fitted without a weight or an
     integral term has another offset.
     """
@@ -819,7 +241,7 @@ def _doubted(fit: CandidateFit, why: str, kept: Sequence[str]) -> CandidateFit:
     return replace(fit, undecided={n: why for n in fit.parameters if n not in kept} | fit.undecided)
 
 
-def _lag(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, float]) -> LagBudget:
+def _lag(ready: PreparedJoint, choice: Choice, goodness: Mapping[str, float]) -> LagBudget:
     """The lag budget with the dead time of the choice, as wide as its misfit makes it."""
     dead, lag_s = choice.lag.dead_time_s, choice.lag.lag_s
     if dead is None:
@@ -837,7 +259,7 @@ def _lag(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, float]) -
     return replace(choice.lag, dead_time_s=replace(wide, low=max(wide.low, 0.0)))
 
 
-def _hidden_rad(ready: PreparedJoint, choice: _Choice, goodness: Mapping[str, float]) -> float:
+def _hidden_rad(ready: PreparedJoint, choice: Choice, goodness: Mapping[str, float]) -> float:
     """RMS error that is not noise [rad]: a motion in a wrong shape can hide as much."""
     if not undescribed(goodness):
         return 0.0
@@ -889,7 +311,7 @@ def _foreign(joint: str, carried: Fitted) -> Iterator[str]:
             )
 
 
-def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) -> Iterator[str]:
+def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: Choice) -> Iterator[str]:
     if why := undescribed(goodness):
         worst = max((r, name) for name, r in goodness.items() if np.isfinite(r))
         at = f" ({worst[0]:.1f} at {worst[1]})" if overall(goodness) > DESCRIBED else ""
@@ -908,7 +330,7 @@ def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: _Choice) ->
         )
 
 
-def _differences(joint: str, choice: _Choice) -> tuple[str, ...]:
+def _differences(joint: str, choice: Choice) -> tuple[str, ...]:
     if choice.repeats is None:
         return ()
     return tuple(each.sentence(joint) for each in choice.repeats.differences)
@@ -925,8 +347,8 @@ def _candidate_fit(
             for p, v, s in zip(structure.parameters, values, sd, strict=True)
         }
     else:
-        parameters, sd = _intervals(fitted), fitted.draws.std(axis=0)
-    parameters["dead_time_s"] = _less_age(parameters["dead_time_s"], ready)
+        parameters, sd = intervals(fitted), fitted.draws.std(axis=0)
+    parameters["dead_time_s"] = less_age(parameters["dead_time_s"], ready)
     speed = max(_command_speed(r) for r in ready.runs)
     undecided = {
         p.name: why
@@ -1081,7 +503,7 @@ def _best(results: Mapping[str, CandidateFit], carried: str) -> str:
 
 
 def _free_warnings(
-    ready: PreparedJoint, results: Mapping[str, CandidateFit], chosen: str, choice: _Choice
+    ready: PreparedJoint, results: Mapping[str, CandidateFit], chosen: str, choice: Choice
 ) -> Iterator[str]:
     joint, carried = ready.joint, choice.carried.structure.name
     pd = results[carried]
@@ -1127,14 +549,14 @@ def _command_speed(run: Run) -> float:
 
 
 def _under_load(
-    ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice
+    ready: PreparedJoint, every: Sequence[Fitted], choice: Choice
 ) -> JointCalibrationResult:
     loaded = _loaded_fit(ready, every, choice)
     structure, values = choice.carried.structure, choice.carried.values
     folds = folds_of(ready.runs)
     left_out = held_out_residuals(structure, choice.carried.folds or [], folds, ready.runs)
     scores = score(free_run(structure, values, ready.runs), ready.runs, left_out)
-    goodness, lag = _goodness(ready, choice.carried), choice.lag
+    goodness, lag = goodness_of(ready, choice.carried), choice.lag
     if why := _doubt(choice, goodness):
         kept = _kept(choice)
         doubted = {n: why for n in loaded.numbers if n not in kept}
@@ -1202,7 +624,7 @@ def _sag_rad(structure: Structure, values: NDArray[np.float64], runs: Sequence[R
     return float(-servo["gravity_nm"] / servo["stiffness"] * np.mean(pulls))
 
 
-def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: _Choice) -> LoadedFit:
+def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: Choice) -> LoadedFit:
     carried, runs = choice.carried, ready.runs
     structure, scales = carried.structure, ready.scales
     own = {name: x[0] for name, x in numbers_of(structure, carried.values[None]).items()}
@@ -1328,7 +750,7 @@ def typical_torque(structure: Structure, values: NDArray[np.float64], runs: Sequ
     return float(np.median(np.concatenate(torques)))
 
 
-def _summary(fitted: Fitted, runs: Sequence[Run], choice: _Choice) -> StructureFit:
+def _summary(fitted: Fitted, runs: Sequence[Run], choice: Choice) -> StructureFit:
     structure, values = fitted.structure, fitted.values
     parts = fresh_residuals(structure, values, runs)
     left_out = (

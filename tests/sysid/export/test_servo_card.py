@@ -23,7 +23,7 @@ from pupper_sysid.servo_models.cards.numbers import LoadedLoop, TorquePD
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 from pupper_sysid.sysid.export.tidy_table import CALIBRATION_COLUMNS, to_csv
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
-from pupper_sysid.sysid.fit.joint_fit import LoadedFit, StructureFit
+from pupper_sysid.sysid.fit.results import LoadedFit, StructureFit
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
 from support.refusals import assert_each_refused

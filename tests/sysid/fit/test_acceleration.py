@@ -11,10 +11,11 @@ from pupper_sysid.servo_models.cards.numbers import LoadedLoop, stated
 from pupper_sysid.servo_models.loaded_servo import LoadedServo, LoadedServoParameters
 from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.doctor.checks import usable_trials
-from pupper_sysid.sysid.fit import joint_fit
+from pupper_sysid.sysid.fit import choice
 from pupper_sysid.sysid.fit.calibrate import calibrate
+from pupper_sysid.sysid.fit.choice import Fitted
 from pupper_sysid.sysid.fit.dead_time import lag
-from pupper_sysid.sysid.fit.joint_fit import Fitted
+from pupper_sysid.sysid.fit.preparation import prepare_joint
 from pupper_sysid.sysid.fit.search import Fit
 from pupper_sysid.sysid.fit.structure import servo_structure
 from pupper_sysid.sysid.recordings.recording import Recording
@@ -120,7 +121,7 @@ def test_the_likelihood_decides_between_structures_of_as_many_parameters():
         ((np.nan, np.nan, np.nan), slew),
     ):  # fmt: skip
         errors = dict(zip(names, unseen, strict=True))
-        assert joint_fit._simplest((more, back_emf, slew), nats, errors) is wanted
+        assert choice.simplest((more, back_emf, slew), nats, errors) is wanted
 
 
 @pytest.mark.slow
@@ -128,11 +129,11 @@ def test_the_likelihood_decides_between_structures_of_as_many_parameters():
 def test_a_profile_competes_in_free_air_before_a_misfit_asks_for_it(limit):
     """Damping imitates a profile within the noise; the likelihood tells the two apart."""
     trials = usable_trials([recording(JUMPS, limit, 5)])["j"]
-    ready = joint_fit.prepare_joint("j", trials, 0, free_air=True)
-    stages = {stage: joint_fit.fit_structures(ready, stage) for stage in joint_fit.stages(ready)}
-    carried = joint_fit._choice(ready, joint_fit._joined(stages)).carried
-    profiled, gained = joint_fit._with_profile(ready, carried)
-    assert (gained > joint_fit._PROFILE_NATS) == np.isfinite(limit)
+    ready = prepare_joint("j", trials, 0, free_air=True)
+    stages = {stage: choice.fit_structures(ready, stage) for stage in choice.stages(ready)}
+    carried = choice.choose(ready, choice.joined(stages)).carried
+    profiled, gained = choice.with_profile(ready, carried)
+    assert (gained > choice._PROFILE_NATS) == np.isfinite(limit)
     if np.isfinite(limit):
         place = profiled.structure.names.index("acceleration_limit")
         assert profiled.values[place] == pytest.approx(limit, rel=0.1)
@@ -148,7 +149,7 @@ def test_delay_and_calibrate_have_one_dead_time_where_a_profile_is_found():
 def test_the_noise_is_that_of_the_fit_which_explains_the_motion():
     """A noise that is a motion leaves fits to their priors, and finds coarse steps fine enough."""
     trials = usable_trials([recording(CHIRP, 8.0, 5)])["j"]
-    ready = joint_fit.prepare_joint("j", trials, 0, free_air=True)
+    ready = prepare_joint("j", trials, 0, free_air=True)
     servo = random_servo(8.0, 5).arrays()
     inertia = float(servo["armature"])
     numbers = {

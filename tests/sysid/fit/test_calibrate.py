@@ -16,7 +16,8 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
 from pupper_sysid.sysid.fit.calibrate import STAGES, calibrate
 from pupper_sysid.sysid.fit.calibration_file import GIVEN_TORQUE, to_calibration, torque_anchors
-from pupper_sysid.sysid.fit.joint_fit import _less_age, fit_joint
+from pupper_sysid.sysid.fit.choice import less_age
+from pupper_sysid.sysid.fit.joint_fit import fit_joint
 from pupper_sysid.sysid.fit.posterior import EFFECTIVE, R_HAT
 from pupper_sysid.sysid.fit.preparation import prepare_joint
 from pupper_sysid.sysid.fit.results import plausible
@@ -109,7 +110,7 @@ def test_readings_that_may_be_live_do_not_ask_for_a_negative_dead_time():
 def test_a_dead_time_without_the_age_of_its_readings_lies_in_its_interval(fitted):
     feedback = SimpleNamespace(time_doubt_s=0.007)
     ready = SimpleNamespace(lag=SimpleNamespace(feedback=feedback))
-    dead_time = _less_age(Interval(fitted, 0.9 * fitted, 1.1 * fitted), ready)
+    dead_time = less_age(Interval(fitted, 0.9 * fitted, 1.1 * fitted), ready)
     assert 0.0 <= dead_time.low <= dead_time.value <= dead_time.high == 1.1 * fitted
     # the readings may be a loop old, or live
     assert dead_time.low == pytest.approx(max(0.9 * fitted - 0.014, 0.0))

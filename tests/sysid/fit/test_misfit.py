@@ -10,8 +10,9 @@ import pytest
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
+from pupper_sysid.sysid.fit.choice import undescribed
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
-from pupper_sysid.sysid.fit.joint_fit import undescribed, unidentified
+from pupper_sysid.sysid.fit.joint_fit import unidentified
 from pupper_sysid.sysid.fit.misfit import (
     Explanation,
     decided,

@@ -8,7 +8,8 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
-from pupper_sysid.sysid.fit.joint_fit import Fitted, _foreign
+from pupper_sysid.sysid.fit.choice import Fitted
+from pupper_sysid.sysid.fit.joint_fit import _foreign
 from pupper_sysid.sysid.fit.search import Fit
 from pupper_sysid.sysid.fit.servo_prior import PER_INERTIA, ServoPrior, servo_prior
 from pupper_sysid.sysid.fit.structure import SIMULATED, Scales, candidate

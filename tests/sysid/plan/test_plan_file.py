@@ -117,7 +117,7 @@ def test_a_plan_is_reduced_to_the_limits_of_the_bus_that_executes_it(path):
 
 
 class Robot:
-    """Writes the same recording for every round, and fits dead times of given half widths."""
+    """Writes a recording of the same motion for every round, and fits dead times of given half widths."""
 
     def __init__(self, folder: Path, half_widths_ms: dict[str, list[float]]):
         self.folder, self._widths = folder, {j: list(w) for j, w in half_widths_ms.items()}
@@ -137,9 +137,9 @@ class Robot:
     def _write(self, number, joints):
         path = self.folder / f"sweep_{number}.csv"
         table = two_joints().table
-        Recording.from_frame(
-            table[table["joint"].isin(joints)], metadata={"readings": "live"}
-        ).save(path)
+        table = table[table["joint"].isin(joints)]
+        table = table.assign(position_rad=table["position_rad"] + 1e-6 * number)
+        Recording.from_frame(table, metadata={"readings": "live"}).save(path)
         return path
 
     def run(self, goal_ms: float, most_seconds: float = 1000.0, report=None):
