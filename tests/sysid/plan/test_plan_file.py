@@ -117,7 +117,7 @@ def test_a_plan_is_reduced_to_the_limits_of_the_bus_that_executes_it(path):
 
 
 class Robot:
-    """Writes a recording of the same motion for every round, and fits dead times of given half widths."""
+    """Records the same motion in every round; dead times have the given half widths."""
 
     def __init__(self, folder: Path, half_widths_ms: dict[str, list[float]]):
         self.folder, self._widths = folder, {j: list(w) for j, w in half_widths_ms.items()}
