@@ -193,7 +193,7 @@ def evolved(
     best = evolve(problem.coarse, refined(problem.coarse, starts), rng, short, crowd)
     near = np.concatenate([best.point[None], starts[-_FINAL:]])
     best = refine(problem, near[np.argsort(problem.costs(near))[:_REFINED]])
-    return from_about(problem, best, rng)
+    return from_about(problem, with_limits(problem, best), rng)
 
 
 def from_about(problem: Problem, best: Fit, rng: np.random.Generator) -> Fit:
@@ -206,11 +206,9 @@ def from_about(problem: Problem, best: Fit, rng: np.random.Generator) -> Fit:
         return best
     low, high = problem.structure.box
     shape, (least, most) = (_NEAR, len(best.point)), np.log(_NEAR_SD)
-    for turn in range(_NEAR_ROUNDS):
+    for _ in range(_NEAR_ROUNDS):
         sd = np.exp(rng.uniform(least, most, (_NEAR, 1))) * problem.structure.scale
         near = np.clip(best.point + sd * rng.standard_normal(shape), low, high)
-        if not turn:
-            near = np.concatenate([near, _where_limits_cut(problem, best.point)])
         fits = local(problem, near, _NEAR_ITERATIONS, _NEAR_STEP)
         before, best = best.cost, min(best, *fits, key=lambda f: f.cost)
         if before - best.cost < 1.0:  # one more number's worth
@@ -218,13 +216,13 @@ def from_about(problem: Problem, best: Fit, rng: np.random.Generator) -> Fit:
     return best
 
 
-def _where_limits_cut(problem: Problem, point: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points where a limit that the motion does not reach would begin to cut it.
+def with_limits(problem: Problem, best: Fit) -> Fit:
+    """The better of a fit and of local fits from where a limit would begin to cut its motion.
 
-    Such a limit has no slope, so that no local fit finds a servo at its limit. Shape (points,
-    parameters): none of limits that the motion reaches.
+    A limit that the motion does not reach has no slope, so that no local fit leads to a servo at
+    its limit.
     """
-    names = problem.structure.names
+    point, names = best.point, problem.structure.names
     limits = [names.index(name) for name in LIMITS if name in names]
     points = np.tile(point, (len(limits), len(_FALLS), 1))
     for n, limit in enumerate(limits):
@@ -235,7 +233,10 @@ def _where_limits_cut(problem: Problem, point: NDArray[np.float64]) -> NDArray[n
     cut = costs > costs[:, :1] + 1.0
     first = np.where(cut.any(axis=1), cut.argmax(axis=1), 0)
     starts = [points[n, k : k + _CUT_STARTS] for n, k in enumerate(first) if k > 1]
-    return np.concatenate([points[:0, 0], *starts])
+    if not starts:
+        return best
+    fits = local(problem, np.concatenate(starts), _LONG, _STEP)
+    return min(best, *fits, key=lambda f: f.cost)
 
 
 def refined(problem: Problem, starts: NDArray[np.float64], final: int = _FINAL) -> list[Fit]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.fit.run import free_run
-from pupper_sysid.sysid.fit.search import Problem, from_about, refine
+from pupper_sysid.sysid.fit.search import Problem, from_about, refine, with_limits
 from pupper_sysid.sysid.fit.structure import candidate
 from support.runs import fine_run
 
@@ -63,4 +63,4 @@ def test_a_limit_that_the_fitted_motion_does_not_reach_is_found_where_it_cuts():
     unlimited = truth * np.array([1.0, 1.0, 1.0, 1.0, 40.0, 1.0, 1.0])
     flat = refine(problem, structure.encode(unlimited)[None])
     assert flat.cost > 10 * best, "the slope leads there, so this proves nothing"
-    assert from_about(problem, flat, rng).cost < best + 1
+    assert with_limits(problem, flat).cost < best + 1
