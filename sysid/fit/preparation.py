@@ -30,7 +30,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
 )
 from pupper_sysid.sysid.feedback.slips import Motion, Upset, find_upsets
 from pupper_sysid.sysid.fit.claimed_load import check_claimed_load
-from pupper_sysid.sysid.fit.goodness import LEAST_NOISE_RAD
+from pupper_sysid.sysid.fit.goodness import DESCRIBED, LEAST_NOISE_RAD, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.loads import loaded_joints
 from pupper_sysid.sysid.fit.noise import noise_by_run
 from pupper_sysid.sysid.fit.operating_point import reference_gain
@@ -331,7 +331,7 @@ def _upsets(
     values: NDArray[np.float64],
     step_s: float,
 ) -> tuple[Upset, ...]:
-    """Commands that never arrived, in all trials."""
+    """Commands that never arrived, in all trials; none by a model that errs elsewhere, too."""
 
     def of_trial(trial: Trial, scale: float) -> list[Upset]:
         read = _readings(trial, lattice)
@@ -343,8 +343,13 @@ def _upsets(
 
         return find_upsets(trial, time, scale, simulate)
 
-    upsets = [of_trial(t, s) for t, s in zip(recorded, noise, strict=True)]
-    return tuple(upset for of_one in upsets for upset in of_one)
+    of_trials = [of_trial(t, s) for t, s in zip(recorded, noise, strict=True)]
+    upsets = tuple(upset for of_one in of_trials for upset in of_one)
+    if upsets:
+        _, others = _dated(recorded, lattice, float("nan"), True, step_s, upsets)
+        if overall(goodness_of_fit(structure, values, others, quantum(recorded))) > DESCRIBED:
+            return ()
+    return upsets
 
 
 def _readings(trial: Trial, lattice: PollLattice) -> Readings:

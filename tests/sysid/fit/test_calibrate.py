@@ -13,6 +13,7 @@ from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import STALL_TORQUE_NM, STALL_TORQUE_SOURCE
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
+from pupper_sysid.sysid.doctor.checks import usable_trials
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
 from pupper_sysid.sysid.fit.calibrate import STAGES, calibrate
 from pupper_sysid.sysid.fit.calibration_file import GIVEN_TORQUE, to_calibration, torque_anchors
@@ -26,6 +27,7 @@ from pupper_sysid.sysid.fit.servo_prior import ServoPrior
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording, Trial, Truncation
 from support.planned_servos import two_joints
+from support.real_recordings import case
 from support.synthetic import LOOP_S, tone_trials
 
 JOINT = "LF_hip"
@@ -277,3 +279,10 @@ def test_a_slow_recording_with_another_unit_as_the_prior_tells_the_effort_limit(
     assert alone.identified == "no" and adapted.identified == "yes"
     assert adapted.high / adapted.low < 0.5 * alone.high / alone.low
     assert adapted.low <= TRUE.effort_limit <= adapted.high
+
+
+@pytest.mark.slow
+def test_a_model_that_errs_everywhere_leaves_no_readings_out():
+    trials = usable_trials([load(case("real/c02_mx106_four_sines_no_freq_column.csv"))])
+    ((joint, of_joint),) = trials.items()
+    assert prepare_joint(joint, of_joint, 0).upsets == ()
