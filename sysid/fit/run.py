@@ -25,7 +25,7 @@ _ACCELERATION = kernel.COLUMNS.index("acceleration_limit")
 SHORTEST_STEP_S = TIME_STEP_S / 4
 """Physics step in which servos are nearly those of continuous time [s]: predictions take it, and
 fits where longer ones would move a number."""
-_LEAST_AT_REST, _SETTLES = 8, 3.0
+_LEAST_AT_REST, _SETTLES, _FAR = 8, 3.0, 5.0
 """Readings whose halves can be compared, and the difference [standard errors] of a moving joint."""
 _VOLTAGE_WINDOW_S = 0.1
 """Length of the mean of logged voltages: single ones catch the ripple of the pulse width."""
@@ -224,8 +224,12 @@ def _rest_rad(trial: Trial) -> float:
     rest = trial.position_rad[known & (trial.read_time_s <= moved_s)]
     if len(rest) < _LEAST_AT_REST:
         return float(trial.position_rad[known][0])
-    away = np.abs(rest - np.median(rest))
-    rest = rest[away <= 5.0 * max(float(np.mean(away)), 1e-9)]  # without single bad readings
+    # without single bad readings, which are away from both of their neighbours
+    beside = rest[:1], rest, rest[-1:]
+    around = np.lib.stride_tricks.sliding_window_view(np.concatenate(beside), 3)
+    away = np.abs(rest - np.median(around, axis=1))
+    usual = float(np.sqrt(np.mean(np.sort(away)[:-1] ** 2)))
+    rest = rest[away <= _FAR * max(usual, 1e-9)]
     early, late = np.array_split(rest, 2)
     error = np.std(rest) / np.sqrt(len(early))
     settles = abs(early.mean() - late.mean()) > _SETTLES * error

@@ -184,8 +184,9 @@ def test_a_run_starts_where_the_joint_rested():
     assert start_rad(noisy) == pytest.approx(0.1, abs=4 * 2e-3 / np.sqrt(40))
     spiked = np.where(count == 20, 1.5, noisy)
     assert start_rad(spiked) == pytest.approx(start_rad(noisy), abs=1e-3)
-    settling = noisy - 0.1 * np.exp(-count / 10)
-    assert start_rad(settling) == settling[0]
+    for rows in (1.5, 10.0):
+        settling = noisy - 0.4 * np.exp(-count / rows)
+        assert start_rad(settling) == settling[0]
 
 
 def test_free_air_is_a_load_of_nothing():
