@@ -231,7 +231,7 @@ def _rest_rad(trial: Trial) -> float:
     usual = float(np.sqrt(np.mean(np.sort(away)[:-1] ** 2)))
     rest = rest[away <= _FAR * max(usual, 1e-9)]
     early, late = np.array_split(rest, 2)
-    error = np.std(rest) / np.sqrt(len(early))
+    error = np.std(late) / np.sqrt(len(late))
     settles = abs(early.mean() - late.mean()) > _SETTLES * error
     return float(rest[0] if settles else rest.mean())
 
