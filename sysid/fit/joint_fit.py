@@ -58,11 +58,13 @@ from pupper_sysid.sysid.fit.search import (
     curvature,
     fit_folds,
     folds_of,
+    refine,
     search,
 )
 from pupper_sysid.sysid.fit.servo_prior import ServoPrior
 from pupper_sysid.sysid.fit.structure import (
     CANDIDATES,
+    LIMITS,
     PREFERRED,
     SIMULATED,
     Parameter,
@@ -80,6 +82,8 @@ _WIDE = 4.0
 _REACHED = 1.25
 """Ends of the effort limit's interval, up to which a motion at that limit tells back-EMF from
 damping. Wider ones gave wrong parts of a right sum on twins (`benchmarks/wide_twins.py`)."""
+_FAR_ABOVE = float(np.log(10.0))
+"""From a limit to one that no motion reaches."""
 _FOREIGN = 3.0
 """Standard deviations of a prior from another unit, beyond which it is of another servo."""
 _SHARP_DEAD_TIME_S = 0.015
@@ -172,6 +176,12 @@ def _in_free_air(
     carried = choice.carried.structure
     goodness = goodness_of(ready, choice.carried)
     lag = choice.lag
+    slight = _slight_limits(ready, choice.carried, goodness)
+    if "effort_rad_s2" in slight and "back_emf_per_s" in results[carried.name].parameters:
+        both = _only_the_sum(results[carried.name].parameters["braking_per_s"], "1/s")
+        slight |= {"back_emf_per_s": both, "damping_per_s": both}
+    fit = results[carried.name]
+    results[carried.name] = replace(fit, undecided=slight | fit.undecided)
     if why := _doubt(choice, goodness):
         kept = _kept(choice)
         results = {name: _doubted(fit, why, kept) for name, fit in results.items()}
@@ -219,6 +229,28 @@ def _in_free_air(
         ),
         runs=runs,
     )  # fmt: skip
+
+
+def _slight_limits(
+    ready: PreparedJoint, carried: Fitted, goodness: Mapping[str, float]
+) -> dict[str, str]:
+    """Why limits are not known that explain less than the model leaves unexplained.
+
+    A torque that is cut for an instant looks like a link that bends, or play.
+    """
+    problem, structure, best = ready.problem(carried.structure), carried.structure, carried.fit
+    unexplained = 0.5 * problem.samples * (1.0 - max(overall(goodness), 1.0) ** -2)
+    slight = {}
+    for name in (name for name in LIMITS if name in structure.names):
+        point = best.point.copy()
+        point[structure.names.index(name)] += _FAR_ABOVE
+        without = refine(problem, np.clip(point, *structure.box)[None]).point
+        with_it, without_it = problem.costs(np.array([best.point, without])) - problem.prior(
+            np.array([best.point, without])
+        )
+        if without_it - with_it < unexplained:
+            slight[name] = "it explains less than the model leaves unexplained"
+    return slight
 
 
 def _doubt(choice: Choice, goodness: Mapping[str, float]) -> str | None:
@@ -664,6 +696,9 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: Choice) -
             why = "it cannot be distinguished from none"
         if why:
             undecided[name] = why
+    if not scales.known_load:
+        slight = _slight_limits(ready, carried, goodness_of(ready, carried))
+        undecided = {_shown(name): why for name, why in slight.items()} | undecided
     if why := undecided.get("no_load_speed_rad_s"):
         undecided["back_emf"] = why  # a speed on its bound stands for none
     if "stall_torque" in undecided and "damping" not in structure.features:
