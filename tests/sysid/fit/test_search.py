@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
+from pupper_sysid.sysid.fit.choice import Fitted
+from pupper_sysid.sysid.fit.joint_fit import _slight_limits
 from pupper_sysid.sysid.fit.run import free_run
-from pupper_sysid.sysid.fit.search import Problem, from_about, refine, with_limits
+from pupper_sysid.sysid.fit.search import Fit, Problem, from_about, refine, with_limits
 from pupper_sysid.sysid.fit.structure import candidate
 from support.runs import fine_run
 
@@ -48,19 +51,33 @@ def test_local_fits_from_points_about_a_fit_find_the_way_along_a_ridge():
     assert any(stuck), "the ridge has no dent, so this proves nothing"
 
 
-def test_a_limit_that_the_fitted_motion_does_not_reach_is_found_where_it_cuts():
-    """Above the largest torque of the motion the cost is flat: no slope leads to the limit."""
+def saturating(effort_rad_s2: float, rng: np.random.Generator) -> tuple[Problem, Fit]:
+    """A chirp that meets a limit of the torque, and the fit from the truth."""
     structure = candidate("delayed_pd")
-    truth = np.array([0.03, 1650.0, 40.0, 30.0, 73.0, 200.0, 0.0])
+    truth = np.array([0.03, 1650.0, 40.0, 30.0, effort_rad_s2, 200.0, 0.0])
     time = CONTINUOUS_S * np.arange(int(3.0 / CONTINUOUS_S))
     run = fine_run(0.25 * np.sin(2 * np.pi * (0.5 * time + 0.6 * time**2)), 0.01)
     (track,) = free_run(structure, truth, (run,))
-    rng = np.random.default_rng(0)
     read = np.interp(run.sample_step, np.arange(len(track)), track)
     read += NOISE_RAD * rng.standard_normal(len(read))
     problem = Problem(structure, (replace(run, sample_rad=read),), (NOISE_RAD,))
-    best = refine(problem, structure.encode(truth)[None]).cost
-    unlimited = truth * np.array([1.0, 1.0, 1.0, 1.0, 40.0, 1.0, 1.0])
-    flat = refine(problem, structure.encode(unlimited)[None])
-    assert flat.cost > 10 * best, "the slope leads there, so this proves nothing"
-    assert with_limits(problem, flat).cost < best + 1
+    return problem, refine(problem, structure.encode(truth)[None])
+
+
+def test_a_limit_that_the_fitted_motion_does_not_reach_is_found_where_it_cuts():
+    """Above the largest torque of the motion the cost is flat: no slope leads to the limit."""
+    rng = np.random.default_rng(0)
+    problem, true = saturating(73.0, rng)
+    unlimited = true.point + np.log(40.0) * (np.arange(7) == 4)
+    flat = refine(problem, unlimited[None])
+    assert flat.cost > 10 * true.cost, "the slope leads there, so this proves nothing"
+    assert with_limits(problem, flat).cost < true.cost + 1
+
+
+def test_a_limit_is_known_where_it_explains_more_than_the_model_leaves_unexplained():
+    for effort_rad_s2, undescribed, known in ((73.0, 1.5, True), (300.0, 1.0, True),
+                                              (300.0, 1.5, False)):  # fmt: skip
+        problem, fit = saturating(effort_rad_s2, np.random.default_rng(0))
+        ready = SimpleNamespace(problem=lambda structure, problem=problem: problem)
+        slight = _slight_limits(ready, Fitted(problem.structure, fit), {"chirp": undescribed})
+        assert ("effort_rad_s2" not in slight) is known, (effort_rad_s2, undescribed)
