@@ -46,6 +46,7 @@ from pupper_sysid.sysid.fit.run import fresh_residuals
 from pupper_sysid.sysid.fit.scores import held_out_residuals, rms
 from pupper_sysid.sysid.fit.search import (
     Fit,
+    Problem,
     evolved,
     fit_folds,
     folds_of,
@@ -53,8 +54,10 @@ from pupper_sysid.sysid.fit.search import (
     in_blocks,
     refine,
     search_widely,
+    without_limit,
 )
 from pupper_sysid.sysid.fit.structure import (
+    LIMITS,
     SIMULATED,
     Structure,
     candidate,
@@ -77,6 +80,10 @@ SHORT_LADDER = ((), ("load friction",))
 """For a joint in free air that DelayedPD does not describe."""
 _PROFILE_NATS = 10.0
 """Log-likelihood by which a limited acceleration is better, from which on all rungs have it."""
+_LIMIT_NATS = 10.0
+"""Log-likelihood that a limit must gain: in twins without one, 6.5 (a step of the simulation) and
+10.3 (a link that bends) were gained by it."""
+_LEAST_GAIN = 0.05  # of log-likelihood: below it a limit that is a tenth higher is not reached
 _CORRELATED = 4.0
 """Temperature above which residuals are a motion, not noise, however small they are beside it: of
 recordings of the fitted structure (`benchmarks/wide_twins.py`, seed 170) none is above 1.2."""
@@ -167,10 +174,29 @@ def _fitted(
             for limit in _ACCELERATIONS_RAD_S2:
                 more.append(np.where(np.arange(len(start)) == place, np.log(limit), start))
     if ready.scales.free_air:
-        best = search_widely(problem, rng, np.array(more), short)
+        best = _without_slight_limits(problem, search_widely(problem, rng, np.array(more), short))
     else:  # the first structure was searched for
         best = evolved(problem, np.array(more), rng, short)
     return Fitted(structure, best)
+
+
+def _without_slight_limits(problem: Problem, best: Fit) -> Fit:
+    """The fit in free air, out of reach of limits that are hardly better than none.
+
+    A torque that is cut for an instant makes up for what a step of the simulation, or a term that
+    the servo has besides, is off.
+    """
+    names = problem.structure.names
+    if not problem.structure.scales.free_air:
+        return best
+    least = _LIMIT_NATS * temperature_at(problem, best)
+    for limit in (names.index(name) for name in LIMITS if name in names):
+        higher = best.point + 0.1 * (np.arange(len(names)) == limit)
+        points = np.array([best.point, np.clip(higher, *problem.structure.box)])
+        reached = np.ptp(problem.costs(points) - problem.prior(points)) > _LEAST_GAIN
+        if reached and (without := without_limit(problem, best, limit)).cost < best.cost + least:
+            best = without
+    return best
 
 
 def _ladder(
@@ -240,6 +266,7 @@ def _compared(
     posterior = sample(problem, best, temperature, rng, rounds)
     points = posterior.points
     best = min(best, refine(problem, posterior.best.point[None]), key=lambda f: f.cost)
+    best = _without_slight_limits(problem, best)
     parents = [
         (f.structure, f.folds)
         for f in tried.values()

@@ -58,8 +58,8 @@ from pupper_sysid.sysid.fit.search import (
     curvature,
     fit_folds,
     folds_of,
-    refine,
     search,
+    without_limit,
 )
 from pupper_sysid.sysid.fit.servo_prior import ServoPrior
 from pupper_sysid.sysid.fit.structure import (
@@ -82,8 +82,6 @@ _WIDE = 4.0
 _REACHED = 1.25
 """Ends of the effort limit's interval, up to which a motion at that limit tells back-EMF from
 damping. Wider ones gave wrong parts of a right sum on twins (`benchmarks/wide_twins.py`)."""
-_FAR_ABOVE = float(np.log(10.0))
-"""From a limit to one that no motion reaches."""
 _FOREIGN = 3.0
 """Standard deviations of a prior from another unit, beyond which it is of another servo."""
 _SHARP_DEAD_TIME_S = 0.015
@@ -91,6 +89,7 @@ _POLL_SD_S = 1e-3
 """Standard deviation of a poll's instant about its lattice: jitter of the bus and drift."""
 _AT_BOUND = 0.03
 """Distance from a bound, in fitted coordinates, that counts as on it."""
+_NEAR_LEAST = 1.1  # of the least dead time: on its bound, as far as gains that make up for it say
 _CUT_SHARE = 0.1
 """The same as a share of a 90 % interval: a bound within two standard deviations cuts the draws."""
 _COMMAND_WINDOW_S = 0.05
@@ -242,12 +241,9 @@ def _slight_limits(
     unexplained = 0.5 * problem.samples * (1.0 - max(overall(goodness), 1.0) ** -2)
     slight = {}
     for name in (name for name in LIMITS if name in structure.names):
-        point = best.point.copy()
-        point[structure.names.index(name)] += _FAR_ABOVE
-        without = refine(problem, np.clip(point, *structure.box)[None]).point
-        with_it, without_it = problem.costs(np.array([best.point, without])) - problem.prior(
-            np.array([best.point, without])
-        )
+        without = without_limit(problem, best, structure.names.index(name))
+        points = np.array([best.point, without.point])
+        with_it, without_it = problem.costs(points) - problem.prior(points)
         if without_it - with_it < unexplained:
             slight[name] = "it explains less than the model leaves unexplained"
     return slight
@@ -398,7 +394,7 @@ def _candidate_fit(
         undecided["dead_time_s"] = why
     doubt_s = max(t.read_time_doubt_s for t in ready.recorded)
     least = structure.parameters[0].low
-    if doubt_s > 0 and float(values[0]) < (1.0 + _AT_BOUND) * least:
+    if doubt_s > 0 and float(values[0]) < _NEAR_LEAST * least:
         why = (
             f"the dead time is on its bound, and readings are dated to {1e3 * doubt_s:.0f} ms "
             "only: gains make up for what the dates are off"

@@ -33,6 +33,7 @@ smaller than the second drowns in friction's stick-slip."""
 _POPULATION, _GENERATIONS, _SHORT_GENERATIONS = 48, 60, 20
 _NEAR, _NEAR_ROUNDS, _NEAR_ITERATIONS = 12, 12, 12
 _FALLS, _CUT_STARTS = -np.linspace(0.0, np.log(30.0), 15), 3  # of the logarithm of a limit
+_FAR_ABOVE = 10.0  # from a limit to one that no motion reaches
 _NEAR_SD, _NEAR_STEP = (0.02, 0.5), 0.02
 """Of the local fits about the best one: how many in a round, rounds at most, iterations, standard
 deviation of their starts and step of the Jacobian in fitted coordinates."""
@@ -237,6 +238,18 @@ def with_limits(problem: Problem, best: Fit) -> Fit:
         return best
     fits = local(problem, np.concatenate(starts), _LONG, _STEP)
     return min(best, *fits, key=lambda f: f.cost)
+
+
+def without_limit(problem: Problem, best: Fit, limit: int) -> Fit:
+    """The fit with number `limit` kept out of the motion's reach."""
+    structure = problem.structure
+    p = structure.parameters[limit]
+    least = min(_FAR_ABOVE * float(structure.decode(best.point)[limit]), 0.99 * p.high)
+    parameters = [*structure.parameters]
+    parameters[limit] = replace(p, low=least)
+    kept = replace(structure, parameters=tuple(parameters))
+    start = np.clip(best.point, *kept.box)
+    return refine(replace(problem, structure=kept), start[None])
 
 
 def refined(problem: Problem, starts: NDArray[np.float64], final: int = _FINAL) -> list[Fit]:
