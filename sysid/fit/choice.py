@@ -50,6 +50,7 @@ from pupper_sysid.sysid.fit.search import (
     evolved,
     fit_folds,
     folds_of,
+    from_about,
     group_count,
     in_blocks,
     refine,
@@ -94,6 +95,7 @@ ADDITIONS = ("damping", "acceleration", "slew", "dead zone", "stribeck", "start 
 _ACCELERATIONS_RAD_S2 = (6.0, 15.0, 40.0, 110.0)
 """Starts of a limit on the set-point's acceleration: its cost has many minima. A Feetech servo's
 register counts 0.153 rad/s² from 1 to 254, whose largest is 39."""
+_SHARES_OF_LAG = (0.1, 0.3, 0.5, 0.7)
 _MOST_COMPARED = 3
 _PREFERENCE = 1.02
 """Error on unseen motion, over the smallest, up to which a simpler structure is carried."""
@@ -180,6 +182,25 @@ def _fitted(
     return Fitted(structure, best)
 
 
+def _as_late(structure: Structure, point: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Critically damped servos that are as late as one at a point, by other dead times.
+
+    Behind a profile the two parts of a lag are nearly the same motion, and the cost along their
+    ridge is rugged. None of a structure without damping.
+    """
+    if "damping_per_s" not in structure.names:
+        return []
+    parts = [structure.names.index(n) for n in ("dead_time_s", "stiffness_per_s2", "damping_per_s")]
+    dead_time_s, stiffness, damping = structure.decode(point)[parts]
+    lag_s, servos = dead_time_s + damping / stiffness, []
+    for share in _SHARES_OF_LAG:
+        rate = 2.0 / ((1.0 - share) * lag_s)
+        values = structure.decode(point)
+        values[parts] = share * lag_s, rate**2, 2.0 * rate
+        servos.append(np.clip(structure.encode(values), *structure.box))
+    return servos
+
+
 def _without_slight_limits(problem: Problem, best: Fit) -> Fit:
     """The fit in free air, out of reach of limits that are hardly better than none.
 
@@ -189,7 +210,8 @@ def _without_slight_limits(problem: Problem, best: Fit) -> Fit:
     names = problem.structure.names
     if not problem.structure.scales.free_air:
         return best
-    least = _LIMIT_NATS * temperature_at(problem, best)
+    # at most: what correlated errors excuse, a limit may be needed to predict
+    least = _LIMIT_NATS * min(temperature_at(problem, best), 1.0)
     for limit in (names.index(name) for name in LIMITS if name in names):
         higher = best.point + 0.1 * (np.arange(len(names)) == limit)
         points = np.array([best.point, np.clip(higher, *problem.structure.box)])
@@ -582,15 +604,28 @@ def with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]:
     structure = servo_structure((*carried.structure.features, "acceleration"), ready.scales)
     tried = {carried.structure.features: carried}
     fitted = _fitted(ready, structure, tried, ready.fit_rng(), short=True)
+    gained = _gained(ready, carried, fitted)
+    if gained < -TELLING_NATS:
+        return fitted, gained
     quieter = ready.with_noise_of(structure, fitted.fit)
     if max(map(operator.truediv, quieter.noise_rad, ready.noise_rad)) < _QUIETER:
         # the noise was the motion that the carried one cannot make
         tried[structure.features] = fitted
-        point = _fitted(quieter, structure, tried, ready.fit_rng(), short=True).fit.point
-        cost = float(ready.searched(structure).costs(point[None])[0])
-        fitted = replace(fitted, fit=Fit(point, cost))
-    nats = _nats(ready, (carried, fitted))
-    return fitted, nats[carried.structure.name] - nats[structure.name]
+        fitted = _fitted(quieter, structure, tried, ready.fit_rng(), short=True)
+    problem, rng = quieter.searched(structure), ready.fit_rng()
+    best = refine(problem, fitted.fit.point[None])
+    for start in _as_late(structure, best.point):
+        fit = from_about(problem, refine(problem, start[None]), rng)
+        best = min(best, fit, key=lambda f: f.cost)
+    cost = float(ready.searched(structure).costs(best.point[None])[0])
+    fitted = replace(fitted, fit=Fit(best.point, cost))
+    return fitted, _gained(ready, carried, fitted)
+
+
+def _gained(ready: PreparedJoint, carried: Fitted, wider: Fitted) -> float:
+    """Log-likelihood that a wider structure gains over the carried one."""
+    nats = _nats(ready, (carried, wider))
+    return nats[carried.structure.name] - nats[wider.structure.name]
 
 
 def _perhaps_profiled(
