@@ -42,6 +42,7 @@ from pupper_sysid.common.joints import select_joints, share_sentences
 from pupper_sysid.common.reading.dialect import whole
 
 if TYPE_CHECKING:
+    from pupper_sysid.common.tables import Table as ResultTable
     from pupper_sysid.sysid.recordings.recording import Recording
 
 JOBS = (1, 1024)
@@ -158,6 +159,19 @@ def table(title: str, *columns: str) -> Table:
             min_width=max(map(len, column.split()), default=0),
         )  # fmt: skip
     return made
+
+
+def print_tables(*tables: ResultTable) -> None:
+    """Print tables of results, an empty line between them; those without rows are left out."""
+    for k, one in enumerate(t for t in tables if t.rows):
+        columns = [column for column in one.columns if not column.detail]
+        shown = table(one.title, *(column.terminal_heading for column in columns))
+        for row in one.rows:
+            style = "bold" if row.get(one.marked) else None
+            shown.add_row(*(column.text(row) for column in columns), style=style)
+        if k:
+            out.print()
+        out.print(shown)
 
 
 def ms(seconds: float | None, digits: int = 1) -> str:

@@ -8,14 +8,11 @@ CSV.
 
 from __future__ import annotations
 
-import csv
-import io
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
@@ -24,52 +21,7 @@ from matplotlib.figure import Figure
 from pupper_sysid.common.figure_style import inline_svg, png, svg
 from pupper_sysid.common.files import refuse_overwrite, write_bytes, write_text
 from pupper_sysid.common.processes.stop import held
-from pupper_sysid.common.results import plain
-
-Row = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column of a table: its heading, and the text of a row's cell."""
-
-    heading: str
-    show: Callable[[Row], str]
-    kind: Literal["key", "number", "words", "prose"] = "number"
-    """Layout: a key stays visible when a table is scrolled, prose is broken into lines."""
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of the report."""
-
-    name: str
-    """Name of its CSV file, without ending; a table without a name has no file."""
-    title: str
-    columns: tuple[Column, ...]
-    """On the page."""
-    rows: tuple[Row, ...]
-    """In the CSV file; all rows have the same keys."""
-    marked: str = ""
-    """Rows in which this key is true are bold on the page."""
-
-    def where(self, key: str, value: object, title: str = "") -> Table:
-        """The part of the rows whose `key` is `value`, without that column; it has no file."""
-        return replace(
-            self, name="", title=title or self.title,
-            rows=tuple(row for row in self.rows if row[key] == value),
-            columns=tuple(c for c in self.columns if c.kind != "key"),
-        )  # fmt: skip
-
-    def to_csv(self) -> str:
-        """All values of all rows; a cell is empty where a number is not finite."""
-        buffer = io.StringIO()
-        writer = csv.DictWriter(
-            buffer, list(self.rows[0]) if self.rows else [], lineterminator="\n"
-        )
-        writer.writeheader()
-        writer.writerows(plain(row) for row in self.rows)
-        return buffer.getvalue()
+from pupper_sysid.common.tables import Column, Row, Table
 
 
 @dataclass(frozen=True)
@@ -181,8 +133,17 @@ def render(title: str, subtitle: str, sections: Sequence[Section]) -> str:
         loader=PackageLoader("pupper_sysid.common"), autoescape=True, undefined=StrictUndefined
     )
     environment.filters["code"] = _code
+    environment.filters["cell"] = _cell
     template = environment.get_template("page.html.j2")
     return template.render(title=title, subtitle=subtitle, sections=sections)
+
+
+def _cell(column: Column, row: Row) -> Markup:
+    """A cell, with a typographic minus in numbers."""
+    text = column.text(row)
+    if column.is_number:
+        text = type(text)(re.sub(r"(?<!\w)-(?=\d)", "−", text))
+    return _code(text)
 
 
 def _code(text: str) -> Markup:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,8 @@ from pupper_sysid.cli.terminal import err, out, print_json
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.figure_style import JOINT_COLOURS, axes_column, styled
 from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_text
-from pupper_sysid.common.page import Column, Picture, Section, Table, write_page
+from pupper_sysid.common.page import Picture, Section, write_page
+from pupper_sysid.common.tables import Column, Table
 from pupper_sysid.policies.analysis import figures
 from pupper_sysid.policies.analysis.attractor import DELAYS_MS
 from pupper_sysid.policies.deploy.stacks import STACKS
@@ -249,8 +251,11 @@ def _markdown(title: str, answer: str, sections: list[Section]) -> str:
         for picture in section.figures:
             blocks += [f"![{picture.caption}]({_file(picture)})", picture.caption]
         for table in section.tables:
-            cells = [[column.heading for column in table.columns], ["---"] * len(table.columns)]
-            cells += [[column.show(row) for column in table.columns] for row in table.rows]
+            cells = [
+                [column.page_heading for column in table.columns],
+                ["---"] * len(table.columns),
+            ]
+            cells += [[column.text(row) for column in table.columns] for row in table.rows]
             blocks.append("\n".join(f"| {' | '.join(row)} |" for row in cells))
     return "\n\n".join(blocks) + "\n"
 
@@ -268,23 +273,17 @@ def _sections(
         for c in found
     )  # fmt: skip
     columns = (
-        Column("", lambda row: row["id"], "key"),
-        *(
-            Column(heading, lambda row, key=key: row[key], "prose")
-            for heading, key in (
-                ("claim", "claim"), ("paper", "paper"), ("here", "here"), ("how", "how"),
-            )
-        ),
-        Column("verdict", lambda row: row["verdict"], "words"),
-    )  # fmt: skip
+        Column("", "id", kind="key"),
+        *(Column(key, key, kind="prose") for key in ("claim", "paper", "here", "how")),
+        Column("verdict", "verdict", kind="words"),
+    )
     kinds, rows = _table_one(evidence)
     one = tuple({"": title} | dict(zip(kinds, cells, strict=True)) for title, cells in rows)
-    first = Column("", lambda row: row[""], "words")
+    first = Column("", "", kind="words")
     compared = []
     if other is not None:
         shown = tuple(
-            Column(heading, lambda row, key=key: row[key], "prose" if heading else "key")
-            for heading, key in _OTHER
+            Column(heading, key, kind="prose" if heading else "key") for heading, key in _OTHER
         )
         tables = [Table("beside", "Judged otherwise", shown, tuple(other))] if other else []
         compared = [Section("beside", _BESIDE, [_other(other)], tables=tables)]
@@ -298,14 +297,14 @@ def _sections(
         Section(
             "table", _TABLE_ONE,
             tables=[Table("table_one", "Architectures, means and ranges",
-                          (first, *(Column(k, lambda row, k=k: row[k]) for k in kinds)), one)],
+                          (first, *(Column(k, k, show=itemgetter(k)) for k in kinds)), one)],
         ),
         Section("pictures", "Pictures", figures=pictures),
         Section(
             "made", _MADE, [f"Made by: `{_command(options)}`", f"{_versions()}."],
             tables=[Table("inputs", "What it was made from", (
-                Column("input", lambda row: row["input"], "words"),
-                Column("SHA-256", lambda row: row["digest"], "prose"),
+                Column("input", "input", kind="words"),
+                Column("SHA-256", "digest", kind="prose"),
             ), tuple({"input": k, "digest": v} for k, v in inputs.items()))],
         ),
     ]  # fmt: skip

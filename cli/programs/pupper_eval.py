@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,14 +15,13 @@ import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.policy_choice import policy_at, run_folder, simulator, warn_of_fallbacks
-from pupper_sysid.cli.terminal import err, need_positive, number, out, print_json
+from pupper_sysid.cli.terminal import err, need_positive, print_json, print_tables
 from pupper_sysid.cli.user_errors import run_program
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, resolved
 from pupper_sysid.sim.robot.terrain import Terrain
 
 if TYPE_CHECKING:
-    from pupper_sysid.common.interval import Interval
     from pupper_sysid.policies.evaluation.evaluate import Evaluation
 
 _FULL, _QUICK = (100, 20.0), (30, 10.0)  # episodes, seconds each
@@ -142,117 +140,16 @@ def _run(options: Eval) -> None:
 
 
 def _show(found: Evaluation, quick: bool) -> None:
+    from pupper_sysid.policies.evaluation.tables import tables_of
+
     first = found.conditions[0].policy
     err.print(
         f"{'Quick look: ' if quick else ''}{first.episodes} episodes of {found.episode_s:g} s, "
         f"actuator {found.actuator}, feedback {found.feedback}. The trot is open-loop: it has a "
         "clock and sees nothing. Episode k has the same robot in every row; intervals are of 90 %."
     )
-    _show_falls(found)
-    _show_errors(found, "every instant", "")
-    _show_errors(found, "the mean over a stride", "stride_")
-    _show_directions(found)
-    _show_effort(found)
-
-
-def _show_falls(found: Evaluation) -> None:
-    """Falls of all three, what the policy's feet do, and what came before the falls."""
-    shown = terminal.table(
-        "Falls, %, and what the policy's feet do", "", "policy", "trot", "standing", "duty",
-        "steps Hz", "slip m/s",
-    )  # fmt: skip
-    for row in found.conditions:
-        own = row.policy
-        rates = [each.intervals.fall_rate for each in (row.policy, row.trot, row.standing)]
-        shown.add_row(
-            row.name,
-            *(f"{100 * r.value:.0f} ({100 * r.low:.0f}–{100 * r.high:.0f})" for r in rates),
-            number(sum(own.duty) / len(own.duty), 2), number(own.stride_hz, 1),
-            number(own.foot_slip_m_s, 3),
-        )  # fmt: skip
-    out.print(shown)
-    if not found.falls:
-        return
-    from pupper_sysid.policies.evaluation.figures import in_short
-
-    shown = terminal.table(
-        "Before falls: median time, median tilt 0.2 s before, usual side; pushed: a push in the "
-        "last second", "", "walker",
-        "falls", "at s", "tilt °", "to the", "tipped", "pushed",
-    )  # fmt: skip
-    for own in in_short(found.falls):
-        shown.add_row(
-            own.row, own.walker, str(own.falls), number(own.time_s, 1),
-            number(own.tilt_before_deg, 0), _SIDES[own.toward], str(own.tipped),
-            str(own.after_push),
-        )  # fmt: skip
-    out.print(shown)
-
-
-def _show_errors(found: Evaluation, of_what: str, prefix: str) -> None:
-    shown = terminal.table(
-        f"Mean absolute errors of {of_what}, mm/s and mrad/s: policy and trot", "",
-        "vx", "vy", "yaw", "trot vx", "vy", "yaw",
-    )  # fmt: skip
-    names = [f"{prefix}{name}" for name in ("mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s")]
-    for row in found.conditions:
-        walkers = (row.policy.intervals, row.trot.intervals)
-        cells = [_within(getattr(own, n), 1000) for own in walkers for n in names]
-        shown.add_row(row.name, *cells)
-    still = found.conditions[0].standing
-    standing = [_within(getattr(still.intervals, name), 1000) for name in names]
-    shown.add_row("standing, random", *standing, *[""] * 3)
-    out.print(shown)
-
-
-def _show_directions(found: Evaluation) -> None:
-    rows = [row for row in found.conditions if row.group == "direction" and any(row.command or ())]
-    if not rows:
-        return
-    shown = terminal.table(
-        f"Speed over the commanded, %, and change of heading over {found.episode_s:g} s, °",
-        "", "m/s, rad/s", "policy", "trot", "policy °", "trot °",
-    )  # fmt: skip
-    for row in rows:
-        each = (row.policy.intervals, row.trot.intervals)
-        shown.add_row(
-            row.name, ", ".join(f"{c:g}" for c in row.command or ()),
-            *(_within(own.speed_share, 100) for own in each),
-            *(_within(own.heading_drift_deg, 1) for own in each),
-        )  # fmt: skip
-    out.print(shown)
-
-
-def _show_effort(found: Evaluation) -> None:
-    """Clearance of the swings and effort of the servos, of policy and trot."""
-    kinds = [k for k in found.conditions[0].policy.torque_saturated_share if k != "hip"]
-    shown = terminal.table(
-        "Clearance of the swings (tenth percentile, median; share below 2 mm) and effort of the "
-        "servos: share of the time at the torque limit and rms torque over the limit, "
-        f"{' and '.join(kinds)}; mechanical power; cost of transport",
-        "", "walker", "p10 mm", "p50 mm", "low %", "at limit %", "rms %", "W", "CoT",
-    )  # fmt: skip
-    for row in found.conditions:
-        for walker, own in (("policy", row.policy), ("trot", row.trot)):
-            pairs = (own.torque_saturated_share, own.rms_torque_share)
-            shown.add_row(
-                row.name if walker == "policy" else "", walker,
-                number(1e3 * own.clearance_p10_m, 1), number(1e3 * own.clearance_p50_m, 1),
-                number(100 * own.low_swing_share, 0),
-                *("/".join(number(100 * each[k], 0) for k in kinds) for each in pairs),
-                number(own.mechanical_power_w, 1), number(own.cost_of_transport, 1),
-            )  # fmt: skip
-    out.print(shown)
-
-
-_SIDES = {"forward": "front", "backward": "rear", "left": "left", "right": "right"}
-
-
-def _within(interval: Interval, scale: float) -> str:
-    half = scale * (interval.high - interval.value)
-    if not math.isfinite(interval.value):
-        return number(interval.value)
-    return f"{number(scale * interval.value, 0 if scale > 1 else 1)} ±{number(half, 0)}"
+    for table in tables_of(found):
+        print_tables(table)
 
 
 if __name__ == "__main__":

@@ -14,11 +14,13 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.figure_style import BLUE, FAINT, RED, WIDTH_IN, axes_column, styled
 from pupper_sysid.common.files import versions
 from pupper_sysid.common.interval import Interval
-from pupper_sysid.common.page import Column, Picture, Section, Table
+from pupper_sysid.common.page import Picture, Section
 from pupper_sysid.common.reading.csv_table import read_table
 from pupper_sysid.common.results import plain
-from pupper_sysid.policies.evaluation.evaluate import Evaluation, Row
-from pupper_sysid.policies.evaluation.figures import Figures, in_short
+from pupper_sysid.common.tables import Column, Table
+from pupper_sysid.policies.evaluation.evaluate import Evaluation
+from pupper_sysid.policies.evaluation.figures import Figures
+from pupper_sysid.policies.evaluation.tables import tables_of
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.train.curves import LARGEST_BYTES, PROGRESS
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run
@@ -45,7 +47,6 @@ def walking_sections(
     `run` is None where the folder does not say how the policy was trained; the folder's curves are
     shown if they are there.
     """
-    rows = [_cells(row) for row in found.conditions]
     walked = (
         f"Walked with the servos of {Path(str(found.actuator)).name}, feedback {found.feedback}, "
         f"seed {found.seed}, in simulation, on robots and terrain of which no training knows. "
@@ -71,14 +72,9 @@ def walking_sections(
                     _falls_figure(found),
                 ),
             ],
-            tables=[
-                Table("walks", "Errors, and what the feet do", _columns(), tuple(rows)),
-                _table_of_effort(found),
-                *_table_of_falls(found),
-            ],
+            tables=tables_of(found),
             notes=[
-                "Errors are of the mean velocity over a stride; of every instant they are in the "
-                "JSON result. A robot that fell counts as one that stands still until the "
+                "A robot that fell counts as one that stands still until the "
                 "end. duty: share of time a foot is on the ground; slip: speed of feet on it; "
                 "speed: mean speed along the command over the commanded one. clearance: largest "
                 "height of the sole over the ground in a swing; low: below 2 mm; at limit: share "
@@ -126,78 +122,6 @@ def _findings(found: Evaluation) -> list[tuple[str, str]]:
             f"{worst.policy.mae_vy_m_s:.3f} m/s sideways.",
         ),
     ]
-
-
-def _cells(row: Row) -> dict[str, Any]:
-    """One row of the table."""
-    found: dict[str, Any] = {"walk": row.name}
-    for walker in ("policy", "trot"):
-        own: Figures = getattr(row, walker)
-        keys = ("fall_rate", *STRIDE_ERRORS, "speed_share")
-        found |= {f"{walker}.{key}": getattr(own, key) for key in keys}
-    own = row.policy
-    duty = float(np.mean(own.duty))
-    return found | {"duty": duty, "stride_hz": own.stride_hz, "slip": own.foot_slip_m_s}
-
-
-def _columns() -> tuple[Column, ...]:
-    found = [Column("", lambda row: row["walk"], "key")]
-    for walker in ("policy", "trot"):
-        found.append(_number(f"{walker}: fell, %", f"{walker}.fall_rate", 100))
-        for key, (name, unit) in zip(STRIDE_ERRORS, ERRORS.values(), strict=True):
-            found.append(_number(f"{name}, {unit}", f"{walker}.{key}", 1, 3))
-        found.append(_number("speed, %", f"{walker}.speed_share", 100))
-    feet = ("duty", "duty", 2), ("strides/s", "stride_hz", 1), ("slip, m/s", "slip", 3)
-    return (*found, *(_number(title, key, 1, digits) for title, key, digits in feet))
-
-
-def _number(title: str, key: str, scale: float = 1.0, digits: int = 0) -> Column:
-    """A column of numbers, a dash where there is none."""
-
-    def text(row: Mapping[str, Any]) -> str:
-        known = row[key] is not None and np.isfinite(row[key])
-        return f"{scale * row[key]:.{digits}f}" if known else "–"
-
-    return Column(title, text)
-
-
-def _table_of_effort(found: Evaluation) -> Table:
-    """Clearance of the swings and effort of the servos, of policy and trot."""
-    rows = tuple(
-        {"walk": row.name, "walker": walker} | own.rows()[0]
-        for row in found.conditions
-        for walker, own in (("policy", row.policy), ("trot", row.trot))
-    )
-    kinds = found.conditions[0].policy.torque_saturated_share
-    columns = (
-        Column("", lambda row: row["walk"], "key"),
-        Column("walker", lambda row: row["walker"]),
-        _number("clearance p10, mm", "clearance_p10_m", 1e3, 1),
-        _number("p50, mm", "clearance_p50_m", 1e3, 1),
-        _number("low swings, %", "low_swing_share", 100),
-        *(_number(f"{k} at limit, %", f"torque_saturated_share_{k}", 100) for k in kinds),
-        *(_number(f"{k} rms, % of limit", f"rms_torque_share_{k}", 100) for k in kinds),
-        _number("power, W", "mechanical_power_w", 1, 1),
-        _number("cost of transport", "cost_of_transport", 1, 1),
-    )
-    return Table("effort", "Clearance of the swings, and effort of the servos", columns, rows)
-
-
-def _table_of_falls(found: Evaluation) -> list[Table]:
-    """What came before the falls."""
-    rows = tuple(plain(own) for own in in_short(found.falls))
-    columns = (
-        Column("", lambda row: row["row"], "key"),
-        Column("walker", lambda row: row["walker"]),
-        _number("falls", "falls"),
-        _number("time, s", "time_s", 1, 1),
-        _number("tilt 0.2 s before, °", "tilt_before_deg"),
-        Column("toward", lambda row: row["toward"]),
-        _number("tipped over", "tipped"),
-        _number("within 1 s of a push", "after_push"),
-    )
-    title = "Before falls: medians of time and tilt, most frequent direction"
-    return [Table("falls", title, columns, rows)] if rows else []
 
 
 def _curves(path: Path) -> dict[str, np.ndarray]:
@@ -275,11 +199,8 @@ def _settings(policy: Policy, run: Run | None) -> Section:
     ]
     if run is None:
         return Section("made", "Where this comes from", words)
-    rows = tuple({"setting": key, "value": value} for key, value in _flat(plain(run)))
-    columns = (
-        Column("setting", lambda row: row["setting"], "key"),
-        Column("value", lambda row: row["value"], "prose"),
-    )
+    rows = [{"setting": key, "value": value} for key, value in _flat(plain(run))]
+    columns = Column("setting", "setting", kind="key"), Column("value", "value", kind="prose")
     return Section(
         "made", "Where this comes from", words,
         tables=[Table("settings", f"Settings of the training ({RUN_FILE})", columns, rows)],

@@ -23,7 +23,8 @@ from matplotlib.figure import Figure
 from pupper_sysid.common.figure_style import BLUE, FAINT, GREEN, INK, RED, axes_column, styled
 from pupper_sysid.common.files import versions
 from pupper_sysid.common.joints import JOINT_NAMES, share_sentences
-from pupper_sysid.common.page import Column, Fold, Picture, Section, Table
+from pupper_sysid.common.page import Fold, Picture, Section
+from pupper_sysid.common.tables import Column, Table
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import Actuator
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
@@ -31,7 +32,7 @@ from pupper_sysid.sysid.fit.structure import PREFERRED
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report import figures, tables
 from pupper_sysid.sysid.report.figures import Track, hold_runs, tracks
-from pupper_sysid.sysid.report.tables import KEY, MODEL_NAMES, number, text
+from pupper_sysid.sysid.report.tables import MODEL_NAMES
 from pupper_sysid.sysid.servo_fit.scores import LINEAR
 
 if TYPE_CHECKING:
@@ -93,11 +94,12 @@ def _summary(results: Mapping[str, JointCalibrationResult]) -> Section:
 
 
 def _lag(results: Mapping[str, JointCalibrationResult]) -> Section:
+    budgets = {joint: r.lag for joint, r in results.items()}
     picture = Picture(
         "lag_budget",
         "Lag budget: the time from sending a command to the row in which its motion is read. The "
         "black line is the raw lag, which is the sum.",
-        figures.lag_budget_figure({joint: r.lag for joint, r in results.items()}),
+        figures.lag_budget_figure(budgets),
     )
     notes = shared({joint: r.lag.warnings for joint, r in results.items()})
     if any(r.lag.stale_lag_s < _NEGATIVE_S for r in results.values()):
@@ -105,9 +107,9 @@ def _lag(results: Mapping[str, JointCalibrationResult]) -> Section:
             "Stale readings with a negative lag: these positions were read after the time stamp of "
             "their row, so they are younger than the row, not older."
         )
-    by_estimator = tables.estimator_table(results)
+    by_estimator = tables.estimator_table(budgets)
     return Section(
-        "lag", "Lag budget", figures=[picture], tables=[tables.lag_table(results)],
+        "lag", "Lag budget", figures=[picture], tables=[tables.lag_table(budgets)],
         folds=[Fold(by_estimator.title, tables=[by_estimator])], files=[by_estimator], notes=notes,
     )  # fmt: skip
 
@@ -134,7 +136,7 @@ def _doctor(found: Findings) -> Section:
     return Section(
         "doctor", "Are the recordings usable?",
         findings=[(names, " ".join(sentences)) for names, sentences in texts.items()],
-        tables=[tables.doctor_table(found.examinations, list(found.results))],
+        tables=[tables.doctor_table(found.examinations, found.results)],
     )  # fmt: skip
 
 
@@ -182,7 +184,7 @@ def _residuals(result: JointCalibrationResult, runs: list[Track]) -> Picture:
 def _joints(found: Findings, runs: Mapping[str, list[Track]], parameters: Table) -> Section:
     """Everything about each joint, folded."""
     models = tables.model_table(found.results)
-    by_frequency = tables.frequency_table(found.results)
+    by_frequency = tables.frequency_table({j: r.lag for j, r in found.results.items()})
     forms = tables.transfer_table(found.responses)
     folds = []
     for joint, result in found.results.items():
@@ -294,7 +296,7 @@ def _parameters(found: Findings, parameters: Table) -> Section:
 
 def _provenance(found: Findings) -> Section:
     recordings, calibration = found.recordings, found.calibration
-    rows = tuple(
+    rows = [
         {
             "recording": r.path.name if r.path else r.name,
             "sha256": r.sha256,
@@ -303,12 +305,12 @@ def _provenance(found: Findings) -> Section:
             "loop_period_s": r.loop_period_s,
         }
         for r in recordings
-    )
+    ]
     columns = (
-        tables.text("recording", "recording"),
-        tables.number("rows", "rows", 0),
-        tables.number("loop, ms", "loop_period_s", 2, 1e3),
-        tables.text("SHA-256", "sha256"),
+        Column("recording", "recording", kind="words"),
+        Column("rows", "rows", digits=0),
+        Column("loop", "loop_period_s", "ms", 2),
+        Column("SHA-256", "sha256", kind="words"),
     )
     made_with = ", ".join(f"{name} {version}" for name, version in versions().items())
     return Section(
@@ -422,17 +424,6 @@ def _gaps(result: JointCalibrationResult, actuator: Actuator) -> list[str]:
 
 def servo_section(found: Comparison) -> Section:
     """Section of a comparison of servo models on the report's recordings."""
-    rows = tuple(found.to_frame().reset_index().to_dict("records"))
-    columns = (
-        KEY,
-        text("model", "model"),
-        number("free run, mrad", "rmse_free_run_rad", 1, 1e3),
-        number("held", "rmse_held_rad", 1, 1e3),
-        number("raw, predicted readings", "rmse_raw_rad", 1, 1e3),
-        number("one step", "rmse_one_step_rad", 1, 1e3),
-        number("persistence", "persistence_rmse_rad", 1, 1e3),
-        number("repeatability", "repeatability_rad", 1, 1e3),
-    )
     pictures = [
         Picture(
             f"servo_{joint}",
@@ -444,11 +435,14 @@ def servo_section(found: Comparison) -> Section:
         for joint in found.data.joints
     ]
     curve = measured()
-    samples = tuple(curve.add_suffix("_rad").reset_index().to_dict("records"))
+    samples = curve.add_suffix("_rad").reset_index().to_dict("records")
     by_samples = (
-        Column("samples per joint", lambda row: f"{row['samples_per_joint']:,}", "key"),
-        *(number(f"{MODELS[m][0]}, mrad", f"{m}_rad", 1, 1e3) for m in map(str, curve)),
-    )
+        Column(
+            "samples per joint", "samples_per_joint", kind="key",
+            show=lambda row: f"{row['samples_per_joint']:,}",
+        ),
+        *(Column(MODELS[m][0], f"{m}_rad", "mrad") for m in map(str, curve)),
+    )  # fmt: skip
     runs = found.data.runs.values()
     own = int(np.median([sum(len(r.readings.rows) for r in joint) for joint in runs]))
     pictures.append(
@@ -470,8 +464,11 @@ def servo_section(found: Comparison) -> Section:
         ],
         figures=pictures,
         tables=[
-            Table("servo_models", "Error of the servo models", columns, rows),
+            *tables.comparison_tables(found),
             Table("servo_data_curve", "Error against samples, emulated robot", by_samples, samples),
+        ],
+        files=[
+            Table("servo_models", "", (), found.to_frame().reset_index().to_dict("records")),
         ],
         notes=[*found.reading_notes(), *found.notes],
     )

@@ -1,24 +1,28 @@
-"""Tables of the report: full numbers for CSV, rounded ones for the page.
+"""Tables of what recordings show and of what was fitted to them (`common.tables`).
 
-Each function turns results into a `Table`. The rows hold the results' own fields under their names,
-in SI units; the columns say which of them the page shows, and in which unit.
+Each function turns results into the `Table` that commands print and the report shows and writes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from markupsafe import Markup
 
-from pupper_sysid.common.page import Column, Row, Table
 from pupper_sysid.common.results import flat, plain
+from pupper_sysid.common.tables import Column, Row, Table, rounded
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of, words_of
-from pupper_sysid.sysid.fit.results import JointCalibrationResult
-from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
+
+if TYPE_CHECKING:
+    from pupper_sysid.sysid.compare.compare import Comparison
+    from pupper_sysid.sysid.doctor.examination import Examination
+    from pupper_sysid.sysid.fit.results import JointCalibrationResult
+    from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
+    from pupper_sysid.sysid.lag.lag_budget import LagBudget
 
 MODEL_NAMES = {
     "pure_delay": "pure delay",
@@ -31,61 +35,64 @@ MODEL_NAMES = {
 }
 
 _LEVEL = "(90\N{NO-BREAK SPACE}%)"
-KEY = Column("joint", lambda row: row["joint"], "key")
-_MS = 1e3
+KEY = Column("joint", "joint", kind="key")
 _DELAY = ("dead time", "delay of the form")
 
 
-def lag_table(results: Mapping[str, JointCalibrationResult]) -> Table:
+def lag_table(budgets: Mapping[str, LagBudget]) -> Table:
     """The lag budget per joint."""
-    rows = tuple(row for result in results.values() for row in result.lag.rows())
     columns = (
         KEY,
-        number("raw, ms", "raw_lag_s", 1, _MS),
-        number("= stale readings", "stale_lag_s", 1, _MS),
-        number("+ command hold", "command_hold_s", 1, _MS),
-        _ranged(f"+ servo lag {_LEVEL}", "lag_s", 1, _MS),
-        _ranged(f"of it dead time {_LEVEL}", "dead_time_s", 1, _MS),
-        number("and dynamics", "dynamics_s", 1, _MS),
-        number("poll, ms", "feedback_poll_period_s", 2, _MS),
-        number("lost polls, %", "feedback_loss", 0, 100.0),
-        number("mean feedback age, ms", "feedback_mean_age_s", 1, _MS),
-    )
-    return Table("lag_budget", "Lag budget", columns, rows)
+        Column("raw", "raw_lag_s", "ms", short="raw"),
+        Column("= stale readings", "stale_lag_s", "ms", short="stale"),
+        Column("+ command hold", "command_hold_s", "ms", short="hold"),
+        Column(f"+ servo lag {_LEVEL}", "lag_s", "ms", kind="interval", short=f"servo {_LEVEL}"),
+        Column(
+            f"of it dead time {_LEVEL}", "dead_time_s", "ms", kind="interval",
+            short=f"of it dead time {_LEVEL}",
+        ),
+        Column("and dynamics", "dynamics_s", "ms", detail=True),
+        Column("poll", "feedback_poll_period_s", "ms", 2, detail=True),
+        Column("lost polls", "feedback_loss", "%", 0, detail=True),
+        Column("mean feedback age", "feedback_mean_age_s", "ms", detail=True),
+    )  # fmt: skip
+    title = "Lag budget, ms: raw = stale readings + command hold + servo lag"
+    rows = [row for budget in budgets.values() for row in budget.rows()]
+    return Table("lag_budget", title, columns, rows)
 
 
-def estimator_table(results: Mapping[str, JointCalibrationResult]) -> Table:
+def estimator_table(budgets: Mapping[str, LagBudget]) -> Table:
     """The lag by every estimator, the usual ones first; a column per joint."""
-    names = list(dict.fromkeys(name for r in results.values() for name in r.lag.estimators_s))
-    rows = tuple(
+    names = dict.fromkeys(name for budget in budgets.values() for name in budget.estimators_s)
+    rows = [
         {"estimator": name}
-        | {f"{j}_lag_s": r.lag.estimators_s.get(name, math.nan) for j, r in results.items()}
+        | {f"{j}_lag_s": budget.estimators_s.get(name) for j, budget in budgets.items()}
         for name in names
-    )
+    ]
     columns = (
-        text("lag in ms by", "estimator"),
-        *(number(joint, f"{joint}_lag_s", 1, _MS) for joint in results),
+        Column("lag by", "estimator", kind="words"),
+        *(Column(joint, f"{joint}_lag_s", "ms", short=joint) for joint in budgets),
     )
-    return Table("estimators", "The same lag, by other estimators", columns, rows)
+    return Table("estimators", "The same lag, by other estimators, ms", columns, rows)
 
 
-def frequency_table(results: Mapping[str, JointCalibrationResult]) -> Table:
+def frequency_table(budgets: Mapping[str, LagBudget]) -> Table:
     """Gain, phase and lag per tone."""
     rows = [
         {"joint": joint} | flat(plain(f))
-        for joint, result in results.items()
-        for f in sorted(result.lag.by_frequency, key=lambda f: f.frequency_hz)
+        for joint, budget in budgets.items()
+        for f in sorted(budget.by_frequency, key=lambda f: f.frequency_hz)
     ]
     columns = (
         KEY,
-        number("Hz", "frequency_hz", 2),
-        number("gain", "gain", 2),
-        number("phase, °", "phase_deg", 0),
-        _ranged(f"lag, ms {_LEVEL}", "lag_s", 1, _MS),
-        number("raw gain", "raw_gain", 2),
-        number("raw lag, ms", "raw_lag_s", 1, _MS),
+        Column("Hz", "frequency_hz", digits=2),
+        Column("gain", "gain", digits=2),
+        Column("phase", "phase_deg", "°", 0),
+        Column(f"lag {_LEVEL}", "lag_s", "ms", kind="interval", short=f"lag ms {_LEVEL}"),
+        Column("raw lag", "raw_lag_s", "ms"),
+        Column("raw gain", "raw_gain", digits=2),
     )
-    return Table("by_frequency", "Frequency by frequency", columns, tuple(rows))
+    return Table("by_frequency", "Per frequency, fresh readings", columns, rows)
 
 
 def transfer_table(responses: Mapping[str, FrequencyResponse]) -> Table:
@@ -104,14 +111,19 @@ def transfer_table(responses: Mapping[str, FrequencyResponse]) -> Table:
     ]
     columns = (
         KEY,
-        text("form", "transfer_function"),
+        Column("form", "transfer_function", kind="words"),
         # a form's delay is not the servo's dead time
-        Column("parameter", lambda r: words_of(r["parameter"]).replace(*_DELAY), "words"),
-        Column(f"value {_LEVEL}", _value_cell),
-        text("unit", "unit"),
-        number("misfit, χ²/dof", "chi2_per_dof"),
+        Column(
+            "parameter",
+            "parameter",
+            kind="words",
+            show=lambda row: words_of(row["parameter"]).replace(*_DELAY),
+        ),
+        Column(f"value {_LEVEL}", "value", show=_value_cell),
+        Column("unit", "unit", kind="words"),
+        Column("misfit, χ²/dof", "chi2_per_dof"),
     )
-    return Table("transfer_functions", "Fitted transfer functions", columns, tuple(rows))
+    return Table("transfer_functions", "Fitted transfer functions", columns, rows)
 
 
 def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:
@@ -135,19 +147,20 @@ def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:
         KEY,
         Column(
             "model",
-            lambda r: model_name(r["model"]) + (", chosen" if r["is_chosen"] else ""),
-            "words",
+            "model",
+            kind="words",
+            show=lambda row: model_name(row["model"]) + (", chosen" if row["is_chosen"] else ""),
         ),
-        number("parameters fitted", "parameter_count", 0),
-        number("fresh, mrad", "rmse_fresh_rad", 1, 1e3),
-        number("unseen frequency (under load: run), mrad", "rmse_unseen_rad", 1, 1e3),
-        number("held, mrad", "rmse_held_rad", 1, 1e3),
-        number("one step, mrad", "rmse_one_step_rad", 1, 1e3),
-        number("fit, %", "fit_percent"),
-        number("positions against rows as logged, mrad (misleads)", "rmse_raw_rad", 1, 1e3),
+        Column("parameters fitted", "parameter_count", digits=0),
+        Column("fresh", "rmse_fresh_rad", "mrad"),
+        Column("unseen frequency (under load: run)", "rmse_unseen_rad", "mrad"),
+        Column("held", "rmse_held_rad", "mrad"),
+        Column("one step", "rmse_one_step_rad", "mrad"),
+        Column("fit, %", "fit_percent"),
+        Column("positions against rows as logged (misleads)", "rmse_raw_rad", "mrad"),
     )
     title = "Candidate models, simplest first"
-    return Table("candidate_models", title, columns, tuple(rows), "is_chosen")
+    return Table("candidate_models", title, columns, rows, "is_chosen")
 
 
 def model_name(name: str) -> str:
@@ -174,13 +187,18 @@ def parameter_table(calibration: Calibration, joints: Sequence[str]) -> Table:
             ]
     columns = (
         KEY,
-        Column("parameter", lambda row: _readable(row["parameter"], row["part"]), "words"),
-        Column(f"value {_LEVEL}", _value_cell),
-        text("unit", "unit"),
-        text("identified", "identified"),
-        Column("why", lambda row: row["why"] or "", "prose"),
+        Column(
+            "parameter",
+            "parameter",
+            kind="words",
+            show=lambda row: _readable(row["parameter"], row["part"]),
+        ),
+        Column(f"value {_LEVEL}", "value", show=_value_cell),
+        Column("unit", "unit", kind="words"),
+        Column("identified", "identified", kind="words"),
+        Column("why", "why", kind="prose"),
     )
-    return Table("parameters", "Parameters", columns, tuple(rows))
+    return Table("parameters", "Parameters", columns, rows)
 
 
 def parameter_matrix(parameters: Table) -> Table:
@@ -208,8 +226,7 @@ def model_matrix(models: Table) -> Table:
     """Error on unseen motion (fresh readings) per model and joint; it has no file."""
 
     def cell(row: Row) -> str:
-        unseen = _digits(row["rmse_unseen_rad"], 1, 1e3)
-        fresh = _digits(row["rmse_fresh_rad"], 1, 1e3)
+        unseen, fresh = (rounded(row[f"rmse_{k}_rad"], 1, 1e3) for k in ("unseen", "fresh"))
         chosen = "<b>{}</b><small>{}</small>" if row["is_chosen"] else "{}<small>{}</small>"
         return Markup(chosen).format(unseen, fresh)
 
@@ -233,11 +250,14 @@ def _matrix(
     for row in rows:
         lines.setdefault(name(row), {})[row["joint"]] = cell(row)
     columns = (
-        Column(heading, lambda row: row[heading], "key"),
-        *(Column(joint, lambda row, joint=joint: row.get(joint, "–")) for joint in joints),
+        Column(heading, heading, kind="key"),
+        *(
+            Column(joint, joint, show=lambda row, joint=joint: row.get(joint, "–"))
+            for joint in joints
+        ),
     )
-    made = tuple({heading: line} | cells for line, cells in lines.items())
-    return Table("", title, columns, made)
+    rows = [{heading: line} | cells for line, cells in lines.items()]
+    return Table("", title, columns, rows)
 
 
 def _readable(name: str, part: str) -> str:
@@ -259,57 +279,92 @@ def _value_cell(row: Row, factor: float = 1.0) -> str:
 _ENDS = ("value", "low", "high")
 
 
-def doctor_table(examinations: Sequence[tuple[str, Any]], joints: Sequence[str]) -> Table:
+def doctor_table(
+    examinations: Iterable[tuple[str, Examination]],
+    joints: Container[str],
+    title: str = "The recordings' health",
+) -> Table:
     """The doctor's verdict per recording and joint; `examinations` are by its name."""
-    rows = tuple(
+    rows = [
         {"recording": recording, "joint": joint}
-        | flat(plain(found))
-        | {"reasons": " ".join(found.reasons)}
+        | flat(plain(examined))
+        | {"reasons": " ".join(examined.reasons)}
         for recording, examination in examinations
-        for joint, found in examination.joints.items()
+        for joint, examined in examination.joints.items()
         if joint in joints
-    )
+    ]
     columns = (
         KEY,
-        text("verdict", "verdict"),
-        number("loop, ms", "loop_period_s", 2, _MS),
-        number("loop jitter, ms", "jitter_s", 2, _MS),
-        number("fresh rows, %", "fresh_fraction", 0, 100.0),
-        number("missing rows, %", "missing_fraction", 0, 100.0),
-        number("offset, mrad", "reading_minus_command_rad", 1, 1e3),
-        number("fastest command, rad/s", "peak_command_rad_s", 1),
+        Column("verdict", "verdict", kind="words"),
+        Column("loop", "loop_period_s", "ms", 2),
+        Column("loop jitter", "jitter_s", "ms", 2, short="jitter ms"),
+        Column("fresh rows", "fresh_fraction", "%", 0, short="fresh %"),
+        Column("missing rows", "missing_fraction", "%", 0, detail=True),
+        Column("poll", "poll_period_s", "ms", 2),
+        Column("lost polls", "loss", digits=2, short="loss"),
+        Column("step of readings", "quantum_rad", "mrad", 3, short="step mrad"),
+        Column("offset", "reading_minus_command_rad", "mrad"),
+        Column("fastest command", "peak_command_rad_s", "rad/s", detail=True),
     )
-    return Table("doctor", "The recordings' health", columns, rows)
+    return Table("doctor", title, columns, rows)
 
 
-def text(heading: str, key: str) -> Column:
-    """Column of words."""
-    return Column(heading, lambda row: str(row[key]), "words")
-
-
-def number(heading: str, key: str, digits: int = 1, factor: float = 1.0) -> Column:
-    """Column of numbers, times `factor`."""
-    return Column(heading, lambda row: _digits(row[key], digits, factor))
-
-
-def _ranged(heading: str, key: str, digits: int = 1, factor: float = 1.0) -> Column:
-    def show(row: Row) -> str:
-        numbers = (row[k] for k in (key, f"{key}_low", f"{key}_high"))
-        return "{} ({} … {})".format(*(_digits(x, digits, factor) for x in numbers))
-
-    return Column(heading, show)
-
-
-def _digits(value: float | None, digits: int, factor: float = 1.0) -> str:
-    if value is None or not math.isfinite(value):
-        return "–"
-    shown = f"{value * factor:.{digits}f}"
-    return shown.replace("-", "−") if float(shown) != 0 else shown.lstrip("-")
+def comparison_tables(comparison: Comparison) -> list[Table]:
+    """Errors of servo models in free run by joint, the means of all errors, and the offsets."""
+    models = comparison.models
+    joints: list[Row] = [
+        {"joint": joint}
+        | {name: model.joints[joint].rmse_free_run_rad for name, model in models.items()}
+        | {
+            "persistence": comparison.persistence_rmse_rad[joint],
+            "repeatability": comparison.repeatability_rad[joint],
+        }
+        for joint in comparison.data.joints
+    ]
+    if len(joints) > 1:
+        means = {name: model.mean.rmse_free_run_rad for name, model in models.items()}
+        joints.append({"joint": "mean", "is_mean": True} | means)
+    by_model = [{"model": name} | plain(model.mean) for name, model in models.items()]
+    offset_rad = {name: model.offset_rad for name, model in models.items() if model.offset_rad}
+    offsets = [
+        {"joint": joint} | {name: by_joint[joint] for name, by_joint in offset_rad.items()}
+        for joint in comparison.data.joints
+    ]
+    errors = {"held": "held", "raw": "raw, predicted readings", "one_step": "one step"}
+    return [
+        Table(
+            "", "RMS error in free run, mrad",
+            [
+                KEY,
+                *(
+                    Column(name, name, "mrad", short=name)
+                    for name in (*models, "persistence", "repeatability")
+                ),
+            ],
+            joints, "is_mean",
+        ),
+        Table(
+            "", "Mean of the joints, RMS error in mrad",
+            [
+                Column("model", "model", kind="key"),
+                *(
+                    Column(heading, f"rmse_{name}_rad", "mrad", short=heading.partition(",")[0])
+                    for name, heading in ({"free_run": "free run"} | errors).items()
+                ),
+            ],
+            by_model,
+        ),
+        Table(
+            "", "Offset of this recording, mrad",
+            [KEY, *(Column(name, name, "mrad", short=name) for name in offset_rad)],
+            offsets if offset_rad else [],
+        ),
+    ]  # fmt: skip
 
 
 def _significant(value: float) -> str:
     """Three significant digits, without powers of ten where they can be avoided."""
     if value == 0 or 1e-4 <= abs(value) < 1e6:
         digits = 2 - math.floor(math.log10(abs(value))) if value else 0
-        return _digits(value, max(digits, 0))
+        return rounded(value, max(digits, 0))
     return f"{value:.2e}".replace("-", "−")

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
+from pupper_sysid.cli import terminal
 from pupper_sysid.cli.programs import pupper_eval, pupper_play, pupper_train
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.evaluation.evaluate import BATTERY
@@ -185,7 +186,7 @@ def test_a_quick_look_is_smaller_and_says_so(capsys, trained, monkeypatch):
 def test_the_battery_fits_a_terminal_of_80_columns_and_its_falls_say_what_came_before(
     capsys, trained, monkeypatch
 ):
-    monkeypatch.setattr(pupper_eval.out, "_width", 80)
+    monkeypatch.setattr(terminal.out, "_width", 80)
     out, _ = ran(
         capsys, trained, "--battery", "--episodes", "2", "--seconds", "0.5", program=pupper_eval
     )

@@ -41,6 +41,7 @@ class Compare(OfRecordings):
         """Compare, print, draw."""
         from pupper_sysid.common.figure_style import refuse_picture, save
         from pupper_sysid.sysid.compare.compare import compare
+        from pupper_sysid.sysid.report.tables import comparison_tables
 
         if not self.models:
             raise InputError(
@@ -53,27 +54,7 @@ class Compare(OfRecordings):
         if self.json:
             terminal.print_json(result.to_dict() | {"written": str(self.plot)})
             return
-        table = terminal.table(
-            "RMS error in free run, mrad", "joint", *result.models, "persistence", "repeatability"
-        )
-        for joint in joints:
-            errors = [m.joints[joint].rmse_free_run_rad for m in result.models.values()]
-            errors += [result.persistence_rmse_rad[joint], result.repeatability_rad[joint]]
-            table.add_row(joint, *map(terminal.ms, errors))
-        if len(joints) > 1:
-            means = (terminal.ms(m.mean.rmse_free_run_rad) for m in result.models.values())
-            table.add_row("mean", *means, style="bold")
-        terminal.out.print(table)
-        for title in ("held", "raw", "one_step"):
-            means = {n: getattr(m.mean, f"rmse_{title}_rad") for n, m in result.models.items()}
-            text = ", ".join(f"{name} {terminal.ms(value)}" for name, value in means.items())
-            terminal.out.print(f"Mean, {title.replace('_', ' ')}: {text}")
-        shifted = {name: m.offset_rad for name, m in result.models.items() if m.offset_rad}
-        offsets = terminal.table("Offset of this recording, mrad", "joint", *shifted)
-        for joint in joints:
-            offsets.add_row(joint, *(terminal.ms(own[joint]) for own in shifted.values()))
-        terminal.out.print()
-        terminal.out.print(offsets)
+        terminal.print_tables(*comparison_tables(result))
         for sentence in result.reading_notes():
             terminal.out.print(sentence)
         terminal.warn(*result.notes)

@@ -36,6 +36,7 @@ class Doctor:
         """Examine and print."""
         from pupper_sysid.sysid.doctor.examination import examine
         from pupper_sysid.sysid.doctor.findings import USE, Finding, shared
+        from pupper_sysid.sysid.report.tables import doctor_table
 
         recordings = terminal.load_all(self.recordings)
         result = examine(recordings, seed=self.seed)
@@ -43,18 +44,7 @@ class Doctor:
             terminal.print_json(result)
             return
         title = result.recording if len(recordings) < 4 else f"{len(recordings)} recordings"
-        table = terminal.table(
-            title, "joint", "verdict", "loop ms", "jitter ms", "fresh %", "poll ms",
-            "loss", "step mrad", "offset mrad",
-        )  # fmt: skip
-        for name, j in result.items():
-            table.add_row(
-                name, j.verdict, terminal.ms(j.loop_period_s, 2), terminal.ms(j.jitter_s, 2),
-                terminal.number(100 * j.fresh_fraction, 0), terminal.ms(j.poll_period_s, 2),
-                terminal.number(j.loss), terminal.ms(j.quantum_rad, 3),
-                terminal.ms(j.reading_minus_command_rad),
-            )  # fmt: skip
-        terminal.out.print(table)
+        terminal.print_tables(doctor_table([(title, result)], result, title))
         terminal.out.print()
         nothing = (Finding("nothing_wrong", USE),)
         for joints, text in shared({name: j.findings or nothing for name, j in result.items()}):
@@ -73,6 +63,7 @@ class Delay(OfRecordings):
     def run(self) -> None:
         """Measure and print."""
         from pupper_sysid.sysid.fit.dead_time import lag
+        from pupper_sysid.sysid.report.tables import estimator_table, frequency_table, lag_table
 
         recordings, joints = self.load()
         with terminal.progress("measuring", len(joints)) as advance:
@@ -80,19 +71,7 @@ class Delay(OfRecordings):
         if self.json:
             terminal.print_json(budgets)
             return
-        budget = terminal.table(
-            "Lag budget, ms: raw = stale readings + command hold + servo lag", "joint", "raw",
-            "stale", "hold", "servo", "90 %", "of it dead time", "90 %",
-        )  # fmt: skip
-        for name, b in budgets.items():
-            dead = b.dead_time_s
-            assert dead is not None
-            budget.add_row(
-                name, terminal.ms(b.raw_lag_s.value), terminal.ms(b.stale_lag_s),
-                terminal.ms(b.command_hold_s), terminal.ms(b.lag_s.value), _ends(b.lag_s),
-                terminal.ms(dead.value), _ends(dead),
-            )  # fmt: skip
-        terminal.out.print(budget)
+        terminal.print_tables(lag_table(budgets))
         terminal.out.print(
             "Only the dead time is the servo's own; the lag moves with gain, amplitude and load."
         )
@@ -101,33 +80,11 @@ class Delay(OfRecordings):
                   if b.lag_range.startswith("mean")}  # fmt: skip
         for names, text in share_sentences(ranges):
             terminal.out.print(f"{names}: {text}")
-        shown = terminal.table(
-            "Per frequency, fresh readings", "joint", "Hz", "gain", "phase °", "lag ms",
-            "90 %", "raw lag ms", "raw gain",
-        )  # fmt: skip
-        for name, b in budgets.items():
-            for f in b.by_frequency:
-                shown.add_row(
-                    name, terminal.number(f.frequency_hz), terminal.number(f.gain),
-                    terminal.number(f.phase_deg, 0), terminal.ms(f.lag_s.value), _ends(f.lag_s),
-                    terminal.ms(f.raw_lag_s), terminal.number(f.raw_gain),
-                )  # fmt: skip
-        if shown.row_count:
-            terminal.out.print()
-            terminal.out.print(shown)
-        first = next(iter(budgets.values()))
-        shown = terminal.table(f"Estimators on {first.joint}", "estimator", "lag ms")
-        for name, value in first.estimators_s.items():
-            shown.add_row(name, terminal.ms(value))
         terminal.out.print()
-        terminal.out.print(shown)
+        first = dict([next(iter(budgets.items()))])  # all joints are too wide
+        terminal.print_tables(frequency_table(budgets), estimator_table(first))
         by_joint = {n: [w.removeprefix(f"{n}: ") for w in b.warnings] for n, b in budgets.items()}
         terminal.warn(*(f"{names}: {text}" for names, text in share_sentences(by_joint)))
-
-
-def _ends(interval: Interval) -> str:
-    # without spaces, at which a narrow table would break it
-    return f"{terminal.ms(interval.low)}…{terminal.ms(interval.high)}"
 
 
 @dataclass(frozen=True)

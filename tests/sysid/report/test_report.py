@@ -18,7 +18,8 @@ from matplotlib.text import Text
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.figure_style import save
-from pupper_sysid.common.page import Column, Section, Table, render
+from pupper_sysid.common.page import Section, render
+from pupper_sysid.common.tables import Column, Table
 from pupper_sysid.sysid.doctor.examination import Examination, JointExamination
 from pupper_sysid.sysid.fit.calibration_file import to_calibration
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
@@ -215,8 +216,7 @@ def test_commands_in_sentences_are_set_as_code_and_escaped():
     html = render("t", "s", [section])
     assert "Add <code>sweep --kind steps</code>, not <code>&lt;b&gt;</code>." in html
     assert "<li>A ` alone.</li>" in html
-    words = Column("", lambda row: row[""], "words")
-    table = Table("t", "T", (words,), ({"": "run `delay`"},))
+    table = Table("t", "T", [Column("", "todo", kind="words")], [{"todo": "run `delay`"}])
     assert "run <code>delay</code></td>" in render("t", "s", [Section("a", "A", tables=[table])])
 
 
