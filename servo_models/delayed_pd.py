@@ -145,7 +145,8 @@ TIME_STEP_S = 0.002
 """Physics step of fitting and of training [s]: 500 Hz."""
 
 FRICTION_IMPEDANCE = 0.9999
-_TORQUES = ("stiffness", "damping", "friction_loss", "effort_limit", "back_emf")
+TORQUES = ("stiffness", "damping", "friction_loss", "effort_limit", "back_emf")
+"""Numbers in proportion to the armature for the same motion."""
 
 
 def whole_steps(low_s: float, high_s: float, time_step_s: float) -> tuple[int, int]:
@@ -201,13 +202,13 @@ class DelayedPDParameters:
     def per_inertia(self) -> DelayedPDParameters:
         """The same motion with an armature of 1: the ratios that free-air data identify."""
         values = self.arrays()
-        ratios = {name: values[name] / values["armature"] for name in _TORQUES}
+        ratios = {name: values[name] / values["armature"] for name in TORQUES}
         return replace(self, **ratios, armature=np.ones_like(values["armature"]))
 
     def scaled(self, armature: ArrayLike) -> DelayedPDParameters:
         """The same motion with another armature."""
         ratios, armature = self.per_inertia().arrays(), np.asarray(armature, float)
-        return replace(self, **{n: ratios[n] * armature for n in _TORQUES}, armature=armature)
+        return replace(self, **{n: ratios[n] * armature for n in TORQUES}, armature=armature)
 
 
 class DelayedPD(DelayedServo):
@@ -271,7 +272,7 @@ def _per_step(
     def flat(value):
         return np.array(np.broadcast_to(value, batch), dtype=float).reshape(-1)
 
-    kp, kd, friction, effort, brake = (flat(values[name] / values["armature"]) for name in _TORQUES)
+    kp, kd, friction, effort, brake = (flat(values[name] / values["armature"]) for name in TORQUES)
     slew = flat(values["velocity_limit"] * h)
     damped = h * (kd + brake) if implicit else np.zeros_like(kd)
     # explicit where the torque is clipped: MuJoCo drops the damping's derivative there

@@ -29,6 +29,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.tones import least_squares, sine_design
 from pupper_sysid.servo_models.delayed_pd import (
     TIME_STEP_S,
+    TORQUES,
     DelayedPDParameters,
     DelayLine,
     integrate,
@@ -240,9 +241,8 @@ def _continuous(parameters: DelayedPDParameters, h: float) -> DelayedPDParameter
 def _driven(
     parameters: DelayedPDParameters, factor: NDArray[np.float64], back_emf: NDArray[np.float64]
 ) -> DelayedPDParameters:
-    names = ("stiffness", "damping", "friction_loss", "effort_limit")
-    torques = {name: getattr(parameters, name) * factor for name in names}
-    return replace(parameters, **torques, back_emf=back_emf)
+    torques = {name: getattr(parameters, name) * factor for name in TORQUES}
+    return replace(parameters, **torques | {"back_emf": back_emf})
 
 
 def _mean_exp(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sim.export.check import compiled, held, moved_by, unseen_tones, walk_commands
-from pupper_sysid.sim.export.export import SIMULATORS
 from pupper_sysid.sim.export.shared import ExportedServos
+from pupper_sysid.sim.export.targets import TARGETS
 from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
 from support import exported_servos as ours
 
@@ -88,7 +88,7 @@ def ran(
         there = moved_by(compiled(servos), names, commands, step_s)
         return there, there
     exported = folder / f"{simulator}_export.py"
-    exported.write_text(SIMULATORS[simulator](servos))
+    exported.write_text(TARGETS[simulator].text(servos))
     each = np.repeat(held(commands, step_s)[:, None], len(names), axis=1)
     np.savez(
         folder / "commands.npz", command=each, step_s=step_s, solref=friction_solref(step_s),

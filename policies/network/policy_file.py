@@ -44,6 +44,7 @@ from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.common.reading.content import refuse_large_header
 from pupper_sysid.policies.network.hyperparameters import Kind
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
+from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS
 from pupper_sysid.servo_models.servo_file import WEIGHTS as SERVO_WEIGHTS
 from pupper_sysid.sim.walking.config import Commands, Walking
 from pupper_sysid.sim.walking.differences import OF_UNIT
@@ -99,7 +100,13 @@ class ServoFeedback(_Part):
 
 
 class ServoNumbers(_Part):
-    """One servo: the numbers of `servo_models.delayed_pd`, and its readings."""
+    """One servo: the numbers of `servo_models.delayed_pd`, and its readings.
+
+    A term that older policies lack is a range besides.
+    """
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Range]
 
     stiffness: Range
     """Torque per angle [N·m/rad]."""
@@ -117,6 +124,12 @@ class ServoNumbers(_Part):
     """Torque lost per speed [N·m s/rad]."""
     dead_time_s: DeadTimeRange
     feedback: ServoFeedback
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        if unknown := set(self.__pydantic_extra__) - set(PARAMETER_KEYS):
+            raise ValueError(f"{min(unknown)} is no number of a servo")
+        return self
 
 
 class TrainedServo(_Part):

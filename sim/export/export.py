@@ -1,4 +1,4 @@
-"""Calibrations for other simulators: one function for every target.
+"""Calibrations for other simulators: one function for every target (`sim.export.targets`).
 
     paths = export(load_calibration("calibrated.yaml"), "isaaclab", "out/", physics_step_s=0.005)
 
@@ -9,7 +9,7 @@ own module; JSON, for any other program, is here.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +17,12 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions, write_text
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.delayed_pd import whole_steps
-from pupper_sysid.sim.export.isaaclab import to_isaaclab, to_isaaclab_bam
-from pupper_sysid.sim.export.mjcf import to_mjcf, to_model
-from pupper_sysid.sim.export.mjlab import to_mjlab
-from pupper_sysid.sim.export.newton import to_newton
+from pupper_sysid.sim.export.mjcf import to_model
 from pupper_sysid.sim.export.shared import FEEDBACK_KEYS, MUJOCO, TORQUE_KEYS, ExportedServos
+from pupper_sysid.sim.export.targets import TARGETS
 
 SCHEMA = "pupper-actuators"
 SCHEMA_VERSION = 3
-MJCF_STEP_S, TRAINING_STEP_S = 0.002, 0.005
 
 
 def to_json(servos: ExportedServos) -> str:
@@ -64,17 +61,6 @@ def to_json(servos: ExportedServos) -> str:
     ) + "\n"  # fmt: skip
 
 
-SIMULATORS: dict[str, Callable[[ExportedServos], str]] = {
-    "mjcf": to_mjcf, "isaaclab": to_isaaclab, "isaaclab-bam": to_isaaclab_bam, "mjlab": to_mjlab,
-    "newton": to_newton, "json": to_json,
-}  # fmt: skip
-ENDINGS = {
-    "mjcf": ".xml", "isaaclab": "_isaaclab.py", "isaaclab-bam": "_isaaclab_bam.py",
-    "mjlab": "_mjlab.py", "newton": "_newton.py", "json": ".json",
-}  # fmt: skip
-"""How the names of their files end."""
-
-
 def exported_text(
     calibration: Calibration,
     to: str,
@@ -89,8 +75,9 @@ def exported_text(
 
     Parameters are those of `export` and `ExportedServos.of`.
     """
-    if to not in SIMULATORS:
-        raise InputError(f"There is no export to {to}; there are {', '.join(SIMULATORS)}.")
+    target = TARGETS.get(to)
+    if target is None:
+        raise InputError(f"There is no export to {to}; there are {', '.join(TARGETS)}.")
     if link_inertia and (unknown := [n for n in link_inertia if n not in calibration.joints]):
         raise InputError(
             f"`link_inertia` names {', '.join(unknown)}; the calibration has "
@@ -100,9 +87,9 @@ def exported_text(
         if to != "mjcf":
             raise InputError(f"A model is of the export to mjcf; {to} takes link inertias.")
         return to_model(calibration, model, out, physics_step_s, gain, link_inertia, sha256)
-    step = MJCF_STEP_S if to == "mjcf" and physics_step_s is None else physics_step_s
-    servos = ExportedServos.of(calibration, step or TRAINING_STEP_S, gain, link_inertia, sha256)
-    return SIMULATORS[to](servos), servos
+    step_s = physics_step_s or target.physics_step_s
+    servos = ExportedServos.of(calibration, step_s, gain, link_inertia, sha256)
+    return target.text(servos), servos
 
 
 def export(
@@ -122,7 +109,8 @@ def export(
     ----------
     calibration : Calibration, Path or str
         Also what `calibrate` returns, the name of a preset or servo card, or the file of one.
-    to : {"mjcf", "isaaclab", "isaaclab-bam", "mjlab", "newton", "json"}
+    to : str
+        "mjcf", "isaaclab", "isaaclab-bam", "mjlab", "newton" or "json" (`sim.export.targets`).
     out : Path or str
         File, or a folder, in which the file is called `servos` with the target's ending.
     physics_step_s : float, optional
@@ -152,7 +140,7 @@ def export(
         )
     path = Path(out)
     if not path.suffix or path.is_dir():
-        path = path / f"servos{ENDINGS.get(to, '')}"
+        path = path / f"servos{TARGETS[to].ending if to in TARGETS else ''}"
     source = None if model is None else Path(model)
     text, _ = exported_text(calibration, to, physics_step_s, gain, link_inertia, source, path)
     write_text(path, text, force)

@@ -26,14 +26,11 @@ from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, Actuator, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, TORQUES, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import MUJOCO, MUJOCO_PID, Engine, nearest_in_loop
 
 FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age_s")
-TORQUE_KEYS = (
-    "stiffness_nm_per_rad", "damping_nm_s_per_rad", "friction_loss_nm", "armature_kg_m2",
-    "effort_limit_nm", "back_emf_nm_s_per_rad",
-)  # fmt: skip
+TORQUE_KEYS = tuple(PARAMETER_KEYS[name] for name in (*TORQUES, "armature"))
 EXPLICIT_PD = Engine(slews=False, implicit=False)
 """Isaac Lab's own PDs: torque before each step, set-points of unlimited speed."""
 CALIBRATED_PD = Engine(implicit=False)
@@ -252,7 +249,7 @@ class ExportedServos:
 def _changed(actuator: Actuator, old: Mapping[str, float], new: Mapping[str, float]) -> Actuator:
     """An actuator whose torques are scaled as from `old` to `new`, and its dead time shifted."""
     numbers = {}
-    for name in ("stiffness", "damping", "friction_loss", "effort_limit", "back_emf"):
+    for name in TORQUES:
         key = PARAMETER_KEYS[name]
         factor = new[name] / old[name] if old[name] > 0 else 1.0
         numbers[key] = getattr(actuator, key).scaled(factor)
@@ -354,8 +351,7 @@ def feedback_block(calibration: Calibration) -> str:
 
 def servos_block(servos: ExportedServos, engine: Engine) -> str:
     """`SERVOS = {…}`: the numbers of each joint's actuator, its dead time for this engine."""
-    torques = ("stiffness", "damping", "effort_limit", "armature", "friction_loss", "back_emf")
-    keys = {name: PARAMETER_KEYS[name] for name in torques} | {
+    keys = {name: PARAMETER_KEYS[name] for name in (*TORQUES, "armature")} | {
         "velocity_limit_rad_s": "velocity_limit_rad_s", "jitter_s": "command_jitter_s",
         "dead_time_s": "dead_time_s",
     }  # fmt: skip

@@ -31,7 +31,7 @@ from pupper_sysid.servo_models.calibration.parts import (
     JointCalibration,
 )
 from pupper_sysid.servo_models.calibration.quantity import Quantity
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, TORQUES, DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.networks import JointArrays
 from pupper_sysid.servo_models.servo_file import load_servo_model
@@ -109,7 +109,7 @@ class ServoRanges:
             for f in PARAMETER_KEYS
         }
         scale = rng.uniform(*torque_scale, (count, 1))
-        for f in ("stiffness", "damping", "friction_loss", "armature", "effort_limit", "back_emf"):
+        for f in (*TORQUES, "armature"):
             drawn[f] *= scale
         return drawn
 
@@ -205,10 +205,9 @@ def nearest_joint(name: str, known: Sequence[str]) -> str:
 
 def _ideal(source: str, joints: tuple[str, ...]) -> ServoRanges:
     """Servos that follow their command, as nearly as a 2 ms step can hold."""
-    own = {
-        "stiffness": 20.0, "damping": 0.25, "friction_loss": 0.0, "armature": 8e-4,
-        "effort_limit": _NO_LIMIT_NM, "velocity_limit": NO_SPEED_LIMIT_RAD_S, "dead_time_s": 0.0,
-        "back_emf": 0.0,
+    own = dict.fromkeys(PARAMETER_KEYS, 0.0) | {
+        "stiffness": 20.0, "damping": 0.25, "armature": 8e-4,
+        "effort_limit": _NO_LIMIT_NM, "velocity_limit": NO_SPEED_LIMIT_RAD_S,
     }  # fmt: skip
     value = {f: np.full(len(joints), x) for f, x in own.items()}
     held = (HeldFeedback(),) * len(joints)

@@ -30,7 +30,7 @@ from pupper_sysid.common.results import Result
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import JointCalibration, OperatingPoint
 from pupper_sysid.servo_models.calibration.quantity import Quantity
-from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
+from pupper_sysid.servo_models.delayed_pd import TORQUES, DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import at_step
 from pupper_sysid.sysid.doctor import checks
 from pupper_sysid.sysid.doctor.checks import Recordings
@@ -108,8 +108,6 @@ class TruthTable(Result):
         return [row.rows()[0] for row in self.quantities]
 
 
-_RATIOS = ("stiffness", "damping", "friction_loss", "effort_limit", "back_emf")
-"""Torques, of which a recording in free air determines the ratios to the armature."""
 _READINGS = ("poll_period_s", "loss", "mean_age_s", "quantum_rad", "offset_rad")
 
 
@@ -121,7 +119,7 @@ def _pairs(
     inertia = actuator["armature"]
     return {
         "dead_time_s": (a.dead_time_s, actuator.get("dead_time_s", math.nan)),
-        **{n: (getattr(ratios, n), actuator.get(n, 0.0) / inertia) for n in _RATIOS},
+        **{n: (getattr(ratios, n), actuator.get(n, 0.0) / inertia) for n in TORQUES},
         "velocity_limit_rad_s": (a.velocity_limit_rad_s, actuator.get("velocity_limit", math.nan)),
         "command_jitter_s": (a.command_jitter_s, actuator.get("command_jitter_s", math.nan)),
         **{n: (getattr(joint.feedback, n), feedback.get(n, math.nan)) for n in _READINGS},

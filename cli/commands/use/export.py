@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -13,9 +13,14 @@ from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, resolved, sha256, write_text
 from pupper_sysid.common.reading.dialect import decimal
 from pupper_sysid.servo_models.calibration.parts import P_GAINS
+from pupper_sysid.sim.export.targets import TARGETS
 
 if TYPE_CHECKING:
     from pupper_sysid.servo_models.calibration.calibration import Calibration
+
+    Format = str
+else:
+    Format = tyro.extras.literal_type_from_choices(["csv", *TARGETS, "bam", "onnx", "torchscript"])
 
 _STEPS_S = 1e-5, 0.1
 
@@ -42,10 +47,7 @@ class Export:
     source: tyro.conf.Positional[str]
     """calibrated.yaml, the name of a preset (paper, release), a servo card, a recording, or the
     folder of a servo model, a policy or a training run."""
-    to: Literal[
-        "csv", "mjcf", "isaaclab", "isaaclab-bam", "mjlab", "newton", "json", "bam", "onnx",
-        "torchscript",
-    ] = "csv"  # fmt: skip
+    to: Format = "csv"
     """Format: csv, a tidy table; mjcf, isaaclab, isaaclab-bam (of servos fitted under load), mjlab,
     newton and json of calibrations and cards, for other simulators; bam of cards, parameters for
     BAM; onnx and torchscript of learned servo models and policies."""
@@ -243,12 +245,12 @@ class Export:
     def _simulator(self, path: Path, calibration: Calibration, links: dict[str, float]) -> Path:
         """The calibration for another simulator."""
         from pupper_sysid.servo_models.cards.card import CardCalibration
-        from pupper_sysid.sim.export.export import ENDINGS, exported_text
+        from pupper_sysid.sim.export.export import exported_text
         from pupper_sysid.sim.export.shared import INCLUDES_LINK
 
         if self.gain is not None:
             self._at_gain(calibration, self.gain)
-        target = self.out or Path(f"{path.stem}{ENDINGS[self.to]}")
+        target = self.out or Path(f"{path.stem}{TARGETS[self.to].ending}")
         refuse_overwrite(target, self.force)
         text, servos = exported_text(
             calibration, self.to, self.physics_step, self.gain, links, self.model, target,

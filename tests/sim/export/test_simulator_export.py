@@ -31,10 +31,11 @@ from pupper_sysid.servo_models.step_size import (
     nearest_in_loop,
 )
 from pupper_sysid.sim.export.check import check, held, walk_commands
-from pupper_sysid.sim.export.export import SIMULATORS, exported_text
+from pupper_sysid.sim.export.export import exported_text
 from pupper_sysid.sim.export.mjcf import to_mjcf
 from pupper_sysid.sim.export.mjlab import BUILTIN_PD
 from pupper_sysid.sim.export.shared import CALIBRATED_PD, EXPLICIT_PD, ExportedServos
+from pupper_sysid.sim.export.targets import TARGETS
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, rest_at
 from pupper_sysid.sysid.recordings.files import load
@@ -398,7 +399,7 @@ def test_the_json_export_holds_every_number_with_its_interval(calibration):
 
 
 def test_every_export_says_where_its_numbers_come_from_and_a_wild_name_cannot_break_it(calibration):
-    for to in sorted(set(SIMULATORS) - {"isaaclab-bam"}):
+    for to in sorted(set(TARGETS) - {"isaaclab-bam"}):
         wild = calibration.model_copy(update={"robot": 'a"""b-->c & <d>\\'})
         text, servos = exported_text(wild, to, 0.004)
         assert servos.sha256 in text

@@ -10,7 +10,8 @@ import pytest
 
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.cards.files import load_card
-from pupper_sysid.sim.export.export import SIMULATORS, exported_text
+from pupper_sysid.sim.export.export import exported_text
+from pupper_sysid.sim.export.targets import TARGETS
 from pupper_sysid.sysid.export.tidy_table import to_csv
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
 from pupper_sysid.sysid.fit.operating_point import reference_gain, with_operating_points
@@ -67,7 +68,7 @@ def calibration():
     return with_operating_points(made, {"knee": runs})
 
 
-@pytest.mark.parametrize("target", SIMULATORS)
+@pytest.mark.parametrize("target", TARGETS)
 def test_every_export_states_gain_armature_and_load(target):
     text = " ".join(exported_text(calibration(), target, 0.002)[0].split())
     for words in (POINT, "without link and load", "0.1 kg at 0.12 m"):
