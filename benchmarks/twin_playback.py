@@ -26,8 +26,7 @@ from real_recordings import SPLIT, SWEEPS, WALK
 from pupper_sysid.common.figure_style import ORANGE, PINK, save, styled
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.policies.twin.drawing import Actuator, of_calibration, robot_for
-from pupper_sysid.policies.twin.figures import draw_bars, draw_joint
-from pupper_sysid.policies.twin.twin import ActuatorTwin, Twin, twin
+from pupper_sysid.policies.twin.twin import ActuatorTwin, Twin, draw_bars, draw_joint, twin
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.recordings.files import load

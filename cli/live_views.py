@@ -106,7 +106,7 @@ class LiveViews:
     """The loop's side; see `live_views`, which closes it."""
 
     def __init__(self, bus: ServoBus, wanted: Wanted, waits: bool):
-        from pupper_sysid.sysid.view.channels import packed
+        from pupper_sysid.sysid.view import packed
 
         self._packed = packed
         self._wanted, self._within_s = wanted, _WAIT_S if waits else 0.0
@@ -166,7 +166,7 @@ class LiveViews:
 
     def close(self, reason: str = "") -> None:
         """Finish what was written, and print where it is, or why it is not whole."""
-        from pupper_sysid.sysid.view.channels import guard_counts
+        from pupper_sysid.sysid.view import guard_counts
 
         if self._report:
             self._tell_events()
@@ -193,7 +193,7 @@ class LiveViews:
 
     def _tell_events(self) -> None:
         """Send what the guard changed since the last time."""
-        from pupper_sysid.sysid.view.channels import guard_text
+        from pupper_sysid.sysid.view import guard_text
 
         assert self._report is not None
         found = self._report.events[self._told :]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pupper_sysid.cli.live_views import TICK
 from pupper_sysid.cli.side_process import LONGEST_MESSAGE
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sysid.view.channels import McapStream, RerunStream, TickChannels
+from pupper_sysid.sysid.view import McapStream, RerunStream, TickChannels
 
 Array = NDArray[np.float64]
 

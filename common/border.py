@@ -144,6 +144,19 @@ def refuse_other_version(path: Path | str, found: Any, known: int, oldest: int =
         )
 
 
+def refuse_other_schema(
+    name: Path | str, data: Any, what: str, schema: str, version: int, remedy: str
+) -> None:
+    """Refuse data of a file that does not state `schema`, or has another version of it.
+
+    `what` names the expected file in the message, such as "is not a plan"; `remedy` says where
+    one comes from.
+    """
+    if not isinstance(data, dict) or data.get("schema") != schema:
+        raise InputError(f"{name} {what}: it does not say `schema: {schema}` at the top. {remedy}")
+    refuse_other_version(name, data.get("schema_version"), version)
+
+
 def validated(
     model: type[_Model],
     data: Any,

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
+from pupper_sysid.common.border import read_yaml, refuse_other_schema, validated
 from pupper_sysid.common.data_sheet import counts_of
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
@@ -392,12 +392,8 @@ def load_joint_map(path_or_preset: Path | str) -> JointMap:
 
 def joint_map_from(data: dict[str, Any], name: str, lines: dict | None = None) -> JointMap:
     """A joint map from plain data, as in the file."""
-    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-        raise InputError(
-            f"{name} is no joint map: it does not say `schema: {SCHEMA}` at the top. Make one with "
-            "`pupper-sysid calibrate-joints`."
-        )
-    refuse_other_version(name, data.get("schema_version"), SCHEMA_VERSION)
+    remedy = "Make one with `pupper-sysid calibrate-joints`."
+    refuse_other_schema(name, data, "is no joint map", SCHEMA, SCHEMA_VERSION, remedy)
     file = validated(JointMapFile, data, name, lines)
     return JointMap(file, tuple(in_order(file.joints)))
 

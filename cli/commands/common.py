@@ -15,7 +15,7 @@ from pupper_sysid.common.errors import PupperError
 from pupper_sysid.common.files import resolved
 
 if TYPE_CHECKING:
-    from pupper_sysid.sysid.fleet.calibration import Fleet
+    from pupper_sysid.sysid.fleet import Fleet
     from pupper_sysid.sysid.recordings.recording import Recording
 
 
@@ -53,7 +53,7 @@ def each_robot(
     robot; `columns` gives title and digits by column of the table. A recording that could not be
     used is a `PupperError` at the end: the exit code says so, too.
     """
-    from pupper_sysid.sysid.fleet.calibration import TABLE, robots_in, trust
+    from pupper_sysid.sysid.fleet import TABLE, robots_in, trust
 
     started = time.perf_counter()
     folder = options.out or resolved(root).with_name(f"{resolved(root).name}_{ending}")

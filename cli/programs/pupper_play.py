@@ -154,7 +154,7 @@ class _Track:
             return
         from pupper_sysid.policies.twin.drawing import bodies_over_time
         from pupper_sysid.sysid.recordings.recording import Recording
-        from pupper_sysid.sysid.view.channels import write_mcap, write_rerun
+        from pupper_sysid.sysid.view import write_mcap, write_rerun
 
         time_s, joints = np.array(self._time_s), self._env.body.joints
         sent, read, qpos = (np.array(part) for part in zip(*self._rows, strict=True))

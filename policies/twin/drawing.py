@@ -35,7 +35,7 @@ from pupper_sysid.sim.walking.servo_ranges import (
     servo_ranges,
 )
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.view.channels import Body, poses
+from pupper_sysid.sysid.view import Body, poses
 
 Array = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator
 
-from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
+from pupper_sysid.common.border import read_yaml, refuse_other_schema, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import as_path, write_text
@@ -354,13 +354,9 @@ def load_calibration(path_or_preset: Path | str) -> Calibration:
 def _load(path: Path) -> Calibration:
     refuse_other_kind(path, SCHEMA)
     data, lines = read_yaml(path)
-    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-        raise InputError(
-            f"{path} is not a calibration: it does not say `schema: {SCHEMA}` at the top. "
-            "Give a file that `pupper-sysid calibrate` wrote."
-        )
-    version = data.get("schema_version")
-    refuse_other_version(path, version, SCHEMA_VERSION)
+    remedy = "Give a file that `pupper-sysid calibrate` wrote."
+    refuse_other_schema(path, data, "is not a calibration", SCHEMA, SCHEMA_VERSION, remedy)
+    version = data["schema_version"]
     if version == SCHEMA_VERSION:
         return validated(Calibration, data, path, lines)
     if version in (2, 3):  # 2 is the same without `under_load`

@@ -35,7 +35,7 @@ from pupper_sysid.common.border import (
     read_json,
     read_text,
     read_yaml,
-    refuse_other_version,
+    refuse_other_schema,
     validated,
 )
 from pupper_sysid.common.errors import InputError
@@ -421,10 +421,6 @@ def _load(path: Path) -> ServoCard:
         return load_bam(path)
     refuse_other_kind(path, SCHEMA)
     data, lines = read_yaml(path)
-    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-        raise InputError(
-            f"{path} is not a servo card: it does not say `schema: {SCHEMA}` at the top. "
-            "`pupper-sysid servo show sts3215-bam-m1 --yaml` prints one as an example."
-        )
-    refuse_other_version(path, data.get("schema_version"), SCHEMA_VERSION)
+    example = "`pupper-sysid servo show sts3215-bam-m1 --yaml` prints one as an example."
+    refuse_other_schema(path, data, "is not a servo card", SCHEMA, SCHEMA_VERSION, example)
     return validated(ServoCard, data, path, lines)

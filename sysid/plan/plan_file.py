@@ -12,8 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from pupper_sysid.common.border import read_yaml, refuse_other_version, validated
-from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.border import read_yaml, refuse_other_schema, validated
 from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import sha256, versions, write_text
 from pupper_sysid.common.joints import strange_joint
@@ -66,12 +65,8 @@ def load_plan(path: Path) -> SweepPlan:
     """Read a plan file."""
     refuse_other_kind(path, SCHEMA)
     data, lines = read_yaml(path)
-    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-        raise InputError(
-            f"{path} is not a plan: it does not say `schema: {SCHEMA}` at the top. "
-            "Give a file that `pupper-sysid plan` wrote."
-        )
-    refuse_other_version(path, data.get("schema_version"), SCHEMA_VERSION)
+    remedy = "Give a file that `pupper-sysid plan` wrote."
+    refuse_other_schema(path, data, "is not a plan", SCHEMA, SCHEMA_VERSION, remedy)
     file = validated(PlanFile, data, path, lines)
     return SweepPlan(**{name: getattr(file, name) for name in SweepPlan.model_fields})
 

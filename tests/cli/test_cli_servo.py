@@ -154,8 +154,8 @@ class Reached(Exception):
 @pytest.mark.parametrize(
     ("command", "worker", "ending"),
     [
-        ("calibrate", "pupper_sysid.sysid.fleet.calibration.calibrate_fleet", "calibrated"),
-        ("fit-servo", "pupper_sysid.sysid.fleet.servo_model.fit_servo_fleet", "servos"),
+        ("calibrate", "pupper_sysid.sysid.fleet.calibrate_fleet", "calibrated"),
+        ("fit-servo", "pupper_sysid.sysid.fleet.fit_servo_fleet", "servos"),
     ],
 )
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 from pupper_sysid.sysid.recordings.files import load
-from pupper_sysid.sysid.view.channels import channels
+from pupper_sysid.sysid.view import channels
 from support.command_line import ran, run_program
 from support.viewer_files import entities_of, topics_of
 

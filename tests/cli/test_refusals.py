@@ -31,7 +31,7 @@ from pupper_sysid.servo_models.calibration.parts import Actuator
 from pupper_sysid.servo_models.calibration.quantity import PlausibleRange
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.sysid.fit.calibrate import calibrate
-from pupper_sysid.sysid.fleet.calibration import Settings
+from pupper_sysid.sysid.fleet import Settings
 from pupper_sysid.sysid.plan.plan_file import save_plan
 from pupper_sysid.sysid.plan.proposal import plan_from_recordings
 from pupper_sysid.sysid.recordings.files import load

@@ -59,9 +59,8 @@ class Twin(Drawn):
     def analyse(self) -> Found:
         """Simulate and compare."""
         from pupper_sysid.policies.twin.drawing import actuator_of, robot_for
-        from pupper_sysid.policies.twin.figures import twin_figure
         from pupper_sysid.policies.twin.gyro import read_imu, spectrum
-        from pupper_sysid.policies.twin.twin import twin
+        from pupper_sysid.policies.twin.twin import twin, twin_figure
         from pupper_sysid.servo_models.calibration.calibration import load_calibration
 
         if not self.actuator:

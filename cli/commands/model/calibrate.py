@@ -113,7 +113,7 @@ class Calibrate(OfRecordings):
 
     def _fleet(self, root: Path) -> None:
         """Many robots, one after the other or side by side."""
-        from pupper_sysid.sysid.fleet.calibration import Settings, calibrate_fleet
+        from pupper_sysid.sysid.fleet import Settings, calibrate_fleet
 
         if self.prior is not None:
             raise InputError("--from: a fleet is calibrated without a prior; leave it out.")

@@ -124,7 +124,7 @@ class FitServo(OfRecordings):
 
     def _fleet(self, root: Path, split: Split) -> None:
         """Many robots, one after the other or side by side."""
-        from pupper_sysid.sysid.fleet.servo_model import ServoSettings, fit_servo_fleet
+        from pupper_sysid.sysid.fleet import ServoSettings, fit_servo_fleet
 
         if self.joints != "all":
             raise InputError("--joints: a fleet is fitted with all its joints; leave it out.")

@@ -148,7 +148,7 @@ class View:
 
     def run(self) -> None:
         """Read and write."""
-        from pupper_sysid.sysid.view.channels import write_mcap, write_rerun
+        from pupper_sysid.sysid.view import write_mcap, write_rerun
 
         if self.rerun is None and self.mcap is None:
             raise InputError("Nothing to write: give --rerun FILE.rrd, --mcap FILE.mcap or both.")

@@ -10,10 +10,9 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.policies.twin.drawing import actuator_of, robot_for, spread_over, stronger
-from pupper_sysid.policies.twin.figures import twin_figure
 from pupper_sysid.policies.twin.gyro import read_imu, spectrum
 from pupper_sysid.policies.twin.playing import _load_share
-from pupper_sysid.policies.twin.twin import twin
+from pupper_sysid.policies.twin.twin import twin, twin_figure
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sim.robot.replay import replay

@@ -14,9 +14,8 @@ from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.reading.content import reading_up_to
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.servo_file import load_servo_model
-from pupper_sysid.sysid.fleet import calibration as fleet
-from pupper_sysid.sysid.fleet.calibration import OUTLIER, QUANTITIES, _outliers
-from pupper_sysid.sysid.fleet.servo_model import ServoSettings, fit_servo_fleet
+from pupper_sysid.sysid import fleet
+from pupper_sysid.sysid.fleet import OUTLIER, QUANTITIES, ServoSettings, _outliers, fit_servo_fleet
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import refused, run
 from support.refusals import assert_each_refused

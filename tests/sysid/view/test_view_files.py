@@ -12,7 +12,7 @@ from pupper_sysid.cli.programs import pupper_play, pupper_sysid
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.view.channels import channels, guard_events, write_mcap, write_rerun
+from pupper_sysid.sysid.view import channels, guard_events, write_mcap, write_rerun
 from support.command_line import refused, run, run_program
 from support.viewer_files import entities_of, topics_of
 

@@ -1,9 +1,9 @@
 """Calibrate the recordings of many robots at once, on some cores or on a Dask cluster.
 
-`run_fleet` does the same for any other product of a robot's recording (`sysid.fleet.servo_model`).
-
     fleet = calibrate_fleet(Path("robots"), Path("fleet"), Settings(seed=0), jobs=2)
     fleet.table                   # one row per robot and joint
+
+`fit_servo_fleet` fits servo models instead; both are `run_fleet` with another product.
 
 One recording is one robot. Each gets its own calibration file, written when it is done, so that an
 interrupted run continues: a file made from the same bytes with the same settings is kept. A
@@ -36,9 +36,12 @@ from pupper_sysid.common.processes.workers import Workers
 from pupper_sysid.common.reading.content import read_limit, reading_up_to
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.fit.calibration_file import GIVEN_TORQUE
 from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.servo_fit.data import servo_data
+from pupper_sysid.sysid.servo_fit.fit import EACH_GROUP_IN_TURN, Split, fit_servo
 
 TABLE = "fleet.csv"
 OUTLIER = 5.0
@@ -321,3 +324,71 @@ def _outliers(table: pd.DataFrame, quantities: Sequence[str]) -> list[str]:
 
 def _ms(quantity) -> float:
     return float("nan") if quantity is None else 1e3 * quantity.value
+
+
+SERVO_QUANTITIES = {
+    "free_run_mrad": "rmse_free_run_rad",
+    "held_mrad": "rmse_held_rad",
+    "linear_mrad": "linear_rmse_rad",
+    "delayed_pd_mrad": "delayed_pd_rmse_rad",
+    "persistence_mrad": "persistence_rmse_rad",
+}
+"""Columns of the table and the scores of the model's contract that they show: unseen data."""
+
+
+@dataclass(frozen=True)
+class ServoSettings:
+    """Settings of every fit: parameters of `servo_fit.fit.fit_servo`."""
+
+    arch: str = "mlp"
+    preset: str = "default"
+    split: Split = EACH_GROUP_IN_TURN
+    readings: str = "auto"
+    seed: int = 0
+
+
+def fit_servo_fleet(
+    root: Path,
+    out: Path,
+    settings: ServoSettings,
+    jobs: int = 1,
+    cluster: str | None = None,
+    force: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> Fleet:
+    """Fit a servo model to every recording in `root`; a folder per robot in `out`, and the table.
+
+    Parameters and errors as for `sysid.fleet.calibrate_fleet`.
+    """
+    targets = {path: out / name for path, name in robots_in(root).items()}
+    return run_fleet(
+        targets, lambda target, path: _is_servo_of(target, path, settings),
+        partial(_fitted, settings=settings), _servo_numbers, tuple(SERVO_QUANTITIES), out,
+        jobs, cluster, force, progress,
+    )  # fmt: skip
+
+
+def _servo_numbers(target: Path) -> dict[str, dict[str, float]]:
+    """Scores of each joint of a model; NaN where it has no such score."""
+    found = {}
+    for joint, known in load_servo_model(target).contract.joints.items():
+        errors = {name: known.scores.get(key) for name, key in SERVO_QUANTITIES.items()}
+        found[joint] = {k: float("nan") if e is None else 1e3 * e for k, e in errors.items()}
+    return found
+
+
+def _is_servo_of(target: Path, path: Path, settings: ServoSettings) -> bool:
+    """Whether a model was fitted to this file with these settings."""
+    made = load_servo_model(target).contract
+    return (
+        [r.sha256 for r in made.recordings] == [sha256(path)]
+        and (made.arch, made.preset, made.seed) == (settings.arch, settings.preset, settings.seed)
+        and made.split == settings.split.name
+        and made.readings_counted
+        == servo_data([load(path)], list(made.joints), settings.readings, settings.seed).modes
+    )
+
+
+def _fitted(path: Path, target: Path, settings: ServoSettings) -> None:
+    """Fit one robot's model."""
+    fit_servo(load(path), **vars(settings), keep_unfinished=False).save(target, force=True)

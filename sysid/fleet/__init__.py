@@ -1,1 +1,0 @@
-"""Fleets: a calibration or a servo model for each of many robots, side by side."""

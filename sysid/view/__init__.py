@@ -1,1 +1,0 @@
-"""Recordings as files of other viewers: Rerun (`.rrd`) and Foxglove (`.mcap`)."""
