@@ -161,17 +161,22 @@ def table(title: str, *columns: str) -> Table:
     return made
 
 
+def result_table(results: ResultTable) -> Table:
+    """A table of results, without its details."""
+    columns = [column for column in results.columns if not column.detail]
+    made = table(results.title, *(column.terminal_heading for column in columns))
+    for row in results.rows:
+        style = "bold" if row.get(results.marked) else None
+        made.add_row(*(column.text(row) for column in columns), style=style)
+    return made
+
+
 def print_tables(*tables: ResultTable) -> None:
     """Print tables of results, an empty line between them; those without rows are left out."""
     for k, one in enumerate(t for t in tables if t.rows):
-        columns = [column for column in one.columns if not column.detail]
-        shown = table(one.title, *(column.terminal_heading for column in columns))
-        for row in one.rows:
-            style = "bold" if row.get(one.marked) else None
-            shown.add_row(*(column.text(row) for column in columns), style=style)
         if k:
             out.print()
-        out.print(shown)
+        out.print(result_table(one))
 
 
 def ms(seconds: float | None, digits: int = 1) -> str:

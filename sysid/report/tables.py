@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from markupsafe import Markup
 
 from pupper_sysid.common.results import flat, plain
-from pupper_sysid.common.tables import Column, Row, Table, rounded
+from pupper_sysid.common.tables import Column, Row, Table, ends, rounded
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of, words_of
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.fit.results import JointCalibrationResult
     from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
     from pupper_sysid.sysid.lag.lag_budget import LagBudget
+    from pupper_sysid.sysid.servo_fit.scores import ModelScores
 
 MODEL_NAMES = {
     "pure_delay": "pure delay",
@@ -324,13 +325,11 @@ def comparison_tables(comparison: Comparison) -> list[Table]:
     if len(joints) > 1:
         means = {name: model.mean.rmse_free_run_rad for name, model in models.items()}
         joints.append({"joint": "mean", "is_mean": True} | means)
-    by_model = [{"model": name} | plain(model.mean) for name, model in models.items()]
     offset_rad = {name: model.offset_rad for name, model in models.items() if model.offset_rad}
     offsets = [
         {"joint": joint} | {name: by_joint[joint] for name, by_joint in offset_rad.items()}
         for joint in comparison.data.joints
     ]
-    errors = {"held": "held", "raw": "raw, predicted readings", "one_step": "one step"}
     return [
         Table(
             "", "RMS error in free run, mrad",
@@ -343,23 +342,37 @@ def comparison_tables(comparison: Comparison) -> list[Table]:
             ],
             joints, "is_mean",
         ),
-        Table(
-            "", "Mean of the joints, RMS error in mrad",
-            [
-                Column("model", "model", kind="key"),
-                *(
-                    Column(heading, f"rmse_{name}_rad", "mrad", short=heading.partition(",")[0])
-                    for name, heading in ({"free_run": "free run"} | errors).items()
-                ),
-            ],
-            by_model,
-        ),
+        mean_error_table(models, comparison.persistence_rmse_rad),
         Table(
             "", "Offset of this recording, mrad",
             [KEY, *(Column(name, name, "mrad", short=name) for name in offset_rad)],
             offsets if offset_rad else [],
         ),
     ]  # fmt: skip
+
+
+def mean_error_table(
+    models: Mapping[str, ModelScores],
+    persistence_rmse_rad: Mapping[str, float],
+    title: str = "RMS error, mrad, mean of the joints",
+) -> Table:
+    """Errors of servo models, mean of the joints, beside persistence."""
+    rows: list[Row] = [
+        {"model": name} | plain(model.mean) | ends("rmse_free_run_rad", model.rmse_free_run_rad)
+        for name, model in models.items()
+    ]
+    known = [error for error in persistence_rmse_rad.values() if math.isfinite(error)]
+    if known:
+        rows.append({"model": "persistence", "rmse_one_step_rad": sum(known) / len(known)})
+    free_run = f"free run {_LEVEL}"
+    columns = (
+        Column("model", "model", kind="key"),
+        Column(free_run, "rmse_free_run_rad", "mrad", kind="interval", short=free_run),
+        Column("held", "rmse_held_rad", "mrad", short="held"),
+        Column("raw, predicted readings", "rmse_raw_rad", "mrad", short="raw"),
+        Column("one step", "rmse_one_step_rad", "mrad", short="one step"),
+    )
+    return Table("", title, columns, rows)
 
 
 def _significant(value: float) -> str:

@@ -49,6 +49,7 @@ class Servo(Analysis):
     def analyse(self) -> Found:
         """Fit and compare the models."""
         from pupper_sysid.sysid.compare.compare import four_way
+        from pupper_sysid.sysid.report.tables import mean_error_table
 
         need_positive("--seconds", self.seconds)
         if len(self.policies) != 1:
@@ -59,19 +60,10 @@ class Servo(Analysis):
         (recording,) = terminal.load_all([path])
         with terminal.share_progress("fitting") as advance:
             compared = four_way(recording, recording.joints, self.seed, advance)
-        table = terminal.table(
-            "RMS error on unseen readings, mrad, mean of the joints", "model", "one step",
-            "free run", "90 % interval",
-        )  # fmt: skip
-        for name, one in compared.models.items():
-            errors = (one.mean.rmse_one_step_rad, one.mean.rmse_free_run_rad)
-            low, high = one.rmse_free_run_rad.low, one.rmse_free_run_rad.high
-            table.add_row(
-                name, *map(terminal.ms, errors), f"{terminal.ms(low)} … {terminal.ms(high)}"
-            )
-        still = float(np.nanmean(list(compared.persistence_rmse_rad.values())))
-        table.add_row("persistence", terminal.ms(still), "", "")
-        return {**compared.to_dict(), "recording": path}, compared.plot(), table
+        title = "RMS error on unseen readings, mrad, mean of the joints"
+        table = mean_error_table(compared.models, compared.persistence_rmse_rad, title)
+        found = {**compared.to_dict(), "recording": path}
+        return found, compared.plot(), terminal.result_table(table)
 
     def _walked(self, folder: Path) -> Path:
         """A recording of the servos of an emulated robot that a policy walks."""
