@@ -36,7 +36,9 @@ class Trial:
     seconds: float = 10.0
     seed: int = 0
     threads: int = 0
-    progress: Callable[[float], None] = field(default=lambda share: None, compare=False)
+    progress: Callable[[float], None] = field(
+        default_factory=lambda: lambda share: None, compare=False
+    )
     """Called with the share of an analysis that is done."""
     _plain: list[tuple[Policy, Rollout]] = field(
         init=False, repr=False, compare=False, default_factory=list

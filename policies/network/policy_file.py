@@ -106,7 +106,7 @@ class ServoNumbers(_Part):
     """
 
     model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, Range]
+    __pydantic_extra__: dict[str, Range]  # pyright: ignore[reportIncompatibleVariableOverride]
 
     stiffness: Range
     """Torque per angle [N·m/rad]."""

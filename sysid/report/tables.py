@@ -247,7 +247,7 @@ def _matrix(
 ) -> Table:
     """Rows of several joints side by side, one column per joint."""
     joints = list(dict.fromkeys(row["joint"] for row in rows))
-    lines: dict[str, Row] = {}
+    lines: dict[str, dict[str, str]] = {}
     for row in rows:
         lines.setdefault(name(row), {})[row["joint"]] = cell(row)
     columns = (
