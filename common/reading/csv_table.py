@@ -15,9 +15,7 @@ import csv
 import io
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -27,23 +25,13 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import allowed, refuse_more
-from pupper_sysid.common.reading.dialect import decimal, is_clock
+from pupper_sysid.common.reading.dialect import decimal, is_clock, is_decimal
 from pupper_sysid.common.strict_yaml import printable
 
 
 def distinct(where: Path | str, names: Iterable[str], what: str = "columns") -> None:
-    """Refuse names of which two are the same.
+    """Refuse `names` of `what` (a plural) of which two are the same; `where` is for messages.
 
-    Parameters
-    ----------
-    where : Path or str
-        File, and place in it, for messages.
-    names : iterable of str
-    what : str
-        Things that are named, in the plural.
-
-    Examples
-    --------
     >>> distinct("log.npz", ["knee", "ankle", "knee"], "joints")
     Traceback (most recent call last):
     ...
@@ -61,17 +49,8 @@ them.
 def one_each(where: Path | str, counts: Mapping[str, int], remedy: str = "Mend the log.") -> None:
     """Refuse parts of a row that are not equally long: commands, positions, names of joints.
 
-    Parameters
-    ----------
-    where : Path or str
-        File, and place in it, for messages.
-    counts : mapping of str to int
-        How many values each part has.
-    remedy : str
-        What else to do, as a sentence.
+    `counts`: how many values each part has. `remedy`: what else to do, as a sentence.
 
-    Examples
-    --------
     >>> one_each("log.npz", {"command": 3, "joint_names": 2})
     Traceback (most recent call last):
     ...
@@ -80,10 +59,10 @@ each joint has one of each. Mend the log.
     """
     if len(set(counts.values())) > 1:
         first, *others = counts.items()
-        listed = [f"{printable(first[0])[:60]} has {first[1]} values"]
-        listed += [f"{printable(what)[:60]} has {n}" for what, n in others]
-        text = f"{', '.join(listed[:-1])} and {listed[-1]}"
-        raise InputError(f"{where}: {text}; each joint has one of each. {remedy}")
+        *listed, last = [f"{printable(first[0])[:60]} has {first[1]} values",
+                         *(f"{printable(what)[:60]} has {n}" for what, n in others)]  # fmt: skip
+        text = f"{', '.join(listed)} and {last}; each joint has one of each"
+        raise InputError(f"{where}: {text}. {remedy}")
 
 
 MOST_ROWS = 5_000_000
@@ -159,10 +138,14 @@ def read_table(
     refuse_more(path, rows, MOST_ROWS, "rows", _SPLIT)
     refuse_more(path, rows * len(found.columns), MOST_CELLS, "cells", _SPLIT)
     end = len(text)
-    if not text.endswith("\n") and (whole_lines or _is_cut(text)):
-        end = max(text.rfind("\n") + 1, at)
-        last = text[end:].strip()
-        found.cut = bool(last) and last[0] != "#"
+    if not text.endswith("\n"):  # the last of many lines may be cut where it is the shortest
+        *others, last = text[-_TAIL:].split("\n")[1:] or [""]
+        shortest = min(map(len, others[-_FEW_LINES:]), default=0)
+        short = len(others) >= _FEW_LINES and last[:1] != "#" and len(last.rstrip()) < shortest
+        if whole_lines or short:
+            end = max(text.rfind("\n") + 1, at)
+            last = text[end:].strip()
+            found.cut = bool(last) and last[0] != "#"
     blocks = _Blocks(path, found, texts, strict)
     while at < end:
         stop = end if at + _BLOCK >= end else text.find("\n", at + _BLOCK, end) + 1 or end
@@ -170,13 +153,6 @@ def read_table(
         at = stop
     blocks.finish()
     return found
-
-
-def _is_cut(text: str) -> bool:
-    """Whether the last line of a text, which does not end, is the shortest of many."""
-    *others, last = text[-_TAIL:].split("\n")[1:] or [""]
-    shortest = min(map(len, others[-_FEW_LINES:]), default=0)
-    return len(others) >= _FEW_LINES and last[:1] != "#" and len(last.rstrip()) < shortest
 
 
 def one_line_end(text: str) -> str:
@@ -191,21 +167,19 @@ def column_names(path: Path | str, text: str) -> list[str]:
 
 def comments_of(path: Path | str, text: str) -> list[tuple[int, str]]:
     """Comment lines of CSV text, numbered from 1."""
-    return _comments(path, one_line_end(text), 1, [])
+    return _comments(path, one_line_end(text))
 
 
-def _comments(
-    path: Path | str, text: str, first: int, known: list[tuple[int, str]]
-) -> list[tuple[int, str]]:
-    """Comment lines of text that begins at line `first`, which follow the `known` ones."""
+def _comments(path: Path | str, text: str, n: int = 1, known: int = 0) -> list[tuple[int, str]]:
+    """Comment lines of text that begins at line `n`, before which `known` ones are."""
     found: list[tuple[int, str]] = []
     if text[:1] != "#" and "\n#" not in text:
         return found
-    n, at = first, 0
+    at = 0
     for match in _COMMENT.finditer(text):
         n, at = n + text.count("\n", at, match.start()), match.start()
         found.append((n, match[0]))
-        refuse_more(path, len(known) + len(found), MOST_COMMENTS, "comment lines", exact=False)
+        refuse_more(path, known + len(found), MOST_COMMENTS, "comment lines", exact=False)
         refuse_more(f"{path}, line {n}", len(match[0]), LONGEST_COMMENT, "characters")
     return found
 
@@ -223,18 +197,16 @@ def _opening(
         at, n = stop + 1, n + 1
         if n > allowed(MOST_COMMENTS):  # blank lines, too
             refuse_more(path, n, MOST_COMMENTS, "lines before its column names", exact=False)
-    comments = _comments(path, text[:at], 1, [])
+    comments = _comments(path, text[:at])
     if at >= len(text):
         return CsvTable([], comments=comments), n, len(text)
     line = text[at:stop]
     refuse_more(path, line.count(",") + 1, MOST_COLUMNS, "columns", _SPLIT)
+    names = [name.strip() for name in (_cells(path, n, line) if columns is None else columns)]
+    refuse_more(path, len(names), MOST_COLUMNS, "columns", _SPLIT)
+    distinct(f"{path}, line {n}" if columns is None else f"{path}, its columns", names)
     if columns is not None:
-        names = [name.strip() for name in columns]
-        refuse_more(path, len(names), MOST_COLUMNS, "columns", _SPLIT)
-        distinct(f"{path}, its columns", names)
         return CsvTable(names, comments=comments), n, at
-    names = [name.strip() for name in _cells(path, n, line)]
-    distinct(f"{path}, line {n}", names)
     return CsvTable(names, comments=comments), n + 1, min(stop + 1, len(text))
 
 
@@ -255,7 +227,7 @@ class _Blocks:
     def add(self, block: str, first: int, last: bool) -> int:
         """Take a block of lines that begins at line `first`; how many lines it has."""
         count = block.count("\n")
-        comments = _comments(self._path, block, first, self._found.comments)
+        comments = _comments(self._path, block, first, len(self._found.comments))
         self._found.comments += comments
         plain = _QUOTED.sub(r"\1", block) if '"' in block else block
         plain, lines = _bare(plain, first, [n for n, _ in comments])
@@ -302,51 +274,51 @@ class _Blocks:
     def _strictly(self, block: str, first: int, last: bool) -> None:
         """Take a block line by line, or refuse it with the place of its fault."""
         path, found = self._path, self._found
-        given = [
-            (n, line) for n, line in enumerate(block.split("\n"), first)
-            if line[:1] != "#" and line.strip()
-        ]  # fmt: skip
         # line by line: a stray quote must not swallow the lines behind it
-        rows = [_cells(path, n, line) for n, line in given]
-        lines = [n for n, _ in given]
-        numeric = [self._strict or _numeric(row) for row in rows]
-        if any(numeric):
-            rows, lines = self._only(numeric, rows, lines)
-        if last and rows and len(rows[-1]) < len(found.columns):
+        rows = {n: _cells(path, n, line) for n, line in enumerate(block.split("\n"), first)
+                if line[:1] != "#" and line.strip()}  # fmt: skip
+        if not self._strict:
+            rows = self._without(
+                rows, [n for n, row in rows.items() if not _numeric(row)], len(rows) - 1
+            )
+        if last and rows and len(rows[max(rows)]) < len(found.columns):
             found.cut = True
-            rows, lines = rows[:-1], lines[:-1]
-        whole = [len(row) == len(found.columns) for row in rows]
-        if not self._strict and 0 < whole.count(False) <= max(_FEW_BROKEN * len(rows), 1):
-            rows, lines = self._only(whole, rows, lines)
-        for n, row in zip(lines, rows, strict=True):
+            rows.popitem()
+        if not self._strict:
+            ragged = [n for n, row in rows.items() if len(row) != len(found.columns)]
+            rows = self._without(rows, ragged, max(_FEW_BROKEN * len(rows), 1))
+        for n, row in rows.items():
             if len(row) != len(found.columns):
                 raise InputError(
                     f"{path}, line {n}: {len(row)} cells where the header names "
                     f"{len(found.columns)} columns; command and position must have the same "
                     "number of values. Mend or remove the line."
                 )
+        lines = [*rows]
         self._lines.append(np.array(lines, np.int64))
         for k, name in enumerate(found.columns):
-            cells = [row[k] for row in rows]
+            cells = [row[k] for row in rows.values()]
             if name in found.texts:
                 found.texts[name] += [self._text(cell) for cell in cells]
             elif name in self._numbers:
                 try:
-                    self._numbers[name].append(
-                        numbers_of(path, name, cells, lines, not self._strict)
-                    )
+                    numbers = numbers_of(path, name, cells, lines, not self._strict)
+                    self._numbers[name].append(numbers)
                 except InputError as error:
                     if self._strict:
                         raise
                     found.faults[name] = str(error)
                     del self._numbers[name]
 
-    def _only(
-        self, good: list[bool], rows: list[list[str]], lines: list[int]
-    ) -> tuple[list[list[str]], list[int]]:
-        """Rows that are `good`, and their lines; the others are broken."""
-        self._found.broken += [n for n, one in zip(lines, good, strict=True) if not one]
-        return list(compress(rows, good)), list(compress(lines, good))
+    def _without(
+        self, rows: dict[int, list[str]], broken: list[int], most: float
+    ) -> dict[int, list[str]]:
+        """Rows by line, without those that are broken if these are not more than `most`."""
+        if len(broken) > most:
+            return rows
+        self._found.broken += broken
+        gone = {*broken}
+        return {n: row for n, row in rows.items() if n not in gone}
 
     def _text(self, cell: str) -> str:
         cell = cell.strip()
@@ -367,9 +339,7 @@ def numbers_of(
     """
     values, shown = np.full(len(cells), np.nan), printable(name)[:60]
     for k, cell in enumerate(cells):
-        if not (text := cell.strip()):
-            continue
-        if words and is_failure(text):
+        if not (text := cell.strip()) or (words and is_failure(text)):
             continue
         try:
             values[k] = decimal(text)
@@ -391,11 +361,7 @@ def is_failure(word: str) -> bool:
 
 def _numeric(row: Sequence[str]) -> bool:
     """Whether a cell is a number or a time of day: in a table of numbers no remark has one."""
-    for cell in row:
-        with suppress(ValueError):
-            decimal(cell)
-            return True
-    return any(map(is_clock, row))
+    return any(map(is_decimal, row)) or any(map(is_clock, row))
 
 
 def _bare(block: str, first: int, comments: Sequence[int]) -> tuple[str, NDArray[np.int64]]:

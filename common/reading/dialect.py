@@ -33,47 +33,25 @@ _SPACES = " \t\r\n"
 
 
 def decimal(text: str) -> float:
-    """The number that `text` is.
+    """The number that `text` is, `nan`, `inf` and exponents included; ValueError if it is none.
 
-    Parameters
-    ----------
-    text : str
-        With `nan`, `inf` and an exponent as in Python, and spaces around it.
-
-    Raises
-    ------
-    ValueError
-        If it is none.
-
-    Examples
-    --------
     >>> decimal(" -4.1e2 ")
     -410.0
-    >>> decimal("4_1")
-    Traceback (most recent call last):
-    ...
-    ValueError: '4_1' is not a number
     """
-    text = text.strip(_SPACES)
-    # re.IGNORECASE matches the Kelvin sign and others to ASCII letters
-    if not text.isascii() or not _DECIMAL.fullmatch(text):
-        raise ValueError(f"{text[:40]!r} is not a number")
+    if not is_decimal(text):
+        raise ValueError(f"{text.strip(_SPACES)[:40]!r} is not a number")
     return float(text)
 
 
+def is_decimal(text: str) -> bool:
+    """Whether `text` is a number as `decimal` reads it."""
+    text = text.strip(_SPACES)
+    # re.IGNORECASE matches the Kelvin sign and others to ASCII letters
+    return text.isascii() and _DECIMAL.fullmatch(text) is not None
+
+
 def whole(text: str) -> int:
-    """The whole number that `text` is.
-
-    Raises
-    ------
-    ValueError
-        If it is none, or has more than 300 digits.
-
-    Examples
-    --------
-    >>> whole("-12")
-    -12
-    """
+    """The whole number that `text` is, of at most 300 digits; ValueError if it is none."""
     text = text.strip(_SPACES)
     if not _WHOLE.fullmatch(text):
         raise ValueError(f"{text[:40]!r} is not a whole number")
@@ -96,17 +74,24 @@ _CLOCK = re.compile(
     r"(\d{1,2}:\d\d:\d\d([.,]\d+|:\d{3})?(Z|[+-]\d\d:?\d\d| ?[AP]M)?|\d{1,3}:\d\d[.,]\d+)"
     r"|\d{8}T\d{6}([.,]\d+)?Z?"
 )
-_EXPONENT = re.compile(r"(?<=[\d.])(?:[dD](?=[+-]\d{2,3}(?![\w.]))|\*\^(?=-?\d))")  # Mathematica's
 _GROUP_MARKS = "['’\u00a0\u2009\u202f]"
-_GROUPED = re.compile(rf"(?<![\w.,'’])[+-]?\d{{1,3}}(?:{_GROUP_MARKS}\d{{3}})+(?![\w'’])")
-_COLOUR = re.compile(r"\x1b\[[\d;]*m")  # of a terminal
-_WRAPPED = re.compile(r"\b(?:tensor|array)\((?:'\w', ?)?(\[[^\]\n]*\])[^()\n]{0,80}\)")
-_COLON = re.compile(r"^[ \t]*(\d+(?:\.\d+)?):(?=[ \t])", re.MULTILINE)  # behind a time
-_CHECKSUM = re.compile(r"\*[0-9A-F]{2}[ \t]*$", re.MULTILINE)  # of NMEA's lines
-_BOX = re.compile("[\u2500-\u257f]")  # lines around cells
-_NUMPY = re.compile(r"\bnp\.\w+\(([-+.\w]+)\)")
-# below the names of a printed table
-_RULE = re.compile(r"^[ \t|+:]*[-=]{3}[-=+ |:\t]*$", re.MULTILINE)
+_IN_TEXT, _IN_ROWS, _IN_EACH = range(3)  # somewhere in the text, in the rows, in each row
+_MARKS = (  # around numbers, what to put in their place, and where they must be
+    (re.compile(r"(?<![\w.])0x[0-9a-f]{1,8}(?![\w.])", re.IGNORECASE),
+     lambda m: str(int(m[0], 16)), _IN_ROWS),
+    (re.compile(r"^[ \t]*(\d+(?:\.\d+)?):(?=[ \t])", re.MULTILINE), r"\1", _IN_EACH),  # a time
+    (re.compile(r"(?<=[\w.\"])[ \t]+(?:#|//)[^\n]*$", re.MULTILINE), "", _IN_EACH),  # a remark
+    (re.compile(r"\*[0-9A-F]{2}[ \t]*$", re.MULTILINE), "", _IN_EACH),  # of NMEA
+    (re.compile("[│┃]"), "|", _IN_TEXT),
+    (re.compile("[\u2500-\u257f]"), "-", _IN_TEXT),  # lines around cells
+    (re.compile(r"^[ \t|+:]*[-=]{3}[-=+ |:\t]*$", re.MULTILINE), "", _IN_TEXT),  # below names
+    (re.compile(r"\x1b\[[\d;]*m"), "", _IN_TEXT),  # colours of a terminal
+    (_NUMPY := re.compile(r"\bnp\.\w+\(([-+.\w]+)\)"), r"\1", _IN_ROWS),
+    (re.compile(r"\b(?:tensor|array)\((?:'\w', ?)?(\[[^\]\n]*\])[^()\n]{0,80}\)"), r"\1", _IN_ROWS),
+    (re.compile(r"(?<=[\d.])(?:[dD](?=[+-]\d{2,3}(?![\w.]))|\*\^(?=-?\d))"), "E", _IN_ROWS),
+    (re.compile(rf"(?<![\w.,'’])[+-]?\d{{1,3}}(?:{_GROUP_MARKS}\d{{3}})+(?![\w'’])"),
+     lambda m: re.sub(_GROUP_MARKS, "", m[0]), _IN_ROWS),
+)  # fmt: skip
 _SINGLE = re.compile(r"(?:^|[,;\t|])'[^',;\t|\n]*'")
 _QUOTED_GROUPS = re.compile(r'"([+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?)"')
 _COMMA_GROUPS = re.compile(r"(?<![\w.,])[+-]?\d{1,3}(?:,\d{3})+(?:\.\d+)?(?![\w,])")
@@ -117,7 +102,6 @@ _UNITS = (
     r"amps?|ma|mv|n\*?m|nm|%|°?c|hz|rad/s|deg/s|rpm|rad/s\^?2|m|mm"
 )
 _UNIT = re.compile(rf"[(\[<{{]?\s*({_UNITS}|raw|-|1|none)\s*[)\]>}}]?", re.IGNORECASE)
-_WORD_OF = {"%": "percent"}  # in names, whose marks separate words
 _ANGLE_UNIT = re.compile(r"rad(ians?)?|deg(rees?)?|°|turns?|rev|counts?|ticks?", re.IGNORECASE)
 _WITH_UNIT = re.compile(rf"([-+]?[\d.,]+(?:[eE][-+]?\d+)?) ?({_UNITS})", re.IGNORECASE)
 _NAMED_LIST = re.compile(
@@ -149,9 +133,7 @@ _BRACKETED = re.compile(
 )
 _BRACKETS = re.compile(r"[\[\]()]")
 _HEX_CELL = re.compile(r"([0-9a-f]{2,8})(h?)", re.IGNORECASE)
-_REST = re.compile(r"(?<=[\w.\"])[ \t]+(?:#|//)[^\n]*$", re.MULTILINE)  # a remark behind a row
 _DOUBLED = re.compile(r"([+-]?\d+),(\d+)(,|$)", re.MULTILINE)  # 0,1,0,2 of decimal commas
-_HEX = re.compile(r"(?<![\w.])0x[0-9a-f]{1,8}(?![\w.])", re.IGNORECASE)
 _TELEPLOT = re.compile(
     r"^>([\w./ \[\]-]+):(?:(\d+(?:\.\d+)?):)?([-+]?[\d.]+(?:e[-+]?\d+)?)(?:[§|].*)?$",
     re.IGNORECASE | re.MULTILINE,
@@ -250,30 +232,11 @@ def _usual_numbers(text: str, rows: Sequence[str]) -> str:
     comma stands before three digits, and other numbers have a decimal point; a point where the
     others have a decimal comma.
     """
-    sample = "\n".join(rows)
-    if "\u2212" in text:
-        text = text.replace("\u2212", "-")
-    if _HEX.search(sample):
-        text = _HEX.sub(lambda m: str(int(m[0], 16)), text)
-    if "│" in text[:_SAMPLE] or "┃" in text[:_SAMPLE]:
-        text = _BOX.sub("-", re.sub("[│┃]", "|", text))
-    if all(_COLON.match(row) for row in rows):
-        text = _COLON.sub(r"\1", text)
-    if all(_REST.search(row) for row in rows):
-        text = _REST.sub("", text)
-    if all(_CHECKSUM.search(row) for row in rows):
-        text = _CHECKSUM.sub("", text)
-    if "---" in text[:_SAMPLE] or "===" in text[:_SAMPLE]:
-        text = _RULE.sub("", text)
-    if "\x1b" in text:
-        text = _COLOUR.sub("", text)
-    text = without_numpy(text) if "np." in sample else text
-    if _WRAPPED.search(sample):
-        text = _WRAPPED.sub(r"\1", text)
-    if _EXPONENT.search(sample):
-        text = _EXPONENT.sub("E", text)
-    if _GROUPED.search(sample):
-        text = _GROUPED.sub(lambda m: re.sub(_GROUP_MARKS, "", m[0]), text)
+    text = text.replace("\u2212", "-")
+    sample, head = "\n".join(rows), text[:_SAMPLE]
+    for pattern, replacement, where in _MARKS:
+        if all(map(pattern.search, ([head], [sample], rows)[where])):
+            text = pattern.sub(replacement, text)
     if all(_SINGLE.search(row) for row in rows) and '"' not in sample:
         text = text.replace("'", '"')
     if _QUOTED_GROUPS.search(sample):
@@ -337,9 +300,8 @@ def _shape(rows: Sequence[str]) -> _Shape | None:
                 counted = _counted([row[0] for row in cells])
                 clocked = all(is_clock(row[0]) for row in cells)
                 blank = tuple(not f for f in full)
-                best = _Shape(
-                    separator, comma, columns, numeric, units, hexed, counted, clocked, blank
-                )
+                best = _Shape(separator, comma, columns, numeric, units, hexed, counted, clocked,
+                              blank)  # fmt: skip
     return best if best is not None and any(best.numeric) else None
 
 
@@ -349,11 +311,9 @@ def _units_of(
     """Columns, of such shares of numbers, in which one unit stands behind each; and the unit."""
     units = {}
     for k, share in enumerate(shares):
-        matches = (
-            [] if share >= _NUMERIC else [_WITH_UNIT.fullmatch(row[k]) for row in cells if row[k]]
-        )
+        matches = (_WITH_UNIT.fullmatch(row[k]) for row in cells if row[k])
         words = {m[2] if m and _number(m[1], comma) else "" for m in matches}
-        if len(words) == 1 and "" not in words:
+        if share < _NUMERIC and len(words) == 1 and "" not in words:
             units[k] = words.pop()
     return units
 
@@ -412,7 +372,7 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
     if before and (cells := _units(lines[before[-1]], shape)) and len(before) > 1:
         units = cells
         before.pop()
-    if before and all(map(_is_decimal, _split(lines[before[-1]], shape.separator))):
+    if before and all(map(is_decimal, _split(lines[before[-1]], shape.separator))):
         lines[before.pop()] = ""  # the end of a row, where a monitor was opened
     if before:
         columns = _names(lines[before[-1]], shape)
@@ -440,12 +400,8 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
         named = [name for name in columns if name]
         if "send_time_s" not in named and (unnamed or len({*named}) < len(named)):
             twice = next((n for n in named if named.count(n) > 1), "")
-            columns, numbered = (
-                None,
-                f"two columns would be called {twice}. Rename one of them"
-                if twice
-                else ("some columns have no names"),
-            )
+            called = f"two columns would be called {twice}. Rename one of them"
+            columns, numbered = None, called if twice else "some columns have no names"
     plain_names = (
         shape.separator == "," and len(before) == 1 and not units and not shape.comma
         and not shape.units and not shape.hexed and columns == _split(lines[before[0]], ",")
@@ -455,18 +411,15 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
         name = lines[before[-1]]
         again = text.find(f"\n{name}\n", sum(len(line) + 1 for line in lines[:first]) - 1)
         return Plain(text if again < 0 else text[:again] + _unnamed(text[again:], name))
-    if columns is None and not numbered:
-        numbered = "its columns have no names"
     if columns is None:
+        numbered = numbered or "its columns have no names"
         columns = [str(k) for k in range(shape.columns)]
         columns[0] = "time_of_day" if shape.clocked else "0"
         if shape.numeric == (True, False, True):  # 0.01 CMD 0.3
             columns, numbered = [columns[0].replace("0", "time"), "name", "value"], ""
-    for k, word in enumerate(units):
-        if word and word not in ("-", "1"):
-            columns[k] = f"{columns[k]} [{_WORD_OF.get(word, word)}]"
-    for k, word in shape.units.items():
-        columns[k : k + 1] = [f"{name} [{_WORD_OF.get(word, word)}]" for name in columns[k : k + 1]]
+    for k, word in [*enumerate(units), *shape.units.items()]:
+        if k < len(columns) and word not in ("", "-", "1"):
+            columns[k] = _with_unit(columns[k], word)
     if units:
         notes.append("a line beside the names was taken for their units")
     if (above := len(before) - (not numbered)) > 0:
@@ -483,11 +436,19 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
     body = text[start:]
     if before:
         body = _unnamed(body, lines[before[-1]])
-    while columns and not columns[-1] and len(columns) > 2:  # each row ends with a separator
+    body = _cells(body, shape)
+    while len(columns) > 2 and not columns[-1]:  # each row ends with a separator
         columns = columns[:-1]
-    trailing = shape.columns - len(columns)
-    body = _cells(body, shape, trailing)
+        body = re.sub(r",[ \t]*$", "", body, flags=re.MULTILINE)
     return Plain(f"{head}\n{body}" if first else body, columns, numbered, _sentence(notes))
+
+
+def _distinct(names: Sequence[str]) -> bool:
+    return all(names) and len({*names}) == len(names)
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return f"{name} [{'percent' if unit == '%' else unit}]"  # marks separate words of names
 
 
 def _unnamed(body: str, names: str) -> str:
@@ -495,16 +456,12 @@ def _unnamed(body: str, names: str) -> str:
     return re.sub(rf"^{re.escape(names)}$", "", body, flags=re.MULTILINE)
 
 
-def _cells(body: str, shape: _Shape, trailing: int) -> str:
+def _cells(body: str, shape: _Shape) -> str:
     """Rows with commas between cells and points in numbers."""
     body = re.sub(r"^[ \t]*(?:%|//|!).*$", "", body, flags=re.MULTILINE)
     quoted = '"' in body and (shape.separator != "," or shape.comma)
-    if (
-        quoted
-        or shape.units
-        or shape.hexed
-        or (shape.separator != "," and "," in body and not shape.comma)
-    ):
+    commas = shape.separator != "," and "," in body and not shape.comma
+    if quoted or commas or shape.units or shape.hexed:
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         for line in body.split("\n"):
@@ -512,14 +469,8 @@ def _cells(body: str, shape: _Shape, trailing: int) -> str:
                 out.write(f"{line}\n")
                 continue
             cells = _split(line, shape.separator)
-            for k in shape.units:
-                if k < len(cells) and (found := _WITH_UNIT.fullmatch(cells[k])):
-                    cells[k] = found[1]
-            for k, turn in shape.hexed.items():
-                if k < len(cells) and (found := _HEX_CELL.fullmatch(cells[k])):
-                    number = int(found[1], 16)
-                    cells[k] = str(number - turn if turn and 2 * number >= turn else number)
-            writer.writerow([c.replace(",", ".") if _number(c, shape.comma) else c for c in cells])
+            numerals = (_numeral(c, k, shape) for k, c in enumerate(cells))
+            writer.writerow([c if n is None else n for c, n in zip(cells, numerals, strict=True)])
         body = out.getvalue().removesuffix("\n")
     elif shape.separator != ",":
         if shape.comma:
@@ -529,8 +480,6 @@ def _cells(body: str, shape: _Shape, trailing: int) -> str:
             body = re.sub(r"[ \t]+", ",", body)
         else:
             body = body.replace(shape.separator, ",")
-    for _ in range(trailing):
-        body = re.sub(r",[ \t]*$", "", body, flags=re.MULTILINE)
     return body
 
 
@@ -560,7 +509,7 @@ def _labelled(
         again = f"_{names[:k].count(name) + 1}" if names.count(name) > 1 else ""
         units = {pairs[k][2] for pairs in alike}
         unit = units.pop() if len(units) == 1 else None
-        columns.append(f"{name}{again} [{_WORD_OF.get(unit, unit)}]" if unit else f"{name}{again}")
+        columns.append(_with_unit(f"{name}{again}", unit) if unit else f"{name}{again}")
     ahead = [float(m[1]) for line in sample if (m := _AHEAD.match(line))]
     steps = {b - a for a, b in pairwise(ahead)}
     timed = len(ahead) == len(sample) and min(steps) >= 0 and not steps <= {0, 1}
@@ -624,10 +573,6 @@ def _sizes(row: str, separator: str) -> list[str]:
     return [cell if cell[:1] == "@" else "" for cell in _split(row, separator)]
 
 
-def _distinct(names: Sequence[str]) -> bool:
-    return all(names) and len(set(names)) == len(names)
-
-
 def _sentence(notes: Sequence[str]) -> list[str]:
     return [f"read as a table: {'; '.join(notes)}."] if notes else []
 
@@ -646,12 +591,8 @@ def _split(line: str, separator: str) -> list[str]:
 
 def _number(cell: str, comma: bool) -> bool:
     """Whether a cell of a table of numbers is one, empty, or a time of day."""
-    if comma and _COMMA_NUMBER.fullmatch(cell):
-        return True
-    try:
-        decimal(cell)
-    except ValueError:
-        return not cell or is_clock(cell)
+    if not is_decimal(cell):
+        return not cell or is_clock(cell) or bool(comma and _COMMA_NUMBER.fullmatch(cell))
     return not (comma and "." in cell)
 
 
@@ -664,39 +605,38 @@ def _wordy(line: str, shape: _Shape) -> bool:
     return all(cell and not _number(cell, shape.comma) for cell, number in numeric if number)
 
 
+def _numeral(cell: str, k: int, shape: _Shape) -> str | None:
+    """The number in a cell of column `k` as a decimal numeral; None if it holds none."""
+    if k in shape.units and (found := _WITH_UNIT.fullmatch(cell)):
+        cell = found[1]
+    elif k in shape.hexed and (found := _HEX_CELL.fullmatch(cell)):
+        number, turn = int(found[1], 16), shape.hexed[k]
+        return str(number - turn if turn and 2 * number >= turn else number)
+    return cell.replace(",", ".") if _number(cell, shape.comma) else None
+
+
 def _is_row(line: str, shape: _Shape, whole: bool = False) -> bool:
     """Whether a line is a row of the table rather than its names, units or a remark.
 
     Of a whole row all cells are numbers where the others' are, rather than most of them.
     """
     cells = _split(line, shape.separator)
-    if len(cells) != shape.columns or any(
-        c and not _number(c, shape.comma)
-        for c, none in zip(cells, shape.blank, strict=True)
-        if none
-    ):
+    if len(cells) != shape.columns:
         return False
-    full = [(k, c) for k, c in enumerate(cells) if shape.numeric[k] and c]
-    numbers = [
-        c for k, c in full
-        if _number(c, shape.comma) or (k in shape.units and _WITH_UNIT.fullmatch(c))
-        or (k in shape.hexed and _HEX_CELL.fullmatch(c))
-    ]  # fmt: skip
-    return len(numbers) > (len(full) - 1 if whole else len(full) / 2)
+    full = [(k, c) for k, c in enumerate(cells) if c]
+    if any(shape.blank[k] and not _number(c, shape.comma) for k, c in full):
+        return False
+    numbers = [_numeral(c, k, shape) is not None for k, c in full if shape.numeric[k]]
+    return sum(numbers) > (len(numbers) - 1 if whole else len(numbers) / 2)
 
 
 def _names(line: str, shape: _Shape) -> list[str] | None:
     """Names of the columns in a line, whose separators may differ from those of the rows."""
     tied = re.sub(r"\s+(?=[(\[])", "_", line.strip())  # time (s): a name and its unit
     ways = [_split(line, shape.separator), _split(tied, shape.separator)]
-    ways += [
-        re.split(r"\s{2,}|\t", line.strip()),
-        _split(line, ","),
-        _split(line, ";"),
-        tied.split(),
-    ]
-    if _REMARK.match(line.split(maxsplit=1)[0]) and shape.separator != " ":
-        ways = ways[:2]
+    if not _REMARK.match(line.split(maxsplit=1)[0]) or shape.separator == " ":
+        spaced = re.split(r"\s{2,}|\t", line.strip())
+        ways += [spaced, _split(line, ","), _split(line, ";"), tied.split()]
     for cells in ways:
         if len(cells) == shape.columns - 1 and not shape.numeric[-1]:
             cells = [*cells, ""]
@@ -706,7 +646,7 @@ def _names(line: str, shape: _Shape) -> list[str] | None:
             cells = ["row" if shape.counted else "time_of_day", *cells]
         if shape.clocked and is_clock(cells[0]):  # a monitor's, before the names
             cells[0] = "time_of_day"
-        if len(cells) == shape.columns and not any(_is_decimal(c) for c in cells if c):
+        if len(cells) == shape.columns and not any(is_decimal(c) for c in cells if c):
             return cells
     return ways[0] if len(ways[0]) > 1 else None
 
@@ -756,19 +696,6 @@ def _once(columns: list[str], rows: list[list[str]]) -> list[str]:
     return names
 
 
-def _is_decimal(cell: str) -> bool:
-    try:
-        decimal(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _usual(text: str) -> float:
-    """Share of printable ASCII characters and line ends."""
-    return sum(32 <= ord(c) < 127 or c in "\t\r\n" for c in text) / max(len(text), 1)
-
-
 _HIGH = re.compile(rb"[\x80-\xff]+")
 _BINARY = {
     b"MATLAB 7.3": ("a MATLAB file of version 7.3", "save it again with save(name, '-v7')"),
@@ -803,6 +730,8 @@ def decoded(path: object, data: bytes) -> str:
             text = data.decode(coding).rstrip("\0")
         except ValueError:
             continue
-        if "\0" not in text and (coding == "utf-8-sig" or _usual(text[:_SAMPLE]) > _USUAL):
+        usual = sum(32 <= ord(c) < 127 or c in "\t\r\n" for c in text[:_SAMPLE])
+        enough = coding == "utf-8-sig" or usual > _USUAL * max(len(text[:_SAMPLE]), 1)
+        if "\0" not in text and enough:
             return text
     raise InputError(f"{path} is not a text file. Give the log as it was written.")

@@ -20,7 +20,7 @@ from pupper_sysid.sysid.recordings.importers.options import (
     LogOptions,
     likely_of_pair,
 )
-from pupper_sysid.sysid.recordings.importers.tables import import_line
+from pupper_sysid.sysid.recordings.importers.refusals import import_line
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT
 
 _LEAST_ROWS = 20

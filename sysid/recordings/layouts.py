@@ -25,16 +25,11 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
+from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS, Table
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.tables import (
-    Table,
-    read_table,
-    spread,
-    unknown_numbers,
-)
+from pupper_sysid.sysid.recordings.importers.refusals import unknown_columns, unknown_numbers
+from pupper_sysid.sysid.recordings.importers.tables import read_table, spread
 from pupper_sysid.sysid.recordings.importers.times import PAUSE_S, READ_AFTER_SEND_S
-from pupper_sysid.sysid.recordings.importers.unknown import unknown_columns
 from pupper_sysid.sysid.recordings.table import REQUIRED_COLUMNS, Parsed, require
 
 SWEEP = ("time_s", "freq_hz", "motor_idx", "command_rad", "actual_rad")

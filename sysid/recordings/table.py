@@ -26,9 +26,9 @@ from pupper_sysid.common.reading.csv_table import (
 )
 from pupper_sysid.common.reading.dialect import plain
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.columns import column, time_columns
+from pupper_sysid.sysid.recordings.importers.columns import column, has_time, time_columns
 from pupper_sysid.sysid.recordings.importers.options import LARGEST_RAD, LogOptions
-from pupper_sysid.sysid.recordings.importers.tables import LABELS, has_time, is_flag
+from pupper_sysid.sysid.recordings.importers.tables import LABELS, is_flag
 from pupper_sysid.sysid.recordings.importers.times import rate_in, tick_in, units_in
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 

@@ -25,17 +25,17 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_bomb, refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS, distinct
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.columns import time_columns
-from pupper_sysid.sysid.recordings.importers.log import LARGEST_BYTES, MOST_JOINTS, Log
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.tables import (
+from pupper_sysid.sysid.recordings.importers.columns import has_time, time_columns
+from pupper_sysid.sysid.recordings.importers.log import (
+    LARGEST_BYTES,
+    MOST_JOINTS,
+    Log,
     Table,
     expanded,
-    has_time,
-    missing,
-    read_numbered,
-    read_table,
 )
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.refusals import missing
+from pupper_sysid.sysid.recordings.importers.tables import read_numbered, read_table
 from pupper_sysid.sysid.recordings.importers.times import stated_rate, units_in
 
 ZIP, NPY, MAT = b"PK\x03\x04", b"\x93NUMPY", b"MATLAB 5.0"

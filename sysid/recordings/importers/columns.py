@@ -95,6 +95,11 @@ TIMES = ("time", "timestamp", "t", "stamp", "time_since_start", "ts", "elapsed",
          "uhrzeit", "hora", "heure")  # fmt: skip
 """Names of times, the likeliest first."""
 
+TIMER = re.compile(r"ticks?|timer|cycles?|counter", re.IGNORECASE)
+"""Names of times in ticks, where the log says how long one is."""
+TIME_STEP = re.compile(r"(d_?t|delta_?t(ime)?|time_?(step|delta))([_ (\[].*)?", re.IGNORECASE)
+"""Names of times between rows."""
+
 _UNIT_RANK = {
     "rad": 0,
     "": 1,
@@ -297,6 +302,13 @@ def time_columns(names: Sequence[str]) -> list[str]:
         elif lower[:3] == ["time", "since", "start"] or name.lower() == "x_value":  # LabVIEW's
             found.append(((False, 4, 3), name))
     return [name for _, name in sorted(found, key=lambda pair: pair[0])]
+
+
+def has_time(names: Sequence[str]) -> bool:
+    """Whether one of these columns is a time."""
+    return any(column(n).kind == "time" or TIME_STEP.fullmatch(n) for n in names) or bool(
+        time_columns(names)
+    )
 
 
 _TIME_UNITS = ("s", "sec", "secs", "ms", "us", "µs", "ns", "millis", "micros", "nanos", "nsec")

@@ -37,22 +37,21 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
 from pupper_sysid.common.reading.dialect import decimal
-from pupper_sysid.sysid.recordings.importers.columns import column
+from pupper_sysid.sysid.recordings.importers.columns import column, has_time
 from pupper_sysid.sysid.recordings.importers.log import (
     MOST_JOINTS,
     Log,
+    expanded,
     joint_names,
     number,
     numbers,
     rows,
 )
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.refusals import missing
 from pupper_sysid.sysid.recordings.importers.tables import (
     GROUPS,
     SERIES,
-    expanded,
-    has_time,
-    missing,
     read_numbered,
     read_table,
 )

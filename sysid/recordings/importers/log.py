@@ -1,11 +1,16 @@
-"""What importers share: the `Log` that each returns, names, numbers, budgets, held commands."""
+"""What importers share: the `Log` that each returns, the `Table` that most make first, and names.
+
+Each reader of tables (text, JSON, parquet, arrays) makes a `Table`, columns by name, and
+`importers.tables` makes rows of it.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
-from pupper_sysid.common.reading.csv_table import distinct
+from pupper_sysid.common.reading.csv_table import distinct, one_each
 from pupper_sysid.common.strict_yaml import printable
 
 LARGEST_BYTES = 500e6
@@ -26,6 +31,126 @@ MOST_TRIALS = 50_000
 MOST_JOINTS = 200
 
 _ENDINGS = re.compile(r"[._/](pos|position)$", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of a log."""
+
+    columns: Mapping[str, NDArray[np.float64]]
+    """Of numbers, equally long; shape (rows,)."""
+    texts: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """Columns that hold text."""
+    faults: Mapping[str, str] = field(default_factory=dict)
+    """Why a column is no numbers, as a sentence."""
+    widths: Mapping[str, int] = field(default_factory=dict)
+    """Arrays with a column per joint, and how many; their columns are `<array>.<joint>`."""
+    joint_names: tuple[str, int] | None = None
+    """What names those joints, and how many."""
+    numbered: str = ""
+    """Why the columns have no names but their numbers, as a clause; empty if they have."""
+    notes: Sequence[str] = ()
+    """What was assumed, in sentences."""
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+    """Entries of the log's header."""
+    rate: float | None = None
+    """Rows a second that the log states beside its columns."""
+    tick_s: float | None = None
+    """Of its times, as the log states beside its columns."""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Units of angles that the log states beside its columns; of the name "" those of all."""
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Names of all columns."""
+        return list(dict.fromkeys([*self.columns, *self.texts, *self.faults]))
+
+    def numbers(self, path: Path | str, name: str) -> NDArray[np.float64]:
+        """Finite or missing numbers of a column."""
+        shown = printable(name)[:60]
+        if name not in self.columns:
+            fault = f"{path}, column {shown}: its values are not numbers."
+            raise InputError(self.faults.get(name, fault))
+        values = np.asarray(self.columns[name], float)
+        if np.isinf(values).any():
+            raise InputError(f"{path}, column {shown}: a value is infinite.")
+        return values
+
+    def known(self, name: str) -> NDArray[np.float64]:
+        """The numbers of a column that are not missing; two zeros if it has none."""
+        values = self.columns.get(name, np.zeros(0))
+        values = values[np.isfinite(values)]
+        return values if len(values) else np.zeros(2)
+
+    @cached_property
+    def moving(self) -> list[str]:
+        """Columns whose numbers are not all the same, and those of text."""
+        return [n for n in self.names if n not in self.columns or np.ptp(self.known(n)) > 0]
+
+    def first(self, names: Sequence[str]) -> str | None:
+        """The first of these names, in any case, that a column of numbers has."""
+        return next((self._lower[n] for n in names if n in self._lower), None)
+
+    def stated_unit(self, name: str) -> str:
+        """The unit that the log states for a column beside it; empty for none."""
+        return self.units.get(name, self.units.get("", ""))
+
+    @cached_property
+    def _lower(self) -> dict[str, str]:
+        return {n.lower(): n for n in self.columns}
+
+    @property
+    def increasing(self) -> list[str]:
+        """Columns whose numbers never decrease, and are not all the same, nor count named rows."""
+        steps = {n: np.diff(v[np.isfinite(v)]) for n, v in self.columns.items()}
+        return [n for n, s in steps.items() if (s >= 0).all() and (s > 0).any()
+                and (self.numbered or not (s == 1).all())]  # fmt: skip
+
+    def taken(self, order: NDArray[np.int64]) -> Table:
+        """The table with its rows in another order."""
+        columns = {name: np.asarray(values)[order] for name, values in self.columns.items()}
+        texts = {name: [cells[k] for k in order] for name, cells in self.texts.items()}
+        return replace(self, columns=columns, texts=texts)
+
+    def check_joints(self, path: Path | str, columns: Iterable[str]) -> None:
+        """Refuse arrays, of which these are columns, with other numbers of joints than names."""
+        used = {key: n for key, n in self.widths.items()
+                if any(column.startswith(f"{key}.") for column in columns)}  # fmt: skip
+        if used:
+            counts = used | dict([self.joint_names] if self.joint_names else [])
+            one_each(path, counts, "Mend the log, or name the joints to read with `joints`.")
+
+
+def expanded(
+    path: Path | str,
+    arrays: Mapping[str, NDArray[np.float64]],
+    names: Sequence[str],
+    named: str | None = None,
+) -> Table:
+    """Table of arrays of which some have a number per joint: `action` becomes `action.<name>`.
+
+    `path`: for messages. `arrays` of shape (rows,) or (rows. `names`: of the joints; arrays of
+    another width get `joint_0`, `joint_1` and so on. `named`: what in the log holds these names;
+    None if it does not name its joints.
+    """
+    distinct(path if named is None else f"{path}, {named}", names, "joints")
+    lengths = [len(values) for values in arrays.values()]
+    rows = max(set(lengths), key=lengths.count, default=0)
+    columns, faults, widths = {}, {}, {}
+    for key, values in arrays.items():
+        parts = {key: values}
+        if values.ndim == 2:
+            width = min(values.shape[1], 10_000)
+            own = names if len(names) == width else [f"joint_{k}" for k in range(width)]
+            parts = {f"{key}.{own[k]}": values[:, k] for k in range(width)}
+            widths[key] = width
+        if len(values) == rows:
+            columns |= parts
+        else:
+            text = f"{path}: {key} has {len(values)} rows where others have {rows}. Mend the log."
+            faults |= dict.fromkeys(parts, text)
+    distinct(path, [*columns, *faults])
+    return Table(columns, {}, faults, widths, None if named is None else (named, len(names)))
 
 
 @dataclass(frozen=True)

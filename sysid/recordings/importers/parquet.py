@@ -23,18 +23,15 @@ from pupper_sysid.common.reading.csv_table import (
     distinct,
 )
 from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.columns import has_time
 from pupper_sysid.sysid.recordings.importers.log import (
     LARGEST_BYTES,
     MOST_JOINTS,
     Log,
+    expanded,
 )
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.tables import (
-    LABELS,
-    expanded,
-    has_time,
-    read_table,
-)
+from pupper_sysid.sysid.recordings.importers.tables import LABELS, read_table
 
 LAYOUT = "parquet table"
 MAGIC = b"PAR1"

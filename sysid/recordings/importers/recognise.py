@@ -24,7 +24,7 @@ from pupper_sysid.sysid.recordings.importers import (
 )
 from pupper_sysid.sysid.recordings.importers.log import Log, joint_names
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.unknown import unknown_folder, unknown_json
+from pupper_sysid.sysid.recordings.importers.refusals import unknown_folder, unknown_json
 
 _ENDINGS = (".csv", ".tsv", ".json", ".jsonl", ".mcap", ".db3", ".npz", ".parquet", ".pt", ".mat")
 _PACKED = (".gz", ".bz2", ".xz")

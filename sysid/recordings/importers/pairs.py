@@ -1,0 +1,244 @@
+"""Which columns of a table are the command and the position of which joint: `pairs`.
+
+By the words of their names (`importers.columns`), or as options name them. Of several columns the
+better ones are taken; where none is better the refusal prints the command line that takes each.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.csv_table import distinct
+from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.columns import Column, column, columns_of
+from pupper_sysid.sysid.recordings.importers.log import Table, bare_name
+from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.refusals import (
+    import_line,
+    lines_by_value,
+    listed,
+    missing,
+    rate_note,
+)
+
+SOLE = "joint"
+"""The joint of a log that names none."""
+_MOST_CHOICES = 4  # that a message lists
+_COMPARED = 8  # columns for one purpose
+_OF_TURNS = {
+    "ODrive": {"setpoint", "estimate"},
+    "ODrive's API": {"input", "estimate"},
+    "moteus": {"servo_stats.position"},
+    "moteus's decoder": {"command_position", "q_current"},
+    "moteus's registers": {"Register.POSITION"},
+    "moteus's telemetry": {"control_position", "q_current"},
+}
+"""Programs that count turns and do not say so, and what gives their logs away: columns, or words of
+the command's and the position's."""
+_DRIVES = re.compile(r"axis\d|odrv|moteus|servo_stats|Register\.|q_current|(^|[_.])iq(_|$)|"
+                     r"input_pos|vel_(estimate|setpoint)", re.IGNORECASE)  # fmt: skip
+"""Names that only those programs have: with one of them the angles are turns without doubt."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Columns of one joint's command and position."""
+
+    command: Column
+    position: Column
+
+    def cost(self, used: Mapping[str, int]) -> tuple[int, ...]:
+        """Order of pairs for one joint, the better ones first."""
+        c, p = self.command, self.position
+        units = {c.unit or "rad", p.unit or "rad"}
+        return (
+            c.rank[0] + p.rank[0], c.rank[1] + p.rank[1], int(len(units) > 1),
+            c.rank[2] + p.rank[2], p.rank[3], -used[c.template] - used[p.template],
+        )  # fmt: skip
+
+    def as_sure(self, other: Pair) -> bool:
+        """Whether words and marks of both pairs tell as much."""
+        return all(
+            own.rank[:2] == theirs.rank[:2]
+            for own, theirs in ((self.command, other.command), (self.position, other.position))
+        )
+
+
+def pairs(path: Path | str, table: Table, options: LogOptions) -> tuple[dict[str, Pair], list[str]]:
+    """Columns by joint, as the log names it, and what was assumed."""
+    if options.command and options.position:
+        found, notes = _stated(path, table, options), []
+    else:
+        found, notes = _by_words(path, table, options)
+    if not options.joints:
+        used = [c.name for pair in found.values() for c in (pair.command, pair.position)]
+        table.check_joints(path, used)
+    return found, notes
+
+
+def _by_words(
+    path: Path | str, table: Table, options: LogOptions
+) -> tuple[dict[str, Pair], list[str]]:
+    every = columns_of(name for name in table.names if name not in table.texts)
+    commands, positions = ([c for c in every if c.kind == k] for k in ("command", "position"))
+    placed = {c.key for c in positions}
+    keys = [key for key in dict.fromkeys(c.key for c in commands) if key in placed]
+    if not keys:
+        return _lone(path, table, commands, positions)
+    used = Counter(c.template for c in every)
+    of_drive = any(map(_DRIVES.search, table.names))
+    found: list[Pair] = []
+    notes: dict[str, str] = {}  # one of a kind
+    for key in keys:
+        ranked = [
+            sorted((c for c in own if c.key == key), key=lambda c: (c.rank, -used[c.template]))
+            for own in (commands, positions)
+        ]
+        choices = product(*(own[:_COMPARED] for own in ranked))
+        best = sorted((Pair(*pair) for pair in choices), key=lambda pair: pair.cost(used))
+        pair = _decided(path, table, best, used)
+        both = f"{pair.command.name} and {pair.position.name}"
+        if sum(map(pair.as_sure, best)) > 1:
+            notes.setdefault(
+                "choice",
+                f"of several columns {pair.command.name} was taken for the command and "
+                f"{pair.position.name} for the position. To take others, name them with "
+                "`command` and `position`.",
+            )
+        given_away = {*table.names} | pair.command.words | pair.position.words
+        program = next((p for p, marks in _OF_TURNS.items() if marks <= given_away), "")
+        if program and not (pair.command.unit or pair.position.unit or options.unit):
+            taken, other = ("turns", "rad") if of_drive else ("rad", "turns")
+            notes.setdefault(
+                program,
+                f"{both} are names of {program}, which counts turns; the values were taken as "
+                f"{taken}. If they are {other}, give `unit='{other}'`; lag and dead time are the "
+                "same.",
+            )
+            if of_drive:
+                pair = Pair(*(replace(c, unit="turns") for c in (pair.command, pair.position)))
+        found.append(pair)
+    # a joint is called as both columns have it, else without further words
+    joints = [min(pair.command.joint, pair.position.joint, key=len) for pair in found]
+    names = [bare_name(j or p.command.key) or SOLE for j, p in zip(joints, found, strict=True)]
+    distinct(path, names, "joints")
+    return dict(zip(names, found, strict=True)), [*notes.values()]
+
+
+def _decided(path: Path | str, table: Table, best: Sequence[Pair], used: Mapping[str, int]) -> Pair:
+    """The first of the best pairs of a joint; refused where another is as good, of other values."""
+    first = best[0]
+    alike = [pair for pair in best if pair.cost(used) == first.cost(used)]
+    for kind in ("command", "position"):
+        own = getattr(first, kind)
+        twice = {getattr(pair, kind).name for pair in best
+                 if pair.cost(used)[:4] == first.cost(used)[:4]
+                 and getattr(pair, kind).words == own.words}  # fmt: skip
+        distinct(path, [bare_name(own.joint or SOLE)] * len(twice), "joints")
+        values = [table.columns.get(n) for n in dict.fromkeys(getattr(p, kind).name for p in alike)]
+        if any(v is None or values[0] is None or not np.array_equal(v, values[0], equal_nan=True)
+               for v in values[1:]):  # fmt: skip
+            why = f"{len(values)} columns may be the {kind} of {own.joint or 'the joint'}"
+            _refuse_choices(path, why, alike)
+    return first
+
+
+def _lone(
+    path: Path | str, table: Table, commands: Sequence[Column], positions: Sequence[Column]
+) -> tuple[dict[str, Pair], list[str]]:
+    """The pair of a table in which no joint has both by name: the only command and position."""
+    table_of = [c.name for c in (*commands, *positions)]
+    if not commands or not positions:
+        table.check_joints(path, table_of)
+        lines = lines_by_value(path, table)
+        note = rate_note(lines[0], table) if lines else ""
+        which = f" Say which is which: {'; or '.join(lines)}{note}." if lines else ""
+        raise InputError(f"{path}: {missing(table.names)}; it has {listed(table.names)}.{which}")
+    first = [
+        [c for c in own if c.rank[:3] == min(c.rank for c in own)[:3]]
+        for own in (commands, positions)
+    ]
+    choices = [Pair(*pair) for pair in product(*first)]
+    if len(choices) > 1:
+        table.check_joints(path, [c.name for own in first for c in own])
+        if len(first[0]) == len(first[1]):  # one line for all
+            joined = [",".join(c.name for c in own) for own in first]
+            choices = [Pair(*(replace(own[0], name=names, template=names)
+                              for own, names in zip(first, joined, strict=True)))]  # fmt: skip
+        _refuse_choices(path, "no joint has both a command and a position by its name", choices)
+    (pair,) = choices
+    name = bare_name(pair.command.joint or pair.position.joint or SOLE)
+    return {name: pair}, [
+        f"{pair.command.name} and {pair.position.name} were taken for the command and the position "
+        "of one joint."
+    ]
+
+
+def _refuse_choices(path: Path | str, why: str, choices: Sequence[Pair]) -> None:
+    """Refuse to choose, with the command line that takes each pair."""
+    lines = list(dict.fromkeys(  # templates are of several joints
+        import_line(path, command=pair.command.template, position=pair.position.template)
+        for pair in choices
+    ))  # fmt: skip
+    more = "" if len(lines) <= _MOST_CHOICES else f" (and {len(lines) - _MOST_CHOICES} more)"
+    raise InputError(f"{path}: {why}. Take one: {'; or '.join(lines[:_MOST_CHOICES])}{more}.")
+
+
+def _stated(path: Path | str, table: Table, options: LogOptions) -> dict[str, Pair]:
+    """Columns that the options name."""
+    matched = []
+    for option in ("command", "position"):
+        text = str(getattr(options, option))
+        if "{joint}" not in text and text not in table.names:
+            found = {str(k): column_named(path, table, option, name.strip())
+                     for k, name in enumerate(text.split(","))}  # fmt: skip
+        else:
+            before, stated, after = text.partition("{joint}")
+            middle = "(?P<joint>.+)" if stated else ""
+            pattern = re.compile(f"{re.escape(before)}{middle}{re.escape(after)}")
+            fits = [m for name in table.names if (m := pattern.fullmatch(name[:200]))]
+            joints = [bare_name(m.groupdict().get("joint") or "0") for m in fits]
+            distinct(path, joints, "joints")
+            found = dict(zip(joints, (m[0] for m in fits), strict=True))
+        if not found:
+            raise InputError(
+                f"{path}: `{option}` is {printable(text)}, which fits no column; it has "
+                f"{listed(table.names)}."
+            )
+        matched.append(found)
+    commands, positions = matched
+    named = "{joint}" in str(options.command)
+    names = both = [joint for joint in commands if joint in positions]
+    if not both or (not named and len(commands) != len(positions)):
+        raise InputError(
+            f"{path}: no joint has both a column of `command` and one of `position`; it has "
+            f"{listed(table.names)}."
+        )
+    if not named:
+        names = [SOLE] if len(both) == 1 else [f"joint_{k}" for k in both]
+        names = [*options.joints] if len(options.joints) == len(both) else names
+    return {
+        name: Pair(column(commands[joint]), column(positions[joint]))
+        for name, joint in zip(names, both, strict=True)
+    }
+
+
+def column_named(path: Path | str, table: Table, option: str, name: str) -> str:
+    """The column of this name, or of this number from 0."""
+    if name in table.names:
+        return name
+    if name.isascii() and name.isdigit() and int(name[:9]) < len(table.names):
+        return table.names[int(name)]
+    hint = " ({joint} stands for a joint's name)" if option in ("command", "position") else ""
+    raise InputError(
+        f"{path}: `{option}` is {printable(name)[:60]}, but there is no such column{hint}; it has "
+        f"{listed(table.names)}."
+    )

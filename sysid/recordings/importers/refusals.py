@@ -1,0 +1,263 @@
+"""Why a log is not read, and the `import` lines with which it is.
+
+A line takes columns by their names where these say enough, else those whose values go together as a
+command and its position do.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+import shlex
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations, product
+from pathlib import Path
+
+import numpy as np
+
+from pupper_sysid.common.reading.dialect import is_clock
+from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.columns import (
+    TIMER,
+    column,
+    columns_of,
+    has_time,
+    time_columns,
+)
+from pupper_sysid.sysid.recordings.importers.log import Table
+from pupper_sysid.sysid.recordings.importers.options import LARGEST_RAD, likely_of_pair
+
+LAYOUTS = {
+    "recording of this project": (
+        "send_time_s", "read_time_s", "trial", "joint", "frequency_hz", "command_rad",
+        "position_rad",
+    ),
+    "Mini Pupper sweep": (
+        "time_s", "freq_hz", "motor_idx", "signal", "command_rad", "actual_rad",
+    ),
+    "Mini Pupper playback": ("time_s", "loop", "LF_hip_command_rad", "LF_hip_position_rad"),
+}  # fmt: skip
+"""Tables of text with names of their own."""
+FILES = (
+    "SAGE folder (control.csv, state_motor.csv, joint_list.txt); LeRobot dataset (folder with "
+    "meta/info.json and data/**/*.parquet); rosbag2 folder or MCAP file (JointState, and commands "
+    "as JointTrajectory, Float64MultiArray or JointState); BAM or K-Scale JSON "
+    "(entries[].timestamp, position, goal_position); ktune JSON (data[].time_since_start, "
+    "position, commanded_position); NumPy .npz or parquet with the columns of a table"
+)
+"""Layouts other than tables of text."""
+_IMU = {"gx", "gy", "gz", "ax", "ay", "az"}
+_CURRENT = re.compile(r"cur(r|rent)?(?![A-Za-z])", re.IGNORECASE)
+_WIDEST_ANGLE = 1e6  # of a joint, in any unit
+_COMPARED, _ALIKE = 12, 0.7  # columns; concordance of a command and its position
+_ORDERED = 100_000  # rows
+
+
+def import_line(path: Path | str, **options: str) -> str:
+    """The command that imports a log with these options."""
+    words = [f"pupper-sysid import {shlex.quote(str(path))}"]
+    for name, value in (options | {"out": "rec.csv"}).items():
+        words.append(f"--{name.replace('_', '-')} {shlex.quote(printable(value)) if value else ''}")
+    return f"`{' '.join(map(str.rstrip, words))}`"
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names for a message."""
+    return printable(", ".join(map(str, names)))[:300]
+
+
+def missing(names: Sequence[str]) -> str:
+    """What a table lacks to be a servo's log; empty if a joint may have command and position."""
+    kinds = {c.kind for c in columns_of(names)}
+    if {"command", "position"} <= kinds:
+        return ""
+    if "command" in kinds:
+        return "no column is a position (knee_position, observation.state.knee, present …)"
+    if "position" in kinds:
+        return "no column is a command (knee_command, action.knee, goal …)"
+    return "no column is a command or a position"
+
+
+def unknown_numbers(path: Path | str, table: Table) -> str:
+    """Why a table whose columns have no names cannot be read, and how it can."""
+    ranges = []
+    for name, values in list(table.columns.items())[:12]:
+        if np.isfinite(values).any():
+            up = ", increasing" if name in table.increasing else ""
+            ranges.append(f"{name} ({np.nanmin(values):.4g} … {np.nanmax(values):.4g}{up})")
+    text = f"{table.numbered}. By their numbers, from 0, they are {'; '.join(ranges)}. "
+    if lines := lines_by_value(path, table):
+        note = rate_note(lines[0], table)
+        return f"{text}Say which is which: {', '.join(lines)}, or others{note}."
+    return f"{text}A log has a column of commands and one of positions, which these are not."
+
+
+def unknown_columns(path: Path | str, table: Table, timed: bool = False) -> str:
+    """Why a table has no known layout; empty where it may have one.
+
+    Layouts that share columns with it are listed with those that it lacks. `timed` tables have
+    their times from elsewhere.
+    """
+    names = table.names
+    lacks = [text] if (text := missing(names)) else []
+    timer = table.tick_s is not None and any(map(TIMER.search, names))
+    timed = timed or table.rate is not None or timer or has_time(names)
+    if not lacks and timed:
+        return ""
+    if {n.lower() for n in names} >= _IMU and text.startswith("no column"):
+        return (
+            "it holds an IMU's readings (gx … az), and no commands and positions of joints, so "
+            "nothing of a servo can be measured with it. Give a log of commands and positions."
+        )
+    lacks += [] if timed else ["no column is a time (time, timestamp, t …)"]
+    parts = [f"any table: {' and '.join(lacks)}"]
+    for layout, columns in LAYOUTS.items():
+        if {*names} & {*columns}:
+            parts.append(f"{layout}: {', '.join(c for c in columns if c not in names)} missing")
+    lines = _lines_by_name(path, table, timed)
+    rest = "" if lines else f" Other layouts: {FILES}."
+    ours = [n for n in LAYOUTS["recording of this project"] if n not in names]
+    near = ((n, hit) for n in names for hit in difflib.get_close_matches(n, ours, 1, 0.8))
+    hint = next((f"Was '{printable(n)[:40]}' meant as {hit}? Rename it. " for n, hit in near), "")
+    return (
+        f"its columns ({listed(names)}) belong to no known layout. {'; '.join(parts)}. "
+        f"{hint}Name the columns{lines} with `pupper-sysid import` --time (or --rate, the "
+        f"rows a second), --command and --position.{rest}"
+    )
+
+
+def _lines_by_name(path: Path | str, table: Table, timed: bool) -> str:
+    """Command lines that take columns whose names say nothing for what is missing."""
+    columns = columns_of(table.names)
+    times = time_columns(table.names)[:1]
+    times = times or [n for n in table.increasing if column(n).kind != "position"][:1]
+    if not times and (len(columns) > 2 or timed):  # of another event
+        still = [n for n in table.columns if np.ptp(table.known(n)) == 0]
+        times = [c.name for c in columns if c.kind in ("time", "unknown") and c.name not in still]
+    when = {"time": times[0]} if times else {"rate": f"{table.rate or 50:g}"}
+    of_number = {c.name: re.sub(r"\d+", "{joint}", c.name, count=1) for c in columns}
+    several = {each for each, n in Counter(of_number.values()).items() if n > 1}
+    by_kind = []
+    for kind in ("command", "position"):
+        sure = [c for c in columns if c.kind == kind]
+        if kind == "command" and not sure:  # qd beside q may be the desired angle
+            sure = [c for c in columns if c.name[-1:] == "d" and c.name[:-1] in table.names]
+        if kind == "position" and not sure:  # beside a command a bare `current` may be a place
+            sure = [c for c in columns if not c.kind and _CURRENT.search(c.name)]
+        chosen = [c.template for c in sure]
+        for others in ("unknown", "time"):
+            chosen = chosen or [
+                of_number[c.name] if of_number[c.name] in several else c.template
+                for c in columns if c.kind == others and c.name not in times[:1]
+            ]  # fmt: skip
+        by_kind.append(chosen)
+    lines = [
+        import_line(path, **when, **_unit_of(table, pair), command=pair[0], position=pair[1])
+        for pair in product(*by_kind)
+        if pair[0] != pair[1]
+    ]
+    text = "; or ".join(list(dict.fromkeys(lines or lines_by_value(path, table)))[:3])
+    return f" ({text}{rate_note(when, table)})" if text else ""
+
+
+def lines_by_value(path: Path | str, table: Table) -> list[str]:
+    """Commands that import the columns that go together as a command and its position do."""
+    clocks = [n for n, cells in table.texts.items() if is_clock(cells[0])]
+    rising = table.increasing
+    named = sorted(time_columns(table.names)[:2], key=lambda n: n not in (*rising, *clocks))
+    time = next(iter([*named[:1], *rising, *clocks]), "")
+    others: list[str] = []  # that move, each once
+    for name, values in table.columns.items():
+        known = table.known(name)
+        same = (np.array_equal(values, table.columns[o], equal_nan=True) for o in others)
+        if name == time or np.ptp(known) == 0 or any(same):
+            continue
+        if np.ptp(known) < _WIDEST_ANGLE:
+            others.append(name)
+        elif (known % 1 == 0).all() and known.min() >= 0 and known.max() < 1e9 and "," not in time:
+            time = f"{time},{name}"  # nanoseconds
+    if len(others) < 2:
+        return []
+    ranked = sorted(
+        (_likeness(table, p) for p in combinations(others[:_COMPARED], 2)), reverse=True
+    )
+    pairs: list[list[str]] = []
+    for likeness, pair in ranked:
+        if likeness > _ALIKE and not {*pair} & {name for other in pairs for name in other}:
+            pairs.append(pair)
+    pairs = pairs or [_likeness(table, others[:2])[1]]
+    first, second = pairs[0]
+    every = (",".join(names) for names in zip(*sorted(pairs), strict=True))
+    choices = dict.fromkeys([tuple(every), (first, second), (second, first), (first, others[-1])])
+    rate = 50 if table.rate is None else table.rate
+    how = {"time": time} if time else {"rate": f"{rate:g}"}
+    how |= _unit_of(table, pairs[0])
+    return [import_line(path, **how, command=c, position=p) for c, p in choices if c != p]
+
+
+def _unit_of(table: Table, names: Iterable[str]) -> dict[str, str]:
+    """The option for a command and a position whose values, in radians, are no angles of a joint.
+
+    `names` may hold `{joint}`.
+    """
+    pair = []
+    for name in names:
+        pattern = re.escape(name).replace(re.escape("{joint}"), ".+")
+        own = next((n for n in table.columns if re.fullmatch(pattern, n)), name.split(",")[0])
+        if column(own).unit:
+            return {}
+        pair.append(table.known(own))
+    largest = max(float(np.abs(values).max()) for values in pair)
+    return {"unit": likely_of_pair(*pair)[0]} if largest > LARGEST_RAD else {}
+
+
+def rate_note(line: str | Mapping[str, str], table: Table) -> str:
+    """What to put in place of a rate that a command line takes for example."""
+    example = "rate" in line and table.rate is None
+    return ", with your rows a second in place of 50: the lag scales with them" if example else ""
+
+
+def _likeness(table: Table, pair: Sequence[str]) -> tuple[float, list[str]]:
+    """How alike two columns are, and the pair, first the one that the other follows.
+
+    Lin's coefficient of concordance at the best lag: 1 for equal columns; an offset counts, another
+    scale, too.
+    """
+    values = [table.columns[name][:_ORDERED] for name in pair]
+    if not all(np.isfinite(table.columns[name]).all() for name in pair):
+        return 0.0, [*pair]
+    first, second = (v - np.mean(v) for v in values)
+    product_at = np.fft.irfft(np.fft.rfft(second, 2 * len(second)).conj()
+                              * np.fft.rfft(first, 2 * len(first)))  # fmt: skip
+    best = int(np.argmax(np.abs(product_at)))
+    apart = len(first) * float(np.mean(values[0]) - np.mean(values[1])) ** 2
+    total = float(first @ first + second @ second) + apart
+    likeness = 2 * float(np.abs(product_at[best])) / max(total, 1e-300)
+    return likeness, [*pair][::-1] if 0 < best < len(first) else [*pair]
+
+
+def unknown_json(keys: Iterable[str]) -> str:
+    """Why JSON has no known layout."""
+    own = set(map(str, keys))
+    return (
+        f"it is JSON of no known layout; it has {listed(sorted(own)) or 'no keys'}. BAM or "
+        f"K-Scale: {_lack(own, 'entries')}; ktune: {_lack(own, 'config', 'data')}. Other "
+        f"layouts: {FILES}; a table as CSV."
+    )
+
+
+def unknown_folder(names: Iterable[str]) -> str:
+    """Why a folder has no known layout."""
+    own = set(names)
+    return (
+        f"it is a folder without a log: it has {listed(sorted(own)[:20]) or 'nothing'}. SAGE: "
+        f"{_lack(own, 'control.csv', 'state_motor.csv', 'joint_list.txt')}; LeRobot: "
+        f"{_lack(own, 'meta', 'data')}; rosbag2: {_lack(own, 'metadata.yaml')}. Give a log's file "
+        "or folder."
+    )
+
+
+def _lack(own: set[str], *wanted: str) -> str:
+    lacking = [name for name in wanted if name not in own]
+    return f"{', '.join(lacking)} missing" if lacking else "not as expected inside"
