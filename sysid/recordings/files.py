@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -23,7 +24,7 @@ from pupper_sysid.common.files import SyncedText, versions
 from pupper_sysid.common.reading.content import unpacked
 from pupper_sysid.common.reading.dialect import decoded
 from pupper_sysid.sysid.recordings.check import check
-from pupper_sysid.sysid.recordings.importers.log import LARGEST_BYTES, Log
+from pupper_sysid.sysid.recordings.importers.log import LARGEST_BYTES
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.recognise import read_content, read_folder
 from pupper_sysid.sysid.recordings.layouts import convert
@@ -72,34 +73,24 @@ def load(path: Path | str, options: LogOptions | None = None) -> Recording:
         )
     path, options = Path(path), options or LogOptions()
     refuse_other_kind(path, RECORDING)
-    if path.is_dir():
-        return _imported(path, read_folder(path, options), options)
     if path.name.endswith(".truth.csv"):
         raise InputError(
             f"{path} holds the true values of {path.name.removesuffix('.truth.csv')}.csv, "
             "not a recording; load that file instead."
         )
-    data = read_bytes(path)
-    content = unpacked(path, data, LARGEST_BYTES)
-    log = read_content(path, content, options)
-    if log is not None:
-        return _imported(path, log, options)
-    parsed = parse(path, decoded(path, content), options)
-    table, metadata, warnings = convert(path, parsed, options)
-    check_metadata(path, metadata)
-    table, more = check(path, table, metadata, options)
-    digest = hashlib.sha256(data).hexdigest()
-    found = [*parsed.warnings, *warnings, *more]
-    return Recording(table, metadata, plain_stem(path), path, digest, tuple(found))
-
-
-def _imported(path: Path, log: Log, options: LogOptions) -> Recording:
-    """The recording of another project's log, checked like any other."""
+    if path.is_dir():
+        log = read_folder(path, options)
+    else:
+        data = read_bytes(path)
+        content = unpacked(path, data, LARGEST_BYTES)
+        log = read_content(path, content, options) or replace(
+            convert(path, parse(path, decoded(path, content), options), options),
+            sha256=hashlib.sha256(data).hexdigest(),
+        )
     check_metadata(path, log.metadata)
     table, more = check(path, log.table, log.metadata, options)
-    return Recording(
-        table, log.metadata, plain_stem(path), path, log.sha256, tuple([*log.warnings, *more])
-    )
+    warnings = (*log.warnings, *more)
+    return Recording(table, log.metadata, plain_stem(path), path, log.sha256, warnings)
 
 
 def plain_stem(path: Path) -> str:

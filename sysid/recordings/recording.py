@@ -30,6 +30,7 @@ from pupper_sysid.common.joints import DEFAULT_POSE, in_order
 from pupper_sysid.common.reading.csv_table import distinct
 from pupper_sysid.hardware.joint_map import PRESETS, load_joint_map
 from pupper_sysid.sysid.recordings.check import check
+from pupper_sysid.sysid.recordings.importers.log import Table
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.times import READ_AFTER_SEND_S, doubt_of_a_turn
 from pupper_sysid.sysid.recordings.layouts import convert
@@ -40,7 +41,6 @@ from pupper_sysid.sysid.recordings.table import (
     SCHEMA_VERSION,
     TEXT_COLUMNS,
     TITLE,
-    Parsed,
     check_metadata,
     comment,
     comments,
@@ -280,29 +280,28 @@ class Recording:
         given: dict[str, Any] = {"imported_from": "a table in memory"} | dict(metadata or {})
         check_metadata(name, given)
         distinct(name, map(str, table.columns))
-        table = table.copy()
-        table.columns = [str(column) for column in table.columns]
-        timed = "read_time_s" in table
-        if "send_time_s" in table:
-            if "read_time_s" not in table:
-                after = given.get("read_after_send_s")
-                table["read_time_s"] = table["send_time_s"] + (
-                    READ_AFTER_SEND_S if after is None else after
-                )
-            for column, value in (("trial", 0), ("frequency_hz", np.nan)):
-                table[column] = table.get(column, value)
+        columns = {str(column): table[column] for column in table}
+        timed = "read_time_s" in columns
+        after = given.get("read_after_send_s")
+        if "send_time_s" in columns:
+            rest = {"trial": 0, "frequency_hz": np.nan}
+            columns = {c: pd.Series(v, table.index) for c, v in rest.items()} | columns
         faults: dict[str, str] = {}
-        strict = "send_time_s" in table or "motor_idx" in table
-        for column in table.columns.difference(TEXT_COLUMNS):
+        texts: dict[str, list[str]] = {}
+        numbers: dict[str, NDArray[np.float64]] = {}
+        strict = "send_time_s" in columns or "motor_idx" in columns
+        for column, cells in columns.items():
+            if column in TEXT_COLUMNS and not pd.api.types.is_numeric_dtype(cells):
+                texts[column] = [str(v) for v in cells.to_numpy(object)]
+                continue
             try:
-                table[column] = table[column].astype(float)
+                values = cells.astype(float).to_numpy(float)
             except (TypeError, ValueError):
                 fault = f"{name}, column {column}: its values are not numbers."
                 if strict:
                     raise InputError(fault) from None
-                faults[str(column)] = fault
+                faults[column] = fault
                 continue
-            values = table[column].to_numpy(float)
             if column in ("send_time_s", "read_time_s") and np.isnan(values).any():
                 row = int(np.flatnonzero(np.isnan(values))[0])
                 raise InputError(
@@ -311,8 +310,13 @@ class Recording:
                 )
             if np.isinf(values).any():
                 raise InputError(f"{name}, column {column}: a value is infinite.")
-        tidy, known, warnings = convert(name, Parsed(given, table, faults=faults), options)
-        if "send_time_s" in table and not timed and given.get("read_after_send_s") is None:
+            numbers[column] = values
+        if "send_time_s" in numbers and not timed:
+            apart = READ_AFTER_SEND_S if after is None else after
+            numbers["read_time_s"] = numbers["send_time_s"] + apart
+        log = convert(name, Table(numbers, texts, faults, metadata=given), options)
+        tidy, known, warnings = log.table, log.metadata, log.warnings
+        if "send_time_s" in columns and not timed and after is None:
             given["read_after_send_s"] = READ_AFTER_SEND_S
             first = tidy["joint"] == tidy["joint"].iloc[0] if len(tidy) else slice(0)
             doubt, text = doubt_of_a_turn(tidy.loc[first, "send_time_s"].to_numpy(float))
@@ -320,8 +324,9 @@ class Recording:
             warnings = [
                 *warnings,
                 text.split(" If you know")[0]
-                + (" If you know, pass `read_time_s`, or `read_after_send_s` in `metadata`."),
+                + " If you know, pass `read_time_s`, or `read_after_send_s` in `metadata`.",
             ]
+            known = known | given
         others = tidy.columns.difference(REQUIRED_COLUMNS, sort=False)
         tidy = tidy.reindex(columns=[*REQUIRED_COLUMNS, *others])
         tidy, more = check(name, tidy, given | known)

@@ -6,12 +6,10 @@ import difflib
 import json
 import re
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import pandas as pd
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from pupper_sysid.common.border import parse_json, refuse_other_version, validated
@@ -27,6 +25,7 @@ from pupper_sysid.common.reading.csv_table import (
 from pupper_sysid.common.reading.dialect import plain
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.columns import column, has_time, time_columns
+from pupper_sysid.sysid.recordings.importers.log import Table
 from pupper_sysid.sysid.recordings.importers.options import LARGEST_RAD, LogOptions
 from pupper_sysid.sysid.recordings.importers.tables import LABELS, is_flag
 from pupper_sysid.sysid.recordings.importers.times import rate_in, tick_in, units_in
@@ -91,28 +90,7 @@ class Header(BaseModel):
     loads: dict[str, PendulumLoad] = {}
 
 
-@dataclass(frozen=True)
-class Parsed:
-    """Header and table of a file of yet unknown layout."""
-
-    metadata: dict[str, Any]
-    table: pd.DataFrame
-    """Numbers, but for the columns of text; empty cells are NaN."""
-    warnings: list[str] = field(default_factory=list)
-    faults: dict[str, str] = field(default_factory=dict)
-    """Columns of other projects' logs that are not in the table, for they hold text, and the
-    sentence on the first such cell."""
-    numbered: str = ""
-    """Why the columns have their numbers as names, as a clause; empty if they have others."""
-    rate: float | None = None
-    """Rows a second by the lines above the table."""
-    units: dict[str, str] = field(default_factory=dict)
-    """Units of angles by the same, by column, or by "" for all."""
-    tick_s: float | None = None
-    """Unit of times by the same."""
-
-
-def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
+def parse(path: Path, text: str, options: LogOptions | None = None) -> Table:
     """Cells of a table of text (`common.reading.dialect`) with a comment header, as numbers.
 
     Raises InputError for ragged rows, text where a number belongs, a broken or newer header, or
@@ -156,17 +134,20 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Parsed:
         warnings.append("it was not recorded to its end; what is there is used.")
     if not len(found):
         raise InputError(f"{path} has column names but no rows. Record it again.")
-    data: dict[str, Any] = {}
-    for name in columns:
-        if name in found.texts:
-            data[name] = _numbered(path, name, found)
-        elif name in found.numbers:
-            data[name] = found.numbers[name]
-    table, head = pd.DataFrame(data), text[:_HEAD]
-    return Parsed(
-        metadata, table if keep.all() else table.loc[keep], warnings, found.faults, opened.numbered,
-        rate_in(head.split("\n")), units_in(head, columns), tick_in(head),
+    numbers, texts = dict(found.numbers), dict(found.texts)
+    for name in [name for name in texts if name not in TEXT_COLUMNS]:
+        with suppress(InputError):  # where a column of joints numbers them
+            numbers[name] = numbers_of(path, name, texts[name], found.line)
+            del texts[name]
+    if "" in texts:
+        texts["time"] = texts.pop("")
+    head = text[:_HEAD]
+    table = Table(
+        {name: numbers[name] for name in columns if name in numbers}, texts, found.faults,
+        numbered=opened.numbered, notes=warnings, metadata=metadata,
+        rate=rate_in(head.split("\n")), tick_s=tick_in(head), units=units_in(head, columns),
     )  # fmt: skip
+    return table if keep.all() else table.taken(np.flatnonzero(keep))
 
 
 def _refuse_other_names(path: Path, text: str, columns: list[str], broken: list[int]) -> None:
@@ -198,15 +179,16 @@ def _may_be_text(name: str, options: LogOptions) -> bool:
     )  # fmt: skip
 
 
-def require(path: Path | str, table: pd.DataFrame, columns: tuple[str, ...]) -> None:
+def require(path: Path | str, table: Table, columns: tuple[str, ...]) -> None:
     """Refuse a table that lacks columns; the message names them and similar names."""
-    lacking = [c for c in columns if c not in table.columns]
+    names = [n for n in table.names if n not in table.faults]
+    lacking = [c for c in columns if c not in names]
     if not lacking:
         return
-    spare = [str(c) for c in table.columns if c not in columns]
+    spare = [n for n in names if n not in columns]
     near = difflib.get_close_matches(lacking[0], spare, n=1, cutoff=0.5)
     hint = f" Was '{printable(near[0])}' meant? Rename it." if near else ""
-    present = printable(", ".join(map(str, table.columns)))
+    present = printable(", ".join(names))
     raise InputError(
         f"{path}: column {', '.join(lacking)} is missing; it has {present}.{hint} "
         f"A recording needs {', '.join(columns)}."
@@ -297,12 +279,3 @@ def _cancelled(
         if len(own):
             cancelled.append((trial, slice(own[0], own[-1] + 1)))
     return cancelled
-
-
-def _numbered(path: Path, name: str, found: CsvTable) -> Any:
-    """A column of text; as numbers where a column of joints numbers them."""
-    cells = found.texts[name]
-    if name not in TEXT_COLUMNS:
-        with suppress(InputError):
-            return numbers_of(path, name, cells, found.line)
-    return cells

@@ -137,11 +137,11 @@ def resume_point(path: Path, plan: Plan, period_s: float) -> Resume:
     whole = text[: text.rfind("\n") + 1]
     if sum(bool(line.strip()) and line[0] != "#" for line in whole.splitlines()) < 2:
         return Resume(0, 0, 0.0, written_at)
-    table = parse(path, whole).table
-    last = float(np.nanmax(table[["send_time_s", "read_time_s"]].to_numpy()))
+    columns = parse(path, whole).columns
+    last = float(np.nanmax([columns["send_time_s"], columns["read_time_s"]]))
     rows = 0
     for number, trial in enumerate(plan.trials):
-        times = table["send_time_s"].to_numpy()[table["trial"].to_numpy() == number]
+        times = columns["send_time_s"][columns["trial"] == number]
         if (
             not len(times)
             or np.nanmax(times) - np.nanmin(times) < trial.duration_s - 2.5 * period_s

@@ -320,7 +320,7 @@ def test_radians_of_a_telemetry_with_ticks_are_taken_and_labels_number_its_trial
 
 def test_readings_go_before_models_and_names_in_the_last_comment_of_savetxt_are_read():
     path = case("real/c13_command_real_and_models.csv")
-    table, _, _ = convert(path, parse(path, path.read_text()))
+    table = convert(path, parse(path, path.read_text())).table
     raw = pd.read_csv(path)
     np.testing.assert_allclose(table["command_rad"], raw["goal_position_rad"])
     np.testing.assert_allclose(table["position_rad"], raw["real_position_rad"])
