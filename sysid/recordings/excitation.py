@@ -212,23 +212,7 @@ def _part(trial: Trial, tone: Segment, end: int) -> Trial:
         # motion between two tones is of neither: only the rest right before this one is kept
         constant = np.flatnonzero(np.diff(trial.command_rad[first : tone.first]) != 0)
         first = first + int(constant[-1]) + 1 if len(constant) else first
-    rows = slice(first, tone.stop)
-    return _rows(trial, rows, tone.frequency_hz)
-
-
-def _rows(trial: Trial, rows: slice, frequency_hz: float) -> Trial:
-    columns = {
-        name: value[rows]
-        for name in (
-            "send_time_s", "read_time_s", "command_rad", "position_rad", "position_count",
-            "torque_enabled", "voltage_v",
-        )
-        if (value := getattr(trial, name)) is not None
-    }  # fmt: skip
-    before = trial.initial_command_rad if rows.start == 0 else trial.command_rad[rows.start - 1]
-    return replace(
-        trial, **columns, initial_command_rad=float(before), frequency_hz=float(frequency_hz)
-    )
+    return replace(trial.rows(first, tone.stop), frequency_hz=float(tone.frequency_hz))
 
 
 def _other(trial: Trial, first: int, stop: int) -> Segment:
@@ -300,79 +284,91 @@ def _tones(time: NDArray[np.float64], command: NDArray[np.float64]) -> list[Segm
     return [] if _is_chirp(found, time) else found
 
 
+@dataclass(frozen=True)
+class _Sine:
+    """The sine that some rows of a command are."""
+
+    clock: NDArray
+    command: NDArray
+    frequency: float
+    solution: NDArray
+    amplitude: float
+
+    @classmethod
+    def of(
+        cls, clock: NDArray, command: NDArray, first: int, stop: int, frequency: float
+    ) -> _Sine | None:
+        """The sine of about this frequency; None if the rows are none."""
+        every = max(1, (stop - first) // _MOST_ROWS)
+        t, value = clock[first:stop:every], command[first:stop:every]
+        if len(t) < 6:
+            return None
+        frequency, solution, left = _sine_fit(t, value, frequency)
+        amplitude = float(np.hypot(solution[1], solution[2]))
+        if not amplitude > _SMALLEST_RAD or left > _IMPURE * amplitude**2 / 2:
+            return None
+        return cls(clock, command, frequency, solution, amplitude)
+
+    def residual(self, first: int, stop: int) -> NDArray[np.float64]:
+        """Command minus sine."""
+        phase = 2 * np.pi * self.frequency * self.clock[first:stop]
+        return self.command[first:stop] - sine_design(phase) @ self.solution
+
+    def away(self, first: int, stop: int) -> NDArray[np.int64]:
+        """Rows at which the command is away from the sine."""
+        apart = np.abs(self.residual(first, stop)) > _AWAY * self.amplitude
+        return first + np.flatnonzero(apart)
+
+
 def _grown(time: NDArray, command: NDArray, first: int, last: int, end: int) -> Segment | None:
     """The tone that the rows from `first` to `last` are part of; None if they are of none."""
     clock = time - time[first]
-    frequency = _SEED / 2 / float(clock[last])
-    fit = _sine(clock, command, first, last + 1, frequency)
+    fit = _Sine.of(clock, command, first, last + 1, _SEED / 2 / float(clock[last]))
     if fit is None:
         return None
     left = 0  # how often the command left the sine: a frequency that is not exact yet, or its end
     while left < _TIMES_LEFT:
-        frequency, solution, amplitude = fit
         # as far as one doubles the stretch: there the frequency's error shows as a phase
         reach = min(last + max(last - first, 8), len(time) - 1)
-        later = _keeps(clock, command, last + 1, reach + 1, frequency, solution, amplitude)
+        wrong = fit.away(last + 1, reach + 1)
+        later = int(wrong[0]) if len(wrong) else reach + 1
         if later == last + 1:
             break
-        longer = _sine(clock, command, first, later, frequency)
+        longer = _Sine.of(clock, command, first, later, fit.frequency)
         if longer is None:
             break
         left += later <= reach
         last, fit = later - 1, longer
-    frequency, solution, amplitude = fit
     while first > end:
         reach = max(end, first - max(last - first, 8))
-        wrong = _away(clock, command, reach, first, frequency, solution, amplitude)
-        earlier = reach + int(np.flatnonzero(wrong)[-1]) + 1 if wrong.any() else reach
+        wrong = fit.away(reach, first)
+        earlier = int(wrong[-1]) + 1 if len(wrong) else reach
         if earlier == first:
             break
         first = earlier
     # the first rows of what follows may be close to the sine by chance
-    rest = np.abs(_residual(clock, command, first, last + 1, frequency, solution))
-    close = rest <= max(_CLOSE * amplitude, 4 * float(np.sqrt(np.mean(rest**2))))
+    rest = np.abs(fit.residual(first, last + 1))
+    close = rest <= max(_CLOSE * fit.amplitude, 4 * float(np.sqrt(np.mean(rest**2))))
     first, last = first + int(np.argmax(close)), last - int(np.argmax(close[::-1]))
-    fit = _sine(clock, command, first, last + 1, frequency)
-    if fit is None or clock[last] - clock[first] < _LEAST_PERIODS / frequency:
+    fit = _Sine.of(clock, command, first, last + 1, fit.frequency)
+    if fit is None or clock[last] - clock[first] < _LEAST_PERIODS / fit.frequency:
         return None
-    frequency = fit[0]
+    frequency = fit.frequency
     middle = (first + last) // 2
-    parts = [_sine(clock, command, a, b, frequency) for a, b in ((first, middle), (middle, last))]
-    if None not in parts:
-        halves = [part[0] for part in parts if part is not None]
-        allowed = _CHIRP + 0.1 * _period_rows(clock, frequency)
-        if abs(halves[0] - halves[1]) > allowed * frequency:
-            return None
+    halves = [
+        part.frequency
+        for a, b in ((first, middle), (middle, last))
+        if (part := _Sine.of(clock, command, a, b, frequency)) is not None
+    ]
+    coarse = float(np.median(np.diff(clock)) * frequency) ** 2  # a row's share of a period, squared
+    if np.ptp(halves or [0.0]) > (_CHIRP + 0.1 * coarse) * frequency:
+        return None
+    # the motion before a steady tone, after a rest or another tone, is its soft start
+    still = np.flatnonzero(np.diff(command[end : first + 1]) == 0)
+    begin = end + int(still[-1]) + 1 if len(still) else first
     longest = max(_SOFT * float(clock[last] - clock[first]), 1.0 / frequency)
-    begin = _soft_start(command, first, end)
     begin = begin if clock[first] - clock[begin] <= longest else first
     return Segment("tone", begin, last + 1, frequency)
-
-
-def _period_rows(clock: NDArray, frequency: float) -> float:
-    """Share of a tone's period that a row takes, squared: how coarsely it is sampled."""
-    return float(np.median(np.diff(clock)) * frequency) ** 2
-
-
-def _soft_start(command: NDArray, first: int, end: int) -> int:
-    """The row at which the motion before a steady tone began, after a rest or another tone."""
-    moved = np.flatnonzero(np.diff(command[end : first + 1]) == 0)
-    return end + int(moved[-1]) + 1 if len(moved) else first
-
-
-def _sine(
-    clock: NDArray, command: NDArray, first: int, stop: int, frequency: float
-) -> tuple[float, NDArray, float] | None:
-    """Frequency, coefficients and amplitude of a sine; None if the rows are no sine."""
-    every = max(1, (stop - first) // _MOST_ROWS)
-    t, value = clock[first:stop:every], command[first:stop:every]
-    if len(t) < 6:
-        return None
-    frequency, solution, left = _sine_fit(t, value, frequency)
-    amplitude = float(np.hypot(solution[1], solution[2]))
-    if not amplitude > _SMALLEST_RAD or left > _IMPURE * amplitude**2 / 2:
-        return None
-    return frequency, solution, amplitude
 
 
 def _sine_fit(
@@ -402,41 +398,16 @@ def _solved(design: NDArray[np.float64], value: NDArray[np.float64]) -> NDArray[
     return np.asarray(np.linalg.solve(regular, design.T @ value), np.float64)
 
 
-def _away(
-    clock: NDArray, command: NDArray, first: int, stop: int, frequency: float, solution: NDArray,
-    amplitude: float,
-) -> NDArray[np.bool_]:  # fmt: skip
-    """Rows at which the command is away from the sine."""
-    return np.abs(_residual(clock, command, first, stop, frequency, solution)) > _AWAY * amplitude
-
-
-def _residual(
-    clock: NDArray, command: NDArray, first: int, stop: int, frequency: float, solution: NDArray
-) -> NDArray[np.float64]:
-    """Command minus sine."""
-    return command[first:stop] - sine_design(2 * np.pi * frequency * clock[first:stop]) @ solution
-
-
-def _keeps(
-    clock: NDArray, command: NDArray, first: int, stop: int, frequency: float, solution: NDArray,
-    amplitude: float,
-) -> int:  # fmt: skip
-    """The first row from `first` on that is away from the sine; `stop` if none is."""
-    if first >= stop:
-        return first
-    wrong = np.flatnonzero(_away(clock, command, first, stop, frequency, solution, amplitude))
-    return first + int(wrong[0]) if len(wrong) else stop
-
-
 def _joined(found: list[Segment], time: NDArray, command: NDArray) -> list[Segment]:
     """Neighbouring tones that are one sine, as one."""
     kept: list[Segment] = []
     for tone in found:
         if kept and abs(tone.frequency_hz - kept[-1].frequency_hz) < _SAME_HZ:
-            fit = _sine(time - time[kept[-1].first], command, kept[-1].first, tone.stop,
-                        tone.frequency_hz)  # fmt: skip
+            first = kept[-1].first
+            clock = time - time[first]
+            fit = _Sine.of(clock, command, first, tone.stop, tone.frequency_hz)
             if fit is not None:
-                kept[-1] = Segment("tone", kept[-1].first, tone.stop, fit[0])
+                kept[-1] = Segment("tone", first, tone.stop, fit.frequency)
                 continue
         kept.append(tone)
     return kept

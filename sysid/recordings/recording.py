@@ -120,16 +120,24 @@ class Trial:
             return self
         edges = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(int), [0]])))
         first, stop = max(edges.reshape(-1, 2).tolist(), key=np.diff, default=(0, 0))
-        rows = {
-            name: value[first:stop]
+        return self.rows(first, stop)
+
+    def rows(self, first: int, stop: int) -> Trial:
+        """The trial from row `first` to the one before `stop`."""
+        before = self.initial_command_rad if first == 0 else float(self.command_rad[first - 1])
+        return replace(self.at(slice(first, stop)), initial_command_rad=before)
+
+    def at(self, rows: slice | NDArray[np.int64]) -> Trial:
+        """These rows of the trial."""
+        columns = {
+            name: value[rows]
             for name in (
                 "send_time_s", "read_time_s", "command_rad", "position_rad", "position_count",
                 "torque_enabled", "voltage_v",
             )
             if (value := getattr(self, name)) is not None
         }  # fmt: skip
-        initial = self.initial_command_rad if first == 0 else float(self.command_rad[first - 1])
-        return replace(self, **rows, initial_command_rad=initial)
+        return replace(self, **columns)
 
 
 @dataclass(frozen=True)
@@ -512,15 +520,10 @@ def in_servo_coordinates(
 def _joined(calf: Trial, thigh: Trial, neutral: float) -> Trial:
     """The calf's trial in servo coordinates."""
     _, own, other = np.intersect1d(calf.send_time_s, thigh.send_time_s, return_indices=True)
-    count = calf.position_count
+    rows, beside = calf.at(own), thigh.at(other)
     return replace(
-        calf,
-        send_time_s=calf.send_time_s[own],
-        read_time_s=calf.read_time_s[own],
-        command_rad=calf.command_rad[own] + thigh.command_rad[other] - neutral,
-        position_rad=calf.position_rad[own] + thigh.position_rad[other] - neutral,
-        position_count=None if count is None else count[own],
-        torque_enabled=None if calf.torque_enabled is None else calf.torque_enabled[own],
-        voltage_v=None if calf.voltage_v is None else calf.voltage_v[own],
+        rows,
+        command_rad=rows.command_rad + beside.command_rad - neutral,
+        position_rad=rows.position_rad + beside.position_rad - neutral,
         initial_command_rad=calf.initial_command_rad + thigh.initial_command_rad - neutral,
     )
