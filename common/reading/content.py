@@ -40,10 +40,7 @@ _times: ContextVar[float] = ContextVar("read_limit", default=1.0)
 
 @contextmanager
 def reading_up_to(times: float) -> Iterator[None]:
-    """Within the block, read files up to `times` the usual limits.
-
-    `times`: 1 to 1000.
-    """
+    """Within the block, read files up to `times` (1 to 1000) the usual limits."""
     if not 1 <= times <= MOST_TIMES:
         raise InputError(
             f"`read_limit` is {times:g}; it must be a number from 1 (the usual limits) to "
@@ -69,24 +66,23 @@ def allowed(most: float) -> float:
 def refuse_more(
     name: Path | str, found: float, most: float, unit: str, remedy: str = "", exact: bool = True
 ) -> None:
-    """Refuse what is beyond a limit.
+    """Refuse what is beyond a limit: `found` of a `unit` such as "rows", where `most` are allowed.
 
-    `name`: the file, and the place in it where that helps. `found`: how much it has. `most`: the
-    limit, before it is raised. `unit`: such as "rows" or "bytes". `remedy`: what to do, as a
-    sentence. `exact`: whether `found` is all, rather than what was counted until the limit was
-    passed.
+    `name`: the file, and the place in it where that helps. `most`: before it is raised. `remedy`:
+    what to do, as a sentence. `exact`: whether `found` is all, rather than what was counted until
+    the limit was passed.
     """
     bound = allowed(most)
     if found <= bound:
         return
-    times = f"{min(max(math.ceil(found / most), 2), MOST_TIMES):.0f}" if exact else "10"
-    if read_limit() > 1 and not exact:
-        times = f"{min(10 * read_limit(), MOST_TIMES):.0f}"
+    times, most_text = 10 * read_limit(), _shown(bound, unit)
+    amount = f"more than {most_text}"
+    if exact:
+        times = max(math.ceil(found / most), 2)
+        amount = f"{_shown(found, unit)}; at most {most_text} are read"
     raise InputError(
-        f"{name} has {_shown(found, unit) if exact else f'more than {_shown(bound, unit)}'}"
-        f"{f'; at most {_shown(bound, unit)} are read' if exact else ''}. "
-        f"{f'{remedy} ' if remedy else ''}If it is meant to be so large, raise the limits of "
-        f"reading with `read_limit={times}`."
+        f"{name} has {amount}. {f'{remedy} ' if remedy else ''}If it is meant to be so large, "
+        f"raise the limits of reading with `read_limit={min(times, MOST_TIMES):.0f}`."
     )
 
 
@@ -120,11 +116,7 @@ def open_regular(path: Path | str, remedy: str = "") -> BufferedReader:
 
 
 def content(path: Path | str, most_bytes: float, remedy: str = "") -> bytes:
-    """Content of a regular file of limited size.
-
-    `most_bytes`: larger files are refused without being read; `budget.reading_up_to` raises it.
-    `remedy`: what to do, as a sentence.
-    """
+    """Content of a regular file of at most `most_bytes`; `remedy`: what to do, as a sentence."""
     try:
         with open_regular(path, remedy) as file:
             size = os.fstat(file.fileno()).st_size
@@ -152,10 +144,8 @@ _FOREIGN = {b"\x28\xb5\x2f\xfd": "zstd", b"7z\xbc\xaf\x27\x1c": "7-Zip", b"Rar!"
 def unpacked(path: Path | str, data: bytes, most_bytes: float) -> bytes:
     """Content of a file that is compressed by gzip, bzip2 or xz, or the one file in a zip archive.
 
-    Other content comes back as it is, also archives of arrays (`.npz`, `.pt`).
-
-    `path`: for messages. `data`: content of the file: its first bytes tell the compression, not its
-    name. `most_bytes`: content that is larger is refused; `budget.reading_up_to` raises it.
+    Other content comes back as it is, also archives of arrays (`.npz`, `.pt`). The first bytes tell
+    the compression, not the name. Content of more than `most_bytes` is refused.
     """
     kind = next((k for mark, k in _PACKED.items() if data.startswith(mark)), None)
     foreign = next((k for mark, k in _FOREIGN.items() if data.startswith(mark)), None)
@@ -243,10 +233,7 @@ def refuse_large_header(path: Path | str, data: bytes) -> None:
 
 
 def refuse_bomb(path: Path | str, data: bytes, remedy: str) -> None:
-    """Refuse a torch file that is no zip archive, or unpacks to more than a checkpoint has.
-
-    `path`: for the message. `data`: content of the file. `remedy`: what to do, as a sentence.
-    """
+    """Refuse a torch file that is no zip archive, or unpacks to more than a checkpoint has."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             inside = archive.infolist()

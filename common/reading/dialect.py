@@ -134,6 +134,9 @@ _BRACKETED = re.compile(
 _BRACKETS = re.compile(r"[\[\]()]")
 _HEX_CELL = re.compile(r"([0-9a-f]{2,8})(h?)", re.IGNORECASE)
 _DOUBLED = re.compile(r"([+-]?\d+),(\d+)(,|$)", re.MULTILINE)  # 0,1,0,2 of decimal commas
+_CELL = r"(?:^|(?<=[;\t])) ?{} ?(?=[;\t]|$)"  # of a table that commas do not separate
+_MARKED = re.compile(_CELL.format(r"([+-]?\d+)([.,])(\d+(?:[eE][+-]?\d+)?)"), re.MULTILINE)
+_NEGATIVE = re.compile(_CELL.format(r"\((\d+(?:[.,]\d+)?)\)"), re.MULTILINE)
 _TELEPLOT = re.compile(
     r"^>([\w./ \[\]-]+):(?:(\d+(?:\.\d+)?):)?([-+]?[\d.]+(?:e[-+]?\d+)?)(?:[§|].*)?$",
     re.IGNORECASE | re.MULTILINE,
@@ -183,14 +186,20 @@ def plain(text: str) -> Plain:
     if len(bare) < 3:
         return Plain(text)
     if (turned := _transposed(text)) is not None:
-        return replace(turned, notes=[*turned.notes, "its rows were taken for columns."])
+        return _noted(turned, "its rows were taken for columns.")
     rows = [lines[n] for n in bare[len(bare) // 2 :][:_ROWS]]
     if (usual := _usual_numbers(text, [*rows, *text[-2000:].split("\n")[1:-1]])) != text:
         return plain(usual)
     doubled = 2 * lines[bare[0]].count(",") + 1
     if all(row.count(",") == doubled and not _DOUBLED.sub("", row) for row in rows):
-        halved = plain(_DOUBLED.sub(r"\1.\2\3", text))
-        return replace(halved, notes=[*halved.notes, "its numbers have decimal commas."])
+        return _noted(plain(_DOUBLED.sub(r"\1.\2\3", text)), "its numbers have decimal commas.")
+    marks = [{m[2] for row in rows for m in _MARKED.finditer(row)}, *map(_MARKED.search, rows)]
+    if marks[0] == {",", "."} and all(marks):
+        return _noted(plain(_MARKED.sub(r"\1.\3", text)), "its numbers have decimal commas, too.")
+    negative = [_NEGATIVE.search(row) is not None for row in rows]
+    if any(negative) and not all(negative):
+        below = plain(_NEGATIVE.sub(r"-\1", text))
+        return _noted(below, "its numbers in parentheses are negative, as in accounts.")
     if all(_TELEPLOT.match(row) for row in rows):
         return _teleplot(text)
     if all(_NAMED_LIST.search(row) for row in rows):
@@ -211,6 +220,10 @@ def plain(text: str) -> Plain:
     if shape is None:
         return Plain(text)
     return _rewritten(text, lines, bare, shape)
+
+
+def _noted(table: Plain, note: str) -> Plain:
+    return replace(table, notes=[*table.notes, note])
 
 
 def _transposed(text: str) -> Plain | None:
@@ -309,13 +322,21 @@ def _units_of(
     cells: Sequence[Sequence[str]], shares: Sequence[float], comma: bool
 ) -> dict[int, str]:
     """Columns, of such shares of numbers, in which one unit stands behind each; and the unit."""
-    units = {}
-    for k, share in enumerate(shares):
-        matches = (_WITH_UNIT.fullmatch(row[k]) for row in cells if row[k])
-        words = {m[2] if m and _number(m[1], comma) else "" for m in matches}
-        if share < _NUMERIC and len(words) == 1 and "" not in words:
-            units[k] = words.pop()
-    return units
+    found = {k: unit_behind([row[k] for row in cells], comma)
+             for k, share in enumerate(shares) if share < _NUMERIC}  # fmt: skip
+    return {k: unit for k, unit in found.items() if unit}
+
+
+def unit_behind(cells: Sequence[str], comma: bool = False) -> str:
+    """The one unit that stands behind each number of these cells; empty for none."""
+    matches = (_WITH_UNIT.fullmatch(cell) for cell in cells if cell)
+    words = {m[2] if m and _number(m[1], comma) else "" for m in matches}
+    return words.pop() if len(words) == 1 else ""
+
+
+def with_unit(name: str, unit: str) -> str:
+    """The name of a column with its unit behind it."""
+    return f"{name} [{'percent' if unit == '%' else unit}]"  # marks separate words of names
 
 
 def _hexadecimal(cells: Sequence[Sequence[str]]) -> dict[int, int]:
@@ -419,7 +440,7 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
             columns, numbered = [columns[0].replace("0", "time"), "name", "value"], ""
     for k, word in [*enumerate(units), *shape.units.items()]:
         if k < len(columns) and word not in ("", "-", "1"):
-            columns[k] = _with_unit(columns[k], word)
+            columns[k] = with_unit(columns[k], word)
     if units:
         notes.append("a line beside the names was taken for their units")
     if (above := len(before) - (not numbered)) > 0:
@@ -445,10 +466,6 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
 
 def _distinct(names: Sequence[str]) -> bool:
     return all(names) and len({*names}) == len(names)
-
-
-def _with_unit(name: str, unit: str) -> str:
-    return f"{name} [{'percent' if unit == '%' else unit}]"  # marks separate words of names
 
 
 def _unnamed(body: str, names: str) -> str:
@@ -509,7 +526,7 @@ def _labelled(
         again = f"_{names[:k].count(name) + 1}" if names.count(name) > 1 else ""
         units = {pairs[k][2] for pairs in alike}
         unit = units.pop() if len(units) == 1 else None
-        columns.append(_with_unit(f"{name}{again}", unit) if unit else f"{name}{again}")
+        columns.append(with_unit(f"{name}{again}", unit) if unit else f"{name}{again}")
     ahead = [float(m[1]) for line in sample if (m := _AHEAD.match(line))]
     steps = {b - a for a, b in pairwise(ahead)}
     timed = len(ahead) == len(sample) and min(steps) >= 0 and not steps <= {0, 1}

@@ -19,6 +19,7 @@ from pupper_sysid.sysid.recordings.importers.options import (
     LARGEST_RAD,
     LogOptions,
     likely_of_pair,
+    unit,
 )
 from pupper_sysid.sysid.recordings.importers.refusals import import_line
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT
@@ -167,9 +168,12 @@ def _refuse_degrees(
     if of_position:
         word, other = (word, of_position) if kind == "command" else (of_position, word)
         beside = f" beside {_words(other)}"
+    factor = unit(word)
     text = (
         f"{path}, column {place}: values reach {largest:.4g}, more than a turn, which looks like "
-        f"{_words(word)}{beside}. Angles must be radians: multiply degrees by 0.0174533"
+        f"{_words(word)}{beside}. Angles must be radians: "
+        f"{f'take {factor.zero:g} off and ' if factor.zero else ''}"
+        f"multiply {_words(word).partition(' ')[0]} by {factor.scale:.6g}"
     )
     if not isinstance(path, Path):  # arrays in memory
         raise InputError(f"{text}.")

@@ -35,10 +35,9 @@ Found = TypeVar("Found")
 
 
 def remembered(most: int) -> Callable[[Callable[..., Found]], Callable[..., Found]]:
-    """Keep the last `most` results of a function of trials, by the content of the trials.
+    """Keep the last `most` results of a function of one or several trials, by their content.
 
-    The function takes a trial or a sequence of trials, and hashable arguments by position. Its
-    results are shared and must not be changed.
+    Further arguments are hashable and by position. Results are shared and must not be changed.
     """
 
     def decorate(compute: Callable[..., Found]) -> Callable[..., Found]:
@@ -62,14 +61,10 @@ def remembered(most: int) -> Callable[[Callable[..., Found]], Callable[..., Foun
 
 def _digest(trials: Sequence[Trial]) -> bytes:
     content = blake2b(digest_size=16)
-    for trial in trials:
-        for field in fields(trial):
-            value = getattr(trial, field.name)
-            if isinstance(value, np.ndarray):
-                content.update(np.ascontiguousarray(value).tobytes())
-            else:
-                content.update(repr(value).encode())
-            content.update(b"|")
+    for value in (getattr(trial, field.name) for trial in trials for field in fields(trial)):
+        array = isinstance(value, np.ndarray)
+        content.update(np.ascontiguousarray(value).tobytes() if array else repr(value).encode())
+        content.update(b"|")
     return content.digest()
 
 

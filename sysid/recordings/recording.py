@@ -299,16 +299,16 @@ class Recording:
         numbers: dict[str, NDArray[np.float64]] = {}
         strict = "send_time_s" in columns or "motor_idx" in columns
         for column, cells in columns.items():
-            if column in TEXT_COLUMNS and not pd.api.types.is_numeric_dtype(cells):
-                texts[column] = [str(v) for v in cells.to_numpy(object)]
-                continue
             try:
+                if column in TEXT_COLUMNS and not pd.api.types.is_numeric_dtype(cells):
+                    raise ValueError
                 values = cells.astype(float).to_numpy(float)
             except (TypeError, ValueError):
-                fault = f"{name}, column {column}: its values are not numbers."
-                if strict:
-                    raise InputError(fault) from None
-                faults[column] = fault
+                if column not in TEXT_COLUMNS:
+                    faults[column] = f"{name}, column {column}: its values are not numbers."
+                    if strict:
+                        raise InputError(faults[column]) from None
+                texts[column] = [str(v) for v in cells.to_numpy(object)]
                 continue
             if column in ("send_time_s", "read_time_s") and np.isnan(values).any():
                 row = int(np.flatnonzero(np.isnan(values))[0])

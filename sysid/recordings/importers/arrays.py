@@ -13,7 +13,7 @@ import io
 import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -50,10 +50,15 @@ def read_arrays(path: Path, data: bytes, options: LogOptions) -> Log:
         return _read_npy(path, data, options)
     if data.startswith(MAT):
         arrays, layout = _mat_arrays(path, data), "MATLAB file"
-    elif _is_torch(data):
-        arrays, layout = _torch_arrays(path, data), "torch file"
     else:
-        arrays, layout = _npz_arrays(path, data), "NumPy archive"
+        inside = _members(path, data)
+        if any(member.filename.endswith("/data.pkl") for member in inside):
+            arrays, layout = _torch_arrays(path, data), "torch file"
+        else:
+            size = sum(member.file_size for member in inside)
+            refuse_more(f"{path}, unpacked,", len(inside), MOST_COLUMNS, "arrays", "Split it.")
+            refuse_more(f"{path}, unpacked,", size, LARGEST_BYTES, "bytes", "Split it.")
+            arrays, layout = _loaded(path, data), "NumPy archive"
     named = next((k for k in _NAMES if k in arrays and arrays[k].dtype.kind in "US"), None)
     names = list(options.joints)
     if named is not None:
@@ -122,18 +127,13 @@ def _read_npy(path: Path, data: bytes, options: LogOptions) -> Log:
     return read_table(path, Table(columns), options, "NumPy array")
 
 
-def _npz_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
-    """The arrays of an archive."""
+def _members(path: Path, data: bytes) -> list[zipfile.ZipInfo]:
+    """What is in a zip archive, of NumPy or torch."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            inside = archive.infolist()
-        size = sum(member.file_size for member in inside)
-        refuse_more(f"{path}, unpacked,", len(inside), MOST_COLUMNS, "arrays", "Split it.")
-        refuse_more(f"{path}, unpacked,", size, LARGEST_BYTES, "bytes", "Split it.")
+            return archive.infolist()
     except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError) as error:
         raise InputError(_damaged(path)) from error
-    loaded = _loaded(path, data)
-    return {name: array for name, array in loaded.items() if isinstance(array, np.ndarray)}
 
 
 def _loaded(path: Path, data: bytes) -> Any:
@@ -144,7 +144,8 @@ def _loaded(path: Path, data: bytes) -> Any:
             return found
         with found:
             distinct(path, found.files, "arrays")
-            return {name: found[name] for name in found.files}
+            arrays = {name: found[name] for name in found.files}
+            return {name: a for name, a in arrays.items() if isinstance(a, np.ndarray)}
     except InputError:
         raise
     except Exception as error:  # damaged ones raise whatever zlib, zipfile and NumPy do
@@ -179,29 +180,26 @@ def _mat_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
         raise
     except Exception as error:  # damaged ones raise whatever zlib and scipy do
         raise InputError(f"{path} is a damaged MATLAB file. {remedy}") from error
-    arrays: dict[str, NDArray[Any]] = {}
-    pending = [(name, value, 0) for name, value in loaded.items() if name[:2] != "__"]
+    named = {name: value for name, value in loaded.items() if name[:2] != "__"}
+    return {name: value for name, value in _flat(path, named)
+            if isinstance(value, np.ndarray) and value.dtype.kind in "biufUS"}  # fmt: skip
+
+
+def _flat(path: Path, loaded: Mapping[Any, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the values in structures or dictionaries as `structure.field`."""
+    count, pending = 0, [(str(name)[:200], value, 0) for name, value in loaded.items()]
     while pending:
+        refuse_more(path, count + len(pending), MOST_COLUMNS, "arrays", exact=False)
         name, value, depth = pending.pop(0)
-        refuse_more(path, len(arrays) + len(pending), MOST_COLUMNS, "arrays", exact=False)
         if isinstance(value, Mapping) and depth < _DEEPEST:
             pending += [(f"{name}.{key}"[:200], inside, depth + 1) for key, inside in value.items()]
-        elif isinstance(value, np.ndarray) and value.dtype.kind in "biufUS":
-            arrays[name] = value
-    return arrays
+        else:
+            count += 1
+            yield name, value
 
 
 def _damaged(path: Path) -> str:
     return f"{path} is no NumPy archive, or is damaged. Save it again with numpy.savez."
-
-
-def _is_torch(data: bytes) -> bool:
-    """Whether a zip archive is one of torch."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            return any(n.endswith("/data.pkl") for n in archive.namelist()[:10_000])
-    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError):
-        return False
 
 
 def _torch_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
@@ -217,30 +215,19 @@ def _torch_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
         raise InputError(
             f"{path} is no torch file of tensors alone, or is damaged ({first}). {remedy}"
         ) from error
-    arrays: dict[str, NDArray[Any]] = {}
-
-    def take(prefix: str, value: Any, depth: int) -> None:
-        refuse_more(path, len(arrays), MOST_COLUMNS, "tensors", remedy, exact=False)
-        if isinstance(value, Mapping) and depth < _DEEPEST:
-            for key, inside in value.items():
-                take(f"{prefix}.{key}".strip(".")[:200], inside, depth + 1)
-        elif (
-            isinstance(value, torch.Tensor)
-            and not value.is_sparse
-            and value.layout == torch.strided
-        ):
-            refuse_more(f"{path}, {prefix}", value.numel(), MOST_CELLS, "values", remedy)
-            if not value.is_complex():
-                arrays[prefix] = value.detach().to(torch.float64).numpy()
-        elif isinstance(value, int | float):
-            arrays[prefix] = np.array(float(value))
-        elif isinstance(value, list | tuple) and 0 < len(value) <= MOST_CELLS:
-            if all(isinstance(v, str) for v in value[:MOST_JOINTS]):
-                arrays[prefix] = np.array([str(v)[:200] for v in value[: MOST_JOINTS + 1]])
-            elif all(isinstance(v, int | float) for v in value):
-                arrays[prefix] = np.array(value, float)
-
     if not isinstance(loaded, Mapping):
         raise InputError(f"{path} holds no tensors by name. {remedy}")
-    take("", loaded, 0)
+    arrays: dict[str, NDArray[Any]] = {}
+    for name, value in _flat(path, loaded):
+        if isinstance(value, torch.Tensor):
+            if value.layout == torch.strided and not value.is_complex():
+                refuse_more(f"{path}, {name}", value.numel(), MOST_CELLS, "values", remedy)
+                arrays[name] = value.detach().to(torch.float64).numpy()
+        elif isinstance(value, int | float):
+            arrays[name] = np.array(float(value))
+        elif isinstance(value, list | tuple) and 0 < len(value) <= MOST_CELLS:
+            if all(isinstance(v, str) for v in value[:MOST_JOINTS]):
+                arrays[name] = np.array([str(v)[:200] for v in value[: MOST_JOINTS + 1]])
+            elif all(isinstance(v, int | float) for v in value):
+                arrays[name] = np.array(value, float)
     return arrays

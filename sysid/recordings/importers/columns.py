@@ -46,6 +46,12 @@ UNITS: dict[str, str] = {
 """Words of units, and the unit as options write it; of counts and steps the log does not say how
 many make a turn."""
 
+SECONDS = {"ns": 1e-9, "nsec": 1e-9, "nanosec": 1e-9, "nsecs": 1e-9, "nanos": 1e-9, "us": 1e-6,
+           "µs": 1e-6, "usec": 1e-6, "micros": 1e-6, "ms": 1e-3, "millis": 1e-3, "s": 1.0,
+           "sec": 1.0, "secs": 1.0, "seconds": 1.0, "min": 60.0, "minutes": 60.0, "秒": 1.0,
+           "毫秒": 1e-3, "초": 1.0}  # fmt: skip
+"""Words of units of time, and how long they are."""
+
 WORDS: dict[str, str] = {
     word: kind
     for kind, words in (
@@ -100,16 +106,8 @@ TIMER = re.compile(r"ticks?|timer|cycles?|counter", re.IGNORECASE)
 TIME_STEP = re.compile(r"(d_?t|delta_?t(ime)?|time_?(step|delta))([_ (\[].*)?", re.IGNORECASE)
 """Names of times between rows."""
 
-_UNIT_RANK = {
-    "rad": 0,
-    "": 1,
-    "mrad": 2,
-    "deg": 3,
-    "turns": 4,
-    "counts": 5,
-    "steps": 5,
-    "percent": 6,
-}
+_UNIT_RANK = {"rad": 0, "": 1, "mrad": 2, "deg": 3, "turns": 4, "counts": 5, "steps": 5,
+              "percent": 6}  # fmt: skip
 _SEPARATORS = re.compile(r"[\s_./:\\\[\](){}<>$%#*,;|='\"（）［］【】：，-]+")
 _CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?(?:[^\W\dA-Z_]|°)+|\d+|[^\w°]+")
 _IN_UNIT = re.compile(r"\s+(?:in|en)\s+(?=\S+$)", re.IGNORECASE)  # Winkel in Grad
@@ -159,23 +157,23 @@ def _column(name: str) -> Column:
     known = [WORDS.get(p.lower(), "") for p in parts]
     kinds = set(known)
     lower = [p.lower() for p in parts]
+
+    def others(kind: str, words: Iterable[str]) -> None:
+        """Make these words of another kind."""
+        known[:] = [kind if w in words else k for w, k in zip(lower, known, strict=True)]
+        kinds.clear()
+        kinds.update(known)
+
     if "d" in lower and ANGLE in kinds and not kinds & {COMMAND, STATE, OTHER}:  # q_d, theta_d
         known[lower.index("d")] = COMMAND
         kinds.add(COMMAND)
     if kinds & {COMMAND, STATE, ANGLE}:  # a joint that is called y
-        known = ["" if w in _SOLE_LETTERS else k for w, k in zip(lower, known, strict=True)]
-        kinds = set(known)
+        others("", _SOLE_LETTERS)
     angle = ANGLE in kinds and (lower.count("p") == 0 or kinds & {COMMAND, STATE, UNIT}
                                 or "pos" in "".join(lower))  # fmt: skip
     long_angle = any(k == ANGLE and len(w) > 1 for w, k in zip(lower, known, strict=True))
-    if (long_angle or UNIT in kinds) and lower[-1:] != [
-        "current"
-    ]:  # current position, not a current of an axis
-        known = [
-            STATE if w in ("current", "curr", "cur") else k
-            for w, k in zip(lower, known, strict=True)
-        ]
-        kinds = set(known)
+    if (long_angle or UNIT in kinds) and lower[-1:] != ["current"]:  # not a current of an axis
+        others(STATE, ("current", "curr", "cur"))
     unit = next((UNITS[w] for w, k in zip(lower[::-1], known[::-1], strict=True)
                  if k == UNIT), "")  # fmt: skip
     if lower[-1:] == ["raw"]:
@@ -190,8 +188,8 @@ def _column(name: str) -> Column:
     telling = {COMMAND, MAYBE_COMMAND, STATE, MAYBE_STATE} | ({ANGLE} if timed else set())
     words = frozenset(w for w, k in zip(lower, known, strict=True) if k in telling)
     kind = ""
-    if OTHER in kinds and not (timed and not kinds & {UNIT}):
-        kind = ""
+    if OTHER in kinds and (UNIT in kinds or not timed):
+        pass
     elif timed:
         kind = "time"
     elif COMMAND in kinds:
@@ -296,7 +294,7 @@ def time_columns(names: Sequence[str]) -> list[str]:
         own = column(name)
         lower = [w.lower() for w in _SEPARATORS.split(name) if w]
         if own.kind == "time" and not own.words:
-            bare = [w for w in lower if WORDS.get(w) == TIME and w not in _TIME_UNITS] or lower
+            bare = [w for w in lower if WORDS.get(w) == TIME and w not in SECONDS] or lower
             place = TIMES.index(bare[0]) if bare[0] in TIMES else len(TIMES)
             found.append(((len(own.key) > 0, place, len(lower)), name))
         elif lower[:3] == ["time", "since", "start"] or name.lower() == "x_value":  # LabVIEW's
@@ -309,6 +307,3 @@ def has_time(names: Sequence[str]) -> bool:
     return any(column(n).kind == "time" or TIME_STEP.fullmatch(n) for n in names) or bool(
         time_columns(names)
     )
-
-
-_TIME_UNITS = ("s", "sec", "secs", "ms", "us", "µs", "ns", "millis", "micros", "nanos", "nsec")

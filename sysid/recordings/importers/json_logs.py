@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS
-from pupper_sysid.common.reading.dialect import decimal
+from pupper_sysid.common.reading.dialect import decimal, unit_behind, with_unit
 from pupper_sysid.sysid.recordings.importers.columns import column, has_time
 from pupper_sysid.sysid.recordings.importers.log import (
     MOST_JOINTS,
@@ -197,6 +197,11 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
                         refuse_more(path, cells, MOST_CELLS, "cells", "Split it.", exact=False)
                         lists[full] = [None] * len(records)
                     lists[full][k] = value
+    for name, values in [*lists.items()]:  # "0.3 deg"
+        texts_only = [v for v in values if v is not None]
+        if all(isinstance(v, str) for v in texts_only) and (word := unit_behind(texts_only)):
+            lists[with_unit(name, word)] = [v and v.removesuffix(word).strip() for v in values]
+            del lists[name]
     found = {name: _numbers(values) for name, values in lists.items() if len(values) > 1}
     arrays = {name: values for name, values in found.items() if values is not None}
     texts = {
@@ -206,29 +211,21 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
         and n not in arrays
         and (has_time([n]) or (n in GROUPS and all(isinstance(each, str) for each in v)))
     }
-    scalars = {k: float(v) for k, v in _scalars(data).items()}
+    beside = _beside(data)
+    scalars = {k: float(v) for k, v in beside if isinstance(v, int | float) and abs(v) < _FAR}
+    remarks = "\n".join(f"{k}: {v}" for k, v in beside if isinstance(v, str))
     table = expanded(path, arrays, list(options.joints))
-    units = units_in(_remarks(data), table.names)
+    units = units_in(remarks[:_FEW_REMARKS], table.names)
     table = replace(table, texts=texts, rate=stated_rate(scalars), units=units)
     if not arrays or (missing(table.names) and not options.command):
         return None
     return read_table(path, table, options, "JSON table")
 
 
-def _scalars(data: Any) -> dict[str, float]:
-    """Numbers beside the lists of JSON, also those a level below, by name."""
-    if not isinstance(data, Mapping):
-        return {}
-    levels = [data, *(v for v in data.values() if isinstance(v, Mapping))]
-    return {k: v for level in levels for k, v in level.items()
-            if isinstance(v, int | float) and abs(v) < _FAR}  # fmt: skip
-
-
-def _remarks(data: Any) -> str:
-    """Texts beside the lists of JSON, also those a level below, as remarks: `unit: deg`."""
+def _beside(data: Any) -> list[tuple[str, Any]]:
+    """Names and values beside the lists of JSON, also those a level below."""
     levels = [data, *data.values()] if isinstance(data, Mapping) else []
-    return "\n".join(f"{k}: {v}" for level in levels if isinstance(level, Mapping)
-                     for k, v in level.items() if isinstance(v, str))[:_FEW_REMARKS]  # fmt: skip
+    return [pair for level in levels if isinstance(level, Mapping) for pair in level.items()]
 
 
 def _of_frame(data: Any) -> Any:
@@ -246,16 +243,12 @@ def _of_frame(data: Any) -> Any:
             return {n: list(v.values()) for n, v in data.items()}
         if "0" in data and "1" in data:  # rows by their numbers
             return list(data.values())
-    series = next((n for n, v in data.items() if _series_by_name(v)), None)
-    return data if series is None else {**data, **_by_name(data[series]), series: None}
-
-
-def _series_by_name(value: Any) -> bool:
-    """Whether this is a list with a record per joint, whose values are lists over time."""
-    if not isinstance(value, list) or not all(isinstance(each, Mapping) for each in value):
-        return False
-    longest = (len(v) for each in value for v in each.values() if isinstance(v, list))
-    return len(value) <= MOST_JOINTS and max(longest, default=0) > _LONGER * len(value)
+    for name, value in data.items():  # a record per joint, whose values are lists over time
+        if isinstance(value, list) and all(isinstance(each, Mapping) for each in value):
+            longest = (len(v) for each in value for v in each.values() if isinstance(v, list))
+            if len(value) <= MOST_JOINTS and max(longest, default=0) > _LONGER * len(value):
+                return {**data, **_by_name(value), name: None}
+    return data
 
 
 def _by_name(value: list[Any]) -> Any:
@@ -282,12 +275,14 @@ def _numbers(values: Any) -> NDArray[np.float64] | None:
     if isinstance(first, str) and len(first) < _LONGEST_NUMBER:
         with suppress(ValueError, AttributeError):
             return np.array([decimal(v) if v else np.nan for v in values])
-    kinds = (list,) if isinstance(first, list) else (int, float, type(None))
-    if first is None or not all(v is None or isinstance(v, kinds) for v in values):
+    if first is None:
         return None
-    if kinds == (list,):
+    inside = values
+    if isinstance(first, list):
         values = [[None] * len(first) if v is None else v for v in values]
-    inside = [v for row in values for v in row] if kinds == (list,) else []
+        if not all(isinstance(v, list) for v in values):
+            return None
+        inside = [v for row in values for v in row]
     if not all(isinstance(v, int | float | None) for v in inside):
         return None
     try:

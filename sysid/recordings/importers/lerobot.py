@@ -40,6 +40,7 @@ from pupper_sysid.sysid.recordings.importers.times import one_after_another
 LAYOUT = "LeRobot dataset"
 
 _ACTION, _STATE = "action", "observation.state"
+_KEYS = (_ACTION, _STATE, "episode_index", "frame_index")
 _SENT_AFTER = 0.5  # of a frame: it waits for the cameras' next pictures in between
 _NOMINAL_RAD = np.pi  # range of a joint whose readings show no step
 _MOST_FILES = 10_000
@@ -66,18 +67,35 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
     fps = options.rate or number(info_path, info.get("fps"), "fps")
     if not 1 <= fps <= 10_000:
         raise InputError(f"{info_path}, fps is {fps:g}. Write the dataset's frames per second.")
-    parts = [_values(p, contents[p], names) for p in data_paths]
-    values = sum(part[_STATE].size for part in parts)
-    refuse_more(folder, values, MOST_CELLS, "values", "Give a part of it.")
-    columns = {key: _joined(folder, key, [part[key] for part in parts]) for key in parts[0]}
+    of_key = {key: names.get(f"{key}, flat", [key]) for key in _KEYS}
+    parts: dict[str, list[NDArray[np.float64]]] = {key: [] for key in _KEYS}
+    for path in data_paths:
+        read = read_columns(path, contents[path], [c for own in of_key.values() for c in own])
+        for key, own in of_key.items():
+            parts[key].append(np.column_stack([read[c] for c in own]))
+    refuse_more(folder, sum(p.size for p in parts[_STATE]), MOST_CELLS, "values",
+                "Give a part of it.")  # fmt: skip
+    columns = {}
+    for key, several in parts.items():
+        if len({part.shape[1] for part in several}) > 1:
+            raise InputError(f"{folder}: {key} has another length in one of the data files.")
+        columns[key] = np.concatenate(several)
+    for key in (_ACTION, _STATE):
+        counts = {
+            key: columns[key].shape[1],
+            "its list of names in meta/info.json": len(names[key]),
+        }
+        one_each(folder, counts)
     commands, positions = (
-        _chosen(folder, key, columns[key], names[key], names["joints"]) for key in (_ACTION, _STATE)
+        columns[key][:, [names[key].index(name) for name in names["joints"]]]
+        for key in (_ACTION, _STATE)
     )
     joints = joint_names(info_path, names["joints"])
-    for key in ("episode_index", "frame_index"):
+    for key in _KEYS[2:]:
         if not np.isfinite(columns[key]).all():
             raise InputError(f"{folder}, column {key}: a value is missing. Mend the dataset.")
-    episode, time_s = one_after_another(columns["frame_index"] / fps, columns["episode_index"])
+    number_of, frame = (columns[key][:, 0] for key in _KEYS[2:])
+    episode, time_s = one_after_another(frame / fps, number_of)
     one_scale, texts = _scales(positions, joints)
     scales = np.column_stack([one_scale, one_scale])  # of commands, of positions
     for k, joint in enumerate(joints):
@@ -96,25 +114,19 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
     }
     if metadata["robot_type"].startswith(_FEETECH):
         metadata["servos"] = {joint: {"model": "STS3215"} for joint in joints}
+    sent_s, angles = time_s + _SENT_AFTER / fps, (scales[:, 0] * commands, scales[:, 1] * positions)
     table = pd.concat(
         [
-            rows(
-                joint, time_s + _SENT_AFTER / fps, time_s, scales[k, 0] * commands[:, k],
-                scales[k, 1] * positions[:, k], episode,
-            )
+            rows(joint, sent_s, time_s, *(values[:, k] for values in angles), episode)
             for k, joint in enumerate(joints)
         ],
         ignore_index=True,
-    )  # fmt: skip
-    return Log(table, metadata, _warnings(fps, texts), digest)
-
-
-def _warnings(fps: float, texts: dict[str, str]) -> list[str]:
+    )
     by_text: dict[str, list[str]] = {}
     for joint, text in texts.items():
         by_text.setdefault(text, []).append(joint)
-    units = "; ".join(f"{', '.join(joints)}: {text}" for text, joints in by_text.items())
-    return [
+    units = "; ".join(f"{', '.join(own)}: {text}" for text, own in by_text.items())
+    warnings = [
         f"its times are frame numbers over {fps:g} Hz, not clock readings: lag and dead time scale "
         "with that rate (`pupper-sysid import --rate` gives another), and when a state was read "
         "and an action sent is not known within a frame, so they are in doubt by half a frame "
@@ -122,6 +134,7 @@ def _warnings(fps: float, texts: dict[str, str]) -> list[str]:
         f"its angles are not in rad. Scales in rad per unit: {units}. Torques, speeds and errors "
         "scale with it; lag and dead time do not.",
     ]
+    return Log(table, metadata, warnings, digest)
 
 
 def _names(path: Path, info: Any) -> dict[str, list[str]]:
@@ -166,33 +179,6 @@ def _flat(names: Any) -> list[str]:
         return [names]
     inside = names.values() if isinstance(names, dict) else names
     return [n for part in inside for n in _flat(part)] if isinstance(inside, Iterable) else []
-
-
-def _values(path: Path, data: bytes, names: dict[str, list[str]]) -> dict[str, NDArray[np.float64]]:
-    """Commands and states, shape (rows, joints), and the numbers of episode and frame."""
-    keys = [_ACTION, _STATE, "episode_index", "frame_index"]
-    wanted = [column for key in keys for column in names.get(f"{key}, flat", [key])]
-    columns = read_columns(path, data, wanted)
-    return {
-        key: np.column_stack([columns[c] for c in own]) if own else columns[key]
-        for key in keys
-        for own in [names.get(f"{key}, flat", [])]
-    }
-
-
-def _joined(folder: Path, key: str, parts: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    if len({part.shape[1:] for part in parts}) > 1:
-        raise InputError(f"{folder}: {key} has another length in one of the data files.")
-    return np.concatenate(parts)
-
-
-def _chosen(
-    folder: Path, key: str, values: NDArray[np.float64], names: list[str], wanted: list[str]
-) -> NDArray[np.float64]:
-    """The wanted joints' columns."""
-    values = values.reshape(len(values), -1)
-    one_each(folder, {key: values.shape[1], "its list of names in meta/info.json": len(names)})
-    return values[:, [names.index(name) for name in wanted]]
 
 
 def _scales(

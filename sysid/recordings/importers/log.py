@@ -129,9 +129,8 @@ def expanded(
 ) -> Table:
     """Table of arrays of which some have a number per joint: `action` becomes `action.<name>`.
 
-    `path`: for messages. `arrays` of shape (rows,) or (rows. `names`: of the joints; arrays of
-    another width get `joint_0`, `joint_1` and so on. `named`: what in the log holds these names;
-    None if it does not name its joints.
+    `arrays` of shape (rows,) or (rows, joints). `names`: of the joints; arrays of another width get
+    `joint_0`, `joint_1` and so on. `named`: what in the log holds these names, if anything does.
     """
     distinct(path if named is None else f"{path}, {named}", names, "joints")
     lengths = [len(values) for values in arrays.values()]
@@ -177,23 +176,15 @@ def rows(
     **optional: ArrayLike,
 ) -> pd.DataFrame:
     """Rows of one joint; `optional` are columns such as `p_gain`."""
-    columns = {
-        "send_time_s": send_time_s,
-        "read_time_s": read_time_s,
-        "trial": trial,
-        "joint": joint,
-        "frequency_hz": np.nan,
-        "command_rad": command_rad,
-        "position_rad": position_rad,
-    }
+    columns = {"send_time_s": send_time_s, "read_time_s": read_time_s, "trial": trial,
+               "joint": joint, "frequency_hz": np.nan, "command_rad": command_rad,
+               "position_rad": position_rad}  # fmt: skip
     return pd.DataFrame(columns | optional)
 
 
 def joint_names(path: Path | str, given: Sequence[str]) -> list[str]:
     """Joints' names as this project can use them: letters, digits and `_`.
 
-    Examples
-    --------
     >>> joint_names("log", ["shoulder pan.pos", "2nd/wrist"])
     ['shoulder_pan', 'joint_2nd_wrist']
     """
@@ -256,25 +247,11 @@ def held_commands(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """The command in force at each reading (zero-order hold); nothing is interpolated.
 
-    Parameters
-    ----------
-    sent_s : ndarray, shape (n,)
-        When commands were sent, not decreasing.
-    commands : ndarray, shape (n,) or (n, joints)
-    read_s : ndarray, shape (m,)
-        When positions were read.
+    `sent_s`, shape (n,), not decreasing: when `commands`, shape (n,) or (n, joints), were sent.
+    `read_s`, shape (m,): when positions were read. Returns when the command of each row was sent
+    (where it had been sent for an earlier reading already, the time of this reading, since it
+    stays in force), the commands, and which readings have a command before them, shape (m,).
 
-    Returns
-    -------
-    send_time_s : ndarray, shape (k,)
-        When the command of each row was sent; where it had been sent for an earlier reading
-        already, the time of this reading, since the same command stays in force.
-    commands : ndarray, shape (k,) or (k, joints)
-    kept : ndarray of bool, shape (m,)
-        Readings with a command before them.
-
-    Examples
-    --------
     >>> sent, command = np.array([0.0, 1.0]), np.array([5.0, 6.0])
     >>> held_commands(sent, command, np.array([-1.0, 0.5, 0.75, 1.5]))
     (array([0.  , 0.75, 1.  ]), array([5., 5., 6.]), array([False,  True,  True,  True]))

@@ -30,8 +30,9 @@ from pydantic import ConfigDict, create_model
 
 from pupper_sysid.common.border import read_yaml, validated
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.dialect import decimal
+from pupper_sysid.common.reading.dialect import decimal, is_decimal
 from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.columns import SECONDS
 
 COUNT_RAD = 2 * np.pi / 4096
 """One count of an encoder with 4,096 a turn."""
@@ -48,27 +49,25 @@ _ANGLE_SCALES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turns": 2 * np.p
 _NARROWEST_RAD, _WIDEST_RAD = 0.2, 2 * np.pi  # range of a joint
 
 
-def scale_by_step(positions: ArrayLike, nominal: float, span: float = 1.0) -> tuple[float, str]:
-    """Radians per unit of readings whose smallest step is one count of 4,096 a turn.
+def scale_by_step(positions: ArrayLike, nominal: float) -> tuple[float, str]:
+    """Radians per unit of shares of a range, whose smallest step is one count of 4,096 a turn.
 
-    `nominal`: range in rad to assume where the readings show no step. `span`: range in the log's
-    unit: 1 for shares, 200 for −100 … 100. Returns the scale and what was assumed, for a warning.
+    `nominal`: range in rad to assume where the readings show no step. Returns the scale and what
+    was assumed, for a warning.
     """
     step = smallest_step(np.asarray(positions, float))
-    found = span * COUNT_RAD / step if step > 0 else 0.0
+    found = COUNT_RAD / step if step > 0 else 0.0
     if _NARROWEST_RAD <= found <= _WIDEST_RAD:
-        return found / span, (
+        return found, (
             f"its range was taken as {found:.3f} rad, since its readings are steps of 1/"
-            f"{span / step:.0f} of it apart and a step was taken for one count of 4096 a turn"
+            f"{1 / step:.0f} of it apart and a step was taken for one count of 4096 a turn"
         )
-    return nominal / span, f"its range was assumed to be {nominal:.3f} rad"
+    return nominal, f"its range was assumed to be {nominal:.3f} rad"
 
 
 def smallest_step(values: NDArray[np.float64]) -> float:
     """Step of which all but a few differences of `values` are multiples; 0 if there is none.
 
-    Examples
-    --------
     >>> round(smallest_step(0.25 * np.array([0, 2, 4, 7, 7, 9, 12, 15, 13, 11, 9, 6, 3])), 6)
     0.25
     """
@@ -110,19 +109,12 @@ class Unit:
 
 
 def unit(text: str, name: str = "`unit`") -> Unit:
-    """The unit that `text` names.
+    """The unit that `text` names; `name` says where it was given, for messages.
 
-    Parameters
-    ----------
-    text : str
-        `rad`, `mrad`, `deg` or `turns`; `counts:4096` with the counts of a turn, half of which is
-        0 rad, or `counts:4096:0` with the count that is; `percent:RANGE_RAD` of −100 … 100 over a
-        range; `scale:RAD_PER_UNIT`.
-    name : str
-        Where it was given, for messages.
+    `rad`, `mrad`, `deg` or `turns`; `counts:4096` with the counts of a turn, half of which is 0
+    rad, or `counts:4096:0` with the count that is; `percent:RANGE_RAD` of −100 … 100 over a range;
+    `scale:RAD_PER_UNIT`.
 
-    Examples
-    --------
     >>> unit("deg").scale * 180 == np.pi, unit("counts:4096").zero, unit("percent:4").scale
     (True, 2048.0, 0.02)
     """
@@ -170,10 +162,12 @@ def likely_of_pair(command: NDArray[np.float64], position: NDArray[np.float64]) 
     if not min(spread) > 0 or 1 / _ALIKE < spread[0] / spread[1] < _ALIKE:
         return together
     ranked = []
+    turns = [f"counts:{n}{zero}" for n in _COUNTS for zero in ("", ":0")]
     choices = (
-        ["rad"] if np.abs(values).max() <= LARGEST_RAD else [*likely_units(values), "mrad"]
+        ["rad"] if np.abs(values).max() <= LARGEST_RAD else
+        dict.fromkeys([*likely_units(values), "mrad", *turns])
         for values in (command, position)
-    )
+    )  # fmt: skip
     for texts in product(*choices):
         c, p = map(unit, texts)
         ratio = spread[0] * c.scale / (spread[1] * p.scale)
@@ -187,7 +181,6 @@ Stamp = Literal["start", "middle", "end"]
 Readings = Literal["live", "polled"]
 
 _DURATION = re.compile(r"([+-]?[0-9.]+(?:e[+-]?[0-9]+)?)\s*(s|ms|us|µs)")
-_SCALES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 _LONGEST_S = 1.0
 _RATES_HZ = (0.1, 100_000.0)
 
@@ -259,10 +252,8 @@ class LogOptions:
         if self.send_after is None:
             return None
         match = _DURATION.fullmatch(self.send_after.strip())
-        try:
-            seconds = decimal(match[1]) * _SCALES[match[2]] if match else float("inf")
-        except ValueError:
-            seconds = float("inf")
+        known = match is not None and is_decimal(match[1])
+        seconds = decimal(match[1]) * SECONDS[match[2]] if match and known else float("inf")
         if abs(seconds) > _LONGEST_S:
             raise InputError(
                 f"`send_after` is {printable(self.send_after)[:40]}. Write a time of at most 1 s "

@@ -18,16 +18,10 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.csv_table import distinct
 from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers import refusals
 from pupper_sysid.sysid.recordings.importers.columns import Column, column, columns_of
 from pupper_sysid.sysid.recordings.importers.log import Table, bare_name
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.refusals import (
-    import_line,
-    lines_by_value,
-    listed,
-    missing,
-    rate_note,
-)
 
 SOLE = "joint"
 """The joint of a log that names none."""
@@ -130,6 +124,8 @@ def _by_words(
     joints = [min(pair.command.joint, pair.position.joint, key=len) for pair in found]
     names = [bare_name(j or p.command.key) or SOLE for j, p in zip(joints, found, strict=True)]
     distinct(path, names, "joints")
+    if names == ["d"]:  # ref_d, meas_d
+        notes["d"] = f"{both} were taken for radians of a joint d; for degrees give `unit='deg'`."
     return dict(zip(names, found, strict=True)), [*notes.values()]
 
 
@@ -158,10 +154,13 @@ def _lone(
     table_of = [c.name for c in (*commands, *positions)]
     if not commands or not positions:
         table.check_joints(path, table_of)
-        lines = lines_by_value(path, table)
-        note = rate_note(lines[0], table) if lines else ""
+        lines = refusals.lines_by_value(path, table)
+        note = refusals.rate_note(lines[0], table) if lines else ""
         which = f" Say which is which: {'; or '.join(lines)}{note}." if lines else ""
-        raise InputError(f"{path}: {missing(table.names)}; it has {listed(table.names)}.{which}")
+        raise InputError(
+            f"{path}: {refusals.missing(table.names)}; it has "
+            f"{refusals.listed(table.names)}.{which}"
+        )
     first = [
         [c for c in own if c.rank[:3] == min(c.rank for c in own)[:3]]
         for own in (commands, positions)
@@ -185,7 +184,7 @@ def _lone(
 def _refuse_choices(path: Path | str, why: str, choices: Sequence[Pair]) -> None:
     """Refuse to choose, with the command line that takes each pair."""
     lines = list(dict.fromkeys(  # templates are of several joints
-        import_line(path, command=pair.command.template, position=pair.position.template)
+        refusals.import_line(path, command=pair.command.template, position=pair.position.template)
         for pair in choices
     ))  # fmt: skip
     more = "" if len(lines) <= _MOST_CHOICES else f" (and {len(lines) - _MOST_CHOICES} more)"
@@ -211,7 +210,7 @@ def _stated(path: Path | str, table: Table, options: LogOptions) -> dict[str, Pa
         if not found:
             raise InputError(
                 f"{path}: `{option}` is {printable(text)}, which fits no column; it has "
-                f"{listed(table.names)}."
+                f"{refusals.listed(table.names)}."
             )
         matched.append(found)
     commands, positions = matched
@@ -220,7 +219,7 @@ def _stated(path: Path | str, table: Table, options: LogOptions) -> dict[str, Pa
     if not both or (not named and len(commands) != len(positions)):
         raise InputError(
             f"{path}: no joint has both a column of `command` and one of `position`; it has "
-            f"{listed(table.names)}."
+            f"{refusals.listed(table.names)}."
         )
     if not named:
         names = [SOLE] if len(both) == 1 else [f"joint_{k}" for k in both]
@@ -240,5 +239,5 @@ def column_named(path: Path | str, table: Table, option: str, name: str) -> str:
     hint = " ({joint} stands for a joint's name)" if option in ("command", "position") else ""
     raise InputError(
         f"{path}: `{option}` is {printable(name)[:60]}, but there is no such column{hint}; it has "
-        f"{listed(table.names)}."
+        f"{refusals.listed(table.names)}."
     )

@@ -84,7 +84,15 @@ def read_columns(path: Path, data: bytes, names: Sequence[str]) -> dict[str, NDA
         raise InputError(
             f"{path}: column {', '.join(lacking)} is missing; it has {', '.join(known)[:300]}."
         )
-    values, unpacked = _sizes(path, file, names)
+    meta = file.metadata
+    try:
+        chunks = (meta.row_group(g).column(c) for g in range(meta.num_row_groups)
+                  for c in range(meta.num_columns))  # fmt: skip
+        own = [c for c in chunks if c.path_in_schema.split(".list.")[0] in names]
+        values = sum(c.num_values for c in own)
+        unpacked = sum(c.total_uncompressed_size for c in own)
+    except (OSError, ValueError, OverflowError) as error:
+        raise InputError(f"{path} is a damaged parquet file: {_first(error)}.") from error
     refuse_more(path, values, MOST_CELLS, "values", "Split the log.")
     refuse_more(f"{path}, unpacked,", unpacked, LARGEST_BYTES, "bytes", "Split the log.")
     try:
@@ -92,21 +100,6 @@ def read_columns(path: Path, data: bytes, names: Sequence[str]) -> dict[str, NDA
         return {name: _array(path, name, table.column(name)) for name in names}
     except (pa.ArrowException, OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as parquet: {_first(error)}.") from error
-
-
-def _sizes(path: Path, file: Any, names: Sequence[str]) -> tuple[int, int]:
-    """How many numbers, and bytes, the columns of these names say they have."""
-    meta = file.metadata
-    try:
-        chunks = [
-            meta.row_group(g).column(c)
-            for g in range(meta.num_row_groups)
-            for c in range(meta.num_columns)
-        ]
-        own = [c for c in chunks if c.path_in_schema.split(".list.")[0] in names]
-        return sum(c.num_values for c in own), sum(c.total_uncompressed_size for c in own)
-    except (OSError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} is a damaged parquet file: {_first(error)}.") from error
 
 
 def _texts(path: Path, data: bytes) -> dict[str, list[str]]:
@@ -161,17 +154,12 @@ def _array(path: Path, name: str, column: Any) -> NDArray[np.float64]:
     flat = np.asarray(column.combine_chunks().flatten().to_pandas().to_numpy(), float)
     rows = len(column)
     width = len(flat) // rows if rows else 0
-    lengths = {width} if not rows else set(_lengths(column))
-    if lengths != {width}:
-        raise InputError(f"{path}, column {name}: its lists are not equally long. Mend the log.")
-    return flat.reshape(rows, width)
-
-
-def _lengths(column: Any) -> list[Any]:
     from pyarrow import compute as loaded
 
     compute: Any = loaded  # its functions are made when it is imported
-    return compute.unique(compute.list_value_length(column)).to_pylist()
+    if rows and {*compute.unique(compute.list_value_length(column)).to_pylist()} != {width}:
+        raise InputError(f"{path}, column {name}: its lists are not equally long. Mend the log.")
+    return flat.reshape(rows, width)
 
 
 def _first(error: Exception) -> str:

@@ -99,14 +99,13 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
     digest = hashlib.sha256(data).hexdigest()
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         data = decoded(path, data).encode()
-    if data.startswith(ros.MAGIC):
-        return replace(ros.read_mcap(path, data, options), sha256=digest)
-    if data.startswith(ros.SQLITE):
-        return replace(ros.read_sqlite(path, options), sha256=digest)
-    if data.startswith((arrays.ZIP, arrays.NPY, arrays.MAT)):
-        return replace(arrays.read_arrays(path, data, options), sha256=digest)
-    if data.startswith(parquet.MAGIC):
-        return replace(parquet.read_parquet(path, data, options), sha256=digest)
+    for marks, read in (
+        ((ros.MAGIC, ros.SQLITE), ros.read_file),
+        ((arrays.ZIP, arrays.NPY, arrays.MAT), arrays.read_arrays),
+        ((parquet.MAGIC,), parquet.read_parquet),
+    ):
+        if data.startswith(marks):
+            return replace(read(path, data, options), sha256=digest)
     start = data[:64].lstrip(b"\xef\xbb\xbf \t\r\n")
     if _MARKUP.match(start):
         raise InputError(f"{path} is XML or HTML, such as a robot's model or a page, not a log.")
@@ -115,14 +114,11 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
             f"{path} holds raw frames of a CAN bus, whose bytes mean what the motor's manual says. "
             "Decode them (python-can, cantools) into columns of time, command and position."
         )
-    documents = None
     if _YAML.match(start) or path.suffix.lower() in (".yaml", ".yml"):
         documents = _documents(path, decoded(path, data))
-    if documents is not None:
-        log = json_logs.read_json_table(path, documents, options)
-        if log is not None:
+        log = documents and json_logs.read_json_table(path, documents, options)
+        if log:
             return replace(log, sha256=digest)
-    if documents is not None or _YAML.match(start) or path.suffix.lower() in (".yaml", ".yml"):
         raise InputError(
             f"{path} is YAML, which is not read: write rows as CSV, or record messages with "
             "`ros2 bag record`."
@@ -130,13 +126,13 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
     if not _JSON.match(start) or _STAMP.match(start) or _ROW.match(data):
         return None
     found = border.parse_json(_whole_json(decoded(path, data)), str(path), "Give it as written.")
-    for layout, known, read in (
+    for layout, known, of_layout in (
         (json_logs.BAM, json_logs.is_bam, json_logs.read_bam),
         (json_logs.KTUNE, json_logs.is_ktune, json_logs.read_ktune),
     ):
         if known(found):
             options.refuse(layout)
-            return chosen(path, replace(read(path, found), sha256=digest), options)
+            return chosen(path, replace(of_layout(path, found), sha256=digest), options)
     log = json_logs.read_json_table(path, found, options)
     if log is None:
         raise InputError(f"{path}: {unknown_json(found if isinstance(found, dict) else [])}")
@@ -163,10 +159,8 @@ def _whole_json(text: str) -> str:
     if len(lines) > 1 and all(line[:1] + line[-1:] == "{}" for line in bare):
         full = [line for line in lines if line.strip() and line[:1] != "#"]
         whole = [line for line in full if line.strip()[:1] + line.strip()[-1:] == "{}"]
-        # one or the last may be cut
-        return (
-            f"[{','.join(whole if len(full) - len(whole) <= max(0.01 * len(full), 1) else full)}]"
-        )
+        few = len(full) - len(whole) <= max(0.01 * len(full), 1)  # one or the last may be cut
+        return f"[{','.join(whole if few else full)}]"
     return text
 
 

@@ -17,7 +17,7 @@ import io
 import re
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -72,24 +72,16 @@ def read_bag(folder: Path, options: LogOptions) -> Log:
     raw: list[Raw] = []
     warnings: list[str] = []
     for path in files:
-        if path.suffix == ".db3":
-            raw += bounded(path, sqlite_messages(path))
-        else:
-            raw += bounded(path, mcap_messages(path, contents[path], warnings))
+        raw += _messages(path, contents[path], warnings)
     log = _log(folder, raw, options)
     return replace(log, sha256=digest, warnings=[*warnings, *log.warnings])
 
 
-def read_mcap(path: Path, data: bytes, options: LogOptions) -> Log:
-    """An MCAP file's joints as rows."""
+def read_file(path: Path, data: bytes, options: LogOptions) -> Log:
+    """The joints of an MCAP or a `.db3` file as rows."""
     warnings: list[str] = []
-    log = _log(path, bounded(path, mcap_messages(path, data, warnings)), options)
+    log = _log(path, _messages(path, data, warnings), options)
     return replace(log, warnings=[*warnings, *log.warnings])
-
-
-def read_sqlite(path: Path, options: LogOptions) -> Log:
-    """A `.db3` file's joints as rows."""
-    return _log(path, bounded(path, sqlite_messages(path)), options)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -192,7 +184,7 @@ def _topics(path: Path, raw: Sequence[Raw]) -> dict[str, _Topic]:
     """Decoded messages by topic."""
     found: dict[str, _Topic] = {}
     values = 0
-    for topic, kind, log_ns, data in raw:
+    for name, kind, log_ns, data in raw:
         if kind not in KINDS:
             continue
         try:
@@ -201,27 +193,26 @@ def _topics(path: Path, raw: Sequence[Raw]) -> dict[str, _Topic]:
             message = decode(kind, data)
         except ValueError as error:
             raise InputError(
-                f"{path}, topic {printable(topic)[:80]}: {error}; it is no {kind} in CDR. Record "
+                f"{path}, topic {printable(name)[:80]}: {error}; it is no {kind} in CDR. Record "
                 "it again."
             ) from error
         values += len(message.positions)
         refuse_more(path, values, MOST_CELLS, "positions", "Split it.", exact=False)
-        own = found.setdefault(topic, _Topic(kind))
+        own = found.setdefault(name, _Topic(kind))
         if message.positions:
             own.log_ns.append(log_ns)
             own.messages.append(message)
-    found = {name: _in_order(topic) for name, topic in found.items() if topic.messages}
+    found = {name: topic for name, topic in found.items() if topic.messages}
+    for topic in found.values():
+        order = np.argsort(topic.log_ns, kind="stable")
+        topic.log_ns = [topic.log_ns[k] for k in order]
+        topic.messages = [topic.messages[k] for k in order]
     if not found:
         kinds = ", ".join(sorted({k for _, k, _, _ in raw})[:8]) or "nothing"
         raise InputError(
             f"{path} has no messages of joints; it has {printable(kinds)}. {_needs({})}"
         )
     return found
-
-
-def _in_order(topic: _Topic) -> _Topic:
-    order = np.argsort(topic.log_ns, kind="stable")
-    return _Topic(topic.kind, [topic.log_ns[k] for k in order], [topic.messages[k] for k in order])
 
 
 def _state(path: Path, topics: Mapping[str, _Topic]) -> str:
@@ -306,11 +297,12 @@ _MOST_STEPS = 1e9  # of SQLite's machine; a message takes some twenty
 _STEPS = 100_000  # between two looks at them
 
 
-def bounded(path: Path, messages: Iterator[Raw]) -> list[Raw]:
-    """All messages."""
+def _messages(path: Path, data: bytes, warnings: list[str]) -> list[Raw]:
+    """All messages of a file; `warnings` gets a sentence if it is cut off."""
+    of_sqlite = data.startswith(SQLITE) or path.suffix == ".db3"
     found: list[Raw] = []
     total = 0
-    for message in messages:
+    for message in sqlite_messages(path) if of_sqlite else mcap_messages(path, data, warnings):
         found.append(message)
         total += len(message[3])
         # a database may say of one place that it is the content of many messages
@@ -454,22 +446,27 @@ class Message:
 
 
 def plain_type(name: str) -> str:
-    """A type's name without the `msg` between package and message.
-
-    Examples
-    --------
-    >>> plain_type("sensor_msgs/msg/JointState")
-    'sensor_msgs/JointState'
-    """
+    """`sensor_msgs/JointState` of `sensor_msgs/msg/JointState`."""
     return name.replace("/msg/", "/")
 
 
 def decode(kind: str, data: bytes) -> Message:
-    """A message of type `kind`, one of this module's.
+    """A message of type `kind`, one of `KINDS`.
 
     Raises ValueError if the bytes are too short, or no such message.
     """
-    return _DECODERS[kind](_Cdr(data))
+    cdr = _Cdr(data)
+    if kind == MULTI_ARRAY:
+        for _ in range(cdr.length()):  # its dimensions
+            cdr.text()
+            cdr.values("I", 4, 2)
+        cdr.values("I", 4)
+        return Message(0, (), cdr.doubles())
+    stamp, names = cdr.stamp_ns(), cdr.texts()
+    if kind == JOINT_STATE:
+        return Message(stamp, names, cdr.doubles())
+    points = cdr.length()
+    return Message(stamp, names, cdr.doubles() if points else (), points)
 
 
 class _Cdr:
@@ -518,28 +515,3 @@ class _Cdr:
         seconds, rest = self.values("i", 4)[0], self.values("I", 4)[0]
         self.text()
         return int(seconds) * 10**9 + int(rest)
-
-
-def _joint_state(cdr: _Cdr) -> Message:
-    return Message(cdr.stamp_ns(), cdr.texts(), cdr.doubles())
-
-
-def _trajectory(cdr: _Cdr) -> Message:
-    stamp, names = cdr.stamp_ns(), cdr.texts()
-    points = cdr.length()
-    return Message(stamp, names, cdr.doubles() if points else (), points)
-
-
-def _multi_array(cdr: _Cdr) -> Message:
-    for _ in range(cdr.length()):
-        cdr.text()
-        cdr.values("I", 4, 2)
-    cdr.values("I", 4)
-    return Message(0, (), cdr.doubles())
-
-
-_DECODERS: dict[str, Callable[[_Cdr], Message]] = {
-    JOINT_STATE: _joint_state,
-    TRAJECTORY: _trajectory,
-    MULTI_ARRAY: _multi_array,
-}

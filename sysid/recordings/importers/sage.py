@@ -12,10 +12,7 @@ It also writes the servos' gains before each motion, which are not in the log.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +22,8 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
-from pupper_sysid.common.reading.csv_table import LONGEST_CELL, MOST_CELLS
-from pupper_sysid.common.reading.dialect import decimal, decoded
+from pupper_sysid.common.reading.csv_table import MOST_CELLS, column_names, read_table
+from pupper_sysid.common.reading.dialect import decoded
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.log import (
     Log,
@@ -67,7 +64,12 @@ def read_sage(folder: Path) -> Log:
     warnings: list[str] = []
     same = len(sent) == len(stamped) and bool(np.all(sent == stamped))
     if same and tuple(names) == _SO101:
-        turns = _serial_turns(sent, len(names))
+        # all goals are written, then each joint's position, speed and current are read
+        middle = sent + 0.5 * _TRANSACTION_S
+        turns = [
+            (middle + k * _TRANSACTION_S, middle + (len(names) + 3 * k) * _TRANSACTION_S)
+            for k in range(len(names))
+        ]
         metadata["bus"] = {"read_time_doubt_s": _DOUBT_S}
         metadata["servos"] = {name: dict(_SETUP) for name in names}
     elif same:
@@ -94,73 +96,30 @@ def read_sage(folder: Path) -> Log:
     return Log(pd.concat(parts, ignore_index=True), metadata, warnings, digest)
 
 
-def _serial_turns(
-    stamp: NDArray[np.float64], joints: int
-) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """When each joint's goal was written and its position read: the middle of each transaction."""
-    middle = 0.5 * _TRANSACTION_S
-    return [
-        (
-            stamp + k * _TRANSACTION_S + middle,
-            stamp + (joints + 3 * k) * _TRANSACTION_S + middle,
-        )
-        for k in range(joints)
-    ]
-
-
 def _table(path: Path, data: bytes, joints: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Times [s] and positions, shape (rows, joints), of one of the two tables."""
     text = decoded(path, data)
     refuse_more(path, text.count("\n") * joints, MOST_CELLS, "values", "Split the log.")
-    first = text.find("\n")
-    refuse_more(f"{path}, line 1", first if first >= 0 else len(text), LONGEST_CELL, "characters")
-    reader = csv.reader(io.StringIO(text))
-    header = [cell.strip() for cell in _next(reader, path) or []]
-    lacking = [c for c in ("timestamp", "positions") if c not in header]
+    names = column_names(path, text)
+    lacking = [c for c in ("timestamp", "positions") if c not in names]
     if lacking:
         raise InputError(
             f"{path}: column {', '.join(lacking)} is missing; it has "
-            f"{printable(', '.join(header)[:200])}. A SAGE table needs timestamp and positions."
+            f"{printable(', '.join(names)[:200])}. A SAGE table needs timestamp and positions."
         )
-    at, where = header.index("timestamp"), header.index("positions")
-    times, values = [], []
-    while (cells := _next(reader, path)) is not None:
-        if cells:
-            times.append(_value(path, reader.line_num, cells, at, decimal, "a time"))
-            wanted = f"a list of {joints} numbers, one per joint of {_JOINTS}"
-            values.append(
-                _value(path, reader.line_num, cells, where, lambda c: _list(c, joints), wanted)
-            )
-    if not times:
+    found = read_table(path, text, [name for name in names if name != "timestamp"])
+    if not len(found):
         raise InputError(f"{path} has column names but no rows. Record it again.")
-    return 1e-6 * np.array(times), np.array(values)
-
-
-def _next(reader: Any, path: Path) -> list[str] | None:
-    """Cells of the next line of a `csv.reader`; None at the end."""
-    try:
-        return next(reader, None)
-    except csv.Error as error:
-        raise InputError(f"{path}, line {reader.line_num}: {error}. Mend the line.") from error
-
-
-def _list(cell: str, count: int) -> list[float]:
-    found = json.loads(cell)
-    if not isinstance(found, list) or len(found) != count:
-        raise ValueError
-    return [float(value) for value in found]
-
-
-def _value(
-    path: Path, line: int, cells: list[str], at: int, kind: Callable[[str], Any], wanted: str
-) -> Any:
-    try:
-        found = kind(cells[at])
-        if not np.all(np.isfinite(found)):
-            raise ValueError
-    except (ValueError, TypeError, IndexError, RecursionError, OverflowError):
-        cell = printable(cells[at][:40]) if at < len(cells) else "nothing"
-        raise InputError(
-            f"{path}, line {line}: '{cell}' where {wanted} belongs. Mend or remove the line."
-        ) from None
-    return found
+    times, values = found.numbers["timestamp"], []
+    for line, time, cell in zip(found.line, times, found.texts["positions"], strict=True):
+        try:
+            angles = np.array(json.loads(cell), float)
+            if angles.shape != (joints,) or not np.isfinite([time, *angles]).all():
+                raise ValueError
+        except (ValueError, TypeError, RecursionError, OverflowError):
+            raise InputError(
+                f"{path}, line {line}: {printable(cell[:40])} at {time:g} where a time and a list "
+                f"of {joints} numbers, one per joint of {_JOINTS}, belong. Mend or remove the line."
+            ) from None
+        values.append(angles)
+    return 1e-6 * times, np.array(values)

@@ -27,6 +27,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_CELLS, MOST_COLUMNS, is_failure
 from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers import refusals, times
 from pupper_sysid.sysid.recordings.importers.columns import (
     TIME_STEP,
     TIMER,
@@ -45,22 +46,6 @@ from pupper_sysid.sysid.recordings.importers.log import (
 )
 from pupper_sysid.sysid.recordings.importers.options import LogOptions, Unit, unit
 from pupper_sysid.sysid.recordings.importers.pairs import SOLE, Pair, column_named, pairs
-from pupper_sysid.sysid.recordings.importers.refusals import (
-    import_line,
-    listed,
-    missing,
-    unknown_numbers,
-)
-from pupper_sysid.sysid.recordings.importers.times import (
-    clock,
-    doubt_of_a_turn,
-    one_after_another,
-    scrambled,
-    sent_at,
-    times_of_day,
-    turns,
-    unwrapped,
-)
 
 LAYOUT = "table"
 
@@ -116,7 +101,7 @@ def read_numbered(
         numbered="its columns have no names",
     )
     if not options.command:
-        raise InputError(f"{path}: {unknown_numbers(path, table)}")
+        raise InputError(f"{path}: {refusals.unknown_numbers(path, table)}")
     return read_table(path, table, options, layout)
 
 
@@ -135,7 +120,7 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
     read_s, send_s, texts = _times(path, table, options)
     notes += texts
     groups = _groups(path, table)
-    if any(scrambled(read_s[own]) for own in groups.values() or [slice(None)]):
+    if any(times.scrambled(read_s[own]) for own in groups.values() or [slice(None)]):
         first = table.first(_TRIALS)
         trial = np.zeros(len(read_s)) if first is None else table.columns[first]
         order = np.lexsort((read_s, trial))
@@ -155,7 +140,7 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
         if joint not in wanted:
             raise InputError(
                 f"{path}: `joints` names {printable(joint)}, which has no command and position; "
-                f"{listed(wanted)} have."
+                f"{refusals.listed(wanted)} have."
             )
     theirs = [*options.joints] or [*wanted]
     names = joint_names(path, [options.joints.get(j) or j for j in theirs])
@@ -221,7 +206,7 @@ def _times(
     if options.rate is not None:
         return np.arange(count) / options.rate, None, []  # of each joint's own rows: `_joint`
     names = table.moving if has_time(table.moving) else table.names
-    names = [name for name in names if name not in table.faults]
+    names = [name for name in names if name in table.columns or name in table.texts]
     steps = next((n for n in names if TIME_STEP.fullmatch(n)), None)
     found = [n for n in time_columns(names) if n != steps]
     if not found and table.tick_s is not None:
@@ -241,14 +226,14 @@ def _times(
         time = (found or read)[0]
     elif steps is not None:
         total = np.cumsum(table.numbers(path, steps))
-        found_clock = clock(steps.lower().removeprefix("d"), total)
+        found_clock = times.clock(steps.lower().removeprefix("d"), total)
         text = f"times are the sums of {steps}, the time between rows."
         return found_clock.seconds(total), None, [*found_clock.notes, text]
     else:
         raise InputError(
             f"{path}: no column is a time (time, timestamp, t …, also with _s, _ms, _us or _ns); "
-            f"it has {listed(table.names)}. Name it with `time`, or give the rows a second with "
-            "`rate`."
+            f"it has {refusals.listed(table.names)}. Name it with `time`, or give the rows a "
+            "second with `rate`."
         )
     read_s, at, texts = _seconds(path, table, time)
     notes += texts
@@ -256,7 +241,7 @@ def _times(
         if options.time is None and sent and time not in sent:
             notes.append(
                 f"commands may have been sent at {sent[0]}: if so, "
-                f"{import_line(path, time=time, command_time=sent[0])}."
+                f"{refusals.import_line(path, time=time, command_time=sent[0])}."
             )
         return read_s, None, notes
     command_time = column_named(path, table, "command_time", command_time)
@@ -269,18 +254,18 @@ def _seconds(
 ) -> tuple[NDArray[np.float64], float, list[str]]:
     """Times of a column in seconds, the time that counts as 0, and notes."""
     if name in table.texts:
-        seconds = times_of_day(path, name, table.texts[name])
+        seconds = times.times_of_day(path, name, table.texts[name])
         below = table.first(_MILLISECONDS)
         if below is not None and not (seconds % 1).any():  # 12:30:01 and 250
             seconds = seconds + 1e-3 * (table.numbers(path, below) % 1000)
         return seconds, 0.0, []
-    values = unwrapped(table.numbers(path, name))
+    values = times.unwrapped(table.numbers(path, name))
     lower = {n.lower(): n for n in table.columns}
     whole = re.fullmatch(r"(.*?)(?:secs?|seconds?)", name.lower())
     rest = [lower[n] for end in _SUBSECONDS if whole and (n := whole[1] + end) in lower]
     if rest:
         return *_of_two(path, table, name, rest[0]), []
-    found = clock(name, values, table.tick_s)
+    found = times.clock(name, values, table.tick_s)
     return found.seconds(values), found.zero * found.scale, found.notes
 
 
@@ -313,7 +298,7 @@ def spread(path: Path | str, table: Table, options: LogOptions) -> Table:
         value = own[0]
     for series in (by_case[n] for n in SERIES if n in by_case):
         codes, found = pd.factorize(np.array(table.texts[series], object))
-        if len(found) > MOST_COLUMNS or missing([*map(str, found)]):
+        if len(found) > MOST_COLUMNS or refusals.missing([*map(str, found)]):
             continue
         refuse_more(path, len(codes) * len(found), MOST_CELLS, "cells", "Split it by joint.")
         values = table.numbers(path, value)
@@ -383,19 +368,19 @@ def _joint(
             "commands and positions stand in rows of their own: each row's time is that of what "
             "it holds, and a command was taken as in force until the next one."
         )
-    number, shifted = one_after_another(stamp, trial)
+    number, shifted = times.one_after_another(stamp, trial)
     if trial is None and number.max(initial=0) > 0:
         warnings.append(
             f"its times start again ({number.max():g} ×): each run of rows was taken for a trial "
             "of the same joint."
         )
     if sent is not None:
-        send, read, doubt = sent_at(sent, stamp) + (shifted - stamp), shifted, 0.0
+        send, read, doubt = times.sent_at(sent, stamp) + (shifted - stamp), shifted, 0.0
     else:
-        send, read, doubt, texts = turns(shifted, options)
+        send, read, doubt, texts = times.turns(shifted, options)
         warnings += texts
     if options.rate is not None:
-        doubt = max(doubt, doubt_of_a_turn(stamp)[0])
+        doubt = max(doubt, times.doubt_of_a_turn(stamp)[0])
         warnings.append(
             f"its times are row numbers over {options.rate:g} Hz: lag and dead time scale with "
             "that rate, and are in doubt by half a turn."
@@ -531,7 +516,7 @@ def _of_name(
         text, example = _LACKING[source.unit]
         raise InputError(
             f"{path}, column {printable(source.name)[:60]}: {text}: "
-            f"{import_line(path, unit=example)}."
+            f"{refusals.import_line(path, unit=example)}."
         )
     if source.unit == "counts":
         known = positions[np.isfinite(positions)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.dialect import is_clock
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.recordings.importers.columns import UNITS
+from pupper_sysid.sysid.recordings.importers.columns import SECONDS, UNITS
 from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 
@@ -26,13 +27,9 @@ PAUSE_S = 0.5
 
 _LONGEST_DOUBT_S = 1.0
 _KNOWN_ORDER_DOUBT_S = 0.001
-_SCALES = {"ns": 1e-9, "nsec": 1e-9, "nanosec": 1e-9, "nsecs": 1e-9, "usec": 1e-6, "us": 1e-6,
-            "µs": 1e-6, "ms": 1e-3, "s": 1.0, "sec": 1.0,
-           "secs": 1.0, "seconds": 1.0, "nanos": 1e-9, "micros": 1e-6, "millis": 1e-3, "min": 60.0,
-           "minutes": 60.0, "秒": 1.0, "毫秒": 1e-3, "초": 1.0}  # fmt: skip
-_UNIT = re.compile(rf"(?:^|[_\s.(\[])({'|'.join(_SCALES)})[)\]]*$", re.IGNORECASE)
+_UNIT = re.compile(rf"(?:^|[_\s.(\[])({'|'.join(SECONDS)})[)\]]*$", re.IGNORECASE)
 _TICKS_OF = re.compile(
-    rf"(?:^|[_(\[]| in )(\d+(?:\.\d+)?) ?({'|'.join(_SCALES)})[)\]]*$", re.IGNORECASE
+    rf"(?:^|[_(\[]| in )(\d+(?:\.\d+)?) ?({'|'.join(SECONDS)})[)\]]*$", re.IGNORECASE
 )
 _OF_100_NS = ((6.2e17, 6.8e17), (1.25e17, 1.5e17))  # .NET's from year 1, Windows' from 1601
 _LOOP_S = (2e-5, 0.5)  # fastest and slowest loop of a servo
@@ -58,7 +55,7 @@ _STATED = re.compile(
     r"(?<![\w-])([a-z]\w*(?:[ _]\w+)?)\s*[\s:=,;]\s*[\"']?(\d[\d.]*(?:e[-+]?\d+)?)"
     r"\s*(khz|hz|s|ms|us|µs)?(?![\w.])", re.IGNORECASE,
 )  # fmt: skip
-_STATED_IN = {"khz": 1e3, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
+_STATED_IN = SECONDS | {"khz": 1e3, "hz": 1.0, "fps": 1.0, "": 1.0}
 _UNIT_WORD = rf"({'|'.join(sorted(map(re.escape, UNITS), key=len, reverse=True))})(?!\w)"
 _SAYS = r"[\"']? *(?:(?:are |is )?in|are|is|[:=(\[<]) *[\[(<\"']? *"
 _ANGLES_IN = re.compile(
@@ -69,13 +66,13 @@ _TICK = re.compile(
     r"(?:(?<![\w-])(?:\w*ticks?|timer(?: clock)?|clock|time units?)\b *(?:=|:|is|are|of)|"
     r"\btime in (?:units of)?) *([\d.]+) *(ns|us|µs|ms|khz|mhz)\b", re.IGNORECASE,
 )  # fmt: skip
-_TICK_S = {"khz": lambda n: 1e-3 / n, "mhz": lambda n: 1e-6 / n}
+_PERIOD_S = {"khz": 1e-3, "mhz": 1e-6}
 _NUMBER = re.compile(r"[-+]?[\d.]+(?:[eE][-+]?\d+)?")
 
 
 @dataclass(frozen=True)
 class Clock:
-    """How a column of times becomes seconds: `(value - zero) * scale`."""
+    """How a column of times becomes seconds."""
 
     scale: float = 1.0
     zero: float = 0.0
@@ -95,10 +92,10 @@ def clock(name: str, values: NDArray[np.float64], tick_s: float | None = None) -
     steps = np.diff(np.sort(values) if scrambled(values) else values)
     steps = steps[steps > 0]
     found = _UNIT.search(name)
-    stated = _SCALES[found[1].lower()] if found else 0.0
+    stated = SECONDS[found[1].lower()] if found else 0.0
     loop = float(np.median(steps)) if len(steps) else 0.0
     if (several := _TICKS_OF.search(name)) is not None:  # t_100us
-        stated = float(several[1]) * _SCALES[several[2].lower()]
+        stated = float(several[1]) * SECONDS[several[2].lower()]
         if _LOOP_S[0] < loop * stated <= _LOOP_S[1]:
             return Clock(stated, float(values[0]))
     if not found and tick_s is not None and _LOOP_S[0] < loop * tick_s <= _LOOP_S[1]:
@@ -135,20 +132,21 @@ def times_of_day(path: object, name: str, cells: Sequence[str]) -> NDArray[np.fl
 
     A date in another order is left out: midnights are found in the times of day.
     """
-    others = [k for k, cell in enumerate(cells) if cell and not is_clock(cell)]
-    bad = next(
-        (k for k in others if not _NUMBER.fullmatch(cells[k])), others[0] if others else None
-    )
-    bare = [_OTHER_DATE.sub("", cell.strip()) for cell in cells]
-    bare = [_COMPACT.sub(r"\1-\2-\3T\4:\5:", cell) for cell in bare]
-    bare = [f"00:{cell}" if cell.count(":") == 1 else cell for cell in bare]  # minutes and seconds
-    bare = [f"{cell[:-4]}.{cell[-3:]}" if cell.count(":") == 3 and cell[-4] == ":" else cell
-            for cell in bare]  # fmt: skip
+    others = [cell for cell in cells if cell and not is_clock(cell)]
+    others = [cell for cell in others if not _NUMBER.fullmatch(cell)] or others
+    bare = [cell.strip() for cell in cells]
+    for pattern, usual in (
+        (_OTHER_DATE, ""),
+        (_COMPACT, r"\1-\2-\3T\4:\5:"),
+        (re.compile(r"^[^:]*:[^:]*$"), r"00:\g<0>"),  # minutes and seconds
+        (re.compile(r"^([^:]*:[^:]*:[^:]*):(?=...$)"), r"\1."),  # milliseconds
+    ):
+        bare = [pattern.sub(usual, cell) for cell in bare]
     halves = [_HALF_DAY.search(cell) for cell in bare]
-    bare = [_HALF_DAY.sub("", cell) for cell in bare]
-    texts = pd.Series([cell.replace(",", ".") or None for cell in bare], dtype=object)
+    bare = [_HALF_DAY.sub("", cell).replace(",", ".") for cell in bare]
+    texts = pd.Series([cell or None for cell in bare], dtype=object)
     try:
-        if bad is not None:
+        if others:
             raise ValueError
         if texts.str.contains("-", regex=False).any():
             parsed = pd.to_datetime(texts, format="ISO8601", utc=True)
@@ -158,7 +156,7 @@ def times_of_day(path: object, name: str, cells: Sequence[str]) -> NDArray[np.fl
             afternoon = np.array([m is not None and m[1] == "P" for m in halves])
             seconds = seconds % (_DAY_S / 2) + _DAY_S / 2 * afternoon
     except (ValueError, TypeError, OverflowError):
-        shown = printable(cells[bad])[:40] if bad is not None else "a cell"
+        shown = printable(others[0])[:40] if others else "a cell"
         raise InputError(
             f"{path}, column {printable(name)[:60]}: '{shown}' is no time. Write seconds, or "
             "2026-05-04T12:30:01.25."
@@ -179,13 +177,12 @@ def rate_in(lines: Iterable[str]) -> float | None:
     """Rows a second by the remarks above a table: `# fs = 100 Hz`, `dt: 10 ms`, `Rate,100`."""
     heads = [line[:200] for line in lines]
     found = (m for line in heads for m in _STATED.finditer(line))
-    stated = {m[1]: float(m[2]) * _STATED_IN.get((m[3] or "").lower(), 1.0)
+    stated = {m[1]: float(m[2]) * _STATED_IN[(m[3] or "").lower()]
               for m in found if m[2].count(".") < 2}  # fmt: skip
     for m in (m for line in heads if line[:1] in "#%/!;" for m in _EVERY.finditer(line)):
         name, value, word = ("period", m[1], m[2]) if m[1] else ("fps", m[3], m[4])
         if value.strip(".") and value.count(".") < 2:
-            scale = 1e3 if word.lower() == "khz" else _STATED_IN.get(word.lower(), 1.0)
-            stated.setdefault(name, float(value) * scale)
+            stated.setdefault(name, float(value) * _STATED_IN[word.lower()])
     return stated_rate(stated)
 
 
@@ -226,9 +223,8 @@ def tick_in(text: str) -> float | None:
     """Seconds of a tick by remarks such as `tick = 0.5 us` or `timer clock: 2 MHz`."""
     for number, word in _TICK.findall(text):
         if number.count(".") < 2 and float(f"0{number}") > 0:
-            unit = word.lower()
-            of = _TICK_S.get(unit, lambda n, unit=unit: n * _SCALES[unit])
-            return of(float(f"0{number}"))
+            unit, count = word.lower(), float(f"0{number}")
+            return _PERIOD_S[unit] / count if unit in _PERIOD_S else SECONDS[unit] * count
     return None
 
 
@@ -269,10 +265,10 @@ def turns(
     if after is not None:
         return send, read, 0.0, []
     if known:
-        order = "read" if before else "sent", "sent" if before else "read"
-        things = ("position", "command") if before else ("command", "position")
+        things = ["position was taken as read", "command was taken as sent"]
+        one, other = things if before else things[::-1]
         text = (
-            f"the {things[0]} was taken as {order[0]} first and the {things[1]} as {order[1]} "
+            f"the {one} first and the {other.replace(' was taken', '')} "
             f"{1e3 * READ_AFTER_SEND_S:g} ms later, in doubt by {1e3 * _KNOWN_ORDER_DOUBT_S:g} ms. "
             f"If more lies between them, give it: `send_after='{'' if before else '-'}3ms'`."
         )
@@ -302,17 +298,13 @@ def one_after_another(
     """
     number = np.zeros(len(stamp)) if trial is None else trial
     with np.errstate(invalid="ignore"):
-        new = np.concatenate(
-            [
-                [False],
-                (np.diff(number) != 0) | (np.diff(stamp) < 0) | (np.diff(stamp) > _CLOCK_SET_S),
-            ]
-        )
-    runs = np.cumsum(new)
+        steps = np.diff(stamp)
+        new = (np.diff(number) != 0) | (steps < 0) | (steps > _CLOCK_SET_S)
+    runs = np.cumsum(np.concatenate([[False], new]))
     shifted, last = stamp.astype(float).copy(), -np.inf
-    starts = np.flatnonzero(np.concatenate([[True], new[1:]]))
+    starts = [0, *(1 + np.flatnonzero(new)).tolist()]
     refuse_more("The log", len(starts), MOST_TRIALS, "trials", "Check its times, or split it.")
-    for start, end in zip(starts, [*starts[1:], len(stamp)], strict=True):
+    for start, end in pairwise([*starts, len(stamp)]):
         own = shifted[start:end]
         if not np.isfinite(own).any():
             continue
