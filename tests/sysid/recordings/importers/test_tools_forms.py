@@ -94,6 +94,12 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
         each("Target angle: {c!r} deg, Actual angle: {p!r} deg, elapsed: {m} ms", DEGREES),
         "joint"),
     # words and marks in cells
+    "decimal commas in one column": ("time;cmd;pos\n" + "".join(
+        f"{t};{str(c).replace('.', ',')};{p}\n" for t, c, p in LOG), "joint"),
+    "negative numbers in parentheses": ("time;cmd;pos\n" + re.sub(
+        r"-([\d.]+)", r"(\1)", each("{t};{c};{p}")), "joint"),
+    "units in texts of JSON": (json.dumps([
+        {"t": t, "cmd": f"{c!r} deg", "pos": f"{p!r} deg"} for t, c, p in DEGREES]), "joint"),
     "spaces between thousands": ("time_us;cmd;pos\n" + "".join(
         f"{1e6 * t:,.0f};".replace(",", " ") + f"{c};{p}\n".replace(".", ",") for t, c, p in LOG),
         "joint"),
@@ -284,6 +290,9 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
     "counts around 0": (each("{t},{c},{p}", SIGNED, "time,goal,pos"), "--unit counts:4096:0"),
     "degrees beside radians": ("time,goal,pos\n" + "".join(
         f"{t},{np.degrees(c)},{p}\n" for t, c, p in LOG), "--unit deg,rad"),
+    "scaled counts beside radians": ("time,goal,pos\n" + "".join(
+        f"{t},{c},{1024 / (2 * np.pi) * p:.3f}\n" for t, c, p in LOG),
+        "--unit rad,counts:1024:0"),
     "counts beside radians": ("time,goal,pos\n" + "".join(
         f"{t},{2048 + 652 * c:.0f},{p}\n" for t, c, p in LOG), "--unit counts:4096,rad"),
     "hexadecimal cells": (each("{m},{c:04X},{p:04X}", COUNTS, "time_ms,goal,pos"),
@@ -385,3 +394,9 @@ def test_what_may_be_several_joints_is_said_to_be_taken_as_trials(tmp_path):
     blocks = f"# t cmd pos\n{each('{t} {c} {p}')}\n\n# knee\n{each('{t} {c} {p}')}"
     recording = load(written(tmp_path, blocks))
     assert any("start again" in text for text in recording.warnings)
+
+
+def test_a_suffix_that_may_mean_degrees_is_said_to_be_taken_for_a_joint(tmp_path):
+    recording = load(written(tmp_path, each("{t},{c},{p}", head="time_s,ref_d,meas_d")))
+    assert recording.joints == ["d"]
+    assert any("for degrees give `unit='deg'`" in text for text in recording.warnings)
