@@ -91,10 +91,6 @@ class Table:
         """The first of these names, in any case, that a column of numbers has."""
         return next((self._lower[n] for n in names if n in self._lower), None)
 
-    def stated_unit(self, name: str) -> str:
-        """The unit that the log states for a column beside it; empty for none."""
-        return self.units.get(name, self.units.get("", ""))
-
     @cached_property
     def _lower(self) -> dict[str, str]:
         return {n.lower(): n for n in self.columns}

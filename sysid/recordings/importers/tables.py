@@ -392,7 +392,7 @@ def _joint(
     metadata.setdefault("columns", {})[names[1]] = used
     commands = table.numbers(path, pair.command.name)[own]
     positions = table.numbers(path, pair.position.name)[own]
-    stated = options.unit_of(*names)
+    stated, units = options.unit_of(*names), table.units
     columns: dict[str, Any] = {}
     for kind, source, values in (
         ("command", pair.command, commands if held is None else held),
@@ -403,7 +403,11 @@ def _joint(
             factor = stated[kind == "position"]
         else:
             factor = _of_name(path, source, positions, commands)
-            if factor is None and not source.unit and (word := table.stated_unit(source.name)):
+            if (
+                factor is None
+                and not source.unit
+                and (word := units.get(source.name, units.get("")))
+            ):
                 factor, said = unit(word), True
                 warnings.append(f"{source.name} was taken as {word}, as the log says beside it.")
             factor = factor or Unit()

@@ -228,16 +228,11 @@ def tick_in(text: str) -> float | None:
     return None
 
 
-def loop_period_s(stamp: NDArray[np.float64]) -> float:
-    """Median time between rows that follow one another."""
-    steps = np.diff(stamp)
-    steps = steps[steps > 0]
-    return float(np.median(steps)) if len(steps) else 0.0
-
-
 def doubt_of_a_turn(stamp: NDArray[np.float64]) -> tuple[float, str]:
     """Half a turn, and the sentence that says why lag and dead time are in doubt by it."""
-    doubt = min(loop_period_s(stamp) / 2, _LONGEST_DOUBT_S)
+    steps = np.diff(stamp)
+    steps = steps[steps > 0]
+    doubt = min(float(np.median(steps)) / 2 if len(steps) else 0.0, _LONGEST_DOUBT_S)
     return doubt, (
         "each row has one time stamp, and the log does not say when in a turn the command was sent "
         f"and the position read: lag and dead time are in doubt by half a turn ({1e3 * doubt:.1f} "
