@@ -278,9 +278,10 @@ class _Blocks:
         rows = {n: _cells(path, n, line) for n, line in enumerate(block.split("\n"), first)
                 if line[:1] != "#" and line.strip()}  # fmt: skip
         if not self._strict:
-            rows = self._without(
-                rows, [n for n, row in rows.items() if not _numeric(row)], len(rows) - 1
-            )
+            # in a table of numbers no remark has a number or a time of day
+            remarks = [n for n, row in rows.items()
+                       if not any(is_decimal(cell) or is_clock(cell) for cell in row)]  # fmt: skip
+            rows = self._without(rows, remarks, len(rows) - 1)
         if last and rows and len(rows[max(rows)]) < len(found.columns):
             found.cut = True
             rows.popitem()
@@ -357,11 +358,6 @@ def is_failure(word: str) -> bool:
     """Whether a word, such as `timeout`, stands for a reading that failed."""
     text = word.strip().lower()
     return len(text) < _LONGEST_WORD and _NOTHING.fullmatch(text) is not None
-
-
-def _numeric(row: Sequence[str]) -> bool:
-    """Whether a cell is a number or a time of day: in a table of numbers no remark has one."""
-    return any(map(is_decimal, row)) or any(map(is_clock, row))
 
 
 def _bare(block: str, first: int, comments: Sequence[int]) -> tuple[str, NDArray[np.int64]]:

@@ -304,7 +304,9 @@ def _shape(rows: Sequence[str]) -> _Shape | None:
                 sum(_number(row[k], comma) for row in cells) / len(cells) for k in range(columns)
             ]
             full = tuple(any(row[k] for row in cells) for k in range(columns))
-            units = {} if separator == " " else _units_of(cells, shares, comma)
+            units = {k: unit for k, share in enumerate(shares)
+                     if share < _NUMERIC and separator != " "
+                     and (unit := unit_behind([row[k] for row in cells], comma))}  # fmt: skip
             hexed = _hexadecimal(cells)
             shares = [1.0 if k in units or k in hexed else s for k, s in enumerate(shares)]
             if sum(shares) > most * columns:
@@ -316,15 +318,6 @@ def _shape(rows: Sequence[str]) -> _Shape | None:
                 best = _Shape(separator, comma, columns, numeric, units, hexed, counted, clocked,
                               blank)  # fmt: skip
     return best if best is not None and any(best.numeric) else None
-
-
-def _units_of(
-    cells: Sequence[Sequence[str]], shares: Sequence[float], comma: bool
-) -> dict[int, str]:
-    """Columns, of such shares of numbers, in which one unit stands behind each; and the unit."""
-    found = {k: unit_behind([row[k] for row in cells], comma)
-             for k, share in enumerate(shares) if share < _NUMERIC}  # fmt: skip
-    return {k: unit for k, unit in found.items() if unit}
 
 
 def unit_behind(cells: Sequence[str], comma: bool = False) -> str:
@@ -386,8 +379,12 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
     if first is None:
         return Plain(text)
     whole = next((n for n in bare if _is_row(lines[n], shape, whole=True)), first)
-    if any(_wordy(lines[n], shape) for n in bare if first < n < whole):
-        first = whole  # lines above the names have as many cells, some of them numbers
+    for cells in (_split(lines[n], shape.separator) for n in bare if first < n < whole):
+        if len(cells) == shape.columns and all(
+            cell and not _number(cell, shape.comma)
+            for cell, number in zip(cells, shape.numeric, strict=True) if number
+        ):  # fmt: skip
+            first = whole  # lines above the names have as many cells, some of them numbers
     before = [n for n in bare if n < first]
     notes, columns, units, numbered = [], None, [], ""
     if before and (cells := _units(lines[before[-1]], shape)) and len(before) > 1:
@@ -405,7 +402,8 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
         columns = next((c for c in map(lambda x: _named_in(x, shape), comments[:-4:-1]) if c), None)
         if columns is not None:
             notes.append("the names of its columns were taken from a comment")
-    while columns and len(before) > 1 and shape.separator != " " and not _distinct(columns):
+    spaced = shape.separator == " "
+    while columns and not spaced and len(before) > 1 and len({*columns, ""}) <= len(columns):
         above = _names(lines[before[-2]], shape)  # names in several lines, as of groups
         if above is None or len(above) != shape.columns:
             break
@@ -462,10 +460,6 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
         columns = columns[:-1]
         body = re.sub(r",[ \t]*$", "", body, flags=re.MULTILINE)
     return Plain(f"{head}\n{body}" if first else body, columns, numbered, _sentence(notes))
-
-
-def _distinct(names: Sequence[str]) -> bool:
-    return all(names) and len({*names}) == len(names)
 
 
 def _unnamed(body: str, names: str) -> str:
@@ -611,15 +605,6 @@ def _number(cell: str, comma: bool) -> bool:
     if not is_decimal(cell):
         return not cell or is_clock(cell) or bool(comma and _COMMA_NUMBER.fullmatch(cell))
     return not (comma and "." in cell)
-
-
-def _wordy(line: str, shape: _Shape) -> bool:
-    """Whether a line has a word in each cell where the rows have numbers."""
-    cells = _split(line, shape.separator)
-    if len(cells) != shape.columns:
-        return False
-    numeric = zip(cells, shape.numeric, strict=True)
-    return all(cell and not _number(cell, shape.comma) for cell, number in numeric if number)
 
 
 def _numeral(cell: str, k: int, shape: _Shape) -> str | None:

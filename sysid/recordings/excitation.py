@@ -221,17 +221,13 @@ def _other(trial: Trial, first: int, stop: int) -> Segment:
     turns = _turning_points(command, 0.1 * float(np.ptp(command)))
     if len(turns) > 8:
         half = np.diff(trial.send_time_s[first:stop][turns])
-        trend = np.corrcoef(np.arange(len(half)), _ranks(half))[0, 1]
+        _, place, count = np.unique(half, return_inverse=True, return_counts=True)
+        ranks = (np.cumsum(count) - (count - 1) / 2)[place]  # equal ones share their mean rank
+        trend = np.corrcoef(np.arange(len(half)), ranks)[0, 1]
         ends = float(half[: len(half) // 4].mean()), float(half[-(len(half) // 4) :].mean())
         if abs(trend) > _ONE_WAY and max(ends) > 1.5 * min(ends):
             return Segment("chirp", first, stop)
     return Segment("free", first, stop)
-
-
-def _ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rank of each value, equal ones sharing their mean rank."""
-    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
-    return (np.cumsum(count) - (count - 1) / 2)[place]
 
 
 def _turning_points(command: NDArray[np.float64], least: float) -> NDArray[np.int64]:

@@ -67,23 +67,28 @@ _LONGER = 10  # times as many values over time as joints
 _NUMBERS = ("mass", "length", "kp", "vin")
 
 
-def _rows_have(found: Any, *names: str) -> bool:
-    """Whether this is a list of records, the first of which has one of these names, or none."""
-    if not isinstance(found, list):
-        return False
-    return not found or (isinstance(found[0], Mapping) and any(n in found[0] for n in names))
+def read_known(path: Path, data: Any, options: LogOptions) -> Log | None:
+    """The log in BAM's, K-Scale's or ktune's JSON; None for another."""
+    for layout, key, names, read in (
+        (BAM, "entries", {"timestamp", "goal_position"}, _read_bam),
+        (KTUNE, "data", {"time_since_start", "commanded_position"}, _read_ktune),
+    ):
+        entries = data.get(key) if isinstance(data, dict) else None
+        if not isinstance(entries, list):
+            continue
+        if not entries or (isinstance(entries[0], Mapping) and names & {*entries[0]}):
+            options.refuse(layout)
+            if not entries:
+                raise InputError(
+                    f"{path}: {key} is empty, so nothing was recorded. Record it again."
+                )
+            return read(path, data)
+    return None
 
 
-def is_bam(data: Any) -> bool:
-    """Whether JSON `data` is such a log."""
-    return isinstance(data, dict) and _rows_have(data.get("entries"), "timestamp", "goal_position")
-
-
-def read_bam(path: Path, data: dict[str, Any]) -> Log:
+def _read_bam(path: Path, data: dict[str, Any]) -> Log:
     """The log as rows; mass, length, gain and voltage go into the header."""
     entries = data["entries"]
-    if not entries:
-        raise InputError(f"{path}: entries is empty, so nothing was recorded. Record it again.")
     stamp = numbers(path, entries, "timestamp", "entries")
     position = numbers(path, entries, "position", "entries", missing=True)
     command = numbers(path, entries, "goal_position", "entries")
@@ -129,21 +134,10 @@ def read_bam(path: Path, data: dict[str, Any]) -> Log:
     return Log(table, metadata)
 
 
-def is_ktune(data: Any) -> bool:
-    """Whether JSON `data` is such a log."""
-    names = ("time_since_start", "commanded_position")
-    return (
-        isinstance(data, dict)
-        and _rows_have(data.get("data"), *names)
-        and isinstance(data.get("config", {}), dict)
-    )
-
-
-def read_ktune(path: Path, data: dict[str, Any]) -> Log:
+def _read_ktune(path: Path, data: dict[str, Any]) -> Log:
     """The log as rows of the joint `actuator_<id>`."""
-    entries, config = data["data"], data.get("config", {})
-    if not entries:
-        raise InputError(f"{path}: data is empty, so nothing was recorded. Record it again.")
+    entries, config = data["data"], data.get("config")
+    config = config if isinstance(config, dict) else {}
     stamp = numbers(path, entries, "time_since_start", "data")
     command = np.deg2rad(numbers(path, entries, "commanded_position", "data"))
     position = np.deg2rad(numbers(path, entries, "position", "data", missing=True))

@@ -126,13 +126,9 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
     if not _JSON.match(start) or _STAMP.match(start) or _ROW.match(data):
         return None
     found = border.parse_json(_whole_json(decoded(path, data)), str(path), "Give it as written.")
-    for layout, known, of_layout in (
-        (json_logs.BAM, json_logs.is_bam, json_logs.read_bam),
-        (json_logs.KTUNE, json_logs.is_ktune, json_logs.read_ktune),
-    ):
-        if known(found):
-            options.refuse(layout)
-            return chosen(path, replace(of_layout(path, found), sha256=digest), options)
+    known = json_logs.read_known(path, found, options)
+    if known is not None:
+        return chosen(path, replace(known, sha256=digest), options)
     log = json_logs.read_json_table(path, found, options)
     if log is None:
         raise InputError(f"{path}: {unknown_json(found if isinstance(found, dict) else [])}")
