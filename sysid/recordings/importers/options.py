@@ -162,10 +162,10 @@ def likely_of_pair(command: NDArray[np.float64], position: NDArray[np.float64]) 
     if not min(spread) > 0 or 1 / _ALIKE < spread[0] / spread[1] < _ALIKE:
         return together
     ranked = []
-    turns = [f"counts:{n}{zero}" for n in _COUNTS for zero in ("", ":0")]
+    turns = [f"counts:{n}:0" for n in _COUNTS]  # also where they were averaged or scaled
     choices = (
         ["rad"] if np.abs(values).max() <= LARGEST_RAD else
-        dict.fromkeys([*likely_units(values), "mrad", *turns])
+        [*likely_units(values), "mrad", *(turns if (values % 1 != 0).any() else [])]
         for values in (command, position)
     )  # fmt: skip
     for texts in product(*choices):

@@ -65,9 +65,9 @@ def read_sage(folder: Path) -> Log:
     same = len(sent) == len(stamped) and bool(np.all(sent == stamped))
     if same and tuple(names) == _SO101:
         # all goals are written, then each joint's position, speed and current are read
-        middle = sent + 0.5 * _TRANSACTION_S
+        middle, each = 0.5 * _TRANSACTION_S, _TRANSACTION_S
         turns = [
-            (middle + k * _TRANSACTION_S, middle + (len(names) + 3 * k) * _TRANSACTION_S)
+            (sent + k * each + middle, sent + (len(names) + 3 * k) * each + middle)
             for k in range(len(names))
         ]
         metadata["bus"] = {"read_time_doubt_s": _DOUBT_S}
