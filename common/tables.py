@@ -1,8 +1,8 @@
 """Tables of results: one list of columns for the terminal, the HTML page and the CSV file.
 
 A result's rows hold its fields under their names, in SI units; the columns say which of them are
-shown, in which unit and with how many digits. `cli.terminal.result_table` sets a `Table` for the terminal,
-`common.page` for a page, `Table.to_csv` writes all rows in full.
+shown, in which unit and with how many digits. `cli.terminal.result_table` sets a `Table` for the
+terminal, `common.page` for a page, `Table.to_csv` writes all rows in full.
 """
 
 from __future__ import annotations

@@ -71,8 +71,10 @@ def test_options_that_a_format_does_not_need_are_refused(capsys, tmp_path):
 
 
 def test_doctor_takes_several_logs_and_folders_of_logs(capsys, arm):
-    for name in ("a.csv", "b.csv"):
-        assert run(capsys, "import", arm, *COLUMNS, "--out", f"logs/{name}")[0] == 0
+    shorter = arm.with_name("shorter.log")
+    shorter.write_text("".join(arm.read_text().splitlines(keepends=True)[:-1]))
+    for log, name in ((arm, "a.csv"), (shorter, "b.csv")):
+        assert run(capsys, "import", log, *COLUMNS, "--out", f"logs/{name}")[0] == 0
     for given in (("logs/a.csv", "logs/b.csv"), ("logs",)):
         found = json_of(capsys, "doctor", *given)
         assert found["recording"] == "a, b"
