@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pupper_sysid.sysid.doctor.changes import followed
 from pupper_sysid.sysid.doctor.explanations import Explanation, Servo, explain, servo_delay
 from pupper_sysid.sysid.doctor.findings import CARE, Finding, rivalled
 from pupper_sysid.sysid.recordings.excitation import remembered
@@ -109,6 +110,11 @@ def bend_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     found = bends(trials, step)
     if not found:
         return []
+    joint = followed(trials, step)
+    if joint and joint.explained:
+        rubs = 2 * float(np.exp(joint.fit.terms[5]))
+        if rubs > _HELD_WIDTH * max(float(np.ptp(t.command_rad)) for t in trials):
+            return _rested(trials, step, rubs)
     friction = _held(trials, step, found, _RIVAL_WIDTH)
     saturation = _saturated(trials, step, found)
     play, level = found["play"].nats, found["saturation"].nats
@@ -146,8 +152,11 @@ def bends(trials: Sequence[Trial], step: float) -> dict[str, Bend]:
                for a, b in zip(starts, ends, strict=True)) + 1e-12  # fmt: skip
     wide = scan.best(_PLAY, [(w * reach / 2,) for w in _WIDTHS])
     widths = [(wide.values[0] * f,) for f in (0.8, 0.87, 0.93, 1.07, 1.15)]
+    joint = followed(trials, step)
+    assert joint is not None
     return {
         "linear": scan.best(_LINEAR),
+        "limits": scan.bend(joint.unexplained, (0.0,) * 4, joint.servo),
         "play": min(wide, scan.best(_PLAY, widths), key=_by_nats),
         "rate": scan.best(_RATE, [(r * rate,) for r in _RATES]),
         "cubic": _cubic(scan),
@@ -285,19 +294,25 @@ def _held(
     reach = float(np.median([np.ptp(t.command_rad) for t in trials if np.ptp(t.command_rad) > 0]))
     if not _explains(play, found) or play.values[0] < width * reach / 2:
         return None
+    return next(iter(_rested(trials, step, 2 * play.values[0])), None)
+
+
+def _rested(trials: Sequence[Trial], step: float, travel: float) -> list[Finding]:
+    """The finding of a friction that holds against a `travel` of the command, if it does."""
     rests = [r for t in trials for r in _rests(t, step, _REST_TRAVEL)]
     if len(rests) < _FEWEST_RESTS:
-        return None
-    values = {
-        "longest_s": max(r.end_s - r.start_s for r in rests),
-        "travel_rad": 2 * play.values[0],
-    }
-    return Finding("held_by_friction", CARE, values)
+        return []
+    values = {"longest_s": max(r.end_s - r.start_s for r in rests), "travel_rad": travel}
+    return [Finding("held_by_friction", CARE, values)]
 
 
 def _explains(bend: Bend, found: dict[str, Bend]) -> bool:
-    """Whether a fault is clearly better than a servo and its speed limit, and a curve no better."""
-    usual = min(found["linear"].nats, found["rate"].nats) - CLEAR_NATS
+    """Whether a fault is clearly better than a servo and its speed limit, and a curve no better.
+
+    Friction is one of the limits of a servo, and is compared with the others.
+    """
+    limits = found["limits"].nats if bend is not found["play"] else np.inf
+    usual = min(found["linear"].nats, found["rate"].nats, limits) - CLEAR_NATS
     curve = found["cubic"].nats + _NEAR_NATS
     return bend.nats < min(usual, curve) and 1 - bend.unexplained > _EXPLAINED
 

@@ -155,35 +155,6 @@ class Explanation:
         return time, _low_pass(command, *FILTERS[filter_number], self.grid_s)
 
 
-@dataclass(frozen=True)
-class Followed:
-    """Readings of a joint that follows its command, trial by trial, and what the servo predicts."""
-
-    trials: tuple[Trial, ...]
-    step: float
-    base: Explanation
-    servo: Servo
-    predicted: tuple[NDArray[np.float64], ...]
-    start_s: float
-
-    @cached_property
-    def fits(self) -> list[tuple[float, NDArray[np.float64]]]:
-        """Gain and residuals of each trial."""
-        found = []
-        for s, x in zip(self.base.samples, self.predicted, strict=True):
-            spread = float(np.var(x))
-            gain = float(np.mean((x - x.mean()) * s.position_rad) / spread) if spread > 0 else 0.0
-            rest = s.position_rad - s.position_rad.mean() - gain * (x - x.mean())
-            found.append((gain, rest))
-        return found
-
-    @cached_property
-    def noise(self) -> float:
-        """Usual size of residuals [rad], at least half a quantisation step."""
-        rest = np.concatenate([r for _, r in self.fits])
-        return max(1.4826 * float(np.median(np.abs(rest))), 0.5 * self.step, 1e-5)
-
-
 def servo_delay(number: int) -> float:
     """Delay of slow motion by a low-pass [s]."""
     hz, damping = FILTERS[number]

@@ -159,6 +159,12 @@ WORDS: dict[str, str] = {
         "readings are of clocks that drift apart, or rows are not at the rate that their times "
         "say. Stamp both with one clock."
     ),
+    "left_path": (
+        "{times} times, the first at {time_s:.1f} s, the joint leaves the path that its command "
+        "sets, for up to {longest_s:.1f} s, and comes back: torque off, a supply that breaks down, "
+        "another program, or something that holds or pushes it. Leave this part out, or record "
+        "again."
+    ),
     "loop_stood_still": (
         "the loop stood still {times} times for more than three periods, up to {longest_s:.2g} "
         "s; commands are taken to hold there. Record on an idle machine, or give each stretch "

@@ -12,29 +12,24 @@ and one entry; its simulator and its codes stand in the tests' own table.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import OptimizeResult, minimize
-from scipy.special import stdtrit
 
 from pupper_sysid.common.tones import fit_sine, least_squares
 from pupper_sysid.sysid.doctor.bends import CLEAR_NATS, bend_findings, bends
+from pupper_sysid.sysid.doctor.changes import Followed, change_findings, followed
 from pupper_sysid.sysid.doctor.explanations import (
-    FILTERS,
     Explanation,
-    Followed,
-    Samples,
     Servo,
     echo,
     explain,
 )
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding, rivalled
 from pupper_sysid.sysid.doctor.writers import second_writer
-from pupper_sysid.sysid.recordings.excitation import named_tones, segments, split_tones
+from pupper_sysid.sysid.recordings.excitation import named_tones
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _UNRELATED, _HALF, _LOOSE, _FOLLOWS = 0.25, 0.5, 0.6, 0.75  # share of the position's variance
@@ -131,7 +126,15 @@ def relation_findings(
         best = next(r for r in ranked if not r.code)
     share = 1 - best.servo.unexplained
     least = _FOLLOWS_LATE if best.servo.total_s > _LATEST_S else _FOLLOWS
-    strange = share < _HALF and not bent and not best.code and _smooth_rest(base, best.servo)
+    joint = followed(trials, step)
+    sound = joint is not None and joint.explained
+    strange = (
+        share < _HALF
+        and not bent
+        and not sound
+        and not best.code
+        and _smooth_rest(base, best.servo)
+    )
     if strange or (best.code and share < least):
         # a fault explains what is left of a servo, or smooth motion of another cause is left
         return [Finding("not_a_position_servo", REFUSE, {"percent": 100 * share})], base, None
@@ -146,20 +149,16 @@ def relation_findings(
         return [_refusal(best, second.code if near else "")], base, None
     if at_once:
         return [at_once], base, None
-    return [] if bent else _loose(trials, base, best.servo), base, best.servo
+    return [] if bent or sound else _loose(trials, base, best.servo), base, best.servo
 
 
 def _clocks_drift(trials: Sequence[Trial], step: float, base: Explanation) -> Finding | None:
     """Clocks that drift: a position that is early at one time and late as a servo's at another."""
-    servo = base.best(1.0, np.ones(base.total_s.shape, bool))
-    joint = _followed(trials, step, base, servo)
-    found = next((f for f in drifts(joint) if f.code == "lag_drifts"), None)
+    joint = followed(trials, step)
+    found = next(
+        (f for f in (change_findings(joint) if joint else ()) if f.code == "lag_drifts"), None
+    )
     return replace(found, verdict=REFUSE) if found else None
-
-
-def _followed(trials: Sequence[Trial], step: float, base: Explanation, servo: Servo) -> Followed:
-    predicted = tuple(base.predicted(servo))
-    return Followed(tuple(trials), step, base, servo, predicted, float(trials[0].send_time_s[0]))
 
 
 def _smooth_rest(base: Explanation, servo: Servo) -> bool:
@@ -414,74 +413,13 @@ def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     if found := echo(trials, step):
         return [found]
     findings, base, servo = relation_findings(trials, step)
-    if base is None or servo is None or 1 - servo.unexplained < _LOOSE:
+    joint = followed(trials, step)
+    if joint is None or base is None or servo is None:
         return findings
-    followed = _followed(trials, step, base, servo)
-    for change in CHANGES:
-        findings = [*findings, *change(followed)]
-    return findings
-
-
-def gain_changed(joint: Followed) -> list[Finding]:
-    """A gain that changes at a moment, with two fits in place of one."""
-    alike = _trials_differ(joint)
-    if alike:
-        return alike
-    best: tuple[float, float, float, float] | None = None
-    for s, x in zip(joint.base.samples, joint.predicted, strict=True):
-        found = _two_gains(s.time_s, s.position_rad, x)
-        if found and (best is None or found[0] < best[0]):
-            best = found
-    if best is None:
-        return []
-    share, at, before, after = best
-    low, high = sorted((abs(before), abs(after)))
-    if share > _TWO_BETTER or low > _OTHER_GAIN * high:
-        return []
-    bent = bends(joint.trials, joint.step)
-    if bent and bent["rate"].unexplained < _RATE_BETTER * bent["linear"].unexplained:
-        return []  # a later tone is faster than the servo
-    values = {"time_s": at - joint.start_s, "before": before, "after": after}
-    return [Finding("gain_changed", CARE, values)]
-
-
-def _two_gains(
-    time: NDArray, position: NDArray, path: NDArray
-) -> tuple[float, float, float, float] | None:
-    """What two gains leave of the residual of one, when they change, and both."""
-    if len(time) < 60 or time[-1] - time[0] < 2 * _PART_S:
-        return None
-    rate = np.gradient(path, time) if (np.diff(time) > 0).all() else np.zeros_like(path)
-    design = np.column_stack([np.ones_like(path), path, rate])
-
-    def left(rows: slice | NDArray[np.bool_]) -> tuple[float, float]:
-        d, y = design[rows], position[rows]
-        gram = d.T @ d + 1e-12 * np.eye(3) * len(d)
-        solution = np.linalg.solve(gram, d.T @ y)
-        return float(np.sum((y - d @ solution) ** 2)), float(solution[1])
-
-    whole, _ = left(slice(None))
-    best = None
-    total = float(np.var(path))
-    for at in np.linspace(time[0] + _PART_S, time[-1] - _PART_S, 40):
-        k = int(np.searchsorted(time, at))
-        parts = slice(0, k), slice(k, None)
-        if min(k, len(time) - k) < 30 or min(np.var(path[p]) for p in parts) < 0.2 * total:
-            continue
-        (a, before), (b, after) = left(parts[0]), left(parts[1])
-        if best is None or a + b < best[0]:
-            best = a + b, float(at), before, after
-    if best is None or whole <= 0:
-        return None
-    # what is faster in one part moves less by itself, but not from one second to the next
-    near = [(time > best[1] - _PART_S) & (time < best[1]), (time >= best[1])
-            & (time < best[1] + _PART_S)]  # fmt: skip
-    if min(np.var(path[rows]) if rows.sum() >= 15 else 0.0 for rows in near) > 0.2 * total:
-        gains = sorted(abs(left(rows)[1]) for rows in near)
-        if gains[0] > _OTHER_GAIN * gains[1]:
-            return None
-    floor = 1e-3 * float(np.var(position)) * len(position)
-    return (best[0] + floor) / (whole + floor), *best[1:]
+    if 1 - servo.unexplained < _LOOSE and not joint.explained:
+        return findings
+    changes = _trials_differ(joint) or change_findings(joint)
+    return [*findings, *second_writer(joint), *changes]
 
 
 def _trials_differ(joint: Followed) -> list[Finding]:
@@ -515,197 +453,3 @@ def _trials_differ(joint: Followed) -> list[Finding]:
     values = {"frequency_hz": f, "gain": before, "other_gain": after,
               "time_s": moment - joint.start_s}  # fmt: skip
     return [Finding("trials_differ", CARE, values)]
-
-
-def zero_moves(joint: Followed) -> list[Finding]:
-    """A zero that moves during a trial; under a load that is known gravity moves it."""
-    if any(t.load is not None for t in joint.trials):
-        return []
-    for s, x, (_, rest) in zip(joint.base.samples, joint.predicted, joint.fits, strict=True):
-        edge = len(rest) // 6
-        if edge < 7:
-            continue
-        sums = np.cumsum(rest - rest.mean())[edge:-edge]
-        at = int(np.argmax(np.abs(sums))) + edge + 1
-        parts = rest[:at], rest[at:]
-        moved = float(np.median(parts[1]) - np.median(parts[0]))
-        left = sum(float(np.sum((p - p.mean()) ** 2)) for p in parts)
-        left /= max(float(np.sum((rest - rest.mean()) ** 2)), 1e-12)
-        reach = float(np.ptp(s.command_rad))
-        sure = left < _SURELY_TWO and all(np.ptp(p) > 0.5 * np.ptp(x) for p in (x[:at], x[at:]))
-        least, share = _SURELY_MOVED if sure else (_DRIFT_RAD, _DRIFT_SHARE)
-        if left < _TWO_ZEROS and abs(moved) > max(least, share * reach):
-            when = float(s.time_s[at]) - joint.start_s
-            return [Finding("zero_moves", CARE, {"offset_rad": abs(moved), "time_s": when})]
-    return []
-
-
-def drifts(joint: Followed) -> list[Finding]:
-    """A lag or a gain that grows or shrinks steadily: clocks that drift apart, a servo that heats.
-
-    Windows of one motion are compared, of one tone or of free motion: another tone, and the next
-    part of a chirp, have another lag and gain by themselves.
-    """
-    stretches, span = [], 0.0
-    for s, x, (gain, rest) in zip(joint.base.samples, joint.predicted, joint.fits, strict=True):
-        if len(x) < 60 or not (np.diff(s.time_s) > 0).all() or not gain > 0:
-            continue
-        rate = gain * np.gradient(x, s.time_s)
-        for start, stop, period in _alike(joint, s):
-            inside = (s.time_s >= start) & (s.time_s <= stop)
-            count = int(min((stop - start) / max(period, 0.5), 8))
-            if count < 4 or inside.sum() < 8 * count:
-                continue
-            found = []
-            for low, high in pairwise(np.linspace(start, stop, count + 1)):
-                rows = (s.time_s >= low) & (s.time_s < high)
-                design = np.column_stack([np.ones(rows.sum()), x[rows], rate[rows]])
-                if rows.sum() < 8 or np.std(rate[rows]) < 0.3 * np.std(rate[inside]):
-                    continue
-                _, more, early = least_squares(design, rest[rows])
-                pace = float(np.std(rate[rows]) / max(np.std(x[rows]), 1e-9))
-                found.append((0.5 * (low + high), -float(early), float(more) / gain, np.log(pace)))
-            if len(found) >= 4 and not _quickens(np.array(found)):
-                stretches.append(np.array(found))
-                span = max(span, float(np.ptp(s.time_s)))
-    if not stretches:
-        lag = _stretch(joint)
-        return [_lag_drifts(lag)] if lag else []
-    lag, gain = (_slope([(f[:, 0], f[:, k]) for f in stretches], least)
-                 for k, least in ((1, _SLOPE), (2, _GAIN_DRIFT / span)))  # fmt: skip
-    lag = _stretch(joint) or lag
-    found = []
-    if abs(lag) > _SLOPE and abs(lag) * span > _LAG_DRIFT_S:
-        found.append(_lag_drifts(lag))
-    if abs(gain) * span > _GAIN_DRIFT:
-        found.append(Finding("gain_drifts", CARE, {"percent": 100 * gain * span}))
-    return found
-
-
-def _lag_drifts(lag: float) -> Finding:
-    return Finding("lag_drifts", CARE, {"drift_ms": 1e3 * lag, "percent": 100 * lag})
-
-
-def _stretch(joint: Followed) -> float:
-    """Growth of the lag per second that one clock for all readings leaves; 0 where it leaves none.
-
-    Servos whose lag grows in proportion to time are compared with servos of a constant one: each
-    low-pass, lag and growth is tried on the longest trial, and the best is refined.
-    """
-    sample = max(joint.base.samples, key=lambda s: len(s.time_s))
-    every = max(1, len(sample.time_s) // _STRETCH_READINGS)
-    time, position = sample.time_s[::every], sample.position_rad[::every]
-    span = float(np.ptp(time))
-    if len(time) < 60 or 2 * len(sample.time_s) < sum(len(s.time_s) for s in joint.base.samples):
-        return 0.0
-    base = replace(joint.base, samples=(replace(sample, time_s=time),))
-    path = base.predicted(joint.servo)[0]
-    parts = [p for p in np.array_split(np.arange(len(time)), 8) if len(p) > 2]
-    paces = [[time[p].mean(), 0.0, 0.0, np.log(np.std(np.gradient(path[p], time[p])) + 1e-9)
-              - np.log(np.std(path[p]) + 1e-9)] for p in parts]  # fmt: skip
-    if _quickens(np.array(paces)):
-        return 0.0  # a limit of the speed delays what is faster
-    share = (time - time.mean()) / span
-    position = position - position.mean()
-    total = max(float(position @ position), 1e-12)
-
-    def unexplained(filter_number: int, lag_s: float, growth_s: float) -> float:
-        path = np.interp(time - lag_s - growth_s * share, *paths[filter_number])
-        path = path - path.mean()
-        product = max(float(path @ position), 0.0)
-        return 1 - product**2 / max(float(path @ path) * total, 1e-18)
-
-    paths = {f: base.path(f) for f in range(0, len(FILTERS), 2)}
-    tried = [
-        (unexplained(f, lag, growth), f, lag, growth)
-        for f in paths for lag in _STRETCH_LAGS_S for growth in _STRETCH_GROWTHS_S
-    ]  # fmt: skip
-    best = []
-    for free in (False, True):
-        _, f, *start = min(t for t in tried if free or (t[3] == 0 and t[2] >= 0))
-        scale = np.array([1.0, float(free)])
-        found: OptimizeResult = minimize(
-            lambda x, f=f, scale=scale: unexplained(f, *(x * scale)), start, method="Nelder-Mead",
-            options={"initial_simplex": start + np.array([[0, 0], [0.01, 0], [0, 0.015]]),
-                     "maxiter": 60},
-        )  # fmt: skip
-        best.append((float(found["fun"]), float(found["x"][1])))
-    (plain, _), (left, growth) = best
-    if left + _CLOCK_FLOOR > _ONE_CLOCK * (plain + _CLOCK_FLOOR) or abs(growth) < _LAG_DRIFT_S:
-        return 0.0
-    return growth / span
-
-
-def _quickens(windows: NDArray[np.float64]) -> bool:
-    """Whether the motion itself becomes faster or slower, shape (windows, 4) with the pace last."""
-    time, pace = windows[:, 0], windows[:, 3]
-    if np.ptp(pace) < np.log(_QUICKER):
-        return False
-    return abs(float(np.corrcoef(time, pace)[0, 1])) > _STEADILY
-
-
-def _slope(lines: Sequence[tuple[NDArray, NDArray]], least: float) -> float:
-    """Common slope of several lines of points; 0 where chance explains it.
-
-    Windows of real motion differ by themselves: the scatter about the lines says by how much, and a
-    few windows say little of it, hence Student's distribution.
-    """
-    time = np.concatenate([t - t.mean() for t, _ in lines])
-    value = np.concatenate([v - v.mean() for _, v in lines])
-    freedom, square = len(time) - len(lines) - 1, float(time @ time)
-    slope = float(time @ value) / square
-    away = value - slope * time
-    error = float(np.sqrt(away @ away / freedom / square)) + least / 20
-    return slope if abs(slope) > -stdtrit(freedom, _CHANCE / 2) * error else 0.0
-
-
-def stood_still(joint: Followed) -> list[Finding]:
-    """Readings that stay while the servo's path goes on by more than its friction holds."""
-    bent = bends(joint.trials, joint.step)
-    held = 2 * bent["play"].values[0] if bent else 0.0
-    longest, stood = 0.0, 0
-    for t in joint.trials:
-        rows = np.flatnonzero(np.isfinite(t.position_rad))
-        mine = [s for s in joint.base.samples if s.start_s == t.send_time_s[0]]
-        if len(rows) < 20 or not mine:
-            continue
-        value, time = t.position_rad[rows], t.read_time_s[rows]
-        every = replace(joint.base, samples=(replace(mine[0], time_s=time),))
-        (path,) = every.predicted(joint.servo)
-        near = max(1.5 * joint.step, 0.01 * float(np.ptp(value)))
-        least = max(_STOOD_SHARE * float(np.ptp(path)), 1.5 * held, 8 * joint.noise)
-        first, longest_s = 0, 0.0
-        for k in range(1, len(value) + 1):
-            if k < len(value) and abs(value[k] - value[first]) <= near:
-                continue
-            lasts = float(time[k - 1] - time[first])
-            middle = (time > time[first] + _SETTLED_S) & (time < time[k - 1] - _SETTLED_S)
-            away = np.ptp(path[middle]) if middle.any() else 0.0
-            inside = value.min() + 2 * near < value[first] < value.max() - 2 * near
-            if inside and lasts > max(_STOOD_S, longest_s) and away > least:
-                longest_s = lasts
-            first = k
-        longest, stood = max(longest, longest_s), stood + (longest_s > 0)
-    if not stood:
-        return []
-    values = {"trials": stood, "of": len(joint.trials), "longest_s": longest}
-    return [Finding("frozen", CARE, values)]
-
-
-def _alike(joint: Followed, samples: Samples) -> Iterator[tuple[float, float, float]]:
-    """Stretches of one motion: from, to, and the period of a tone."""
-    for trial in joint.trials:
-        if trial.send_time_s[0] != samples.start_s:
-            continue
-        for part in split_tones(trial):
-            start, stop = float(part.send_time_s[0]), float(part.send_time_s[-1])
-            if part.frequency_hz > 0:
-                settle = min(0.25 * (stop - start), 0.5)
-                yield start + settle, stop, 1 / part.frequency_hz
-            elif all(s.kind != "chirp" for s in segments(part)):
-                yield start + 0.3, stop, 1.0
-
-
-CHANGES: tuple[Callable[[Followed], list[Finding]], ...] = (
-    second_writer, gain_changed, zero_moves, drifts, stood_still,
-)  # fmt: skip

@@ -20,14 +20,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import least_squares
-from pupper_sysid.sysid.doctor.bends import bends
-from pupper_sysid.sysid.doctor.explanations import FILTERS, Followed
+from pupper_sysid.sysid.doctor.changes import Followed, follower_path
 from pupper_sysid.sysid.doctor.findings import CARE, Finding
 from pupper_sysid.sysid.doctor.signals import interpolation_findings
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, quantum, readings
 from pupper_sysid.sysid.recordings.recording import Trial
 
-_UNFILTERED_HZ = 15.0  # natural frequency of a servo that no low-pass explains better
 _ROWS_OF_PERIOD = 60.0  # more rows in a natural period are not needed
 _ERRORS = np.geomspace(0.01, 10, 6)  # of the set-point, of the residuals
 _DATES_S = (0.0, 0.001, 0.004, 0.012)  # standard deviation of a reading's time
@@ -38,7 +36,6 @@ _JUMP, _FEWEST_ROWS = 0.3, 40  # of the command's range in a row
 _FEWEST_PUSHES, _HEAVY, _ONE_WAY = 6, 12.0, 0.85
 _PLACES = np.linspace(-0.5, 1.5, 41)  # of the command's range
 _PARTS, _MOST_IN_PART = 6, 0.6
-_BENT = 0.5  # of what a servo leaves
 
 _HIGHEST_HZ, _LEAST_AMPLITUDE_RAD, _LEAST_STEPS = 4.5, 0.1, 20.0
 _SCATTER, _SCATTER_S = 0.15, 0.012  # of the amplitude; as an error of the time
@@ -48,9 +45,6 @@ _HARMONICS, _FEWEST_READINGS = 3, 25
 def second_writer(joint: Followed) -> list[Finding]:
     """Pushes towards one place while the command goes on, unless a bend of the path makes them."""
     if interpolation_findings(joint.trials, joint.step):
-        return []
-    bent = bends(joint.trials, joint.step)
-    if bent and min(b.unexplained for b in bent.values()) < _BENT * bent["linear"].unexplained:
         return []
     pushes = [_pushes(joint, number) for number in range(len(joint.base.samples))]
     times, sizes, wanted = (np.concatenate(each) for each in zip(*pushes, strict=True))
@@ -77,9 +71,10 @@ def _spread(times: NDArray[np.float64], joint: Followed) -> bool:
 def _pushes(joint: Followed, number: int) -> tuple[NDArray[np.float64], ...]:
     """Times, sizes and places [rad of command] of pushes in one trial."""
     none = (np.zeros(0),) * 3
-    sample, path = joint.base.samples[number], joint.predicted[number]
-    hz, damping = FILTERS[joint.servo.filter]
-    natural = 2 * np.pi * (hz or _UNFILTERED_HZ)
+    sample = joint.base.samples[number]
+    terms = joint.fit.terms
+    path = follower_path(sample, terms, sample.time_s, joint.start_s)
+    natural, damping = np.exp(terms[:2])
     if len(path) < _FEWEST_ROWS or not (np.diff(sample.time_s) > 0).all():
         return none
     jump = float(np.max(np.abs(np.diff(sample.command_rad)), initial=0.0))
