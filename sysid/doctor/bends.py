@@ -111,10 +111,10 @@ def bend_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     if not found:
         return []
     joint = followed(trials, step)
-    if joint and joint.explained:
-        rubs = 2 * float(np.exp(joint.fit.terms[5]))
-        if rubs > _HELD_WIDTH * max(float(np.ptp(t.command_rad)) for t in trials):
-            return _rested(trials, step, rubs)
+    assert joint is not None
+    least = _HELD_WIDTH / 2 * max(float(np.ptp(t.command_rad)) for t in trials)
+    if joint.explained and np.exp(joint.fit.terms[5]) > least and joint.friction_rad:
+        return _rested(trials, step, 2 * joint.friction_rad)
     friction = _held(trials, step, found, _RIVAL_WIDTH)
     saturation = _saturated(trials, step, found)
     play, level = found["play"].nats, found["saturation"].nats
@@ -128,6 +128,8 @@ def bend_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     if saturation:  # less friction is usual, and may look like levels
         usual = play < level - CLEAR_NATS
         return [] if usual else [rivalled(saturation, "held_by_friction" if rubs else "")]
+    if joint.explained or joint.changes:
+        return []
     clearly = play < found["linear"].nats - 2 * CLEAR_NATS
     rests = sum(len(_rests(t, step, _REST_TRAVEL)) for t in trials) >= _FEWEST_RESTS
     rival = "held_by_friction" if near and rests else ""

@@ -24,21 +24,32 @@ from scipy.optimize import OptimizeResult, minimize
 
 from pupper_sysid.sysid.doctor.explanations import FILTERS, Explanation, Samples, Servo, explain
 from pupper_sysid.sysid.doctor.findings import CARE, Finding
+from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.excitation import remembered
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _MOST_READINGS, _GRID_S = 1500, 0.0025
+_USUAL = ((50.0, 0.7, 0.02, 4.0, 25.0), (50.0, 0.7, 0.02, 100.0, 1e4))
+"""Servos to begin with where the linear one says little: natural frequency [rad/s], damping ratio,
+lag [s], speed [rad/s] and acceleration [rad/s²]."""
 _UNFILTERED_HZ = 15.0  # natural frequency of a servo that no low-pass explains better
 _LONGEST_LAG_S = 0.5
-_EVALUATIONS = 260
+_EVALUATIONS, _POLISHED = 260, 0.03  # the latter of the position's mean deviation
 _HIGHEST = np.array([5.5, 1.5, 0.8, 9.0, 12.0, 3.0, 6.0, 0.1])  # of the terms
 _STEPS = np.array([0.4, -0.3, 0.012, -1.0, -1.0, 1.0, -1.0, 1.0])
-_BOUND, _CRUDE, _WELL, _EXPLAINED = 0.25, 0.004, 0.012, 0.06  # of the position's mean deviation
+_BOUND, _CRUDE, _WELL, _EXPLAINED, _FOLLOWS = (
+    0.25,
+    0.004,
+    0.012,
+    0.06,
+    0.12,
+)  # of the position's mean deviation
+_LITTLE = 0.3  # of a friction
 _WORTH, _FITTED = 0.95, 3  # costs that are worth a fit of its own, and how many are
 _MUCH_LESS, _LESS_SIMPLE = 0.6, 0.06  # of what the servo alone leaves; for each simpler change
 _SPLITS = 30
 _EDGE_S = 1.0  # of a change, from either end
-_OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S = 0.75, 0.2, 0.008
+_OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S, _CLOCK = 0.75, 0.2, 0.008, 0.03
 _MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
 _LEFT_S, _AGAIN_S, _MOST_LEFT, _TIMES_LEFT = 0.3, 0.3, 0.45, 4
 
@@ -104,12 +115,46 @@ class Followed:
         hz, damping = FILTERS[self.servo.filter]
         natural = 2 * np.pi * (hz or _UNFILTERED_HZ)
         fast = natural * reach
-        common = [np.log(natural), np.log(damping), max(self.servo.lag_s, 0.0)]
-        limits = (2 * fast, 4 * natural * fast), (0.15 * fast, 0.2 * natural * fast)
-        return min(
-            (follow(self, np.array([*common, *np.log([*limit, 0.004 * reach, reach]), 0.0]))
-             for limit in limits), key=lambda fit: fit.regression.cost,
-        )  # fmt: skip
+        lag = max(self.servo.lag_s, 0.0)
+        begins = [(natural, damping, lag, 2 * fast, 4 * natural * fast),
+                  (natural, damping, lag, 0.15 * fast, 0.2 * natural * fast), *_USUAL]  # fmt: skip
+        best: Follower | None = None
+        for begin in begins:
+            if begin in _USUAL and best and best.regression.cost < _EXPLAINED:
+                break
+            terms = np.log([begin[0], begin[1], 1.0, *begin[3:], 0.004 * reach, reach, 1.0])
+            terms[2] = begin[2]
+            fit = follow(self, terms)
+            if best is None or fit.regression.cost < best.regression.cost:
+                best = fit
+        assert best is not None
+        more = follow(self, best.terms) if best.regression.cost > _POLISHED else best
+        return min(best, more, key=lambda fit: fit.regression.cost)
+
+    @cached_property
+    def disturbed(self) -> float:
+        """Cost of the fit beyond what readings of unknown age explain."""
+        gaps = np.concatenate([np.diff(t.send_time_s) for t in self.trials])
+        age = 0.25 * float(np.median(gaps)) * (staleness(self.trials).kind != "live")
+        rate = np.abs(
+            np.gradient(self.fit.path_rad, self.time_s + 1e-9 * np.arange(len(self.time_s)))
+        )
+        return self.fit.regression.cost - age * float(np.median(rate)) / self.scale
+
+    @cached_property
+    def friction_rad(self) -> float:
+        """Error of the command that friction holds against; 0 where a servo needs none."""
+        friction = float(np.exp(self.fit.terms[5]))
+        highest = _HIGHEST.copy()
+        highest[5] = np.log(_LITTLE * friction)
+        terms = np.minimum(self.fit.terms, highest)
+        without = follow(self, terms, highest=highest).regression.cost
+        return friction if self.fit.regression.cost < _MUCH_LESS * without else 0.0
+
+    @cached_property
+    def changes(self) -> list[Finding]:
+        """The change that explains most of what the servo alone leaves, if any does."""
+        return _compared(self)
 
     def path(self, terms: NDArray) -> NDArray[np.float64]:
         """The command as a servo follows it, at each reading [rad of command]."""
@@ -159,18 +204,20 @@ def follower_path(
     return np.interp(time_s - terms[2] - terms[7] * (time_s - start_s), clock, out)
 
 
-def follow(joint: Followed, begin: NDArray, change: _Change | None = None) -> Follower:
+def follow(
+    joint: Followed, begin: NDArray, change: _Change | None = None, highest: NDArray = _HIGHEST
+) -> Follower:
     """Fit a servo with limits, by itself or with a change on top of it."""
     drift = float(begin[7])
 
     def fitted(terms: NDArray) -> Follower:
-        terms = np.minimum(terms if drift else np.append(terms, 0.0), _HIGHEST)
+        terms = np.minimum(terms if drift else np.append(terms, 0.0), highest)
         path = joint.path(terms)
         more = change.columns(path) if change else []
         return Follower(terms, path, joint.regressed(path, *more))
 
     def cost(terms: NDArray) -> float:
-        beyond = np.sum(np.maximum(terms - _HIGHEST[: len(terms)], 0.0)) + max(-1.5 - terms[1], 0)
+        beyond = np.sum(np.maximum(terms - highest[: len(terms)], 0.0)) + max(-1.5 - terms[1], 0)
         early = 0.0 if drift else 20 * max(-terms[2], 0.0)
         found = fitted(terms).regression
         return found.cost + beyond + early + (found.values[0] <= 0)
@@ -269,8 +316,7 @@ class _Change:
     """Of the readings that it leaves."""
 
 
-def change_findings(joint: Followed) -> list[Finding]:
-    """The change that explains most of what the servo alone leaves, if any does."""
+def _compared(joint: Followed) -> list[Finding]:
     alone = joint.fit.regression.cost
     if alone < _WELL:
         return []
@@ -286,7 +332,7 @@ def change_findings(joint: Followed) -> list[Finding]:
         alone = min(alone, joint.regressed(joint.path(np.append(fit.terms[:7], 0.0))).cost)
         found = change.finding(part, fit)
         cost = fit.regression.cost * (1 + _LESS_SIMPLE * tried.index(change))
-        if found and (best is None or cost < best[0]):
+        if found and fit.regression.cost < _FOLLOWS and (best is None or cost < best[0]):
             best = cost, found
     return [best[1]] if best and best[0] < _MUCH_LESS * alone else []
 
@@ -395,23 +441,28 @@ def _lag_drifts(joint: Followed) -> _Change | None:
 
     def finding(joint: Followed, fit: Follower) -> Finding | None:
         growth = float(fit.terms[7])
-        if abs(growth) * np.ptp(joint.time_s) < _LAG_DRIFT_S:
+        if abs(growth) * np.ptp(joint.time_s) < _LAG_DRIFT_S or abs(growth) > _CLOCK:
             return None
         return Finding("lag_drifts", CARE, {"drift_ms": 1e3 * growth, "percent": 100 * growth})
 
-    return _Change(found.cost, lambda path: [], finding, growth)
+    # edges bend what a small growth of the lag changes: it is worth a fit
+    cost = min(found.cost, 0.9 * joint.fit.regression.cost)
+    return _Change(cost, lambda path: [], finding, growth)
 
 
 def _leaves_path(joint: Followed) -> _Change | None:
     """Some whiles in which the joint is elsewhere; where it rests, it does not answer."""
-    size = np.abs(joint.fit.regression.residuals_rad)
+    rest = joint.fit.regression.residuals_rad
+    size = np.abs(rest)
     away = size > max(_BOUND * joint.scale, 4 * float(np.median(size)), 4 * joint.step)
     whiles: list[tuple[int, int]] = []
     for a, b in zip(joint.starts[:-1], joint.starts[1:], strict=True):
         rows = a + np.flatnonzero(away[a:b])
         cuts = np.flatnonzero(np.diff(joint.time_s[rows]) > _AGAIN_S)
         for part in np.split(rows, cuts + 1):
-            if len(part) > 3 and joint.time_s[part[-1]] - joint.time_s[part[0]] > _LEFT_S:
+            long = len(part) > 3 and joint.time_s[part[-1]] - joint.time_s[part[0]] > _LEFT_S
+            # beside its path at rest a joint is held by friction
+            if long and np.ptp(rest[part]) > 2 * _BOUND * joint.scale:
                 whiles.append((part[0], part[-1] + 1))
     out = np.zeros(len(size), bool)
     for a, b in whiles:

@@ -86,6 +86,11 @@ WORDS: dict[str, str] = {
         "the command moves and the reading does not: torque off, wrong servo id, or a servo "
         "that no longer answers. Power it again and look at it move."
     ),
+    "disturbed": (
+        "a servo with the usual limits leaves {percent:.1f} % of the motion unexplained, all "
+        "along: another program commands it too (a second writer), a load or play moves it, or "
+        "readings are older than their times. Record the joint in free air with one program on the bus."
+    ),
     "echo": (
         "the position is the command itself, {late}: an echo and no measurement. Read the "
         "servo's Present_Position, not its goal."

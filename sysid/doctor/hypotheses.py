@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import fit_sine, least_squares
 from pupper_sysid.sysid.doctor.bends import CLEAR_NATS, bend_findings, bends
-from pupper_sysid.sysid.doctor.changes import Followed, change_findings, followed
+from pupper_sysid.sysid.doctor.changes import Followed, followed
 from pupper_sysid.sysid.doctor.explanations import (
     Explanation,
     Servo,
@@ -45,6 +45,8 @@ _UNITS = {
 _SAME_SCALE, _NO_SERVO = 0.35, 1.2  # of the logarithm
 _STEPWISE, _HOLD_S = 0.75, 0.1  # share of repeats, and how long a level lasts
 _MOVES_MORE = 0.2  # share of repeats that what follows a stepwise command lacks
+_SURE = 0.8  # of the position's variance, with a lag for each trial
+_DISTURBED = 0.12  # of the position's mean deviation
 _LEVEL, _AT_LEAST = 0.05, 0.8  # of the range, between two levels; share of changes that are such
 _CLEARLY_EARLY_S, _MUCH_LESS = 0.03, 0.3
 _SMOOTH = 0.6  # autocorrelation of what is left
@@ -136,6 +138,8 @@ def relation_findings(
         and _smooth_rest(base, best.servo)
     )
     if strange or (best.code and share < least):
+        if joint and joint.changes:
+            return joint.changes, base, None
         # a fault explains what is left of a servo, or smooth motion of another cause is left
         return [Finding("not_a_position_servo", REFUSE, {"percent": 100 * share})], base, None
     if best.code != "columns_swapped" and (scaled := _scale(base, best.servo)):
@@ -155,9 +159,7 @@ def relation_findings(
 def _clocks_drift(trials: Sequence[Trial], step: float, base: Explanation) -> Finding | None:
     """Clocks that drift: a position that is early at one time and late as a servo's at another."""
     joint = followed(trials, step)
-    found = next(
-        (f for f in (change_findings(joint) if joint else ()) if f.code == "lag_drifts"), None
-    )
+    found = next((f for f in (joint.changes if joint else ()) if f.code == "lag_drifts"), None)
     return replace(found, verdict=REFUSE) if found else None
 
 
@@ -416,10 +418,16 @@ def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     joint = followed(trials, step)
     if joint is None or base is None or servo is None:
         return findings
+    changes = _trials_differ(joint) or joint.changes
+    if changes:
+        findings = [f for f in findings if f.code not in ("loosely_related", "no_one_lag")]
     if 1 - servo.unexplained < _LOOSE and not joint.explained:
-        return findings
-    changes = _trials_differ(joint) or change_findings(joint)
-    return [*findings, *second_writer(joint), *changes]
+        return [*findings, *changes]
+    found = [*findings, *second_writer(joint), *changes]
+    loaded = any(t.load is not None for t in trials)
+    if joint.disturbed > _DISTURBED and not (found or loaded or bend_findings(trials, step)):
+        return [Finding("disturbed", CARE, {"percent": 100 * joint.unexplained})]
+    return found
 
 
 def _trials_differ(joint: Followed) -> list[Finding]:

@@ -20,6 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import least_squares
+from pupper_sysid.sysid.doctor.bends import bends
 from pupper_sysid.sysid.doctor.changes import Followed, follower_path
 from pupper_sysid.sysid.doctor.findings import CARE, Finding
 from pupper_sysid.sysid.doctor.signals import interpolation_findings
@@ -36,6 +37,7 @@ _JUMP, _FEWEST_ROWS = 0.3, 40  # of the command's range in a row
 _FEWEST_PUSHES, _HEAVY, _ONE_WAY = 6, 12.0, 0.85
 _PLACES = np.linspace(-0.5, 1.5, 41)  # of the command's range
 _PARTS, _MOST_IN_PART = 6, 0.6
+_BENT = 0.5  # of what a servo leaves
 
 _HIGHEST_HZ, _LEAST_AMPLITUDE_RAD, _LEAST_STEPS = 4.5, 0.1, 20.0
 _SCATTER, _SCATTER_S = 0.15, 0.012  # of the amplitude; as an error of the time
@@ -45,6 +47,9 @@ _HARMONICS, _FEWEST_READINGS = 3, 25
 def second_writer(joint: Followed) -> list[Finding]:
     """Pushes towards one place while the command goes on, unless a bend of the path makes them."""
     if interpolation_findings(joint.trials, joint.step):
+        return []
+    bent = bends(joint.trials, joint.step)
+    if bent and min(b.unexplained for b in bent.values()) < _BENT * bent["linear"].unexplained:
         return []
     pushes = [_pushes(joint, number) for number in range(len(joint.base.samples))]
     times, sizes, wanted = (np.concatenate(each) for each in zip(*pushes, strict=True))
