@@ -51,6 +51,7 @@ _SPLITS = 30
 _EDGE_S = 1.0  # of a change, from either end
 _OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S, _CLOCK = 0.75, 0.2, 0.008, 0.03
 _MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
+_GROWTHS = [sign * size for size in (0.001, 0.002, 0.004, 0.006, 0.009, 0.014) for sign in (-1, 1)]
 _LEFT_S, _AGAIN_S, _MOST_LEFT, _TIMES_LEFT = 0.3, 0.3, 0.45, 4
 
 
@@ -324,11 +325,9 @@ def _compared(joint: Followed) -> list[Finding]:
     best: tuple[float, Finding] | None = None
     for change in sorted(tried, key=lambda c: c.cost)[:_FITTED]:
         part = joint if change.rows is None else _without(joint, ~change.rows)
-        terms = joint.fit.terms.copy()
-        if change.growth:
-            middle = float(np.mean(joint.time_s)) - joint.start_s
-            terms[[2, 7]] += -change.growth * middle, change.growth
-        fit = follow(part, terms, None if change.growth else change)
+        fit = follow(part, _growing(joint, change.growth), None if change.growth else change)
+        if change.growth:  # it began with another servo's terms
+            fit = follow(part, fit.terms)
         alone = min(alone, joint.regressed(joint.path(np.append(fit.terms[:7], 0.0))).cost)
         found = change.finding(part, fit)
         cost = fit.regression.cost * (1 + _LESS_SIMPLE * tried.index(change))
@@ -420,7 +419,7 @@ def _gain_drifts(joint: Followed) -> _Change | None:
     share = (joint.time_s - joint.time_s.mean()) / max(float(np.ptp(joint.time_s)), 1e-9)
 
     def columns(path: NDArray) -> list[NDArray]:
-        return [path * share]
+        return [path * share, share]
 
     def finding(joint: Followed, fit: Follower) -> Finding | None:
         change = float(fit.regression.values[1] / max(fit.regression.values[0], 1e-9))
@@ -433,11 +432,8 @@ def _gain_drifts(joint: Followed) -> _Change | None:
 
 def _lag_drifts(joint: Followed) -> _Change | None:
     """A lag that grows steadily: clocks that drift apart."""
-    terms, path = joint.fit.terms, joint.fit.path_rad
-    later = np.array([0, 0, 0.002, 0, 0, 0, 0, 0])
-    rate = (joint.path(terms - later) - joint.path(terms + later)) / 0.004
-    found = joint.regressed(path, rate * (joint.time_s - joint.time_s.mean()))
-    growth = -float(found.values[1] / max(found.values[0], 1e-9))
+    costs = {g: joint.regressed(joint.path(_growing(joint, g))).cost for g in _GROWTHS}
+    growth = min(costs, key=lambda g: costs[g])
 
     def finding(joint: Followed, fit: Follower) -> Finding | None:
         growth = float(fit.terms[7])
@@ -445,9 +441,16 @@ def _lag_drifts(joint: Followed) -> _Change | None:
             return None
         return Finding("lag_drifts", CARE, {"drift_ms": 1e3 * growth, "percent": 100 * growth})
 
-    # edges bend what a small growth of the lag changes: it is worth a fit
-    cost = min(found.cost, 0.9 * joint.fit.regression.cost)
+    # with another servo it explains more: always worth a fit
+    cost = min(costs[growth], 0.9 * joint.fit.regression.cost)
     return _Change(cost, lambda path: [], finding, growth)
+
+
+def _growing(joint: Followed, growth: float) -> NDArray[np.float64]:
+    """Terms of the servo, with a lag that grows about the middle of the recording."""
+    terms = joint.fit.terms.copy()
+    terms[[2, 7]] += -growth * (float(np.mean(joint.time_s)) - joint.start_s), growth
+    return terms
 
 
 def _leaves_path(joint: Followed) -> _Change | None:
@@ -485,5 +488,5 @@ def _leaves_path(joint: Followed) -> _Change | None:
 
 
 CHANGES: tuple[Callable[[Followed], _Change | None], ...] = (
-    _zero_moves, _gain_changes, _gain_drifts, _lag_drifts, _leaves_path,
+    _zero_moves, _lag_drifts, _gain_drifts, _gain_changes, _leaves_path,
 )  # fmt: skip

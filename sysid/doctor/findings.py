@@ -89,7 +89,7 @@ WORDS: dict[str, str] = {
     "disturbed": (
         "a servo with the usual limits leaves {percent:.1f} % of the motion unexplained, all "
         "along: another program commands it too (a second writer), a load or play moves it, or "
-        "readings are older than their times. Record the joint in free air with one program on the bus."
+        "readings are older than their times. Record in free air with one program on the bus."
     ),
     "echo": (
         "the position is the command itself, {late}: an echo and no measurement. Read the "
