@@ -106,6 +106,10 @@ def relation_findings(
     base = explain(trials, step)
     if base is None:
         return [], None, None
+    joint = followed(trials, step)
+    sound = joint is not None and joint.explained
+    if base.explained < _UNRELATED and joint and sound:
+        return [], base, joint.servo  # a set-point that ramps is late by a part of the motion
     if base.explained < _UNRELATED:
         values = {"percent": 100 * base.explained}
         return [Finding("unrelated", REFUSE, values)], base, None
@@ -128,8 +132,6 @@ def relation_findings(
         best = next(r for r in ranked if not r.code)
     share = 1 - best.servo.unexplained
     least = _FOLLOWS_LATE if best.servo.total_s > _LATEST_S else _FOLLOWS
-    joint = followed(trials, step)
-    sound = joint is not None and joint.explained
     strange = (
         share < _HALF
         and not bent

@@ -142,9 +142,9 @@ def test_clocks_that_drift_are_no_early_position_and_no_swapped_columns():
     assert found["lag_drifts"].values["drift_ms"] == pytest.approx(-6, rel=0.1)
 
 
-@pytest.mark.parametrize("motion", ["prbs", "steps"])
-def test_clocks_that_drift_are_found_in_motion_with_sharp_edges(motion):
-    """All readings together show what the lags of short windows do not."""
+@pytest.mark.parametrize("motion", ["prbs", "steps", "tones", "chirp"])
+def test_clocks_that_drift_are_found_in_any_motion(motion):
+    """All readings together show what the lags of short windows, or of one tone, do not."""
     world = replace(
         draw_world(np.random.default_rng(3), "smart", motion, 3e-4), rate_hz=100.0, poll_s=0.0,
         friction_rad=0.0, gravity_rad=0.0, duration_s=14.0, quantum_rad=0.0015,
@@ -153,6 +153,50 @@ def test_clocks_that_drift_are_found_in_motion_with_sharp_edges(motion):
     late = np.interp(1.006 * table.read_time_s, table.read_time_s, table.position_rad)
     assert "lag_drifts" in codes(recorded(table.assign(position_rad=late)))
     assert "lag_drifts" not in codes(recorded(table))
+
+
+def followed_by_a_ramp(command, rate_hz, speed_rad_s, acceleration_rad_s2):
+    """Readings of a servo whose set-point ramps to each command, 20 ms late."""
+    out, place, rate = np.empty_like(command), command[0], 0.0
+    for k, goal in enumerate(command):
+        for _ in range(10):
+            step, away = 0.1 / rate_hz, goal - place
+            wanted = np.sign(away) * min(speed_rad_s, np.sqrt(2 * acceleration_rad_s2 * abs(away)))
+            most = acceleration_rad_s2 * step
+            rate += min(max(wanted - rate, -most), most)
+            place += rate * step
+        out[k] = place
+    late = round(0.02 * rate_hz)
+    return 0.0015 * np.round(np.concatenate([np.full(late, out[0]), out[:-late]]) / 0.0015)
+
+
+def test_a_set_point_that_ramps_is_a_position_servo():
+    """Of a walk of 0.65 rad at 2.2 Hz a ramp of 12 rad/s² leaves a fraction, half a turn late."""
+    time = np.arange(0.0, 14.0, 0.01)
+    angle = 2 * np.pi * 2.2 * np.maximum(time - 0.4, 0.0)
+    command = 0.65 * (0.7 * np.sin(angle) + 0.3 * np.sin(2 * angle))
+    position = followed_by_a_ramp(command, 100.0, 5.0, 12.0)
+    log = ps.Recording.from_arrays(
+        time, {"joint": command}, {"joint": position}, read_time_s=time + 1e-3
+    )
+    assert not {"unrelated", "not_a_position_servo", "sign_inverted"} & set(codes(log))
+
+
+@pytest.mark.parametrize("motion", ["teleoperation", "steps"])
+def test_a_joint_that_falls_for_a_while_is_no_other_servo(motion):
+    """A supply that breaks down for two seconds: the joint falls to its stop and comes back."""
+    world = replace(
+        draw_world(np.random.default_rng(3), "smart", motion, 3e-4), amplitude_rad=0.3,
+        rate_hz=80.0, poll_s=0.0, friction_rad=0.0, gravity_rad=0.0, duration_s=14.0,
+        quantum_rad=0.0015,
+    )  # fmt: skip
+    table = simulated(world)
+    since = table.read_time_s - 6.0
+    fall = np.clip(np.minimum(3 * since, 12 * (2.2 - since)), 0, 1)
+    position = table.position_rad * (1 - fall) - (0.6 - world.offset_rad) * fall
+    found = codes(recorded(table.assign(position_rad=position)))
+    assert set(found) == {"left_path"}
+    assert found["left_path"].values["time_s"] == pytest.approx(6.0, abs=0.3)
 
 
 def test_a_chirp_beyond_the_speed_limit_is_no_change_of_gain_and_no_drift():
