@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
 
 import numpy as np
 from numba import njit
@@ -52,6 +53,7 @@ _EDGE_S = 1.0  # of a change, from either end
 _OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S, _CLOCK = 0.75, 0.2, 0.008, 0.03
 _MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
 _GROWTHS = [sign * size for size in (0.001, 0.002, 0.004, 0.006, 0.009, 0.014) for sign in (-1, 1)]
+_SHIFTS_S = (-0.06, -0.03, 0.0, 0.03, 0.06)
 _LEFT_S, _AGAIN_S, _MOST_LEFT, _TIMES_LEFT = 0.3, 0.3, 0.45, 4
 
 
@@ -311,8 +313,8 @@ class _Change:
     """What it adds to the path of a servo, from that path."""
     finding: Callable[[Followed, Follower], Finding | None]
     """What it is when the servo was fitted again with it; None where it is too small to matter."""
-    growth: float = 0.0
-    """Of the lag, to begin with."""
+    begin: NDArray[np.float64] | None = None
+    """Terms to begin with, if not those of the servo alone."""
     rows: NDArray[np.bool_] | None = None
     """Of the readings that it leaves."""
 
@@ -325,8 +327,9 @@ def _compared(joint: Followed) -> list[Finding]:
     best: tuple[float, Finding] | None = None
     for change in sorted(tried, key=lambda c: c.cost)[:_FITTED]:
         part = joint if change.rows is None else _without(joint, ~change.rows)
-        fit = follow(part, _growing(joint, change.growth), None if change.growth else change)
-        if change.growth:  # it began with another servo's terms
+        begin = joint.fit.terms if change.begin is None else change.begin
+        fit = follow(part, begin, change)
+        if change.begin is not None:  # of another servo
             fit = follow(part, fit.terms)
         alone = min(alone, joint.regressed(joint.path(np.append(fit.terms[:7], 0.0))).cost)
         found = change.finding(part, fit)
@@ -432,8 +435,15 @@ def _gain_drifts(joint: Followed) -> _Change | None:
 
 def _lag_drifts(joint: Followed) -> _Change | None:
     """A lag that grows steadily: clocks that drift apart."""
-    costs = {g: joint.regressed(joint.path(_growing(joint, g))).cost for g in _GROWTHS}
-    growth = min(costs, key=lambda g: costs[g])
+    usual = joint.fit.terms.copy()
+    usual[:2] = np.log(_USUAL[0][:2])  # a servo without a drift may have become too fast for it
+    middle = float(np.mean(joint.time_s)) - joint.start_s
+    tried = []
+    for growth, shift in product(_GROWTHS, _SHIFTS_S):
+        for terms in (joint.fit.terms.copy(), usual.copy()):
+            terms[[2, 7]] += shift - growth * middle, growth
+            tried.append((joint.regressed(joint.path(terms)).cost, tuple(terms)))
+    least, begin = min(tried)
 
     def finding(joint: Followed, fit: Follower) -> Finding | None:
         growth = float(fit.terms[7])
@@ -442,15 +452,8 @@ def _lag_drifts(joint: Followed) -> _Change | None:
         return Finding("lag_drifts", CARE, {"drift_ms": 1e3 * growth, "percent": 100 * growth})
 
     # with another servo it explains more: always worth a fit
-    cost = min(costs[growth], 0.9 * joint.fit.regression.cost)
-    return _Change(cost, lambda path: [], finding, growth)
-
-
-def _growing(joint: Followed, growth: float) -> NDArray[np.float64]:
-    """Terms of the servo, with a lag that grows about the middle of the recording."""
-    terms = joint.fit.terms.copy()
-    terms[[2, 7]] += -growth * (float(np.mean(joint.time_s)) - joint.start_s), growth
-    return terms
+    cost = min(least, 0.9 * joint.fit.regression.cost)
+    return _Change(cost, lambda path: [], finding, np.array(begin))
 
 
 def _leaves_path(joint: Followed) -> _Change | None:
