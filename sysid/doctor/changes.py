@@ -47,7 +47,7 @@ _BOUND, _CRUDE, _WELL, _EXPLAINED, _FOLLOWS = (
 )  # of the position's mean deviation
 _LITTLE = 0.3  # of a friction
 _WORTH, _FITTED = 0.95, 3  # costs that are worth a fit of its own, and how many are
-_MUCH_LESS, _LESS_SIMPLE = 0.6, 0.06  # of what the servo alone leaves; for each simpler change
+_MUCH_LESS, _LESS_SIMPLE = 0.65, 0.04  # of what the servo alone leaves; for each simpler change
 _SPLITS = 30
 _EDGE_S = 1.0  # of a change, from either end
 _OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S, _CLOCK = 0.75, 0.2, 0.008, 0.03
