@@ -113,7 +113,7 @@ def bend_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     joint = followed(trials, step)
     assert joint is not None
     least = _HELD_WIDTH / 2 * max(float(np.ptp(t.command_rad)) for t in trials)
-    if joint.explained and np.exp(joint.fit.terms[5]) > least and joint.friction_rad:
+    if joint.explained and np.exp(joint.fit.terms[4]) > least and False:
         return _rested(trials, step, 2 * joint.friction_rad)
     friction = _held(trials, step, found, _RIVAL_WIDTH)
     saturation = _saturated(trials, step, found)

@@ -1,70 +1,66 @@
-"""What happens within a recording to a servo that follows: hypotheses compared on one path.
+"""What happens within a recording to a servo that follows: hypotheses compared on one servo.
 
 A linear servo (`explanations`) says what the pair of columns is. What a sound servo does beyond it,
-a set-point that ramps, a motor that saturates, friction, looks like a fault to whatever compares
-its readings with a straight line. `follow` fits a second-order servo behind a set-point of limited
-speed and acceleration, with an effort limit and Coulomb friction, by a bounded cost: what happens
-in a part of a recording does not bend the whole.
+a set-point that ramps, a motor that saturates, friction, a load, looks like a fault to whatever
+compares its readings with a straight line. `fitted` fits a second-order servo with these limits by
+Levenberg-Marquardt at a bounded cost: what happens in a part of a recording does not bend the
+whole.
 
-`change_findings` then compares what may have come on top: a zero or a gain that moves at a moment,
-a gain or a lag that drifts, a while in which the joint leaves its path. The best is named if it
-leaves much less than the servo alone does.
+`compared` then fits it again with what may have come on top: a zero or a gain that moves at a
+moment, a gain or a lag that drifts, a clamped goal, a stop, a while in which the joint leaves its
+path. The best is named if the servo alone explains the readings much less: residuals that agree
+with those beside them count as one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import product
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.optimize import OptimizeResult, minimize
 
-from pupper_sysid.sysid.doctor.explanations import FILTERS, Explanation, Samples, Servo, explain
+from pupper_sysid.sysid.doctor.explanations import FILTERS, Explanation, Servo, explain
 from pupper_sysid.sysid.doctor.findings import CARE, Finding
 from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.excitation import remembered
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _MOST_READINGS, _GRID_S = 1500, 0.0025
-_USUAL = ((50.0, 0.7, 0.02, 4.0, 25.0), (50.0, 0.7, 0.02, 100.0, 1e4))
-"""Servos to begin with where the linear one says little: natural frequency [rad/s], damping ratio,
-lag [s], speed [rad/s] and acceleration [rad/s²]."""
 _UNFILTERED_HZ = 15.0  # natural frequency of a servo that no low-pass explains better
 _LONGEST_LAG_S = 0.5
-_EVALUATIONS, _POLISHED = 260, 0.03  # the latter of the position's mean deviation
-_HIGHEST = np.array([5.5, 1.5, 0.8, 9.0, 12.0, 3.0, 6.0, 0.1])  # of the terms
-_STEPS = np.array([0.4, -0.3, 0.012, -1.0, -1.0, 1.0, -1.0, 1.0])
-_BOUND, _CRUDE, _WELL, _EXPLAINED, _FOLLOWS = (
-    0.25,
-    0.004,
-    0.012,
-    0.06,
-    0.12,
-)  # of the position's mean deviation
-_LITTLE = 0.3  # of a friction
-_WORTH, _FITTED = 0.95, 3  # costs that are worth a fit of its own, and how many are
-_MUCH_LESS, _LESS_SIMPLE = 0.65, 0.04  # of what the servo alone leaves; for each simpler change
-_SPLITS = 30
-_EDGE_S = 1.0  # of a change, from either end
-_OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S, _CLOCK = 0.75, 0.2, 0.008, 0.03
+
+(_NATURAL, _DAMPING, _SPEED, _RAMP, _FRICTION, _EFFORT, _MOTOR, _INTEGRAL,
+ _BIAS, _LAG, _GROWTH, _LOW, _HIGH, _BOTTOM, _TOP) = range(15)  # fmt: skip
+_LOGARITHMS = slice(0, 8)
+_FAR = 1e6  # levels that nothing reaches [rad]
+_LOWEST = np.array([*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.1, 1e-3]), -2, 0, -0.03, *[-_FAR] * 4])
+_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 300, 30]), 2, 0.8, 0.03, *[_FAR] * 4])
+_STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.1, 0.2, 0.02, 0.002, 2e-4, *[0.01] * 4])
+"""Bounds of a servo's terms, and differences for their derivatives; of levels and the bias in units
+of the command's range."""
+_ALONE = tuple(range(_GROWTH))
+_DRAWN, _DRAWN_FROM = 200, (
+    (10, 90), (0.5, 1.3), (1.5, 6), (8, 80), (0.002, 0.04), (0.1, 1), (2, 12), (0.3, 5),
+    (0.003, 0.08),
+)  # fmt: skip
+"""Servos tried, and ranges of their terms, the lag last; friction and effort of the range."""
+_OF_A_KIND = 2
+_REFINED, _HOPS, _TRIED, _WELL = 3, 3, 5, 0.02
+_BOUND, _CRUDE = 0.25, 0.004  # of the position's mean deviation
+EXPLAINED = 0.06
+"""Of the position's mean deviation: what a servo with limits leaves where it explains nearly all."""
+_SPLITS, _EDGE_S = 30, 1.0  # moments of a change, and their least distance from either end
+_OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S = 0.75, 0.2, 0.008
 _MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
-_GROWTHS = [sign * size for size in (0.001, 0.002, 0.004, 0.006, 0.009, 0.014) for sign in (-1, 1)]
-_SHIFTS_S = (-0.06, -0.03, 0.0, 0.03, 0.06)
+_GROWTHS = tuple(sign * size for size in (0.0015, 0.003, 0.006, 0.012) for sign in (-1, 1))
+_SHIFTS_S = (-0.04, 0.0, 0.04)
+_LEVELS = np.linspace(0.15, 0.95, 9)  # of the command's range
+_DEEP, _BEYOND = 0.06, 0.03  # of the path's range; of the readings
 _LEFT_S, _AGAIN_S, _MOST_LEFT, _TIMES_LEFT = 0.3, 0.3, 0.45, 4
-
-
-@dataclass(frozen=True)
-class Regression:
-    """Of the readings of a joint."""
-
-    cost: float
-    """Mean bounded error over the mean deviation, and what no model explains."""
-    values: NDArray[np.float64]
-    residuals_rad: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -72,13 +68,24 @@ class Follower:
     """A servo with limits, fitted."""
 
     terms: NDArray[np.float64]
-    """Logarithms of natural frequency [rad/s] and damping ratio, lag [s], logarithms of speed
-    [rad/s], acceleration [rad/s²], friction and effort limit [rad of command], growth of the lag
-    per second."""
+    """Logarithms of natural frequency [rad/s], damping ratio, speed [rad/s] and acceleration
+    [rad/s²] of the set-point, friction and effort limit [rad of command], speed of the motor
+    [rad/s] and integral gain [1/s]; a constant load [ranges of the command], lag [s] and its growth
+    per second; lowest and highest goal and place [rad of command]."""
     path_rad: NDArray[np.float64]
     """The command as it is followed, at each reading."""
-    regression: Regression
-    """Of the position on the path, and on what a change adds."""
+    cost: float
+    """Mean bounded error over the mean deviation, and what no model explains."""
+    values: NDArray[np.float64]
+    """Of the regression of the position on the path, and on what a change adds."""
+    residuals_rad: NDArray[np.float64]
+
+    @property
+    def independent(self) -> float:
+        """Residuals that count as independent: their correlation with the next one says how many."""
+        r = self.residuals_rad
+        along = float(np.clip(r[1:] @ r[:-1] / max(float(r @ r), 1e-18), 0.0, 0.99))
+        return len(r) * (1 - along) / (1 + along)
 
 
 @dataclass(frozen=True)
@@ -92,6 +99,8 @@ class Followed:
     start_s: float
     scale: float
     """Mean distance of readings from the median of their trial [rad]."""
+    reach: float
+    """Range of the command [rad]."""
     time_s: NDArray[np.float64]
     position_rad: NDArray[np.float64]
     starts: NDArray[np.int64]
@@ -100,39 +109,65 @@ class Followed:
     @property
     def explained(self) -> bool:
         """Whether a servo with limits explains nearly all."""
-        return self.fit.regression.cost < _EXPLAINED
+        return self.fit.cost < EXPLAINED
 
     @property
     def unexplained(self) -> float:
         """Share of the variance of all readings that it leaves."""
         parts = np.split(self.position_rad, self.starts[1:-1])
         about = np.concatenate([p - p.mean() for p in parts])
-        rest = np.split(self.fit.regression.residuals_rad, self.starts[1:-1])
+        rest = np.split(self.fit.residuals_rad, self.starts[1:-1])
         left = np.concatenate([r - r.mean() for r in rest])
         return float(left @ left / max(about @ about, 1e-18))
 
     @cached_property
-    def fit(self) -> Follower:
-        """The servo that explains most readings, from one that is linear and one that ramps."""
-        reach = max(float(np.ptp(s.command_rad)) for s in self.base.samples)
+    def screen(self) -> list[Follower]:
+        """The linear servo, and the best of many drawn from what servos are."""
         hz, damping = FILTERS[self.servo.filter]
-        natural = 2 * np.pi * (hz or _UNFILTERED_HZ)
-        fast = natural * reach
-        lag = max(self.servo.lag_s, 0.0)
-        begins = [(natural, damping, lag, 2 * fast, 4 * natural * fast),
-                  (natural, damping, lag, 0.15 * fast, 0.2 * natural * fast), *_USUAL]  # fmt: skip
-        best: Follower | None = None
-        for begin in begins:
-            if begin in _USUAL and best and best.regression.cost < _EXPLAINED:
+        natural, lag = 2 * np.pi * (hz or _UNFILTERED_HZ), max(self.servo.lag_s, 0.0)
+        linear = [natural, damping, 300.0, 2e4, 0.004 * self.reach, 20.0, 300.0, 0.01, lag]
+        servos = []
+        for kind in ([linear], *_drawn(self.reach)):
+            tried = []
+            for *logarithms, late in kind:
+                terms = [*np.log(logarithms), 0.0, late, 0.0, -_FAR, _FAR, -_FAR, _FAR]
+                tried.append(self.follower(np.clip(terms, _LOWEST, _HIGHEST)))
+            servos += sorted(tried, key=_cost)[:_OF_A_KIND]
+        return servos
+
+    @cached_property
+    def fit(self) -> Follower:
+        """The servo that explains most readings: the best of the screen, refined."""
+        best: Sequence[Follower] = self.screen
+        for count, rounds in ((_REFINED, 4), (1, 20)):
+            best = sorted((fitted(self, f, rounds=rounds) for f in best), key=_cost)[:count]
+        fit = best[0]
+        for _ in range(_HOPS):
+            if fit.cost < _WELL:
                 break
-            terms = np.log([begin[0], begin[1], 1.0, *begin[3:], 0.004 * reach, reach, 1.0])
-            terms[2] = begin[2]
-            fit = follow(self, terms)
-            if best is None or fit.regression.cost < best.regression.cost:
-                best = fit
-        assert best is not None
-        more = follow(self, best.terms) if best.regression.cost > _POLISHED else best
-        return min(best, more, key=lambda fit: fit.regression.cost)
+            tried = [fitted(self, f, rounds=5) for f in self._varied(fit)]
+            better = min(tried, key=_cost)
+            if better.cost > 0.97 * fit.cost:
+                break
+            fit = fitted(self, better, rounds=15)
+        return fit
+
+    def _varied(self, fit: Follower) -> list[Follower]:
+        """The same servo with another kind of limit: the way to it may lead uphill."""
+        fast = np.exp(fit.terms[_NATURAL]) * self.reach
+        effort = min(0.3 * self.reach, 0.5 * float(np.exp(fit.terms[_EFFORT])))
+        servos = []
+        for change in (
+            {_INTEGRAL: 1.5}, {_INTEGRAL: 0.01, _BIAS: 0.0}, {_EFFORT: effort, _MOTOR: fast},
+            {_EFFORT: 20.0, _MOTOR: 2 * fast}, {_SPEED: 5.0, _RAMP: 25.0},
+            {_SPEED: 300.0, _RAMP: 2e4}, {_FRICTION: 0.05 * self.reach},
+            {_FRICTION: 0.004 * self.reach},
+        ):  # fmt: skip
+            terms = fit.terms.copy()
+            for k, value in change.items():
+                terms[k] = value if k == _BIAS else np.log(value)
+            servos.append(self.follower(np.clip(terms, _LOWEST, _HIGHEST)))
+        return sorted(servos, key=_cost)[:_TRIED]
 
     @cached_property
     def disturbed(self) -> float:
@@ -142,38 +177,58 @@ class Followed:
         rate = np.abs(
             np.gradient(self.fit.path_rad, self.time_s + 1e-9 * np.arange(len(self.time_s)))
         )
-        return self.fit.regression.cost - age * float(np.median(rate)) / self.scale
-
-    @cached_property
-    def friction_rad(self) -> float:
-        """Error of the command that friction holds against; 0 where a servo needs none."""
-        friction = float(np.exp(self.fit.terms[5]))
-        highest = _HIGHEST.copy()
-        highest[5] = np.log(_LITTLE * friction)
-        terms = np.minimum(self.fit.terms, highest)
-        without = follow(self, terms, highest=highest).regression.cost
-        return friction if self.fit.regression.cost < _MUCH_LESS * without else 0.0
+        return self.fit.cost - age * float(np.median(rate)) / self.scale
 
     @cached_property
     def changes(self) -> list[Finding]:
         """The change that explains most of what the servo alone leaves, if any does."""
-        return _compared(self)
+        return compared(self)
+
+    @cached_property
+    def _inputs(self) -> list[tuple]:
+        """Command, its rest, and the grid and the start of its time, of each trial."""
+        inputs = []
+        for s in self.base.samples:
+            every = max(1, int(_GRID_S / s.grid_s))
+            command = np.ascontiguousarray(s.command_rad[::every])
+            inputs.append((command, s.rest_rad, s.grid_s * every, s.start_s))
+        return inputs
 
     def path(self, terms: NDArray) -> NDArray[np.float64]:
         """The command as a servo follows it, at each reading [rad of command]."""
-        return np.concatenate([
-            follower_path(s, terms, t, self.start_s)
-            for s, t in zip(self.base.samples, np.split(self.time_s, self.starts[1:-1]),
-                            strict=True)
-        ])  # fmt: skip
+        terms = terms.copy()
+        terms[_LOGARITHMS] = np.exp(terms[_LOGARITHMS])
+        terms[_BIAS] *= self.reach
+        path, middle = np.empty_like(self.time_s), self.start_s
+        for inputs, a, b in zip(self._inputs, self.starts[:-1], self.starts[1:], strict=True):
+            late = self.time_s[a:b] - terms[_LAG] - terms[_GROWTH] * (self.time_s[a:b] - middle)
+            _follow(*inputs, terms, late, path[a:b])
+        return path
 
-    def regressed(self, *columns: NDArray) -> Regression:
-        """Position by columns and a constant per trial, at the least bounded cost."""
+    def path_of_trial(self, number: int) -> NDArray[np.float64]:
+        """The same of the fit, at all readings of a trial."""
+        sample = self.base.samples[number]
+        base = replace(self.base, samples=(sample,))
+        ends = np.array([0, len(sample.time_s)])
+        return replace(self, base=base, time_s=sample.time_s, starts=ends).path(self.fit.terms)
+
+    def follower(self, terms: NDArray, columns: Columns | None = None) -> Follower:
+        """Regress the position on the path, what is added to it, and a constant per trial."""
+        return self.regressed(terms, self.path(terms), columns)
+
+    def regressed(self, terms: NDArray, path: NDArray, columns: Columns | None) -> Follower:
+        """The same of a path that is known."""
+        design = np.column_stack([path, *(columns(path) if columns else ())])
         floor = 0.01 * self.scale + 0.25 * self.step
         cost, values, rest = _regression(
-            np.column_stack(columns), self.position_rad, self.starts, _BOUND * self.scale, floor
+            design, self.position_rad, self.starts, _BOUND * self.scale, floor
         )
-        return Regression(cost / self.scale + _CRUDE + 0.05 * self.step / self.scale, values, rest)
+        cost = cost / self.scale + _CRUDE + 0.05 * self.step / self.scale
+        return Follower(terms, path, cost, values, rest)
+
+
+Columns = Callable[[NDArray], Sequence[NDArray]]
+"""What a change adds to the path of a servo, from that path."""
 
 
 @remembered(8)
@@ -188,86 +243,129 @@ def followed(trials: Sequence[Trial], step: float) -> Followed | None:
     times = [s.time_s[::every] for s in base.samples]
     position = [s.position_rad[::every] for s in base.samples]
     away = np.concatenate([np.abs(p - np.median(p)) for p in position])
+    reach = max(float(np.ptp(s.command_rad)) for s in base.samples)
     return Followed(
         tuple(trials), step, base, servo, float(trials[0].send_time_s[0]),
-        max(float(away.mean()), 1e-9), np.concatenate(times), np.concatenate(position),
+        max(float(away.mean()), 1e-9), reach, np.concatenate(times), np.concatenate(position),
         np.cumsum([0, *map(len, times)]),
     )  # fmt: skip
 
 
-def follower_path(
-    samples: Samples, terms: NDArray, time_s: NDArray, start_s: float
-) -> NDArray[np.float64]:
-    """Path of a servo with the `terms` of a `Follower`, at times of one trial."""
-    natural, damping, _, *limits, _ = np.exp(terms)
-    every = max(1, int(_GRID_S / samples.grid_s))
-    grid = samples.grid_s * every
-    out = _follow(samples.command_rad[::every], samples.rest_rad, grid, natural, damping, *limits)
-    clock = samples.start_s + grid * np.arange(len(out))
-    return np.interp(time_s - terms[2] - terms[7] * (time_s - start_s), clock, out)
+def _drawn(reach: float) -> list[NDArray[np.float64]]:
+    """Terms of servos with the lag last: ramped, weak, held by friction, and with none of these."""
+    u = np.random.default_rng(0).random((_DRAWN, 10))
+    low, high = np.array(_DRAWN_FROM).T
+    terms = np.exp(np.log(low) + u[:, :9] * np.log(high / low))
+    terms[:, [_FRICTION, _EFFORT]] *= reach
+    kind = np.minimum((5 * u[:, 9]).astype(int), 3)
+    terms[kind != 3, _SPEED : _RAMP + 1] = 300.0, 2e4  # two in five ramp
+    terms[kind != 1, _EFFORT], terms[kind != 1, _MOTOR] = 20.0, 300.0
+    terms[kind == 2, _FRICTION] *= 10
+    terms[u[:, 0] * 7 % 1 < 0.7, _INTEGRAL] = 0.01
+    return [terms[kind == k] for k in range(4)]
 
 
-def follow(
-    joint: Followed, begin: NDArray, change: _Change | None = None, highest: NDArray = _HIGHEST
-) -> Follower:
-    """Fit a servo with limits, by itself or with a change on top of it."""
-    drift = float(begin[7])
+def _cost(fit: Follower) -> float:
+    return fit.cost if fit.values[0] > 0 else np.inf
 
-    def fitted(terms: NDArray) -> Follower:
-        terms = np.minimum(terms if drift else np.append(terms, 0.0), highest)
-        path = joint.path(terms)
-        more = change.columns(path) if change else []
-        return Follower(terms, path, joint.regressed(path, *more))
 
-    def cost(terms: NDArray) -> float:
-        beyond = np.sum(np.maximum(terms - highest[: len(terms)], 0.0)) + max(-1.5 - terms[1], 0)
-        early = 0.0 if drift else 20 * max(-terms[2], 0.0)
-        found = fitted(terms).regression
-        return found.cost + beyond + early + (found.values[0] <= 0)
-
-    begin = begin if drift else begin[:7]
-    simplex = np.vstack([begin, begin + np.diag(_STEPS[: len(begin)])])
-    if drift:
-        middle = float(np.mean(joint.time_s)) - joint.start_s
-        simplex[-1, [2, 7]] = begin[[2, 7]] + np.array([middle, -1.0]) * 0.7 * drift
-    result: OptimizeResult = minimize(
-        cost, begin, method="Nelder-Mead",
-        options={"initial_simplex": simplex, "maxfev": _EVALUATIONS, "fatol": 5e-5, "xatol": 1e-4},
-    )  # fmt: skip
-    return fitted(result["x"])
+def fitted(
+    joint: Followed, begin: Follower, columns: Columns | None = None,
+    free: Sequence[int] = _ALONE, rounds: int = 12,
+) -> Follower:  # fmt: skip
+    """Fit the `free` terms of a servo by Levenberg-Marquardt, reweighted for the bounded cost."""
+    best, damping = joint.follower(begin.terms, columns), 0.03
+    free = [k for k in free if k < _LOW or abs(begin.terms[k]) < _FAR]  # levels that are set
+    bound, floor = _BOUND * joint.scale, 0.01 * joint.scale + 0.25 * joint.step
+    steps = _STEPS.copy()
+    steps[_LOW:] *= joint.reach
+    terms_free = np.array(free)
+    for _ in range(rounds):
+        size = np.abs(best.residuals_rad)
+        weight = (bound / (size + bound)) ** 2 / np.maximum(size, floor)
+        slopes = []
+        for k in free:
+            moved = best.terms.copy()
+            step = steps[k] if moved[k] + steps[k] <= _HIGHEST[k] else -steps[k]
+            moved[k] += step
+            slopes.append((joint.path(moved) - best.path_rad) * (best.values[0] / step))
+        more = columns(best.path_rad) if columns else ()
+        design = np.column_stack([*slopes, best.path_rad, *more])
+        rest = best.residuals_rad.copy()
+        for a, b in zip(joint.starts[:-1], joint.starts[1:], strict=True):
+            share = weight[a:b] / weight[a:b].sum()
+            design[a:b] -= share @ design[a:b]
+            rest[a:b] -= share @ rest[a:b]
+        gram = design.T @ (weight[:, None] * design)
+        right = design.T @ (weight * rest)
+        size, before = np.diag(gram) + 1e-9 * np.trace(gram) / len(gram), best.cost
+        for _ in range(4):
+            held = np.where(np.arange(len(gram)) < len(free), damping, 1e-9) * size
+            way = np.linalg.solve(gram + np.diag(held), right)[: len(free)]
+            way = np.clip(way, -8 * steps[terms_free], 8 * steps[terms_free])
+            terms = best.terms.copy()
+            terms[terms_free] += way
+            tried = joint.follower(np.clip(terms, _LOWEST, _HIGHEST), columns)
+            if tried.values[0] > 0 and tried.cost < best.cost:
+                best, damping = tried, max(damping / 4, 1e-4)
+                break
+            damping *= 5
+        if best.cost > 0.999 * before:
+            break
+    return best
 
 
 @njit(cache=True)
-def _follow(command, rest, grid, natural, damping, speed, acceleration, friction, effort):
-    """Path of a servo from rest, at each point of the grid."""
+def _follow(command, rest, grid, start, terms, time, out):
+    """Path of a servo from rest, at times."""
+    natural, damping, speed, ramp, friction, effort, motor, integral, bias = terms[:9]
+    low, high, bottom, top = terms[11:15]
     parts = max(1, int(np.ceil(grid * natural / 0.3)))
-    step = grid / parts
-    goal = place = rest
+    step, square = grid / parts, natural * natural
+    goal = min(max(rest, low), high)
+    place = min(max(goal, bottom), top)
     rate = velocity = 0.0
-    hold, most_force = natural * natural * friction, natural * natural * effort
-    out = np.empty(len(command))
+    load = hand = bias * square  # the integral, or a hand before the first command, carries the load
+    if integral < 0.01:
+        hand = 0.0
+    hold, most_force, most = square * friction, square * effort, ramp * step
+    places = np.empty(len(command))
     for k in range(len(command)):
+        wished = min(max(command[k], low), high)
         for _ in range(parts):
-            away = command[k] - goal
-            wanted = min(speed, np.sqrt(2 * acceleration * abs(away)))
-            wanted = wanted if away > 0 else -wanted
-            most = acceleration * step
-            rate += min(max(wanted - rate, -most), most)
-            goal += rate * step
-            if (command[k] - goal) * away <= 0:
-                goal = command[k]
-                if abs(rate) <= 2 * most:
-                    rate = 0.0
-            force = natural * natural * (goal - place)
+            away = wished - goal
+            if away != 0.0 or rate != 0.0:
+                wanted = min(speed, np.sqrt(2 * ramp * abs(away)))
+                wanted = wanted if away > 0 else -wanted
+                rate += min(max(wanted - rate, -most), most)
+                goal += rate * step
+                if (wished - goal) * away <= 0:
+                    goal = wished
+                    if abs(rate) <= 2 * most:
+                        rate = 0.0
+            force = square * (goal - place) + hand
+            if abs(force) < most_force:
+                hand += integral * square * (goal - place) * step
             force = min(max(force, -most_force), most_force) - 2 * damping * natural * velocity
+            if force * velocity > 0:
+                moving = most_force * max(1 - abs(velocity) / motor, 0.0)
+                force = min(max(force, -moving), moving)
+            force -= load
             if velocity == 0.0 and abs(force) <= hold:
                 continue
             way = np.sign(velocity) if velocity != 0.0 else np.sign(force)
             after = velocity + step * (force - way * hold)
             velocity = 0.0 if velocity != 0.0 and after * velocity < 0 else after
             place += step * velocity
-        out[k] = place
-    return out
+            if place < bottom:
+                place, velocity = bottom, 0.0
+            elif place > top:
+                place, velocity = top, 0.0
+        places[k] = place
+    for k in range(len(time)):
+        x = (time[k] - start) / grid
+        n = int(min(max(np.floor(x), 0), len(places) - 2))
+        out[k] = places[n] + min(max(x - n, 0.0), 1.0) * (places[n + 1] - places[n])
 
 
 @njit(cache=True)
@@ -306,37 +404,59 @@ def _regression(design, position, starts, bound, floor):
 # ----- hypotheses
 @dataclass(frozen=True)
 class _Change:
-    """A hypothesis, screened on the servo's path alone."""
+    """A hypothesis, and how it is fitted."""
 
-    cost: float
-    columns: Callable[[NDArray], list[NDArray]]
-    """What it adds to the path of a servo, from that path."""
-    finding: Callable[[Followed, Follower], Finding | None]
-    """What it is when the servo was fitted again with it; None where it is too small to matter."""
-    begin: NDArray[np.float64] | None = None
-    """Terms to begin with, if not those of the servo alone."""
-    rows: NDArray[np.bool_] | None = None
-    """Of the readings that it leaves."""
+    begins: Sequence[Follower]
+    """Servos to begin with."""
+    finding: Callable[[Follower], Finding | None]
+    """What it is once it is fitted; None where it is too small to matter."""
+    columns: Columns | None = None
+    free: Sequence[int] = ()
+    """Terms of the servo that it adds."""
+    without: NDArray[np.bool_] | None = None
+    """Readings that it leaves out."""
+    values: float = 1
+    """How many numbers it adds."""
 
 
-def _compared(joint: Followed) -> list[Finding]:
-    alone = joint.fit.regression.cost
-    if alone < _WELL:
+@dataclass(frozen=True)
+class Compared:
+    """A change against the servo alone."""
+
+    nats: float
+    """Advantage of the change."""
+    alone: float
+    fit: Follower
+    finding: Finding | None
+
+
+def comparisons(joint: Followed) -> list[Compared]:
+    """Every change, fitted."""
+    found = []
+    for change in CHANGES:
+        if tried := change(joint):
+            part = joint if tried.without is None else _without(joint, tried.without)
+            fits = [fitted(part, b, tried.columns, (*_ALONE, *tried.free)) for b in tried.begins]
+            fit = min(fits, key=_cost)
+            alone = fit.terms.copy()
+            alone[_GROWTH:] = joint.fit.terms[_GROWTH:]
+            plain = min(joint.fit.cost, fitted(joint, joint.follower(alone), rounds=8).cost)
+            values = tried.values
+            if tried.without is not None:  # a number for each independent reading that is left out
+                values = fit.independent * tried.without.mean()
+            nats = fit.independent * np.log(plain / fit.cost)
+            nats -= 0.5 * values * np.log(len(joint.time_s))
+            found.append(Compared(float(nats), plain, fit, tried.finding(fit)))
+    return found
+
+
+def compared(joint: Followed) -> list[Finding]:
+    """The finding of the best change, if it is one and clearly better than the servo alone."""
+    tried = [c for c in comparisons(joint) if c.finding]
+    best = max(tried, key=lambda c: c.nats, default=None)
+    if best is None or not best.finding or best.nats < 10:
         return []
-    tried = [c for change in CHANGES if (c := change(joint)) and c.cost < _WORTH * alone]
-    best: tuple[float, Finding] | None = None
-    for change in sorted(tried, key=lambda c: c.cost)[:_FITTED]:
-        part = joint if change.rows is None else _without(joint, ~change.rows)
-        begin = joint.fit.terms if change.begin is None else change.begin
-        fit = follow(part, begin, change)
-        if change.begin is not None:  # of another servo
-            fit = follow(part, fit.terms)
-        alone = min(alone, joint.regressed(joint.path(np.append(fit.terms[:7], 0.0))).cost)
-        found = change.finding(part, fit)
-        cost = fit.regression.cost * (1 + _LESS_SIMPLE * tried.index(change))
-        if found and fit.regression.cost < _FOLLOWS and (best is None or cost < best[0]):
-            best = cost, found
-    return [best[1]] if best and best[0] < _MUCH_LESS * alone else []
+    return [best.finding]
 
 
 def _without(joint: Followed, rows: NDArray[np.bool_]) -> Followed:
@@ -353,18 +473,32 @@ def _without(joint: Followed, rows: NDArray[np.bool_]) -> Followed:
 
 
 def _split(
-    joint: Followed, columns: Callable[[int, NDArray], list[NDArray]]
-) -> tuple[float, int] | None:
-    """Cost and reading of a change that explains most, a while from either end of its trial."""
-    each, path = max(_SPLITS // (len(joint.starts) - 1), 3), joint.fit.path_rad
-    tried: list[tuple[float, int]] = []
-    for a, b in zip(joint.starts[:-1], joint.starts[1:], strict=True):
-        time = joint.time_s[a:b]
-        low, high = time[0] + _EDGE_S, time[-1] - _EDGE_S
-        if low < high:
-            for k in a + np.searchsorted(time, np.linspace(low, high, each)):
-                tried.append((joint.regressed(path, *columns(int(k), path)).cost, int(k)))
-    return min(tried, default=None)
+    joint: Followed, columns: Callable[[int], Columns]
+) -> tuple[int, Follower] | None:
+    """Reading of a change that explains most, and the servo that it begins with.
+
+    A servo that explains both parts alike has become another one: those of the screen are tried as
+    well, and the moment is found again for the one that the change makes best.
+    """
+    low, high = joint.time_s[0] + _EDGE_S, joint.time_s[-1] - _EDGE_S
+    if low >= high:
+        return None
+    moments = np.searchsorted(joint.time_s, np.linspace(low, high, _SPLITS)).tolist()
+    begin = joint.fit
+    for spread in (1.0, 0.1):
+        tried = []
+        for k in moments:
+            tried.append((joint.regressed(begin.terms, begin.path_rad, columns(k)).cost, k))
+        at = min(tried)[1]
+        servos = [joint.regressed(f.terms, f.path_rad, columns(at)) for f in joint.screen]
+        best = [begin, *sorted(servos, key=_cost)[:2]]
+        begin = min((fitted(joint, f, columns(at), rounds=4) for f in best), key=_cost)
+        around = 2 * spread * len(joint.time_s) / _SPLITS
+        near = np.unique(np.linspace(at - around, at + around, 21).astype(int))
+        trial = np.searchsorted(joint.starts, at, "right")
+        low, high = joint.starts[trial - 1] + 2, joint.starts[trial] - 2
+        moments = near[(near > low) & (near < high)].tolist() or [at]
+    return at, begin
 
 
 def _after(joint: Followed, at: int) -> NDArray[np.float64]:
@@ -376,89 +510,124 @@ def _after(joint: Followed, at: int) -> NDArray[np.float64]:
 
 def _zero_moves(joint: Followed) -> _Change | None:
     """A zero that moves at a moment; under a load that is known gravity moves it."""
-
-    def columns(k: int, path: NDArray) -> list[NDArray]:
-        return [_after(joint, k)]
-
-    best = None if any(t.load is not None for t in joint.trials) else _split(joint, columns)
+    loaded = any(t.load is not None for t in joint.trials)
+    best = None if loaded else _split(joint, lambda k: lambda path: [_after(joint, k)])
     if best is None:
         return None
-    at = best[1]
+    at, begin = best
 
-    def finding(joint: Followed, fit: Follower) -> Finding | None:
-        moved = abs(float(fit.regression.values[1]))
-        reach = max(float(np.ptp(s.command_rad)) for s in joint.base.samples)
+    def finding(fit: Follower) -> Finding | None:
+        moved = abs(float(fit.values[1]))
         values = {"offset_rad": moved, "time_s": float(joint.time_s[at]) - joint.start_s}
-        small = moved < max(_MOVED_RAD, _MOVED_SHARE * reach)
+        small = moved < max(_MOVED_RAD, _MOVED_SHARE * joint.reach)
         return None if small else Finding("zero_moves", CARE, values)
 
-    return _Change(best[0], partial(columns, at), finding)
+    return _Change([begin], finding, lambda path: [_after(joint, at)], values=2)
 
 
 def _gain_changes(joint: Followed) -> _Change | None:
     """A gain that changes at a moment, about any place."""
     row = np.arange(len(joint.time_s))
 
-    def columns(k: int, path: NDArray) -> list[NDArray]:
-        return [path * (row >= k), _after(joint, k)]
+    def columns(k: int) -> Columns:
+        return lambda path: [path * (row >= k), _after(joint, k)]
 
     best = _split(joint, columns)
     if best is None:
         return None
-    at = best[1]
+    at, begin = best
 
-    def finding(joint: Followed, fit: Follower) -> Finding | None:
-        before, more = map(float, fit.regression.values[:2])
+    def finding(fit: Follower) -> Finding | None:
+        before, more = map(float, fit.values[:2])
         low, high = sorted((before, before + more))
         values = {"time_s": float(joint.time_s[at]) - joint.start_s, "before": before,
                   "after": before + more}  # fmt: skip
         return None if low > _OTHER_GAIN * high else Finding("gain_changed", CARE, values)
 
-    return _Change(best[0], partial(columns, at), finding)
+    return _Change([begin], finding, columns(at), values=3)
 
 
 def _gain_drifts(joint: Followed) -> _Change | None:
     """A gain that grows or shrinks steadily."""
     share = (joint.time_s - joint.time_s.mean()) / max(float(np.ptp(joint.time_s)), 1e-9)
 
-    def columns(path: NDArray) -> list[NDArray]:
-        return [path * share, share]
-
-    def finding(joint: Followed, fit: Follower) -> Finding | None:
-        change = float(fit.regression.values[1] / max(fit.regression.values[0], 1e-9))
+    def finding(fit: Follower) -> Finding | None:
+        change = float(fit.values[1] / max(fit.values[0], 1e-9))
         values = {"percent": 100 * change}
         return None if abs(change) < _GAIN_DRIFT else Finding("gain_drifts", CARE, values)
 
-    path = joint.fit.path_rad
-    return _Change(joint.regressed(path, *columns(path)).cost, columns, finding)
+    def columns(path: NDArray) -> list[NDArray]:
+        return [path * share, share]
+
+    servos = [joint.regressed(f.terms, f.path_rad, columns) for f in joint.screen]
+    return _Change([joint.fit, min(servos, key=_cost)], finding, columns, values=2)
 
 
 def _lag_drifts(joint: Followed) -> _Change | None:
     """A lag that grows steadily: clocks that drift apart."""
-    usual = joint.fit.terms.copy()
-    usual[:2] = np.log(_USUAL[0][:2])  # a servo without a drift may have become too fast for it
+    # a servo without a drift may have become another one for it
+    servos = [joint.fit, *sorted(joint.screen, key=_cost)[:3]]
     middle = float(np.mean(joint.time_s)) - joint.start_s
     tried = []
-    for growth, shift in product(_GROWTHS, _SHIFTS_S):
-        for terms in (joint.fit.terms.copy(), usual.copy()):
-            terms[[2, 7]] += shift - growth * middle, growth
-            tried.append((joint.regressed(joint.path(terms)).cost, tuple(terms)))
-    least, begin = min(tried)
+    for growth, shift, servo in product(_GROWTHS, _SHIFTS_S, servos):
+        moved = servo.terms.copy()
+        moved[[_LAG, _GROWTH]] += shift - growth * middle, growth
+        tried.append(joint.follower(moved))
 
-    def finding(joint: Followed, fit: Follower) -> Finding | None:
-        growth = float(fit.terms[7])
-        if abs(growth) * np.ptp(joint.time_s) < _LAG_DRIFT_S or abs(growth) > _CLOCK:
+    def finding(fit: Follower) -> Finding | None:
+        growth = float(fit.terms[_GROWTH])
+        if abs(growth) * np.ptp(joint.time_s) < _LAG_DRIFT_S:
             return None
         return Finding("lag_drifts", CARE, {"drift_ms": 1e3 * growth, "percent": 100 * growth})
 
-    # with another servo it explains more: always worth a fit
-    cost = min(least, 0.9 * joint.fit.regression.cost)
-    return _Change(cost, lambda path: [], finding, np.array(begin))
+    return _Change(sorted(tried, key=_cost)[:2], finding, free=(_GROWTH,))
+
+
+def _clipped(joint: Followed) -> _Change | None:
+    """A goal that is clamped, or a motion that ends at a stop, above, below or both."""
+    command = np.concatenate([s.command_rad for s in joint.base.samples])
+    low, high = float(command.min()), float(command.max())
+
+    def levels(servo: Follower, terms: Sequence[int], shares: NDArray) -> list[Follower]:
+        tried = []
+        for term, share in product(terms, shares):
+            moved = servo.terms.copy()
+            over = term in (_HIGH, _TOP)
+            moved[term] = low + share * (high - low) if over else high - share * (high - low)
+            tried.append(joint.follower(moved))
+        return tried
+
+    def term(servo: Follower) -> int:
+        return _LOW + int(np.argmin(np.abs(servo.terms[_LOW:])))
+
+    servos = [joint.fit, *sorted(joint.screen, key=_cost)[:3]]
+    one = sorted((f for s in servos for f in levels(s, range(_LOW, _TOP + 1), _LEVELS)), key=_cost)
+    begins = one[:2]
+    pair = {_LOW: _HIGH, _HIGH: _LOW, _BOTTOM: _TOP, _TOP: _BOTTOM}
+    begins.append(min(levels(one[0], [pair[term(one[0])]], _LEVELS[::2]), key=_cost))
+
+    def finding(fit: Follower) -> Finding | None:
+        plain = fit.terms.copy()
+        plain[_LOW:] = joint.fit.terms[_LOW:]
+        path = joint.path(plain)
+        best: tuple[float, float] | None = None
+        for k in np.flatnonzero(np.abs(fit.terms[_LOW:]) < _FAR) + _LOW:
+            over = k in (_HIGH, _TOP)
+            beyond = path > fit.terms[k] if over else path < fit.terms[k]
+            depth = path.max() - fit.terms[k] if over else fit.terms[k] - path.min()
+            share = float(beyond.mean())
+            if depth > _DEEP * np.ptp(path) and share > max(_BEYOND, best[0] if best else 0.0):
+                best = share, float(np.median(joint.position_rad[beyond]))
+        if best is None:
+            return None
+        return Finding("clipped", CARE, {"level_rad": best[1], "percent": 100 * best[0]})
+
+    return _Change(begins, finding, free=range(_LOW, _TOP + 1), values=2)
 
 
 def _leaves_path(joint: Followed) -> _Change | None:
     """Some whiles in which the joint is elsewhere; where it rests, it does not answer."""
-    rest = joint.fit.regression.residuals_rad
+    rest = joint.fit.residuals_rad
     size = np.abs(rest)
     away = size > max(_BOUND * joint.scale, 4 * float(np.median(size)), 4 * joint.step)
     whiles: list[tuple[int, int]] = []
@@ -468,7 +637,7 @@ def _leaves_path(joint: Followed) -> _Change | None:
         for part in np.split(rows, cuts + 1):
             long = len(part) > 3 and joint.time_s[part[-1]] - joint.time_s[part[0]] > _LEFT_S
             # beside its path at rest a joint is held by friction
-            if long and np.ptp(rest[part]) > 2 * _BOUND * joint.scale:
+            if long and np.ptp(rest[part]) > 2 * _BOUND * joint.scale and part[-1] < b - 4:
                 whiles.append((part[0], part[-1] + 1))
     out = np.zeros(len(size), bool)
     for a, b in whiles:
@@ -485,11 +654,9 @@ def _leaves_path(joint: Followed) -> _Change | None:
         values = {"times": len(whiles), "longest_s": longest,
                   "time_s": float(joint.time_s[whiles[0][0]]) - joint.start_s}  # fmt: skip
         found = Finding("left_path", CARE, values)
-    path = joint.fit.path_rad[~out]
-    cost = _without(joint, out).regressed(path).cost
-    return _Change(cost, lambda path: [], lambda joint, fit: found, rows=~out)
+    return _Change([joint.fit], lambda fit: found, without=out, values=2 * len(whiles))
 
 
 CHANGES: tuple[Callable[[Followed], _Change | None], ...] = (
-    _zero_moves, _lag_drifts, _gain_drifts, _gain_changes, _leaves_path,
+    _zero_moves, _lag_drifts, _gain_drifts, _gain_changes, _clipped, _leaves_path,
 )  # fmt: skip

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import least_squares
 from pupper_sysid.sysid.doctor.bends import bends
-from pupper_sysid.sysid.doctor.changes import Followed, follower_path
+from pupper_sysid.sysid.doctor.changes import Followed
 from pupper_sysid.sysid.doctor.findings import CARE, Finding
 from pupper_sysid.sysid.doctor.signals import interpolation_findings
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, quantum, readings
@@ -78,7 +78,7 @@ def _pushes(joint: Followed, number: int) -> tuple[NDArray[np.float64], ...]:
     none = (np.zeros(0),) * 3
     sample = joint.base.samples[number]
     terms = joint.fit.terms
-    path = follower_path(sample, terms, sample.time_s, joint.start_s)
+    path = joint.path_of_trial(number)
     natural, damping = np.exp(terms[:2])
     if len(path) < _FEWEST_ROWS or not (np.diff(sample.time_s) > 0).all():
         return none
