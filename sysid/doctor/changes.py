@@ -6,7 +6,7 @@ compares its readings with a straight line. `fitted` fits a second-order servo w
 Levenberg-Marquardt at a bounded cost: what happens in a part of a recording does not bend the
 whole.
 
-`compared` then fits it again with what may have come on top: a zero or a gain that moves at a
+`comparisons` then fits it again with what may have come on top: a zero or a gain that moves at a
 moment, a gain or a lag that drifts, a clamped goal, a stop, a while in which the joint leaves its
 path. The best is named if the servo alone explains the readings much less: residuals that agree
 with those beside them count as one.
@@ -37,7 +37,9 @@ _LONGEST_LAG_S = 0.5
  _BIAS, _LAG, _GROWTH, _LOW, _HIGH, _BOTTOM, _TOP) = range(15)  # fmt: skip
 _LOGARITHMS = slice(0, 8)
 _FAR = 1e6  # levels that nothing reaches [rad]
-_LOWEST = np.array([*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.1, 1e-3]), -2, 0, -0.03, *[-_FAR] * 4])
+_LOWEST = np.array(
+    [*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.1, 1e-3]), -2, 0, -0.03, *[-_FAR] * 4]
+)
 _HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 300, 30]), 2, 0.8, 0.03, *[_FAR] * 4])
 _STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.1, 0.2, 0.02, 0.002, 2e-4, *[0.01] * 4])
 """Bounds of a servo's terms, and differences for their derivatives; of levels and the bias in units
@@ -53,14 +55,21 @@ _REFINED, _HOPS, _TRIED, _WELL = 3, 3, 5, 0.02
 _BOUND, _CRUDE = 0.25, 0.004  # of the position's mean deviation
 EXPLAINED = 0.06
 """Of the position's mean deviation: what a servo with limits leaves where it explains nearly all."""
-_SPLITS, _EDGE_S = 30, 1.0  # moments of a change, and their least distance from either end
+_WELL_EXPLAINED = 0.008  # of the same: nothing is left that a change could explain
+_FOLLOWS, _LITTLE = 0.12, 0.3  # of the same; of a friction
+CLEAR_NATS = 20.0
+"""Advantage of a fault over a servo without it. Of 110 sound recordings drawn at random (servos of
+six kinds, six motions, 15 to 400 Hz, with and without polls) the best change has 0 or less in 108
+and 33 at most; a threshold of 20 is passed by fewer than one in a hundred."""
+_SPLITS = 30
+_EDGE_S, _EDGE_SHARE = 1.0, 0.125  # from either end: an integral settles at the beginning
 _OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S = 0.75, 0.2, 0.008
 _MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
 _GROWTHS = tuple(sign * size for size in (0.0015, 0.003, 0.006, 0.012) for sign in (-1, 1))
 _SHIFTS_S = (-0.04, 0.0, 0.04)
 _LEVELS = np.linspace(0.15, 0.95, 9)  # of the command's range
 _DEEP, _BEYOND = 0.06, 0.03  # of the path's range; of the readings
-_LEFT_S, _AGAIN_S, _MOST_LEFT, _TIMES_LEFT = 0.3, 0.3, 0.45, 4
+_LEFT_S, _AGAIN_S, _MOST_LEFT, _TIMES_LEFT = 0.4, 0.3, 0.45, 4
 
 
 @dataclass(frozen=True)
@@ -82,10 +91,17 @@ class Follower:
 
     @property
     def independent(self) -> float:
-        """Residuals that count as independent: their correlation with the next one says how many."""
+        """Residuals that count as independent, by their correlation with the next ones."""
         r = self.residuals_rad
         along = float(np.clip(r[1:] @ r[:-1] / max(float(r @ r), 1e-18), 0.0, 0.99))
         return len(r) * (1 - along) / (1 + along)
+
+    def unexplained(self, joint: Followed) -> float:
+        """Share of the variance of the readings."""
+        parts = np.split(joint.position_rad, joint.starts[1:-1])
+        about = np.concatenate([p - p.mean() for p in parts])
+        left = self.residuals_rad - self.residuals_rad.mean()
+        return float(np.mean(left**2) / max(np.mean(about**2), 1e-18))
 
 
 @dataclass(frozen=True)
@@ -114,11 +130,7 @@ class Followed:
     @property
     def unexplained(self) -> float:
         """Share of the variance of all readings that it leaves."""
-        parts = np.split(self.position_rad, self.starts[1:-1])
-        about = np.concatenate([p - p.mean() for p in parts])
-        rest = np.split(self.fit.residuals_rad, self.starts[1:-1])
-        left = np.concatenate([r - r.mean() for r in rest])
-        return float(left @ left / max(about @ about, 1e-18))
+        return self.fit.unexplained(self)
 
     @cached_property
     def screen(self) -> list[Follower]:
@@ -180,9 +192,29 @@ class Followed:
         return self.fit.cost - age * float(np.median(rate)) / self.scale
 
     @cached_property
+    def friction_rad(self) -> float:
+        """Error of the command that friction holds against; 0 where a servo needs none."""
+        if self.fit.cost > _FOLLOWS:
+            return 0.0
+        terms = self.fit.terms.copy()
+        terms[_FRICTION] += np.log(_LITTLE)
+        free = [k for k in _ALONE if k != _FRICTION]
+        without = fitted(self, self.follower(terms), free=free)
+        nats = self.fit.independent * np.log(without.cost / self.fit.cost)
+        return float(np.exp(self.fit.terms[_FRICTION])) if nats > CLEAR_NATS else 0.0
+
+    @cached_property
+    def changed(self) -> Compared | None:
+        """The change that explains most of what the servo alone leaves, if one clearly does."""
+        if self.fit.cost < _WELL_EXPLAINED:
+            return None
+        best = max((c for c in comparisons(self) if c.finding), key=lambda c: c.nats, default=None)
+        return best if best and best.nats > CLEAR_NATS else None
+
+    @property
     def changes(self) -> list[Finding]:
-        """The change that explains most of what the servo alone leaves, if any does."""
-        return compared(self)
+        """Its finding."""
+        return [self.changed.finding] if self.changed and self.changed.finding else []
 
     @cached_property
     def _inputs(self) -> list[tuple]:
@@ -325,7 +357,9 @@ def _follow(command, rest, grid, start, terms, time, out):
     goal = min(max(rest, low), high)
     place = min(max(goal, bottom), top)
     rate = velocity = 0.0
-    load = hand = bias * square  # the integral, or a hand before the first command, carries the load
+    load = hand = (
+        bias * square
+    )  # the integral, or a hand before the first command, carries the load
     if integral < 0.01:
         hand = 0.0
     hold, most_force, most = square * friction, square * effort, ramp * step
@@ -450,15 +484,6 @@ def comparisons(joint: Followed) -> list[Compared]:
     return found
 
 
-def compared(joint: Followed) -> list[Finding]:
-    """The finding of the best change, if it is one and clearly better than the servo alone."""
-    tried = [c for c in comparisons(joint) if c.finding]
-    best = max(tried, key=lambda c: c.nats, default=None)
-    if best is None or not best.finding or best.nats < 10:
-        return []
-    return [best.finding]
-
-
 def _without(joint: Followed, rows: NDArray[np.bool_]) -> Followed:
     """The readings but for some."""
     keep = ~rows
@@ -472,15 +497,14 @@ def _without(joint: Followed, rows: NDArray[np.bool_]) -> Followed:
     )  # fmt: skip
 
 
-def _split(
-    joint: Followed, columns: Callable[[int], Columns]
-) -> tuple[int, Follower] | None:
+def _split(joint: Followed, columns: Callable[[int], Columns]) -> tuple[int, Follower] | None:
     """Reading of a change that explains most, and the servo that it begins with.
 
     A servo that explains both parts alike has become another one: those of the screen are tried as
     well, and the moment is found again for the one that the change makes best.
     """
-    low, high = joint.time_s[0] + _EDGE_S, joint.time_s[-1] - _EDGE_S
+    edge = max(_EDGE_S, _EDGE_SHARE * float(np.ptp(joint.time_s)))
+    low, high = joint.time_s[0] + edge, joint.time_s[-1] - edge
     if low >= high:
         return None
     moments = np.searchsorted(joint.time_s, np.linspace(low, high, _SPLITS)).tolist()

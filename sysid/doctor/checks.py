@@ -25,7 +25,7 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, in_order, select_joints
 from pupper_sysid.common.processes.workers import Workers, prepare
-from pupper_sysid.sysid.doctor.bends import bend_findings
+from pupper_sysid.sysid.doctor.bends import held_findings
 from pupper_sysid.sysid.doctor.explanations import crossed
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, Finding
 from pupper_sysid.sysid.doctor.hypotheses import (
@@ -107,7 +107,7 @@ def _shaped(register: str, value: int, limit: str, cure: str) -> Finding:
 
 
 _CHECKS = (
-    motion_findings, tone_findings, speed_findings, encoder_findings, unit_findings, bend_findings,
+    motion_findings, tone_findings, speed_findings, encoder_findings, unit_findings, held_findings,
     frozen_findings, offset_findings, hypothesis_findings, start_findings, interpolation_findings,
     register_findings,
 )  # fmt: skip

@@ -48,6 +48,8 @@ _NOT_LINEAR = 0.006  # of the variance
 _USUAL_LAG_S, _LAG_SCALE_S = 0.06, 0.05  # dead time with the age of a reading: usual, and beyond
 _USUAL_GAIN, _MOST_GAIN_NATS = 0.3, 12.0  # of the logarithm
 
+_HELD_S, _HELD_GAPS = 0.12, 5.0  # seconds, and usual times between new readings
+
 Filtered = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -224,11 +226,27 @@ def _samples(trial: Trial, live: bool, grid: float) -> Samples:
         rows = fresh_rows(trial)
         rows = rows[rows > 0]
         time = 0.5 * (trial.read_time_s[rows] + trial.read_time_s[rows - 1])
+        resting = _resting(trial, rows)
+        time = np.concatenate([time, trial.read_time_s[resting]])
+        order = np.argsort(time, kind="stable")
+        rows, time = np.concatenate([rows, resting])[order], time[order]
     inside = (time >= begin) & (time <= begin + grid * (points - 1))
     rest, first = trial.initial_command_rad, float(trial.command_rad[0])
     # a rest of the header far from the first command is another session's
     rest = rest if abs(rest - first) <= np.ptp(trial.command_rad) + 0.1 else first
     return Samples(time[inside], trial.position_rad[rows[inside]], command, begin, rest, grid)
+
+
+def _resting(trial: Trial, fresh: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows in which the joint rests: their value has stayed for longer than any poll holds one."""
+    seen = np.flatnonzero(np.isfinite(trial.position_rad))
+    time = trial.read_time_s
+    if len(fresh) < 3 or not len(seen):
+        return np.zeros(0, np.int64)
+    held = max(_HELD_S, _HELD_GAPS * float(np.median(np.diff(time[fresh]))))
+    last = np.searchsorted(fresh, seen, "right") - 1
+    since = time[seen] - time[fresh[np.maximum(last, 0)]]
+    return seen[(last >= 0) & (since > held)]
 
 
 def _low_pass(command: NDArray, hz: float, damping: float, grid: float) -> NDArray[np.float64]:
