@@ -24,7 +24,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pupper_sysid.sysid.doctor.explanations import FILTERS, Explanation, Servo, explain
-from pupper_sysid.sysid.doctor.findings import CARE, Finding
+from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding
 from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.excitation import remembered
 from pupper_sysid.sysid.recordings.recording import Trial
@@ -63,11 +63,11 @@ six kinds, six motions, 15 to 400 Hz, with and without polls) the best change ha
 and 33 at most; a threshold of 20 is passed by fewer than one in a hundred."""
 _SPLITS = 30
 _EDGE_S, _EDGE_SHARE = 1.0, 0.125  # from either end: an integral settles at the beginning
-_OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S = 0.75, 0.2, 0.008
+_OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S, _EARLY_S = 0.75, 0.2, 0.008, 0.02
 _MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
 _GROWTHS = tuple(sign * size for size in (0.0015, 0.003, 0.006, 0.012) for sign in (-1, 1))
 _SHIFTS_S = (-0.04, 0.0, 0.04)
-_LEVELS = np.linspace(0.15, 0.95, 9)  # of the command's range
+_SERVOS, _LEVELS = 4, np.linspace(0.15, 0.95, 9)  # of the command's range
 _DEEP, _BEYOND = 0.06, 0.03  # of the path's range; of the readings
 _LEFT_S, _AGAIN_S, _MOST_LEFT, _TIMES_LEFT = 0.4, 0.3, 0.45, 4
 
@@ -602,7 +602,9 @@ def _lag_drifts(joint: Followed) -> _Change | None:
         growth = float(fit.terms[_GROWTH])
         if abs(growth) * np.ptp(joint.time_s) < _LAG_DRIFT_S:
             return None
-        return Finding("lag_drifts", CARE, {"drift_ms": 1e3 * growth, "percent": 100 * growth})
+        lags = fit.terms[_LAG] + growth * (joint.time_s - joint.start_s)
+        verdict = REFUSE if lags.min() < -_EARLY_S else CARE  # early is what no servo is
+        return Finding("lag_drifts", verdict, {"drift_ms": 1e3 * growth, "percent": 100 * growth})
 
     return _Change(sorted(tried, key=_cost)[:2], finding, free=(_GROWTH,))
 
@@ -612,23 +614,18 @@ def _clipped(joint: Followed) -> _Change | None:
     command = np.concatenate([s.command_rad for s in joint.base.samples])
     low, high = float(command.min()), float(command.max())
 
-    def levels(servo: Follower, terms: Sequence[int], shares: NDArray) -> list[Follower]:
+    def level(term: int, share: float) -> float:
+        return low + share * (high - low) if term in (_HIGH, _TOP) else high - share * (high - low)
+
+    begins: list[Follower] = []
+    for sides in ([(k,) for k in range(_LOW, _TOP + 1)], [(_LOW, _HIGH), (_BOTTOM, _TOP)]):
         tried = []
-        for term, share in product(terms, shares):
-            moved = servo.terms.copy()
-            over = term in (_HIGH, _TOP)
-            moved[term] = low + share * (high - low) if over else high - share * (high - low)
-            tried.append(joint.follower(moved))
-        return tried
-
-    def term(servo: Follower) -> int:
-        return _LOW + int(np.argmin(np.abs(servo.terms[_LOW:])))
-
-    servos = [joint.fit, *sorted(joint.screen, key=_cost)[:3]]
-    one = sorted((f for s in servos for f in levels(s, range(_LOW, _TOP + 1), _LEVELS)), key=_cost)
-    begins = one[:2]
-    pair = {_LOW: _HIGH, _HIGH: _LOW, _BOTTOM: _TOP, _TOP: _BOTTOM}
-    begins.append(min(levels(one[0], [pair[term(one[0])]], _LEVELS[::2]), key=_cost))
+        for servo in (joint.fit, *sorted(joint.screen, key=_cost)[:_SERVOS]):
+            for terms, share in product(sides, _LEVELS):
+                moved = servo.terms.copy()
+                moved[list(terms)] = [level(k, share) for k in terms]
+                tried.append(joint.follower(moved))
+        begins += sorted(tried, key=_cost)[:2]
 
     def finding(fit: Follower) -> Finding | None:
         plain = fit.terms.copy()

@@ -141,7 +141,7 @@ def relation_findings(
         return [scaled], base, None
     at_once = None if best.code else _at_once(trials, base, best.servo)
     if at_once or best.code in ("position_early", "columns_swapped"):
-        if apart := _clocks_drift(trials, step, base):
+        if apart := _clocks_drift(joint, base):
             return [apart], base, None
     if best.code:
         near = second.servo.nats < best.servo.nats + CLEAR_NATS
@@ -151,11 +151,13 @@ def relation_findings(
     return [] if usual else _loose(trials, base, best.servo), base, best.servo
 
 
-def _clocks_drift(trials: Sequence[Trial], step: float, base: Explanation) -> Finding | None:
+def _clocks_drift(joint: Followed, base: Explanation) -> Finding | None:
     """Clocks that drift: a position that is early at one time and late as a servo's at another."""
-    joint = followed(trials, step)
-    found = next((f for f in (joint.changes if joint else ()) if f.code == "lag_drifts"), None)
-    return replace(found, verdict=REFUSE) if found else None
+    change = joint.changed
+    if change is None or change.finding is None or change.finding.code != "lag_drifts":
+        return None
+    less = change.fit.unexplained(joint) + base.floor < 0.5 * (1 - base.explained + base.floor)
+    return replace(change.finding, verdict=REFUSE) if less else None
 
 
 def _smooth_rest(base: Explanation, servo: Servo) -> bool:
