@@ -54,7 +54,7 @@ _OF_A_KIND = 2
 _REFINED, _HOPS, _TRIED, _WELL = 3, 3, 5, 0.02
 _BOUND, _CRUDE = 0.25, 0.004  # of the position's mean deviation
 EXPLAINED = 0.06
-"""Of the position's mean deviation: what a servo with limits leaves where it explains nearly all."""
+"""Of the position's mean deviation: a servo that leaves less explains nearly all."""
 _WELL_EXPLAINED = 0.008  # of the same: nothing is left that a change could explain
 _FOLLOWS, _LITTLE = 0.12, 0.3  # of the same; of a friction
 CLEAR_NATS = 20.0
@@ -67,6 +67,7 @@ _OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S, _EARLY_S = 0.75, 0.2, 0.008, 0.02
 _MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
 _GROWTHS = tuple(sign * size for size in (0.0015, 0.003, 0.006, 0.012) for sign in (-1, 1))
 _SHIFTS_S = (-0.04, 0.0, 0.04)
+_FEW_LEVELS = 4
 _SERVOS, _LEVELS = 4, np.linspace(0.15, 0.95, 9)  # of the command's range
 _DEEP, _BEYOND = 0.06, 0.03  # of the path's range; of the readings
 _LEFT_S, _AGAIN_S, _MOST_LEFT, _TIMES_LEFT = 0.4, 0.3, 0.45, 4
@@ -451,6 +452,8 @@ class _Change:
     """Readings that it leaves out."""
     values: float = 1
     """How many numbers it adds."""
+    usual: Columns | None = None
+    """What of a sound servo looks like it."""
 
 
 @dataclass(frozen=True)
@@ -466,8 +469,10 @@ class Compared:
 
 def comparisons(joint: Followed) -> list[Compared]:
     """Every change, fitted."""
+    # a load that is known sags and swings as its fit finds, and this servo does not
+    loaded = any(t.load is not None for t in joint.trials)
     found = []
-    for change in CHANGES:
+    for change in (_lag_drifts, _leaves_path) if loaded else CHANGES:
         if tried := change(joint):
             part = joint if tried.without is None else _without(joint, tried.without)
             fits = [fitted(part, b, tried.columns, (*_ALONE, *tried.free)) for b in tried.begins]
@@ -475,6 +480,9 @@ def comparisons(joint: Followed) -> list[Compared]:
             alone = fit.terms.copy()
             alone[_GROWTH:] = joint.fit.terms[_GROWTH:]
             plain = min(joint.fit.cost, fitted(joint, joint.follower(alone), rounds=8).cost)
+            if tried.usual:
+                begins = joint.fit, joint.follower(alone)
+                plain = min(plain, *(fitted(joint, b, tried.usual).cost for b in begins))
             values = tried.values
             if tried.without is not None:  # a number for each independent reading that is left out
                 values = fit.independent * tried.without.mean()
@@ -533,9 +541,8 @@ def _after(joint: Followed, at: int) -> NDArray[np.float64]:
 
 
 def _zero_moves(joint: Followed) -> _Change | None:
-    """A zero that moves at a moment; under a load that is known gravity moves it."""
-    loaded = any(t.load is not None for t in joint.trials)
-    best = None if loaded else _split(joint, lambda k: lambda path: [_after(joint, k)])
+    """A zero that moves at a moment."""
+    best = _split(joint, lambda k: lambda path: [_after(joint, k)])
     if best is None:
         return None
     at, begin = best
@@ -543,7 +550,8 @@ def _zero_moves(joint: Followed) -> _Change | None:
     def finding(fit: Follower) -> Finding | None:
         moved = abs(float(fit.values[1]))
         values = {"offset_rad": moved, "time_s": float(joint.time_s[at]) - joint.start_s}
-        small = moved < max(_MOVED_RAD, _MOVED_SHARE * joint.reach)
+        friction = 2 * float(np.exp(fit.terms[_FRICTION]))  # within it a joint rests anywhere
+        small = moved < max(_MOVED_RAD, _MOVED_SHARE * joint.reach, friction)
         return None if small else Finding("zero_moves", CARE, values)
 
     return _Change([begin], finding, lambda path: [_after(joint, at)], values=2)
@@ -613,6 +621,9 @@ def _clipped(joint: Followed) -> _Change | None:
     """A goal that is clamped, or a motion that ends at a stop, above, below or both."""
     command = np.concatenate([s.command_rad for s in joint.base.samples])
     low, high = float(command.min()), float(command.max())
+    rows = np.sort(np.bincount(((command - low) / (0.02 * joint.reach + 1e-12)).astype(int)))
+    if rows[-_FEW_LEVELS:].sum() > 0.9 * len(command):
+        return None  # clamped, a command of few levels is one of others
 
     def level(term: int, share: float) -> float:
         return low + share * (high - low) if term in (_HIGH, _TOP) else high - share * (high - low)
@@ -643,7 +654,12 @@ def _clipped(joint: Followed) -> _Change | None:
             return None
         return Finding("clipped", CARE, {"level_rad": best[1], "percent": 100 * best[0]})
 
-    return _Change(begins, finding, free=range(_LOW, _TOP + 1), values=2)
+    def curve(path: NDArray) -> list[NDArray]:
+        """As of gravity, or of a bent potentiometer."""
+        about = (path - np.median(path)) / joint.reach
+        return [about**2, about**3]
+
+    return _Change(begins, finding, free=range(_LOW, _TOP + 1), values=2, usual=curve)
 
 
 def _leaves_path(joint: Followed) -> _Change | None:

@@ -45,7 +45,6 @@ _UNITS = {
 _SAME_SCALE, _NO_SERVO = 0.35, 1.2  # of the logarithm
 _STEPWISE, _HOLD_S = 0.75, 0.1  # share of repeats, and how long a level lasts
 _MOVES_MORE = 0.2  # share of repeats that what follows a stepwise command lacks
-_SURE = 0.8  # of the position's variance, with a lag for each trial
 _DISTURBED = 0.08  # of the position's mean deviation; 1 of 110 sound recordings has more
 _LEVEL, _AT_LEAST = 0.05, 0.8  # of the range, between two levels; share of changes that are such
 _CLEARLY_EARLY_S, _MUCH_LESS = 0.03, 0.3

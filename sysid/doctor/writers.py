@@ -30,7 +30,7 @@ _ORDER, _FEWEST_ROWS = 4, 40  # of the autoregression; of a trial
 _PLACES = np.linspace(-0.5, 1.5, 15)  # of the path's range
 _LARGEST = 20.0  # innovation that counts, of the median
 _FAR = 4.0  # innovation that shows its direction, of the usual size
-_PUSHED_NATS = 20.0  # 1 of 110 sound recordings drawn at random has more, and 10 more than 7
+_PUSHED_NATS, _ONE_WAY_NATS = 13.0, 3.0  # twice what any of 48 sound recordings drawn has
 
 _HIGHEST_HZ, _LEAST_AMPLITUDE_RAD, _LEAST_STEPS = 4.5, 0.1, 20.0
 _SCATTER, _SCATTER_S = 0.15, 0.012  # of the amplitude; as an error of the time
@@ -39,7 +39,8 @@ _HARMONICS, _FEWEST_READINGS = 3, 25
 
 def second_writer(joint: Followed) -> list[Finding]:
     """Pushes towards one place while the command goes on."""
-    if interpolation_findings(joint.trials, joint.step):
+    loaded = any(t.load is not None for t in joint.trials)  # its swings are not this servo's
+    if loaded or interpolation_findings(joint.trials, joint.step):
         return []
     nats, times = pushes(joint)
     if nats < _PUSHED_NATS or not len(times):
@@ -80,7 +81,9 @@ def pushes(joint: Followed) -> tuple[float, NDArray[np.float64]]:
             (1 - along) / (1 + along)
         )
         towards = np.sign(place - path[far]) == np.sign(innovations[far])
-        best = max(best, likelier + _one_way(int(towards.sum()), len(towards)))
+        one_way = _one_way(int(towards.sum()), len(towards))
+        if one_way > _ONE_WAY_NATS:  # size alone goes with a load or the place of friction, too
+            best = max(best, likelier + one_way)
     return best, time[far]
 
 
