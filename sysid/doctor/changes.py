@@ -55,6 +55,7 @@ _REFINED, _HOPS, _TRIED, _WELL = 3, 3, 5, 0.02
 _BOUND, _CRUDE = 0.25, 0.004  # of the position's mean deviation
 EXPLAINED = 0.06
 """Of the position's mean deviation: a servo that leaves less explains nearly all."""
+_OF_TRAVEL = 8.0  # readings in one motion over the range, as from rest to rest
 _WELL_EXPLAINED = 0.008  # of the same: nothing is left that a change could explain
 _FOLLOWS, _LITTLE = 0.12, 0.3  # of the same; of a friction
 CLEAR_NATS = 20.0
@@ -92,10 +93,19 @@ class Follower:
 
     @property
     def independent(self) -> float:
-        """Residuals that count as independent, by their correlation with the next ones."""
-        r = self.residuals_rad
-        along = float(np.clip(r[1:] @ r[:-1] / max(float(r @ r), 1e-18), 0.0, 0.99))
-        return len(r) * (1 - along) / (1 + along)
+        """Residuals that count as independent, by what their means over longer parts still vary.
+
+        A joint at rest has been read once however often it is: motion over the range gives some.
+        """
+        r, count = self.residuals_rad, len(self.residuals_rad)
+        lengths = [m for m in (4, 8, 16, 32, 64) if m * 8 <= count]
+        means = [r[: count // m * m].reshape(-1, m).mean(axis=1) for m in lengths]
+        spread = float(np.var(r)) + 1e-18
+        shares = [
+            spread / (m * float(np.var(b)) + 1e-18) for m, b in zip(lengths, means, strict=True)
+        ]
+        travel = np.sum(np.abs(np.diff(self.path_rad))) / (np.ptp(self.path_rad) + 1e-12)
+        return min(count * min([1.0, *shares]), _OF_TRAVEL * float(travel))
 
     def unexplained(self, joint: Followed) -> float:
         """Share of the variance of the readings."""
