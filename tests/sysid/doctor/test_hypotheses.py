@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import pupper_sysid as ps
+from pupper_sysid.sysid.doctor.changes import followed
 from pupper_sysid.sysid.doctor.checks import findings
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, RIVALS, USE, WORDS, Finding, rivalled
 from pupper_sysid.sysid.doctor.hypotheses import _since_command_s
@@ -196,6 +197,38 @@ def test_a_joint_that_falls_for_a_while_is_no_other_servo(motion):
     position = table.position_rad * (1 - fall) - (0.6 - world.offset_rad) * fall
     found = codes(recorded(table.assign(position_rad=position)))
     assert len(found) == 1 and set(found) < {"left_path", "frozen"}  # at its stop it rests
+
+
+def of_a_usual_servo(motion: str, seed: int = 3, **changes):
+    """A world of a smart servo at 40 Hz, small and without a poll."""
+    world = draw_world(np.random.default_rng(seed), "smart", motion, 3e-4)
+    usual = {"amplitude_rad": 0.4, "rate_hz": 40.0, "poll_s": 0.0, "friction_rad": 0.0,
+             "gravity_rad": 0.0, "duration_s": 10.0, "quantum_rad": 0.0015}  # fmt: skip
+    return replace(world, **(usual | changes))
+
+
+def test_a_servo_with_limits_explains_a_weak_motor_and_its_changes_are_few():
+    """What a limit of the speed leaves of a line is no fault, and nothing is left of the servo."""
+    table = simulated(of_a_usual_servo("walk", speed_rad_s=2.0))
+    (trial,) = recorded(table).trials("joint")
+    joint = followed([trial], 0.0015)
+    assert joint.fit.cost < 0.5 * joint.screen[0].cost and joint.changes == []
+
+
+def test_rests_of_a_joint_count_as_one_reading():
+    """Steps from rest to rest: any change explains a few of them, however often they are read."""
+    table = simulated(of_a_usual_servo("steps", rate_hz=100.0))
+    (trial,) = recorded(table).trials("joint")
+    fit = followed([trial], 0.0015).fit
+    travel = np.abs(np.diff(fit.path_rad)).sum() / np.ptp(fit.path_rad)
+    assert fit.independent <= 8 * travel + 1e-9 < len(table)
+
+
+def test_a_motion_that_ends_at_a_stop_is_clipped_at_its_level():
+    world = of_a_usual_servo("teleoperation", gain=1.0, offset_rad=0.0)
+    world = replace(world, stop_rad=(-np.inf, 0.1))
+    found = codes(recorded(simulated(world)))
+    assert found["clipped"].values["level_rad"] == pytest.approx(0.1, abs=0.01)
 
 
 def test_a_chirp_beyond_the_speed_limit_is_no_change_of_gain_and_no_drift():
