@@ -28,7 +28,7 @@ def held_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     joint = None if any(t.load is not None for t in trials) else followed(trials, step)
     if joint is None:
         return []  # a known load sags, and its friction is fitted
-    travel = 2 * joint.friction_rad
+    travel = 0.0 if joint.changes else 2 * joint.friction_rad  # a stop holds as well
     if travel > _HELD * joint.reach:
         rests = [r for t in trials for r in _rests(t, step, _REST_TRAVEL)]
         if len(rests) >= _FEWEST_RESTS:

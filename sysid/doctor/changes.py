@@ -64,7 +64,7 @@ six kinds, six motions, 15 to 400 Hz, with and without polls) the best change ha
 and 33 at most; a threshold of 20 is passed by fewer than one in a hundred."""
 _SPLITS = 30
 _EDGE_S, _EDGE_SHARE = 1.0, 0.125  # from either end: an integral settles at the beginning
-_OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S, _EARLY_S = 0.75, 0.2, 0.008, 0.02
+_NO_GAIN, _OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S, _EARLY_S = 0.1, 0.75, 0.2, 0.008, 0.02
 _MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
 _GROWTHS = tuple(sign * size for size in (0.0015, 0.003, 0.006, 0.012) for sign in (-1, 1))
 _SHIFTS_S = (-0.04, 0.0, 0.04)
@@ -344,7 +344,7 @@ def fitted(
         size, before = np.diag(gram) + 1e-9 * np.trace(gram) / len(gram), best.cost
         for _ in range(4):
             held = np.where(np.arange(len(gram)) < len(free), damping, 1e-9) * size
-            way = np.linalg.solve(gram + np.diag(held), right)[: len(free)]
+            way = np.linalg.lstsq(gram + np.diag(held), right, rcond=None)[0][: len(free)]
             way = np.clip(way, -8 * steps[terms_free], 8 * steps[terms_free])
             terms = best.terms.copy()
             terms[terms_free] += way
@@ -584,7 +584,8 @@ def _gain_changes(joint: Followed) -> _Change | None:
         low, high = sorted((before, before + more))
         values = {"time_s": float(joint.time_s[at]) - joint.start_s, "before": before,
                   "after": before + more}  # fmt: skip
-        return None if low > _OTHER_GAIN * high else Finding("gain_changed", CARE, values)
+        usual = _NO_GAIN * high < low < _OTHER_GAIN * high  # a joint without a gain is held or dead
+        return Finding("gain_changed", CARE, values) if usual else None
 
     return _Change([begin], finding, columns(at), values=3)
 

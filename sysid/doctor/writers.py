@@ -28,6 +28,7 @@ from pupper_sysid.sysid.recordings.recording import Trial
 
 _ORDER, _FEWEST_ROWS = 4, 40  # of the autoregression; of a trial
 _PLACES = np.linspace(-0.5, 1.5, 15)  # of the path's range
+_JUMP = 0.3  # of the command's range in a row
 _LARGEST = 20.0  # innovation that counts, of the median
 _FAR = 4.0  # innovation that shows its direction, of the usual size
 _PUSHED_NATS, _ONE_WAY_NATS = 13.0, 3.0  # twice what any of 48 sound recordings drawn has
@@ -54,8 +55,9 @@ def pushes(joint: Followed) -> tuple[float, NDArray[np.float64]]:
     parts = []
     for number, sample in enumerate(joint.base.samples):
         time, rises = sample.time_s, np.diff(sample.time_s) > 0
-        if len(time) < _FEWEST_ROWS or not rises.all():
-            continue
+        jump = float(np.max(np.abs(np.diff(sample.command_rad)), initial=0.0))
+        if len(time) < _FEWEST_ROWS or not rises.all() or jump > _JUMP * joint.reach:
+            continue  # after a step friction stops a servo on its way, to a place between all
         path = joint.path_of_trial(number)
         rate = np.gradient(path, time)
         rest = sample.position_rad - joint.fit.values[0] * path
