@@ -31,7 +31,7 @@ _PLACES = np.linspace(-0.5, 1.5, 15)  # of the path's range
 _JUMP = 0.3  # of the command's range in a row
 _LARGEST = 20.0  # innovation that counts, of the median
 _FAR = 4.0  # innovation that shows its direction, of the usual size
-_PUSHED_NATS, _ONE_WAY_NATS = 13.0, 3.0  # twice what any of 48 sound recordings drawn has
+_PUSHED_NATS, _ONE_WAY_NATS = 13.0, 3.0  # of 48 sound recordings the most is 6
 
 _HIGHEST_HZ, _LEAST_AMPLITUDE_RAD, _LEAST_STEPS = 4.5, 0.1, 20.0
 _SCATTER, _SCATTER_S = 0.15, 0.012  # of the amplitude; as an error of the time
