@@ -87,7 +87,7 @@ def exported_text(
         if to != "mjcf":
             raise InputError(f"A model is of the export to mjcf; {to} takes link inertias.")
         return to_model(calibration, model, out, physics_step_s, gain, link_inertia, sha256)
-    step_s = physics_step_s or target.physics_step_s
+    step_s = target.physics_step_s if physics_step_s is None else physics_step_s
     servos = ExportedServos.of(calibration, step_s, gain, link_inertia, sha256)
     return target.text(servos), servos
 

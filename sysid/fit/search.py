@@ -221,8 +221,10 @@ def with_limits(problem: Problem, best: Fit) -> Fit:
     """The better of a fit and of local fits from where a limit would begin to cut its motion.
 
     A limit that the motion does not reach has no slope, so that no local fit leads to a servo at
-    its limit.
+    its limit. A known load tells torques from inertia, and the search finds such limits.
     """
+    if problem.structure.scales.known_load:
+        return best
     point, names = best.point, problem.structure.names
     limits = [names.index(name) for name in LIMITS if name in names]
     points = np.tile(point, (len(limits), len(_FALLS), 1))

@@ -119,16 +119,19 @@ def test_recordings_that_give_no_servo_data_are_refused():
 def test_tones_are_groups_across_recordings_and_loops_are_not():
     tones = [
         recording(
-            trial(0, 0.0, ramp(9), ramp(9), frequency_hz=2.0),
-            trial(1, 9.0, ramp(9), ramp(9), frequency_hz=3.5),
+            trial(0, 0.0, ramp(9), late + ramp(9), frequency_hz=2.0),
+            trial(1, 9.0, ramp(9), late + ramp(9), frequency_hz=3.5),
             name=name,
         )
-        for name in ("a", "b")
+        for name, late in (("a", 0.0), ("b", 1e-3))
     ]
     data = servo_data(tones, [JOINT], "all")
     assert data.groups == ("2 Hz", "3.5 Hz")
     assert [int(r.group[0]) for r in data.runs[JOINT]] == [0, 1, 0, 1]
-    loops = [recording(trial(0, 0.0, ramp(9), ramp(9)), name=name) for name in ("a", "b")]
+    loops = [
+        recording(trial(0, 0.0, ramp(9), late + ramp(9)), name=name)
+        for name, late in (("a", 0.0), ("b", 1e-3))
+    ]
     assert servo_data(loops, [JOINT], "all").groups == ("a, loop 0", "b, loop 0")
 
 
