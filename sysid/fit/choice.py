@@ -210,8 +210,10 @@ def _without_slight_limits(problem: Problem, best: Fit) -> Fit:
     names = problem.structure.names
     if not problem.structure.scales.free_air:
         return best
-    # at most: what correlated errors excuse, a limit may be needed to predict
-    least = _LIMIT_NATS * min(temperature_at(problem, best), 1.0)
+    temperature = temperature_at(problem, best)
+    if temperature > 1.0:  # what is left is a motion, of which a limit may predict a part
+        return best
+    least = _LIMIT_NATS * temperature
     for limit in (names.index(name) for name in LIMITS if name in names):
         higher = best.point + 0.1 * (np.arange(len(names)) == limit)
         points = np.array([best.point, np.clip(higher, *problem.structure.box)])

@@ -128,7 +128,7 @@ def _playback(path: Path | str, table: Table, joints: list[str]) -> Log:
     for joint in joints:
         own = (f"{joint}_command_rad", f"{joint}_position_rad")
         require(path, table, own)
-        angles = [table.numbers(path, name) for name in own]
-        parts.append(rows(joint, time, time + READ_AFTER_SEND_S, *angles, loop))
+        command, position = (table.numbers(path, name) for name in own)
+        parts.append(rows(joint, time, time + READ_AFTER_SEND_S, command, position, loop))
     metadata = _metadata("12-joint playback", joints, None)
     return Log(pd.concat(parts, ignore_index=True), metadata, [*table.notes])

@@ -117,7 +117,7 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
     sent_s, angles = time_s + _SENT_AFTER / fps, (scales[:, 0] * commands, scales[:, 1] * positions)
     table = pd.concat(
         [
-            rows(joint, sent_s, time_s, *(values[:, k] for values in angles), episode)
+            rows(joint, sent_s, time_s, angles[0][:, k], angles[1][:, k], episode)
             for k, joint in enumerate(joints)
         ],
         ignore_index=True,

@@ -125,6 +125,7 @@ def _by_words(
     names = [bare_name(j or p.command.key) or SOLE for j, p in zip(joints, found, strict=True)]
     distinct(path, names, "joints")
     if names == ["d"]:  # ref_d, meas_d
+        both = f"{found[0].command.name} and {found[0].position.name}"
         notes["d"] = f"{both} were taken for radians of a joint d; for degrees give `unit='deg'`."
     return dict(zip(names, found, strict=True)), [*notes.values()]
 

@@ -116,8 +116,8 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
         )
     if _YAML.match(start) or path.suffix.lower() in (".yaml", ".yml"):
         documents = _documents(path, decoded(path, data))
-        log = documents and json_logs.read_json_table(path, documents, options)
-        if log:
+        log = json_logs.read_json_table(path, documents, options) if documents else None
+        if log is not None:
             return replace(log, sha256=digest)
         raise InputError(
             f"{path} is YAML, which is not read: write rows as CSV, or record messages with "
