@@ -81,9 +81,6 @@ SHORT_LADDER = ((), ("load friction",))
 """For a joint in free air that DelayedPD does not describe."""
 _PROFILE_NATS = 10.0
 """Log-likelihood by which a limited acceleration is better, from which on all rungs have it."""
-_LIMIT_NATS = 10.0
-"""Log-likelihood that a limit must gain: in twins without one, 6.5 (a step of the simulation) and
-10.3 (a link that bends) were gained by it."""
 _LEAST_GAIN = 0.05  # of log-likelihood: below it a limit that is a tenth higher is not reached
 _CORRELATED = 4.0
 """Temperature above which residuals are a motion, not noise, however small they are beside it: of
@@ -210,10 +207,8 @@ def _without_slight_limits(problem: Problem, best: Fit) -> Fit:
     names = problem.structure.names
     if not problem.structure.scales.free_air:
         return best
-    temperature = temperature_at(problem, best)
-    if temperature > 1.0:  # what is left is a motion, of which a limit may predict a part
-        return best
-    least = _LIMIT_NATS * temperature
+    # the price of a number by Schwarz's criterion
+    least = 0.5 * np.log(problem.samples) * temperature_at(problem, best)
     for limit in (names.index(name) for name in LIMITS if name in names):
         higher = best.point + 0.1 * (np.arange(len(names)) == limit)
         points = np.array([best.point, np.clip(higher, *problem.structure.box)])
