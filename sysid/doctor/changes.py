@@ -227,7 +227,7 @@ class Followed:
         return [self.changed.finding] if self.changed and self.changed.finding else []
 
     @cached_property
-    def _inputs(self) -> list[tuple]:
+    def _inputs(self) -> list[tuple[NDArray[np.float64], float, float, float]]:
         """Command, its rest, and the grid and the start of its time, of each trial."""
         inputs = []
         for s in self.base.samples:
@@ -266,7 +266,7 @@ class Followed:
             design, self.position_rad, self.starts, _BOUND * self.scale, floor
         )
         cost = cost / self.scale + _CRUDE + 0.05 * self.step / self.scale
-        return Follower(terms, path, cost, values, rest)
+        return Follower(terms, path, cost, np.asarray(values, np.float64), rest)
 
 
 Columns = Callable[[NDArray], Sequence[NDArray]]
