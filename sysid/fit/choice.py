@@ -33,7 +33,6 @@ from pupper_sysid.sysid.fit.posterior import (
     as_wide_as_folds,
     interval_of,
     sample,
-    temperature_at,
     with_date_errors,
 )
 from pupper_sysid.sysid.fit.preparation import PreparedJoint
@@ -55,6 +54,7 @@ from pupper_sysid.sysid.fit.search import (
     in_blocks,
     refine,
     search_widely,
+    temperature_at,
     without_limit,
 )
 from pupper_sysid.sysid.fit.structure import (

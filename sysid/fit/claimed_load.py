@@ -21,9 +21,8 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.fit import search
 from pupper_sysid.sysid.fit.noise import noise_by_run
 from pupper_sysid.sysid.fit.operating_point import loads_in_words
-from pupper_sysid.sysid.fit.posterior import temperature_at
 from pupper_sysid.sysid.fit.run import Run, fresh_residuals
-from pupper_sysid.sysid.fit.search import Fit, Problem
+from pupper_sysid.sysid.fit.search import Fit, Problem, temperature_at
 from pupper_sysid.sysid.fit.structure import Structure
 from pupper_sysid.sysid.recordings.recording import Trial
 

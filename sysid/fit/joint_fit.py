@@ -40,7 +40,6 @@ from pupper_sysid.sysid.fit.posterior import (
     HARDLY_CONVERGED,
     R_HAT,
     interval_of,
-    temperature_at,
 )
 from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
 from pupper_sysid.sysid.fit.repeats import by_number
@@ -59,6 +58,7 @@ from pupper_sysid.sysid.fit.search import (
     fit_folds,
     folds_of,
     search,
+    temperature_at,
     without_limit,
 )
 from pupper_sysid.sysid.fit.servo_prior import ServoPrior

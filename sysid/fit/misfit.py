@@ -19,9 +19,15 @@ from scipy.special import ndtri
 from pupper_sysid.common import filters
 from pupper_sysid.common.interval import LEVEL
 from pupper_sysid.sysid.fit import kernel
-from pupper_sysid.sysid.fit.posterior import temperature_at
 from pupper_sysid.sysid.fit.run import Run
-from pupper_sysid.sysid.fit.search import Fit, Problem, from_about, refine, search_widely
+from pupper_sysid.sysid.fit.search import (
+    Fit,
+    Problem,
+    from_about,
+    refine,
+    search_widely,
+    temperature_at,
+)
 from pupper_sysid.sysid.fit.structure import Structure, servo_structure
 
 _LOW_PASS_S = (0.004, 0.008, 0.016, 0.032, 0.064)

@@ -1,9 +1,9 @@
-"""Noise of a joint's readings, motion by motion, and the command jitter that explains its growth.
+"""Noise of a joint's readings, motion by motion; what it says of commands and of readings.
 
 Fast tones leave larger residuals than slow ones: a command that comes a few milliseconds late moves
 a fast joint further off. With one noise for all tones the fastest would decide every fit, so each
 tone has its own (`noise_by_run`). `command_jitter` asks which random latency of commands the growth
-amounts to.
+amounts to. Residuals are correlated besides: `temperature_of` says how many readings count as one.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from pupper_sysid.common.interval import Interval
+from pupper_sysid.common.tones import least_squares
 from pupper_sysid.sysid.fit.run import Run, at_steps, free_run, with_late_commands
 from pupper_sysid.sysid.fit.structure import Structure
 from pupper_sysid.sysid.recordings.recording import Trial
@@ -24,6 +25,8 @@ _NOISE_RATIO = 1.5  # of the noise of a run without a tone to that of the others
 _PROBE_S = 0.002  # jitter at which its effect is simulated: small beside the servo's own times
 _PROBES, _DRAWS = 6, 200
 _DATES = (0.5, 1.5)  # of the standard deviation of dates
+_HARMONICS = (1, 2, 3)
+_REMEMBERED_S = 0.5
 _SAMPLES_PER_INDEPENDENT = 4.0  # a servo carries a late command on for about so many readings
 
 
@@ -105,3 +108,62 @@ def command_jitter(
     dates = rng.uniform(*_DATES, _DRAWS)
     found = [jitter(s, d) for s, d in zip(draws, dates, strict=True)]
     return Interval.of_draws(jitter(square, 1.0), np.array(found))
+
+
+def temperature_of(
+    residuals: Sequence[NDArray[np.float64]], runs: Sequence[Run], parameters: int
+) -> float:
+    """By which the cost of readings is divided: readings per independent one, over their weight.
+
+    A soft-L1 cost weighs each reading less than its noise deserves. The ratio of the variance of
+    its slope to its mean curvature (Godambe) makes up for that: 0.57 for normal noise.
+
+    What counts against a parameter is the power of residuals where its effect is. Of a tone that is
+    at the tone and its harmonics: their power there over their power elsewhere. Of other motions it
+    is at low frequencies: 1 + 2 Σ ρ(k), up to where the autocorrelation ρ vanishes, and no further
+    than half a second, because what friction leaves for longer hardly moves with a parameter.
+
+    `residuals` of shape (samples,) each: in units of their noise. `parameters`: fitted to them: so
+    many numbers less are left of the power at the harmonics.
+    """
+    every = np.concatenate([np.empty(0), *residuals])
+    if not len(every):
+        return 1.0
+    bent = np.mean((1.0 + every**2) ** -1.5)
+    weight = float(np.mean(every**2 / (1.0 + every**2)) / max(bent, 1e-12))
+    pairs = list(zip(residuals, runs, strict=True))
+    tones = [(r, run) for r, run in pairs if run.tone > 0 and len(r) >= 4 * len(_HARMONICS)]
+    if sum(len(r) for r, _ in tones) > sum(len(r) for r, _ in pairs) / 2:
+        return weight * _at_harmonics(tones, parameters)
+    return weight * _autocorrelation([(r, run) for r, run in pairs if len(r) > 1])
+
+
+def _at_harmonics(tones: Sequence[tuple[NDArray, Run]], parameters: int) -> float:
+    within, elsewhere, count, others = 0.0, 0.0, 0, 0
+    for r, run in tones:
+        turn = 2 * np.pi * run.frequency_hz * run.step_s * run.sample_step
+        design = np.column_stack([f(n * turn) for n in _HARMONICS for f in (np.sin, np.cos)])
+        repeating = design @ least_squares(design, r)
+        within += float(repeating @ repeating)
+        elsewhere += float(np.sum((r - repeating) ** 2))
+        count += design.shape[1]
+        others += len(r) - design.shape[1]
+    if count <= parameters or not elsewhere > 0:
+        return 1.0
+    return max(1.0, (within / (count - parameters)) / (elsewhere / others))
+
+
+def _autocorrelation(pairs: Sequence[tuple[NDArray, Run]]) -> float:
+    if not pairs:
+        return 1.0
+    apart = np.concatenate([np.diff(run.sample_step) * run.step_s for _, run in pairs])
+    longest = _REMEMBERED_S / max(float(np.median(apart)), 1e-4)
+    longest = int(min(longest, min(len(r) for r, _ in pairs) - 1))
+    total, lagged = 0.0, np.zeros(longest)
+    for r, _ in pairs:
+        x = np.clip(r, -4, 4)
+        total += float(x @ x)
+        for lag in range(1, longest + 1):
+            lagged[lag - 1] += float(x[lag:] @ x[:-lag])
+    rho = lagged / max(total, 1e-18)
+    return float(max(1.0, 1.0 + 2.0 * np.sum(rho * np.cumprod(rho > 0.05))))

@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp, ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
-from pupper_sysid.common.tones import least_squares
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.sysid.fit.run import Run, fresh_residuals
 from pupper_sysid.sysid.fit.search import Fit, Problem, curvatures, local
 from pupper_sysid.sysid.fit.structure import Structure
 
@@ -35,7 +33,6 @@ deviation over random emulated pendulums that move in other steps."""
 _PROFILE_SHARE = 0.02
 """The same of a limited acceleration: chirps and jumps of six random servos in steps of 0.1 ms are
 matched best in steps of 2 ms by limits that are 1 to 3 % lower."""
-_HARMONICS = (1, 2, 3)
 R_HAT, EFFECTIVE = 1.03, 400.0
 """R̂ at most, and effective draws at least, of draws that have converged."""
 ROUNDS, FEW_ROUNDS = 32, 8
@@ -58,7 +55,6 @@ LEAST_FOLDS = 3
 _MEDIAN_OF_NORMAL = float(ndtri(0.75))  # of the size of a standard normal number
 _CURVATURE_STEP = 0.03  # the slope over a likely error, not of one kink
 _OVERDISPERSED, _WIDEST = 1.3, 0.7  # of the first points, over a Gaussian's; and at most
-_REMEMBERED_S = 0.5
 _Z = float(ndtri(0.5 + LEVEL / 2))
 
 
@@ -331,73 +327,6 @@ def convergence(points: NDArray[np.float64], weight: NDArray[np.float64]) -> tup
         means.append(own @ points[part::_GROUPS] / max(own.sum(), 1e-300))
     between = np.var(means, axis=0, ddof=1)
     return float(np.sqrt(1.0 + between / variance).max()), float(effective.min())
-
-
-def temperature_of(
-    residuals: Sequence[NDArray[np.float64]], runs: Sequence[Run], parameters: int
-) -> float:
-    """By which the cost of readings is divided: readings per independent one, over their weight.
-
-    A soft-L1 cost weighs each reading less than its noise deserves. The ratio of the variance of
-    its slope to its mean curvature (Godambe) makes up for that: 0.57 for normal noise.
-
-    What counts against a parameter is the power of residuals where its effect is. Of a tone that is
-    at the tone and its harmonics: their power there over their power elsewhere. Of other motions it
-    is at low frequencies: 1 + 2 Σ ρ(k), up to where the autocorrelation ρ vanishes, and no further
-    than half a second, because what friction leaves for longer hardly moves with a parameter.
-
-    `residuals` of shape (samples,) each: in units of their noise. `parameters`: fitted to them: so
-    many numbers less are left of the power at the harmonics.
-    """
-    every = np.concatenate([np.empty(0), *residuals])
-    if not len(every):
-        return 1.0
-    bent = np.mean((1.0 + every**2) ** -1.5)
-    weight = float(np.mean(every**2 / (1.0 + every**2)) / max(bent, 1e-12))
-    pairs = list(zip(residuals, runs, strict=True))
-    tones = [(r, run) for r, run in pairs if run.tone > 0 and len(r) >= 4 * len(_HARMONICS)]
-    if sum(len(r) for r, _ in tones) > sum(len(r) for r, _ in pairs) / 2:
-        return weight * _at_harmonics(tones, parameters)
-    return weight * _autocorrelation([(r, run) for r, run in pairs if len(r) > 1])
-
-
-def temperature_at(problem: Problem, fit: Fit) -> float:
-    """The temperature of a fit's own residuals."""
-    values = problem.structure.decode(fit.point)
-    residuals = fresh_residuals(problem.structure, values, problem.runs)
-    scaled = [r / noise for r, noise in zip(residuals, problem.noise_rad, strict=True)]
-    return temperature_of(scaled, problem.runs, len(values))
-
-
-def _at_harmonics(tones: Sequence[tuple[NDArray, Run]], parameters: int) -> float:
-    within, elsewhere, count, others = 0.0, 0.0, 0, 0
-    for r, run in tones:
-        turn = 2 * np.pi * run.frequency_hz * run.step_s * run.sample_step
-        design = np.column_stack([f(n * turn) for n in _HARMONICS for f in (np.sin, np.cos)])
-        repeating = design @ least_squares(design, r)
-        within += float(repeating @ repeating)
-        elsewhere += float(np.sum((r - repeating) ** 2))
-        count += design.shape[1]
-        others += len(r) - design.shape[1]
-    if count <= parameters or not elsewhere > 0:
-        return 1.0
-    return max(1.0, (within / (count - parameters)) / (elsewhere / others))
-
-
-def _autocorrelation(pairs: Sequence[tuple[NDArray, Run]]) -> float:
-    if not pairs:
-        return 1.0
-    apart = np.concatenate([np.diff(run.sample_step) * run.step_s for _, run in pairs])
-    longest = _REMEMBERED_S / max(float(np.median(apart)), 1e-4)
-    longest = int(min(longest, min(len(r) for r, _ in pairs) - 1))
-    total, lagged = 0.0, np.zeros(longest)
-    for r, _ in pairs:
-        x = np.clip(r, -4, 4)
-        total += float(x @ x)
-        for lag in range(1, longest + 1):
-            lagged[lag - 1] += float(x[lag:] @ x[:-lag])
-    rho = lagged / max(total, 1e-18)
-    return float(max(1.0, 1.0 + 2.0 * np.sum(rho * np.cumprod(rho > 0.05))))
 
 
 def with_date_errors(

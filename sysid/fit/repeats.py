@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.servo_models.calibration.quantity import words_of
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
-from pupper_sysid.sysid.fit.noise import noise_by_run
-from pupper_sysid.sysid.fit.posterior import temperature_of
+from pupper_sysid.sysid.fit.noise import noise_by_run, temperature_of
 from pupper_sysid.sysid.fit.run import fresh_residuals
 from pupper_sysid.sysid.fit.search import Fit, Problem, curvature, local, refine
 from pupper_sysid.sysid.fit.servo_prior import PER_INERTIA

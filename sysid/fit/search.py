@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.sysid.fit.run import Run, costs, moments_if_later, residuals
+from pupper_sysid.sysid.fit.noise import temperature_of
+from pupper_sysid.sysid.fit.run import Run, costs, fresh_residuals, moments_if_later, residuals
 from pupper_sysid.sysid.fit.structure import LIMITS, Structure
 
 _CANDIDATES, _KEEP, _FINAL = 512, 12, 4
@@ -30,7 +31,13 @@ _SHORT, _LONG = 8, 20  # iterations of the local fit
 _WIDE_STEP, _STEP = 0.05, 0.01
 """Steps of the Jacobian in fitted coordinates: a wide one looks past a rugged cost's dents, one
 smaller than the second drowns in friction's stick-slip."""
-_POPULATION, _GENERATIONS, _SHORT_GENERATIONS = 48, 60, 20
+_POPULATION, _LEADERS = 48, 12
+_GENERATIONS, _SHORT_GENERATIONS = (600, 60), (200, 20)
+"""Members of the population, and those the others move toward. Generations at most, and how many
+without a better member end it: of a search, and of a short one."""
+_CORRELATED = 1.5
+"""Temperature above which a fit in free air leaves motion, not noise: 0.6 to 1.2 of the best fits
+to servos of the fitted structure."""
 _NEAR, _NEAR_ROUNDS, _NEAR_ITERATIONS = 12, 12, 12
 _FALLS, _CUT_STARTS = -np.linspace(0.0, np.log(30.0), 15), 3  # of the logarithm of a limit
 _FAR_ABOVE = 10.0  # from a limit to one that no motion reaches
@@ -141,6 +148,14 @@ class Fit:
     cost: float
 
 
+def temperature_at(problem: Problem, fit: Fit) -> float:
+    """The temperature of a fit's own residuals."""
+    values = problem.structure.decode(fit.point)
+    residuals = fresh_residuals(problem.structure, values, problem.runs)
+    scaled = [r / noise for r, noise in zip(residuals, problem.noise_rad, strict=True)]
+    return temperature_of(scaled, problem.runs, len(values))
+
+
 def search(
     problem: Problem,
     rng: np.random.Generator,
@@ -194,6 +209,9 @@ def evolved(
     best = evolve(problem.coarse, refined(problem.coarse, starts), rng, short, crowd)
     near = np.concatenate([best.point[None], starts[-_FINAL:]])
     best = refine(problem, near[np.argsort(problem.costs(near))[:_REFINED]])
+    if problem.structure.scales.free_air and temperature_at(problem, best) > _CORRELATED:
+        # a stiff servo at its limits moves otherwise in coarse steps
+        best = evolve(problem, [best], rng, short, near)
     return from_about(problem, with_limits(problem, best), rng)
 
 
@@ -440,9 +458,15 @@ def evolve(
     z[: len(seeds)] = seeds
     cost = problem.costs(z)
     everyone = np.arange(len(z))
-    for _ in range(_SHORT_GENERATIONS if short else _GENERATIONS):
+    most, patience = _SHORT_GENERATIONS if short else _GENERATIONS
+    lowest, since = np.inf, 0
+    for _ in range(most):
+        if lowest - cost.min() > 1.0:  # one more number's worth
+            lowest, since = float(cost.min()), 0
+        elif (since := since + 1) > patience:
+            break
         one, two = (rng.permutation(everyone) for _ in range(2))
-        toward = z[np.argsort(cost)[rng.integers(0, 6, len(z))]]
+        toward = z[np.argsort(cost)[rng.integers(0, _LEADERS, len(z))]]
         factor = rng.uniform(0.4, 0.9, (len(z), 1))
         trial = z + factor * (toward - z) + factor * (z[one] - z[two])
         keep = rng.random(z.shape) > 0.9
