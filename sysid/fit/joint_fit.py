@@ -176,9 +176,8 @@ def _in_free_air(
     goodness = goodness_of(ready, choice.carried)
     lag = choice.lag
     slight = _slight_limits(ready, choice.carried, goodness)
-    if "effort_rad_s2" in slight and "back_emf_per_s" in results[carried.name].parameters:
-        both = _only_the_sum(results[carried.name].parameters["braking_per_s"], "1/s")
-        slight |= {"back_emf_per_s": both, "damping_per_s": both}
+    if "effort_rad_s2" in slight:
+        slight |= _inseparable(results[carried.name].parameters)
     fit = results[carried.name]
     results[carried.name] = replace(fit, undecided=slight | fit.undecided)
     if why := _doubt(choice, goodness):
@@ -386,10 +385,8 @@ def _candidate_fit(
     if "braking_per_s" in parameters:
         undecided |= _vague("braking_per_s", parameters["braking_per_s"])
     vague = "no_load_speed_rad_s" in undecided or _ratio_of(parameters, "effort_rad_s2") > _REACHED
-    if "back_emf_per_s" in parameters and vague:
-        # inside of the effort limit the two brake alike
-        both = _only_the_sum(parameters["braking_per_s"], "1/s")
-        undecided |= {"back_emf_per_s": both, "damping_per_s": both}
+    if vague:
+        undecided |= _inseparable(parameters)
     if why := _undated(ready.lag.feedback):
         undecided["dead_time_s"] = why
     doubt_s = max(t.read_time_doubt_s for t in ready.recorded)
@@ -423,6 +420,17 @@ def _vague(name: str, interval: Interval) -> dict[str, str]:
         return {name: "it cannot be distinguished from none"}
     wide = interval.high > _WIDE * interval.low
     return {name: f"its interval is wider than a factor of {_WIDE:g}"} if wide else {}
+
+
+def _inseparable(parameters: Mapping[str, Interval]) -> dict[str, str]:
+    """Why damping and back-EMF are not known, of a fit in free air.
+
+    Inside of the effort limit the two brake alike, whether the structure has both or not.
+    """
+    if "braking_per_s" not in parameters:
+        return {}
+    both = _only_the_sum(parameters["braking_per_s"], "1/s")
+    return {name: both for name in ("back_emf_per_s", "damping_per_s") if name in parameters}
 
 
 def _only_the_sum(total: Interval, unit: str) -> str:

@@ -35,9 +35,9 @@ _POPULATION, _LEADERS = 48, 12
 _GENERATIONS, _SHORT_GENERATIONS = (600, 60), (200, 20)
 """Members of the population, and those the others move toward. Generations at most, and how many
 without a better member end it: of a search, and of a short one."""
-_CORRELATED = 1.5
+_CORRELATED, _FINE_ROUNDS = 1.5, 2
 """Temperature above which a fit in free air leaves motion, not noise: 0.6 to 1.2 of the best fits
-to servos of the fitted structure."""
+to servos of the fitted structure. Populations in fine steps then, at most."""
 _NEAR, _NEAR_ROUNDS, _NEAR_ITERATIONS = 12, 12, 12
 _FALLS, _CUT_STARTS = -np.linspace(0.0, np.log(30.0), 15), 3  # of the logarithm of a limit
 _FAR_ABOVE = 10.0  # from a limit to one that no motion reaches
@@ -209,7 +209,9 @@ def evolved(
     best = evolve(problem.coarse, refined(problem.coarse, starts), rng, short, crowd)
     near = np.concatenate([best.point[None], starts[-_FINAL:]])
     best = refine(problem, near[np.argsort(problem.costs(near))[:_REFINED]])
-    if problem.structure.scales.free_air and temperature_at(problem, best) > _CORRELATED:
+    for _ in range(_FINE_ROUNDS if problem.structure.scales.free_air else 0):
+        if temperature_at(problem, best) <= _CORRELATED:
+            break
         # a stiff servo at its limits moves otherwise in coarse steps
         best = evolve(problem, [best], rng, short, near)
     return from_about(problem, with_limits(problem, best), rng)

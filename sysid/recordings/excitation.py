@@ -79,7 +79,8 @@ _CHIRP = 0.015  # of the frequency, by which the two halves of a tone may differ
 _COVERED = 0.8  # share of the moving time that tones must take
 _SOFT = 0.4  # of a steady tone's time: the longest soft start before it
 _SAME_HZ = 0.02
-_RESTS_S = 0.15  # a servo has come to rest, or nearly so
+_RESTS_S = 0.15  # a servo may have come to rest
+_LEAST_STILL, _STILL = 4, 0.002  # readings at rest; share of the motion within which they are
 _LEAD_S, _LEAD = 0.5, 0.4  # rest kept in front of a tone, at most, and as a share of the tone
 _ONE_WAY = 0.8  # rank correlation of half periods with their number
 _STEPPED = 0.5  # share of rows without a change of command, from which on it moves in steps
@@ -192,8 +193,30 @@ def _grouped(trial: Trial, found: Sequence[Segment]) -> list[Segment]:
             rested = False
         elif s.kind == "rest":
             stop = min(s.stop, len(trial.send_time_s) - 1)
-            rested = trial.send_time_s[stop] - trial.send_time_s[s.first] >= _RESTS_S
+            long = trial.send_time_s[stop] - trial.send_time_s[s.first] >= _RESTS_S
+            rested = long and _at_rest_from(trial, s.first, s.stop) < s.stop
     return groups
+
+
+def _at_rest_from(trial: Trial, first: int, stop: int) -> int:
+    """The row from which on readings of rows `first` to `stop` - 1 stay where they end.
+
+    `stop` where too few do so: the joint still moves.
+    """
+    position = trial.position_rad[first:stop]
+    (seen,) = np.nonzero(np.isfinite(position))
+    if len(seen) < 2 * _LEAST_STILL:
+        return first  # nothing is known of it
+    position, every = position[seen], trial.position_rad[np.isfinite(trial.position_rad)]
+    changes = np.abs(np.diff(every))
+    quantum = float(np.min(changes[changes > 0], initial=np.inf))
+    last = position[-max(_LEAST_STILL, len(seen) // 4) :]
+    noise = 1.4826 * float(np.median(np.abs(last - np.median(last))))
+    span = float(np.ptp(every))
+    near = max(4.0 * noise, 1.01 * quantum, _STILL * span)
+    (moving,) = np.nonzero(np.abs(position - np.median(last)) > near)
+    still = int(moving[-1]) + 1 if len(moving) else 0
+    return first + int(seen[still]) if len(seen) - still >= _LEAST_STILL else stop
 
 
 def _part(trial: Trial, tone: Segment, end: int) -> Trial:
@@ -207,6 +230,8 @@ def _part(trial: Trial, tone: Segment, end: int) -> Trial:
         # motion between two tones is of neither: only the rest right before this one is kept
         constant = np.flatnonzero(np.diff(trial.command_rad[first : tone.first]) != 0)
         first = first + int(constant[-1]) + 1 if len(constant) else first
+    at_rest = _at_rest_from(trial, first, tone.first)
+    first = at_rest if at_rest < tone.first else first
     return replace(trial.rows(first, tone.stop), frequency_hz=float(tone.frequency_hz))
 
 

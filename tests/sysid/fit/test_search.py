@@ -11,7 +11,14 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.fit.choice import Fitted
 from pupper_sysid.sysid.fit.joint_fit import _slight_limits
 from pupper_sysid.sysid.fit.run import free_run
-from pupper_sysid.sysid.fit.search import Fit, Problem, from_about, refine, with_limits
+from pupper_sysid.sysid.fit.search import (
+    Fit,
+    Problem,
+    from_about,
+    refine,
+    search_widely,
+    with_limits,
+)
 from pupper_sysid.sysid.fit.structure import candidate
 from support.runs import fine_run
 
@@ -49,6 +56,24 @@ def test_local_fits_from_points_about_a_fit_find_the_way_along_a_ridge():
         stuck.append(near.cost > best + 100)
         assert from_about(problem, near, rng).cost < best + 1
     assert any(stuck), "the ridge has no dent, so this proves nothing"
+
+
+def test_a_stiff_servo_that_is_always_at_its_limits_is_found():
+    # in steps of 2 ms it moves so differently that the search in them leads elsewhere
+    noise_rad, structure = 2e-3, candidate("delayed_pd")
+    truth = np.array([0.015, 34_000.0, 397.0, 5.4, 152.0, 3.9, 0.0])
+    time = CONTINUOUS_S * np.arange(int(4.0 / CONTINUOUS_S))
+    sent = np.floor(time / 0.01) * 0.01
+    run = fine_run(0.24 * np.sin(2 * np.pi * (2.0 * sent + 0.4 * sent**2)), 0.008)
+    run = run.coarser().coarser()
+    (track,) = free_run(structure, truth, (run,))
+    clean = np.interp(run.sample_step, np.arange(len(track)), track)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        read = clean + noise_rad * rng.standard_normal(len(clean))
+        problem = Problem(structure, (replace(run, sample_rad=read),), (noise_rad,))
+        best = refine(problem, structure.encode(truth)[None]).cost
+        assert search_widely(problem, rng).cost < best + 30
 
 
 def saturating(effort_rad_s2: float, rng: np.random.Generator) -> tuple[Problem, Fit]:

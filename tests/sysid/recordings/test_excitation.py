@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -122,3 +124,27 @@ def test_a_sine_and_four_sines_of_strangers_are_read_by_frequency():
     assert tones.frequency_hz == pytest.approx([0.25, 0.5, 1, 2], rel=0.01)
     lags_ms = -tones.phase_deg / 360 / tones.frequency_hz * 1e3
     assert lags_ms == pytest.approx([27.4, 23.7, 19.4, 15.5], abs=0.7)
+
+
+def slow_answer(trial_time: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """A joint that follows its command with a time constant of 80 ms."""
+    position, lag = np.empty_like(command), 0.08
+    position[0] = command[0]
+    for n in range(1, len(command)):
+        share = 1 - np.exp(-(trial_time[n] - trial_time[n - 1]) / lag)
+        position[n] = position[n - 1] + share * (command[n - 1] - position[n - 1])
+    return position
+
+
+def test_tones_are_cut_where_the_joint_has_come_to_rest():
+    # the command rests at once, the joint half a second later
+    time = clock(200.0, 16.0, np.random.default_rng(1))
+    command = stepped(time, [1.0, 2.1, 3.3], 1.2)
+    rested = replace(trial(time, command), position_rad=slow_answer(time, command))
+    parts = named_tones([rested])
+    assert [round(part.frequency_hz, 1) for part in parts] == [1.0, 2.1, 3.3]
+    for part in parts:
+        assert abs(part.position_rad[0]) < 0.01
+    hurried = stepped(time, [1.0, 2.1, 3.3], 0.2)
+    moving = replace(trial(time, hurried), position_rad=slow_answer(time, hurried))
+    assert len(named_tones([moving])) == 1
