@@ -211,7 +211,9 @@ def _at_rest_from(trial: Trial, first: int, stop: int) -> int:
     changes = np.abs(np.diff(every))
     quantum = float(np.min(changes[changes > 0], initial=np.inf))
     last = position[-max(_LEAST_STILL, len(seen) // 4) :]
-    noise = 1.4826 * float(np.median(np.abs(last - np.median(last))))
+    # of second differences, which a steady motion leaves at zero; their variance is six times as
+    # large
+    noise = 1.4826 * float(np.median(np.abs(np.diff(last, 2)))) / np.sqrt(6.0)
     span = float(np.ptp(every))
     near = max(4.0 * noise, 1.01 * quantum, _STILL * span)
     (moving,) = np.nonzero(np.abs(position - np.median(last)) > near)
