@@ -29,7 +29,7 @@ from pupper_sysid.sysid.doctor.explanations import (
 )
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding, rivalled
 from pupper_sysid.sysid.doctor.writers import second_writer
-from pupper_sysid.sysid.recordings.excitation import named_tones
+from pupper_sysid.sysid.recordings.excitation import split_tones
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _UNRELATED, _HALF, _LOOSE, _FOLLOWS = 0.25, 0.5, 0.6, 0.75  # share of the position's variance
@@ -427,7 +427,7 @@ def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
 def _trials_differ(joint: Followed) -> list[Finding]:
     """Trials of one tone and amplitude, named or found, that differ."""
     tones = []
-    for trial in named_tones(joint.trials):
+    for trial in (part for trial in joint.trials for part in split_tones(trial)):
         if not trial.frequency_hz > 0 or np.isfinite(trial.position_rad).sum() < 16:
             continue
         seen = np.isfinite(trial.position_rad)

@@ -89,7 +89,7 @@ _POLL_SD_S = 1e-3
 """Standard deviation of a poll's instant about its lattice: jitter of the bus and drift."""
 _AT_BOUND = 0.03
 """Distance from a bound, in fitted coordinates, that counts as on it."""
-_NEAR_LEAST = 1.1  # of the least dead time: on its bound, as far as gains that make up for it say
+_CUT_OFF = 0.25  # of an interval: a value as near to the bound is on it, as far as is known
 _CUT_SHARE = 0.1
 """The same as a share of a 90 % interval: a bound within two standard deviations cuts the draws."""
 _COMMAND_WINDOW_S = 0.05
@@ -375,7 +375,8 @@ def _candidate_fit(
         }
     else:
         parameters, sd = intervals(fitted), fitted.draws.std(axis=0)
-    parameters["dead_time_s"] = less_age(parameters["dead_time_s"], ready)
+    fitted_s = parameters["dead_time_s"]
+    parameters["dead_time_s"] = less_age(fitted_s, ready)
     speed = max(_command_speed(r) for r in ready.runs)
     undecided = {
         p.name: why
@@ -391,7 +392,7 @@ def _candidate_fit(
         undecided["dead_time_s"] = why
     doubt_s = max(t.read_time_doubt_s for t in ready.recorded)
     least = structure.parameters[0].low
-    if doubt_s > 0 and float(values[0]) < _NEAR_LEAST * least:
+    if doubt_s > 0 and fitted_s.value - least < _CUT_OFF * (fitted_s.high - least):
         why = (
             f"the dead time is on its bound, and readings are dated to {1e3 * doubt_s:.0f} ms "
             "only: gains make up for what the dates are off"
