@@ -427,7 +427,7 @@ def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
 def _trials_differ(joint: Followed) -> list[Finding]:
     """Trials of one tone and amplitude, named or found, that differ."""
     tones = []
-    for trial in (part for trial in joint.trials for part in split_tones(trial)):
+    for trial in (part for whole in joint.trials for part in split_tones(whole)):
         if not trial.frequency_hz > 0 or np.isfinite(trial.position_rad).sum() < 16:
             continue
         seen = np.isfinite(trial.position_rad)
