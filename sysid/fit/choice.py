@@ -52,6 +52,7 @@ from pupper_sysid.sysid.fit.search import (
     from_about,
     group_count,
     in_blocks,
+    price_of_a_number,
     refine,
     search_widely,
     temperature_at,
@@ -207,8 +208,7 @@ def _without_slight_limits(problem: Problem, best: Fit) -> Fit:
     names = problem.structure.names
     if not problem.structure.scales.free_air:
         return best
-    # the price of a number by Schwarz's criterion
-    least = 0.5 * np.log(problem.samples) * temperature_at(problem, best)
+    least = price_of_a_number(problem, best)
     for limit in (names.index(name) for name in LIMITS if name in names):
         higher = best.point + 0.1 * (np.arange(len(names)) == limit)
         points = np.array([best.point, np.clip(higher, *problem.structure.box)])

@@ -57,6 +57,7 @@ from pupper_sysid.sysid.fit.search import (
     curvature,
     fit_folds,
     folds_of,
+    price_of_a_number,
     search,
     temperature_at,
     without_limit,
@@ -232,7 +233,7 @@ def _in_free_air(
 def _slight_limits(
     ready: PreparedJoint, carried: Fitted, goodness: Mapping[str, float]
 ) -> dict[str, str]:
-    """Why limits are not known that explain less than the model leaves unexplained.
+    """Why limits are not known that explain less than a number must, or the model leaves over.
 
     A torque that is cut for an instant looks like a link that bends, or play.
     """
@@ -243,8 +244,11 @@ def _slight_limits(
         without = without_limit(problem, best, structure.names.index(name))
         points = np.array([best.point, without.point])
         with_it, without_it = problem.costs(points) - problem.prior(points)
-        if without_it - with_it < unexplained:
+        gained = without_it - with_it
+        if gained < unexplained:
             slight[name] = "it explains less than the model leaves unexplained"
+        elif gained < price_of_a_number(problem, best):
+            slight[name] = "a servo without it moves the same, as far as readings show"
     return slight
 
 

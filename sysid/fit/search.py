@@ -156,6 +156,11 @@ def temperature_at(problem: Problem, fit: Fit) -> float:
     return temperature_of(scaled, problem.runs, len(values))
 
 
+def price_of_a_number(problem: Problem, fit: Fit) -> float:
+    """By how much a further number must lower the cost of a fit: Schwarz's criterion."""
+    return float(0.5 * np.log(problem.samples) * temperature_at(problem, fit))
+
+
 def search(
     problem: Problem,
     rng: np.random.Generator,
