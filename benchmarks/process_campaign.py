@@ -69,7 +69,7 @@ PROGRAM = """
 import fcntl, os, signal, sys, termios, time
 from pathlib import Path
 import numpy as np
-from pupper_sysid.cli.user_errors import end_politely
+from pupper_sysid.cli.program import end_politely
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.safety.guard import open_guarded

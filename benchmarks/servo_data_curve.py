@@ -32,12 +32,10 @@ from pupper_sysid.sysid.report.sections import MODELS as CURVES
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.fit import delayed_pd_fits
-from pupper_sysid.sysid.servo_fit.networks import fit_network, past_ticks
-from pupper_sysid.sysid.servo_fit.published import fit_published
+from pupper_sysid.sysid.servo_fit.networks import fit_network, fit_published, past_ticks
 from pupper_sysid.sysid.servo_fit.windows import Part, grouped, merged_groups, samples
 from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S
-from pupper_sysid.sysid.sweep.recorder import record
-from pupper_sysid.sysid.sweep.resume import playback
+from pupper_sysid.sysid.sweep.recorder import playback, record
 
 JOINTS = ("LF_hip", "LF_calf")
 PERIOD_S, LOOP_ROWS = 0.02, 500

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.keyboard import terminal_without
+from pupper_sysid.cli.terminal import terminal_without
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.policies.deploy.deployment import Tick
@@ -34,7 +34,7 @@ _SHOWN_EVERY_S = 0.2
 class Driver:
     """Commands from the keyboard, no further than those `trained`, and a live table of the ticks.
 
-    Use it as a context; it is a `policies.deploy.commands.Commands`.
+    Use it as a context; it is a `policies.deploy.deployment.Commands`.
     """
 
     def __init__(self, trained: CommandRanges) -> None:

@@ -1,12 +1,18 @@
 """Rerun and MCAP while a loop runs: the channels of `view`, from a process of its own.
 
-`cli.live_writer` writes. The loop only hands it a message per tick, which is dropped where the
-writer is behind: a slow disk or viewer delays no servo. How many were dropped is said at the end.
+`SideProcess` is a process beside a loop that moves or reads servos, which takes messages and may be
+slow; here it is `cli.live_writer`, which writes. The loop hands it a message per tick and never
+waits: one for which there is no space is dropped, so that a slow disk or viewer delays no servo.
+How many were dropped is printed at the end.
 """
 
 from __future__ import annotations
 
 import json
+import select
+import socket
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -17,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.side_process import SideProcess
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.joints import JOINT_NAMES
@@ -26,6 +31,62 @@ from pupper_sysid.hardware.safety.guard import GuardedBus
 
 if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.deployment import Tick
+
+LONGEST_MESSAGE = 65536
+
+
+class SideProcess:
+    """A module in a process of its own, behind a socket whose descriptor is its argument.
+
+    Its reading end ends with this process, however that ends.
+    """
+
+    def __init__(self, module: str):
+        self.here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with there:
+            self.process = subprocess.Popen(
+                # -P: a file in the user's folder, such as json.py, must not stand in for a module
+                [sys.executable, "-P", "-m", module, str(there.fileno())],
+                pass_fds=[there.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+            )  # fmt: skip
+        self.here.setblocking(False)
+
+    def send(self, message: bytes, within_s: float = 0.0) -> bool:
+        """Hand over a message, at most `LONGEST_MESSAGE`; whether it was taken.
+
+        For `within_s` space is awaited.
+        """
+        try:
+            if within_s:
+                select.select([], [self.here], [], within_s)
+            self.here.send(message)
+        except OSError:  # behind, or ended: the loop goes on
+            return False
+        return True
+
+    def answer(self, within_s: float) -> bytes:
+        """A message of the process; empty if it ended."""
+        if not select.select([self.here], [], [], within_s)[0]:
+            raise InputError(
+                f"A helping process did not answer within {within_s:.0f} s. Check the machine's "
+                "load and memory, then try again."
+            )
+        try:
+            return self.here.recv(LONGEST_MESSAGE)
+        except OSError:
+            return b""
+
+    def end(self, within_s: float) -> bool:
+        """Say that nothing follows, and wait; whether the process ended by itself."""
+        self.here.close()
+        try:
+            self.process.wait(within_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+            return False
+        return True
+
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.cli.live_views import TICK
-from pupper_sysid.cli.side_process import LONGEST_MESSAGE
+from pupper_sysid.cli.live_views import LONGEST_MESSAGE, TICK
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.view import McapStream, RerunStream, TickChannels
 
@@ -76,7 +75,7 @@ class Writer:
         self._robot = None
         if about["knee"]:
             from pupper_sysid.policies.twin.drawing import HungRobot
-            from pupper_sysid.sim.robot.servo_robot import mini_pupper_robot
+            from pupper_sysid.sim.robot.replay import mini_pupper_robot
 
             self._robot = HungRobot(mini_pupper_robot(about["knee"]))
             self._rerun.show(self._robot.bodies(self._robot.robot.rest_rad[None]))

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.side_process import LONGEST_MESSAGE, SideProcess
+from pupper_sysid.cli.live_views import LONGEST_MESSAGE, SideProcess
 from pupper_sysid.hardware.bus import BusSample
 
 Array = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Output of all commands: streams, tables, numbers, JSON, progress bars.
+"""Output of all commands: streams, tables, numbers, JSON, progress bars; questions at the keyboard.
 
 Results go to stdout, everything else (progress, warnings, what to run next) to stderr: with
 `--json`, stdout is one JSON object.
@@ -13,15 +13,19 @@ for a caller of the library and at the command line::
     `learning_rate`      --learner.learning-rate
 
 An option is found by the argument's name, by its name without the unit, or by `_OTHER_NAMES`.
-Errors (`user_errors`) and warnings (`terminal.warn`) are spelled so; a command need not call this.
+Errors (`program.user_errors`) and warnings (`warn`) are spelled so; a command need not call this.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import re
+import select
 import shlex
+import sys
+import termios
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -315,3 +319,70 @@ def _flags_of(options: Any, prefix: str = "--") -> dict[str, str]:
         elif "Positional" not in kind:
             own[field.name] = flag
     return nested | own
+
+
+@contextmanager
+def terminal_without(flags: int, fd: int) -> Iterator[None]:
+    """Local flags of a terminal, such as `termios.ECHO`, off during the block."""
+    before = termios.tcgetattr(fd)
+    changed = [*before[:3], before[3] & ~flags, *before[4:]]
+    termios.tcsetattr(fd, termios.TCSANOW, changed)
+    try:
+        yield
+    finally:
+        termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+
+class Keyboard:
+    """Lines typed at the terminal, read without blocking."""
+
+    def __init__(self) -> None:
+        try:
+            self._fd = sys.stdin.fileno()
+        except (OSError, ValueError, AttributeError):
+            raise _ended() from None
+        self._typed = b""
+
+    def ask(self, question: str) -> str:
+        """Answer to a question, in lower case; waits for it."""
+        err.print(Text(question, "bold"))
+        self.forget()
+        while (line := self.line()) is None:
+            select.select([self._fd], [], [])
+        return line
+
+    def forget(self) -> None:
+        """Discard what was typed before the question."""
+        if os.isatty(self._fd):
+            termios.tcflush(self._fd, termios.TCIFLUSH)
+            self._typed = b""
+
+    @contextmanager
+    def unseen(self) -> Iterator[None]:
+        """Without echo during the block: Enter would push a live table down by a line."""
+        if not os.isatty(self._fd):
+            yield
+            return
+        self.forget()
+        with terminal_without(termios.ECHO, self._fd):
+            yield
+
+    def line(self) -> str | None:
+        """A line if one has been typed."""
+        if b"\n" not in self._typed and select.select([self._fd], [], [], 0)[0]:
+            typed = os.read(self._fd, 1024)
+            if not typed:
+                raise _ended()
+            self._typed += typed
+        line, end, rest = self._typed.partition(b"\n")
+        if not end:
+            return None
+        self._typed = rest
+        return line.decode(errors="replace").strip().lower()
+
+
+def _ended() -> InputError:
+    return InputError(
+        "the input ended before the calibration did, so nothing was written. Run it in a terminal, "
+        "where questions can be answered; servos that went limp stay so."
+    )

@@ -21,7 +21,7 @@ from numpydoc import docscrape_sphinx
 from sphinx.addnodes import pending_xref
 from sphinx.domains.python import PythonDomain
 
-from pupper_sysid.cli.dispatch import words
+from pupper_sysid.cli.program import words
 
 HERE = Path(__file__).resolve().parent
 REFERENCE = HERE / "reference"  # written by `setup`

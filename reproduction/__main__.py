@@ -11,7 +11,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import tyro
 
-from pupper_sysid.cli.user_errors import run_program
+from pupper_sysid.cli.program import run_program
 from pupper_sysid.common.errors import InputError
 
 DESCRIPTION = """Every published claim beside what is found here, as pages with figures.
@@ -68,7 +68,7 @@ def _run(options: Options) -> None:
         raise InputError("No policy was named: python -m reproduction runs/<name>.")
     import torch
 
-    from pupper_sysid.cli.commands.analyze.common import tries_of
+    from pupper_sysid.cli.commands.analyze.walks import tries_of
     from reproduction.page import write_claims
 
     torch.set_num_threads(1)

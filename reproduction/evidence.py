@@ -1,21 +1,28 @@
-"""Evidence for the claims about policies: every analysis of each of them."""
+"""Evidence for the claims about policies, and how a published claim is judged.
+
+A claim is a function of evidence under `claim`, which returns a `Finding`, or raises `NotTestable`:
+one row of the report, beside what the paper says. `gather` makes every analysis of a policy.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from math import nan
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from pupper_sysid.common.border import read_text
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
-from pupper_sysid.policies.analysis.attractor import Orbits, orbits
-from pupper_sysid.policies.analysis.autonomy import Autonomy, autonomy
+from pupper_sysid.common.reading.csv_table import read_table
+from pupper_sysid.common.results import Result
+from pupper_sysid.policies.analysis.autonomy import Autonomy, Orbits, autonomy, orbits
 from pupper_sysid.policies.analysis.gait import GaitReport, describe
 from pupper_sysid.policies.analysis.robustness import (
     AblationPoint,
@@ -34,7 +41,102 @@ from pupper_sysid.policies.train.curves import PROGRESS
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run
 from pupper_sysid.policies.walks.rollouts import Rollout
 from pupper_sysid.sim.walking.config import Curriculum
-from reproduction.claims import NotTestable
+
+Verdict = Literal["holds", "holds partly", "does not hold here", "not testable here"]
+Evidence = TypeVar("Evidence")
+
+
+@dataclass(frozen=True)
+class Claim(Result):
+    """One row of the report."""
+
+    id: str
+    claim: str
+    paper: str
+    ours: str
+    interval: dict[str, Interval] | None
+    """90 % intervals of the numbers in `ours`: over policies of a kind where there are several,
+    else over robots or stretches of time."""
+    verdict: Verdict
+    how: str
+    """How it was measured and judged."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Finding on a claim: `ours`, `interval` and `verdict` of `Claim`."""
+
+    ours: str
+    interval: dict[str, Interval] | None
+    verdict: Verdict
+    note: str
+    """The threshold, and its meaning; appended to the claim's `how`."""
+
+
+class NotTestable(Exception):
+    """The evidence cannot decide the claim; the message names what could."""
+
+
+def claim(
+    id: str, text: str, paper: str, how: str
+) -> Callable[[Callable[[Evidence], Finding]], Callable[[Evidence], Claim]]:
+    """Decorate a function of evidence so that it returns a row of the report.
+
+    `how` says how it is measured; the others are those of `Claim`.
+    """
+
+    def decorate(look: Callable[[Evidence], Finding]) -> Callable[[Evidence], Claim]:
+        @wraps(look)
+        def row(evidence: Evidence) -> Claim:
+            try:
+                found = look(evidence)
+            except NotTestable as missing:
+                return Claim(id, text, paper, "–", None, "not testable here", f"{how} {missing}")
+            return Claim(
+                id, text, paper, found.ours, found.interval, found.verdict, f"{how} {found.note}"
+            )
+
+        return row
+
+    return decorate
+
+
+def holds(wholly: bool, partly: bool = False) -> Verdict:
+    """The verdict of evidence that could decide."""
+    return "holds" if wholly else "holds partly" if partly else "does not hold here"
+
+
+_COLUMNS = ("id", "ours", "verdict")
+
+
+def differences(found: Sequence[Claim], beside: Path) -> list[dict[str, str]]:
+    """Claims that another page judges otherwise.
+
+    Each has `id`, `claim`, `here`, `verdict`, `there` and `verdict_there`.
+    """
+    text = read_text(beside)
+    header = text.split("\n", 1)[0].strip().split(",")
+    missing = [name for name in _COLUMNS if name not in header]
+    if missing:
+        raise InputError(
+            f"{beside} has no column `{missing[0]}`. Give the tables/claims.csv of a page that "
+            "`python -m reproduction` wrote."
+        )
+    table = read_table(beside, text, header)
+    rows = zip(*(table.texts[name] for name in _COLUMNS), strict=True)
+    there = {id: (ours, verdict) for id, ours, verdict in rows}
+    for id, (_, verdict) in there.items():
+        if verdict not in get_args(Verdict):
+            raise InputError(f"{beside}: the verdict of {id} is {verdict!r}, which is none.")
+    return [
+        {
+            "id": c.id, "claim": c.claim, "here": c.ours, "verdict": c.verdict,
+            "there": there[c.id][0], "verdict_there": there[c.id][1],
+        }
+        for c in found
+        if c.id in there and there[c.id][1] != c.verdict
+    ]  # fmt: skip
+
 
 KINDS = {"mlp": "MLP", "lstm": "LSTM", "gru": "GRU", "transformer": "Transformer"}
 """Names of the architectures compared."""

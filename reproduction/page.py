@@ -25,14 +25,23 @@ from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_
 from pupper_sysid.common.page import Picture, Section, write_page
 from pupper_sysid.common.tables import Column, Table
 from pupper_sysid.policies.analysis import figures
-from pupper_sysid.policies.analysis.attractor import DELAYS_MS
+from pupper_sysid.policies.analysis.autonomy import DELAYS_MS
 from pupper_sysid.policies.deploy.stacks import STACKS
 from pupper_sysid.servo_models.servo_file import WEIGHTS
 from pupper_sysid.sysid.report.figures import sweep_figure
 from reproduction import servos as servo_claims
 from reproduction import walks as walk_claims
-from reproduction.claims import Claim, differences
-from reproduction.evidence import A_TROT, KINDS, PolicyEvidence, Training, gather, over, training
+from reproduction.evidence import (
+    A_TROT,
+    KINDS,
+    Claim,
+    PolicyEvidence,
+    Training,
+    differences,
+    gather,
+    over,
+    training,
+)
 from reproduction.policies import TAUGHT, judge
 from reproduction.servos import ServoEvidence
 from reproduction.walks import Walker, compare_stacks
@@ -40,7 +49,7 @@ from reproduction.walks import Walker, compare_stacks
 Evidence = tuple[list[PolicyEvidence], list[Training]]
 
 if TYPE_CHECKING:
-    from pupper_sysid.cli.commands.analyze.common import Tries
+    from pupper_sysid.cli.commands.analyze.walks import Tries
     from reproduction.__main__ import Options
 
 _SHOWN_S = 2.0

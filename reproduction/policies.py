@@ -1,7 +1,7 @@
 """The published claims about policies, one by one: what the paper says, what is found, a verdict.
 
 Each claim is a function of the evidence (`reproduction.evidence`), declared with
-`reproduction.claims.claim`; `judge` evaluates all. A verdict follows from thresholds given in the
+`reproduction.evidence.claim`; `judge` evaluates all. A verdict follows from thresholds given in the
 claim's `how`. "Not testable here" means that the evidence cannot decide it, and names what could.
 They are about training, about the gait, about the deployed stacks, and those that need another
 experiment.
@@ -15,14 +15,25 @@ from typing import Any
 import numpy as np
 
 from pupper_sysid.common.interval import Interval, mean_of
-from pupper_sysid.policies.analysis.attractor import DELAYS_MS
-from pupper_sysid.policies.analysis.autonomy import NUDGE_M_S, PUSH_M_S
+from pupper_sysid.policies.analysis.autonomy import DELAYS_MS, NUDGE_M_S, PUSH_M_S
 from pupper_sysid.policies.analysis.gait import SHORTEST_S, null_r2, sine_fit_r2, sine_frequency
 from pupper_sysid.policies.deploy.stacks import STACKS
-from pupper_sysid.policies.walks.tracking import ERRORS
+from pupper_sysid.policies.walks.rollouts import ERRORS
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-from reproduction.claims import Claim, Finding, NotTestable, Verdict, claim, holds
-from reproduction.evidence import PolicyEvidence, Training, bounds, of_kind, of_kinds, several
+from reproduction.evidence import (
+    Claim,
+    Finding,
+    NotTestable,
+    PolicyEvidence,
+    Training,
+    Verdict,
+    bounds,
+    claim,
+    holds,
+    of_kind,
+    of_kinds,
+    several,
+)
 
 Policies = Sequence[PolicyEvidence]
 Trainings = Sequence[Training]

@@ -13,7 +13,7 @@ from pupper_sysid.sysid.doctor.examination import JointExamination, examine
 from pupper_sysid.sysid.fit.dead_time import lag
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
-from reproduction.claims import Claim, Finding, NotTestable, claim, holds
+from reproduction.evidence import Claim, Finding, NotTestable, claim, holds
 
 
 @dataclass

@@ -15,13 +15,12 @@ import numpy as np
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import mean_of
-from pupper_sysid.policies.deploy.emulated_walk import walk_once
+from pupper_sysid.policies.deploy.assembly import walk_once
 from pupper_sysid.policies.deploy.stacks import Stack
 from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.twin.gyro import Gyro, ImuLog, read_imu, spectrum
-from pupper_sysid.policies.walks.tracking import ERRORS
-from reproduction.claims import Claim, Finding, NotTestable, claim, holds
-from reproduction.evidence import KINDS
+from pupper_sysid.policies.twin.twin import Gyro, ImuLog, read_imu, spectrum
+from pupper_sysid.policies.walks.rollouts import ERRORS
+from reproduction.evidence import KINDS, Claim, Finding, NotTestable, claim, holds
 
 _YAW = 2
 _PAPER_HZ = 2.8

@@ -32,8 +32,8 @@ from scipy.io import savemat
 
 from pupper_sysid.common.errors import PupperError
 from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.policies.deploy.commands import COLUMNS as SCRIPT_COLUMNS
-from pupper_sysid.policies.deploy.commands import script
+from pupper_sysid.policies.deploy.deployment import COLUMNS as SCRIPT_COLUMNS
+from pupper_sysid.policies.deploy.deployment import script
 from pupper_sysid.policies.deploy.walk_log import COLUMNS as WALK_COLUMNS
 from pupper_sysid.policies.deploy.walk_log import TITLE as WALK_TITLE
 from pupper_sysid.policies.deploy.walk_log import read_walk
@@ -45,7 +45,7 @@ from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.plan.plan_file import load_plan, save_plan
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.importers.options import LogOptions, read_mapping
-from pupper_sysid.sysid.sweep.resume import playback
+from pupper_sysid.sysid.sweep.recorder import playback
 from support.planned_servos import small_plan
 from support.saved_servo_models import saved
 

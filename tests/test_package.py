@@ -267,7 +267,7 @@ def test_an_environment_of_a_newer_python_is_kept_when_none_is_named(tmp_path):
 # ----- clocks
 
 DATES = {"cli/programs/pupper_train.py", "servo_models/calibration/calibration.py"}
-DATES |= {"servo_models/cards/files.py", "sysid/recordings/files.py", "sysid/sweep/resume.py"}
+DATES |= {"servo_models/cards/files.py", "sysid/recordings/files.py", "sysid/sweep/recorder.py"}
 """Names and dates in files, and the pause before a sweep that is resumed (a file has no other)."""
 
 WALL_CLOCK = {"time.time", "time.time_ns", "time.localtime", "time.gmtime"}

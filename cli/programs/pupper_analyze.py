@@ -8,8 +8,7 @@ from collections.abc import Sequence
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from pupper_sysid.cli.dispatch import commands_of, run_command
-from pupper_sysid.cli.user_errors import user_errors
+from pupper_sysid.cli.program import commands_of, run_command, user_errors
 from pupper_sysid.common.errors import InputError
 
 DESCRIPTION = """Analyse the walk of policies in the simulator: tables, JSON and a picture each.
@@ -34,7 +33,7 @@ _SUMMARIES = {
         "servo-demand": "What a gait needs, against what a servo has.",
     },
 }
-_MODULES = {"servo": "servos", "servo-demand": "servos", "twin": "twin"}
+_MODULES = {"servo": "servos", "servo-demand": "servos", "twin": "servos"}
 COMMANDS = commands_of(_SUMMARIES, lambda _, word: f"analyze.{_MODULES.get(word, 'walks')}")
 
 

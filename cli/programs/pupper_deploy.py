@@ -20,8 +20,8 @@ from pupper_sysid.cli import policy_choice, terminal
 from pupper_sysid.cli.buses import chosen_map
 from pupper_sysid.cli.commands.recording.sweep import Sweep
 from pupper_sysid.cli.live_views import Wanted, live_views
+from pupper_sysid.cli.program import end_politely, run_program
 from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
-from pupper_sysid.cli.user_errors import end_politely, run_program
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_path
 from pupper_sysid.hardware.address import EMULATED, KINDS, SOCKET, bus_name, parse_address
@@ -35,7 +35,7 @@ from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, Sta
 
 if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.assembly import Assembly
-    from pupper_sysid.policies.deploy.commands import Commands
+    from pupper_sysid.policies.deploy.deployment import Commands
     from pupper_sysid.policies.network.policy_file import CommandRanges
     from pupper_sysid.sim.emulator.robot import EmulatedRobot
     from pupper_sysid.sim.robot.body import Body
@@ -215,7 +215,7 @@ def _run(options: Deploy) -> None:
 def _commands(options: Deploy, trained: CommandRanges) -> Commands:
     """Commands within what the policy was trained for."""
     from pupper_sysid.cli.drive import Driver
-    from pupper_sysid.policies.deploy.commands import constant, script
+    from pupper_sysid.policies.deploy.deployment import constant, script
 
     if options.keyboard:
         return Driver(trained)
@@ -365,8 +365,8 @@ def _walk(
 ) -> None:  # fmt: skip
     """Walk, log, and show the result."""
     from pupper_sysid.cli.drive import Driver
+    from pupper_sysid.policies.deploy.assembly import ERRORS, WalkScore
     from pupper_sysid.policies.deploy.deployment import deploy
-    from pupper_sysid.policies.deploy.emulated_walk import ERRORS, WalkScore
     from pupper_sysid.sysid.recordings.files import RecordingWriter
 
     score = WalkScore(bus, truth) if truth else None

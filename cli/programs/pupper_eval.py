@@ -15,8 +15,8 @@ import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.policy_choice import policy_at, run_folder, simulator, warn_of_fallbacks
+from pupper_sysid.cli.program import run_program
 from pupper_sysid.cli.terminal import err, need_positive, print_json, print_tables
-from pupper_sysid.cli.user_errors import run_program
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, resolved
 from pupper_sysid.sim.robot.terrain import Terrain
@@ -140,7 +140,7 @@ def _run(options: Eval) -> None:
 
 
 def _show(found: Evaluation, quick: bool) -> None:
-    from pupper_sysid.policies.evaluation.tables import tables_of
+    from pupper_sysid.policies.evaluation.report import tables_of
 
     first = found.conditions[0].policy
     err.print(

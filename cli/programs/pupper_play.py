@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from pupper_sysid.cli import policy_choice
 from pupper_sysid.cli.live_views import refuse_files
+from pupper_sysid.cli.program import run_program
 from pupper_sysid.cli.terminal import err, need_positive, out, seconds_progress, warn
-from pupper_sysid.cli.user_errors import run_program
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, replacing
 from pupper_sysid.sim.robot.terrain import Terrain
@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: Play) -> None:
     need_positive("--seconds", options.seconds)
-    from pupper_sysid.policies.deploy.commands import checked_command
+    from pupper_sysid.policies.deploy.deployment import checked_command
 
     command = checked_command(options.command)
     if options.video:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from pupper_sysid.cli.dispatch import commands_of, run_command
+from pupper_sysid.cli.program import commands_of, run_command
 
 DESCRIPTION = "Measure a cheap servo."
 _SUMMARIES = {
@@ -47,8 +47,8 @@ _SUMMARIES = {
 }
 _MODULES = {
     "import": "files", "view": "files", "doctor": "measure", "delay": "measure", "bode": "measure",
-    "backlash": "measure", "compare-truth": "compare", "sindy": "fit_servo", "report": "pages",
-    "samples": "pages",
+    "backlash": "measure", "park": "scan", "compare-truth": "compare", "sindy": "fit_servo",
+    "report": "pages", "samples": "pages",
 }  # fmt: skip
 COMMANDS = commands_of(
     _SUMMARIES,

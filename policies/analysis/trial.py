@@ -14,8 +14,7 @@ from pupper_sysid.common.results import Result
 from pupper_sysid.policies.analysis.gait import amplitude, frequency, jitter, steady
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.conditions import Change, Condition, Disturb, evaluation_task
-from pupper_sysid.policies.walks.rollouts import Rollout, collect
-from pupper_sysid.policies.walks.tracking import pooled_errors
+from pupper_sysid.policies.walks.rollouts import Rollout, collect, pooled_errors
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 

@@ -1,13 +1,19 @@
-"""Assembly of a controller from policy, stack and observer, with checks.
+"""Assembly of a controller from policy, stack and observer, with checks; emulated walks.
 
 The observer is compared with the training's actuator, and the servos with the training's. While the
 robot walks, `FrozenReadings` compares readings with a model of the servo.
+
+`walk_once` walks an emulated robot in virtual time, through guard, bus and log as on a robot. Its
+servos are drawn as `sim.emulator.robot` draws them, and its true motion is known: `WalkScore`
+compares it with the commands.
 """
 
 from __future__ import annotations
 
+import tempfile
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,17 +24,23 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError, SafetyStop
 from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.monitor import GuardLimits
 from pupper_sysid.policies.deploy.controller import Controller
+from pupper_sysid.policies.deploy.deployment import Outcome, Rows, Tick, constant, deploy
 from pupper_sysid.policies.deploy.matches import Match, ServoMatch, compare, servo_match
 from pupper_sysid.policies.deploy.stacks import Observer, Stack, SyntheticPD, make_observer
 from pupper_sysid.policies.network.policy_file import Policy, trained_servo
+from pupper_sysid.policies.walks.rollouts import ERRORS, named, tracking_errors
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.servo_file import WEIGHTS
+from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.robot.body import Body
+from pupper_sysid.sim.walking.bus import WalkingBus
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.robot import body_joint_map
+from pupper_sysid.sim.walking.robot import WalkingRobot, body_joint_map
 from pupper_sysid.sim.walking.servo_ranges import (
     ServoRanges,
     is_servo_model,
@@ -215,3 +227,60 @@ class FrozenReadings:
                 f"servo under its commands moves by {moved[k]:.2f} rad. It is blocked, without "
                 "power, or has stopped answering; switch the servos' power off and on."
             )
+
+
+class WalkScore:
+    """Tracking errors of an emulated robot; a watcher of `policies.deploy.deployment.deploy`.
+
+    Times are those of `bus`.
+    """
+
+    def __init__(self, bus: ServoBus, robot: WalkingRobot):
+        self._bus, self._robot = bus, robot
+        self._moved: list[np.ndarray] = []
+        self._commands: list[np.ndarray] = []
+
+    def __call__(self, tick: Tick) -> None:
+        """Record the robot's true motion at a tick."""
+        trunk = self._robot.trunk(self._bus.now())
+        self._moved.append(np.array([*trunk.velocity_m_s[:2], trunk.yaw_rate_rad_s]))
+        self._commands.append(tick.senses.command)
+
+    def summary(self) -> dict[str, Any]:
+        """Mean absolute errors and `mean_motion` up to the last tick; None before the first."""
+        if not self._moved:
+            return dict.fromkeys((*ERRORS, "mean_motion"))
+        moved, commands = (np.array(x)[:, None] for x in (self._moved, self._commands))
+        up, fell = np.ones((len(moved), 1), bool), np.zeros(1, bool)
+        errors = tracking_errors(moved, commands, up, fell)[0]
+        return {**named(errors), "mean_motion": (moved[:, 0].sum(axis=0) / len(moved)).tolist()}
+
+
+def walk_once(
+    policy: Policy,
+    stack: Stack,
+    command: tuple[float, float, float],
+    seconds: float,
+    seed: int,
+    actuator: str,
+    servo: Path | None = None,
+    rows: Rows | None = None,
+    noise: int = 0,
+) -> tuple[Outcome, WalkScore]:
+    """One walk of one emulated robot; its log is discarded.
+
+    The command is forward and sideways speed [m/s] and turn rate [rad/s]; `seed` is that of the
+    robot, `noise` of all else: lost polls, noise, timing. `actuator` and `servo` are as for
+    `policies.deploy.assembly.assemble`; `rows` takes the servos' rows, as of a recording.
+    """
+    truth = draw_robot(np.random.default_rng(seed))
+    joint_map = load_joint_map("mini_pupper_2")
+    inner = WalkingBus(truth, np.random.default_rng([seed, noise]))
+    with closing(GuardedBus(inner)) as bus, tempfile.TemporaryDirectory() as folder:
+        parts = assemble(policy, stack, joint_map, actuator, servo)
+        score = WalkScore(bus, inner.robot)
+        outcome = deploy(
+            bus, inner, parts.controller, constant(command), seconds,
+            Path(folder) / "walk.csv", parts.header, rows, [score, parts.frozen_readings],
+        )  # fmt: skip
+    return outcome, score

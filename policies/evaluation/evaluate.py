@@ -16,30 +16,415 @@ open-loop trot falls under none of them. These go on until it does: pushes, slop
 off centre, a weak leg, missed control ticks, late and jittered servos, slippery ground, and all
 that typically differs between a robot and its model (`sim.walking.differences.TYPICAL`). All are
 walked under random commands.
+
+`Figures` are the numbers of a row: falls, errors, speed, drift of the heading, feet, and effort of
+servos.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import beta
+
+from pupper_sysid.common.interval import LEVEL, Interval, mean_of
 from pupper_sysid.common.results import Result
-from pupper_sysid.policies.evaluation.figures import Fall, Figures, Recorder, falls_of, figures_of
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.conditions import (
     DIRECTIONS,
     Condition,
     Handicap,
+    Moment,
+    StepRecorder,
     Walker,
     evaluation_task,
     share_of_usual,
+)
+from pupper_sysid.policies.walks.rollouts import (
+    ERRORS,
+    STRIDE_ERRORS,
+    counted,
+    heading,
+    planar_velocity,
+    stride_errors,
+    tracking_errors,
 )
 from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.terrain import STAIRS_M, Terrain
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.differences import TYPICAL, Differences
+from pupper_sysid.sim.walking.observation import FALLEN_TILT
+from pupper_sysid.sim.walking.rewards.strides import LOW_SWING_M, by_kind
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+
+Array = NDArray[np.float64]
+
+START_S = 1.0
+"""Time in which a robot starts to move, without which mean speeds are given [s]."""
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Episodes of one or more robots under one condition; zeros after a robot's last step."""
+
+    step_s: float
+    kinds: tuple[str, ...]
+    """Of joints (`Body.kinds`)."""
+    fell: NDArray[np.bool_]
+    """Shape (episodes,)."""
+    command: Array
+    """Forward and sideways speed [m/s], turn rate [rad/s]; shape (steps, episodes, 3)."""
+    velocity: Array
+    contact: NDArray[np.bool_]
+    """Feet on the ground; shape (steps, episodes, 4)."""
+    alive: NDArray[np.bool_]
+    """Shape (steps, episodes)."""
+    gravity: Array
+    """The ground's normal, downwards, in the trunk's frame; shape (steps, episodes, 3)."""
+    heading: Array
+    """Continuous [rad], shape (steps, episodes)."""
+    slip_m_s: Array
+    """Speed of the feet on the ground, summed over those; shape (steps, episodes)."""
+    swing_s: Array
+    """Length of the swings that ended, summed; shape (steps, episodes)."""
+    swings: NDArray[np.int_]
+    """How many ended; shape (steps, episodes)."""
+    clearance_m: NDArray[np.float32]
+    """Of the swings that ended, NaN of other feet; shape (steps, episodes, 4)."""
+    saturated: NDArray[np.float32]
+    """Share of the time at the torque limit by kind of joint; shape (steps, episodes, 3)."""
+    torque_square: NDArray[np.float32]
+    """Mean square of torque over limit by kind of joint; shape (steps, episodes, 3)."""
+    work_j: Array
+    """Positive work of all servos; shape (steps, episodes)."""
+    carried_j: Array
+    """Weight times distance; shape (steps, episodes)."""
+
+    @property
+    def error(self) -> Array:
+        """Mean absolute errors at every control step, shape (episodes, 3)."""
+        return tracking_errors(self.velocity, self.command, self.alive, self.fell)
+
+    @property
+    def stride_error(self) -> Array:
+        """Mean absolute errors of the mean velocity over a stride, shape (episodes, 3)."""
+        with np.errstate(divide="ignore"):
+            stride_s = 1.0 / self.stride_hz
+        return stride_errors(
+            self.velocity, self.command, self.alive, self.fell, stride_s, self.step_s
+        )
+
+    @property
+    def commanded(self) -> Array:
+        """Mean absolute command: the error of a robot that stands still, shape (episodes, 3)."""
+        return tracking_errors(np.zeros_like(self.velocity), self.command, self.alive, self.fell)
+
+    @property
+    def stride_hz(self) -> Array:
+        """Strides per second of each robot while it was up, shape (episodes,)."""
+        feet = self.contact.shape[-1]
+        up_s = self.step_s * np.maximum(self.alive.sum(axis=0), 1)
+        return self.swings.sum(axis=0) / feet / up_s
+
+    @property
+    def mean_velocity(self) -> Array:
+        """Mean velocity after the first second, with falls as standing; shape (episodes, 3)."""
+        velocity, counts = counted(self.velocity, self.alive, self.fell)
+        first = min(round(START_S / self.step_s), len(velocity) // 2)
+        each = counts[first:, :, None]
+        return (each * velocity[first:]).sum(axis=0) / np.maximum(each.sum(axis=0), 1)
+
+    @property
+    def drift_deg(self) -> Array:
+        """Size of the change of heading over the episode; NaN of robots that did not finish it."""
+        change = np.degrees(np.abs(self.heading[-1] - self.heading[0]))
+        return np.where(self.alive[-1], change, np.nan)
+
+    def first(self, episodes: int) -> Walk:
+        """The same of the first episodes."""
+        arrays = {f.name: getattr(self, f.name) for f in fields(self)[3:]}
+        first = {name: array[:, :episodes] for name, array in arrays.items()}
+        return Walk(self.step_s, self.kinds, self.fell[:episodes], **first)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intervals(Result):
+    """90 % intervals over episodes.
+
+    Of the share that fell by Clopper and Pearson, of all else by Student's t.
+    """
+
+    fall_rate: Interval
+    mae_vx_m_s: Interval
+    mae_vy_m_s: Interval
+    mae_yaw_rad_s: Interval
+    stride_mae_vx_m_s: Interval
+    stride_mae_vy_m_s: Interval
+    stride_mae_yaw_rad_s: Interval
+    speed_share: Interval
+    heading_drift_deg: Interval
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figures(Result):
+    """Figures of a number of episodes."""
+
+    episodes: int
+    fall_rate: float
+    mae_vx_m_s: float
+    """Of every control step, as the other two; see `policies.walks.rollouts`."""
+    mae_vy_m_s: float
+    mae_yaw_rad_s: float
+    stride_mae_vx_m_s: float
+    """Of the mean velocity over a stride, as the other two."""
+    stride_mae_vy_m_s: float
+    stride_mae_yaw_rad_s: float
+    speed_share: float
+    """Mean speed along the command over the commanded one after the first second, 0 after a fall;
+    NaN for random commands and for standing."""
+    mean_velocity: tuple[float, ...]
+    """Forward, sideways, turning, after the first second; 0 after a fall."""
+    heading_drift_deg: float
+    """Mean size of the change of heading over the episode, of robots that finished it; NaN where
+    the command turns."""
+    duty: tuple[float, ...]
+    """Share of time that each foot stands."""
+    stride_hz: float
+    """Strides per second."""
+    swing_s: float
+    """Mean length of a swing."""
+    foot_slip_m_s: float
+    """Mean speed of feet on the ground."""
+    clearance_p10_m: float
+    """Tenth percentile of the clearance over all swings: the largest height of the sole over the
+    ground in a swing (`sim.walking.rewards.strides`); NaN without a swing, as the next two."""
+    clearance_p50_m: float
+    """Its median."""
+    low_swing_share: float
+    """Share of the swings whose clearance is below 2 mm."""
+    torque_saturated_share: dict[str, float]
+    """Share of the time in which a servo is at its torque limit, by kind of joint (`hip`, `thigh`,
+    `calf`)."""
+    rms_torque_share: dict[str, float]
+    """Root mean square of torque over its limit, by kind of joint."""
+    mechanical_power_w: float
+    """Mean positive work of all servos over time."""
+    cost_of_transport: float
+    """Positive work over weight times distance, of the mean motion over a stride; NaN where the
+    command is to stay in place."""
+    intervals: Intervals
+
+
+class Recorder(StepRecorder):
+    """What figures are made of, for the robots of one environment."""
+
+    def arrays(self, now: Moment) -> dict[str, NDArray]:
+        """Columns of a `Walk`."""
+        facts, step_s = now.facts, self.env.config.control_step_s
+        standing = facts.contact & now.alive[:, None]
+        ended = facts.swing_ended & now.alive[:, None]
+        # of the mean motion over a stride
+        travelled = step_s * np.linalg.norm(facts.stride_velocity[:, :2], axis=1)
+        # before the first step a foot may have been elsewhere: its speed is not known
+        slip = facts.foot_speed_m_s * standing if self.steps else np.zeros(standing.shape)
+        return {
+            "velocity": planar_velocity(facts), "contact": facts.contact, "alive": now.alive,
+            "gravity": facts.gravity.astype(np.float32),
+            "heading": heading(self.env.robots.qpos), "slip_m_s": slip.sum(axis=1),
+            "swing_s": (facts.last_air_s * ended).sum(axis=1), "swings": ended.sum(axis=1),
+            "clearance_m": np.where(ended, facts.clearance_m, np.nan).astype(np.float32),
+            "saturated": by_kind(facts.body, facts.saturated).astype(np.float32),
+            "torque_square": by_kind(facts.body, facts.torque_square).astype(np.float32),
+            "work_j": step_s * facts.power_w, "carried_j": facts.weight_n * travelled,
+        }  # fmt: skip
+
+    def of(self, condition: Condition, robots: slice, steps: int, commands: Array) -> Walk:
+        """The walk of a condition's robots."""
+        arrays = self.stacked(robots, steps)
+        arrays["heading"] = np.unwrap(arrays["heading"], axis=0)
+        rest = len(commands) - steps
+        padded = {
+            name: np.concatenate([x, np.zeros((rest, *x.shape[1:]), x.dtype)])
+            for name, x in arrays.items()
+        }
+        step_s, kinds = condition.task.control_step_s, tuple(self.env.body.kinds)
+        return Walk(step_s, kinds, self.fell[robots], commands, **padded)
+
+
+def figures_of(found: Walk, command: tuple[float, float, float] | None = None) -> Figures:
+    """Figures of a number of episodes; `command` is the fixed one, None for random ones."""
+    alive = found.alive
+    standing, swings = (found.contact & alive[..., None]).sum(), found.swings.sum()
+    each = dict(zip(ERRORS, found.error.T, strict=True))
+    each |= dict(zip(STRIDE_ERRORS, found.stride_error.T, strict=True))
+    nothing = np.full(len(found.fell), np.nan)
+    size = 0.0 if command is None else float(np.dot(command, command))
+    each["speed_share"] = found.mean_velocity @ np.array(command) / size if size else nothing
+    drifts = command is not None and command[2] == 0
+    each["heading_drift_deg"] = found.drift_deg if drifts else nothing
+    intervals = {name: mean_of(values) for name, values in each.items()}
+    return Figures(
+        episodes=len(found.fell),
+        fall_rate=float(found.fell.mean()),
+        **{name: interval.value for name, interval in intervals.items()},
+        mean_velocity=tuple(found.mean_velocity.mean(axis=0).tolist()),
+        duty=tuple(found.contact[alive].mean(axis=0).tolist()),
+        stride_hz=float(found.stride_hz.mean()),
+        swing_s=float(found.swing_s.sum() / swings) if swings else float("nan"),
+        foot_slip_m_s=float(found.slip_m_s.sum() / max(standing, 1)),
+        **_effort(found, command is None or any(command[:2])),
+        intervals=Intervals(
+            fall_rate=share_interval(int(found.fell.sum()), len(found.fell)), **intervals
+        ),
+    )
+
+
+def _effort(found: Walk, travels: bool) -> dict[str, Any]:
+    """Clearance of the swings and effort of the servos, by the names of `Figures`."""
+    alive, nothing = found.alive, float("nan")
+    clearance = found.clearance_m[alive]
+    clearance = clearance[np.isfinite(clearance)]
+    low, middle = np.quantile(clearance, (0.1, 0.5)) if len(clearance) else (nothing, nothing)
+    up_s = found.step_s * alive.sum()
+    work, carried = found.work_j[alive].sum(), found.carried_j[alive].sum()
+
+    def named(each: NDArray) -> dict[str, float]:
+        means = (
+            each[alive].mean(axis=0, dtype=float) if up_s else np.full(len(found.kinds), nothing)
+        )
+        return dict(zip(found.kinds, means.tolist(), strict=True))
+
+    return {
+        "clearance_p10_m": float(low),
+        "clearance_p50_m": float(middle),
+        "low_swing_share": float((clearance < LOW_SWING_M).mean()) if len(clearance) else nothing,
+        "torque_saturated_share": named(found.saturated),
+        "rms_torque_share": {k: v**0.5 for k, v in named(found.torque_square).items()},
+        "mechanical_power_w": float(work / up_s) if up_s else nothing,
+        "cost_of_transport": float(work / carried) if travels and carried else nothing,
+    }
+
+
+def share_interval(some: int, of: int) -> Interval:
+    """Share with its interval by Clopper and Pearson."""
+    tail = (1 - LEVEL) / 2
+    low = float(beta.ppf(tail, some, of - some + 1)) if some else 0.0
+    high = float(beta.ppf(1 - tail, some + 1, of - some)) if some < of else 1.0
+    return Interval(some / of, low, high)
+
+
+BEFORE_S = 0.2
+"""How long before a fall the tilt is taken [s]."""
+
+Direction = Literal["forward", "backward", "left", "right"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fall(Result):
+    """One fall."""
+
+    row: str
+    """Name of the condition."""
+    walker: Walker
+    episode: int
+    time_s: float
+    """Since the start of the episode."""
+    tilt_before_deg: float
+    """Between the trunk and the ground, 0.2 s before the fall."""
+    tilt_deg: float
+    """At the fall."""
+    toward: Direction
+    """To which side the trunk tilts at the fall."""
+    tipped: bool
+    """Whether it tipped over; otherwise trunk, hips or thighs touched the ground."""
+    command: tuple[float, float, float]
+    """Forward and sideways speed [m/s], turn rate [rad/s], at the fall."""
+    since_push_s: float | None
+    """Time since the last push; null without one."""
+
+
+def falls_of(
+    row: str, condition: Condition, fell: NDArray[np.bool_], alive: NDArray[np.bool_],
+    gravity: Array, command: Array,
+) -> list[Fall]:  # fmt: skip
+    """Falls of the robots of a condition.
+
+    `fell` has the shape (n,), `alive` (steps, n), `command` (steps, n, 3), and so has `gravity`,
+    the ground's normal, downwards, in the trunk's frame.
+    """
+    step_s = condition.task.control_step_s
+    before = round(BEFORE_S / step_s)
+    found = []
+    for i in np.flatnonzero(fell).tolist():
+        at = int(alive[:, i].sum())
+        x, y, down = gravity[at, i]
+        time_s = (at + 1) * step_s
+        found.append(
+            Fall(
+                row=row, walker=condition.walker, episode=i, time_s=time_s,
+                tilt_before_deg=_tilt_deg(gravity[max(at - before, 0), i]),
+                tilt_deg=_tilt_deg(gravity[at, i]), toward=_toward(float(x), float(y)),
+                tipped=bool(down > -FALLEN_TILT), command=tuple(command[at, i].tolist()),
+                since_push_s=condition.handicap.since_push_s(time_s),
+            )
+        )  # fmt: skip
+    return found
+
+
+def _tilt_deg(gravity: Array) -> float:
+    return float(np.degrees(np.arccos(np.clip(-gravity[2], -1.0, 1.0))))
+
+
+def _toward(x: float, y: float) -> Direction:
+    """Side of gravity in the trunk's frame, which is that to which it tilts."""
+    if abs(x) >= abs(y):
+        return "forward" if x > 0 else "backward"
+    return "left" if y > 0 else "right"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FallsOfRow(Result):
+    """Falls of one walker under one condition, in short."""
+
+    row: str
+    walker: Walker
+    falls: int
+    time_s: float
+    """Median."""
+    tilt_before_deg: float
+    """Median."""
+    toward: Direction
+    """Most frequent."""
+    tipped: int
+    after_push: int
+    """Within 1 s of a push."""
+
+
+def in_short(falls: Sequence[Fall]) -> list[FallsOfRow]:
+    """Falls by condition and walker, in their order."""
+    groups: dict[tuple[str, Walker], list[Fall]] = {}
+    for fall in falls:
+        groups.setdefault((fall.row, fall.walker), []).append(fall)
+    found = []
+    for (row, walker), own in groups.items():
+        sides: list[Direction] = [fall.toward for fall in own]
+        pushed = [f.since_push_s for f in own if f.since_push_s is not None]
+        found.append(
+            FallsOfRow(
+                row=row, walker=walker, falls=len(own),
+                time_s=float(np.median([f.time_s for f in own])),
+                tilt_before_deg=float(np.median([f.tilt_before_deg for f in own])),
+                toward=max(sides, key=lambda side: sides.count(side)),
+                tipped=sum(f.tipped for f in own),
+                after_push=sum(since <= 1.0 for since in pushed),
+            )
+        )  # fmt: skip
+    return found
+
 
 Group = Literal[
     "random", "direction", "ground", "dead time", "push", "slope", "stairs", "payload", "leg",

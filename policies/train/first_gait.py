@@ -33,7 +33,7 @@ from pupper_sysid.policies.network.hyperparameters import OWN, TROT
 from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.policies.train.selection import COMMANDS, scored
 from pupper_sysid.policies.walks.conditions import evaluation_task
-from pupper_sysid.policies.walks.tracking import planar_velocity
+from pupper_sysid.policies.walks.rollouts import planar_velocity
 from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Walking

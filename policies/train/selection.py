@@ -13,7 +13,7 @@ from rsl_rl.models import MLPModel
 
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.policies.walks.conditions import evaluation_task, share_of_usual
-from pupper_sysid.policies.walks.tracking import planar_velocity
+from pupper_sysid.policies.walks.rollouts import planar_velocity
 from pupper_sysid.servo_models.networks import JointArrays
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.env import PupperEnv

@@ -42,8 +42,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval, t_quantile
 from pupper_sysid.common.results import Result
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.sim.robot.replay import Replayed, replay
-from pupper_sysid.sim.robot.servo_robot import ServoRobot
+from pupper_sysid.sim.robot.replay import Replayed, ServoRobot, replay
 from pupper_sysid.sim.walking.config import Randomisation
 from pupper_sysid.sysid.servo_fit.data import Run, ServoData
 from pupper_sysid.sysid.servo_fit.scores import (

@@ -3,29 +3,38 @@
 `twin` gives the commands of a recording to the whole simulated robot, with the servos of one or of
 several actuators, in the air (its trunk fixed) and on the ground. Each predicts the readings that
 the recording's bus would have shown of it: their age, and an offset per joint
-(`sysid.servo_fit.scores`). Errors per joint stand beside the robot's repeatability
-and persistence, and readings say whether the robot was on the ground (`policies.twin.playing`).
+(`sysid.servo_fit.scores`). Errors per joint stand beside the robot's repeatability and persistence,
+and readings say whether the robot was on the ground (`policies.twin.playing`).
 
 On the ground several copies move, which differ in friction and payload; the prediction is the mean
 of those that stay up. A robot on its back predicts what one in the air does.
+
+A robot's IMU log stands beside the trunk of the simulated robot on the ground. It is a CSV file
+with a column of times and one per axis. Both signals get the same estimator, a least-squares
+periodogram (Lomb-Scargle with a constant per frequency, J. VanderPlas, "Understanding the
+Lomb-Scargle Periodogram", 2018), since a log's rows are not evenly spaced.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import astuple, dataclass
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.signal import lombscargle
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.figure_style import BLUE, FAINT, GREEN, INK, RED, WIDTH_IN, styled
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import share_sentences
+from pupper_sysid.common.reading.content import content
+from pupper_sysid.common.reading.csv_table import read_table
 from pupper_sysid.common.results import Result, internal
 from pupper_sysid.policies.twin.drawing import Actuator, stronger
-from pupper_sysid.policies.twin.gyro import STEP_S, Gyro, spectrum
 from pupper_sysid.policies.twin.playing import (
     STRONGER,
     Case,
@@ -37,7 +46,7 @@ from pupper_sysid.policies.twin.playing import (
     sequences,
 )
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration
-from pupper_sysid.sim.robot.servo_robot import ServoRobot
+from pupper_sysid.sim.robot.replay import ServoRobot
 from pupper_sysid.sysid.doctor.checks import chosen_joints
 from pupper_sysid.sysid.fit.predict import ReadingRule, in_words, rule_of
 from pupper_sysid.sysid.recordings.recording import Recording
@@ -52,6 +61,99 @@ from pupper_sysid.sysid.servo_fit.scores import (
     with_ages,
 )
 from pupper_sysid.sysid.servo_fit.windows import Part, everything
+
+Array = NDArray[np.float64]
+
+_RATES, _ACCELERATIONS = ("gx", "gy", "gz"), ("ax", "ay", "az")
+STEP_S = 0.02
+"""Between samples of the simulated gyro: the rate at which robots log theirs."""
+
+_TIMES, _MOST_BYTES = ("timestamp", "time_s"), 100e6
+_SETTLE_S, _SHORTEST_S = 2.0, 5.0
+_LOW_HZ, _HIGH_HZ = 0.5, 10.0
+_PER_BIN = 8  # frequencies per 1 / duration
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gyro(Result):
+    """Spectrum of a gyro; each number for x, y and z."""
+
+    deviation_rad_s: tuple[float, ...]
+    """Standard deviation; of several robots their mean."""
+    peak_hz: tuple[float, ...]
+    """Frequency of 0.5 to 10 Hz whose sine explains most; NaN of an axis that does not turn."""
+    peak_share: tuple[float, ...]
+    """Share of the variance that this sine explains."""
+
+
+@dataclass(frozen=True)
+class ImuLog:
+    """Samples of an IMU."""
+
+    time_s: Array
+    """From the first sample on, shape (n,)."""
+    rate_rad_s: Array
+    """Shape (n, 3)."""
+    acceleration_m_s2: Array
+    """NaN where none was logged, shape (n, 3)."""
+
+
+def read_imu(path: Path) -> ImuLog:
+    """Read the log of an IMU.
+
+    It is a CSV file with the columns `timestamp` or `time_s` [s], `gx`, `gy`, `gz` [rad/s], and
+    perhaps `ax`, `ay`, `az` [m/s²].
+    """
+    data = content(path, _MOST_BYTES, "Give a shorter log.")
+    table = read_table(path, data.decode("utf-8", errors="replace"))
+    name = next((n for n in _TIMES if n in table.numbers), _TIMES[0])
+    needed = (name, *_RATES)
+    if missing := [n for n in needed if n not in table.numbers]:
+        raise InputError(
+            f"{path} has no column {missing[0]}. An IMU log has the columns {', '.join(needed)} "
+            "(s and rad/s)."
+        )
+    values = np.stack([table.numbers[n] for n in needed], axis=1)
+    whole = np.isfinite(values).all(axis=1)
+    nothing = np.full(len(values), np.nan)
+    acceleration = np.stack([table.numbers.get(n, nothing) for n in _ACCELERATIONS], axis=1)
+    values, acceleration = values[whole], acceleration[whole]
+    time = values[:, 0]
+    if (np.diff(time) <= 0).any():
+        raise InputError(f"{path}: its times do not increase. Give one log per file.")
+    if not len(time) or np.ptp(time) < _SETTLE_S + _SHORTEST_S:
+        raise InputError(
+            f"{path} is shorter than {_SETTLE_S + _SHORTEST_S:g} s, which a rhythm needs. Give a "
+            "longer log."
+        )
+    return ImuLog(time - time[0], values[:, 1:], acceleration)
+
+
+def spectrum(time_s: Array, rates_rad_s: Sequence[Array]) -> Gyro | None:
+    """Spectrum after the first two seconds; None if less than five are left.
+
+    Rates have the shape (n, 3); spectra of several robots are averaged.
+    """
+    late = time_s >= _SETTLE_S
+    time = time_s[late]
+    if not len(rates_rad_s) or len(time) < 2 or np.ptp(time) < _SHORTEST_S - STEP_S:
+        return None
+    highest = min(_HIGH_HZ, 0.5 / float(np.median(np.diff(time))))
+    at = np.arange(_LOW_HZ, highest, 1.0 / (_PER_BIN * float(np.ptp(time))))
+    rates = np.stack([rate[late] for rate in rates_rad_s])
+    deviation = rates.std(axis=1).mean(axis=0)
+    peaks = []
+    for axis, turning in enumerate(deviation > 0):
+        power = np.zeros(len(at))
+        for rate in rates[..., axis] if turning else ():
+            power += lombscargle(time, rate, 2 * np.pi * at, normalize=True, floating_mean=True)
+        best = int(power.argmax())
+        peaks.append((float(at[best]) if turning else float("nan"), power[best] / len(rates)))
+    peak_hz, peak_share = zip(*peaks, strict=True)
+    return Gyro(
+        deviation_rad_s=tuple(map(float, deviation)), peak_hz=peak_hz,
+        peak_share=tuple(map(float, peak_share)),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.joints import JOINT_NAMES, LEGS
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import TRUNK_BOX_AT_M, TRUNK_BOX_M
-from pupper_sysid.sim.robot.motion import own_velocity
-from pupper_sysid.sim.robot.robot_batch import RobotBatch
+from pupper_sysid.sim.robot.robot_batch import RobotBatch, own_velocity
 from pupper_sysid.sim.robot.terrain import STAIRS_M
 from pupper_sysid.sim.walking.config import Commands, Curriculum, Walking
 from pupper_sysid.sim.walking.env import PupperEnv

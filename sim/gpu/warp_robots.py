@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.networks import JointArrays
 from pupper_sysid.sim.gpu.worlds import Worlds
-from pupper_sysid.sim.robot.motion import Moved
-from pupper_sysid.sim.robot.robot_batch import RobotBatch
+from pupper_sysid.sim.robot.robot_batch import Moved, RobotBatch
 from pupper_sysid.sim.robot.terrain import Ground
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges

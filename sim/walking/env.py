@@ -19,8 +19,13 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.networks import JointArrays
-from pupper_sysid.sim.robot.motion import Moved, gravity_direction, own_velocity, planar
-from pupper_sysid.sim.robot.robot_batch import RobotBatch
+from pupper_sysid.sim.robot.robot_batch import (
+    Moved,
+    RobotBatch,
+    gravity_direction,
+    own_velocity,
+    planar,
+)
 from pupper_sysid.sim.robot.terrain import make_ground
 from pupper_sysid.sim.walking.config import PRESETS, Walking, for_robot
 from pupper_sysid.sim.walking.draws import Twins, at_rest, draw_commands, draw_pose, generator

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.sim.emulator.robot import RobotSpec
-from pupper_sysid.sim.robot.motion import Moved
-from pupper_sysid.sim.robot.robot_batch import RobotBatch
+from pupper_sysid.sim.robot.robot_batch import Moved, RobotBatch
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.differences import Differences
 from pupper_sysid.sim.walking.observation import VELOCITY_STEPS

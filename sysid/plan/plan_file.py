@@ -1,26 +1,52 @@
-"""The plan file: the trials of a sweep that `plan` proposes and `sweep --plan` executes, as YAML.
+"""Plans as files, and recording until an interval is narrow.
 
-save_plan(proposal, Path("plan.yaml"))
-executable(load_plan(path), path, joints, …)      # what the recorder takes
+A plan file has the trials of a sweep that `plan` proposes and `sweep --plan` executes, as YAML:
+
+    save_plan(proposal, Path("plan.yaml"))
+    executable(load_plan(path), path, joints, …)      # what the recorder takes
+
+`sweep --until` fits what there is, plans what narrows it most, and records that:
+
+    goal = parse_goal("dead_time:2ms")
+    outcome = record_until(goal, paths, joints, fit, record_next, most_seconds=120.0)
+
+A goal is reached by a joint when half of its dead time's 90 % interval, (high - low) / 2, is at
+most the goal's width. Joints that have reached it, or cannot, are not recorded again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
 from pupper_sysid.common.border import read_yaml, refuse_other_schema, validated
+from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import sha256, versions, write_text
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import strange_joint
-from pupper_sysid.common.results import plain
+from pupper_sysid.common.reading.dialect import decimal
+from pupper_sysid.common.results import Result, derived, plain
 from pupper_sysid.common.strict_yaml import dump
 from pupper_sysid.servo_models.calibration.calibration import utc_now
-from pupper_sysid.sysid.plan.planner import PlannedTrial
-from pupper_sysid.sysid.plan.proposal import SweepPlan
+from pupper_sysid.sysid.doctor.checks import joint_trials
+from pupper_sysid.sysid.fit.results import JointCalibrationResult
+from pupper_sysid.sysid.plan.planner import (
+    DEAD_TIME,
+    LEAST_HALF_WIDTH_S,
+    SHORTEST_S,
+    Ends,
+    PlannedTrial,
+    trial_seconds,
+)
+from pupper_sysid.sysid.plan.proposal import SweepPlan, plan_from_fits, recorded_s
+from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.sweep.excitation import Plan, plan
 
 SCHEMA = "pupper-sysid plan"
@@ -111,3 +137,167 @@ def executable(
     }
     trials = tuple(t for p in parts for t in p.trials)
     return Plan(trials, dict(start_pose_rad), description, changes)
+
+
+ROUND_S = 20.0  # most recorded seconds per joint between two fits
+
+_QUANTITIES = ("dead_time",)
+_UNITS = {"ms": 1e-3, "s": 1.0}
+_GOAL = re.compile(r"([a-z_]+):([0-9.eE+-]+) ?([a-z]*)")
+_PROGRESS = 0.97  # of the width before: more, twice in a row, is none
+_EXPECTED = 0.98  # of the present width: a plan that promises more promises nothing
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A quantity, and half the width that its 90 % interval may have."""
+
+    quantity: str
+    half_width_s: float
+
+    def reached(self, interval: Interval) -> bool:
+        """Whether an interval is narrow enough."""
+        return half_width(interval) <= self.half_width_s + 1e-9  # a nanosecond, for rounding
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointOutcome(Result):
+    """How far a joint came."""
+
+    dead_time_s: Interval
+    recorded_s: float
+    """Of all rounds."""
+    rounds: int
+    """Recordings with this joint."""
+    why: str = ""
+    """Why its interval is not narrow enough; empty if it is."""
+
+    @derived
+    def reached(self) -> bool:
+        """Whether the interval is narrow enough."""
+        return not self.why
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome(Result):
+    """All joints and recordings of `record_until`."""
+
+    joints: dict[str, JointOutcome]
+    recordings: tuple[Path, ...]
+
+    @derived
+    def reached(self) -> bool:
+        """Whether every joint has reached the goal."""
+        return all(joint.reached for joint in self.joints.values())
+
+
+Fit = Callable[[Sequence[Recording], list[str]], Mapping[str, JointCalibrationResult]]
+"""Fits joints to recordings, pooled (`sysid.fit.joint_fit.fit_joint`)."""
+
+RecordNext = Callable[[SweepPlan, int], Path]
+"""Records a plan as the round of this number, from 2, and returns the recording's file."""
+
+
+def half_width(interval: Interval | Ends) -> float:
+    """Half of an interval's width."""
+    return (interval.high - interval.low) / 2
+
+
+def parse_goal(text: str) -> Goal:
+    """Goal that `text` names: quantity, colon, half width with its unit.
+
+    Examples
+    --------
+    >>> parse_goal("dead_time:2ms")
+    Goal(quantity='dead_time', half_width_s=0.002)
+    """
+    form = "write dead_time:2ms for a dead time known within ± 2 ms"
+    found = _GOAL.fullmatch(text.strip())
+    if found is None or found[1] not in _QUANTITIES:
+        raise InputError(f"`until`: '{text}' is not a goal; {form}.")
+    if found[3] not in _UNITS:
+        raise InputError(f"`until`: '{text}' has no unit of time; {form}.")
+    try:
+        half = decimal(found[2]) * _UNITS[found[3]]
+    except ValueError:
+        raise InputError(f"`until`: '{found[2]}' is not a number; {form}.") from None
+    if not LEAST_HALF_WIDTH_S < half <= 1:
+        raise InputError(
+            f"`until`: ± {1e3 * half:g} ms is out of reach. The model's time step alone leaves "
+            f"± {1e3 * LEAST_HALF_WIDTH_S:.2g} ms; give a half width above it, up to 1 s."
+        )
+    return Goal(found[1], half)
+
+
+def record_until(
+    goal: Goal,
+    paths: Sequence[Path],
+    joints: Sequence[str],
+    fit: Fit,
+    record_next: RecordNext,
+    *,
+    most_seconds: float,
+    seed: int = 0,
+    report: Callable[[dict[str, JointOutcome]], None] | None = None,
+) -> Outcome:
+    """Fit, plan and record until every joint has reached a goal or cannot.
+
+    `paths` are the recordings that there are: the first sweep, and rounds of an earlier call.
+    `most_seconds` is the most recorded time of a joint, the first sweep included [s]. `report` is
+    called with the joints' state after every round of fits.
+    """
+    files, found, widths = list(paths), dict[str, JointOutcome](), dict[str, list[float]]()
+    left = list(joints)
+    while True:
+        recordings = [load(path) for path in files]
+        plans: dict[str, SweepPlan] = {}
+        for joint, one in fit(recordings, left).items():
+            widths.setdefault(joint, []).append(half_width(one.dead_time_s))
+            found[joint], plan = _judged(goal, one, recordings, widths[joint], most_seconds, seed)
+            if plan is not None:
+                plans[joint] = plan
+        left = list(plans)
+        if report:
+            report(found)
+        if not left:
+            ordered = {joint: found[joint] for joint in joints}
+            return Outcome(joints=ordered, recordings=tuple(files))
+        joined = {
+            name: tuple(entry for p in plans.values() for entry in getattr(p, name))
+            for name in ("trials", "predictions", "notes")
+        }
+        planned = next(iter(plans.values())).model_copy(update=joined)
+        files.append(record_next(planned, len(files) + 1))
+
+
+def _judged(
+    goal: Goal,
+    fit: JointCalibrationResult,
+    recordings: Sequence[Recording],
+    widths: Sequence[float],
+    most_seconds: float,
+    seed: int,
+) -> tuple[JointOutcome, SweepPlan | None]:
+    """State of a joint, and what to record next if that may help."""
+    trials = joint_trials(recordings, fit.joint)
+    done = recorded_s(trials)
+    rounds = sum(bool(r.trials(fit.joint)) for r in recordings)
+
+    def state(why: str = "") -> JointOutcome:
+        return JointOutcome(dead_time_s=fit.dead_time_s, recorded_s=done, rounds=rounds, why=why)
+
+    if goal.reached(fit.dead_time_s):
+        return state(), None
+    seconds = min(most_seconds - done, ROUND_S)
+    if seconds < trial_seconds(SHORTEST_S):
+        return state(
+            f"{done:.0f} s are recorded and `most_seconds` is {most_seconds:g}; allow more"
+        ), None
+    plan = plan_from_fits(recordings, {fit.joint: fit}, seconds=seconds, seed=seed)
+    notes = " ".join(n.removeprefix(f"{fit.joint}: ") for n in plan.notes if "dead time" in n)
+    if len(widths) > 2 and min(widths[-2:]) > _PROGRESS * widths[-3]:
+        return state(f"the last two rounds did not narrow it. {notes}".strip().rstrip(".")), None
+    (dead,) = (p for p in plan.predictions if p.quantity == DEAD_TIME)
+    if half_width(dead.after) > _EXPECTED * half_width(dead.now):
+        return state(notes.rstrip(".") or "no trial within the limits would narrow it"), None
+    return state("more recordings are needed"), plan

@@ -28,10 +28,10 @@ from pupper_sysid.sysid.fit.results import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.structure import SIMULATED, Parameter, Structure, candidate
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
-from pupper_sysid.sysid.plan.candidates import LARGEST_RAD, Setup
 from pupper_sysid.sysid.plan.planner import (
     CLEAR_NATS,
     DEAD_TIME,
+    LARGEST_RAD,
     LEAST_HALF_WIDTH_S,
     Hypothesis,
     JointPlan,
@@ -39,6 +39,7 @@ from pupper_sysid.sysid.plan.planner import (
     PlannedTrial,
     Prediction,
     Servo,
+    Setup,
     fitted_noise,
     pooled,
     prior_information,

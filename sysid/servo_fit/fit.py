@@ -46,8 +46,7 @@ from pupper_sysid.sysid.fit.structure import PREFERRED, candidate
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT
 from pupper_sysid.sysid.servo_fit import scores, windows
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
-from pupper_sysid.sysid.servo_fit.networks import Learned, fit_network, past_ticks
-from pupper_sysid.sysid.servo_fit.published import fit_published
+from pupper_sysid.sysid.servo_fit.networks import Learned, fit_network, fit_published, past_ticks
 from pupper_sysid.sysid.servo_fit.scores import ModelScores, Scores, Tracks
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """Excitations: the trials of a recording, each a smooth, bounded motion from rest.
 
 `plan` makes them from a kind ("sine", "chirp", "multisine", "steps", "square"), and
-`sysid.sweep.resume` from a file of recorded commands; `sysid.sweep.recorder` executes them.
+`sysid.sweep.recorder` from a file of recorded commands; `sysid.sweep.recorder` executes them.
 
 Every trial begins with a short rest at the start pose: the onset from rest separates dead time from
 dynamics. Amplitudes are reduced where the servo could not follow, and tones are moved off the

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pupper_sysid.cli.program import _is_interrupt, user_errors
 from pupper_sysid.cli.programs import pupper_sysid
-from pupper_sysid.cli.user_errors import _is_interrupt, user_errors
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.joint_map import load_joint_map
@@ -23,7 +23,7 @@ from pupper_sysid.hardware.loop import BUS, GUARD, IMU, LOG, POLICY, VIEWS, Fixe
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy import deployment
 from pupper_sysid.policies.deploy.assembly import assemble
-from pupper_sysid.policies.deploy.commands import constant
+from pupper_sysid.policies.deploy.deployment import constant
 from pupper_sysid.policies.deploy.stacks import STACKS, suited
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.sim.emulator.robot import draw_robot

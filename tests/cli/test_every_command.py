@@ -18,11 +18,10 @@ import pytest
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.dispatch import overview, words
 from pupper_sysid.cli.help_page import SCREEN_LINES
+from pupper_sysid.cli.program import overview, parse, words
 from pupper_sysid.cli.programs import pupper_analyze, pupper_sysid
 from pupper_sysid.cli.terminal import remember, spell
-from pupper_sysid.cli.user_errors import parse
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import select_joints
 from support.command_line import json_of, ran, refused

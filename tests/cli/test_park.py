@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pupper_sysid.cli.commands.robot import park
-from pupper_sysid.cli.commands.robot.park import Park
+from pupper_sysid.cli.commands.robot import scan
+from pupper_sysid.cli.commands.robot.scan import Park
 from pupper_sysid.cli.programs.pupper_sysid import COMMANDS
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.hardware import loop as clock
@@ -181,7 +181,7 @@ def test_a_supervisor_that_is_ended_has_said_what_it_switched_off(tmp_path, monk
         assert "the torque of LF_hip" in text
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(park.terminal.err, "print", ended)
+    monkeypatch.setattr(scan.terminal.err, "print", ended)
     with pytest.raises(KeyboardInterrupt):
         Park(seconds=0.1).run()
     assert len(notes()) == 1, "it is settled only once it was said"

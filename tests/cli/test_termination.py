@@ -27,7 +27,7 @@ from pupper_sysid.common.processes.stop import finishing, stop_process
 stop_process()
 import hashlib, os, time, weakref
 from pathlib import Path
-from pupper_sysid.cli.user_errors import begin_work, end_politely, user_errors
+from pupper_sysid.cli.program import begin_work, end_politely, user_errors
 from pupper_sysid.common.files import replacing
 from pupper_sysid.common.processes.workers import Workers
 

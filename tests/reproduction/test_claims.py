@@ -20,12 +20,13 @@ from pupper_sysid.cli.programs import pupper_analyze
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.common.interval import Interval
-from pupper_sysid.policies.analysis.attractor import DELAYS_MS, Orbits
 from pupper_sysid.policies.analysis.autonomy import (
+    DELAYS_MS,
     NUDGE_M_S,
     PUSH_M_S,
     Autonomy,
     FrozenTest,
+    Orbits,
     PushTest,
     RatePoint,
     rate_exponent,
@@ -43,8 +44,7 @@ from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.servo_fit import networks
 from pupper_sysid.sysid.servo_fit.training import Recipe
 from reproduction import servos as servo_claims
-from reproduction.claims import Claim
-from reproduction.evidence import PolicyEvidence, ScalePoint, Training, imitated, training
+from reproduction.evidence import Claim, PolicyEvidence, ScalePoint, Training, imitated, training
 from reproduction.policies import judge
 from support.command_line import refused, run_program
 from support.walks import walked

@@ -3,7 +3,7 @@
 import pytest
 
 from pupper_sysid.sim.export import foreign, mjcf
-from pupper_sysid.sim.robot import hinges, robot_map, servo_robot
+from pupper_sysid.sim.robot import hinges, replay, robot_map
 
 
 @pytest.fixture
@@ -18,5 +18,5 @@ def read_here(monkeypatch):
             return apart(path)
 
     monkeypatch.setattr(hinges, "_limit_this_process", lambda: None)
-    for module in (foreign, mjcf, robot_map, servo_robot):
+    for module in (foreign, mjcf, robot_map, replay):
         monkeypatch.setattr(module, "hinges_of", hinges_of)

@@ -30,8 +30,7 @@ from pupper_sysid.sim.emulator.pendulum import (
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sysid.sweep.bench import bench_plan, parse_load
 from pupper_sysid.sysid.sweep.excitation import POLL_RATE_HZ, Plan, TrialPlan, plan
-from pupper_sysid.sysid.sweep.recorder import record
-from pupper_sysid.sysid.sweep.resume import playback
+from pupper_sysid.sysid.sweep.recorder import playback, record
 from support.real_recordings import FOLDER
 
 WALK = Path(__file__).resolve().parents[2] / "data" / "samples" / "walk_commands.csv"

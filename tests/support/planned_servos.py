@@ -13,14 +13,15 @@ from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
 from pupper_sysid.sysid.fit.structure import candidate
-from pupper_sysid.sysid.plan.candidates import Setup, recorded
 from pupper_sysid.sysid.plan.planner import (
     Hypothesis,
     Noise,
     PlannedTrial,
     Servo,
+    Setup,
     pooled,
     prior_information,
+    recorded,
     respond,
 )
 from pupper_sysid.sysid.plan.proposal import SweepPlan

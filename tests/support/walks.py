@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pupper_sysid.policies.analysis.trial import Trial
-from pupper_sysid.policies.evaluation.figures import Recorder, Walk
+from pupper_sysid.policies.evaluation.evaluate import Recorder, Walk
 from pupper_sysid.policies.walks.conditions import Condition
 from pupper_sysid.policies.walks.rollouts import Rollout
 from pupper_sysid.policies.walks.together import walk_together

@@ -17,7 +17,7 @@ import numpy as np
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE, connect, joints_on, parse_registers
-from pupper_sysid.cli.commands.recording.rounds import run_rounds, say_how_to_resume
+from pupper_sysid.cli.commands.recording.plan import run_rounds, say_how_to_resume
 from pupper_sysid.cli.live_views import Wanted, live_views
 from pupper_sysid.common.errors import BusError, InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, sha256
@@ -124,7 +124,7 @@ class Sweep:
     def run(self) -> None:
         """Plan, record, and name the next commands."""
         from pupper_sysid.sysid.recordings.files import FOLDER
-        from pupper_sysid.sysid.sweep.resume import header_of
+        from pupper_sysid.sysid.sweep.recorder import header_of
 
         started = time.perf_counter()
         self._views.check()
@@ -163,8 +163,7 @@ class Sweep:
     def _record(self, path: Path, request: dict[str, Any], resume: bool) -> tuple[Plan, list[Path]]:
         """Record a request, or the rest of it; returns what was executed, and the files written."""
         from pupper_sysid.sim.emulator.bus import EmulatedBus
-        from pupper_sysid.sysid.sweep.recorder import record
-        from pupper_sysid.sysid.sweep.resume import resume_point
+        from pupper_sysid.sysid.sweep.recorder import record, resume_point
 
         bus = guarded(_open_bus(request))
         try:
@@ -308,7 +307,7 @@ class Sweep:
 
     def _series(self, joints: list[str]) -> dict[str, Any]:
         """What the recordings of a sweep with `until` have in common, and the number of this."""
-        from pupper_sysid.sysid.plan.until import parse_goal
+        from pupper_sysid.sysid.plan.plan_file import parse_goal
 
         assert self.until is not None
         parse_goal(self.until)
@@ -390,7 +389,7 @@ def _plan_of(request: dict[str, Any], bus: ServoBus) -> Plan:
     """The plan that a request describes, within the limits of the bus."""
     joints, load = request["joints"], _load_of(request)
     if request["playback"]:
-        from pupper_sysid.sysid.sweep.resume import playback
+        from pupper_sysid.sysid.sweep.recorder import playback
 
         chosen = playback(Path(request["playback"]), joints)
         return replace(chosen, trials=chosen.trials * request.get("loops", 1))
@@ -470,7 +469,7 @@ def _priority_of(request: dict[str, Any]) -> Iterator[str]:
 
 def _guard_warnings(path: Path) -> list[str]:
     """Sentences on commands that the guard changed."""
-    from pupper_sysid.sysid.sweep.resume import footer
+    from pupper_sysid.sysid.sweep.recorder import footer
 
     counts = footer(path).get("guard", {})
     sentences = {

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import joints_on, say_remarks
-from pupper_sysid.cli.keyboard import Keyboard
+from pupper_sysid.cli.terminal import Keyboard
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.hardware import joint_calibration as jc

@@ -20,7 +20,7 @@ import yaml
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import parse_servo_registers
-from pupper_sysid.cli.keyboard import terminal_without
+from pupper_sysid.cli.terminal import terminal_without
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.reading.dialect import whole

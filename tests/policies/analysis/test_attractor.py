@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pupper_sysid.policies.analysis.attractor import area, area_ratio, closure, principal_components
+from pupper_sysid.policies.analysis.autonomy import area, area_ratio, closure, principal_components
 from support.refusals import assert_each_refused
 
 STEP_S, HZ = 0.02, 3.25

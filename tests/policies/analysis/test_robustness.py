@@ -10,8 +10,13 @@ import pytest
 
 from pupper_sysid.cli.commands.analyze.walks import Delay
 from pupper_sysid.policies.analysis import figures
-from pupper_sysid.policies.analysis.attractor import orbits
-from pupper_sysid.policies.analysis.autonomy import Autonomy, RatePoint, frozen, push_response
+from pupper_sysid.policies.analysis.autonomy import (
+    Autonomy,
+    RatePoint,
+    frozen,
+    orbits,
+    push_response,
+)
 from pupper_sysid.policies.analysis.robustness import DelayPoint, ablation, delay_curve
 from pupper_sysid.policies.analysis.trial import moving_frequency
 from pupper_sysid.policies.walks import perturbations

@@ -11,13 +11,16 @@ from pupper_sysid.policies.evaluation.evaluate import (
     BATTERY,
     WALKERS,
     Case,
+    Recorder,
     battery_robots,
     evaluate,
+    figures_of,
+    in_short,
+    share_interval,
     table,
     usual_robots,
 )  # fmt: skip
 from pupper_sysid.policies.evaluation.evaluate import RANDOM as RANDOM_COMMANDS
-from pupper_sysid.policies.evaluation.figures import Recorder, figures_of, in_short, share_interval
 from pupper_sysid.policies.walks.conditions import DIRECTIONS, RANDOM, Condition, evaluation_task
 from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.mini_pupper import MASS_KG

@@ -10,13 +10,11 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.policies.twin.drawing import actuator_of, robot_for, spread_over, stronger
-from pupper_sysid.policies.twin.gyro import read_imu, spectrum
 from pupper_sysid.policies.twin.playing import _load_share
-from pupper_sysid.policies.twin.twin import twin, twin_figure
+from pupper_sysid.policies.twin.twin import read_imu, spectrum, twin, twin_figure
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.sim.robot.replay import replay
-from pupper_sysid.sim.robot.servo_robot import mini_pupper_robot, robot_of
+from pupper_sysid.sim.robot.replay import mini_pupper_robot, replay, robot_of
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sysid.recordings.recording import Recording
 from support.package import ROOT

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pupper_sysid.policies.evaluation.figures import Recorder
+from pupper_sysid.policies.evaluation.evaluate import Recorder
 from pupper_sysid.policies.walks import together as module
 from pupper_sysid.policies.walks.conditions import (
     RANDOM,

@@ -12,10 +12,12 @@ from pupper_sysid.policies.analysis.trial import outcome
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.network.policy_network import WIDTH
 from pupper_sysid.policies.walks.conditions import Condition, evaluation_task
-from pupper_sysid.policies.walks.rollouts import Rollout, collect, replay
-from pupper_sysid.policies.walks.tracking import (
+from pupper_sysid.policies.walks.rollouts import (
+    Rollout,
+    collect,
     counted,
     pooled_errors,
+    replay,
     stride_errors,
     tracking_errors,
 )

@@ -18,7 +18,7 @@ from pupper_sysid.sim.robot.mini_pupper import (
     foot_position,
     joint_angles,
 )
-from pupper_sysid.sim.robot.motion import Moved
+from pupper_sysid.sim.robot.robot_batch import Moved
 from pupper_sysid.sim.walking.config import PRESETS
 from pupper_sysid.sim.walking.rewards import terms as wr
 from pupper_sysid.sim.walking.rewards.strides import EffortMeter, Strides, by_kind

@@ -22,7 +22,7 @@ from pupper_sysid.sysid.fit.results import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.fit.scores import Scores
 from pupper_sysid.sysid.fit.structure import SIMULATED, candidate
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
-from pupper_sysid.sysid.plan.candidates import Setup
+from pupper_sysid.sysid.plan.planner import Setup
 from pupper_sysid.sysid.plan.proposal import feedback_setup
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report.figures import hold_runs

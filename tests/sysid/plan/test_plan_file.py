@@ -8,10 +8,17 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.servo_models.calibration.calibration import InputFile
-from pupper_sysid.sysid.plan.plan_file import executable, load_plan, save_plan
+from pupper_sysid.sysid.plan.plan_file import (
+    Goal,
+    executable,
+    half_width,
+    load_plan,
+    parse_goal,
+    record_until,
+    save_plan,
+)
 from pupper_sysid.sysid.plan.planner import LEAST_HALF_WIDTH_S, PlannedTrial, Prediction
 from pupper_sysid.sysid.plan.proposal import SweepPlan
-from pupper_sysid.sysid.plan.until import Goal, half_width, parse_goal, record_until
 from pupper_sysid.sysid.recordings.recording import Recording
 from support.planned_servos import SECONDS, fit_of_half_width, two_joints
 from support.refusals import assert_each_refused

@@ -11,19 +11,22 @@ from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.sysid.fit.posterior import PHASE_SD_S
 from pupper_sysid.sysid.fit.run import at_steps, free_run
 from pupper_sysid.sysid.fit.structure import candidate
-from pupper_sysid.sysid.plan.candidates import Setup, candidates, recorded, trial_seconds
 from pupper_sysid.sysid.plan.planner import (
     CLEAR_NATS,
     LEAST_HALF_WIDTH_S,
     Hypothesis,
     Noise,
     Servo,
+    Setup,
+    candidates,
     fitted_noise,
     now,
     prior_information,
     propose,
+    recorded,
     respond,
     separation,
+    trial_seconds,
     without_shift,
 )
 from pupper_sysid.sysid.plan.proposal import (

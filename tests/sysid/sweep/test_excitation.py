@@ -18,7 +18,7 @@ from pupper_sysid.sysid.sweep.excitation import (
     parse_frequencies,
     plan,
 )
-from pupper_sysid.sysid.sweep.resume import playback
+from pupper_sysid.sysid.sweep.recorder import playback
 from support.refusals import assert_each_refused
 
 STEP = 1e-4

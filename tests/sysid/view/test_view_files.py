@@ -118,7 +118,7 @@ def test_the_robot_of_the_rerun_file_stands_where_its_servos_were_read(tmp_path)
     import mujoco
 
     from pupper_sysid.policies.twin.drawing import robot_over_time
-    from pupper_sysid.sim.robot.servo_robot import compiled, mini_pupper_robot
+    from pupper_sysid.sim.robot.replay import compiled, mini_pupper_robot
 
     recording = load(SAMPLES / "playback.csv")
     time_s, bodies = robot_over_time(recording)
