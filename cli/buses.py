@@ -70,8 +70,8 @@ def parse_registers(text: str) -> dict[str, int]:
 def parse_servo_registers(text: str, series: Series) -> dict[int | None, dict[str, int]]:
     """Registers of emulated servos by id, of all servos under None: p=16,5:mode=1."""
     chosen = _registers(text, sorted([*series.registers, *series.aliases]), "p=16 or 5:mode=1")
-    for own in chosen.values():
-        for name, value in own.items():
+    for registers in chosen.values():
+        for name, value in registers.items():
             try:
                 series.encode(name, value)
             except OverflowError:
@@ -80,7 +80,7 @@ def parse_servo_registers(text: str, series: Series) -> dict[int | None, dict[st
 
 
 def _registers(text: str, known: Iterable[str], example: str) -> dict[int | None, dict[str, int]]:
-    found: dict[int | None, dict[str, int]] = {None: {}}
+    by_id: dict[int | None, dict[str, int]] = {None: {}}
     for part in filter(None, text.split(",")):
         name, _, value = (piece.strip() for piece in part.partition("="))
         servo, colon, own = name.partition(":")
@@ -100,5 +100,5 @@ def _registers(text: str, known: Iterable[str], example: str) -> dict[int | None
                 f"--registers: '{part}' sets no register that acts here; write {example}, and of "
                 f"these: {', '.join(known)}."
             )
-        found.setdefault(one, {})[name] = number
-    return found
+        by_id.setdefault(one, {})[name] = number
+    return by_id

@@ -96,17 +96,17 @@ class Driver:
 
 def _table(tick: Tick, joints: Sequence[str], age_s: np.ndarray, notice: str) -> Table:
     forward, left, turn = tick.senses.command
-    shown = terminal.table(
+    table = terminal.table(
         f"{tick.elapsed_s:6.1f} s   {forward:+.2f} m/s forward  {left:+.2f} left  "
         f"{turn:+.2f} rad/s{notice}\n{_HELP}",
         "joint", "sent rad", "read rad", "unchanged ms", "load N·m", "margin rad",
     )  # fmt: skip
     for i, joint in enumerate(joints):
         room = tick.decision.margin[i]
-        shown.add_row(
+        table.add_row(
             joint, terminal.number(tick.sent[i], 3),
             terminal.number(float(tick.reading.position_rad[i]), 3), terminal.ms(age_s[i], 0),
             terminal.number(tick.senses.load[i], 2),
             Text(f"{room:.2f}", "red") if room < 0.02 else terminal.number(room, 2),
         )  # fmt: skip
-    return shown
+    return table

@@ -104,15 +104,15 @@ def _groups(
 ) -> Iterable[tuple[str, list[argparse.Action]]]:
     """Positional arguments, options, and groups of settings, in that order."""
     for group in parser._action_groups:
-        own = [
+        actions = [
             action
             for action in group._group_actions
             if not isinstance(action.choices, dict)
             and (nested or not any("." in name for name in action.option_strings))
         ]
-        if own:
+        if actions:
             title = "" if group.title in ("options", "positional arguments") else group.title
-            yield (title or "").removesuffix(" options"), own
+            yield (title or "").removesuffix(" options"), actions
 
 
 def _left_out(parser: argparse.ArgumentParser) -> str:
@@ -161,17 +161,17 @@ def _row(name: str, text: str, width: int) -> list[str]:
     """Lines of one option."""
     wrapped = textwrap.wrap(text, width - _COLUMN, break_on_hyphens=False) or [""]
     indent = " " * _COLUMN
-    left = f"  {name}"
-    if len(left) + 2 > _COLUMN:
+    head = f"  {name}"
+    if len(head) + 2 > _COLUMN:
         rows = textwrap.wrap(
-            f"{left}  {text}", width, subsequent_indent=indent, break_on_hyphens=False,
+            f"{head}  {text}", width, subsequent_indent=indent, break_on_hyphens=False,
             drop_whitespace=True,
         )  # fmt: skip
-        if len(left) + 2 + 16 <= width:
+        if len(head) + 2 + 16 <= width:
             return rows
-        return [left, *(indent + line for line in wrapped)]
+        return [head, *(indent + line for line in wrapped)]
     first, *rest = wrapped
-    return [f"{left:{_COLUMN}}{first}".rstrip(), *(indent + line for line in rest)]
+    return [f"{head:{_COLUMN}}{first}".rstrip(), *(indent + line for line in rest)]
 
 
 def _first_sentence(text: str) -> str:

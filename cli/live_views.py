@@ -257,10 +257,10 @@ class LiveViews:
         from pupper_sysid.sysid.view import guard_text
 
         assert self._report is not None
-        found = self._report.events[self._told :]
-        texts = [[time_s, guard_text(kind)] for time_s, kind in found]
+        events = self._report.events[self._told :]
+        texts = [[time_s, guard_text(kind)] for time_s, kind in events]
         if self._process.send(TEXTS + json.dumps({"events": texts}).encode(), self._within_s):
-            self._told += len(found)
+            self._told += len(events)
 
     def _answer(self, within_s: float) -> str:
         """What the writer says is wrong; empty if nothing is."""

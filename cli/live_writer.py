@@ -82,12 +82,12 @@ class Writer:
 
     def take(self, rows: Array, events: list[tuple[float, str]]) -> None:
         """Write ticks, shape (n, numbers of a tick), and sentences with their times."""
-        found = self._channels.take(rows) if len(rows) else []
-        self._any |= bool(found or events)
+        messages = self._channels.take(rows) if len(rows) else []
+        self._any |= bool(messages or events)
         if self._mcap:
-            self._mcap.add(found, events)
+            self._mcap.add(messages, events)
         if self._rerun:
-            self._rerun.add(found, events)
+            self._rerun.add(messages, events)
             if self._robot and len(rows):
                 self._move(rows)
 
@@ -97,18 +97,18 @@ class Writer:
 
         assert self._robot and self._rerun
         time_s, held, gravity = self._channels.poses(rows)
-        shown = []
+        rows_shown = []
         for k, now in enumerate(time_s):
             if now >= self._posed_s + 1 / POSES_PER_S:
                 self._posed_s = now
-                shown.append(k)
-        if not shown:
+                rows_shown.append(k)
+        if not rows_shown:
             return
         robot = self._robot.robot
-        servo = np.tile(robot.rest_rad, (len(shown), 1))
+        servo = np.tile(robot.rest_rad, (len(rows_shown), 1))
         at = [robot.joints.index(joint) for joint in self._joints]
-        servo[:, at] = np.where(np.isfinite(held[shown]), held[shown], servo[:, at])
-        self._rerun.move(time_s[shown], self._robot.bodies(servo, gravity[shown]))
+        servo[:, at] = np.where(np.isfinite(held[rows_shown]), held[rows_shown], servo[:, at])
+        self._rerun.move(time_s[rows_shown], self._robot.bodies(servo, gravity[rows_shown]))
 
     def close(self) -> None:
         """Finish the files; those without content are removed."""

@@ -140,16 +140,18 @@ class Screen:
         values = table[:, 2:].reshape(len(table), len(_CHANNELS), -1)
         data = dict(zip(_CHANNELS, values.transpose(1, 0, 2), strict=True))
         known = np.isfinite(data["position"]) | np.isfinite(data["command"])
-        shown = [k for k in range(len(self.joints)) if known[:, k].any()]
-        extent = [max(_extent(data[c][:, k]) for c in ("command", "position")) for k in shown]
-        moving = [k for k, e in zip(shown, extent, strict=True) if e > _STILL_RAD] or shown
-        still = [k for k in shown if k not in moving]
+        seen = [k for k in range(len(self.joints)) if known[:, k].any()]
+        extent = [max(_extent(data[c][:, k]) for c in ("command", "position")) for k in seen]
+        moving = [k for k, e in zip(seen, extent, strict=True) if e > _STILL_RAD] or seen
+        still = [k for k in seen if k not in moving]
         most = max((width + _GAP) // (_NARROWEST + _GAP), 1)
-        left = height - 2 - -(-len(still) // most)
+        rows_left = height - 2 - -(-len(still) // most)
         high = 1 + _FEWEST_ROWS
-        columns = next((c for c in range(1, most) if -(-len(moving) // c) * high <= left), most)
-        moving = moving[: max(left // high, 1) * columns]
-        rows = max(left // max(-(-len(moving) // columns), 1) - 1, 1)
+        columns = next(
+            (c for c in range(1, most) if -(-len(moving) // c) * high <= rows_left), most
+        )
+        moving = moving[: max(rows_left // high, 1) * columns]
+        rows = max(rows_left // max(-(-len(moving) // columns), 1) - 1, 1)
         across = _across(width, columns)
         blocks = [self._block(k, table[:, 0], data, across, rows) for k in moving]
         _append(text, blocks, columns, across)

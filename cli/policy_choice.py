@@ -32,8 +32,8 @@ def is_policy(folder: Path) -> bool:
     if (folder / RUN_FILE).is_file():
         return True
     with contextlib.suppress(InputError):
-        found = read_json(folder / _CONTRACT)
-        return isinstance(found, dict) and found.get("schema") == "pupper-policy"
+        content = read_json(folder / _CONTRACT)
+        return isinstance(content, dict) and content.get("schema") == "pupper-policy"
     return False
 
 
@@ -86,9 +86,9 @@ def trained_actuator(path: Path, policy: Policy, run: Run | None) -> tuple[str |
     name = run.actuator if run else policy.contract.actuator
     if name == IDEAL or is_shipped(name):
         return name, True
-    wanted, found = policy.contract.actuator_sha256, _near(name, path)
-    same = [f for f in found if wanted is None or (f.is_file() and sha256(f) == wanted)]
-    return (str((same or found)[0]) if found else None), bool(same)
+    wanted, candidates = policy.contract.actuator_sha256, _near(name, path)
+    same = [f for f in candidates if wanted is None or (f.is_file() and sha256(f) == wanted)]
+    return (str((same or candidates)[0]) if candidates else None), bool(same)
 
 
 def chosen_actuator(path: Path, policy: Policy, run: Run | None, given: str | None) -> str:
@@ -96,8 +96,8 @@ def chosen_actuator(path: Path, policy: Policy, run: Run | None, given: str | No
     if given is not None:
         check_actuator(given)
         return given
-    found, same = trained_actuator(path, policy, run)
-    if found is None:
+    trained, same = trained_actuator(path, policy, run)
+    if trained is None:
         file, name = (RUN_FILE, run.actuator) if run else (_CONTRACT, policy.contract.actuator)
         raise InputError(
             f"{file} of {path} names the actuator {name}, which is not here. Give --actuator: a "
@@ -105,10 +105,10 @@ def chosen_actuator(path: Path, policy: Policy, run: Run | None, given: str | No
         )
     if not same:
         warn(
-            f"{found} is not the file with which {path} was trained: it was changed, or only "
+            f"{trained} is not the file with which {path} was trained: it was changed, or only "
             "has the same name. Give the right one, or this one, with --actuator."
         )
-    return found
+    return trained
 
 
 def _near(name: str, path: Path) -> list[Path]:
@@ -119,10 +119,10 @@ def _near(name: str, path: Path) -> list[Path]:
 
 def refuse_other_robot(policy: Policy) -> None:
     """Refuse a policy that walks another robot than the Mini Pupper 2."""
-    if (own := policy.contract.robot) is not None:
+    if (robot := policy.contract.robot) is not None:
         raise InputError(
-            f"pupper-analyze knows the Mini Pupper 2 only, and this policy walks {own.name}. Look "
-            "at it with pupper-play, measure it with pupper-eval, compare its servos with "
+            f"pupper-analyze knows the Mini Pupper 2 only, and this policy walks {robot.name}. "
+            "Look at it with pupper-play, measure it with pupper-eval, compare its servos with "
             "pupper-analyze servo-demand, and walk it with pupper-deploy."
         )
 
@@ -134,12 +134,13 @@ def body_at(path: Path, policy: Policy, run: Run | None) -> Body:
 
 def _of_robot(task: Walking, path: Path, policy: Policy, run: Run | None) -> Walking:
     """The task with the robot that the policy was trained on, whose files must be as they were."""
-    own = policy.contract.robot
-    if own is None:
+    robot = policy.contract.robot
+    if robot is None:
         return task
     files = {}
     for key, name, wanted in (
-        ("robot", own.mjcf, own.mjcf_sha256), ("robot_config", own.config, own.config_sha256),
+        ("robot", robot.mjcf, robot.mjcf_sha256),
+        ("robot_config", robot.config, robot.config_sha256),
     ):  # fmt: skip
         if name is None or wanted is None:
             files[key] = ""
@@ -150,8 +151,8 @@ def _of_robot(task: Walking, path: Path, policy: Policy, run: Run | None) -> Wal
         if same is None:
             what = f"{there[0]} is not as it was" if there else "is not here"
             raise InputError(
-                f"The policy at {path} walks {own.name}, of {name}, which {what}. Put the file of "
-                "its training there, or beside the policy."
+                f"The policy at {path} walks {robot.name}, of {name}, which {what}. Put the file "
+                "of its training there, or beside the policy."
             )
         files[key] = str(same)
     if run is None:
@@ -226,10 +227,10 @@ def show_match(match: Match) -> None:
     warn(match.sentence())
     rows = [row for row in match.table() if row["frequency_hz"] % 1 == 0]
     titles = (name.replace("_", " ") for name in rows[0])
-    shown = table("Swing over command, and phase", *titles)
+    response = table("Swing over command, and phase", *titles)
     for row in rows:
-        shown.add_row(*(cell(v, 2) for v in row.values()))
-    err.print(shown)
+        response.add_row(*(cell(v, 2) for v in row.values()))
+    err.print(response)
 
 
 def show_servos(match: ServoMatch | None, carried: bool) -> None:

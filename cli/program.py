@@ -82,8 +82,8 @@ def run_program(
     arguments: Sequence[str] | None,
 ) -> None:
     """Parse a program's arguments into `options` and run `work`; ends the process on errors."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    with user_errors(given, program) as rest:
+    words_typed = list(sys.argv[1:] if arguments is None else arguments)
+    with user_errors(words_typed, program) as rest:
         parsed = parse(options, rest, program, description)
         begin_work()
         work(parsed)
@@ -100,12 +100,12 @@ def parse(
 
     `keywords` are further ones of `tyro.cli`.
     """
-    given = {"config": CONFIG, "description": description, "registry": NUMERALS} | keywords
+    settings = {"config": CONFIG, "description": description, "registry": NUMERALS} | keywords
     if {*HELP, ALL} & {*arguments} and hasattr(tyro.extras, "get_parser"):
-        known = {key: value for key, value in given.items() if key != "description"}
-        print(help_page(options, arguments, program, given["description"], **known))
+        known = {key: value for key, value in settings.items() if key != "description"}
+        print(help_page(options, arguments, program, settings["description"], **known))
         sys.exit(0)
-    parsed = tyro.cli(options, args=arguments, prog=program, **given)
+    parsed = tyro.cli(options, args=arguments, prog=program, **settings)
     remember(parsed)
     seed = getattr(parsed, "seed", 0)
     if not 0 <= seed <= LARGEST_SEED:
@@ -153,8 +153,8 @@ def _sentences(arguments: Sequence[str], program: str, stop: Stop) -> Iterator[l
     try:
         try:
             if "--version" in arguments:
-                own, *rest = versions().items()
-                out.print(f"{program} {own[1]} ({', '.join(f'{k} {v}' for k, v in rest)})")
+                tool, *rest = versions().items()
+                out.print(f"{program} {tool[1]} ({', '.join(f'{k} {v}' for k, v in rest)})")
                 sys.exit(0)
             if "--install-completion" in arguments:
                 arguments = _completion(program)
@@ -213,16 +213,16 @@ def _read_limit(arguments: Sequence[str]) -> tuple[float, list[str]]:
     """Factor of `--read-limit`, and the other arguments."""
     rest, times = list(arguments), 1.0
     for k in [k for k, a in enumerate(rest) if a.partition("=")[0] == _READ_LIMIT][::-1]:
-        name, found, value = rest[k].partition("=")
-        given = [value] if found else rest[k + 1 : k + 2]
+        name, equals, value = rest[k].partition("=")
+        values = [value] if equals else rest[k + 1 : k + 2]
         try:
-            times = decimal(given[0])
+            times = decimal(values[0])
         except (IndexError, ValueError):
             raise InputError(
                 f"{name} needs a number: how many times the usual limits of reading to allow, "
                 f"such as {name} 4."
             ) from None
-        del rest[k : k + (1 if found else 2)]
+        del rest[k : k + (1 if equals else 2)]
     return times, rest
 
 
@@ -403,16 +403,16 @@ def run_command(
     Ends the process with 0, 2 (bad input, one sentence) or 1. `description`, what the program is
     for, stands above its table of commands.
     """
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    with user_errors(given, program) as left:
-        first, rest = (left[0], left[1:]) if left else ("--help", [])
+    words_typed = list(sys.argv[1:] if arguments is None else arguments)
+    with user_errors(words_typed, program) as words_left:
+        first, rest = (words_left[0], words_left[1:]) if words_left else ("--help", [])
         if first in (*HELP, ALL):
             print(overview(program, description, commands))
             return
         if first.startswith("--tyro-"):  # completion, of all words and their options
             words = (Annotated[c.load(), tyro.conf.subcommand(w)] for w, c in commands.items())
             every: Any = functools.reduce(operator.or_, words)
-            tyro.cli(every, prog=program, args=left, config=CONFIG)
+            tyro.cli(every, prog=program, args=words_left, config=CONFIG)
         if first not in commands:
             near = difflib.get_close_matches(first, commands, n=1, cutoff=0.5)
             hint = f" Did you mean `{program} {near[0]}`?" if near else ""
@@ -452,8 +452,8 @@ def overview(program: str, description: str, commands: Mapping[str, Command]) ->
 
 def words(commands: Mapping[str, Command]) -> list[str]:
     """All commands, those of a command's own as two words."""
-    found = []
+    names = []
     for word, command in commands.items():
         inner = (get_args(one)[1].name for one in get_args(command.load()))
-        found += [word, *(f"{word} {name}" for name in inner)]
-    return found
+        names += [word, *(f"{word} {name}" for name in inner)]
+    return names

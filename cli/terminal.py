@@ -120,7 +120,7 @@ def print_json(value: Any) -> None:
 
     text = json.dumps(plain(value), indent=2, ensure_ascii=False)
     # control characters that JSON leaves as they are; its line ends are not within strings
-    print(_CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text))
+    print(_CONTROL.sub(lambda match: f"\\u{ord(match[0]):04x}", text))
 
 
 def warn(*sentences: str) -> None:
@@ -137,42 +137,42 @@ class _FittingTable(Table):
         yield from super().__rich_console__(console, options)
 
     def _fit(self, width: int) -> None:
-        left = width - 2 * (len(self.columns) - 1)  # a space on both sides of each gap
+        available = width - 2 * (len(self.columns) - 1)  # a space on both sides of each gap
         texts = [[str(text) for text in (c.header, *c.cells)] for c in self.columns]
         words = [[w for t in ts for w in (t.split() if k else [t])] for k, ts in enumerate(texts)]
         natural = [max(map(cell_len, ts)) for ts in texts]
         least = [max(map(cell_len, ws), default=0) for ws in words]
-        while sum(natural) > left and natural != least:
+        while sum(natural) > available and natural != least:
             spare = [n if n > m else 0 for n, m in zip(natural, least, strict=True)]
             natural[spare.index(max(spare))] -= 1
-        if sum(natural) <= left:
-            for column, own in zip(self.columns, natural, strict=True):
-                column.width = own
+        if sum(natural) <= available:
+            for column, width_of in zip(self.columns, natural, strict=True):
+                column.width = width_of
 
 
 def table(title: str, *columns: str) -> Table:
     """Empty table; the first column is left-aligned text, the others numbers."""
-    made = _FittingTable(
+    empty = _FittingTable(
         title=title, title_justify="left", title_style="bold", box=None, pad_edge=False,
         min_width=min(len(title), out.width),  # a title is broken at the table's width
     )  # fmt: skip
     for k, column in enumerate(columns):
         # folded where it is too wide, headings between words: a number cut off at … is another
-        made.add_column(
+        empty.add_column(
             column, justify="left" if k == 0 else "right", no_wrap=k == 0, overflow="fold",
             min_width=max(map(len, column.split()), default=0),
         )  # fmt: skip
-    return made
+    return empty
 
 
 def result_table(results: ResultTable) -> Table:
     """A table of results, without its details."""
     columns = [column for column in results.columns if not column.detail]
-    made = table(results.title, *(column.terminal_heading for column in columns))
+    filled = table(results.title, *(column.terminal_heading for column in columns))
     for row in results.rows:
         style = "bold" if row.get(results.marked) else None
-        made.add_row(*(column.text(row) for column in columns), style=style)
-    return made
+        filled.add_row(*(column.text(row) for column in columns), style=style)
+    return filled
 
 
 def print_tables(*tables: ResultTable) -> None:
@@ -264,8 +264,8 @@ def _bar(label: str, total: float, count: str) -> Iterator[Any]:
             bar.update(task, **changes)
             if not err.is_terminal and time.monotonic() - said >= _LINE_S:
                 said = time.monotonic()
-                shown = bar.tasks[0]
-                err.print(f"{shown.description}: {shown.percentage:.0f} %, "
+                state = bar.tasks[0]
+                err.print(f"{state.description}: {state.percentage:.0f} %, "
                           f"{said - started:.0f} s")  # fmt: skip
 
         yield update
@@ -297,28 +297,28 @@ def spell(text: str) -> str:
     """`text` with the arguments in back-quotes replaced by the running command's options."""
     known = _OF_EVERY_PROGRAM | dict(_flags.get({}))
 
-    def flag(found: re.Match[str]) -> str:
-        name = _UNIT.sub("", found[1])
-        options = (known.get(n) for n in (found[1], name, _OTHER_NAMES.get(name)) if n)
+    def flag(match: re.Match[str]) -> str:
+        name = _UNIT.sub("", match[1])
+        options = (known.get(n) for n in (match[1], name, _OTHER_NAMES.get(name)) if n)
         option = next(filter(None, options), None)
         if option is None:
-            return found[0]
-        return option if found[3] in (None, "True") else f"{option} {found[3]}"
+            return match[0]
+        return option if match[3] in (None, "True") else f"{option} {match[3]}"
 
     return _ARGUMENT.sub(flag, text)
 
 
 def _flags_of(options: Any, prefix: str = "--") -> dict[str, str]:
     """Flag of every option that is not positional, by field; those of nested groups, too."""
-    own, nested = {}, {}
+    flat, nested = {}, {}
     for field in fields(options):
         value, kind = getattr(options, field.name), str(field.type)
         flag = prefix + field.name.replace("_", "-")
         if is_dataclass(value):
             nested = _flags_of(value, prefix if "name=''" in kind else f"{flag}.") | nested
         elif "Positional" not in kind:
-            own[field.name] = flag
-    return nested | own
+            flat[field.name] = flag
+    return nested | flat
 
 
 @contextmanager

@@ -89,11 +89,17 @@ def claim(
         @wraps(look)
         def row(evidence: Evidence) -> Claim:
             try:
-                found = look(evidence)
+                finding = look(evidence)
             except NotTestable as missing:
                 return Claim(id, text, paper, "–", None, "not testable here", f"{how} {missing}")
             return Claim(
-                id, text, paper, found.ours, found.interval, found.verdict, f"{how} {found.note}"
+                id,
+                text,
+                paper,
+                finding.ours,
+                finding.interval,
+                finding.verdict,
+                f"{how} {finding.note}",
             )
 
         return row
@@ -109,7 +115,7 @@ def holds(wholly: bool, partly: bool = False) -> Verdict:
 _COLUMNS = ("id", "ours", "verdict")
 
 
-def differences(found: Sequence[Claim], beside: Path) -> list[dict[str, str]]:
+def differences(claims: Sequence[Claim], beside: Path) -> list[dict[str, str]]:
     """Claims that another page judges otherwise.
 
     Each has `id`, `claim`, `here`, `verdict`, `there` and `verdict_there`.
@@ -133,7 +139,7 @@ def differences(found: Sequence[Claim], beside: Path) -> list[dict[str, str]]:
             "id": c.id, "claim": c.claim, "here": c.ours, "verdict": c.verdict,
             "there": there[c.id][0], "verdict_there": there[c.id][1],
         }
-        for c in found
+        for c in claims
         if c.id in there and there[c.id][1] != c.verdict
     ]  # fmt: skip
 
@@ -219,9 +225,9 @@ def gather(
     """
     rng = np.random.default_rng(trial.seed)
 
-    def step(what: str, made: Callable[[], Any]) -> Any:
+    def step(what: str, compute: Callable[[], Any]) -> Any:
         progress(f"{name}: {what}")
-        return made()
+        return compute()
 
     walk = step("gait", lambda: trial.walk(policy))
     try:
@@ -278,11 +284,11 @@ def imitated(run: Run) -> str | None:
 
 def scales(policy: Policy, trial: Trial) -> list[ScalePoint]:
     """Walks with other scales of what is sent, as deployed robots had."""
-    given = sorted({*SCALES_RAD, trial.task.action_scale})
-    walks = trial.walks(policy, [trial.condition(action_scale=scale) for scale in given])
+    scales_rad = sorted({*SCALES_RAD, trial.task.action_scale})
+    walks = trial.walks(policy, [trial.condition(action_scale=scale) for scale in scales_rad])
     return [
         ScalePoint(scale_rad=scale, **outcome(walked))
-        for scale, walked in zip(given, walks, strict=True)
+        for scale, walked in zip(scales_rad, walks, strict=True)
     ]
 
 
@@ -305,19 +311,19 @@ def of_kinds(
     evidence: Sequence[Any], value: Callable[[Any], float], *needed: str
 ) -> dict[str, Interval]:
     """`over` for each of `KINDS` of which there is a number."""
-    given = [k for k in KINDS if any(e.kind == k for e in evidence)]
-    if not given or not set(needed) <= set(given):
+    kinds = [k for k in KINDS if any(e.kind == k for e in evidence)]
+    if not kinds or not set(needed) <= set(kinds):
         wanted = " and of the ".join(KINDS[k] for k in needed or ("lstm",))
         raise NotTestable(f"Give a run of the {wanted}.")
-    found = {k: over(evidence, k, value) for k in given}
-    found = {k: v for k, v in found.items() if not np.isnan(v.value)}
-    without = [KINDS[k] for k in needed or given if k not in found]
-    if without and (needed or not found):
+    values = {k: over(evidence, k, value) for k in kinds}
+    values = {k: v for k, v in values.items() if not np.isnan(v.value)}
+    without = [KINDS[k] for k in needed or kinds if k not in values]
+    if without and (needed or not values):
         raise NotTestable(
             f"Of the {' and of the '.join(without)} that was given there is no number for it: no "
             "robot stayed up and moved for long enough."
         )
-    return found
+    return values
 
 
 def of_kind(evidence: Sequence[PolicyEvidence], kind: str) -> list[PolicyEvidence]:
@@ -328,17 +334,17 @@ def of_kind(evidence: Sequence[PolicyEvidence], kind: str) -> list[PolicyEvidenc
     return mine
 
 
-def several(found: dict[str, Interval], digits: int) -> str:
+def several(values: dict[str, Interval], digits: int) -> str:
     """The values by architecture, in words."""
     return ", ".join(
         f"{KINDS[k]} " + (f"{v.value:,.{digits}f}" if np.isfinite(v.value) else "∞")
-        for k, v in found.items()
+        for k, v in values.items()
     )
 
 
-def bounds(found: dict[str, Interval]) -> dict[str, Interval] | None:
+def bounds(values: dict[str, Interval]) -> dict[str, Interval] | None:
     """Those with an interval, by the architecture's name; None if there are none."""
-    return {KINDS[k]: v for k, v in found.items() if np.isfinite(v.low)} or None
+    return {KINDS[k]: v for k, v in values.items() if np.isfinite(v.low)} or None
 
 
 def _trained(folder: Path | None, step_s: float) -> dict[str, float]:

@@ -128,32 +128,32 @@ def write_claims(options: Options, tries: Tries) -> None:
     evidence = []
     for (name, (policy, trial)), path in zip(tries.items(), options.policies, strict=True):
         evidence.append(gather(name, policy, trial, run_folder(path), _show_step))
-    found = [
+    claims = [
         *servo_claims.judge(robot),
         *judge(evidence, _played(robot), stacks, trainings),
         *walk_claims.judge(walks),
     ]
-    other = differences(found, options.beside) if options.beside is not None else None
+    other = differences(claims, options.beside) if options.beside is not None else None
     pictures = _draw(evidence, robot, trainings)
     inputs = _inputs(options, tries)
-    summary = _summary(found, evidence, trainings)
+    summary = _summary(claims, evidence, trainings)
     both = (evidence, trainings)
-    sections = _sections(found, other, both, pictures, inputs, options, summary[1:])
+    sections = _sections(claims, other, both, pictures, inputs, options, summary[1:])
     write_text(page, _markdown(_TITLE, summary[0], sections), options.force)
     write_page(report, _TITLE, summary[0], sections, options.force)
     if options.json:
         print_json(
             {
-                "claims": found, "page": str(page), "report": str(report),
+                "claims": claims, "page": str(page), "report": str(report),
                 "pictures": [_file(p) for p in pictures], "inputs_sha256": inputs,
                 "versions": versions(*_MORE),
             }
         )  # fmt: skip
         return
-    shown = terminal.table("Published claims", "", "claim", "paper", "here", "verdict")
-    for c in found:
-        shown.add_row(c.id, c.claim, c.paper, c.ours, c.verdict)
-    out.print(shown)
+    table = terminal.table("Published claims", "", "claim", "paper", "here", "verdict")
+    for c in claims:
+        table.add_row(c.id, c.claim, c.paper, c.ours, c.verdict)
+    out.print(table)
     err.print(f"Wrote {report}, {page} and {len(pictures)} pictures beside them.", soft_wrap=True)
 
 
@@ -183,36 +183,36 @@ def _played(robot: ServoEvidence) -> dict[str, tuple[np.ndarray, np.ndarray, np.
     """Longest trial of each joint of the playback."""
     if robot.played is None:
         return {}
-    found = {}
+    trials_of = {}
     for joint in robot.played.joints:
         trial = max(robot.played.trials(joint), key=lambda t: len(t.send_time_s))
-        found[joint] = (trial.send_time_s, trial.command_rad, trial.position_rad)
-    return found
+        trials_of[joint] = (trial.send_time_s, trial.command_rad, trial.position_rad)
+    return trials_of
 
 
 def _draw(
     evidence: list[PolicyEvidence], robot: ServoEvidence, trainings: list[Training]
 ) -> list[Picture]:
     """What can be shown of the evidence."""
-    made: list[Picture] = []
+    drawn_pictures: list[Picture] = []
     if trainings:
         caption = "Trainings from random weights in the published task, each a line."
-        made.append(Picture("training", caption, training_figure(trainings)))
+        drawn_pictures.append(Picture("training", caption, training_figure(trainings)))
     if robot.sweep is not None:
         joint = robot.sweep.joints[-1]
         trials = [t for t in robot.sweep.trials(joint) if np.isfinite(t.frequency_hz)]
         caption = "As the paper's figure 2: commands and readings by frequency. Faint ones are old."
-        made.append(Picture("sweep", caption, sweep_figure(trials)))
+        drawn_pictures.append(Picture("sweep", caption, sweep_figure(trials)))
     for kind in ("lstm", "mlp"):
         first = next((e for e in evidence if e.kind == kind), None)
         if first:
             caption = f"As figure 4: the gait of {first.name}."
-            made.append(Picture(f"gait-{kind}", caption, figures.gait_figure(first.walk)))
-    shown = _one_per_kind([e for e in evidence if e.orbits])
-    if shown:
-        orbits = {f"{e.name} {k}": v.orbits for e in shown for k, v in e.orbits.items()}
-        late = {e.name: e.orbits["actions"].states for e in shown}
-        made += [
+            drawn_pictures.append(Picture(f"gait-{kind}", caption, figures.gait_figure(first.walk)))
+    moving = _one_per_kind([e for e in evidence if e.orbits])
+    if moving:
+        orbits = {f"{e.name} {k}": v.orbits for e in moving for k, v in e.orbits.items()}
+        late = {e.name: e.orbits["actions"].states for e in moving}
+        drawn_pictures += [
             Picture(
                 "orbits",
                 "As figure 5: orbits of actions and hidden states, joints late by 0, 160, 320 ms.",
@@ -221,7 +221,7 @@ def _draw(
             Picture(
                 "late",
                 "As figure 6: the LF thigh's action in replay with late joints.",
-                delay_trace_figure(late, DELAYS_MS, shown[0].walk.step_s),
+                delay_trace_figure(late, DELAYS_MS, moving[0].walk.step_s),
             ),
         ]
     every = _one_per_kind(evidence)
@@ -235,11 +235,11 @@ def _draw(
     }  # fmt: skip
     for name, caption in captions.items():  # each is an analysis, with a figure of its name
         drawn = getattr(figures, f"{name}_figure")({e.name: getattr(e, name) for e in every})
-        made.append(Picture(name, caption, drawn))
+        drawn_pictures.append(Picture(name, caption, drawn))
     if robot.servos is not None:
         caption = "As the extension's figure: four servo models on an unseen loop."
-        made.append(Picture("servos", caption, robot.servos.plot()))
-    return made
+        drawn_pictures.append(Picture("servos", caption, robot.servos.plot()))
+    return drawn_pictures
 
 
 def _file(picture: Picture) -> str:
@@ -270,7 +270,7 @@ def _markdown(title: str, answer: str, sections: list[Section]) -> str:
 
 
 def _sections(
-    found: list[Claim], other: list[dict[str, str]] | None, evidence: Evidence,
+    claims_found: list[Claim], other: list[dict[str, str]] | None, evidence: Evidence,
     pictures: list[Picture], inputs: dict[str, str], options: Options, summary: list[str],
 ) -> list[Section]:  # fmt: skip
     """The parts of the page."""
@@ -279,7 +279,7 @@ def _sections(
             **c.to_dict(), "id": _id(c, evidence[0]),
             "here": c.ours + (f" ({_bounds(c)})" if c.interval else ""),
         }
-        for c in found
+        for c in claims_found
     )  # fmt: skip
     columns = (
         Column("", "id", kind="key"),
@@ -291,10 +291,10 @@ def _sections(
     first = Column("", "", kind="words")
     compared = []
     if other is not None:
-        shown = tuple(
+        columns_shown = tuple(
             Column(heading, key, kind="prose" if heading else "key") for heading, key in _OTHER
         )
-        tables = [Table("beside", "Judged otherwise", shown, tuple(other))] if other else []
+        tables = [Table("beside", "Judged otherwise", columns_shown, tuple(other))] if other else []
         compared = [Section("beside", _BESIDE, [_other(other)], tables=tables)]
     return [
         Section(
@@ -347,14 +347,14 @@ def _other(rows: list[dict[str, str]]) -> str:
 
 
 def _summary(
-    found: list[Claim], evidence: list[PolicyEvidence], trainings: list[Training]
+    claims: list[Claim], evidence: list[PolicyEvidence], trainings: list[Training]
 ) -> list[str]:
     """A paragraph each: the answer, what imitation decides, what was not tested as published."""
     by_verdict: dict[str, list[Claim]] = {}
-    for one in found:
+    for one in claims:
         by_verdict.setdefault(one.verdict, []).append(one)
     counts = [f"{len(by_verdict[v])} {words}" for v, words in _HOLD.items() if v in by_verdict]
-    answer = f"Of {len(found)} published claims {', '.join(counts)}."
+    answer = f"Of {len(claims)} published claims {', '.join(counts)}."
     for verdict, words in (("holds", "What holds"), ("holds partly", "In part")):
         if rows := by_verdict.get(verdict):
             answer += f" {words}: " + "; ".join(f"{c.claim} ({c.id})" for c in rows) + "."
@@ -420,7 +420,7 @@ def _versions() -> str:
 
 def _inputs(options: Options, tries: Tries) -> dict[str, str]:
     """SHA-256 of everything the page rests on, by name."""
-    found = {
+    hashes = {
         f"policy {name}": policy.contract.weights_sha256 for name, (policy, _) in tries.items()
     }
     servos = {Path(trial.servos.source) for _, trial in tries.values()}
@@ -429,7 +429,7 @@ def _inputs(options: Options, tries: Tries) -> dict[str, str]:
     files = [p / WEIGHTS if p.is_dir() else p for p in sorted(servos)]
     files += [options.beside] if options.beside else []
     files += [*options.recordings, *(Path(name) for _, name in _logs(options))]
-    return found | {"/".join(f.parts[-2:]): sha256(f) for f in files if f.is_file()}
+    return hashes | {"/".join(f.parts[-2:]): sha256(f) for f in files if f.is_file()}
 
 
 def _bounds(claim: Claim) -> str:
@@ -458,16 +458,16 @@ def _table_one(both: Evidence) -> tuple[list[str], list[tuple[str, list[str]]]]:
         ),
         "forward error, m/s": (evidence, lambda e: e.terrain[0].mae_vx_m_s, 3),
     }  # fmt: skip
-    made = [("policies", [str(sum(e.kind == k for e in evidence)) for k in kinds])]
+    table_rows = [("policies", [str(sum(e.kind == k for e in evidence)) for k in kinds])]
     for title, (where, value, digits) in rows.items():
         cells = []
         for kind in kinds:
-            found = over(where, kind, value)
-            cells.append(terminal.number(found.value, digits))
-            if np.isfinite(found.low):
-                cells[-1] += f" ({found.low:.{digits}f} to {found.high:.{digits}f})"
-        made.append((title, cells))
-    return [KINDS[k] for k in kinds], made
+            mean = over(where, kind, value)
+            cells.append(terminal.number(mean.value, digits))
+            if np.isfinite(mean.low):
+                cells[-1] += f" ({mean.low:.{digits}f} to {mean.high:.{digits}f})"
+        table_rows.append((title, cells))
+    return [KINDS[k] for k in kinds], table_rows
 
 
 def _number(value: float) -> str:

@@ -188,9 +188,10 @@ def _delay_frequency(kind: str, id_: str, text: str, paper: str) -> Callable[[Po
     "PCA of states in replay at 0, +160, +320 ms together (`pupper-analyze attractor`).",
 )  # fmt: skip
 def components(policies: Policies) -> Finding:
-    found = of_kinds(policies, lambda e: 100 * _hidden(e, "explained_3"), "mlp", "lstm")
+    variance = of_kinds(policies, lambda e: 100 * _hidden(e, "explained_3"), "mlp", "lstm")
     return Finding(
-        f"{several(found, 0)} %", bounds(found), holds(found["lstm"].value > found["mlp"].value),
+        f"{several(variance, 0)} %", bounds(variance),
+        holds(variance["lstm"].value > variance["mlp"].value),
         "Variance explained says little of order: see P2.",
     )  # fmt: skip
 
@@ -217,11 +218,11 @@ def orbit(policies: Policies) -> Finding:
     "Observations 12 to 47 zeroed: correlation of actions in replay, survival in closed loop.",
 )  # fmt: skip
 def zeros(policies: Policies) -> Finding:
-    found = of_kinds(policies, lambda e: _ablated(e, "zero", "correlation"), "mlp", "lstm")
+    correlation = of_kinds(policies, lambda e: _ablated(e, "zero", "correlation"), "mlp", "lstm")
     up = of_kinds(policies, lambda e: 100 * _ablated(e, "zero", "survival"))
     return Finding(
-        f"{several(found, 2)}; still up {several(up, 0)} %", bounds(found),
-        holds(found["lstm"].value > found["mlp"].value + 0.02), "Holds if 0.02 more.",
+        f"{several(correlation, 2)}; still up {several(up, 0)} %", bounds(correlation),
+        holds(correlation["lstm"].value > correlation["mlp"].value + 0.02), "Holds if 0.02 more.",
     )  # fmt: skip
 
 
@@ -230,10 +231,10 @@ def zeros(policies: Policies) -> Finding:
     "Noise in shares of each channel's own deviation; where replay correlates as with zeros.",
 )  # fmt: skip
 def crossover(policies: Policies) -> Finding:
-    found = of_kinds(policies, _crossing, "mlp", "lstm")
-    close = all(0.1 < found[k].value < 0.4 for k in ("mlp", "lstm"))
+    share = of_kinds(policies, _crossing, "mlp", "lstm")
+    close = all(0.1 < share[k].value < 0.4 for k in ("mlp", "lstm"))
     return Finding(
-        f"{several(found, 2)} of a deviation", bounds(found), holds(close),
+        f"{several(share, 2)} of a deviation", bounds(share), holds(close),
         "One σ for radians, rad/s and efforts has no unit; ours is relative (0.1 to 0.4); ∞ if one "
         "of the policies was never worse with noise than with zeros.",
     )  # fmt: skip
@@ -308,11 +309,11 @@ def ground(policies: Policies) -> Finding:
         raise NotTestable(
             "Give runs, with their run.yaml, of the MLP and of the LSTM on flat ground."
         )
-    found = of_kinds(flat, survival, "mlp", "lstm")
-    more = found["lstm"].value > found["mlp"].value + 10
-    fine = found["lstm"].value > 90
+    still_up = of_kinds(flat, survival, "mlp", "lstm")
+    more = still_up["lstm"].value > still_up["mlp"].value + 10
+    fine = still_up["lstm"].value > 90
     return Finding(
-        f"{several(found, 0)} % still up", bounds(found), holds(more and fine, fine),
+        f"{several(still_up, 0)} % still up", bounds(still_up), holds(more and fine, fine),
         "Holds if the LSTM has 10 points more; partly if it walks, but the MLP, too.",
     )  # fmt: skip
 
@@ -337,13 +338,13 @@ def directions(policies: Policies) -> Finding:
     "Change of heading per metre, forward; to the left is positive.",
 )  # fmt: skip
 def arc(policies: Policies) -> Finding:
-    found = of_kinds(
+    bend = of_kinds(
         policies,
         lambda e: next(r.arc_rad_m.value for r in e.compliance if r.direction == "forward"),
     )
     return Finding(
-        f"{several(found, 2)} rad/m", bounds(found),
-        holds(all(v.value < -0.05 for v in found.values())),
+        f"{several(bend, 2)} rad/m", bounds(bend),
+        holds(all(v.value < -0.05 for v in bend.values())),
         "A symmetric robot in simulation; theirs had servos of its own.",
     )  # fmt: skip
 
@@ -357,14 +358,14 @@ def half_rate(policies: Policies) -> Finding:
     up = of_kinds(policies, lambda e: 100 * _at_rate(e, 25.0, "survival"))
     if not any(v.value for v in up.values()):
         return Finding(f"still up {several(up, 0)} %", bounds(up), holds(False), "It falls.")
-    found = of_kinds(policies, lambda e: _at_rate(e, 25.0, "frequency_hz"))
+    slow = of_kinds(policies, lambda e: _at_rate(e, 25.0, "frequency_hz"))
     usual = of_kinds(policies, lambda e: _at_rate(e, 50.0, "frequency_hz"))
-    ratios = [found[k].value / usual[k].value for k in found if k in usual]
+    ratios = [slow[k].value / usual[k].value for k in slow if k in usual]
     halves = bool(ratios) and 0.4 < float(np.mean(ratios)) < 0.65
     return Finding(
-        f"{several(usual, 2)} Hz at 50 Hz, {several(found, 2)} at 25 Hz; still up "
+        f"{several(usual, 2)} Hz at 50 Hz, {several(slow, 2)} at 25 Hz; still up "
         f"{several(up, 0)} %",
-        bounds(found), holds(halves), "Halves if 0.4 to 0.65 of it.",
+        bounds(slow), holds(halves), "Halves if 0.4 to 0.65 of it.",
     )  # fmt: skip
 
 
@@ -379,10 +380,10 @@ def scale(policies: Policies) -> Finding:
         scale: [r for p in mine for r in p.scale if r.scale_rad == scale]
         for scale in sorted({r.scale_rad for r in mine[0].scale})
     }
-    errors = {s: float(np.mean([r.mae_vx_m_s for r in found])) for s, found in rows.items()}
+    errors = {s: float(np.mean([r.mae_vx_m_s for r in walked])) for s, walked in rows.items()}
     ours = ", ".join(
-        f"{s:g} rad: {100 * np.mean([r.survival for r in found]):.0f} % up, {errors[s]:.3f} m/s"
-        for s, found in rows.items()
+        f"{s:g} rad: {100 * np.mean([r.survival for r in walked]):.0f} % up, {errors[s]:.3f} m/s"
+        for s, walked in rows.items()
     )
     best = min(errors, key=lambda s: errors[s] if np.isfinite(errors[s]) else np.inf)
     return Finding(ours, None, holds(best >= 0.6), "Holds if 0.6 rad or more is best.")

@@ -36,25 +36,25 @@ def gather(
     recordings: Sequence[Recording], seed: int, progress: Callable[[str], None] = lambda what: None
 ) -> ServoEvidence:
     """Lag and staleness from sweeps, servo models from the recording with most joints."""
-    found = ServoEvidence()
+    evidence = ServoEvidence()
     rng = np.random.default_rng(seed)
     tones = [bool(np.isfinite(r.table["frequency_hz"]).any()) for r in recordings]
     sweeps = [r for r, tone in zip(recordings, tones, strict=True) if tone]
     others = [r for r, tone in zip(recordings, tones, strict=True) if not tone]
     for recording in sweeps:
-        found.health |= {
+        evidence.health |= {
             f"{recording.name} {name}": one
             for name, one in examine(recording, seed=rng).joints.items()
         }
     if sweeps:
         progress("lag of the sweeps")
-        found.lag = dict(lag(sweeps, seed=seed, workers=2))
-        found.sweep = max(sweeps, key=lambda r: len(r.table))
+        evidence.lag = dict(lag(sweeps, seed=seed, workers=2))
+        evidence.sweep = max(sweeps, key=lambda r: len(r.table))
     if others:
-        found.played = max(others, key=lambda r: (len(r.joints), len(r.table)))
-        progress(f"servo models on {found.played.name}")
-        found.servos = four_way(found.played, found.played.joints, seed)
-    return found
+        evidence.played = max(others, key=lambda r: (len(r.joints), len(r.table)))
+        progress(f"servo models on {evidence.played.name}")
+        evidence.servos = four_way(evidence.played, evidence.played.joints, seed)
+    return evidence
 
 
 def judge(evidence: ServoEvidence) -> list[Claim]:
@@ -66,8 +66,8 @@ def judge(evidence: ServoEvidence) -> list[Claim]:
     "A1", "Transport delay is a constant 76 ms from 1 to 6 Hz", "76 ms, same at all rates",
     "Sweeps: lag of all rows, of fresh rows, and of the servo (`pupper-sysid delay`).",
 )  # fmt: skip
-def constant_lag(found: ServoEvidence) -> Finding:
-    budgets = list(_sweeps(found).values())
+def constant_lag(evidence: ServoEvidence) -> Finding:
+    budgets = list(_sweeps(evidence).values())
     raw, fresh, servo = (
         1e3 * np.mean([getattr(b, k).value for b in budgets])
         for k in ("raw_lag_s", "fresh_lag_s", "lag_s")
@@ -91,8 +91,8 @@ def constant_lag(found: ServoEvidence) -> Finding:
     "A2", "Tracking degrades above 3 Hz", "visible loss of amplitude above 3 Hz",
     "Sweeps: gain per tone, of all rows and of fresh ones.",
 )  # fmt: skip
-def above_three_hertz(found: ServoEvidence) -> Finding:
-    tones = [f for d in found.lag.values() for f in d.by_frequency]
+def above_three_hertz(evidence: ServoEvidence) -> Finding:
+    tones = [f for d in evidence.lag.values() for f in d.by_frequency]
     high = [f for f in tones if f.frequency_hz > 3.0]
     if not high:
         raise NotTestable("Give sweeps above 3 Hz with --recordings.")
@@ -111,9 +111,9 @@ def above_three_hertz(found: ServoEvidence) -> Finding:
     "A3", "Readings are noisy", "σ 0.101 rad in position, 3.17 rad/s in velocity",
     "Sweeps: noise of fresh readings about their tone; share of rows that repeat an old value.",
 )  # fmt: skip
-def reading_noise(found: ServoEvidence) -> Finding:
-    noise = float(np.mean([d.noise_rad for d in _sweeps(found).values()]))
-    fresh = float(np.mean([h.fresh_fraction for h in found.health.values()]))
+def reading_noise(evidence: ServoEvidence) -> Finding:
+    noise = float(np.mean([d.noise_rad for d in _sweeps(evidence).values()]))
+    fresh = float(np.mean([h.fresh_fraction for h in evidence.health.values()]))
     return Finding(
         f"σ {1e3 * noise:.1f} mrad in fresh readings; {100 * (1 - fresh):.0f} % of rows are old",
         None, holds(noise >= 0.03),
@@ -125,8 +125,8 @@ def reading_noise(found: ServoEvidence) -> Finding:
     "S1", "A servo network is far better than a PD", "PD 0.1 to 1.8 rad, MLP 0.003 to 0.03 rad",
     "Playback, last loop held out, free run from commands alone, per joint.",
 )  # fmt: skip
-def servo_error(found: ServoEvidence) -> Finding:
-    published, fitted, mlp = (_by_joint(found, name) for name in (PUBLISHED, FITTED, "MLP"))
+def servo_error(evidence: ServoEvidence) -> Finding:
+    published, fitted, mlp = (_by_joint(evidence, name) for name in (PUBLISHED, FITTED, "MLP"))
     return Finding(
         f"published PD {_range(published)}, a fitted PD {_range(fitted)}, MLP {_range(mlp)} mrad",
         None, holds(bool(np.mean(fitted) > 3 * np.mean(mlp))),
@@ -138,8 +138,8 @@ def servo_error(found: ServoEvidence) -> Finding:
     "S2", "In free run the LSTM servo drifts", "RMSE LSTM 0.070, MLP 0.028 rad",
     "As S1, mean of the joints, 90 % intervals over stretches of time.",
 )  # fmt: skip
-def free_run(found: ServoEvidence) -> Finding:
-    spans = {k: _servos(found).models[k].rmse_free_run_rad for k in ("LSTM", "MLP")}
+def free_run(evidence: ServoEvidence) -> Finding:
+    spans = {k: _servos(evidence).models[k].rmse_free_run_rad for k in ("LSTM", "MLP")}
     mean = {k: 1e3 * i.value for k, i in spans.items()}
     return Finding(
         f"LSTM {mean['LSTM']:.1f}, MLP {mean['MLP']:.1f} mrad",
@@ -153,8 +153,8 @@ def free_run(found: ServoEvidence) -> Finding:
     "S3", "One step ahead the LSTM servo is better", "LSTM better in one step",
     "As S1, one step ahead of the last reading; beside it persistence (the last reading).",
 )  # fmt: skip
-def one_step(found: ServoEvidence) -> Finding:
-    servos = _servos(found)
+def one_step(evidence: ServoEvidence) -> Finding:
+    servos = _servos(evidence)
     ahead = {k: 1e3 * servos.models[k].mean.rmse_one_step_rad for k in ("LSTM", "MLP")}
     still = 1e3 * float(np.nanmean(list(servos.persistence_rmse_rad.values())))
     return Finding(
@@ -167,34 +167,34 @@ def one_step(found: ServoEvidence) -> Finding:
     "S4", "390 samples per joint are enough", "390 samples in 3 loops",
     "As S1: MLP against the robot's repeatability.",
 )  # fmt: skip
-def enough_data(found: ServoEvidence) -> Finding:
-    mlp = 1e3 * float(np.mean(_by_joint(found, "MLP")))
-    known = [v for v in _servos(found).repeatability_rad.values() if np.isfinite(v)]
+def enough_data(evidence: ServoEvidence) -> Finding:
+    mlp = 1e3 * float(np.mean(_by_joint(evidence, "MLP")))
+    known = [v for v in _servos(evidence).repeatability_rad.values() if np.isfinite(v)]
     if not known:
         raise NotTestable("Give a playback that sends the same commands more than once.")
     floor = 1e3 * float(np.mean(known))
-    rows = len(found.played.table) // len(found.played.joints) if found.played else 0
+    rows = len(evidence.played.table) // len(evidence.played.joints) if evidence.played else 0
     return Finding(
         f"{rows} rows per joint: MLP {mlp:.1f} mrad, repeatability {floor:.1f}", None,
         holds(mlp <= 1.1 * floor, True), "More data: the data curve of the servo report.",
     )  # fmt: skip
 
 
-def _sweeps(found: ServoEvidence) -> dict[str, LagBudget]:
-    if not found.lag:
+def _sweeps(evidence: ServoEvidence) -> dict[str, LagBudget]:
+    if not evidence.lag:
         raise NotTestable("Give sweeps with --recordings.")
-    return found.lag
+    return evidence.lag
 
 
-def _servos(found: ServoEvidence) -> Comparison:
-    if found.servos is None:
+def _servos(evidence: ServoEvidence) -> Comparison:
+    if evidence.servos is None:
         raise NotTestable("Give a playback or walk with --recordings.")
-    return found.servos
+    return evidence.servos
 
 
-def _by_joint(found: ServoEvidence, model: str) -> np.ndarray:
+def _by_joint(evidence: ServoEvidence, model: str) -> np.ndarray:
     """Free-run error of each joint [rad]."""
-    joints = _servos(found).models[model].joints
+    joints = _servos(evidence).models[model].joints
     return np.array([s.rmse_free_run_rad for s in joints.values()])
 
 

@@ -41,10 +41,10 @@ class ImuWalk:
     log has no accelerations."""
 
 
-def gather(given: Sequence[str]) -> list[ImuWalk]:
+def gather(logs: Sequence[str]) -> list[ImuWalk]:
     """Read logs given as `KIND=FILE`."""
-    found = []
-    for text in given:
+    walks = []
+    for text in logs:
         kind, equals, name = text.partition("=")
         if not equals or kind not in KINDS:
             raise InputError(
@@ -54,8 +54,8 @@ def gather(given: Sequence[str]) -> list[ImuWalk]:
         log = read_imu(Path(name))
         gyro = spectrum(log.time_s, [log.rate_rad_s])
         assert gyro is not None  # `read_imu` refuses what is too short for one
-        found.append(ImuWalk(kind, float(log.time_s[-1]), gyro, _largest_tilt(log)))
-    return found
+        walks.append(ImuWalk(kind, float(log.time_s[-1]), gyro, _largest_tilt(log)))
+    return walks
 
 
 def _largest_tilt(log: ImuLog) -> float:
@@ -170,7 +170,7 @@ def compare_stacks(
     `mae_yaw_rad_s` as Interval over walkers, and from the second stack on `less_...`: this stack's
     error less the first one's, walker by walker.
     """
-    found: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
     first: np.ndarray | None = None
     for name, stack in stacks.items():
         errors, falls = [], []
@@ -193,8 +193,8 @@ def compare_stacks(
         if first is not None:
             row |= _means("less_", table - first)
         first = table if first is None else first
-        found.append(row)
-    return found
+        rows.append(row)
+    return rows
 
 
 def _means(prefix: str, table: np.ndarray) -> dict[str, Any]:

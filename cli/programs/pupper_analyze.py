@@ -39,14 +39,14 @@ COMMANDS = commands_of(_SUMMARIES, lambda _, word: f"analyze.{_MODULES.get(word,
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command; ends the process with 0, 2 (bad input, one sentence) or 1."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    if given[:1] == ["claims"]:
-        with user_errors(given, "pupper-analyze"):
+    typed = list(sys.argv[1:] if arguments is None else arguments)
+    if typed[:1] == ["claims"]:
+        with user_errors(typed, "pupper-analyze"):
             raise InputError(
                 "The published claims are tested apart from the tool: run "
-                f"`{' '.join(['python -m reproduction', *given[1:]])}` in the repository."
+                f"`{' '.join(['python -m reproduction', *typed[1:]])}` in the repository."
             )
-    run_command("pupper-analyze", DESCRIPTION, COMMANDS, given)
+    run_command("pupper-analyze", DESCRIPTION, COMMANDS, typed)
 
 
 if __name__ == "__main__":

@@ -228,11 +228,11 @@ def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
     """The stack, with the user's changes."""
     name = suited(contract) if options.stack == "auto" else options.stack
     stack = replace(STACKS[name], **_changes(options))
-    own = 1 / contract.control_step_s
-    if stack.rate_hz and abs(stack.rate_hz / own - 1) > 1e-6:
+    trained_hz = 1 / contract.control_step_s
+    if stack.rate_hz and abs(stack.rate_hz / trained_hz - 1) > 1e-6:
         warn(
-            f"the policy was trained at {own:g} Hz and runs at {stack.rate_hz:g} Hz: its gait "
-            f"is {stack.rate_hz / own:.2f} times as fast."
+            f"the policy was trained at {trained_hz:g} Hz and runs at {stack.rate_hz:g} Hz: its "
+            f"gait is {stack.rate_hz / trained_hz:.2f} times as fast."
         )
     return name, stack
 
@@ -405,7 +405,7 @@ def _walk(
     steps = outcome.steps
     # only the true motion of an emulated robot is known
     motion: dict[str, Any] = score.summary() if score else dict.fromkeys(ERRORS)
-    found = {
+    result = {
         "rate_hz": 1 / outcome.loop.get("mean_period_s", float("nan")),
         "seconds": outcome.seconds,
         "deadline_misses": outcome.deadline_misses,
@@ -423,13 +423,13 @@ def _walk(
         "log": str(log),
     }  # fmt: skip
     if options.json:
-        print_json(found)
+        print_json(result)
         return
     shown = terminal.table(f"{outcome.seconds:.1f} s on {bus.name}", "", "")
     shown.show_header = False
     for key, label in _SHOWN.items():
-        if found.get(key) is not None:  # true motion is known of an emulated robot only
-            shown.add_row(label, terminal.cell(found[key], 3))
+        if result.get(key) is not None:  # true motion is known of an emulated robot only
+            shown.add_row(label, terminal.cell(result[key], 3))
     out.print(shown)
     repeat = terminal.command("pupper-deploy", options.policy, "--replay", log)
     err.print(f"Repeat it: {repeat}")

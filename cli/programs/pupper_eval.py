@@ -116,7 +116,7 @@ def _run(options: Eval) -> None:
     cases = BATTERY if options.battery else table(options.terrain, options.extra_delay_ms)
     robots = battery_robots(episodes) if options.battery else usual_robots(episodes)
     with terminal.share_progress("walking") as advance:
-        found = evaluate(
+        evaluation = evaluate(
             policy, replace(task, episode_s=seconds), servos, cases, robots, options.seed,
             options.threads, feedback=options.feedback or policy.contract.feedback,
             progress=partial(advance, f"{episodes} episodes of {seconds:g} s and all conditions"),
@@ -126,29 +126,30 @@ def _run(options: Eval) -> None:
         from pupper_sysid.policies.evaluation.report import walking_sections
 
         folder = run_folder(options.policy)
-        sections = walking_sections(policy, run, folder, found)
+        sections = walking_sections(policy, run, folder, evaluation)
         title = f"Walking report: {folder.name}"
         name = resolved(options.policy).name
         write_page(page, title, f"{name}, seed {options.seed}", sections, options.force)
     if options.json:
         about = {"quick": options.quick, "battery": options.battery}
-        print_json(about | found.to_dict() | ({"report": page} if page else {}))
+        print_json(about | evaluation.to_dict() | ({"report": page} if page else {}))
         return
-    _show(found, options.quick)
+    _show(evaluation, options.quick)
     if page:
         err.print(f"Wrote {page}.")
 
 
-def _show(found: Evaluation, quick: bool) -> None:
+def _show(evaluation: Evaluation, quick: bool) -> None:
     from pupper_sysid.policies.evaluation.report import tables_of
 
-    first = found.conditions[0].policy
+    first = evaluation.conditions[0].policy
     err.print(
-        f"{'Quick look: ' if quick else ''}{first.episodes} episodes of {found.episode_s:g} s, "
-        f"actuator {found.actuator}, feedback {found.feedback}. The trot is open-loop: it has a "
-        "clock and sees nothing. Episode k has the same robot in every row; intervals are of 90 %."
+        f"{'Quick look: ' if quick else ''}{first.episodes} episodes of "
+        f"{evaluation.episode_s:g} s, actuator {evaluation.actuator}, feedback "
+        f"{evaluation.feedback}. The trot is open-loop: it has a clock and sees nothing. Episode k "
+        "has the same robot in every row; intervals are of 90 %."
     )
-    for table in tables_of(found):
+    for table in tables_of(evaluation):
         print_tables(table)
 
 

@@ -108,14 +108,14 @@ def _run(options: Play) -> None:
         screen = _Screen(env, options, files)
         for step in range(1, round(options.seconds / step_s) + 1):
             action = policy.act(observation)
-            found = env.step(action)
-            observation = found.observation
-            if found.done[0]:
-                what = "Left the ground's edge" if found.timed_out[0] else "Fell"
+            stepped = env.step(action)
+            observation = stepped.observation
+            if stepped.done[0]:
+                what = "Left the ground's edge" if stepped.timed_out[0] else "Fell"
                 ended = f"{what} after {step * step_s:.1f} s."
                 break
             away = env.robots.qpos[0, :2] - start
-            facts = found.facts
+            facts = stepped.facts
             track.add(step * step_s, action)
             velocities.append([*facts.linear_velocity[0, :2], facts.angular_velocity[0, 2]])
             if not screen.show(step_s, np.array(velocities[-1])):

@@ -188,11 +188,11 @@ def orbits(
         acted.append(plain.action_scale * actions[now, robot].astype(float))
         hidden_states.append(hidden[now, robot].astype(float))
     rate = moving_frequency(acted[0], plain.step_s)
-    found = {}
+    by_kind = {}
     for name, conditions in (("actions", acted), ("hidden", hidden_states)):
         axes = principal_components(conditions, 3)
         paths = [axes.orbit(c) for c in conditions]
-        found[name] = Orbits(
+        by_kind[name] = Orbits(
             states=conditions,
             orbits=paths,
             explained=axes.explained.tolist(),
@@ -201,7 +201,7 @@ def orbits(
             closure=[closure(path, plain.step_s, rate) for path in paths],
             area_ratio=[area_ratio(path[:, :2], paths[0][:, :2]) for path in paths],
         )
-    return found
+    return by_kind
 
 
 Array = NDArray[np.float64]
@@ -286,20 +286,20 @@ def frozen(policy: Policy, trial: Trial) -> tuple[FrozenTest, ...]:
     """
     plain = trial.walk(policy)
     start = round(SETTLE_S / plain.step_s)
-    own = _LAST_ACTION
+    last = _LAST_ACTION
     before = gait_of_actions(plain, plain.action)["amplitude_rad"]
     tests = {
         "nothing frozen": (None, False),
-        "senses frozen, its own last action": (slice(0, own.start), True),
-        "senses and last action frozen": (slice(0, own.stop), False),
-        "last action frozen, senses recorded": (own, False),
+        "senses frozen, its own last action": (slice(0, last.start), True),
+        "senses and last action frozen": (slice(0, last.stop), False),
+        "last action frozen, senses recorded": (last, False),
     }
-    found = []
+    results = []
     for name, (part, feeds_back) in tests.items():
         gait = gait_of_actions(plain, _driven(policy, plain, part, feeds_back, start))
         share = gait["amplitude_rad"] / before if before > STILL_RAD else NAN
-        found.append(FrozenTest(test=name, share=share, **gait))
-    return tuple(found)
+        results.append(FrozenTest(test=name, share=share, **gait))
+    return tuple(results)
 
 
 def push_response(policy: Policy, trial: Trial) -> tuple[PushTest, ...]:
@@ -320,7 +320,7 @@ def push_response(policy: Policy, trial: Trial) -> tuple[PushTest, ...]:
         return ()
     rates = {i: sine_frequency(settled[:, i], step_s) for i in robots}
     period = 1 / float(np.median(list(rates.values())))
-    found = []
+    results = []
     times = [begin + round(k * period / _PUSHES / step_s) for k in range(_PUSHES)]
     speeds = (NUDGE_M_S, PUSH_M_S)
     conditions = [trial.condition(None, _pusher(at, speed)) for speed in speeds for at in times]
@@ -336,7 +336,7 @@ def push_response(policy: Policy, trial: Trial) -> tuple[PushTest, ...]:
             ]
             phases += [_phase(plain, at, i, rates[i]) for i in both]
         early, late = np.array(shifts).reshape(-1, 2).T
-        found.append(
+        results.append(
             PushTest(
                 push_m_s=speed,
                 survival=float(np.mean(survived)),
@@ -347,7 +347,7 @@ def push_response(policy: Policy, trial: Trial) -> tuple[PushTest, ...]:
                 shifts=tuple(late.tolist()),
             )
         )
-    return tuple(found)
+    return tuple(results)
 
 
 def rate_response(policy: Policy, trial: Trial) -> tuple[RatePoint, ...]:
@@ -383,12 +383,12 @@ def _driven(
     player.reset(seen[0, :, _LAST_ACTION])
     last, actions = seen[0, :, _LAST_ACTION], []
     for step, observation in enumerate(seen):
-        shown = observation.copy()
+        altered = observation.copy()
         if part is not None and step >= start:
-            shown[:, part] = seen[start, :, part]
+            altered[:, part] = seen[start, :, part]
         if own_action:
-            shown[:, _LAST_ACTION] = last
-        last = player.act(shown)
+            altered[:, _LAST_ACTION] = last
+        last = player.act(altered)
         actions.append(last)
     return np.stack(actions)
 

@@ -131,18 +131,18 @@ def autonomy_figure(tests: Mapping[str, Autonomy]) -> Figure:
     """Amplitude with inputs frozen, phase shift after pushes, and frequency against rate."""
     figure, (bars, shifts, rates) = axes_column(3, 8.0)
     count = len(tests)
-    for k, (policy, found) in enumerate(tests.items()):
+    for k, (policy, test) in enumerate(tests.items()):
         colour = _colour(k)
-        rows = found.frozen
+        rows = test.frozen
         places = np.arange(len(rows)) + 0.8 * k / count
         bars.barh(places, [r.share for r in rows], 0.8 / count, color=colour, label=policy)
-        for row, mark in zip(found.push, ("x", "o"), strict=False):  # none if no robot walked
+        for row, mark in zip(test.push, ("x", "o"), strict=False):  # none if no robot walked
             shifts.plot(
                 row.phases, row.shifts, mark, ms=3, color=colour, ls="",
                 label=f"{policy}, {row.push_m_s:g} m/s",
             )  # fmt: skip
         rates.plot(
-            [r.rate_hz for r in found.rate], [r.frequency_hz for r in found.rate],
+            [r.rate_hz for r in test.rate], [r.frequency_hz for r in test.rate],
             marker="o", ms=3, color=colour, label=policy,
         )  # fmt: skip
     names = [r.test for r in next(iter(tests.values())).frozen]
@@ -206,11 +206,11 @@ def demand_figure(demand: ServoDemand) -> Figure:
         torque = np.concatenate([demand.samples[name][1] for name in names])
         every = max(1, len(speed) // _SHOWN)
         one.plot(speed[::every], torque[::every], ".", ms=1.5, color=BLUE, rasterized=True)
-        own = demand.joints[names[0]]
-        stall, top = own.stall_torque_nm, own.top_speed_rad_s
+        servo = demand.joints[names[0]]
+        stall, top = servo.stall_torque_nm, servo.top_speed_rad_s
         end = float(speed.max())
         last = end if top is None else top
-        at_last = stall if top is None else own.torque_at_top_nm
+        at_last = stall if top is None else servo.torque_at_top_nm
         # driving the torque left falls with speed, braking it rises by as much
         one.plot([0, last, last, 0], [stall, at_last, at_last - 2 * stall, -stall], color=RED)
         one.set_title(kind if kind in KINDS else ", ".join(names))

@@ -286,8 +286,8 @@ class ForeignPolicy:
         settings: dict[str, Any] = {}
         if robot_config is not None:
             content, lines = read_yaml(robot_config)
-            own = validated(RobotFile, content or {}, robot_config, lines)
-            settings = own.model_dump(exclude_none=True)
+            stated = validated(RobotFile, content or {}, robot_config, lines)
+            settings = stated.model_dump(exclude_none=True)
         settings.setdefault("pose", dict(zip(self.joints, self.pose.tolist(), strict=True)))
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "robot.yaml"
@@ -337,8 +337,8 @@ class ForeignPolicy:
 
     def reset(self, action: NDArray[np.floating]) -> None:
         """Start an episode of all robots after their last `action` in the task's units."""
-        own = np.asarray(action, np.float32)[:, self._at]
-        self._action = ((own - self._shift) / self._ratio).astype(np.float32)
+        moved = np.asarray(action, np.float32)[:, self._at]
+        self._action = ((moved - self._shift) / self._ratio).astype(np.float32)
         self._state = [s.numpy() for s in self.network.initial_state(len(action))]
         self._angles: deque[Row] = deque(maxlen=_LONGEST_HISTORY + 1)
         self._histories = [deque[Row](maxlen=t.age + t.history) for t in self.terms]
@@ -359,9 +359,9 @@ class ForeignPolicy:
             action = np.clip(action, -self.about.clip_actions, self.about.clip_actions)
         self._action = np.asarray(action, np.float32)
         self._ticks += 1
-        found = np.zeros((len(row), len(self._body.joints)), np.float32)
-        found[:, self._at] = self._ratio * self._action + self._shift
-        return found
+        actions = np.zeros((len(row), len(self._body.joints)), np.float32)
+        actions[:, self._at] = self._ratio * self._action + self._shift
+        return actions
 
     def observe(self, observation: NDArray[np.floating]) -> Row:
         """The policy's own observation, shape (n, size); takes the values into the histories."""

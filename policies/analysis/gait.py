@@ -94,11 +94,11 @@ def sine_frequency(signal: Signal, step_s: float) -> float:
         raise InputError("Nothing moves in this signal: it has no frequency.")
     coarse, within = _peak(y, step_s), 0.5 / (len(y) * step_s)
     low, high = max(coarse - within, _SLOWEST_HZ), min(coarse + within, 0.25 / step_s)
-    found: Any = minimize_scalar(
+    optimum: Any = minimize_scalar(
         lambda f: -sine_fit_r2(y, step_s, f).sum(),
         bounds=(low, high), method="bounded", options={"xatol": 1e-7},
     )  # fmt: skip
-    return float(found.x)
+    return float(optimum.x)
 
 
 def sine_fit_r2(signal: Signal, step_s: float, frequency_hz: float) -> Array:
@@ -109,9 +109,9 @@ def sine_fit_r2(signal: Signal, step_s: float, frequency_hz: float) -> Array:
     """
     y = standardised(signal)
     design = sine_design(2 * np.pi * frequency_hz * times(len(y), step_s))
-    left = y - design @ least_squares(design, y)
+    residuals = y - design @ least_squares(design, y)
     moves = np.any(y, axis=0)
-    return np.where(moves, 1.0 - (left**2).mean(axis=0), 0.0)
+    return np.where(moves, 1.0 - (residuals**2).mean(axis=0), 0.0)
 
 
 def null_r2(signal: Signal, step_s: float, rng: np.random.Generator, draws: int = 200) -> Array:
@@ -128,8 +128,8 @@ def null_r2(signal: Signal, step_s: float, rng: np.random.Generator, draws: int 
     memory = np.clip((y[1:] * y[:-1]).mean(axis=0), -0.999, 0.999)
     variance, axes = np.linalg.eigh(y.T @ y / steps)
     mix = (axes * np.sqrt(np.clip(variance, 0.0, None))).T
-    found = np.zeros((draws, channels))
-    for row in found:
+    r2 = np.zeros((draws, channels))
+    for row in r2:
         pushes = rng.standard_normal((steps, channels)) @ mix
         # stationary from the first step, or that would look like a slow oscillation
         pushes[0] /= np.sqrt(1.0 - memory**2)
@@ -137,7 +137,7 @@ def null_r2(signal: Signal, step_s: float, rng: np.random.Generator, draws: int 
             [lfilter([1.0], [1.0, -m], x) for m, x in zip(memory, pushes.T, strict=True)], axis=1
         )
         row[:] = sine_fit_r2(noise, step_s, _peak(standardised(noise), step_s))
-    return found
+    return r2
 
 
 def standardised(signal: Signal) -> Array:
@@ -178,8 +178,8 @@ def _slope(phase: Array, time: Array) -> tuple[float, float]:
     factor = np.linalg.cholesky(np.eye(count) + _WALKS[best] * walk)
     white = np.linalg.solve(factor, line)
     covariance = np.linalg.inv(white.T @ white) * misfit[best] / len(error)
-    found = np.linalg.lstsq(white, np.linalg.solve(factor, phase), rcond=None)[0]
-    return float(found[1]), float(np.sqrt(covariance[1, 1]))
+    solution = np.linalg.lstsq(white, np.linalg.solve(factor, phase), rcond=None)[0]
+    return float(solution[1]), float(np.sqrt(covariance[1, 1]))
 
 
 SETTLE_S = 2.0
@@ -258,14 +258,14 @@ def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
             f"{rollout.alive.sum(axis=0).max() * step_s:.1f} s. Collect a longer rollout, or "
             "describe no gait here."
         )
-    found = [
+    reports = [
         _describe_one(
             rollout.action_rad[now, i], rollout.joint_position[now, i], rollout.contact[now, i],
             step_s, rng,
         )
         for i, now in walked.items()
     ]  # fmt: skip
-    each = {name: np.array([f[name] for f in found]) for name in found[0]}
+    each = {name: np.array([f[name] for f in reports]) for name in reports[0]}
     rate, null, phase = (each.pop(name) for name in ("frequency_hz", "null_r2", "phase"))
     action_r2, joint_r2 = (each[f"{x}_r2_by_joint"].mean(axis=1) for x in ("action", "joint"))
     rest: dict[str, Any] = {
@@ -405,7 +405,7 @@ def _describe_one(
     """All measures of one robot, by name."""
     moves = bool((action.std(axis=0) > STILL).any())
     rate = frequency(action, step_s) if moves else UNKNOWN
-    found: dict[str, Any] = {
+    measures: dict[str, Any] = {
         "frequency_hz": astuple(rate),
         "null_r2": float("nan"),
         "duty": contact.mean(axis=0),
@@ -416,12 +416,12 @@ def _describe_one(
     }
     if moves:
         null = null_r2(action, step_s, rng, _NULL_DRAWS).mean(axis=1)
-        found["null_r2"] = float(np.quantile(null, _NULL_QUANTILE))
+        measures["null_r2"] = float(np.quantile(null, _NULL_QUANTILE))
     for name, prefix, signal in (("action", "", action), ("joint", "joint_", joints)):
-        found[f"{prefix}half_range_rad"], found[f"{prefix}deviation_rad"] = amplitude(signal)
+        measures[f"{prefix}half_range_rad"], measures[f"{prefix}deviation_rad"] = amplitude(signal)
         best = sine_frequency(signal, step_s) if signal.std(axis=0).max() > STILL else 1.0
-        found[f"{name}_r2_by_joint"] = sine_fit_r2(signal, step_s, best)
-    return found
+        measures[f"{name}_r2_by_joint"] = sine_fit_r2(signal, step_s, best)
+    return measures
 
 
 def _wrapped(cycles: NDArray[np.floating]) -> Array:

@@ -109,14 +109,14 @@ def delay_curve(
     replays = _replayed(
         policy, plain, [perturbations.delayed(JOINTS, round(e / step_ms)) for e in extra_ms]
     )
-    found = []
+    points = []
     for extra, actions, (fixed, moving) in zip(extra_ms, replays, walked, strict=True):
-        found += [
+        points += [
             DelayPoint(extra_delay_ms=extra, mode="replay", **gait_of_actions(plain, actions)),
             DelayPoint(extra_delay_ms=extra, mode="fixed", **outcome(fixed)),
             DelayPoint(extra_delay_ms=extra, mode="jittered", **outcome(moving)),
         ]
-    return found
+    return points
 
 
 def ablation(
@@ -189,15 +189,15 @@ def _replayed(
 
 def _agreements(policy: Policy, plain: Rollout, changes: Sequence[Change]) -> list[float]:
     """Gait correlation of replayed actions with the walk's, mean over walking robots."""
-    found = []
+    agreements = []
     for start in range(0, len(changes), _REPLAYED):  # a few at a time, for their memory's sake
         for altered in _replayed(policy, plain, changes[start : start + _REPLAYED]):
             alike = [
                 correlation(plain.action[now, i], altered[now, i])
                 for i, now in walking(plain).items()
             ]
-            found.append(mean(alike))
-    return found
+            agreements.append(mean(alike))
+    return agreements
 
 
 _SHORTEST_M, _SMALLEST_TURN_RAD = 0.05, 0.2  # less motion gives no value per metre or turn

@@ -174,26 +174,26 @@ def servo_demand(
             f"No robot walked for {SETTLE_S:g} s, so there is no gait to measure. Give a policy "
             "that walks on these servos."
         )
-    own, body = candidate.value, trial.task.body
+    numbers, body = candidate.value, trial.task.body
     speed, acceleration, force = plain.speed[now], plain.acceleration[now], plain.force[now]
     walked = {name: np.broadcast_to(x, plain.speed.shape)[now] for name, x in plain.servos.items()}
     direction = np.sign(speed)
     need = force - walked["back_emf"] * speed
-    need += (own["armature"] - walked["armature"]) * acceleration
-    need += (own["friction_loss"] - walked["friction_loss"]) * direction
-    used, short = _load(need, speed, own)
+    need += (numbers["armature"] - walked["armature"]) * acceleration
+    need += (numbers["friction_loss"] - walked["friction_loss"]) * direction
+    used, short = _load(need, speed, numbers)
     _, walked_short = _load(force - walked["back_emf"] * speed, speed, walked)
-    top = _top_speed(own)
-    at_top = own["effort_limit"] - own["back_emf"] * np.minimum(top, NO_SPEED_LIMIT_RAD_S)
+    top = _top_speed(numbers)
+    at_top = numbers["effort_limit"] - numbers["back_emf"] * np.minimum(top, NO_SPEED_LIMIT_RAD_S)
     joints = {
         name: JointDemand(
             speed_rad_s=Spread.of(speed[:, i]),
             torque_nm=Spread.of(need[:, i]),
             top_speed_rad_s=None if top[i] >= NO_SPEED_LIMIT_RAD_S else float(top[i]),
-            stall_torque_nm=float(own["effort_limit"][i]),
+            stall_torque_nm=float(numbers["effort_limit"][i]),
             torque_at_top_nm=float(at_top[i]),
             torque_used=float(np.quantile(used[:, i], 0.99)),
-            rotor_nm=float(np.quantile(np.abs(own["armature"][i] * acceleration[:, i]), 0.99)),
+            rotor_nm=float(np.quantile(np.abs(numbers["armature"][i] * acceleration[:, i]), 0.99)),
             short=float(short[:, i].mean()),
             walked_short=float(walked_short[:, i].mean()),
             walked_nm=Spread.of(force[:, i]),
@@ -210,12 +210,12 @@ def servo_demand(
         )  # fmt: skip
     except InputError:  # too stiff for the task's physics steps
         on_it = None
-    found = ServoDemand(
+    demand = ServoDemand(
         servo=candidate.source,
         walked_on=trial.servos.source,
         robots=int(now.any(axis=0).sum()),
         joints=joints,
-        dead_time_s=float(own["dead_time_s"].mean()) if dead_time_known else None,
+        dead_time_s=float(numbers["dead_time_s"].mean()) if dead_time_known else None,
         tolerated_dead_time_s=float(trial.servos.value["dead_time_s"].mean())
         + extra_dead_times_s[last],
         tolerated_at_least=last == len(enough) - 1,
@@ -230,58 +230,63 @@ def servo_demand(
         },
         kinds={kind: tuple(body.joints[i] for i in at) for kind, at in body.kinds.items()},
     )
-    return replace(found, verdict=_verdict(found))
+    return replace(demand, verdict=_verdict(demand))
 
 
-def _load(need: Array, speed: Array, own: Mapping[str, Array]) -> tuple[Array, NDArray[np.bool_]]:
+def _load(
+    need: Array, speed: Array, numbers: Mapping[str, Array]
+) -> tuple[Array, NDArray[np.bool_]]:
     """Needed torque over what a servo has left, and where that is too little or too slow."""
-    left = own["effort_limit"] - own["back_emf"] * speed * np.sign(need)
-    used = np.minimum(np.abs(need) / np.maximum(left, 1e-9), _MOST_USED)
-    return used, (used > _TOLERANCE) | (np.abs(speed) > _TOLERANCE * _top_speed(own))
+    available = numbers["effort_limit"] - numbers["back_emf"] * speed * np.sign(need)
+    used = np.minimum(np.abs(need) / np.maximum(available, 1e-9), _MOST_USED)
+    return used, (used > _TOLERANCE) | (np.abs(speed) > _TOLERANCE * _top_speed(numbers))
 
 
-def _top_speed(own: Mapping[str, Array]) -> Array:
+def _top_speed(numbers: Mapping[str, Array]) -> Array:
     """Speeds without load of all servos [rad/s]."""
-    left = np.maximum(own["effort_limit"] - own["friction_loss"], 0.0)
-    free = np.where(own["back_emf"] > 0, left / np.maximum(own["back_emf"], 1e-12), np.inf)
-    return np.minimum(free, own["velocity_limit"])
-
-
-def _verdict(found: ServoDemand) -> str:
-    """The result in a sentence or two."""
-    servo, joints = found.servo.rpartition("/")[2], found.joints
-    bound = f"{'at least ' if found.tolerated_at_least else ''}" + (
-        f"{1e3 * found.tolerated_dead_time_s:.0f} ms with which the gait walks"
+    available = np.maximum(numbers["effort_limit"] - numbers["friction_loss"], 0.0)
+    free = np.where(
+        numbers["back_emf"] > 0, available / np.maximum(numbers["back_emf"], 1e-12), np.inf
     )
-    late = found.dead_time_s is not None and found.dead_time_s > found.tolerated_dead_time_s
-    if found.dead_time_s is None:
+    return np.minimum(free, numbers["velocity_limit"])
+
+
+def _verdict(demand: ServoDemand) -> str:
+    """The result in a sentence or two."""
+    servo, joints = demand.servo.rpartition("/")[2], demand.joints
+    bound = f"{'at least ' if demand.tolerated_at_least else ''}" + (
+        f"{1e3 * demand.tolerated_dead_time_s:.0f} ms with which the gait walks"
+    )
+    late = demand.dead_time_s is not None and demand.dead_time_s > demand.tolerated_dead_time_s
+    if demand.dead_time_s is None:
         about = f"its source has no dead time, to hold against the {bound}"
     else:
-        about = f"its dead time of {1e3 * found.dead_time_s:.0f} ms is " + (
+        about = f"its dead time of {1e3 * demand.dead_time_s:.0f} ms is " + (
             f"{'more than' if late else 'within'} the {bound}"
         )
-    if found.survival_on_it is None or found.speed_on_it_m_s is None:
+    if demand.survival_on_it is None or demand.speed_on_it_m_s is None:
         walk = "it is too stiff to be simulated in the task's physics steps"
     else:
         walk = (
-            f"in the simulator {100 * found.survival_on_it:.0f} % of the robots stay up on it and "
-            f"walk at {found.speed_on_it_m_s:.2f} m/s, against "
-            f"{100 * found.survival:.0f} % and {found.speed_m_s:.2f} on "
-            f"{found.walked_on.rpartition('/')[2]}"
+            f"in the simulator {100 * demand.survival_on_it:.0f} % of the robots stay up on it and "
+            f"walk at {demand.speed_on_it_m_s:.2f} m/s, against "
+            f"{100 * demand.survival:.0f} % and {demand.speed_m_s:.2f} on "
+            f"{demand.walked_on.rpartition('/')[2]}"
         )
     lacking = [name for name, joint in joints.items() if joint.lacks]
     if lacking:
         worst = max(lacking, key=lambda name: joints[name].short)
-        own = joints[worst]
+        weakest = joints[worst]
         why = f"{servo} is short of torque or speed in {len(lacking)} of {len(joints)} joints, "
-        why += f"most in {worst}, {100 * own.short:.0f} % of the time"
-        if own.rotor_nm > 0.5 * own.torque_nm.p99:
-            why += f" (its own armature takes {own.rotor_nm:.2g} of {own.torque_nm.p99:.2g} N·m)"
+        why += f"most in {worst}, {100 * weakest.short:.0f} % of the time"
+        if weakest.rotor_nm > 0.5 * weakest.torque_nm.p99:
+            of_all = f"{weakest.rotor_nm:.2g} of {weakest.torque_nm.p99:.2g} N·m"
+            why += f" (its own armature takes {of_all})"
     else:
         most = max(joints, key=lambda name: joints[name].torque_used)
         why = f"{servo} is as strong and fast as the gait needs: at most "
         why += f"{100 * joints[most].torque_used:.0f} % of its torque ({most})"
-    return f"{'Yes' if found.sufficient else 'No'}: {why}; {about}; {walk}."
+    return f"{'Yes' if demand.sufficient else 'No'}: {why}; {about}; {walk}."
 
 
 @dataclass(frozen=True)
@@ -305,9 +310,9 @@ class _Kept:
 
     def steady(self, after_s: float) -> NDArray[np.bool_]:
         """Steps of robots that are up, some seconds after the start; shape (steps, n)."""
-        found = self.alive.copy()
-        found[: round(after_s / self.step_s)] = False
-        return found
+        counts = self.alive.copy()
+        counts[: round(after_s / self.step_s)] = False
+        return counts
 
 
 class _Recorder(StepRecorder):

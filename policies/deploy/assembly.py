@@ -131,26 +131,26 @@ def reassemble(
         if joint_map is None or header["joint_map"] != joint_map.file.name:
             joint_map = load_joint_map(header["joint_map"])
         servo = Path(header["servo"]) if header["servo"] else None
-        found = assemble(policy, stack, joint_map, header["actuator"], servo, body=body)
+        parts = assemble(policy, stack, joint_map, header["actuator"], servo, body=body)
         hashes = ("actuator_sha256", "servo_sha256")
-        changed = [key for key in hashes if header[key] != found.header[key]]
+        changed = [key for key in hashes if header[key] != parts.header[key]]
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{log}: its header is damaged: {error}.") from error
     if changed:
         file = header[changed[0].removesuffix("_sha256")]
         raise InputError(f"{log} was made with another file at {file}. Restore that file.")
-    return found.controller
+    return parts.controller
 
 
 def _servo_match(policy: Policy, here: ServoRanges, trained: str | None) -> ServoMatch | None:
     """Compare with the servos in the policy's file, or with the calibration of an older one."""
     if is_servo_model(here.source):
         return None
-    own, feedback = policy.contract.servo, policy.contract.feedback
-    if own is None and trained is not None:
+    trained_servos, feedback = policy.contract.servo, policy.contract.feedback
+    if trained_servos is None and trained is not None:
         known = feedback if feedback in ("held", "ideal") else "held"
-        own = trained_servo(trained, known, Walking(), servo_ranges(trained, known))
-    return None if own is None else servo_match(own, here)
+        trained_servos = trained_servo(trained, known, Walking(), servo_ranges(trained, known))
+    return None if trained_servos is None else servo_match(trained_servos, here)
 
 
 def _hash(path: Path) -> str | None:

@@ -235,12 +235,12 @@ def _phasors(positions: Array, frequencies: Array, period_s: float) -> NDArray[n
     steps = len(positions)
     time = period_s * np.arange(1, steps + 1)
     window = steps * period_s - _SETTLE_S
-    found = []
+    swings = []
     for i, f in enumerate(frequencies):
         cycles = np.floor(window * f + 1e-9)
         last = slice(steps - round(cycles / f / period_s), None)
-        found.append(1j * fit_sine(2 * np.pi * f * time[last], positions[last, i]).phasor)
-    return np.array(found)
+        swings.append(1j * fit_sine(2 * np.pi * f * time[last], positions[last, i]).phasor)
+    return np.array(swings)
 
 
 def _largest(values: Array) -> tuple[int, int]:
@@ -301,7 +301,7 @@ class ServoMatch(Result):
         groups: dict[str, list[Outside]] = {}
         for one in self.outside:
             groups.setdefault(one.quantity, []).append(one)
-        return [_sentence(quantity, own) for quantity, own in groups.items()]
+        return [_sentence(quantity, outliers) for quantity, outliers in groups.items()]
 
 
 def servo_match(trained: TrainedServo, here: ServoRanges) -> ServoMatch | None:
@@ -314,16 +314,16 @@ def servo_match(trained: TrainedServo, here: ServoRanges) -> ServoMatch | None:
         return None
     outside: list[Outside] = []
     compared = 0
-    for name, own in joints_of(here).items():
+    for name, servo in joints_of(here).items():
         for quantity, unit, relative, of in _QUANTITIES:
             expected = of(trained.joints[name], trained.voltage_scale, trained.poll_scale)
-            found = of(own, _NOTHING, _NOTHING)
-            if expected is not None and found is not None:
+            measured = of(servo, _NOTHING, _NOTHING)
+            if expected is not None and measured is not None:
                 compared += 1
-                outside += _outside(quantity, unit, relative, name, expected, found)
+                outside += _outside(quantity, unit, relative, name, expected, measured)
     jitter = 1e3 * here.command_jitter_s
-    found, expected = Interval(jitter, jitter, jitter), _times(trained.command_jitter_s, 1e3)
-    outside += _outside("command jitter", "ms", False, None, expected, found)
+    measured, expected = Interval(jitter, jitter, jitter), _times(trained.command_jitter_s, 1e3)
+    outside += _outside("command jitter", "ms", False, None, expected, measured)
     return ServoMatch(
         trained=trained.actuator, here=here.source, compared=compared + 1, outside=tuple(outside)
     )
@@ -348,13 +348,13 @@ def _outside(
     ]  # fmt: skip
 
 
-def _sentence(quantity: str, own: Sequence[Outside]) -> str:
+def _sentence(quantity: str, outliers: Sequence[Outside]) -> str:
     def distance(one: Outside) -> float:
         return abs(one.beyond) / max(abs(one.trained_low), abs(one.trained_high), 1e-12)
 
-    worst = max(own, key=distance)
+    worst = max(outliers, key=distance)
     joint = f" ({worst.joint})" if worst.joint else ""
-    among = f", and {len(own) - 1} more joints differ" if len(own) > 1 else ""
+    among = f", and {len(outliers) - 1} more joints differ" if len(outliers) > 1 else ""
     unit = f" {worst.unit}" if worst.unit else ""
     return (
         f"{quantity.capitalize()}{joint}: {worst.here.value:.3g}{unit}, {worst.amount()} "
@@ -388,13 +388,13 @@ def _dead_band(own: ServoNumbers, voltage: Range, poll: Range) -> Interval | Non
     )
 
 
-def _top_speed(own: ServoNumbers, voltage: Range, poll: Range) -> Interval:
+def _top_speed(servo: ServoNumbers, voltage: Range, poll: Range) -> Interval:
     """Of the motor without load, or of the set-point, whichever is slower."""
 
     def speed(limit: float, effort: float, back_emf: float, scale: float) -> float:
         return scale * min(limit, effort / back_emf) if back_emf else scale * limit
 
-    limit, effort, back = own.velocity_limit, own.effort_limit, own.back_emf
+    limit, effort, back = servo.velocity_limit, servo.effort_limit, servo.back_emf
     return Interval(
         speed(limit.value, effort.value, back.value, voltage.value),
         speed(limit.low, effort.low, back.high, voltage.low),
@@ -402,14 +402,14 @@ def _top_speed(own: ServoNumbers, voltage: Range, poll: Range) -> Interval:
     )
 
 
-def _age(own: ServoNumbers, voltage: Range, poll: Range) -> Interval:
-    feedback = own.feedback
+def _age(servo: ServoNumbers, voltage: Range, poll: Range) -> Interval:
+    feedback = servo.feedback
     periods = 0.5 + feedback.loss / (1.0 - feedback.loss)
     return _times(poll, 1e3 * feedback.poll_period_s * periods)
 
 
-def _times(own: Range, factor: float) -> Interval:
-    return Interval(factor * own.value, factor * own.low, factor * own.high)
+def _times(range_: Range, factor: float) -> Interval:
+    return Interval(factor * range_.value, factor * range_.low, factor * range_.high)
 
 
 Quantity = Callable[[ServoNumbers, Range, Range], Interval | None]

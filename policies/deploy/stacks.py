@@ -198,9 +198,9 @@ class SyntheticPD(Observer):
             velocity_limit=np.inf,
             dead_time_s=delay * period_s,
         )
-        found = cls(parameters, period_s, _PAPER_SUBSTEPS, limits_rad)
-        found.name = "paper-pd"
-        return found
+        observer = cls(parameters, period_s, _PAPER_SUBSTEPS, limits_rad)
+        observer.name = "paper-pd"
+        return observer
 
     def reset(self, position: ArrayLike) -> None:
         """See `Observer`."""
@@ -252,9 +252,9 @@ class _StoppedServo(DelayedPD):
 
     def estimate(self) -> JointEstimate:
         """The present state; the scale of a torque without a limit is unknown."""
-        (position, velocity, setpoint), own = self._state, self._values
-        torque = own["stiffness"] * (setpoint - position) - own["damping"] * velocity
-        limit = np.broadcast_to(own["effort_limit"], self.batch)
+        (position, velocity, setpoint), numbers = self._state, self._values
+        torque = numbers["stiffness"] * (setpoint - position) - numbers["damping"] * velocity
+        limit = np.broadcast_to(numbers["effort_limit"], self.batch)
         effort = np.where(np.isfinite(limit), np.clip(torque, -limit, limit), 0.0)
         return JointEstimate(position.copy(), velocity.copy(), effort)
 

@@ -196,11 +196,11 @@ def replay(walk: Walk, controller: Controller) -> int | None:
     """Run a controller over a log's inputs; the first tick with another output, or None."""
     controller.reset(walk.start, walk.rest)
     for i, senses in enumerate(walk.senses):
-        found = controller.step(senses)
+        decision = controller.step(senses)
         same = (
-            np.array_equal(found.observation, walk.observation[i], equal_nan=True)
-            and np.array_equal(found.action, walk.action[i])
-            and np.array_equal(found.target, walk.target[i])
+            np.array_equal(decision.observation, walk.observation[i], equal_nan=True)
+            and np.array_equal(decision.action, walk.action[i])
+            and np.array_equal(decision.target, walk.target[i])
         )
         if not same:
             return i

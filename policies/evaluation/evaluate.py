@@ -255,55 +255,53 @@ class Recorder(StepRecorder):
         return Walk(step_s, kinds, self.fell[robots], commands, **padded)
 
 
-def figures_of(found: Walk, command: tuple[float, float, float] | None = None) -> Figures:
+def figures_of(walk: Walk, command: tuple[float, float, float] | None = None) -> Figures:
     """Figures of a number of episodes; `command` is the fixed one, None for random ones."""
-    alive = found.alive
-    standing, swings = (found.contact & alive[..., None]).sum(), found.swings.sum()
-    each = dict(zip(ERRORS, found.error.T, strict=True))
-    each |= dict(zip(STRIDE_ERRORS, found.stride_error.T, strict=True))
-    nothing = np.full(len(found.fell), np.nan)
+    alive = walk.alive
+    standing, swings = (walk.contact & alive[..., None]).sum(), walk.swings.sum()
+    each = dict(zip(ERRORS, walk.error.T, strict=True))
+    each |= dict(zip(STRIDE_ERRORS, walk.stride_error.T, strict=True))
+    nothing = np.full(len(walk.fell), np.nan)
     size = 0.0 if command is None else float(np.dot(command, command))
-    each["speed_share"] = found.mean_velocity @ np.array(command) / size if size else nothing
+    each["speed_share"] = walk.mean_velocity @ np.array(command) / size if size else nothing
     drifts = command is not None and command[2] == 0
-    each["heading_drift_deg"] = found.drift_deg if drifts else nothing
+    each["heading_drift_deg"] = walk.drift_deg if drifts else nothing
     intervals = {name: mean_of(values) for name, values in each.items()}
     return Figures(
-        episodes=len(found.fell),
-        fall_rate=float(found.fell.mean()),
+        episodes=len(walk.fell),
+        fall_rate=float(walk.fell.mean()),
         **{name: interval.value for name, interval in intervals.items()},
-        mean_velocity=tuple(found.mean_velocity.mean(axis=0).tolist()),
-        duty=tuple(found.contact[alive].mean(axis=0).tolist()),
-        stride_hz=float(found.stride_hz.mean()),
-        swing_s=float(found.swing_s.sum() / swings) if swings else float("nan"),
-        foot_slip_m_s=float(found.slip_m_s.sum() / max(standing, 1)),
-        **_effort(found, command is None or any(command[:2])),
+        mean_velocity=tuple(walk.mean_velocity.mean(axis=0).tolist()),
+        duty=tuple(walk.contact[alive].mean(axis=0).tolist()),
+        stride_hz=float(walk.stride_hz.mean()),
+        swing_s=float(walk.swing_s.sum() / swings) if swings else float("nan"),
+        foot_slip_m_s=float(walk.slip_m_s.sum() / max(standing, 1)),
+        **_effort(walk, command is None or any(command[:2])),
         intervals=Intervals(
-            fall_rate=share_interval(int(found.fell.sum()), len(found.fell)), **intervals
+            fall_rate=share_interval(int(walk.fell.sum()), len(walk.fell)), **intervals
         ),
     )
 
 
-def _effort(found: Walk, travels: bool) -> dict[str, Any]:
+def _effort(walk: Walk, travels: bool) -> dict[str, Any]:
     """Clearance of the swings and effort of the servos, by the names of `Figures`."""
-    alive, nothing = found.alive, float("nan")
-    clearance = found.clearance_m[alive]
+    alive, nothing = walk.alive, float("nan")
+    clearance = walk.clearance_m[alive]
     clearance = clearance[np.isfinite(clearance)]
     low, middle = np.quantile(clearance, (0.1, 0.5)) if len(clearance) else (nothing, nothing)
-    up_s = found.step_s * alive.sum()
-    work, carried = found.work_j[alive].sum(), found.carried_j[alive].sum()
+    up_s = walk.step_s * alive.sum()
+    work, carried = walk.work_j[alive].sum(), walk.carried_j[alive].sum()
 
     def named(each: NDArray) -> dict[str, float]:
-        means = (
-            each[alive].mean(axis=0, dtype=float) if up_s else np.full(len(found.kinds), nothing)
-        )
-        return dict(zip(found.kinds, means.tolist(), strict=True))
+        means = each[alive].mean(axis=0, dtype=float) if up_s else np.full(len(walk.kinds), nothing)
+        return dict(zip(walk.kinds, means.tolist(), strict=True))
 
     return {
         "clearance_p10_m": float(low),
         "clearance_p50_m": float(middle),
         "low_swing_share": float((clearance < LOW_SWING_M).mean()) if len(clearance) else nothing,
-        "torque_saturated_share": named(found.saturated),
-        "rms_torque_share": {k: v**0.5 for k, v in named(found.torque_square).items()},
+        "torque_saturated_share": named(walk.saturated),
+        "rms_torque_share": {k: v**0.5 for k, v in named(walk.torque_square).items()},
         "mechanical_power_w": float(work / up_s) if up_s else nothing,
         "cost_of_transport": float(work / carried) if travels and carried else nothing,
     }
@@ -358,12 +356,12 @@ def falls_of(
     """
     step_s = condition.task.control_step_s
     before = round(BEFORE_S / step_s)
-    found = []
+    falls = []
     for i in np.flatnonzero(fell).tolist():
         at = int(alive[:, i].sum())
         x, y, down = gravity[at, i]
         time_s = (at + 1) * step_s
-        found.append(
+        falls.append(
             Fall(
                 row=row, walker=condition.walker, episode=i, time_s=time_s,
                 tilt_before_deg=_tilt_deg(gravity[max(at - before, 0), i]),
@@ -372,7 +370,7 @@ def falls_of(
                 since_push_s=condition.handicap.since_push_s(time_s),
             )
         )  # fmt: skip
-    return found
+    return falls
 
 
 def _tilt_deg(gravity: Array) -> float:
@@ -409,11 +407,11 @@ def in_short(falls: Sequence[Fall]) -> list[FallsOfRow]:
     groups: dict[tuple[str, Walker], list[Fall]] = {}
     for fall in falls:
         groups.setdefault((fall.row, fall.walker), []).append(fall)
-    found = []
+    rows = []
     for (row, walker), own in groups.items():
         sides: list[Direction] = [fall.toward for fall in own]
         pushed = [f.since_push_s for f in own if f.since_push_s is not None]
-        found.append(
+        rows.append(
             FallsOfRow(
                 row=row, walker=walker, falls=len(own),
                 time_s=float(np.median([f.time_s for f in own])),
@@ -423,7 +421,7 @@ def in_short(falls: Sequence[Fall]) -> list[FallsOfRow]:
                 after_push=sum(since <= 1.0 for since in pushed),
             )
         )  # fmt: skip
-    return found
+    return rows
 
 
 Group = Literal[
@@ -491,9 +489,9 @@ class Evaluation(Result):
     def rows(self) -> list[dict[str, Any]]:
         """One row per condition and walker."""
         return [
-            {"group": row.group, "name": row.name, "walker": walker, **own.rows()[0]}
+            {"group": row.group, "name": row.name, "walker": walker, **figures.rows()[0]}
             for row in self.conditions
-            for walker, own in zip(WALKERS, (row.policy, row.trot, row.standing), strict=True)
+            for walker, figures in zip(WALKERS, (row.policy, row.trot, row.standing), strict=True)
         ]
 
 
@@ -547,10 +545,10 @@ def evaluate(
         policy, servos, conditions, plain.episode_s, seed, threads, Recorder, progress
     )
     rows, falls = [], []
-    found = list(zip(conditions, walks, strict=True))
+    pairs = list(zip(conditions, walks, strict=True))
     for i, case in enumerate(cases):
         figures = {}
-        for condition, walked in found[i * len(WALKERS) : (i + 1) * len(WALKERS)]:
+        for condition, walked in pairs[i * len(WALKERS) : (i + 1) * len(WALKERS)]:
             figures[condition.walker] = figures_of(walked, case.command)
             falls += falls_of(
                 case.name, condition, walked.fell, walked.alive, walked.gravity, walked.command

@@ -29,14 +29,14 @@ _SIDES = {"forward": "front", "backward": "rear", "left": "left", "right": "righ
 _AXES = (("vx", "mm/s"), ("vy", "mm/s"), ("yaw", "mrad/s"))
 
 
-def tables_of(found: Evaluation) -> list[Table]:
+def tables_of(evaluation: Evaluation) -> list[Table]:
     """Falls, what came before them, errors, directions and effort, a row per condition."""
     rows: list[dict[str, Any]] = [
         {"walk": row.name}
         | {k: v for walker in WALKERS for k, v in _figures(walker, getattr(row, walker)).items()}
         | {"duty": float(np.mean(row.policy.duty)), "stride_hz": row.policy.stride_hz}
         | {"slip": row.policy.foot_slip_m_s}
-        for row in found.conditions
+        for row in evaluation.conditions
     ]
     falls = Table(
         "walks", "Falls, %, and what the policy's feet do",
@@ -50,19 +50,19 @@ def tables_of(found: Evaluation) -> list[Table]:
         rows,
     )  # fmt: skip
     return [
-        falls, _before_falls(found), _errors(rows, "every instant", ERRORS),
-        _errors(rows, "the mean over a stride", STRIDE_ERRORS), _directions(found, rows),
-        _effort(found),
+        falls, _before_falls(evaluation), _errors(rows, "every instant", ERRORS),
+        _errors(rows, "the mean over a stride", STRIDE_ERRORS), _directions(evaluation, rows),
+        _effort(evaluation),
     ]  # fmt: skip
 
 
-def _figures(walker: str, own: Figures) -> dict[str, float]:
+def _figures(walker: str, figures: Figures) -> dict[str, float]:
     """Figures of one walker with their intervals, under names that begin with its own."""
     names = ("fall_rate", *ERRORS, *STRIDE_ERRORS, "speed_share", "heading_drift_deg")
     return {
         key: number
         for name in names
-        for key, number in ends(f"{walker}.{name}", getattr(own.intervals, name)).items()
+        for key, number in ends(f"{walker}.{name}", getattr(figures.intervals, name)).items()
     }
 
 
@@ -79,10 +79,10 @@ def _errors(rows: list[dict[str, Any]], of_what: str, names: tuple[str, ...]) ->
     return Table("", title, columns, [*rows, {"walk": "standing, random"} | still])
 
 
-def _directions(found: Evaluation, rows: list[dict[str, Any]]) -> Table:
-    shown = [
+def _directions(evaluation: Evaluation, rows: list[dict[str, Any]]) -> Table:
+    columns_shown = [
         row | {"command": ", ".join(f"{c:g}" for c in condition.command or ())}
-        for condition, row in zip(found.conditions, rows, strict=True)
+        for condition, row in zip(evaluation.conditions, rows, strict=True)
         if condition.group == "direction" and any(condition.command or ())
     ]
     columns = (
@@ -93,18 +93,18 @@ def _directions(found: Evaluation, rows: list[dict[str, Any]]) -> Table:
         ),
         *(Column(w, f"{w}.heading_drift_deg", "°", 1, "margin") for w in ("policy", "trot")),
     )  # fmt: skip
-    title = f"Speed over the commanded, %, and change of heading over {found.episode_s:g} s, °"
-    return Table("", title, columns, shown)
+    title = f"Speed over the commanded, %, and change of heading over {evaluation.episode_s:g} s, °"
+    return Table("", title, columns, columns_shown)
 
 
-def _effort(found: Evaluation) -> Table:
+def _effort(evaluation: Evaluation) -> Table:
     """Clearance of the swings and effort of the servos, of policy and trot."""
     rows = [
-        {"walk": row.name, "walker": walker} | own.rows()[0]
-        for row in found.conditions
-        for walker, own in (("policy", row.policy), ("trot", row.trot))
+        {"walk": row.name, "walker": walker} | figures.rows()[0]
+        for row in evaluation.conditions
+        for walker, figures in (("policy", row.policy), ("trot", row.trot))
     ]
-    kinds = list(found.conditions[0].policy.torque_saturated_share)
+    kinds = list(evaluation.conditions[0].policy.torque_saturated_share)
 
     def of_kinds(heading: str, name: str) -> Column:
         return Column(
@@ -134,7 +134,7 @@ def _effort(found: Evaluation) -> Table:
     return Table("effort", title, columns, rows)
 
 
-def _before_falls(found: Evaluation) -> Table:
+def _before_falls(evaluation: Evaluation) -> Table:
     columns = (
         Column("", "row", kind="key"),
         Column("walker", "walker", kind="words"),
@@ -149,7 +149,7 @@ def _before_falls(found: Evaluation) -> Table:
         "Before falls: median time, median tilt 0.2 s before, usual side; pushed: a push in the "
         "last second"
     )
-    return Table("falls", title, columns, [plain(row) for row in in_short(found.falls)])
+    return Table("falls", title, columns, [plain(row) for row in in_short(evaluation.falls)])
 
 
 ERROR_UNITS = {
@@ -166,7 +166,7 @@ _SCORE = {"score": "score without noise"}  # by which the best policy is chosen;
 
 
 def walking_sections(
-    policy: Policy, run: Run | None, folder: Path, found: Evaluation
+    policy: Policy, run: Run | None, folder: Path, evaluation: Evaluation
 ) -> list[Section]:
     """The page's sections.
 
@@ -174,12 +174,13 @@ def walking_sections(
     shown if they are there.
     """
     walked = (
-        f"Walked with the servos of {Path(str(found.actuator)).name}, feedback {found.feedback}, "
-        f"seed {found.seed}, in simulation, on robots and terrain of which no training knows. "
-        "Evaluate with the calibration of another robot before the policy walks on it."
+        f"Walked with the servos of {Path(str(evaluation.actuator)).name}, feedback "
+        f"{evaluation.feedback}, seed {evaluation.seed}, in simulation, on robots and terrain of "
+        "which no training knows. Evaluate with the calibration of another robot before the policy "
+        "walks on it."
     )
     sections = [
-        Section("found", "What was found", findings=_findings(found), notes=[walked]),
+        Section("found", "What was found", findings=_findings(evaluation), notes=[walked]),
         Section(
             "walks",
             "How it walks",
@@ -189,16 +190,16 @@ def walking_sections(
                     "Mean absolute errors of the mean velocity over a stride, with 90 % intervals. "
                     "Blue: policy, red where some robots fell; grey: open-loop trot; dotted: a "
                     "robot that stands, under random commands.",
-                    _errors_figure(found),
+                    _errors_figure(evaluation),
                 ),
                 Picture(
                     "falls",
                     "Share of robots that fell, with 90 % intervals. Blue: policy; grey: open-loop "
                     "trot; hollow: standing.",
-                    _falls_figure(found),
+                    _falls_figure(evaluation),
                 ),
             ],
-            tables=tables_of(found),
+            tables=tables_of(evaluation),
             notes=[
                 "A robot that fell counts as one that stands still until the "
                 "end. duty: share of time a foot is on the ground; slip: speed of feet on it; "
@@ -216,29 +217,29 @@ def walking_sections(
     return [*sections, _settings(policy, run)]
 
 
-def _findings(found: Evaluation) -> list[tuple[str, str]]:
-    first = found.conditions[0]
-    own, trot, still = first.policy, first.trot, first.standing
+def _findings(evaluation: Evaluation) -> list[tuple[str, str]]:
+    first = evaluation.conditions[0]
+    walked, trot, still = first.policy, first.trot, first.standing
     errors = (
-        f"{getattr(own, key):.3f} {unit} {name} (trot {getattr(trot, key):.3f}, standing "
+        f"{getattr(walked, key):.3f} {unit} {name} (trot {getattr(trot, key):.3f}, standing "
         f"{getattr(still, key):.3f})"
         for key, (name, unit) in ERROR_UNITS.items()
     )
-    worst = max(found.conditions, key=lambda r: (r.policy.fall_rate, r.policy.mae_vx_m_s))
-    half = [r for r in found.conditions if r.trot.fall_rate >= 0.1]
+    worst = max(evaluation.conditions, key=lambda r: (r.policy.fall_rate, r.policy.mae_vx_m_s))
+    half = [r for r in evaluation.conditions if r.trot.fall_rate >= 0.1]
     won = sum(r.policy.fall_rate <= 0.5 * r.trot.fall_rate for r in half)
     beside = (
         f"The open-loop trot falls in 10 % of episodes or more under {len(half)} of "
-        f"{len(found.conditions)} conditions; the policy falls at most half as often in {won} of "
-        "them."
+        f"{len(evaluation.conditions)} conditions; the policy falls at most half as often in "
+        f"{won} of them."
         if half
         else "The open-loop trot falls in less than 10 % of episodes under all of them."
     )
     return [
         (
             "Falls",
-            f"{100 * own.fall_rate:.0f} % of {own.episodes} episodes of {found.episode_s:g} s with "
-            f"random commands. {beside}",
+            f"{100 * walked.fall_rate:.0f} % of {walked.episodes} episodes of "
+            f"{evaluation.episode_s:g} s with random commands. {beside}",
         ),
         ("Tracking", "; ".join(errors) + ". Mean absolute errors of every instant."),
         (
@@ -253,18 +254,18 @@ def _findings(found: Evaluation) -> list[tuple[str, str]]:
 def _curves(path: Path) -> dict[str, np.ndarray]:
     """Columns of `progress.csv`."""
     remedy = "Move it away for a page without the training."
-    found = read_table(path, read_text(path, LARGEST_BYTES, remedy), strict=False).numbers
-    lacking = [name for name in ("samples", *_CURVES) if name not in found]
+    columns = read_table(path, read_text(path, LARGEST_BYTES, remedy), strict=False).numbers
+    lacking = [name for name in ("samples", *_CURVES) if name not in columns]
     if lacking:
         raise InputError(f"{path} has no numbers called {lacking[0]}. {remedy}")
-    return {name: found[name] for name in ("samples", *_SCORE, *_CURVES) if name in found}
+    return {name: columns[name] for name in ("samples", *_SCORE, *_CURVES) if name in columns}
 
 
 @styled
 def _training_figure(curves: Mapping[str, np.ndarray]) -> Figure:
-    shown = {key: title for key, title in (_SCORE | _CURVES).items() if key in curves}
-    figure, axes = axes_column(len(shown), 1.7 * len(shown))
-    for (key, title), one in zip(shown.items(), axes, strict=True):
+    titles = {key: title for key, title in (_SCORE | _CURVES).items() if key in curves}
+    figure, axes = axes_column(len(titles), 1.7 * len(titles))
+    for (key, title), one in zip(titles.items(), axes, strict=True):
         one.plot(curves["samples"] / 1e6, curves[key], color=BLUE, lw=1.2)
         one.set_ylabel(title)
         if key == "falls_per_1000_steps":
@@ -274,17 +275,17 @@ def _training_figure(curves: Mapping[str, np.ndarray]) -> Figure:
 
 
 @styled
-def _errors_figure(found: Evaluation) -> Figure:
-    rows, still = found.conditions, found.conditions[0].standing
+def _errors_figure(evaluation: Evaluation) -> Figure:
+    rows, still = evaluation.conditions, evaluation.conditions[0].standing
     figure = Figure(figsize=(WIDTH_IN, 1.2 + 0.3 * len(rows)), layout="constrained")
     axes = figure.subplots(1, len(STRIDE_ERRORS), sharey=True)
     place = -np.arange(len(rows))
     for key, (name, unit), one in zip(STRIDE_ERRORS, ERROR_UNITS.values(), axes, strict=True):
         for off, walker in ((0.15, "policy"), (-0.15, "trot")):
             for at, row in zip(place, rows, strict=True):
-                own: Figures = getattr(row, walker)
-                colour = FAINT if walker == "trot" else RED if own.fall_rate > 0 else BLUE
-                _point(one, getattr(own.intervals, key), at + off, 1.0, colour)
+                figures: Figures = getattr(row, walker)
+                colour = FAINT if walker == "trot" else RED if figures.fall_rate > 0 else BLUE
+                _point(one, getattr(figures.intervals, key), at + off, 1.0, colour)
         one.axvline(getattr(still, key), color=FAINT, ls=":")
         one.set_title(f"{name}, {unit}", fontsize=9)
         one.set_xlim(left=0)
@@ -294,8 +295,8 @@ def _errors_figure(found: Evaluation) -> Figure:
 
 
 @styled
-def _falls_figure(found: Evaluation) -> Figure:
-    rows = found.conditions
+def _falls_figure(evaluation: Evaluation) -> Figure:
+    rows = evaluation.conditions
     figure = Figure(figsize=(WIDTH_IN, 1.2 + 0.3 * len(rows)), layout="constrained")
     axes = figure.subplots()
     place = -np.arange(len(rows))
@@ -335,11 +336,11 @@ def _settings(policy: Policy, run: Run | None) -> Section:
 
 def _flat(value: Mapping[str, Any], before: str = "") -> list[tuple[str, str]]:
     """Nested settings as dotted names."""
-    found = []
+    values = []
     for key, one in value.items():
         if isinstance(one, Mapping):
-            found += _flat(one, f"{before}{key}.")
+            values += _flat(one, f"{before}{key}.")
         else:
             words = ", ".join(map(str, one)) if isinstance(one, list | tuple) else str(one)
-            found.append((f"{before}{key}", words))
-    return found
+            values.append((f"{before}{key}", words))
+    return values

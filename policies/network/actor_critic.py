@@ -228,18 +228,18 @@ def build(
         "least_std": explore.std[1] if explore.learned else 1e-6, "learn_std": explore.learned,
         "correlation": explore.correlation(control_step_s),
     }  # fmt: skip
-    own = common | {"hidden_dims": list(architecture.hidden), "distribution_cfg": gaussian}
+    of_actor = common | {"hidden_dims": list(architecture.hidden), "distribution_cfg": gaussian}
     actions = observations["noise"].shape[-1]
     if architecture.kind in ("lstm", "gru"):
         actor: MLPModel = RNNActor(
             observations, groups, "actor", actions, rnn_type=architecture.kind,
-            rnn_hidden_dim=architecture.memory, **own,
+            rnn_hidden_dim=architecture.memory, **of_actor,
         )  # fmt: skip
     elif architecture.kind == "transformer":
-        actor = TransformerActor(observations, groups, "actor", actions, **own)
+        actor = TransformerActor(observations, groups, "actor", actions, **of_actor)
     else:
         network = TeacherActor if architecture.privileged_actor else MLPActor
-        actor = network(observations, groups, "actor", actions, **own)
+        actor = network(observations, groups, "actor", actions, **of_actor)
     # the first policy stands; another wide one would swing through its last action, and fast
     head = [layer for layer in actor.mlp if isinstance(layer, torch.nn.Linear)][-1]
     with torch.no_grad():

@@ -68,10 +68,10 @@ class OnnxNetwork:
         return f"OnnxNetwork {self.path.name}: {self.observation_size} numbers to {self.actions}"
 
     def __deepcopy__(self, memo: dict[int, Any]) -> OnnxNetwork:
-        own = object.__new__(OnnxNetwork)
-        own.__dict__.update(self.__dict__)
-        own._evaluator = own._new_evaluator()  # evaluators are not made for several threads
-        return own
+        network = object.__new__(OnnxNetwork)
+        network.__dict__.update(self.__dict__)
+        network._evaluator = network._new_evaluator()  # evaluators are not made for several threads
+        return network
 
     def eval(self) -> OnnxNetwork:
         """The network itself, which never trains."""

@@ -166,8 +166,8 @@ class TrainedServo(_Part):
         """Shortest and longest dead time; None of a learned model."""
         if self.joints is None:
             return None
-        own = [joint.dead_time_s for joint in self.joints.values()]
-        return min(r.low for r in own), max(r.high for r in own)
+        dead_times = [joint.dead_time_s for joint in self.joints.values()]
+        return min(r.low for r in dead_times), max(r.high for r in dead_times)
 
 
 def trained_servo(actuator: str, feedback: str, task: Walking, servos: ServoRanges) -> TrainedServo:
@@ -211,10 +211,10 @@ def _numbers(servos: ServoRanges, joint: int, spread: float) -> ServoNumbers:
         }
         for field in servos.value
     }
-    own = servos.feedback[joint]
+    reading = servos.feedback[joint]
     feedback = {
-        "poll_period_s": float(own.poll_period_s), "loss": float(own.loss),
-        "quantum_rad": float(own.quantum_rad), "offset_rad": float(own.offset_rad),
+        "poll_period_s": float(reading.poll_period_s), "loss": float(reading.loss),
+        "quantum_rad": float(reading.quantum_rad), "offset_rad": float(reading.offset_rad),
     }  # fmt: skip
     return ServoNumbers.model_validate({**ranges, "feedback": feedback})
 
@@ -338,16 +338,16 @@ class Contract(_Part):
 
     @model_validator(mode="after")
     def _one_servo(self) -> Self:
-        own = self.servo
-        if own is None:
+        servo = self.servo
+        if servo is None:
             return self
-        if own.dead_times_s is not None and own.dead_times_s != tuple(self.dead_time_s):
+        if servo.dead_times_s is not None and servo.dead_times_s != tuple(self.dead_time_s):
             raise ValueError("dead_time_s is not that of the servo")
-        if own.joints is not None and list(own.joints) != list(self.default_pose_rad):
+        if servo.joints is not None and list(servo.joints) != list(self.default_pose_rad):
             raise ValueError("default_pose_rad must name the servo's joints, in their order")
-        if own.actuator != self.actuator or own.feedback != self.feedback:
+        if servo.actuator != self.actuator or servo.feedback != self.feedback:
             raise ValueError("actuator and feedback are not those of the servo")
-        if self.actuator_sha256 is not None and own.actuator_sha256 != self.actuator_sha256:
+        if self.actuator_sha256 is not None and servo.actuator_sha256 != self.actuator_sha256:
             raise ValueError("actuator_sha256 is not that of the servo")
         return self
 
@@ -394,14 +394,14 @@ class Policy:
 
     def for_one(self) -> Policy:
         """A copy with its own state for one robot: the same bits in half the time."""
-        own = copy(self)
-        shown = torch.zeros(1, self.contract.observation_size)
+        policy = copy(self)
+        example = torch.zeros(1, self.contract.observation_size)
         with warnings.catch_warnings(), torch.inference_mode():
             warnings.simplefilter("ignore")  # a trace is of one size, as intended
             state = self.network.initial_state(1)
-            traced: Any = torch.jit.trace(self.network.eval(), (shown, *state))
-            own._run = torch.jit.freeze(traced)
-        return own
+            traced: Any = torch.jit.trace(self.network.eval(), (example, *state))
+            policy._run = torch.jit.freeze(traced)
+        return policy
 
     def act(self, observation: np.ndarray, missed: np.ndarray | None = None) -> np.ndarray:
         """Actions, shape (n, 12), for observations (n, 60).
@@ -414,15 +414,15 @@ class Policy:
             action, *state = self._run(torch.from_numpy(seen.astype(np.float32)), *self._state)
         before, past = self._state, self._past
         self._state = tuple(s.clone() for s in state)
-        found = action.numpy()
+        actions = action.numpy()
         if past.shape[1]:
-            self._past = np.concatenate([found[:, None], past[:, :-1]], axis=1)
+            self._past = np.concatenate([actions[:, None], past[:, :-1]], axis=1)
         if missed is not None and missed.any():
             kept = torch.from_numpy(missed)[:, None]  # states are (layers, n, size)
             pairs = zip(before, self._state, strict=True)
             self._state = tuple(torch.where(kept, old, new) for old, new in pairs)
             self._past = np.where(missed[:, None, None], past, self._past)
-        return found
+        return actions
 
 
 def save_policy(
@@ -469,12 +469,12 @@ def load_policy(folder: Path | str) -> Policy:
     for file in (path, weights):
         if not file.is_file():
             raise InputError(f"{folder} holds no policy: there is no {file.name} in it.")
-    found = read_json(path, remedy=_AGAIN)
-    if isinstance(found, dict):
-        refuse_other_version(path, found.get("schema_version"), VERSION)
-        if isinstance(servo := found.get("servo"), dict):
+    content = read_json(path, remedy=_AGAIN)
+    if isinstance(content, dict):
+        refuse_other_version(path, content.get("schema_version"), VERSION)
+        if isinstance(servo := content.get("servo"), dict):
             refuse_other_version(f"{path}, servo", servo.get("schema_version"), SERVO_VERSION)
-    contract = validated(Contract, found, path, remedy="copy the whole folder again")
+    contract = validated(Contract, content, path, remedy="copy the whole folder again")
     contract = contract.model_copy(update={"schema_version": VERSION})
     if contract.robot is None and list(contract.default_pose_rad) != list(JOINT_NAMES):
         raise InputError(f"{path}: default_pose_rad must name the joints in this project's order.")
@@ -503,11 +503,11 @@ def load_policy(folder: Path | str) -> Policy:
 def refuse_other_observation(contract: Contract) -> None:
     """Refuse a policy of another observation, which would act wrongly without an error."""
     expected = [(p.name, p.size) for p in contract.observation]
-    given = [(name, size) for name, size, _ in observation_of(contract.actions)]
-    if expected != given or contract.velocity_steps != VELOCITY_STEPS:
+    parts = [(name, size) for name, size, _ in observation_of(contract.actions)]
+    if expected != parts or contract.velocity_steps != VELOCITY_STEPS:
         raise InputError(
             "The policy's observation is not the one this version gives "
-            f"({', '.join(name for name, _ in given)}; velocity over {VELOCITY_STEPS} steps). "
+            f"({', '.join(name for name, _ in parts)}; velocity over {VELOCITY_STEPS} steps). "
             "Use the version that trained it, or train it again."
         )
 

@@ -78,8 +78,8 @@ def of_calibration(calibration: Calibration, robot: ServoRobot, recording: Recor
     gains = {t.p_gain for joint in recording.joints for t in recording.trials(joint)}
     if len(gains) == 1 and np.isfinite(gain := gains.pop()):
         joints = {
-            joint: own.at_p_gain(gain) if own.under_load else own
-            for joint, own in calibration.joints.items()
+            joint: fitted.at_p_gain(gain) if fitted.under_load else fitted
+            for joint, fitted in calibration.joints.items()
         }
         calibration = calibration.model_copy(update={"joints": joints})
     servos = [calibration.joint(joint).actuator for joint in robot.joints]
@@ -172,8 +172,8 @@ class HungRobot:
         qpos = np.tile(data.qpos, (len(servo_rad), 1))
         at = [int(model.joint(name).qposadr[0]) for name in joints]
         qpos[:, at] = _joint_angles(model, data, joints, servo_rad + self.robot.shift_rad)
-        found = bodies_over_time(model, qpos, self._surfaces)
-        return found if gravity is None else _tilted(found, gravity)
+        bodies = bodies_over_time(model, qpos, self._surfaces)
+        return bodies if gravity is None else _tilted(bodies, gravity)
 
 
 def bodies_over_time(

@@ -81,28 +81,28 @@ def sequences(data: ServoData, robot: ServoRobot) -> Sequences:
 
     The robot has all joints of `data`.
     """
-    found: dict[tuple, dict[str, int]] = {}
+    by_start: dict[tuple, dict[str, int]] = {}
     for joint in data.joints:
         for place, run in enumerate(data.runs[joint]):
             begins = round(float(run.trial.send_time_s[0]) / data.period_s)
             key = (run.recording, int(run.number[0]), begins)
-            found.setdefault(key, {})[joint] = place
+            by_start.setdefault(key, {})[joint] = place
     idle = robot.rest_rad.copy()
     for joint in data.joints:
         idle[robot.joints.index(joint)] = _start(data.runs[joint][0])
     arrived = [
-        {j: received(data.runs[j][place], data.period_s) for j, place in own.items()}
-        for own in found.values()
+        {j: received(data.runs[j][place], data.period_s) for j, place in of_joint.items()}
+        for of_joint in by_start.values()
     ]
-    steps = max(len(command) for own in arrived for command in own.values())
-    if 8.0 * len(found) * steps * len(idle) > _MOST_BYTES:
-        raise _too_much(len(found), steps)
-    commands = np.tile(idle, (len(found), steps + 1, 1))
+    steps = max(len(command) for of_joint in arrived for command in of_joint.values())
+    if 8.0 * len(by_start) * steps * len(idle) > _MOST_BYTES:
+        raise _too_much(len(by_start), steps)
+    commands = np.tile(idle, (len(by_start), steps + 1, 1))
     reach = [idle[None]]
-    for sequence, (own, places) in enumerate(zip(arrived, found.values(), strict=True)):
+    for sequence, (of_joint, places) in enumerate(zip(arrived, by_start.values(), strict=True)):
         rows = max(len(data.runs[j][place].command_rad) for j, place in places.items())
         been = np.tile(idle, (rows, 1))
-        for joint, command in own.items():
+        for joint, command in of_joint.items():
             n, run = robot.joints.index(joint), data.runs[joint][places[joint]]
             commands[sequence, 0, n] = _start(run)
             commands[sequence, 1 : 1 + len(command), n] = command
@@ -110,7 +110,7 @@ def sequences(data: ServoData, robot: ServoRobot) -> Sequences:
             seen = run.trial.position_rad - _shift(run)
             been[: len(seen), n] = np.where(np.isfinite(seen), seen, idle[n])
         reach.append(been)
-    return Sequences(tuple(found.values()), commands, np.concatenate(reach))
+    return Sequences(tuple(by_start.values()), commands, np.concatenate(reach))
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def play(
     robot: ServoRobot,
     fixed: bool,
     servos: Sequence[Mapping[str, Array]],
-    given: Sequences,
+    motions: Sequences,
     data: ServoData,
     copies: int,
     seed: int,
@@ -149,37 +149,37 @@ def play(
     count, rng = 1 if fixed else copies, np.random.default_rng(seed)
     friction = rng.uniform(*Randomisation().friction, count)
     payload = rng.uniform(-_PAYLOAD, _PAYLOAD, count) * (not fixed)
-    total = len(given.runs) * count
-    _, steps, joints = given.commands.shape
+    total = len(motions.runs) * count
+    _, steps, joints = motions.commands.shape
     together = int(_MOST_BYTES / (4.0 * total * steps * joints))
     if not together:
         raise _too_much(total, steps)
-    which = np.repeat(np.arange(len(given.runs)), count)
-    found: list[Played] = []
+    which = np.repeat(np.arange(len(motions.runs)), count)
+    results: list[Played] = []
     for at in range(0, len(servos), together):
-        own = servos[at : at + together]
+        group = servos[at : at + together]
         values = {
-            name: np.repeat(np.stack([s[name] for s in own]), total, axis=0) for name in own[0]
+            name: np.repeat(np.stack([s[name] for s in group]), total, axis=0) for name in group[0]
         }
-        done, part = at / len(servos), len(own) / len(servos)
+        done, part = at / len(servos), len(group) / len(servos)
         moved = replay(
-            robot, fixed, values, given.commands, np.tile(which, len(own)), given.reach,
-            np.tile(friction, total // count * len(own)),
-            np.tile(payload, total // count * len(own)), threads,
+            robot, fixed, values, motions.commands, np.tile(which, len(group)), motions.reach,
+            np.tile(friction, total // count * len(group)),
+            np.tile(payload, total // count * len(group)), threads,
             lambda share, done=done, part=part: progress(done + part * share),
         )  # fmt: skip
-        for k in range(len(own)):
+        for k in range(len(group)):
             rows = slice(k * total, (k + 1) * total)
             one = Replayed(moved.servo_rad[rows], moved.fell_s[rows], moved.gyro_rad_s[rows])
-            found.append(_played(one, robot, given, data, count, fixed))
-    return found
+            results.append(_played(one, robot, motions, data, count, fixed))
+    return results
 
 
 def _played(
-    moved: Replayed, robot: ServoRobot, given: Sequences, data: ServoData, count: int, fixed: bool
+    moved: Replayed, robot: ServoRobot, motions: Sequences, data: ServoData, count: int, fixed: bool
 ) -> Played:
     tracks: Tracks = {j: [np.empty(0)] * len(runs) for j, runs in data.runs.items()}
-    for sequence, places in enumerate(given.runs):
+    for sequence, places in enumerate(motions.runs):
         rows = slice(sequence * count, (sequence + 1) * count)
         up = ~np.isfinite(moved.fell_s[rows])
         mean = moved.servo_rad[rows][up if up.any() else slice(None)].mean(axis=0, dtype=float)
@@ -291,16 +291,20 @@ def _motion(case: Case, data: ServoData, part: Part, seed: int) -> Motion | None
     place = {b: n for n, b in enumerate(blocks)}
     sums = np.zeros((3, len(blocks)))
     for joint, errors in case.errors.items():
-        moved, left = _unexplained(case, joint, data, part)
-        index, weight = [place[b] for b in errors.block], 1.0 / max(float(left.var()), 1e-12)
-        for own, product in zip(sums, (left * moved, moved**2, left**2), strict=True):
-            own += weight * np.bincount(index, product, len(blocks))
+        moved, residuals = _unexplained(case, joint, data, part)
+        index, weight = [place[b] for b in errors.block], 1.0 / max(float(residuals.var()), 1e-12)
+        for product_sums, product in zip(
+            sums, (residuals * moved, moved**2, residuals**2), strict=True
+        ):
+            product_sums += weight * np.bincount(index, product, len(blocks))
     if not sums[1].sum() > 1e-12 * len(blocks):
         return None
     draws = np.random.default_rng(seed).multinomial(
         len(blocks), np.full(len(blocks), 1 / len(blocks)), _DRAWS
     )
-    together, ground, error = (np.append(draws @ own, own.sum()) for own in sums)
+    together, ground, error = (
+        np.append(draws @ product_sums, product_sums.sum()) for product_sums in sums
+    )
     ground = np.maximum(ground, 1e-300)
     share, correlation = together / ground, together / np.sqrt(ground * np.maximum(error, 1e-300))
     return Motion(
@@ -323,8 +327,8 @@ def _unexplained(case: Case, joint: str, data: ServoData, part: Part) -> tuple[A
         rows.append(np.vstack([seen, run.position_rad])[:, counts])
     air, speed, acceleration, ground, reading = np.concatenate(rows, axis=1)
     servo, _ = np.linalg.qr(np.stack([np.ones(len(air)), air, speed, acceleration], axis=1))
-    moved, left = ground - air, reading - air
-    return moved - servo @ (servo.T @ moved), left - servo @ (servo.T @ left)
+    moved, residuals = ground - air, reading - air
+    return moved - servo @ (servo.T @ moved), residuals - servo @ (servo.T @ residuals)
 
 
 def _load_share(offsets: Mapping[str, tuple[float, float]]) -> Interval | None:
@@ -336,8 +340,8 @@ def _load_share(offsets: Mapping[str, tuple[float, float]]) -> Interval | None:
     free = len(sag) - np.linalg.matrix_rank(design)
     if free < _FEWEST_FREE or np.linalg.matrix_rank(design) < design.shape[1]:
         return None
-    found = np.linalg.lstsq(design, in_air)[0]
-    left = in_air - design @ found
-    variance = np.linalg.inv(design.T @ design)[0, 0] * float(left @ left) / free
+    solution = np.linalg.lstsq(design, in_air)[0]
+    residuals = in_air - design @ solution
+    variance = np.linalg.inv(design.T @ design)[0, 0] * float(residuals @ residuals) / free
     half = t_quantile(int(free)) * float(np.sqrt(variance))
-    return Interval(float(found[0]), float(found[0]) - half, float(found[0]) + half)
+    return Interval(float(solution[0]), float(solution[0]) - half, float(solution[0]) + half)

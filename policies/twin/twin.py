@@ -267,22 +267,22 @@ def twin(
     rules = {j: rule_of(j, data.lattices[j], recording.name, known) for j in data.joints}
     data = with_ages(data, rules)
     test, rest, scored = _parts(recording, test_loops)
-    given = sequences(data, robot)
+    motions = sequences(data, robot)
     numbers = [a.values for a in actuators.values()]
     if robot.free:
-        numbers += [stronger(own, STRONGER) for own in numbers]
+        numbers += [stronger(servos, STRONGER) for servos in numbers]
     conditions: list[list[Condition]] = []
     done, shares = 0.0, [1.0, float(copies)] if robot.free else [1.0]
     for place, share in enumerate(shares):
         part = share / sum(shares)
         played = play(
-            robot, place == 0, numbers, given, data, copies, seed, threads,
+            robot, place == 0, numbers, motions, data, copies, seed, threads,
             lambda share, done=done, part=part: progress(done + part * share),
         )  # fmt: skip
         conditions.append([_condition(one, data, test, rest, seed) for one in played])
         done += part
     models = {
-        name: _twin_of([own[k :: len(actuators)] for own in conditions], data, test, seed)
+        name: _twin_of([servos[k :: len(actuators)] for servos in conditions], data, test, seed)
         for k, name in enumerate(actuators)
     }
     judges = [
@@ -291,10 +291,10 @@ def twin(
                for one in (actuator.calibration.inputs if actuator.calibration else []))
     ]  # fmt: skip
     judge = min(judges, key=lambda name: models[name].best_rad, default=None)
-    found = models[judge].evidence if judge else None
+    judged = models[judge].evidence if judge else None
     return Twin(
         robot=robot.name, models=models, best=min(models, key=lambda name: models[name].best_rad),
-        verdict=found.verdict if found else "cannot tell", judge=judge, scored=scored,
+        verdict=judged.verdict if judged else "cannot tell", judge=judge, scored=scored,
         readings=rules, persistence_rmse_rad=scores.persistence(data, test),
         repeatability_rad=scores.repeatability(data, test), time_step_s=data.period_s,
         notes=tuple(_notes(actuators, robot, models, rules)), data=data,
@@ -305,13 +305,13 @@ def _parts(recording: Recording, test_loops: Sequence[int]) -> tuple[Part, Part,
     """Rows to score, rows of the offsets, and the former in words."""
     if not test_loops:
         return everything, everything, "the whole recording"
-    own = sorted({int(n) for n in recording.table["trial"].unique()})
-    if strange := [n for n in test_loops if n not in own]:
+    loops = sorted({int(n) for n in recording.table["trial"].unique()})
+    if strange := [n for n in test_loops if n not in loops]:
         raise InputError(
-            f"{recording.name} has no loop {strange[0]}: its loops are {_listed(own)}. Name some "
+            f"{recording.name} has no loop {strange[0]}: its loops are {_listed(loops)}. Name some "
             "of them in `test_loops`."
         )
-    if set(test_loops) == set(own):
+    if set(test_loops) == set(loops):
         raise InputError(
             f"`test_loops` names all loops of {recording.name}: one must be left to estimate the "
             "offsets from. Leave one out, or give no loops."
@@ -324,10 +324,12 @@ def _parts(recording: Recording, test_loops: Sequence[int]) -> tuple[Part, Part,
     )
 
 
-def _condition(own: Played, data: ServoData, test: Part, rest: Part, seed: int) -> Condition:
+def _condition(played: Played, data: ServoData, test: Part, rest: Part, seed: int) -> Condition:
     """Scores of one simulated robot."""
-    zero = {joint: found[0] for joint, found in offsets(own.tracks, data, rest).items()}
-    tracks = {joint: [t + zero[joint] for t in own.tracks[joint]] for joint in data.joints}
+    zero = {
+        joint: by_recording[0] for joint, by_recording in offsets(played.tracks, data, rest).items()
+    }
+    tracks = {joint: [t + zero[joint] for t in played.tracks[joint]] for joint in data.joints}
     errors = scores.errors(None, tracks, data, test)
     joints = {
         joint: TwinErrors(
@@ -340,31 +342,31 @@ def _condition(own: Played, data: ServoData, test: Part, rest: Part, seed: int) 
     means = {n: scores.mean_known([getattr(j, n) for j in joints.values()]) for n in names}
     offset = float(np.mean(np.abs([j.offset_rad for j in joints.values()])))
     mean = TwinErrors(**means, offset_rad=offset)
-    times = STEP_S * np.arange(len(own.gyro[0]) if own.gyro else 0, dtype=float)
+    times = STEP_S * np.arange(len(played.gyro[0]) if played.gyro else 0, dtype=float)
     return Condition(
-        joints=joints, mean=mean, rmse_rad=scores.interval(errors, seed), copies=own.copies,
-        upright=own.upright, gyro=spectrum(times, own.gyro), errors=errors, tracks=tracks,
-        first_fall_s=own.first_fall_s if np.isfinite(own.first_fall_s) else None,
+        joints=joints, mean=mean, rmse_rad=scores.interval(errors, seed), copies=played.copies,
+        upright=played.upright, gyro=spectrum(times, played.gyro), errors=errors, tracks=tracks,
+        first_fall_s=played.first_fall_s if np.isfinite(played.first_fall_s) else None,
     )  # fmt: skip
 
 
 def _twin_of(
-    found: Sequence[Sequence[Condition]], data: ServoData, test: Part, seed: int
+    conditions: Sequence[Sequence[Condition]], data: ServoData, test: Part, seed: int
 ) -> ActuatorTwin:
     """Conditions of one actuator, its torques as they are and stronger, and what they say."""
-    if len(found) == 1:
-        return ActuatorTwin(air=found[0][0], ground=None, evidence=None)
+    if len(conditions) == 1:
+        return ActuatorTwin(air=conditions[0][0], ground=None, evidence=None)
     cases = [
         Case(
             air=air.tracks, ground=ground.tracks, errors=air.errors, ground_errors=ground.errors,
             offsets={
-                j: (own.offset_rad, ground.joints[j].offset_rad) for j, own in air.joints.items()
+                j: (one.offset_rad, ground.joints[j].offset_rad) for j, one in air.joints.items()
             },
         )
-        for air, ground in zip(*found, strict=True)
+        for air, ground in zip(*conditions, strict=True)
     ]  # fmt: skip
     return ActuatorTwin(
-        air=found[0][0], ground=found[1][0], evidence=evidence(cases, data, test, seed)
+        air=conditions[0][0], ground=conditions[1][0], evidence=evidence(cases, data, test, seed)
     )
 
 
@@ -377,8 +379,8 @@ def _notes(
     notes = [*in_words(rules)]
     if not robot.free:
         notes.append(f"{robot.name} is fixed to the world in its model: there is no other ground.")
-    for name, own in actuators.items():
-        borrowed = {joint: [f"{other}'s numbers"] for joint, other in own.fallbacks.items()}
+    for name, servos in actuators.items():
+        borrowed = {joint: [f"{other}'s numbers"] for joint, other in servos.fallbacks.items()}
         notes += [f"{name}: {j} have {said}." for j, said in share_sentences(borrowed)]
         ground = models[name].ground
         if ground and not ground.upright:
@@ -405,46 +407,46 @@ _BAR = 0.36
 
 
 @styled
-def twin_figure(found: Twin) -> Figure:
+def twin_figure(result: Twin) -> Figure:
     """Errors of every actuator; below, two seconds of each joint with the best one."""
-    joints = found.data.joints
+    joints = result.data.joints
     columns = min(_COLUMNS, len(joints))
     rows = -(-len(joints) // columns)
-    top = 1.1 + 0.42 * len(found.models)
+    top = 1.1 + 0.42 * len(result.models)
     figure = Figure(figsize=(2 * WIDTH_IN, top + 1.7 * rows), layout="constrained")
     grid = figure.add_gridspec(1 + rows, columns, height_ratios=[top, *[1.7] * rows])
-    draw_bars(figure.add_subplot(grid[0, :]), found)
+    draw_bars(figure.add_subplot(grid[0, :]), result)
     first = None
     for k, joint in enumerate(joints):
         axes = figure.add_subplot(grid[1 + k // columns, k % columns], sharex=first)
         first = first or axes
-        draw_joint(axes, found, joint, found.best)
+        draw_joint(axes, result, joint, result.best)
         if k % columns == 0:
             axes.set_ylabel("rad")
         if k + columns >= len(joints):
             axes.set_xlabel("time [s]")
     lines, labels = figure.axes[1].get_legend_handles_labels()
     figure.legend(
-        lines, labels, loc="outside lower center", ncols=len(lines), title=f"with {found.best}"
+        lines, labels, loc="outside lower center", ncols=len(lines), title=f"with {result.best}"
     )
     return figure
 
 
-def draw_bars(axes: Axes, found: Twin) -> None:
+def draw_bars(axes: Axes, result: Twin) -> None:
     """Mean error of every actuator in the air and on the ground, with 90 % intervals."""
-    names = list(found.models)
+    names = list(result.models)
     for place, colour, words in PLACES:
         shift = -_BAR / 2 if place == "air" else _BAR / 2
         for k, name in enumerate(names):
-            own: Condition | None = getattr(found.models[name], place)
-            if own is None:
+            condition: Condition | None = getattr(result.models[name], place)
+            if condition is None:
                 continue
-            value, low, high = (1e3 * x for x in astuple(own.rmse_rad))
+            value, low, high = (1e3 * x for x in astuple(condition.rmse_rad))
             axes.barh(
                 k + shift, value, _BAR, color=colour, label=words if k == 0 else None,
                 xerr=[[value - low], [high - value]], ecolor=INK, capsize=2,
             )  # fmt: skip
-    floor = 1e3 * mean_known(list(found.repeatability_rad.values()))
+    floor = 1e3 * mean_known(list(result.repeatability_rad.values()))
     if np.isfinite(floor):
         axes.axvline(floor, color=GREEN, ls="--", label=f"repeatability {floor:.1f}")
     axes.set_yticks(range(len(names)), names)
@@ -454,20 +456,20 @@ def draw_bars(axes: Axes, found: Twin) -> None:
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
 
 
-def draw_joint(axes: Axes, found: Twin, joint: str, actuator: str) -> None:
+def draw_joint(axes: Axes, result: Twin, joint: str, actuator: str) -> None:
     """Readings of a joint where its command moves most, and what an actuator predicts."""
-    runs, model = found.data.runs[joint], found.models[actuator]
+    runs, model = result.data.runs[joint], result.models[actuator]
     place = max(range(len(runs)), key=lambda n: np.std(runs[n].command_rad))
     run = runs[place]
     time = run.trial.send_time_s - run.trial.send_time_s[0]
-    shown = _busiest(run.command_rad, max(int(_SHOWN_S / found.time_step_s), 2))
-    time = time[shown] - time[shown][0]
-    axes.step(time, run.command_rad[shown], where="post", color=FAINT, lw=0.9, label="command")
-    axes.plot(time, run.trial.position_rad[shown], "o", ms=2.2, color=INK, label="readings")
+    rows = _busiest(run.command_rad, max(int(_SHOWN_S / result.time_step_s), 2))
+    time = time[rows] - time[rows][0]
+    axes.step(time, run.command_rad[rows], where="post", color=FAINT, lw=0.9, label="command")
+    axes.plot(time, run.trial.position_rad[rows], "o", ms=2.2, color=INK, label="readings")
     for key, colour, words in PLACES:
-        own: Condition | None = getattr(model, key)
-        if own is not None:
-            line = predicted(own.tracks[joint][place], run, run.reading_tick)[shown]
+        condition: Condition | None = getattr(model, key)
+        if condition is not None:
+            line = predicted(condition.tracks[joint][place], run, run.reading_tick)[rows]
             axes.plot(time, line, color=colour, lw=1.1, label=words)
     axes.set_title(joint)
 

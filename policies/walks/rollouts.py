@@ -67,8 +67,8 @@ def tracking_errors(velocity: Array, command: Array, alive: Bools, fell: Bools) 
 
     Commands have the shape (3,) or (steps, n, 3), the others are as `counted` takes them.
     """
-    shown, counts = counted(velocity, alive, fell)
-    error = (counts[..., None] * np.abs(shown - command)).sum(axis=0)
+    moved, counts = counted(velocity, alive, fell)
+    error = (counts[..., None] * np.abs(moved - command)).sum(axis=0)
     return error / np.maximum(counts.sum(axis=0), 1)[:, None]
 
 
@@ -82,8 +82,8 @@ def stride_errors(
     and `fell` are as `counted` takes them; the stride of each robot, shape (n,), is used within 0.2
     to 1 s, and is 0.3 s where it is not finite.
     """
-    shown, counts = counted(velocity, alive, fell)
-    error = counts[..., None] * (shown - command)
+    moved, counts = counted(velocity, alive, fell)
+    error = counts[..., None] * (moved - command)
     total = np.concatenate([np.zeros_like(error[:1]), error.cumsum(axis=0)])
     length = counts.sum(axis=0)
     span = np.clip(np.where(np.isfinite(stride_s), stride_s, _USUAL_STRIDE_S), *_STRIDE_S)
@@ -92,8 +92,8 @@ def stride_errors(
     inside = begin + window <= length
     ends = np.minimum(begin + window, len(error))[..., None]
     mean = (np.take_along_axis(total, ends, axis=0) - total[:-1]) / window[:, None]
-    found = (inside[..., None] * np.abs(mean)).sum(axis=0)
-    return found / np.maximum(inside.sum(axis=0), 1)[:, None]
+    errors = (inside[..., None] * np.abs(mean)).sum(axis=0)
+    return errors / np.maximum(inside.sum(axis=0), 1)[:, None]
 
 
 def pooled_errors(
@@ -104,9 +104,9 @@ def pooled_errors(
     Velocities, `alive` and `fell` are as `counted` takes them, until no robot was up any more;
     `steps` is the length of the whole walk: to its end, a robot that fell stands still.
     """
-    shown, counts = counted(velocity, alive, fell)
+    moved, counts = counted(velocity, alive, fell)
     after = int(fell.sum()) * max(steps - len(velocity), 0)
-    error = np.abs(shown - command)[counts].sum(axis=0) + after * np.abs(command)
+    error = np.abs(moved - command)[counts].sum(axis=0) + after * np.abs(command)
     return named(error / max(int(counts.sum()) + after, 1))
 
 
@@ -209,16 +209,16 @@ class _Recorder(StepRecorder):
         }  # fmt: skip
 
     def of(self, condition: Condition, robots: slice, steps: int, commands: Array) -> Rollout:
-        found = self.stacked(robots, steps)
-        found["position"][..., 2] = np.unwrap(found["position"][..., 2], axis=0)
+        arrays = self.stacked(robots, steps)
+        arrays["position"][..., 2] = np.unwrap(arrays["position"][..., 2], axis=0)
         inside = np.flatnonzero((self._whole >= robots.start) & (self._whole < robots.stop))
         for name, kept in (("observation", self._seen), ("hidden", self._hidden)):
-            found[name] = np.stack([step[inside] for step in kept[:steps]])
+            arrays[name] = np.stack([step[inside] for step in kept[:steps]])
         task, command = condition.task, condition.command
         assert command is not None
-        found["fell"] = self.fell[robots]
+        arrays["fell"] = self.fell[robots]
         whole = len(commands)
-        return Rollout(task.control_step_s, command, task.action_scale, **found, whole_steps=whole)
+        return Rollout(task.control_step_s, command, task.action_scale, **arrays, whole_steps=whole)
 
 
 def replay(
@@ -234,10 +234,10 @@ def replay(
     """
     hidden: list[NDArray[np.float32]] = []
     handle = _listen(policy.network, lambda state: hidden.append(state.numpy().copy()))
-    own = copy(policy)  # a policy replaces its state and never writes into it
+    player = copy(policy)  # a policy replaces its state and never writes into it
     try:
-        own.reset(observations[0][:, _LAST_ACTION])
-        actions = [own.act(row) for row in observations]
+        player.reset(observations[0][:, _LAST_ACTION])
+        actions = [player.act(row) for row in observations]
     finally:
         handle.remove()
     return np.array(actions), np.array(hidden)
@@ -247,14 +247,14 @@ def _listen(network: PolicyNetwork, keep: Callable[[torch.Tensor], None]) -> Rem
     """Call `keep` with the hidden state, shape (n, k), each time the network runs."""
     if network.kind in ("lstm", "gru"):
 
-        def of_memory(_: nn.Module, given: tuple, found: tuple) -> None:
-            state = found[1][1] if network.kind == "lstm" else found[1]
+        def of_memory(_: nn.Module, inputs: tuple, outputs: tuple) -> None:
+            state = outputs[1][1] if network.kind == "lstm" else outputs[1]
             keep(state[0])
 
         return network.rnn["rnn"].register_forward_hook(of_memory)
     # a Transformer's latent enters its head; an MLP's last hidden layer enters its output layer
     reader = network.mlp if network.kind == "transformer" else network.mlp[-1]
-    return reader.register_forward_pre_hook(lambda _, given: keep(given[0]))
+    return reader.register_forward_pre_hook(lambda _, inputs: keep(inputs[0]))
 
 
 def heading(qpos: Array) -> Array:

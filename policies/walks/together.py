@@ -82,7 +82,7 @@ def walk_together(
     )
     done, lock, stop = 0.0, threading.Lock(), threading.Event()
     total = seconds * sum(c.robots for c in conditions)
-    found: dict[int, T] = {}
+    kept: dict[int, T] = {}
 
     def advance(robot_seconds: float) -> bool:
         """Count what was walked; whether to go on."""
@@ -94,11 +94,13 @@ def walk_together(
 
     def walk(environments: list[list[int]], threads: int) -> None:
         for chosen in environments:
-            own = [conditions[i] for i in chosen]
-            group = _Group(policy, servos, own, seconds, seed, threads, shared, recorder)
+            group_conditions = [conditions[i] for i in chosen]
+            group = _Group(
+                policy, servos, group_conditions, seconds, seed, threads, shared, recorder
+            )
             if not group.walk(advance):
                 return
-            found.update(zip(chosen, group.found(), strict=True))
+            kept.update(zip(chosen, group.found(), strict=True))
 
     shares = _shares(conditions)
     cores = threads or os.cpu_count() or 1
@@ -112,7 +114,7 @@ def walk_together(
             stop.set()
         for one in running:
             one.result()
-    return [found[i] for i in range(len(conditions))]
+    return [kept[i] for i in range(len(conditions))]
 
 
 def _refuse_impossible(conditions: Sequence[Condition], seconds: float, threads: int) -> None:
@@ -182,8 +184,8 @@ class _Group:
             each([c.extra_dead_time_s for c in conditions]), Twins(number, shared.robots),
             each([c.handicap.extra_jitter_s for c in conditions]) if shared.jitter else None,
         )  # fmt: skip
-        for own, robots in zip(conditions, self.robots, strict=True):
-            impose(self.env.robots, _numbers(robots), own.handicap)
+        for condition, robots in zip(conditions, self.robots, strict=True):
+            impose(self.env.robots, _numbers(robots), condition.handicap)
         self.policy = deepcopy(policy)  # hooks of a recorder hear this environment only
         self.recorder = recorder(self.env, self.policy, conditions)
         random = random_commands(
@@ -220,9 +222,9 @@ class _Group:
             observation[:, _COMMAND] = command
             self._handicap(step, observation)
             action = self._action(step, observation)
-            for own, robots in zip(self.conditions, self.robots, strict=True):
-                if own.disturb:
-                    own.disturb(step, env, _numbers(robots))
+            for condition, robots in zip(self.conditions, self.robots, strict=True):
+                if condition.disturb:
+                    condition.disturb(step, env, _numbers(robots))
             result = env.step(action)
             up = np.array([alive[robots].any() for robots in self.robots])
             self.last[up] = step + 1
@@ -230,23 +232,23 @@ class _Group:
             alive = alive & ~result.done
             self.recorder.keep(Moment(observation, action, command, result.facts, alive, fell))
             observation = result.observation
-            left = self.steps - step - 1 if not alive.any() else 0
-            if not advance((1 + left) * n * self.step_s):
+            skipped = self.steps - step - 1 if not alive.any() else 0
+            if not advance((1 + skipped) * n * self.step_s):
                 return False
-            if left:
+            if skipped:
                 break
         return True
 
     def _handicap(self, step: int, observation: NDArray[np.float32]) -> None:
         """Push robots, and alter what they see."""
         direction = self.pushes.get(step)
-        for own, robots in zip(self.conditions, self.robots, strict=True):
-            if own.handicap.push_m_s and direction is not None:
-                ids, added = _numbers(robots), own.handicap.push_m_s * direction
+        for condition, robots in zip(self.conditions, self.robots, strict=True):
+            if condition.handicap.push_m_s and direction is not None:
+                ids, added = _numbers(robots), condition.handicap.push_m_s * direction
                 self.env.robots.push(ids, self.env.robots.qvel[ids, :2] + added[: len(ids)])
-            see_slope(observation[robots], _numbers(robots), self.env.robots, own.handicap)
-            if own.change:
-                observation[robots] = own.change(step, observation[robots])
+            see_slope(observation[robots], _numbers(robots), self.env.robots, condition.handicap)
+            if condition.change:
+                observation[robots] = condition.change(step, observation[robots])
 
     def _action(self, step: int, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """What each robot does by its walker."""
@@ -267,8 +269,8 @@ class _Group:
 
     def found(self) -> list:
         """What was kept, by condition."""
-        given = zip(self.conditions, self.robots, self.last.tolist(), strict=True)
-        return [self.recorder.of(c, robots, n, self.commands[:, robots]) for c, robots, n in given]
+        parts = zip(self.conditions, self.robots, self.last.tolist(), strict=True)
+        return [self.recorder.of(c, robots, n, self.commands[:, robots]) for c, robots, n in parts]
 
 
 def _reference(task: Walking) -> Trot:

@@ -292,13 +292,13 @@ def touches_ground(qpos: Array, gravity: Array, ground: Ground) -> NDArray[np.bo
     above = qpos[:, 2] - ground.highest_near(qpos[:, 0], qpos[:, 1])
     # a walking robot is too high for any pose to reach the ground, but with its feet
     low = np.flatnonzero(above < _DOWN_M + _ASIDE_M * tilt)
-    found = np.zeros(len(qpos), bool)
+    touching = np.zeros(len(qpos), bool)
     if len(low):
         points, radius = lowest_points(qpos[low, 7:])
         at = qpos[low, None, :3] + np.einsum("nij,npj->npi", _axes(qpos[low, 3:7]), points)
         gap = at[..., 2] - radius - ground.height(at[..., 0], at[..., 1])
-        found[low] = gap.min(axis=1) < 0.0
-    return found
+        touching[low] = gap.min(axis=1) < 0.0
+    return touching
 
 
 def lowest_points(joints: Array) -> tuple[Array, Array]:

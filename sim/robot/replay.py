@@ -130,8 +130,8 @@ def compiled(robot: ServoRobot, longest_dead_time_s: float, fixed: bool) -> Any:
 
 def _with_servos(spec: Any, joints: Sequence[str]) -> Any:
     """The description with servos, and without what refers to its own actuators."""
-    for own in (spec.actuators, spec.sensors, spec.keys):
-        for element in list(own):
+    for elements in (spec.actuators, spec.sensors, spec.keys):
+        for element in list(elements):
             spec.delete(element)
     for name in joints:
         servo = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
@@ -239,16 +239,16 @@ def replay(
     batch.bind("history")[:] = servo_mjcf.delay_lines(servo_mjcf.empty_delay_lines(model), held)
     warned = batch.warning.copy()
     batch.step(None, round(SETTLE_S / TIME_STEP_S))
-    found = np.empty((n, steps + 1, len(robot.joints)), np.float32)
+    servo_rad = np.empty((n, steps + 1, len(robot.joints)), np.float32)
     fell = np.full(n, np.inf)
-    found[:, 0] = qpos @ mix - robot.shift_rad
+    servo_rad[:, 0] = qpos @ mix - robot.shift_rad
     gyro = np.zeros((n, steps // GYRO_STEPS, 3), np.float32)
     for at in range(0, steps, _CHUNK):
         control = commands[which, at + 1 : at + 1 + _CHUNK] + robot.shift_rad
         count = control.shape[1]
         recorded = batch.rollout(count, control, record=("qpos", "qvel"))
         moved = recorded["qpos"]
-        found[:, at + 1 : at + 1 + count] = moved @ mix - robot.shift_rad
+        servo_rad[:, at + 1 : at + 1 + count] = moved @ mix - robot.shift_rad
         fallen = np.einsum("nsk,nk->ns", _down(moved, root), before) < _FALLEN
         when = TIME_STEP_S * (at + 1 + fallen.argmax(axis=1))
         fell = np.minimum(fell, np.where(fallen.any(axis=1), when, np.inf))
@@ -256,12 +256,12 @@ def replay(
             seen = recorded["qvel"][:, GYRO_STEPS - 1 :: GYRO_STEPS, spin : spin + 3]
             gyro[:, at // GYRO_STEPS :][:, : seen.shape[1]] = seen
         progress((at + count) / steps)
-    if (batch.warning != warned).any() or not np.isfinite(found).all():
+    if (batch.warning != warned).any() or not np.isfinite(servo_rad).all():
         raise InputError(
             f"{robot.name} becomes unstable in physics steps of {1e3 * TIME_STEP_S:g} ms with one "
             "of these actuators. Leave out the one that is stiffest for its armature."
         )
-    return Replayed(found, fell, gyro)
+    return Replayed(servo_rad, fell, gyro)
 
 
 def _mixing(model) -> Array:
@@ -302,7 +302,7 @@ def _equip(
 def _lift(model, trunk: int, qpos: Array) -> Array:
     """Height by which each copy must be lifted to be just above the ground [m], shape (n,)."""
     touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    own = np.flatnonzero(touching & (model.body_rootid[model.geom_bodyid] == trunk))
+    touching_trunk = np.flatnonzero(touching & (model.body_rootid[model.geom_bodyid] == trunk))
     ground = np.flatnonzero(touching & (model.geom_bodyid == 0))
     poses, which = np.unique(qpos, axis=0, return_inverse=True)
     gaps, data = [], mujoco.MjData(model)
@@ -314,7 +314,7 @@ def _lift(model, trunk: int, qpos: Array) -> Array:
                 (
                     mujoco.mj_geomDistance(model, data, int(a), int(b), _FAR_M, None)
                     for a in ground
-                    for b in own
+                    for b in touching_trunk
                 ),
                 default=0.0,
             )
@@ -326,5 +326,5 @@ def _down(qpos: Array, root: int | None) -> Array:
     """Direction of gravity in the trunk's frame, shape (..., 3); z where it is fixed."""
     if root is None:
         return np.broadcast_to([0.0, 0.0, -1.0], (*qpos.shape[:-1], 3))
-    own = qpos[..., root : root + 7]
-    return gravity_direction(own.reshape(-1, 7)).reshape(*own.shape[:-1], 3)
+    pose = qpos[..., root : root + 7]
+    return gravity_direction(pose.reshape(-1, 7)).reshape(*pose.shape[:-1], 3)

@@ -56,11 +56,11 @@ class Moved:
 def gravity_direction(qpos: Array) -> Array:
     """Direction of gravity in the trunk's frame, shape (n, 3), from MuJoCo's positions."""
     w, x, y, z = qpos[:, 3:7].T.copy()
-    found = np.empty((len(qpos), 3))
-    found[:, 0] = 2 * (w * y - x * z)
-    found[:, 1] = -2 * (y * z + w * x)
-    found[:, 2] = 2 * (x * x + y * y) - 1
-    return found
+    gravity = np.empty((len(qpos), 3))
+    gravity[:, 0] = 2 * (w * y - x * z)
+    gravity[:, 1] = -2 * (y * z + w * x)
+    gravity[:, 2] = 2 * (x * x + y * y) - 1
+    return gravity
 
 
 def own_velocity(qpos: Array, qvel: Array) -> Array:
@@ -69,11 +69,11 @@ def own_velocity(qpos: Array, qvel: Array) -> Array:
     a, b, c = qvel[:, :3].T.copy()
     # rotate by the inverse: v + w t + t × q with t = 2 (v × q), by hand: np.cross is slow
     t, u, v = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
-    found = np.empty((len(qpos), 3))
-    found[:, 0] = a + w * t + u * z - v * y
-    found[:, 1] = b + w * u + v * x - t * z
-    found[:, 2] = c + w * v + t * y - u * x
-    return found
+    velocity = np.empty((len(qpos), 3))
+    velocity[:, 0] = a + w * t + u * z - v * y
+    velocity[:, 1] = b + w * u + v * x - t * z
+    velocity[:, 2] = c + w * v + t * y - u * x
+    return velocity
 
 
 def planar(velocity: Array, qvel: Array) -> Array:
@@ -262,13 +262,13 @@ class RobotBatch:
     def _rollout(self, part: int, start: Array, control: Array | None) -> Moved:
         """The physics of one part."""
         rows, records = self._parts[part], self._records[part]
-        own = None if control is None else control[rows]
-        found = self._records[part] = self.batch.rollout(
-            self.config.substeps, own, record=_RECORD, ids=self._ids[part], out=records
+        part_control = None if control is None else control[rows]
+        rows_out = self._records[part] = self.batch.rollout(
+            self.config.substeps, part_control, record=_RECORD, ids=self._ids[part], out=records
         )
-        touch = found["sensordata"][:, -self._touch_steps :, self._touch].max(axis=1)
-        feet = found["site_xpos"][:, :, self._feet_sites]
-        return Moved(rows, start[rows], found["qpos"], found["actuator_force"], touch, feet)
+        touch = rows_out["sensordata"][:, -self._touch_steps :, self._touch].max(axis=1)
+        feet = rows_out["site_xpos"][:, :, self._feet_sites]
+        return Moved(rows, start[rows], rows_out["qpos"], rows_out["actuator_force"], touch, feet)
 
     def _predicted(self, model: JointArrays, target: Array) -> Array:
         """Controls of each physics step, from the positions that a servo model predicts."""
@@ -379,25 +379,25 @@ class RobotBatch:
     @property
     def state(self) -> dict[str, Any]:
         """Everything that changes, as copies, for an exact restart."""
-        found: dict[str, Any] = {f"drawn.{k}": v.copy() for k, v in self.drawn.items()}
-        found |= {"friction": self.friction.copy(), "payload_kg": self.payload_kg.copy()}
-        found |= {f"bodies.{k}": v.copy() for k, v in self.bodies.state.items()}
-        found |= {"batch.state": self.batch.state.copy()}
-        found |= {"robot": self._hash, "knee": self.config.knee}
+        state: dict[str, Any] = {f"drawn.{k}": v.copy() for k, v in self.drawn.items()}
+        state |= {"friction": self.friction.copy(), "payload_kg": self.payload_kg.copy()}
+        state |= {f"bodies.{k}": v.copy() for k, v in self.bodies.state.items()}
+        state |= {"batch.state": self.batch.state.copy()}
+        state |= {"robot": self._hash, "knee": self.config.knee}
         if self.servo_model is not None:
-            found |= {f"servo.{k}": v.copy() for k, v in self.servo_model.memory.items()}
-        return found
+            state |= {f"servo.{k}": v.copy() for k, v in self.servo_model.memory.items()}
+        return state
 
     def restore(self, state: dict[str, Any]) -> bool:
         """Go back to a `state` of as many such robots; whether what follows is exactly the same.
 
         It is not where the state is of another model of the robot, from an older version.
         """
-        shape, own = state["batch.state"].shape, self.batch.state.shape
-        if shape != own or state["knee"] != self.config.knee:
+        shape, expected = state["batch.state"].shape, self.batch.state.shape
+        if shape != expected or state["knee"] != self.config.knee:
             raise InputError(
                 f"The saved environments have a knee with {state['knee']} and state {shape}, these "
-                f"{self.config.knee} and {own}. Resume with the settings of the run."
+                f"{self.config.knee} and {expected}. Resume with the settings of the run."
             )
         for k, v in self.drawn.items():
             v[:] = state[f"drawn.{k}"]

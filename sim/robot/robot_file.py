@@ -73,13 +73,13 @@ def body_from_file(path: Path, config: Path | None) -> Body:
     """
     if not path.is_file():
         raise InputError(f"There is no {path}. Give the robot's MJCF as `robot`.")
-    own = RobotFile()
+    settings = RobotFile()
     if config is not None:
         if not config.is_file():
             raise InputError(f"There is no {config}. Give the robot's YAML as `robot_config`.")
         content, lines = read_yaml(config)
-        own = validated(RobotFile, content or {}, config, lines)
-    return _Reader(path, config, own).body()
+        settings = validated(RobotFile, content or {}, config, lines)
+    return _Reader(path, config, settings).body()
 
 
 class _Reader:
@@ -455,9 +455,9 @@ class _Reader:
         self._place(self.pose)
 
         def feet_in_trunk(joints: Array) -> Array:
-            found = np.repeat(feet[None], len(joints), axis=0)
+            angles = np.repeat(feet[None], len(joints), axis=0)
             for legs, own, axes, anchors in rounds:
-                arm = found[:, legs] - anchors
+                arm = angles[:, legs] - anchors
                 c, s = np.cos(joints[:, own, None]), np.sin(joints[:, own, None])
                 along = (arm * axes).sum(axis=-1, keepdims=True) * axes
                 # Rodrigues; np.cross is slow for few robots
@@ -468,8 +468,8 @@ class _Reader:
                     ],
                     axis=-1,
                 )
-                found[:, legs] = anchors + c * (arm - along) + s * turned + along
-            return found
+                angles[:, legs] = anchors + c * (arm - along) + s * turned + along
+            return angles
 
         return feet_in_trunk
 
@@ -546,16 +546,16 @@ class _Reader:
         return fixed_offsets(feet_at)
 
     def _servo_of(self) -> dict[str, str]:
-        own = self.own.servos
-        if own is None:
+        stated = self.own.servos
+        if stated is None:
             return {}
-        if isinstance(own, str):
-            return dict.fromkeys(self.joints, own)
-        found = {}
-        for wanted, servo in own.items():
+        if isinstance(stated, str):
+            return dict.fromkeys(self.joints, stated)
+        servos = {}
+        for wanted, servo in stated.items():
             for name in self._matching(wanted, self.joints, "servos", "joint with a servo"):
-                found[name] = servo
-        return found
+                servos[name] = servo
+        return servos
 
     def _xml_writer(self, names: tuple[str, ...], geoms: list[int]):
         """Function that writes the MJCF with servos on a ground."""
@@ -648,8 +648,8 @@ _GRID = (
 def _images(places: Array, near: float) -> NDArray[np.intp] | None:
     """Which place each place is the mirror image of; None if one has none."""
     distance = np.linalg.norm(places[:, None] * [1, -1, 1] - places[None], axis=-1)
-    found = distance.argmin(axis=1)
-    return found if (distance.min(axis=1) < near).all() else None
+    nearest = distance.argmin(axis=1)
+    return nearest if (distance.min(axis=1) < near).all() else None
 
 
 def _line(error: Exception) -> str:

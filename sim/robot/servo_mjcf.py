@@ -65,7 +65,7 @@ def actuator_attributes(parameters: DelayedPDParameters, time_step_s: float) -> 
         )
     effort = float(np.asarray(parameters.effort_limit))
     speed = float(np.asarray(parameters.velocity_limit))
-    found = {
+    attributes_ = {
         "kp": _number(parameters.stiffness),
         "kv": _number(parameters.damping),
         "input": "pos",
@@ -75,18 +75,18 @@ def actuator_attributes(parameters: DelayedPDParameters, time_step_s: float) -> 
         "interp": "linear",
     }
     if np.isfinite(speed):
-        found["slewmax"] = _number(speed)
+        attributes_["slewmax"] = _number(speed)
     if np.isfinite(effort):
-        found["forcerange"] = f"{_number(-effort)} {_number(effort)}"
-    return found
+        attributes_["forcerange"] = f"{_number(-effort)} {_number(effort)}"
+    return attributes_
 
 
 def pid_element(
     names: Mapping[str, str], parameters: DelayedPDParameters, time_step_s: float
 ) -> str:
     """The `<pid>` actuator with its `names`: `name`, and `joint` or `tendon`."""
-    own = actuator_attributes(parameters, time_step_s)
-    return f"<pid {attributes({**names, **own})}/>"
+    pid = actuator_attributes(parameters, time_step_s)
+    return f"<pid {attributes({**names, **pid})}/>"
 
 
 def free_air_xml(servos: Sequence[DelayedPDParameters], time_step_s: float) -> str:
@@ -182,10 +182,10 @@ def write_servos(
     fields["actuator_delay"][ids] = servos["dead_time_s"]
     for kind, places in (("dof", dof_of), ("tendon", tendon_of)):
         if places:
-            own, at = list(places), list(places.values())
-            fields[f"{kind}_armature"][ids[:, None], at] = servos["armature"][:, own]
-            fields[f"{kind}_frictionloss"][ids[:, None], at] = servos["friction_loss"][:, own]
-            fields[f"{kind}_damping"][ids[:, None], at] = servos["back_emf"][:, own]
+            names, at = list(places), list(places.values())
+            fields[f"{kind}_armature"][ids[:, None], at] = servos["armature"][:, names]
+            fields[f"{kind}_frictionloss"][ids[:, None], at] = servos["friction_loss"][:, names]
+            fields[f"{kind}_damping"][ids[:, None], at] = servos["back_emf"][:, names]
 
 
 def empty_delay_lines(model: Any) -> NDArray[np.float64]:

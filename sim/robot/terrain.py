@@ -88,11 +88,11 @@ class Ground:
         self, x: NDArray[np.float64], y: NDArray[np.float64], near_m: float
     ) -> NDArray[np.float64]:
         """Height of the highest box [m] at positions, or within `near_m` of them."""
-        found = np.zeros(np.broadcast_shapes(x.shape, y.shape))
+        height = np.zeros(np.broadcast_shapes(x.shape, y.shape))
         for at_x, at_y, half, top in self.boxes:
             over = np.maximum(np.abs(x - at_x), np.abs(y - at_y)) <= half + near_m
-            np.maximum(found, top, out=found, where=over)
-        return found
+            np.maximum(height, top, out=height, where=over)
+        return height
 
     @cached_property
     def _highest(self) -> NDArray[np.float64] | None:

@@ -75,7 +75,7 @@ def likeliest_periods(
         return (best,)
     tried = [*periods[:_ALTERNATIVES], 2 * best, best / 2]
     tried += [1 / abs(1 / loop - 1 / p) for p in tried if abs(p / loop - 1) > 0.01]
-    found = {}
+    scores = {}
     for period in tried:
         if not 1.02 * loop < period < LONGEST_S:
             continue
@@ -85,13 +85,13 @@ def likeliest_periods(
         loss = count_loss(trials, phases, sure)[0]
         loss = float(np.clip(loss, 0.02, 0.98)) if np.isfinite(loss) else 0.5
         # a period may not win by the width of its instants
-        found[period] = max(
+        scores[period] = max(
             sum(evidence(s, period, blur, loss) for s in stretches) for blur in poll_search.BLURS_S
         )
-    if not found:
+    if not scores:
         return (best,)
-    order = sorted(found, key=lambda p: -found[p])
-    close = [p for p in order if found[order[0]] - found[p] < _RIVAL]
+    order = sorted(scores, key=lambda p: -scores[p])
+    close = [p for p in order if scores[order[0]] - scores[p] < _RIVAL]
     return (order[0], *(p for p in close[1:] if abs(p / order[0] - 1) > 2 * poll_search.DRIFT))
 
 
@@ -255,16 +255,16 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     fraction = fresh / max(rows, 1)
     # the readings of a joint that stands still repeat as well, and show nothing of the bus
     trials = [t for t in trials if t.readings != "live"]
-    told = staleness(trials).kind if trials else "live"
+    liveness = staleness(trials).kind if trials else "live"
     declared = any(t.readings == "polled" for t in trials)
-    if told == "live" and not declared:
+    if liveness == "live" and not declared:
         return PollLattice(kind="every read", readings="live", fresh_fraction=fraction)
     loop = loop_period(trials)
     nothing = PollLattice(
-        kind="unresolved", readings="polled" if declared or told == "stale" else "cannot tell",
+        kind="unresolved", readings="polled" if declared or liveness == "stale" else "cannot tell",
         fresh_fraction=fraction, time_doubt_s=loop / 2 if np.isfinite(loop) else 0.0,
     )  # fmt: skip
-    if told == "live":  # a new value at each read: the poll is faster than the loop
+    if liveness == "live":  # a new value at each read: the poll is faster than the loop
         return nothing
     step = max(quantum(trials), 1e-6)
     stretches = [s for t in trials if len(t.read_time_s) > 3 for s in stretches_of(t, step)]
@@ -301,15 +301,15 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
         # second pass: rows that did not change count, too, and the blur is what fits best
         blur = poll_search.best_blur(informative, period, possible)
         phases = tuple(poll_search.refine(s, period, blur, possible) for s in stretches)
-    found = replace(
+    lattice = replace(
         nothing, kind="lattice", readings="polled", time_doubt_s=0.0, poll_period_s=period,
         rivals_s=likely[1:], loss=loss, blur_s=blur, phases=phases,
     )  # fmt: skip
-    found = _with_segments(trials, stretches, replace(found, z_score=z_score), None, sure)
-    known = told == "stale" and period > _NEAR_LOOP * loop
-    if found.hit_rate < 0.9 or z_score < (_SIGNIFICANT if known else _SIGNIFICANT_ALONE):
-        return replace(nothing, z_score=z_score, hit_rate=found.hit_rate)
-    return found
+    lattice = _with_segments(trials, stretches, replace(lattice, z_score=z_score), None, sure)
+    known = liveness == "stale" and period > _NEAR_LOOP * loop
+    if lattice.hit_rate < 0.9 or z_score < (_SIGNIFICANT if known else _SIGNIFICANT_ALONE):
+        return replace(nothing, z_score=z_score, hit_rate=lattice.hit_rate)
+    return lattice
 
 
 def redate(trials: Sequence[Trial], lattice: PollLattice, motions: Sequence[Motion]) -> PollLattice:
@@ -323,10 +323,10 @@ def redate(trials: Sequence[Trial], lattice: PollLattice, motions: Sequence[Moti
     if lattice.kind != "lattice":
         return lattice
     polled = [(t, m) for t, m in zip(trials, motions, strict=True) if t.readings != "live"]
-    own = [t for t, _ in polled]
-    step = max(quantum(own), 1e-6)
-    stretches = [s for t in own if len(t.read_time_s) > 3 for s in stretches_of(t, step)]
-    return _with_segments(own, stretches, lattice, {t.number: m for t, m in polled}, None)
+    polled_trials = [t for t, _ in polled]
+    step = max(quantum(polled_trials), 1e-6)
+    stretches = [s for t in polled_trials if len(t.read_time_s) > 3 for s in stretches_of(t, step)]
+    return _with_segments(polled_trials, stretches, lattice, {t.number: m for t, m in polled}, None)
 
 
 def _with_segments(
@@ -412,8 +412,8 @@ def _instants(stretch: Stretch, phases: Sequence[Phase]) -> NDArray[np.float64]:
     time = middle
     for p in phases:
         near = p.phase_s + p.period_s * np.round((middle - p.phase_s) / p.period_s)
-        own = (stretch.end >= p.start_s) & (stretch.end <= p.stop_s)
-        time = np.where(own, np.clip(near, stretch.begin, stretch.end), time)
+        inside = (stretch.end >= p.start_s) & (stretch.end <= p.stop_s)
+        time = np.where(inside, np.clip(near, stretch.begin, stretch.end), time)
     return time
 
 
@@ -431,16 +431,16 @@ def readings(trial: Trial, lattice: PollLattice) -> Readings:
         return Readings(rows, read[rows], trial.position_rad[rows], read.copy(), 0.0)
     time = 0.5 * (before + read[rows])
     sd = float(np.median(read[rows] - before) / np.sqrt(12 * max(len(rows), 1))) if len(rows) else 0
-    own = [p for p in lattice.phases if p.trial == trial.number]
-    for phase in own:
+    phases = [p for p in lattice.phases if p.trial == trial.number]
+    for phase in phases:
         inside = (read[rows] >= phase.start_s) & (read[rows] <= phase.stop_s)
         count = np.round((time - phase.phase_s) / phase.period_s)
         instant = phase.phase_s + count * phase.period_s
         slack = 0.5 * poll_search.BLURS_S[-1]
         hit = inside & (instant >= before - slack) & (instant <= read[rows] + slack)
         time = np.where(hit, np.minimum(instant, read[rows]), time)
-    if own:
-        sd = float(np.sqrt(np.mean([p.phase_sd_s**2 for p in own]) / len(own)))
+    if phases:
+        sd = float(np.sqrt(np.mean([p.phase_sd_s**2 for p in phases]) / len(phases)))
     held = np.full(len(read), np.nan)
     held[rows] = time
     last = np.maximum.accumulate(np.where(np.isfinite(held), np.arange(len(read)), -1))

@@ -28,7 +28,7 @@ def most_hits(begin, end, periods, bins):
     `begin` and `end` have shape (intervals,), `periods` and the result (periods,); times are in
     seconds.
     """
-    found, edges = np.zeros(len(periods), np.int64), np.zeros(2 * bins + 1, np.int64)
+    hits, edges = np.zeros(len(periods), np.int64), np.zeros(2 * bins + 1, np.int64)
     for i in range(len(periods)):
         edges[:] = 0
         for n in range(len(begin)):
@@ -39,8 +39,8 @@ def most_hits(begin, end, periods, bins):
         for b in range(1, 2 * bins):
             edges[b] += edges[b - 1]
         for b in range(bins):
-            found[i] = max(found[i], edges[b] + edges[b + bins])
-    return found
+            hits[i] = max(hits[i], edges[b] + edges[b + bins])
+    return hits
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -88,7 +88,7 @@ def summed_scores(
     track_step` [s]; empty if there is none.
     """
     count = len(periods) * len(phases)
-    found, total = np.zeros((len(stops), count)), np.zeros(count)
+    sums, total = np.zeros((len(stops), count)), np.zeros(count)
     at = 1
     for n in range(len(begin)):
         half = 0.5 * (end[n] - begin[n]) / blur + 0.5
@@ -125,9 +125,9 @@ def summed_scores(
                     total[g] -= np.sqrt(1.0 + residual * residual) - 1.0
         while at < len(stops) and stops[at] == n + 1:
             for g in range(count):  # assigning the row takes five times as long to compile
-                found[at, g] = total[g]
+                sums[at, g] = total[g]
             at += 1
-    return found
+    return sums
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -184,10 +184,10 @@ class Stretch:
 
     def between(self, start_s: float, stop_s: float) -> Stretch:
         """Rows read within a part of the stretch."""
-        own, same = ((e > start_s) & (e <= stop_s) for e in (self.end, self.same_end))
+        changed, same = ((e > start_s) & (e <= stop_s) for e in (self.end, self.same_end))
         return Stretch(
-            self.trial, start_s, stop_s, self.begin[own], self.end[own], self.same_begin[same],
-            self.same_end[same],
+            self.trial, start_s, stop_s, self.begin[changed], self.end[changed],
+            self.same_begin[same], self.same_end[same],
         )  # fmt: skip
 
 
@@ -216,14 +216,14 @@ def best_periods(
     evenly spaced in their logarithm. The period is NaN if none is possible.
     """
     pooled = _pool([_score(s.begin, s.end, grid) for s in stretches], grid)
-    found = []
+    peaks = []
     for _ in range(_PEAKS):
         peak = int(np.argmax(pooled))
         if not np.isfinite(pooled[peak]):
             break
-        found.append((float(grid[peak]), _evidence(stretches, grid[peak], BLUR_S, None)))
+        peaks.append((float(grid[peak]), _evidence(stretches, grid[peak], BLUR_S, None)))
         pooled[np.abs(np.log(grid / grid[peak])) < _APART] = -np.inf
-    return sorted(found, key=lambda pair: -pair[1]) or [(float("nan"), -np.inf)]
+    return sorted(peaks, key=lambda pair: -pair[1]) or [(float("nan"), -np.inf)]
 
 
 def shuffled(stretch: Stretch, rng: np.random.Generator) -> Stretch:

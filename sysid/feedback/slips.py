@@ -125,15 +125,15 @@ def find_segments(
     inner = (0.5 * (grid.read[stops[c] - 1] + grid.read[stops[c]]) for c in cuts)
     borders = [stretch.start_s, *inner, stretch.stop_s]
     chosen = [0, *cuts, len(stops) - 1]
-    found = []
+    segments = []
     for n in range(len(chosen) - 1):
         g = int(lattice[chosen[n], chosen[n + 1]])
         period = float(periods[g // len(phases)])
         phase = reference + float(phases[g % len(phases)]) * period
         middle = 0.5 * (borders[n] + borders[n + 1])
         phase += period * np.round((middle - phase) / period)
-        found.append(Segment(borders[n], borders[n + 1], period, phase, ([0.0, *gains])[n]))
-    return found
+        segments.append(Segment(borders[n], borders[n + 1], period, phase, ([0.0, *gains])[n]))
+    return segments
 
 
 def evidence(stretch: Stretch, period_s: float, blur_s: float, loss: float) -> float:
@@ -180,12 +180,12 @@ def _scored(
     begin = np.concatenate([stretch.begin, stretch.same_begin[:same]])
     changed = np.arange(len(end)) < len(stretch.end)
     order = np.argsort(end, kind="stable")
-    shown = np.zeros(len(end))
-    shown[: len(value)] = value
+    values = np.zeros(len(end))
+    values[: len(value)] = value
 
-    own = np.flatnonzero(changed[order])
-    every = max(_EVERY, -(-len(own) // _MOST_STOPS))
-    stops = np.concatenate([[0], own[every:-1:every], [len(end)]])
+    changed_rows = np.flatnonzero(changed[order])
+    every = max(_EVERY, -(-len(changed_rows) // _MOST_STOPS))
+    stops = np.concatenate([[0], changed_rows[every:-1:every], [len(end)]])
     longest = max(stretch.stop_s - stretch.start_s, 1e-3)
     spread = _REACH * DRIFT
     # neighbouring periods differ by two phase steps at the ends of the stretch
@@ -198,7 +198,7 @@ def _scored(
         times = np.arange(first, float(end.max()) + 2 * _TRACK_STEP_S, _TRACK_STEP_S)
         track = motion(times)
     summed = summed_scores(
-        begin[order] - reference, end[order] - reference, changed[order], shown[order], stops,
+        begin[order] - reference, end[order] - reference, changed[order], values[order], stops,
         periods, phases, blur_s, OUTLIERS, 1.0 - loss if same else 0.0, track, first - reference,
         _TRACK_STEP_S, scale_rad,
     )  # fmt: skip
@@ -327,8 +327,8 @@ def _count(
                 for whole, edge in ((np.ceil, p.start_s), (np.floor, p.stop_s))
             )
             instants = p.phase_s + p.period_s * np.arange(first, last + 1)
-            own = (read[rows] > p.start_s) & (read[rows] <= p.stop_s)
-            dated = p.phase_s + p.period_s * np.round((middle[own] - p.phase_s) / p.period_s)
+            inside = (read[rows] > p.start_s) & (read[rows] <= p.stop_s)
+            dated = p.phase_s + p.period_s * np.round((middle[inside] - p.phase_s) / p.period_s)
             polls += int(np.sum(counts(instants, p.period_s)))
             successes += int(np.sum(counts(dated, p.period_s)))
     return successes, polls
@@ -356,12 +356,12 @@ def _expected_speed(
     late = np.interp(time[None] - lags[:, None], grid, smooth)
     late -= late.mean(axis=1, keepdims=True)
     centred = position - position.mean()
-    both, own = late @ centred, np.maximum(np.sum(late**2, axis=1), 1e-12)
-    match = np.sign(both) * both**2 / own
+    both, power = late @ centred, np.maximum(np.sum(late**2, axis=1), 1e-12)
+    match = np.sign(both) * both**2 / power
     best = int(np.argmax(match))
     if match[best] < 0.5 * np.sum(centred**2):
         return none
-    speed = np.abs(np.gradient(smooth, _GRID_S)) * both[best] / own[best]
+    speed = np.abs(np.gradient(smooth, _GRID_S)) * both[best] / power[best]
     return np.interp(trial.read_time_s - lags[best], grid, speed)
 
 
@@ -411,15 +411,15 @@ def find_upsets(
     residuals at these times. `scale_rad` is the noise of the trial's tone; where the bulk of the
     residuals is smaller, that counts.
     """
-    found: list[Upset] = []
+    upsets: list[Upset] = []
     rest = simulate(trial.command_rad)
     # an upset is part of the tone's noise, unless that is taken from the bulk
     bulk = 1.4826 * float(np.median(np.abs(rest))) if len(rest) else 0.0
     scale_rad = float(np.clip(bulk, _LEAST_BULK * scale_rad, scale_rad))
     rest = rest / scale_rad
-    left = np.ones(len(rest), bool)
+    unexplained = np.ones(len(rest), bool)
     for _ in range(_MOST_UPSETS):
-        far = (np.abs(rest) > _FAR) & left
+        far = (np.abs(rest) > _FAR) & unexplained
         runs = np.lib.stride_tricks.sliding_window_view(far, _IN_A_ROW).all(axis=1)
         if not runs.any():
             break
@@ -429,7 +429,7 @@ def find_upsets(
         for row in np.flatnonzero((sent < time_s[first]) & (sent > time_s[first] - _LONGEST_S)):
             for rows in range(1, _MOST_LOST + 1):
                 without = simulate(without_commands(trial, int(row), rows)) / scale_rad
-                gain = float(np.sum((_cost(rest) - _cost(without))[left]))
+                gain = float(np.sum((_cost(rest) - _cost(without))[unexplained]))
                 if gain > best[0]:
                     best = gain, int(row), rows, without
         run = [first]
@@ -437,17 +437,17 @@ def find_upsets(
             run.append(run[-1] + 1)
         gain, row, rows, without = best
         if gain < max(NATS, _EXPLAINED * float(np.sum(_cost(rest[run])))):
-            left[run] = False  # something else: look on behind it
+            unexplained[run] = False  # something else: look on behind it
             continue
-        touched = left & (np.abs(without - rest) > _TOUCHED)
-        left &= ~touched
-        found.append(
+        touched = unexplained & (np.abs(without - rest) > _TOUCHED)
+        unexplained &= ~touched
+        upsets.append(
             Upset(
                 trial=trial.number, time_s=float(sent[row] - sent[0]), commands=rows, nats=gain,
                 readings=tuple(int(k) for k in np.flatnonzero(touched)),
             )
         )  # fmt: skip
-    return sorted(found, key=lambda u: u.time_s)
+    return sorted(upsets, key=lambda u: u.time_s)
 
 
 def _cost(residual: NDArray[np.float64]) -> NDArray[np.float64]:

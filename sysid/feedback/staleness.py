@@ -55,14 +55,22 @@ def stretches_of(trial: Trial, step: float) -> list[Stretch]:
     same = np.setdiff1d(moving[known[moving]], rows)
     parts = max(1, int(np.ceil((read[-1] - read[0]) / STRETCH_S)))
     edges = np.linspace(read[0], read[-1], parts + 1)
-    found = []
+    stretches = []
     for start, stop in pairwise(edges):
-        own, held = (r[(read[r] > start) & (read[r] <= stop)] for r in (rows, same))
-        if len(own) >= 8:
-            found.append(
-                Stretch(trial.number, start, stop, before[own], read[own], before[held], read[held])
+        changed, held = (r[(read[r] > start) & (read[r] <= stop)] for r in (rows, same))
+        if len(changed) >= 8:
+            stretches.append(
+                Stretch(
+                    trial.number,
+                    start,
+                    stop,
+                    before[changed],
+                    read[changed],
+                    before[held],
+                    read[held],
+                )
             )
-    return found
+    return stretches
 
 
 def loop_period(trials: Sequence[Trial]) -> float:
@@ -102,8 +110,8 @@ def quantum(trials: Sequence[Trial]) -> float:
     gives a first guess, and least squares over all of them the step; a file's decimals only blur
     it.
     """
-    given = [t.position_rad for t in trials]
-    steps = np.concatenate([np.zeros(0), *(np.abs(np.diff(p)) for p in given)])
+    positions = [t.position_rad for t in trials]
+    steps = np.concatenate([np.zeros(0), *(np.abs(np.diff(p)) for p in positions)])
     steps = np.sort(steps[np.isfinite(steps) & (steps > 1e-7)])
     different = np.unique(np.round(steps, 9))
     if len(steps) < 3:
@@ -115,9 +123,9 @@ def quantum(trials: Sequence[Trial]) -> float:
     frequent = [c for c in clusters if len(c) >= least]
     first = float(np.median((frequent or clusters)[0]))
     for divisor in range(1, _FIRST_MULTIPLES + 1):
-        found = _multiples_of(different, first / divisor)
-        if found:
-            return found
+        step = _multiples_of(different, first / divisor)
+        if step:
+            return step
     return 0.0
 
 
@@ -203,19 +211,19 @@ def staleness(trials: Sequence[Trial]) -> Staleness:
     scatter = _scatter(values)
     least = max(_COUNTS * step, _NOISES * scatter if scatter > step else 0.0)
 
-    found = _count(rows, offset, least)
+    repeats = _count(rows, offset, least)
     if len(repeated) >= _NEEDED and not _impossible(int(repeated.sum()), len(repeated)):
-        return _verdict("live", found)  # every row is new, in motion or not
+        return _verdict("live", repeats)  # every row is new, in motion or not
     every = 1
-    while len(found) < _NEEDED:
+    while len(repeats) < _NEEDED:
         every = math.ceil(1.5 * every)
         if not every * loop <= _LONGEST_S:
-            return _verdict("live" if _new_in_motion(trials, step) else "cannot tell", found)
-        found = _count(list(_thinned(rows, every)), offset, least)
-    if _impossible(int(np.sum(found > 0)), len(found)):
-        return _verdict("stale", found)
-    shown = every == 1 or _follows_rows(values) or _shortest(values) * loop <= _HARMLESS_S
-    return _verdict("live" if shown or _new_in_motion(trials, step) else "cannot tell", found)
+            return _verdict("live" if _new_in_motion(trials, step) else "cannot tell", repeats)
+        repeats = _count(list(_thinned(rows, every)), offset, least)
+    if _impossible(int(np.sum(repeats > 0)), len(repeats)):
+        return _verdict("stale", repeats)
+    certain = every == 1 or _follows_rows(values) or _shortest(values) * loop <= _HARMLESS_S
+    return _verdict("live" if certain or _new_in_motion(trials, step) else "cannot tell", repeats)
 
 
 def _new_in_motion(trials: Sequence[Trial], step: float) -> bool:
@@ -314,10 +322,10 @@ def _scatter(values: Sequence[NDArray[np.float64]]) -> float:
         turn = step[:-1] * step[1:] < 0
         size = np.lib.stride_tricks.sliding_window_view(np.abs(step), 3).min(axis=1)
         smallest.append(size[turn[:-1] & turn[1:]])
-    found = np.concatenate(smallest)
-    if len(found) < max(_FEWEST_STEPS, _TO_AND_FRO * total):
+    sizes = np.concatenate(smallest)
+    if len(sizes) < max(_FEWEST_STEPS, _TO_AND_FRO * total):
         return 0.0
-    return float(np.median(found) / _SMALLEST_OF_NOISE)
+    return float(np.median(sizes) / _SMALLEST_OF_NOISE)
 
 
 def _follows_rows(values: Sequence[NDArray[np.float64]]) -> bool:
@@ -338,5 +346,5 @@ def _shortest(values: Sequence[NDArray[np.float64]]) -> float:
         if len(sign) > 2:
             one = (sign[:-2] == sign[1:-1]) & (sign[1:-1] == sign[2:])
             gaps.append(length[1:-1][one])
-    found = np.concatenate(gaps)
-    return float(np.quantile(found, 0.1)) if len(found) else math.inf
+    lengths = np.concatenate(gaps)
+    return float(np.quantile(lengths, 0.1)) if len(lengths) else math.inf

@@ -263,18 +263,18 @@ class _Seen:
             return ()
         frequency = np.array([t.frequency_hz for t in self.tones])
         lags = tone_lags(np.array([t.response for t in self.tones]), frequency, self.near_s)
-        found = []
+        rows = []
         for t, lag in zip(self.tones, map(float, lags), strict=True):
             f, raw = t.frequency_hz, t.raw / t.command_rows
-            own = Interval.of_draws(lag, lag_near(t.response_draws, f, lag))
-            found.append(
+            interval = Interval.of_draws(lag, lag_near(t.response_draws, f, lag))
+            rows.append(
                 FrequencyLag(
-                    frequency_hz=f, gain=abs(t.response), phase_deg=-360.0 * f * lag, lag_s=own,
-                    raw_lag_s=float(lag_near(raw, f, lag + _USUAL_AGE_S)), raw_gain=abs(raw),
-                    trial=t.trial,
+                    frequency_hz=f, gain=abs(t.response), phase_deg=-360.0 * f * lag,
+                    lag_s=interval, raw_lag_s=float(lag_near(raw, f, lag + _USUAL_AGE_S)),
+                    raw_gain=abs(raw), trial=t.trial,
                 )
             )  # fmt: skip
-        return tuple(found)
+        return tuple(rows)
 
 
 def _seen(
@@ -328,30 +328,30 @@ def _seen(
 
 
 def _warnings(joint: str, seen: _Seen) -> list[str]:
-    tones, lag, found = seen.tones, seen.lag, []
+    tones, lag, warnings = seen.tones, seen.lag, []
     if not tones:
-        found.append(
+        warnings.append(
             f"{joint}: no tones in this recording, so the lag is the time shift of its held "
             "command that resembles the motion best. Record a sweep for a lag per frequency."
         )
     lost = [t for t, w in zip(tones, tone_weights(tones), strict=True) if w == 0] if tones else []
     if lost:
         listed = ", ".join(f"{t.frequency_hz:.3g}" for t in lost)
-        found.append(
+        warnings.append(
             f"{joint}: at {listed} Hz it moves less than half as far as commanded, so these "
             "tones are left out of the lag; record them with a smaller amplitude."
         )
     if len({round(t.frequency_hz, 2) for t in tones}) == 1:
-        found.append(
+        warnings.append(
             f"{joint}: one frequency only, so a lag of one period "
             f"({1e3 / tones[0].frequency_hz:.0f} ms) more would look the same; record several."
         )
     if not EARLIEST_S + _NEAR_END_S < lag.low <= lag.high < LONGEST_S - _NEAR_END_S:
-        found.append(
+        warnings.append(
             f"{joint}: the lag's interval reaches the end of its search range "
             f"({1e3 * EARLIEST_S:.0f} to {1e3 * LONGEST_S:.0f} ms), so the lag is not identified."
         )
-    return found
+    return warnings
 
 
 def _later(interval: Interval, by: float) -> Interval:
@@ -367,7 +367,7 @@ def estimators(
 ) -> dict[str, float]:
     """All estimators side by side, each the mean over trials [s]; `lag_s` is the budget's."""
     pairs = list(zip(trials, read, strict=True))
-    found = {
+    by_name = {
         "integer cross-correlation, all rows": [_integer(t, None) for t in trials],
         "integer cross-correlation, fresh rows": [_integer(t, r.rows) for t, r in pairs],
         "sub-sample cross-correlation, all rows": [
@@ -380,9 +380,10 @@ def estimators(
     frequency = np.array([t.frequency_hz for t in tones])
     for pair, name in (("raw_rows", "all rows"), ("fresh_rows", "fresh rows")):
         lags = list(tone_lags(responses(tones, pair)[0], frequency)) if tones else []
-        found[f"sine phase, {name}"] = lags
+        by_name[f"sine phase, {name}"] = lags
     result = {
-        k: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for k, v in found.items()
+        k: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan")
+        for k, v in by_name.items()
     }
     if tones:
         result["phase slope, all rows"] = slope(tones, "raw_rows").value

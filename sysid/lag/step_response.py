@@ -184,9 +184,9 @@ class Stretch:
         product = np.empty((self.blocks, 2 * most + 1))
         for k, (first, last) in enumerate(pairwise(ends)):
             size = 1 << int(np.ceil(np.log2(last - first + 2 * most + 1)))
-            own = np.fft.rfft(level[first:last], size)
+            spectrum = np.fft.rfft(level[first:last], size)
             near = np.fft.rfft(padded[first : last + 2 * most], size)
-            product[k] = np.fft.irfft(near * np.conj(own), size)[: 2 * most + 1]
+            product[k] = np.fft.irfft(near * np.conj(spectrum), size)[: 2 * most + 1]
         shift = np.asarray(step * np.arange(-most, most + 1), np.float64)
         return shift, 0.5 * (product + product[:, ::-1])
 
@@ -382,13 +382,13 @@ def _fit(
     except np.linalg.LinAlgError:
         return None
     whitened = root.T @ gram[bins[0] :, bins[0] :] @ root
-    own = root.T @ moment[bins]
-    fitted, complexity = _evidence(whitened.copy(), own.copy(), _SIZES)
+    projected = root.T @ moment[bins]
+    fitted, complexity = _evidence(whitened.copy(), projected.copy(), _SIZES)
     # a fast response may begin late in a gap between readings; a slow one may not, and there are
     # fewer ways to have it: all places of a jump are equally likely only with this prior
     complexity = complexity + 2 * np.log(decay_s)
     variance = np.maximum(square - fitted, _TINY * square) / count
-    return _Prior(dead_time_s, bins, root, whitened, own, variance, complexity)
+    return _Prior(dead_time_s, bins, root, whitened, projected, variance, complexity)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
@@ -453,8 +453,8 @@ def _best(priors: Sequence[_Prior], count: float) -> tuple[_Prior, int]:
 def _scores(sums: Sums, prior: _Prior, inverse: NDArray) -> NDArray[np.float64]:
     """Gradient of the fit in every block, in the prior's coordinates."""
     mean, bins = prior.root @ (inverse @ prior.moment), prior.bins
-    left = sums.moment[:, bins] - sums.gram[:, bins[0] :, bins[0] :] @ mean
-    return left @ prior.root
+    residual_moment = sums.moment[:, bins] - sums.gram[:, bins[0] :, bins[0] :] @ mean
+    return residual_moment @ prior.root
 
 
 def _inflation(sums: Sums, prior: _Prior, k: int) -> float:
@@ -482,13 +482,13 @@ def _draw(
     masses = np.zeros((_DRAWS, size))
     for flat in np.unique(picked):
         i, k = divmod(int(flat), len(_SIZES))
-        prior, own = priors[i], np.flatnonzero(picked == flat)
+        prior, rows = priors[i], np.flatnonzero(picked == flat)
         inverse = prior.inverse(k)
         # what was fitted away from the blocks is missing from their spread
-        left = max(count - inflation * _used(inverse, k), count / 4)
-        lost = np.sqrt(count / left * blocks / (blocks - 1))
-        noise = (weights[own] - 1.0) @ _scores(sums, prior, inverse) * lost
+        freedom = max(count - inflation * _used(inverse, k), count / 4)
+        lost = np.sqrt(count / freedom * blocks / (blocks - 1))
+        noise = (weights[rows] - 1.0) @ _scores(sums, prior, inverse) * lost
         free = np.sqrt(inflation * prior.variance[k] / _SIZES[k])
-        noise += free * rng.standard_normal((len(own), len(prior.bins)))
-        masses[own[:, None], prior.bins] = (prior.moment + noise) @ inverse @ prior.root.T
+        noise += free * rng.standard_normal((len(rows), len(prior.bins)))
+        masses[rows[:, None], prior.bins] = (prior.moment + noise) @ inverse @ prior.root.T
     return masses, weights

@@ -219,7 +219,7 @@ def without_ripple(
         return list(tones)  # a position that precedes its command: the lags as they are
     by_number = {t.number: (t, r) for t, r in zip(trials, read, strict=True)}
     turn = -2j * np.pi * np.outer(frequency, edges)
-    own = np.diff(np.exp(turn)) / np.diff(turn)
+    own_means = np.diff(np.exp(turn)) / np.diff(turn)
     held_means: dict[tuple[float, ...], NDArray[np.float64]] = {}  # of the tones of one trial
 
     def row(tone: ToneResponse) -> NDArray[np.complex128]:
@@ -238,7 +238,7 @@ def without_ripple(
 
     ripple = np.stack([row(t) for t in tones])
     held = np.array([t.command_held for t in tones])
-    predicted = masses @ (ripple + held[:, None] * own).T
+    predicted = masses @ (ripple + held[:, None] * own_means).T
     chance, gain = _chances(predicted, tones)
     seen = gain[:, None] * (masses @ ripple.T)
     drawn = seen[rng.choice(len(chance), _DRAWS, p=chance)]
@@ -251,7 +251,7 @@ def without_ripple(
 
 def _servos(edges: NDArray, frequency: NDArray, lags: NDArray) -> NDArray[np.float64]:
     """Masses per bin of second-order servos whose lag may be the one seen, shape (servos, bins)."""
-    found = []
+    masses = []
     for constant in _TIME_CONSTANTS_S:
         for damping in _DAMPING:
             s = 2j * np.pi * frequency * constant
@@ -261,8 +261,8 @@ def _servos(edges: NDArray, frequency: NDArray, lags: NDArray) -> NDArray[np.flo
             dead_time = centre + reach
             dead_time = dead_time[dead_time >= 0]
             past = np.maximum(edges - dead_time[:, None], 0.0) / constant
-            found.append(np.diff(_second_order(past, damping), axis=1))
-    return np.concatenate(found)
+            masses.append(np.diff(_second_order(past, damping), axis=1))
+    return np.concatenate(masses)
 
 
 def _second_order(past: NDArray, damping: float) -> NDArray[np.float64]:
@@ -452,13 +452,13 @@ def _lines(time: NDArray[np.float64], command: NDArray[np.float64]) -> NDArray[n
     spectrum_hz = np.fft.rfftfreq(8 * len(even), loop)
     usable = spectrum_hz > 1.0 / span
     variance = float(np.var(command))
-    lines, left = np.zeros(0), command - command.mean()
-    while np.var(left) > _LEFT_OVER * variance:
+    lines, residuals = np.zeros(0), command - command.mean()
+    while np.var(residuals) > _LEFT_OVER * variance:
         if len(lines) == _MOST_LINES:
             return np.zeros(0)
-        strength = np.abs(np.fft.rfft(np.interp(even, time, left), 8 * len(even)))
+        strength = np.abs(np.fft.rfft(np.interp(even, time, residuals), 8 * len(even)))
         lines = np.append(lines, spectrum_hz[int(np.argmax(strength * usable))])
-        lines, left = _sharpened(time, command, lines)
+        lines, residuals = _sharpened(time, command, lines)
         if len(lines) > 1 and np.min(np.diff(np.sort(lines))) < _APART / span:
             return np.zeros(0)
     if np.min(lines, initial=np.inf) < _LEAST_PERIODS / span or not _predicts(time, command, lines):

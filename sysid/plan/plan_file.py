@@ -212,21 +212,21 @@ def parse_goal(text: str) -> Goal:
     Goal(quantity='dead_time', half_width_s=0.002)
     """
     form = "write dead_time:2ms for a dead time known within ± 2 ms"
-    found = _GOAL.fullmatch(text.strip())
-    if found is None or found[1] not in _QUANTITIES:
+    match = _GOAL.fullmatch(text.strip())
+    if match is None or match[1] not in _QUANTITIES:
         raise InputError(f"`until`: '{text}' is not a goal; {form}.")
-    if found[3] not in _UNITS:
+    if match[3] not in _UNITS:
         raise InputError(f"`until`: '{text}' has no unit of time; {form}.")
     try:
-        half = decimal(found[2]) * _UNITS[found[3]]
+        half = decimal(match[2]) * _UNITS[match[3]]
     except ValueError:
-        raise InputError(f"`until`: '{found[2]}' is not a number; {form}.") from None
+        raise InputError(f"`until`: '{match[2]}' is not a number; {form}.") from None
     if not LEAST_HALF_WIDTH_S < half <= 1:
         raise InputError(
             f"`until`: ± {1e3 * half:g} ms is out of reach. The model's time step alone leaves "
             f"± {1e3 * LEAST_HALF_WIDTH_S:.2g} ms; give a half width above it, up to 1 s."
         )
-    return Goal(found[1], half)
+    return Goal(match[1], half)
 
 
 def record_until(
@@ -246,21 +246,23 @@ def record_until(
     `most_seconds` is the most recorded time of a joint, the first sweep included [s]. `report` is
     called with the joints' state after every round of fits.
     """
-    files, found, widths = list(paths), dict[str, JointOutcome](), dict[str, list[float]]()
-    left = list(joints)
+    files, outcomes, widths = list(paths), dict[str, JointOutcome](), dict[str, list[float]]()
+    open_joints = list(joints)
     while True:
         recordings = [load(path) for path in files]
         plans: dict[str, SweepPlan] = {}
-        for joint, one in fit(recordings, left).items():
+        for joint, one in fit(recordings, open_joints).items():
             widths.setdefault(joint, []).append(half_width(one.dead_time_s))
-            found[joint], plan = _judged(goal, one, recordings, widths[joint], most_seconds, seed)
+            outcomes[joint], plan = _judged(
+                goal, one, recordings, widths[joint], most_seconds, seed
+            )
             if plan is not None:
                 plans[joint] = plan
-        left = list(plans)
+        open_joints = list(plans)
         if report:
-            report(found)
-        if not left:
-            ordered = {joint: found[joint] for joint in joints}
+            report(outcomes)
+        if not open_joints:
+            ordered = {joint: outcomes[joint] for joint in joints}
             return Outcome(joints=ordered, recordings=tuple(files))
         joined = {
             name: tuple(entry for p in plans.values() for entry in getattr(p, name))

@@ -109,15 +109,15 @@ class Candidate:
 
 def candidates(setup: Setup, duration_s: float) -> list[Candidate]:
     """Trials of `duration_s` without the lead-in [s] that a joint may execute."""
-    found = []
+    trials = []
     for kind, frequency, amplitude in _choices(setup, duration_s):
-        made = excitation.plan(
+        planned = excitation.plan(
             kind, ["joint"], [frequency], amplitude, duration_s, setup.loop_period_s,
             setup.speed_limit_rad_s, setup.poll_rate_hz,
         )  # fmt: skip
-        run = recorded(made.trials[0], setup)
-        found.append(Candidate(kind, frequency, amplitude, duration_s, run))
-    return found
+        run = recorded(planned.trials[0], setup)
+        trials.append(Candidate(kind, frequency, amplitude, duration_s, run))
+    return trials
 
 
 def recorded(trial: excitation.TrialPlan, setup: Setup) -> Run:
@@ -282,8 +282,8 @@ def propose(joint: str, servos: Sequence[Servo], setup: Setup, seconds: float) -
     chosen: list[int] = []
     for _ in range(count):
         used = [tones[k] for k in chosen]
-        left = [k for k in usable if used.count(tones[k]) < _MOST_OF_A_TONE] or usable
-        chosen.append(min(left, key=lambda k: _criterion(worlds, [*chosen, k])))
+        allowed = [k for k in usable if used.count(tones[k]) < _MOST_OF_A_TONE] or usable
+        chosen.append(min(allowed, key=lambda k: _criterion(worlds, [*chosen, k])))
     purposes = [_purpose(worlds, chosen[:n], chosen[n]) for n in range(count)]
     trials = [
         PlannedTrial(
@@ -350,17 +350,17 @@ class _World:
         With `smooth` its ends move from the hull to the first hypothesis' own interval as the nats
         grow to `SURE_NATS`, so that every trial that tells the two apart counts.
         """
-        own = self.interval(0, 0, chosen)
-        low, high = own.low, own.high
+        now = self.interval(0, 0, chosen)
+        low, high = now.low, now.high
         for which in range(1, len(self.servo.hypotheses)):
             nats = self.nats(which, chosen)
             share = 1.0 - nats / SURE_NATS if smooth else float(nats <= CLEAR_NATS)
             if share > 0:
                 rival = self.interval(which, 0, chosen)
-                low = min(low, own.low + share * (rival.low - own.low))
-                high = max(high, own.high + share * (rival.high - own.high))
+                low = min(low, now.low + share * (rival.low - now.low))
+                high = max(high, now.high + share * (rival.high - now.high))
         doubt = self.servo.doubt_s
-        return Interval(own.value, max(low - doubt, 0.0), high + doubt)
+        return Interval(now.value, max(low - doubt, 0.0), high + doubt)
 
     def interval(self, which: int, coordinate: int, chosen: Sequence[int]) -> Interval:
         """Expected interval of one parameter under one hypothesis, in its own unit."""
@@ -407,14 +407,14 @@ def _purpose(worlds: Sequence[_World], before: Sequence[int], one: int) -> str:
     """What a trial is for: the quantities that it narrows most after those chosen before it."""
     chosen = [*before, one]
     names = [p.name for p in worlds[0].servo.hypotheses[0].model.parameters[:-1]]
-    gain, told = np.zeros(len(names)), 0.0
+    gain, separated = np.zeros(len(names)), 0.0
     for world in worlds:
         with_, without = (np.diag(world.covariance(0, c)) for c in (chosen, before))
         gain += np.log(without / with_)[:-1]
         for which in range(1, len(world.servo.hypotheses)):
             least, most = (min(world.nats(which, c), CLEAR_NATS) for c in (before, chosen))
-            told += (most - least) / CLEAR_NATS
-    if told > _TELLS * len(worlds):
+            separated += (most - least) / CLEAR_NATS
+    if separated > _TELLS * len(worlds):
         return "structure"
     order = sorted(range(len(names)), key=lambda k: (k != 0, -gain[k]))
     most = [names[k] for k in order if gain[k] >= 0.6 * gain.max()]
@@ -436,7 +436,7 @@ def _notes(
     joint: str, world: _World, choice: Sequence[Candidate], chosen: Sequence[int]
 ) -> list[str]:
     """What stays unknown, and whether any of the candidates alone could show it."""
-    found = []
+    notes = []
     count = len(chosen)
     sd = np.sqrt(np.diag(world.covariance(0, chosen)))
     best = np.min(
@@ -446,13 +446,13 @@ def _notes(
         name = word(parameter.name)
         most = min(_UNSEEN_SD, _PRIOR_SHARE * parameter.prior_sd)
         if best[k] > most:
-            found.append(
+            notes.append(
                 f"{joint}: {name} cannot be seen at any amplitude within the limits "
                 f"(excursion {max(c.amplitude_rad for c in choice):g} rad): its interval would "
                 f"span a factor of {np.exp(2 * HALF_WIDTH_SD * best[k]):.1f} at best."
             )
         elif sd[k] > most:
-            found.append(
+            notes.append(
                 f"{joint}: {name} would still span a factor of "
                 f"{np.exp(2 * HALF_WIDTH_SD * sd[k]):.1f}; more seconds would narrow it."
             )
@@ -460,25 +460,25 @@ def _notes(
         nats = world.nats(which, chosen)
         if nats < CLEAR_NATS:
             names = [world.servo.hypotheses[i].model.name for i in (0, which)]
-            found.append(
+            notes.append(
                 f"{joint}: {names[0]} and {names[1]} would still explain the readings alike "
                 f"(log Bayes factor {nats:.1f}, below {CLEAR_NATS:g}): the dead time's interval "
                 "covers both."
             )
     if world.servo.doubt_s > 0:
-        found.append(
+        notes.append(
             f"{joint}: the dates of the readings are in doubt by ± "
             f"{1e3 * world.servo.doubt_s:.1f} ms, and so is the dead time, whatever is recorded. "
             "A longer trial may show the poll; a header line `# readings` settles live readings."
         )
     now, after = world.dead_time_s([]), world.dead_time_s(chosen)
     if (after.high - after.low) > (1 - _HELPS) * (now.high - now.low):
-        found.append(
+        notes.append(
             f"{joint}: no trial within the limits narrows the dead time's interval of "
             f"± {500 * (now.high - now.low):.1f} ms; ± {1e3 * LEAST_HALF_WIDTH_S:.1f} ms of it "
             "are the model's time step."
         )
-    return found
+    return notes
 
 
 _STEP = 0.03  # of the sensitivities: the slope over a likely error, not of one kink

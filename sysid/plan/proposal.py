@@ -157,13 +157,13 @@ def plan_from_calibration(
     base = Setup(loop_period_s=loop_period_s)
     plans, polls = [], []
     for joint in joints:
-        own = calibration.joint(joint)
-        poll = own.feedback
+        fitted = calibration.joint(joint)
+        poll = fitted.feedback
         setup = replace(
             _within(base, joint, margins, LARGEST_RAD), poll_period_s=poll.poll_period_s.value,
             loss=poll.loss.value, quantum_rad=poll.quantum_rad.value,
         )  # fmt: skip
-        plans.append(propose(joint, [calibrated_servo(own)], setup, seconds))
+        plans.append(propose(joint, [calibrated_servo(fitted)], setup, seconds))
         polls.append(setup.poll_rate_hz)
     return _pooled(plans, (source,), seed, replace(base, poll_period_s=_period(polls)))
 
@@ -180,14 +180,16 @@ def plan_first_sweep(
 
     The trials are the best on average over servos drawn from the prior of `sysid.fit.structure`.
     """
-    servos, made, plans = unknown_servos(seed), dict[float, JointPlan](), []
+    servos, plans_by_amplitude, plans = unknown_servos(seed), dict[float, JointPlan](), []
     for joint in joints:
-        own = _within(setup, joint, margins, LARGEST_RAD)
-        reach = min(own.margin_rad, LARGEST_RAD)
-        if reach not in made:  # joints with the same margin get the same trials
-            made[reach] = propose(joint, servos, own, seconds)
-        trials = tuple(t.model_copy(update={"joint": joint}) for t in made[reach].trials)
-        plans.append(replace(made[reach], trials=trials))
+        joint_setup = _within(setup, joint, margins, LARGEST_RAD)
+        reach = min(joint_setup.margin_rad, LARGEST_RAD)
+        if reach not in plans_by_amplitude:  # joints with the same margin get the same trials
+            plans_by_amplitude[reach] = propose(joint, servos, joint_setup, seconds)
+        trials = tuple(
+            t.model_copy(update={"joint": joint}) for t in plans_by_amplitude[reach].trials
+        )
+        plans.append(replace(plans_by_amplitude[reach], trials=trials))
     return _pooled(plans, (), seed, setup)
 
 
@@ -292,31 +294,31 @@ def calibrated_servo(joint: JointCalibration) -> Servo:
         max(joint.scores.rmse_free_run_fresh_rad or 0.0, floor),
         _USUAL_NOISE.jitter_s if jitter.identified == "no" else jitter.value,
     )
-    found = []
+    servos = []
     for name in SIMULATED:
         model = candidate(name)
         values = named.get(name) or (_preset(joint.actuator) if name == SIMULATED[0] else None)
         if values is not None and set(model.names) <= set(values):
             known = prior_information(model) + _interval_information(model, joint.actuator)
-            found.append(Hypothesis(model, np.array([values[n] for n in model.names]), known))
+            servos.append(Hypothesis(model, np.array([values[n] for n in model.names]), known))
     chosen = joint.selection.model
-    found.sort(key=lambda h: h.model.name != chosen)
+    servos.sort(key=lambda h: h.model.name != chosen)
     scores = {c.model: c.rmse_fresh_rad for c in joint.selection.candidate_models}
-    best = scores.get(found[0].model.name)
+    best = scores.get(servos[0].model.name)
     # a calibration tells of its readings no more than the size of the errors: models whose errors
     # differ by less than a tenth count as equally good
     nats = tuple(
         CLEAR_NATS if best and (scores.get(h.model.name) or best) > 1.1 * best else 0.0
-        for h in found
+        for h in servos
     )
-    return Servo(tuple(found), noise, nats)
+    return Servo(tuple(servos), noise, nats)
 
 
 def unknown_servos(seed: int) -> list[Servo]:
     """Servos drawn from the prior, with both structures each."""
     rng = np.random.default_rng(seed)
-    found: list[Servo] = []
-    while len(found) < _DRAWS:
+    servos: list[Servo] = []
+    while len(servos) < _DRAWS:
         hypotheses = []
         shared: dict[str, float] = {}
         for model in map(candidate, SIMULATED):
@@ -332,8 +334,8 @@ def unknown_servos(seed: int) -> list[Servo]:
             values = np.array([shared[n] for n in model.names])
             hypotheses.append(Hypothesis(model, values, prior_information(model)))
         if shared["friction_rad_s2"] < 0.7 * shared["effort_rad_s2"]:  # it moves at all
-            found.append(Servo(tuple(hypotheses), _USUAL_NOISE, (0.0,) * len(hypotheses)))
-    return found
+            servos.append(Servo(tuple(hypotheses), _USUAL_NOISE, (0.0,) * len(hypotheses)))
+    return servos
 
 
 def feedback_setup(lag: LagBudget, setup: Setup) -> Setup:

@@ -88,21 +88,28 @@ def _lag_bar(axes: Axes, row: int, part: LagBudget) -> float:
     raw, dead_time = 1e3 * part.raw_lag_s.value, part.dead_time_s
     assert dead_time is not None
     lengths = (part.command_hold_s, dead_time.value, part.dynamics_s, part.stale_lag_s)
-    left = 0.0
+    start = 0.0
     for (name, colour, hatch), length in zip(_LAG_KINDS, lengths, strict=True):
-        shown = max(1e3 * length, 0.0)
+        length_ms = max(1e3 * length, 0.0)
         axes.barh(
-            row, shown, left=left, height=0.62, color=colour, hatch=hatch, edgecolor="white", lw=0
+            row,
+            length_ms,
+            left=start,
+            height=0.62,
+            color=colour,
+            hatch=hatch,
+            edgecolor="white",
+            lw=0,
         )
-        if shown > 5.0:
+        if length_ms > 5.0:
             # the feedback's hatching would run through its number
             box = {"boxstyle": "round,pad=0.15", "fc": colour, "ec": "none"}
             axes.text(
-                left + 0.5 * shown, row - 0.13 * (name == "dead time"), f"{shown:.0f}",
+                start + 0.5 * length_ms, row - 0.13 * (name == "dead time"), f"{length_ms:.0f}",
                 ha="center", va="center", color=_LIGHT if colour in (BLUE, GREEN) else _DARK,
                 bbox=box if hatch else None,
             )  # fmt: skip
-        left += shown
+        start += length_ms
     middle = 1e3 * (part.command_hold_s + dead_time.value)
     below = 1e3 * max(dead_time.value - dead_time.low, 0.0)
     above = 1e3 * max(dead_time.high - dead_time.value, 0.0)
@@ -113,16 +120,16 @@ def _lag_bar(axes: Axes, row: int, part: LagBudget) -> float:
         )  # fmt: skip
     axes.plot([raw, raw], [row - 0.4, row + 0.4], color=INK, lw=2.2)
     axes.text(raw + 0.015 * max(raw, 1.0), row, f"{raw:.0f}", va="center", weight="bold")
-    return max(raw, left)
+    return max(raw, start)
 
 
 @styled
-def hold_histogram_figure(found: Mapping[str, HoldRuns]) -> Figure:
+def hold_histogram_figure(holds: Mapping[str, HoldRuns]) -> Figure:
     """For how many rows each reading stayed the same, counted and predicted by poll and loss."""
-    columns = 1 if len(found) <= _SINGLE else 3
-    figure, grid = axes_grid(len(found), columns, 1.6)
+    columns = 1 if len(holds) <= _SINGLE else 3
+    figure, grid = axes_grid(len(holds), columns, 1.6)
     length = np.arange(1, LONGEST_RUN + 1)
-    for n, (axes, (joint, runs)) in enumerate(zip(grid, found.items(), strict=True)):
+    for n, (axes, (joint, runs)) in enumerate(zip(grid, holds.items(), strict=True)):
         lattice = runs.lattice
         axes.bar(length, runs.count, color=ORANGE, label="counted")
         title = f"{joint}: {_LATTICE_WORDS.get(lattice.kind, lattice.kind)}"
@@ -207,11 +214,11 @@ def sweep_figure(trials: Sequence[Trial]) -> Figure:
     figure, panels = axes_column(len(trials), 0.6 + 1.35 * len(trials))
     for axes, trial in zip(panels, trials, strict=True):
         start = float(np.median(trial.send_time_s))
-        shown = within(trial.send_time_s, start, start + 3.0 / trial.frequency_hz)
-        time = trial.send_time_s[shown] - start
-        reading = trial.position_rad[shown]
+        rows = within(trial.send_time_s, start, start + 3.0 / trial.frequency_hz)
+        time = trial.send_time_s[rows] - start
+        reading = trial.position_rad[rows]
         fresh = np.diff(reading, prepend=np.nan) != 0
-        axes.plot(time, trial.command_rad[shown], "--", color=BLUE, lw=1.2, label="command")
+        axes.plot(time, trial.command_rad[rows], "--", color=BLUE, lw=1.2, label="command")
         axes.plot(time[~fresh], reading[~fresh], "o", ms=2.5, color=FAINT, label="stale reading")
         axes.plot(time[fresh], reading[fresh], "o", ms=3.0, color=RED, label="fresh reading")
         axes.set_title(f"{trial.joint}, {trial.frequency_hz:g} Hz")
@@ -308,9 +315,9 @@ def within(time: NDArray, start: float, stop: float) -> NDArray[np.bool_]:
     return (time >= start) & (time <= stop)
 
 
-def some_tracks(found: list[Track], count: int = 4) -> list[Track]:
+def some_tracks(every: list[Track], count: int = 4) -> list[Track]:
     """At most `count` tracks, spread over their frequencies, slowest first."""
-    order = sorted(found, key=lambda t: t.frequency_hz if t.frequency_hz > 0 else 0.0)
+    order = sorted(every, key=lambda t: t.frequency_hz if t.frequency_hz > 0 else 0.0)
     seen: dict[float, Track] = {}
     for n, track in enumerate(order):
         seen.setdefault(
@@ -369,11 +376,11 @@ def hold_runs(
 
 
 @styled
-def overlay_figure(result: JointCalibrationResult, found: list[Track] | None = None) -> Figure:
+def overlay_figure(result: JointCalibrationResult, of_trials: list[Track] | None = None) -> Figure:
     """Command, model and readings, the fresh ones at the time they were measured."""
-    shown = some_tracks(tracks(result) if found is None else found)
-    figure, grid = axes_column(len(shown), 1.2 + 1.75 * len(shown))
-    for axes, track in zip(grid, shown, strict=True):
+    chosen = some_tracks(tracks(result) if of_trials is None else of_trials)
+    figure, grid = axes_column(len(chosen), 1.2 + 1.75 * len(chosen))
+    for axes, track in zip(grid, chosen, strict=True):
         _overlay(axes, track, result.joint, 1.0)
         axes.set_ylabel("from rest [rad]")
     grid[-1].set_xlabel("time in the trial [s]")
@@ -382,25 +389,25 @@ def overlay_figure(result: JointCalibrationResult, found: list[Track] | None = N
 
 
 @styled
-def overlay_grid(found: Mapping[str, list[Track]]) -> Figure:
+def overlay_grid(by_joint: Mapping[str, list[Track]]) -> Figure:
     """The same of every joint beside the others, one frequency each; no joint without tracks."""
 
-    def draw(axes: Axes, joint: str, own: list[Track]) -> None:
-        spread = some_tracks(own, 3)
+    def draw(axes: Axes, joint: str, joint_tracks: list[Track]) -> None:
+        spread = some_tracks(joint_tracks, 3)
         _overlay(axes, spread[len(spread) // 2], joint, 0.7)
 
-    columns = 2 if len(found) < 3 else 4  # of a narrow and of a wide figure
-    return _small_multiples(found, draw, "time in the trial [s]", "from rest [rad]", columns)
+    columns = 2 if len(by_joint) < 3 else 4  # of a narrow and of a wide figure
+    return _small_multiples(by_joint, draw, "time in the trial [s]", "from rest [rad]", columns)
 
 
 def _small_multiples(
-    found: Mapping[str, list[Track]], draw: Callable[[Axes, str, list[Track]], None],
+    by_joint: Mapping[str, list[Track]], draw: Callable[[Axes, str, list[Track]], None],
     below: str, beside: str, columns: int,
 ) -> Figure:  # fmt: skip
     """A panel per joint, three in a row, with one legend of `columns`."""
-    figure, grid = axes_grid(len(found), 3, 1.75)
-    for n, (axes, (joint, own)) in enumerate(zip(grid, found.items(), strict=True)):
-        draw(axes, joint, own)
+    figure, grid = axes_grid(len(by_joint), 3, 1.75)
+    for n, (axes, (joint, joint_tracks)) in enumerate(zip(grid, by_joint.items(), strict=True)):
+        draw(axes, joint, joint_tracks)
         if n % 3 == 0:
             axes.set_ylabel(beside)
         if n >= len(grid) - 3:
@@ -442,32 +449,34 @@ OVERLAY_PARTS = {
 
 
 @styled
-def residual_figure(result: JointCalibrationResult, found: list[Track] | None = None) -> Figure:
+def residual_figure(result: JointCalibrationResult, of_trials: list[Track] | None = None) -> Figure:
     """Residuals of the model: over speed, fresh and raw; and over time."""
-    found = tracks(result) if found is None else found
+    of_trials = tracks(result) if of_trials is None else of_trials
     figure, (over_speed, over_time) = axes_column(2, 6.0)
     lattice = result.lag.feedback
     age = 1e3 * (lattice.mean_age_s if np.isfinite(lattice.mean_age_s) else result.lag.stale_lag_s)
     rows = f"all rows at their own time (dashed: speed × {age:.0f} ms)"
-    _residuals_over_speed(over_speed, found, 1.0, rows)
-    fastest = np.max([np.max(np.abs(t.row_speed_rad_s), initial=0.0) for t in found], initial=0.0)
+    _residuals_over_speed(over_speed, of_trials, 1.0, rows)
+    fastest = np.max(
+        [np.max(np.abs(t.row_speed_rad_s), initial=0.0) for t in of_trials], initial=0.0
+    )
     reach = np.array([-1.0, 1.0]) * fastest
     over_speed.plot(reach, -age * reach, color=INK, lw=1.2, ls=(0, (4, 2)))
     over_speed.set_xlabel("speed of the model [rad/s]")
     over_speed.set_ylabel("reading − model [mrad]")
     start = 0.0
-    for n, track in enumerate(found):
+    for n, track in enumerate(of_trials):
         over_time.plot(
             start + track.fresh_time_s, 1e3 * track.fresh_error_rad, ".", color=RED, ms=4
         )
-        if track.frequency_hz > 0 and len(found) <= 12:
+        if track.frequency_hz > 0 and len(of_trials) <= 12:
             over_time.text(
                 start + 0.5 * track.time_s[-1], 0.97, f"{track.frequency_hz:.3g} Hz",
                 transform=over_time.get_xaxis_transform(), ha="center", va="top",
                 fontsize=9,
             )  # fmt: skip
         start += float(track.time_s[-1])
-        if n < len(found) - 1:
+        if n < len(of_trials) - 1:
             over_time.axvline(start, color=FAINT, lw=0.8)
     over_time.axhline(0, color=INK, lw=0.8)
     over_time.margins(x=0.01, y=0.2)
@@ -478,20 +487,20 @@ def residual_figure(result: JointCalibrationResult, found: list[Track] | None = 
 
 
 @styled
-def residual_grid(found: Mapping[str, list[Track]]) -> Figure:
+def residual_grid(by_joint: Mapping[str, list[Track]]) -> Figure:
     """Fresh and raw residuals over speed, of every joint beside the others."""
 
-    def draw(axes: Axes, joint: str, own: list[Track]) -> None:
-        _residuals_over_speed(axes, own, 0.7, "all rows at their own time")
+    def draw(axes: Axes, joint: str, joint_tracks: list[Track]) -> None:
+        _residuals_over_speed(axes, joint_tracks, 0.7, "all rows at their own time")
         axes.set_title(joint)
 
     speed, error = "speed of the model [rad/s]", "reading − model [mrad]"
-    return _small_multiples(found, draw, speed, error, 1 if len(found) < 3 else 2)
+    return _small_multiples(by_joint, draw, speed, error, 1 if len(by_joint) < 3 else 2)
 
 
-def _residuals_over_speed(axes: Axes, found: list[Track], size: float, rows: str) -> None:
+def _residuals_over_speed(axes: Axes, of_trials: list[Track], size: float, rows: str) -> None:
     def gathered(name: str) -> NDArray:
-        return np.concatenate([getattr(t, name) for t in found])
+        return np.concatenate([getattr(t, name) for t in of_trials])
 
     axes.plot(
         gathered("row_speed_rad_s"), 1e3 * gathered("row_error_rad"), ".", color=FAINT,

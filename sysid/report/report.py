@@ -121,16 +121,16 @@ def write_report(
         if progress:
             progress(what, done / steps)
 
-    for given in models:  # before the work, not after it
-        named = isinstance(given, str | Path) and not is_shipped(given)
-        if named and not Path(str(given)).exists():
-            raise InputError(f"`servo` is {given}: there is no such servo model, file or folder.")
+    for model in models:  # before the work, not after it
+        named = isinstance(model, str | Path) and not is_shipped(model)
+        if named and not Path(str(model)).exists():
+            raise InputError(f"`servo` is {model}: there is no such servo model, file or folder.")
     results: dict[str, JointCalibrationResult] = {}
     if calibration is not None:
         if known := [name for name in names if can_recall(calibration.joint(name))]:
             results = recall(calibration, recordings, known, advance)
-    if left := [name for name in names if name not in results]:
-        fitted = calibrate(recordings, left, seed, workers=workers, progress=advance)
+    if missing := [name for name in names if name not in results]:
+        fitted = calibrate(recordings, missing, seed, workers=workers, progress=advance)
         calibration = calibration or fitted.calibration
         results |= fitted.joints
     assert calibration is not None
@@ -149,20 +149,20 @@ def write_report(
 
         lattices = {joint: lag.feedback for joint, lag in lags.items()}
         comparison = compare(recordings, models, names, seed=seed, lattices=lattices)
-    found = Findings(
+    findings = Findings(
         recordings=recordings, results=results, calibration=calibration, responses=responses,
         examinations=((examined.recording, examined),), comparison=comparison,
     )  # fmt: skip
-    return write_findings(found, Path(folder), force)
+    return write_findings(findings, Path(folder), force)
 
 
-def write_findings(found: Findings, folder: Path, force: bool = False) -> WrittenPage:
+def write_findings(findings: Findings, folder: Path, force: bool = False) -> WrittenPage:
     """Write the page of findings, its figures and its tables; errors as for `write_page`."""
-    more = len(found.recordings) - 1
-    title = f"Servo report: {found.recordings[0].name}" + (f" and {more} more" if more else "")
-    made = found.calibration
-    subtitle = f"{made.robot} · {', '.join(found.results)} · {made.created}"
-    return write_page(folder / PAGE, title, subtitle, sections(found), force)
+    more = len(findings.recordings) - 1
+    title = f"Servo report: {findings.recordings[0].name}" + (f" and {more} more" if more else "")
+    calibration = findings.calibration
+    subtitle = f"{calibration.robot} · {', '.join(findings.results)} · {calibration.created}"
+    return write_page(folder / PAGE, title, subtitle, sections(findings), force)
 
 
 def can_recall(joint: JointCalibration) -> bool:
@@ -183,12 +183,12 @@ def recall(
     `can_recall` holds for all `joints`. Intervals are those of the file: of the model that
     simulators run. Errors by left-out frequency are not in the file; the error over all of them is.
     """
-    found = {}
+    results = {}
     for name, trials in checks.usable_trials(recordings, joints).items():
-        found[name] = _joint(name, calibration.joint(name), trials, calibration.seed or 0)
+        results[name] = _joint(name, calibration.joint(name), trials, calibration.seed or 0)
         if progress:
             progress(name)
-    return found
+    return results
 
 
 def _joint(
@@ -221,9 +221,9 @@ def _joint(
 
 def _lag(measured: LagBudget, known: JointCalibration) -> LagBudget:
     """The lag budget with the numbers of the file: other dates move the last digits."""
-    own = known.lag
+    stated_lag = known.lag
     lags = {
-        name: getattr(measured, name) if (q := getattr(own, name)) is None else _interval(q)
+        name: getattr(measured, name) if (q := getattr(stated_lag, name)) is None else _interval(q)
         for name in ("lag_s", "raw_lag_s", "fresh_lag_s")
     }
     lattice = measured.feedback
@@ -295,6 +295,6 @@ def _quantities(joint: JointCalibration) -> dict[str, Quantity]:
 
 
 def _interval(quantity: Quantity, value: float | None = None) -> Interval:
-    own = quantity.value if value is None else value
-    low = own if quantity.low is None else quantity.low
-    return Interval(own, low, own if quantity.high is None else quantity.high)
+    best = quantity.value if value is None else value
+    low = best if quantity.low is None else quantity.low
+    return Interval(best, low, best if quantity.high is None else quantity.high)

@@ -58,22 +58,27 @@ class Findings:
     """Of servo models."""
 
 
-def sections(found: Findings) -> list[Section]:
+def sections(findings: Findings) -> list[Section]:
     """All sections of the page, in order: first what holds for all joints, then joint by joint."""
-    results = found.results
-    runs = {joint: made for joint, result in results.items() if (made := tracks(result))}
-    made = [_summary(results), _lag(results), _doctor(found), _free_runs(results, runs)]
-    parameters = tables.parameter_table(found.calibration, list(results))
-    made += [_parameters(found, parameters), _models(results), _holds(found), _bode(found)]
-    if found.comparison:
-        made.append(servo_section(found.comparison))
-    next_steps = advice(results, found.calibration, found.examinations)
-    made += [
-        _joints(found, runs, parameters),
-        Section("next", "What to record next", findings=[("", text) for text in next_steps]),
-        _provenance(found),
+    results = findings.results
+    runs = {joint: parts for joint, result in results.items() if (parts := tracks(result))}
+    parts = [_summary(results), _lag(results), _doctor(findings), _free_runs(results, runs)]
+    parameters = tables.parameter_table(findings.calibration, list(results))
+    parts += [
+        _parameters(findings, parameters),
+        _models(results),
+        _holds(findings),
+        _bode(findings),
     ]
-    return [s for s in made if s.text or s.findings or s.figures or s.tables or s.folds]
+    if findings.comparison:
+        parts.append(servo_section(findings.comparison))
+    next_steps = advice(results, findings.calibration, findings.examinations)
+    parts += [
+        _joints(findings, runs, parameters),
+        Section("next", "What to record next", findings=[("", text) for text in next_steps]),
+        _provenance(findings),
+    ]
+    return [s for s in parts if s.text or s.findings or s.figures or s.tables or s.folds]
 
 
 def _summary(results: Mapping[str, JointCalibrationResult]) -> Section:
@@ -119,15 +124,17 @@ _NEGATIVE_S = -5e-5
 
 def shared(by_joint: Mapping[str, Sequence[str]]) -> list[str]:
     """Sentences of joints, each once, behind the names of all joints that it holds for."""
-    bare = {joint: [t.removeprefix(f"{joint}: ") for t in own] for joint, own in by_joint.items()}
+    bare = {
+        joint: [t.removeprefix(f"{joint}: ") for t in texts] for joint, texts in by_joint.items()
+    }
     return [f"{names}: {text}" for names, text in share_sentences(bare)]
 
 
-def _doctor(found: Findings) -> Section:
+def _doctor(findings: Findings) -> Section:
     said: dict[str, list[str]] = {}
-    for _, examination in found.examinations:
+    for _, examination in findings.examinations:
         for name, joint in examination.joints.items():
-            if name in found.results:
+            if name in findings.results:
                 sentences = (f"{joint.verdict}.", *joint.reasons)
                 said.setdefault(name, []).extend(t[:1].upper() + t[1:] for t in sentences)
     texts: dict[str, list[str]] = {}
@@ -136,7 +143,7 @@ def _doctor(found: Findings) -> Section:
     return Section(
         "doctor", "Are the recordings usable?",
         findings=[(names, " ".join(sentences)) for names, sentences in texts.items()],
-        tables=[tables.doctor_table(found.examinations, found.results)],
+        tables=[tables.doctor_table(findings.examinations, findings.results)],
     )  # fmt: skip
 
 
@@ -147,8 +154,11 @@ def _free_runs(
     text = "DelayedPD runs freely from where the joint rested: its input is commands only."
     pictures = []
     if len(runs) == 1:
-        ((joint, own),) = runs.items()
-        pictures = [_overlay(results[joint], own), _residuals(results[joint], own)]
+        ((joint, joint_tracks),) = runs.items()
+        pictures = [
+            _overlay(results[joint], joint_tracks),
+            _residuals(results[joint], joint_tracks),
+        ]
     elif runs:
         pictures = [
             Picture("overlay", _OVERLAY, figures.overlay_grid(runs), wide=True),
@@ -181,20 +191,24 @@ def _residuals(result: JointCalibrationResult, runs: list[Track]) -> Picture:
     return Picture(f"residuals_{result.joint}", words, drawn)
 
 
-def _joints(found: Findings, runs: Mapping[str, list[Track]], parameters: Table) -> Section:
+def _joints(findings: Findings, runs: Mapping[str, list[Track]], parameters: Table) -> Section:
     """Everything about each joint, folded."""
-    models = tables.model_table(found.results)
-    by_frequency = tables.frequency_table({j: r.lag for j, r in found.results.items()})
-    forms = tables.transfer_table(found.responses)
+    models = tables.model_table(findings.results)
+    by_frequency = tables.frequency_table({j: r.lag for j, r in findings.results.items()})
+    forms = tables.transfer_table(findings.responses)
     folds = []
-    for joint, result in found.results.items():
-        own = runs.get(joint, [])
-        drawn = [_overlay(result, own), _residuals(result, own)] if own and len(runs) > 1 else []
-        shown = [t.where("joint", joint) for t in (parameters, models, by_frequency, forms)]
+    for joint, result in findings.results.items():
+        joint_tracks = runs.get(joint, [])
+        drawn = (
+            [_overlay(result, joint_tracks), _residuals(result, joint_tracks)]
+            if joint_tracks and len(runs) > 1
+            else []
+        )
+        joint_tables = [t.where("joint", joint) for t in (parameters, models, by_frequency, forms)]
         folds.append(
             Fold(
-                joint, figures=drawn, tables=[t for t in shown if t.rows],
-                opened=len(found.results) == 1,
+                joint, figures=drawn, tables=[t for t in joint_tables if t.rows],
+                opened=len(findings.results) == 1,
             )
         )  # fmt: skip
     return Section(
@@ -202,10 +216,10 @@ def _joints(found: Findings, runs: Mapping[str, list[Track]], parameters: Table)
     )
 
 
-def _holds(found: Findings) -> Section:
+def _holds(findings: Findings) -> Section:
     held = {}
-    for joint, result in found.results.items():
-        examined = [e.joints[joint] for _, e in found.examinations if joint in e.joints]
+    for joint, result in findings.results.items():
+        examined = [e.joints[joint] for _, e in findings.examinations if joint in e.joints]
         if examined:
             held[joint] = hold_runs(
                 [e.hold_histogram for e in examined],
@@ -223,27 +237,27 @@ def _holds(found: Findings) -> Section:
     return Section("holds", "How long readings are held", figures=pictures)
 
 
-def _bode(found: Findings) -> Section:
+def _bode(findings: Findings) -> Section:
     pictures = []
-    if found.responses:
+    if findings.responses:
         text = (
             "Frequency response from the held command to the motion, from fresh readings, with "
             "90 % intervals. Hollow marks: gain of all rows, held ones included, which is too low."
         )
-        pictures.append(Picture("bode", text, figures.bode_figure(found.responses)))
+        pictures.append(Picture("bode", text, figures.bode_figure(findings.responses)))
     return Section(
         "bode", "Frequency response", figures=pictures,
         findings=share_sentences(
             {
                 joint: [f"−3 dB bandwidth {response.bandwidth_text}."]
-                for joint, response in found.responses.items()
+                for joint, response in findings.responses.items()
             }
         ),
         notes=[
             "A transfer function has neither friction nor limits, so the delay of its form is not "
             "the dead time of the servo, which stands under Parameters. The forms stand under each "
             "joint.",
-        ] if found.responses else [],
+        ] if findings.responses else [],
     )  # fmt: skip
 
 
@@ -273,8 +287,8 @@ def _models(results: Mapping[str, JointCalibrationResult]) -> Section:
     )
 
 
-def _parameters(found: Findings, parameters: Table) -> Section:
-    scale = found.calibration.joint(next(iter(found.results))).actuator.scale
+def _parameters(findings: Findings, parameters: Table) -> Section:
+    scale = findings.calibration.joint(next(iter(findings.results))).actuator.scale
     return Section(
         "parameters",
         "Parameters",
@@ -288,14 +302,14 @@ def _parameters(found: Findings, parameters: Table) -> Section:
         notes=shared(
             {
                 joint: [w for w in r.warnings if w not in (*r.lag.warnings, *r.differences)]
-                for joint, r in found.results.items()
+                for joint, r in findings.results.items()
             }
         ),
     )
 
 
-def _provenance(found: Findings) -> Section:
-    recordings, calibration = found.recordings, found.calibration
+def _provenance(findings: Findings) -> Section:
+    recordings, calibration = findings.recordings, findings.calibration
     rows = [
         {
             "recording": r.path.name if r.path else r.name,
@@ -353,17 +367,21 @@ def advice(
     gaps = {
         joint: _gaps(result, calibration.joint(joint).actuator) for joint, result in results.items()
     }
-    found = [f"{j}: {text}" for own in (again, gaps) for j, text in share_sentences(own)]
+    sentences = [
+        f"{j}: {text}" for by_joint in (again, gaps) for j, text in share_sentences(by_joint)
+    ]
     if any(calibration.joint(j).actuator.scale.anchor == "stall torque" for j in results):
-        found.append(
+        sentences.append(
             "Torques rest on an assumed stall torque, because a joint that swings in free air "
             "shows only ratios to its inertia. Hang a known mass at a known distance from the "
             "joint and record the same sweep: that gives the scale."
         )
     missing = [j for j in JOINT_NAMES if j not in results]
     if 0 < len(missing) < len(JOINT_NAMES):  # of a Mini Pupper; how many others have is not known
-        found.append(f"Not recorded yet: {', '.join(missing)}. `pupper-sysid sweep` records them.")
-    return found
+        sentences.append(
+            f"Not recorded yet: {', '.join(missing)}. `pupper-sysid sweep` records them."
+        )
+    return sentences
 
 
 def _gaps(result: JointCalibrationResult, actuator: Actuator) -> list[str]:
@@ -372,57 +390,61 @@ def _gaps(result: JointCalibrationResult, actuator: Actuator) -> list[str]:
     tones = sorted({round(t.frequency_hz, 2) for t in result.runs if t.frequency_hz > 0})
     fresh = sum(len(t.sample_step) for t in result.runs)
     width = 1e3 * (result.dead_time_s.high - result.dead_time_s.low)
-    found = []
+    sentences = []
     ratios = actuator.ratios_to_armature
     limits = {
         "speed": (actuator.velocity_limit_rad_s, ratios.back_emf), "torque": (ratios.effort_limit,)
     }  # fmt: skip
     unknown = [
-        name for name, own in limits.items() if all(quantity.identified == "no" for quantity in own)
+        name
+        for name, quantities in limits.items()
+        if all(quantity.identified == "no" for quantity in quantities)
     ]
     if unknown:
-        found.append(
+        sentences.append(
             f"the limit of its {' and '.join(unknown)} is not identified. Record steps, or tones "
             "whose peak speed 2π·f·A comes close to the servo's no-load speed."
         )
     if ratios.friction_loss.identified == "no":
-        found.append(
+        sentences.append(
             "friction is not identified. Record a slow tone (0.2–0.5 Hz): the joint sticks at its "
             "turning points."
         )
     if not tones:
-        found.append(
+        sentences.append(
             "there are no tones in this recording. Record a sweep of 1 to 10 Hz: it gives gain and "
             "lag per frequency, and a model can be tested on tones left out of its fit."
         )
     elif len(tones) < _FEW_FREQUENCIES:
-        found.append(
+        sentences.append(
             f"only {len(tones)} frequenc{'y' if len(tones) == 1 else 'ies'} "
             f"({', '.join(f'{f:g}' for f in tones)} Hz), too few to test a model on one left out "
             "of its fit. Record 1 to 10 Hz."
         )
     if tones and (tones[-1] < _FAST_HZ or width > _WIDE_MS):
-        found.append(
+        sentences.append(
             f"the dead time rests on tones of {tones[-1]:g} Hz and below, where it is hard to "
             "separate from slow dynamics. Record faster tones (up to 10 Hz, at a smaller "
             "amplitude) or steps."
         )
     if fresh < _FEW_READINGS:
-        found.append(
+        sentences.append(
             f"fewer than {_FEW_READINGS} fresh readings. Hold each tone longer: four times the "
             "time halves every interval."
         )
     if lattice.kind == "unresolved":
-        found.append(
+        sentences.append(
             "readings are held, but the bus's poll period could not be found. Record a longer "
             f"sweep ({_LONG_S:g} s or more) at full amplitude."
         )
     if not np.isfinite(pd.scores.rmse_unseen_rad) and tones:
-        found.append("no frequency could be left out, so the model was not tested on new motion.")
-    return found
+        sentences.append(
+            "no frequency could be left out, so the model was not tested on new motion."
+        )
+    return sentences
 
 
-def servo_section(found: Comparison) -> Section:
+def servo_section(comparison: Comparison) -> Section:
     """Section of a comparison of servo models on the report's recordings."""
     pictures = [
         Picture(
@@ -430,9 +452,9 @@ def servo_section(found: Comparison) -> Section:
             f"{joint}: models in free run, commands only. The shaded band is where the first "
             "model predicts nine readings in ten, from its errors on data held out of its fit; it "
             "widens with speed, because the time of a polled reading is uncertain.",
-            found.plot([joint]),
+            comparison.plot([joint]),
         )
-        for joint in found.data.joints
+        for joint in comparison.data.joints
     ]
     curve = measured()
     samples = curve.add_suffix("_rad").reset_index().to_dict("records")
@@ -443,15 +465,15 @@ def servo_section(found: Comparison) -> Section:
         ),
         *(Column(MODELS[m][0], f"{m}_rad", "mrad") for m in map(str, curve)),
     )  # fmt: skip
-    runs = found.data.runs.values()
-    own = int(np.median([sum(len(r.readings.rows) for r in joint) for joint in runs]))
+    runs = comparison.data.runs.values()
+    readings = int(np.median([sum(len(r.readings.rows) for r in joint) for joint in runs]))
     pictures.append(
         Picture(
             "servo_data_curve",
             "How much data a servo model needs, measured on the emulated robot under random "
             "commands of 0.5 to 4 Hz (the emulated servo is a DelayedPD, which therefore needs "
             "least). The line marks the readings per joint of this recording.",
-            data_curve_figure(curve, own),
+            data_curve_figure(curve, readings),
         )
     )
     return Section(
@@ -464,13 +486,13 @@ def servo_section(found: Comparison) -> Section:
         ],
         figures=pictures,
         tables=[
-            *tables.comparison_tables(found),
+            *tables.comparison_tables(comparison),
             Table("servo_data_curve", "Error against samples, emulated robot", by_samples, samples),
         ],
         files=[
-            Table("servo_models", "", (), found.to_frame().reset_index().to_dict("records")),
+            Table("servo_models", "", (), comparison.to_frame().reset_index().to_dict("records")),
         ],
-        notes=[*found.reading_notes(), *found.notes],
+        notes=[*comparison.reading_notes(), *comparison.notes],
     )
 
 

@@ -208,10 +208,10 @@ def parameter_matrix(parameters: Table) -> Table:
     def cell(row: Row) -> str:
         factor, _ = _SMALL_UNITS.get(row["unit"], (1.0, row["unit"]))
         value, _, more = _value_cell(row, factor).replace(",", " (").partition(" (")
-        shown = Markup("{}<small>{}</small>").format(value, more.rstrip(")").strip())
+        text = Markup("{}<small>{}</small>").format(value, more.rstrip(")").strip())
         if row["identified"] == "no":
-            shown = Markup('<span class="undecided" title="{}">{}</span>').format(row["why"], shown)
-        return shown
+            text = Markup('<span class="undecided" title="{}">{}</span>').format(row["why"], text)
+        return text
 
     def name(row: Row) -> str:
         _, unit = _SMALL_UNITS.get(row["unit"], (1.0, row["unit"]))

@@ -143,12 +143,12 @@ def servo_data(
     polls: dict[str, PollLattice] = {}
     for joint in joints:
         known = (lattices or {}).get(joint)
-        found, modes[joint], polls[joint] = _joint_runs(
+        joint_runs, modes[joint], polls[joint] = _joint_runs(
             recordings, joint, mode, period, labels, seed, known
         )
-        if not sum(len(r.tick) for r in found):
+        if not sum(len(r.tick) for r in joint_runs):
             raise InputError(f"{joint}: no reading changed; a model cannot be fitted.")
-        runs[joint] = tuple(found)
+        runs[joint] = tuple(joint_runs)
     return ServoData(tuple(joints), period, runs, tuple(labels), modes, polls)
 
 
@@ -201,11 +201,11 @@ def _joint_runs(
     timed = iter([readings(t, lattice) for t in trials])
     runs = []
     for place, recording in enumerate(recordings):
-        own = recording.trials(joint)
+        trials_here = recording.trials(joint)
         known = joint in (recording.metadata.get("start_pose_rad") or {})
         prefix = f"{recording.name}, " if len(recordings) > 1 else ""
         joined: list[list[_Part]] = []
-        for trial in own:
+        for trial in trials_here:
             tone = np.isfinite(trial.frequency_hz) and trial.frequency_hz > 0
             name = f"{trial.frequency_hz:g} Hz" if tone else f"{prefix}loop {trial.number}"
             group = labels.setdefault(name, len(labels))
@@ -252,10 +252,10 @@ def _without_pauses(trial: Trial, r: Readings, group: int, period: float) -> lis
     parts, rest = [], trial.initial_command_rad
     for low, high in zip([0, *gaps], [*gaps, len(trial.send_time_s)], strict=True):
         rows = {name: getattr(trial, name)[low:high] for name in _ROWS}
-        own = r.only((r.rows >= low) & (r.rows < high))
-        own = replace(own, rows=own.rows - low, held_time_s=r.held_time_s[low:high])
+        counted = r.only((r.rows >= low) & (r.rows < high))
+        counted = replace(counted, rows=counted.rows - low, held_time_s=r.held_time_s[low:high])
         cut = replace(trial, **rows, position_count=None, initial_command_rad=rest)
-        parts.append((cut, own, group, start))
+        parts.append((cut, counted, group, start))
         rest = float(trial.command_rad[high - 1])
     return parts
 

@@ -38,9 +38,9 @@ def free_run_figure(
 
     All mappings are by model; errors and bands then by joint. Bands are drawn for the first model.
     """
-    shown = list(data.joints if joints is None else joints)
-    figure, panels = axes_column(len(shown), 0.7 + 1.75 * len(shown))
-    for axes, joint in zip(panels, shown, strict=True):
+    names = list(data.joints if joints is None else joints)
+    figure, panels = axes_column(len(names), 0.7 + 1.75 * len(names))
+    for axes, joint in zip(panels, names, strict=True):
         index, low, high = _liveliest(data, joint)
         run = data.runs[joint][index]
         ticks = np.arange(low, high)
@@ -51,8 +51,8 @@ def free_run_figure(
         inside = (run.tick >= low) & (run.tick < high - 1)
         when = np.interp(run.tick[inside], ticks, time)
         axes.plot(when, run.position_rad[inside], "o", ms=3.2, color=INK, label="reading")
-        for n, (name, found) in enumerate(tracks.items()):
-            track = found[joint][index]
+        for n, (name, model_tracks) in enumerate(tracks.items()):
+            track = model_tracks[joint][index]
             track = track[:: scores.steps_per_tick(track, run)]
             colour = _COLOURS[n % len(_COLOURS)]
             error = 1e3 * scores.rms(errors[name][joint].free_run)

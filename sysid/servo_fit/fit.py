@@ -306,10 +306,10 @@ def fit_servo(
         )
     models = {"linear": linear, "delayed-pd": physics, arch: ours.folds}
     scored = {}
-    for name, own in models.items():
+    for name, fold_models in models.items():
         parts = [
             scores.errors(model, scores.tracks(model, data), data, test)
-            for model, (_, test) in zip(own, folds, strict=True)
+            for model, (_, test) in zip(fold_models, folds, strict=True)
         ]
         scored[name] = ModelScores.of(scores.pooled(parts), seed)
     errors = scored[arch].errors
@@ -378,9 +378,9 @@ def _with_two_groups(data: ServoData, part: windows.Part) -> ServoData:
         - {-1}
         for j in data.joints
     }
-    for joint, own in present.items():
-        if len(own) < 2:
-            seen = ", ".join(data.groups[g] for g in own) or "nothing"
+    for joint, group_numbers in present.items():
+        if len(group_numbers) < 2:
+            seen = ", ".join(data.groups[g] for g in group_numbers) or "nothing"
             raise InputError(
                 f"{joint} has readings of {seen} only, others of more, so it cannot be tested on "
                 "what it has not seen. Leave it out of `joints`, record it again, or split by time "
@@ -389,7 +389,10 @@ def _with_two_groups(data: ServoData, part: windows.Part) -> ServoData:
     used = sorted(set().union(*present.values()))
     place = np.full(len(data.groups) + 1, -1)
     place[used] = np.arange(len(used))
-    runs = {j: tuple(replace(r, group=place[r.group]) for r in own) for j, own in data.runs.items()}
+    runs = {
+        j: tuple(replace(r, group=place[r.group]) for r in group_numbers)
+        for j, group_numbers in data.runs.items()
+    }
     return replace(data, runs=runs, groups=tuple(data.groups[g] for g in used))
 
 
@@ -426,14 +429,16 @@ def _fit(
         models: list[ServoModel] = [physical_model(arch, v, data.period_s) for v in values]
         return _Fitted(models[0], values[0], models if same else models[1:], {}, None, 0)
     if preset == "paper":
-        found = [
+        published = [
             fit_published(arch, data, part, seed, lambda share: say(f"{arch} as published", share))
             for part in ([f[0] for f in folds] + ([] if split.test is not None else [whole]))
         ]
         size = sum(
-            v[0].size for k, v in found[-1].parameters.items() if "weight" in k or "bias" in k
+            v[0].size for k, v in published[-1].parameters.items() if "weight" in k or "bias" in k
         )
-        return _Fitted(found[-1], found[-1].parameters, list(found[: len(folds)]), {}, None, size)
+        return _Fitted(
+            published[-1], published[-1].parameters, list(published[: len(folds)]), {}, None, size
+        )
     fit = fit_network(
         arch, data.joints, data.period_s, ready, seed, nested=split.test is None,
         progress=lambda done, steps: say(arch, done / steps),
@@ -485,13 +490,13 @@ def delayed_pd_fits(
     keep, final = (12, 3) if len(parts) * len(data.joints) <= _MANY else (6, 2)
     fits = []
     for part in parts:
-        own = []
+        points = []
         for joint in data.joints:
             runs = part_runs(data, joint, part)
             problem = Problem(model, runs, (noise_scale(data, joint),) * len(runs))
             rng = np.random.default_rng(seed)
-            own.append(model.decode(search(problem, rng, keep=keep, final=final)[0].point))
-        v = np.array(own).T
+            points.append(model.decode(search(problem, rng, keep=keep, final=final)[0].point))
+        v = np.array(points).T
         shifts = np.array([_truncation_shift(data, joint) for joint in data.joints])
         servos = DelayedPDParameters(
             **dict(zip(_NAMES, v, strict=False)), armature=np.ones_like(v[0])
@@ -512,7 +517,7 @@ def sindy_fits(
     """
     from pupper_sysid.sysid.sparse import fit_equations
 
-    found = []
+    equations = []
     for part in parts:
         runs = {j: part_runs(data, j, part) for j in data.joints}
         results = fit_equations(runs, {j: noise_scale(data, j) for j in data.joints}, seed)
@@ -526,14 +531,14 @@ def sindy_fits(
         values["offset_rad"] = np.array(
             [r.offset_rad + _truncation_shift(data, j) for j, r in results.items()]
         )
-        found.append(values)
-    return found
+        equations.append(values)
+    return equations
 
 
 def part_runs(data: ServoData, joint: str, part: windows.Part) -> tuple[Run, ...]:
     """Runs of a joint on the clock of physics, with only the part's readings."""
-    found = [(run, windows.chosen(run, part)) for run in data.runs[joint]]
-    return tuple(run.on_physics(use) for run, use in found if use.any())
+    chosen = [(run, windows.chosen(run, part)) for run in data.runs[joint]]
+    return tuple(run.on_physics(use) for run, use in chosen if use.any())
 
 
 def noise_scale(data: ServoData, joint: str) -> float:

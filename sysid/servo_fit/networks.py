@@ -245,28 +245,28 @@ _Trial = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 def _trials(data: ServoData, joint: str, part: Part) -> list[_Trial]:
     """Commands and positions of each trial's training rows, as displacements from the pose."""
-    found = []
+    trials = []
     for run in data.runs[joint]:
         inside = chosen_rows(run, part) & np.isfinite(run.trial.position_rad)
         for number in np.unique(run.number):
             rows = inside & (run.number == number)
             if rows.sum() > _COMMANDS + 1:
-                found.append(
+                trials.append(
                     (run.command_rad[rows] - DEFAULT_POSE[joint],
                      run.trial.position_rad[rows] - DEFAULT_POSE[joint])
                 )  # fmt: skip
-    if not found:
+    if not trials:
         raise InputError(f"{joint}: no trial is long enough for the published networks.")
-    return found
+    return trials
 
 
 def _mlp(
     trials: list[list[_Trial]], generator: torch.Generator, say: Callable[[float], None]
 ) -> dict[str, NDArray]:
     rows = []
-    for own in trials:
+    for joint_trials in trials:
         parts = []
-        for command, position in own:
+        for command, position in joint_trials:
             t = np.arange(_COMMANDS, len(command) - 1)
             seen = np.stack([command[t - k] for k in range(_COMMANDS)] + [position[t]], axis=-1)
             parts.append(np.column_stack([seen, position[t + 1]]))
@@ -323,8 +323,8 @@ def _lstm(
             counted[:rows, j, n] = 1.0
 
     def uniform(*size: int) -> torch.Tensor:
-        made = (2 * torch.rand(joints, *size, generator=generator) - 1) * _UNITS**-0.5
-        return made.requires_grad_(True)
+        drawn = (2 * torch.rand(joints, *size, generator=generator) - 1) * _UNITS**-0.5
+        return drawn.requires_grad_(True)
 
     w = {
         "weight_input": uniform(2, 4 * _UNITS), "weight_hidden": uniform(_UNITS, 4 * _UNITS),

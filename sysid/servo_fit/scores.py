@@ -76,17 +76,17 @@ class ModelScores:
     errors: dict[str, Errors] = internal()
 
     @classmethod
-    def of(cls, found: dict[str, Errors], seed: int) -> ModelScores:
+    def of(cls, errors_of: dict[str, Errors], seed: int) -> ModelScores:
         """Scores of errors; `seed` is that of the bootstrap."""
         joints = {
             joint: Scores(
                 rmse_one_step_rad=rms(e.one_step), rmse_free_run_rad=rms(e.free_run),
                 rmse_held_rad=rms(e.held), rmse_raw_rad=rms(e.raw),
             )
-            for joint, e in found.items()
+            for joint, e in errors_of.items()
         }  # fmt: skip
-        return cls(joints=joints, mean=mean(joints), rmse_free_run_rad=interval(found, seed),
-                   errors=found)  # fmt: skip
+        return cls(joints=joints, mean=mean(joints), rmse_free_run_rad=interval(errors_of, seed),
+                   errors=errors_of)  # fmt: skip
 
 
 _S = TypeVar("_S", bound=Scores)
@@ -167,7 +167,7 @@ def errors(
     firsts = [data.runs[joint][0].trial.send_time_s for joint in data.joints[:2]]
     # of joints that were recorded one at a time the stretches are independent
     apart = len(firsts) == 2 and not np.array_equal(firsts[0], firsts[1])
-    made = {}
+    by_joint = {}
     for joint in data.joints:
         parts, alone = [], joint if apart else ""
         for n, run in enumerate(data.runs[joint]):
@@ -193,8 +193,8 @@ def errors(
                     raw=raw[rows & np.isfinite(raw)],
                 )
             )
-        made[joint] = _joined(parts)
-    return made
+        by_joint[joint] = _joined(parts)
+    return by_joint
 
 
 def pooled(parts: Sequence[dict[str, Errors]]) -> dict[str, Errors]:
@@ -226,12 +226,12 @@ def mean_known(values: ArrayLike) -> float:
 
 def persistence(data: ServoData, part: Part) -> dict[str, float]:
     """RMS [rad] of the last reading as the prediction of the next, per joint."""
-    found = {}
+    rms_of = {}
     for joint in data.joints:
         moves = [np.diff(r.position_rad, prepend=np.nan)[chosen(r, part)] for r in data.runs[joint]]
         every = np.concatenate(moves)
-        found[joint] = rms(every[np.isfinite(every)])
-    return found
+        rms_of[joint] = rms(every[np.isfinite(every)])
+    return rms_of
 
 
 def repeatability(data: ServoData, part: Part) -> dict[str, float]:
@@ -239,7 +239,7 @@ def repeatability(data: ServoData, part: Part) -> dict[str, float]:
 
     A model that predicts the mean of the repetitions has this error.
     """
-    found = {}
+    rms_of = {}
     for joint in data.joints:
         trials = []
         for run in data.runs[joint]:
@@ -254,12 +254,12 @@ def repeatability(data: ServoData, part: Part) -> dict[str, float]:
                 if inside.any() and same and np.abs(other - command).max() < 1e-6:
                     apart.append((position - theirs)[inside] / np.sqrt(2))
         every = np.concatenate(apart) if apart else np.empty(0)
-        found[joint] = rms(every[np.isfinite(every)])
-    return found
+        rms_of[joint] = rms(every[np.isfinite(every)])
+    return rms_of
 
 
 def interval(
-    found: dict[str, Errors], seed: int, other: dict[str, Errors] | None = None
+    errors_of: dict[str, Errors], seed: int, other: dict[str, Errors] | None = None
 ) -> Interval:
     """Mean over joints of the free-run RMS [rad], with its interval by block bootstrap.
 
@@ -269,7 +269,7 @@ def interval(
     def value(models: dict[str, Errors]) -> float:
         return mean_known([rms(e.free_run) for e in models.values()])
 
-    blocks = sorted({b for e in found.values() for b in e.block})
+    blocks = sorted({b for e in errors_of.values() for b in e.block})
     place = {b: n for n, b in enumerate(blocks)}
     draws = np.random.default_rng(seed).multinomial(
         len(blocks), np.full(len(blocks), 1 / len(blocks)), _DRAWS
@@ -286,16 +286,16 @@ def interval(
         return np.nanmean(means, axis=0)
 
     if other is None:
-        return Interval.of_draws(value(found), drawn(found))
-    return Interval.of_draws(value(found) - value(other), drawn(found) - drawn(other))
+        return Interval.of_draws(value(errors_of), drawn(errors_of))
+    return Interval.of_draws(value(errors_of) - value(other), drawn(errors_of) - drawn(other))
 
 
-def band(found: Errors) -> Band:
+def band(errors_of: Errors) -> Band:
     """Noise [rad] and timing [s] of a band: error variance = noise² + (timing · speed)².
 
     The form that readings of a polled servo have: counts, plus an uncertain time of measurement.
     """
-    squares, speed = found.free_run**2, found.speed
+    squares, speed = errors_of.free_run**2, errors_of.speed
     if len(squares) < 5:
         return float("nan"), float("nan")
     # one outlier must not widen the band for all: cap at five times the median's equivalent
@@ -308,15 +308,15 @@ def band(found: Errors) -> Band:
     return float(np.sqrt(noise)), float(np.sqrt(timing))
 
 
-def band_half_width(found: Band, speed: NDArray[np.float64]) -> NDArray[np.float64]:
+def band_half_width(band_of: Band, speed: NDArray[np.float64]) -> NDArray[np.float64]:
     """Half of the 90 % band about a free run [rad], at a speed [rad/s]."""
-    return HALF_WIDTH_SD * np.sqrt(found[0] ** 2 + (found[1] * speed) ** 2)
+    return HALF_WIDTH_SD * np.sqrt(band_of[0] ** 2 + (band_of[1] * speed) ** 2)
 
 
 def stacked(data: ServoData) -> tuple[NDArray, NDArray, NDArray]:
     """Commands, starts (runs, joints) and readings (steps, runs, joints), all padded."""
-    most = max(len(found) for found in data.runs.values())
-    steps = max(len(r.command_rad) for found in data.runs.values() for r in found)
+    most = max(len(runs_of) for runs_of in data.runs.values())
+    steps = max(len(r.command_rad) for runs_of in data.runs.values() for r in runs_of)
     commands = np.zeros((steps, most, len(data.joints)))
     position, start = np.zeros_like(commands), np.zeros((most, len(data.joints)))
     for n, joint in enumerate(data.joints):
@@ -362,8 +362,8 @@ def learned_run(model: ServoModel, data: ServoData) -> FreeRun:
     _, start, _ = stacked(data)
     unknown = np.zeros(start.shape)
     for n, joint in enumerate(data.joints):
-        for e, own in enumerate(data.runs[joint]):
-            unknown[e, n] = not own.rest_known
+        for e, run in enumerate(data.runs[joint]):
+            unknown[e, n] = not run.rest_known
     return lambda offset: tracks(model, data, start - unknown * offset)
 
 
@@ -377,21 +377,21 @@ def run_with_offset(
     """
     offset = np.zeros(stacked(data)[1].shape)
     tracks = run(offset)
-    found = offsets(tracks, data, part)
+    shifts = offsets(tracks, data, part)
     for _ in range(2):  # the offset may move the start, and with it a little itself
         for n, joint in enumerate(data.joints):
-            for e, own in enumerate(data.runs[joint]):
-                offset[e, n] = found[joint][own.recording]
+            for e, run_of in enumerate(data.runs[joint]):
+                offset[e, n] = shifts[joint][run_of.recording]
         tracks = run(offset)
-        found = offsets(tracks, data, part)
+        shifts = offsets(tracks, data, part)
     shifted = {
         joint: [
-            track + found[joint][own.recording]
-            for track, own in zip(tracks[joint], data.runs[joint], strict=True)
+            track + shifts[joint][run_of.recording]
+            for track, run_of in zip(tracks[joint], data.runs[joint], strict=True)
         ]
         for joint in data.joints
     }
-    return shifted, {j: float(np.mean(list(own.values()))) for j, own in found.items()}
+    return shifted, {j: float(np.mean(list(run_of.values()))) for j, run_of in shifts.items()}
 
 
 def offsets(tracks: Tracks, data: ServoData, part: Part) -> dict[str, dict[int, float]]:
@@ -399,7 +399,7 @@ def offsets(tracks: Tracks, data: ServoData, part: Part) -> dict[str, dict[int, 
 
     Readings outside of `part` do not count; 0 where a recording has none of a joint.
     """
-    found: dict[str, dict[int, float]] = {}
+    medians: dict[str, dict[int, float]] = {}
     for joint in data.joints:
         apart: dict[int, list[NDArray[np.float64]]] = {}
         for track, run in zip(tracks[joint], data.runs[joint], strict=True):
@@ -407,11 +407,11 @@ def offsets(tracks: Tracks, data: ServoData, part: Part) -> dict[str, dict[int, 
             apart.setdefault(run.recording, []).append(
                 (run.position_rad - value)[chosen(run, part) & np.isfinite(value)]
             )
-        found[joint] = {
+        medians[joint] = {
             recording: float(np.median(every)) if (every := np.concatenate(parts)).size else 0.0
             for recording, parts in apart.items()
         }
-    return found
+    return medians
 
 
 def received(run: Run, period_s: float) -> NDArray[np.float64]:

@@ -48,17 +48,17 @@ class Lstm(torch.autograd.Function):
         ctx.save_for_backward(weight_input, weight_hidden, bias, weight_out, inputs)
         ctx.past = past
         out = torch.empty(*weight_out.shape[:2], inputs.shape[1], inputs.shape[2] - past)
-        given = (weight_input, weight_hidden, bias, weight_out, inputs, out)
-        _lstm_forward_pass(*(t.detach().numpy() for t in given))
+        arrays = (weight_input, weight_hidden, bias, weight_out, inputs, out)
+        _lstm_forward_pass(*(t.detach().numpy() for t in arrays))
         return out
 
     @staticmethod
     def backward(ctx, *of_outputs):
         """Gradients of the weights."""
-        found = [torch.zeros_like(t) for t in ctx.saved_tensors[:4]]
-        given = (*ctx.saved_tensors, of_outputs[0].contiguous(), *found)
-        _lstm_backward(*(t.detach().numpy() for t in given))
-        return (*found, None, None)
+        gradients = [torch.zeros_like(t) for t in ctx.saved_tensors[:4]]
+        arrays = (*ctx.saved_tensors, of_outputs[0].contiguous(), *gradients)
+        _lstm_backward(*(t.detach().numpy() for t in arrays))
+        return (*gradients, None, None)
 
 
 @njit(fastmath=True, error_model="numpy", inline="always")
@@ -162,10 +162,10 @@ def _lstm_backward(
                 for t in range(steps - 1, -1, -1):
                     row = gates[t]
                     if t >= first:
-                        given = of_outputs[j, q, w, t - first]
+                        of_output = of_outputs[j, q, w, t - first]
                         for u in range(units):
-                            to_out[u] += given * hidden[t + 1, u]
-                            of_state[u] += given * last[u]
+                            to_out[u] += of_output * hidden[t + 1, u]
+                            of_state[u] += of_output * last[u]
                     for u in range(units):  # the gates give way to their gradients
                         i, f = row[u], row[units + u]
                         g, o = row[2 * units + u], row[3 * units + u]
@@ -207,10 +207,10 @@ class Mlp(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *of_outputs):
         """Gradients of the weights."""
-        found = [torch.empty_like(t) for t in ctx.saved_tensors[:3]]
-        given = (*ctx.saved_tensors, of_outputs[0].contiguous(), *found)
-        _mlp_backward(*(t.detach().numpy() for t in given))
-        return (*found, None)
+        gradients = [torch.empty_like(t) for t in ctx.saved_tensors[:3]]
+        arrays = (*ctx.saved_tensors, of_outputs[0].contiguous(), *gradients)
+        _mlp_backward(*(t.detach().numpy() for t in arrays))
+        return (*gradients, None)
 
 
 @njit(fastmath=True, error_model="numpy", inline="always")
@@ -257,13 +257,13 @@ def _mlp_backward(weight_0, bias_0, weight_1, inputs, of_outputs, of_0, of_bias,
     for j in range(joints):
         x = inputs[j]
         for q in range(networks):
-            given = of_outputs[j, q]
+            of_output = of_outputs[j, q]
             for u in range(units):
                 _before_bend(weight_0[j, q], bias_0[j, q, u], x, u, hidden)
                 w, one, bias = weight_1[j, q, u], np.float32(0.0), np.float32(0.0)
                 for n in range(samples):
-                    one += given[n] * max(hidden[n], np.float32(0.0))
-                    hidden[n] = w * given[n] if hidden[n] > 0 else np.float32(0.0)
+                    one += of_output[n] * max(hidden[n], np.float32(0.0))
+                    hidden[n] = w * of_output[n] if hidden[n] > 0 else np.float32(0.0)
                     bias += hidden[n]
                 of_1[j, q, u], of_bias[j, q, u] = one, bias
                 for t in range(0, whole, 4):
@@ -388,8 +388,8 @@ def train(
         with torch.no_grad():
             for low in range(0, data.windows, 4 * per_step):
                 part = _some(every, slice(low, low + 4 * per_step))
-                found = error_of(part, averaged=True)[:, :, :, 0]
-                parts.append(found.permute(0, 3, 4, 1, 2).numpy())
+                errors = error_of(part, averaged=True)[:, :, :, 0]
+                parts.append(errors.permute(0, 3, 4, 1, 2).numpy())
             now = {k: w.detach().numpy().copy() for k, w in weights.items()}
         return Checkpoint(step, np.concatenate(parts, axis=1), now)
 
@@ -424,16 +424,16 @@ def _some(every: dict[str, torch.Tensor], chosen) -> dict[str, torch.Tensor]:
 
     `look` (joints, windows, outputs, readings) has the four weights of each reading.
     """
-    found = dict(every)
+    arrays = dict(every)
     for name in ("command", "index", "weight"):
-        found[name] = every[name][:, chosen]
+        arrays[name] = every[name][:, chosen]
     for name in ("residual", "learns"):
-        found[name] = every[name][:, :, chosen]
-    index, weight = found["index"], found["weight"]
+        arrays[name] = every[name][:, :, chosen]
+    index, weight = arrays["index"], arrays["weight"]
     look = torch.zeros(*index.shape[:2], WINDOW + 3, index.shape[2])
     for n in range(4):
         look.scatter_add_(2, index[:, :, None] + n, weight[:, :, None, :, n])
-    return found | {"look": look}
+    return arrays | {"look": look}
 
 
 class _Adam:
@@ -483,8 +483,8 @@ def _mlp_forward(
     history = command[..., past - taps :].unfold(-1, taps, 1).flip(-1)  # newest first
     windows, outputs = history.shape[1:3]
     x = (history * fade).reshape(joints, windows * outputs, taps).mT.contiguous()
-    own = [w[k].flatten(1, 3) for k in ("weight_0", "bias_0", "weight_1")]
-    out = Mlp.apply(*own, x) + w["bias_1"].reshape(joints, -1, 1)
+    stacked = [w[k].flatten(1, 3) for k in ("weight_0", "bias_0", "weight_1")]
+    out = Mlp.apply(*stacked, x) + w["bias_1"].reshape(joints, -1, 1)
     return out.reshape(joints, sets, decays, members, windows, outputs)
 
 
@@ -508,10 +508,10 @@ def _lstm_forward(
 ) -> torch.Tensor:
     """Outputs (*shape, windows, WINDOW + 3) of commands (joints, windows, past + WINDOW + 2)."""
     shape = w["bias_out"].shape
-    own = {k: v.flatten(1, 3) for k, v in w.items()}
+    flat = {k: v.flatten(1, 3) for k, v in w.items()}
     out = Lstm.apply(
-        own["weight_input"][:, :, 0], own["weight_hidden"], own["bias"], own["weight_out"],
+        flat["weight_input"][:, :, 0], flat["weight_hidden"], flat["bias"], flat["weight_out"],
         command.contiguous(), past - 1,
     )  # fmt: skip
-    out = out + own["bias_out"][:, :, None, None]
+    out = out + flat["bias_out"][:, :, None, None]
     return out.reshape(*shape, *out.shape[2:])

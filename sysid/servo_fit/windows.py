@@ -113,8 +113,8 @@ def grouped(data: ServoData, part: Part) -> tuple[ServoData, str | None]:
     """
     present = {
         int(g)
-        for found in data.runs.values()
-        for run in found
+        for joint_runs in data.runs.values()
+        for run in joint_runs
         for g in run.group[run.readings.rows][chosen(run, part)]
     }
     if len(present) > 1:
@@ -128,7 +128,7 @@ def grouped(data: ServoData, part: Part) -> tuple[ServoData, str | None]:
             group[rows[min(memory, len(rows) // 2) if n else 0 :]] = n
         return replace(run, group=group)
 
-    runs = {j: tuple(cut(run) for run in found) for j, found in data.runs.items()}
+    runs = {j: tuple(cut(run) for run in joint_runs) for j, joint_runs in data.runs.items()}
     names = tuple(f"stretch {n + 1}" for n in range(_STRETCHES))
     group = data.groups[next(iter(present))] if present else "nothing"
     return replace(data, runs=runs, groups=names), (
@@ -154,7 +154,8 @@ def merged_groups(data: ServoData, most: int = 5) -> ServoData:
         fold[g] = place % most
     names = [", ".join(data.groups[g] for g in order[n::most]) for n in range(most)]
     runs = {
-        j: tuple(replace(r, group=fold[r.group]) for r in found) for j, found in data.runs.items()
+        j: tuple(replace(r, group=fold[r.group]) for r in joint_runs)
+        for j, joint_runs in data.runs.items()
     }
     return replace(data, runs=runs, groups=tuple(names))
 
@@ -320,8 +321,8 @@ def _robust(a: NDArray, y: NDArray, ridge: float) -> tuple[NDArray, NDArray]:
     weight, w = np.ones(len(y)), np.zeros(a.shape[1])
     r = y
     for _ in range(_ITERATIONS):
-        left = a * weight[:, None]
-        w = np.linalg.solve(left.T @ a + ridge * weight.sum() * penalty, left.T @ y)
+        weighted = a * weight[:, None]
+        w = np.linalg.solve(weighted.T @ a + ridge * weight.sum() * penalty, weighted.T @ y)
         r = y - a @ w
         sigma = max(1.4826 * float(np.median(np.abs(r))), 1e-6)
         weight = np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(r), 1e-12))

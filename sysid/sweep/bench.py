@@ -77,12 +77,12 @@ def parse_load(text: str) -> PendulumLoad | None:
     """
     if text == "none":
         return None
-    found = _LOAD.fullmatch(text)
+    match = _LOAD.fullmatch(text)
     values: dict[str, float] = {}
     try:
-        if not found:
+        if not match:
             raise ValueError
-        for part in found[3].split(",")[1:]:
+        for part in match[3].split(",")[1:]:
             key, _, value = part.partition("=")
             name, unit = _MORE[key]
             if not value.endswith(unit):
@@ -94,7 +94,7 @@ def parse_load(text: str) -> PendulumLoad | None:
                 f"`load`: hanging={hanging_rad:g}rad is more than half a turn from 0. Write "
                 f"radians: {hanging_rad:g} degrees are {np.radians(hanging_rad):.2g}."
             )
-        load = PendulumLoad(mass_kg=decimal(found[1]), length_m=decimal(found[2]), **values)
+        load = PendulumLoad(mass_kg=decimal(match[1]), length_m=decimal(match[2]), **values)
         if not load.gravity_nm > 0:
             raise ValueError
     except (ValueError, KeyError):

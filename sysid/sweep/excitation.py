@@ -312,7 +312,7 @@ def parse_frequencies(text: str, highest_hz: float = HIGHEST_HZ) -> list[float]:
     >>> parse_frequencies("1-3,4-5:0.5")
     [1.0, 2.0, 3.0, 4.0, 4.5, 5.0]
     """
-    found: list[float] = []
+    frequencies: list[float] = []
     for part in (piece.strip() for piece in text.split(",")):
         span, _, step_text = part.partition(":")
         low_text, dash, high_text = span.partition("-")
@@ -333,8 +333,8 @@ def parse_frequencies(text: str, highest_hz: float = HIGHEST_HZ) -> list[float]:
         if (high - low) / step > 1000:
             raise InputError(f"`frequencies`: '{part}' has more than 1000; use a larger step.")
         count = int((high - low) / step + 1e-9) + 1
-        found += [round(low + i * step, 9) for i in range(count)]
-    return sorted(set(found))
+        frequencies += [round(low + i * step, 9) for i in range(count)]
+    return sorted(set(frequencies))
 
 
 def off_harmonics(frequency_hz: float, rates_hz: Sequence[float], duration_s: float) -> float:

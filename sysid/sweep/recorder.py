@@ -434,7 +434,7 @@ class _Session:
                     raise BusError(f"{what}: the torque could not be switched off. {_CHECK_LINE}")
             on = held
             sample = bus.read()
-            made: list[dict[str, Any]] = []
+            rows_written: list[dict[str, Any]] = []
             for joint, i in zip(trial.joints, index, strict=True):
                 row = {
                     "send_time_s": sent_s + self._shift_s,
@@ -450,12 +450,12 @@ class _Session:
                         row[name] = float(values[i])
                 if self._on_a_bench:
                     row |= {"p_gain": trial.p_gain, "torque_enabled": float(on)}
-                made.append(row)
+                rows_written.append(row)
             with self._loop.spent.on(LOG):
-                writer.append(made)
-            shown = self._sent if on else np.full(len(goal), np.nan)
+                writer.append(rows_written)
+            in_force = self._sent if on else np.full(len(goal), np.nan)
             with self._loop.spent.on(VIEWS):
-                self._observe(number, Sent(sent_s, shown), sample, self._loop.missed_deadlines)
+                self._observe(number, Sent(sent_s, in_force), sample, self._loop.missed_deadlines)
                 self._progress(done + min(elapsed, trial.duration_s), self._total_s, what)
             rows += len(index)
         return rows

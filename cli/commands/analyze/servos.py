@@ -66,8 +66,8 @@ class Servo(Analysis):
             compared = four_way(recording, recording.joints, self.seed, advance)
         title = "RMS error on unseen readings, mrad, mean of the joints"
         table = mean_error_table(compared.models, compared.persistence_rmse_rad, title)
-        found = {**compared.to_dict(), "recording": path}
-        return found, compared.plot(), terminal.result_table(table)
+        data = {**compared.to_dict(), "recording": path}
+        return data, compared.plot(), terminal.result_table(table)
 
     def _walked(self, folder: Path) -> Path:
         """A recording of the servos of an emulated robot that a policy walks."""
@@ -139,8 +139,8 @@ class ServoDemand(Commanded):
         def demand_of(policy: Actor, trial: Trial) -> Demand:
             return servo_demand(policy, trial, candidate(trial.task.body), known)
 
-        found: dict[str, Demand] = self.each(demand_of, self.command)
-        (name, demand), *_ = found.items()
+        demands: dict[str, Demand] = self.each(demand_of, self.command)
+        (name, demand), *_ = demands.items()
         wanted = float(np.hypot(*self.command[:2]))
         if path_is_onnx(self.policies[0]) and demand.speed_m_s < _STROLL * wanted:
             terminal.warn(
@@ -152,17 +152,17 @@ class ServoDemand(Commanded):
             self.title(f"{name} on {Path(self.servo).name}"), "servo", "rad/s 99 %", "peak", "has",
             "N·m 99 %", "has", "used", "short", "(walked)",
         )  # fmt: skip
-        for joint, own in demand.joints.items():
+        for joint, needs in demand.joints.items():
             table.add_row(
-                joint, number(own.speed_rad_s.p99, 1), number(own.speed_rad_s.peak, 1),
-                number(own.top_speed_rad_s, 1), number(own.torque_nm.p99, 2),
-                number(own.stall_torque_nm, 2), f"{100 * own.torque_used:.0f} %",
-                f"{100 * own.short:.0f} %", f"{100 * own.walked_short:.0f} %",
+                joint, number(needs.speed_rad_s.p99, 1), number(needs.speed_rad_s.peak, 1),
+                number(needs.top_speed_rad_s, 1), number(needs.torque_nm.p99, 2),
+                number(needs.stall_torque_nm, 2), f"{100 * needs.torque_used:.0f} %",
+                f"{100 * needs.short:.0f} %", f"{100 * needs.walked_short:.0f} %",
             )  # fmt: skip
         if not self.json:
             for line in wrap(demand.verdict, _WIDTH):
                 terminal.out.print(line)
-        return {"demand": found, "verdict": demand.verdict}, demand_figure(demand), table
+        return {"demand": demands, "verdict": demand.verdict}, demand_figure(demand), table
 
     def tries(self, command: tuple[float, float, float]) -> Tries:
         """The policy of a run or of an ONNX file, and how it is tried."""
@@ -201,9 +201,9 @@ class ServoDemand(Commanded):
             if file is not None and not file.is_file():
                 raise InputError(f"There is no {file}. Give {what}.")
         network = OnnxNetwork(path)
-        own = exported_policy(network)
-        if own is not None and self.policy_config is None:
-            return own, *simulator(path, own, None, self.actuator, self.feedback)
+        exported = exported_policy(network)
+        if exported is not None and self.policy_config is None:
+            return exported, *simulator(path, exported, None, self.actuator, self.feedback)
         policy = ForeignPolicy.of(network, self.policy_config)
         task = policy.task(self.robot, self.robot_config)
         policy.fit(task)
@@ -280,7 +280,7 @@ class Twin(Drawn):
         loops = terminal.whole_numbers("--test-loops", self.test_loops) if self.test_loops else []
         feedback = {self.feedback.name: load_calibration(self.feedback)} if self.feedback else {}
         with terminal.share_progress("simulating") as advance:
-            found = twin(
+            result = twin(
                 recordings[0], actuators, robot, feedback,
                 test_loops=loops,
                 copies=self.robots, seed=self.seed, threads=self.threads,
@@ -288,11 +288,11 @@ class Twin(Drawn):
             )  # fmt: skip
         seen = {name: spectrum(log.time_s, [log.rate_rad_s]) for name, log in logs.items()}
         if not self.json:
-            _explain(found, seen)
+            _explain(result, seen)
         return (
-            {**found.to_dict(), "imu": seen, "recording": recordings[0].name},
-            twin_figure(found),
-            _table(found),
+            {**result.to_dict(), "imu": seen, "recording": recordings[0].name},
+            twin_figure(result),
+            _table(result),
         )
 
 
@@ -300,32 +300,34 @@ def _short(name: str) -> str:
     return Path(name).name or name
 
 
-def _explain(found: Result, seen: dict[str, Gyro | None]) -> None:
+def _explain(result: Result, seen: dict[str, Gyro | None]) -> None:
     """Errors by joint, gyro, notes and the verdict, above the table."""
-    best = found.models[found.best]
-    own = {words: getattr(best, place) for place, words in _PLACES if getattr(best, place)}
-    columns = [f"{what} {words}" for words in own for what in ("RMS", "mean")]
+    best = result.models[result.best]
+    conditions = {words: getattr(best, place) for place, words in _PLACES if getattr(best, place)}
+    columns = [f"{what} {words}" for words in conditions for what in ("RMS", "mean")]
     joints = terminal.table(
-        f"Errors of {found.best} by joint, mrad", "joint", *columns, "repeatability"
+        f"Errors of {result.best} by joint, mrad", "joint", *columns, "repeatability"
     )
-    for joint in found.readings:
+    for joint in result.readings:
         errors = [
-            e for c in own.values() for e in (c.joints[joint].rmse_rad, c.joints[joint].mae_rad)
+            e
+            for c in conditions.values()
+            for e in (c.joints[joint].rmse_rad, c.joints[joint].mae_rad)
         ]
-        joints.add_row(joint, *map(ms, [*errors, found.repeatability_rad[joint]]))
+        joints.add_row(joint, *map(ms, [*errors, result.repeatability_rad[joint]]))
     terminal.out.print(joints)
     if seen:
-        terminal.out.print(_gyro_table(found, seen))
-    terminal.warn(*found.notes)
-    for line in wrap(found.verdict_in_words, _WIDTH):
+        terminal.out.print(_gyro_table(result, seen))
+    terminal.warn(*result.notes)
+    for line in wrap(result.verdict_in_words, _WIDTH):
         terminal.out.print(line)
 
 
-def _gyro_table(found: Result, seen: dict[str, Gyro | None]) -> Table:
+def _gyro_table(result: Result, seen: dict[str, Gyro | None]) -> Table:
     table = terminal.table(
         "Gyro: deviation rad/s, peak Hz and its share of the variance", "", "x", "y", "z"
     )
-    simulated = {f"simulated, {n}": m.ground.gyro for n, m in found.models.items() if m.ground}
+    simulated = {f"simulated, {n}": m.ground.gyro for n, m in result.models.items() if m.ground}
     for name, gyro in (seen | simulated).items():
         if gyro is not None:
             axes = zip(gyro.deviation_rad_s, gyro.peak_hz, gyro.peak_share, strict=True)
@@ -333,24 +335,24 @@ def _gyro_table(found: Result, seen: dict[str, Gyro | None]) -> Table:
     return table
 
 
-def _table(found: Result) -> Table:
+def _table(result: Result) -> Table:
     table = terminal.table(
-        f"Simulated {found.robot} against readings, mean of the joints, mrad ({found.scored})",
+        f"Simulated {result.robot} against readings, mean of the joints, mrad ({result.scored})",
         "actuator", "", "RMS (90 %)", "mean abs.", "upright", "robot was",
     )  # fmt: skip
-    for name, model in found.models.items():
+    for name, model in result.models.items():
         for place, words in _PLACES:
-            own = getattr(model, place)
-            if own is None:
+            condition = getattr(model, place)
+            if condition is None:
                 continue
-            error = own.rmse_rad
+            error = condition.rmse_rad
             evidence = model.evidence.verdict if model.evidence and place == "ground" else ""
             table.add_row(
                 name if place == "air" else "", words,
-                f"{ms(error.value)} ({ms(error.low)}–{ms(error.high)})", ms(own.mean.mae_rad),
-                f"{own.upright} of {own.copies}" if place == "ground" else "", evidence,
+                f"{ms(error.value)} ({ms(error.low)}–{ms(error.high)})", ms(condition.mean.mae_rad),
+                f"{condition.upright} of {condition.copies}" if place == "ground" else "", evidence,
             )  # fmt: skip
-    means = {"persistence": found.persistence_rmse_rad, "repeatability": found.repeatability_rad}
+    means = {"persistence": result.persistence_rmse_rad, "repeatability": result.repeatability_rad}
     for name, by_joint in means.items():
         values = [x for x in by_joint.values() if x == x]
         table.add_row(name, "", ms(sum(values) / len(values)) if values else "–", "", "", "")

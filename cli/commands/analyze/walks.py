@@ -56,12 +56,12 @@ class Drawn(ABC):
 
         picture = self.out / f"{self.word}.png"
         refuse_overwrite(picture, self.force)
-        found, figure, table = self.analyse()
+        data, figure, table = self.analyse()
         if caption := self.caption(str(table.title)):
             figure.suptitle(caption, fontsize=8)
         save(figure, picture, self.force)
         if self.json:
-            print_json({**self.about(), **found, "picture": picture})
+            print_json({**self.about(), **data, "picture": picture})
             return
         out.print(table)
         err.print(f"Picture: {picture}")
@@ -130,15 +130,17 @@ class OfPolicies(Analysis):
     ) -> dict[str, Any]:
         """An analysis of every policy, by its short name, with a progress bar over all of them."""
         tries = self.tries(command)
-        found = {}
+        results = {}
         with terminal.share_progress("walking") as advance:
             for name, (policy, trial) in tries.items():
 
                 def watch(share: float, name: str = name) -> None:
-                    advance(name, (len(found) + share) / len(tries))
+                    advance(name, (len(results) + share) / len(tries))
 
-                found[name] = analyse(policy, replace(trial, threads=self.threads, progress=watch))
-        return found
+                results[name] = analyse(
+                    policy, replace(trial, threads=self.threads, progress=watch)
+                )
+        return results
 
     def tries(self, command: tuple[float, float, float]) -> Tries:
         """Policies by their short names, and how each is tried."""
@@ -238,12 +240,12 @@ _HEADINGS = {
 
 def table_of(title: str, tables: Mapping[str, Sequence[Any]], columns: Sequence[str]) -> Table:
     """Rows of results by policy, with these fields as columns."""
-    made = terminal.table(title, "policy", *(_HEADINGS.get(c, c) for c in columns))
+    table = terminal.table(title, "policy", *(_HEADINGS.get(c, c) for c in columns))
     for name, rows in tables.items():
         for row in rows:
             cells = (terminal.cell(getattr(row, c), 3) for c in columns)
-            made.add_row(name, *(cell.replace("_", " ") for cell in cells))
-    return made
+            table.add_row(name, *(cell.replace("_", " ") for cell in cells))
+    return table
 
 
 def interval(value: Interval, digits: int) -> str:
@@ -266,19 +268,19 @@ class Gait(Commanded):
 
         rng = np.random.default_rng(self.seed)
         walks = self.each(lambda policy, trial: trial.walk(policy), self.command)
-        found = {name: describe(walked, rng) for name, walked in walks.items()}
+        reports = {name: describe(walked, rng) for name, walked in walks.items()}
         table = terminal.table(
             self.title("Gait, 90 % intervals over robots"), "policy", "Hz", "sine R² actions",
             "of noise", "diagonal", "duty", "jitter rad", "robots",
         )  # fmt: skip
-        for name, gait in found.items():
+        for name, gait in reports.items():
             table.add_row(
                 name, interval(gait.frequency_hz, 2), interval(gait.action_r2, 2),
                 number(gait.null_r2, 2), interval(gait.diagonal, 2),
                 number(float(np.mean([d.value for d in gait.duty])), 2),
                 number(gait.jitter_rad.value, 3), f"{gait.robots} of {self.size[0]}",
             )  # fmt: skip
-        return {"gaits": found}, gait_figure(next(iter(walks.values()))), table
+        return {"gaits": reports}, gait_figure(next(iter(walks.values()))), table
 
 
 @dataclass(frozen=True)
@@ -294,8 +296,8 @@ class Attractor(Commanded):
         from pupper_sysid.policies.analysis.figures import orbit_figure
         from pupper_sysid.policies.analysis.gait import SETTLE_S, SHORTEST_S
 
-        found = {name: one for name, one in self.each(orbits, self.command).items() if one}
-        if not found:
+        by_policy = {name: one for name, one in self.each(orbits, self.command).items() if one}
+        if not by_policy:
             raise InputError(
                 f"No robot walked for {SETTLE_S + SHORTEST_S:g} s and moved: there is no orbit to "
                 "analyse. Give a policy that walks, or more --seconds."
@@ -306,7 +308,7 @@ class Attractor(Commanded):
             *(f"area +{d:g} ms" for d in DELAYS_MS[1:]),
         )  # fmt: skip
         drawn = {}
-        for name, one in found.items():
+        for name, one in by_policy.items():
             for states, orbit in one.items():
                 drawn[f"{name} {states}"] = orbit.orbits
                 table.add_row(
@@ -314,7 +316,7 @@ class Attractor(Commanded):
                     number(orbit.participation_ratio, 1), *(number(c, 2) for c in orbit.closure),
                     *(number(a, 2) for a in orbit.area_ratio[1:]),
                 )  # fmt: skip
-        return {"delays_ms": DELAYS_MS, "orbits": found}, orbit_figure(drawn, DELAYS_MS), table
+        return {"delays_ms": DELAYS_MS, "orbits": by_policy}, orbit_figure(drawn, DELAYS_MS), table
 
 
 @dataclass(frozen=True)
@@ -329,12 +331,12 @@ class Delay(Commanded):
         from pupper_sysid.policies.analysis.figures import delay_figure
         from pupper_sysid.policies.analysis.robustness import delay_curve
 
-        found = self.each(delay_curve, self.command)
+        curves = self.each(delay_curve, self.command)
         columns = (
             "extra_delay_ms", "mode", "survival", "frequency_hz", "amplitude_rad", "mae_vx_m_s",
         )  # fmt: skip
-        table = table_of(self.title("Against more delay"), found, columns)
-        return {"curves": found}, delay_figure(found), table
+        table = table_of(self.title("Against more delay"), curves, columns)
+        return {"curves": curves}, delay_figure(curves), table
 
 
 @dataclass(frozen=True)
@@ -349,10 +351,10 @@ class Ablation(Commanded):
         from pupper_sysid.policies.analysis.figures import ablation_figure
         from pupper_sysid.policies.analysis.robustness import ablation
 
-        found = self.each(ablation, self.command)
+        points = self.each(ablation, self.command)
         columns = ("channel", "kind", "level", "sigma", "correlation", "survival", "mae_vx_m_s")
-        table = table_of(self.title("Altered observations"), found, columns)
-        return {"ablations": found}, ablation_figure(found), table
+        table = table_of(self.title("Altered observations"), points, columns)
+        return {"ablations": points}, ablation_figure(points), table
 
 
 @dataclass(frozen=True)
@@ -367,12 +369,12 @@ class Autonomy(Commanded):
         from pupper_sysid.policies.analysis.autonomy import autonomy
         from pupper_sysid.policies.analysis.figures import autonomy_figure
 
-        found = self.each(autonomy, self.command)
+        tests_of = self.each(autonomy, self.command)
         table = terminal.table(
             self.title("Autonomy of the rhythm"), "policy", "test", "gait Hz", "share of amplitude",
             "still up", "phase shift", "of it kept",
         )  # fmt: skip
-        for name, tests in found.items():
+        for name, tests in tests_of.items():
             for r in tests.frozen:
                 table.add_row(
                     name, r.test, number(r.frequency_hz, 2), number(r.share, 2), "", "", ""
@@ -387,7 +389,7 @@ class Autonomy(Commanded):
                     name, f"control rate {r.rate_hz:.4g} Hz", number(r.frequency_hz, 2), "",
                     number(r.survival, 2), "", "",
                 )  # fmt: skip
-        return {"autonomy": found}, autonomy_figure(found), table
+        return {"autonomy": tests_of}, autonomy_figure(tests_of), table
 
 
 @dataclass(frozen=True)
@@ -402,12 +404,12 @@ class Terrain(Commanded):
         from pupper_sysid.policies.analysis.figures import terrain_figure
         from pupper_sysid.policies.analysis.robustness import terrain
 
-        found = self.each(terrain, self.command)
+        points = self.each(terrain, self.command)
         columns = (
             "ground", "survival", "frequency_hz", "mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s",
         )  # fmt: skip
-        table = table_of(self.title("On other ground"), found, columns)
-        return {"terrain": found}, terrain_figure(found), table
+        table = table_of(self.title("On other ground"), points, columns)
+        return {"terrain": points}, terrain_figure(points), table
 
 
 @dataclass(frozen=True)
@@ -422,16 +424,16 @@ class Compliance(OfPolicies):
         from pupper_sysid.policies.analysis.figures import compliance_figure
         from pupper_sysid.policies.analysis.robustness import compliance
 
-        found = self.each(compliance)
+        walks = self.each(compliance)
         table = terminal.table(
             self.title("Walks by direction, 90 % intervals over robots"), "policy", "direction",
             "still up", "share of speed", "drift m/m", "arc rad/m", "wander m/turn",
         )  # fmt: skip
-        for name, rows in found.items():
+        for name, rows in walks.items():
             for row in rows:
                 measures = (row.share, row.drift, row.arc_rad_m, row.wander_m)
                 table.add_row(
                     name, row.direction, number(row.survival, 2),
                     *(interval(m, 2) for m in measures),
                 )  # fmt: skip
-        return {"compliance": found}, compliance_figure(found), table
+        return {"compliance": walks}, compliance_figure(walks), table

@@ -85,15 +85,15 @@ class Calibrate(OfRecordings):
             raise InputError(f"--out {out}: a calibration is a .yaml file. Choose another name.")
         started = time.perf_counter()
         recordings, joints = self.load()
-        left = dict.fromkeys(joints, len(STAGES))
-        with terminal.progress("calibrating", sum(left.values())) as advance:
+        stages = dict.fromkeys(joints, len(STAGES))
+        with terminal.progress("calibrating", sum(stages.values())) as advance:
 
             def staged(joint: str, stage: str) -> None:
-                left[joint] -= 1
+                stages[joint] -= 1
                 advance(f"{joint}, {stage}")
 
             def done(joint: str) -> None:  # joints under load have fewer stages
-                for _ in range(left.pop(joint)):
+                for _ in range(stages.pop(joint)):
                     advance(joint)
 
             result = calibrate(
@@ -182,10 +182,10 @@ def _mark(quantity: Quantity) -> str:
 
 def _damping(actuator: Actuator) -> str:
     """The damping, or its sum with the back-EMF where only that is known."""
-    own, both = actuator.damping_nm_s_per_rad, actuator.ratios_to_armature.damping_and_back_emf
-    if own.identified == "no" and both is not None and both.identified != "no":
+    damping, both = actuator.damping_nm_s_per_rad, actuator.ratios_to_armature.damping_and_back_emf
+    if damping.identified == "no" and both is not None and both.identified != "no":
         return f"{terminal.number(actuator.armature_kg_m2.value * both.value, 3)}Σ"
-    return _number(own, 3)
+    return _number(damping, 3)
 
 
 def _number(quantity: Quantity, decimals: int, factor: float = 1.0) -> str:

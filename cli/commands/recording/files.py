@@ -100,20 +100,20 @@ class Import:
                 }
             )  # fmt: skip
             return
-        shown = terminal.table(f"{self.log}: {layout}", "joint", "trials", "rows", "s",
+        table = terminal.table(f"{self.log}: {layout}", "joint", "trials", "rows", "s",
                                "command rad", "position rad")  # fmt: skip
-        own = recording.table.groupby("joint")
-        ranges = own[["command_rad", "position_rad"]].agg(["min", "max"])
-        counts = own.size()
+        by_joint = recording.table.groupby("joint")
+        ranges = by_joint[["command_rad", "position_rad"]].agg(["min", "max"])
+        counts = by_joint.size()
         for joint in recording.joints:
             trials = recording.trials(joint)
-            shown.add_row(
+            table.add_row(
                 joint, str(len(trials)), str(counts[joint]),
                 terminal.number(sum(float(t.send_time_s[-1] - t.send_time_s[0]) for t in trials)),
                 *(f"{low:.2f} … {high:.2f}"
                   for low, high in ranges.loc[joint].to_numpy().reshape(2, 2)),
             )  # fmt: skip
-        terminal.out.print(shown)
+        terminal.out.print(table)
         following = terminal.command("pupper-sysid", "doctor", out)
         terminal.err.print(f"Wrote {out}. Next: {following}")
 

@@ -92,7 +92,7 @@ def run_rounds(
         outcome = record_until(
             parse_goal(series["goal"]), paths, series["joints"], fit, record_next,
             most_seconds=series["most_seconds"], seed=request["seed"],
-            report=lambda found: _say_progress(found, series["goal"]),
+            report=lambda outcomes: _say_progress(outcomes, series["goal"]),
         )  # fmt: skip
     except KeyboardInterrupt:
         say_how_to_resume(first)
@@ -112,18 +112,18 @@ def _recorded(first: Path) -> list[Path]:
     """Files of the rounds that were begun."""
     if not first.exists():
         raise InputError(f"{first}, the first recording of this sweep, is missing. Put it back.")
-    found, number = [first], 2
+    files, number = [first], 2
     while (path := _of_round(first, number)).exists():
-        found.append(path)
+        files.append(path)
         number += 1
-    return found
+    return files
 
 
-def _say_progress(found: dict[str, JointOutcome], goal: str) -> None:
+def _say_progress(outcomes: dict[str, JointOutcome], goal: str) -> None:
     """One line per joint on stderr."""
     from pupper_sysid.sysid.plan.plan_file import half_width
 
-    for joint, state in found.items():
+    for joint, state in outcomes.items():
         dead = state.dead_time_s
         terminal.err.print(
             f"{joint}: after {state.recorded_s:.0f} s the dead time is "
@@ -133,17 +133,17 @@ def _say_progress(found: dict[str, JointOutcome], goal: str) -> None:
 
 
 def _print_outcome(outcome: Outcome, written: list[Path], goal: str) -> None:
-    shown = terminal.table(
+    table = terminal.table(
         f"Until {goal}", "joint", "rounds", "seconds", "dead time ms", "90 % interval", "goal"
     )
     for joint, state in outcome.joints.items():
         dead = state.dead_time_s
-        shown.add_row(
+        table.add_row(
             joint, str(state.rounds), terminal.number(state.recorded_s, 0),
             terminal.ms(dead.value), f"{terminal.ms(dead.low)} … {terminal.ms(dead.high)}",
             "reached" if state.reached else "not reached",
         )  # fmt: skip
-    terminal.out.print(shown)
+    terminal.out.print(table)
     for joint, state in outcome.joints.items():
         if state.why:
             terminal.warn(f"{joint}: the goal was not reached: {state.why}.")
@@ -200,13 +200,13 @@ class Plan:
             refuse_outside("--rate", self.rate, *RATES_HZ, "Hz")
         from pupper_sysid.sysid.plan.plan_file import save_plan
 
-        made = self._made()
+        plan = self._made()
         if self.out is not None:
-            save_plan(made, self.out, self.force)
+            save_plan(plan, self.out, self.force)
         if self.json:
-            terminal.print_json(plain(made) | {"written": self.out})
+            terminal.print_json(plain(plan) | {"written": self.out})
             return
-        show(made)
+        show(plan)
         if self.out is not None:
             following = terminal.command("pupper-sysid", "sweep", "--plan", self.out)
             terminal.err.print(f"Wrote {self.out}. Next: {following}")
@@ -271,9 +271,9 @@ class Plan:
 
 def margins(joint_map: JointMap) -> dict[str, float]:
     """Largest excursion of each joint to either side of its rest pose [rad]."""
-    own = joint_map.per_servo()
-    margin = own.position_limits().margin(own.rest_pose())
-    return dict(zip(own.joint_names, map(float, margin), strict=True))
+    servos = joint_map.per_servo()
+    margin = servos.position_limits().margin(servos.rest_pose())
+    return dict(zip(servos.joint_names, map(float, margin), strict=True))
 
 
 def _some_margins(joint_map: JointMap, joints: list[str]) -> dict[str, float] | None:

@@ -365,16 +365,22 @@ def _open_bus(request: dict[str, Any]) -> ServoBus:
         )  # fmt: skip
         bus = EmulatedBus(robot, rng, real_time, pendulum.PendulumBench(robot))
         return GuardedBus(bus, BENCH_LIMITS)
-    own = load_joint_map(joint_map) if joint_map else None
-    what = f"an emulated one with the servos of {own.file.name}" if own else "the emulated one"
+    robot_map = load_joint_map(joint_map) if joint_map else None
+    what = (
+        f"an emulated one with the servos of {robot_map.file.name}"
+        if robot_map
+        else "the emulated one"
+    )
     terminal.err.print(f"No robot: using {what}{', in real time' * real_time}.")
     registers = request.get("registers") or {}
-    if registers and not (own and pendulum.has_registers(own)):
+    if registers and not (robot_map and pendulum.has_registers(robot_map)):
         raise InputError(
             "--registers: the servos of this robot have none that act. Give a --joint-map whose "
             "`servo` is STS3215."
         )
-    drawn, plant = pendulum.draw_of_map(rng, own, registers) if own else (draw_robot(rng), None)
+    drawn, plant = (
+        pendulum.draw_of_map(rng, robot_map, registers) if robot_map else (draw_robot(rng), None)
+    )
     if request.get("plan"):  # the same robot, but not once more the same noise
         noise = int(sha256(Path(request["plan"]))[:12], 16)
         rng = np.random.default_rng([request["seed"], noise])
@@ -483,8 +489,8 @@ def _guard_warnings(path: Path) -> list[str]:
 
 def _say_what_stays(bus: GuardedBus) -> None:
     """Warn of registers that could not be set back."""
-    for joint, own in bus.registers.found.items():
-        for name, value in own.items():
+    for joint, registers in bus.registers.found.items():
+        for name, value in registers.items():
             terminal.warn(
                 f"{joint}: its register {name} could not be set back to {value}. Switch the "
                 f"servo's power off and on; if `scan` still shows another value, write {value} "

@@ -76,18 +76,18 @@ class CalibrateJoints:
                 "--by-hand` in another terminal and use the bus that it names."
             )
         address = parse_address(self.bus)
-        given = load_joint_map(self.joint_map) if self.joint_map else None
-        names = joints_on(self.bus, given, self.joints)
+        start_map = load_joint_map(self.joint_map) if self.joint_map else None
+        names = joints_on(self.bus, start_map, self.joints)
         if self.scale_joint and self.scale_joint not in names:
             raise InputError(
                 f"--scale-joint {self.scale_joint}: it is not among the joints that are "
                 f"calibrated ({', '.join(names)})."
             )
         wanted = None if self.joints == "all" else names
-        bus = open_bus(address, given.per_servo() if given else None, wanted)
+        bus = open_bus(address, start_map.per_servo() if start_map else None, wanted)
         try:
             say_remarks(bus)
-            start = given or load_joint_map(bus.metadata["joint_map"])
+            start = start_map or load_joint_map(bus.metadata["joint_map"])
             # a line need not have all servos
             here = [n for n in names if n in bus.joint_names]
             silent = [n for n in names if n not in here]
@@ -249,19 +249,19 @@ class Guide:
             )
             after = self._mean()[0][which]
             measured = jc.counts_per_rad(before, after, angle_deg)
-            found = f"{abs(after - before):.0f} counts: {measured:.1f} counts per radian"
+            words = f"{abs(after - before):.0f} counts: {measured:.1f} counts per radian"
             if abs(after - before) < jc.SMALLEST_TRAVEL * self._counts:
-                terminal.err.print(f"{found}. That is too little motion; try again.")
+                terminal.err.print(f"{words}. That is too little motion; try again.")
                 continue
             if jc.scales_agree(measured, stated):
                 terminal.err.print(
-                    f"{found}, within {100 * jc.SCALE_AGREES:.0f} % of the map's {stated:.1f}, "
+                    f"{words}, within {100 * jc.SCALE_AGREES:.0f} % of the map's {stated:.1f}, "
                     "which is kept."
                 )
                 return measured, False
             known = jc.known_scale_near(measured, self._counts)
             terminal.err.print(
-                f"{found}; the starting map has {stated:.1f} "
+                f"{words}; the starting map has {stated:.1f} "
                 f"({100 * (measured / stated - 1):+.0f} %)."
                 + (f" It agrees with {known}." if known else "")
             )

@@ -190,7 +190,7 @@ class Feetech(SerialLine):
         layout = load_joint_map(self.joint_map or preset)
         registers = parse_servo_registers(self.registers, series)
         moves = any(
-            name in pendulum.FEETECH_REGISTERS for own in registers.values() for name in own
+            name in pendulum.FEETECH_REGISTERS for by_name in registers.values() for name in by_name
         )
         loaded_servos = bool(
             self.load
@@ -282,13 +282,13 @@ def _bench(
     """The servos of a robot in free air or on the ground."""
     if options.walking and options.by_hand:
         raise InputError("--by-hand swings legs in free air: leave out --walking.")
-    own, imu = rng.spawn(2)
+    servos, imu = rng.spawn(2)
     plant = None
     if options.walking:
         from pupper_sysid.sim.walking.robot import WalkingRobot
 
         plant = WalkingRobot(robot, imu)
-    return ServoBench(robot, layout, own, keep_log=False, plant=plant)
+    return ServoBench(robot, layout, servos, keep_log=False, plant=plant)
 
 
 @contextmanager
@@ -299,10 +299,10 @@ def _imu_beside(bench: ServoBench, path: Path | None, rng: np.random.Generator) 
         return
     # a proxy polls its servos, although this one does not return them
     polled = replace(bench.robot, spec=RobotSpec())
-    shown = ServoBench(
+    bench_shown = ServoBench(
         polled, load_joint_map("mini_pupper_2"), rng.spawn(1)[0], keep_log=False, plant=bench.plant
     )
-    with closing(ProxySocket(ImuProxy(shown, rng.spawn(1)[0]), path)) as server:
+    with closing(ProxySocket(ImuProxy(bench_shown, rng.spawn(1)[0]), path)) as server:
         thread = threading.Thread(target=server.serve, daemon=True)
         thread.start()
         try:
@@ -323,10 +323,10 @@ def _serve_line(
         if not options.load:
             _serve(options, server, bench, what, _commands(options, bus, own_map))
             return
-        shown = f" --joint-map {own_map}" if own_map else ""
+        map_option = f" --joint-map {own_map}" if own_map else ""
         kind = " --gains 8,16,32" if emulator.family.name == "feetech" else ""
         kind = kind if parse_load(options.load) else " --kind reversal"
-        sweep = f"  pupper-sysid sweep --load {options.load}{kind}{shown} --bus {bus}\n"
+        sweep = f"  pupper-sysid sweep --load {options.load}{kind}{map_option} --bus {bus}\n"
         _serve(options, server, bench, f"{what} Load: {options.load}.", sweep)
 
 

@@ -211,16 +211,16 @@ class Park:
         if self.supervise:
             self._supervise()
             return
-        left = [note for note in notes() if not note.in_control()]
-        if not all([_take(note, self.seconds) for note in left]):
+        abandoned = [note for note in notes() if not note.in_control()]
+        if not all([_take(note, self.seconds) for note in abandoned]):
             raise BusError("Not every robot that was left on could be switched off.")
-        if not left:
+        if not abandoned:
             terminal.err.print("No driver that is gone left a robot on; --bus names another.")
 
     def _named(self, address: BusAddress) -> None:
-        left = _until_limp(address, chosen_map(self.joint_map), None, self.seconds)
-        if left:
-            raise BusError(f"{address.where}: {may_be_on(left)}")
+        unconfirmed = _until_limp(address, chosen_map(self.joint_map), None, self.seconds)
+        if unconfirmed:
+            raise BusError(f"{address.where}: {may_be_on(unconfirmed)}")
         terminal.err.print("Every servo confirmed that its torque is off.")
         for note in notes():
             if note.robot != os.path.realpath(address.where):
@@ -238,10 +238,10 @@ class Park:
         since_s: dict[tuple[tuple[int, int], ...], float] = {}
         tried: set[tuple[tuple[int, int], ...]] = set()
         while True:
-            left = {note.processes: note for note in notes() if not note.in_control()}
+            abandoned = {note.processes: note for note in notes() if not note.in_control()}
             now = time.monotonic()
-            since_s = {one: since_s.get(one, now) for one in left}
-            for one, note in left.items():
+            since_s = {one: since_s.get(one, now) for one in abandoned}
+            for one, note in abandoned.items():
                 # a driver that was stopped for less goes on, and would switch on again
                 if now - since_s[one] > HANG_S:
                     _take(note, min(self.seconds, _OTHERS_WAIT_S), say=one not in tried)
@@ -254,14 +254,14 @@ def _take(note: Note, seconds: float, say: bool = True) -> bool:
     where, on = note.address.where, list(note.joints)
     try:
         on = _until_limp(note.address, note.joint_map, note.joints, seconds)
-        told = may_be_on(on) if on else "its driver was gone; its torque was switched off."
+        outcome = may_be_on(on) if on else "its driver was gone; its torque was switched off."
         settled = not on
     except PupperError as error:
-        told, settled = str(error), False
+        outcome, settled = str(error), False
     if not settled and not is_there(note.address) and not can_come_back(note.address):
-        told, settled = f"gone for good; {may_be_on(note.joints)}", True
+        outcome, settled = f"gone for good; {may_be_on(note.joints)}", True
     if settled or say:
-        terminal.err.print(f"{where}: {told}")
+        terminal.err.print(f"{where}: {outcome}")
     if not on:
         restore(note.address, note.joint_map, note.registers)
     if settled:  # last: what is interrupted here is said again, not lost
@@ -276,17 +276,17 @@ def _until_limp(
 
     An error of the bus is raised if nothing was reached and the joints are not known.
     """
-    until, left = time.monotonic() + seconds, list(joints or ())
+    until, unconfirmed = time.monotonic() + seconds, list(joints or ())
     while True:
         failed: PupperError | None = None
         try:
-            left = switch_off(address, joint_map, left or None)
-            if not left:
+            unconfirmed = switch_off(address, joint_map, unconfirmed or None)
+            if not unconfirmed:
                 return []
         except PupperError as error:
             failed = error
         if time.monotonic() > until:
-            if failed and not left:
+            if failed and not unconfirmed:
                 raise failed
-            return left
+            return unconfirmed
         time.sleep(_AGAIN_S)

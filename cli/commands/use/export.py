@@ -158,23 +158,23 @@ class Export:
                 "that `pupper-sysid fit-servo` wrote. Export it with `--to csv`."
             )
         if named or kind != ".csv":
-            found = load_calibration(self.source)
+            calibration = load_calibration(self.source)
             if self.check:
-                return self._check(found, links)
+                return self._check(calibration, links)
             if self.to != "csv":
-                return self._simulator(path, found, links)
+                return self._simulator(path, calibration, links)
             if self.gain is not None:
-                found = self._at_gain(found, self.gain)
+                calibration = self._at_gain(calibration, self.gain)
         elif self.to != "csv":
             raise InputError(
                 f"{self.source} is a recording; {self.to} needs a calibration. Make one with "
                 f"`pupper-sysid calibrate {self.source}`."
             )
         else:
-            found = load(path)
-            terminal.warn(*found.warnings)
+            calibration = load(path)
+            terminal.warn(*calibration.warnings)
         target = self.out or Path(path.name).with_suffix(".tidy.csv" if kind == ".csv" else ".csv")
-        to_csv(found, target, self.force)
+        to_csv(calibration, target, self.force)
         return target
 
     @staticmethod
@@ -185,10 +185,10 @@ class Export:
             for joint in calibration.joints.values()
             if joint.under_load is not None
         }
-        found = calibration.at_p_gain(gain)
+        at_gain = calibration.at_p_gain(gain)
         for sentence in sorted(said):
             terminal.err.print(sentence)
-        return found
+        return at_gain
 
     def _bam(self, path: Path, card: bool) -> Path:
         """A servo card as a parameter file of BAM."""

@@ -134,18 +134,20 @@ class Diff:
 
         if self.gain is not None:
             refuse_outside("--gain", self.gain, *P_GAINS)
-        found = compared(self.first, self.second, self.joint, self.gain, _servo)
+        comparison = compared(self.first, self.second, self.joint, self.gain, _servo)
         if self.json:
-            terminal.print_json(found)
+            terminal.print_json(comparison)
             return
-        table = terminal.table("", "", _column(found.first), _column(found.second), "ratio")
-        for row in found.differences:
+        table = terminal.table(
+            "", "", _column(comparison.first), _column(comparison.second), "ratio"
+        )
+        for row in comparison.differences:
             table.add_row(
                 f"{row.quantity} [{row.unit}]", _with_interval(row.first),
                 _with_interval(row.second), terminal.number(row.ratio, 2),
             )  # fmt: skip
         terminal.out.print(table)
-        for sentence in (*found.notes, _verdict(found.differences), _motion(found)):
+        for sentence in (*comparison.notes, _verdict(comparison.differences), _motion(comparison)):
             for line in wrap(sentence, _WIDTH):
                 terminal.out.print(line)
 
@@ -205,11 +207,11 @@ def _numbers(card: ServoCard, name: str, gain: float | None) -> Any:
 
     numbers, pd = card.specimens[name], card.pd(name, gain)
     table = terminal.table(f"\n{name}" if len(card.specimens) > 1 else "", "", "value", "unit")
-    shown: Mapping[str, Any] = {"": pd}
+    parts: Mapping[str, Any] = {"": pd}
     if not isinstance(numbers, TorquePD):
         p = card.gains.p if gain is None else gain
-        shown = {"position loop": numbers, f"as PD in torque, P {_plain(p)}": pd}
-    for title, part in shown.items():
+        parts = {"position loop": numbers, f"as PD in torque, P {_plain(p)}": pd}
+    for title, part in parts.items():
         if title:
             table.add_row(title, "", "")
         for key in type(part).model_fields:
@@ -247,9 +249,9 @@ def _servo(source: str, part: str | None, gain: float | None) -> Compared:
     return foreign_servo(source, part)
 
 
-def _motion(found: Comparison) -> str:
+def _motion(comparison: Comparison) -> str:
     """Lags and distance of the two motions in words."""
-    motion = found.motion
+    motion = comparison.motion
     numbers = map(terminal.ms, (motion.first_lag_s, motion.second_lag_s, motion.apart_rad))
     return (
         "On tones of 1, 2 and 4 Hz, 0.2 rad: lag {} and {} ms, {} mrad apart (RMS), each as it "
@@ -257,9 +259,9 @@ def _motion(found: Comparison) -> str:
     ).format(*numbers)
 
 
-def _verdict(found: Sequence[Difference]) -> str:
+def _verdict(differences: Sequence[Difference]) -> str:
     """The largest difference in words."""
-    known = [row for row in found if row.ratio is not None]
+    known = [row for row in differences if row.ratio is not None]
     if not known:
         raise InputError("The two have no number in common.")
     most = max(known, key=lambda row: row.distance)
