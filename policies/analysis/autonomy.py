@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import mean_of
 from pupper_sysid.common.results import Result, internal
 from pupper_sysid.policies.analysis.gait import SETTLE_S, sine_frequency
@@ -88,17 +87,10 @@ def principal_components(
     `count` axes are kept.
     """
     states = np.concatenate([np.asarray(c, float).reshape(-1, np.shape(c)[-1]) for c in conditions])
-    if len(states) <= count or states.shape[1] < count:
-        raise InputError(
-            f"{count} principal components need more than {count} states of at least {count} "
-            f"numbers; these are {len(states)} of {states.shape[1]}."
-        )
     mean = states.mean(axis=0)
     # of the small d × d matrix: states are many
     variance, axes = np.linalg.eigh((states - mean).T @ (states - mean) / len(states))
     variance, axes = np.clip(variance[::-1], 0.0, None), axes.T[::-1][:count]
-    if not variance[0] > 0:
-        raise InputError("Nothing varies in these states: there is no orbit to look at.")
     # the sign of an axis is arbitrary: fix it, or figures would flip between machines
     largest = np.abs(axes).argmax(axis=1)
     axes = axes * np.sign(axes[np.arange(count), largest])[:, None]

@@ -25,7 +25,13 @@ from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, KINDS
 from pupper_sysid.common.results import Result
 from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.policies.deploy.stacks import Observer, SyntheticPD
-from pupper_sysid.policies.network.policy_file import Range, ServoNumbers, TrainedServo, joints_of
+from pupper_sysid.policies.network.policy_file import (
+    Range,
+    ServoFeedback,
+    ServoNumbers,
+    TrainedServo,
+    joints_of,
+)
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
@@ -190,11 +196,11 @@ def compare(
     targets = _sines(FREQUENCIES_HZ, AMPLITUDE_RAD, period_s, pose)
     count = len(pose)
     nothing = np.full_like(targets, np.nan)
-    moved = _drive(SyntheticPD(actuator, period_s, joints=count), targets, nothing, period_s)
+    moved = _drive(SyntheticPD(actuator, period_s, joints=count), targets, nothing)
     readings = moved
     if robot is not None:
-        readings = _drive(SyntheticPD(robot, period_s, joints=count), targets, nothing, period_s)
-    seen = _drive(observer, targets, readings, period_s)
+        readings = _drive(SyntheticPD(robot, period_s, joints=count), targets, nothing)
+    seen = _drive(observer, targets, readings)
     estimated, trained = (
         _phasors(x, FREQUENCIES_HZ, period_s) / AMPLITUDE_RAD for x in (seen, moved)
     )
@@ -219,13 +225,8 @@ def _sines(
     return swing[..., None] + np.array([*pose.values()])
 
 
-def _drive(observer: Observer, targets: Array, readings: Array, period_s: float) -> Array:
+def _drive(observer: Observer, targets: Array, readings: Array) -> Array:
     """Positions [rad] at the end of each control period, shape (steps, frequencies, 12)."""
-    if abs(observer.period_s - period_s) > 1e-9:
-        raise InputError(
-            f"The observer {observer.name} steps every {observer.period_s:g} s, the controller "
-            f"every {period_s:g} s: its joints would move at another speed. Make it for this rate."
-        )
     observer.reset(targets[0])
     return np.stack([observer.step(t, r).position for t, r in zip(targets, readings, strict=True)])
 
@@ -315,11 +316,12 @@ def servo_match(trained: TrainedServo, here: ServoRanges) -> ServoMatch | None:
     outside: list[Outside] = []
     compared = 0
     for name, servo in joints_of(here).items():
-        for quantity, unit, relative, of in _QUANTITIES:
+        for quantity, unit, factor, relative, of in _QUANTITIES:
             expected = of(trained.joints[name], trained.voltage_scale, trained.poll_scale)
             measured = of(servo, _NOTHING, _NOTHING)
             if expected is not None and measured is not None:
                 compared += 1
+                expected, measured = _times(expected, factor), _times(measured, factor)
                 outside += _outside(quantity, unit, relative, name, expected, measured)
     jitter = 1e3 * here.command_jitter_s
     measured, expected = Interval(jitter, jitter, jitter), _times(trained.command_jitter_s, 1e3)
@@ -362,33 +364,17 @@ def _sentence(quantity: str, outliers: Sequence[Outside]) -> str:
     )
 
 
-def _per_inertia(field: str, with_voltage: bool) -> Quantity:
-    def of(own: ServoNumbers, voltage: Range, poll: Range) -> Interval | None:
-        top, inertia = getattr(own, field), own.armature
-        scale = voltage if with_voltage else _NOTHING
-        if not inertia.low > 0:
-            return None
-        return Interval(
-            top.value * scale.value / inertia.value,
-            top.low * scale.low / inertia.high,
-            top.high * scale.high / inertia.low,
-        )
-
-    return of
+def _product(one: Range | Interval, other: Range) -> Interval:
+    return Interval(one.value * other.value, one.low * other.low, one.high * other.high)
 
 
-def _dead_band(own: ServoNumbers, voltage: Range, poll: Range) -> Interval | None:
-    friction, stiff = own.friction_loss, own.stiffness
-    if not stiff.low * voltage.low > 0:
+def _quotient(top: Range | Interval, bottom: Range | Interval) -> Interval | None:
+    if not bottom.low > 0:
         return None
-    return Interval(
-        1e3 * friction.value / (stiff.value * voltage.value),
-        1e3 * friction.low / (stiff.high * voltage.high),
-        1e3 * friction.high / (stiff.low * voltage.low),
-    )
+    return Interval(top.value / bottom.value, top.low / bottom.high, top.high / bottom.low)
 
 
-def _top_speed(servo: ServoNumbers, voltage: Range, poll: Range) -> Interval:
+def _top_speed(servo: ServoNumbers, voltage: Range) -> Interval:
     """Of the motor without load, or of the set-point, whichever is slower."""
 
     def speed(limit: float, effort: float, back_emf: float, scale: float) -> float:
@@ -402,30 +388,38 @@ def _top_speed(servo: ServoNumbers, voltage: Range, poll: Range) -> Interval:
     )
 
 
-def _age(servo: ServoNumbers, voltage: Range, poll: Range) -> Interval:
-    feedback = servo.feedback
-    periods = 0.5 + feedback.loss / (1.0 - feedback.loss)
-    return _times(poll, 1e3 * feedback.poll_period_s * periods)
+def _age(feedback: ServoFeedback, poll: Range) -> Interval:
+    return _times(poll, feedback.poll_period_s * (0.5 + feedback.loss / (1.0 - feedback.loss)))
 
 
-def _times(range_: Range, factor: float) -> Interval:
+def _times(range_: Range | Interval, factor: float) -> Interval:
     return Interval(factor * range_.value, factor * range_.low, factor * range_.high)
 
 
 Quantity = Callable[[ServoNumbers, Range, Range], Interval | None]
-_QUANTITIES: tuple[tuple[str, str, bool, Quantity], ...] = (
-    ("dead time", "ms", False, lambda own, voltage, poll: _times(own.dead_time_s, 1e3)),
-    ("stiffness per inertia", "1/s²", True, _per_inertia("stiffness", True)),
-    ("damping per inertia", "1/s", True, _per_inertia("damping", False)),
-    ("effort limit per inertia", "rad/s²", True, _per_inertia("effort_limit", True)),
-    ("dead band", "mrad", False, _dead_band),
-    ("top speed", "rad/s", True, _top_speed),
-    ("mean age of readings", "ms", False, _age),
+_QUANTITIES: tuple[tuple[str, str, float, bool, Quantity], ...] = (
+    ("dead time", "ms", 1e3, False, lambda s, voltage, poll: _times(s.dead_time_s, 1.0)),
     (
-        "quantisation step",
-        "mrad",
-        False,
-        lambda own, voltage, poll: Interval(*[1e3 * own.feedback.quantum_rad] * 3),
+        "stiffness per inertia", "1/s²", 1.0, True,
+        lambda s, voltage, poll: _quotient(_product(s.stiffness, voltage), s.armature),
     ),
-)
-"""Name, unit, whether differences are factors, and the number of a servo in that unit."""
+    (
+        "damping per inertia", "1/s", 1.0, True,
+        lambda s, voltage, poll: _quotient(s.damping, s.armature),
+    ),
+    (
+        "effort limit per inertia", "rad/s²", 1.0, True,
+        lambda s, voltage, poll: _quotient(_product(s.effort_limit, voltage), s.armature),
+    ),
+    (
+        "dead band", "mrad", 1e3, False,
+        lambda s, voltage, poll: _quotient(s.friction_loss, _product(s.stiffness, voltage)),
+    ),
+    ("top speed", "rad/s", 1.0, True, lambda s, voltage, poll: _top_speed(s, voltage)),
+    ("mean age of readings", "ms", 1e3, False, lambda s, voltage, poll: _age(s.feedback, poll)),
+    (
+        "quantisation step", "mrad", 1e3, False,
+        lambda s, voltage, poll: Interval(*[s.feedback.quantum_rad] * 3),
+    ),
+)  # fmt: skip
+"""Name, unit, its factor on SI, whether differences are factors, and the number of a servo."""

@@ -114,8 +114,6 @@ class JointEstimate:
 class Observer(ABC):
     """Source of a policy's joint observation; see the module's docstring."""
 
-    name: str
-
     def __init__(self, period_s: float, joints: int = _JOINTS):
         self.period_s, self.joints = float(period_s), joints
         self.reset(np.zeros(joints))
@@ -147,8 +145,6 @@ class SyntheticPD(Observer):
     many substeps as in training, of 2 ms each, by default; a joint that reaches one of its limits
     (lowest and highest position, scalars or arrays of 12 [rad]) stops.
     """
-
-    name = "synthetic-pd"
 
     def __init__(
         self,
@@ -198,9 +194,7 @@ class SyntheticPD(Observer):
             velocity_limit=np.inf,
             dead_time_s=delay * period_s,
         )
-        observer = cls(parameters, period_s, _PAPER_SUBSTEPS, limits_rad)
-        observer.name = "paper-pd"
-        return observer
+        return cls(parameters, period_s, _PAPER_SUBSTEPS, limits_rad)
 
     def reset(self, position: ArrayLike) -> None:
         """See `Observer`."""
@@ -266,8 +260,6 @@ class ServoModelObserver(Observer):
     state.
     """
 
-    name = "servo-model"
-
     def __init__(self, model: JointArrays, period_s: float):
         self._model = model
         super().__init__(period_s)
@@ -292,8 +284,6 @@ class HeldEncoder(Observer):
     `velocity_steps` control periods apart: cheap buses poll too rarely for less.
     """
 
-    name = "encoder"
-
     def __init__(self, period_s: float, velocity_steps: int, joints: int = _JOINTS):
         self._velocity_steps = velocity_steps
         super().__init__(period_s, joints)
@@ -315,8 +305,6 @@ class HeldEncoder(Observer):
 
 class Zero(Observer):
     """Joints that always rest: a walk without joint feedback."""
-
-    name = "zero"
 
     def step(self, target: ArrayLike, reading: ArrayLike) -> JointEstimate:
         """See `Observer`; neither is used."""

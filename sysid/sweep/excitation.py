@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import gcd
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,7 +130,9 @@ def lift(height: float, duration_s: float) -> Offset:
     return lambda t: height * minimum_jerk(np.asarray(t, float) / duration_s)
 
 
-KINDS = ("sine", "chirp", "multisine", "steps", "square", "prbs")
+Kind = Literal["sine", "chirp", "multisine", "steps", "square", "prbs", "bench", "drop", "reversal"]
+"""Shapes of a sweep's motion; the last three are those of a bench (`sysid.sweep.bench`)."""
+KINDS = get_args(Kind)[:6]
 
 HIGHEST_HZ = 25.0  # half of the usual 52 Hz command rate: a faster tone cannot be commanded
 LEAD_IN_S = 0.2  # rest at the start pose, recorded at the head of every trial [s]

@@ -11,5 +11,5 @@ def response(observer, frequencies_hz, amplitude_rad: float, period_s: float) ->
     """Swing of each joint over that of its target, shape (frequencies, 12), without readings."""
     frequencies = np.asarray(frequencies_hz, float)
     targets = _sines(frequencies, amplitude_rad, period_s)
-    positions = _drive(observer, targets, np.full_like(targets, np.nan), period_s)
+    positions = _drive(observer, targets, np.full_like(targets, np.nan))
     return _phasors(positions, frequencies, period_s) / amplitude_rad

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -62,12 +62,7 @@ class Sweep:
     joint_map: str | None = None
     """Joint map: a file or a preset; by default joints.yaml if it is here, else the preset that
     fits the bus. With the emulated bus, the robot that is emulated."""
-    kind: (
-        Literal[
-            "sine", "chirp", "multisine", "steps", "square", "prbs", "bench", "drop", "reversal"
-        ]
-        | None
-    ) = None
+    kind: excitation.Kind | None = None
     """Shape of the motion; by default sine, or bench with --load: tones, chirp, prbs, steps and
     drops. drop and reversal (slow strokes, for backlash) are of a bench, too."""
     load: str | None = None

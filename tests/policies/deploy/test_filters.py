@@ -47,14 +47,9 @@ def test_reset_is_the_steady_state_of_each_channel_so_a_constant_input_passes_un
         assert smooth(value) == pytest.approx(value, abs=1e-14)
 
 
-def test_cutoffs_and_samples_that_cannot_be_are_refused_and_leave_the_state():
+def test_cutoffs_that_cannot_be_are_refused():
     cutoffs = [(c, "half the rate, 12.5 Hz") for c in (12.5, 20.0, 0.0, -1.0, np.nan)]
     assert_each_refused(cutoffs, lambda cutoff_hz: LowPass(cutoff_hz, 25.0, 12))
-    smooth = LowPass(8.0, 25.0, 12)
-    smooth.reset([0.3] * 12)
-    samples = ([0.0] * 11, [[0.0] * 12], [np.nan] * 12)
-    assert_each_refused([(sample, "low-pass") for sample in samples], smooth)
-    assert smooth([0.3] * 12) == pytest.approx([0.3] * 12)
 
 
 # ---------------------------------------------------------------------------------- attitude
@@ -122,18 +117,6 @@ def test_clipped_samples_and_reads_of_zeros_move_gravity_by_the_gyro_alone():
     assert imu.step([0, 0, 0], [0, 0, 0], 0.02).gravity == pytest.approx([0.6, 0, -0.8])
 
 
-def test_an_imu_that_cannot_be_is_refused():
-    imu = ComplementaryFilter()
-    cases = [
-        (lambda: ComplementaryFilter(weight=0.5), "weight"),
-        (lambda: ComplementaryFilter(limit_m_s2=2.0), "1 g"),  # in g
-        (lambda: imu.reset(start([0, 0, 0])), "no direction"),
-        (lambda: imu.step([np.nan, 0, 0], [0, 0, G], 0.02), "gyro"),
-        (lambda: imu.step([0, 0, 0], [0, 0], 0.02), "accelerometer"),
-    ]
-    assert_each_refused(cases, lambda use: use())
-
-
 # ---------------------------------------------------------------------------------- at rest
 
 
@@ -157,15 +140,12 @@ def test_at_rest_finds_bias_and_gravity_to_the_noise_of_the_mean():
 
 def test_at_rest_refuses_what_is_not_a_robot_at_rest():
     rates, forces = still()
-    jerked, broken, turning = rates.copy(), rates.copy(), rates + np.array([0, 0, 0.5])
+    jerked, turning = rates.copy(), rates + np.array([0, 0, 0.5])
     jerked[20:25, 1] += 0.4
-    broken[3, 0] = np.nan
     cases = [
         ((jerked, forces), "moved"), ((turning, forces), "moved"),
         *(((rates, scale * forces), "not 9.81") for scale in (0.0, 0.8, 1 / G)),
         (still(Rotation.from_euler("x", 45, degrees=True)), "tilted by 4"),
         ((rates, -forces), "upside down"),
-        ((rates[:19], forces[:19]), "19 IMU samples"), ((rates, forces[:-1]), "shapes"),
-        ((broken, forces), "not finite"),
     ]  # fmt: skip
     assert_each_refused(cases, lambda samples: at_rest(*samples))
