@@ -145,13 +145,11 @@ class Screen:
         moving = [k for k, e in zip(seen, extent, strict=True) if e > _STILL_RAD] or seen
         still = [k for k in seen if k not in moving]
         most = max((width + _GAP) // (_NARROWEST + _GAP), 1)
-        rows_left = height - 2 - -(-len(still) // most)
+        spare = height - 2 - -(-len(still) // most)
         high = 1 + _FEWEST_ROWS
-        columns = next(
-            (c for c in range(1, most) if -(-len(moving) // c) * high <= rows_left), most
-        )
-        moving = moving[: max(rows_left // high, 1) * columns]
-        rows = max(rows_left // max(-(-len(moving) // columns), 1) - 1, 1)
+        columns = next((c for c in range(1, most) if -(-len(moving) // c) * high <= spare), most)
+        moving = moving[: max(spare // high, 1) * columns]
+        rows = max(spare // max(-(-len(moving) // columns), 1) - 1, 1)
         across = _across(width, columns)
         blocks = [self._block(k, table[:, 0], data, across, rows) for k in moving]
         _append(text, blocks, columns, across)

@@ -89,17 +89,11 @@ def claim(
         @wraps(look)
         def row(evidence: Evidence) -> Claim:
             try:
-                finding = look(evidence)
+                seen = look(evidence)
             except NotTestable as missing:
                 return Claim(id, text, paper, "–", None, "not testable here", f"{how} {missing}")
             return Claim(
-                id,
-                text,
-                paper,
-                finding.ours,
-                finding.interval,
-                finding.verdict,
-                f"{how} {finding.note}",
+                id, text, paper, seen.ours, seen.interval, seen.verdict, f"{how} {seen.note}"
             )
 
         return row

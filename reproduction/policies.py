@@ -188,10 +188,10 @@ def _delay_frequency(kind: str, id_: str, text: str, paper: str) -> Callable[[Po
     "PCA of states in replay at 0, +160, +320 ms together (`pupper-analyze attractor`).",
 )  # fmt: skip
 def components(policies: Policies) -> Finding:
-    variance = of_kinds(policies, lambda e: 100 * _hidden(e, "explained_3"), "mlp", "lstm")
+    share = of_kinds(policies, lambda e: 100 * _hidden(e, "explained_3"), "mlp", "lstm")
     return Finding(
-        f"{several(variance, 0)} %", bounds(variance),
-        holds(variance["lstm"].value > variance["mlp"].value),
+        f"{several(share, 0)} %", bounds(share),
+        holds(share["lstm"].value > share["mlp"].value),
         "Variance explained says little of order: see P2.",
     )  # fmt: skip
 

@@ -233,22 +233,18 @@ def servo_demand(
     return replace(demand, verdict=_verdict(demand))
 
 
-def _load(
-    need: Array, speed: Array, numbers: Mapping[str, Array]
-) -> tuple[Array, NDArray[np.bool_]]:
+def _load(need: Array, speed: Array, servo: Mapping[str, Array]) -> tuple[Array, NDArray[np.bool_]]:
     """Needed torque over what a servo has left, and where that is too little or too slow."""
-    available = numbers["effort_limit"] - numbers["back_emf"] * speed * np.sign(need)
-    used = np.minimum(np.abs(need) / np.maximum(available, 1e-9), _MOST_USED)
-    return used, (used > _TOLERANCE) | (np.abs(speed) > _TOLERANCE * _top_speed(numbers))
+    spare = servo["effort_limit"] - servo["back_emf"] * speed * np.sign(need)
+    used = np.minimum(np.abs(need) / np.maximum(spare, 1e-9), _MOST_USED)
+    return used, (used > _TOLERANCE) | (np.abs(speed) > _TOLERANCE * _top_speed(servo))
 
 
-def _top_speed(numbers: Mapping[str, Array]) -> Array:
+def _top_speed(servo: Mapping[str, Array]) -> Array:
     """Speeds without load of all servos [rad/s]."""
-    available = np.maximum(numbers["effort_limit"] - numbers["friction_loss"], 0.0)
-    free = np.where(
-        numbers["back_emf"] > 0, available / np.maximum(numbers["back_emf"], 1e-12), np.inf
-    )
-    return np.minimum(free, numbers["velocity_limit"])
+    spare = np.maximum(servo["effort_limit"] - servo["friction_loss"], 0.0)
+    free = np.where(servo["back_emf"] > 0, spare / np.maximum(servo["back_emf"], 1e-12), np.inf)
+    return np.minimum(free, servo["velocity_limit"])
 
 
 def _verdict(demand: ServoDemand) -> str:
@@ -276,11 +272,11 @@ def _verdict(demand: ServoDemand) -> str:
     lacking = [name for name, joint in joints.items() if joint.lacks]
     if lacking:
         worst = max(lacking, key=lambda name: joints[name].short)
-        weakest = joints[worst]
+        worst_joint = joints[worst]
         why = f"{servo} is short of torque or speed in {len(lacking)} of {len(joints)} joints, "
-        why += f"most in {worst}, {100 * weakest.short:.0f} % of the time"
-        if weakest.rotor_nm > 0.5 * weakest.torque_nm.p99:
-            of_all = f"{weakest.rotor_nm:.2g} of {weakest.torque_nm.p99:.2g} N·m"
+        why += f"most in {worst}, {100 * worst_joint.short:.0f} % of the time"
+        if worst_joint.rotor_nm > 0.5 * worst_joint.torque_nm.p99:
+            of_all = f"{worst_joint.rotor_nm:.2g} of {worst_joint.torque_nm.p99:.2g} N·m"
             why += f" (its own armature takes {of_all})"
     else:
         most = max(joints, key=lambda name: joints[name].torque_used)

@@ -21,12 +21,7 @@ from pupper_sysid.servo_models.calibration.calibration import Calibration, load_
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, JointCalibration
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.robot.engine import mujoco
-from pupper_sysid.sim.robot.replay import (
-    ServoRobot,
-    compiled,
-    mini_pupper_robot,
-    robot_of,
-)
+from pupper_sysid.sim.robot.replay import ServoRobot, compiled, mini_pupper_robot, robot_of
 from pupper_sysid.sim.walking.servo_ranges import (
     IDEAL,
     check_actuator,

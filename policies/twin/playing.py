@@ -48,6 +48,7 @@ from pupper_sysid.sysid.servo_fit.data import Run, ServoData
 from pupper_sysid.sysid.servo_fit.scores import (
     Errors,
     Tracks,
+    block_draws,
     counted_ticks,
     interval,
     on_ticks,
@@ -216,7 +217,6 @@ STRONGER = 4.0
 
 _CORRELATED, _UNCORRELATED, _NONE = 0.08, 0.06, 0.25
 _FEWEST_FREE = 3  # degrees of freedom of a load share
-_DRAWS = 1000
 _WHY: dict[Verdict, str] = {
     "ground": "The robot was on the ground: its joints deviate as under the simulated load.",
     "air": (
@@ -287,24 +287,16 @@ def evidence(cases: Sequence[Case], data: ServoData, part: Part, seed: int) -> E
 
 
 def _motion(case: Case, data: ServoData, part: Part, seed: int) -> Motion | None:
-    blocks = sorted({b for e in case.errors.values() for b in e.block})
-    place = {b: n for n, b in enumerate(blocks)}
-    sums = np.zeros((3, len(blocks)))
+    place, draws = block_draws(case.errors, seed)
+    sums = np.zeros((3, len(place)))
     for joint, errors in case.errors.items():
-        moved, residuals = _unexplained(case, joint, data, part)
-        index, weight = [place[b] for b in errors.block], 1.0 / max(float(residuals.var()), 1e-12)
-        for product_sums, product in zip(
-            sums, (residuals * moved, moved**2, residuals**2), strict=True
-        ):
-            product_sums += weight * np.bincount(index, product, len(blocks))
-    if not sums[1].sum() > 1e-12 * len(blocks):
+        moved, rest = _unexplained(case, joint, data, part)
+        index, weight = [place[b] for b in errors.block], 1.0 / max(float(rest.var()), 1e-12)
+        for row, product in zip(sums, (rest * moved, moved**2, rest**2), strict=True):
+            row += weight * np.bincount(index, product, len(place))
+    if not sums[1].sum() > 1e-12 * len(place):
         return None
-    draws = np.random.default_rng(seed).multinomial(
-        len(blocks), np.full(len(blocks), 1 / len(blocks)), _DRAWS
-    )
-    together, ground, error = (
-        np.append(draws @ product_sums, product_sums.sum()) for product_sums in sums
-    )
+    together, ground, error = (np.append(draws @ row, row.sum()) for row in sums)
     ground = np.maximum(ground, 1e-300)
     share, correlation = together / ground, together / np.sqrt(ground * np.maximum(error, 1e-300))
     return Motion(
@@ -327,8 +319,8 @@ def _unexplained(case: Case, joint: str, data: ServoData, part: Part) -> tuple[A
         rows.append(np.vstack([seen, run.position_rad])[:, counts])
     air, speed, acceleration, ground, reading = np.concatenate(rows, axis=1)
     servo, _ = np.linalg.qr(np.stack([np.ones(len(air)), air, speed, acceleration], axis=1))
-    moved, residuals = ground - air, reading - air
-    return moved - servo @ (servo.T @ moved), residuals - servo @ (servo.T @ residuals)
+    moved, rest = ground - air, reading - air
+    return moved - servo @ (servo.T @ moved), rest - servo @ (servo.T @ rest)
 
 
 def _load_share(offsets: Mapping[str, tuple[float, float]]) -> Interval | None:

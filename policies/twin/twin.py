@@ -52,6 +52,7 @@ from pupper_sysid.sysid.fit.predict import ReadingRule, in_words, rule_of
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
+from pupper_sysid.sysid.servo_fit.figures import busiest
 from pupper_sysid.sysid.servo_fit.scores import (
     Errors,
     Tracks,
@@ -326,9 +327,7 @@ def _parts(recording: Recording, test_loops: Sequence[int]) -> tuple[Part, Part,
 
 def _condition(played: Played, data: ServoData, test: Part, rest: Part, seed: int) -> Condition:
     """Scores of one simulated robot."""
-    zero = {
-        joint: by_recording[0] for joint, by_recording in offsets(played.tracks, data, rest).items()
-    }
+    zero = {joint: shift[0] for joint, shift in offsets(played.tracks, data, rest).items()}
     tracks = {joint: [t + zero[joint] for t in played.tracks[joint]] for joint in data.joints}
     errors = scores.errors(None, tracks, data, test)
     joints = {
@@ -462,7 +461,7 @@ def draw_joint(axes: Axes, result: Twin, joint: str, actuator: str) -> None:
     place = max(range(len(runs)), key=lambda n: np.std(runs[n].command_rad))
     run = runs[place]
     time = run.trial.send_time_s - run.trial.send_time_s[0]
-    rows = _busiest(run.command_rad, max(int(_SHOWN_S / result.time_step_s), 2))
+    rows = busiest(run.command_rad, max(int(_SHOWN_S / result.time_step_s), 2))
     time = time[rows] - time[rows][0]
     axes.step(time, run.command_rad[rows], where="post", color=FAINT, lw=0.9, label="command")
     axes.plot(time, run.trial.position_rad[rows], "o", ms=2.2, color=INK, label="readings")
@@ -472,12 +471,3 @@ def draw_joint(axes: Axes, result: Twin, joint: str, actuator: str) -> None:
             line = predicted(condition.tracks[joint][place], run, run.reading_tick)[rows]
             axes.plot(time, line, color=colour, lw=1.1, label=words)
     axes.set_title(joint)
-
-
-def _busiest(command: np.ndarray, count: int) -> slice:
-    """The `count` rows in which a command moves most."""
-    if len(command) <= count:
-        return slice(None)
-    path = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(command)))])
-    start = int(np.argmax(path[count:] - path[:-count]))
-    return slice(start, start + count)

@@ -94,10 +94,8 @@ def walk_together(
 
     def walk(environments: list[list[int]], threads: int) -> None:
         for chosen in environments:
-            group_conditions = [conditions[i] for i in chosen]
-            group = _Group(
-                policy, servos, group_conditions, seconds, seed, threads, shared, recorder
-            )
+            some = [conditions[i] for i in chosen]
+            group = _Group(policy, servos, some, seconds, seed, threads, shared, recorder)
             if not group.walk(advance):
                 return
             kept.update(zip(chosen, group.found(), strict=True))

@@ -184,9 +184,9 @@ class Stretch:
 
     def between(self, start_s: float, stop_s: float) -> Stretch:
         """Rows read within a part of the stretch."""
-        changed, same = ((e > start_s) & (e <= stop_s) for e in (self.end, self.same_end))
+        new, same = ((e > start_s) & (e <= stop_s) for e in (self.end, self.same_end))
         return Stretch(
-            self.trial, start_s, stop_s, self.begin[changed], self.end[changed],
+            self.trial, start_s, stop_s, self.begin[new], self.end[new],
             self.same_begin[same], self.same_end[same],
         )  # fmt: skip
 

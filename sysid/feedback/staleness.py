@@ -57,18 +57,10 @@ def stretches_of(trial: Trial, step: float) -> list[Stretch]:
     edges = np.linspace(read[0], read[-1], parts + 1)
     stretches = []
     for start, stop in pairwise(edges):
-        changed, held = (r[(read[r] > start) & (read[r] <= stop)] for r in (rows, same))
-        if len(changed) >= 8:
+        new, held = (r[(read[r] > start) & (read[r] <= stop)] for r in (rows, same))
+        if len(new) >= 8:
             stretches.append(
-                Stretch(
-                    trial.number,
-                    start,
-                    stop,
-                    before[changed],
-                    read[changed],
-                    before[held],
-                    read[held],
-                )
+                Stretch(trial.number, start, stop, before[new], read[new], before[held], read[held])
             )
     return stretches
 

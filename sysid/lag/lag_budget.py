@@ -367,7 +367,7 @@ def estimators(
 ) -> dict[str, float]:
     """All estimators side by side, each the mean over trials [s]; `lag_s` is the budget's."""
     pairs = list(zip(trials, read, strict=True))
-    by_name = {
+    each = {
         "integer cross-correlation, all rows": [_integer(t, None) for t in trials],
         "integer cross-correlation, fresh rows": [_integer(t, r.rows) for t, r in pairs],
         "sub-sample cross-correlation, all rows": [
@@ -380,10 +380,9 @@ def estimators(
     frequency = np.array([t.frequency_hz for t in tones])
     for pair, name in (("raw_rows", "all rows"), ("fresh_rows", "fresh rows")):
         lags = list(tone_lags(responses(tones, pair)[0], frequency)) if tones else []
-        by_name[f"sine phase, {name}"] = lags
+        each[f"sine phase, {name}"] = lags
     result = {
-        k: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan")
-        for k, v in by_name.items()
+        k: float(np.nanmean(v)) if np.isfinite(v).any() else float("nan") for k, v in each.items()
     }
     if tones:
         result["phase slope, all rows"] = slope(tones, "raw_rows").value

@@ -103,10 +103,7 @@ class ToneResponse:
 
 
 def tone_response(
-    trial: Trial,
-    reading: Readings,
-    rng: np.random.Generator,
-    draws: int = _TONE_DRAWS,
+    trial: Trial, reading: Readings, rng: np.random.Generator, draws: int = _TONE_DRAWS
 ) -> ToneResponse | None:
     """Fit the tone of `trial`; None if it is no tone or has fewer than two steady periods.
 

@@ -246,23 +246,21 @@ def record_until(
     `most_seconds` is the most recorded time of a joint, the first sweep included [s]. `report` is
     called with the joints' state after every round of fits.
     """
-    files, outcomes, widths = list(paths), dict[str, JointOutcome](), dict[str, list[float]]()
+    files, state, widths = list(paths), dict[str, JointOutcome](), dict[str, list[float]]()
     open_joints = list(joints)
     while True:
         recordings = [load(path) for path in files]
         plans: dict[str, SweepPlan] = {}
         for joint, one in fit(recordings, open_joints).items():
             widths.setdefault(joint, []).append(half_width(one.dead_time_s))
-            outcomes[joint], plan = _judged(
-                goal, one, recordings, widths[joint], most_seconds, seed
-            )
+            state[joint], plan = _judged(goal, one, recordings, widths[joint], most_seconds, seed)
             if plan is not None:
                 plans[joint] = plan
         open_joints = list(plans)
         if report:
-            report(outcomes)
+            report(state)
         if not open_joints:
-            ordered = {joint: outcomes[joint] for joint in joints}
+            ordered = {joint: state[joint] for joint in joints}
             return Outcome(joints=ordered, recordings=tuple(files))
         joined = {
             name: tuple(entry for p in plans.values() for entry in getattr(p, name))

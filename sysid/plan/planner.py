@@ -573,9 +573,7 @@ def respond(hypothesis: Hypothesis, trial: Run, noise: Noise, seen: float = 1.0)
     slope = (off[: len(par)] - off[len(par) :]).T / (2 * step)
     shift = slope[:, :1] / values[0]  # of the logarithm: a tone's shift is a dead time of its own
     return Response(
-        at_steps(track, trial.sample_step),
-        seen * noise.weights(speed),
-        np.hstack([slope, shift]),
+        at_steps(track, trial.sample_step), seen * noise.weights(speed), np.hstack([slope, shift])
     )
 
 

@@ -180,16 +180,14 @@ def plan_first_sweep(
 
     The trials are the best on average over servos drawn from the prior of `sysid.fit.structure`.
     """
-    servos, plans_by_amplitude, plans = unknown_servos(seed), dict[float, JointPlan](), []
+    servos, by_reach, plans = unknown_servos(seed), dict[float, JointPlan](), []
     for joint in joints:
         joint_setup = _within(setup, joint, margins, LARGEST_RAD)
         reach = min(joint_setup.margin_rad, LARGEST_RAD)
-        if reach not in plans_by_amplitude:  # joints with the same margin get the same trials
-            plans_by_amplitude[reach] = propose(joint, servos, joint_setup, seconds)
-        trials = tuple(
-            t.model_copy(update={"joint": joint}) for t in plans_by_amplitude[reach].trials
-        )
-        plans.append(replace(plans_by_amplitude[reach], trials=trials))
+        if reach not in by_reach:  # joints with the same margin get the same trials
+            by_reach[reach] = propose(joint, servos, joint_setup, seconds)
+        trials = tuple(t.model_copy(update={"joint": joint}) for t in by_reach[reach].trials)
+        plans.append(replace(by_reach[reach], trials=trials))
     return _pooled(plans, (), seed, setup)
 
 

@@ -46,6 +46,7 @@ from pupper_sysid.sysid.fit.structure import candidate, loaded_columns
 from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.servo_fit.figures import busiest
 
 
 @styled
@@ -88,28 +89,21 @@ def _lag_bar(axes: Axes, row: int, part: LagBudget) -> float:
     raw, dead_time = 1e3 * part.raw_lag_s.value, part.dead_time_s
     assert dead_time is not None
     lengths = (part.command_hold_s, dead_time.value, part.dynamics_s, part.stale_lag_s)
-    start = 0.0
+    at = 0.0
     for (name, colour, hatch), length in zip(_LAG_KINDS, lengths, strict=True):
-        length_ms = max(1e3 * length, 0.0)
+        long = max(1e3 * length, 0.0)
         axes.barh(
-            row,
-            length_ms,
-            left=start,
-            height=0.62,
-            color=colour,
-            hatch=hatch,
-            edgecolor="white",
-            lw=0,
+            row, long, left=at, height=0.62, color=colour, hatch=hatch, edgecolor="white", lw=0
         )
-        if length_ms > 5.0:
+        if long > 5.0:
             # the feedback's hatching would run through its number
             box = {"boxstyle": "round,pad=0.15", "fc": colour, "ec": "none"}
             axes.text(
-                start + 0.5 * length_ms, row - 0.13 * (name == "dead time"), f"{length_ms:.0f}",
+                at + 0.5 * long, row - 0.13 * (name == "dead time"), f"{long:.0f}",
                 ha="center", va="center", color=_LIGHT if colour in (BLUE, GREEN) else _DARK,
                 bbox=box if hatch else None,
             )  # fmt: skip
-        start += length_ms
+        at += long
     middle = 1e3 * (part.command_hold_s + dead_time.value)
     below = 1e3 * max(dead_time.value - dead_time.low, 0.0)
     above = 1e3 * max(dead_time.high - dead_time.value, 0.0)
@@ -120,7 +114,7 @@ def _lag_bar(axes: Axes, row: int, part: LagBudget) -> float:
         )  # fmt: skip
     axes.plot([raw, raw], [row - 0.4, row + 0.4], color=INK, lw=2.2)
     axes.text(raw + 0.015 * max(raw, 1.0), row, f"{raw:.0f}", va="center", weight="bold")
-    return max(raw, start)
+    return max(raw, at)
 
 
 @styled
@@ -228,6 +222,7 @@ def sweep_figure(trials: Sequence[Trial]) -> Figure:
     return figure
 
 
+_SHOWN_PERIODS, _SHOWN_S = 2.5, 3.0  # of a tone, and of other motion
 LONGEST_RUN = 12  # hold runs of this many rows and more share the last bar
 
 
@@ -295,19 +290,15 @@ def _track(run: Run, simulated: NDArray) -> Track:
     )  # fmt: skip
 
 
-def window(track: Track, periods: float = 2.5, longest_s: float = 3.0) -> tuple[float, float]:
+def window(track: Track) -> tuple[float, float]:
     """Start and end of the stretch of `track` to show [s]: steady tone, or largest motion."""
     end = float(track.time_s[-1])
     if track.frequency_hz > 0:
-        length = min(periods / track.frequency_hz, end)
+        length = min(_SHOWN_PERIODS / track.frequency_hz, end)
         start = min(0.5 * end, end - length)
         return start, start + length
-    if end <= longest_s:
-        return 0.0, end
-    travel = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(track.command_rad)))])
-    width = int(longest_s / TIME_STEP_S)
-    start = float(track.time_s[int(np.argmax(travel[width:] - travel[:-width]))])
-    return start, start + longest_s
+    part = busiest(track.command_rad, int(_SHOWN_S / TIME_STEP_S))
+    return float(track.time_s[part.start]), float(track.time_s[part.stop - 1])
 
 
 def within(time: NDArray, start: float, stop: float) -> NDArray[np.bool_]:
@@ -376,9 +367,9 @@ def hold_runs(
 
 
 @styled
-def overlay_figure(result: JointCalibrationResult, of_trials: list[Track] | None = None) -> Figure:
+def overlay_figure(result: JointCalibrationResult, runs: list[Track] | None = None) -> Figure:
     """Command, model and readings, the fresh ones at the time they were measured."""
-    chosen = some_tracks(tracks(result) if of_trials is None else of_trials)
+    chosen = some_tracks(tracks(result) if runs is None else runs)
     figure, grid = axes_column(len(chosen), 1.2 + 1.75 * len(chosen))
     for axes, track in zip(grid, chosen, strict=True):
         _overlay(axes, track, result.joint, 1.0)
@@ -449,34 +440,32 @@ OVERLAY_PARTS = {
 
 
 @styled
-def residual_figure(result: JointCalibrationResult, of_trials: list[Track] | None = None) -> Figure:
+def residual_figure(result: JointCalibrationResult, runs: list[Track] | None = None) -> Figure:
     """Residuals of the model: over speed, fresh and raw; and over time."""
-    of_trials = tracks(result) if of_trials is None else of_trials
+    runs = tracks(result) if runs is None else runs
     figure, (over_speed, over_time) = axes_column(2, 6.0)
     lattice = result.lag.feedback
     age = 1e3 * (lattice.mean_age_s if np.isfinite(lattice.mean_age_s) else result.lag.stale_lag_s)
     rows = f"all rows at their own time (dashed: speed × {age:.0f} ms)"
-    _residuals_over_speed(over_speed, of_trials, 1.0, rows)
-    fastest = np.max(
-        [np.max(np.abs(t.row_speed_rad_s), initial=0.0) for t in of_trials], initial=0.0
-    )
+    _residuals_over_speed(over_speed, runs, 1.0, rows)
+    fastest = np.max([np.max(np.abs(t.row_speed_rad_s), initial=0.0) for t in runs], initial=0.0)
     reach = np.array([-1.0, 1.0]) * fastest
     over_speed.plot(reach, -age * reach, color=INK, lw=1.2, ls=(0, (4, 2)))
     over_speed.set_xlabel("speed of the model [rad/s]")
     over_speed.set_ylabel("reading − model [mrad]")
     start = 0.0
-    for n, track in enumerate(of_trials):
+    for n, track in enumerate(runs):
         over_time.plot(
             start + track.fresh_time_s, 1e3 * track.fresh_error_rad, ".", color=RED, ms=4
         )
-        if track.frequency_hz > 0 and len(of_trials) <= 12:
+        if track.frequency_hz > 0 and len(runs) <= 12:
             over_time.text(
                 start + 0.5 * track.time_s[-1], 0.97, f"{track.frequency_hz:.3g} Hz",
                 transform=over_time.get_xaxis_transform(), ha="center", va="top",
                 fontsize=9,
             )  # fmt: skip
         start += float(track.time_s[-1])
-        if n < len(of_trials) - 1:
+        if n < len(runs) - 1:
             over_time.axvline(start, color=FAINT, lw=0.8)
     over_time.axhline(0, color=INK, lw=0.8)
     over_time.margins(x=0.01, y=0.2)
@@ -498,9 +487,9 @@ def residual_grid(by_joint: Mapping[str, list[Track]]) -> Figure:
     return _small_multiples(by_joint, draw, speed, error, 1 if len(by_joint) < 3 else 2)
 
 
-def _residuals_over_speed(axes: Axes, of_trials: list[Track], size: float, rows: str) -> None:
+def _residuals_over_speed(axes: Axes, runs: list[Track], size: float, rows: str) -> None:
     def gathered(name: str) -> NDArray:
-        return np.concatenate([getattr(t, name) for t in of_trials])
+        return np.concatenate([getattr(t, name) for t in runs])
 
     axes.plot(
         gathered("row_speed_rad_s"), 1e3 * gathered("row_error_rad"), ".", color=FAINT,

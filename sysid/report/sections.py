@@ -58,27 +58,22 @@ class Findings:
     """Of servo models."""
 
 
-def sections(findings: Findings) -> list[Section]:
+def sections(report: Findings) -> list[Section]:
     """All sections of the page, in order: first what holds for all joints, then joint by joint."""
-    results = findings.results
-    runs = {joint: parts for joint, result in results.items() if (parts := tracks(result))}
-    parts = [_summary(results), _lag(results), _doctor(findings), _free_runs(results, runs)]
-    parameters = tables.parameter_table(findings.calibration, list(results))
-    parts += [
-        _parameters(findings, parameters),
-        _models(results),
-        _holds(findings),
-        _bode(findings),
-    ]
-    if findings.comparison:
-        parts.append(servo_section(findings.comparison))
-    next_steps = advice(results, findings.calibration, findings.examinations)
-    parts += [
-        _joints(findings, runs, parameters),
+    results = report.results
+    runs = {joint: page for joint, result in results.items() if (page := tracks(result))}
+    page = [_summary(results), _lag(results), _doctor(report), _free_runs(results, runs)]
+    parameters = tables.parameter_table(report.calibration, list(results))
+    page += [_parameters(report, parameters), _models(results), _holds(report), _bode(report)]
+    if report.comparison:
+        page.append(servo_section(report.comparison))
+    next_steps = advice(results, report.calibration, report.examinations)
+    page += [
+        _joints(report, runs, parameters),
         Section("next", "What to record next", findings=[("", text) for text in next_steps]),
-        _provenance(findings),
+        _provenance(report),
     ]
-    return [s for s in parts if s.text or s.findings or s.figures or s.tables or s.folds]
+    return [s for s in page if s.text or s.findings or s.figures or s.tables or s.folds]
 
 
 def _summary(results: Mapping[str, JointCalibrationResult]) -> Section:
@@ -93,7 +88,7 @@ def _summary(results: Mapping[str, JointCalibrationResult]) -> Section:
         notes=[
             "Raw lag: from a command's row to the position's row, as a cross-correlation of the "
             "log measures it. Only the servo's own part belongs to a simulated actuator; stale "
-            "feedback belongs to the observation.",
+            "feedback belongs to the observation."
         ],
     )
 
@@ -125,16 +120,17 @@ _NEGATIVE_S = -5e-5
 def shared(by_joint: Mapping[str, Sequence[str]]) -> list[str]:
     """Sentences of joints, each once, behind the names of all joints that it holds for."""
     bare = {
-        joint: [t.removeprefix(f"{joint}: ") for t in texts] for joint, texts in by_joint.items()
+        joint: [t.removeprefix(f"{joint}: ") for t in own_texts]
+        for joint, own_texts in by_joint.items()
     }
     return [f"{names}: {text}" for names, text in share_sentences(bare)]
 
 
-def _doctor(findings: Findings) -> Section:
+def _doctor(report: Findings) -> Section:
     said: dict[str, list[str]] = {}
-    for _, examination in findings.examinations:
+    for _, examination in report.examinations:
         for name, joint in examination.joints.items():
-            if name in findings.results:
+            if name in report.results:
                 sentences = (f"{joint.verdict}.", *joint.reasons)
                 said.setdefault(name, []).extend(t[:1].upper() + t[1:] for t in sentences)
     texts: dict[str, list[str]] = {}
@@ -143,7 +139,7 @@ def _doctor(findings: Findings) -> Section:
     return Section(
         "doctor", "Are the recordings usable?",
         findings=[(names, " ".join(sentences)) for names, sentences in texts.items()],
-        tables=[tables.doctor_table(findings.examinations, findings.results)],
+        tables=[tables.doctor_table(report.examinations, report.results)],
     )  # fmt: skip
 
 
@@ -154,11 +150,8 @@ def _free_runs(
     text = "DelayedPD runs freely from where the joint rested: its input is commands only."
     pictures = []
     if len(runs) == 1:
-        ((joint, joint_tracks),) = runs.items()
-        pictures = [
-            _overlay(results[joint], joint_tracks),
-            _residuals(results[joint], joint_tracks),
-        ]
+        ((joint, runs_of),) = runs.items()
+        pictures = [_overlay(results[joint], runs_of), _residuals(results[joint], runs_of)]
     elif runs:
         pictures = [
             Picture("overlay", _OVERLAY, figures.overlay_grid(runs), wide=True),
@@ -191,24 +184,24 @@ def _residuals(result: JointCalibrationResult, runs: list[Track]) -> Picture:
     return Picture(f"residuals_{result.joint}", words, drawn)
 
 
-def _joints(findings: Findings, runs: Mapping[str, list[Track]], parameters: Table) -> Section:
+def _joints(report: Findings, runs: Mapping[str, list[Track]], parameters: Table) -> Section:
     """Everything about each joint, folded."""
-    models = tables.model_table(findings.results)
-    by_frequency = tables.frequency_table({j: r.lag for j, r in findings.results.items()})
-    forms = tables.transfer_table(findings.responses)
+    models = tables.model_table(report.results)
+    by_frequency = tables.frequency_table({j: r.lag for j, r in report.results.items()})
+    forms = tables.transfer_table(report.responses)
     folds = []
-    for joint, result in findings.results.items():
-        joint_tracks = runs.get(joint, [])
+    for joint, result in report.results.items():
+        drawn_runs = runs.get(joint, [])
         drawn = (
-            [_overlay(result, joint_tracks), _residuals(result, joint_tracks)]
-            if joint_tracks and len(runs) > 1
+            [_overlay(result, drawn_runs), _residuals(result, drawn_runs)]
+            if drawn_runs and len(runs) > 1
             else []
         )
-        joint_tables = [t.where("joint", joint) for t in (parameters, models, by_frequency, forms)]
+        parts = [t.where("joint", joint) for t in (parameters, models, by_frequency, forms)]
         folds.append(
             Fold(
-                joint, figures=drawn, tables=[t for t in joint_tables if t.rows],
-                opened=len(findings.results) == 1,
+                joint, figures=drawn, tables=[t for t in parts if t.rows],
+                opened=len(report.results) == 1,
             )
         )  # fmt: skip
     return Section(
@@ -216,10 +209,10 @@ def _joints(findings: Findings, runs: Mapping[str, list[Track]], parameters: Tab
     )
 
 
-def _holds(findings: Findings) -> Section:
+def _holds(report: Findings) -> Section:
     held = {}
-    for joint, result in findings.results.items():
-        examined = [e.joints[joint] for _, e in findings.examinations if joint in e.joints]
+    for joint, result in report.results.items():
+        examined = [e.joints[joint] for _, e in report.examinations if joint in e.joints]
         if examined:
             held[joint] = hold_runs(
                 [e.hold_histogram for e in examined],
@@ -237,27 +230,27 @@ def _holds(findings: Findings) -> Section:
     return Section("holds", "How long readings are held", figures=pictures)
 
 
-def _bode(findings: Findings) -> Section:
+def _bode(report: Findings) -> Section:
     pictures = []
-    if findings.responses:
+    if report.responses:
         text = (
             "Frequency response from the held command to the motion, from fresh readings, with "
             "90 % intervals. Hollow marks: gain of all rows, held ones included, which is too low."
         )
-        pictures.append(Picture("bode", text, figures.bode_figure(findings.responses)))
+        pictures.append(Picture("bode", text, figures.bode_figure(report.responses)))
     return Section(
         "bode", "Frequency response", figures=pictures,
         findings=share_sentences(
             {
                 joint: [f"−3 dB bandwidth {response.bandwidth_text}."]
-                for joint, response in findings.responses.items()
+                for joint, response in report.responses.items()
             }
         ),
         notes=[
             "A transfer function has neither friction nor limits, so the delay of its form is not "
             "the dead time of the servo, which stands under Parameters. The forms stand under each "
             "joint.",
-        ] if findings.responses else [],
+        ] if report.responses else [],
     )  # fmt: skip
 
 
@@ -276,19 +269,19 @@ def _models(results: Mapping[str, JointCalibrationResult]) -> Section:
             "Errors are root mean squares of free runs. Fresh: against fresh readings when they "
             "were measured. Unseen frequency: the same on tones left out of the fit; the model "
             f"best at that is chosen ({MODEL_NAMES[PREFERRED]} where it comes within 5 %, because "
-            "simulators run it). Presets are published settings, scored the same way.",
+            "simulators run it). Presets are published settings, scored the same way."
         ],
         tables=[tables.model_matrix(tables.model_table(results))],
         notes=[
             "The raw score takes every row as measured when it was logged. Held readings then "
             "count as errors, no model can get below them, and a model with too much delay is "
-            "best: do not choose by it. " + " ".join(preferred),
+            "best: do not choose by it. " + " ".join(preferred)
         ],
     )
 
 
-def _parameters(findings: Findings, parameters: Table) -> Section:
-    scale = findings.calibration.joint(next(iter(findings.results))).actuator.scale
+def _parameters(report: Findings, parameters: Table) -> Section:
+    scale = report.calibration.joint(next(iter(report.results))).actuator.scale
     return Section(
         "parameters",
         "Parameters",
@@ -296,20 +289,20 @@ def _parameters(findings: Findings, parameters: Table) -> Section:
             f"Torques follow from one anchor: {scale.anchor}, {scale.value_nm:g} N·m "
             f"({scale.source}). “Ratio only” means that the recording gives this number divided by "
             "the armature, and the anchor gives the rest. Numbers in italics are not identified; "
-            "the reason stands under each joint.",
+            "the reason stands under each joint."
         ],
         tables=[tables.parameter_matrix(parameters)],
         notes=shared(
             {
                 joint: [w for w in r.warnings if w not in (*r.lag.warnings, *r.differences)]
-                for joint, r in findings.results.items()
+                for joint, r in report.results.items()
             }
         ),
     )
 
 
-def _provenance(findings: Findings) -> Section:
-    recordings, calibration = findings.recordings, findings.calibration
+def _provenance(report: Findings) -> Section:
+    recordings, calibration = report.recordings, report.calibration
     rows = [
         {
             "recording": r.path.name if r.path else r.name,
@@ -332,7 +325,7 @@ def _provenance(findings: Findings) -> Section:
         "Where this comes from",
         text=[
             f"Calibration of {calibration.robot}, {calibration.created}, seed {calibration.seed}. "
-            f"Made with {made_with}.",
+            f"Made with {made_with}."
         ],
         tables=[Table("recordings", "Recordings", columns, rows)],
         notes=[*(w for r in recordings for w in r.warnings), *calibration.notes],
@@ -367,21 +360,17 @@ def advice(
     gaps = {
         joint: _gaps(result, calibration.joint(joint).actuator) for joint, result in results.items()
     }
-    sentences = [
-        f"{j}: {text}" for by_joint in (again, gaps) for j, text in share_sentences(by_joint)
-    ]
+    texts = [f"{j}: {text}" for part in (again, gaps) for j, text in share_sentences(part)]
     if any(calibration.joint(j).actuator.scale.anchor == "stall torque" for j in results):
-        sentences.append(
+        texts.append(
             "Torques rest on an assumed stall torque, because a joint that swings in free air "
             "shows only ratios to its inertia. Hang a known mass at a known distance from the "
             "joint and record the same sweep: that gives the scale."
         )
     missing = [j for j in JOINT_NAMES if j not in results]
     if 0 < len(missing) < len(JOINT_NAMES):  # of a Mini Pupper; how many others have is not known
-        sentences.append(
-            f"Not recorded yet: {', '.join(missing)}. `pupper-sysid sweep` records them."
-        )
-    return sentences
+        texts.append(f"Not recorded yet: {', '.join(missing)}. `pupper-sysid sweep` records them.")
+    return texts
 
 
 def _gaps(result: JointCalibrationResult, actuator: Actuator) -> list[str]:
@@ -390,58 +379,56 @@ def _gaps(result: JointCalibrationResult, actuator: Actuator) -> list[str]:
     tones = sorted({round(t.frequency_hz, 2) for t in result.runs if t.frequency_hz > 0})
     fresh = sum(len(t.sample_step) for t in result.runs)
     width = 1e3 * (result.dead_time_s.high - result.dead_time_s.low)
-    sentences = []
+    gaps = []
     ratios = actuator.ratios_to_armature
     limits = {
         "speed": (actuator.velocity_limit_rad_s, ratios.back_emf), "torque": (ratios.effort_limit,)
     }  # fmt: skip
     unknown = [
         name
-        for name, quantities in limits.items()
-        if all(quantity.identified == "no" for quantity in quantities)
+        for name, parts in limits.items()
+        if all(quantity.identified == "no" for quantity in parts)
     ]
     if unknown:
-        sentences.append(
+        gaps.append(
             f"the limit of its {' and '.join(unknown)} is not identified. Record steps, or tones "
             "whose peak speed 2π·f·A comes close to the servo's no-load speed."
         )
     if ratios.friction_loss.identified == "no":
-        sentences.append(
+        gaps.append(
             "friction is not identified. Record a slow tone (0.2–0.5 Hz): the joint sticks at its "
             "turning points."
         )
     if not tones:
-        sentences.append(
+        gaps.append(
             "there are no tones in this recording. Record a sweep of 1 to 10 Hz: it gives gain and "
             "lag per frequency, and a model can be tested on tones left out of its fit."
         )
     elif len(tones) < _FEW_FREQUENCIES:
-        sentences.append(
+        gaps.append(
             f"only {len(tones)} frequenc{'y' if len(tones) == 1 else 'ies'} "
             f"({', '.join(f'{f:g}' for f in tones)} Hz), too few to test a model on one left out "
             "of its fit. Record 1 to 10 Hz."
         )
     if tones and (tones[-1] < _FAST_HZ or width > _WIDE_MS):
-        sentences.append(
+        gaps.append(
             f"the dead time rests on tones of {tones[-1]:g} Hz and below, where it is hard to "
             "separate from slow dynamics. Record faster tones (up to 10 Hz, at a smaller "
             "amplitude) or steps."
         )
     if fresh < _FEW_READINGS:
-        sentences.append(
+        gaps.append(
             f"fewer than {_FEW_READINGS} fresh readings. Hold each tone longer: four times the "
             "time halves every interval."
         )
     if lattice.kind == "unresolved":
-        sentences.append(
+        gaps.append(
             "readings are held, but the bus's poll period could not be found. Record a longer "
             f"sweep ({_LONG_S:g} s or more) at full amplitude."
         )
     if not np.isfinite(pd.scores.rmse_unseen_rad) and tones:
-        sentences.append(
-            "no frequency could be left out, so the model was not tested on new motion."
-        )
-    return sentences
+        gaps.append("no frequency could be left out, so the model was not tested on new motion.")
+    return gaps
 
 
 def servo_section(comparison: Comparison) -> Section:
@@ -490,7 +477,7 @@ def servo_section(comparison: Comparison) -> Section:
             Table("servo_data_curve", "Error against samples, emulated robot", by_samples, samples),
         ],
         files=[
-            Table("servo_models", "", (), comparison.to_frame().reset_index().to_dict("records")),
+            Table("servo_models", "", (), comparison.to_frame().reset_index().to_dict("records"))
         ],
         notes=[*comparison.reading_notes(), *comparison.notes],
     )

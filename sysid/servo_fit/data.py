@@ -152,9 +152,7 @@ def servo_data(
     return ServoData(tuple(joints), period, runs, tuple(labels), modes, polls)
 
 
-def look_up_weights(
-    tick: NDArray[np.float64],
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def look_up_weights(tick: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Tick before each of `tick`, shape (n,), and weights of a Catmull-Rom cubic, shape (n, 4).
 
     The weights are of the ticks `index - 1` to `index + 2`.

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from pupper_sysid.common.figure_style import (
     BLUE,
@@ -41,13 +42,11 @@ def free_run_figure(
     names = list(data.joints if joints is None else joints)
     figure, panels = axes_column(len(names), 0.7 + 1.75 * len(names))
     for axes, joint in zip(panels, names, strict=True):
-        index, low, high = _liveliest(data, joint)
-        run = data.runs[joint][index]
+        index, part = _liveliest(data, joint)
+        run, low, high = data.runs[joint][index], part.start, part.stop
         ticks = np.arange(low, high)
-        time = run.trial.send_time_s[low:high] - run.trial.send_time_s[low]
-        axes.step(
-            time, run.command_rad[low:high], where="post", color=FAINT, lw=1.0, label="command"
-        )
+        time = run.trial.send_time_s[part] - run.trial.send_time_s[low]
+        axes.step(time, run.command_rad[part], where="post", color=FAINT, lw=1.0, label="command")
         inside = (run.tick >= low) & (run.tick < high - 1)
         when = np.interp(run.tick[inside], ticks, time)
         axes.plot(when, run.position_rad[inside], "o", ms=3.2, color=INK, label="reading")
@@ -58,12 +57,12 @@ def free_run_figure(
             error = 1e3 * scores.rms(errors[name][joint].free_run)
             label = f"{name}, {error:.1f} mrad"
             axes.plot(
-                time, track[low:high], ls=_LINES[n % len(_LINES)], color=colour, lw=1.5, label=label
+                time, track[part], ls=_LINES[n % len(_LINES)], color=colour, lw=1.5, label=label
             )
             band = bands.get(name, {}).get(joint)
             if band and n == 0:
-                half = scores.band_half_width(band, np.gradient(track) / data.period_s)[low:high]
-                middle = track[low:high]
+                half = scores.band_half_width(band, np.gradient(track) / data.period_s)[part]
+                middle = track[part]
                 axes.fill_between(
                     time, middle - half, middle + half, color=colour, alpha=0.15, lw=0
                 )
@@ -75,14 +74,22 @@ def free_run_figure(
     return figure
 
 
-def _liveliest(data: ServoData, joint: str) -> tuple[int, int, int]:
+def busiest(command_rad: NDArray[np.float64], rows: int) -> slice:
+    """The `rows` consecutive rows in which a command moves most."""
+    if len(command_rad) <= rows:
+        return slice(0, len(command_rad))
+    path = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(command_rad)))])
+    start = int(np.argmax(path[rows:] - path[:-rows]))
+    return slice(start, start + rows)
+
+
+def _liveliest(data: ServoData, joint: str) -> tuple[int, slice]:
     """Run and rows of the few seconds in which the command moves most."""
     rows = round(_LONGEST_S / data.period_s)
-    best = (-1.0, 0, 0, 0)
-    for index, run in enumerate(data.runs[joint]):
-        moved = np.abs(np.diff(run.command_rad, prepend=run.initial_rad))
-        total = np.cumsum(np.concatenate([[0.0], moved]))
-        for low in range(0, max(1, len(moved) - rows + 1), max(1, rows // 4)):
-            high = min(low + rows, len(moved))
-            best = max(best, (float(total[high] - total[low]), index, low, high))
-    return best[1:]
+    parts = [busiest(run.command_rad, rows) for run in data.runs[joint]]
+    moved = [
+        np.abs(np.diff(run.command_rad[part])).sum()
+        for run, part in zip(data.runs[joint], parts, strict=True)
+    ]
+    index = int(np.argmax(moved))
+    return index, parts[index]

@@ -378,9 +378,9 @@ def _with_two_groups(data: ServoData, part: windows.Part) -> ServoData:
         - {-1}
         for j in data.joints
     }
-    for joint, group_numbers in present.items():
-        if len(group_numbers) < 2:
-            seen = ", ".join(data.groups[g] for g in group_numbers) or "nothing"
+    for joint, groups in present.items():
+        if len(groups) < 2:
+            seen = ", ".join(data.groups[g] for g in groups) or "nothing"
             raise InputError(
                 f"{joint} has readings of {seen} only, others of more, so it cannot be tested on "
                 "what it has not seen. Leave it out of `joints`, record it again, or split by time "
@@ -390,8 +390,8 @@ def _with_two_groups(data: ServoData, part: windows.Part) -> ServoData:
     place = np.full(len(data.groups) + 1, -1)
     place[used] = np.arange(len(used))
     runs = {
-        j: tuple(replace(r, group=place[r.group]) for r in group_numbers)
-        for j, group_numbers in data.runs.items()
+        j: tuple(replace(r, group=place[r.group]) for r in groups)
+        for j, groups in data.runs.items()
     }
     return replace(data, runs=runs, groups=tuple(data.groups[g] for g in used))
 

@@ -258,6 +258,16 @@ def repeatability(data: ServoData, part: Part) -> dict[str, float]:
     return rms_of
 
 
+def block_draws(
+    errors_of: Mapping[str, Errors], seed: int
+) -> tuple[dict[tuple[str, int, int], int], NDArray[np.int64]]:
+    """Place of each stretch of time, and how often each is drawn, shape (draws, stretches)."""
+    blocks = sorted({b for e in errors_of.values() for b in e.block})
+    even = np.full(len(blocks), 1 / len(blocks))
+    draws = np.random.default_rng(seed).multinomial(len(blocks), even, _DRAWS)
+    return {b: n for n, b in enumerate(blocks)}, draws
+
+
 def interval(
     errors_of: dict[str, Errors], seed: int, other: dict[str, Errors] | None = None
 ) -> Interval:
@@ -269,18 +279,14 @@ def interval(
     def value(models: dict[str, Errors]) -> float:
         return mean_known([rms(e.free_run) for e in models.values()])
 
-    blocks = sorted({b for e in errors_of.values() for b in e.block})
-    place = {b: n for n, b in enumerate(blocks)}
-    draws = np.random.default_rng(seed).multinomial(
-        len(blocks), np.full(len(blocks), 1 / len(blocks)), _DRAWS
-    )
+    place, draws = block_draws(errors_of, seed)
 
     def drawn(models: dict[str, Errors]) -> NDArray[np.float64]:
         means = []
         for e in models.values():
             index = np.array([place[b] for b in e.block], int)
-            total = np.bincount(index, e.free_run**2, len(blocks))
-            count = np.bincount(index, minlength=len(blocks))
+            total = np.bincount(index, e.free_run**2, len(place))
+            count = np.bincount(index, minlength=len(place))
             with np.errstate(invalid="ignore"):
                 means.append(np.sqrt((draws @ total) / (draws @ count)))
         return np.nanmean(means, axis=0)

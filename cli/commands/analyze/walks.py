@@ -130,17 +130,15 @@ class OfPolicies(Analysis):
     ) -> dict[str, Any]:
         """An analysis of every policy, by its short name, with a progress bar over all of them."""
         tries = self.tries(command)
-        results = {}
+        done = {}
         with terminal.share_progress("walking") as advance:
             for name, (policy, trial) in tries.items():
 
                 def watch(share: float, name: str = name) -> None:
-                    advance(name, (len(results) + share) / len(tries))
+                    advance(name, (len(done) + share) / len(tries))
 
-                results[name] = analyse(
-                    policy, replace(trial, threads=self.threads, progress=watch)
-                )
-        return results
+                done[name] = analyse(policy, replace(trial, threads=self.threads, progress=watch))
+        return done
 
     def tries(self, command: tuple[float, float, float]) -> Tries:
         """Policies by their short names, and how each is tried."""

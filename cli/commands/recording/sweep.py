@@ -360,22 +360,16 @@ def _open_bus(request: dict[str, Any]) -> ServoBus:
         )  # fmt: skip
         bus = EmulatedBus(robot, rng, real_time, pendulum.PendulumBench(robot))
         return GuardedBus(bus, BENCH_LIMITS)
-    robot_map = load_joint_map(joint_map) if joint_map else None
-    what = (
-        f"an emulated one with the servos of {robot_map.file.name}"
-        if robot_map
-        else "the emulated one"
-    )
+    map_ = load_joint_map(joint_map) if joint_map else None
+    what = f"an emulated one with the servos of {map_.file.name}" if map_ else "the emulated one"
     terminal.err.print(f"No robot: using {what}{', in real time' * real_time}.")
     registers = request.get("registers") or {}
-    if registers and not (robot_map and pendulum.has_registers(robot_map)):
+    if registers and not (map_ and pendulum.has_registers(map_)):
         raise InputError(
             "--registers: the servos of this robot have none that act. Give a --joint-map whose "
             "`servo` is STS3215."
         )
-    drawn, plant = (
-        pendulum.draw_of_map(rng, robot_map, registers) if robot_map else (draw_robot(rng), None)
-    )
+    drawn, plant = pendulum.draw_of_map(rng, map_, registers) if map_ else (draw_robot(rng), None)
     if request.get("plan"):  # the same robot, but not once more the same noise
         noise = int(sha256(Path(request["plan"]))[:12], 16)
         rng = np.random.default_rng([request["seed"], noise])

@@ -134,20 +134,18 @@ class Diff:
 
         if self.gain is not None:
             refuse_outside("--gain", self.gain, *P_GAINS)
-        comparison = compared(self.first, self.second, self.joint, self.gain, _servo)
+        both = compared(self.first, self.second, self.joint, self.gain, _servo)
         if self.json:
-            terminal.print_json(comparison)
+            terminal.print_json(both)
             return
-        table = terminal.table(
-            "", "", _column(comparison.first), _column(comparison.second), "ratio"
-        )
-        for row in comparison.differences:
+        table = terminal.table("", "", _column(both.first), _column(both.second), "ratio")
+        for row in both.differences:
             table.add_row(
                 f"{row.quantity} [{row.unit}]", _with_interval(row.first),
                 _with_interval(row.second), terminal.number(row.ratio, 2),
             )  # fmt: skip
         terminal.out.print(table)
-        for sentence in (*comparison.notes, _verdict(comparison.differences), _motion(comparison)):
+        for sentence in (*both.notes, _verdict(both.differences), _motion(both)):
             for line in wrap(sentence, _WIDTH):
                 terminal.out.print(line)
 
