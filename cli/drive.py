@@ -34,7 +34,7 @@ _SHOWN_EVERY_S = 0.2
 class Driver:
     """Commands from the keyboard, no further than those `trained`, and a live table of the ticks.
 
-    Use it as a context; it is a `policies.deploy.deployment.Commands`.
+    Use it as a context; it is a `policies.deploy.commands.Commands`.
     """
 
     def __init__(self, trained: CommandRanges) -> None:

@@ -35,7 +35,7 @@ from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, Sta
 
 if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.assembly import Assembly
-    from pupper_sysid.policies.deploy.deployment import Commands
+    from pupper_sysid.policies.deploy.commands import Commands
     from pupper_sysid.policies.network.policy_file import CommandRanges
     from pupper_sysid.sim.emulator.robot import EmulatedRobot
     from pupper_sysid.sim.robot.body import Body
@@ -215,7 +215,7 @@ def _run(options: Deploy) -> None:
 def _commands(options: Deploy, trained: CommandRanges) -> Commands:
     """Commands within what the policy was trained for."""
     from pupper_sysid.cli.drive import Driver
-    from pupper_sysid.policies.deploy.deployment import constant, script
+    from pupper_sysid.policies.deploy.commands import constant, script
 
     if options.keyboard:
         return Driver(trained)

@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(options: Play) -> None:
     need_positive("--seconds", options.seconds)
-    from pupper_sysid.policies.deploy.deployment import checked_command
+    from pupper_sysid.policies.deploy.commands import checked_command
 
     command = checked_command(options.command)
     if options.video:

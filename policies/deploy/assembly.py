@@ -28,8 +28,9 @@ from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.monitor import GuardLimits
+from pupper_sysid.policies.deploy.commands import constant
 from pupper_sysid.policies.deploy.controller import Controller
-from pupper_sysid.policies.deploy.deployment import Outcome, Rows, Tick, constant, deploy
+from pupper_sysid.policies.deploy.deployment import Outcome, Rows, Tick, deploy
 from pupper_sysid.policies.deploy.matches import Match, ServoMatch, compare, servo_match
 from pupper_sysid.policies.deploy.stacks import Observer, Stack, SyntheticPD, make_observer
 from pupper_sysid.policies.network.policy_file import Policy, trained_servo

@@ -118,11 +118,11 @@ class Body:
             return {kind: np.arange(k, len(self.joints), 3) for k, kind in enumerate(KINDS)}
         place = np.zeros(len(self.joints), int)
         for leg in range(len(self.feet)):
-            joints = np.flatnonzero(self.leg_of == leg)
-            place[joints] = np.arange(1, len(joints) + 1)
-        by_place = {f"joint {k}": np.flatnonzero(place == k) for k in range(1, place.max() + 1)}
+            own = np.flatnonzero(self.leg_of == leg)
+            place[own] = np.arange(1, len(own) + 1)
+        found = {f"joint {k}": np.flatnonzero(place == k) for k in range(1, place.max() + 1)}
         other = np.flatnonzero(self.leg_of < 0)
-        return by_place | ({"other": other} if len(other) else {})
+        return found | ({"other": other} if len(other) else {})
 
     @cached_property
     def hips(self) -> NDArray[np.intp]:
@@ -219,7 +219,7 @@ def fixed_offsets(feet_at: Array) -> Array:
     """
     offsets = np.zeros(len(feet_at))
     for right in (False, True):
-        side = np.flatnonzero((feet_at[:, 1] < 0) == right)
-        ahead = side[np.argsort(-feet_at[side, 0], kind="stable")]
-        offsets[ahead] = 0.5 * ((np.arange(len(side)) + right) % 2)
+        own = np.flatnonzero((feet_at[:, 1] < 0) == right)
+        ahead = own[np.argsort(-feet_at[own, 0], kind="stable")]
+        offsets[ahead] = 0.5 * ((np.arange(len(own)) + right) % 2)
     return offsets

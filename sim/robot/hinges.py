@@ -54,20 +54,20 @@ def hinges_of(path: Path) -> list[Hinge]:
     try:
         ended = subprocess.run(command, capture_output=True, timeout=_TIME_S, check=False)
         lines = ended.stdout.decode(errors="replace").splitlines()
-        answer: dict[str, Any] = json.loads(lines[-1]) if lines else {"out_of": "memory or time"}
+        found: dict[str, Any] = json.loads(lines[-1]) if lines else {"out_of": "memory or time"}
     except (subprocess.TimeoutExpired, ValueError):
-        answer = {"out_of": "time"}
-    if "out_of" in answer:
+        found = {"out_of": "time"}
+    if "out_of" in found:
         raise InputError(
             f"{path} takes MuJoCo more than {_MEMORY_BYTES >> 30} GB or {_TIME_S} s to read. A "
             "joint map needs joints and actuators only: take height fields, textures, replicated "
             "bodies and includes out."
         )
-    if "reason" in answer:
-        reason = "".join(c if c.isprintable() else " " for c in answer["reason"])
+    if "reason" in found:
+        reason = "".join(c if c.isprintable() else " " for c in found["reason"])
         reason = " ".join(reason.split()).rstrip(".")
         raise InputError(f"{path} cannot be read as a robot: {reason}. {_ADVICE}")
-    return [Hinge(**hinge) for hinge in answer["hinges"]]
+    return [Hinge(**hinge) for hinge in found["hinges"]]
 
 
 def _limit_this_process() -> None:
@@ -88,14 +88,14 @@ def _read(path: str) -> list[Hinge]:
     leaders = _leaders(model, mujoco)
     driven = _driven(model, mujoco) if model.nu else set(hinges) - set(leaders)
     zero = _zero_ranges(path)
-    hinges_read = []
+    found = []
     for j in hinges:
         low, high = (float(x) if abs(x) < 1e6 else None for x in model.jnt_range[j])
         limited = bool(model.jnt_limited[j])
         name = model.joint(j).name
         follows = model.joint(leaders[j]).name if j in leaders else ""
-        hinges_read.append(Hinge(name, limited, low, high, j in driven, follows, name in zero))
-    return hinges_read
+        found.append(Hinge(name, limited, low, high, j in driven, follows, name in zero))
+    return found
 
 
 def _model(mujoco, path: str):
@@ -106,8 +106,8 @@ def _model(mujoco, path: str):
         reason = error
     try:
         spec = mujoco.MjSpec.from_file(path)
-        for drawn in (*spec.geoms, *spec.sites, *spec.tendons):
-            drawn.material = ""
+        for shown in (*spec.geoms, *spec.sites, *spec.tendons):
+            shown.material = ""
         for geom in list(spec.geoms):
             if geom.meshname or geom.hfieldname:
                 spec.delete(geom)
@@ -169,29 +169,29 @@ def _bound(text: bytes) -> bytes:
 
 def _driven(model, mujoco) -> set[int]:
     """Joints that an actuator drives."""
-    driven: set[int] = set()
+    found: set[int] = set()
     trn = mujoco.mjtTrn
     for kind, (target, _) in zip(model.actuator_trntype, model.actuator_trnid, strict=True):
         if kind == trn.mjTRN_JOINT or kind == trn.mjTRN_JOINTINPARENT:
-            driven.add(int(target))
+            found.add(int(target))
         elif kind == trn.mjTRN_TENDON:
             first = model.tendon_adr[target]
             for wrap in range(first, first + model.tendon_num[target]):
                 if model.wrap_type[wrap] == mujoco.mjtWrap.mjWRAP_JOINT:
-                    driven.add(int(model.wrap_objid[wrap]))
-    return driven
+                    found.add(int(model.wrap_objid[wrap]))
+    return found
 
 
 def _main() -> None:
     try:
-        answer = {"hinges": [asdict(hinge) for hinge in _read(sys.argv[1])]}
+        found = {"hinges": [asdict(hinge) for hinge in _read(sys.argv[1])]}
     except MemoryError:
-        answer = {"out_of": "memory"}
+        found = {"out_of": "memory"}
     except Exception as error:  # whatever MuJoCo raises is about the file
         # a failed allocation comes in MuJoCo's own words or as pybind11's "unknown exception"
         memory = any(words in str(error) for words in ("allocate memory", "unknown exception"))
-        answer = {"out_of": "memory"} if memory else {"reason": str(error)}
-    print(json.dumps(answer))
+        found = {"out_of": "memory"} if memory else {"reason": str(error)}
+    print(json.dumps(found))
 
 
 if __name__ == "__main__":

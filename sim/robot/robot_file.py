@@ -73,13 +73,13 @@ def body_from_file(path: Path, config: Path | None) -> Body:
     """
     if not path.is_file():
         raise InputError(f"There is no {path}. Give the robot's MJCF as `robot`.")
-    settings = RobotFile()
+    own = RobotFile()
     if config is not None:
         if not config.is_file():
             raise InputError(f"There is no {config}. Give the robot's YAML as `robot_config`.")
         content, lines = read_yaml(config)
-        settings = validated(RobotFile, content or {}, config, lines)
-    return _Reader(path, config, settings).body()
+        own = validated(RobotFile, content or {}, config, lines)
+    return _Reader(path, config, own).body()
 
 
 class _Reader:
@@ -455,9 +455,9 @@ class _Reader:
         self._place(self.pose)
 
         def feet_in_trunk(joints: Array) -> Array:
-            angles = np.repeat(feet[None], len(joints), axis=0)
+            found = np.repeat(feet[None], len(joints), axis=0)
             for legs, own, axes, anchors in rounds:
-                arm = angles[:, legs] - anchors
+                arm = found[:, legs] - anchors
                 c, s = np.cos(joints[:, own, None]), np.sin(joints[:, own, None])
                 along = (arm * axes).sum(axis=-1, keepdims=True) * axes
                 # Rodrigues; np.cross is slow for few robots
@@ -468,8 +468,8 @@ class _Reader:
                     ],
                     axis=-1,
                 )
-                angles[:, legs] = anchors + c * (arm - along) + s * turned + along
-            return angles
+                found[:, legs] = anchors + c * (arm - along) + s * turned + along
+            return found
 
         return feet_in_trunk
 
@@ -546,16 +546,16 @@ class _Reader:
         return fixed_offsets(feet_at)
 
     def _servo_of(self) -> dict[str, str]:
-        stated = self.own.servos
-        if stated is None:
+        own = self.own.servos
+        if own is None:
             return {}
-        if isinstance(stated, str):
-            return dict.fromkeys(self.joints, stated)
-        servos = {}
-        for wanted, servo in stated.items():
+        if isinstance(own, str):
+            return dict.fromkeys(self.joints, own)
+        found = {}
+        for wanted, servo in own.items():
             for name in self._matching(wanted, self.joints, "servos", "joint with a servo"):
-                servos[name] = servo
-        return servos
+                found[name] = servo
+        return found
 
     def _xml_writer(self, names: tuple[str, ...], geoms: list[int]):
         """Function that writes the MJCF with servos on a ground."""
@@ -648,8 +648,8 @@ _GRID = (
 def _images(places: Array, near: float) -> NDArray[np.intp] | None:
     """Which place each place is the mirror image of; None if one has none."""
     distance = np.linalg.norm(places[:, None] * [1, -1, 1] - places[None], axis=-1)
-    nearest = distance.argmin(axis=1)
-    return nearest if (distance.min(axis=1) < near).all() else None
+    found = distance.argmin(axis=1)
+    return found if (distance.min(axis=1) < near).all() else None
 
 
 def _line(error: Exception) -> str:

@@ -119,12 +119,12 @@ class Trot:
 
     def _cycle(self, phase: NDArray[np.float64], body: Body) -> tuple[NDArray, NDArray]:
         """Where feet are in their strokes, 1 to -1, and how high [m], each shape (4, n)."""
-        share = (phase / (2 * np.pi) + body.offsets[:, None]) % 1.0
-        stands = share < self.duty
-        swing = np.pi * (share - self.duty) / (1.0 - self.duty)
+        own = (phase / (2 * np.pi) + body.offsets[:, None]) % 1.0
+        stands = own < self.duty
+        swing = np.pi * (own - self.duty) / (1.0 - self.duty)
         even, round_ = 2.0 / np.pi * swing - 1.0, -np.cos(swing)
         back = round_ + self.even_swing * (even - round_)
-        along = np.where(stands, 1.0 - 2.0 * share / self.duty, back)
+        along = np.where(stands, 1.0 - 2.0 * own / self.duty, back)
         return along, np.where(stands, 0.0, self.lift_m * np.sin(swing))
 
     def _strokes(

@@ -23,7 +23,7 @@ from pupper_sysid.hardware.loop import BUS, GUARD, IMU, LOG, POLICY, VIEWS, Fixe
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy import deployment
 from pupper_sysid.policies.deploy.assembly import assemble
-from pupper_sysid.policies.deploy.deployment import constant
+from pupper_sysid.policies.deploy.commands import constant
 from pupper_sysid.policies.deploy.stacks import STACKS, suited
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.sim.emulator.robot import draw_robot

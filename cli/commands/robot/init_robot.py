@@ -63,13 +63,13 @@ class InitRobot:
                 "init-robot needs the robot's MJCF or URDF; or, without one, --joints with the "
                 "servos' ids, such as pan=1,tilt=2 (--lerobot-calibration goes with a model)."
             )
-        map_, left_out = robot.joint_map, robot.left_out
+        found, left_out = robot.joint_map, robot.left_out
         target = self.out or usual
-        map_.save(target, self.force)
-        servos = map_.per_servo()
+        found.save(target, self.force)
+        servos = found.per_servo()
         margin = servos.position_limits().margin(servos.rest_pose())
         joints: dict[float, list[str]] = {}  # by amplitudes that leave a fifth of their margin
-        for name, free in zip(map_.joint_names, margin, strict=True):
+        for name, free in zip(found.joint_names, margin, strict=True):
             amplitude = max(min(_AMPLITUDE_RAD, np.floor(80 * free) / 100), _SMALLEST_RAD)
             joints.setdefault(float(amplitude), []).append(name)
         sweeps = [
@@ -88,7 +88,7 @@ class InitRobot:
         if robot.following:
             pairs = ", ".join(f"{name} (follows {of})" for name, of in robot.following.items())
             terminal.warn(f"no servo of their own, left out: {pairs}.")
-        narrow = [n for n, r in zip(map_.joint_names, margin, strict=True) if r < _SMALLEST_RAD]
+        narrow = [n for n, r in zip(found.joint_names, margin, strict=True) if r < _SMALLEST_RAD]
         if narrow:
             terminal.warn(
                 f"{', '.join(narrow)}: less than {_SMALLEST_RAD:g} rad of margin, too little "
@@ -98,9 +98,9 @@ class InitRobot:
         if self.json:
             terminal.print_json(
                 {
-                    "joint_map": target, "joints": map_.joint_names, "ids": map_.ids,
+                    "joint_map": target, "joints": found.joint_names, "ids": found.ids,
                     "left_out": left_out, "following": robot.following, "doubts": robot.doubts,
-                    "margin_rad": dict(zip(map_.joint_names, margin, strict=True)),
+                    "margin_rad": dict(zip(found.joint_names, margin, strict=True)),
                     "sweeps": sweeps,
                 }
             )  # fmt: skip
@@ -113,8 +113,8 @@ class InitRobot:
             "limits rad",
             "margin rad",
         )
-        for k, name in enumerate(map_.joint_names):
-            entry = map_.file.joints[name]
+        for k, name in enumerate(found.joint_names):
+            entry = found.file.joints[name]
             low, high = entry.limits_rad
             table.add_row(
                 name, str(entry.id), f"{entry.neutral_rad:.2f}", f"{low:.2f} … {high:.2f}",
