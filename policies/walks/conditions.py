@@ -78,28 +78,28 @@ class Handicap:
         return (time_s - FIRST_PUSH_S) % PUSH_EVERY_S
 
 
-def impose(robots: RobotBatch, ids: NDArray[np.intp], handicap: Handicap) -> None:
+def impose(robots: RobotBatch, ids: NDArray[np.intp], own: Handicap) -> None:
     """Give robots a handicap, at the start of their walk.
 
     `ids` are robots in the order of their numbers, from 0 on.
     """
-    if handicap.weak_leg != 1.0:
+    if own.weak_leg != 1.0:
         first = _PER_LEG * (np.arange(len(ids)) % len(LEGS))
         joints = first[:, None] + np.arange(_PER_LEG)
         for name in _OF_MOTOR:
-            robots.drawn[name][ids[:, None], joints] *= handicap.weak_leg
-    if handicap.friction is not None:
-        robots.friction[ids] = handicap.friction
-    if handicap.weak_leg != 1.0 or handicap.friction is not None:
+            robots.drawn[name][ids[:, None], joints] *= own.weak_leg
+    if own.friction is not None:
+        robots.friction[ids] = own.friction
+    if own.weak_leg != 1.0 or own.friction is not None:
         robots.write(ids)
-    if handicap.payload_kg:
-        _load(robots, ids, handicap.payload_kg, np.array([*handicap.payload_at_m, _ABOVE_M]))
-    if handicap.slope_deg:
+    if own.payload_kg:
+        _load(robots, ids, own.payload_kg, np.array([*own.payload_at_m, _ABOVE_M]))
+    if own.slope_deg:
         size = np.linalg.norm(robots.model.opt.gravity)
-        robots.field("opt.gravity")[ids] = size * handicap.gravity_direction
-    if handicap.riser_m is not None:
+        robots.field("opt.gravity")[ids] = size * own.gravity_direction
+    if own.riser_m is not None:
         # pyramids are wider than the square in which robots are placed
-        robots.move(ids, STAIRS_M[handicap.riser_m] + 3.0 * robots.qpos[ids, :2])
+        robots.move(ids, STAIRS_M[own.riser_m] + 3.0 * robots.qpos[ids, :2])
 
 
 def _load(robots: RobotBatch, ids: NDArray[np.intp], mass_kg: float, at: Array) -> None:
@@ -127,13 +127,13 @@ def _load(robots: RobotBatch, ids: NDArray[np.intp], mass_kg: float, at: Array) 
 
 
 def see_slope(
-    observation: NDArray[np.float32], ids: NDArray[np.intp], robots: RobotBatch, handicap: Handicap
+    observation: NDArray[np.float32], ids: NDArray[np.intp], robots: RobotBatch, own: Handicap
 ) -> None:
     """Tilt the gravity that robots on a slope see; `observation` is theirs, shape (k, 60)."""
-    if handicap.slope_deg:
+    if own.slope_deg:
         flat = np.array([0.0, 0.0, -1.0])
         added = np.zeros((len(ids), 6))
-        added[:, :3] = handicap.gravity_direction - flat
+        added[:, :3] = own.gravity_direction - flat
         observation[:, _GRAVITY] += own_velocity(robots.qpos[ids], added)
 
 
@@ -141,18 +141,18 @@ def push_directions(robots: int, steps: int, step_s: float, seed: int) -> dict[i
     """Unit vectors, shape (robots, 2), by the control step before which robots are pushed."""
     first, every = round(FIRST_PUSH_S / step_s), round(PUSH_EVERY_S / step_s)
     rng = np.random.default_rng([seed, 5])
-    directions = {}
+    found = {}
     for step in range(first, steps, every):
         angle = rng.uniform(-np.pi, np.pi, robots)
-        directions[step] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return directions
+        found[step] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return found
 
 
 def missed_ticks(robots: int, steps: int, seed: int) -> Array:
     """Numbers in 0–1, shape (steps, robots): a tick is missed where they are below its chance."""
-    chances = np.random.default_rng([seed, 4]).random((steps, robots))
-    chances[0] = 1.0  # the first tick begins the walk
-    return chances
+    found = np.random.default_rng([seed, 4]).random((steps, robots))
+    found[0] = 1.0  # the first tick begins the walk
+    return found
 
 
 Kept = TypeVar("Kept", covariant=True)
@@ -283,10 +283,10 @@ def evaluation_task(task: Walking, seconds: float | None = None) -> Walking:
     )  # fmt: skip
     commands = RANDOM
     if task.robot:  # as far within the robot's own ranges
-        ranges = task.commands
+        own = task.commands
         commands = replace(
-            RANDOM, forward_m_s=ranges.forward_m_s, sideways_m_s=ranges.sideways_m_s,
-            yaw_rad_s=ranges.yaw_rad_s, dead_band=ranges.dead_band,
+            RANDOM, forward_m_s=own.forward_m_s, sideways_m_s=own.sideways_m_s,
+            yaw_rad_s=own.yaw_rad_s, dead_band=own.dead_band,
         )  # fmt: skip
     return replace(
         task.evaluated(), commands=commands, curriculum=Curriculum(), randomisation=gentle,
@@ -296,11 +296,11 @@ def evaluation_task(task: Walking, seconds: float | None = None) -> Walking:
 
 def share_of_usual(task: Walking) -> Array:
     """Largest commands of a task over those of `RANDOM`, shape (3,)."""
-    largest, usual = (
+    own, usual = (
         np.abs([c.forward_m_s, c.sideways_m_s, c.yaw_rad_s]).max(axis=1)
         for c in (task.commands, RANDOM)
     )
-    return largest / usual
+    return own / usual
 
 
 def random_commands(
