@@ -44,6 +44,8 @@ from pupper_sysid.policies.walks.rollouts import Rollout, heading, replay
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 
+Array = NDArray[np.float64]
+
 DELAYS_MS = (0.0, 160.0, 320.0)
 """Of the published orbits."""
 
@@ -195,8 +197,6 @@ def orbits(
         )
     return by_kind
 
-
-Array = NDArray[np.float64]
 
 PUSH_M_S = 0.2
 """Sideways speed that a push gives the trunk: the largest of the training."""

@@ -1,6 +1,7 @@
 """A policy that others trained, walking in this project's simulator: ONNX file, YAML, MJCF.
 
-    policy = ForeignPolicy.load(Path("walk.onnx"))     # and walk.yaml beside it, where there is one
+    network = OnnxNetwork(Path("walk.onnx"))
+    policy = ForeignPolicy.of(network)                 # and walk.yaml beside it, where there is one
     task = policy.task(Path("robot.xml"), Path("robot.yaml"))
     policy.fit(task)
     action = policy.act(observation)                   # in the place of a `Policy` in a walk
@@ -232,16 +233,8 @@ class ForeignPolicy:
             )
 
     @classmethod
-    def load(cls, path: Path, config: Path | None = None) -> ForeignPolicy:
-        """Read an ONNX file and the YAML beside it.
-
-        `config` is the YAML; by default the file of the same name, if there is one.
-        """
-        return cls.of(OnnxNetwork(path), config)
-
-    @classmethod
     def of(cls, network: OnnxNetwork, config: Path | None = None) -> ForeignPolicy:
-        """The same, of a network that was read."""
+        """The policy of a network, with its YAML: by default the file beside it, if it is there."""
         beside = config or network.path.with_suffix(".yaml")
         stated = PolicyYaml()
         if config is not None or beside.is_file():

@@ -35,6 +35,8 @@ from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sim.walking.step import Step
 
+Array = NDArray[np.float64]
+
 Bools = NDArray[np.bool_]
 
 ERRORS = ("mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s")
@@ -114,8 +116,6 @@ def named(errors: Array) -> dict[str, float]:
     """Three errors by name."""
     return dict(zip(ERRORS, errors.tolist(), strict=True))
 
-
-Array = NDArray[np.float64]
 
 _LAST_ACTION = slice(-ACTIONS, None)  # of an observation
 

@@ -31,6 +31,8 @@ from pupper_sysid.sim.robot.mini_pupper import EVALUATION_SOLVER, Knee, default_
 from pupper_sysid.sim.robot.robot_batch import gravity_direction
 from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
 
+Array = NDArray[np.float64]
+
 _IN_THE_AIR_M = 1.0
 _LARGEST_ARENA_BYTES = 1 << 30  # MuJoCo allocates it once per thread
 _NUMBERS = DelayedPDParameters(
@@ -158,8 +160,6 @@ def _compile(spec: Any, name: str) -> Any:
             f"{name} cannot be simulated with servos on its joints: {reason}."
         ) from None
 
-
-Array = NDArray[np.float64]
 
 SETTLE_S = 1.0
 _FALLEN = 0.5  # cosine of the tilt of a trunk from how it stood

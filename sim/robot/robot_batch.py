@@ -33,6 +33,8 @@ from pupper_sysid.sim.walking.config import Randomisation, Walking
 from pupper_sysid.sim.walking.differences import Bodies
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
+Array = NDArray[np.float64]
+
 
 @dataclass(frozen=True)
 class Moved:
@@ -83,8 +85,6 @@ def planar(velocity: Array, qvel: Array) -> Array:
     """
     return np.column_stack([velocity[:, :2], qvel[:, 5]])
 
-
-Array = NDArray[np.float64]
 
 _TOUCH_S = 0.006  # a foot is down if it was so in the last milliseconds: contacts flicker
 _RECORD = ("qpos", "actuator_force", "sensordata", "site_xpos")

@@ -125,7 +125,7 @@ def test_an_exported_policy_acts_as_the_one_it_came_from(tmp_path, kind):
 
 def test_the_observation_of_terms_is_this_projects_own_where_the_terms_are(theirs):
     policy = load_policy(SAMPLES / "policies" / "mlp")
-    foreign = ForeignPolicy.load(theirs)
+    foreign = ForeignPolicy.of(OnnxNetwork(theirs))
     foreign.fit(foreign.task(None))
     rng = np.random.default_rng(0)
     start = rng.standard_normal((3, 12)).astype(np.float32)
@@ -159,7 +159,7 @@ def rows_of(
         f"joints: [{', '.join(joints)}]\ndefault_pose_rad: {[POSE[j] for j in joints]}\n"
         f"action_scale_rad: 0.25\ncontrol_step_s: 0.02\n{terms}\n"
     )
-    policy = ForeignPolicy.load(path)
+    policy = ForeignPolicy.of(OnnxNetwork(path))
     policy.fit(policy.task(None))
     policy.reset(np.zeros((1, 12)))
     return policy
@@ -250,7 +250,7 @@ def test_metadata_of_mjlabs_exporter_are_read(tmp_path):
     }
     path = linear(np.eye(12, 51), tmp_path / "walk.onnx", metadata)
     path.with_suffix(".yaml").write_text("control_step_s: 0.02\n")
-    policy = ForeignPolicy.load(path)
+    policy = ForeignPolicy.of(OnnxNetwork(path))
     assert policy.joints == JOINT_NAMES and policy.scale.tolist() == [0.5] * 12
     np.testing.assert_allclose(policy.pose, np.linspace(-0.5, 0.6, 12), atol=5e-4)
     names = [t.term for t in policy.terms]
@@ -287,7 +287,7 @@ def test_what_is_missing_or_does_not_fit_is_named_with_the_line_that_the_yaml_ne
         if isinstance(source, tuple):
             assert source[0] in good
             path.with_suffix(".yaml").write_text(good.replace(*source))
-        policy = ForeignPolicy.load(path)
+        policy = ForeignPolicy.of(OnnxNetwork(path))
         policy.fit(policy.task(None))
 
     named = as_mjlab(JOINT_NAMES[:2], [0.0, 0.0])
@@ -380,7 +380,7 @@ def _stirring_duck(tmp_path) -> Path:
 def test_a_biped_of_another_trainer_needs_the_speed_of_its_clock(tmp_path):
     if not DUCK.is_file():
         pytest.skip(f"{DUCK} is not there")
-    policy = ForeignPolicy.load(_stirring_duck(tmp_path))
+    policy = ForeignPolicy.of(OnnxNetwork(_stirring_duck(tmp_path)))
     task = policy.task(DUCK)
     policy.fit(task)
     servos = servos_of_training(policy, task, DUCK)
@@ -403,7 +403,7 @@ def test_a_biped_of_another_trainer_needs_the_speed_of_its_clock(tmp_path):
 def test_joints_that_the_model_lacks_and_servos_that_no_file_states_are_named(tmp_path):
     if not DUCK.is_file():
         pytest.skip(f"{DUCK} is not there")
-    policy = ForeignPolicy.load(_stirring_duck(tmp_path))
+    policy = ForeignPolicy.of(OnnxNetwork(_stirring_duck(tmp_path)))
     assert_each_refused(
         [(None, "left_ankle"), (DUCK.with_name("unitree_go1.xml"), "left_hip_yaw")],
         policy.task,
