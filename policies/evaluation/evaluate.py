@@ -119,11 +119,6 @@ class Walk:
         )
 
     @property
-    def commanded(self) -> Array:
-        """Mean absolute command: the error of a robot that stands still, shape (episodes, 3)."""
-        return tracking_errors(np.zeros_like(self.velocity), self.command, self.alive, self.fell)
-
-    @property
     def stride_hz(self) -> Array:
         """Strides per second of each robot while it was up, shape (episodes,)."""
         feet = self.contact.shape[-1]

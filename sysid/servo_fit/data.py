@@ -38,7 +38,6 @@ from pupper_sysid.sysid.fit.run import Run as PhysicsRun
 from pupper_sysid.sysid.fit.run import prepare, whole_counts
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
-MODES = ("auto", "fresh", "all")
 _HELD_FRACTION = 0.2  # the doctor's limit, beyond which raw rows mislead
 _PAUSE = 1.5  # in ticks; a longer gap ends a run
 _SAME_RATE = 0.05
