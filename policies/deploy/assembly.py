@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,9 +48,6 @@ from pupper_sysid.sim.walking.servo_ranges import (
     servo_model_of,
     servo_ranges,
 )
-
-if TYPE_CHECKING:
-    from pupper_sysid.policies.deploy.deployment import Tick
 
 
 @dataclass(frozen=True)
@@ -90,15 +87,15 @@ def assemble(
     pose = contract.default_pose_rad
     parameters = DelayedPDParameters(**servos.value)
     limits = joint_map.per_servo().position_limits()
+    ends = limits.low_rad, limits.high_rad
     model = None
     if stack.observer == "servo-model" and servo is not None:
         if not servo.is_dir():
             raise InputError(f"`servo` is {servo}: there is no such folder.")
         model = servo_model_of(servo, period)
     observer = make_observer(
-        stack.observer, period, contract.velocity_steps, parameters,
-        (limits.low_rad, limits.high_rad), model, len(pose),
-    )  # fmt: skip
+        stack.observer, period, contract.velocity_steps, parameters, ends, model, len(pose)
+    )
     if trained is None or trained == actuator:
         match = compare(observer, parameters, period, pose=pose)
     else:
@@ -107,7 +104,6 @@ def assemble(
     stall = float(np.median(servos.value["effort_limit"]))  # torque at full duty
     stall = stall if np.isfinite(stall) else 0.0
     controller = Controller(policy, stack, observer, joint_map, stall)
-    ends = (limits.low_rad, limits.high_rad)
     moving = SyntheticPD(parameters, period, limits_rad=ends, joints=len(pose))
     frozen = FrozenReadings(moving, controller.to_servo, controller.joints)
     header = {
