@@ -83,8 +83,8 @@ def _registers(text: str, known: Iterable[str], example: str) -> dict[int | None
     by_id: dict[int | None, dict[str, int]] = {None: {}}
     for part in filter(None, text.split(",")):
         name, _, value = (piece.strip() for piece in part.partition("="))
-        servo, colon, own = name.partition(":")
-        name = own if colon else name
+        servo, colon, of_servo = name.partition(":")
+        name = of_servo if colon else name
         digits = value.removeprefix("-")
         number = whole(value) if digits.isascii() and digits.isdecimal() else None
         one = whole(servo) if colon and servo.isascii() and servo.isdecimal() else None

@@ -91,11 +91,11 @@ def trained_actuator(path: Path, policy: Policy, run: Run | None) -> tuple[str |
     return (str((same or candidates)[0]) if candidates else None), bool(same)
 
 
-def chosen_actuator(path: Path, policy: Policy, run: Run | None, given: str | None) -> str:
-    """The actuator for the policy at `path`: the `given` one, else that of its training."""
-    if given is not None:
-        check_actuator(given)
-        return given
+def chosen_actuator(path: Path, policy: Policy, run: Run | None, named: str | None) -> str:
+    """The actuator for the policy at `path`: the `named` one, else that of its training."""
+    if named is not None:
+        check_actuator(named)
+        return named
     trained, same = trained_actuator(path, policy, run)
     if trained is None:
         file, name = (RUN_FILE, run.actuator) if run else (_CONTRACT, policy.contract.actuator)

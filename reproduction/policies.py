@@ -148,7 +148,7 @@ def _delay_frequency(kind: str, id_: str, text: str, paper: str) -> Callable[[Po
         "Replay of recorded observations whose joints are late by 0 to 320 ms, as published, and "
         "closed loop with later servos (`pupper-analyze delay`).",
     )  # fmt: skip
-    def made(policies: Policies) -> Finding:
+    def judged(policies: Policies) -> Finding:
         mine = of_kind(policies, kind)
         values = {  # a row per delay, a column per policy
             mode: np.array(
@@ -179,7 +179,7 @@ def _delay_frequency(kind: str, id_: str, text: str, paper: str) -> Callable[[Po
             "Constant if within 5 % in replay; partly if some of several policies are so.",
         )  # fmt: skip
 
-    return made
+    return judged
 
 
 @claim(
@@ -203,11 +203,11 @@ def components(policies: Policies) -> Finding:
 )  # fmt: skip
 def orbit(policies: Policies) -> Finding:
     closed = of_kinds(policies, lambda e: _acted(e, "closure")[-1], "mlp", "lstm")
-    left = of_kinds(policies, lambda e: _acted(e, "area_ratio")[-1], "mlp", "lstm")
-    lstm = closed["lstm"].value < 0.3 and left["lstm"].value > 0.5
-    mlp = closed["mlp"].value > 0.3 or left["mlp"].value < 0.5
+    area = of_kinds(policies, lambda e: _acted(e, "area_ratio")[-1], "mlp", "lstm")
+    lstm = closed["lstm"].value < 0.3 and area["lstm"].value > 0.5
+    mlp = closed["mlp"].value > 0.3 or area["mlp"].value < 0.5
     return Finding(
-        f"closure {several(closed, 2)}; area left {several(left, 2)}", bounds(closed),
+        f"closure {several(closed, 2)}; area left {several(area, 2)}", bounds(closed),
         holds(lstm and mlp, lstm or mlp), "An ellipse: closure below 0.3, half of the area left.",
     )  # fmt: skip
 

@@ -425,12 +425,12 @@ def _walk(
     if options.json:
         print_json(result)
         return
-    shown = terminal.table(f"{outcome.seconds:.1f} s on {bus.name}", "", "")
-    shown.show_header = False
+    summary = terminal.table(f"{outcome.seconds:.1f} s on {bus.name}", "", "")
+    summary.show_header = False
     for key, label in _SHOWN.items():
         if result.get(key) is not None:  # true motion is known of an emulated robot only
-            shown.add_row(label, terminal.cell(result[key], 3))
-    out.print(shown)
+            summary.add_row(label, terminal.cell(result[key], 3))
+    out.print(summary)
     repeat = terminal.command("pupper-deploy", options.policy, "--replay", log)
     err.print(f"Repeat it: {repeat}")
 

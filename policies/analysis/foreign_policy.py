@@ -383,12 +383,12 @@ class ForeignPolicy:
             waves = {"sin": np.sin(angle), "cos": np.cos(angle)}
             return np.tile([waves[w] for w in term.waves], (count, 1))
         if name in ("last_action", "joint_target"):
-            own = self._action
+            action = self._action
             if name == "joint_target":
-                own = self.pose + self.scale * own
+                action = self.pose + self.scale * action
             if term.joints is None:
-                return own
-            return own[:, [self.joints.index(j) for j in term.joints]]
+                return action
+            return action[:, [self.joints.index(j) for j in term.joints]]
         at = self._at
         if term.joints is not None:
             at = np.array([self._body.joints.index(j) for j in term.joints])
@@ -402,8 +402,8 @@ class ForeignPolicy:
         angles = self._angles[-1][:, at]
         away = self._body.pose[at].astype(np.float32)
         if name == "joint_pos_rel":
-            own = dict(zip(self.joints, self.pose.tolist(), strict=True))
-            default = [own.get(self._body.joints[i], self._body.pose[i]) for i in at]
+            poses = dict(zip(self.joints, self.pose.tolist(), strict=True))
+            default = [poses.get(self._body.joints[i], self._body.pose[i]) for i in at]
             away = (self._body.pose[at] - default).astype(np.float32)
         return angles + away
 

@@ -81,11 +81,11 @@ class Trial:
         known = next((r for p, r in self._plain if p is policy), None)
         new = [c for c in conditions if known is None or c != plain]
         start, end = part
-        found = collect(
+        new_rollouts = collect(
             policy, self.servos, new, self.seconds, self.seed, self.threads,
             lambda share: self.progress(start + share * (end - start)), len(conditions) > 1,
         ) if new else []  # fmt: skip
-        walked = iter(found)
+        walked = iter(new_rollouts)
         rollouts = [known if known and c == plain else next(walked) for c in conditions]
         if known is None and plain in conditions:
             self._plain.append((policy, rollouts[list(conditions).index(plain)]))

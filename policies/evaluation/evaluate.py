@@ -403,16 +403,16 @@ def in_short(falls: Sequence[Fall]) -> list[FallsOfRow]:
     for fall in falls:
         groups.setdefault((fall.row, fall.walker), []).append(fall)
     rows = []
-    for (row, walker), own in groups.items():
-        sides: list[Direction] = [fall.toward for fall in own]
-        pushed = [f.since_push_s for f in own if f.since_push_s is not None]
+    for (row, walker), group in groups.items():
+        sides: list[Direction] = [fall.toward for fall in group]
+        pushed = [f.since_push_s for f in group if f.since_push_s is not None]
         rows.append(
             FallsOfRow(
-                row=row, walker=walker, falls=len(own),
-                time_s=float(np.median([f.time_s for f in own])),
-                tilt_before_deg=float(np.median([f.tilt_before_deg for f in own])),
+                row=row, walker=walker, falls=len(group),
+                time_s=float(np.median([f.time_s for f in group])),
+                tilt_before_deg=float(np.median([f.tilt_before_deg for f in group])),
                 toward=max(sides, key=lambda side: sides.count(side)),
-                tipped=sum(f.tipped for f in own),
+                tipped=sum(f.tipped for f in group),
                 after_push=sum(since <= 1.0 for since in pushed),
             )
         )  # fmt: skip
@@ -562,8 +562,8 @@ def usual_robots(episodes: int) -> Callable[[Case, Walker], int]:
     """
 
     def count(case: Case, walker: Walker) -> int:
-        own = episodes if case is RANDOM else max(episodes // 8, 1)
-        return {"policy": own, "trot": max(own // 2, 2), "standing": max(own // 6, 2)}[walker]
+        most = episodes if case is RANDOM else max(episodes // 8, 1)
+        return {"policy": most, "trot": max(most // 2, 2), "standing": max(most // 6, 2)}[walker]
 
     return count
 

@@ -88,15 +88,15 @@ def robot_of(path: Path, recorded: Sequence[str]) -> ServoRobot:
     def spec() -> Any:
         return _with_servos(mujoco.MjSpec.from_file(str(path)), joints)
 
-    own = spec()
-    model = _compile(own, path.name)
+    description = spec()
+    model = _compile(description, path.name)
     if model.narena > _LARGEST_ARENA_BYTES:
         raise InputError(
             f"{path} asks for {model.narena / 1e9:.1f} GB of memory for the simulation. Take the "
             "size out, or give less than 1 GB."
         )
     rest = model.qpos0[[int(model.joint(name).qposadr[0]) for name in joints]]
-    free = _root(own, joints[0]) is not None
+    free = _root(description, joints[0]) is not None
     return ServoRobot(path.stem, joints, rest, np.zeros(len(joints)), free, spec)
 
 

@@ -325,7 +325,7 @@ class _World:
         self.responses = [
             [respond(h, c.run, servo.noise, seen) for c in choice] for h in servo.hypotheses
         ]
-        self.information = [[r.information for r in own] for own in self.responses]
+        self.information = [[r.information for r in responses] for responses in self.responses]
         self.tones = [(c.kind, c.frequency_hz) for c in choice]
 
     def covariance(self, which: int, chosen: Sequence[int]) -> NDArray[np.float64]:
@@ -382,11 +382,10 @@ def _followed(worlds: Sequence[_World], candidate: Candidate, number: int) -> bo
     if candidate.kind != "sine":
         return True
     commanded = np.std(candidate.run.command[len(candidate.run.command) // 4 :])
-    moved = [
-        min(np.std(own[number].position_rad[len(own[number].position_rad) // 4 :])
-            for own in world.responses)
-        for world in worlds
-    ]  # fmt: skip
+    moved = []
+    for world in worlds:
+        positions = [responses[number].position_rad for responses in world.responses]
+        moved.append(min(np.std(position[len(position) // 4 :]) for position in positions))
     return bool(np.median(moved) > _FOLLOWED * commanded)
 
 
@@ -535,8 +534,8 @@ class Response:
 
 def without_shift(information: NDArray[np.float64]) -> NDArray[np.float64]:
     """Information of a tone's trials, summed, about the parameters whatever its shift in time."""
-    shift, own = information[:-1, -1], information[-1, -1] + PHASE_SD_S**-2
-    return information[:-1, :-1] - np.outer(shift, shift) / own
+    shift, of_shift = information[:-1, -1], information[-1, -1] + PHASE_SD_S**-2
+    return information[:-1, :-1] - np.outer(shift, shift) / of_shift
 
 
 def pooled(
@@ -610,8 +609,8 @@ def separation(
     for true, wrong in zip(truth, rival, strict=True):
         off = (wrong.position_rad - true.position_rad)[:, None]
         push, information = wrong.inner(wrong.sensitivity, off)[:, 0], wrong.information
-        own = information[-1, -1] + PHASE_SD_S**-2
-        total += wrong.inner(off, off).item() - push[-1] ** 2 / own
-        pull += push[:-1] - information[:-1, -1] * push[-1] / own
+        of_shift = information[-1, -1] + PHASE_SD_S**-2
+        total += wrong.inner(off, off).item() - push[-1] ** 2 / of_shift
+        pull += push[:-1] - information[:-1, -1] * push[-1] / of_shift
         curvature += without_shift(information)
     return 0.5 * max(total - float(pull @ np.linalg.solve(curvature, pull)), 0.0)

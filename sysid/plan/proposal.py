@@ -277,8 +277,8 @@ def _sd(parameter: Parameter, interval: Interval) -> float:
     """Standard deviation of a fitted coordinate, from the interval of its value."""
     if parameter.name == DEAD_TIME:
         half = (interval.high - interval.low) / 2
-        own = math.sqrt(max(half**2 - LEAST_HALF_WIDTH_S**2, (0.05 * half) ** 2))
-        return own / (HALF_WIDTH_SD * interval.value)
+        fitted_half = math.sqrt(max(half**2 - LEAST_HALF_WIDTH_S**2, (0.05 * half) ** 2))
+        return fitted_half / (HALF_WIDTH_SD * interval.value)
     low, high = (float(parameter.encode(end)) for end in (interval.low, interval.high))
     return (high - low) / (2 * HALF_WIDTH_SD)
 

@@ -311,11 +311,11 @@ def _lstm(
     trials: list[list[_Trial]], generator: torch.Generator, say: Callable[[float], None]
 ) -> dict[str, NDArray]:
     joints, most = len(trials), max(len(t) for t in trials)
-    longest = max(len(c) for own in trials for c, _ in own)
+    longest = max(len(c) for of_joint in trials for c, _ in of_joint)
     x, y = torch.zeros(longest - 1, joints, most, 2), torch.zeros(longest - 1, joints, most)
     counted = torch.zeros_like(y)
-    for j, own in enumerate(trials):
-        for n, (command, position) in enumerate(own):
+    for j, of_joint in enumerate(trials):
+        for n, (command, position) in enumerate(of_joint):
             rows = len(command) - 1
             x[:rows, j, n, 0] = torch.from_numpy(command[:-1])
             x[:rows, j, n, 1] = torch.from_numpy(position[:-1])

@@ -156,7 +156,7 @@ def counted_ticks(run: Run, mode: str) -> NDArray[np.float64]:
 
 
 def errors(
-    model: ServoModel | None, found: Tracks, data: ServoData, part: Part
+    model: ServoModel | None, free_run: Tracks, data: ServoData, part: Part
 ) -> dict[str, Errors]:
     """Errors of a model on a part of the data, given its free run from `tracks`."""
     ahead = None
@@ -171,7 +171,7 @@ def errors(
     for joint in data.joints:
         parts, alone = [], joint if apart else ""
         for n, run in enumerate(data.runs[joint]):
-            track = found[joint][n]
+            track = free_run[joint][n]
             when = counted_ticks(run, data.modes[joint])
             error = predicted(track, run, when) - run.position_rad
             use, rows = chosen(run, part) & np.isfinite(error), chosen_rows(run, part)

@@ -199,10 +199,10 @@ class Export:
                 f"{self.source} is no servo card, and BAM needs motor and position loop: give a "
                 "card (`pupper-sysid servo list`)."
             )
-        found = load_card(self.source)
+        servo_card = load_card(self.source)
         target = self.out or Path(f"{path.name.removesuffix(path.suffix)}_bam.json")
-        write_text(target, to_bam_json(found), self.force)
-        terminal.warn(*not_in_bam(found))
+        write_text(target, to_bam_json(servo_card), self.force)
+        terminal.warn(*not_in_bam(servo_card))
         return target
 
     def _check(self, calibration: Calibration, links: dict[str, float]) -> None:
