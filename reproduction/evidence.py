@@ -336,6 +336,15 @@ def several(values: dict[str, Interval], digits: int) -> str:
     )
 
 
+def span(values: Sequence[float] | NDArray[np.float64], digits: int) -> str:
+    """Smallest to largest; one number where these look alike, a dash where there is none."""
+    known = np.asarray(values, float)[np.isfinite(values)]
+    if not len(known):
+        return "–"
+    low, high = (f"{end:.{digits}f}" for end in (known.min(), known.max()))
+    return low if low == high else f"{low} to {high}"
+
+
 def bounds(values: dict[str, Interval]) -> dict[str, Interval] | None:
     """Those with an interval, by the architecture's name; None if there are none."""
     return {KINDS[k]: v for k, v in values.items() if np.isfinite(v.low)} or None

@@ -33,6 +33,7 @@ from reproduction.evidence import (
     of_kind,
     of_kinds,
     several,
+    span,
 )
 
 Policies = Sequence[PolicyEvidence]
@@ -123,7 +124,7 @@ def _learned(trainings: Trainings, holds_: bool) -> Verdict:
 
 def _progress(trainings: Trainings) -> str:
     """How far trainings came."""
-    samples = _range(np.array([t.million_samples for t in trainings]), 1)
+    samples = span([t.million_samples for t in trainings], 1)
     longest = max(t.lasted_s for t in trainings)
     return (
         f"After {samples} million samples robots stay up for {longest:.1f} s of "
@@ -167,9 +168,9 @@ def _delay_frequency(kind: str, id_: str, text: str, paper: str) -> Callable[[Po
         ]
         up = [np.mean([_delayed(p, d, "survival") for p in mine]) for d in DELAYS_MS]
         ours = (
-            f"replay {_range(values['replay'], 2)} Hz, amplitude "
+            f"replay {span(values['replay'], 2)} Hz, amplitude "
             f"{', '.join(f'{s:.2f}' for s in sizes)} rad at {_list(DELAYS_MS)} ms; closed loop "
-            f"{_range(values['fixed'], 2)} Hz, {', '.join(f'{100 * u:.0f} %' for u in up)} up"
+            f"{span(values['fixed'], 2)} Hz, {', '.join(f'{100 * u:.0f} %' for u in up)} up"
         )
         # of each policy: two that walk at rates of their own are not erratic for it
         constant = [max(rates) / min(rates) - 1 < 0.05 for rates in values["replay"].T]
@@ -401,12 +402,6 @@ _GAIT = (
     components, orbit, zeros, crossover, autonomous, adapts, ground, directions, arc, half_rate,
     scale,
 )  # fmt: skip
-
-
-def _range(values: np.ndarray, digits: int) -> str:
-    """Smallest to largest; a dash if there are none."""
-    known = values[np.isfinite(values)]
-    return f"{known.min():.{digits}f} to {known.max():.{digits}f}" if len(known) else "–"
 
 
 def _list(values: Sequence[float]) -> str:

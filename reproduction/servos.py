@@ -13,7 +13,7 @@ from pupper_sysid.sysid.doctor.examination import JointExamination, examine
 from pupper_sysid.sysid.fit.dead_time import lag
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Recording
-from reproduction.evidence import Claim, Finding, NotTestable, claim, holds
+from reproduction.evidence import Claim, Finding, NotTestable, claim, holds, span
 
 
 @dataclass
@@ -126,9 +126,12 @@ def reading_noise(evidence: ServoEvidence) -> Finding:
     "Playback, last loop held out, free run from commands alone, per joint.",
 )  # fmt: skip
 def servo_error(evidence: ServoEvidence) -> Finding:
-    published, fitted, mlp = (_by_joint(evidence, name) for name in (PUBLISHED, FITTED, "MLP"))
+    published, fitted, mlp = (
+        1e3 * _by_joint(evidence, name) for name in (PUBLISHED, FITTED, "MLP")
+    )
     return Finding(
-        f"published PD {_range(published)}, a fitted PD {_range(fitted)}, MLP {_range(mlp)} mrad",
+        f"published PD {span(published, 0)}, a fitted PD {span(fitted, 0)}, "
+        f"MLP {span(mlp, 0)} mrad",
         None, holds(bool(np.mean(fitted) > 3 * np.mean(mlp))),
         "Holds if a fitted PD is 3 times worse.",
     )  # fmt: skip
@@ -196,11 +199,6 @@ def _by_joint(evidence: ServoEvidence, model: str) -> np.ndarray:
     """Free-run error of each joint [rad]."""
     joints = _servos(evidence).models[model].joints
     return np.array([s.rmse_free_run_rad for s in joints.values()])
-
-
-def _range(values: np.ndarray) -> str:
-    """Smallest to largest, in mrad."""
-    return f"{1e3 * np.nanmin(values):.0f} to {1e3 * np.nanmax(values):.0f}"
 
 
 _CLAIMS = (

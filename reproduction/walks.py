@@ -20,7 +20,7 @@ from pupper_sysid.policies.deploy.stacks import Stack
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.twin.twin import Gyro, ImuLog, read_imu, spectrum
 from pupper_sysid.policies.walks.rollouts import ERRORS
-from reproduction.evidence import KINDS, Claim, Finding, NotTestable, claim, holds
+from reproduction.evidence import KINDS, Claim, Finding, NotTestable, claim, holds, span
 
 _YAW = 2
 _PAPER_HZ = 2.8
@@ -99,7 +99,7 @@ def steadiness(walks: Sequence[ImuWalk]) -> Finding:
     lstm = [w.gyro.peak_share[_YAW] for w in _of(walks, "lstm")]
     mlp = [w.gyro.peak_share[_YAW] for w in _of(walks, "mlp")]
     return Finding(
-        f"LSTM {_range(lstm, 2)}, MLP {_range(mlp, 2)}", None,
+        f"LSTM {span(lstm, 2)}, MLP {span(mlp, 2)}", None,
         holds(min(lstm) > max(mlp), bool(np.mean(lstm) > np.mean(mlp))),
         "Holds if it is larger in each of the LSTM's logs, partly if on average.",
     )  # fmt: skip
@@ -135,14 +135,9 @@ def _of(walks: Sequence[ImuWalk], kind: str) -> list[ImuWalk]:
 
 def _shown(walks: Sequence[ImuWalk], kind: str) -> str:
     mine = _of(walks, kind)
-    hertz = _range([w.gyro.peak_hz[_YAW] for w in mine], 2)
-    shares = _range([w.gyro.peak_share[_YAW] for w in mine], 2)
+    hertz = span([w.gyro.peak_hz[_YAW] for w in mine], 2)
+    shares = span([w.gyro.peak_share[_YAW] for w in mine], 2)
     return f"{KINDS[kind]} {hertz} Hz ({shares} of the variance)"
-
-
-def _range(values: Sequence[float], digits: int) -> str:
-    low, high = (f"{end:.{digits}f}" for end in (min(values), max(values)))
-    return low if low == high else f"{low} to {high}"
 
 
 @dataclass(frozen=True)
