@@ -4,8 +4,6 @@ Curves differ from each other in more than colour (`common.figure_style`); what 
 page has a `gid`. `tracks` is the free run of a fitted model beside commands and readings;
 `hold_runs` counts for how many rows readings stay the same, beside the prediction of the poll
 lattice.
-
-Hysteresis of a servo over its P gain, with what explains it.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from pupper_sysid.common.errors import InputError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from pupper_sysid.cli.commands.analyze.walks import Found, Tries
+    from pupper_sysid.cli.commands.analyze.walks import Results, Tries
     from pupper_sysid.policies.analysis.servo_demand import ServoDemand as Demand
     from pupper_sysid.policies.analysis.trial import Trial
     from pupper_sysid.policies.twin.twin import Gyro
@@ -50,7 +50,7 @@ class Servo(Analysis):
     seconds: float = 10.0
     """Duration of a policy's walk."""
 
-    def analyse(self) -> Found:
+    def analyse(self) -> Results:
         """Fit and compare the models."""
         from pupper_sysid.sysid.compare.compare import four_way
         from pupper_sysid.sysid.report.tables import mean_error_table
@@ -109,7 +109,7 @@ class ServoDemand(Commanded):
     """YAML of an ONNX file: joints, default pose, action scale, time step, observation. By default
     the one beside it."""
 
-    def analyse(self) -> Found:
+    def analyse(self) -> Results:
         """Walk, and compare."""
         from pupper_sysid.policies.analysis.figures import demand_figure
         from pupper_sysid.policies.analysis.servo_demand import servo_demand
@@ -259,7 +259,7 @@ class Twin(Drawn):
     threads: int = 0
     """Of the physics; 0 for all cores."""
 
-    def analyse(self) -> Found:
+    def analyse(self) -> Results:
         """Simulate and compare."""
         from pupper_sysid.policies.twin.drawing import actuator_of, robot_for
         from pupper_sysid.policies.twin.twin import read_imu, spectrum, twin, twin_figure

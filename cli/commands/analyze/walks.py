@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     Tries = Mapping[str, tuple[Any, Trial]]
     """Policy and trial by the policy's name."""
-    Found = tuple[Mapping[str, Any], Figure, Table]
+    Results = tuple[Mapping[str, Any], Figure, Table]
     """Results for --json, figure, and table."""
 
 _FULL, _QUICK = (16, 10.0), (5, 8.0)  # robots, seconds each
@@ -76,7 +76,7 @@ class Drawn(ABC):
         return re.sub(r"(?<!^)(?=[A-Z])", "-", type(self).__name__).lower()
 
     @abstractmethod
-    def analyse(self) -> Found:
+    def analyse(self) -> Results:
         """Results, figure and table."""
 
     def about(self) -> dict[str, Any]:
@@ -259,7 +259,7 @@ class Gait(Commanded):
     Example: pupper-analyze gait runs/<name> --command 0.15 0 0
     """
 
-    def analyse(self) -> Found:
+    def analyse(self) -> Results:
         """Describe the gait of each policy."""
         from pupper_sysid.policies.analysis.figures import gait_figure
         from pupper_sysid.policies.analysis.gait import describe
@@ -288,7 +288,7 @@ class Attractor(Commanded):
     Example: pupper-analyze attractor runs/<name>
     """
 
-    def analyse(self) -> Found:
+    def analyse(self) -> Results:
         """Orbits of each policy."""
         from pupper_sysid.policies.analysis.autonomy import DELAYS_MS, orbits
         from pupper_sysid.policies.analysis.figures import orbit_figure
@@ -324,7 +324,7 @@ class Delay(Commanded):
     Example: pupper-analyze delay runs/A runs/B
     """
 
-    def analyse(self) -> Found:
+    def analyse(self) -> Results:
         """Delay curves of each policy."""
         from pupper_sysid.policies.analysis.figures import delay_figure
         from pupper_sysid.policies.analysis.robustness import delay_curve
@@ -344,7 +344,7 @@ class Ablation(Commanded):
     Example: pupper-analyze ablation runs/<name>
     """
 
-    def analyse(self) -> Found:
+    def analyse(self) -> Results:
         """Ablations of each policy."""
         from pupper_sysid.policies.analysis.figures import ablation_figure
         from pupper_sysid.policies.analysis.robustness import ablation
@@ -362,7 +362,7 @@ class Autonomy(Commanded):
     Example: pupper-analyze autonomy runs/<name>
     """
 
-    def analyse(self) -> Found:
+    def analyse(self) -> Results:
         """Tests of each policy."""
         from pupper_sysid.policies.analysis.autonomy import autonomy
         from pupper_sysid.policies.analysis.figures import autonomy_figure
@@ -397,7 +397,7 @@ class Terrain(Commanded):
     Example: pupper-analyze terrain runs/<name>
     """
 
-    def analyse(self) -> Found:
+    def analyse(self) -> Results:
         """Walks of each policy on each ground."""
         from pupper_sysid.policies.analysis.figures import terrain_figure
         from pupper_sysid.policies.analysis.robustness import terrain
@@ -417,7 +417,7 @@ class Compliance(OfPolicies):
     Example: pupper-analyze compliance runs/<name>
     """
 
-    def analyse(self) -> Found:
+    def analyse(self) -> Results:
         """Walks of each policy in each direction."""
         from pupper_sysid.policies.analysis.figures import compliance_figure
         from pupper_sysid.policies.analysis.robustness import compliance
