@@ -88,20 +88,20 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
-    typed = list(sys.argv[1:] if arguments is None else arguments)
-    with user_errors(typed, "pupper-train") as rest:
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    with user_errors(given, "pupper-train") as rest:
         options = _parse(rest)
         begin_work()
         _run(options, rest)
 
 
-def _parse(words: list[str]) -> Options:
+def _parse(given: list[str]) -> Options:
     """Options; --preset, --policy and --start set the defaults of the others."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     kinds = {"start": Start, "preset": Preset, "policy": Kind}
     for name in (*kinds, "robot", "robot-config"):
         parser.add_argument(f"--{name}", nargs="?")
-    typed = vars(parser.parse_known_args(words)[0])
+    typed = vars(parser.parse_known_args(given)[0])
     # a wrong choice is refused by tyro, which then parses them all
     choices = {n: typed[n] if typed[n] in get_args(k) else get_args(k)[0] for n, k in kinds.items()}
     start: Any = choices["start"]
@@ -112,12 +112,12 @@ def _parse(words: list[str]) -> Options:
     if robot is not None:
         begun = with_robot(begun, robot, config)
     return parse(
-        Options, words, "pupper-train", DESCRIPTION,
+        Options, given, "pupper-train", DESCRIPTION,
         default=Options(begun, start=start), config=(tyro.conf.FlagCreatePairsOff,),
     )  # fmt: skip
 
 
-def _run(options: Options, words: list[str]) -> None:
+def _run(options: Options, given: list[str]) -> None:
     run = options.run
     if options.print_config:
         print(yaml.safe_dump(plain(run), sort_keys=False), end="")
@@ -140,11 +140,11 @@ def _run(options: Options, words: list[str]) -> None:
         check_actuator(here.actuator)
         if here is not run:
             warn(f"There is no {run.actuator} here; measuring with {here.actuator}.")
-        paces = measure(here)
+        found = measure(here)
         if options.json:
-            print_json(paces)
+            print_json(found)
         else:
-            for name, value in paces.items():
+            for name, value in found.items():
                 text = f"{value:,.3g}" if isinstance(value, float) else str(value)
                 out.print(f"{name:28} {text}")
         return
@@ -169,7 +169,7 @@ def _run(options: Options, words: list[str]) -> None:
     with _bar() as watch:
         notice, stopping = (warn, err.print) if ranks.rank == 0 else (lambda text: None,) * 2
         if options.resume:
-            learner = train(folder, None, watch, *_extension(options, words), notice, stopping)
+            learner = train(folder, None, watch, *_extension(options, given), notice, stopping)
         else:
             spent_s = time.monotonic() - begun
             learner = train(folder, run, watch, notice=notice, stopping=stopping, spent_s=spent_s)
@@ -204,9 +204,9 @@ def _with_first_gait(run: Run, ranks: Ranks) -> Run:
     return replace(run, task=replace(run.task, trot=trot, rewards=rewards))
 
 
-def _extension(options: Options, words: list[str]) -> tuple[int | None, float | None]:
+def _extension(options: Options, given: list[str]) -> tuple[int | None, float | None]:
     """New --iterations and --minutes of a resumed run; anything else would have no effect."""
-    flags = {a.split("=")[0] for a in words if a.startswith("--")}
+    flags = {a.split("=")[0] for a in given if a.startswith("--")}
     other = flags - {"--resume", "--iterations", "--minutes"}
     if other:
         raise InputError(
