@@ -119,9 +119,15 @@ _ALIASES = {
 MEMORY_BYTES = 147
 
 MODELS = {
-    1190: "XL330-M077", 1200: "XL330-M288", 1240: "XC330-M288", 1060: "XL430-W250",
-    1030: "XM430-W210", 1020: "XM430-W350", 1110: "XH430-W350", 1130: "XM540-W150",
-    1120: "XM540-W270", 30: "MX-28", 311: "MX-64", 321: "MX-106",
+    1190: "XL330-M077", 1200: "XL330-M288", 1230: "XC330-M181", 1240: "XC330-M288",
+    1210: "XC330-T181", 1220: "XC330-T288", 1060: "XL430-W250", 1090: "2XL430-W250",
+    1070: "XC430-W150", 1080: "XC430-W240", 1160: "2XC430-W250", 1030: "XM430-W210",
+    1020: "XM430-W350", 1010: "XH430-W210", 1000: "XH430-W350", 1050: "XH430-V210",
+    1040: "XH430-V350", 1011: "XD430-T210", 1001: "XD430-T350", 1280: "XW430-T200",
+    1270: "XW430-T333", 1130: "XM540-W150", 1120: "XM540-W270", 1110: "XH540-W150",
+    1100: "XH540-W270", 1150: "XH540-V150", 1140: "XH540-V270", 1111: "XD540-T150",
+    1101: "XD540-T270", 1180: "XW540-T140", 1170: "XW540-T260", 30: "MX-28", 311: "MX-64",
+    321: "MX-106",
 }  # fmt: skip
 """Names by model number; MX are those with the firmware for protocol 2.0."""
 
@@ -504,6 +510,7 @@ FAMILY = Family(
     rates=(1_000_000, 57_600, 2_000_000, 3_000_000, 4_000_000, 115_200),
     highest_id=HIGHEST_ID,
     series=SERIES,
+    by_firmware=lambda line, servo, model: None,
     profiles={},
     presets={},
     error_bits=HARDWARE_ERRORS | {ALERT: "hardware error"},

@@ -1,7 +1,9 @@
 """Feetech servos (STS, SCS and SMS series) as a `ServoBus`: `--bus feetech:/dev/ttyUSB0`.
 
-The series differ: address 48 locks the EEPROM of one and limits the torque of the other. So a
-servo's model number, at address 3 in both, is read before anything else.
+The series differ: address 48 locks the EEPROM of one and limits the torque of the other, and 34 is
+a protection of STS and a gain of HLS servos. So a servo's model number, at address 3 in all, is
+read before anything else. One that is not known here belongs to a series by its firmware and byte
+order, as the vendor's FD program has it.
 
 Frames are `FF FF ID LEN X ... CHK`, found in a stream that may hold anything: `X` is the
 instruction or the error byte, `LEN` counts it, the parameters and the checksum, which is the
@@ -13,8 +15,10 @@ Beside the faults that all SDKs share (`hardware.serial_servos.line`), version 1
 `scservo_sdk` keeps the byte order in a module global, does not check a reply's length, and loses
 the replies of a group read after one silent servo. All three are therefore handled here.
 
-Sources: the vendor's memory tables (wiki and ST3215 sheet), the Mini Pupper's firmware, LeRobot's
-tables; entries on which they disagree are left out.
+Sources: the vendor's memory tables (wiki, ST3215 sheet, STS and HLS tables of 2026), its headers
+SMS_STS.h, SCSCL.h and HLSCL.h, the model list of its FD program, LeRobot's tables, the Mini
+Pupper's firmware. Entries on which they disagree are left out, such as address 44 of STS servos,
+the time of a motion or the duty of the PWM mode.
 """
 
 from __future__ import annotations
@@ -29,6 +33,7 @@ from pupper_sysid.common.errors import BusError
 from pupper_sysid.hardware.serial_servos.bus import SerialBus
 from pupper_sysid.hardware.serial_servos.line import LineFrame, Reply, SerialLine
 from pupper_sysid.hardware.serial_servos.series import ERROR_BITS, Family, Profile, Register, Series
+from pupper_sysid.hardware.serial_servos.settings import RegisterFault
 
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
 BROADCAST_ID = 0xFE
@@ -38,16 +43,16 @@ BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_
 """By the value of the servo's baud register."""
 
 MODEL_ADDRESS, TORQUE_ADDRESS = 3, 40
-_SPEED_SIGN, _LOAD_SIGN, _OFFSET_SIGN = 15, 10, 11
+_SPEED_SIGN, _LOAD_SIGN = 15, 10
 
 
 _COMMON = {
     "firmware_major": Register(0),
     "firmware_minor": Register(1),
+    "big_endian": Register(2),
     "model": Register(MODEL_ADDRESS, 2),
     "id": Register(5),
     "baud": Register(6),
-    "return_delay": Register(7),
     "response_level": Register(8),
     "min_angle": Register(9, 2),
     "max_angle": Register(11, 2),
@@ -65,7 +70,6 @@ _COMMON = {
     "dead_zone_ccw": Register(27),
     "torque_enable": Register(TORQUE_ADDRESS),
     "acceleration": Register(41),
-    "goal_time": Register(44, 2),
     "goal_speed": Register(46, 2),
     "present_speed": Register(58, 2, _SPEED_SIGN),
     "present_load": Register(60, 2, _LOAD_SIGN),
@@ -77,48 +81,121 @@ _COMMON = {
 }
 
 
+_MAGNETIC = _COMMON | {
+    "protection_current": Register(28, 2),
+    "mode": Register(33),
+    "goal_position": Register(42, 2, 15),
+    "torque_limit": Register(48, 2),
+    "present_position": Register(56, 2, 15),
+    "current": Register(69, 2, 15),
+}
+_MULTI_TURN = 16  # of the phase: several turns are reported, instead of one (LeRobot clears it)
+
 SCS0009 = Series(
     "SCS0009", 1284, True, 1024, False, 48,
-    _COMMON | {"goal_position": Register(42, 2), "present_position": Register(56, 2)},
+    _COMMON
+    | {
+        "return_delay": Register(7),
+        "goal_position": Register(42, 2),
+        "goal_time": Register(44, 2),
+        "present_position": Register(56, 2),
+    },
 )  # fmt: skip
 STS3215 = Series(
     "STS3215", 777, False, 4096, True, 55,
-    _COMMON
+    _MAGNETIC
     | {
-        "homing_offset": Register(31, 2, _OFFSET_SIGN),
-        "mode": Register(33),
+        "return_delay": Register(7),
+        "homing_offset": Register(31, 2, 11),
         "protective_torque": Register(34),
         "protection_time": Register(35),
         "overload_torque": Register(36),
-        "goal_position": Register(42, 2, 15),
-        "torque_limit": Register(48, 2),
-        "present_position": Register(56, 2, 15),
-        "current": Register(69, 2, 15),
     },
-    # several turns are reported, instead of one (LeRobot clears it)
-    multi_turn_bit=16,
+    multi_turn_bit=_MULTI_TURN,
 )  # fmt: skip
-HD1910 = replace(
-    STS3215,
-    name="HD-1910",
-    model=0,
-    registers=STS3215.registers | {"p": Register(50), "d": Register(51)},
-    more_position_modes=frozenset({4}),  # as delivered, by a builder's notes on firmware 3.46
-)
-"""Microduck's Feetech servo: STS protocol, with the gains in use at 50 and 51. No source states its
-model number, so that a joint map has to name it."""
-SERIES = {int.from_bytes(s.word(s.model), "little"): s for s in (SCS0009, STS3215)}
+HLS3625 = Series(
+    "HLS3625", 3338, False, 4096, True, 55,
+    _MAGNETIC
+    | {
+        "homing_offset": Register(31, 2, 15),
+        "goal_current": Register(44, 2, 15),
+        # in use; those at 21 to 23 are loaded at power on
+        "p": Register(50),
+        "d": Register(51),
+        "i": Register(52),
+    },
+    # position without a current loop: the HD-1910's as delivered
+    more_position_modes=frozenset({4}),
+    multi_turn_bit=_MULTI_TURN,
+)  # fmt: skip
+HD1910 = replace(HLS3625, name="HD-1910", model=0)
+"""Microduck's servo, an HLS by its firmware 3.46. No source states its model number, so that only a
+joint map names it."""
+
+_NAMES: tuple[tuple[Series, int, dict[int, str]], ...] = (
+    (SCS0009, 5, {
+        1: "SCS0002", 2: "SCS0037", 3: "SCS2304", 4: "SCS0009", 5: "SCS1025", 6: "SCS0018",
+        7: "SCS0017", 8: "SCS2332", 9: "SCS0005", 10: "SCS0043", 12: "SCS45", 15: "SCS15",
+        16: "SCS315", 25: "SCS115", 35: "SCS215", 40: "SCS40", 60: "SCS6560",
+    }),
+    (STS3215, 9, {
+        1: "STS3015", 2: "STS3032", 3: "STS3215", 4: "STS3040", 5: "STS3020", 6: "STS3046",
+        7: "STS3045", 8: "STS3235", 9: "STS3095", 10: "STS3095", 11: "STS3250", 12: "STS3036",
+        13: "STS3120",
+    }),
+    (STS3215, 10, {
+        1: "HTS3235", 2: "HTS3032", 3: "HTS3240", 4: "HTS3235", 5: "STS3045BL", 6: "STS3046BL",
+        7: "HTS3032", 8: "HTS3045", 9: "STS3009BL", 25: "STS3025BL", 26: "STS3200BL",
+    }),
+    (HLS3625, 10, {
+        10: "HLS3606", 11: "HLS3612", 12: "HLS3620", 13: "HLS3625", 14: "HLS3640", 15: "HLS3925",
+        16: "HLS3930", 17: "HLS3935", 18: "HLS3950", 19: "HLS3955", 20: "HLS3915", 21: "HLS3615",
+        22: "HLS3960", 23: "HLS3608", 24: "HLS3604", 27: "HLS2915", 28: "HLS3906", 29: "HLS2606",
+    }),
+)  # fmt: skip
+"""By series and the first byte of the model number: names by its second byte."""
+SERIES = {
+    minor << 8 | major: replace(
+        series, name=name, model=major << 8 | minor if series.big_endian else minor << 8 | major
+    )
+    for series, major, names in _NAMES
+    for minor, name in names.items()
+}
 """By model number, its bytes as little endian."""
+
+
+def by_firmware(line: SerialLine, servo: int, model: int) -> Series | None:
+    """STS, HLS or SCS, for a servo whose model number is not known; None if its firmware is not."""
+    reply = line.read(servo, 0, 3)
+    if reply is None:
+        return None
+    major, minor, big_endian = reply.frame.data
+    kinds = ((SCS0009, 1, 0, range(40)), (STS3215, 0, 3, range(40)), (HLS3625, 0, 3, range(40, 60)))
+    series = next(
+        (
+            s
+            for s, end, first, rest in kinds
+            if (end, first) == (big_endian, major) and minor in rest
+        ),
+        None,
+    )
+    if series is None:
+        return None
+    return replace(series, name=series.name[:3], model=model)
+
 
 SHAPING = (
     "return_delay", "response_level", "min_start_force", "dead_zone_cw", "dead_zone_ccw",
     "max_torque", "torque_limit", "max_temperature", "max_voltage", "min_voltage", "min_angle",
     "max_angle", "homing_offset", "phase", "mode", "acceleration", "goal_time", "goal_speed",
+    "goal_current", "protection_current",
 )  # fmt: skip
 """Registers beside the gains that shape how a servo moves and answers."""
 
 _ACCELERATION_COUNTS_S2 = 100
-_HEAT, _OVERLOAD = 4, 32  # of ERROR_BITS
+_FAST_SPEED_COUNTS_S = 50
+_SINGLE_COUNTS, _ZERO_IS_FULL_SPEED = 4, 8  # of the phase of STS: unit and 0 of goal_speed
+_HEAT, _OVERCURRENT, _OVERLOAD = 4, 8, 32  # of ERROR_BITS
 _MOST = {"protective_torque": 20, "protection_time": 200, "overload_torque": 80}
 """Factory settings: share of the torque afterwards [%], duration [10 ms], share before [%]."""
 _OFF_AT_ZERO = ("protection_time", "overload_torque")
@@ -136,8 +213,11 @@ def protections_to_set(series: Series, registers: Mapping[str, int]) -> dict[str
     --------
     >>> protections_to_set(SCS0009, {"unload_condition": 1})
     {'unload_condition': 37}
+    >>> protections_to_set(HLS3625, {"unload_condition": 4})  # protected by current, not by load
+    {'unload_condition': 12}
     """
-    wanted = {"unload_condition": registers["unload_condition"] | _HEAT | _OVERLOAD}
+    blocked = _OVERCURRENT if series.has("goal_current") else _OVERLOAD
+    wanted = {"unload_condition": registers["unload_condition"] | _HEAT | blocked}
     for name, most in _MOST.items():
         if name in series.registers:
             off = registers[name] == 0 and name in _OFF_AT_ZERO
@@ -146,20 +226,43 @@ def protections_to_set(series: Series, registers: Mapping[str, int]) -> dict[str
 
 
 def profile(series: Series, registers: Mapping[str, int]) -> Profile:
-    """Ramp of the set-point: acceleration in 100 counts/s², speed in counts/s, time in ms.
+    """Ramp of the set-point: acceleration in 100 counts/s², speed, and time in ms (SCS).
 
-    A speed overrides the time.
+    A speed overrides the time. It is in counts/s, in 50 counts/s of HLS servos and of STS servos
+    whose phase says so.
     """
     count = math.tau / (counts_of(series.name) or series.counts)
     acceleration, speed = registers.get("acceleration", 0), registers.get("goal_speed", 0)
     duration = 0 if speed else registers.get("goal_time", 0)
     named = {"acceleration": acceleration, "goal_speed": speed, "goal_time": duration}
+    fine = registers.get("phase", 0) & _SINGLE_COUNTS if _is_sts(series) else series.big_endian
     return Profile(
-        speed * count if speed else math.inf,
+        speed * count * (1 if fine else _FAST_SPEED_COUNTS_S) if speed else math.inf,
         _ACCELERATION_COUNTS_S2 * acceleration * count if acceleration else math.inf,
         duration / 1e3,
         tuple(name for name, value in named.items() if value),
     )
+
+
+def own_faults(series: Series, registers: Mapping[str, int]) -> list[RegisterFault]:
+    """Registers with which a servo of these series does not move."""
+    faults = []
+    if registers.get("goal_current", 1) == 0:
+        meaning = "the motor gets no current, so the servo does not move"
+        cure = "Switch its power off and on, which loads protection_current (address 28) into it"
+        faults.append(RegisterFault("goal_current", 0, meaning, cure))
+    full_at_zero = series.big_endian or (
+        _is_sts(series) and registers.get("phase", 0) & _ZERO_IS_FULL_SPEED
+    )
+    if not full_at_zero and registers.get("goal_speed", 1) == 0:
+        meaning = "by the vendor's table 0 stops this servo, and is not its full speed"
+        cure = "If it does not move, switch its power off and on, which loads its usual speed"
+        faults.append(RegisterFault("goal_speed", 0, meaning, cure, False))
+    return faults
+
+
+def _is_sts(series: Series) -> bool:
+    return series.has("protective_torque")
 
 
 HEADER = b"\xff\xff"
@@ -296,6 +399,7 @@ FAMILY = Family(
     rates=(1_000_000, 500_000, 115_200, 250_000, 57_600, 38_400),
     highest_id=HIGHEST_ID,
     series=SERIES,
+    by_firmware=by_firmware,
     profiles={HD1910.name: HD1910},
     presets={SCS0009.name: "mini_pupper_2_direct", STS3215.name: "sts3215"},
     error_bits=ERROR_BITS,
@@ -303,12 +407,16 @@ FAMILY = Family(
     reading_bytes=(6, 7, 8, 9, 10, 11),  # position, speed, load; voltage; temperature; …
     memory_pieces=(16, 15, 14, 13, 9),  # registers 0 to 66
     shaping=SHAPING,
-    modes={1: "wheel mode", 2: "PWM mode", 3: "step mode"},
+    modes={
+        1: "wheel mode",
+        2: "PWM mode (HLS: current mode)",
+        3: "step mode (HLS: PWM mode)",
+    },
     position_mode=0,
     turns_freely=frozenset(),
     acknowledges=1,
     profile=profile,
-    own_faults=lambda series, found: [],
+    own_faults=own_faults,
     protections=protections_to_set,
     volt_scale=0.1,
     load=("present_load", 1e-3),

@@ -330,6 +330,11 @@ def read_lerobot(path: Path) -> dict[str, LeRobotJoint]:
     fields = set(LeRobotJoint.model_fields)
     if not isinstance(data, dict) or not data:
         raise InputError(f"{path} is no calibration of LeRobot: it must map joints to entries.")
+    if "motor_names" in data:
+        raise InputError(
+            f"{path} is of an older LeRobot, whose zeros were not in the servos. Calibrate the arm "
+            "again with `lerobot-calibrate`."
+        )
     joints = {}
     for name, entry in data.items():
         if not isinstance(entry, dict) or not fields & set(entry):
@@ -351,7 +356,7 @@ def apply_lerobot(data: dict[str, Any], joints: Mapping[str, LeRobotJoint], path
             f"{path} has the joints {', '.join(entries)}, and LeRobot's calibration "
             f"{', '.join(joints)}: {', '.join(missing)} has no entry. Rename one of them."
         )
-    software = data["servo"].startswith(("STS", "SCS", "HD"))
+    software = _reversed_by_software(data["servo"])
     for name, entry in entries.items():
         joint = joints[name]
         low, high = joint.range_min, joint.range_max
@@ -371,6 +376,11 @@ def apply_lerobot(data: dict[str, Any], joints: Mapping[str, LeRobotJoint], path
     data["source"] += "; ids, directions, offsets and ranges of LeRobot's calibration"
 
 
+def _reversed_by_software(servo: str | None) -> bool:
+    """Whether LeRobot itself turns a drive mode of 1 around, and not the servo."""
+    return not (servo or "STS").startswith(("X", "2X", "MX"))
+
+
 def lerobot_calibration(
     joint_map: JointMap, homing_offsets: Mapping[str, int]
 ) -> dict[str, dict[str, int]]:
@@ -378,7 +388,7 @@ def lerobot_calibration(
 
     `homing_offsets` are those of the servos' registers, by joint; of servos without one they are 0.
     """
-    software = not (joint_map.file.servo or "STS").startswith(("X", "MX"))
+    software = _reversed_by_software(joint_map.file.servo)
     entries = {}
     for name in joint_map.joint_names:
         entry = joint_map.file.joints[name]

@@ -95,7 +95,7 @@ class SerialBus(HostClock):
         )
         try:
             named = wanted.file.servo if wanted else None
-            series = scan.known_series(self.family, models, device, named)
+            series = scan.known_series(self.family, self.line, models, named)
             if wanted is None:
                 wanted = scan.default_map(self.family, self.line, series)
                 wanted = wanted.select(joints) if joints else wanted

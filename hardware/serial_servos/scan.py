@@ -88,7 +88,8 @@ def scan_line(
                 continue
             first = first or rate
             servos += [_report(family, line, servo, model) for servo, model in answering.items()]
-            known = next((family.series[m] for m in answering.values() if m in family.series), None)
+            found = (series_of(family, line, servo, m) for servo, m in answering.items())
+            known = next((series for series in found if series), None)
             if known is not None:
                 where, size = known.register(family.present).address, family.reading_bytes[0]
                 doubled = line.doubled(list({*answering, *line.garbled}), where, size)
@@ -138,15 +139,16 @@ def _answering(line: SerialLine, ids: range | tuple[int, ...]) -> dict[int, int]
 
 
 def _report(family: Family, line: SerialLine, servo: int, model: int) -> ServoReport:
-    series = family.series.get(model)
+    series = series_of(family, line, servo, model)
     if series is None:
         return ServoReport(servo, f"unknown ({model})", "", line.baud)
+    name = series.name if model in family.series else f"{series.name} ({model})"
     reply = line.read(servo, series.register(family.present).address, family.reading_bytes[0])
     errors = bits_in_words(reply.frame.code, family.error_bits) if reply else ""
     tries = (memory_of(line, servo, family.memory_pieces) for _ in range(_TRIES))
     memory = next((one for one in tries if one is not None), None)
     if memory is None:
-        return ServoReport(servo, series.name, errors, line.baud)
+        return ServoReport(servo, name, errors, line.baud)
     registers = registers_of(series, memory)
 
     def value(name: str) -> int:
@@ -159,7 +161,7 @@ def _report(family: Family, line: SerialLine, servo: int, model: int) -> ServoRe
     faults = register_faults(family, series, registers, inside)
     return ServoReport(
         servo,
-        series.name,
+        name,
         errors,
         line.baud,
         setup["firmware"],
@@ -217,23 +219,27 @@ def rates_in_words(family: Family, baud: int | None) -> str:
     return ", ".join(map(str, family.rates)) if baud is None else str(baud)
 
 
+def series_of(family: Family, line: SerialLine, servo: int, model: int) -> Series | None:
+    """Series of a servo by its model number, or by its firmware; None if neither is known."""
+    return family.series.get(model) or family.by_firmware(line, servo, model)
+
+
 def known_series(
-    family: Family, models: dict[int, int], device: str, named: str | None = None
+    family: Family, line: SerialLine, models: dict[int, int], named: str | None = None
 ) -> dict[int, Series]:
     """Series of the servos that answered; `named` is the servo of the joint map."""
-    profile = family.profiles.get(named or "")
+    profile, found = family.profiles.get(named or ""), {}
     for servo, model in models.items():
-        if model not in family.series and profile is None:
+        series = family.series.get(model) or profile or family.by_firmware(line, servo, model)
+        if series is None:
             known = ", ".join(f"{s.name} ({s.model})" for s in family.series.values())
             raise BusError(
-                f"{device}: servo {servo} has the model number {model}, which is not known; known "
-                f"are {known}. Registers differ between series, so nothing is sent to it."
+                f"{line.device}: servo {servo} has the model number {model}, which is not known, "
+                f"nor is its firmware; known are {known}. Registers differ between series, so "
+                "nothing is sent to it."
             )
-    return {
-        servo: series
-        for servo, model in models.items()
-        if (series := family.series.get(model, profile)) is not None
-    }
+        found[servo] = series
+    return found
 
 
 def answering_joints(
@@ -269,7 +275,7 @@ def default_map(family: Family, line: SerialLine, series: dict[int, Series]) -> 
     preset = family.presets.get(one.name)
     silent = [i for i in MINI_PUPPER_IDS if i not in series]
     if preset is not None and len(silent) <= _NEARLY_ALL:
-        series |= known_series(family, line.find(silent), line.device)
+        series |= known_series(family, line, line.find(silent))
     others = [] if preset is None else sorted(line.roll_call(_OTHER_IDS))
     if preset is not None and sorted(series) == list(MINI_PUPPER_IDS) and not others:
         return load_joint_map(preset).per_servo()
@@ -298,11 +304,12 @@ def refuse_other_servos(joint_map: JointMap, family: Family, one: Series, device
             f"the joint map {name} is for servos of {counts} counts; these {one.name} have "
             f"{one.counts}. Choose another map."
         )
-    named = data_sheet(joint_map.file.servo) if joint_map.file.servo else None
-    if named and named.model_number != one.model:
+    servo = joint_map.file.servo or one.name
+    sheet = data_sheet(servo)
+    names = {series.name for series in (*family.series.values(), *family.profiles.values())}
+    if one.name != servo and (sheet.model_number != one.model if sheet else servo in names):
         raise InputError(
-            f"the joint map {name} is for {named.name} servos; these are {one.name}. Choose "
-            "another map."
+            f"the joint map {name} is for {servo} servos; these are {one.name}. Choose another map."
         )
 
 

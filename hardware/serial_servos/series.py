@@ -126,6 +126,9 @@ class Family:
     highest_id: int
     series: Mapping[int, Series]
     """By model number."""
+    by_firmware: Callable[[Any, int, int], Series | None]
+    """Series of a servo whose model number is none of them, from its line, id and model number;
+    None if nothing shows it."""
     profiles: Mapping[str, Series]
     """By the servo's name in a joint map, for servos whose model number is not published."""
     presets: Mapping[str, str]

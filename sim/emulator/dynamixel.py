@@ -32,7 +32,7 @@ _XL430 = {"min_voltage_limit": 60, "max_voltage_limit": 140, "temperature_limit"
 
 
 def _factory(name: str) -> dict[str, int]:
-    own = _COMMON | (_SMALL if name.startswith(("XL330", "XC330")) else _LARGE)
+    own = _COMMON | (_SMALL if name.startswith(("XL330", "XC330-M")) else _LARGE)
     p, i, d = DYNAMIXEL_GAINS.get(name, (800, 0, 0))
     gains = {"position_p_gain": p, "position_i_gain": i, "position_d_gain": d}
     return own | (_XL430 if name == "XL430-W250" else {}) | gains

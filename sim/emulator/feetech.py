@@ -17,7 +17,7 @@ _SCS0009 = {
     "firmware_major": 0, "firmware_minor": 16, "return_delay": 0, "response_level": 1,
     "min_angle": 20, "max_angle": 1003, "max_temperature": 80, "max_voltage": 84,
     "min_voltage": 40, "max_torque": 1000, "p": 15, "d": 15, "i": 0, "min_start_force": 24,
-    "dead_zone_cw": 1, "dead_zone_ccw": 1, "unload_condition": 37,
+    "dead_zone_cw": 1, "dead_zone_ccw": 1, "unload_condition": 37, "big_endian": 1,
 }  # fmt: skip
 _STS3215 = {
     "firmware_major": 3, "firmware_minor": 9, "return_delay": 250, "response_level": 1,
@@ -27,6 +27,10 @@ _STS3215 = {
     "unload_condition": 44, "protective_torque": 20, "protection_time": 200,
     "overload_torque": 80,
 }  # fmt: skip
+_HLS = {name: value for name, value in _STS3215.items() if table.HLS3625.has(name)} | {
+    "firmware_minor": 46, "d": 40, "unload_condition": 13, "goal_current": 500, "goal_speed": 100,
+    "protection_current": 500,
+}  # fmt: skip
 
 
 class FeetechEmulator(LineEmulator):
@@ -35,7 +39,8 @@ class FeetechEmulator(LineEmulator):
     family = FAMILY
     memory_bytes = 80
     factory: ClassVar = {
-        "SCS0009": _SCS0009, "STS3215": _STS3215, "HD-1910": _STS3215 | {"mode": 4},
+        "SCS0009": _SCS0009, "STS3215": _STS3215, "HLS3625": _HLS,
+        "HD-1910": _HLS | {"mode": 4},
     }  # fmt: skip
 
     def _new_reader(self) -> FrameReader:

@@ -243,7 +243,10 @@ class LineEmulator(ABC):
         servo, encode = self.servos.get(servo_id), encode or self._status
         if servo is None or self._free_at < self._brown_out_until:
             return []
-        delay = self.family.return_delay_unit_s * self._get(servo_id, "return_delay") * waits
+        delays = self.series.has("return_delay") and waits
+        delay = (
+            self.family.return_delay_unit_s * self._get(servo_id, "return_delay") if delays else 0.0
+        )
         begin = self._free_at + delay
         kind = self._inject_fault(servo_id, begin)
         if begin < self._brown_out_until:

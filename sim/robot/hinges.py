@@ -1,19 +1,26 @@
 """Hinges of a robot's MJCF or URDF, read in a child process with limits on memory and time.
 
+A URDF states joints, limits and followers in its XML, and nothing else of it is read: many that
+other programs use have links without masses, paths of packages or numbers that MuJoCo refuses. An
+MJCF has defaults, includes and tendons, so MuJoCo compiles it.
+
 A model file can ask for any amount of memory (height fields, textures, `replicate`) or block (an
-include of a pipe). MuJoCo therefore reads it in a process of its own, which prints the hinges as
-JSON: `python -m pupper_sysid.sim.robot.hinges FILE`.
+include of a pipe). It is therefore read in a process of its own, which prints the hinges as JSON:
+`python -m pupper_sysid.sim.robot.hinges FILE`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import math
 import re
 import subprocess
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element, ParseError, fromstring
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import resolved
@@ -21,7 +28,9 @@ from pupper_sysid.common.files import resolved
 _LARGEST_BYTES = 50_000_000
 _MEMORY_BYTES = 2 << 30
 _TIME_S = 10
-_ADVICE = "Give an MJCF or URDF that MuJoCo's viewer opens, with its meshes beside it."
+_ADVICE = "Give a URDF, or an MJCF that MuJoCo's viewer opens."
+_NO_LIMIT_RAD = 1e4
+"""Limits beyond say that there are none."""
 
 
 @dataclass(frozen=True)
@@ -80,14 +89,17 @@ def _limit_this_process() -> None:
 
 
 def _read(path: str) -> list[Hinge]:
+    _limit_this_process()
+    root = _xml(path)
+    if root is not None and root.tag == "robot":
+        return _of_urdf(root)
     from pupper_sysid.sim.robot.engine import mujoco
 
-    _limit_this_process()
     model = _model(mujoco, path)
     hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
     leaders = _leaders(model, mujoco)
     driven = _driven(model, mujoco) if model.nu else set(hinges) - set(leaders)
-    zero = _zero_ranges(path)
+    zero = set() if root is None else _zero_ranges(root)
     found = []
     for j in hinges:
         low, high = (float(x) if abs(x) < 1e6 else None for x in model.jnt_range[j])
@@ -96,6 +108,55 @@ def _read(path: str) -> list[Hinge]:
         follows = model.joint(leaders[j]).name if j in leaders else ""
         found.append(Hinge(name, limited, low, high, j in driven, follows, name in zero))
     return found
+
+
+def _of_urdf(root: Element) -> list[Hinge]:
+    """Hinges of a URDF in the order of the file."""
+    tags = (element.tag for element in root.iter() if isinstance(element.tag, str))
+    values = (
+        value for joint in root.iter("joint") for e in joint.iter() for value in e.attrib.values()
+    )
+    if any(tag.startswith("{") and "xacro" in tag for tag in tags) or any(
+        "${" in v for v in values
+    ):
+        raise ValueError("it is a xacro file, to be expanded: `xacro FILE > robot.urdf`")
+    found: list[Hinge] = []
+    for joint in root.findall("joint"):
+        kind, limit = joint.get("type"), joint.find("limit")
+        if kind not in ("revolute", "continuous"):
+            continue
+        ends = {} if limit is None or kind == "continuous" else limit.attrib
+        low, high = (_number(ends.get(end, "0")) for end in ("lower", "upper"))
+        free = kind == "continuous" or (
+            low is not None and high is not None and min(-low, high) > _NO_LIMIT_RAD
+        )
+        mimic = joint.find("mimic")
+        follows = "" if mimic is None else mimic.get("joint", "")
+        zero = not free and low == high == 0.0
+        if joint.get("name") in {hinge.name for hinge in found}:
+            raise ValueError(f"two joints are called '{joint.get('name')}'")
+        found.append(
+            Hinge(joint.get("name", ""), not free, 0.0 if free else low, 0.0 if free else high,
+                  not follows, follows, zero)
+        )  # fmt: skip
+    return found
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return None if math.isnan(value) else value
+
+
+def _xml(path: str) -> Element | None:
+    """Root of an XML file; None where it is not XML, of which MuJoCo takes more."""
+    text = Path(path).read_bytes()
+    for attempt in (text, _bound(text)):
+        with contextlib.suppress(ParseError):
+            return fromstring(attempt)
+    return None
 
 
 def _model(mujoco, path: str):
@@ -133,30 +194,14 @@ def _leaders(model, mujoco) -> dict[int, int]:
     }
 
 
-def _zero_ranges(path: str) -> set[str]:
-    """Joints for which the file itself states a range of 0 to 0."""
-    import xml.etree.ElementTree as tree
-
-    text = Path(path).read_bytes()
-    try:
-        root = tree.fromstring(text)
-    except tree.ParseError:
-        try:
-            root = tree.fromstring(_bound(text))
-        except tree.ParseError:  # MuJoCo takes more than XML
-            return set()
-    zero = set()
-    for joint in root.iter("joint"):
-        limit = joint.find("limit")
-        ends = joint.get("range", "").split()
-        if limit is not None and joint.get("type") == "revolute":
-            ends = [limit.get("lower", "0"), limit.get("upper", "0")]
-        try:
-            if len(ends) == 2 and float(ends[0]) == float(ends[1]) == 0.0:
-                zero.add(joint.get("name", ""))
-        except ValueError:
-            continue
-    return zero
+def _zero_ranges(root: Element) -> set[str]:
+    """Joints for which an MJCF itself states a range of 0 to 0."""
+    ranges = {joint.get("name", ""): joint.get("range", "").split() for joint in root.iter("joint")}
+    return {
+        name
+        for name, ends in ranges.items()
+        if len(ends) == 2 and all(_number(e) == 0 for e in ends)
+    }
 
 
 def _bound(text: bytes) -> bytes:

@@ -22,19 +22,18 @@ import numpy as np
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import strange_joint
+from pupper_sysid.hardware import dynamixel, feetech
 from pupper_sysid.hardware.joint_calibration import LeRobotJoint, apply_lerobot
 from pupper_sysid.hardware.joint_map import SCHEMA, SCHEMA_VERSION, JointMap, joint_map_from
 from pupper_sysid.sim.robot.hinges import Hinge, hinges_of
 
-_TURN = (4096, 2 * np.pi)
-SERVOS = {"sts3215": _TURN, "scs0009": (1024, np.radians(300))} | dict.fromkeys(
-    (
-        "hd-1910", "xl330-m288", "xl330-m077", "xc330-m288", "xl430-w250", "xm430-w350",
-        "xm430-w210", "xh430-w350", "xm540-w150", "xm540-w270", "mx-28", "mx-64", "mx-106",
-    ),
-    _TURN,
-)  # fmt: skip
-"""Counts of the encoder, and the angle that they span [rad]."""
+FAMILIES = {
+    series.name.lower(): family
+    for family in (feetech.FAMILY, dynamixel.FAMILY)
+    for series in (*family.series.values(), *family.profiles.values())
+} | dict.fromkeys(("sts", "hls", "scs"), feetech.FAMILY)
+"""Vendor's family by type of servo; `sts`, `hls` and `scs` are servos without another name here."""
+_SCS_COUNTS, _SCS_RAD = 1024, np.radians(300)
 
 _MARGIN_COUNTS = 20  # servos clip goals near the ends of their range
 _MOST_SERVOS = 253
@@ -61,7 +60,7 @@ def joint_map_of(
 ) -> RobotMap:
     """Joint map of the robot described in `path`, and what was left out of it.
 
-    It is a MJCF or URDF; all servos are of one type of `SERVOS`. With LeRobot's calibration of an
+    It is a MJCF or URDF; all servos are of one type of `FAMILIES`. With LeRobot's calibration of an
     arm its ids, directions and ranges are taken.
     """
     hinges = hinges_of(path)
@@ -99,7 +98,7 @@ def joint_map_of(
 def joint_map_of_servos(ids: Mapping[str, int], servo: str) -> RobotMap:
     """Joint map of servos without a model file: a bench, or a part of a robot.
 
-    `ids` are servo ids by joint; all servos are of one type of `SERVOS`.
+    `ids` are servo ids by joint; all servos are of one type of `FAMILIES`.
     """
     hinges = [Hinge(name, True, -_UNKNOWN_RAD, _UNKNOWN_RAD, driven=True) for name in ids]
     source = f"names and ids as stated, for {servo} servos; centres, signs and limits are guesses"
@@ -115,7 +114,10 @@ def _map_data(
     path: Path, joints: list[Hinge], ids: Iterable[int], servo: str, source: str, of_joint: str
 ) -> dict:
     """A joint map's file; `of_joint` is the source of each joint's values."""
-    counts, span = SERVOS[servo]
+    if servo.lower() not in FAMILIES:
+        raise InputError(f"`servo` {servo} is not known; choose one of {', '.join(FAMILIES)}.")
+    scs = servo.lower().startswith("scs")
+    counts, span = (_SCS_COUNTS, _SCS_RAD) if scs else (4096, 2 * np.pi)
     return {
         "schema": SCHEMA, "schema_version": SCHEMA_VERSION, "name": path.stem, "frame": "raw",
         "counts": counts, "servo": servo.upper(), "linkage": "none", "source": source,

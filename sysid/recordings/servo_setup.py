@@ -43,13 +43,15 @@ class ServoSetup(BaseModel):
 
     @property
     def set_point_acceleration_rad_s2(self) -> float | None:
-        """Largest acceleration of the set-point by the register `acceleration` [rad/s²].
+        """Largest acceleration of the set-point by the servo's registers [rad/s²].
 
-        None where it is not stated; infinite at 0. A unit is 100 counts/s².
+        None where it is not stated; infinite where there is no limit. The header has the number, or
+        Feetech's register `acceleration`, in units of 100 counts/s².
         """
         units = self.registers.get("acceleration")
         if units is None:
-            return None
+            unlimited = math.inf if "profile_velocity" in self.registers else None
+            return (self.model_extra or {}).get("set_point_acceleration_rad_s2", unlimited)
         counts = counts_of(self.model or "STS3215") or 4096.0
         return 100 * units * math.tau / counts if units else math.inf
 

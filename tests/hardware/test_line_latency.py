@@ -108,6 +108,15 @@ def test_scan_without_a_bus_tries_every_port_and_says_what_answers_where(capsys,
     assert code == 0 and f"--bus feetech:{server.device}" in out and "nothing answers" in err
 
 
+def test_what_lies_beside_a_port_is_no_port(monkeypatch, tmp_path):
+    with on_a_port(still_servos(ids=[])) as server:
+        (tmp_path / "ttyUSB0").symlink_to(server.device)
+        (tmp_path / "ttyUSB0.joints.yaml").touch()
+        listed = [SimpleNamespace(device=str(path)) for path in tmp_path.iterdir()]
+        monkeypatch.setattr("serial.tools.list_ports.comports", lambda: listed)
+        assert scan_command.serial_ports() == [str(tmp_path / "ttyUSB0")]
+
+
 def test_scan_without_ports_says_what_to_connect(capsys, monkeypatch):
     monkeypatch.setattr(scan_command, "serial_ports", list)
     monkeypatch.setattr(scan_command, "SOCKET", scan_command.Path("/nowhere"))

@@ -10,7 +10,7 @@ import pytest
 
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.dynamixel import DynamixelBus
-from pupper_sysid.hardware.feetech import SCS0009, STS3215, FeetechBus
+from pupper_sysid.hardware.feetech import HD1910, SCS0009, STS3215, FeetechBus
 from pupper_sysid.hardware.joint_map import joint_map_from
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.serial_servos import line as serial_line
@@ -198,15 +198,14 @@ def test_without_a_map_servos_of_another_robot_are_never_moved(lines):
 
 
 def test_a_servo_without_a_published_model_number_is_driven_by_the_map_that_names_it():
-    servos = still_servos(STS3215, IDS)
+    servos = still_servos(HD1910, IDS)
     for servo in IDS:
         servos._set(servo, "model", 3333)
-        servos._set(servo, "mode", 4)
-        servos.servos[servo].memory[50:52] = bytes([16, 8])
+        servos.servos[servo].memory[50:52] = bytes([16, 8])  # in use; 21 and 22 are loaded from
     data = map_of(*IDS).file.model_dump(by_alias=True) | {"servo": "HD-1910"}
     layout = joint_map_from(data, "microduck").per_servo().select(["LF_hip", "LF_thigh"])
     with on_a_port(servos) as server:
-        with pytest.raises(BusError, match="model number 3333, which is not known"):
+        with pytest.raises(InputError, match="is for STS3215 servos; these are HLS"):
             FeetechBus(server.device, 1_000_000, map_of(*IDS))
         bus = GuardedBus(FeetechBus(server.device, 1_000_000, layout))
         assert bus.torque(True)

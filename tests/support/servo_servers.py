@@ -132,7 +132,7 @@ def still_servos(
     series: Series = STS3215, ids: Sequence[int] | None = None, **keywords
 ) -> Listening:
     """Servos without physics."""
-    bench = StillBench(LAYOUTS[series.name])
+    bench = StillBench(LAYOUTS.get(series.name, "sts3215"))
     return Listening(bench, series, np.random.default_rng(0), ids, **keywords)
 
 

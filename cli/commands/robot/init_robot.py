@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import tyro
@@ -30,12 +29,9 @@ class InitRobot:
     """The robot's MJCF or URDF."""
     joints: str | None = None
     """Instead of a model file, names of joints and their servos' ids: pan=1,tilt=2."""
-    servo: Literal[
-        "sts3215", "scs0009", "hd-1910", "xl330-m288", "xl330-m077", "xc330-m288", "xl430-w250",
-        "xm430-w350", "xm430-w210", "xh430-w350", "xm540-w150", "xm540-w270", "mx-28", "mx-64",
-        "mx-106",
-    ] = "sts3215"  # fmt: skip
-    """Which servos it has."""
+    servo: str = "sts3215"
+    """Which servos it has: sts3215, scs0009, hd-1910, xl330-m288, xm430-w350, mx-28 or another name
+    that scan prints; sts, hls or scs for Feetech servos that it only numbers."""
     lerobot_calibration: Path | None = None
     """LeRobot's calibration of this arm (.json): its ids, directions, homing offsets and ranges are
     taken instead of guesses."""
@@ -50,7 +46,7 @@ class InitRobot:
     def run(self) -> None:
         """Read the model, write the map, print the next commands."""
         from pupper_sysid.hardware.joint_calibration import read_lerobot
-        from pupper_sysid.sim.robot.robot_map import joint_map_of, joint_map_of_servos
+        from pupper_sysid.sim.robot.robot_map import FAMILIES, joint_map_of, joint_map_of_servos
 
         lerobot = read_lerobot(self.lerobot_calibration) if self.lerobot_calibration else None
         if self.model is not None and self.joints is None:
@@ -121,8 +117,7 @@ class InitRobot:
                 f"{margin[k]:.2f}",
             )  # fmt: skip
         terminal.out.print(table)
-        feetech = self.servo.startswith(("sts", "scs", "hd"))
-        bus = f"{'feetech' if feetech else 'dynamixel'}:/dev/ttyUSB0"
+        bus = f"{FAMILIES[self.servo.lower()].name}:/dev/ttyUSB0"
         quoted = terminal.command(target)
         terminal.out.print(
             "Ids, signs and centres are guesses. Ids and signs are for you to check: with the "

@@ -20,7 +20,7 @@ from pupper_sysid.hardware.safety.watchdog import HANG_S
 from pupper_sysid.hardware.safety.watchdog_process import restore
 from pupper_sysid.hardware.serial_servos.scan import LineReport
 
-_USB_PORTS = ("ttyUSB", "ttyACM", "ttyAMA", "ttySC", "cu.usb", "COM")
+_SERVO_PORTS = ("ttyUSB", "ttyACM", "ttyAMA", "ttySC", "cu.usb", "COM")
 
 
 @dataclass(frozen=True)
@@ -144,8 +144,11 @@ def serial_ports() -> list[str]:
     """Serial ports to which a servo adapter may be connected."""
     from serial.tools.list_ports import comports
 
-    devices = sorted(port.device for port in comports())
-    return [device for device in devices if Path(device).name.startswith(_USB_PORTS)]
+    paths = [Path(port.device) for port in comports()]
+    return sorted(
+        str(path) for path in paths
+        if path.name.startswith(_SERVO_PORTS) and (os.name == "nt" or path.is_char_device())
+    )  # fmt: skip
 
 
 def _tried(device: str, advance: Callable[[str], None]) -> LineReport | str:

@@ -241,15 +241,21 @@ def test_two_different_answers_of_one_servo_in_a_sync_read_are_none():
 
 
 def test_servos_that_cannot_be_driven_are_left_alone_and_the_refusal_says_which(monkeypatch):
-    def model(*number: int):
+    def model(*number: int, firmware: int = 3):
         servos = still_servos()
         servos.servos[2].memory[3:5] = bytes(number)
+        servos.servos[2].memory[0] = firmware
         return servos
 
     for servos, joints, patience_s, words in (
         (still_servos(ids=[]), None, 0.003, "no servo answers at 1000000 baud (tried ids 1 to 12"),
         (still_servos(ids=[4]), ["LF_hip", "LF_thigh"], 0.1, "LF_thigh (id 5) does not answer"),
-        (model(0x39, 5), None, 0.4, "servo 2 has the model number 1337, which is not known"),
+        (
+            model(0x39, 5, firmware=8),
+            None,
+            0.4,
+            "servo 2 has the model number 1337, which is not known",
+        ),
         (model(5, 4), None, 0.4, "SCS0009, STS3215) share the line"),
     ):
         monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", patience_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -14,9 +15,20 @@ import pytest
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.bus import header_entries
-from pupper_sysid.hardware.feetech import SCS0009, STS3215, FeetechBus
+from pupper_sysid.hardware.feetech import (
+    FAMILY,
+    HD1910,
+    HLS3625,
+    SCS0009,
+    SERIES,
+    STS3215,
+    FeetechBus,
+    profile,
+)
+from pupper_sysid.hardware.joint_map import joint_map_from
 from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
 from pupper_sysid.hardware.serial_servos import line as serial_line
+from pupper_sysid.hardware.serial_servos.scan import scan_line
 from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
 from support.servo_servers import (
     bench_of,
@@ -177,3 +189,73 @@ def test_the_watchdog_sets_registers_and_protections_back_if_the_driver_is_kille
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     assert wait_until(lambda: protection(sts) == OFF and p_of(sts) == 32)
+
+
+def hls(**registers: int):
+    """An HLS servo, id 4, with a model number that no source has."""
+    servos = still_servos(HD1910, [4])
+    for name, value in ({"model": 0x7A0A} | registers).items():
+        servos._set(4, name, value)
+    return servos
+
+
+def hls_bus(server) -> FeetechBus:
+    data = map_of(4).file.model_dump(by_alias=True) | {"servo": "HLS"}
+    layout = joint_map_from(data, "an HLS").per_servo().select(["LF_hip"])
+    return FeetechBus(server.device, 1_000_000, layout)
+
+
+def test_a_servo_without_a_known_number_is_of_the_series_that_its_firmware_shows():
+    servos = hls()
+    memory = bytes(servos.servos[4].memory)
+    with on_a_port(servos) as server:
+        report = scan_line(FAMILY, server.device, 1_000_000).servos[0]
+        bus = GuardedBus(hls_bus(server))
+        assert bus.bus.servo_setups()["LF_hip"]["model"] == "HLS"
+        assert bus.torque(True)
+        # address 34 to 36 are gains here, and were three protections of an STS servo
+        now = bytes(servos.servos[4].memory)
+        assert now[34:40] == memory[34:40] and now[19] == 13
+        bus.close()
+    assert report.model == "HLS (31242)" and report.gains == (32, 40, 0)
+
+
+@pytest.mark.parametrize(
+    ("registers", "sentence", "refused"),
+    [
+        ({"goal_current": 0}, "goal_current (address 44) is 0: the motor gets no current", True),
+        ({"goal_speed": 0}, "goal_speed (address 46) is 0: by the vendor's table", False),
+        ({"mode": 2}, "mode (address 33) is 2: ", True),
+        ({"homing_offset": -3000}, "(its register homing_offset is -3000)", True),
+    ],
+)
+def test_registers_with_which_an_hls_servo_does_not_move_are_judged(registers, sentence, refused):
+    servos = hls(phase=16, **registers)
+    with on_a_port(servos) as server:
+        bus = hls_bus(server)
+        remarks = " ".join(bus.remarks())
+        assert sentence in remarks and "goal_time" not in remarks
+        if refused:
+            with pytest.raises(BusError, match="torque was not switched on"):
+                GuardedBus(bus).torque(True)
+        bus.close()
+
+
+def test_a_speed_of_the_set_point_is_in_the_unit_of_the_series():
+    # counts/s per unit: 1 of STS whose phase says so and of SCS, else 50
+    cases = ((STS3215, 12, 1), (STS3215, 8, 50), (HLS3625, 12, 50), (SCS0009, 0, 1))
+    for series, phase, counts_s in cases:
+        speed = profile(series, {"goal_speed": 20, "phase": phase}).speed_rad_s
+        turn = 1024 * 1.2 if series is SCS0009 else 4096
+        assert speed == pytest.approx(20 * counts_s * 2 * math.pi / turn)
+
+
+def test_every_feetech_servo_of_the_vendors_list_has_the_registers_of_its_series():
+    # (3, 4) of the memory: number as little endian; LeRobot has 777, 2825, 1284 and 3338
+    names = {number: SERIES[number].name for number in (777, 2825, 4 << 8 | 5, 3338)}
+    assert names == {777: "STS3215", 2825: "STS3250", 1029: "SCS0009", 3338: "HLS3625"}
+    assert SERIES[1029].model == 1284 and SERIES[0x0209].name == "STS3032"
+    for series in SERIES.values():
+        assert series.has("goal_current") == series.name.startswith("HLS")
+        assert series.has("protective_torque") == series.name.startswith(("STS", "HTS"))
+        assert series.big_endian == series.name.startswith("SCS")

@@ -106,6 +106,48 @@ def test_a_joint_map_needs_neither_sound_inertias_nor_declared_prefixes():
     assert "limits of pan, tilt are 0 to 0" in robot.doubts[0]
 
 
+@pytest.mark.parametrize(
+    ("original", "other"),
+    [
+        ('izz="1e-4"', ""),  # a mass without an inertia
+        ("package://arm/", "package:/arm/"),
+        ('<axis xyz="0 0 1"/>', '<origin rpy="0, 0, 1"/><axis xyz="0 0 1"/>'),
+        ('<child link="l1"/>', '<child link="missing"/>'),
+        ("</robot>", '<transmission><joint name="pan"/></transmission></robot>'),
+    ],
+)
+def test_a_urdf_that_mujoco_refuses_still_states_its_joints(original, other):
+    text = urdf(("pan", -1, 1, ""), mesh=MESH)
+    assert original in text
+    robot = robot_of(text.replace(original, other))
+    assert robot.joint_map.joint_names == ("pan",) and robot.doubts == []
+
+
+def test_a_urdf_joint_without_limits_has_the_servos_own_range():
+    spun = JOINT.format("spun", "l0", "l1", 0, 0, "").replace("revolute", "continuous")
+    endless = JOINT.format("endless", "l1", "l2", "-1e16", "1e16", "")
+    robot = robot_of(f'<robot name="arm">{spun}{endless}</robot>')
+    for entry in robot.joint_map.file.joints.values():
+        assert entry.limits_rad == pytest.approx((-3.11, 3.11), abs=0.01)
+    assert robot.doubts == []
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (urdf(("pan", "${-pi}", "${pi}", "")), "xacro FILE > robot.urdf"),
+        ('<robot xmlns:xacro="http://ros.org/wiki/xacro"><xacro:arm/></robot>', "xacro FILE"),
+        (urdf(("pan", -1, 1, ""), ("pan", -1, 1, "")), "two joints are called 'pan'"),
+        (urdf(("pan", "nan", 1, "")), "the range of joint pan is not two rising numbers"),
+        (urdf(("pan", 1, -1, "")), "the range of joint pan is not two rising numbers"),
+    ],
+)
+def test_a_urdf_that_states_no_robot_is_refused_with_the_reason(text, words):
+    with pytest.raises(InputError) as refused:
+        robot_of(text)
+    assert words in str(refused.value)
+
+
 def test_an_mjcf_is_read_without_its_textures_and_height_fields():
     robot = robot_of(
         f"""<mujoco><asset><texture name="t" type="2d" file="absent.png"/>
@@ -172,6 +214,7 @@ def test_a_line_with_other_homing_offsets_than_lerobots_is_refused(capsys, monke
     [
         ([], "must map joints to entries"),
         ({"pan": 3}, "pan must have drive_mode"),
+        ({"homing_offset": [2048], "drive_mode": [0], "motor_names": ["pan"]}, "an older LeRobot"),
         ({"pan": FOLLOWER["pan"] | {"drive_mode": 2}}, "drive_mode"),
         ({"pan": FOLLOWER["pan"] | {"range_max": 900}}, "was not moved through its range"),
         ({"pan": FOLLOWER["pan"], "tilt": FOLLOWER["pan"]}, "two joints have the same id"),
