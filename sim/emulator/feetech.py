@@ -39,9 +39,13 @@ class FeetechEmulator(LineEmulator):
     family = FAMILY
     memory_bytes = 80
     factory: ClassVar = {
-        "SCS0009": _SCS0009, "STS3215": _STS3215, "HLS3625": _HLS,
-        "HD-1910": _HLS | {"mode": 4},
-    }  # fmt: skip
+        series.name: _SCS0009
+        if series.big_endian
+        else _HLS
+        if series.has("goal_current")
+        else _STS3215
+        for series in FAMILY.series.values()
+    } | {"HD-1910": _HLS | {"mode": 4}}
 
     def _new_reader(self) -> FrameReader:
         return FrameReader()

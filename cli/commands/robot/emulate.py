@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -25,10 +25,10 @@ from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.reading.dialect import whole
 from pupper_sysid.hardware.address import SOCKET
-from pupper_sysid.hardware.feetech import BAUD_RATES, SCS0009, STS3215
+from pupper_sysid.hardware.feetech import BAUD_RATES, FAMILY, STS3215
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
-from pupper_sysid.hardware.serial_servos.series import Series
+from pupper_sysid.hardware.serial_servos.series import Family, Series
 from pupper_sysid.sim.emulator import pendulum
 from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator, ProxySocket
@@ -167,8 +167,9 @@ class Feetech(SerialLine):
     Example: pupper-sysid emulate feetech --model sts3215 --ids 1-12
     """
 
-    model: Literal["sts3215", "scs0009"] = "sts3215"
-    """Which servos."""
+    model: str | None = None
+    """Which servos: sts3215, scs0009, or any that init-robot knows with the joint map of it; by
+    default those of the joint map, or sts3215."""
     backlash: float = 0.0
     """With --load: play of its gears [degrees]."""
     imu_socket: Path | None = None
@@ -177,17 +178,23 @@ class Feetech(SerialLine):
     def run(self) -> None:
         """Serve until Ctrl-C."""
         rng = np.random.default_rng(self.seed)
-        series = STS3215 if self.model == "sts3215" else SCS0009
-        preset = "sts3215" if series is STS3215 else "mini_pupper_2_direct"
+        layout = load_joint_map(self.joint_map) if self.joint_map else None
+        series = _series_of(FAMILY, self.model, layout, STS3215)
+        preset = FAMILY.presets.get(series.name)
+        if layout is None and preset is None:
+            raise InputError(
+                f"--model {self.model}: add --joint-map; `pupper-sysid init-robot --servo "
+                f"{series.name.lower()} --joints pan=1,tilt=2` makes one."
+            )
         if self.load:
             preset = pendulum.BENCH_MAP
-            if series is not STS3215 or self.walking:
+            if series != STS3215 or self.walking:
                 raise InputError(
                     "--load is a bench with one STS3215: leave out --model, --walking."
                 )
         elif self.backlash:
             raise InputError("--backlash is of a bench: add --load (or --load none).")
-        layout = load_joint_map(self.joint_map or preset)
+        layout = layout or load_joint_map(str(preset))
         registers = parse_servo_registers(self.registers, series)
         moves = any(
             name in pendulum.FEETECH_REGISTERS for by_name in registers.values() for name in by_name
@@ -216,7 +223,7 @@ class Feetech(SerialLine):
             spec = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
             robot = draw_robot(rng, spec, layout if self.joint_map else None)
             bench = _bench(self, robot, layout, rng)
-        usual = 1_000_000 if series is STS3215 else 500_000
+        usual = 500_000 if series.big_endian else 1_000_000
         emulator = self.line(
             FeetechEmulator, series, bench, rng, usual if self.baud is None else self.baud
         )
@@ -236,8 +243,9 @@ class Dynamixel(SerialLine):
     Example: pupper-sysid emulate dynamixel --model xm430-w350
     """
 
-    model: Literal["xl330-m288", "xl430-w250", "xm430-w350", "xm430-w210", "mx-28"] = "xl330-m288"
-    """Which servos."""
+    model: str | None = None
+    """Which servos: xl330-m288, xl430-w250, xm430-w350, xm430-w210, mx-28; by default those of the
+    joint map, or xl330-m288."""
 
     def run(self) -> None:
         """Serve until Ctrl-C."""
@@ -248,25 +256,34 @@ class Dynamixel(SerialLine):
             raise InputError("--walking: the Mini Pupper that walks has no Dynamixel servos.")
         self.refuse_outside(table.BAUD_RATES)
         rng = np.random.default_rng(self.seed)
-        series = next(s for s in table.SERIES.values() if s.name == self.model.upper())
         place, own_map = self.place(), self.joint_map
+        layout = load_joint_map(own_map) if own_map else None
+        series = _series_of(table.FAMILY, self.model, layout, table.SERIES[1200])
         if own_map is None:
             own_map = f"{place}.joints.yaml"
             one = load_joint_map(pendulum.BENCH_MAP).file.model_dump(by_alias=True)
-            one |= {"servo": series.name, "name": f"one {series.name} on a bench"}
+            name = f"one {series.name} on a bench"
+            source = f"{name}: 360 degrees over 4096 counts; limits: 2.6 rad to both sides"
+            one |= {"servo": series.name, "name": name, "source": source}
             joint_map_from(one, own_map).save(Path(own_map), force=True)
-        layout = load_joint_map(own_map)
-        if layout.file.servo != series.name:
-            raise InputError(
-                f"--joint-map {own_map} is of {layout.file.servo or 'servos without a name'}; "
-                f"choose --model, or make one with `pupper-sysid init-robot --servo {self.model}`."
-            )
+        layout = layout or load_joint_map(own_map)
         spec = pendulum.dynamixel_bench(series.name)
         bench = self.on_bench(rng, spec, layout)
         emulator = self.line(
             DynamixelEmulator, series, bench, rng, 1_000_000 if self.baud is None else self.baud
         )
         _serve_line(replace(self, link=place), emulator, bench, ".", own_map)
+
+
+def _series_of(family: Family, model: str | None, layout: JointMap | None, usual: Series) -> Series:
+    """Series that is emulated: the one chosen, or that of the joint map."""
+    of_map = layout.file.servo if layout else None
+    known = {s.name.lower(): s for s in (*family.series.values(), *family.profiles.values())}
+    name = (model or of_map or usual.name).lower()
+    if name not in known or (of_map and name != of_map.lower()):
+        whose = f"; the joint map is of {of_map}" if of_map else ""
+        raise InputError(f"--model {name}: choose one of {', '.join(known)}{whose}.")
+    return known[name]
 
 
 Emulate = (
