@@ -395,6 +395,7 @@ class DynamixelLine(SerialLine):
     longest_return_delay_s = 0.00051  # 254 units of 2 µs
     model_bytes = 3  # model number and firmware, in the reply to a ping
     rates_in_words = "57600, 115200, 1000000, 2000000, 3000000 or 4000000"
+    unused_id = HIGHEST_ID
     torque_address = _TORQUE
 
     def __init__(self, device: str, baud: int, exclusive: bool = True):
@@ -486,7 +487,7 @@ class DynamixelLine(SerialLine):
 
     def echo_probe(self) -> bytes:
         """A request to which no servo answers."""
-        return Frame(HIGHEST_ID, PING, b"").encode()
+        return Frame(self.unused_id, PING, b"").encode()
 
     def _reader(self, accepted: Callable[[int, int], bool]) -> FrameReader:
         return FrameReader(accepted, status=True)

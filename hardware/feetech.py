@@ -339,6 +339,7 @@ class FeetechLine(SerialLine):
     longest_return_delay_s = 0.00051  # 254 units of 2 µs
     model_bytes = 2
     rates_in_words = "1000000, 500000, 250000, 128000, 115200, 57600 or 38400"
+    unused_id = HIGHEST_ID
     torque_address = TORQUE_ADDRESS
 
     def __init__(self, device: str, baud: int, exclusive: bool = True):
@@ -368,7 +369,7 @@ class FeetechLine(SerialLine):
 
     def echo_probe(self) -> bytes:
         """A request to which no servo answers."""
-        return Frame(BROADCAST_ID - 1, PING, b"").encode()
+        return Frame(self.unused_id, PING, b"").encode()
 
     def _reader(self, accepted: Callable[[int, int], bool]) -> FrameReader:
         return FrameReader(lambda servo, length: accepted(servo, length - 2))

@@ -30,7 +30,7 @@ from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.joint_map import JointMap
 from pupper_sysid.hardware.loop import HostClock
 from pupper_sysid.hardware.serial_servos import scan, settings
-from pupper_sysid.hardware.serial_servos.line import Reply, slow_adapter
+from pupper_sysid.hardware.serial_servos.line import Reply, line_remarks
 from pupper_sysid.hardware.serial_servos.scan import LineReport
 from pupper_sysid.hardware.serial_servos.series import Family, Series
 from pupper_sysid.hardware.serial_servos.settings import RegisterFault
@@ -175,8 +175,7 @@ class SerialBus(HostClock):
 
     def remarks(self) -> list[str]:
         """Sentences about the line and all registers that are not as they should be."""
-        slow = slow_adapter(self.line)
-        return ([slow] if slow else []) + [sentence for _, sentence in self._faults()]
+        return line_remarks(self.line) + [sentence for _, sentence in self._faults()]
 
     def write(self, position_rad: NDArray[np.float64]) -> Sent:
         """Send commands to all servos in one frame."""

@@ -103,6 +103,8 @@ class SerialLine(ABC):
     """Data of the reply to `ask_model`; the first two are the model number."""
     rates_in_words: str
     """Rates that the SDK can set."""
+    unused_id: int
+    """At which no servo is expected."""
     torque_address: int
     """Of the register that switches a servo's torque."""
     _packets: Any
@@ -116,6 +118,8 @@ class SerialLine(ABC):
         """Replies by id, of exchanges with one servo."""
         self.garbled: Counter[int] = Counter()
         """Exchanges with one servo that gave bytes and no frame, or two different ones."""
+        self.chatters = False
+        """Whether bytes come that belong to no reply, as far as `doubled` has seen."""
         self._port = self._new_port(device, baud, exclusive)
         self._fastest_s: dict[tuple[int, ...], float] = {}
         self._retry_s = self._busy_s = 0.0
@@ -293,7 +297,8 @@ class SerialLine(ABC):
 
         Two servos of one id answer at the same time, and destroy each other's replies, at the
         registers at `address` in which they differ: their positions. Suspects are read again,
-        patiently: a late or half reply is no sign of a second servo.
+        patiently: a late or half reply is no sign of a second servo, nor are bytes that come from
+        an id without a servo, too (`chatters`).
         """
         suspects = [servo for servo in servos if self.garbled[servo] >= _GARBLED_AT_LEAST]
         others = [servo for servo in servos if servo not in suspects]
@@ -301,16 +306,18 @@ class SerialLine(ABC):
         if noisy > sum(self.answered[servo] for servo in others) / 20:
             return []
         usual_s, self.patience_s = self.patience_s, max(self.patience_s, SLOWEST_ADAPTER_S)
-        doubled = []
-        for servo in suspects:
+
+        def is_garbled(servo: int) -> bool:
             before = self.garbled[servo]
             for _ in range(_CONFIRMED_BY):
                 self._arrived(_CONFIRMED_BY * self.reply_bytes)  # what is late, to be discarded
                 self.read(servo, address, size)
-            if self.garbled[servo] - before >= _CONFIRMED_BY / 2:
-                doubled.append(servo)
+            return self.garbled[servo] - before >= _CONFIRMED_BY / 2
+
+        doubled = [servo for servo in suspects if is_garbled(servo)]
+        self.chatters = bool(doubled) and is_garbled(self.unused_id)
         self.patience_s = usual_s
-        return doubled
+        return [] if self.chatters else doubled
 
     def close(self) -> None:
         """Release the port; may be called twice."""
@@ -525,6 +532,16 @@ def latency_timer_s(device: str) -> float | None:
         return float(_latency_timer(device).read_text()) / 1e3
     except (OSError, ValueError):
         return None
+
+
+def line_remarks(line: SerialLine) -> list[str]:
+    """Sentences about bytes that no servo sent, and about an adapter that delays replies."""
+    slow = slow_adapter(line)
+    chatter = (
+        f"{line.device}: bytes come that belong to no reply, and some readings are lost to them. "
+        "Another program may use the line, or the adapter's own firmware writes to it."
+    )
+    return [chatter] * line.chatters + ([slow] if slow else [])
 
 
 def slow_adapter(line: SerialLine) -> str | None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pupper_sysid.common.data_sheet import data_sheet
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
-from pupper_sysid.hardware.serial_servos.line import SerialLine, slow_adapter
+from pupper_sysid.hardware.serial_servos.line import SerialLine, line_remarks
 from pupper_sysid.hardware.serial_servos.series import Family, Series, bits_in_words
 from pupper_sysid.hardware.serial_servos.settings import (
     memory_of,
@@ -94,8 +94,7 @@ def scan_line(
                 where, size = known.register(family.present).address, family.reading_bytes[0]
                 doubled = line.doubled(list({*answering, *line.garbled}), where, size)
                 remarks += [two_of_one_id(line, servo) for servo in doubled]
-            if slow := slow_adapter(line):
-                remarks.append(slow)
+            remarks += line_remarks(line)
         finally:
             line.close()
     if not servos:

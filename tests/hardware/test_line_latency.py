@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from threading import Event, Thread
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +18,7 @@ from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.dynamixel import FAMILY as DYNAMIXEL_FAMILY
 from pupper_sysid.hardware.feetech import FAMILY, FeetechBus
 from pupper_sysid.hardware.serial_servos import line as serial_line
-from pupper_sysid.hardware.serial_servos.line import slow_adapter
+from pupper_sysid.hardware.serial_servos.line import line_remarks, slow_adapter
 from pupper_sysid.hardware.serial_servos.scan import scan_line
 from pupper_sysid.sim.emulator.serial_line import SerialPty
 from support.command_line import json_of, run
@@ -88,6 +90,40 @@ def test_no_servo_is_missed_in_20_scans_whatever_the_adapter(known, latency_ms):
             for _ in range(20)
         ]
     assert listed == [list(range(1, 13))] * 20
+
+
+@contextmanager
+def chatter(server: SerialPty, text: bytes) -> Iterator[None]:
+    """An adapter whose own firmware writes to the line."""
+    ended = Event()
+
+    def write() -> None:
+        while not ended.wait(0.003):
+            with suppress(OSError):
+                os.write(server._host, text)
+
+    writer = Thread(target=write)
+    writer.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        writer.join()
+
+
+@pytest.mark.parametrize("text", [b"boot ok\r\n", b"\xff\xff\x01", b"\xff\xff\xfd\x00"])
+@pytest.mark.parametrize("family", [FAMILY, DYNAMIXEL_FAMILY], ids=lambda family: family.name)
+def test_a_chatty_adapter_is_no_second_servo_of_an_id(family, text):
+    servos = still_servos(ids=[1, 2]) if family is FAMILY else still_dynamixels([1, 2])
+    register = servos.series.register("present_position")
+    with on_a_port(servos) as server:
+        line = family.open_line(server.device, 1_000_000, True)
+        with chatter(server, text):
+            assert list(line.find([1, 2])) == [1, 2]
+            line.garbled[9] = 5  # as after a scan of the gaps between ids
+            assert line.doubled([1, 2, 9], register.address, register.size) == []
+        assert "bytes come that belong to no reply" in line_remarks(line)[0]
+        line.close()
 
 
 def test_scan_without_a_bus_tries_every_port_and_says_what_answers_where(capsys, monkeypatch):
