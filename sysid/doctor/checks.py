@@ -13,7 +13,6 @@ each joint in a process of its own, with its own seed.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePath
@@ -55,7 +54,6 @@ LEAST_ROWS = 3
 _FEW_MISSING, _MANY_MISSING = 0.02, 0.5
 _LEAST_FRESH = 16
 _MANY_BAD = 0.05  # share of the readings
-_COUNT_RAD = {"STS3215": math.tau / 4096, "SCS0009": math.radians(300) / 1024}
 _LEAST_LAG_S = 0.002
 _SERVO_RAD_S = 7.5  # no servo of this size follows a faster set-point
 _OVER_S = 0.1
@@ -70,16 +68,18 @@ def setup_findings(setup: ServoSetup, speed_rad_s: float = _SERVO_RAD_S) -> list
     `speed_rad_s`: speed of the fast parts of the motion [rad/s].
     """
     found, registers = [], setup.registers
-    count_rad = _COUNT_RAD.get(setup.model or "", _COUNT_RAD["STS3215"])
+    dynamixel = "profile_velocity" in registers
     limit = setup.set_point_acceleration_rad_s2
     if limit is not None and (lag_s := speed_rad_s / (2 * limit)) > _LEAST_LAG_S:
         said = f"{limit:.1f} rad/s², a lag of up to {1e3 * lag_s:.0f} ms at {speed_rad_s:.1f} rad/s"
-        found.append(_shaped("acceleration", registers["acceleration"], said, "0"))
-    speed = registers.get("goal_speed", 0)
-    if 0 < speed * count_rad < _SERVO_RAD_S:
-        found.append(_shaped("goal_speed", speed, f"{speed * count_rad:.2f} rad/s", "0"))
+        name = "profile_acceleration" if dynamixel else "acceleration"
+        found.append(_shaped(name, registers.get(name, 0), said, "0"))
+    speed = setup.set_point_speed_rad_s
+    if speed is not None and speed < _SERVO_RAD_S:
+        name = "profile_velocity" if dynamixel else "goal_speed"
+        found.append(_shaped(name, registers.get(name, 0), f"{speed:.2f} rad/s", "0"))
     duration = registers.get("goal_time", 0)
-    if duration > 0 and speed == 0:
+    if duration > 0 and speed is None:
         found.append(_shaped("goal_time", duration, f"{duration} ms for each command", "0"))
     return found
 

@@ -52,8 +52,20 @@ class ServoSetup(BaseModel):
         if units is None:
             unlimited = math.inf if "profile_velocity" in self.registers else None
             return (self.model_extra or {}).get("set_point_acceleration_rad_s2", unlimited)
-        counts = counts_of(self.model or "STS3215") or 4096.0
-        return 100 * units * math.tau / counts if units else math.inf
+        return 100 * units * self._count_rad if units else math.inf
+
+    @property
+    def set_point_speed_rad_s(self) -> float | None:
+        """Largest speed of the set-point by the servo's registers [rad/s]; None for no limit.
+
+        The header has the number, or Feetech's register `goal_speed`, in counts/s.
+        """
+        speed = self.registers.get("goal_speed", 0) * self._count_rad
+        return (self.model_extra or {}).get("set_point_speed_rad_s", speed or None)
+
+    @property
+    def _count_rad(self) -> float:
+        return math.tau / (counts_of(self.model or "STS3215") or 4096.0)
 
 
 class PendulumLoad(BaseModel):

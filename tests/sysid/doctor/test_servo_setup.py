@@ -34,6 +34,18 @@ def test_the_largest_acceleration_that_lerobot_writes_counts_in_fast_motion_only
     assert "39.0 rad/s², a lag of up to 19 ms at 1.5 rad/s" in found.text
 
 
+def test_the_limits_that_a_header_states_are_named_by_the_registers_of_its_servo():
+    registers = {"profile_velocity": 100, "profile_acceleration": 20}
+    stated = {"set_point_speed_rad_s": 2.4, "set_point_acceleration_rad_s2": 7.5}
+    setup = ServoSetup(model="XL330-M288", registers=registers, **stated)
+    texts = [found.text for found in setup_findings(setup, 1.5)]
+    assert "profile_acceleration" in texts[0] and "7.5 rad/s²" in texts[0]
+    assert "profile_velocity" in texts[1] and "2.40 rad/s" in texts[1]
+    unlimited = ServoSetup(model="XL330-M288", registers=dict.fromkeys(registers, 0))
+    assert setup_findings(unlimited, 1.5) == []
+    assert unlimited.set_point_acceleration_rad_s2 == np.inf
+
+
 def test_the_speed_is_that_of_the_recorded_motion():
     time = 0.02 * np.arange(500)
     for amplitude, named in ((0.01, False), (0.5, True)):
