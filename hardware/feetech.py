@@ -82,6 +82,7 @@ _COMMON = {
 
 
 _MAGNETIC = _COMMON | {
+    "min_start_force": Register(24),  # the byte behind it limits the integral, on newer firmware
     "protection_current": Register(28, 2),
     "mode": Register(33),
     "goal_position": Register(42, 2, 15),

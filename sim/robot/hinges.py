@@ -111,7 +111,7 @@ def _read(path: str) -> list[Hinge]:
 
 
 def _of_urdf(root: Element) -> list[Hinge]:
-    """Hinges of a URDF in the order of the file."""
+    """Hinges of a URDF, each limb from its base on, whatever the order of the file."""
     tags = (element.tag for element in root.iter() if isinstance(element.tag, str))
     values = (
         value for joint in root.iter("joint") for e in joint.iter() for value in e.attrib.values()
@@ -121,7 +121,7 @@ def _of_urdf(root: Element) -> list[Hinge]:
     ):
         raise ValueError("it is a xacro file, to be expanded: `xacro FILE > robot.urdf`")
     found: list[Hinge] = []
-    for joint in root.findall("joint"):
+    for joint in _from_the_base_on(root.findall("joint")):
         kind, limit = joint.get("type"), joint.find("limit")
         if kind not in ("revolute", "continuous"):
             continue
@@ -140,6 +140,26 @@ def _of_urdf(root: Element) -> list[Hinge]:
                   not follows, follows, zero)
         )  # fmt: skip
     return found
+
+
+def _from_the_base_on(joints: list[Element]) -> list[Element]:
+    """Joints depth first, as MuJoCo has them; those that belong to no tree are the last."""
+
+    def link(joint: Element, end: str) -> str | None:
+        found = joint.find(end)
+        return None if found is None else found.get("link")
+
+    moved = {link(joint, "child") for joint in joints}
+    waiting = [joint for joint in joints if link(joint, "parent") not in moved][::-1]
+    ordered: list[Element] = []
+    while waiting:
+        joint = waiting.pop()
+        if joint in ordered:  # a loop
+            continue
+        ordered.append(joint)
+        child = link(joint, "child")
+        waiting += [other for other in joints if link(other, "parent") == child][::-1]
+    return ordered + [joint for joint in joints if joint not in ordered]
 
 
 def _number(text: str) -> float | None:

@@ -11,6 +11,7 @@ import pytest
 from pupper_sysid.hardware.dynamixel import (
     ACCESS,
     DATA_LIMIT,
+    MODELS,
     Frame,
     FrameReader,
     crc16,
@@ -226,3 +227,9 @@ def test_the_vendors_sdk_reads_writes_and_groups(served, monkeypatch):
     finally:
         port.closePort()
     assert bench_of(servos).goals[-2:] == [(1, 2000), (2, 2200)]
+
+
+def test_model_numbers_are_those_of_the_vendors_drivers():
+    # read in Robotis' ROS driver; 1110 is an XH540, not the XH430-W350
+    stated = {1000: "XH430-W350", 1110: "XH540-W150", 1240: "XC330-M288", 1220: "XC330-T288"}
+    assert {number: MODELS[number] for number in stated} == stated

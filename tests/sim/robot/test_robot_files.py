@@ -123,6 +123,14 @@ def test_a_urdf_that_mujoco_refuses_still_states_its_joints(original, other):
     assert robot.joint_map.joint_names == ("pan",) and robot.doubts == []
 
 
+def test_a_urdf_is_numbered_from_the_base_on_whatever_the_order_of_its_file():
+    joints = [JOINT.format(name, f"l{k}", f"l{k + 1}", -1, 1, "") for k, name in enumerate("abc")]
+    joints.append(JOINT.format("d", "l1", "l9", -1, 1, ""))  # a second limb, from a's link on
+    loop = JOINT.format("e", "l8", "l8", -1, 1, "")
+    robot = robot_of(f'<robot name="arm">{loop}{"".join(reversed(joints))}</robot>')
+    assert robot.joint_map.joint_names == ("a", "d", "b", "c", "e")
+
+
 def test_a_urdf_joint_without_limits_has_the_servos_own_range():
     spun = JOINT.format("spun", "l0", "l1", 0, 0, "").replace("revolute", "continuous")
     endless = JOINT.format("endless", "l1", "l2", "-1e16", "1e16", "")
