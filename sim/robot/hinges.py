@@ -97,15 +97,15 @@ def _read(path: str) -> list[Hinge]:
 
     model = _model(mujoco, path)
     hinges = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
-    leaders = _leaders(model, mujoco)
-    driven = _driven(model, mujoco) if model.nu else set(hinges) - set(leaders)
+    led = leaders(model)
+    driven = driven_joints(model) if model.nu else set(hinges) - set(led)
     zero = set() if root is None else _zero_ranges(root)
     found = []
     for j in hinges:
         low, high = (float(x) if abs(x) < 1e6 else None for x in model.jnt_range[j])
         limited = bool(model.jnt_limited[j])
         name = model.joint(j).name
-        follows = model.joint(leaders[j]).name if j in leaders else ""
+        follows = model.joint(led[j]).name if j in led else ""
         found.append(Hinge(name, limited, low, high, j in driven, follows, name in zero))
     return found
 
@@ -203,8 +203,10 @@ def _model(mujoco, path: str):
         raise reason from None
 
 
-def _leaders(model, mujoco) -> dict[int, int]:
+def leaders(model: Any) -> dict[int, int]:
     """Joints that follow another by an active equality, and which."""
+    from pupper_sysid.sim.robot.engine import mujoco
+
     return {
         int(model.eq_obj1id[k]): int(model.eq_obj2id[k])
         for k in range(model.neq)
@@ -232,8 +234,10 @@ def _bound(text: bytes) -> bytes:
     return re.sub(rb"<(robot|mujoco)\b", lambda begin: begin[0] + declared, text, count=1)
 
 
-def _driven(model, mujoco) -> set[int]:
-    """Joints that an actuator drives."""
+def driven_joints(model: Any) -> set[int]:
+    """Joints that an actuator drives, by itself or through a tendon."""
+    from pupper_sysid.sim.robot.engine import mujoco
+
     found: set[int] = set()
     trn = mujoco.mjtTrn
     for kind, (target, _) in zip(model.actuator_trntype, model.actuator_trnid, strict=True):

@@ -29,6 +29,7 @@ from pupper_sysid.common.files import sha256
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.robot.body import Body, fixed_offsets
 from pupper_sysid.sim.robot.engine import mujoco
+from pupper_sysid.sim.robot.hinges import driven_joints, leaders
 from pupper_sysid.sim.robot.mini_pupper import EVALUATION_SOLVER, Physics
 from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
 from pupper_sysid.sim.robot.terrain import Ground
@@ -93,7 +94,7 @@ class _Reader:
             self.spec = mujoco.MjSpec.from_file(str(path))
         except ValueError as error:
             raise InputError(f"{path} is no MJCF that MuJoCo reads: {_line(error)}.") from None
-        self._without_meshes()
+        self._without_shown()
         free = [j for j in self.spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
         if not free or free[0].parent.parent.name != self.spec.worldbody.name:
             bodies = self.spec.worldbody.bodies
@@ -108,90 +109,122 @@ class _Reader:
                 "; a robot has one. Take the others out."
             )
         self.root = free[0].parent
-        if not self.root.name:
-            self.root.name = "trunk"
-        self._of_keyframe = self._keyframe()
-        self.joints = self._servo_joints()
-        self._strip()
+        for k, own_body in enumerate(self.spec.bodies):
+            own_body.name = own_body.name or ("trunk" if own_body is self.root else f"body {k}")
+            own_body.gravcomp = 0.0
+        whole = self._compiled()
+        self.joints = self._servo_joints(whole)
+        self.resting = self._keyframe(whole)
+        self._strip(whole)
         self.model = self._compiled()
-        self.pose, self.low, self.high = self._pose()
+        self.pose, self.low, self.high = self._pose(whole)
         self.data = mujoco.MjData(self.model)
         self._place(self.pose)
         self.feet = self._feet()
 
     # ------------------------------------------------------------------------- the MJCF
 
-    def _without_meshes(self) -> None:
-        """Take out meshes whose files are not there, and all that nothing collides with."""
-        spec, folder = self.spec, self.path.parent / (self.spec.meshdir or "")
-        missing = [
-            m.name or m.file for m in spec.meshes
-            if m.file and not (folder / m.file).is_file() and not Path(m.file).is_file()
-        ]  # fmt: skip
-        lost = []
+    def _without_shown(self) -> None:
+        """Take out what is only shown, and meshes whose files are not there."""
+        spec, types = self.spec, mujoco.mjtGeom
+        folder = (self.path.parent / (spec.meshdir or "")).resolve()
+        missing = {
+            m.name or Path(m.file).stem
+            for m in spec.meshes if m.file and not (folder / m.file).is_file()
+        }  # fmt: skip
+        touching = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+        lost, massless = [], []
         for geom in list(spec.geoms):
-            if geom.type != mujoco.mjtGeom.mjGEOM_MESH:
+            body = geom.parent
+            collides = bool(geom.contype or geom.conaffinity) or geom.name in touching - {""}
+            if collides and not (geom.contype or geom.conaffinity):
+                geom.contype = 1
+            if geom.type != types.mjGEOM_MESH:
                 continue
-            collides = bool(geom.contype or geom.conaffinity)
-            if collides and geom.meshname in missing:
-                lost.append(geom.meshname)
-            if not collides or geom.meshname in missing:
-                spec.delete(geom)
+            weighs = not _states_mass(spec, body) and geom.mass != 0 and geom.density != 0
+            if geom.meshname in missing:
+                lost += [geom.meshname] if collides else []
+                massless += [body.name or "without a name"] if weighs else []
+            elif collides or weighs:
+                continue
+            spec.delete(geom)
+        used = {g.meshname for g in spec.geoms if g.type == types.mjGEOM_MESH}
         for mesh in list(spec.meshes):
-            if mesh.name in missing or (mesh.name or mesh.file) in missing:
+            if (mesh.name or Path(mesh.file).stem) not in used:
                 spec.delete(mesh)
+            elif mesh.file:  # the model with servos is compiled from text, without a folder
+                mesh.file = str(folder / mesh.file)
+        spec.meshdir = ""
+        for material in spec.materials:
+            material.textures = [""] * len(material.textures)
+        for shown in (*spec.skins, *spec.textures):
+            spec.delete(shown)
         if lost:
             self.notes.append(
-                f"Meshes of {self.path.name} that collide are not there ({', '.join(lost[:3])}"
-                f"{', …' if len(lost) > 3 else ''}); the robot was built without them."
+                f"Meshes of {self.path.name} that collide are not there ({_some(lost)}); the robot "
+                f"is built without them. They belong into {folder}."
+            )
+        if massless:
+            self.notes.append(
+                f"Masses of {_some(massless)} come from meshes that are not there and count as 0: "
+                f"put them into {folder}, or give these bodies an <inertial>."
             )
 
-    def _keyframe(self) -> tuple[str, Array] | None:
-        """Name and positions of the keyframe that is the pose."""
-        keys = {key.name: np.array(key.qpos) for key in self.spec.keys}
-        wanted = self.own.pose
+    def _keyframe(self, whole: Any) -> Array:
+        """All positions of the file's joints in the keyframe that is the pose, or at rest."""
+        names, wanted = [whole.key(k).name for k in range(whole.nkey)], self.own.pose
         if isinstance(wanted, str):
-            if wanted not in keys:
+            if wanted not in names:
                 raise InputError(
                     f"{self.where}: {self.path.name} has no keyframe '{wanted}'; it has "
-                    f"{', '.join(keys) or 'none'}. Give angles by joint as `pose` instead."
+                    f"{', '.join(names) or 'none'}. Give angles by joint as `pose` instead."
                 )
-            return wanted, keys[wanted]
-        if wanted is None and keys:
-            name = next(iter(keys))
-            self.notes.append(f"The default pose is the keyframe '{name}' of {self.path.name}.")
-            return name, keys[name]
-        return None
+            return whole.key_qpos[names.index(wanted)].copy()
+        found = whole.qpos0.copy()
+        if isinstance(wanted, dict):
+            hinges = [whole.joint(j).name for j in _hinges(whole)]
+            for pattern, angle in wanted.items():
+                for name in self._matching(pattern, hinges, "pose", "hinge"):
+                    found[whole.joint(name).qposadr[0]] = angle
+        elif names:
+            self.notes.append(f"The default pose is the keyframe '{names[0]}' of {self.path.name}.")
+            return whole.key_qpos[0].copy()
+        else:
+            self.notes.append(
+                f"{self.path.name} has no keyframe and there is no `pose`: the default pose is all "
+                "joints at 0, or at the limit next to it, with which few robots can stand."
+            )
+        return found
 
-    def _servo_joints(self) -> tuple[str, ...]:
-        spec = self.spec
-        hinges = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE]
-        slides = [j.name for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_SLIDE]
+    def _servo_joints(self, whole: Any) -> tuple[str, ...]:
+        hinges = _hinges(whole)
         if not hinges:
             raise InputError(
                 f"{self.path} has no hinge joint: there is nothing for a servo to turn."
             )
-        names = [j.name for j in hinges]
+        names = [whole.joint(j).name for j in hinges]
         if "" in names:
             raise InputError(f"{self.path} has a hinge without a name. Give every joint a name.")
         if self.own.joints is not None:
             chosen = {
                 n for w in self.own.joints for n in self._matching(w, names, "joints", "hinge")
             }
+        elif driven := driven_joints(whole) & set(hinges):
+            chosen = {whole.joint(j).name for j in driven}
         else:
-            at = mujoco.mjtTrn.mjTRN_JOINT
-            chosen = {a.target for a in spec.actuators if a.trntype == at} & set(names)
-            if not chosen:
-                chosen = set(names)
-                self.notes.append(
-                    f"{self.path.name} has no actuators: each of its {len(names)} hinges gets "
-                    "a servo."
-                )
-        self._fixed = [n for n in names if n not in chosen] + slides
-        if self._fixed:
+            chosen = {whole.joint(j).name for j in set(hinges) - set(leaders(whole))}
             self.notes.append(
-                f"Joints without a servo are fixed: {', '.join(self._fixed[:6])}"
-                f"{', …' if len(self._fixed) > 6 else ''}."
+                f"{self.path.name} has no actuators of hinges: each of its {len(chosen)} hinges "
+                "gets a servo."
+            )
+        fixed = [n for n in names if n not in chosen]
+        if fixed:
+            self.notes.append(f"Joints without a servo are fixed: {_some(fixed)}.")
+        if whole.neq:
+            self.notes.append(
+                f"{self.path.name} couples bodies or joints (<equality>: closed linkages, joints "
+                "that follow others). That is taken out: a leg with such a coupling moves "
+                "otherwise than the robot's. Describe it as a chain with a servo on each joint."
             )
         return tuple(n for n in names if n in chosen)
 
@@ -204,55 +237,60 @@ class _Reader:
             )
         return matching
 
-    def _strip(self) -> None:
-        """Take out actuators, sensors, keyframes, tendons, equalities, ground and fixed joints."""
-        spec = self.spec
-        order = self._order_of_keyframe()
+    def _strip(self, whole: Any) -> None:
+        """Take out all but bodies, geoms and joints with a servo; fix the others in their pose."""
+        spec, free = self.spec, mujoco.mjtJoint.mjJNT_FREE
+        spec.option = mujoco.MjSpec().option
         for elements in (spec.actuators, spec.sensors, spec.keys, spec.tendons, spec.equalities,
                          spec.excludes, spec.pairs):  # fmt: skip
             for element in list(elements):
                 spec.delete(element)
         plane, field = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD
-        for geom in list(spec.worldbody.geoms):
+        for geom in list(spec.geoms):
             if geom.type in (plane, field):
                 spec.delete(geom)
-        for joint in list(spec.joints):
-            if joint.name in self._fixed and joint.type != mujoco.mjtJoint.mjJNT_FREE:
-                spec.delete(joint)
-        self._key_pose = order
+        fixed = [j for j in spec.joints if j.type != free and j.name not in self.joints]
+        self._turn(whole, {j.parent.name for j in fixed})
+        for joint in fixed:
+            spec.delete(joint)
         for joint in spec.joints:
-            if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+            if joint.type != free:
                 # the servo's friction, inertia and damping are all of the joint's
                 joint.damping, joint.stiffness = np.zeros(3), np.zeros(3)
                 joint.frictionloss = joint.armature = 0.0
         for k, geom in enumerate(spec.geoms):
-            if not geom.name:
-                geom.name = f"geom_{k}"
+            geom.name = geom.name or f"geom {k}"
 
-    def _order_of_keyframe(self) -> dict[str, float]:
-        """Angles by joint of the keyframe, which is in the order of the file as it is."""
-        if self._of_keyframe is None:
-            return {}
-        model = self._compiled()
-        name, qpos = self._of_keyframe
-        if len(qpos) != model.nq:
-            raise InputError(
-                f"{self.path}: keyframe '{name}' has {len(qpos)} positions, the robot {model.nq}."
-            )
-        return {n: float(qpos[model.joint(n).qposadr[0]]) for n in self.joints}
+    def _turn(self, whole: Any, bodies: set[str]) -> None:
+        """Turn bodies of joints that are fixed as these are in the pose."""
+        data = mujoco.MjData(whole)
+        data.qpos[:] = self.resting
+        for name in self.joints:
+            at = whole.joint(name).qposadr[0]
+            data.qpos[at] = whole.qpos0[at]
+        mujoco.mj_kinematics(whole, data)
+        for name in bodies:
+            at = whole.body(name).id
+            above = int(whole.body_parentid[at])
+            back, place, turn = np.zeros(4), np.zeros(3), np.zeros(4)
+            mujoco.mju_negQuat(back, data.xquat[above])
+            mujoco.mju_rotVecQuat(place, data.xpos[at] - data.xpos[above], back)
+            mujoco.mju_mulQuat(turn, back, data.xquat[at])
+            own_body = self.spec.body(name)
+            own_body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            own_body.pos, own_body.quat = place, turn
 
     def _compiled(self) -> Any:
         try:
             return self.spec.copy().compile()
         except ValueError as error:
             raise InputError(
-                f"{self.path} cannot be simulated: {_line(error)}. If masses come from meshes that "
-                "are not there, give bodies an <inertial>."
+                " ".join([f"{self.path} cannot be simulated: {_line(error)}.", *self.notes])
             ) from None
 
     # ------------------------------------------------------------------------- pose
 
-    def _pose(self) -> tuple[Array, Array, Array]:
+    def _pose(self, whole: Any) -> tuple[Array, Array, Array]:
         model = self.model
         low, high = np.full((2, len(self.joints)), 0.0)
         pose = np.zeros(len(self.joints))
@@ -260,23 +298,17 @@ class _Reader:
             joint = model.joint(name)
             limited = bool(joint.limited[0])
             low[k], high[k] = joint.range if limited else (-np.pi, np.pi)
-            pose[k] = self._key_pose.get(name, float(model.qpos0[joint.qposadr[0]]))
-        if isinstance(self.own.pose, dict):
-            for wanted, angle in self.own.pose.items():
-                for name in self._matching(wanted, self.joints, "pose", "joint with a servo"):
-                    pose[self.joints.index(name)] = angle
-        elif not self._key_pose:
-            self.notes.append(
-                f"{self.path.name} has no keyframe and there is no `pose`: the default pose is all "
-                "joints at 0, or at the limit next to it, with which few robots can stand."
-            )
+            pose[k] = self.resting[whole.joint(name).qposadr[0]]
         outside = [
             f"{n} ({p:g}, limits {a:g} to {b:g})"
             for n, p, a, b in zip(self.joints, pose, low, high, strict=True)
             if not a - 1e-6 <= p <= b + 1e-6
         ]
         if outside and isinstance(self.own.pose, dict):
-            raise InputError(f"{self.where}: pose is beyond the limits of {', '.join(outside)}.")
+            raise InputError(
+                f"{self.where}: pose is beyond the limits of {_some(outside)}. Angles are in "
+                "radians."
+            )
         return np.clip(pose, low, high), low, high
 
     def _place(self, pose: Array) -> None:
@@ -314,11 +346,12 @@ class _Reader:
         """Geoms of each foot, by its name, the lowest first."""
         model = self.model
         collides = np.flatnonzero((model.geom_contype | model.geom_conaffinity) > 0)
-        of_robot = [int(g) for g in collides if model.body_rootid[model.geom_bodyid[g]] != 0]
+        root = model.body(self.root.name).id
+        of_robot = [int(g) for g in collides if model.body_rootid[model.geom_bodyid[g]] == root]
         if not of_robot:
             raise InputError(
-                f"{self.path}: no geom of the robot collides (contype and conaffinity are 0, or "
-                "meshes are not there). Give each foot a sphere, capsule or box that does."
+                " ".join([f"{self.path}: no geom of the robot collides.", *self.notes])
+                + " Give each foot a sphere, capsule or box that does (contype 1)."
             )
         by_body: dict[int, list[int]] = {}
         for g in sorted(of_robot, key=self._lowest):
@@ -362,10 +395,13 @@ class _Reader:
         low = {body: self._lowest(geoms[0]) for body, geoms in by_body.items()}
         ground = min(low.values())
         near = [b for b, z in low.items() if z - ground < _SAME_HEIGHT * abs(ground)]
-        moved = [b for b in near if b != self.model.body(self.root.name).id]
+        above: set[int] = {model.body(self.root.name).id}
+        for b in near:
+            while b:
+                b = int(model.body_parentid[b])
+                above.add(b)
         # of a chain of bodies, the last one that is so low
-        parents = {int(model.body_parentid[b]) for b in moved}
-        ends = sorted(b for b in moved if b not in parents)
+        ends = sorted(b for b in near if b not in above)
         if not ends:
             raise InputError(
                 f"{self.path}: in the default pose its lowest geom is of the trunk, so no feet "
@@ -379,20 +415,19 @@ class _Reader:
 
     def body(self) -> Body:
         """Everything together."""
-        model, data = self.model, self.data
+        model = self.model
         names = tuple(self.feet)
         if len(names) < 2:
             raise InputError(
-                f"{self.where}: only one foot ({', '.join(names) or 'or none'}) was found; a robot "
+                f"{self.where}: only one foot ({names[0]}) was found; a robot "
                 "that walks has two or more. Give `feet` in the YAML."
             )
-        geoms = [g[0] for g in self.feet.values()]
-        feet_at = data.geom_xpos[geoms].copy()
-        soles = np.array([self._lowest(g) for g in geoms])
+        feet_at = self._middles()
+        soles = np.array([self._lowest(own[0]) for own in self.feet.values()])
         height = -float(soles.min())
         if not height > 0:
             raise InputError(f"{self.path}: the feet are not below the trunk in the default pose.")
-        chains = [self._chain(g) for g in geoms]
+        chains = [self._above(b) for b in self.foot_bodies]
         leg_of = np.full(len(self.joints), -1)
         for leg, chain in enumerate(chains):
             leg_of[chain] = leg
@@ -404,11 +439,11 @@ class _Reader:
                 "The robot has no mirror image by its geometry: training does without images."
             )
         commands = self.own.commands.model_dump(exclude_none=True)
-        xml = self._xml_writer(names, geoms)
+        xml = self._xml_writer(names)
         hashes = {"robot": sha256(self.path)}
         if self.config is not None:
             hashes["robot_config"] = sha256(self.config)
-        kinematics = self._kinematics(geoms)
+        kinematics = self._kinematics()
 
         def fallen(qpos: Array, gravity: Array, ground: Ground) -> NDArray[np.bool_]:
             above = qpos[:, 2] - ground.height(qpos[:, 0], qpos[:, 1])
@@ -428,10 +463,9 @@ class _Reader:
             notes=tuple(self.notes), hashes=hashes,
         )  # fmt: skip
 
-    def _chain(self, geom: int) -> list[int]:
-        """Joints between trunk and a geom, from the trunk on."""
+    def _above(self, body: int) -> list[int]:
+        """Joints between trunk and a body, its own included, from the trunk on."""
         model, chain = self.model, []
-        body = int(model.geom_bodyid[geom])
         while body:
             for j in reversed(range(model.body_jntnum[body])):
                 name = model.joint(int(model.body_jntadr[body]) + j).name
@@ -440,12 +474,22 @@ class _Reader:
             body = int(model.body_parentid[body])
         return chain[::-1]
 
-    def _kinematics(self, geoms: list[int]):
+    @property
+    def foot_bodies(self) -> list[int]:
+        """Of each foot."""
+        return [int(self.model.geom_bodyid[own[0]]) for own in self.feet.values()]
+
+    def _middles(self) -> Array:
+        """Each foot's place in the world: the middle of the geoms that it stands on."""
+        return np.array([self.data.geom_xpos[own].mean(axis=0) for own in self.feet.values()])
+
+    def _kinematics(self):
         """Feet in the trunk's frame as a function of joint angles, without MuJoCo."""
         model, data = self.model, self.data
         self._place(np.zeros(len(self.joints)))
-        feet = data.geom_xpos[geoms].copy()
-        chains = [self._chain(g)[::-1] for g in geoms]  # the joint next to the foot turns it first
+        feet = self._middles()
+        # the joint next to the foot turns it first
+        chains = [self._above(b)[::-1] for b in self.foot_bodies]
         rounds = []
         for k in range(max(len(chain) for chain in chains)):
             legs = np.array([leg for leg, chain in enumerate(chains) if k < len(chain)])
@@ -510,13 +554,18 @@ class _Reader:
         at, axes = data.xanchor[ids], data.xaxis[ids]
         images = axes * [-1.0, 1.0, -1.0]  # an axis is axial: the plane turns it the other way
         near = _SAME_PLACE * height
+        before = np.array([len(self._above(int(model.jnt_bodyid[j]))) for j in ids])
         found, signs = np.zeros(len(ids), int), np.zeros(len(ids))
         for k in range(len(ids)):
             # where on its axis a joint is placed says nothing
             apart = at - at[k] * [1, -1, 1]
             beside = apart - (apart @ images[k])[:, None] * images[k]
             along = (axes * images[k]).sum(axis=1)
-            fits = np.flatnonzero((np.linalg.norm(beside, axis=1) < near) & (np.abs(along) > 0.99))
+            fits = np.flatnonzero(
+                (np.linalg.norm(beside, axis=1) < near)
+                & (np.abs(along) > 0.99)
+                & (before == before[k])  # two joints of a chain can turn about the same line
+            )
             if not len(fits):
                 return None, None
             found[k] = fits[np.argmin(np.linalg.norm(apart[fits], axis=1))]
@@ -557,19 +606,19 @@ class _Reader:
                 found[name] = servo
         return found
 
-    def _xml_writer(self, names: tuple[str, ...], geoms: list[int]):
+    def _xml_writer(self, names: tuple[str, ...]):
         """Function that writes the MJCF with servos on a ground."""
         spec, model = self.spec, self.model
         feet_geoms = {model.geom(g).name for own in self.feet.values() for g in own}
-        for name, g in zip(names, geoms, strict=True):
-            body = spec.body(model.body(int(model.geom_bodyid[g])).name)
-            sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-            at = spec.geom(model.geom(g).name)
-            place = model.geom_pos[g]
-            del at
-            body.add_site(
-                name=f"foot_{name}", pos=place, type=sphere, group=4,
-                size=[_TOUCH * float(model.geom_rbound[g]), 0, 0],
+        for site in list(spec.sites):
+            spec.delete(site)
+        for name, body_id, own in zip(names, self.foot_bodies, self.feet.values(), strict=True):
+            places, reach = model.geom_pos[own], model.geom_rbound[own]
+            middle = places.mean(axis=0)
+            radius = (np.linalg.norm(places - middle, axis=1) + _TOUCH * reach).max()
+            spec.body(model.body(body_id).name).add_site(
+                name=f"foot_{name}", pos=middle, type=mujoco.mjtGeom.mjGEOM_SPHERE, group=4,
+                size=[float(radius), 0, 0],
             )  # fmt: skip
             spec.add_sensor(
                 name=f"foot_{name}_touch", type=mujoco.mjtSensor.mjSENS_TOUCH,
@@ -587,7 +636,7 @@ class _Reader:
                 on = foot or (collides and physics == "evaluation")
                 geom.contype, geom.conaffinity = int(on), 0
                 if foot:
-                    geom.priority = 1
+                    geom.priority, geom.condim = 1, max(geom.condim, 3)  # 1 is without friction
             option = own.option
             option.timestep = step_s
             option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -623,10 +672,9 @@ class _Reader:
             own.compile()
             text = own.to_xml()
             at = text.index("<worldbody>") + len("<worldbody>")
-            text = text[:at] + ground.xml + text[at:]
-            skybox = mujoco.mjtTexture.mjTEXTURE_SKYBOX
-            drawn = physics == "evaluation" and all(t.type != skybox for t in own.textures)
-            sky = _SKY if drawn else ""
+            below = ground.xml.replace('material="grid"', f'material="{_GROUND}"')
+            text = text[:at] + below + text[at:]
+            sky = _SKY if physics == "evaluation" else ""
             return text.replace(
                 "<worldbody>", f"<asset>{_GRID}{sky}{ground.assets}</asset><worldbody>", 1
             )
@@ -638,11 +686,16 @@ _SKY = (
     '<texture name="sky of the walk" type="skybox" builtin="gradient" rgb1="0.95 0.97 1" '
     'rgb2="0.7 0.8 0.95" width="64" height="64"/>'
 )
+_GROUND = "grid of the walk"
 _GRID = (
-    '<texture name="grid" type="2d" builtin="checker" rgb1="0.80 0.83 0.87" rgb2="0.68 0.72 0.77" '
-    'width="300" height="300"/><material name="grid" texture="grid" texrepeat="5 5" '
-    'texuniform="true"/>'
+    f'<texture name="{_GROUND}" type="2d" builtin="checker" rgb1="0.80 0.83 0.87" '
+    'rgb2="0.68 0.72 0.77" width="300" height="300"/>'
+    f'<material name="{_GROUND}" texture="{_GROUND}" texrepeat="5 5" texuniform="true"/>'
 )
+
+
+def _hinges(model: Any) -> list[int]:
+    return np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE).tolist()
 
 
 def _images(places: Array, near: float) -> NDArray[np.intp] | None:
@@ -650,6 +703,21 @@ def _images(places: Array, near: float) -> NDArray[np.intp] | None:
     distance = np.linalg.norm(places[:, None] * [1, -1, 1] - places[None], axis=-1)
     found = distance.argmin(axis=1)
     return found if (distance.min(axis=1) < near).all() else None
+
+
+def _states_mass(spec: Any, body: Any) -> bool:
+    """Whether a body's mass is of its <inertial>, not of its geoms."""
+    ways = mujoco.mjtInertiaFromGeom
+    way = spec.compiler.inertiafromgeom
+    return way == ways.mjINERTIAFROMGEOM_FALSE or bool(
+        way == ways.mjINERTIAFROMGEOM_AUTO and body.explicitinertial
+    )
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first names of a list."""
+    names = list(dict.fromkeys(names))
+    return ", ".join(names[:6]) + (", …" if len(names) > 6 else "")
 
 
 def _line(error: Exception) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.walks.conditions import evaluation_task
 from pupper_sysid.sim.robot.body import Body, body_of, fixed_offsets, mini_pupper
+from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import robot_xml
+from pupper_sysid.sim.robot.terrain import make_ground
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import PRESETS, Walking, for_robot
 from pupper_sysid.sim.walking.env import PupperEnv
@@ -147,6 +150,129 @@ def test_a_servo_that_the_calibration_lacks_is_named(tmp_path):
     own = body(tmp_path, config=POSE + "servos: LF_elbow\n")
     with pytest.raises(InputError, match="servo of 'LF_elbow'"):
         servo_ranges("paper", "held", own)
+
+
+def compiled(own: Body) -> Any:
+    ranges = servo_ranges("paper", "held", own)
+    return mujoco.MjModel.from_xml_string(
+        own.xml(ranges.nominal(), 0.002, make_ground("flat", 0), "evaluation")
+    )
+
+
+CUBE = "".join(
+    f"v {x} {y} {z}\n" for x in (-0.01, 0.01) for y in (-0.01, 0.01) for z in (-0.01, 0.01)
+) + "f 1 2 3\nf 2 3 4\nf 5 6 7\nf 6 7 8\nf 1 2 5\nf 3 4 7\n"  # fmt: skip
+BALL = '<geom type="sphere" size="0.01" pos="0 0 -0.1"/>'
+
+
+def test_feet_may_be_meshes_beside_the_file_and_names_of_the_walk_may_be_taken(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "paw.obj").write_text(CUBE)
+    assets = """<asset><mesh name="paw" file="paw.obj"/><texture name="grid" type="2d"
+        builtin="flat" width="8" height="8"/><texture name="skin" type="2d" file="absent.png"/>
+        <material name="grid" texture="grid"/><material name="skin" texture="skin"/></asset>"""
+    mesh = '<geom type="mesh" mesh="paw" pos="0 0 -0.1" material="skin"/>'
+    xml = mjcf(PLACES, more=assets).replace(BALL, mesh)
+    xml = xml.replace('<body name="torso"', '<site name="foot_rear_left_shank"/><body name="torso"')
+    xml = xml.replace("<compiler", '<compiler meshdir="parts"')
+    monkeypatch.chdir("/")
+    model = compiled(body(tmp_path, xml))
+    assert model.nmesh == 1 and (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).sum() == 4
+    (tmp_path / "parts" / "paw.obj").unlink()
+    body_of.cache_clear()
+    with pytest.raises(InputError, match=r"are not there \(paw\).* belong into .*parts"):
+        body(tmp_path, xml.replace('<geom type="box"', '<geom contype="0" conaffinity="0"'))
+
+
+def test_a_mesh_that_is_only_shown_counts_where_it_is_all_of_a_bodys_mass(tmp_path):
+    shown = '<geom type="mesh" mesh="block" contype="0" conaffinity="0" density="1e6"/>'
+    corners = [f"{x} {y} {z}" for x in (0, 0.02) for y in (0, 0.02) for z in (0, 0.02)]
+    asset = f'<asset><mesh name="block" vertex="{" ".join(corners)}"/></asset>'
+    trunk = '<inertial mass="1" pos="0 0 0"\n        diaginertia="0.01 0.01 0.01"/>'
+    xml = mjcf(PLACES, more=asset).replace(trunk, shown)
+    own = body(tmp_path, xml)
+    assert own.mass_kg == pytest.approx(4 * 0.13 + 8.0 + 0.96, rel=0.01)  # density times volume
+
+
+def test_bodies_need_no_names_and_a_knee_above_a_foot_is_none(tmp_path):
+    xml = mjcf(PLACES).replace(
+        BALL, f'<body><inertial mass="0.01" pos="0 0 0" diaginertia="1e-6 1e-6 1e-6"/>'
+        f"<body>{BALL}</body></body><geom size='0.005' pos='0 0 -0.095'/>"
+    )  # fmt: skip
+    own = body(tmp_path, xml)
+    assert len(own.feet) == 4 and len(set(own.feet)) == 4
+    assert own.standing_height_m == pytest.approx(0.2 * np.cos(0.7) + 0.01)
+
+
+def test_feet_of_several_geoms_stand_in_their_middle_and_feel_all_of_them(tmp_path):
+    corners = "".join(
+        f'<geom size="0.01" pos="{x} {y} -0.1"/>' for x in (0.02, -0.02) for y in (0.01, -0.01)
+    )
+    two = {n: (0, side) for n, (_, side) in list(PLACES.items())[:2]}
+    own = body(tmp_path, mjcf(two).replace(BALL, corners), "gait: biped\n")
+    np.testing.assert_allclose(own.feet_at, [[0, 0.09, -0.2], [0, -0.09, -0.2]], atol=1e-12)
+    assert own.mirror_feet is not None
+    assert compiled(own).site_size[0, 0] > np.hypot(0.02, 0.01) + 0.01
+
+
+def test_geoms_that_only_touch_in_pairs_can_be_feet(tmp_path):
+    foot = '<geom name="{name}" size="0.01" pos="0 0 -0.1" contype="0" conaffinity="0"/>'
+    xml = mjcf(PLACES)
+    for n in PLACES:
+        xml = xml.replace(BALL, foot.format(name=n), 1)
+    ground = '<worldbody><geom name="floor" type="plane" size="1 1 1"/></worldbody>'
+    pairs = "".join(f'<pair geom1="{n}" geom2="floor"/>' for n in PLACES)
+    own = body(tmp_path, xml.replace("</mujoco>", f"{ground}<contact>{pairs}</contact></mujoco>"))
+    assert own.foot_geoms == tuple(PLACES)
+
+
+ARM = """<body name="neck" pos="0.1 0 0.05"><joint name="neck" axis="0 1 0" range="-2 2"/>
+  <geom size="0.01" pos="0 0 0.1" mass="0.05"/><body name="head" pos="0 0 0.1"><joint name="head"
+    axis="1 0 0"/><geom size="0.01" pos="0.05 0 0" mass="0.05"/><body name="jaw"><joint name="jaw"
+    axis="1 0 0"/><geom size="0.01" pos="0.05 0 0" mass="0.05"/></body></body></body>"""
+
+
+def test_joints_that_are_fixed_stay_as_they_are_in_the_pose(tmp_path):
+    xml = mjcf(PLACES, base="<freejoint/>" + ARM)
+    legs = "joints: ['*_roll', '*_pitch', '*_knee']\n"
+    pose = POSE.replace("}", ", neck: -1.5707963}")
+    model = compiled(body(tmp_path, xml, legs + pose))
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    head = data.body("head").xpos - data.body("torso").xpos
+    np.testing.assert_allclose(head, [0, 0, 0.05], atol=1e-6)
+
+
+def test_joints_of_a_chain_that_turn_about_one_line_are_images_of_themselves(tmp_path):
+    own = body(tmp_path, mjcf(PLACES, base="<freejoint/>" + ARM))
+    assert own.mirror_joints is not None and own.mirror_signs is not None
+    assert {n: own.mirror_signs[own.joints.index(n)] for n in ("neck", "head", "jaw")} == {
+        "neck": 1, "head": -1, "jaw": -1,
+    }  # fmt: skip
+
+
+def test_linkages_are_taken_out_and_said_and_joints_of_tendons_have_servos(tmp_path):
+    spare = '<body name="rod"><joint type="ball"/><geom size="0.005" mass="0.01"/></body>'
+    joints = [f"{n}_{k}" for n in PLACES for k in ("roll", "pitch")]
+    motors = "".join(f'<motor joint="{j}"/>' for j in joints)
+    knees = "".join(f'<joint joint="{n}_knee" coef="1"/>' for n in PLACES)
+    more = f"""<tendon><fixed name="knees">{knees}</fixed></tendon>
+        <actuator>{motors}<motor tendon="knees"/></actuator>
+        <equality><connect body1="rod" body2="rear_left_shank" anchor="0 0 0"/></equality>"""
+    own = body(tmp_path, mjcf(PLACES, base="<freejoint/>" + spare, more=more))
+    assert len(own.joints) == 12
+    assert any("couples bodies or joints" in note for note in own.notes)
+    assert compiled(own).nq == 7 + 12
+
+
+def test_gravity_and_friction_are_those_of_a_walk_whatever_the_file_has(tmp_path):
+    more = '<option gravity="0 0 0" impratio="100"><flag contact="disable"/></option>'
+    xml = mjcf(PLACES, more=more).replace(BALL, BALL.replace("/>", ' condim="1"/>'))
+    model = compiled(body(tmp_path, xml.replace('name="torso"', 'name="torso" gravcomp="1"')))
+    assert (model.opt.gravity[2], model.opt.impratio, model.opt.disableflags) == (-9.81, 1, 0)
+    assert not model.body_gravcomp.any() and model.geom("geom 1").condim == 3
 
 
 def test_two_legs_walk_by_turns_and_joints_without_a_servo_are_fixed(tmp_path):
