@@ -42,7 +42,7 @@ from pupper_sysid.policies.walks.conditions import (
     StepRecorder,
     Walker,
     evaluation_task,
-    share_of_usual,
+    within,
 )
 from pupper_sysid.policies.walks.rollouts import (
     ERRORS,
@@ -530,9 +530,8 @@ def evaluate(
     plain = evaluation_task(task)
     cases = (RANDOM, *cases)
     if task.robot:  # commands as far within its ranges as usual ones are within theirs
-        size = share_of_usual(plain)
         cases = tuple(
-            c if c.command is None else replace(c, command=tuple((size * c.command).tolist()))
+            c if c.command is None else replace(c, command=tuple(within(plain, c.command).tolist()))
             for c in cases
         )
     conditions = [c.condition(plain, robots(c, w), w) for c in cases for w in WALKERS]

@@ -298,7 +298,7 @@ def fit_trot(
             drawn[half:] = low + (strata + rng.random(strata.shape)) / half * (high - low)
         trots = [_trot(task.trot, values) for values in drawn]
         walked = _walk(
-            trots, quick, servos, _SEARCH_COMMANDS * _scale(task), _SEARCH_S, _SEARCH_IGNORED_S,
+            trots, quick, servos, _within(task, _SEARCH_COMMANDS), _SEARCH_S, _SEARCH_IGNORED_S,
             seed, threads,
         )  # fmt: skip
         costs = [_cost(one) for one in walked]
@@ -333,7 +333,7 @@ def _judged(
     trots: Sequence[Trot], task: Walking, servos: ServoRanges, seed: int, threads: int,
     changes: Sequence[dict[str, float]] = (),
 ) -> list[_Walked]:  # fmt: skip
-    command = np.repeat(COMMANDS, _EACH, axis=0) * _scale(task)
+    command = np.repeat(_within(task, COMMANDS), _EACH, axis=0)
     return _walk(
         trots, _gentle(task, _SECONDS), servos, command, _SECONDS, _IGNORED_S, seed, threads,
         changes,
@@ -346,6 +346,13 @@ def _scale(task: Walking) -> Array:
     ends = np.abs([own.forward_m_s, own.sideways_m_s, own.yaw_rad_s]).max(axis=1)
     # those of another robot are its own, as large as they are
     return ends / _LARGEST if task.robot else np.minimum(ends / _LARGEST, 1.0)
+
+
+def _within(task: Walking, usual: Array) -> Array:
+    """Commands of walks [m/s, m/s, rad/s], shape (n, 3), within the task's."""
+    own = task.commands
+    ends = np.array([own.forward_m_s, own.sideways_m_s, own.yaw_rad_s])
+    return np.clip(usual * _scale(task), *ends.T)
 
 
 def _gentle(task: Walking, seconds: float) -> Walking:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rsl_rl.models import MLPModel
 
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
-from pupper_sysid.policies.walks.conditions import evaluation_task, share_of_usual
+from pupper_sysid.policies.walks.conditions import evaluation_task, share_of_usual, within
 from pupper_sysid.policies.walks.rollouts import planar_velocity
 from pupper_sysid.servo_models.networks import JointArrays
 from pupper_sysid.sim.walking.config import Walking
@@ -56,7 +56,8 @@ class Judge:
         robots = _EACH * len(COMMANDS)
         env = PupperEnv(task, servos, robots, seed + _SEED, threads, servo_model)
         self._scale = share_of_usual(task) if task.robot else np.ones(3)
-        self._command = np.repeat(COMMANDS, _EACH, axis=0) * self._scale
+        commands = within(task, COMMANDS) if task.robot else COMMANDS
+        self._command = np.repeat(commands, _EACH, axis=0)
         env.set_command(self._command)
         self._env = WalkingVecEnv(env, action_history, device)
         self._start = self._env.state

@@ -21,7 +21,6 @@ from typing import Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.joints import JOINT_NAMES, LEGS
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import TRUNK_BOX_AT_M, TRUNK_BOX_M
 from pupper_sysid.sim.robot.robot_batch import RobotBatch, own_velocity
@@ -36,7 +35,6 @@ Array = NDArray[np.float64]
 FIRST_PUSH_S, PUSH_EVERY_S = 3.0, 4.0
 _GRAVITY = OBSERVATION_PARTS["projected_gravity"]
 _ABOVE_M = TRUNK_BOX_AT_M[2] + TRUNK_BOX_M[2]  # loads lie on the trunk
-_PER_LEG = len(JOINT_NAMES) // len(LEGS)
 _OF_MOTOR = ("stiffness", "damping", "effort_limit")
 
 
@@ -56,7 +54,7 @@ class Handicap:
     payload_at_m: tuple[float, float] = (0.0, 0.0)
     """Where it lies: forward and to the left of the trunk's origin."""
     weak_leg: float = 1.0
-    """Factor on the torque of the motors of one leg, robot k's leg k of LF, RF, LB, RB and again;
+    """Factor on the torque of the motors of one leg, robot k's leg k of the body's and again;
     their friction stays."""
     missed_ticks: float = 0.0
     """Chance that a control tick is missed: the set-points stay, and the policy does not run."""
@@ -84,10 +82,10 @@ def impose(robots: RobotBatch, ids: NDArray[np.intp], own: Handicap) -> None:
     `ids` are robots in the order of their numbers, from 0 on.
     """
     if own.weak_leg != 1.0:
-        first = _PER_LEG * (np.arange(len(ids)) % len(LEGS))
-        joints = first[:, None] + np.arange(_PER_LEG)
+        leg_of, legs = robots.body.leg_of, len(robots.body.feet)
+        of_weak_leg = leg_of == (np.arange(len(ids)) % legs)[:, None]
         for name in _OF_MOTOR:
-            robots.drawn[name][ids[:, None], joints] *= own.weak_leg
+            robots.drawn[name][ids] *= np.where(of_weak_leg, own.weak_leg, 1.0)
     if own.friction is not None:
         robots.friction[ids] = own.friction
     if own.weak_leg != 1.0 or own.friction is not None:
@@ -295,12 +293,22 @@ def evaluation_task(task: Walking, seconds: float | None = None) -> Walking:
 
 
 def share_of_usual(task: Walking) -> Array:
-    """Largest commands of a task over those of `RANDOM`, shape (3,)."""
-    own, usual = (
-        np.abs([c.forward_m_s, c.sideways_m_s, c.yaw_rad_s]).max(axis=1)
-        for c in (task.commands, RANDOM)
-    )
-    return own / usual
+    """Largest commands of a task over those of `RANDOM`, shape (3,); 1 where a task has none."""
+    own, usual = (np.abs(_ranges(c)).max(axis=1) for c in (task.commands, RANDOM))
+    return np.where(own > 0, own / usual, 1.0)
+
+
+def within(task: Walking, usual: Array) -> Array:
+    """Commands that are as far within a task's ranges as `usual` ones within those of `RANDOM`.
+
+    Both have the shape (n, 3).
+    """
+    return np.clip(share_of_usual(task) * usual, *_ranges(task.commands).T)
+
+
+def _ranges(commands: Commands) -> Array:
+    """Lowest and highest of each part, shape (3, 2)."""
+    return np.array([commands.forward_m_s, commands.sideways_m_s, commands.yaw_rad_s])
 
 
 def random_commands(
@@ -308,7 +316,7 @@ def random_commands(
 ) -> Array:
     """Commands of `RANDOM`, or others, for each robot and step, shape (steps, robots, 3)."""
     rng = np.random.default_rng([seed, 3])
-    low, high = np.array([commands.forward_m_s, commands.sideways_m_s, commands.yaw_rad_s]).T
+    low, high = _ranges(commands).T
     drawn = rng.uniform(low, high, (steps, robots, 3))
     # of exponential intervals, memoryless: in each step a new one comes with this chance
     new = rng.random((steps, robots)) < 1 - np.exp(-step_s / commands.every_s)

@@ -14,6 +14,7 @@ visual meshes are not needed. What was assumed is said in `Body.notes`.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -40,7 +41,8 @@ _SAME_HEIGHT = 0.1  # feet's lowest points differ by less, in shares of the stan
 _SAME_SOLE = 0.03  # of the geoms of one foot, likewise
 _SAME_PLACE = 0.06  # of a joint and its mirror image, likewise
 _TOUCH = 1.3  # radius of a touch sensor's site, in those of the geom
-_INVERSE_STEPS, _NUDGE_RAD, _DAMPING = 6, 1e-4, 0.02  # damping in standing heights per rad
+_INVERSE_STEPS, _NUDGE_RAD = 6, 1e-4
+_DAMPING, _LEVEL = 0.02, 0.05  # standing heights per rad: of joints, and of a sole's tilt
 _FALLEN = 0.5  # share of the standing height below which the trunk has come down
 _WALK = (0.0, 0.5, 0.75, 0.25)  # left front, right front, left rear, right rear
 _TRAINING_ITERATIONS = 8  # of PGS, as of the Mini Pupper
@@ -428,6 +430,11 @@ class _Reader:
         if not height > 0:
             raise InputError(f"{self.path}: the feet are not below the trunk in the default pose.")
         chains = [self._above(b) for b in self.foot_bodies]
+        shared = Counter(j for chain in chains for j in chain)
+        chains = [[j for j in chain if shared[j] == 1] for chain in chains]  # without a spine
+        if not all(chains):
+            still = names[[bool(chain) for chain in chains].index(False)]
+            raise InputError(f"{self.where}: no joint with a servo moves foot '{still}' alone.")
         leg_of = np.full(len(self.joints), -1)
         for leg, chain in enumerate(chains):
             leg_of[chain] = leg
@@ -483,13 +490,19 @@ class _Reader:
         """Each foot's place in the world: the middle of the geoms that it stands on."""
         return np.array([self.data.geom_xpos[own].mean(axis=0) for own in self.feet.values()])
 
-    def _kinematics(self):
-        """Feet in the trunk's frame as a function of joint angles, without MuJoCo."""
-        model, data = self.model, self.data
+    def _kinematics(self, up_m: float = 0.0):
+        """Feet in the trunk's frame as a function of joint angles, without MuJoCo.
+
+        Or points fixed to them, `up_m` above them in the default pose.
+        """
+        model, data, bodies = self.model, self.data, self.foot_bodies
+        self._place(self.pose)
+        above = up_m * data.xmat[bodies].reshape(-1, 3, 3)[:, 2]  # in the frames of their bodies
         self._place(np.zeros(len(self.joints)))
-        feet = self._middles()
+        turns = data.xmat[bodies].reshape(-1, 3, 3)
+        feet = self._middles() + (turns @ above[..., None])[..., 0]
         # the joint next to the foot turns it first
-        chains = [self._above(b)[::-1] for b in self.foot_bodies]
+        chains = [self._above(b)[::-1] for b in bodies]
         rounds = []
         for k in range(max(len(chain) for chain in chains)):
             legs = np.array([leg for leg, chain in enumerate(chains) if k < len(chain)])
@@ -520,22 +533,36 @@ class _Reader:
     def _inverse(self, kinematics: Any, chains: list[list[int]], height: float):
         """Joint angles that put the feet somewhere: damped least squares from the default pose.
 
-        Out of reach, or where a leg has fewer than three joints, feet come as near as they can.
+        Out of reach, or where a leg has fewer than three joints, feet come as near as they can;
+        with more, soles stay as level as they are in the default pose. `chains` are the joints of
+        each leg alone.
         """
         pose, low, high = self.pose, self.low, self.high
         longest = max(len(chain) for chain in chains)
+        level = _LEVEL * height * np.array([len(chain) > 3 for chain in chains])[:, None]
+        tips = self._kinematics(1.0) if level.any() else None
+
+        def reached(joints: Array) -> Array:
+            """Feet, and the directions of their soles as lengths; shape (n, legs, 3 or 6)."""
+            here = kinematics(joints)
+            if tips is None:
+                return here
+            return np.concatenate([here, level * (tips(joints) - here)], axis=-1)
 
         def joints_at(feet: Array) -> Array:
             joints = np.repeat(pose[None], len(feet), axis=0)
+            if tips is not None:
+                upright = np.broadcast_to(level * [0.0, 0.0, 1.0], feet.shape)
+                feet = np.concatenate([feet, upright], axis=-1)
             for _ in range(_INVERSE_STEPS):
-                here = kinematics(joints)
+                here = reached(joints)
                 slopes = np.zeros((*here.shape, longest))
                 for k in range(longest):  # one joint of every leg at a time
                     moved = joints.copy()
                     for chain in chains:
                         if k < len(chain):
                             moved[:, chain[k]] += _NUDGE_RAD
-                    slopes[..., k] = (kinematics(moved) - here) / _NUDGE_RAD
+                    slopes[..., k] = (reached(moved) - here) / _NUDGE_RAD
                 away = (feet - here)[..., None]
                 square = slopes.swapaxes(-1, -2) @ slopes
                 square = square + (_DAMPING * height) ** 2 * np.eye(longest)

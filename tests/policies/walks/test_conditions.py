@@ -16,14 +16,26 @@ from pupper_sysid.policies.walks.conditions import (
     Condition,
     evaluation_task,
     random_commands,
+    share_of_usual,
+    within,
 )
 from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.config import PRESETS, Walking
+from pupper_sysid.sim.walking.config import PRESETS, Commands, Walking
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.refusals import assert_each_refused
+
+
+def test_commands_are_as_far_within_a_robots_ranges_as_usual_ones_within_theirs():
+    own = Commands((0.0, 0.4), (0.0, 0.0), (-1.0, 1.0))
+    usual = np.array([[0.15, 0.08, 0.4], [-0.15, -0.08, -0.4]])
+    found = within(replace(TASK, commands=own), usual)
+    # never backward, never sideways
+    np.testing.assert_allclose(found, [[0.3, 0.0, 0.8], [0.0, 0.0, -0.8]])
+    assert (share_of_usual(replace(TASK, commands=own)) > 0).all()
+
 
 SERVOS = servo_ranges(Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml")
 TASK = evaluation_task(Walking())
