@@ -22,7 +22,7 @@ Commands = Callable[[float], NDArray[np.float64] | None]
 stop."""
 
 COLUMNS = ("seconds", "forward_m_s", "left_m_s", "turn_rad_s")
-_LARGEST = 2.0
+_LARGEST = 5.0
 
 
 def constant(

@@ -140,6 +140,11 @@ class Body:
         """1 of feet on the left, -1 on the right, 0 in the middle."""
         return np.sign(np.where(np.abs(self.feet_at[:, 1]) > 1e-6, self.feet_at[:, 1], 0.0))
 
+    @cached_property
+    def sways(self) -> bool:
+        """Whether the gait carries the trunk on one side after the other, as on two legs."""
+        return bool(np.abs((self.sides * np.exp(2j * np.pi * self.offsets)).sum()) > 0.5)
+
     @property
     def scale(self) -> float:
         """Length scale: standing height over the Mini Pupper's; exactly 1 of that."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -215,6 +216,48 @@ def test_feet_of_several_geoms_stand_in_their_middle_and_feel_all_of_them(tmp_pa
     np.testing.assert_allclose(own.feet_at, [[0, 0.09, -0.2], [0, -0.09, -0.2]], atol=1e-12)
     assert own.mirror_feet is not None
     assert compiled(own).site_size[0, 0] > np.hypot(0.02, 0.01) + 0.01
+
+
+TWO = {n: (0, side) for n, (_, side) in list(PLACES.items())[:2]}
+ANKLE = """<body pos="0 0 -0.1"><joint name="{}_ankle" axis="0 1 0" range="-2 2"/><inertial
+    mass="0.02" pos="0 0 0" diaginertia="1e-5 1e-5 1e-5"/><geom type="box" size="0.03 0.02 0.005"
+    pos="0.01 0 -0.01"/></body>"""
+
+
+def biped(folder: Path) -> Body:
+    xml = mjcf(TWO)
+    for name in TWO:
+        xml = xml.replace(BALL, ANKLE.format(name), 1)
+    return body(folder, xml, POSE.replace("}", ', "*_left_ankle": 0.7, "*_right_ankle": 0.7}'))
+
+
+def test_soles_of_legs_with_an_ankle_stay_level_and_feet_where_they_are_to_be(tmp_path):
+    own = biped(tmp_path)
+    moved = np.random.default_rng(0).uniform(-1, 1, (20, 2, 3)) * [0.02, 0.0, 0.02]
+    joints = own.joints_at(own.feet_at + moved)
+    np.testing.assert_allclose(own.feet_in_trunk(joints), own.feet_at + moved, atol=2e-4)
+    signs = [1.0 if n.endswith(("pitch", "ankle", "left_knee")) else -1.0 for n in own.joints]
+    pitch = joints * np.where([n.endswith("roll") for n in own.joints], 0.0, signs)
+    np.testing.assert_allclose(pitch.reshape(20, 2, 4).sum(axis=2), 0.0, atol=0.01)
+
+
+def test_a_gait_on_two_legs_sways_over_the_foot_that_stands_and_a_trot_does_not(tmp_path):
+    own, trot = biped(tmp_path), Trot(frequency_hz=2.0, sway_m=0.01, crouch_m=0.01, spread_m=0.0)
+    assert own.sways and not mini_pupper().sways
+    command = np.tile([0.1, 0.0, 0.0], (40, 1))
+    phase = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    feet = own.feet_in_trunk(trot.joints(phase, command, own))
+    lifted = feet[:, :, 2] - feet[:, :, 2].min(axis=0)
+    # while the left foot is highest all feet are to the left: the trunk is over the right one
+    aside = feet[lifted.argmax(axis=0), :, 1] - own.feet_at[:, 1]
+    np.testing.assert_allclose(aside, [[0.01, 0.01], [-0.01, -0.01]], atol=5e-4)
+    still = replace(trot, sway_m=0.0)
+    np.testing.assert_allclose(trot.joints(phase, command), still.joints(phase, command), atol=1e-12)
+    # so the phase is found from where the feet are, and a moment before
+    span, step = 0.02, 2 * np.pi * 2.0 * 0.02
+    earlier = trot.joints(phase - step, command, own)
+    found = trot.phase_of(trot.joints(phase, command, own), earlier, span, command, own)
+    np.testing.assert_allclose(np.cos(found - phase), 1.0, atol=0.01)
 
 
 def test_geoms_that_only_touch_in_pairs_can_be_feet(tmp_path):
