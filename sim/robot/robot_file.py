@@ -5,11 +5,12 @@
     pose: home                     # a keyframe, or angles by joint: {"*_thigh_joint": 0.9, …}
     servos: LF_thigh               # one servo of the calibration for all, or {"*_hip_*": LF_hip, …}
     gait: trot                     # or walk, or {FR: 0.5, …}: shares of a cycle behind the first
+    forward: y                     # where the front is in the trunk's frame, by default x
     commands: {forward_m_s: [-0.6, 0.6], sideways_m_s: [-0.3, 0.3], yaw_rad_s: [-1, 1]}
 
-All lines may be left out; names may be patterns. x is forward, y to the left, z up in the trunk's
-frame. The robot's own actuators, sensors and ground are taken out, hinges without a servo fixed;
-visual meshes are not needed. What was assumed is said in `Body.notes`.
+All lines may be left out; names may be patterns. z is up in the trunk's frame. The robot's own
+actuators, sensors and ground are taken out, hinges without a servo fixed; visual meshes are not
+needed. What was assumed is said in `Body.notes`.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,9 @@ _INVERSE_STEPS, _NUDGE_RAD = 6, 1e-4
 _DAMPING, _LEVEL = 0.02, 0.05  # standing heights per rad: of joints, and of a sole's tilt
 _FALLEN = 0.5  # share of the standing height below which the trunk has come down
 _WALK = (0.0, 0.5, 0.75, 0.25)  # left front, right front, left rear, right rear
+_QUARTERS = {"y": -1, "-x": 2, "-y": 1}  # of a turn to the left, to x
+_PARTS = ("bodies", "geoms", "sites", "cameras", "lights", "frames")
+_LEFT_RIGHT, _FRONT_BACK = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0])
 _TRAINING_ITERATIONS = 8  # of PGS, as of the Mini Pupper
 
 _Ends = Annotated[list[Annotated[float, Field(ge=-100, le=100)]], Field(min_length=2, max_length=2)]
@@ -66,6 +70,7 @@ class RobotFile(BaseModel):
     pose: str | dict[str, float] | None = None
     servos: str | dict[str, str] | None = None
     gait: str | dict[str, float] = "trot"
+    forward: Literal["x", "y", "-x", "-y"] = "x"
     commands: _Commands = Field(default_factory=_Commands)
 
 
@@ -114,6 +119,8 @@ class _Reader:
         for k, own_body in enumerate(self.spec.bodies):
             own_body.name = own_body.name or ("trunk" if own_body is self.root else f"body {k}")
             own_body.gravcomp = 0.0
+        if own.forward != "x":
+            self._face(_QUARTERS[own.forward])
         whole = self._compiled()
         self.joints = self._servo_joints(whole)
         self.resting = self._keyframe(whole)
@@ -171,6 +178,24 @@ class _Reader:
                 f"Masses of {_some(massless)} come from meshes that are not there and count as 0: "
                 f"put them into {folder}, or give these bodies an <inertial>."
             )
+
+    def _face(self, quarters: int) -> None:
+        """Turn all that the trunk carries about its vertical axis, so that x is forward."""
+        root, turn = self.root, np.zeros(4)
+        mujoco.mju_axisAngle2Quat(turn, np.array([0.0, 0.0, 1.0]), 0.5 * np.pi * quarters)
+        parts = [e for kind in _PARTS for e in getattr(root, kind) if e.frame is None]
+        frame = root.add_frame(quat=turn)
+        for part in parts:
+            part.set_frame(frame)
+        if _states_mass(self.spec, root):
+            model = self._compiled()
+            at = model.body(root.name).id
+            place, axes = np.zeros(3), np.zeros(4)
+            mujoco.mju_rotVecQuat(place, model.body_ipos[at], turn)
+            mujoco.mju_mulQuat(axes, turn, model.body_iquat[at])
+            root.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            root.fullinertia = np.full(6, np.nan)
+            root.ipos, root.iquat, root.inertia = place, axes, model.body_inertia[at]
 
     def _keyframe(self, whole: Any) -> Array:
         """All positions of the file's joints in the keyframe that is the pose, or at rest."""
@@ -438,12 +463,19 @@ class _Reader:
         leg_of = np.full(len(self.joints), -1)
         for leg, chain in enumerate(chains):
             leg_of[chain] = leg
-        joints, signs = self._mirror(height)
+        joints, signs = self._mirror(height, _LEFT_RIGHT)
         feet_image = _images(feet_at, _SAME_PLACE * height)
         if joints is None or feet_image is None:
             joints = signs = feet_image = None
+            turned = self._mirror(height, _FRONT_BACK)[0] is not None
             self.notes.append(
                 "The robot has no mirror image by its geometry: training does without images."
+                + (
+                    " It is symmetric about x instead of y: if its front is where y points, write "
+                    "`forward: y` (or -y)."
+                    if turned
+                    else ""
+                )
             )
         commands = self.own.commands.model_dump(exclude_none=True)
         xml = self._xml_writer(names)
@@ -574,18 +606,18 @@ class _Reader:
 
         return joints_at
 
-    def _mirror(self, height: float) -> tuple[NDArray[np.intp] | None, Array | None]:
-        """Image of each joint, left for right, and its sign; None without."""
+    def _mirror(self, height: float, plane: Array) -> tuple[NDArray[np.intp] | None, Array | None]:
+        """Image of each joint in a plane through the trunk, and its sign; None without."""
         model, data = self.model, self.data
         ids = [int(model.joint(name).id) for name in self.joints]
         at, axes = data.xanchor[ids], data.xaxis[ids]
-        images = axes * [-1.0, 1.0, -1.0]  # an axis is axial: the plane turns it the other way
+        images = -axes * plane  # an axis is axial: the plane turns it the other way
         near = _SAME_PLACE * height
         before = np.array([len(self._above(int(model.jnt_bodyid[j]))) for j in ids])
         found, signs = np.zeros(len(ids), int), np.zeros(len(ids))
         for k in range(len(ids)):
             # where on its axis a joint is placed says nothing
-            apart = at - at[k] * [1, -1, 1]
+            apart = at - at[k] * plane
             beside = apart - (apart @ images[k])[:, None] * images[k]
             along = (axes * images[k]).sum(axis=1)
             fits = np.flatnonzero(

@@ -54,6 +54,7 @@ def body(folder: Path, xml: str | None = None, config: str = POSE) -> Body:
     robot, own = folder / "robot.xml", folder / "robot.yaml"
     robot.write_text(xml or mjcf(PLACES))
     own.write_text(config)
+    body_of.cache_clear()
     return body_of(str(robot), str(own))
 
 
@@ -182,7 +183,6 @@ def test_feet_may_be_meshes_beside_the_file_and_names_of_the_walk_may_be_taken(
     model = compiled(body(tmp_path, xml))
     assert model.nmesh == 1 and (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).sum() == 4
     (tmp_path / "parts" / "paw.obj").unlink()
-    body_of.cache_clear()
     with pytest.raises(InputError, match=r"are not there \(paw\).* belong into .*parts"):
         body(tmp_path, xml.replace('<geom type="box"', '<geom contype="0" conaffinity="0"'))
 
@@ -252,12 +252,41 @@ def test_a_gait_on_two_legs_sways_over_the_foot_that_stands_and_a_trot_does_not(
     aside = feet[lifted.argmax(axis=0), :, 1] - own.feet_at[:, 1]
     np.testing.assert_allclose(aside, [[0.01, 0.01], [-0.01, -0.01]], atol=5e-4)
     still = replace(trot, sway_m=0.0)
-    np.testing.assert_allclose(trot.joints(phase, command), still.joints(phase, command), atol=1e-12)
+    np.testing.assert_allclose(
+        trot.joints(phase, command), still.joints(phase, command), atol=1e-12
+    )
     # so the phase is found from where the feet are, and a moment before
     span, step = 0.02, 2 * np.pi * 2.0 * 0.02
     earlier = trot.joints(phase - step, command, own)
     found = trot.phase_of(trot.joints(phase, command, own), earlier, span, command, own)
     np.testing.assert_allclose(np.cos(found - phase), 1.0, atol=0.01)
+
+
+def test_a_robot_that_faces_along_y_is_said_to_and_turned(tmp_path):
+    tensor = 'fullinertia="0.01 0.02 0.025 0.001 0 0"'
+    xml = mjcf(PLACES).replace('diaginertia="0.01 0.01 0.01"', tensor)
+    usual = body(tmp_path, xml)
+    # the same robot, but the trunk's y is forward
+    head, inside, tail = (
+        xml[: (a := xml.index("<inertial"))], xml[a : (b := xml.index("</body>\n      </world"))],
+        xml[b:],
+    )  # fmt: skip
+    rest = inside[inside.index("/>") + 2 :]
+    inertial = '<inertial mass="1" pos="0 0 0" fullinertia="0.02 0.01 0.025 -0.001 0 0"/>'
+    turned = f'{head}{inertial}<frame euler="0 0 {np.pi / 2}">{rest}</frame>{tail}'
+    seen = body(tmp_path, turned)
+    assert seen.mirror_joints is None and any("`forward: y`" in note for note in seen.notes)
+    own = body(tmp_path, turned, POSE + "forward: y\n")
+    np.testing.assert_allclose(own.feet_at, usual.feet_at, atol=1e-9)
+    np.testing.assert_array_equal(own.mirror_signs, usual.mirror_signs)
+    tensors = []
+    for one in (usual, own):
+        model = compiled(one)
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, model.body("torso").iquat)
+        turn = turn.reshape(3, 3)
+        tensors.append(turn @ np.diag(model.body("torso").inertia) @ turn.T)
+    np.testing.assert_allclose(*tensors, atol=1e-9)
 
 
 def test_geoms_that_only_touch_in_pairs_can_be_feet(tmp_path):
