@@ -30,6 +30,7 @@ from pupper_sysid.cli.terminal import err, out, print_json, share_progress, spel
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import hold_output, refuse_path
+from pupper_sysid.common.processes.stop import finishing
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.network.hyperparameters import OWN, TROT, Kind
 from pupper_sysid.policies.train.run_file import (
@@ -54,6 +55,8 @@ Then `pupper-play runs/<name>` and `pupper-eval runs/<name>`.
 """
 Preset = Literal["fast", "paper", "release"]
 
+_SEARCHING = 0.3  # of a run's minutes: the most in which a first gait is searched
+
 
 @dataclass(frozen=True)
 class Options:
@@ -71,7 +74,7 @@ class Options:
     start from nothing."""
     robot: Path | None = None
     """MJCF of another robot than the Mini Pupper 2: any with legs and position servos. Its task is
-    scaled by its size; where no open-loop gait walks, as on two legs, give `--start scratch`."""
+    scaled by its size."""
     robot_config: Path | None = None
     """YAML beside it: joints, feet, pose, servos, gait, commands (docs/own_robot.md)."""
     name: str | None = None
@@ -165,7 +168,7 @@ def _run(options: Options, given: list[str]) -> None:
             warn_of_fallbacks([servo_ranges(run.actuator, run.feedback, run.task.body)])
             for note in run.task.body.notes:
                 err.print(note)
-        run = _with_first_gait(run, ranks)
+        run = _with_first_gait(run, ranks, begun + 60 * _SEARCHING * run.minutes)
     with _bar() as watch:
         notice, stopping = (warn, err.print) if ranks.rank == 0 else (lambda text: None,) * 2
         if options.resume:
@@ -188,17 +191,22 @@ def _run(options: Options, given: list[str]) -> None:
     err.print(f"Saved. {use}; {on}")
 
 
-def _with_first_gait(run: Run, ranks: Ranks) -> Run:
-    """The run with a gait for its servos, which the first process searches for all."""
+def _with_first_gait(run: Run, ranks: Ranks, until: float) -> Run:
+    """The run with a gait for its servos, which the first process searches for all.
+
+    It does so until a time of the monotonic clock, or a stop.
+    """
     from pupper_sysid.policies.train.first_gait import fits_trots, with_first_gait
 
     if not fits_trots(run):
         return run
     task = run.task
     if ranks.rank == 0:
-        with share_progress("first gait") as advance:
-            searching = partial(advance, "searching")
-            task = with_first_gait(run, lambda text: err.print(spell(text)), searching).task
+        with share_progress("first gait") as advance, finishing(err.print) as stop_requested:
+            task = with_first_gait(
+                run, lambda text: err.print(spell(text)), partial(advance, "searching"),
+                lambda: stop_requested() or time.monotonic() > until,
+            ).task  # fmt: skip
     parts = json.loads(ranks.same(json.dumps(plain({"trot": task.trot, "rewards": task.rewards}))))
     trot, rewards = Trot(**parts["trot"]), Rewards(**parts["rewards"])
     return replace(run, task=replace(run.task, trot=trot, rewards=rewards))

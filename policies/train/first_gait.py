@@ -176,11 +176,12 @@ def with_first_gait(
     run: Run,
     say: Callable[[str], None] = lambda text: None,
     progress: Callable[[float], None] = lambda share: None,
+    ends: Callable[[], bool] = lambda: False,
 ) -> Run:
     """The run with a first gait for its servos: its own where that walks, else a fitted one.
 
     `say` is called with sentences about the gait, `progress` with the share of the search that is
-    done.
+    done. The search goes on until `ends`: the best until then is taken.
     """
     servos = servo_ranges(run.actuator, run.feedback, run.task.body)
     name = Path(run.actuator).name
@@ -198,7 +199,7 @@ def with_first_gait(
             )
             return run
     say("Searching a better one for these servos takes about a minute on two cores.")
-    found = fit_trot(run.task, servos, run.seed, threads, progress)
+    found = fit_trot(run.task, servos, run.seed, threads, progress, ends)
     if found.trot == run.task.trot:
         say("Nothing better was found.")
     else:
@@ -208,7 +209,9 @@ def with_first_gait(
             f"{1e3 * t.lift_m:.0f} mm, crouch {1e3 * t.crouch_m:.0f} mm, gain {t.gain:.2f}, "
             f"turning {t.turn_gain:.2f}."
         )
-    if found.after.poor:
+    if ends():
+        say("The search was ended before it was complete.")
+    elif found.after.poor:
         say(_sentence(found))
     return suited(run, found)
 
@@ -279,10 +282,12 @@ def fit_trot(
     seed: int,
     threads: int = 0,
     progress: Callable[[float], None] = lambda share: None,
+    ends: Callable[[], bool] = lambda: False,
 ) -> FirstGait:
     """Search a trot for some servos, beginning with that of a task.
 
-    `progress` is called with the share of the work that is done.
+    `progress` is called with the share of the work that is done. What was found until `ends` is
+    judged.
     """
     rng = np.random.default_rng([seed, 6])
     quick = _quick(task, servos)
@@ -301,8 +306,10 @@ def fit_trot(
         trots = [_trot(task.trot, box, values) for values in drawn]
         walked = _walk(
             trots, quick, servos, _within(task, _SEARCH_COMMANDS), _SEARCH_S, _SEARCH_IGNORED_S,
-            seed, threads,
+            seed, threads, ends=ends,
         )  # fmt: skip
+        if not walked:
+            break
         costs = [_cost(one) for one in walked]
         order = np.argsort(costs, kind="stable")[:_ELITE]
         elite = [_corrected(trots[i], walked[i]) for i in order]
@@ -326,7 +333,8 @@ def fit_trot(
     scores = [_score(one) for one in walked]
     chosen = int(np.argmax([_merit(score) for score in scores]))
     trot, after = trots[chosen], scores[chosen]
-    limit = _limit(trot, after, task, servos, seed, threads) if after.poor else None
+    poor = after.poor and not ends()
+    limit = _limit(trot, after, task, servos, seed, threads) if poor else None
     progress(1.0)
     return FirstGait(before=before, trot=trot, after=after, limit=limit)
 
@@ -417,8 +425,12 @@ class _Walked:
 def _walk(
     trots: Sequence[Trot], task: Walking, servos: ServoRanges, command: Array, seconds: float,
     ignored_s: float, seed: int, threads: int, changes: Sequence[dict[str, float]] = (),
+    ends: Callable[[], bool] = lambda: False,
 ) -> list[_Walked]:  # fmt: skip
-    """Walk with every trot on the same robots, one for each row of `command`."""
+    """Walk with every trot on the same robots, one for each row of `command`.
+
+    Nothing if it `ends` before.
+    """
     n, count, scale = len(command), len(trots), _scale(task)
     step_s = task.control_step_s
     steps, first = round(seconds / step_s), round(ignored_s / step_s)
@@ -438,6 +450,8 @@ def _walk(
         for name in ("velocity", "stride", "up", "clearance", "saturated", "square", "sway")
     }
     for action in actions:
+        if ends():
+            return []
         result = env.step(action)
         facts, alive = result.facts, alive & ~result.done
         for name, value in (

@@ -22,6 +22,7 @@ from pupper_sysid.policies.train.run_file import preset, teacher_of
 from pupper_sysid.policies.train.selection import COMMANDS
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Commands, Walking
+from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_ranges
 from support.tiny_training import CALIBRATION, tiny_run
 
@@ -122,6 +123,16 @@ def test_a_trot_is_fitted_to_servos_of_two_thirds_of_the_stiffness_and_torque(mo
     assert found.before.poor and found.after.score > found.before.score + 0.1
     assert abs(found.after.forward_share - 1) < abs(found.before.forward_share - 1)
     assert shares == sorted(shares) and shares[-1] == 1.0
+
+
+def test_a_search_that_is_ended_judges_what_there_is_and_names_no_limit(short, monkeypatch):
+    steps = []
+    walk = PupperEnv.step
+    monkeypatch.setattr(PupperEnv, "step", lambda *a: steps.append(0) or walk(*a))
+    found = fit_trot(Walking(), servo_ranges(CALIBRATION), 0, 1, ends=lambda: True)
+    assert found.after.score >= found.before.score and found.limit is None
+    judged = 3 * round(first_gait._SECONDS / Walking().control_step_s)
+    assert len(steps) == judged  # none of the search
 
 
 # ------------------------------------------------------------------------------ of a run
