@@ -76,7 +76,7 @@ _BOX = {
     "crouch_m": (0.0, 0.03), "spread_m": (0.0, 0.015), "gain": (0.5, 2.5), "back_gain": (0.5, 2.0),
     "side_gain": (0.5, 2.0), "turn_gain": (0.4, 2.5),
 }  # fmt: skip
-_SWAYING = {"lift_m": (0.004, 0.03), "sway_m": (0.0, 0.02)}
+_SWAYING = {"lift_m": (0.004, 0.03)}
 """Of robots whose gait sways (`Body.sways`): a foot that is lifted high throws them over."""
 _FIRST_WIDTH, _NARROWEST = 0.2, 0.02  # standard deviations, in shares of the box
 

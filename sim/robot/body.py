@@ -79,8 +79,9 @@ class Body:
     """`xml(servos, time_step_s, ground, physics)` gives the MJCF on a `Ground`."""
     feet_in_trunk: Callable[[Array], Array]
     """Feet in the trunk's frame [m], shape (n, feet, 3), of joint angles (n, joints) [rad]."""
-    joints_at: Callable[[Array], Array]
-    """The inverse: joint angles (n, joints) that put the feet there, or near."""
+    joints_at: Callable[[Array, Array], Array]
+    """The inverse: joint angles (n, joints) that put the feet there, or near, and turn those with
+    ankles to headings (n, feet) [rad]."""
     touches_ground: Callable[[Array, Array, Ground], NDArray[np.bool_]]
     """`touches_ground(qpos, gravity, ground)`: whether more than feet do, shape (n,)."""
     foot_geoms: tuple[str, ...]
@@ -182,7 +183,7 @@ def _mini_pupper(knee: Knee) -> Body:
         each = joints.reshape(-1, len(LEGS), 3)
         return np.stack([foot_position(leg, *each[:, i].T) for i, leg in enumerate(LEGS)], axis=1)
 
-    def joints_at(feet: Array) -> Array:
+    def joints_at(feet: Array, heading: Array) -> Array:
         return np.concatenate([joint_angles(leg, feet[:, i]) for i, leg in enumerate(LEGS)], axis=1)
 
     pose, (low, high) = default_pose(), limits()

@@ -522,17 +522,17 @@ class _Reader:
         """Each foot's place in the world: the middle of the geoms that it stands on."""
         return np.array([self.data.geom_xpos[own].mean(axis=0) for own in self.feet.values()])
 
-    def _kinematics(self, up_m: float = 0.0):
+    def _kinematics(self, away: Sequence[float] = (0.0, 0.0, 0.0)):
         """Feet in the trunk's frame as a function of joint angles, without MuJoCo.
 
-        Or points fixed to them, `up_m` above them in the default pose.
+        Or points fixed to them, which are so far away from them in the default pose [m].
         """
         model, data, bodies = self.model, self.data, self.foot_bodies
         self._place(self.pose)
-        above = up_m * data.xmat[bodies].reshape(-1, 3, 3)[:, 2]  # in the frames of their bodies
+        own = np.array(away) @ data.xmat[bodies].reshape(-1, 3, 3)  # in the frames of their bodies
         self._place(np.zeros(len(self.joints)))
         turns = data.xmat[bodies].reshape(-1, 3, 3)
-        feet = self._middles() + (turns @ above[..., None])[..., 0]
+        feet = self._middles() + (turns @ own[..., None])[..., 0]
         # the joint next to the foot turns it first
         chains = [self._above(b)[::-1] for b in bodies]
         rounds = []
@@ -566,26 +566,27 @@ class _Reader:
         """Joint angles that put the feet somewhere: damped least squares from the default pose.
 
         Out of reach, or where a leg has fewer than three joints, feet come as near as they can;
-        with more, soles stay as level as they are in the default pose. `chains` are the joints of
-        each leg alone.
+        with more, soles stay as level as they are in the default pose, and have a heading. `chains`
+        are the joints of each leg alone.
         """
         pose, low, high = self.pose, self.low, self.high
         longest = max(len(chain) for chain in chains)
         level = _LEVEL * height * np.array([len(chain) > 3 for chain in chains])[:, None]
-        tips = self._kinematics(1.0) if level.any() else None
+        tips = [self._kinematics(e) for e in np.eye(3)[[0, 2]]] if level.any() else []
 
         def reached(joints: Array) -> Array:
-            """Feet, and the directions of their soles as lengths; shape (n, legs, 3 or 6)."""
+            """Feet, and the directions of their soles as lengths; shape (n, legs, 3 or 9)."""
             here = kinematics(joints)
-            if tips is None:
-                return here
-            return np.concatenate([here, level * (tips(joints) - here)], axis=-1)
+            axes = [level * (tip(joints) - here) for tip in tips]
+            return np.concatenate([here, *axes], axis=-1)
 
-        def joints_at(feet: Array) -> Array:
+        def joints_at(feet: Array, heading: Array) -> Array:
             joints = np.repeat(pose[None], len(feet), axis=0)
-            if tips is not None:
-                upright = np.broadcast_to(level * [0.0, 0.0, 1.0], feet.shape)
-                feet = np.concatenate([feet, upright], axis=-1)
+            if tips:
+                none, one = np.zeros_like(heading), np.ones_like(heading)
+                ahead = np.stack([np.cos(heading), np.sin(heading), none], axis=-1)
+                up = np.stack([none, none, one], axis=-1)
+                feet = np.concatenate([feet, level * ahead, level * up], axis=-1)
             for _ in range(_INVERSE_STEPS):
                 here = reached(joints)
                 slopes = np.zeros((*here.shape, longest))

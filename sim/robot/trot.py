@@ -51,9 +51,6 @@ class Trot:
     """Factor on `gain` sideways."""
     turn_gain: float = 0.785
     """The same of turning: this robot turns farther than its feet while it trots."""
-    sway_m: float = 0.0
-    """How far the trunk moves towards the side whose feet stand while the other side's swing; a
-    trot, in which each side has one of both, does not sway."""
     turn_dead_band_rad_s: float = 0.087
     """Turn rate that is lost where feet do not step sideways: strokes of 1 mm lie in the dead band
     of the hips' friction. A turning command gets it on top."""
@@ -83,9 +80,9 @@ class Trot:
         for i in range(len(centre)):
             path = np.concatenate([stroke[:, i] * along[i][:, None], up[i][:, None]], axis=1)
             feet[:, i] = centre[i] + path
-        if self.sway_m:
-            feet[..., 1] += self._sway(phase, body)[:, None]
-        return np.where(moving[:, None], body.joints_at(feet), body.pose)
+        # a foot that stands turns under the trunk as it passes
+        heading = self._turn(command) * self.duty / (2 * self.frequency_hz) * along
+        return np.where(moving[:, None], body.joints_at(feet, heading.T), body.pose)
 
     def phase_of(
         self,
@@ -115,9 +112,6 @@ class Trot:
                 distance -= 2 * (away[:, :2] * stroke[:, i]).sum(axis=1)[:, None] * along[i]
                 distance += (stroke[:, i] ** 2).sum(axis=1)[:, None] * along[i] ** 2
                 distance += up[i] * (up[i] - 2 * away[:, 2:])
-                if self.sway_m:
-                    aside = self._sway(phase, body)
-                    distance += aside * (aside - 2 * (away[:, 1:2] - stroke[:, i, 1:] * along[i]))
         nearest = distance.argmin(axis=1)
         rows = np.arange(len(joints))
         before, at, after = (distance[rows, (nearest + k) % len(_GRID)] for k in (-1, 0, 1))
@@ -134,12 +128,6 @@ class Trot:
         back = round_ + self.even_swing * (even - round_)
         along = np.where(stands, 1.0 - 2.0 * own / self.duty, back)
         return along, np.where(stands, 0.0, self.lift_m * np.sin(swing))
-
-    def _sway(self, phase: NDArray[np.float64], body: Body) -> NDArray[np.float64]:
-        """How far all feet are to the left [m], shape (n,), for the trunk to be to the right."""
-        swing = phase / (2 * np.pi) + body.offsets[:, None] - 0.5 * (1.0 + self.duty)
-        sides = body.sides / max(np.abs(body.sides).sum() / 2, 1.0)
-        return 0.5 * self.sway_m * sides @ np.cos(2 * np.pi * swing)
 
     def _strokes(
         self, command: NDArray[np.float64], centre: NDArray[np.float64]
@@ -178,4 +166,5 @@ def feet_at(body: Body, crouch_m: float, spread_m: float) -> NDArray[np.float64]
 
 def stance(body: Body, crouch_m: float, spread_m: float) -> NDArray[np.float64]:
     """Joint angles [rad], shape (12,), of a robot that stands so low and wide."""
-    return body.joints_at(feet_at(body, crouch_m, spread_m)[None])[0]
+    feet = feet_at(body, crouch_m, spread_m)[None]
+    return body.joints_at(feet, np.zeros(feet.shape[:2]))[0]

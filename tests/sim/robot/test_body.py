@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +78,9 @@ def test_joints_that_put_feet_somewhere_are_the_inverse_of_where_feet_are(tmp_pa
     for own in (body(tmp_path), mini_pupper()):
         moved = np.random.default_rng(0).uniform(-0.05, 0.05, (20, len(own.feet), 3))
         feet = own.feet_at + own.standing_height_m * moved
-        np.testing.assert_allclose(own.feet_in_trunk(own.joints_at(feet)), feet, atol=1e-6)
+        np.testing.assert_allclose(
+            own.feet_in_trunk(own.joints_at(feet, np.zeros(feet.shape[:2]))), feet, atol=1e-6
+        )
 
 
 @pytest.mark.slow
@@ -224,42 +226,41 @@ ANKLE = """<body pos="0 0 -0.1"><joint name="{}_ankle" axis="0 1 0" range="-2 2"
     pos="0.01 0 -0.01"/></body>"""
 
 
-def biped(folder: Path) -> Body:
+def biped(folder: Path, more: Callable[[str, str], str] = lambda xml, name: xml) -> Body:
     xml = mjcf(TWO)
     for name in TWO:
-        xml = xml.replace(BALL, ANKLE.format(name), 1)
+        xml = more(xml.replace(BALL, ANKLE.format(name), 1), name)
     return body(folder, xml, POSE.replace("}", ', "*_left_ankle": 0.7, "*_right_ankle": 0.7}'))
 
 
 def test_soles_of_legs_with_an_ankle_stay_level_and_feet_where_they_are_to_be(tmp_path):
     own = biped(tmp_path)
     moved = np.random.default_rng(0).uniform(-1, 1, (20, 2, 3)) * [0.02, 0.0, 0.02]
-    joints = own.joints_at(own.feet_at + moved)
+    joints = own.joints_at(own.feet_at + moved, np.zeros((20, 2)))
     np.testing.assert_allclose(own.feet_in_trunk(joints), own.feet_at + moved, atol=2e-4)
     signs = [1.0 if n.endswith(("pitch", "ankle", "left_knee")) else -1.0 for n in own.joints]
     pitch = joints * np.where([n.endswith("roll") for n in own.joints], 0.0, signs)
     np.testing.assert_allclose(pitch.reshape(20, 2, 4).sum(axis=2), 0.0, atol=0.01)
 
 
-def test_a_gait_on_two_legs_sways_over_the_foot_that_stands_and_a_trot_does_not(tmp_path):
-    own, trot = biped(tmp_path), Trot(frequency_hz=2.0, sway_m=0.01, crouch_m=0.01, spread_m=0.0)
-    assert own.sways and not mini_pupper().sways
-    command = np.tile([0.1, 0.0, 0.0], (40, 1))
-    phase = np.linspace(0, 2 * np.pi, 40, endpoint=False)
-    feet = own.feet_in_trunk(trot.joints(phase, command, own))
-    lifted = feet[:, :, 2] - feet[:, :, 2].min(axis=0)
-    # while the left foot is highest all feet are to the left: the trunk is over the right one
-    aside = feet[lifted.argmax(axis=0), :, 1] - own.feet_at[:, 1]
-    np.testing.assert_allclose(aside, [[0.01, 0.01], [-0.01, -0.01]], atol=5e-4)
-    still = replace(trot, sway_m=0.0)
-    np.testing.assert_allclose(
-        trot.joints(phase, command), still.joints(phase, command), atol=1e-12
+def test_soles_turn_under_the_trunk_while_they_stand(tmp_path):
+    yaw = '<joint name="{}_yaw" axis="0 0 1" range="-1 1"/>'
+    before = '<body name="{}_thigh"'
+    own = biped(
+        tmp_path, lambda xml, n: xml.replace(before.format(n), yaw.format(n) + before.format(n))
     )
-    # so the phase is found from where the feet are, and a moment before
-    span, step = 0.02, 2 * np.pi * 2.0 * 0.02
-    earlier = trot.joints(phase - step, command, own)
-    found = trot.phase_of(trot.joints(phase, command, own), earlier, span, command, own)
-    np.testing.assert_allclose(np.cos(found - phase), 1.0, atol=0.01)
+    assert own.sways and not mini_pupper().sways
+    heading = np.tile([0.2, -0.1], (3, 1))
+    joints = own.joints_at(np.repeat(own.feet_at[None], 3, axis=0), heading)
+    turned = joints[:, [own.joints.index(f"{n}_yaw") for n in TWO]]
+    np.testing.assert_allclose(turned, heading, atol=0.01)
+    # by the rate of the turn times the time that a foot stands
+    trot, command = Trot(frequency_hz=2.0, turn_gain=1.0, turn_dead_band_rad_s=0.0), [[0, 0, 0.4]]
+    ends = [
+        trot.joints(np.array([2 * np.pi * at]), np.array(command), own)[0] for at in (0, trot.duty)
+    ]
+    left = own.joints.index("front_left_yaw")
+    assert ends[0][left] - ends[1][left] == pytest.approx(0.4 * trot.duty / 2.0, rel=0.1)
 
 
 def test_a_robot_that_faces_along_y_is_said_to_and_turned(tmp_path):
