@@ -121,7 +121,7 @@ def _parse(given: list[str]) -> Options:
 
 
 def _run(options: Options, given: list[str]) -> None:
-    run = options.run
+    run, begun = options.run, time.monotonic()
     if options.print_config:
         print(yaml.safe_dump(plain(run), sort_keys=False), end="")
         return
@@ -151,7 +151,6 @@ def _run(options: Options, given: list[str]) -> None:
                 text = f"{value:,.3g}" if isinstance(value, float) else str(value)
                 out.print(f"{name:28} {text}")
         return
-    begun = time.monotonic()
     ranks = Ranks.join()
     name = options.name or f"{options.policy}-{datetime.now():%Y%m%d-%H%M%S}"
     folder = options.resume or Path("runs") / ranks.same(name)
