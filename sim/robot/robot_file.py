@@ -247,11 +247,12 @@ class _Reader:
         fixed = [n for n in names if n not in chosen]
         if fixed:
             self.notes.append(f"Joints without a servo are fixed: {_some(fixed)}.")
-        if whole.neq:
+        if whole.neq or whole.ntendon:
             self.notes.append(
-                f"{self.path.name} couples bodies or joints (<equality>: closed linkages, joints "
-                "that follow others). That is taken out: a leg with such a coupling moves "
-                "otherwise than the robot's. Describe it as a chain with a servo on each joint."
+                f"{self.path.name} couples bodies or joints (<equality>, <tendon>: closed "
+                "linkages, joints that follow others). That is taken out: a leg with such a "
+                "coupling moves otherwise than the robot's. Describe it as a chain with a servo on "
+                "each joint."
             )
         return tuple(n for n in names if n in chosen)
 
