@@ -46,8 +46,9 @@ Array = NDArray[np.float64]
 
 POOR_SCORE = 0.6
 """Score below which a trot is fitted to the servos; on the shipped calibration it has 0.7. Fitted,
-it rises from 0.28 to 0.66 on servos of 0.6 of the stiffness and 0.8 of the torque, from 0.45 to
-0.69 on `ideal` ones, and by at most 0.07 where it was 0.66 or more."""
+it rises from 0.26 to 0.34 on servos of 0.6 of the stiffness and 0.8 of the torque (14 to 60 % of
+the speed forward, clearance 0.6 to 9.9 mm), from 0.40 to 0.70 on `ideal` ones, from 0.51 to 0.73 on
+servos of twice the stiffness and torque, and by at most 0.03 where it was 0.7 or more."""
 FORWARD = (0.9, 1.1)
 """Shares of the commanded forward speed within which a trot need not be fitted."""
 LOW_SWINGS = 0.25
@@ -73,7 +74,8 @@ _MOST_CORRECTION = 1.6  # of a gain, in one generation
 
 _BOX = {
     "frequency_hz": (1.8, 5.0), "duty": (0.5, 0.85), "lift_m": (0.009, 0.03),
-    "crouch_m": (0.0, 0.03), "spread_m": (0.0, 0.015), "gain": (0.5, 2.5), "back_gain": (0.5, 2.0),
+    "crouch_m": (-0.015, 0.03),  # straighter legs ask less torque of the knees
+    "spread_m": (0.0, 0.015), "gain": (0.5, 2.5), "back_gain": (0.5, 2.0),
     "side_gain": (0.5, 2.0), "turn_gain": (0.4, 2.5),
 }  # fmt: skip
 _SWAYING = {"lift_m": (0.004, 0.03)}
