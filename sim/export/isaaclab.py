@@ -15,7 +15,6 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.cards.files import motor_of
 from pupper_sysid.servo_models.delayed_pd import whole_steps
 from pupper_sysid.sim.export.shared import (
-    CALIBRATED_PD,
     EXPLICIT_PD,
     NOT_CARRIED,
     ExportedServos,
@@ -32,7 +31,7 @@ from isaaclab.utils import configclass"""
 
 _CODE = '''
 class CalibratedServo(IdealPDActuator):
-    """Isaac Lab's PD, with the set-points of real servos and the readings that they give."""
+    """Torques of real servos, and the readings that they give."""
 
     def __init__(self, cfg, joint_names, *args, **kwargs):
         super().__init__(cfg, joint_names, *args, **kwargs)
@@ -45,10 +44,12 @@ class CalibratedServo(IdealPDActuator):
         self.servos.restart(env_ids)
 
     def compute(self, control_action, joint_pos, joint_vel):
-        control_action.joint_positions = self.servos.command(
-            control_action.joint_positions, joint_pos
+        self.computed_effort = self.servos.efforts(
+            control_action.joint_positions, joint_pos, joint_vel
         )
-        return super().compute(control_action, joint_pos, joint_vel)
+        self.applied_effort = control_action.joint_efforts = self.computed_effort
+        control_action.joint_positions = control_action.joint_velocities = None
+        return control_action
 
 
 @configclass
@@ -81,7 +82,7 @@ ACTUATORS = {
         armature=_by_joint("armature"),
         friction=_by_joint("friction_loss"),
         dynamic_friction=_by_joint("friction_loss"),
-        viscous_friction=_by_joint("back_emf"),
+        viscous_friction=0.0,  # back-EMF is in the torques
         **_limits(
             effort_limit=_by_joint("effort_limit"),
             velocity_limit=_by_joint("velocity_limit_rad_s"),
@@ -140,7 +141,7 @@ def to_isaaclab(servos: ExportedServos) -> str:
         + '"""For `ArticulationCfg(actuators=WHOLE_STEP_ACTUATORS)`, where the class cannot be '
         'used."""\n'
     )
-    return torch_module(servos, CALIBRATED_PD, "Isaac Lab", notes, _IMPORTS, f"{_CODE}{whole}")
+    return torch_module(servos, "Isaac Lab", notes, _IMPORTS, f"{_CODE}{whole}")
 
 
 _BAM_IMPORTS = '''\

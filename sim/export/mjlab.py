@@ -1,6 +1,6 @@
 """A calibration for mjlab: a Python module of actuators and the feedback.
 
-A class on mjlab's `Actuator` gives MuJoCo-Warp the set-points of the servos, with delays of any
+A class on mjlab's `Actuator` gives MuJoCo-Warp the torques of the servos, with delays of any
 fraction of a step; beside it the released `BuiltinPositionActuatorCfg`, in whole steps. Names are
 those of mjlab 1.6.0; `benchmarks/peers/check_exports.py` holds them against the released package.
 """
@@ -8,7 +8,7 @@ those of mjlab 1.6.0; `benchmarks/peers/check_exports.py` holds them against the
 from __future__ import annotations
 
 from pupper_sysid.servo_models.delayed_pd import whole_steps
-from pupper_sysid.servo_models.step_size import MUJOCO, Engine
+from pupper_sysid.servo_models.step_size import Engine
 from pupper_sysid.sim.export.shared import NOT_CARRIED, ExportedServos, block, call, torch_module
 from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
 
@@ -33,26 +33,26 @@ class CalibratedServoCfg(ActuatorCfg):
 
 
 class CalibratedServo(Actuator):
-    """MuJoCo's position actuators, with the set-points of real servos and their readings."""
+    """Motors with the torques of real servos, and their readings."""
 
     def edit_spec(self, spec, target_names):
         for target in target_names:
             servo, joint = SERVOS[target.split("/")[-1]], spec.joint(target)
             joint.armature, joint.frictionloss = servo["armature"], servo["friction_loss"]
             joint.solref_friction, joint.solimp_friction = FRICTION_SOLREF, FRICTION_SOLIMP
-            for name, value in (("damping", servo["back_emf"]), ("stiffness", 0.0)):
+            for name in ("damping", "stiffness"):
                 polynomial = hasattr(getattr(joint, name), "__len__")
-                setattr(joint, name, [value, 0.0, 0.0] if polynomial else value)
+                setattr(joint, name, [0.0, 0.0, 0.0] if polynomial else 0.0)
             joint.actfrclimited = False
             actuator = spec.add_actuator(name=target, target=target)
             actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
+            actuator.dyntype = mujoco.mjtDyn.mjDYN_NONE
             actuator.gaintype = mujoco.mjtGain.mjGAIN_FIXED
-            actuator.biastype = mujoco.mjtBias.mjBIAS_AFFINE
-            actuator.gainprm[0], actuator.biasprm[1] = servo["stiffness"], -servo["stiffness"]
-            actuator.biasprm[2] = -servo["damping"]
-            actuator.inheritrange, actuator.ctrllimited = 0.0, False
-            actuator.forcelimited = True
-            actuator.forcerange[:] = [-servo["effort_limit"], servo["effort_limit"]]
+            actuator.biastype = mujoco.mjtBias.mjBIAS_NONE
+            actuator.gainprm[:], actuator.biasprm[:], actuator.gear[:] = 0.0, 0.0, 0.0
+            actuator.gainprm[0] = actuator.gear[0] = 1.0
+            actuator.inheritrange = 0.0
+            actuator.ctrllimited = actuator.forcelimited = False
             self._mjs_actuators.append(actuator)
 
     def initialize(self, mj_model, model, data, device):
@@ -65,7 +65,7 @@ class CalibratedServo(Actuator):
         self.servos.restart(env_ids)
 
     def compute(self, cmd):
-        return self.servos.command(cmd.position_target, cmd.pos)
+        return self.servos.efforts(cmd.position_target, cmd.pos, cmd.vel)
 
 
 def held_joint_pos(env, entity="robot"):
@@ -135,4 +135,4 @@ def to_mjlab(servos: ExportedServos) -> str:
         + block("DELAY_STEPS", bounds)
         + '"""Least and greatest delay of each joint, in physics steps."""\n'
     )
-    return torch_module(servos, MUJOCO, "mjlab", notes, _IMPORTS, f"{friction}{_CODE}{whole}")
+    return torch_module(servos, "mjlab", notes, _IMPORTS, f"{friction}{_CODE}{whole}")

@@ -9,7 +9,7 @@ those of Newton 1.8.0; `benchmarks/peers/check_exports.py` holds them against th
 
 from __future__ import annotations
 
-from pupper_sysid.sim.export.shared import CALIBRATED_PD, NOT_CARRIED, ExportedServos, torch_module
+from pupper_sysid.sim.export.shared import NOT_CARRIED, ExportedServos, torch_module
 from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
 
 _IMPORTS = "import warp as wp"
@@ -26,7 +26,7 @@ def add_servos(builder):
         builder.joint_target_ke[dof] = builder.joint_target_kd[dof] = 0.0
         builder.joint_armature[dof] = servo["armature"]
         builder.joint_friction[dof] = servo["friction_loss"]
-        builder.joint_damping[dof] = servo["back_emf"]
+        builder.joint_damping[dof] = 0.0  # back-EMF is in the efforts
         builder.joint_target_mode[dof] = 0  # JointTargetMode.NONE: `Servos` gives the efforts
         for key, value in FRICTION.items():
             attribute = builder.custom_attributes.get(key)
@@ -60,20 +60,12 @@ class Servos:
         self.dof = [builder.joint_qd_start[j] for j in joints]
         self.worlds, device = num_worlds, str(wp.device_to_torch(model.device))
         self.bank = ServoBank(SERVOS, FEEDBACK, list(SERVOS), num_worlds, PHYSICS_DT, device)
-        self.gains = {
-            key: torch.tensor([servo[key] for servo in SERVOS.values()], device=device)
-            for key in ("stiffness", "damping", "effort_limit")
-        }
 
     def command(self, commands, state, control):
         """Set the joints' efforts for the next physics step."""
-        position = self._position(state)
         velocity = wp.to_torch(state.joint_qd).view(self.worlds, -1)[:, self.dof]
-        error = self.bank.command(commands, position) - position
-        effort = self.gains["stiffness"] * error - self.gains["damping"] * velocity
-        limit = self.gains["effort_limit"]
         efforts = wp.to_torch(control.joint_f).view(self.worlds, -1)
-        efforts[:, self.dof] = torch.minimum(torch.maximum(effort, -limit), limit)
+        efforts[:, self.dof] = self.bank.efforts(commands, self._position(state), velocity)
 
     def read(self, state):
         """What the servos report, in place of the joint positions."""
@@ -105,4 +97,4 @@ def to_newton(servos: ExportedServos) -> str:
         "}\n"
         '"""Friction that stops a joint within one physics step; of SolverMuJoCo."""\n\n'
     )
-    return torch_module(servos, CALIBRATED_PD, "Newton", notes, _IMPORTS, f"{friction}{_CODE}")
+    return torch_module(servos, "Newton", notes, _IMPORTS, f"{friction}{_CODE}")

@@ -33,8 +33,6 @@ FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age
 TORQUE_KEYS = tuple(PARAMETER_KEYS[name] for name in (*TORQUES, "armature"))
 EXPLICIT_PD = Engine(slews=False, implicit=False)
 """Isaac Lab's own PDs: torque before each step, set-points of unlimited speed."""
-CALIBRATED_PD = Engine(implicit=False)
-"""The classes for Isaac Lab and Newton: set-points of limited speed, torque before each step."""
 UNITS = "Units: N·m, rad, s, kg·m²; delays in steps are in physics steps."
 NOT_CARRIED = (
     "The feedback is no part of an actuator, and without it the simulated robot sees more than the "
@@ -132,8 +130,8 @@ class ExportedServos:
             for name, a in actuators.items()
         }
 
-    def head(self, engine: Engine, *target: str) -> list[str]:
-        """Sentences of a file's head, those about the `target` last."""
+    def head(self, engine: Engine | None, *target: str) -> list[str]:
+        """Sentences of a file's head, those about the `target` last; classes need no engine."""
         calibration = self.calibration
         inputs = ", ".join(f"{f.name} (sha256 {f.sha256[:12]}…)" for f in calibration.inputs)
         return [
@@ -225,10 +223,13 @@ class ExportedServos:
                 "has the whole servo."
             )
 
-    def _step_note(self, engine: Engine) -> Iterator[str]:
+    def _step_note(self, engine: Engine | None) -> Iterator[str]:
         """The step that the numbers are for, and what was changed for its length."""
         h = 1e3 * self.physics_step_s
         yield f"Made for physics steps of {h:g} ms; others: export again."
+        if engine is None:
+            yield "SERVOS has the numbers of the calibration as they are; the classes step them."
+            return
         fitted = [joint.actuator.parameters.arrays() for joint in self.calibration.joints.values()]
         stepped = [a.parameters.arrays() for a in self.actuators(engine).values()]
         pairs = list(zip(fitted, stepped, strict=True))
@@ -349,18 +350,24 @@ def feedback_block(calibration: Calibration) -> str:
     ])  # fmt: skip
 
 
-def servos_block(servos: ExportedServos, engine: Engine) -> str:
-    """`SERVOS = {…}`: the numbers of each joint's actuator, its dead time for this engine."""
+def servos_block(servos: ExportedServos) -> str:
+    """`SERVOS = {…}`: the numbers of each joint's servo, and all the inertia that it moved."""
     keys = {name: PARAMETER_KEYS[name] for name in (*TORQUES, "armature")} | {
         "velocity_limit_rad_s": "velocity_limit_rad_s", "jitter_s": "command_jitter_s",
         "dead_time_s": "dead_time_s",
     }  # fmt: skip
     rows = []
-    for name, actuator in servos.actuators(engine).items():
+    for name, joint in servos.calibration.joints.items():
+        actuator = joint.actuator
         quantities = {shown: getattr(actuator, key) for shown, key in keys.items()}
         lines = [
             f'    "{shown}": {q.value!r},  # {unit_of(keys[shown])}, {known_text(q)}'
             for shown, q in quantities.items()
+        ]
+        inertia = servos.moving.joint(name).actuator.armature_kg_m2.value
+        lines += [
+            f'    "inertia": {inertia!r},  # kg·m², of all that moved in the recordings',
+            f'    "step_s": {actuator.fitted_step_s!r},  # s, of MuJoCo, in which all this holds',
         ]
         rows.append("\n".join([f'"{name}": {{', *lines, "},"]))
     return block("SERVOS", rows) + '"""The servos by joint."""\n'
@@ -368,7 +375,6 @@ def servos_block(servos: ExportedServos, engine: Engine) -> str:
 
 def torch_module(
     servos: ExportedServos,
-    engine: Engine,
     target: str,
     notes: Sequence[str],
     imports: str,
@@ -382,13 +388,13 @@ def torch_module(
     # read, not imported: that would load torch
     code = (resources.files("pupper_sysid.sim.export") / "torch_servos.py").read_text()
     return (
-        f"{docstring(f'Servos for {target}.', servos.head(engine, *notes))}\n"
+        f"{docstring(f'Servos for {target}.', servos.head(None, *notes))}\n"
         "from __future__ import annotations\n\n"
         "import math\nfrom collections.abc import Mapping, Sequence\n\n"
         f"import torch\n{imports}\n\n"
         f"PHYSICS_DT = {servos.physics_step_s!r}\n"
         '"""Physics step that the delays below are made for [s]."""\n\n'
-        f"{servos_block(servos, engine)}\n"
+        f"{servos_block(servos)}\n"
         f"{feedback_block(servos.calibration)}"
         '"""What makes each joint\'s readings stale and quantised; `HeldFeedback` applies it."""\n'
         f"\n\n{code[code.index('class SetPoint') :]}\n\n{actuators}"

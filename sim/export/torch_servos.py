@@ -27,9 +27,9 @@ import torch
 class SetPoint:
     """Set-points of many robots' position loops: commands after their dead time, at limited speed.
 
-    A command that changes on physics steps and takes effect within one is the mean of the two
-    commands over that step. With a jitter every command has a latency of its own, and none
-    overtakes the one before it.
+    What `step` gives is the mean over the step of a set-point that begins to run whenever a command
+    arrives. With a jitter every command has a latency of its own, and none overtakes the one
+    before it.
 
     `servos` has, by joint, `dead_time_s`, `jitter_s` (standard deviation of the latency, part of
     the dead time) and `velocity_limit_rad_s`; `joint_names` is the order of the columns of what
@@ -50,7 +50,7 @@ class SetPoint:
 
         self.dead_time, self.jitter = column("dead_time_s"), column("jitter_s")
         self.jitter = torch.minimum(self.jitter, self.dead_time)  # its mean is in the dead time
-        self.slew = column("velocity_limit_rad_s") * physics_dt
+        self.speed = column("velocity_limit_rad_s").clamp(max=1e9)  # beyond, at once
         self.physics_dt, self.generator = physics_dt, generator
         self.longest = self.dead_time + 7 * self.jitter  # an exponential is longer once in 3,000
         slots = math.ceil(float(self.longest.max()) / physics_dt) + 2
@@ -68,7 +68,7 @@ class SetPoint:
         self.arrival[env_ids] = -1.0
 
     def step(self, command: torch.Tensor) -> torch.Tensor:
-        """Set-points of the next physics step; both (environments, joints) [rad]."""
+        """Mean set-points over the next physics step; both (environments, joints) [rad]."""
         new = (command != self.last)[..., None]
         latency = self.dead_time.expand_as(command)
         if bool((self.jitter > 0).any()):
@@ -84,11 +84,23 @@ class SetPoint:
         start = self.arrival.clamp(0.0, self.physics_dt)
         start[..., 0] = 0.0
         end = torch.full_like(command, self.physics_dt)[..., None]
-        share = torch.diff(start, dim=-1, append=end) / self.physics_dt
-        wanted = (self.value * share).sum(-1)
-        self.target = self.target + (wanted - self.target).clamp(-self.slew, self.slew)
+        times = torch.diff(start, dim=-1, append=end)
+        # until the first arrival of the step, and what arrives in the rest of it
+        place = (times > 0).int().argmax(-1, keepdim=True)
+        until = times.gather(-1, place)[..., 0]
+        before = self.value.gather(-1, place)[..., 0]
+        rest = self.physics_dt - until
+        after = ((self.value * times).sum(-1) - before * until) / rest.clamp(min=1e-9)
+        area = self._run(before, until) + self._run(torch.where(rest > 0, after, before), rest)
         self.arrival = (self.arrival - self.physics_dt).clamp(min=-1.0)
-        return self.target.clone()
+        return area / self.physics_dt
+
+    def _run(self, goal: torch.Tensor, duration: torch.Tensor) -> torch.Tensor:
+        """Let the set-point run to a goal for a time; its integral over this time."""
+        reach = self.speed * duration
+        change = torch.minimum(torch.maximum(goal - self.target, -reach), reach)
+        self.target = self.target + change
+        return self.target * duration - change * change.abs() / (2 * self.speed)
 
 
 class HeldFeedback:
@@ -162,9 +174,12 @@ class HeldFeedback:
 
 
 class ServoBank:
-    """Commands and readings of a group of servos, in the order in which simulators call for them.
+    """Torques and readings of a group of servos, in the order in which simulators call for them.
 
-    Parameters are those of `SetPoint` and `HeldFeedback`.
+    Parameters are those of `SetPoint` and `HeldFeedback`; `servos` also has, by joint, `stiffness`,
+    `damping`, `effort_limit` and `back_emf`, `inertia`, the armature with what else moved in the
+    recordings, and `step_s`, the steps of MuJoCo in which these numbers are the servo's. Dry
+    friction and armature are the simulator's.
     """
 
     def __init__(
@@ -176,8 +191,27 @@ class ServoBank:
         physics_dt: float,
         device: str = "cpu",
     ):
-        self.set_point = SetPoint(servos, joint_names, num_envs, physics_dt, device)
+        def column(key: str) -> torch.Tensor:
+            return torch.tensor([servos[name][key] for name in joint_names], device=device)
+
+        self.stiffness, self.damping = column("stiffness"), column("damping")
+        self.limit, self.brake = column("effort_limit"), column("back_emf")
+        # a simulator's velocity is that of half a step ago, and MuJoCo brakes with the next one
+        lead = (physics_dt + column("step_s")) / 2
+        self.steps_ahead, self.per_torque = lead / physics_dt, lead / column("inertia")
+        # a step's torque is one of its beginning: it takes the mean of the set-points around that;
+        # MuJoCo's is that half a step later or, where it runs, has run for all of its first step
+        later = {}
+        for name in joint_names:
+            own = servos[name]
+            part = (own["dead_time_s"] / own["step_s"] + 1e-6) % 1.0
+            runs = own["velocity_limit_rad_s"] < 1000.0  # which stands for none
+            ahead = own["step_s"] * (1 + part if runs else 0.5)
+            delay = max(own["dead_time_s"] + physics_dt / 2 - ahead, 0.0)
+            later[name] = {**own, "dead_time_s": delay}
+        self.set_point = SetPoint(later, joint_names, num_envs, physics_dt, device)
         self.feedback = HeldFeedback(feedback, joint_names, num_envs, physics_dt, device)
+        self.effort, self.velocity = torch.zeros((2, num_envs, len(joint_names)), device=device)
         self.new = torch.ones(num_envs, dtype=torch.bool, device=device)
         self.any_new = True  # known here without waiting for the device
         self.has_read = False
@@ -195,12 +229,30 @@ class ServoBank:
         if self.any_new:
             self.feedback.reset(position, self.new)
             self.set_point.reset(position, self.new)
+            self.effort[self.new], self.velocity[self.new] = 0.0, torch.nan
             self.new[:] = False
             self.any_new = False
         return self.feedback.reading.clone()
 
-    def command(self, command: torch.Tensor, position: torch.Tensor) -> torch.Tensor:
-        """Set-points of the next physics step, which begins at `position`; all [rad]."""
+    def efforts(
+        self, command: torch.Tensor, position: torch.Tensor, velocity: torch.Tensor
+    ) -> torch.Tensor:
+        """Torques of the next physics step [N·m], of joints at `position` [rad] with `velocity`.
+
+        The servo brakes with the velocity of the present: the acceleration of the last step goes
+        on, but for what the torque changes of it. So the motion is the servo's to the second order
+        of the step, whatever load the joint has, and a joint at rest gets the whole torque.
+        """
         self.read(position)
         self.has_read = False
-        return self.set_point.step(command)
+        drive = self.stiffness * (self.set_point.step(command) - position)
+        change = torch.nan_to_num(velocity - self.velocity, nan=0.0)  # NaN: none before
+        now = velocity + self.steps_ahead * change - self.per_torque * self.effort
+        brakes = self.damping + self.brake
+        free = (drive - brakes * now) / (1 + self.per_torque * brakes)
+        motor = drive - self.damping * (now + self.per_torque * free)
+        largest = torch.minimum(torch.maximum(motor, -self.limit), self.limit)
+        clipped = (largest - self.brake * now) / (1 + self.per_torque * self.brake)
+        self.effort = torch.where(motor == largest, free, clipped)
+        self.velocity = velocity.clone()
+        return self.effort.clone()

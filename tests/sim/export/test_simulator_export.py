@@ -34,7 +34,7 @@ from pupper_sysid.sim.export.check import check, held, walk_commands
 from pupper_sysid.sim.export.export import exported_text
 from pupper_sysid.sim.export.mjcf import to_mjcf
 from pupper_sysid.sim.export.mjlab import BUILTIN_PD
-from pupper_sysid.sim.export.shared import CALIBRATED_PD, EXPLICIT_PD, ExportedServos
+from pupper_sysid.sim.export.shared import EXPLICIT_PD, ExportedServos
 from pupper_sysid.sim.export.targets import TARGETS
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, rest_at
@@ -184,7 +184,7 @@ def executed(text: str) -> dict[str, Any]:
 
 
 def isaac_lab(text: str, monkeypatch, fields: set[str] = ISAACLAB) -> dict[str, Any]:
-    """An export's names, in a stub of Isaac Lab whose PD is that of its manual."""
+    """An export's names, in a stub of Isaac Lab."""
 
     class IdealPDActuatorCfg:
         def __init__(self, **given):
@@ -194,20 +194,9 @@ def isaac_lab(text: str, monkeypatch, fields: set[str] = ISAACLAB) -> dict[str, 
     class IdealPDActuator:
         def __init__(self, cfg, joint_names, joint_ids, num_envs, device, **_):
             self.cfg, self._num_envs, self._device = cfg, num_envs, device
-            names = [n for n in vars(cfg) if n not in ("joint_names_expr",)]
-            for name in names:
-                values = getattr(cfg, name)
-                setattr(self, name, torch.tensor([values[j] for j in joint_names]))
 
         def reset(self, env_ids):
             pass
-
-        def compute(self, action, position, velocity):
-            effort = self.stiffness * (action.joint_positions - position) - self.damping * velocity
-            limit = getattr(self, "effort_limit", None)
-            limit = self.actuator_effort_limit if limit is None else limit
-            action.joint_efforts = torch.minimum(torch.maximum(effort, -limit), limit)
-            return action
 
     def configclass(cls):
         return cls
@@ -266,13 +255,13 @@ def test_back_emf_brakes_in_every_simulator(braking, monkeypatch):
     explicit, implicit = ([a.back_emf_nm_s_per_rad.value for a in servos.actuators(e).values()]
                           for e in (EXPLICIT_PD, MUJOCO))  # fmt: skip
     space = isaac_lab(text_of(braking, "isaaclab"), monkeypatch)
-    assert list(space["ACTUATORS"]["servos"].viscous_friction.values()) == explicit
+    assert space["ACTUATORS"]["servos"].viscous_friction == 0  # it is in the class's torques
     whole = space["WHOLE_STEP_ACTUATORS"].values()
     assert [made["viscous_friction"] for made in whole] == explicit
     space = mjlab(text_of(braking, "mjlab"), monkeypatch)
     assert [made["viscous_damping"] for made in space["WHOLE_STEP_ACTUATORS"]] == implicit
-    for to, brakes in (("mjlab", implicit), ("newton", explicit)):
-        assert all(f'"back_emf": {brake!r}' in text_of(braking, to) for brake in brakes)
+    for to in ("isaaclab", "mjlab", "newton"):
+        assert text_of(braking, to).count('"back_emf": 0.0321,') == 3
     assert text_of(braking, "mjcf", 0.002).count('damping="0.0321 0 0"') == 3
     joints = json.loads(text_of(braking, "json"))["joints"]
     assert [j["actuator"]["back_emf_nm_s_per_rad"]["value"] for j in joints.values()] == implicit
@@ -288,9 +277,10 @@ def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
     delays, actuators = exported.delays(EXPLICIT_PD), exported.actuators(EXPLICIT_PD)
     servos = space["ACTUATORS"]["servos"]
     for name, made in space["WHOLE_STEP_ACTUATORS"].items():
-        own = actuators[name]
+        whole, own = actuators[name], calibration.joint(name).actuator
         assert made["joint_names_expr"] == [name]
-        assert made["stiffness"] == servos.stiffness[name] == own.stiffness_nm_per_rad.value
+        assert made["stiffness"] == whole.stiffness_nm_per_rad.value
+        assert servos.stiffness[name] == own.stiffness_nm_per_rad.value
         assert made["armature"] == servos.armature[name] == own.armature_kg_m2.value
         assert made["min_delay"] * 0.005 <= delays[name].low
         assert delays[name].high <= made["max_delay"] * 0.005
@@ -301,7 +291,7 @@ def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
         known = 0.0 if key == "offset_rad" else getattr(feedback, key).value
         assert space["FEEDBACK"]["LF_hip"][key] == known
     # the name of the torque limit is that of the release that is installed
-    limits = [a.effort_limit_nm.value for a in actuators.values()]
+    limits = [joint.actuator.effort_limit_nm.value for joint in calibration.joints.values()]
     assert list(servos.effort_limit.values()) == limits
     newer = isaac_lab(text, monkeypatch, ISAACLAB_3)["ACTUATORS"]["servos"]
     assert list(newer.actuator_effort_limit.values()) == limits
@@ -348,10 +338,10 @@ def test_the_class_for_isaac_lab_moves_its_joints_as_the_calibration_does(calibr
     servo.reset(np.zeros(3))
     own = servo.rollout(np.repeat(held(walk_commands()[:75], TIME_STEP_S)[:, None], 3, axis=1))
     apart = there[1::2] - own
-    assert np.sqrt(np.mean(apart**2)) < 3e-3  # 3 mrad: another step, an explicit PD
+    assert np.sqrt(np.mean(apart**2)) < 1.5e-3  # the set-points of a fit in steps run in steps
 
 
-def test_the_mjlab_class_builds_mujocos_servo(calibration, monkeypatch):
+def test_the_mjlab_class_builds_motors_and_gives_them_the_servos_torques(calibration, monkeypatch):
     space = mjlab(text_of(calibration, "mjlab", TIME_STEP_S), monkeypatch)
     spec = mujoco.MjSpec.from_string(
         '<mujoco><default><joint damping="0.6" stiffness="3"/></default><worldbody>'
@@ -368,21 +358,23 @@ def test_the_mjlab_class_builds_mujocos_servo(calibration, monkeypatch):
     actuator.edit_spec(spec, names)
     model = spec.compile()
     own = [joint.actuator for joint in calibration.joints.values()]
-    pairs = {
-        "dof_armature": "armature_kg_m2", "dof_frictionloss": "friction_loss_nm",
-        "dof_damping": "back_emf_nm_s_per_rad",
-    }  # fmt: skip
+    pairs = {"dof_armature": "armature_kg_m2", "dof_frictionloss": "friction_loss_nm"}
     for field, key in pairs.items():
         np.testing.assert_allclose(getattr(model, field), [getattr(a, key).value for a in own])
-    np.testing.assert_array_equal(model.jnt_stiffness, 0)
-    np.testing.assert_allclose(
-        -model.actuator_biasprm[:, 1:3],
-        [(a.stiffness_nm_per_rad.value, a.damping_nm_s_per_rad.value) for a in own],
-    )
+    for field in ("dof_damping", "jnt_stiffness", "actuator_biasprm", "actuator_forcelimited"):
+        np.testing.assert_array_equal(getattr(model, field), 0)
+    np.testing.assert_array_equal(model.actuator_gainprm[:, 0], 1)
+    np.testing.assert_array_equal(model.actuator_gear, [[1, 0, 0, 0, 0, 0]] * 3)
     actuator.initialize(model, None, types.SimpleNamespace(nworld=2), "cpu")
     rest = torch.full((2, 3), 0.3)
-    cmd = types.SimpleNamespace(position_target=torch.full((2, 3), 0.5), pos=rest)
-    assert torch.equal(actuator.compute(cmd), rest)  # the command is on its way
+    cmd = types.SimpleNamespace(
+        position_target=torch.full((2, 3), 0.5), pos=rest, vel=torch.zeros(2, 3)
+    )
+    assert not actuator.compute(cmd).any()  # the command is on its way
+    for _ in range(40):
+        torques = actuator.compute(cmd)
+    held_fast = [min(0.2 * a.stiffness_nm_per_rad.value, a.effort_limit_nm.value) for a in own]
+    torch.testing.assert_close(torques, torch.tensor([held_fast] * 2))
 
 
 def test_the_json_export_holds_every_number_with_its_interval(calibration):
@@ -428,7 +420,7 @@ def test_the_newton_module_finds_joints_by_name_behind_a_free_base(calibration, 
         },
     )  # fmt: skip
     space["add_servos"](builder)
-    own = ExportedServos.of(calibration, 0.005).actuators(CALIBRATED_PD)["LF_hip"]
+    own = calibration.joint("LF_hip").actuator
     assert builder.joint_armature[6] == own.armature_kg_m2.value
     assert sorted(attribute.values) == [6, 7, 8]
     servos = space["Servos"](builder, types.SimpleNamespace(device=None), num_worlds=2)
