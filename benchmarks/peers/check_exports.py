@@ -1,12 +1,13 @@
 """Do the released simulators know the names that our exports use, and move as we do?
 
-    .venv/bin/python benchmarks/peers/check_exports.py
+    .venv/bin/python benchmarks/peers/check_exports.py [WALK.csv]
 
 Downloads the newest wheels of Isaac Lab, mjlab and Newton (without what they depend on), reads the
 fields of their configuration classes, and compares them with those of
 `tests/support/exported_servos.py`, which the tests hold the exports against. Where `install.sh` has
 been run, Newton, mjlab and Isaac Lab's actuators run their exports: unseen tones and a walk through
 servos behind a floating base, against the calibration's own model, and the age of their readings.
+`WALK.csv` has other commands for the walk, a column of angles every 20 ms [rad].
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
 
@@ -36,7 +37,10 @@ from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
 from support import exported_servos as ours
 
 HERE = ROOT / "benchmarks/peers"
-CARDS = (str(ROOT / "data/samples/calibrated.yaml"), "sts3215-bam-m1", "sts3215-open-duck")
+CARDS = (
+    str(ROOT / "data/samples/calibrated.yaml"), "sts3215-bam-m1", "sts3215-open-duck", "xl330-m288",
+    "robstride-03",
+)  # fmt: skip
 STEPS_S = (0.002, 0.005)
 VENVS = Path(os.environ.get("EXPORT_VENVS", HERE))
 """Where `install.sh` made the environments."""
@@ -80,47 +84,52 @@ def fields(root: Path, part: str, names: tuple[str, ...]) -> set[str]:
 
 
 def ran(
-    simulator: str, servos: ExportedServos, commands: NDArray, folder: Path
-) -> tuple[NDArray, NDArray]:
-    """Positions and readings of the servos, shape (steps, joints), in a simulator."""
-    step_s, names = servos.physics_step_s, servos.calibration.joint_names
+    simulator: str, jobs: Sequence[tuple[ExportedServos, NDArray]], folder: Path
+) -> list[tuple[NDArray, NDArray]]:
+    """Positions and readings of servos under commands in a simulator, each (steps, joints)."""
     if simulator == "mujoco":
-        there = moved_by(compiled(servos), names, commands, step_s)
-        return there, there
-    exported = folder / f"{simulator}_export.py"
-    exported.write_text(TARGETS[simulator].text(servos))
-    each = np.repeat(held(commands, step_s)[:, None], len(names), axis=1)
-    np.savez(
-        folder / "commands.npz", command=each, step_s=step_s, solref=friction_solref(step_s),
-        solimp=FRICTION_SOLIMP,
-    )  # fmt: skip
+        moved = [moved_by(compiled(s), s.calibration.joint_names, c, s.physics_step_s)
+                 for s, c in jobs]  # fmt: skip
+        return [(there, there) for there in moved]
+    files = []
+    for n, (servos, commands) in enumerate(jobs):
+        files.append([f"{simulator}{n}.py", f"{simulator}{n}.npz", f"{simulator}{n}_out.npz"])
+        (folder / files[-1][0]).write_text(TARGETS[simulator].text(servos))
+        step_s, joints = servos.physics_step_s, len(servos.calibration.joints)
+        np.savez(
+            folder / files[-1][1], step_s=step_s, solref=friction_solref(step_s),
+            command=np.repeat(held(commands, step_s)[:, None], joints, axis=1),
+            solimp=FRICTION_SOLIMP,
+        )  # fmt: skip
     subprocess.run(
-        [VENVS / f".venv-{simulator}/bin/python", HERE / f"in_{simulator}.py", exported,
-         "commands.npz", "out.npz"],
+        [VENVS / f".venv-{simulator}/bin/python", HERE / f"in_{simulator}.py",
+         *(name for job in files for name in job)],
         cwd=folder, check=True, capture_output=True,
     )  # fmt: skip
-    out = np.load(folder / "out.npz")
-    return out["position"], out["reading"]
+    outs = [np.load(folder / out) for _, _, out in files]
+    return [(out["position"], out["reading"]) for out in outs]
 
 
-def parity(folder: Path) -> Iterator[list[str]]:
+def parity(folder: Path, walk: NDArray) -> Iterator[list[str]]:
     """Rows: how far each card is from its own model in each simulator that is installed."""
-    for card, step_s in product(CARDS, STEPS_S):
-        servos = ExportedServos.of(load_calibration(card), step_s)
-        of = servos.calibration
-        held_s = np.mean([of.held_feedback(name).mean_age_s for name in of.joint_names])
-        cost = f"{1e3 * servos.cost_of_whole_steps():.1f}"
-        for simulator in ("mujoco", "mjlab", "newton", "isaaclab"):
-            if simulator != "mujoco" and not (VENVS / f".venv-{simulator}").exists():
-                continue
-            apart, age = [], np.nan
-            for commands in (unseen_tones(), walk_commands()):
-                there, readings = ran(simulator, servos, commands, folder)
-                off = there - own_motion(servos, commands, len(there))
+    servos = [ExportedServos.of(load_calibration(c), h) for c, h in product(CARDS, STEPS_S)]
+    jobs = [(each, commands) for each in servos for commands in (unseen_tones(), walk)]
+    for simulator in ("mujoco", "mjlab", "newton", "isaaclab"):
+        if simulator != "mujoco" and not (VENVS / f".venv-{simulator}").exists():
+            continue
+        motions = ran(simulator, jobs, folder)
+        for n, each in enumerate(servos):
+            apart = []
+            for (_, commands), (there, _) in zip(jobs[2 * n :][:2], motions[2 * n :], strict=False):
+                off = there - own_motion(each, commands, len(there))
                 apart.append(f"{1e3 * np.sqrt(np.mean(off**2)):.2f}")
-                age = mean_age_s(there, readings, step_s)
-            ages = ["", ""] if simulator == "mujoco" else [f"{1e3 * x:.1f}" for x in (age, held_s)]
-            yield [Path(card).stem, f"{1e3 * step_s:g}", simulator, *apart, *ages, cost]
+            of, step_s = each.calibration, each.physics_step_s
+            held_s = np.mean([of.held_feedback(name).mean_age_s for name in of.joint_names])
+            ages = (mean_age_s(*motions[2 * n + 1], step_s), held_s)
+            shown = ["", ""] if simulator == "mujoco" else [f"{1e3 * x:.1f}" for x in ages]
+            cost = f"{1e3 * each.cost_of_whole_steps():.1f}"
+            card = Path(CARDS[n // len(STEPS_S)]).stem
+            yield [card, f"{1e3 * step_s:g}", simulator, *apart, *shown, cost]
 
 
 def own_motion(servos: ExportedServos, commands: NDArray, steps: int) -> NDArray[np.float64]:
@@ -160,6 +169,7 @@ def names(folder: Path) -> Iterator[list[str]]:
 
 def main() -> None:
     """Print what was found; ends with 1 if a name is unknown."""
+    walk = np.loadtxt(sys.argv[1], delimiter=",", ndmin=1) if sys.argv[1:] else walk_commands()
     with tempfile.TemporaryDirectory() as name:
         rows = list(names(Path(name)))
         print_rows(
@@ -168,7 +178,7 @@ def main() -> None:
         )
         print_rows(
             ("card", "step ms", "simulator", "tones mrad", "walk mrad", "readings: age ms",
-             "of the card", "whole steps would cost mrad"), parity(Path(name)),
+             "of the card", "whole steps would cost mrad"), parity(Path(name), walk),
         )  # fmt: skip
     sys.exit(any(len(row) > 2 for row in rows))
 

@@ -2,7 +2,7 @@
 
 Called by `check_exports.py` in an environment with Isaac Lab's package, but without Isaac Sim:
 
-    .venv-isaaclab/bin/python in_isaaclab.py EXPORTED.py commands.npz out.npz
+    .venv-isaaclab/bin/python in_isaaclab.py EXPORTED.py commands.npz out.npz [...]
 
 Arguments as of `in_newton.py`; `commands.npz` also has `solref` and `solimp` of hard friction.
 Configuration and torques are Isaac Lab's. PhysX needs Isaac Sim and a GPU, so MuJoCo moves the
@@ -35,10 +35,8 @@ def find_isaac_lab() -> None:
     sys.modules[assets.__name__] = assets
 
 
-def main() -> None:
+def run(path: str, given: str, out: str) -> None:
     """Simulate and write."""
-    path, given, out = sys.argv[1:]
-    find_isaac_lab()
     from isaaclab.utils.types import ArticulationActions
 
     exported = runpy.run_path(path)
@@ -70,4 +68,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    find_isaac_lab()
+    for job in zip(*[iter(sys.argv[1:])] * 3, strict=True):
+        run(*job)

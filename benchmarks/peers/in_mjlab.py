@@ -2,7 +2,7 @@
 
 Called by `check_exports.py` in mjlab's own environment; arguments as `in_newton.py`:
 
-    .venv-mjlab/bin/python in_mjlab.py EXPORTED.py commands.npz out.npz
+    .venv-mjlab/bin/python in_mjlab.py EXPORTED.py commands.npz out.npz [...]
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from mjlab.scene import Scene, SceneCfg
 from mjlab.sim.sim import MujocoCfg, Simulation, SimulationCfg
 
 
-def main() -> None:
+def run(path: str, given: str, out: str) -> None:
     """Simulate and write."""
-    path, given, out = sys.argv[1:]
     exported = runpy.run_path(path)
     data = np.load(given)
     command, step_s = data["command"], float(data["step_s"])
@@ -53,4 +52,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    for job in zip(*[iter(sys.argv[1:])] * 3, strict=True):
+        run(*job)

@@ -2,7 +2,7 @@
 
 Called by `check_exports.py` in Newton's own environment:
 
-    .venv-newton/bin/python in_newton.py EXPORTED.py commands.npz out.npz
+    .venv-newton/bin/python in_newton.py EXPORTED.py commands.npz out.npz [...]
 
 `commands.npz` has `command` (steps, joints) [rad] and `step_s`; `out.npz` gets `position` of the
 same shape, where each joint is after each step, and `reading`, what its servo reports.
@@ -20,9 +20,8 @@ import warp as wp
 from free_joints import model_of
 
 
-def main() -> None:
+def run(path: str, given: str, out: str) -> None:
     """Simulate and write."""
-    path, given, out = sys.argv[1:]
     exported = runpy.run_path(path)
     data = np.load(given)
     command, step_s = data["command"], float(data["step_s"])
@@ -46,4 +45,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    for job in zip(*[iter(sys.argv[1:])] * 3, strict=True):
+        run(*job)

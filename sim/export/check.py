@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.results import JointResults, Result
 from pupper_sysid.servo_models.calibration.parts import JointCalibration
-from pupper_sysid.servo_models.delayed_pd import DelayedPD
+from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayLine
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.loaded_servo import LoadedServo
 from pupper_sysid.servo_models.step_size import (
@@ -144,13 +144,22 @@ def _own_motion(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Times and positions of the calibration's own model, in the steps of its fit."""
     actuator, loaded = joint.actuator, joint.under_load
-    servo: DelayedPD | LoadedServo = DelayedPD(actuator.parameters, actuator.fitted_step_s)
+    step_s, start = actuator.fitted_step_s, np.array(commands[0])
+    servo: DelayedPD | LoadedServo = DelayedPD(actuator.parameters, step_s)
+    arriving = held(commands, step_s)
     if loaded is not None:
-        carried = loaded.servo(actuator.dead_time_s.value)
-        servo = LoadedServo(carried, loaded.p_gain, time_step_s=actuator.fitted_step_s)
-    servo.reset(commands[0])
-    moved = servo.rollout(held(commands, servo.time_step_s))
-    return servo.time_step_s * np.arange(len(moved) + 1, dtype=float), np.append(commands[0], moved)
+        # this model has no limit on the set-point's speed, which a card states
+        servo = LoadedServo(loaded.servo(0.0), loaded.p_gain, time_step_s=step_s)
+        line = DelayLine(np.array(actuator.dead_time_s.value), step_s)
+        line.reset(start)
+        most = actuator.velocity_limit_rad_s.value * step_s
+        targets, target = line.shift(arriving), float(start)
+        for n, wanted in enumerate(targets):
+            targets[n] = target = target + min(max(wanted - target, -most), most)
+        arriving = targets
+    servo.reset(start)
+    moved = servo.rollout(arriving)
+    return step_s * np.arange(len(moved) + 1, dtype=float), np.append(start, moved)
 
 
 def _apart(at: NDArray, moved: NDArray, other_at: NDArray, other: NDArray) -> float:

@@ -468,6 +468,9 @@ def test_a_check_says_what_the_step_costs_apart_from_what_the_target_does(calibr
     loaded = check(ExportedServos.of(load_calibration("sts3215-bam-m6"), 0.005))
     (row,) = loaded.joints.values()
     assert row.not_carried_rad > 1e-4
+    # a card's limit on the set-point's speed is no friction: its simplest model is an actuator
+    (row,) = check(ExportedServos.of(load_calibration("sts3215-bam-m1"), 0.005)).joints.values()
+    assert row.not_carried_rad < 2e-4
 
 
 def test_the_dead_time_for_a_step_is_that_of_the_nearest_motion_on_other_commands(calibration):
