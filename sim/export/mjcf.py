@@ -285,19 +285,24 @@ def _put_servos(root: Element, servos: ExportedServos, model: Path, group: str) 
     counts = dict.fromkeys(calibration.joint_names, 0)
     pids = {a.get("joint"): a for a in actuators}
     names = {e.get("name") for s in root.iter("actuator") for e in s}
+    removed: dict[str, Element] = {}
+    unnamed: list[str] = []
     for section in root.iter("actuator"):
         for place, element in [*enumerate(section)]:
             target = element.get("joint") or element.get("jointinparent")
             if target in counts:
                 counts[target] += 1
                 section.remove(element)
+                if own := element.get("name"):
+                    removed[own] = pids[target]
                 if counts[target] == 1:
-                    pids[target].set("name", element.get("name") or target)
+                    unnamed.extend([target] * (not own))
+                    pids[target].set("name", own or target)
                     section.insert(
                         place - sum(max(n - 1, 0) for n in counts.values()), pids[target]
                     )
     missing = [name for name, count in counts.items() if count == 0]
-    for name in missing:
+    for name in [*missing, *unnamed]:
         while pids[name].get("name") in names:
             pids[name].set("name", f"{pids[name].get('name')}_")
     if missing:
@@ -308,6 +313,10 @@ def _put_servos(root: Element, servos: ExportedServos, model: Path, group: str) 
         while sensor.get("name") in known:
             sensor.set("name", f"{sensor.get('name')}_")
     ElementTree.SubElement(root, "sensor").extend(sensors)
+    for element in root.iter():  # sensors and tuples of a removed actuator get the joint's servo
+        key = "objname" if element.get("objtype") == "actuator" else "actuator"
+        if (servo := removed.get(element.get(key, ""))) is not None:
+            element.set(key, servo.get("name", ""))
     if replaced := [name for name, count in counts.items() if count]:
         yield f"Own actuators were replaced, under their names: {', '.join(replaced)}."
     if several := [f"{name} ({count})" for name, count in counts.items() if count > 1]:
@@ -385,9 +394,7 @@ def _keyframes(
         return
     places = {id(e): n for n, e in enumerate(before)}
     commanded = {
-        e.get("joint"): n
-        for n, e in reversed([*enumerate(before)])
-        if e.tag in ("position", "intvelocity", "pid")
+        e.get("joint"): n for n, e in reversed([*enumerate(before)]) if e.tag in ("position", "pid")
     }
     for k, key in enumerate(keys):
         ctrl, act = [], []

@@ -176,13 +176,25 @@ def test_own_actuators_are_replaced_under_their_names_and_keyframes_hold_the_pos
     key = (
         '<keyframe><key name="home" qpos="0 0 0 1 0 0 0 0.1 0.2 0.3" ctrl="0.15 0 0 0"/></keyframe>'
     )
-    text = robot(LINKS, actuators=OWN + key + "<sensor><actuatorpos actuator='first'/></sensor>")
+    integrated = '<actuator><intvelocity joint="LF_thigh" actrange="-1 1" kp="3"/></actuator>'
+    own = OWN.replace('<motor name="thigh" joint="LF_thigh"/></actuator>', "</actuator>")
+    velocity = robot(LINKS, actuators=own + integrated + key.replace('ctrl="', 'act="0.2" ctrl="'))
+    model, _ = put_into(tmp_path, velocity, calibration, physics_step_s=TIME_STEP_S)
+    assert model.key_ctrl[0].tolist() == [0.15, 0.3, 0.2]  # a speed is no set-point
+    text = robot(LINKS, actuators=OWN + key + "<sensor><actuatorfrc actuator='second'/></sensor>")
     model, _ = put_into(tmp_path, text, calibration, physics_step_s=TIME_STEP_S)
     assert [model.actuator(i).name for i in range(model.nu)] == ["first", "LF_calf", "thigh"]
     np.testing.assert_allclose(model.key_ctrl[0], [0.15, 0.3, 0.2])
     np.testing.assert_allclose(model.key_act[0], [0.15, 0.3, 0.2])
     text = " ".join((tmp_path / "out.xml").read_text().split())
     assert "LF_hip (2)" in text
+    assert model.sensor_objid[0] == 0  # of an actuator that was removed: the joint's servo
+
+
+def test_a_servo_without_a_name_to_take_over_gets_one_that_is_free(calibration, tmp_path):
+    taken = OWN.replace('name="thigh"', 'name="LF_calf"')
+    model, _ = put_into(tmp_path, robot(LINKS, actuators=taken), calibration)
+    assert [model.actuator(i).name for i in range(model.nu)] == ["first", "LF_calf_", "LF_calf"]
 
 
 def test_actuators_on_tendons_are_no_servos_whatever_their_ids(calibration, tmp_path):
