@@ -2,7 +2,7 @@
 
     .venv/bin/python benchmarks/peers/check_exports.py [WALK.csv]
 
-Downloads the newest wheels of Isaac Lab, mjlab and Newton (without what they depend on), reads the
+Downloads wheels of Isaac Lab, mjlab and Newton (without what they depend on), reads the
 fields of their configuration classes, and compares them with those of
 `tests/support/exported_servos.py`, which the tests hold the exports against. Where `install.sh` has
 been run, Newton, mjlab and Isaac Lab's actuators run their exports: unseen tones and a walk through
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -42,6 +43,12 @@ CARDS = (
     "robstride-03",
 )  # fmt: skip
 STEPS_S = (0.002, 0.005)
+RELEASES = {
+    "isaaclab": ("2.2.0", "2.3.2.post1", ""),
+    "mjlab": ("1.3.0", ""),
+    "newton": ("1.3.0", ""),
+}
+"""The oldest that the exports claim, and the newest."""
 VENVS = Path(os.environ.get("EXPORT_VENVS", HERE))
 """Where `install.sh` made the environments."""
 
@@ -58,16 +65,19 @@ _NEWTON = {
 }  # fmt: skip
 
 
-def fetched(package: str, folder: Path) -> tuple[str, Path]:
-    """The newest wheel's version, and where it lies unpacked."""
+def fetched(package: str, version: str, folder: Path) -> tuple[str, Path]:
+    """A wheel's version, the newest by default, and where it lies unpacked."""
+    folder = folder / f"{package}{version}"
+    wanted = f"{package}=={version}" if version else package
     subprocess.run(
-        [sys.executable, "-m", "pip", "download", "--no-deps", "-q", "-d", folder, package],
+        [sys.executable, "-m", "pip", "download", "--no-deps", "--ignore-requires-python", "-q",
+         "-d", folder, wanted],
         check=True, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     wheel = next(folder.glob(f"{package}-*.whl"))
     with zipfile.ZipFile(wheel) as file:
-        file.extractall(folder / package)
-    return wheel.name.split("-")[1], folder / package
+        file.extractall(folder)
+    return wheel.name.split("-")[1], folder
 
 
 def fields(root: Path, part: str, names: tuple[str, ...]) -> set[str]:
@@ -94,7 +104,9 @@ def ran(
     files = []
     for n, (servos, commands) in enumerate(jobs):
         files.append([f"{simulator}{n}.py", f"{simulator}{n}.npz", f"{simulator}{n}_out.npz"])
-        (folder / files[-1][0]).write_text(TARGETS[simulator].text(servos))
+        text = TARGETS[simulator].text(servos)
+        # latencies that are drawn have no motion to be compared with: the mean is in the dead time
+        (folder / files[-1][0]).write_text(re.sub(r'"jitter_s": [^,]*', '"jitter_s": 0.0', text))
         step_s, joints = servos.physics_step_s, len(servos.calibration.joints)
         np.savez(
             folder / files[-1][1], step_s=step_s, solref=friction_solref(step_s),
@@ -157,14 +169,18 @@ def mean_age_s(positions: NDArray, readings: NDArray, step_s: float) -> float:
 
 
 def names(folder: Path) -> Iterator[list[str]]:
-    """Rows: the fields that we write and that the released packages do not know."""
-    for package, written in (("isaaclab", ours.ISAACLAB), ("mjlab", ours.MJLAB)):
-        version, root = fetched(package, folder)
-        yield [package, version, *sorted(written - fields(root, *_CLASSES[package]))]
-    version, root = fetched("newton", folder)
-    text = {p.stem: p.read_text() for p in root.rglob("*.py") if p.stem in _NEWTON}
-    yield ["newton", version, *sorted(n for k, own in _NEWTON.items() for n in own
-                                      if n not in text[k])]  # fmt: skip
+    """Rows: the fields that we write and that a released package does not know."""
+    for package, versions in RELEASES.items():
+        for wanted in versions:
+            version, root = fetched(package, wanted, folder)
+            if package == "newton":
+                text = {p.stem: p.read_text() for p in root.rglob("*.py") if p.stem in _NEWTON}
+                bad = {n for k, own in _NEWTON.items() for n in own if n not in text[k]}
+            else:
+                isaac_lab = ours.ISAACLAB if version < "3" else ours.ISAACLAB_3
+                written = ours.MJLAB if package == "mjlab" else isaac_lab
+                bad = written - fields(root, *_CLASSES[package])
+            yield [package, version, *sorted(bad)]
 
 
 def main() -> None:

@@ -4,7 +4,7 @@
 step, and the speed of set-points is limited; beside it the released `DelayedPDActuatorCfg`, in
 whole steps. `to_isaaclab_bam` writes `BamActuatorCfg`, for servos that were fitted under load.
 
-Field names are those of Isaac Lab 2.3.2 and 3.0.0, which `benchmarks/peers/check_exports.py` holds
+Field names are those of Isaac Lab 2.2 to 3.0, which `benchmarks/peers/check_exports.py` holds
 against the released packages; 3.0 renamed the limits of actuator models, and the module written
 finds out which names are there. `BamActuatorCfg` is that of Isaac Lab after 3.0.0.
 """
@@ -130,10 +130,8 @@ def to_isaaclab(servos: ExportedServos) -> str:
         f"whole step is up to {1e3 * servos.cost_of_whole_steps():.1f} mrad off (RMS) at 4 Hz, "
         "0.3 rad, and the set-point's speed is not limited.",
         "friction is a torque from Isaac Sim 5.0 on; 4.5 takes a coefficient there, so leave the "
-        "friction lines out with it. viscous_friction is the back-EMF, which brakes outside of the "
-        "effort limit.",
-        "Not represented: the PD is computed once per physics step, before it, so keep steps at "
-        "5 ms or less.",
+        "friction lines out with it. viscous_friction of WHOLE_STEP_ACTUATORS is the back-EMF, "
+        "which brakes outside of the effort limit.",
         NOT_CARRIED,
     )
     whole = (

@@ -2,7 +2,8 @@
 
 A class on mjlab's `Actuator` gives MuJoCo-Warp the torques of the servos, with delays of any
 fraction of a step; beside it the released `BuiltinPositionActuatorCfg`, in whole steps. Names are
-those of mjlab 1.6.0; `benchmarks/peers/check_exports.py` holds them against the released package.
+those of mjlab 1.3 to 1.6; `benchmarks/peers/check_exports.py` holds them against the released
+packages.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """A calibration for Newton: a Python module that puts the servos into a model and feeds them.
 
-Armature, dry friction and back-EMF (as damping) are attributes of Newton's joints. Dead times of
-any fraction of a step, set-points of limited speed and the PD are computed on torch before each
-physics step, as efforts: the joints' own drives clip their effort at the joint, where their damping
-goes on acting, which makes a servo at its limit too slow (8 mrad on the sample's tones). Names are
-those of Newton 1.8.0; `benchmarks/peers/check_exports.py` holds them against the release.
+Armature and dry friction are attributes of Newton's joints. Dead times of any fraction of a step,
+set-points of limited speed and the torques are computed on torch before each physics step, as
+efforts: the joints' own drives clip their effort at the joint, where their damping goes on acting,
+which makes a servo at its limit too slow (8 mrad on the sample's tones). Names are
+those of Newton 1.3 to 1.8; `benchmarks/peers/check_exports.py` holds them against the releases.
 """
 
 from __future__ import annotations
@@ -85,8 +85,7 @@ def to_newton(servos: ExportedServos) -> str:
     notes = (
         "Take SolverMuJoCo with integrator='implicitfast' and steps of PHYSICS_DT. Delays are any "
         "fraction of a step, interpolated linearly, with a latency of its own for each command "
-        "where its jitter is known; the set-point's speed is limited. The PD is computed once per "
-        "physics step, before it, so keep steps at 5 ms or less.",
+        "where its jitter is known; the set-point's speed is limited.",
         "Not represented by other solvers: friction as hard as gears.",
         NOT_CARRIED,
     )
