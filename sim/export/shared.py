@@ -385,6 +385,7 @@ def torch_module(
     `notes` say in sentences what the target carries and does not, `imports` are the lines that
     import its names, and `actuators` is code that stands behind the numbers and the classes.
     """
+    servos.actuators(MUJOCO)  # refuses steps in which a servo is not stable
     # read, not imported: that would load torch
     code = (resources.files("pupper_sysid.sim.export") / "torch_servos.py").read_text()
     return (
