@@ -46,7 +46,10 @@ def unit_of(name: str) -> str:
 _UNIT_ENDING = re.compile(
     "_(per_s2|per_s|per_nm|rad_s2|nm_s_per_rad|nm_per_rad|kg_m2|rad_s|(?<!per_)rad|nm|s)$"
 )
-_WORDS = {"effort_rad_s2": "effort limit", "friction_rad_s2": "friction loss"}
+_WORDS = {
+    "effort_rad_s2": "effort limit", "friction_rad_s2": "friction loss", "back_emf": "back-EMF",
+    "damping_and_back_emf": "damping + back-EMF",
+}  # fmt: skip
 
 
 def words_of(name: str) -> str:

@@ -79,8 +79,9 @@ class TruthRow(Result):
 
     joint: str
     quantity: str
-    """`joint` and `quantity`: `stiffness`, `damping`, `friction_loss`, `effort_limit` and
-    `back_emf` are ratios to the armature; the other names end in their unit."""
+    """`joint` and `quantity`: `stiffness`, `damping`, `friction_loss`, `effort_limit`, `back_emf`
+    and, where damping alone is not known, `damping_and_back_emf` are ratios to the armature; the
+    other names end in their unit."""
     found: Interval
     """With its 90 % interval; NaN at ends that the calibration does not give."""
     identified: str
@@ -117,9 +118,14 @@ def _pairs(
     """Quantities of a calibration by name, each with the truth's number (NaN where it has none)."""
     a, ratios = joint.actuator, joint.actuator.ratios_to_armature
     inertia = actuator["armature"]
+    torques = {n: (getattr(ratios, n), actuator.get(n, 0.0) / inertia) for n in TORQUES}
+    both = ratios.damping_and_back_emf
+    if both is not None and ratios.damping.identified == "no":
+        known = sum(torques[n][1] for n in ("damping", "back_emf"))
+        torques["damping_and_back_emf"] = both, known
     return {
         "dead_time_s": (a.dead_time_s, actuator.get("dead_time_s", math.nan)),
-        **{n: (getattr(ratios, n), actuator.get(n, 0.0) / inertia) for n in TORQUES},
+        **torques,
         "velocity_limit_rad_s": (a.velocity_limit_rad_s, actuator.get("velocity_limit", math.nan)),
         "command_jitter_s": (a.command_jitter_s, actuator.get("command_jitter_s", math.nan)),
         **{n: (getattr(joint.feedback, n), feedback.get(n, math.nan)) for n in _READINGS},

@@ -125,7 +125,7 @@ class CompareTruth:
         held = sum(bool(row.held) for row in known_rows)
         terminal.out.print(
             f"\n{held} of {len(known_rows)} intervals of identified numbers hold the truth. "
-            "stiffness, damping, friction loss, effort limit and back EMF are ratios to the "
+            "stiffness, damping, friction loss, effort limit and back-EMF are ratios to the "
             "armature."
         )
         for definition in rows.definitions:
