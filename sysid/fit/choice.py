@@ -363,6 +363,10 @@ class Choice:
 
 
 def choose(ready: PreparedJoint, fitted: Sequence[Fitted]) -> Choice:
+    """The structure that is carried, among those that were compared.
+
+    `fitted`: all structures, from `fit_structures`.
+    """
     simulated = [f for f in fitted if not ready.scales.free_air or f.structure.name in SIMULATED]
     nats = _nats(ready, simulated)
     compared = [f for f in simulated if f.draws is not None]
@@ -662,6 +666,7 @@ def braking(fitted: Fitted) -> Interval:
 
 
 def goodness_of(ready: PreparedJoint, fitted: Fitted) -> dict[str, float]:
+    """Residual over noise by tone, or label of the run, as `goodness_of_fit` has it."""
     quantum_rad = ready.lag.quantum_rad
     return goodness_of_fit(
         fitted.structure, fitted.values, ready.runs,
