@@ -114,9 +114,10 @@ def test_a_plan_that_has_changed_since_is_not_continued(capsys, planned):
 
 def test_the_emulated_robot_does_not_repeat_its_noise_in_a_planned_sweep(capsys, planned):
     change_plan()
-    run(capsys, "sweep", "--plan", "plan.yaml", "--joints", "LF_hip", "--out", "b.csv")
-    a, b = (load(name).table["position_rad"][:10].to_numpy() for name in ("a.csv", "b.csv"))
-    assert (a != b).any()  # both still at rest
+    for name in "bcd":  # ten held readings of a joint at rest may well be the same ones once
+        run(capsys, "sweep", "--plan", "plan.yaml", "--joints", "LF_hip", "--out", f"{name}.csv")
+    at_rest = {tuple(load(f"{name}.csv").table["position_rad"][:10]) for name in "abcd"}
+    assert len(at_rest) > 1
 
 
 SHORT = ("--joints", "LF_hip,LF_thigh", "--freqs", "4", "--duration", "2", "--out", "a.csv")

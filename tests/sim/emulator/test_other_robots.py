@@ -167,7 +167,7 @@ def test_a_model_that_cannot_be_read_or_takes_too_much_is_refused(monkeypatch):
     )
     with pytest.raises(InputError, match="nowhere.xml is no file"):
         robot_map.joint_map_of(Path("nowhere.xml"), "sts3215")
-    monkeypatch.setattr(hinges, "_TIME_S", 1)
+    monkeypatch.setattr(hinges, "_PATIENCE_S", 1)
     os.mkfifo("pipe")
     heavy = "take height fields, textures"
     assert_each_refused([(BODY.format(bomb, "-1 1", GEOM, ""), heavy) for bomb in BOMBS], read)
