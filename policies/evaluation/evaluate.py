@@ -531,7 +531,9 @@ def evaluate(
     cases = (RANDOM, *cases)
     if task.robot:  # commands as far within its ranges as usual ones are within theirs
         cases = tuple(
-            c if c.command is None else replace(c, command=tuple(within(plain, c.command).tolist()))
+            c
+            if c.command is None
+            else replace(c, command=tuple(within(plain, np.array(c.command)).tolist()))
             for c in cases
         )
     conditions = [c.condition(plain, robots(c, w), w) for c in cases for w in WALKERS]

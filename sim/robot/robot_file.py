@@ -447,7 +447,7 @@ class _Reader:
         names = tuple(self.feet)
         if len(names) < 2:
             raise InputError(
-                f"{self.where}: only one foot ({names[0]}) was found; a robot "
+                f"{self.where}: only one foot ({', '.join(names)}) was found; a robot "
                 "that walks has two or more. Give `feet` in the YAML."
             )
         feet_at = self._middles()
