@@ -292,13 +292,13 @@ def _compared(
         if f.folds and structure.contains(f.structure)
     ]
     parts = folds_of(problem.runs)
-    folds = fit_folds(problem, parts, rng, points, parents, best)
+    folds = fit_folds(problem, parts, rng, points, parents)
     if ready.lag.feedback.kind == "lattice":
         points = with_date_errors(points, problem, best, rng)
     left_out, groups = folds, group_count(problem.runs)
     if len(parts) < LEAST_FOLDS:
         blocks, apart = in_blocks(problem)
-        left_out, groups = fit_folds(blocks, apart, rng, points, best=best), len(apart)
+        left_out, groups = fit_folds(blocks, apart, rng, points), len(apart)
     points = as_wide_as_folds(points, structure, best, left_out, groups)
     points = np.clip(points, *structure.box)
     return replace(

@@ -550,14 +550,12 @@ def fit_folds(
     rng: np.random.Generator,
     draws: NDArray[np.float64] | None = None,
     parents: Sequence[tuple[Structure, Sequence[Fit]]] = (),
-    best: Fit | None = None,
 ) -> list[Fit]:
     """The best fit without each fold's runs.
 
     A fold's fit is the lowest cost on its own runs, from draws of the posterior (from starts all
     over the box without any), and from the fits of simpler structures to the same runs: so it is
-    as good an optimum as that of all runs. Where the fit to all runs (`best`) leads to one that is
-    as good, that counts: how far a fold's fit is from it must not be a matter of chance.
+    as good an optimum as that of all runs.
 
     `problem`: all runs. `folds`: from `folds_of`. `draws` of shape (draws, parameters): in fitted
     coordinates. `parents`: structures that this one contains, and their fits, one per fold.
@@ -583,7 +581,5 @@ def fit_folds(
         for parent, own in parents:
             crowd.append(problem.structure.adopt(parent, own[n].point[None]))
         rough = refined(part.coarse, np.concatenate(crowd), _REFINED)[:_REFINED]
-        fit = refine(part, np.array([f.point for f in rough]))
-        near = fit if best is None else refine(part, best.point[None])
-        fits.append(near if near.cost < fit.cost + _LEAST_GAIN else fit)
+        fits.append(refine(part, np.array([f.point for f in rough])))
     return fits
