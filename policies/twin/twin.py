@@ -9,7 +9,7 @@ and readings say whether the robot was on the ground (`policies.twin.playing`).
 On the ground several copies move, which differ in friction and payload; the prediction is the mean
 of those that stay up. A robot on its back predicts what one in the air does.
 
-A robot's IMU log stands beside the trunk of the simulated robot on the ground. It is a CSV file
+A robot's IMU log is compared with the trunk of the simulated robot on the ground. It is a CSV file
 with a column of times and one per axis. Both signals get the same estimator, a least-squares
 periodogram (Lomb-Scargle with a constant per frequency, J. VanderPlas, "Understanding the
 Lomb-Scargle Periodogram", 2018), since a log's rows are not evenly spaced.

@@ -53,18 +53,8 @@ _AT_ONCE_S, _FASTEST_S, _LATE_S = 0.02, 0.001, 0.008
 _BEYOND, _SURELY = 4.0, 0.01
 _LONGEST_LAG_S = 0.5
 _FASTEST_RAD_S, _WRAP_RAD, _UNUSUAL = 60.0, 1.0, 8.0
-_TWO_BETTER, _OTHER_GAIN, _PART_S, _RATE_BETTER = 0.3, 0.75, 1.5, 0.5
 _SAME_TONE_HZ = 0.02
 _DIFFERENT = 0.35  # of the gain
-_DRIFT_RAD, _DRIFT_SHARE = 0.1, 0.3
-_TWO_ZEROS = 0.5  # of the residuals' variance that two zeros may leave
-_SLOPE, _CHANCE, _LAG_DRIFT_S, _GAIN_DRIFT = 4e-4, 1e-3, 0.008, 0.2
-_STRETCH_READINGS, _ONE_CLOCK, _CLOCK_FLOOR = 1000, 0.3, 1e-4  # shares of the variance
-_STRETCH_LAGS_S = np.arange(-0.1, 0.3, 0.02)
-_STRETCH_GROWTHS_S = np.linspace(-0.36, 0.36, 25)  # from the first reading to the last
-_QUICKER, _STEADILY = 1.7, 0.7
-_STOOD_S, _STOOD_SHARE, _SETTLED_S = 0.5, 0.25, 0.15  # the share of the path's range
-_SURELY_TWO, _SURELY_MOVED = 0.35, (0.03, 0.08)  # rad; of the command's range
 _SPEED_LEFT, _SPEED_BETTER, _SPEED_GAIN = 0.12, 0.35, 0.55  # the last of the logarithm
 
 
