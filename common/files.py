@@ -15,7 +15,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from contextvars import ContextVar
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -106,7 +106,7 @@ def replacing(path: Path, force: bool = False, hold: bool = True) -> Iterator[Pa
         path.parent.mkdir(parents=True, exist_ok=True)
         with held() if hold else nullcontext():
             handle, name = tempfile.mkstemp(path.suffix, f".{path.stem}.", path.parent)
-            with removed_at_stop(name):
+            with removed_at_stop(partial(os.unlink, name)):
                 try:
                     os.close(handle)
                     yield Path(name)
@@ -208,13 +208,16 @@ def holding_outputs() -> Iterator[None]:
     if hasattr(os, "register_at_fork"):
         # else a worker that outlives this process would keep its locks
         os.register_at_fork(after_in_child=lambda: [lock.forget() for lock in locks.values()])
-    try:
-        yield
-    finally:
-        _held.reset(before)
-        for lock in locks.values():
-            lock.release()
-        locks.clear()
+    with removed_at_stop(lambda: [lock.remove() for lock in tuple(locks.values())]):
+        try:
+            yield
+        finally:
+            with held():
+                _held.reset(before)
+                for lock in locks.values():
+                    lock.remove()
+                    lock.forget()
+                locks.clear()
 
 
 def hold_output(path: Path) -> None:
@@ -223,7 +226,8 @@ def hold_output(path: Path) -> None:
     if locks is None:
         _refuse_held(path)
     elif output not in locks:
-        locks[output] = _Lock(path, output)
+        with held():  # a lock that was taken is one that is released
+            locks[output] = _Lock(path, output)
 
 
 def _refuse_held(path: Path) -> None:
@@ -313,14 +317,12 @@ class _Lock:
             raise
         return descriptor
 
-    def release(self) -> None:
+    def remove(self) -> None:
         """Remove the lock file, and the folders made for it that are still empty."""
-        if self._descriptor is None:
-            return
-        with suppress(OSError):
-            os.unlink(self._file)
-        self.forget()
-        self._remove_folders()
+        if self._descriptor is not None:
+            with suppress(OSError):
+                os.unlink(self._file)
+            self._remove_folders()
 
     def forget(self) -> None:
         """Close the lock file and leave it, as in a child process: its parent holds it."""

@@ -54,8 +54,8 @@ class Stop:
     def __init__(self, ends_process: bool):
         self.number = 0
         self.ends_process = ends_process
-        self.temporaries: set[str] = set()
-        """Files that are removed if the process is ended."""
+        self.removals: set[Callable[[], object]] = set()
+        """What removes temporary and lock files if the process is ended."""
         self._phase: Phase = "start" if ends_process else "work"
         self._begun_s = self._first_s = 0.0  # of the phase, of the first signal
         self._before: dict[int, Any] = {}
@@ -110,9 +110,9 @@ class Stop:
         """End this process now, with the line if it was not written yet."""
         if self._line.acquire(blocking=False):
             _write_line(STOPPED)
-        for name in tuple(self.temporaries):
+        for remove in tuple(self.removals):
             with suppress(OSError):
-                os.unlink(name)
+                remove()
         os._exit(self.exit_code)
 
     @contextmanager
@@ -280,14 +280,14 @@ def held() -> AbstractContextManager[None]:
 
 
 @contextmanager
-def removed_at_stop(name: str) -> Iterator[None]:
-    """Remove a file if the process is ended within the block."""
-    temporaries = _current.temporaries if _current else set[str]()
-    temporaries.add(name)
+def removed_at_stop(remove: Callable[[], object]) -> Iterator[None]:
+    """Call `remove` if the process is ended within the block, past every `finally`."""
+    removals = _current.removals if _current else set[Callable[[], object]]()
+    removals.add(remove)
     try:
         yield
     finally:
-        temporaries.discard(name)
+        removals.discard(remove)
 
 
 @contextmanager

@@ -28,7 +28,7 @@ stop_process()
 import hashlib, os, time, weakref
 from pathlib import Path
 from pupper_sysid.cli.program import begin_work, end_politely, user_errors
-from pupper_sysid.common.files import replacing
+from pupper_sysid.common.files import hold_output, replacing
 from pupper_sysid.common.processes.workers import Workers
 
 def begin():
@@ -102,6 +102,7 @@ def robot():
 
 with user_errors([], "pupper-sysid"):
     begin_work()
+    hold_output(Path("runs/run"))
     WORK()
 """
 
@@ -203,6 +204,7 @@ def test_a_second_ctrl_c_ends_a_training_at_once(tmp_path):
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)
         assert ended(process) == (130, "Stopped.\n")
+    assert list(tmp_path.iterdir()) == []  # nor the lock file of the run
 
 
 def test_an_iteration_that_outlasts_sigterm_is_given_up(tmp_path):
@@ -210,6 +212,7 @@ def test_an_iteration_that_outlasts_sigterm_is_given_up(tmp_path):
         begun(process)
         process.send_signal(signal.SIGTERM)
         assert ended(process) == (143, "Stopped.\n")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_robot_is_parked_however_long_that_takes(tmp_path):
