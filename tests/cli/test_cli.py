@@ -31,7 +31,7 @@ def test_one_tone_is_calibrated_with_a_warning_and_written_as_printed_and_never_
     capsys, tmp_path
 ):
     path = table_with(tmp_path, lambda t: t[t.trial == 2])
-    arguments = ("calibrate", path, "--out", "c.yaml", "--json")
+    arguments = ("calibrate", path, "--out", "c.yaml", "--jobs", "1", "--json")
     code, out, _ = run(capsys, *arguments)
     found = json.loads(out)
     joint = found["joints"]["LF_hip"]

@@ -89,14 +89,6 @@ def test_a_teacher_is_trained_and_then_learned_from(capsys, here):
     assert (here / "runs/s/policy_best").is_dir()
 
 
-def test_a_run_is_not_begun_in_the_folder_of_another(capsys, trained, monkeypatch):
-    monkeypatch.chdir(trained.parents[1])
-    before = (trained / "last.pt").read_bytes()
-    said = refused(capsys, pupper_train, *TINY, "--name", "tiny")
-    assert "holds a run already" in said and "--resume" in said
-    assert (trained / "last.pt").read_bytes() == before
-
-
 def test_a_finished_run_can_be_resumed_and_stays_as_it_is(capsys, trained):
     _, err = ran(capsys, "--resume", trained, program=pupper_train)
     assert f"Going on with {trained}".replace(" ", "") in err.replace(" ", "")

@@ -81,12 +81,6 @@ class _Full:
         pass
 
 
-def test_only_a_failed_write_to_standard_output_is_blamed_on_it(capsys, monkeypatch):
-    monkeypatch.setattr(sys, "stdout", _Full(errno.ENOSPC))
-    code, error = said(capsys, lambda: print("x"))
-    assert code == 2 and error.startswith("error: standard output: No space left on device.")
-
-
 def test_a_reader_that_has_gone_ends_the_program_and_a_broken_pipe_elsewhere_is_an_error(
     capsys, monkeypatch
 ):

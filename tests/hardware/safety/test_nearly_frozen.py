@@ -27,13 +27,12 @@ class Following(FollowingBus):
         super().__init__(reach_rad=3.0)
         self.metadata = {} if quantum is None else {"command_quantum_rad": {"LF_hip": quantum}}
         self.quantum, self.share, self.noise = quantum or COARSE, share, noise_steps
-        self.rng, self.silent_from_s = np.random.default_rng(0), np.inf
+        self.rng = np.random.default_rng(0)
 
     def read(self) -> BusSample:
         noise = self.rng.integers(-self.noise, self.noise + 1)
         count = np.round(self.share * self.goal / self.quantum) + noise
-        silent = self.time >= self.silent_from_s
-        return self.sample(np.where(silent, np.nan, count * self.quantum))
+        return self.sample(count * self.quantum)
 
 
 def sweep_of(bus: Following, amplitude: float, hz: float, seconds: float = 4.5) -> None:
@@ -73,13 +72,6 @@ def test_a_servo_that_moves_by_more_than_noise_or_is_commanded_little_goes_on(
     quantum, share, noise, amplitude, hz
 ):
     sweep_of(Following(quantum, share, noise), amplitude, hz)
-
-
-def test_a_joint_that_falls_silent_is_said_to_be_silent_and_not_stuck():
-    bus = Following(FINE, share=1.0, noise_steps=0)
-    bus.silent_from_s = 3.0
-    with pytest.raises(SafetyStop, match="the bus has been silent"):
-        sweep_of(bus, 0.3, 1.0)
 
 
 def test_a_reading_that_is_infinite_is_a_missing_one():

@@ -117,7 +117,7 @@ def test_a_runner_up_is_named_in_words_and_by_its_code():
 def test_free_motion_shows_what_happened_within_a_trial(fault, code):
     rng = np.random.default_rng(3)
     world = replace(
-        draw_world(rng, "smart", "teleoperation", 3e-4), amplitude_rad=0.3, rate_hz=80.0,
+        draw_world(rng, "smart", "teleoperation", 3e-4), amplitude_rad=0.3, rate_hz=50.0,
         poll_s=0.0, friction_rad=0.0, gravity_rad=0.0, duration_s=24.0, quantum_rad=0.0015,
     )  # fmt: skip
     assert code not in codes(recorded(simulated(world)))
@@ -133,7 +133,7 @@ def test_windows_that_differ_by_themselves_are_no_drift():
 def test_clocks_that_drift_are_no_early_position_and_no_swapped_columns():
     world = draw_world(np.random.default_rng(3), "smart", "walk", 3e-4)
     world = replace(
-        world, rate_hz=80.0, poll_s=0.0, friction_rad=0.0, gravity_rad=0.0, duration_s=20.0,
+        world, rate_hz=50.0, poll_s=0.0, friction_rad=0.0, gravity_rad=0.0, duration_s=20.0,
         quantum_rad=0.0015,
     )  # fmt: skip
     table = simulated(world)
@@ -147,7 +147,7 @@ def test_clocks_that_drift_are_no_early_position_and_no_swapped_columns():
 def test_clocks_that_drift_are_found_in_any_motion(motion):
     """All readings together show what the lags of short windows, or of one tone, do not."""
     world = replace(
-        draw_world(np.random.default_rng(3), "smart", motion, 3e-4), rate_hz=100.0, poll_s=0.0,
+        draw_world(np.random.default_rng(3), "smart", motion, 3e-4), rate_hz=60.0, poll_s=0.0,
         friction_rad=0.0, gravity_rad=0.0, duration_s=14.0, quantum_rad=0.0015,
     )  # fmt: skip
     table = simulated(world)
@@ -234,7 +234,7 @@ def test_a_motion_that_ends_at_a_stop_is_clipped_at_its_level():
 def test_a_chirp_beyond_the_speed_limit_is_no_change_of_gain_and_no_drift():
     world = draw_world(np.random.default_rng(1), "smart", "chirp", 3e-4)
     world = replace(
-        world, amplitude_rad=0.4, speed_rad_s=3.0, bandwidth_hz=8.0, rate_hz=80.0, poll_s=0.0,
+        world, amplitude_rad=0.4, speed_rad_s=3.0, bandwidth_hz=8.0, rate_hz=50.0, poll_s=0.0,
         friction_rad=0.0, gravity_rad=0.0, gain=0.9, duration_s=14.0, quantum_rad=0.0015,
     )  # fmt: skip
     assert not {"gain_changed", "lag_drifts"} & set(codes(recorded(simulated(world))))

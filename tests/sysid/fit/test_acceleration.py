@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from pupper_sysid.servo_models.cards.files import load_card
@@ -50,19 +49,15 @@ def recording(
     per = round(LOOP_S / STEP_S)
     moved = servo.rollout(np.repeat(command, per))[per - 6 :: per]
     count = 2 * np.pi / 4096
-    table = pd.DataFrame(
-        {
-            "send_time_s": time, "read_time_s": time + LOOP_S - 5 * STEP_S, "trial": 0,
-            "joint": "j", "frequency_hz": np.nan, "command_rad": command,
-            "position_rad": np.round(moved / count) * count,
-        }
-    )  # fmt: skip
     setup = {"p_gain": 16.0, "registers": registers or {}}
     header = {
         "readings": "live", "joints": ["j"], "start_pose_rad": {"j": float(command[0])},
         "servos": {"j": setup},
     }  # fmt: skip
-    return Recording.from_frame(table, metadata=header, name=motion)
+    return Recording.from_arrays(
+        time, {"j": command}, {"j": np.round(moved / count) * count},
+        read_time_s=time + LOOP_S - 5 * STEP_S, metadata=header, name=motion,
+    )  # fmt: skip
 
 
 @pytest.mark.slow

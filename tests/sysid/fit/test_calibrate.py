@@ -120,7 +120,7 @@ def test_a_dead_time_without_the_age_of_its_readings_lies_in_its_interval(fitted
 
 @pytest.fixture(scope="module")
 def result():
-    return calibrate(servo_recording(1))[JOINT]
+    return calibrate(servo_recording(1, (1.0, 2.5, 4.0)))[JOINT]
 
 
 @pytest.mark.parametrize("doubt_s", [0.0, 0.006])

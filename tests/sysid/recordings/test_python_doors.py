@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pandas as pd
 import pytest
 
 import pupper_sysid as ps
 from pupper_sysid.common.errors import InputError
-from support.command_line import run
 from support.refusals import assert_each_refused
 
 TIME = 0.02 * np.arange(60)
@@ -69,15 +66,3 @@ def test_one_time_stamp_leaves_the_same_doubt_at_every_door(tmp_path):
         (trial,) = recording.trials("knee")
         np.testing.assert_allclose(trial.read_time_s - trial.send_time_s, 0.002)
         assert trial.read_time_doubt_s == 0 and not recording.warnings
-
-
-def test_examine_is_what_doctor_prints(capsys, tmp_path):
-    path = tmp_path / "log.csv"
-    TABLE.to_csv(path, index=False)
-    code, out, _ = run(capsys, "doctor", path, "--json")
-    found = json.loads(out)
-    same = json.loads(json.dumps(ps.examine(ps.load(path)).to_dict()))
-    assert code == 0 and found["joints"].keys() == same["joints"].keys()
-    for joint, row in same["joints"].items():
-        assert found["joints"][joint]["verdict"] == row["verdict"]
-        assert found["joints"][joint]["reasons"] == row["reasons"]

@@ -58,24 +58,6 @@ def test_a_full_disk_is_said_in_a_sentence_and_leaves_no_thread(tmp_path, monkey
     assert threading.active_count() == before
 
 
-def test_what_the_writer_writes_load_reads_back(tmp_path):
-    path = tmp_path / "out" / "a.csv"
-    with RecordingWriter(path, {"start_pose_rad": {"LF_hip": 0.5}, "seed": 3}) as writer:
-        for k in range(30):
-            writer.append(
-                {"send_time_s": 0.02 * k, "read_time_s": 0.02 * k + 0.001, "trial": 0,
-                 "joint": "LF_hip", "frequency_hz": 2.0, "command_rad": 0.01 * k,
-                 "position_rad": float("nan") if k == 5 else 0.02 * k, "position_count": 512 + k}
-            )  # fmt: skip
-        writer.close({"rows": 30})
-    recording = load(path)
-    (trial,) = recording.trials("LF_hip")
-    np.testing.assert_allclose(trial.command_rad, 0.01 * np.arange(30))
-    assert np.isnan(trial.position_rad[5]) and trial.position_count[7] == 519
-    assert trial.initial_command_rad == 0.5 and recording.metadata["seed"] == 3
-    assert recording.metadata["completed"] == {"rows": 30}
-
-
 def test_rows_are_on_disk_before_the_next_is_appended(tmp_path):
     path = tmp_path / "a.csv"
     writer = RecordingWriter(path, {})
@@ -83,14 +65,6 @@ def test_rows_are_on_disk_before_the_next_is_appended(tmp_path):
     writer.append(row)
     assert path.read_text().count("LF_hip") == 1
     writer.close()
-
-
-def test_an_existing_file_is_kept_without_force(tmp_path):
-    path = write(tmp_path, rows())
-    before = path.read_bytes()
-    with pytest.raises(FileExistsRefusal, match="force=True"):
-        RecordingWriter(path, {})
-    assert path.read_bytes() == before
 
 
 def test_a_file_cut_in_the_middle_of_a_line_loads_without_that_line(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Iterator
 from html import unescape
 from pathlib import Path
 
@@ -25,6 +26,7 @@ from pupper_sysid.sysid.report.figures import tracks
 from pupper_sysid.sysid.report.report import can_recall, recall
 from pupper_sysid.sysid.sweep.excitation import plan
 from pupper_sysid.sysid.sweep.recorder import record
+from support.fitted_once import fit_once
 from support.undrawn import leave_undrawn
 
 JOINT = "LF_thigh"
@@ -42,6 +44,14 @@ def swept(tmp_path_factory) -> Recording:
 @pytest.fixture(scope="module")
 def made(swept) -> CalibrationResult:
     return calibrate(swept)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def fitted() -> Iterator[None]:
+    """`delay` and `calibrate` take one fit: what they make of it is the matter."""
+    with pytest.MonkeyPatch.context() as patch:
+        fit_once(patch)
+        yield
 
 
 @pytest.fixture(scope="module")
