@@ -316,6 +316,17 @@ def test_an_mlp_learns_what_a_filter_cannot(quick):
     assert sorted(network.held_out) == [0, 1, 2, 3]
 
 
+def test_a_fit_of_a_network_repeats_bit_for_bit_under_its_seed(monkeypatch):
+    monkeypatch.setattr(network_fit, "MLP", Recipe(16, 2, (0.1, 1.0), 40, 1e-2, 20, 9))
+    _, ready = loops(HIP, 3, 100)
+    network, again, other = (fit_network("mlp", HIP, P, ready, seed=s) for s in (4, 4, 5))
+    for name, value in network.model.parameters.items():
+        np.testing.assert_array_equal(value, again.model.parameters[name])
+    assert network.choices == again.choices
+    weights = (fit.model.parameters["weight_0"] for fit in (network, other))
+    assert not np.array_equal(*weights)
+
+
 def test_a_nested_fit_of_a_group_does_not_depend_on_its_readings(monkeypatch):
     monkeypatch.setattr(network_fit, "MLP", Recipe(8, 2, (0.1, 1.0), 40, 1e-2, 20, 9))
     monkeypatch.setattr(network_fit.windows, "RIDGES", (1e-3,))
