@@ -7,7 +7,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from pupper_sysid.common.errors import InputError
@@ -22,6 +21,7 @@ from pupper_sysid.sysid.report import report
 from pupper_sysid.sysid.report.figures import tracks
 from pupper_sysid.sysid.servo_fit.fit import fit_servo
 from pupper_sysid.sysid.servo_fit.scores import LINEAR
+from support.servo_recordings import trial
 from support.undrawn import leave_undrawn
 
 MASS_KG, LENGTH_M = 0.4, 0.12
@@ -46,14 +46,11 @@ def recording(gain: float, seed: int = 0, steps: int = 300) -> Recording:
     per = round(LOOP_S / STEP_S)
     moved = servo.rollout(np.repeat(command, per), np.repeat(on, per))
     position = np.concatenate([[0.0], moved])[round(READ_S / STEP_S) :: per][:steps]
-    time = LOOP_S * np.arange(steps)
-    table = pd.DataFrame(
-        {
-            "send_time_s": time, "read_time_s": time + READ_S, "trial": 0, "joint": "knee",
-            "frequency_hz": np.nan, "command_rad": command, "torque_enabled": on,
-            "position_rad": np.round(position * 4096 / (2 * np.pi)) * 2 * np.pi / 4096,
-        }
-    )  # fmt: skip
+    count = 2 * np.pi / 4096
+    table = trial(
+        0, 0.0, command, np.round(position / count) * count, joint="knee", period_s=LOOP_S,
+        read_after_s=READ_S,
+    ).assign(torque_enabled=on)  # fmt: skip
     header = {
         "readings": "live", "joints": ["knee"], "start_pose_rad": {"knee": 0.0},
         "servos": {"knee": {"p_gain": gain}},

@@ -21,6 +21,7 @@ from pupper_sysid.sysid.fit.search import Problem, folds_of
 from pupper_sysid.sysid.fit.structure import CANDIDATES, candidate, servo_structure
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 from support import wide_servo
+from support.servo_recordings import trial
 
 JOINT, COUNT_RAD = "knee", 2 * np.pi / 4096
 # per inertia: an SCS0009, an STS3215 (hardly damped inside of its loop) and an XL330
@@ -51,15 +52,10 @@ def recording(servo: str, motion: str, sign: int = 1) -> Recording:
             command = 0.2 * np.sin(2 * np.pi * 1.8 * time) + 0.1 * np.sin(2 * np.pi * 3.7 * time)
         command, read = sign * command, time + 0.001
         path = wide_servo.simulate(moving, time, command, read[-1] + 0.01, np.random.default_rng(0))
-        moved = np.interp(read, path.time_s, path.angle)
+        moved = COUNT_RAD * np.round(np.interp(read, path.time_s, path.angle) / COUNT_RAD)
         parts.append(
-            pd.DataFrame(
-                {
-                    "send_time_s": start + time, "read_time_s": start + read,
-                    "trial": number, "joint": JOINT, "frequency_hz": tone,
-                    "command_rad": command, "position_rad": np.round(moved / COUNT_RAD) * COUNT_RAD,
-                }
-            )
+            trial(number, start, command, moved, joint=JOINT, frequency_hz=tone, period_s=0.01,
+                  read_after_s=0.001)
         )  # fmt: skip
         start += float(time[-1]) + 1.0
     header = {"readings": "live", "start_pose_rad": {JOINT: 0.0}}
