@@ -38,6 +38,7 @@ from pupper_sysid.hardware.serial_servos.settings import RegisterFault
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
 BROADCAST_ID = 0xFE
 HIGHEST_ID = 253
+_TRIES = 3
 
 BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
 """By the value of the servo's baud register."""
@@ -167,7 +168,9 @@ SERIES = {
 
 def by_firmware(line: SerialLine, servo: int, model: int) -> Series | None:
     """STS, HLS or SCS, for a servo whose model number is not known; None if its firmware is not."""
-    reply = line.read(servo, 0, 3)
+    # again where an answer is lost: the servo would be refused, not the line blamed
+    replies = (line.read(servo, 0, 3) for _ in range(_TRIES))
+    reply = next((r for r in replies if r is not None), None)
     if reply is None:
         return None
     major, minor, big_endian = reply.frame.data

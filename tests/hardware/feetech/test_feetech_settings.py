@@ -222,6 +222,24 @@ def test_a_servo_without_a_known_number_is_of_the_series_that_its_firmware_shows
     assert report.model == "HLS (31242)" and report.gains == (32, 40, 0)
 
 
+def test_a_lost_answer_does_not_make_the_firmware_of_a_servo_unknown(monkeypatch):
+    servos, lost = hls(), []
+    receive = servos.receive
+
+    def lossy(data: bytes, now: float, baud: int | None = None) -> list[tuple[float, bytes]]:
+        pieces = receive(data, now, baud)
+        if b"\x02\x00\x03" in data and not lost:  # a read of the firmware, at address 0
+            lost.append(data)
+            return []
+        return pieces
+
+    monkeypatch.setattr(servos, "receive", lossy)
+    with on_a_port(servos) as server:
+        bus = hls_bus(server)
+        assert bus.servo_setups()["LF_hip"]["model"] == "HLS" and lost
+        bus.close()
+
+
 @pytest.mark.parametrize(
     ("registers", "sentence", "refused"),
     [
