@@ -293,8 +293,8 @@ def _compared(
     ]
     parts = folds_of(problem.runs)
     folds = fit_folds(problem, parts, rng, points, parents)
-    if ready.lag.feedback.kind == "lattice":
-        points = with_date_errors(points, problem, best, rng)
+    polled = ready.lag.feedback.kind == "lattice"
+    points = with_date_errors(points, problem, best, ready.recorded, polled, rng)
     left_out, groups = folds, group_count(problem.runs)
     if len(parts) < LEAST_FOLDS:
         blocks, apart = in_blocks(problem)

@@ -57,7 +57,9 @@ from pupper_sysid.sysid.fit.search import (
     curvature,
     fit_folds,
     folds_of,
+    from_about,
     price_of_a_number,
+    refine,
     search,
     temperature_at,
     without_limit,
@@ -90,7 +92,6 @@ _POLL_SD_S = 1e-3
 """Standard deviation of a poll's instant about its lattice: jitter of the bus and drift."""
 _AT_BOUND = 0.03
 """Distance from a bound, in fitted coordinates, that counts as on it."""
-_CUT_OFF = 0.25  # of an interval: a value as near to the bound is on it, as far as is known
 _CUT_SHARE = 0.1
 """The same as a share of a 90 % interval: a bound within two standard deviations cuts the draws."""
 _COMMAND_WINDOW_S = 0.05
@@ -395,11 +396,10 @@ def _candidate_fit(
     if why := _undated(ready.lag.feedback):
         undecided["dead_time_s"] = why
     doubt_s = max(t.read_time_doubt_s for t in ready.recorded)
-    least = structure.parameters[0].low
-    if doubt_s > 0 and fitted_s.value - least < _CUT_OFF * (fitted_s.high - least):
+    if fitted_s.value < doubt_s and _wants_less_than_none(ready, fitted, doubt_s):
         why = (
-            f"the dead time is on its bound, and readings are dated to {1e3 * doubt_s:.0f} ms "
-            "only: gains make up for what the dates are off"
+            "the servo answers before its commands, and readings are dated to "
+            f"{1e3 * doubt_s:.0f} ms only: gains make up for what the dates are off"
         )
         undecided |= {name: why for name in parameters if name not in ("dead_time_s", "offset_rad")}
     left_out = (
@@ -411,6 +411,18 @@ def _candidate_fit(
         undecided=undecided,
         scores=score(free_run(structure, values, ready.runs), ready.runs, left_out),
     )
+
+
+def _wants_less_than_none(ready: PreparedJoint, fitted: Fitted, doubt_s: float) -> bool:
+    """Whether readings dated later by their doubt leave the servo less dead time than the doubt."""
+    structure, problem = fitted.structure, ready.problem(fitted.structure)
+    later = tuple(replace(r, sample_step=r.sample_step + doubt_s / r.step_s) for r in problem.runs)
+    values = fitted.values
+    values[0] += doubt_s
+    start = np.clip(structure.encode(values), *structure.box)
+    problem = replace(problem, runs=later)
+    best = from_about(problem, refine(problem, start[None]), ready.fit_rng())
+    return float(structure.decode(best.point)[0]) - doubt_s < structure.parameters[0].low
 
 
 def _ratio_of(parameters: Mapping[str, Interval], name: str) -> float:

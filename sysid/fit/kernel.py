@@ -152,7 +152,7 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
     next_, next_cut_ = _lanes(), _lanes()
     before, after = _lanes(), _lanes()
     one, two, share = _lanes(), _lanes(), _lanes()
-    on, rate, play = _lanes(), _lanes(), _lanes()
+    on, rate, play, per_limit = _lanes(), _lanes(), _lanes(), _lanes()
     summed, most_summed, mean_error = _lanes(), _lanes(), _lanes()
     braked, clipped, drive, free = _lanes(), _lanes(), _lanes(), _lanes()
     begin, error, acting, pull, limit = _lanes(), _lanes(), _lanes(), _lanes(), _lanes()
@@ -173,6 +173,7 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
         for j in (1, 2, 3, 5, 8, 14):  # torques over the inertia
             p[j, i] = w[j] / inertia
         p[6, i] = w[6] * h
+        per_limit[i] = 1.0 / p[6, i]
         p[9, i] = 1.0 / (w[9] * w[9])
         p[12, i] = w[12] * inertia
         p[17, i] = w[17] * p[2, i]
@@ -265,7 +266,8 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
                     rate[i] += change
                     move = (rate[i] - 0.5 * change) * long
                     move = move if limited else clip(way, p[6, i] * weight)
-                    one[i] += weight * (s[i] + 0.5 * move)
+                    moving = weight if limited else abs(move) * per_limit[i]
+                    one[i] += weight * (s[i] + move) - 0.5 * moving * move
                     s[i] += move
             for i in range(LANES):
                 curved = 1.0 if p[7, i] < np.inf or p[6, i] < np.inf else 0.0
@@ -273,15 +275,18 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
                 one[i] = before[i] + (mean - before[i]) * curved
                 two[i] = after[i] + (mean - after[i]) * curved
         elif slew:
+            # a set-point that arrives within its part of the step waits there for the rest of it
             for i in range(LANES):
-                first = clip(before[i] - s[i], p[6, i] * share[i])
-                mean = share[i] * (s[i] + 0.5 * first)
-                s[i] += first
-                then = clip(after[i] - s[i], p[6, i] * (1.0 - share[i]))
-                mean += (1.0 - share[i]) * (s[i] + 0.5 * then)
-                s[i] += then
-                one[i] = mean
-                two[i] = mean
+                one[i] = 0.0
+            for part_of in range(1 if steady else 0, 2):
+                for i in range(LANES):
+                    weight = 1.0 - share[i] if part_of else share[i]
+                    target = after[i] if part_of else before[i]
+                    move = clip(target - s[i], p[6, i] * weight)
+                    s[i] += move
+                    one[i] += weight * s[i] - 0.5 * move * abs(move) * per_limit[i]
+            for i in range(LANES):
+                two[i] = one[i]
         else:
             for i in range(LANES):
                 one[i] = before[i]
@@ -438,6 +443,19 @@ def _fill_lanes(first, order, who):
     return used
 
 
+@njit(fastmath=SAFE, error_model="numpy", inline="always")
+def _positions_at(track, moment, steps, out):
+    """Positions within a step, on the parabola of the accelerations before and after it."""
+    row = min(int(moment), steps - 1)
+    part = moment - row
+    before, after = max(row - 1, 0), min(row + 2, steps)
+    bent = 0.25 * part * (1.0 - part)
+    of_low, of_high = 1.0 - part + bent, part + bent
+    for i in range(LANES):
+        near = of_low * track[row, i] + of_high * track[row + 1, i]
+        out[i] = near - bent * (track[before, i] + track[after, i])
+
+
 _POSITIONS, _RESIDUALS, _COSTS, _MOMENTS = range(4)
 _NONE, _NO_TABLE = np.empty(0), np.empty((0, 0))
 
@@ -454,9 +472,9 @@ def _evaluate(
         last_step = -1.0
         for n in range(samples):
             last_step = max(last_step, step[n])
-        steps = min(int(np.ceil(last_step)) + 1, steps)
+        steps = min(int(np.ceil(last_step)) + 2, steps)
     who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
-    offset, cost, error_sum = _lanes(), _lanes(), _lanes()
+    offset, cost, error_sum, position = _lanes(), _lanes(), _lanes(), _lanes()
     per_noise = 1.0 / noise
     until = np.full(edges.shape[1], edges.shape[1] - 1)
     for k in range(edges.shape[1] - 2, -1, -1):
@@ -487,20 +505,15 @@ def _evaluate(
                     out[k, who[i]] = track[k, i] + offset[i]
         elif task == _RESIDUALS:
             for n in range(samples):
-                row = min(int(step[n]), steps - 1)
-                part = step[n] - row
+                _positions_at(track, step[n], steps, position)
                 for i in range(used):
-                    low = track[row, i]
-                    position = low + part * (track[row + 1, i] - low)
-                    out[who[i], n] = position + offset[i] - reading[n]
+                    out[who[i], n] = position[i] + offset[i] - reading[n]
         elif task == _COSTS:
             for n in range(samples):
-                row = min(int(step[n]), steps - 1)
-                part, read = step[n] - row, reading[n]
+                _positions_at(track, step[n], steps, position)
+                read = reading[n]
                 for i in range(LANES):
-                    low = track[row, i]
-                    position = low + part * (track[row + 1, i] - low)
-                    r = (position + offset[i] - read) * per_noise
+                    r = (position[i] + offset[i] - read) * per_noise
                     cost[i] += np.sqrt(1.0 + r * r) - 1.0
             for i in range(used):
                 out[0, who[i]] = cost[i]
@@ -509,12 +522,10 @@ def _evaluate(
                 for i in range(LANES):
                     error_sum[i], cost[i] = 0.0, 0.0
                 for n in range(samples):
-                    moment = max(step[n] - later[m], 0.0)
-                    row = min(int(moment), steps - 1)
-                    part, read = moment - row, reading[n]
+                    _positions_at(track, max(step[n] - later[m], 0.0), steps, position)
+                    read = reading[n]
                     for i in range(LANES):
-                        low = track[row, i]
-                        error = low + part * (track[row + 1, i] - low) + offset[i] - read
+                        error = position[i] + offset[i] - read
                         error_sum[i] += error
                         cost[i] += error * error
                 for i in range(used):

@@ -343,7 +343,9 @@ def _with_feature(
         values = np.concatenate([values, traded])
     starts = np.clip(wider.encode(values), *wider.box)
     behind = replace(problem, structure=wider)
-    fits = [from_about(behind, refine(behind, starts), rng)]
+    fits = [refine(behind, starts)]
+    if best.cost - fits[0].cost > temperature:  # there is something, so that its size matters
+        fits = [from_about(behind, fits[0], rng)]
     if name in _TRADED and {"friction_rad_s2", "stiffness_per_s2"} <= {*wider.names}:
         # what the two hold back together may be all that the data tell: the least likely friction
         known = np.concatenate([fits[0].point[None], starts])

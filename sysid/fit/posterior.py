@@ -22,8 +22,11 @@ from scipy.special import logsumexp, ndtri
 from pupper_sysid.common.interval import LEVEL, Interval
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.fit.goodness import LEAST_NOISE_RAD
-from pupper_sysid.sysid.fit.search import Fit, Problem, curvatures, local
+from pupper_sysid.sysid.fit.run import with_late_commands
+from pupper_sysid.sysid.fit.scores import rms
+from pupper_sysid.sysid.fit.search import Fit, Problem, curvatures, local, slopes_at
 from pupper_sysid.sysid.fit.structure import Structure
+from pupper_sysid.sysid.recordings.recording import Trial
 
 STEPPING_SD_S = 0.1 * TIME_STEP_S
 """Error of a dead time [s] that no number of readings reduces, because the model moves in steps:
@@ -50,10 +53,13 @@ HARDLY_CONVERGED = 1.1, 100.0
 fifth of a standard deviation and more."""
 _BETTER = 4.0  # log-likelihood by which another optimum has to be better
 _STEP = 0.01
+LATCH_SD_S = 0.0003
+"""Standard deviation of the time that a command waits in a servo whose loop turns once in a
+millisecond [s]."""
 PHASE_SD_S = 0.0003
 """Standard deviation of the date error that all readings of a polled run share [s], about that of
 the phase of a poll estimated from a few seconds."""
-_DATE_DRAWS, _DATE_ITERATIONS = 24, 6
+_DATE_DRAWS, _ITERATIONS = 24, 6
 LEAST_FOLDS = 3
 """Fits without a part, below which their scatter says nothing."""
 _MEDIAN_OF_NORMAL = float(ndtri(0.75))  # of the size of a standard normal number
@@ -131,7 +137,7 @@ def sample(
             continue
         if own[first] < least - _BETTER and turn < rounds // 2:  # an optimum beside: begin there
             start = target.fitted(drawn[first : first + 1])
-            fit = local(problem, start, _DATE_ITERATIONS, _CURVATURE_STEP)[0]
+            fit = local(problem, start, _ITERATIONS, _CURVATURE_STEP)[0]
             begin = target.straight(fit.point[None])
             least = float(target.cost(begin)[0])
             mixture, mixtures = _Mixture.about(target, begin), []
@@ -334,27 +340,49 @@ def convergence(points: NDArray[np.float64], weight: NDArray[np.float64]) -> tup
 
 
 def with_date_errors(
-    draws: NDArray[np.float64], problem: Problem, best: Fit, rng: np.random.Generator
+    draws: NDArray[np.float64],
+    problem: Problem,
+    best: Fit,
+    recorded: Sequence[Trial],
+    polled: bool,
+    rng: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """Draws with what it does to the optimum that the readings of each run share a date error.
+    """Draws with what errors of dates, which many readings share, do to the optimum.
 
-    The phase of a poll is estimated for each trial, so its readings are early or late together, by
-    `PHASE_SD_S`. No likelihood of independent readings knows that, and stiffness, damping and
-    friction move more by it than the dead time does.
+    A command waits for the servo's next turn, and the servo carries that on for many readings: of
+    each draw here all commands are late at random (`LATCH_SD_S`), by no more than residuals allow.
+    The phase of a poll is estimated for each trial, so that its readings are early or late together
+    (`PHASE_SD_S`). No likelihood of independent readings knows that, and stiffness, damping and
+    limits move more by it than the dead time does.
 
-    `draws` of shape (draws, parameters).
+    `draws` of shape (draws, parameters). `recorded`: the trials of the runs, as recorded. `polled`:
+    whether readings are dated by a poll's lattice.
     """
-    moved = []
-    for _ in range(_DATE_DRAWS):
-        runs = tuple(
-            replace(r, sample_step=np.maximum(r.sample_step + late / r.step_s, 0.0))
-            for r, late in zip(
-                problem.runs, PHASE_SD_S * rng.standard_normal(len(problem.runs)), strict=True
-            )
-        )  # fmt: skip
-        shifted = replace(problem, runs=runs)
-        moved.append(local(shifted, best.point[None], _DATE_ITERATIONS, _CURVATURE_STEP)[0].point)
-    apart = np.array(moved) - best.point
+    runs, point = problem.runs, best.point[None]
+    plain = problem.scaled(point)[0]
+    ends = np.cumsum([len(run.sample_step) for run in runs])[:-1]
+
+    def off(latch_s: Sequence[float], phase_s: float) -> NDArray[np.float64]:
+        """Residuals of the best fit with commands and polls at other times, less its own."""
+        late = [
+            with_late_commands(run, trial, sd, rng)
+            for run, trial, sd in zip(runs, recorded, latch_s, strict=True)
+        ]
+        shifted = tuple(
+            replace(run, sample_step=np.maximum(run.sample_step + by / run.step_s, 0.0))
+            for run, by in zip(late, phase_s * rng.standard_normal(len(runs)), strict=True)
+        )
+        return replace(problem, runs=shifted).scaled(point)[0] - plain
+
+    moved = off([LATCH_SD_S] * len(runs), 0.0)
+    latch_s = [
+        LATCH_SD_S * min(1.0, rms([own]) / max(rms([of_latch]), 1e-12))
+        for own, of_latch in zip(np.split(plain, ends), np.split(moved, ends), strict=True)
+    ]
+    jacobian, bent = slopes_at(problem, best.point, _CURVATURE_STEP)
+    errors = np.array([off(latch_s, PHASE_SD_S if polled else 0.0) for _ in range(_DATE_DRAWS)])
+    weighted = errors / (1.0 + plain**2) ** 0.25
+    apart = -np.linalg.solve(bent, jacobian @ weighted.T).T
     return draws + apart[rng.integers(0, len(apart), len(draws))]
 
 

@@ -380,10 +380,14 @@ def fresh_residuals(
 
 
 def at_steps(track: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A track at fractional steps; NaN where the step is."""
-    return np.where(
-        np.isnan(step), np.nan, np.interp(np.nan_to_num(step), np.arange(len(track)), track)
-    )
+    """A track at fractional steps, on the kernel's parabola; NaN where the step is."""
+    last = len(track) - 1
+    inside = np.clip(np.nan_to_num(step), 0.0, last)
+    row = np.minimum(inside.astype(int), last - 1)
+    part = inside - row
+    before, low, high, after = (track[np.clip(row + n, 0, last)] for n in (-1, 0, 1, 2))
+    between = low + part * (high - low) - 0.25 * part * (1.0 - part) * (before - low - high + after)
+    return np.where(np.isnan(step), np.nan, between)
 
 
 def _simulated(

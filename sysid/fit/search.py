@@ -415,6 +415,18 @@ def curvatures(problem: Problem, points: NDArray[np.float64], difference: float)
     return _slopes(problem, points, difference)[2]
 
 
+def slopes_at(
+    problem: Problem, point: NDArray[np.float64], difference: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes of the weighted residuals at a point, (parameters, samples), and the curvature."""
+    structure = problem.structure
+    step = difference * structure.scale
+    away = np.where(point + step > structure.box[1], -1.0, 1.0) * step
+    r = problem.scaled(np.concatenate([point[None], point + np.diag(away)]))
+    jacobian = (r[1:] - r[0]) / away[:, None] / (1.0 + r[0] ** 2) ** 0.25
+    return jacobian, jacobian @ jacobian.T + structure.prior_precision
+
+
 def _slopes(problem: Problem, points: NDArray, difference: float) -> tuple[NDArray, ...]:
     """Cost, gradient and curvature at points (starts, parameters)."""
     structure, k = problem.structure, points.shape[1]

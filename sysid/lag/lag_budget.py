@@ -307,10 +307,12 @@ def _seen(
             "so there is no lag to measure. Was its torque on, and do commands and positions "
             "belong to one joint? See `pupper-sysid doctor`."
         )
-    if np.mean(impulse.masses.sum(axis=1) < 0) > 0.95:
+    _, alike = _resemblance(impulse)
+    if np.mean(impulse.masses.sum(axis=1) < 0) > 0.95 and -alike.min() > alike.max():
         raise InputError(
             f"{joint}: it moves against its command (gain {impulse.gain:.2f}), so there is no lag "
-            "to measure. Turn the sign of its position or of its command."
+            "to measure. Turn the sign of its position or of its command; a servo that is late by "
+            "half a period of a fast motion looks the same: record a slower one."
         )
     drawn = shift_draws(impulse, rng)
     near = float(np.median(drawn))
@@ -420,20 +422,20 @@ _Product = tuple[NDArray[np.float64], NDArray[np.float64]]
 def shift_draws(response: ImpulseResponse, rng: np.random.Generator) -> NDArray[np.float64]:
     """Draws of the lag that impulse responses and the recording's own command give [s].
 
+    Where the motion resembles its command most, upright: of a fast motion the gain at standstill,
+    and with it a sign, is not known.
+
     `rng` draws where the mass within a bin sits.
     """
     edges, masses = response.edges_s, response.masses
-    gain = -1.0 if response.gain < 0 else 1.0
+    everywhere, alike = _resemblance(response)
+    centre = everywhere[int(np.argmax(alike))]
     products = [s.autocorrelation(LONGEST_S + edges[-1]) for s in response.stretches]
-    everywhere = np.arange(EARLIEST_S, LONGEST_S, 2.5 * _STEP_S)
-    # of the mean: draws differ in where they begin, and medians of single bins are no response
-    whole = masses.mean(axis=0) @ _correlation(products, edges, everywhere).sum(axis=0)
-    centre = everywhere[int(np.argmax(gain * whole))]
     shift = np.arange(max(EARLIEST_S, centre - _NEAR_S), min(LONGEST_S, centre + _NEAR_S), _STEP_S)
     command = _correlation(products, edges, shift)
     draws, blocks = response.weights.shape
     mixed = (response.weights @ command.reshape(blocks, -1)).reshape(draws, *command.shape[1:])
-    lag = _peaks(gain * np.einsum("dj,djt->dt", masses, mixed), shift)
+    lag = _peaks(np.einsum("dj,djt->dt", masses, mixed), shift)
     # the response is constant within a bin; a jump may be anywhere in it
     share = np.sqrt(np.sum((masses * np.diff(edges)) ** 2, axis=1) / 12)
     share /= np.maximum(np.abs(masses.sum(axis=1)), 0.1)
@@ -441,6 +443,17 @@ def shift_draws(response: ImpulseResponse, rng: np.random.Generator) -> NDArray[
     # few blocks: Student's quantile instead of the normal one
     wider = stdtrit(max(blocks - 1, 1), (1 + LEVEL) / 2) / stdtrit(1e6, (1 + LEVEL) / 2)
     return np.median(lag) + wider * (lag - np.median(lag))
+
+
+def _resemblance(response: ImpulseResponse) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Correlation of the motion with the command, all over the search range: shifts [s], values.
+
+    Of the mean response: draws differ in where they begin, and medians of single bins are none.
+    """
+    products = [s.autocorrelation(LONGEST_S + response.edges_s[-1]) for s in response.stretches]
+    shifts = np.arange(EARLIEST_S, LONGEST_S, 2.5 * _STEP_S)
+    command = _correlation(products, response.edges_s, shifts).sum(axis=0)
+    return shifts, response.masses.mean(axis=0) @ command
 
 
 def _correlation(

@@ -335,7 +335,7 @@ def rough_lag(parts: Sequence[Stretch]) -> float:
     prior, k = _best([p for p in priors if p is not None], count)
     mean = prior.root @ (prior.inverse(k) @ prior.moment)
     # the readings' own correlation with the command would see one phase of the staircase only
-    return float(edges[int(np.argmax(np.abs(gram @ mean)))] + edges[1] / 2)
+    return float(edges[int(np.argmax(gram @ mean))] + edges[1] / 2)
 
 
 def past_bins(width_s: float, until_s: float, growth: float) -> NDArray[np.float64]:

@@ -84,12 +84,13 @@ def servo(
                 wanted_rate = np.clip(way / long, -fastest, fastest)
                 change = np.clip(wanted_rate - rate, -limit * long, limit * long)
                 rate += change
-                move = (rate - change / 2) * long
+                move, moving = (rate - change / 2) * long, part
             else:
                 most = w["velocity_limit"] * h * part if part > 0 else 0.0
                 move = np.clip(way, -most, most)
-            moved += part * (setpoint + move / 2)
+                moving = abs(move) / (w["velocity_limit"] * h)
             setpoint += move
+            moved += part * setpoint - moving * move / 2
         limited = np.isfinite(w["velocity_limit"]) or np.isfinite(w["acceleration_limit"])
         targets = [moved, moved] if limited else [first, last]
         middle = y + v * h / 2

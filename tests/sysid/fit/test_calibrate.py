@@ -129,7 +129,7 @@ def test_gains_make_up_for_dates_that_leave_no_dead_time(doubt_s):
     (trial,) = exact_recording(1e-3, 450.0, 0.02, "live", 0.003).trials(JOINT)
     late = replace(trial, send_time_s=trial.send_time_s + 0.004, read_time_doubt_s=doubt_s)
     fit = fit_joint(JOINT, (late,), 0).candidate_models["delayed_pd"]
-    assert fit.parameters["dead_time_s"].value < 0.0013
+    assert fit.parameters["dead_time_s"].value < 0.002
     doubted = [name for name, why in fit.undecided.items() if "readings are dated to" in why]
     assert ("stiffness_per_s2" in doubted) is (doubt_s > 0)
 

@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import pupper_sysid as ps
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
-from pupper_sysid.sysid.fit.posterior import _Target, sample
-from pupper_sysid.sysid.fit.run import free_run
-from pupper_sysid.sysid.fit.search import Problem, refine
+from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
+from pupper_sysid.sysid.fit.posterior import LATCH_SD_S, _Target, sample, with_date_errors
+from pupper_sysid.sysid.fit.run import at_steps, free_run, prepare
+from pupper_sysid.sysid.fit.search import Fit, Problem, refine
 from pupper_sysid.sysid.fit.structure import candidate
 from support.runs import fine_run
 
@@ -65,3 +67,31 @@ def test_the_change_of_coordinates_has_an_inverse_a_determinant_of_one_and_a_hes
     np.testing.assert_allclose(
         target.curvature(points[:1])[0], slope.T @ other.curvature(fitted[:1])[0] @ slope, rtol=1e-5
     )
+
+
+@pytest.mark.parametrize(("jumps", "noise_rad"), [(1, 0.02), (16, 0.02), (1, 1e-5)])
+def test_a_dead_time_is_no_surer_than_the_turn_of_the_servo_at_which_each_command_begins(
+    jumps, noise_rad
+):
+    rng, loop_s = np.random.default_rng(3), 0.01
+    sent = loop_s * np.arange(round(0.4 / loop_s * jumps))
+    level = 0.1 * (np.arange(len(sent)) // round(0.2 / loop_s) % 2)
+    trial = ps.Recording.from_arrays(
+        sent, {"knee": level}, {"knee": level}, read_time_s=sent + 0.001,
+        metadata={"readings": "live", "start_pose_rad": {"knee": 0.0}},
+    ).trials("knee")[0]  # fmt: skip
+    lattice = find_poll_lattice([trial], rng)
+    run = prepare(trial, lattice).in_free_air()
+    values = np.array([TRUTH[n] for n in STRUCTURE.names])
+    (track,) = free_run(STRUCTURE, values, (run,))
+    read = at_steps(track, run.sample_step)
+    read += noise_rad * rng.standard_normal(len(read))
+    problem = Problem(STRUCTURE, (replace(run, sample_rad=read),), (noise_rad,))
+    point = STRUCTURE.encode(values)
+    still = np.tile(point, (4000, 1))
+    wider = with_date_errors(still, problem, Fit(point, 0.0), [trial], False, rng)
+    spread_s = STRUCTURE.decode(wider)[:, 0].std()
+    if noise_rad < 1e-3:  # readings that are exact allow no command to be late
+        assert spread_s < 0.1 * LATCH_SD_S
+    else:
+        assert spread_s == pytest.approx(LATCH_SD_S / np.sqrt(2 * jumps), rel=0.6)

@@ -163,3 +163,20 @@ def test_draws_that_begin_at_different_times_do_not_lose_the_lag_they_share():
     response = ImpulseResponse(edges, masses, np.ones((30, 8)), (stretch,), 1.0)
     # 1.6 · 65 - 0.6 · 95 ms in the middle of the three
     assert np.median(shift_draws(response, rng)) == pytest.approx(0.047, abs=0.01)
+
+
+def test_a_fast_motion_whose_gain_at_standstill_comes_out_negative_has_its_lag_upright():
+    """A walk tells the gain at its frequencies only: a wide, weak response may take it below 0."""
+    edges = 0.01 * np.arange(121)
+    masses = np.zeros((30, 120))
+    masses[:, 8] = 1.0
+    masses[:, 20:120] = -0.013
+    rng = np.random.default_rng(7)
+    trial = first_order_trial(
+        lambda t: 0.2 * np.sin(2 * np.pi * 2.0 * t) + 0.1 * np.sin(2 * np.pi * 4.0 * t),
+        0.02, 0.05, loop_s=0.02,
+    )  # fmt: skip
+    stretch = Stretch(HeldCommand.of(trial), trial.read_time_s, trial.position_rad, 8)
+    response = ImpulseResponse(edges, masses, np.ones((30, 8)), (stretch,), 1.0)
+    assert response.gain < 0
+    assert np.median(shift_draws(response, rng)) == pytest.approx(0.085, abs=0.01)
