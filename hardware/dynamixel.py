@@ -38,8 +38,9 @@ from pupper_sysid.hardware.serial_servos.line import SLOWEST_ADAPTER_S, LineFram
 from pupper_sysid.hardware.serial_servos.series import Family, Profile, Register, Series
 from pupper_sysid.hardware.serial_servos.settings import RegisterFault, read_register
 
-PING, READ, WRITE, REG_WRITE, ACTION, REBOOT = 1, 2, 3, 4, 5, 8
+PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, REBOOT, CLEAR = 1, 2, 3, 4, 5, 6, 8, 16
 SYNC_READ, SYNC_WRITE, FAST_SYNC_READ = 0x82, 0x83, 0x8A
+BULK_READ, BULK_WRITE, FAST_BULK_READ = 0x92, 0x93, 0x9A
 BROADCAST_ID, HIGHEST_ID = 0xFE, 252
 
 ALERT = 0x80
@@ -89,6 +90,7 @@ _TABLE = {
     "shutdown": Register(63),
     "torque_enable": Register(64),
     "status_return_level": Register(68),
+    "registered_instruction": Register(69),
     "hardware_error_status": Register(70),
     "position_d_gain": Register(80, 2),
     "position_i_gain": Register(82, 2),
@@ -292,15 +294,15 @@ FAST_HEAD_BYTES, FAST_BLOCK_BYTES = 8, 4
 """Of the answer to a fast sync read: before the first servo's block; of a block without data."""
 
 
-def fast_head(servos: int, size: int) -> bytes:
-    """First bytes of the answer of `servos` servos to a fast sync read of `size` bytes each.
+def fast_head(sizes: Sequence[int]) -> bytes:
+    """First bytes of the answer to a fast read of so many bytes of each servo.
 
     Examples
     --------
-    >>> fast_head(3, 4).hex(" ")
+    >>> fast_head([4, 4, 4]).hex(" ")
     'ff ff fd 00 fe 19 00 55'
     """
-    length = 1 + servos * (size + FAST_BLOCK_BYTES)
+    length = 1 + sum(sizes) + len(sizes) * FAST_BLOCK_BYTES
     return HEADER + bytes([BROADCAST_ID]) + length.to_bytes(2, "little") + bytes([STATUS])
 
 
@@ -429,7 +431,7 @@ class DynamixelLine(SerialLine):
     def fast_sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
         """`sync_read` by the fast request, whether or not all servos support it."""
         ids, arrived = list(servos), bytearray()
-        head, block = fast_head(len(ids), size), size + FAST_BLOCK_BYTES
+        head, block = fast_head([size] * len(ids)), size + FAST_BLOCK_BYTES
         whole, last_s = len(head) + len(ids) * block, 0.0
         kind = FAST_SYNC_READ, len(ids), 0  # what precedes the blocks depends on no length
 

@@ -35,7 +35,7 @@ from pupper_sysid.hardware.serial_servos.line import LineFrame, Reply, SerialLin
 from pupper_sysid.hardware.serial_servos.series import ERROR_BITS, Family, Profile, Register, Series
 from pupper_sysid.hardware.serial_servos.settings import RegisterFault
 
-PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
+PING, READ, WRITE, REG_WRITE, ACTION, SYNC_READ, SYNC_WRITE = 1, 2, 3, 4, 5, 0x82, 0x83
 BROADCAST_ID = 0xFE
 HIGHEST_ID = 253
 _TRIES = 3

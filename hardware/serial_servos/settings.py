@@ -96,6 +96,8 @@ def setup_of(
         setup["set_point_speed_rad_s"] = round(profile.speed_rad_s, 4)
     if math.isfinite(profile.acceleration_rad_s2):
         setup["set_point_acceleration_rad_s2"] = round(profile.acceleration_rad_s2, 3)
+    if profile.duration_s:
+        setup["set_point_duration_s"] = profile.duration_s
     return setup
 
 

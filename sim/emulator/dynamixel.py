@@ -45,8 +45,30 @@ _CHOICES = {
 _READ_ONLY = {
     "model_number", "firmware", "moving", "hardware_error_status", "present_pwm",
     "present_current", "present_velocity", "present_position", "present_input_voltage",
-    "present_temperature",
+    "present_temperature", "registered_instruction",
 }  # fmt: skip
+
+
+_WRITES = (table.SYNC_WRITE, table.BULK_WRITE)
+_FAST = (table.FAST_SYNC_READ, table.FAST_BULK_READ)
+_BULK = (table.BULK_READ, table.BULK_WRITE, table.FAST_BULK_READ)
+_SEVERAL = {table.SYNC_READ, *_WRITES, *_FAST, *_BULK}
+
+
+def _parts(frame: Frame) -> list[tuple[int, int, int, bytes]]:
+    """Id, address, size and data of each servo in a request to several."""
+    params, parts = frame.data, []
+    writes, bulk = frame.code in _WRITES, frame.code in _BULK
+    head = 4 if bulk else 0  # address and size stand behind each id, or once before them
+    at, common = (0, b"") if bulk else (4, params[:4])
+    while at + head < len(params):
+        where = common or params[at + 1 : at + 5]
+        address, size = (int.from_bytes(where[k : k + 2], "little") for k in (0, 2))
+        end = at + 1 + head + size * writes
+        if end <= len(params):
+            parts.append((params[at], address, size, params[at + 1 + head : end]))
+        at = end
+    return parts
 
 
 class DynamixelEmulator(LineEmulator):
@@ -54,13 +76,11 @@ class DynamixelEmulator(LineEmulator):
 
     family = FAMILY
     memory_bytes = table.MEMORY_BYTES
+    rates = table.BAUD_RATES
     factory: ClassVar = {name: _factory(name) for name in table.MODELS.values()}
 
     def _new_reader(self) -> FrameReader:
         return FrameReader()
-
-    def _baud_register(self, baud: int) -> dict[str, int]:
-        return {"baud_rate": table.BAUD_RATES.index(baud)}
 
     def _status(self, servo_id: int, error: int, data: bytes) -> bytes:
         return Frame(servo_id, error, data, is_status=True).encode()
@@ -74,57 +94,54 @@ class DynamixelEmulator(LineEmulator):
             self._watch(servo_id, max(now, self._free_at))
         pieces = super().receive(data, now, baud)
         for servo_id in self._reader.crc_errors:
-            if servo_id in self.servos:
+            if self._hears(servo_id):
                 pieces += self._answer(servo_id, 0, 0, self._byte_s(baud), table.CRC)
         self._reader.crc_errors.clear()
         return pieces
 
     def _execute(self, frame: Frame, byte_s: float) -> Pieces:
         at, to_all = self._free_at, frame.id == BROADCAST_ID
-        heard = sorted(self.servos) if to_all else [frame.id] * (frame.id in self.servos)
+        heard = [i for i in (sorted(self.servos) if to_all else [frame.id]) if self._hears(i)]
         for servo_id in heard:
             self.servos[servo_id].heard_s = at
-        if frame.code in (table.SYNC_READ, table.SYNC_WRITE, table.FAST_SYNC_READ):
-            return self._sync(frame, byte_s)
+        if frame.code in _SEVERAL:
+            return self._to_several(frame, byte_s)
         pieces: Pieces = []
         for servo_id in heard:
             reply = self._instruct(servo_id, frame, at, byte_s)
             pieces += [] if to_all and frame.code != table.PING else reply
         return pieces
 
-    def _sync(self, frame: Frame, byte_s: float) -> Pieces:
-        params, pieces = frame.data, []
-        if len(params) < 5 or frame.id != BROADCAST_ID:
-            return []
-        address, size = (int.from_bytes(params[k : k + 2], "little") for k in (0, 2))
-        rest = params[4:]
-        if frame.code == table.FAST_SYNC_READ:
-            return self._fast(rest, address, size, byte_s)
-        if frame.code == table.SYNC_READ:
-            for servo_id in rest:
-                if servo_id in self.servos and self._level(servo_id) >= 1:
-                    error = 0 if address + size <= self.memory_bytes else table.ACCESS
-                    pieces += self._answer(servo_id, address, 0 if error else size, byte_s, error)
-            return pieces
-        for k in range(0, len(rest) - size, size + 1):
-            if rest[k] in self.servos:
-                self._try_store(rest[k], address, rest[k + 1 : k + 1 + size], self._free_at)
-        return []
+    def _to_several(self, frame: Frame, byte_s: float) -> Pieces:
+        """Sync and bulk instructions."""
+        pieces: Pieces = []
+        parts = _parts(frame) if frame.id == BROADCAST_ID else []
+        if frame.code in _FAST:
+            return self._fast(parts, byte_s)
+        for servo_id, address, size, data in parts:
+            if not self._hears(servo_id):
+                continue
+            if frame.code in _WRITES:
+                self._try_store(servo_id, address, data, self._free_at)
+            elif self._level(servo_id):
+                error = 0 if address + size <= self.memory_bytes else table.ACCESS
+                pieces += self._answer(servo_id, address, 0 if error else size, byte_s, error)
+        return pieces
 
-    def _fast(self, ids: bytes, address: int, size: int, byte_s: float) -> Pieces:
+    def _fast(self, parts: list[tuple[int, int, int, bytes]], byte_s: float) -> Pieces:
         """One frame from all servos: each adds its block when as many bytes as its turn needs are
         on the line, so one that stays silent silences those behind it.
         """
-        line, pieces = table.fast_head(len(ids), size), []
+        line, pieces = table.fast_head([size for _, _, size, _ in parts]), []
 
         def block(servo_id: int, error: int, data: bytes) -> bytes:
             own = bytes([error, servo_id]) + data
             head = b"" if pieces else line
             return head + own + table.crc16(own, table.crc16(line)).to_bytes(2, "little")
 
-        for servo_id in ids:
+        for servo_id, address, size, _ in parts:
             if (
-                servo_id not in self.servos
+                not self._hears(servo_id)
                 or not self._level(servo_id)
                 or not table.has_fast_sync_read(self.series, self._get(servo_id, "firmware"))
                 or address + size > self.memory_bytes
@@ -160,18 +177,19 @@ class DynamixelEmulator(LineEmulator):
                 error = self._try_store(servo_id, address, params[2:], at)
             else:
                 servo.state["registered"] = (address, params[2:])
+                self._set(servo_id, "registered_instruction", 1)
                 error = 0
         elif code in (table.WRITE, table.REG_WRITE):
             error = table.DATA_LENGTH
         elif code == table.ACTION:
             kept = servo.state.pop("registered", None)
+            self._set(servo_id, "registered_instruction", 0)
             error = self._try_store(servo_id, kept[0], kept[1], at) if kept else table.RESULT_FAIL
-        elif code == table.REBOOT:
+        elif code == table.CLEAR:  # of the turns; these servos have one
+            error = table.RESULT_FAIL if self._get(servo_id, "torque_enable") else 0
+        elif code in (table.REBOOT, table.FACTORY_RESET):
+            self.restart(servo_id, at, keeps_eeprom=code == table.REBOOT)
             error = 0
-            for name in ("hardware_error_status", "torque_enable", "bus_watchdog"):
-                self._set(servo_id, name, 0)
-            servo.stopped = servo.overloaded = False
-            self.bench.torque(self.bench.index_of_id[servo_id], at, False)
         return self._answer(servo_id, 0, 0, byte_s, error) if level >= 2 else []
 
     def _reply(self, servo_id: int, data: bytes, byte_s: float) -> Pieces:

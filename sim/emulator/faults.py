@@ -3,9 +3,9 @@
     faults = BusFaults.parse("lost=0.02,late=0.01", rng)
 
 Faults of single answers: lost, late, truncated, corrupted, duplicated, foreign, wrong length. Of
-servos, for a while: error bits, frozen; in a brown-out all are limp and deaf, and stay limp until a
-command switches them on. Of the line: unplugged, a second writer. `counts` and `ended` keep
-account.
+servos, for a while: error bits, frozen; one that reboots is limp, its registers as after power-on;
+in a brown-out all do, and are deaf. Of the line: unplugged, a second writer. `counts` and `ended`
+keep account.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pupper_sysid.common.reading.dialect import decimal
 ANSWER_KINDS = (
     "lost", "late", "truncated", "corrupted", "duplicated", "foreign", "wrong-length",
 )  # fmt: skip
-STATE_KINDS = ("error-bits", "frozen", "brown-out", "unplugged", "second-writer")
+STATE_KINDS = ("error-bits", "frozen", "reboot", "brown-out", "unplugged", "second-writer")
 KINDS = (*ANSWER_KINDS, *STATE_KINDS)
 
 _LATE_S = (0.004, 0.06)
@@ -81,7 +81,7 @@ class BusFaults:
         `other` is the answer to another request.
         """
         match kind:
-            case "lost":
+            case "lost" | "reboot":
                 return []
             case "late":
                 return [(float(self.rng.uniform(*_LATE_S)), answer)]

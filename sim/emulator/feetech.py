@@ -38,6 +38,7 @@ class FeetechEmulator(LineEmulator):
 
     family = FAMILY
     memory_bytes = 80
+    rates = table.BAUD_RATES
     factory: ClassVar = {
         series.name: _SCS0009
         if series.big_endian
@@ -50,9 +51,6 @@ class FeetechEmulator(LineEmulator):
     def _new_reader(self) -> FrameReader:
         return FrameReader()
 
-    def _baud_register(self, baud: int) -> dict[str, int]:
-        return {"baud": table.BAUD_RATES.index(baud)}
-
     def _status(self, servo_id: int, error: int, data: bytes) -> bytes:
         return Frame(servo_id, error, data).encode()
 
@@ -60,32 +58,39 @@ class FeetechEmulator(LineEmulator):
         return Frame(servo_id, table.WRITE, bytes([address]) + data).encode()
 
     def _execute(self, frame: Frame, byte_s: float) -> Pieces:
-        at, params = self._free_at, frame.data
+        at, params, to_all = self._free_at, frame.data, frame.id == table.BROADCAST_ID
+        pieces: Pieces = []
         if frame.code == table.SYNC_WRITE and len(params) > 2:
             address, size = params[0], params[1]
             for k in range(2, len(params) - size, size + 1):
-                self._store(params[k], address, params[k + 1 : k + 1 + size], at)
+                if self._hears(params[k]):
+                    self._store(params[k], address, params[k + 1 : k + 1 + size], at)
             return []
         if frame.code == table.SYNC_READ and len(params) > 2 and self.series.has_sync_read:
-            address, size, ids = params[0], params[1], params[2:]
-            pieces = []
-            for servo_id in ids:
-                pieces += self._answer(servo_id, address, size, byte_s)
+            for servo_id in filter(self._hears, params[2:]):
+                pieces += self._answer(servo_id, params[0], params[1], byte_s)
             return pieces
-        if frame.id == table.BROADCAST_ID:
-            if frame.code == table.WRITE and len(params) > 1:
-                for servo_id in self.servos:
-                    self._store(servo_id, params[0], params[1:], at)
+        for servo_id in filter(self._hears, [*self.servos] if to_all else [frame.id]):
+            reply = self._instruct(servo_id, frame, at, byte_s)
+            pieces += [] if to_all else reply
+        return pieces
+
+    def _instruct(self, servo_id: int, frame: Frame, at: float, byte_s: float) -> Pieces:
+        """Execute an instruction of one servo; its reply, before it takes another id."""
+        code, params, state = frame.code, frame.data, self.servos[servo_id].state
+        if code == table.READ and len(params) == 2:
+            return self._answer(servo_id, params[0], params[1], byte_s)
+        if code == table.WRITE and len(params) > 1:
+            self._store(servo_id, params[0], params[1:], at)
+        elif code == table.REG_WRITE and len(params) > 1:
+            state["registered"] = params
+        elif code == table.ACTION:
+            kept = state.pop("registered", b"\0")
+            self._store(servo_id, kept[0], kept[1:], at)
+        elif code != table.PING:
             return []
-        if frame.code == table.PING:
-            return self._answer(frame.id, 0, 0, byte_s)
-        if frame.code == table.READ and len(params) == 2:
-            return self._answer(frame.id, params[0], params[1], byte_s)
-        if frame.code == table.WRITE and len(params) > 1 and frame.id in self.servos:
-            self._store(frame.id, params[0], params[1:], at)
-            if self._get(frame.id, "response_level"):
-                return self._answer(frame.id, 0, 0, byte_s)
-        return []
+        answers = code == table.PING or self._get(servo_id, "response_level")
+        return self._answer(servo_id, 0, 0, byte_s) if answers else []
 
     def _go(self, servo_id: int, k: int, at: float) -> None:
         # a goal switches the torque on

@@ -7,9 +7,9 @@ program. A vendor's emulator (`sim.emulator.feetech`, `sim.emulator.dynamixel`) 
 instructions.
 
 Every servo has its memory table and obeys it: operating mode, angle limits, homing offset,
-response level; gains, ramps and torque limits as far as the bench's servos have them. Commands and
-torque act on `ServoBench` when the last byte of their frame has arrived, and a position is measured
-when its answer begins.
+response level, id and rate; gains, ramps and torque limits as far as the bench's servos have them.
+Commands and torque act on `ServoBench` when the last byte of their frame has arrived, and a
+position is measured when its answer begins.
 
 A pseudo-terminal has no baud rate of its own, so the server holds bytes back for as long as a real
 line would. It keeps one end open itself, or a client that closes would end it; an unplugged adapter
@@ -81,6 +81,8 @@ class LineEmulator(ABC):
     memory_bytes: int
     factory: ClassVar[Mapping[str, Mapping[str, int]]]
     """Registers as a servo leaves the factory, by series' name."""
+    rates: ClassVar[Sequence[int]]
+    """By the value of the servo's baud register."""
 
     def __init__(
         self,
@@ -100,6 +102,8 @@ class LineEmulator(ABC):
         self._reader = self._new_reader()
         self._free_at = 0.0
         self._brown_out_until = -np.inf
+        self._heard_at = baud
+        self._renamed: set[int] = set()
         self.unplug_for_s = 0.0
         """Set by a fault: the port shall vanish for this time [s]."""
         self.readings: list[tuple[float, int, int]] = []
@@ -111,34 +115,54 @@ class LineEmulator(ABC):
             changed: dict[str, int] = {}
             for whose in (None, servo_id):
                 changed |= (registers or {}).get(whose, {})
-            settings = dict(self.factory[series.name]) | {
-                "model": series.model, "id": servo_id, "torque_enable": 1,
-            } | self._baud_register(baud)  # fmt: skip
-            for name, value in settings.items():
-                self._set(servo_id, name, value)
-            if series.lock_address is not None:
-                self.servos[servo_id].memory[series.lock_address] = 1
             k = bench.index_of_id[servo_id]
-            for name in self._acting:
-                self._set(servo_id, name, bench.register(k, name))
+            as_built = {name: bench.register(k, name) for name in self._acting}
+            self._load(servo_id, {"torque_enable": 1} | as_built)
             for name, value in changed.items():
                 self._set(servo_id, name, value)
                 if name in self._acting:
                     bench.set_register(k, 0.0, name, value)
-            if series.has("homing_offset") and "homing_offset" not in changed:
-                self._set(servo_id, "homing_offset", self._mapped_offset(servo_id))
             goal = int(np.clip(self._present(servo_id, 0.0), 0, series.counts - 1))
             self._set(servo_id, "goal_position", goal)
+
+    def _load(self, servo_id: int, more: Mapping[str, int]) -> None:
+        """Fill a servo's memory as it leaves the factory, but for its id, rate and offset."""
+        settings = dict(self.factory[self.series.name]) | {
+            "model": self.series.model, "id": servo_id, "baud": self.rates.index(self.baud),
+        } | dict(more)  # fmt: skip
+        if self.series.has("homing_offset"):
+            settings["homing_offset"] = self._mapped_offset(servo_id)
+        for name, value in settings.items():
+            self._set(servo_id, name, value)
+        if self.series.lock_address is not None:
+            self.servos[servo_id].memory[self.series.lock_address] = 1
+
+    def restart(self, servo_id: int, at: float, keeps_eeprom: bool = True) -> None:
+        """Limp, and with the registers of a servo that was switched on, as after its power failed.
+
+        Without its EEPROM it is as it left the factory.
+        """
+        servo, end = self.servos[servo_id], self.series.eeprom_end * keeps_eeprom
+        k, kept = self.bench.index_of_id[servo_id], bytes(servo.memory[:end])
+        servo.memory[end:] = bytes(self.memory_bytes - end)
+        self._load(servo_id, {"torque_enable": 0})
+        servo.memory[:end] = kept
+        for name, limit in (("torque_limit", "max_torque"), ("goal_current", "current_limit")):
+            if self.series.has(name) and self.series.has(limit):
+                self._set(servo_id, name, self._get(servo_id, limit))
+        self.bench.torque(k, at, False)
+        servo.stopped = servo.overloaded = False
+        servo.state.clear()
+        for name in self._acting:
+            self.bench.set_register(k, at, name, self._get(servo_id, name))
+        goal = int(np.clip(self._present(servo_id, at), 0, self.series.counts - 1))
+        self._set(servo_id, "goal_position", goal)
 
     # ----- what a vendor's emulator adds
 
     @abstractmethod
     def _new_reader(self) -> Any:
         """Reader of requests."""
-
-    @abstractmethod
-    def _baud_register(self, baud: int) -> dict[str, int]:
-        """Register that holds the rate."""
 
     @abstractmethod
     def _execute(self, frame: Any, byte_s: float) -> Pieces:
@@ -161,17 +185,35 @@ class LineEmulator(ABC):
     def receive(self, data: bytes, now: float, baud: int | None = None) -> Pieces:
         """What comes back, in order of time, for `data` that the host began to send at `now`.
 
-        `now` [s] must not go backwards. At another rate than theirs, `baud`, the
-        servos receive only noise.
+        `now` [s] must not go backwards. Servos of another rate than `baud` receive only noise.
         """
         byte_s, self._free_at = self._byte_s(baud), max(now, self._free_at)
+        self._heard_at = self.baud if baud is None else baud
         pieces = [(self._free_at + len(data) * byte_s, data)] if self.echo else []
         for byte in data:  # a request acts at its own end, however many come at once
             self._free_at += byte_s
-            if baud is None or baud == self.baud:
-                for frame in self._reader.feed(bytes([byte])):
-                    pieces += self._execute(frame, byte_s)
+            for frame in self._reader.feed(bytes([byte])):
+                pieces += self._execute(frame, byte_s)
+                self._rename()
         return sorted(pieces, key=lambda p: p[0])
+
+    def _hears(self, servo_id: int) -> bool:
+        """Whether there is such a servo, and the present bytes come at its rate."""
+        if servo_id not in self.servos:
+            return False
+        rate = self._get(servo_id, "baud")
+        return rate < len(self.rates) and self.rates[rate] == self._heard_at
+
+    def _rename(self) -> None:
+        """Move a servo to the id that was written into it, where another one may be."""
+        for old in self._renamed:
+            new, servo = self._get(old, "id"), self.servos.pop(old)
+            index = self.bench.index_of_id.pop(old)
+            if new in self.servos:
+                self._doubled.add(new)
+            else:
+                self.servos[new], self.bench.index_of_id[new] = servo, index
+        self._renamed.clear()
 
     def _byte_s(self, baud: int | None) -> float:
         return 10.0 / (self.baud if baud is None or baud <= 0 else baud)  # 0: without a name
@@ -213,6 +255,8 @@ class LineEmulator(ABC):
             return
         servo.memory[address : address + len(data)] = data
         touched = range(address, address + len(data))
+        if self.series.register("id").address in touched and self._get(servo_id, "id") != servo_id:
+            self._renamed.add(servo_id)
         k = self.bench.index_of_id[servo_id]
         for name in self._acting:
             if self.series.register(name).address in touched:
@@ -303,6 +347,8 @@ class LineEmulator(ABC):
             self.fail(servo_id, at, bits, self.faults.lasts_s)
         elif kind == "brown-out":
             self.brown_out(at, self.faults.lasts_s)
+        elif kind == "reboot":
+            self.restart(servo_id, at)
         elif kind == "unplugged":
             self.unplug_for_s = self.faults.lasts_s
         return kind
@@ -311,8 +357,7 @@ class LineEmulator(ABC):
         """Supply too low from `at` on: all servos are limp, and deaf for some seconds."""
         self._brown_out_until = at + seconds
         for servo_id in self.servos:
-            self._set(servo_id, "torque_enable", 0)
-            self.bench.torque(self.bench.index_of_id[servo_id], at, False)
+            self.restart(servo_id, at)
         self.faults.ended.append(("brown-out", self._brown_out_until))
 
     def fail(self, servo_id: int, at: float, bits: int, seconds: float) -> None:

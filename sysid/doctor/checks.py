@@ -78,9 +78,10 @@ def setup_findings(setup: ServoSetup, speed_rad_s: float = _SERVO_RAD_S) -> list
     if speed is not None and speed < _SERVO_RAD_S:
         name = "profile_velocity" if dynamixel else "goal_speed"
         found.append(_shaped(name, registers.get(name, 0), f"{speed:.2f} rad/s", "0"))
-    duration = registers.get("goal_time", 0)
-    if duration > 0 and speed is None:
-        found.append(_shaped("goal_time", duration, f"{duration} ms for each command", "0"))
+    if duration_s := setup.set_point_duration_s:
+        name = "profile_velocity" if dynamixel else "goal_time"
+        said = f"{1e3 * duration_s:.0f} ms for each command"
+        found.append(_shaped(name, registers.get(name, 0), said, "0"))
     return found
 
 

@@ -232,7 +232,7 @@ def _ladder(
     is better.
     """
     scales = ready.scales
-    stated: tuple[str, ...] = ("acceleration",) if np.isfinite(scales.acceleration_rad_s2) else ()
+    stated = scales.stated_features
     plain, first = next(iter(ready.first.values()))
     tried = {plain.features: Fitted(plain, first)}
 
@@ -246,13 +246,16 @@ def _ladder(
         near = structure.adopt(profiled.structure, profiled.fit.point)
         fit = refine(ready.searched(structure), near[None])
         tried[structure.features] = Fitted(structure, fit)
-        stated = ("acceleration",)
-    elif not stated:  # first, because friction that grows with the load imitates a profile
-        try_out()
-        try_out("acceleration")
+        stated = tuple(dict.fromkeys((*stated, "acceleration")))
+    elif "acceleration" not in stated:
+        # first, because friction that grows with the load imitates a profile
+        limited = (*stated, "acceleration")
+        try_out(*stated)
+        try_out(*limited)
         nats = _nats(ready, tried.values())
-        if nats["base"] - nats["acceleration"] > _PROFILE_NATS:
-            stated = ("acceleration",)
+        names = [tried["back-EMF", *features].structure.name for features in (stated, limited)]
+        if nats[names[0]] - nats[names[1]] > _PROFILE_NATS:
+            stated = limited
     for features in ladder:
         if servo_structure(("back-EMF", *features, *stated), scales).features not in tried:
             try_out(*features, *stated)
@@ -602,7 +605,8 @@ def with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]:
     unnamed = all(t.servo.model is None for t in ready.recorded)
     if all(unlimited) or (unnamed and ready.joint in JOINT_NAMES):
         return carried, -np.inf
-    structure = servo_structure((*carried.structure.features, "acceleration"), ready.scales)
+    features = (*carried.structure.features, *ready.scales.stated_features, "acceleration")
+    structure = servo_structure(tuple(dict.fromkeys(features)), ready.scales)
     tried = {carried.structure.features: carried}
     fitted = _fitted(ready, structure, tried, ready.fit_rng(), short=True)
     gained = _gained(ready, carried, fitted)

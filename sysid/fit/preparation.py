@@ -7,7 +7,7 @@ are left out, and each motion gets the noise that its residuals show.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 
@@ -272,15 +272,21 @@ def _in_free_air(joint: str, trials: Sequence[Trial]) -> Scales:
     speed = no_load_speed(model, supply) if model else None
     if model is None and joint in JOINT_NAMES:
         speed = NO_LOAD_SPEED_RAD_S
-    scales = Scales(acceleration_rad_s2=_stated_acceleration(trials))
+    scales = Scales(**_stated_limits(trials))
     return scales if speed is None else replace(scales, top_speed_rad_s=speed)
 
 
-def _stated_acceleration(trials: Sequence[Trial]) -> float:
-    """Limit on the set-point's acceleration that headers state [rad/s²]; NaN if none."""
-    ramps = [t.servo.set_point_acceleration_rad_s2 for t in trials]
-    stated = [ramp for ramp in ramps if ramp is not None and np.isfinite(ramp)]
-    return float(np.median(stated)) if stated else float("nan")
+def _stated_limits(trials: Sequence[Trial]) -> dict[str, float]:
+    """Limits on the set-point that headers state, for `Scales`; NaN if none."""
+
+    def median(limits: Iterable[float | None]) -> float:
+        stated = [limit for limit in limits if limit is not None and np.isfinite(limit)]
+        return float(np.median(stated)) if stated else float("nan")
+
+    return {
+        "acceleration_rad_s2": median(t.servo.set_point_acceleration_rad_s2 for t in trials),
+        "set_point_speed_rad_s": median(t.servo.set_point_speed_rad_s for t in trials),
+    }
 
 
 def scales_of(trials: Sequence[Trial], runs: Sequence[Run]) -> Scales:
@@ -292,7 +298,7 @@ def scales_of(trials: Sequence[Trial], runs: Sequence[Run]) -> Scales:
     return Scales(
         torque=torque, inertia=inertia, p_gain=reference_gain(trials).value or 1.0, free_air=False,
         known_load=known, torque_off=any((r.torque_on < 0.5).any() for r in runs),
-        acceleration_rad_s2=_stated_acceleration(trials),
+        **_stated_limits(trials),
     )  # fmt: skip
 
 

@@ -93,6 +93,8 @@ class Scales:
         Whether a run has the torque switched off.
     acceleration_rad_s2 : float
         Limit on the set-point's acceleration that headers state; NaN if none.
+    set_point_speed_rad_s : float
+        Limit on the set-point's speed that headers state; NaN if none.
     top_speed_rad_s : float
         Speed without load by the data sheet of the servo's model; NaN if that is not known.
     prior : ServoPrior or None
@@ -106,6 +108,7 @@ class Scales:
     known_load: bool = False
     torque_off: bool = False
     acceleration_rad_s2: float = float("nan")
+    set_point_speed_rad_s: float = float("nan")
     top_speed_rad_s: float = float("nan")
     prior: ServoPrior | None = None
 
@@ -113,6 +116,20 @@ class Scales:
     def gravity(self) -> bool:
         """Whether the gravity of an unknown load is fitted."""
         return not (self.free_air or self.known_load)
+
+    @property
+    def stated(self) -> dict[str, float]:
+        """Limits that headers state, by the names of their terms."""
+        limits = {
+            "velocity_limit_rad_s": self.set_point_speed_rad_s,
+            "acceleration_limit": self.acceleration_rad_s2,
+        }
+        return {name: limit for name, limit in limits.items() if np.isfinite(limit)}
+
+    @property
+    def stated_features(self) -> tuple[str, ...]:
+        """Features (`FEATURES`) whose limits headers state."""
+        return tuple(f for f, names in FEATURES.items() if self.stated.keys() & {*names})
 
 
 FREE_AIR = Scales()
@@ -434,6 +451,8 @@ def _plain_parameter(term: Term, scales: Scales) -> Parameter:
         nominal, low, high, sd = term.free
         if term.name in _SPEEDS and np.isfinite(scales.top_speed_rad_s):
             nominal, sd = scales.top_speed_rad_s, _DATA_SHEET_SD
+        if term.name in scales.stated:
+            nominal, sd = scales.stated[term.name], _STATED_SD
         return Parameter(term.free_name, nominal, low, high, sd)
     name = term.name if scales.known_load else term.free_name
     # per inertia, torques are about those of a joint that gains 10 rad/s within 0.1 s
@@ -442,8 +461,8 @@ def _plain_parameter(term: Term, scales: Scales) -> Parameter:
         "": 1.0, "torque": torque, "inertia": scales.inertia, "per torque": 1.0 / torque
     }[term.scale]  # fmt: skip
     nominal, low, high, sd = term.nominal, term.low, term.high, term.prior_sd
-    if term.name == "acceleration_limit" and np.isfinite(scales.acceleration_rad_s2):
-        nominal, sd = scales.acceleration_rad_s2, _STATED_SD
+    if term.name in scales.stated:
+        nominal, sd = scales.stated[term.name], _STATED_SD
     if term.scale == "torque" and term.name.startswith("gravity"):
         sd *= factor
     if term.name == "offset_rad" and scales.known_load:

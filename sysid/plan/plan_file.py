@@ -16,6 +16,7 @@ most the goal's width. Joints that have reached it, or cannot, are not recorded 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -104,6 +105,7 @@ def executable(
     margin_rad: Mapping[str, float],
     start_pose_rad: Mapping[str, float],
     speed_limit_rad_s: float,
+    acceleration_limit_rad_s2: float = math.inf,
 ) -> Plan:
     """The plan in the form that the recorder executes, within the limits of a bus.
 
@@ -115,7 +117,7 @@ def executable(
         plan(
             t.kind, [t.joint], [t.frequency_hz], t.amplitude_rad, t.duration_s,
             proposal.loop_period_s, min(proposal.speed_limit_rad_s, speed_limit_rad_s),
-            proposal.poll_rate_hz, margin_rad, start_pose_rad,
+            proposal.poll_rate_hz, margin_rad, start_pose_rad, acceleration_limit_rad_s2,
         )
         for t in chosen
     ]  # fmt: skip

@@ -149,7 +149,7 @@ def _choices(setup: Setup, duration_s: float) -> Iterator[tuple[Kind, float, flo
         frequency = excitation.off_harmonics(wanted, rates, duration_s)
         if frequency > highest or frequency * duration_s < 1:
             continue
-        fastest = excitation.SPEED_MARGIN * setup.speed_limit_rad_s / (2 * np.pi * frequency)
+        fastest = float(excitation.Pace(setup.speed_limit_rad_s).largest_rad(frequency))
         most = _rounded_down(min(largest, fastest))
         amplitudes = {a for a in _TONES_RAD if a < 0.9 * most} | {most}
         for amplitude in sorted(a for a in amplitudes if a >= least):

@@ -49,10 +49,14 @@ class ServoSetup(BaseModel):
         Feetech's register `acceleration`, in units of 100 counts/s².
         """
         units = self.registers.get("acceleration")
-        if units is None:
-            unlimited = math.inf if "profile_velocity" in self.registers else None
-            return (self.model_extra or {}).get("set_point_acceleration_rad_s2", unlimited)
-        return 100 * units * self._count_rad if units else math.inf
+        if self.set_point_duration_s:
+            unlimited = None
+        elif units:
+            unlimited = 100 * units * self._count_rad
+        else:
+            stated = units == 0 or "profile_velocity" in self.registers
+            unlimited = math.inf if stated else None
+        return (self.model_extra or {}).get("set_point_acceleration_rad_s2", unlimited)
 
     @property
     def set_point_speed_rad_s(self) -> float | None:
@@ -62,6 +66,15 @@ class ServoSetup(BaseModel):
         """
         speed = self.registers.get("goal_speed", 0) * self._count_rad
         return (self.model_extra or {}).get("set_point_speed_rad_s", speed or None)
+
+    @property
+    def set_point_duration_s(self) -> float:
+        """Duration that the servo's registers give to every motion [s]; 0 for none.
+
+        The header has the number, or Feetech's register `goal_time` [ms], which a speed overrides.
+        """
+        duration = 0 if self.set_point_speed_rad_s else self.registers.get("goal_time", 0) / 1e3
+        return (self.model_extra or {}).get("set_point_duration_s", duration)
 
     @property
     def _count_rad(self) -> float:

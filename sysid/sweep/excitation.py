@@ -12,12 +12,12 @@ change.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import gcd
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
@@ -25,6 +25,27 @@ from pupper_sysid.common.reading.dialect import decimal
 from pupper_sysid.hardware.loop import minimum_jerk, raised_cosine
 
 Offset = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+SPEED_MARGIN = 0.9  # largest speed and acceleration of an excitation, as a share of their limits
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast a servo can follow: its own speed, and the ramp of its set-point by its registers.
+
+    A ramp that cannot follow turns back late and anywhere: no model predicts what it does then.
+    """
+
+    speed_rad_s: float
+    acceleration_rad_s2: float = np.inf
+
+    def largest_rad(self, frequency_hz: ArrayLike) -> NDArray[np.float64]:
+        """Largest amplitude of a tone that the servo follows [rad]."""
+        omega = 2 * np.pi * np.asarray(frequency_hz, float)
+        return SPEED_MARGIN * np.minimum(
+            self.speed_rad_s / omega, self.acceleration_rad_s2 / omega**2
+        )
+
 
 PRBS_CLOCK_S = 0.11  # time between possible changes of a pseudo-random binary sequence [s]
 
@@ -55,14 +76,17 @@ def square(frequency_hz: float, amplitude: float) -> Offset:
     return lambda t: amplitude * np.where((t * frequency_hz) % 1.0 < 0.5, 1.0, -1.0)
 
 
-def chirp(low: float, high: float, duration_s: float, amplitude: float, top_speed: float) -> Offset:
-    """Logarithmic chirp from `low` to `high` Hz, its speed bounded by `top_speed`."""
+def chirp(
+    low: float, high: float, duration_s: float, amplitude: float, pace: Pace | None = None
+) -> Offset:
+    """Logarithmic chirp from `low` to `high` Hz, slow enough for the servo."""
+    pace = pace or Pace(np.inf)
 
     def offset(t: NDArray[np.float64]) -> NDArray[np.float64]:
         rate = np.log(high / low) / duration_s
         grown = np.exp(rate * t)
         cycles = low * t if rate == 0 else low * (grown - 1) / rate
-        bounded = np.minimum(amplitude, top_speed / (2 * np.pi * low * grown))
+        bounded = np.minimum(amplitude, pace.largest_rad(low * grown))
         return bounded * raised_cosine(2 * low * t) * np.sin(2 * np.pi * cycles)
 
     return offset
@@ -136,7 +160,6 @@ KINDS = get_args(Kind)[:6]
 
 HIGHEST_HZ = 25.0  # half of the usual 52 Hz command rate: a faster tone cannot be commanded
 LEAD_IN_S = 0.2  # rest at the start pose, recorded at the head of every trial [s]
-SPEED_MARGIN = 0.9  # largest speed of an excitation, as a share of the speed limit
 
 LOOP_PERIOD_S = 0.019
 """Default time between commands [s]: the rate of the recordings this project starts from."""
@@ -211,6 +234,7 @@ def plan(
     poll_rate_hz: float = POLL_RATE_HZ,
     margin_rad: Mapping[str, float] | None = None,
     start_pose_rad: Mapping[str, float] | None = None,
+    acceleration_limit_rad_s2: float = np.inf,
 ) -> Plan:
     """The trials of an excitation, one joint after the other.
 
@@ -221,10 +245,11 @@ def plan(
     from the start pose, is not reduced for steps, square waves and PRBS, which are meant to reach
     the speed limit.
 
-    `duration_s` is of each trial without its lead-in; by default for tones 5 s or 5 periods,
-    whichever is longer; 20 s for a chirp, a multisine or a PRBS; one pass for steps. `poll_rate_hz`
-    is 0 if there are no polls. `margin_rad` is the largest excursion of each joint to both sides of
-    its start pose, which is by default the Mini Pupper's standing pose.
+    `speed_limit_rad_s` and `acceleration_limit_rad_s2` are those of the servo and of the ramp of
+    its set-point. `duration_s` is of each trial without its lead-in; by default for tones 5 s or 5
+    periods, whichever is longer; 20 s for a chirp, a multisine or a PRBS; one pass for steps.
+    `poll_rate_hz` is 0 if there are no polls. `margin_rad` is the largest excursion of each joint
+    to both sides of its start pose, which is by default the Mini Pupper's standing pose.
     """
     if kind not in KINDS:
         raise InputError(f"excitation '{kind}' is unknown; choose from {', '.join(KINDS)}.")
@@ -246,7 +271,7 @@ def plan(
         raise InputError("excitation: no frequency was chosen; give at least one, such as 1-10.")
     warnings: list[str] = []
     amplitude_rad = _within(amplitude_rad, joints, margin_rad or {}, warnings)
-    top_speed = SPEED_MARGIN * speed_limit_rad_s
+    pace = Pace(speed_limit_rad_s, acceleration_limit_rad_s2)
     span = 20.0 if duration_s is None else duration_s
     if kind in ("sine", "square"):
         shapes = []
@@ -259,20 +284,25 @@ def plan(
                     f"poll ({poll_rate_hz:.1f} Hz) would sample it at a few phases only."
                 )
             if kind == "sine":
-                amplitude = _bounded(amplitude_rad, 2 * np.pi * f, top_speed, f"{f:g} Hz", warnings)
+                amplitude = _bounded(amplitude_rad, pace, f, f"{f:g} Hz", warnings)
                 shapes.append((f, time, sine(f, amplitude)))
             else:
                 shapes.append((np.nan, time, square(f, amplitude_rad)))
     elif kind == "chirp":
         low, high = min(frequencies), max(frequencies)
-        _bounded(amplitude_rad, 2 * np.pi * high, top_speed, f"chirp at {high:g} Hz", warnings)
-        shapes = [(np.nan, span, chirp(low, high, span, amplitude_rad, top_speed))]
+        _bounded(amplitude_rad, pace, high, f"chirp at {high:g} Hz", warnings)
+        shapes = [(np.nan, span, chirp(low, high, span, amplitude_rad, pace))]
     elif kind == "multisine":
         shape = multisine(frequencies)
-        # largest excursion and speed over 20 of its longest periods
+        # over 20 of its longest periods, the tone of as high a speed or acceleration
         value = shape(np.arange(0.0, 20.0 / min(frequencies), 0.001))
-        peak, speed = float(np.abs(value).max()), float(np.abs(np.diff(value)).max() / 0.001)
-        amplitude = _bounded(amplitude_rad, speed / peak, top_speed, "multisine", warnings)
+        peak, speed, bend = (float(np.abs(np.diff(value, n)).max() / 0.001**n) for n in range(3))
+        amplitude = amplitude_rad
+        for rate, limited in (
+            (speed / peak, replace(pace, acceleration_rad_s2=np.inf)),
+            (np.sqrt(bend / peak), replace(pace, speed_rad_s=np.inf)),
+        ):
+            amplitude = _bounded(amplitude, limited, rate / (2 * np.pi), "multisine", warnings)
         shapes = [(np.nan, span, lambda t: amplitude / peak * shape(t))]
     elif kind == "prbs":
         shapes = [(np.nan, span, prbs(amplitude_rad))]
@@ -398,14 +428,20 @@ def _within(
 
 
 def _bounded(
-    amplitude: float, speed_per_rad: float, top_speed: float, what: str, warnings: list[str]
+    amplitude: float, pace: Pace, frequency_hz: float, what: str, warnings: list[str]
 ) -> float:
-    """`amplitude`, or with a warning the largest whose speed stays below `top_speed`."""
-    if amplitude * speed_per_rad <= top_speed:
+    """`amplitude`, or with a warning the largest that the servo follows at a frequency."""
+    reduced = float(pace.largest_rad(frequency_hz))
+    if amplitude <= reduced:
         return amplitude
-    reduced = top_speed / speed_per_rad
+    omega = 2 * np.pi * frequency_hz
+    stays = (
+        f"speed stays at {reduced * omega:.2f} rad/s"
+        if pace.speed_rad_s < pace.acceleration_rad_s2 / omega
+        else f"acceleration stays at {reduced * omega**2:.1f} rad/s²: the servo's registers ramp "
+        "its set-point"
+    )
     warnings.append(
-        f"{what}: amplitude reduced from {amplitude:g} to {reduced:.3f} rad, "
-        f"so that the speed stays at {top_speed:.2f} rad/s."
+        f"{what}: amplitude reduced from {amplitude:g} to {reduced:.3f} rad, so that the {stays}."
     )
     return reduced

@@ -23,12 +23,12 @@ from pupper_sysid.common.errors import BusError, InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import select_joints
 from pupper_sysid.hardware.address import EMULATED, bus_name
-from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus
+from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, header_entries
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
 from pupper_sysid.hardware.safety.monitor import GuardLimits
-from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
+from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 from pupper_sysid.sysid.sweep import bench, excitation
 from pupper_sysid.sysid.sweep.bench import bench_plan, parse_load
 from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S, Plan
@@ -393,7 +393,12 @@ def _plan_of(request: dict[str, Any], bus: ServoBus) -> Plan:
         pose[joints[0]] = load.hanging_rad
     free = bus.limits.margin(np.array([pose[name] for name in bus.joint_names]))
     margin = dict(zip(bus.joint_names, map(float, free), strict=True))
-    speed_limit = bus.metadata["speed_limit_rad_s"]
+    stated = header_entries(bus).get("servos", {})
+    setups = [ServoSetup(**stated[joint]) for joint in joints if joint in stated]
+    speeds = [setup.set_point_speed_rad_s for setup in setups]
+    speed_limit = min([bus.metadata["speed_limit_rad_s"], *filter(None, speeds)])
+    ramps = [setup.set_point_acceleration_rad_s2 for setup in setups]
+    ramp_limit = min([*filter(None, ramps), np.inf])
     if request.get("load"):
         (joint,) = joints
         return bench_plan(
@@ -406,11 +411,11 @@ def _plan_of(request: dict[str, Any], bus: ServoBus) -> Plan:
         from pupper_sysid.sysid.plan.plan_file import executable, load_plan
 
         path = Path(request["plan"])
-        return executable(load_plan(path), path, joints, margin, pose, speed_limit)
+        return executable(load_plan(path), path, joints, margin, pose, speed_limit, ramp_limit)
     return excitation.plan(
         request["kind"], joints, request["frequencies_hz"], request["amplitude_rad"],
         request["duration_s"], request["loop_period_s"], speed_limit,
-        bus.metadata.get("poll_rate_hz", excitation.POLL_RATE_HZ), margin, pose,
+        bus.metadata.get("poll_rate_hz", excitation.POLL_RATE_HZ), margin, pose, ramp_limit,
     )  # fmt: skip
 
 

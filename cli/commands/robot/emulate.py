@@ -54,7 +54,7 @@ class Common:
     """Seed of the robot: its servos, its lost polls, its noise."""
     faults: str = ""
     """Faults to inject, as kind=probability per answer: lost=0.02,late=0.01,corrupted=0.01. Kinds:
-    lost, late, truncated, corrupted, duplicated, foreign, wrong-length, error-bits, frozen,
+    lost, late, truncated, corrupted, duplicated, foreign, wrong-length, error-bits, frozen, reboot,
     brown-out, unplugged, second-writer."""
     walking: bool = False
     """The robot stands on the ground and walks where its servos carry it; otherwise its legs hang
