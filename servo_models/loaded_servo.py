@@ -19,8 +19,9 @@ models for the physics simulation of servo actuators", ICRA 2025). `error` is ze
 With the torque switched off no duty is applied and `off_brake` of the back-EMF remains: 0 with open
 motor terminals and no viscous friction, 1 with shorted ones. Commands, and switching the torque,
 take effect after `dead_time_s`, as in `DelayedPD`. The set-point follows the command at once, or
-as a trajectory generator with an `acceleration_limit` moves it: at a rate from which it can stop on
-the command, sqrt(2 · limit · distance), that changes by the limit at most.
+as a trajectory generator moves it: at `velocity_limit` at most, and with an `acceleration_limit` at
+a rate from which it can stop on the command, sqrt(2 · limit · distance), that changes by the limit
+at most.
 
 Without the terms of the load-dependent and Stribeck friction this is `DelayedPD` with stiffness
 duty_per_rad · P · stall_torque, damping duty_s_per_rad · stall_torque and effort limit
@@ -90,6 +91,8 @@ class LoadedServoParameters:
     """Duty added to overcome friction wherever there is an error."""
     acceleration_limit: ArrayLike = np.inf
     """Largest acceleration of the set-point [rad/s²]: the firmware's trajectory generator."""
+    velocity_limit: ArrayLike = np.inf
+    """Largest speed of the set-point [rad/s]."""
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """The numbers as arrays, by name."""
@@ -121,7 +124,7 @@ class LoadedServoParameters:
             friction_loss=friction,
             armature=own["armature"] + np.asarray(load_inertia_kg_m2),
             effort_limit=np.minimum(own["stall_torque"], own["torque_limit"]),
-            velocity_limit=np.inf,
+            velocity_limit=own["velocity_limit"],
             dead_time_s=own["dead_time_s"],
             back_emf=own["back_emf"],
         )
@@ -236,9 +239,9 @@ class LoadedServo(DelayedServo):
 
 _ROWS = (
     "stiffness", "duty_s_per_rad", "stall_torque", "back_emf", "friction_loss", "torque_limit",
-    "dead_zone_rad", "start_duty", "off_brake", "acceleration_limit", "stribeck_friction",
-    "stribeck_speed", "load_friction_static", "load_friction_motor", "load_friction_load",
-    "load_friction_quadratic", "per_inertia", "gravity", "hanging",
+    "dead_zone_rad", "start_duty", "off_brake", "acceleration_limit", "velocity_limit",
+    "stribeck_friction", "stribeck_speed", "load_friction_static", "load_friction_motor",
+    "load_friction_load", "load_friction_quadratic", "per_inertia", "gravity", "hanging",
 )  # fmt: skip
 """Rows of the table of `_steps`."""
 
@@ -247,7 +250,7 @@ def _steps(delayed, on, volts, positions, position, velocity, setpoint, rates, t
     """Fill `positions`, shape (steps, servos); the four of the state move in place."""
     for k in range(delayed.shape[0]):
         for n in range(delayed.shape[1]):
-            (stiffness, damper, stall, emf, loss, torque_limit, zone, start, off_brake, ramp,
+            (stiffness, damper, stall, emf, loss, torque_limit, zone, start, off_brake, ramp, slew,
              stribeck, stribeck_speed, static, by_motor, by_load, quadratic, per, gravity,
              hanging) = table[:, n]  # fmt: skip
             y, v, target = position[n], velocity[n], setpoint[n]
@@ -257,12 +260,12 @@ def _steps(delayed, on, volts, positions, position, velocity, setpoint, rates, t
                 brake = 0.5 * h * ramp
                 toward = rates[n] * np.sign(way)
                 room = max(brake**2 + 2.0 * (ramp * abs(way) - brake * toward), brake**2)
-                rate = min(math.sqrt(room) - brake, abs(way) / h) * np.sign(way)
+                rate = min(math.sqrt(room) - brake, abs(way) / h, slew) * np.sign(way)
                 change = min(max(rate - rates[n], -ramp * h), ramp * h)
                 target += (rates[n] + 0.5 * change) * h
                 rates[n] += change
             else:
-                target = delayed[k, n]
+                target += min(max(way, -slew * h), slew * h)
             error = target - y
             error -= min(max(error, -zone), zone)
             wanted = stiffness * error - damper * v

@@ -108,6 +108,8 @@ class UnderLoad(Part):
     """Duty added wherever there is an error."""
     acceleration_limit_rad_s2: Annotated[Quantity | None, LARGE] = None
     """Largest acceleration of the set-point [rad/s²]; null where it follows commands at once."""
+    velocity_limit_rad_s: Annotated[Quantity | None, SPEED] = None
+    """Largest speed of the set-point [rad/s]; null where it has none."""
     gravity_nm: Annotated[Quantity | None, TORQUE] = None
     """Largest torque of gravity of an unknown load [N·m]; null where the load was known."""
     hanging_rad: Annotated[Quantity | None, OFFSET] = None

@@ -278,6 +278,7 @@ _NOT_IN_BAM = {
     "dead_zone_rad": "the dead zone",
     "start_duty": "the minimum start force",
     "acceleration_limit_rad_s2": "the limit on the set-point's acceleration",
+    "velocity_limit_rad_s": "the limit on the set-point's speed",
 }
 
 

@@ -312,6 +312,8 @@ class LoadedLoop(Part):
     """Duty added wherever there is an error."""
     acceleration_limit_rad_s2: Cited | None = None
     """Largest acceleration of the set-point [rad/s²]."""
+    velocity_limit_rad_s: Annotated[Cited | None, SPEED] = None
+    """Largest speed of the set-point [rad/s]."""
 
     def loaded(self) -> LoadedServoParameters:
         """The numbers as the servo model takes them; an unknown dead time is 0."""

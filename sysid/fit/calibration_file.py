@@ -277,7 +277,11 @@ def _loaded_actuator(
         friction_loss_nm=numbers["friction_loss"],
         armature_kg_m2=inertia,
         effort_limit_nm=numbers["effort_limit"],
-        velocity_limit_rad_s=Quantity(
+        velocity_limit_rad_s=quantity_of(
+            loaded.numbers["velocity_limit"], why=loaded.undecided.get("velocity_limit")
+        )
+        if "velocity_limit" in loaded.numbers
+        else Quantity(
             value=NO_SPEED_LIMIT_RAD_S, identified="no", why="the chosen structure has none"
         ),
         back_emf_nm_s_per_rad=numbers["back_emf"],

@@ -790,6 +790,7 @@ def _shown(name: str) -> str:
         "effort_rad_s2": "stall_torque", "friction_rad_s2": "friction_loss",
         "damping": "duty_s_per_rad", "damping_per_s": "duty_s_per_rad",
         "stribeck_speed_rad_s": "stribeck_speed", "torque_limit_share": "torque_limit",
+        "velocity_limit_rad_s": "velocity_limit",
     }.get(name, name)  # fmt: skip
 
 

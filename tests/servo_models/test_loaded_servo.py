@@ -78,11 +78,14 @@ def test_mujoco_swings_the_same_pendulum():
         assert abs(data.qpos[0] - found[k]) < 1e-6, k
 
 
-@pytest.mark.parametrize(("servo", "ramp"), [(SERVO, np.inf), (EXTENDED, 30.0)])
+@pytest.mark.parametrize(
+    ("servo", "ramp", "speed"),
+    [(SERVO, np.inf, np.inf), (EXTENDED, 30.0, np.inf), (EXTENDED, 30.0, 1.5), (SERVO, np.inf, 1)],
+)
 def test_in_ever_shorter_steps_the_servo_becomes_the_compiled_one(
-    servo: LoadedServoParameters, ramp: float
+    servo: LoadedServoParameters, ramp: float, speed: float
 ):
-    servo, start = replace(servo, acceleration_limit=ramp), -0.2
+    servo, start = replace(servo, acceleration_limit=ramp, velocity_limit=speed), -0.2
     command, on = commands(1500), np.ones(1500)
     on[900:] = 0.0
     volts = 1.0 + 0.1 * np.sin(np.arange(1500) / 50)
@@ -110,12 +113,15 @@ def test_a_limp_servo_falls_to_where_its_load_hangs():
     assert abs(end - 0.05) < np.arcsin(0.03 / 0.48)  # dry friction holds it there
 
 
-def test_a_set_point_with_limited_acceleration_arrives_when_theory_says():
+@pytest.mark.parametrize(
+    ("speed", "lasts_s"), [(np.inf, 2 * np.sqrt(0.8 / 20.0)), (2.0, 0.8 / 2.0 + 2.0 / 20.0)]
+)
+def test_a_set_point_with_limited_acceleration_arrives_when_theory_says(speed, lasts_s):
     # from rest to rest over x with acceleration a and then -a takes 2 sqrt(x / a)
     stiff = replace(SERVO, duty_per_rad=5.0, stall_torque=50.0, back_emf=0.0, friction_loss=0.0,
-                    dead_time_s=0.0, acceleration_limit=20.0)  # fmt: skip
+                    dead_time_s=0.0, acceleration_limit=20.0, velocity_limit=speed)  # fmt: skip
     own = LoadedServo(stiff, 16.0, time_step_s=STEP_S)
     own.reset(0.0)
     found = own.rollout(np.full(500, 0.8))
     arrived = STEP_S * np.argmax(found > 0.99 * 0.8)
-    assert arrived == pytest.approx(2 * np.sqrt(0.8 / 20.0), rel=0.1)
+    assert arrived == pytest.approx(lasts_s, rel=0.1)
