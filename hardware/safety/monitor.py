@@ -155,6 +155,12 @@ class Monitor:
     def _check_silence(self, now: float) -> None:
         silent_s = now - self._last_read_s
         if silent_s.min() > self._limits.silent_for_s:
+            if device := getattr(self._bus, "lost_device", None):
+                raise SafetyStop(
+                    f"{device} is gone: the adapter was unplugged or lost its power. Servos that "
+                    "still have theirs hold their last command: plug it in again, or switch them "
+                    "off."
+                )
             raise SafetyStop(
                 f"the bus has been silent for {silent_s.min():.1f} s. Check the cable, the power "
                 "and whether another program uses the servos."

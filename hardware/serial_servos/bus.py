@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -229,6 +230,11 @@ class SerialBus(HostClock):
         if not on:  # all at once, also those that hear but do not answer
             self.line.torque_off([s.id for s in self._servos])
         return all([any(self._torque(s, on) for _ in range(tries)) for s in self._servos])
+
+    @property
+    def lost_device(self) -> str | None:
+        """Name of the serial device if it is no longer there."""
+        return None if Path(self.line.device).exists() else self.line.device
 
     def has_lost_torque(self, joint: str) -> bool:
         """Whether a servo answers that its torque is off."""

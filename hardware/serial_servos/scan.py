@@ -32,7 +32,7 @@ class ServoReport:
 
     id: int
     model: str
-    """Name, or "unknown (number)"."""
+    """Name, "unknown (number)", or what else it is."""
     errors: str
     """Error bits in words."""
     baud: int = 0
@@ -140,7 +140,9 @@ def _answering(line: SerialLine, ids: range | tuple[int, ...]) -> dict[int, int]
 def _report(family: Family, line: SerialLine, servo: int, model: int) -> ServoReport:
     series = series_of(family, line, servo, model)
     if series is None:
-        return ServoReport(servo, f"unknown ({model})", "", line.baud)
+        old = is_protocol_1(line, servo, model)
+        name = "Dynamixel, protocol 1" if old else f"unknown ({model})"
+        return ServoReport(servo, name, "", line.baud)
     name = series.name if model in family.series else f"{series.name} ({model})"
     reply = line.read(servo, series.register(family.present).address, family.reading_bytes[0])
     errors = bits_in_words(reply.frame.code, family.error_bits) if reply else ""
@@ -223,6 +225,11 @@ def series_of(family: Family, line: SerialLine, servo: int, model: int) -> Serie
     return family.series.get(model) or family.by_firmware(line, servo, model)
 
 
+def is_protocol_1(line: SerialLine, servo: int, model: int) -> bool:
+    """Whether a "model number" is a Dynamixel's id and rate, which protocol 1 has at its place."""
+    return model == servo | (round(2e6 / line.baud) - 1) << 8
+
+
 def known_series(
     family: Family, line: SerialLine, models: dict[int, int], named: str | None = None
 ) -> dict[int, Series]:
@@ -231,11 +238,17 @@ def known_series(
     for servo, model in models.items():
         series = family.series.get(model) or profile or family.by_firmware(line, servo, model)
         if series is None:
-            known = ", ".join(f"{s.name} ({s.model})" for s in family.series.values())
+            if is_protocol_1(line, servo, model):
+                raise BusError(
+                    f"{line.device}: servo {servo} answers as a Dynamixel with protocol 1 (AX, RX, "
+                    "or MX with their first firmware), for which there is no bus here. MX-28, -64 "
+                    "and -106 take the firmware for protocol 2.0 from DYNAMIXEL Wizard."
+                )
             raise BusError(
-                f"{line.device}: servo {servo} has the model number {model}, which is not known, "
-                f"nor is its firmware; known are {known}. Registers differ between series, so "
-                "nothing is sent to it."
+                f"{line.device}: servo {servo} has the model number {model}, which is not among "
+                f"the {len(family.series)} that are known of {family.name} servos, nor does its "
+                "firmware tell its series. Registers differ between series, so nothing is sent to "
+                "it."
             )
         found[servo] = series
     return found

@@ -86,6 +86,7 @@ CASES = [
      "Write 0 and 1023"),
     ("SCS0009", {"max_angle": 520}, "max_angle (address 11) is 520", "limits_counts"),
     ("SCS0009", {"response_level": 0}, "response_level (address 8) is 0", "Write 1"),
+    ("XL330-M288", {"secondary_id": 5}, "secondary_id (address 12) is 5", "Write 255"),
     ("XL330-M288", {"operating_mode": 1}, "operating_mode (address 11) is 1: velocity mode",
      "Write 3 into operating_mode"),
     ("XL330-M288", {"operating_mode": 0}, "operating_mode (address 11) is 0: current mode",

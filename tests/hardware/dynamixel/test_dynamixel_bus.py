@@ -52,6 +52,12 @@ def test_the_header_has_the_registers_that_shape_the_motion(line):
     setup = bus.servo_setups()["LF_hip"]
     remarks = " ".join(bus.remarks())
     bus.close()
+    servos._set(4, "drive_mode", 4)  # profiles by time
+    bus = opened(device)
+    timed = bus.servo_setups()["LF_hip"]
+    bus.close()
+    assert timed["set_point_duration_s"] == 0.1 and "set_point_speed_rad_s" not in timed
+    servos._set(4, "drive_mode", 0)
     servos._set(4, "profile_velocity", 0)
     servos._set(4, "profile_acceleration", 0)
     assert (setup["model"], setup["firmware"]) == ("XL330-M288", "46")
@@ -167,6 +173,21 @@ def test_a_servo_that_a_moment_without_supply_left_limp_is_named_as_limp():
                 bus.sleep_until(start + elapsed + 0.02)
                 bus.read()
         bus.close()
+
+
+def test_an_adapter_that_is_unplugged_is_named_in_one_sentence():
+    servos = moving_dynamixel()
+    with on_a_port(servos) as server:
+        bus = GuardedBus(DynamixelBus(server.device, 1_000_000, servos.bench.map.per_servo()))
+        bus.torque(True)
+        start = bus.now()
+        servos.unplug_for_s = 2.0
+        with pytest.raises(SafetyStop) as stopped:
+            while (elapsed := bus.now() - start) < 8:
+                bus.sleep_until(start + elapsed + 0.02)
+                bus.read()
+        bus.close()
+    assert str(stopped.value).startswith(f"{server.device} is gone: the adapter was unplugged")
 
 
 @contextmanager

@@ -229,6 +229,51 @@ def test_the_vendors_sdk_reads_writes_and_groups(served, monkeypatch):
     assert bench_of(servos).goals[-2:] == [(1, 2000), (2, 2200)]
 
 
+def test_the_vendors_sdk_writes_in_bulk_reboots_and_gives_ids_and_rates(monkeypatch):
+    monkeypatch.setattr(dynamixel_sdk.port_handler, "LATENCY_TIMER", 200)
+    servos = still_dynamixels([1, 2], model=1030)
+    with on_a_port(servos) as server:
+        port = dynamixel_sdk.PortHandler(server.device)
+        packets = dynamixel_sdk.PacketHandler(2.0)
+        assert port.openPort() and port.setBaudRate(1_000_000)
+
+        def read(address: int, size: int, servo: int = 1) -> int:
+            data, result, error = packets.readTxRx(port, servo, address, size)
+            assert (result, error) == (0, 0)
+            return int.from_bytes(bytes(data), "little")
+
+        def write(address: int, size: int, value: int, servo: int = 1) -> None:
+            data = list(value.to_bytes(size, "little"))
+            assert packets.writeTxRx(port, servo, address, size, data) == (0, 0)
+
+        bulk = dynamixel_sdk.GroupBulkWrite(port, packets)
+        assert bulk.addParam(1, 116, 4, [200, 7, 0, 0]) and bulk.addParam(2, 65, 1, [1])
+        assert bulk.txPacket() == 0
+        mixed = dynamixel_sdk.GroupBulkRead(port, packets)
+        assert mixed.addParam(1, 116, 4) and mixed.addParam(2, 65, 1)
+        for ask in (mixed.txRxPacket, mixed.fastBulkRead):
+            assert ask() == 0
+            assert (mixed.getData(1, 116, 4), mixed.getData(2, 65, 1)) == (1992, 1)
+        assert packets.regWriteTxRx(port, 1, 116, 4, [8, 8, 0, 0]) == (0, 0)
+        assert (read(116, 4), read(69, 1)) == (1992, 1)
+        assert packets.action(port, 254) == 0
+        assert (read(116, 4), read(69, 1)) == (2056, 0)
+        # a gain is lost with the power, a limit is not; a factory reset takes both
+        for servo in (1, 2):
+            write(64, 1, 0, servo)
+        write(84, 2, 99)
+        write(48, 4, 3000)
+        assert packets.reboot(port, 1) == (0, 0) and packets.clearMultiTurn(port, 1) == (0, 0)
+        assert (read(84, 2), read(48, 4)) == (800, 3000)
+        assert packets.factoryReset(port, 1, 2) == (0, 0) and read(48, 4) == 4095
+        write(7, 1, 9, servo=2)
+        write(8, 1, 1, servo=9)
+        assert packets.ping(port, 9)[1] != 0, "it hears its new rate only"
+        assert port.setBaudRate(57_600)
+        assert packets.ping(port, 9)[:2] == (1030, 0) and packets.ping(port, 1)[1] != 0
+        port.closePort()
+
+
 def test_model_numbers_are_those_of_the_vendors_drivers():
     # read in Robotis' ROS driver; 1110 is an XH540, not the XH430-W350
     stated = {1000: "XH430-W350", 1110: "XH540-W150", 1240: "XC330-M288", 1220: "XC330-T288"}

@@ -254,8 +254,10 @@ def test_servos_that_cannot_be_driven_are_left_alone_and_the_refusal_says_which(
             model(0x39, 5, firmware=8),
             None,
             0.4,
-            "servo 2 has the model number 1337, which is not known",
+            "servo 2 has the model number 1337, which is not among",
         ),
+        # protocol 1 has id and rate (1: a megabaud) where these have their model number
+        (model(2, 1, firmware=12), None, 0.4, "servo 2 answers as a Dynamixel with protocol 1"),
         (model(5, 4), None, 0.4, "SCS0009, STS3215) share the line"),
     ):
         monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", patience_s)

@@ -157,6 +157,14 @@ def test_sdk_sync_write_and_action_are_golden_unanswered_and_obeyed(sts):
     assert servos.said == b""
 
 
+def test_sdk_a_registered_write_is_obeyed_with_the_action(sts):
+    servos, sdk = sts
+    assert sdk.handler.regWriteTxRx(sdk.port, 1, 42, 2, word(2100)) == (0, 0)
+    assert bench_of(servos).goals == []
+    assert sdk.handler.action(sdk.port, 254) == scservo_sdk.COMM_SUCCESS
+    assert wait_until(lambda: bench_of(servos).goals == [(1, 2100)])
+
+
 def test_sdk_sync_writes_to_scs_are_golden_unanswered_and_obeyed(scs):
     servos, sdk = scs
     sync_write(sdk, 42, {i: word(512) for i in range(1, 13)})

@@ -41,6 +41,12 @@ def test_the_limits_that_a_header_states_are_named_by_the_registers_of_its_servo
     texts = [found.text for found in setup_findings(setup, 1.5)]
     assert "profile_acceleration" in texts[0] and "7.5 rad/s²" in texts[0]
     assert "profile_velocity" in texts[1] and "2.40 rad/s" in texts[1]
+    timed = ServoSetup(model="XL330-M288", registers=registers, set_point_duration_s=0.1)
+    (found,) = setup_findings(timed, 1.5)
+    assert "profile_velocity is 100 (100 ms for each command)" in found.text
+    assert timed.set_point_acceleration_rad_s2 is None, (
+        "a ramp, but not one of limited acceleration"
+    )
     unlimited = ServoSetup(model="XL330-M288", registers=dict.fromkeys(registers, 0))
     assert setup_findings(unlimited, 1.5) == []
     assert unlimited.set_point_acceleration_rad_s2 == np.inf

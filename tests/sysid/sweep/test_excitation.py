@@ -80,6 +80,19 @@ def test_amplitude_is_reduced_to_nine_tenths_of_the_speed_limit_with_a_warning()
     assert plan("sine", ["LF_hip"], [1.0, 2.0, 3.0]).warnings == ()
 
 
+@pytest.mark.parametrize("kind", ["sine", "multisine", "chirp"])
+def test_a_ramp_by_the_servos_registers_bounds_the_acceleration(kind):
+    ramp = 12.0
+    made = plan(kind, ["LF_hip"], [1.0, 3.0], 0.3, 6.0, acceleration_limit_rad_s2=ramp)
+    for trial in made.trials:
+        time, offset = sampled(trial)
+        grown = time > LEAD_IN_S + 0.6  # a tone grows over its first half period
+        bend = np.abs(np.diff(offset, 2))[grown[2:]].max() / STEP**2
+        assert bend <= 0.9 * ramp * 1.02
+        assert bend >= 0.5 * min(0.9 * ramp, 0.3 * (2 * np.pi) ** 2)
+    assert any("registers ramp" in w for w in made.warnings)
+
+
 def test_a_chirp_passes_every_frequency_within_the_speed_limit():
     made = plan("chirp", ["LF_hip"], [1.0, 10.0], duration_s=20.0)
     time, offset = sampled(made.trials[0])
