@@ -41,6 +41,7 @@ from pupper_sysid.common.border import (
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import LOADED_KEYS, UnderLoad
 from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number, Part
 from pupper_sysid.servo_models.cards.card import SCHEMA, SCHEMA_VERSION, Gains, ServoCard, Source
@@ -260,11 +261,15 @@ def class_of(card: ServoCard) -> tuple[str, Actuator]:
     own = card.as_published.get("actuator")
     if isinstance(own, str) and own in ACTUATORS:
         return own, ACTUATORS[own]
+    return _class_for(card.servo)
+
+
+def _class_for(servo: str) -> tuple[str, Actuator]:
     for name, kind in ACTUATORS.items():
-        if kind.servo.split()[-1] in card.servo:
+        if kind.servo.split()[-1] in servo:
             return name, kind
     raise InputError(
-        f"BAM has no actuator class for {card.servo}; known here are "
+        f"BAM has no actuator class for {servo}; known here are "
         f"{', '.join(ACTUATORS)}. Its parameter file would not be readable there."
     )
 
@@ -321,6 +326,79 @@ def motor_of(servo: UnderLoad) -> tuple[dict[str, Any], tuple[str, ...]]:
         "load_friction_external_stribeck": static * on_load,
     }
     return motor, tuple(words for key, words in _NOT_IN_BAM.items() if value.get(key))
+
+
+def bam_card(calibration: Calibration) -> ServoCard:
+    """The servo of a calibration under load as a card whose numbers are those of BAM's models.
+
+    Raises
+    ------
+    InputError
+        If it is of several joints, was not fitted under a known load, states no supply voltage, or
+        is not of a servo that BAM knows.
+    """
+    (name, joint), *others = calibration.joints.items()
+    block = joint.under_load
+    if block is None or not block.known_load:
+        raise InputError(
+            f"{name} was fitted without a known load, which tells torques only relative to the "
+            "inertia that it moved, and BAM's kt and R are not among what it tells: record it with "
+            "`pupper-sysid sweep` and a `load`, or give a servo card."
+        )
+    if others:
+        raise InputError(
+            f"BAM's file is of one servo, and this calibration of {len(others) + 1} joints: "
+            f"{', '.join(calibration.joints)}. Calibrate one of them alone."
+        )
+    if block.reference_voltage_v is None:
+        raise InputError(
+            f"{name}: its recordings state no supply voltage, without which kt and R are unknown."
+        )
+    motor, (_, kind) = motor_of(block)[0], _class_for(calibration.robot)
+    # our full duty is the largest that the servo's firmware gives
+    ours = {
+        "duty_per_rad": motor["error_gain"] * kind.duty_limit,
+        "duty_limit": kind.duty_limit,
+        "stall_torque_nm": block.stall_torque_nm.value / kind.duty_limit,
+        "back_emf_nm_s_per_rad": block.back_emf_nm_s_per_rad.value - motor["friction_viscous"],
+        "armature_kg_m2": block.armature_kg_m2.value,
+        "friction_loss_nm": motor["friction_base"],
+        "viscous_friction_nm_s_per_rad": motor["friction_viscous"] or None,
+        "dead_time_s": joint.actuator.dead_time_s.value,
+        "velocity_limit_rad_s": block.velocity_limit_rad_s and block.velocity_limit_rad_s.value,
+    }
+    if motor["model"] != "m1":
+        ours |= {
+            "stribeck_friction_nm": motor["friction_stribeck"],
+            "stribeck_speed_rad_s": motor["dtheta_stribeck"],
+            "stribeck_exponent": motor["alpha"],
+        }
+    if motor["model"] == "m5":
+        ours |= {
+            "load_friction_motor": motor["load_friction_motor"],
+            "load_friction_load": motor["load_friction_external"],
+            "load_stribeck_motor": motor["load_friction_motor_stribeck"],
+            "load_stribeck_load": motor["load_friction_external_stribeck"],
+        }
+    given = {key: stated(value) for key, value in ours.items() if value is not None}
+    return ServoCard(
+        name="calibration",
+        servo=calibration.robot,
+        supply_v=block.reference_voltage_v,
+        gains=Gains(p=block.p_gain),
+        load="known",
+        published=False,
+        source=Source(title="a calibration of this project", url=URL, licence="its owner's"),
+        date=str(calibration.created)[:10],
+        specimens={"servo": PositionLoop(model="position_loop", **given)},
+    )
+
+
+def lost_in_bam(calibration: Calibration) -> list[str]:
+    """What BAM's models do not have of a servo under load, in sentences."""
+    (joint,) = calibration.joints.values()
+    assert joint.under_load is not None
+    return [f"Not represented: {words}." for words in motor_of(joint.under_load)[1]]
 
 
 def _frictions(numbers: PositionLoop) -> tuple[str, dict[str, Any]]:

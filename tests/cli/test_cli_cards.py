@@ -7,9 +7,10 @@ import json
 import pytest
 
 from pupper_sysid.cli.programs.pupper_sysid import main
+from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import load
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
-from pupper_sysid.servo_models.cards.files import card_names, load_card
+from pupper_sysid.servo_models.cards.files import bam_card, card_names, load_card, to_bam
 from pupper_sysid.sim.walking.servo_ranges import check_actuator, servo_ranges
 
 pytestmark = pytest.mark.usefixtures("narrow")
@@ -90,4 +91,18 @@ def test_a_card_goes_to_bam_and_comes_back(tmp_path, monkeypatch, capsys):
     main(["export", "sts3215-bam-m6_bam.json", "--to", "mjcf"])
     with pytest.raises(SystemExit):
         main(["export", "paper", "--to", "bam"])
-    assert "is no servo card" in capsys.readouterr().err
+    assert "was fitted without a known load" in capsys.readouterr().err
+
+
+def test_a_servo_calibrated_under_load_goes_to_bam_and_one_in_free_air_is_told_why_not():
+    card = load_card("sts3215-bam-m5")
+    calibration = card.calibration()
+    of_card, of_fit = to_bam(card), to_bam(bam_card(calibration))
+    assert of_card.keys() - of_fit.keys() <= {"max_velocity"}
+    assert of_fit["model"] == of_card["model"] == "m5"
+    for name in ("kt", "R", "armature", "friction_base", "command_delay", "load_friction_motor"):
+        assert of_fit[name] == pytest.approx(of_card[name], rel=1e-6), name
+    (name, joint), *_ = calibration.joints.items()
+    free = joint.model_copy(update={"under_load": None})
+    with pytest.raises(InputError, match="without a known load, which tells torques only relative"):
+        bam_card(calibration.model_copy(update={"joints": {name: free}}))

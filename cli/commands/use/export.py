@@ -49,8 +49,9 @@ class Export:
     folder of a servo model, a policy or a training run."""
     to: Format = "csv"
     """Format: csv, a tidy table; mjcf, isaaclab, isaaclab-bam (of servos fitted under load), mjlab,
-    newton and json of calibrations and cards, for other simulators; bam of cards, parameters for
-    BAM; onnx and torchscript of learned servo models and policies."""
+    newton and json of calibrations and cards, for other simulators; bam of cards and of servos
+    fitted under load, parameters for BAM; onnx and torchscript of learned servo models and
+    policies."""
     physics_step: float | None = None
     """Physics step of that simulator [s], in which most count delays; by default 0.002 for mjcf, or
     that of its model, and 0.005 for the others."""
@@ -191,18 +192,19 @@ class Export:
         return at_gain
 
     def _bam(self, path: Path, card: bool) -> Path:
-        """A servo card as a parameter file of BAM."""
-        from pupper_sysid.servo_models.cards.files import load_card, not_in_bam, to_bam_json
+        """A servo card, or a servo calibrated under load, as a parameter file of BAM."""
+        from pupper_sysid.servo_models.calibration.calibration import load_calibration
+        from pupper_sysid.servo_models.cards import files
 
-        if not card:
-            raise InputError(
-                f"{self.source} is no servo card, and BAM needs motor and position loop: give a "
-                "card (`pupper-sysid servo list`)."
-            )
-        servo_card = load_card(self.source)
+        lost = []
+        if card:
+            servo_card = files.load_card(self.source)
+        else:
+            calibration = load_calibration(self.source)
+            servo_card, lost = files.bam_card(calibration), files.lost_in_bam(calibration)
         target = self.out or Path(f"{path.name.removesuffix(path.suffix)}_bam.json")
-        write_text(target, to_bam_json(servo_card), self.force)
-        terminal.warn(*not_in_bam(servo_card))
+        write_text(target, files.to_bam_json(servo_card), self.force)
+        terminal.warn(*files.not_in_bam(servo_card), *lost)
         return target
 
     def _check(self, calibration: Calibration, links: dict[str, float]) -> None:
