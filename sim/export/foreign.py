@@ -35,7 +35,7 @@ _WORDS = {
     "damping_nm_s_per_rad": ("damping", "kv", "kd", "d_gain"),
     "armature_kg_m2": ("armature",),
     "friction_loss_nm": ("frictionloss", "friction_loss", "friction"),
-    "effort_limit_nm": ("actuator_effort_limit", "effort_limit", "effort_limit_sim", "max_effort"),
+    "effort_limit_nm": ("effort_limit", "actuator_effort_limit", "effort_limit_sim", "max_effort"),
     "back_emf_nm_s_per_rad": ("viscous_friction", "viscous_damping", "back_emf"),
     "dead_time_s": ("dead_time_s",),
 }
@@ -135,10 +135,12 @@ def _driven_servo(path: Path, model: Any, name: str, i: int) -> Servo:
 
 
 def _in_python(path: Path, joint: str | None) -> Servo:
+    if not path.exists():
+        raise InputError(f"{path} does not exist.")
     if not path.is_file() or path.stat().st_size > _LARGEST_BYTES:
         raise InputError(f"{path} is no Python file of a configuration.")
     try:
-        tree = ast.parse(path.read_text(encoding="utf-8"))
+        tree = ast.parse(path.read_text(encoding="utf-8"), path.name)
     except (SyntaxError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is no Python that can be read: {error}.") from error
     # names at the top of the file that stand for literals, or for arithmetic with such names
