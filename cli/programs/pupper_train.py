@@ -26,7 +26,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pupper_sysid.cli.policy_choice import warn_of_fallbacks
 from pupper_sysid.cli.program import begin_work, parse, user_errors
-from pupper_sysid.cli.terminal import err, out, print_json, share_progress, spell, warn
+from pupper_sysid.cli.terminal import err, out, print_json, remember, share_progress, spell, warn
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import hold_output, refuse_path
@@ -37,6 +37,7 @@ from pupper_sysid.policies.train.run_file import (
     Run,
     Start,
     check_teacher,
+    load_run,
     preset,
     refuse_taken,
     with_robot,
@@ -109,6 +110,7 @@ def _parse(given: list[str]) -> Options:
     choices = {n: typed[n] if typed[n] in get_args(k) else get_args(k)[0] for n, k in kinds.items()}
     start: Any = choices["start"]
     begun = preset(choices["preset"], choices["policy"], start)
+    remember(Options(begun))  # errors before the parsing name options, too
     robot, config = (typed[n] and Path(typed[n]) for n in ("robot", "robot_config"))
     if config is not None and robot is None:
         raise InputError("--robot-config describes the robot of --robot; give that, too.")
@@ -159,12 +161,15 @@ def _run(options: Options, given: list[str]) -> None:
         raise InputError(f"{options.resume} does not exist. Give the folder of a run.")
     if options.resume is None:
         refuse_taken(folder)
+        servos = [servo_ranges(run.actuator, run.feedback, run.task.body)]
+    else:
+        load_run(options.resume)
     if ranks.rank == 0:
         hold_output(folder)
         err.print(f"{'Going on with' if options.resume else 'Training into'} {folder}.")
     if options.resume is None:
         if ranks.rank == 0:
-            warn_of_fallbacks([servo_ranges(run.actuator, run.feedback, run.task.body)])
+            warn_of_fallbacks(servos)
             for note in run.task.body.notes:
                 err.print(note)
         run = _with_first_gait(run, ranks, begun + 60 * _SEARCHING * run.minutes)

@@ -33,7 +33,6 @@ from pupper_sysid.policies.network.hyperparameters import OWN, TROT
 from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.policies.train.selection import COMMANDS, scored
 from pupper_sysid.policies.walks.conditions import evaluation_task
-from pupper_sysid.policies.walks.rollouts import planar_velocity
 from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Walking
@@ -420,8 +419,6 @@ class _Walked:
     """Of thighs and calves."""
     torque_square: float
     sway_rad_s: float
-    sways: bool = False
-    """`Body.sways`."""
 
 
 def _walk(
@@ -457,7 +454,7 @@ def _walk(
         result = env.step(action)
         facts, alive = result.facts, alive & ~result.done
         for name, value in (
-            ("velocity", planar_velocity(facts)), ("stride", facts.stride_velocity),
+            ("velocity", facts.followed_velocity), ("stride", facts.stride_velocity),
             ("up", alive), ("clearance", facts.clearance_m),
             ("saturated", by_kind(facts.body, facts.saturated)), ("square", facts.torque_square),
             ("sway", facts.angular_velocity[:, :2]),
@@ -475,7 +472,7 @@ def _walk(
                 scale, env.body.scale, command, own["velocity"], own["stride"], own["up"],
                 clearance[np.isfinite(clearance)],
                 _mean(own["saturated"][walks][:, 1:]), _mean(own["square"][walks]),
-                _mean(own["sway"][walks] ** 2) ** 0.5, env.body.sways,
+                _mean(own["sway"][walks] ** 2) ** 0.5,
             )
         )  # fmt: skip
     return found
@@ -513,13 +510,9 @@ def _share(one: _Walked, chosen: NDArray[np.bool_]) -> float:
 
 
 def _relative(one: _Walked) -> dict[str, float]:
-    """Score of walks as if their commands were usual ones, and their errors in proportion.
-
-    The sway of a gait that cannot do without is no error.
-    """
+    """Score of walks as if their commands were usual ones, and their errors in proportion."""
     scale = np.where(one.scale > 0, one.scale, 1.0)
-    velocity = one.stride_velocity if one.sways else one.velocity
-    return scored(velocity / scale, one.up, one.command / scale)
+    return scored(one.velocity / scale, one.up, one.command / scale)
 
 
 def _score(one: _Walked) -> GaitScore:

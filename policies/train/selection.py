@@ -13,7 +13,6 @@ from rsl_rl.models import MLPModel
 
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.policies.walks.conditions import evaluation_task, share_of_usual, within
-from pupper_sysid.policies.walks.rollouts import planar_velocity
 from pupper_sysid.servo_models.networks import JointArrays
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.env import PupperEnv
@@ -87,7 +86,7 @@ class Judge:
                 observations, _, dones, extras = env.step(actor(observations))
                 alive &= ~dones.cpu().numpy()
                 facts = extras["facts"]
-                velocity.append(planar_velocity(facts))
+                velocity.append(facts.followed_velocity)
                 feet.append((facts.landed[walks].mean(), facts.contact[walks].mean()))
                 up.append(alive.copy())
                 actor.reset(dones)

@@ -150,8 +150,8 @@ def _from_calibration(
         wanted = servo_of.get(name)
         if wanted is not None and wanted not in calibration.joint_names:
             raise InputError(
-                f"Joint {name} is to have the servo of '{wanted}', but {source} has none. It has "
-                f"{', '.join(calibration.joint_names)}."
+                f"The robot's YAML gives {name} the servo of '{wanted}' (`servos`), but {source} "
+                f"has none of that name. It has {', '.join(calibration.joint_names)}."
             )
         nearest = wanted or nearest_joint(name, calibration.joint_names)
         if wanted is None and nearest != name:

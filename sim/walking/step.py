@@ -85,6 +85,16 @@ class Step:
     """`power_w` and `weight_n`: positive mechanical power of all servos; weight of the robot; shape
     (n,)."""
 
+    @property
+    def followed_velocity(self) -> Array:
+        """Forward and sideways speed [m/s] and turn rate [rad/s] to be as commanded, shape (n, 3).
+
+        Those of the trunk; over a stride where a gait cannot do without sway (`Body.sways`).
+        """
+        if self.body.sways:
+            return self.stride_velocity
+        return np.column_stack([self.linear_velocity[:, :2], self.angular_velocity[:, 2]])
+
     def moving(self, threshold_m_s: float) -> NDArray[np.bool_]:
         """Whether a robot is commanded to move, or moves, shape (n,)."""
         commanded = np.abs(self.command).max(axis=1) > 0

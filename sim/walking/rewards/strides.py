@@ -25,7 +25,7 @@ from pupper_sysid.sim.walking.rewards.weights import Rewards
 
 Array = NDArray[np.float64]
 
-_STRIDE_S = 0.2  # time constant of the average over a stride
+_STRIDE_S = 0.2  # time constant of the average over a stride of the Mini Pupper
 
 
 class Strides:
@@ -45,6 +45,7 @@ class Strides:
 
     def __init__(self, body: Body, robots: int, span_s: float, rewards: Rewards):
         self._span, self._rewards, feet = span_s, rewards, len(body.feet)
+        self._share = span_s / (_STRIDE_S * float(body.command_scale[0]))
         self._touch_n, self._signs = body.touch_n, body.swing_signs
         self._in_turn = np.argsort(-self._signs, kind="stable")
         self.air_s, self.stance_s = np.zeros((2, robots, feet))
@@ -102,7 +103,7 @@ class Strides:
         np.sqrt(moved.sum(axis=-1), out=facts["foot_speed_m_s"])
         facts["foot_speed_m_s"] /= span
         facts["foot_height_m"][:] = height
-        self.velocity[rows] += span / _STRIDE_S * (velocity - self.velocity[rows])
+        self.velocity[rows] += self._share * (velocity - self.velocity[rows])
         self._tick(rows, height)
         for name, value in (
             ("air_s", self.air_s), ("contact_s", self.stance_s), ("last_air_s", self._last_air),
@@ -129,7 +130,7 @@ class Strides:
         swing *= 2.0 / len(self._signs)
         phase, in_time = self.phase[rows], self.in_time[rows]
         angle = 2 * np.pi * phase
-        in_time += self._span / _STRIDE_S * (2 * swing * np.sin(angle) - in_time)
+        in_time += self._share * (2 * swing * np.sin(angle) - in_time)
         phase += self._span * rewards.clock_hz
         phase += 2 * self._span * rewards.clock_pull_hz * swing * np.cos(angle)
         phase %= 1.0

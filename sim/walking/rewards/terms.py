@@ -22,7 +22,7 @@ _SLOW = (0.05, 0.15)  # commands [m/s, rad/s] that are not much above the trunk'
 
 def base_linear_velocity(s: Step, p: Rewards) -> Array:
     """Tracking of the commanded speed, 0 to 1 (more with `fast_bonus`)."""
-    error = np.linalg.norm(s.command[:, :2] - s.linear_velocity[:, :2], axis=1)
+    error = np.linalg.norm((s.command - s.followed_velocity)[:, :2], axis=1)
     speed = np.linalg.norm(s.command[:, :2], axis=1)
     bonus = np.maximum(1.0, 1.0 + p.fast_bonus * (speed - p.fast_above))
     return _tracking(error, p.linear_sigma, p) * bonus
@@ -30,7 +30,7 @@ def base_linear_velocity(s: Step, p: Rewards) -> Array:
 
 def base_angular_velocity(s: Step, p: Rewards) -> Array:
     """Tracking of the commanded turn rate, 0 to 1."""
-    return _tracking(np.abs(s.command[:, 2] - s.angular_velocity[:, 2]), p.angular_sigma, p)
+    return _tracking(np.abs(s.command[:, 2] - s.followed_velocity[:, 2]), p.angular_sigma, p)
 
 
 def stride_linear_velocity(s: Step, p: Rewards) -> Array:
@@ -110,8 +110,9 @@ def foot_paths(s: Step, p: Rewards) -> Array:
 
     While the clock wants a foot down, it passes evenly under its place in the default pose at the
     commanded speed, by the rule of Raibert (1986); meanwhile the others swing back and rise by
-    `clock_height`. Margolis and Agrawal (2022) reward both. The mean place of the feet and how far
-    they are spread are free (see `stance`).
+    `clock_height`. Margolis and Agrawal (2022) reward both. The mean place of the feet along the
+    trunk and their height are free, and how far they are spread (see `stance`); of a gait that
+    sways, their mean place to the side instead.
     """
     cycle = np.arctan2(s.clock[:, 1], s.clock[:, 0])[:, None] / (2 * np.pi)
     # since the middle of a foot's swing, -0.5 to 0.5 cycles
@@ -120,13 +121,15 @@ def foot_paths(s: Step, p: Rewards) -> Array:
     swings = np.abs(own) < half
     along = np.where(swings, own / half, np.sign(own) * (0.5 - np.abs(own)) / (0.5 - half))
     x, y, turn = s.command.T[:, :, None]
-    at, sides = s.body.feet_at, s.body.sides
+    at = s.body.feet_at
     speed = np.stack([x - turn * at[:, 1], y + turn * at[:, 0]], axis=-1)
     away = _feet_away(s)
     away[..., :2] -= along[..., None] * speed * p.clock_duty / (2 * p.clock_hz)
     away[..., 2] -= np.where(swings, p.clock_height * np.cos(0.5 * np.pi * own / half), 0.0)
     away[..., 0::2] -= away[..., 0::2].mean(axis=1, keepdims=True)
-    away[..., 1] -= sides * (sides * away[..., 1]).mean(axis=1, keepdims=True)
+    # a gait that sways carries the trunk from foot to foot
+    free = np.ones(len(at)) if s.body.sways else s.body.sides
+    away[..., 1] -= free * (free * away[..., 1]).mean(axis=1, keepdims=True)
     missed = (away**2).sum(axis=(1, 2)) / p.foot_paths_sigma**2
     return np.where(np.abs(s.command).max(axis=1) > 0, np.maximum(1.0 - missed, -2.0), 0.0)
 
