@@ -32,7 +32,7 @@ from pupper_sysid.common.results import Result
 from pupper_sysid.policies.network.hyperparameters import OWN, TROT
 from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.policies.train.selection import COMMANDS, scored
-from pupper_sysid.policies.walks.conditions import evaluation_task
+from pupper_sysid.policies.walks.conditions import evaluation_task, share_of_usual, within
 from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Walking
@@ -54,8 +54,6 @@ LOW_SWINGS = 0.25
 """Share of low swings above which a trot is fitted."""
 
 _FORWARD_M_S, _TURN_RAD_S = 0.15, 0.4
-_LARGEST = np.array([0.2, 0.1, 0.5])
-"""Commands of a usual task, within which those of the walks are [m/s, m/s, rad/s]."""
 _SEED = 4_000_037  # of robots that neither trainings nor judges nor evaluations have
 _SECONDS, _IGNORED_S = 4.0, 1.0
 _EACH = 2  # robots per command of the judge
@@ -306,7 +304,7 @@ def fit_trot(
             drawn[half:] = low + (strata + rng.random(strata.shape)) / half * (high - low)
         trots = [_trot(task.trot, box, values) for values in drawn]
         walked = _walk(
-            trots, quick, servos, _within(task, _SEARCH_COMMANDS), _SEARCH_S, _SEARCH_IGNORED_S,
+            trots, quick, servos, within(task, _SEARCH_COMMANDS), _SEARCH_S, _SEARCH_IGNORED_S,
             seed, threads, ends=ends,
         )  # fmt: skip
         if not walked:
@@ -344,26 +342,11 @@ def _judged(
     trots: Sequence[Trot], task: Walking, servos: ServoRanges, seed: int, threads: int,
     changes: Sequence[dict[str, float]] = (),
 ) -> list[_Walked]:  # fmt: skip
-    command = np.repeat(_within(task, COMMANDS), _EACH, axis=0)
+    command = np.repeat(within(task, COMMANDS), _EACH, axis=0)
     return _walk(
         trots, _gentle(task, _SECONDS), servos, command, _SECONDS, _IGNORED_S, seed, threads,
         changes,
     )  # fmt: skip
-
-
-def _scale(task: Walking) -> Array:
-    """Largest commands of a task over usual ones, at most 1, of each part: by which to scale."""
-    own = task.commands
-    ends = np.abs([own.forward_m_s, own.sideways_m_s, own.yaw_rad_s]).max(axis=1)
-    # those of another robot are its own, as large as they are
-    return ends / _LARGEST if task.robot else np.minimum(ends / _LARGEST, 1.0)
-
-
-def _within(task: Walking, usual: Array) -> Array:
-    """Commands of walks [m/s, m/s, rad/s], shape (n, 3), within the task's."""
-    own = task.commands
-    ends = np.array([own.forward_m_s, own.sideways_m_s, own.yaw_rad_s])
-    return np.clip(usual * _scale(task), *ends.T)
 
 
 def _gentle(task: Walking, seconds: float) -> Walking:
@@ -430,7 +413,7 @@ def _walk(
 
     Nothing if it `ends` before.
     """
-    n, count, scale = len(command), len(trots), _scale(task)
+    n, count, scale = len(command), len(trots), share_of_usual(task)
     step_s = task.control_step_s
     steps, first = round(seconds / step_s), round(ignored_s / step_s)
     number = np.tile(np.arange(n), count)
@@ -511,8 +494,7 @@ def _share(one: _Walked, chosen: NDArray[np.bool_]) -> float:
 
 def _relative(one: _Walked) -> dict[str, float]:
     """Score of walks as if their commands were usual ones, and their errors in proportion."""
-    scale = np.where(one.scale > 0, one.scale, 1.0)
-    return scored(one.velocity / scale, one.up, one.command / scale)
+    return scored(one.velocity / one.scale, one.up, one.command / one.scale)
 
 
 def _score(one: _Walked) -> GaitScore:

@@ -67,8 +67,7 @@ class Teacher(ABC):
     def __init__(self, env: WalkingVecEnv, state: dict[str, torch.Tensor] | None = None):
         self._vec_env, self._env = env, env.env
         self._command = self._env.command.copy()
-        task = self._env.config
-        self._range = _RANGE * (share_of_usual(task) if task.robot else 1.0)
+        self._range = _RANGE * share_of_usual(self._env.config)
         self.quiet = np.arange(env.num_envs) % _QUIET == 0
         self.correction, self._since = np.zeros((3, 6)), np.zeros(env.num_envs)
         if state:

@@ -54,9 +54,8 @@ class Judge:
         self._steps = round(seconds / task.control_step_s)
         robots = _EACH * len(COMMANDS)
         env = PupperEnv(task, servos, robots, seed + _SEED, threads, servo_model)
-        self._scale = share_of_usual(task) if task.robot else np.ones(3)
-        commands = within(task, COMMANDS) if task.robot else COMMANDS
-        self._command = np.repeat(commands, _EACH, axis=0)
+        self._scale = share_of_usual(task)
+        self._command = np.repeat(within(task, COMMANDS), _EACH, axis=0)
         env.set_command(self._command)
         self._env = WalkingVecEnv(env, action_history, device)
         self._start = self._env.state

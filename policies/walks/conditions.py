@@ -293,9 +293,13 @@ def evaluation_task(task: Walking, seconds: float | None = None) -> Walking:
 
 
 def share_of_usual(task: Walking) -> Array:
-    """Largest commands of a task over those of `RANDOM`, shape (3,); 1 where a task has none."""
+    """Largest commands of a task over those of `RANDOM`, shape (3,); 1 where a task has none.
+
+    Of the Mini Pupper at most 1; those of another robot are its own, as large as they are.
+    """
     own, usual = (np.abs(_ranges(c)).max(axis=1) for c in (task.commands, RANDOM))
-    return np.where(own > 0, own / usual, 1.0)
+    share = np.where(own > 0, own / usual, 1.0)
+    return share if task.robot else np.minimum(share, 1.0)
 
 
 def within(task: Walking, usual: Array) -> Array:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.joints import LEGS
 from pupper_sysid.sim.robot.body import Body, body_of
 from pupper_sysid.sim.robot.mini_pupper import MASS_KG, Knee, Physics
 from pupper_sysid.sim.robot.terrain import Terrain
@@ -284,7 +285,7 @@ PRESETS = {
 
 
 _LENGTHS = (
-    "foot_paths_sigma", "clock_height", "clearance_height", "clearance_sigma", "least_clearance",
+    "clock_height", "clearance_height", "clearance_sigma", "least_clearance",
 )  # fmt: skip
 _SPEEDS = (
     "linear_sigma", "stride_linear_sigma", "fast_above", "gait_threshold", "moving_threshold",
@@ -342,6 +343,10 @@ def _commands(own: Commands, body: Body) -> Commands:
 def _rewards(own: Rewards, body: Body) -> Rewards:
     length, speed, _, rate = body.scale, *body.command_scale.tolist()
     time, torque = speed, body.mass_kg / MASS_KG * length
+    # feet of a robot whose commands are slower have shorter strokes, and they are summed over feet
+    usual, asked = speed * max(Commands().forward_m_s), _commands(Commands(), body)
+    fastest = max(map(abs, (*asked.forward_m_s, *asked.sideways_m_s)))
+    strokes = min(max(fastest / usual, 0.25), 1.0) * (len(body.feet) / len(LEGS)) ** 0.5
     factors = (
         dict.fromkeys(_LENGTHS, length) | dict.fromkeys(_SPEEDS, speed)
         | dict.fromkeys(_RATES, rate) | dict.fromkeys(_TIMES, time)
@@ -349,8 +354,9 @@ def _rewards(own: Rewards, body: Body) -> Rewards:
         | {
             # the default pose is the robot's own
             "crouch": 0.0, "spread": 0.0, "stance": 1.0 / length, "gait_sigma": time**2,
-            "swing_height": 1.0 / (length**2 * speed), "joint_torques": 1.0 / torque,
-            "joint_acceleration": time**2, "joint_velocity": time, "air_time": rate,
+            "foot_paths_sigma": strokes * length, "swing_height": 1.0 / (length**2 * speed),
+            "joint_torques": 1.0 / torque, "joint_acceleration": time**2, "joint_velocity": time,
+            "air_time": rate,
         }
     )  # fmt: skip
     return replace(own, **{name: getattr(own, name) * f for name, f in factors.items()})

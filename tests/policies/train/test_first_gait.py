@@ -20,6 +20,7 @@ from pupper_sysid.policies.train.first_gait import (
 )
 from pupper_sysid.policies.train.run_file import preset, teacher_of
 from pupper_sysid.policies.train.selection import COMMANDS
+from pupper_sysid.policies.walks.conditions import share_of_usual, within
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Commands, Walking
 from pupper_sysid.sim.walking.env import PupperEnv
@@ -90,11 +91,11 @@ def test_trots_are_judged_on_the_same_robots_and_with_servos_that_are_changed_fo
 
 def test_a_task_of_slower_commands_is_judged_by_slower_walks_with_the_same_relative_errors():
     task = Walking(commands=Commands((-0.1, 0.1), (0.0, 0.0), (-0.5, 0.5)))
-    np.testing.assert_allclose(first_gait._scale(task), [0.5, 0.0, 1.0])
-    assert (first_gait._scale(Walking(commands=Commands((-9, 9), (-9, 9), (-9, 9)))) == 1).all()
+    np.testing.assert_allclose(share_of_usual(task), [0.5, 1.0, 1.0])
+    assert (share_of_usual(Walking(commands=Commands((-9, 9), (-9, 9), (-9, 9)))) == 1).all()
     usual = walked(COMMANDS, np.full((len(COMMANDS), 3), 0.8))
-    slower = walked(COMMANDS * first_gait._scale(task), np.full((len(COMMANDS), 3), 0.8))
-    slower = replace(slower, scale=first_gait._scale(task))
+    slower = walked(within(task, COMMANDS), np.full((len(COMMANDS), 3), 0.8))
+    slower = replace(slower, scale=share_of_usual(task))
     a, b = first_gait._score(usual), first_gait._score(slower)
     assert (b.forward_m_s, b.turn_rad_s) == (0.075, 0.4) and "of 0.075 m/s forward" in str(b)
     assert a.forward_share == b.forward_share == pytest.approx(0.8)

@@ -229,6 +229,24 @@ def test_feet_are_paid_to_touch_down_ahead_by_half_of_what_they_pass():
         assert wr.foot_paths(on_paths(command, 0.5, **wide), p)[0] == pytest.approx(1.0)
 
 
+def test_a_gait_that_sways_is_paid_for_its_mean_speed_and_may_lean_to_the_side():
+    pace = replace(mini_pupper(), offsets=np.array([0.0, 0.5, 0.0, 0.5]))
+    assert pace.sways
+    leaning = dict.fromkeys(LEGS, (0.0, 0.01, 0.0))
+    costs = {}
+    for name, moved in (("none", {}), ("lean", leaning), ("spread", {LF: leaning[LF]})):
+        steps = on_paths((1e-9, 0, 0), 0.0, **moved)
+        costs[name] = [wr.foot_paths(replace(steps, body=b), P)[0] for b in (mini_pupper(), pace)]
+    assert costs["lean"][0] < costs["none"][0] and costs["spread"][1] < costs["none"][1]
+    assert costs["lean"][1] == pytest.approx(costs["none"][1])
+    swaying = step(
+        command=FORWARD, linear_velocity=(0.2, 0.3, 0), angular_velocity=(0, 0, 0.5),
+        stride_velocity=FORWARD,
+    )  # fmt: skip
+    for term in (wr.base_linear_velocity, wr.base_angular_velocity):
+        assert term(swaying, P)[0] < term(replace(swaying, body=pace), P)[0] == 1.0
+
+
 def test_in_a_turn_feet_are_paid_to_go_around():
     p = replace(P, clock_duty=0.5, clock_hz=4.0)
     moved = {}
