@@ -30,7 +30,6 @@ from pupper_sysid.cli.terminal import err, out, print_json, remember, share_prog
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import hold_output, refuse_path
-from pupper_sysid.common.processes.stop import finishing
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.network.hyperparameters import OWN, TROT, Kind
 from pupper_sysid.policies.train.run_file import (
@@ -198,7 +197,7 @@ def _run(options: Options, given: list[str]) -> None:
 def _with_first_gait(run: Run, ranks: Ranks, until: float) -> Run:
     """The run with a gait for its servos, which the first process searches for all.
 
-    It does so until a time of the monotonic clock, or a stop.
+    It does so until a time of the monotonic clock.
     """
     from pupper_sysid.policies.train.first_gait import fits_trots, with_first_gait
 
@@ -206,10 +205,10 @@ def _with_first_gait(run: Run, ranks: Ranks, until: float) -> Run:
         return run
     task = run.task
     if ranks.rank == 0:
-        with share_progress("first gait") as advance, finishing(err.print) as stop_requested:
+        with share_progress("first gait") as advance:
             task = with_first_gait(
                 run, lambda text: err.print(spell(text)), partial(advance, "searching"),
-                lambda: stop_requested() or time.monotonic() > until,
+                lambda: time.monotonic() > until,
             ).task  # fmt: skip
     parts = json.loads(ranks.same(json.dumps(plain({"trot": task.trot, "rewards": task.rewards}))))
     trot, rewards = Trot(**parts["trot"]), Rewards(**parts["rewards"])
