@@ -247,6 +247,19 @@ def test_a_gait_that_sways_is_paid_for_its_mean_speed_and_may_lean_to_the_side()
         assert term(swaying, P)[0] < term(replace(swaying, body=pace), P)[0] == 1.0
 
 
+def test_the_stride_of_a_robot_of_four_times_the_height_lasts_twice_as_long():
+    own = mini_pupper()
+    tall = replace(own, standing_height_m=4 * own.standing_height_m)
+    gained = []
+    for body in (own, tall):
+        strides, actions = Strides(body, 1, 0.02, P), np.zeros((1, 12))
+        facts = empty_facts(body, np.zeros((1, 3)), actions, actions, actions)
+        feet = np.zeros((1, 4, 2)), np.zeros((1, 4))
+        strides.advance(slice(None), np.ones((1, 4)), feet, np.ones((1, 3)), facts)
+        gained.append(strides.velocity[0, 0])
+    assert gained == pytest.approx([0.02 / 0.2, 0.01 / 0.2])
+
+
 def test_in_a_turn_feet_are_paid_to_go_around():
     p = replace(P, clock_duty=0.5, clock_hz=4.0)
     moved = {}
