@@ -101,7 +101,7 @@ _GROUPS = {
     "Use": ("report", "export", "load_calibration", "Calibration", "load_servo_model"),
     "Simulate": (
         "DelayedPD", "DelayedPDParameters", "HeldFeedback", "SparseEquation", "PupperEnv",
-        "load_policy", "Policy",
+        "make_env", "load_policy", "Policy",
     ),
     "Values and errors": ("Interval", "JOINT_NAMES", "InputError", "PupperError"),
 }  # fmt: skip
