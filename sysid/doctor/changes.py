@@ -22,6 +22,8 @@ from itertools import product
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
+from scipy.optimize import nnls
 
 from pupper_sysid.sysid.doctor.explanations import FILTERS, Explanation, Servo, explain
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding
@@ -55,22 +57,30 @@ _REFINED, _HOPS, _TRIED, _WELL = 3, 3, 5, 0.02
 _BOUND, _CRUDE = 0.25, 0.004  # of the position's mean deviation
 EXPLAINED = 0.06
 """Of the position's mean deviation: a servo that leaves less explains nearly all."""
-_OF_TRAVEL = 8.0  # readings in one motion over the range, as from rest to rest
 _WELL_EXPLAINED = 0.008  # of the same: nothing is left that a change could explain
 _FOLLOWS, _LITTLE = 0.12, 0.3  # of the same; of a friction
 CLEAR_NATS = 20.0
 """Advantage of a fault over a servo without it: of 96 sound recordings drawn afresh (servos of six
 kinds, six motions, 15 to 400 Hz, with and without polls) no change has as much."""
-_SPLITS = 30
+_SPLITS, _WHILES, _CELLS = 30, 14, 128
+_FEWEST_PARTS = 8
 _EDGE_S, _EDGE_SHARE = 1.0, 0.125  # from either end: an integral settles at the beginning
-_NO_GAIN, _OTHER_GAIN, _GAIN_DRIFT, _LAG_DRIFT_S, _EARLY_S = 0.1, 0.75, 0.2, 0.008, 0.02
+_NO_GAIN, _OTHER_GAIN, _OPPOSITE, _GAIN_DRIFT, _LAG_DRIFT_S, _EARLY_S = (
+    0.1,
+    0.75,
+    0.5,
+    0.2,
+    0.008,
+    0.02,
+)
 _MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
 _GROWTHS = tuple(sign * size for size in (0.0015, 0.003, 0.006, 0.012) for sign in (-1, 1))
 _SHIFTS_S = (-0.04, 0.0, 0.04)
+_LATER_S, _PER_GROWTH = (-0.06, -0.025, 0.025, 0.06), 0.1  # growth [1] of a lag by as many seconds
 _FEW_LEVELS = 4
 _SERVOS, _LEVELS = 4, np.linspace(0.15, 0.95, 9)  # of the command's range
 _DEEP, _BEYOND = 0.06, 0.03  # of the path's range; of the readings
-_LEFT_S, _AGAIN_S, _MOST_LEFT, _TIMES_LEFT = 0.4, 0.3, 0.45, 4
+_MOST_LEFT, _TIMES_LARGER, _ROUNDS = 0.45, 5.0, 4
 
 
 @dataclass(frozen=True)
@@ -92,19 +102,15 @@ class Follower:
 
     @property
     def independent(self) -> float:
-        """Residuals that count as independent, by what their means over longer parts still vary.
+        """Residuals that count as independent: see `_independent_share`."""
+        return len(self.residuals_rad) * _independent_share(self.residuals_rad)
 
-        A joint at rest has been read once however often it is: motion over the range gives some.
-        """
-        r, count = self.residuals_rad, len(self.residuals_rad)
-        lengths = [m for m in (4, 8, 16, 32, 64) if m * 8 <= count]
-        means = [r[: count // m * m].reshape(-1, m).mean(axis=1) for m in lengths]
-        spread = float(np.var(r)) + 1e-18
-        shares = [
-            spread / (m * float(np.var(b)) + 1e-18) for m, b in zip(lengths, means, strict=True)
-        ]
-        travel = np.sum(np.abs(np.diff(self.path_rad))) / (np.ptp(self.path_rad) + 1e-12)
-        return min(count * min([1.0, *shares]), _OF_TRAVEL * float(travel))
+    @property
+    def settles_s(self) -> float:
+        """Time after which it is within 2 % of a command [s]: four time constants, and its lag."""
+        natural, damping = np.exp(self.terms[[_NATURAL, _DAMPING]])
+        slow = damping - np.sqrt(max(damping * damping - 1, 0.0))
+        return float(4 / (natural * slow) + self.terms[_LAG])
 
     def unexplained(self, joint: Followed) -> float:
         """Share of the variance of the readings."""
@@ -131,6 +137,8 @@ class Followed:
     position_rad: NDArray[np.float64]
     starts: NDArray[np.int64]
     """First reading of each trial, and the end."""
+    later: NDArray[np.float64]
+    """What the lag's growth goes with: time since the start [s]."""
 
     @property
     def explained(self) -> bool:
@@ -215,11 +223,18 @@ class Followed:
 
     @cached_property
     def changed(self) -> Compared | None:
-        """The change that explains most of what the servo alone leaves, if one clearly does."""
+        """The change that explains most of what the servo alone leaves, if one clearly does.
+
+        Whiles away from the path have no cause yet: what explains most of them is one.
+        """
         if self.fit.cost < _WELL_EXPLAINED:
             return None
+        nats, whiles = whiles_away(self, self.fit)
         best = max((c for c in comparisons(self) if c.finding), key=lambda c: c.nats, default=None)
-        return best if best and best.nats > CLEAR_NATS else None
+        best = best if best and best.nats > CLEAR_NATS else None
+        if nats < CLEAR_NATS or (best and whiles_away(self, best.fit)[0] < 0.5 * nats):
+            return best
+        return Compared(nats, self.fit.cost, self.fit, left_path(self, whiles))
 
     @property
     def changes(self) -> list[Finding]:
@@ -241,10 +256,10 @@ class Followed:
         terms = terms.copy()
         terms[_LOGARITHMS] = np.exp(terms[_LOGARITHMS])
         terms[_BIAS] *= self.reach
-        path, middle = np.empty_like(self.time_s), self.start_s
+        path = np.empty_like(self.time_s)
+        late = self.time_s - terms[_LAG] - terms[_GROWTH] * self.later
         for inputs, a, b in zip(self._inputs, self.starts[:-1], self.starts[1:], strict=True):
-            late = self.time_s[a:b] - terms[_LAG] - terms[_GROWTH] * (self.time_s[a:b] - middle)
-            _follow(*inputs, terms, late, path[a:b])
+            _follow(*inputs, terms, late[a:b], path[a:b])
         return path
 
     def path_of_trial(self, number: int) -> NDArray[np.float64]:
@@ -252,7 +267,9 @@ class Followed:
         sample = self.base.samples[number]
         base = replace(self.base, samples=(sample,))
         ends = np.array([0, len(sample.time_s)])
-        return replace(self, base=base, time_s=sample.time_s, starts=ends).path(self.fit.terms)
+        time = sample.time_s
+        later = time - self.start_s
+        return replace(self, base=base, time_s=time, starts=ends, later=later).path(self.fit.terms)
 
     def follower(self, terms: NDArray, columns: Columns | None = None) -> Follower:
         """Regress the position on the path, what is added to it, and a constant per trial."""
@@ -289,7 +306,7 @@ def followed(trials: Sequence[Trial], step: float) -> Followed | None:
     return Followed(
         tuple(trials), step, base, servo, float(trials[0].send_time_s[0]),
         max(float(away.mean()), 1e-9), reach, np.concatenate(times), np.concatenate(position),
-        np.cumsum([0, *map(len, times)]),
+        np.cumsum([0, *map(len, times)]), np.concatenate(times) - trials[0].send_time_s[0],
     )  # fmt: skip
 
 
@@ -305,6 +322,38 @@ def _drawn(reach: float) -> list[NDArray[np.float64]]:
     terms[kind == 2, _FRICTION] *= 10
     terms[u[:, 0] * 7 % 1 < 0.7, _INTEGRAL] = 0.01
     return [terms[kind == k] for k in range(4)]
+
+
+def _independent_share(values: NDArray[np.float64], some_apart: bool = False) -> float:
+    """Share of values that are independent, by what their means over longer parts still vary.
+
+    `some_apart`: a part of the values is not of the others' kind, and the median leaves it out.
+    """
+
+    def variance(x: NDArray) -> float:
+        away = (x - np.median(x)) ** 2 if some_apart else (x - x.mean()) ** 2
+        return float(np.median(away) / 0.455 if some_apart else away.mean()) + 1e-18
+
+    count, spread, shares, m = len(values), variance(values), [1.0], 4
+    if some_apart:
+        spread = (float(np.median(values)) / np.log(2)) ** 2  # of exponential values
+    while _FEWEST_PARTS * (4 if some_apart else 1) * m <= count:
+        shares.append(spread / (m * variance(values[: count // m * m].reshape(-1, m).mean(axis=1))))
+        m *= 2
+    return min(shares)
+
+
+def likely_spread(
+    size: NDArray, usual: float, causes: Sequence[NDArray], rows: NDArray | slice = slice(None)
+) -> NDArray[np.float64]:
+    """Mean of exponential sizes as a sum of positive shares of 1 and `causes`, by some `rows`."""
+    design = np.column_stack([np.ones_like(size), *causes])
+    design = design / np.maximum(design[rows].mean(axis=0), 1e-12)
+    spread = np.full_like(size, usual)
+    for _ in range(3):
+        weighted = design[rows] / spread[rows, None]
+        spread = np.maximum(design @ nnls(weighted, size[rows] / spread[rows])[0], 0.3 * usual)
+    return spread
 
 
 def _cost(fit: Follower) -> float:
@@ -457,10 +506,10 @@ class _Change:
     columns: Columns | None = None
     free: Sequence[int] = ()
     """Terms of the servo that it adds."""
-    without: NDArray[np.bool_] | None = None
-    """Readings that it leaves out."""
     values: float = 1
     """How many numbers it adds."""
+    joint: Followed | None = None
+    """The readings with times of their own."""
     usual: Columns | None = None
     """What of a sound servo looks like it."""
 
@@ -481,10 +530,10 @@ def comparisons(joint: Followed) -> list[Compared]:
     # a load that is known sags and swings as its fit finds, and this servo does not
     loaded = any(t.load is not None for t in joint.trials)
     found = []
-    for change in (_lag_drifts, _leaves_path) if loaded else CHANGES:
+    for change in (_lag_drifts, _lag_changes) if loaded else CHANGES:
         if tried := change(joint):
-            part = joint if tried.without is None else _without(joint, tried.without)
-            fits = [fitted(part, b, tried.columns, (*_ALONE, *tried.free)) for b in tried.begins]
+            part, free = tried.joint or joint, (*_ALONE, *tried.free)
+            fits = [fitted(part, b, tried.columns, free) for b in tried.begins]
             fit = min(fits, key=_cost)
             alone = fit.terms.copy()
             alone[_GROWTH:] = joint.fit.terms[_GROWTH:]
@@ -492,101 +541,124 @@ def comparisons(joint: Followed) -> list[Compared]:
             if tried.usual:
                 begins = joint.fit, joint.follower(alone)
                 plain = min(plain, *(fitted(joint, b, tried.usual).cost for b in begins))
-            values = tried.values
-            if tried.without is not None:  # a number for each independent reading that is left out
-                values = fit.independent * tried.without.mean()
             nats = fit.independent * np.log(plain / fit.cost)
-            nats -= 0.5 * values * np.log(len(joint.time_s))
+            nats -= 0.5 * tried.values * np.log(len(joint.time_s))
             found.append(Compared(float(nats), plain, fit, tried.finding(fit)))
     return found
 
 
-def _without(joint: Followed, rows: NDArray[np.bool_]) -> Followed:
-    """The readings but for some."""
-    keep = ~rows
-    counts = [
-        int(keep[a:b].sum()) for a, b in zip(joint.starts[:-1], joint.starts[1:], strict=True)
-    ]
-    samples = tuple(s for s, n in zip(joint.base.samples, counts, strict=True) if n)
-    return replace(
-        joint, base=replace(joint.base, samples=samples), time_s=joint.time_s[keep],
-        position_rad=joint.position_rad[keep], starts=np.cumsum([0, *(n for n in counts if n)]),
-    )  # fmt: skip
+def _split(
+    joint: Followed, columns: Callable[[int, int], Columns], for_a_while: bool
+) -> tuple[int, int, Follower] | None:
+    """First reading and end of the change that explains most, and the servo that it begins with.
 
-
-def _split(joint: Followed, columns: Callable[[int], Columns]) -> tuple[int, Follower] | None:
-    """Reading of a change that explains most, and the servo that it begins with.
-
-    A servo that explains both parts alike has become another one: those of the screen are tried as
-    well, and the moment is found again for the one that the change makes best.
+    It lasts to the end of its trial, or to any later moment if it may be `for_a_while`. A servo
+    that explains both parts alike has become another one: those of the screen are tried as well,
+    and the moments are found again for the one that the change makes best.
     """
     edge = max(_EDGE_S, _EDGE_SHARE * float(np.ptp(joint.time_s)))
     low, high = joint.time_s[0] + edge, joint.time_s[-1] - edge
     if low >= high:
         return None
-    moments = np.searchsorted(joint.time_s, np.linspace(low, high, _SPLITS)).tolist()
-    begin = joint.fit
-    for spread in (1.0, 0.1):
-        tried = []
-        for k in moments:
-            tried.append((joint.regressed(begin.terms, begin.path_rad, columns(k)).cost, k))
-        at = min(tried)[1]
-        servos = [joint.regressed(f.terms, f.path_rad, columns(at)) for f in joint.screen]
+    count = len(joint.time_s)
+    moments = np.searchsorted(
+        joint.time_s, np.linspace(low, high, _WHILES if for_a_while else _SPLITS)
+    ).tolist()
+    windows = [
+        (k, end) for n, k in enumerate(moments)
+        for end in ([*moments[n + 1:], count] if for_a_while else [_end(joint, k)])
+    ]  # fmt: skip
+    begin, around = joint.fit, (high - low) / (joint.time_s[-1] - joint.time_s[0]) * count
+    around /= len(moments)
+    for _ in range(2):
+        tried = [
+            (joint.regressed(begin.terms, begin.path_rad, columns(*w)).cost, w) for w in windows
+        ]
+        first, end = min(tried)[1]
+        servos = [joint.regressed(f.terms, f.path_rad, columns(first, end)) for f in joint.screen]
         best = [begin, *sorted(servos, key=_cost)[:2]]
-        begin = min((fitted(joint, f, columns(at), rounds=4) for f in best), key=_cost)
-        around = 2 * spread * len(joint.time_s) / _SPLITS
-        near = np.unique(np.linspace(at - around, at + around, 21).astype(int))
-        trial = np.searchsorted(joint.starts, at, "right")
-        low, high = joint.starts[trial - 1] + 2, joint.starts[trial] - 2
-        moments = near[(near > low) & (near < high)].tolist() or [at]
-    return at, begin
+        begin = min((fitted(joint, f, columns(first, end), rounds=4) for f in best), key=_cost)
+        near = np.linspace(-around, around, 9 if for_a_while else 21).astype(int)
+        ends = end + near if for_a_while and end < count else [end]
+        windows = [
+            (a, b) for a in (first + near).tolist() for b in ends
+            if 2 < a < b - 2 < count - 1 and (for_a_while or _end(joint, a) == end)
+        ] or [(first, end)]  # fmt: skip
+    return first, end, begin
 
 
-def _after(joint: Followed, at: int) -> NDArray[np.float64]:
-    """1 for the readings from `at` on in its trial."""
-    end = joint.starts[np.searchsorted(joint.starts, at, "right")]
+def _end(joint: Followed, at: int) -> int:
+    """End of the trial of a reading."""
+    return int(joint.starts[min(np.searchsorted(joint.starts, at, "right"), len(joint.starts) - 1)])
+
+
+def _within(joint: Followed, first: int, end: int) -> NDArray[np.float64]:
+    """1 for the readings from `first` up to `end`."""
     row = np.arange(len(joint.time_s))
-    return ((row >= at) & (row < end)).astype(np.float64)
+    return ((row >= first) & (row < end)).astype(np.float64)
 
 
 def _zero_moves(joint: Followed) -> _Change | None:
     """A zero that moves at a moment."""
-    best = _split(joint, lambda k: lambda path: [_after(joint, k)])
+    best = _split(joint, lambda a, b: lambda path: [_within(joint, a, b)], False)
     if best is None:
         return None
-    at, begin = best
+    first, end, begin = best
 
     def finding(fit: Follower) -> Finding | None:
         moved = abs(float(fit.values[1]))
-        values = {"offset_rad": moved, "time_s": float(joint.time_s[at]) - joint.start_s}
-        friction = 2 * float(np.exp(fit.terms[_FRICTION]))  # within it a joint rests anywhere
-        small = moved < max(_MOVED_RAD, _MOVED_SHARE * joint.reach, friction)
-        return None if small else Finding("zero_moves", CARE, values)
+        values = {"offset_rad": moved, "time_s": float(joint.time_s[first]) - joint.start_s}
+        return Finding("zero_moves", CARE, values) if _moves(joint, moved) else None
 
-    return _Change([begin], finding, lambda path: [_after(joint, at)], values=2)
+    return _Change([begin], finding, lambda path: [_within(joint, first, end)], values=2)
+
+
+def _moves(joint: Followed, moved: float) -> bool:
+    """Whether a zero moves by more than where friction lets a joint rest."""
+    return moved > max(_MOVED_RAD, _MOVED_SHARE * joint.reach, 2 * joint.friction_rad)
+
+
+def _zero_drifts(joint: Followed) -> _Change | None:
+    """A zero that moves steadily."""
+    share = (joint.time_s - joint.time_s.mean()) / max(float(np.ptp(joint.time_s)), 1e-9)
+
+    def finding(fit: Follower) -> Finding | None:
+        moved = float(fit.values[1])
+        values = {"offset_rad": moved}
+        return Finding("zero_drifts", CARE, values) if _moves(joint, abs(moved)) else None
+
+    def columns(path: NDArray) -> list[NDArray]:
+        return [share]
+
+    servos = [joint.regressed(f.terms, f.path_rad, columns) for f in joint.screen]
+    return _Change([joint.fit, min(servos, key=_cost)], finding, columns)
 
 
 def _gain_changes(joint: Followed) -> _Change | None:
-    """A gain that changes at a moment, about any place."""
-    row = np.arange(len(joint.time_s))
+    """A gain that changes at a moment or for a while, about any place."""
 
-    def columns(k: int) -> Columns:
-        return lambda path: [path * (row >= k), _after(joint, k)]
+    def columns(first: int, end: int) -> Columns:
+        inside = _within(joint, first, end)
+        return lambda path: [path * inside, inside]
 
-    best = _split(joint, columns)
+    best = _split(joint, columns, True)
     if best is None:
         return None
-    at, begin = best
+    first, end, begin = best
 
     def finding(fit: Follower) -> Finding | None:
         before, more = map(float, fit.values[:2])
         low, high = sorted((before, before + more))
-        values = {"time_s": float(joint.time_s[at]) - joint.start_s, "before": before,
+        times = joint.time_s[[first, end - 1]] - joint.start_s
+        values = {"time_s": float(times[0]), "until_s": float(times[1]), "before": before,
                   "after": before + more}  # fmt: skip
+        if low < -_OPPOSITE * high:
+            return Finding("sign_changed", REFUSE, values)
         usual = _NO_GAIN * high < low < _OTHER_GAIN * high  # a joint without a gain is held or dead
         return Finding("gain_changed", CARE, values) if usual else None
 
-    return _Change([begin], finding, columns(at), values=3)
+    values = 3 if end == len(joint.time_s) else 4
+    return _Change([begin], finding, columns(first, end), values=values)
 
 
 def _gain_drifts(joint: Followed) -> _Change | None:
@@ -609,7 +681,7 @@ def _lag_drifts(joint: Followed) -> _Change | None:
     """A lag that grows steadily: clocks that drift apart."""
     # a servo without a drift may have become another one for it
     servos = [joint.fit, *sorted(joint.screen, key=_cost)[:3]]
-    middle = float(np.mean(joint.time_s)) - joint.start_s
+    middle = float(np.mean(joint.later))
     tried = []
     for growth, shift, servo in product(_GROWTHS, _SHIFTS_S, servos):
         moved = servo.terms.copy()
@@ -620,11 +692,44 @@ def _lag_drifts(joint: Followed) -> _Change | None:
         growth = float(fit.terms[_GROWTH])
         if abs(growth) * np.ptp(joint.time_s) < _LAG_DRIFT_S:
             return None
-        lags = fit.terms[_LAG] + growth * (joint.time_s - joint.start_s)
+        lags = fit.terms[_LAG] + growth * joint.later
         verdict = REFUSE if lags.min() < -_EARLY_S else CARE  # early is what no servo is
         return Finding("lag_drifts", verdict, {"drift_ms": 1e3 * growth, "percent": 100 * growth})
 
-    return _Change(sorted(tried, key=_cost)[:2], finding, free=(_GROWTH,))
+    return _Change(sorted(tried, key=_cost)[:2], finding, free=(_GROWTH,), usual=_shifted(joint))
+
+
+def _lag_changes(joint: Followed) -> _Change | None:
+    """A lag that changes at a moment."""
+    edge = _EDGE_SHARE * float(np.ptp(joint.time_s))
+    moments = np.linspace(joint.time_s[0] + edge, joint.time_s[-1] - edge, _WHILES)
+    tried = []
+    for moment in moments:
+        later = replace(joint, later=(joint.time_s > moment) / _PER_GROWTH)
+        for size in _LATER_S:
+            moved = joint.fit.terms.copy()
+            moved[[_LAG, _GROWTH]] += -size / 2, size * _PER_GROWTH
+            tried.append((later.follower(np.clip(moved, _LOWEST, _HIGHEST)).cost, moment, moved))
+    _, moment, moved = min(tried, key=lambda t: t[0])
+    around = np.linspace(-1, 1, 9) * (moments[1] - moments[0])
+    joints = [replace(joint, later=(joint.time_s > moment + d) / _PER_GROWTH) for d in around]
+    later = min(joints, key=lambda j: j.follower(moved).cost)
+
+    def finding(fit: Follower) -> Finding | None:
+        more = float(fit.terms[_GROWTH]) / _PER_GROWTH
+        if abs(more) < _LAG_DRIFT_S:
+            return None
+        at = float(joint.time_s[np.argmax(later.later > 0)]) - joint.start_s
+        return Finding("lag_changed", CARE, {"more_ms": 1e3 * more, "time_s": at})
+
+    return _Change([later.follower(moved)], finding, free=(_GROWTH,), values=2, joint=later,
+                   usual=_shifted(joint))  # fmt: skip
+
+
+def _shifted(joint: Followed) -> Columns:
+    """What a constant shift in time adds, such as that of a position before its command."""
+    time = joint.time_s + 1e-9 * np.arange(len(joint.time_s))
+    return lambda path: [np.gradient(path, time)]
 
 
 def _clipped(joint: Followed) -> _Change | None:
@@ -672,38 +777,74 @@ def _clipped(joint: Followed) -> _Change | None:
     return _Change(begins, finding, free=range(_LOW, _TOP + 1), values=2, usual=curve)
 
 
-def _leaves_path(joint: Followed) -> _Change | None:
-    """Some whiles in which the joint is elsewhere; where it rests, it does not answer."""
-    rest = joint.fit.residuals_rad
-    size = np.abs(rest)
-    away = size > max(_BOUND * joint.scale, 4 * float(np.median(size)), 4 * joint.step)
-    whiles: list[tuple[int, int]] = []
-    for a, b in zip(joint.starts[:-1], joint.starts[1:], strict=True):
-        rows = a + np.flatnonzero(away[a:b])
-        cuts = np.flatnonzero(np.diff(joint.time_s[rows]) > _AGAIN_S)
-        for part in np.split(rows, cuts + 1):
-            long = len(part) > 3 and joint.time_s[part[-1]] - joint.time_s[part[0]] > _LEFT_S
-            # beside its path at rest a joint is held by friction
-            if long and np.ptp(rest[part]) > 2 * _BOUND * joint.scale and part[-1] < b - 4:
-                whiles.append((part[0], part[-1] + 1))
-    out = np.zeros(len(size), bool)
-    for a, b in whiles:
-        out[a:b] = True
-    if not whiles or len(whiles) > _TIMES_LEFT or out.mean() > _MOST_LEFT:
-        return None
+def left_path(joint: Followed, whiles: Sequence[tuple[int, int]]) -> Finding:
+    """Whiles in which the joint is elsewhere; where it rests, it does not answer."""
     a, b = max(whiles, key=lambda w: joint.time_s[w[1] - 1] - joint.time_s[w[0]])
     longest = float(joint.time_s[b - 1] - joint.time_s[a])
     middle = joint.position_rad[a + (b - a) // 6 : b - (b - a) // 6]
     if np.ptp(middle) <= max(1.5 * joint.step, 0.02 * joint.scale):
         values = {"trials": len(whiles), "of": len(joint.trials), "longest_s": longest}
-        found = Finding("frozen", CARE, values)
-    else:
-        values = {"times": len(whiles), "longest_s": longest,
-                  "time_s": float(joint.time_s[whiles[0][0]]) - joint.start_s}  # fmt: skip
-        found = Finding("left_path", CARE, values)
-    return _Change([joint.fit], lambda fit: found, without=out, values=2 * len(whiles))
+        return Finding("frozen", CARE, values)
+    values = {"times": len(whiles), "longest_s": longest,
+              "time_s": float(joint.time_s[whiles[0][0]]) - joint.start_s}  # fmt: skip
+    return Finding("left_path", CARE, values)
+
+
+def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, int]]]:
+    """Whiles whose residuals are larger than those of the same motion elsewhere: nats, rows.
+
+    Errors of a sound servo are of its noise, its speed and its force: their mean is a sum of
+    positive shares of these, and they are exponential about it. In a while with a mean `times` as
+    large, a reading of size x is likelier by x (1 - 1 / times) - log times. The share of
+    independent readings is what the means of parts of the rest show.
+    """
+    count, dt = len(joint.time_s), float(np.median(np.diff(joint.time_s)))
+    width = max(3, 1 + 2 * round(min(fit.settles_s, 1.0) / max(dt, 1e-4)))
+    causes = []
+    for a, b in zip(joint.starts[:-1], joint.starts[1:], strict=True):
+        time = joint.time_s[a:b] + 1e-9 * np.arange(b - a)
+        rate = np.gradient(fit.path_rad[a:b], time) if b - a > 2 else np.zeros(b - a)
+        bend = np.gradient(rate, time) if b - a > 2 else rate
+        causes.append([maximum_filter1d(np.abs(x), min(width, 2 * (b - a) - 1))
+                       for x in (rate, bend)])  # fmt: skip
+    causes = np.concatenate(causes, axis=1)
+    size = np.abs(fit.residuals_rad) + joint.step / 4 + 1e-9
+    edges = np.unique(np.linspace(0, count, _CELLS + 1).astype(int))
+    cells, times, inside = np.diff(edges), _TIMES_LARGER, np.zeros(count, bool)
+    for _ in range(_ROUNDS):
+        usual = float(np.median(size[~inside]))
+        scaled = np.minimum(size, 20 * usual)
+        scaled = scaled / likely_spread(scaled, usual, causes, ~inside)
+        share = _independent_share(scaled[~inside], True)
+        mean = np.add.reduceat(scaled, edges[:-1]) / cells
+        gains = share * cells * (mean * (1 - 1 / times) - np.log(times))
+        larger = _segments(gains, np.log(count))
+        inside = np.repeat(larger, cells)
+        if not larger.any() or inside.mean() > _MOST_LEFT:
+            return 0.0, []
+        times = max(float(scaled[inside].mean()), 2.0)
+    if np.quantile(size[inside], 0.9) < max(_MOVED_RAD, _MOVED_SHARE * joint.reach):
+        return 0.0, []  # as small as a zero that moves and does not matter
+    nats = float(gains[larger].sum()) / share * min(share, _independent_share(scaled[~inside]))
+    flips = np.flatnonzero(np.diff(np.concatenate([[0], larger, [0]])))
+    whiles = [(int(edges[a]), int(edges[b])) for a, b in flips.reshape(-1, 2)]
+    return nats - len(whiles) * float(np.log(count)), whiles
+
+
+def _segments(gains: NDArray[np.float64], cost: float) -> NDArray[np.bool_]:
+    """Segments of the largest sum of gains, each of which costs something."""
+    outside, inside = 0.0, -np.inf
+    came = np.zeros((len(gains), 2), bool)  # whether from inside, to outside and to inside
+    for k, gain in enumerate(gains):
+        came[k] = inside > outside, inside > outside - cost
+        outside, inside = max(outside, inside), gain + max(inside, outside - cost)
+    states, state = np.zeros(len(gains), bool), inside > outside
+    for k in reversed(range(len(gains))):
+        states[k] = state
+        state = came[k, int(state)]
+    return states
 
 
 CHANGES: tuple[Callable[[Followed], _Change | None], ...] = (
-    _zero_moves, _lag_drifts, _gain_drifts, _gain_changes, _clipped, _leaves_path,
+    _zero_moves, _zero_drifts, _lag_drifts, _lag_changes, _gain_drifts, _gain_changes, _clipped,
 )  # fmt: skip

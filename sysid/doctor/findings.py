@@ -121,9 +121,9 @@ WORDS: dict[str, str] = {
         "Record these trials again."
     ),
     "gain_changed": (
-        "the joint moves {before:.2f} times as far as the command up to {time_s:.1f} s, and "
-        "{after:.2f} times after it: settings, supply, torque limit or load changed. Use the "
-        "two parts apart."
+        "from {time_s:.1f} to {until_s:.1f} s the joint moves {after:.2f} times as far as the "
+        "command, and {before:.2f} times otherwise: settings, supply, torque limit or load "
+        "changed. Use the parts apart."
     ),
     "clocks_drift": (
         "the clock of the readings drifts from that of the commands by {percent:+.3f} %; readings "
@@ -158,6 +158,10 @@ WORDS: dict[str, str] = {
         "{percent:.0f} % of the positions lie on straight lines between others: the log was "
         "interpolated, and when its readings were taken is lost. Use the log as it was "
         "recorded."
+    ),
+    "lag_changed": (
+        "the lag changes by {more_ms:+.0f} ms at {time_s:.1f} s: buffers of an adapter, another "
+        "rate of the loop, or two recordings in one. Use the two parts apart."
     ),
     "lag_drifts": (
         "the lag grows by {drift_ms:.1f} ms a second ({percent:.2f} %): times of commands and "
@@ -294,6 +298,11 @@ WORDS: dict[str, str] = {
         "and run backwards there: negative counts are sent as a sign bit (bit {bit}) and a "
         "magnitude. Clear this bit and negate, then import again."
     ),
+    "sign_changed": (
+        "from {time_s:.1f} to {until_s:.1f} s the joint moves {after:.2f} times as far as the "
+        "command, and {before:.2f} times otherwise: the sign of a column changes there. Make it "
+        "one sign, or use the parts apart."
+    ),
     "sign_inverted": (
         "the position moves against the command: its sign is inverted (gain {gain:.2f}, "
         "{lag_ms:.0f} ms late). Change the direction in the joint map, or multiply one column "
@@ -363,6 +372,10 @@ WORDS: dict[str, str] = {
     "wrong_unit": (
         "{large} are {factor:.0f} times as large as {small}, which looks like {unit}. Convert "
         "them to radians: degrees times 0.0174533, counts times 2π over the counts of a turn."
+    ),
+    "zero_drifts": (
+        "the joint's zero moves steadily, by {offset_rad:.2f} rad from first to last reading: a "
+        "sensor that warms, a slipping horn, or a load that grows. Use a part, or record again."
     ),
     "zero_moves": (
         "the joint's zero moves by {offset_rad:.2f} rad within a trial, at {time_s:.1f} s: a "

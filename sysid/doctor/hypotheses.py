@@ -52,7 +52,7 @@ _SMOOTH = 0.6  # autocorrelation of what is left
 _AT_ONCE_S, _FASTEST_S, _LATE_S = 0.02, 0.001, 0.008
 _BEYOND, _SURELY = 4.0, 0.01
 _LONGEST_LAG_S = 0.5
-_FASTEST_RAD_S, _WRAP_RAD, _UNUSUAL = 60.0, 1.0, 8.0
+_FASTEST_RAD_S, _WRAP_RAD, _UNUSUAL = 20.0, 0.5, 8.0  # a good servo of this size; compared then
 _SAME_TONE_HZ = 0.02
 _DIFFERENT = 0.35  # of the gain
 _SPEED_LEFT, _SPEED_BETTER, _SPEED_GAIN = 0.12, 0.35, 0.55  # the last of the logarithm
@@ -313,6 +313,10 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     if left[""] < _FITS:
         return []  # a fast joint, or one in another unit
     best = min(left, key=lambda name: left[name])
+    turn = 2 * np.pi
+    near = min(abs(jump - k * turn / 6) for k in (5, 6))  # servos of 300 and of 360 degrees
+    if near > 0.1 * turn and (not best or left[best] > _FITS):
+        return []  # it is no turn that jumps, and put back no servo explains it
     if not best or left[best] > 0.7 * left[""]:
         best = "shifted"
     values = {"times": len(sizes), "time_s": when}
@@ -321,8 +325,6 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     if best == "mirrored":
         values |= {"jump_rad": jump, "bit": round(bits)}
         return [Finding("sign_bit", REFUSE, values)]
-    turn = 2 * np.pi
-    near = min(abs(jump - k * turn / 6) for k in (5, 6))  # servos of 300 and of 360 degrees
     if bits > 8 and abs(jump - turn) > 0.15 * turn and near > 0.1 * turn:
         exact = step * 2.0 ** round(bits)
         if abs(exact - jump) < 0.1 * jump:
@@ -338,8 +340,9 @@ def _jumps(trial: Trial, step: float) -> tuple[NDArray[np.float64], NDArray[np.f
     new = np.concatenate([[0], np.flatnonzero(np.diff(value)) + 1]) if len(value) else []
     if len(new) < 4:
         return np.zeros(0), np.zeros(0)
-    # a held value may be old: the jump took as long as nothing new was read
+    # a held value may be old, of a joint at rest by no more than usual
     move, taken = np.diff(value[new]), np.maximum(np.diff(time[new]), 1e-6)
+    taken = np.minimum(taken, 2 * np.median(taken))
     usual = _UNUSUAL * float(np.median(np.abs(move)))
     far = np.abs(move) > np.maximum(_FASTEST_RAD_S * taken, max(5 * step + 0.2, usual))
     far &= np.abs(move) > _WRAP_RAD
