@@ -28,7 +28,7 @@ from scipy.optimize import nnls
 from pupper_sysid.sysid.doctor.explanations import FILTERS, Explanation, Servo, explain
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding
 from pupper_sysid.sysid.feedback.staleness import staleness
-from pupper_sysid.sysid.recordings.excitation import remembered
+from pupper_sysid.sysid.recordings.excitation import named_tones, remembered
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _MOST_READINGS, _GRID_S = 1500, 0.0025
@@ -645,8 +645,12 @@ def _gain_changes(joint: Followed) -> _Change | None:
     if best is None:
         return None
     first, end, begin = best
+    numbers = 3 if end == len(joint.time_s) else 4
 
     def finding(fit: Follower) -> Finding | None:
+        part = fit.path_rad[first:end]
+        if np.abs(np.diff(part)).sum() <= numbers * np.ptp(part):
+            return None  # as many numbers as strokes explain any
         before, more = map(float, fit.values[:2])
         low, high = sorted((before, before + more))
         times = joint.time_s[[first, end - 1]] - joint.start_s
@@ -657,8 +661,7 @@ def _gain_changes(joint: Followed) -> _Change | None:
         usual = _NO_GAIN * high < low < _OTHER_GAIN * high  # a joint without a gain is held or dead
         return Finding("gain_changed", CARE, values) if usual else None
 
-    values = 3 if end == len(joint.time_s) else 4
-    return _Change([begin], finding, columns(first, end), values=values)
+    return _Change([begin], finding, columns(first, end), values=numbers)
 
 
 def _gain_drifts(joint: Followed) -> _Change | None:
@@ -794,20 +797,22 @@ def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, 
     """Whiles whose residuals are larger than those of the same motion elsewhere: nats, rows.
 
     Errors of a sound servo are of its noise, its speed and its force: their mean is a sum of
-    positive shares of these, and they are exponential about it. In a while with a mean `times` as
-    large, a reading of size x is likelier by x (1 - 1 / times) - log times. The share of
-    independent readings is what the means of parts of the rest show.
+    positive shares of these and of the tone, and they are exponential about it. In a while with a
+    mean `times` as large, a reading of size x is likelier by x (1 - 1 / times) - log times. The
+    share of independent readings is what the means of parts of the rest show. Whiles count that
+    hold most of what the servo leaves, and are as far away as a zero that matters.
     """
     count, dt = len(joint.time_s), float(np.median(np.diff(joint.time_s)))
     width = max(3, 1 + 2 * round(min(fit.settles_s, 1.0) / max(dt, 1e-4)))
-    causes = []
+    shapes = []
     for a, b in zip(joint.starts[:-1], joint.starts[1:], strict=True):
         time = joint.time_s[a:b] + 1e-9 * np.arange(b - a)
         rate = np.gradient(fit.path_rad[a:b], time) if b - a > 2 else np.zeros(b - a)
         bend = np.gradient(rate, time) if b - a > 2 else rate
-        causes.append([maximum_filter1d(np.abs(x), min(width, 2 * (b - a) - 1))
+        shapes.append([maximum_filter1d(np.abs(x), min(width, 2 * (b - a) - 1))
                        for x in (rate, bend)])  # fmt: skip
-    causes = np.concatenate(causes, axis=1)
+    tones = np.searchsorted([t.send_time_s[0] for t in named_tones(joint.trials)], joint.time_s)
+    causes = [*np.concatenate(shapes, axis=1), *(1.0 * (tones == n) for n in np.unique(tones)[1:])]
     size = np.abs(fit.residuals_rad) + joint.step / 4 + 1e-9
     edges = np.unique(np.linspace(0, count, _CELLS + 1).astype(int))
     cells, times, inside = np.diff(edges), _TIMES_LARGER, np.zeros(count, bool)
@@ -823,8 +828,9 @@ def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, 
         if not larger.any() or inside.mean() > _MOST_LEFT:
             return 0.0, []
         times = max(float(scaled[inside].mean()), 2.0)
-    if np.quantile(size[inside], 0.9) < max(_MOVED_RAD, _MOVED_SHARE * joint.reach):
-        return 0.0, []  # as small as a zero that moves and does not matter
+    small = size[inside].sum() < 0.5 * size.sum()  # of all that the servo leaves
+    if small or np.quantile(size[inside], 0.9) < max(_MOVED_RAD, _MOVED_SHARE * joint.reach):
+        return 0.0, []
     nats = float(gains[larger].sum()) / share * min(share, _independent_share(scaled[~inside]))
     flips = np.flatnonzero(np.diff(np.concatenate([[0], larger, [0]])))
     whiles = [(int(edges[a]), int(edges[b])) for a, b in flips.reshape(-1, 2)]

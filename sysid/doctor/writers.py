@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import least_squares
 from pupper_sysid.sysid.doctor.changes import Followed, likely_spread
-from pupper_sysid.sysid.doctor.explanations import Samples
 from pupper_sysid.sysid.doctor.findings import CARE, Finding
 from pupper_sysid.sysid.doctor.signals import interpolation_findings
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, quantum, readings
@@ -55,19 +54,17 @@ def pushes(joint: Followed) -> tuple[float, NDArray[np.float64]]:
     parts = []
     for number, sample in enumerate(joint.base.samples):
         time, rises = sample.time_s, np.diff(sample.time_s) > 0
-        if len(time) < _FEWEST_ROWS or not rises.all():
-            continue
-        # on its way after a step a servo stops by friction, at a place between all
-        rows = _settled(joint, sample)[_ORDER:]
+        jump = float(np.max(np.abs(np.diff(sample.command_rad)), initial=0.0))
+        if len(time) < _FEWEST_ROWS or not rises.all() or jump > _JUMP * joint.reach:
+            continue  # after a step friction stops a servo on its way, to a place between all
         path = joint.path_of_trial(number)
         rate = np.gradient(path, time)
         rest = sample.position_rad - joint.fit.values[0] * path
         parts.append(
-            [x[rows] for x in (
-                time[_ORDER:], path[_ORDER:], np.abs(rate[_ORDER:]),
-                np.abs(np.gradient(rate, time)[_ORDER:]), _innovations(rest - np.median(rest)))]
+            (time[_ORDER:], path[_ORDER:], np.abs(rate[_ORDER:]),
+             np.abs(np.gradient(rate, time)[_ORDER:]), _innovations(rest - np.median(rest)))
         )  # fmt: skip
-    if sum(len(p[0]) for p in parts) < _FEWEST_ROWS:
+    if not parts:
         return 0.0, np.zeros(0)
     time, path, rate, bend, innovations = (np.concatenate(p) for p in zip(*parts, strict=True))
     usual = float(np.median(np.abs(innovations))) + joint.step / 4 + 1e-9
@@ -89,15 +86,6 @@ def pushes(joint: Followed) -> tuple[float, NDArray[np.float64]]:
         if one_way > _ONE_WAY_NATS:  # size alone goes with a load or the place of friction, too
             best = max(best, likelier + one_way)
     return best, time[far]
-
-
-def _settled(joint: Followed, sample: Samples) -> NDArray[np.bool_]:
-    """Readings after the servo has had time to settle since the command jumped."""
-    moved = np.abs(np.diff(sample.command_rad, prepend=sample.rest_rad)) > _JUMP * joint.reach
-    jumps = sample.start_s + sample.grid_s * np.flatnonzero(moved)
-    last = np.searchsorted(jumps, sample.time_s, "right") - 1
-    since = np.where(last >= 0, sample.time_s - np.append(jumps, 0.0)[last], np.inf)
-    return since > joint.fit.settles_s
 
 
 def _innovations(rest: NDArray[np.float64]) -> NDArray[np.float64]:
