@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 
 import numpy as np
@@ -64,6 +64,9 @@ CLEAR_NATS = 20.0
 kinds, six motions, 15 to 400 Hz, with and without polls) no change has as much."""
 _SPLITS, _WHILES, _CELLS = 30, 14, 128
 _FEWEST_PARTS = 8
+_OF_TRAVEL = 2 * 4.0
+"""Independent readings of one motion over the range: a servo settles within four of its time
+constants, and does so twice, when it starts and when it stops."""
 _EDGE_S, _EDGE_SHARE = 1.0, 0.125  # from either end: an integral settles at the beginning
 _NO_GAIN, _OTHER_GAIN, _OPPOSITE, _GAIN_DRIFT, _LAG_DRIFT_S, _EARLY_S = (
     0.1,
@@ -102,8 +105,13 @@ class Follower:
 
     @property
     def independent(self) -> float:
-        """Residuals that count as independent: see `_independent_share`."""
-        return len(self.residuals_rad) * _independent_share(self.residuals_rad)
+        """Residuals that count as independent, by `_independent_share` and by the motion.
+
+        A joint at rest has been read once however often it is: motion over the range gives some.
+        """
+        travel = np.sum(np.abs(np.diff(self.path_rad))) / (np.ptp(self.path_rad) + 1e-12)
+        count = len(self.residuals_rad) * _independent_share(self.residuals_rad)
+        return min(count, _OF_TRAVEL * float(travel))
 
     @property
     def settles_s(self) -> float:
@@ -548,11 +556,11 @@ def comparisons(joint: Followed) -> list[Compared]:
 
 
 def _split(
-    joint: Followed, columns: Callable[[int, int], Columns], for_a_while: bool
+    joint: Followed, columns: Callable[[int, int], Columns], ends: Callable[[int], int] | None
 ) -> tuple[int, int, Follower] | None:
     """First reading and end of the change that explains most, and the servo that it begins with.
 
-    It lasts to the end of its trial, or to any later moment if it may be `for_a_while`. A servo
+    It lasts to the one that `ends` names, or to any later moment if that is None. A servo
     that explains both parts alike has become another one: those of the screen are tried as well,
     and the moments are found again for the one that the change makes best.
     """
@@ -560,13 +568,10 @@ def _split(
     low, high = joint.time_s[0] + edge, joint.time_s[-1] - edge
     if low >= high:
         return None
-    count = len(joint.time_s)
-    moments = np.searchsorted(
-        joint.time_s, np.linspace(low, high, _WHILES if for_a_while else _SPLITS)
-    ).tolist()
+    count, splits = len(joint.time_s), _SPLITS if ends else _WHILES
+    moments = np.searchsorted(joint.time_s, np.linspace(low, high, splits)).tolist()
     windows = [
-        (k, end) for n, k in enumerate(moments)
-        for end in ([*moments[n + 1:], count] if for_a_while else [_end(joint, k)])
+        (k, end) for n, k in enumerate(moments) for end in ([ends(k)] if ends else moments[n + 1:])
     ]  # fmt: skip
     begin, around = joint.fit, (high - low) / (joint.time_s[-1] - joint.time_s[0]) * count
     around /= len(moments)
@@ -578,11 +583,10 @@ def _split(
         servos = [joint.regressed(f.terms, f.path_rad, columns(first, end)) for f in joint.screen]
         best = [begin, *sorted(servos, key=_cost)[:2]]
         begin = min((fitted(joint, f, columns(first, end), rounds=4) for f in best), key=_cost)
-        near = np.linspace(-around, around, 9 if for_a_while else 21).astype(int)
-        ends = end + near if for_a_while and end < count else [end]
+        near = np.linspace(-around, around, 21 if ends else 9).astype(int)
         windows = [
-            (a, b) for a in (first + near).tolist() for b in ends
-            if 2 < a < b - 2 < count - 1 and (for_a_while or _end(joint, a) == end)
+            (a, b) for a in (first + near).tolist() for b in ([end] if ends else end + near)
+            if 2 < a < b - 2 < count - 1 and (ends is None or ends(a) == end)
         ] or [(first, end)]  # fmt: skip
     return first, end, begin
 
@@ -600,7 +604,7 @@ def _within(joint: Followed, first: int, end: int) -> NDArray[np.float64]:
 
 def _zero_moves(joint: Followed) -> _Change | None:
     """A zero that moves at a moment."""
-    best = _split(joint, lambda a, b: lambda path: [_within(joint, a, b)], False)
+    best = _split(joint, lambda a, b: lambda path: [_within(joint, a, b)], partial(_end, joint))
     if best is None:
         return None
     first, end, begin = best
@@ -635,21 +639,32 @@ def _zero_drifts(joint: Followed) -> _Change | None:
 
 
 def _gain_changes(joint: Followed) -> _Change | None:
-    """A gain that changes at a moment or for a while, about any place."""
+    """A gain that changes at a moment."""
+    return _another_gain(joint, lambda k: len(joint.time_s), 3)
+
+
+def _gain_for_a_while(joint: Followed) -> _Change | None:
+    """A gain that changes and changes back."""
+    return _another_gain(joint, None, 4)
+
+
+def _another_gain(
+    joint: Followed, ends: Callable[[int], int] | None, numbers: int
+) -> _Change | None:
+    """A gain that is another one in a part of the recording, about any place."""
 
     def columns(first: int, end: int) -> Columns:
         inside = _within(joint, first, end)
         return lambda path: [path * inside, inside]
 
-    best = _split(joint, columns, True)
+    best = _split(joint, columns, ends)
     if best is None:
         return None
     first, end, begin = best
-    numbers = 3 if end == len(joint.time_s) else 4
 
     def finding(fit: Follower) -> Finding | None:
         part = fit.path_rad[first:end]
-        if np.abs(np.diff(part)).sum() <= numbers * np.ptp(part):
+        if ends is None and np.abs(np.diff(part)).sum() <= numbers * np.ptp(part):
             return None  # as many numbers as strokes explain any
         before, more = map(float, fit.values[:2])
         low, high = sorted((before, before + more))
@@ -852,5 +867,6 @@ def _segments(gains: NDArray[np.float64], cost: float) -> NDArray[np.bool_]:
 
 
 CHANGES: tuple[Callable[[Followed], _Change | None], ...] = (
-    _zero_moves, _zero_drifts, _lag_drifts, _lag_changes, _gain_drifts, _gain_changes, _clipped,
+    _zero_moves, _zero_drifts, _lag_drifts, _lag_changes, _gain_drifts, _gain_changes,
+    _gain_for_a_while, _clipped,
 )  # fmt: skip
