@@ -795,13 +795,15 @@ def _clipped(joint: Followed) -> _Change | None:
     return _Change(begins, finding, free=range(_LOW, _TOP + 1), values=2, usual=curve)
 
 
-def left_path(joint: Followed, whiles: Sequence[tuple[int, int]]) -> Finding:
+def left_path(joint: Followed, whiles: Sequence[tuple[int, int]]) -> Finding | None:
     """Whiles in which the joint is elsewhere; where it rests, it does not answer."""
     a, b = max(whiles, key=lambda w: joint.time_s[w[1] - 1] - joint.time_s[w[0]])
     longest = float(joint.time_s[b - 1] - joint.time_s[a])
     middle = joint.position_rad[a + (b - a) // 6 : b - (b - a) // 6]
     if np.ptp(middle) <= max(1.5 * joint.step, 0.02 * joint.scale):
-        values = {"trials": len(whiles), "of": len(joint.trials), "longest_s": longest}
+        if len(whiles) > 1:
+            return None  # what stops it again and again, such as an object, is in its way
+        values = {"trials": 1, "of": len(joint.trials), "longest_s": longest}
         return Finding("frozen", CARE, values)
     values = {"times": len(whiles), "longest_s": longest,
               "time_s": float(joint.time_s[whiles[0][0]]) - joint.start_s}  # fmt: skip
