@@ -29,10 +29,10 @@ import tyro
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, load_calibration
+from pupper_sysid.servo_models.kernel import COLUMNS
 from pupper_sysid.sysid.compare.compare import calibrated_run, compare
 from pupper_sysid.sysid.fit.calibrate import calibrate
 from pupper_sysid.sysid.fit.joint_fit import fit_joint
-from pupper_sysid.sysid.fit.kernel import COLUMNS
 from pupper_sysid.sysid.fit.predict import rule_of
 from pupper_sysid.sysid.fit.results import LoadedFit
 from pupper_sysid.sysid.fit.run import Run, at_steps, prepare, simulate

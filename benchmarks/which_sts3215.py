@@ -36,8 +36,8 @@ from real_recordings import FITTED_S, JOINTS, MOTIONS, first
 
 from pupper_sysid.servo_models.cards.card import ServoCard
 from pupper_sysid.servo_models.cards.files import load_card
+from pupper_sysid.servo_models.kernel import COLUMNS
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
-from pupper_sysid.sysid.fit.kernel import COLUMNS
 from pupper_sysid.sysid.fit.run import Run, at_steps, prepare, simulate
 from pupper_sysid.sysid.fit.search import Problem, evolve, local
 from pupper_sysid.sysid.fit.structure import Parameter, Structure, loaded_columns
@@ -86,7 +86,7 @@ TERMS = ("stiffness", "inertia", "damping", "friction", "largest torque", "dead 
 class Model:
     """A servo with its load at the P gain of the recordings.
 
-    `columns` are those of `sysid.fit.kernel.COLUMNS`, the stiffness in N·m/rad.
+    `columns` are those of `servo_models.kernel.COLUMNS`, the stiffness in N·m/rad.
     """
 
     columns: np.ndarray

@@ -33,6 +33,7 @@ from scipy.interpolate import make_smoothing_spline
 
 from pupper_sysid.common.results import JointResults, Result, derived
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.servo_models.kernel import SPARSE
 from pupper_sysid.servo_models.sparse_equation import (
     COEFFICIENTS,
     SparseEquation,
@@ -42,7 +43,6 @@ from pupper_sysid.servo_models.sparse_equation import (
 )
 from pupper_sysid.sysid.doctor import checks
 from pupper_sysid.sysid.doctor.checks import Joints, Recordings
-from pupper_sysid.sysid.fit.kernel import SPARSE
 from pupper_sysid.sysid.fit.preparation import prepare_joint
 from pupper_sysid.sysid.fit.run import Run, free_run
 from pupper_sysid.sysid.fit.scores import Scores, held_out_residuals, score

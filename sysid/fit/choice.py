@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.sysid.fit import kernel
+from pupper_sysid.servo_models import kernel
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, DESCRIBED_ONE, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, with_delays
 from pupper_sysid.sysid.fit.noise import noise_by_run

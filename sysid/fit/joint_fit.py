@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from pupper_sysid.common.interval import LEVEL, Interval
+from pupper_sysid.servo_models import kernel
 from pupper_sysid.servo_models.calibration.quantity import words_of
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
-from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.choice import (
     Choice,
     Fitted,

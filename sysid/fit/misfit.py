@@ -18,7 +18,7 @@ from scipy.special import ndtri
 
 from pupper_sysid.common import filters
 from pupper_sysid.common.interval import LEVEL
-from pupper_sysid.sysid.fit import kernel
+from pupper_sysid.servo_models import kernel
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.search import (
     Fit,

@@ -35,11 +35,11 @@ from pupper_sysid.common.results import Result
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
+from pupper_sysid.servo_models.kernel import COLUMNS
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S, at_step
 from pupper_sysid.sysid.doctor.checks import joint_rng
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
-from pupper_sysid.sysid.fit.kernel import COLUMNS
 from pupper_sysid.sysid.fit.run import (
     SHORTEST_STEP_S,
     Run,

@@ -3,8 +3,8 @@
 A run is one trial with its dated readings, its held command, gain, load and torque state. `prepare`
 makes it; every fit, score and comparison reads runs and nothing else. Angles are absolute, because
 gravity depends on them. A run starts at rest, where the joint rested. The functions below simulate
-any number of candidates, which are parameter vectors of one structure; `sysid.fit.kernel` does the
-arithmetic.
+any number of candidates, which are parameter vectors of one structure; `servo_models.kernel` does
+the arithmetic.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.servo_models import kernel
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, Readings, readings
-from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.structure import LONGEST_DEAD_TIME_S, Structure
 from pupper_sysid.sysid.recordings.recording import Trial
 

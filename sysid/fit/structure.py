@@ -3,7 +3,7 @@
 A servo is a position loop with an effort limit, a limit on its speed, dry friction, inertia and a
 dead time; `FEATURES` are what may be added. In free air the armature is 1 and there is no load:
 positions tell torques per inertia only. Under a known load torques are in N·m. A `Structure`
-translates between fitted coordinates and the columns of `sysid.fit.kernel`; `SERVO_TERMS` is the
+translates between fitted coordinates and the columns of `servo_models.kernel`; `SERVO_TERMS` is the
 one table of its numbers.
 
 The linear models (a pure delay, one and two poles) are what other people fit, and stand beside the
@@ -19,8 +19,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.servo_models import kernel
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
-from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.servo_prior import PER_INERTIA, ServoPrior
 
 LONGEST_DEAD_TIME_S = 0.4
@@ -261,7 +261,7 @@ class Structure:
     parameters : tuple of Parameter
         The dead time [s] is the first and the offset [rad] the last, in every structure.
     kind : int
-        Which arithmetic of `sysid.fit.kernel` it is.
+        Which arithmetic of `servo_models.kernel` it is.
     features : tuple of str
         Of `FEATURES`, of a servo.
     scales : Scales

@@ -35,9 +35,9 @@ from pupper_sysid.common.figure_style import (
 )
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.servo_models.kernel import COLUMNS
 from pupper_sysid.sysid.backlash import JointBacklash
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice
-from pupper_sysid.sysid.fit.kernel import COLUMNS
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.fit.run import Run, at_steps, free_run, simulate
 from pupper_sysid.sysid.fit.structure import candidate, loaded_columns

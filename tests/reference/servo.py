@@ -1,4 +1,4 @@
-"""The servo's equations in NumPy, one step a line: what `sysid.fit.kernel` compiles.
+"""The servo's equations in NumPy, one step a line: what `servo_models.kernel` compiles.
 
 Slow and readable. The compiled form is compared with it term by term; DelayedPD and MuJoCo are
 compared with the compiled form elsewhere, so an error here shows, too.
@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.servo_models.kernel import ABSENT, COLUMNS
 from pupper_sysid.servo_models.loaded_servo import START_ERROR_RAD
-from pupper_sysid.sysid.fit.kernel import ABSENT, COLUMNS
 
 
 def columns(**numbers: float) -> NDArray[np.float64]:

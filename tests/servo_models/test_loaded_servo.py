@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from pupper_sysid.servo_models import kernel
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
 from pupper_sysid.servo_models.loaded_servo import (
     Load,
@@ -15,7 +16,6 @@ from pupper_sysid.servo_models.loaded_servo import (
     LoadedServoParameters,
 )
 from pupper_sysid.sim.robot.servo_mjcf import free_air_xml, rest_at
-from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.structure import loaded_columns
 from support.refusals import assert_each_refused
 

@@ -34,7 +34,7 @@ Dispatcher.compile = _compile_alone
 
 def compile_kernel() -> None:
     """Compile the kernel of the fits, or load what was compiled before."""
-    from pupper_sysid.sysid.fit import kernel
+    from pupper_sysid.servo_models import kernel
     from pupper_sysid.sysid.fit.run import simulate
     from support.runs import run_of
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
+from pupper_sysid.servo_models.kernel import edges_of
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
-from pupper_sysid.sysid.fit.kernel import edges_of
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.structure import LONGEST_DEAD_TIME_S
 

@@ -10,11 +10,11 @@ import pandas as pd
 import pytest
 
 from pupper_sysid.servo_models.calibration.quantity import Quantity
+from pupper_sysid.servo_models.kernel import COLUMNS
 from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
 from pupper_sysid.sysid.fit.calibrate import CalibrationResult, calibrate
 from pupper_sysid.sysid.fit.choice import fit_structures, stages
-from pupper_sysid.sysid.fit.kernel import COLUMNS
 from pupper_sysid.sysid.fit.preparation import prepare_joint
 from pupper_sysid.sysid.fit.run import prepare, simulate
 from pupper_sysid.sysid.fit.search import Problem, folds_of

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from reference.servo import columns, delayed, servo
 
+from pupper_sysid.servo_models import kernel
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.sparse_equation import SparseEquation
-from pupper_sysid.sysid.fit import kernel
 from pupper_sysid.sysid.fit.run import at_steps
 from pupper_sysid.sysid.fit.structure import candidate
 
