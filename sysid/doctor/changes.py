@@ -25,30 +25,31 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import nnls
 
+from pupper_sysid.servo_models import kernel
 from pupper_sysid.sysid.doctor.explanations import FILTERS, Explanation, Servo, explain
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding
 from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.excitation import named_tones, remembered
 from pupper_sysid.sysid.recordings.recording import Trial
 
-_MOST_READINGS, _GRID_S = 1500, 0.0025
+_MOST_READINGS, _STEP_S = 1500, 0.005
 _UNFILTERED_HZ = 15.0  # natural frequency of a servo that no low-pass explains better
 _LONGEST_LAG_S = 0.5
 
-(_NATURAL, _DAMPING, _SPEED, _RAMP, _FRICTION, _EFFORT, _MOTOR, _INTEGRAL,
- _BIAS, _LAG, _GROWTH, _LOW, _HIGH, _BOTTOM, _TOP) = range(15)  # fmt: skip
+(_NATURAL, _DAMPING, _SPEED, _RAMP, _FRICTION, _EFFORT, _BACK_EMF, _INTEGRAL,
+ _LAG, _GROWTH, _LOW, _HIGH, _BOTTOM, _TOP) = range(14)  # fmt: skip
 _LOGARITHMS = slice(0, 8)
 _FAR = 1e6  # levels that nothing reaches [rad]
-_LOWEST = np.array(
-    [*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.1, 1e-3]), -2, 0, -0.03, *[-_FAR] * 4]
-)
-_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 300, 30]), 2, 0.8, 0.03, *[_FAR] * 4])
-_STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.1, 0.2, 0.02, 0.002, 2e-4, *[0.01] * 4])
-"""Bounds of a servo's terms, and differences for their derivatives; of levels and the bias in units
-of the command's range."""
+_DAMPED = np.array([0.2, 1.0, 5.0, 25.0, 125.0])  # times the damping before, tried abreast
+_NO_LOAD, _NO_INTEGRAL = np.zeros(3), 0.01  # [1/s]
+_LOWEST = np.array([*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.01, 1e-3]), 0, -0.03, *[-_FAR] * 4])
+_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 1, 30]), 0.8, 0.03, *[_FAR] * 4])
+_STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.002, 2e-4, *[0.01] * 4])
+"""Bounds of a servo's terms, and differences for their derivatives; of levels in units of the
+command's range."""
 _ALONE = tuple(range(_GROWTH))
 _DRAWN, _DRAWN_FROM = 200, (
-    (10, 90), (0.5, 1.3), (1.5, 6), (8, 80), (0.002, 0.04), (0.1, 1), (2, 12), (0.3, 5),
+    (10, 90), (0.5, 1.3), (1.5, 6), (8, 80), (0.002, 0.04), (0.1, 1), (0.1, 1), (0.3, 5),
     (0.003, 0.08),
 )  # fmt: skip
 """Servos tried, and ranges of their terms, the lag last; friction and effort of the range."""
@@ -92,9 +93,9 @@ class Follower:
 
     terms: NDArray[np.float64]
     """Logarithms of natural frequency [rad/s], damping ratio, speed [rad/s] and acceleration
-    [rad/s²] of the set-point, friction and effort limit [rad of command], speed of the motor
-    [rad/s] and integral gain [1/s]; a constant load [ranges of the command], lag [s] and its growth
-    per second; lowest and highest goal and place [rad of command]."""
+    [rad/s²] of the set-point, friction and effort limit [rad of command], share of the damping
+    that is back-EMF, and integral gain [1/s]; lag [s] and its growth per second; lowest and highest
+    goal and place [rad of command]."""
     path_rad: NDArray[np.float64]
     """The command as it is followed, at each reading."""
     cost: float
@@ -163,14 +164,10 @@ class Followed:
         """The linear servo, and the best of many drawn from what servos are."""
         hz, damping = FILTERS[self.servo.filter]
         natural, lag = 2 * np.pi * (hz or _UNFILTERED_HZ), max(self.servo.lag_s, 0.0)
-        linear = [natural, damping, 300.0, 2e4, 0.004 * self.reach, 20.0, 300.0, 0.01, lag]
+        linear = [natural, damping, 300.0, 2e4, 0.004 * self.reach, 20.0, 1.0, 0.01, lag]
         servos = []
-        for kind in ([linear], *_drawn(self.reach)):
-            tried = []
-            for *logarithms, late in kind:
-                terms = [*np.log(logarithms), 0.0, late, 0.0, -_FAR, _FAR, -_FAR, _FAR]
-                tried.append(self.follower(np.clip(terms, _LOWEST, _HIGHEST)))
-            servos += sorted(tried, key=_cost)[:_OF_A_KIND]
+        for kind in (np.array([linear]), *_drawn(self.reach)):
+            servos += sorted(self.followers(_servos(kind)), key=_cost)[:_OF_A_KIND]
         return servos
 
     @cached_property
@@ -192,20 +189,16 @@ class Followed:
 
     def _varied(self, fit: Follower) -> list[Follower]:
         """The same servo with another kind of limit: the way to it may lead uphill."""
-        fast = np.exp(fit.terms[_NATURAL]) * self.reach
         effort = min(0.3 * self.reach, 0.5 * float(np.exp(fit.terms[_EFFORT])))
-        servos = []
-        for change in (
-            {_INTEGRAL: 1.5}, {_INTEGRAL: 0.01, _BIAS: 0.0}, {_EFFORT: effort, _MOTOR: fast},
-            {_EFFORT: 20.0, _MOTOR: 2 * fast}, {_SPEED: 5.0, _RAMP: 25.0},
+        terms = np.tile(fit.terms, (8, 1))
+        for row, change in zip(terms, (
+            {_INTEGRAL: 1.5}, {_INTEGRAL: 0.01}, {_EFFORT: effort, _BACK_EMF: 1.0},
+            {_EFFORT: effort, _BACK_EMF: 0.1}, {_SPEED: 5.0, _RAMP: 25.0},
             {_SPEED: 300.0, _RAMP: 2e4}, {_FRICTION: 0.05 * self.reach},
             {_FRICTION: 0.004 * self.reach},
-        ):  # fmt: skip
-            terms = fit.terms.copy()
-            for k, value in change.items():
-                terms[k] = value if k == _BIAS else np.log(value)
-            servos.append(self.follower(np.clip(terms, _LOWEST, _HIGHEST)))
-        return sorted(servos, key=_cost)[:_TRIED]
+        ), strict=True):  # fmt: skip
+            row[list(change)] = np.log(list(change.values()))
+        return sorted(self.followers(terms), key=_cost)[:_TRIED]
 
     @cached_property
     def disturbed(self) -> float:
@@ -250,25 +243,44 @@ class Followed:
         return [self.changed.finding] if self.changed and self.changed.finding else []
 
     @cached_property
-    def _inputs(self) -> list[tuple[NDArray[np.float64], float, float, float]]:
-        """Command, its rest, and the grid and the start of its time, of each trial."""
+    def _inputs(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64], float, float]]:
+        """Mean command of each step and that at its end, the step and the start, of each trial.
+
+        A rest as long as the longest lag comes first.
+        """
         inputs = []
         for s in self.base.samples:
-            every = max(1, int(_GRID_S / s.grid_s))
-            command = np.ascontiguousarray(s.command_rad[::every])
-            inputs.append((command, s.rest_rad, s.grid_s * every, s.start_s))
+            every = max(1, int(_STEP_S / s.grid_s))
+            command = s.command_rad[: len(s.command_rad) // every * every].reshape(-1, every)
+            rest = np.full(_rest_steps(every * s.grid_s), s.rest_rad)
+            inputs.append((
+                np.concatenate([rest, command.mean(axis=1)]),
+                np.concatenate([rest, command[:, -1]]), every * s.grid_s, s.start_s,
+            ))  # fmt: skip
         return inputs
 
     def path(self, terms: NDArray) -> NDArray[np.float64]:
         """The command as a servo follows it, at each reading [rad of command]."""
-        terms = terms.copy()
-        terms[_LOGARITHMS] = np.exp(terms[_LOGARITHMS])
-        terms[_BIAS] *= self.reach
-        path = np.empty_like(self.time_s)
-        late = self.time_s - terms[_LAG] - terms[_GROWTH] * self.later
-        for inputs, a, b in zip(self._inputs, self.starts[:-1], self.starts[1:], strict=True):
-            _follow(*inputs, terms, late[a:b], path[a:b])
-        return path
+        return self.paths(terms[None])[0]
+
+    def paths(self, terms: NDArray) -> NDArray[np.float64]:
+        """The same of several servos, shape (servos, readings), by the kernel of the fits."""
+        paths, unlike = np.empty((len(terms), len(self.time_s))), np.ones(len(terms), bool)
+        while unlike.any():  # servos abreast have one command, and are read at one time
+            growth, low, high = terms[np.argmax(unlike), _GROWTH : _HIGH + 1]
+            abreast = (terms[:, _GROWTH : _HIGH + 1] == (growth, low, high)).all(axis=1)
+            unlike &= ~abreast
+            servos, late = _columns(terms[abreast]), self.time_s - growth * self.later
+            for (mean, end, step, start), a, b in zip(
+                self._inputs, self.starts[:-1], self.starts[1:], strict=True
+            ):
+                mean, end = np.clip(mean, low, high), np.clip(end, low, high)
+                paths[abreast, a:b] = kernel.residuals(
+                    kernel.SERVO, servos, terms[abreast, _LAG] / step, mean[None],
+                    kernel.edges_of(mean, end), 1.0, _NO_LOAD, mean[0], _rest_steps(step), step,
+                    step=np.maximum((late[a:b] - start) / step, 0.0), reading=np.zeros(b - a),
+                )  # fmt: skip
+        return np.clip(paths, terms[:, _BOTTOM, None], terms[:, _TOP, None])
 
     def path_of_trial(self, number: int) -> NDArray[np.float64]:
         """The same of the fit, at all readings of a trial."""
@@ -282,6 +294,12 @@ class Followed:
     def follower(self, terms: NDArray, columns: Columns | None = None) -> Follower:
         """Regress the position on the path, what is added to it, and a constant per trial."""
         return self.regressed(terms, self.path(terms), columns)
+
+    def followers(self, terms: NDArray, columns: Columns | None = None) -> list[Follower]:
+        """Several servos, inside their bounds."""
+        terms = np.clip(terms, _LOWEST, _HIGHEST)
+        paths = self.paths(terms)
+        return [self.regressed(t, p, columns) for t, p in zip(terms, paths, strict=True)]
 
     def regressed(self, terms: NDArray, path: NDArray, columns: Columns | None) -> Follower:
         """The same of a path that is known."""
@@ -306,7 +324,7 @@ def followed(trials: Sequence[Trial], step: float) -> Followed | None:
         return None
     causal = (base.lags_s >= -0.5 * base.grid_s) & (base.lags_s <= _LONGEST_LAG_S)
     servo = base.best(1.0, np.broadcast_to(causal, base.total_s.shape))
-    every = max(1, sum(len(s.time_s) for s in base.samples) // _MOST_READINGS)
+    every = -(-sum(len(s.time_s) for s in base.samples) // _MOST_READINGS)
     times = [s.time_s[::every] for s in base.samples]
     position = [s.position_rad[::every] for s in base.samples]
     away = np.concatenate([np.abs(p - np.median(p)) for p in position])
@@ -326,7 +344,7 @@ def _drawn(reach: float) -> list[NDArray[np.float64]]:
     terms[:, [_FRICTION, _EFFORT]] *= reach
     kind = np.minimum((5 * u[:, 9]).astype(int), 3)
     terms[kind != 3, _SPEED : _RAMP + 1] = 300.0, 2e4  # two in five ramp
-    terms[kind != 1, _EFFORT], terms[kind != 1, _MOTOR] = 20.0, 300.0
+    terms[kind != 1, _EFFORT] = 20.0
     terms[kind == 2, _FRICTION] *= 10
     terms[u[:, 0] * 7 % 1 < 0.7, _INTEGRAL] = 0.01
     return [terms[kind == k] for k in range(4)]
@@ -364,6 +382,33 @@ def likely_spread(
     return spread
 
 
+def _rest_steps(step_s: float) -> int:
+    return int(_HIGHEST[_LAG] / step_s) + 4
+
+
+def _servos(numbers: NDArray) -> NDArray[np.float64]:
+    """Terms of servos without levels from their limits and lags."""
+    others = np.tile([0.0, -_FAR, _FAR, -_FAR, _FAR], (len(numbers), 1))
+    return np.column_stack([np.log(numbers[:, :-1]), numbers[:, -1], others])
+
+
+def _columns(terms: NDArray) -> NDArray[np.float64]:
+    """Servos as the kernel has them: their inertia is 1."""
+    limits = np.exp(terms[:, _LOGARITHMS].T)
+    natural, damping, speed, ramp, friction, effort, share, integral = limits
+    square, brakes = natural**2, 2 * damping * natural
+    servos = np.tile(kernel.ABSENT, (len(terms), 1))
+    for name, value in {
+        "stiffness": square, "damping": brakes * (1 - share), "effort_limit": square * effort,
+        "back_emf": brakes * share, "friction_loss": square * friction,
+        "velocity_limit": np.where(terms[:, _SPEED] < _HIGHEST[_SPEED], speed, np.inf),
+        "acceleration_limit": np.where(terms[:, _RAMP] < _HIGHEST[_RAMP], ramp, np.inf),
+        "integral_per_s": np.where(integral > _NO_INTEGRAL, integral, 0.0),
+    }.items():  # fmt: skip
+        servos[:, kernel.COLUMNS.index(name)] = value
+    return servos
+
+
 def _cost(fit: Follower) -> float:
     return fit.cost if fit.values[0] > 0 else np.inf
 
@@ -382,12 +427,9 @@ def fitted(
     for _ in range(rounds):
         size = np.abs(best.residuals_rad)
         weight = (bound / (size + bound)) ** 2 / np.maximum(size, floor)
-        slopes = []
-        for k in free:
-            moved = best.terms.copy()
-            step = steps[k] if moved[k] + steps[k] <= _HIGHEST[k] else -steps[k]
-            moved[k] += step
-            slopes.append((joint.path(moved) - best.path_rad) * (best.values[0] / step))
+        step = np.where(best.terms + steps <= _HIGHEST, steps, -steps)[terms_free]
+        moved = best.terms + np.eye(len(steps))[terms_free] * step[:, None]
+        slopes = (joint.paths(moved) - best.path_rad) * (best.values[0] / step)[:, None]
         more = columns(best.path_rad) if columns else ()
         design = np.column_stack([*slopes, best.path_rad, *more])
         rest = best.residuals_rad.copy()
@@ -398,75 +440,19 @@ def fitted(
         gram = design.T @ (weight[:, None] * design)
         right = design.T @ (weight * rest)
         size, before = np.diag(gram) + 1e-9 * np.trace(gram) / len(gram), best.cost
-        for _ in range(4):
-            held = np.where(np.arange(len(gram)) < len(free), damping, 1e-9) * size
-            way = np.linalg.lstsq(gram + np.diag(held), right, rcond=None)[0][: len(free)]
-            way = np.clip(way, -8 * steps[terms_free], 8 * steps[terms_free])
-            terms = best.terms.copy()
-            terms[terms_free] += way
-            tried = joint.follower(np.clip(terms, _LOWEST, _HIGHEST), columns)
-            if tried.values[0] > 0 and tried.cost < best.cost:
-                best, damping = tried, max(damping / 4, 1e-4)
-                break
-            damping *= 5
+        held = np.full((len(_DAMPED), len(gram)), 1e-9)
+        held[:, : len(free)] = damping * _DAMPED[:, None]
+        ways = np.linalg.solve(gram + held[:, None] * np.diag(size), right[:, None])
+        ways = np.clip(ways[:, : len(free), 0], -8 * steps[terms_free], 8 * steps[terms_free])
+        terms = np.tile(best.terms, (len(ways), 1))
+        terms[:, terms_free] += ways
+        tried = joint.followers(terms, columns)
+        at = int(np.argmin([_cost(f) for f in tried]))
+        damping = float(np.clip(damping * _DAMPED[at], 1e-4, 1e4))
+        best = tried[at] if _cost(tried[at]) < best.cost else best
         if best.cost > 0.999 * before:
             break
     return best
-
-
-@njit(cache=True)
-def _follow(command, rest, grid, start, terms, time, out):
-    """Path of a servo from rest, at times."""
-    natural, damping, speed, ramp, friction, effort, motor, integral, bias = terms[:9]
-    low, high, bottom, top = terms[11:15]
-    parts = max(1, int(np.ceil(grid * natural / 0.3)))
-    step, square = grid / parts, natural * natural
-    goal = min(max(rest, low), high)
-    place = min(max(goal, bottom), top)
-    rate = velocity = 0.0
-    load = hand = (
-        bias * square
-    )  # the integral, or a hand before the first command, carries the load
-    if integral < 0.01:
-        hand = 0.0
-    hold, most_force, most = square * friction, square * effort, ramp * step
-    places = np.empty(len(command))
-    for k in range(len(command)):
-        wished = min(max(command[k], low), high)
-        for _ in range(parts):
-            away = wished - goal
-            if away != 0.0 or rate != 0.0:
-                wanted = min(speed, np.sqrt(2 * ramp * abs(away)))
-                wanted = wanted if away > 0 else -wanted
-                rate += min(max(wanted - rate, -most), most)
-                goal += rate * step
-                if (wished - goal) * away <= 0:
-                    goal = wished
-                    if abs(rate) <= 2 * most:
-                        rate = 0.0
-            force = square * (goal - place) + hand
-            if abs(force) < most_force:
-                hand += integral * square * (goal - place) * step
-            force = min(max(force, -most_force), most_force) - 2 * damping * natural * velocity
-            if force * velocity > 0:
-                moving = most_force * max(1 - abs(velocity) / motor, 0.0)
-                force = min(max(force, -moving), moving)
-            force -= load
-            if velocity == 0.0 and abs(force) <= hold:
-                continue
-            way = np.sign(velocity) if velocity != 0.0 else np.sign(force)
-            after = velocity + step * (force - way * hold)
-            velocity = 0.0 if velocity != 0.0 and after * velocity < 0 else after
-            place += step * velocity
-            if place < bottom:
-                place, velocity = bottom, 0.0
-            elif place > top:
-                place, velocity = top, 0.0
-        places[k] = place
-    for k in range(len(time)):
-        x = (time[k] - start) / grid
-        n = int(min(max(np.floor(x), 0), len(places) - 2))
-        out[k] = places[n] + min(max(x - n, 0.0), 1.0) * (places[n + 1] - places[n])
 
 
 @njit(cache=True)
@@ -704,7 +690,7 @@ def _lag_drifts(joint: Followed) -> _Change | None:
     for growth, shift, servo in product(_GROWTHS, _SHIFTS_S, servos):
         moved = servo.terms.copy()
         moved[[_LAG, _GROWTH]] += shift - growth * middle, growth
-        tried.append(joint.follower(moved))
+        tried.append(moved)
 
     def finding(fit: Follower) -> Finding | None:
         growth = float(fit.terms[_GROWTH])
@@ -714,7 +700,8 @@ def _lag_drifts(joint: Followed) -> _Change | None:
         verdict = REFUSE if lags.min() < -_EARLY_S else CARE  # early is what no servo is
         return Finding("lag_drifts", verdict, {"drift_ms": 1e3 * growth, "percent": 100 * growth})
 
-    return _Change(sorted(tried, key=_cost)[:2], finding, free=(_GROWTH,), usual=_shifted(joint))
+    begins = sorted(joint.followers(np.array(tried)), key=_cost)[:2]
+    return _Change(begins, finding, free=(_GROWTH,), usual=_shifted(joint))
 
 
 def _lag_changes(joint: Followed) -> _Change | None:
@@ -768,8 +755,8 @@ def _clipped(joint: Followed) -> _Change | None:
             for terms, share in product(sides, _LEVELS):
                 moved = servo.terms.copy()
                 moved[list(terms)] = [level(k, share) for k in terms]
-                tried.append(joint.follower(moved))
-        begins += sorted(tried, key=_cost)[:2]
+                tried.append(moved)
+        begins += sorted(joint.followers(np.array(tried)), key=_cost)[:2]
 
     def finding(fit: Follower) -> Finding | None:
         plain = fit.terms.copy()
