@@ -126,7 +126,10 @@ def relation_findings(
         # a fault explains what is left of a servo, or smooth motion of another cause is left
         found = changes or [Finding("not_a_position_servo", REFUSE, {"percent": 100 * share})]
         return found, base, None
-    if best.code != "columns_swapped" and (scaled := _scale(base, best.servo)):
+    scaled = None
+    if best.code != "columns_swapped" and not _usual_gain(joint, base, best):
+        scaled = _scale(base, best.servo)
+    if scaled:
         return [scaled], base, None
     at_once = None if best.code else _at_once(trials, base, best.servo)
     if at_once or best.code in ("position_early", "columns_swapped"):
@@ -137,7 +140,7 @@ def relation_findings(
         return [_refusal(best, second.code if near else "")], base, None
     if at_once:
         return [at_once], base, None
-    return [] if usual else _loose(trials, base, best.servo), base, best.servo
+    return [] if usual else _loose(trials, joint, base, best), base, best.servo
 
 
 def _clocks_drift(joint: Followed, base: Explanation) -> Finding | None:
@@ -204,6 +207,25 @@ def _refusal(relation: Relation, rival: str) -> Finding:
     return rivalled(Finding(relation.code, REFUSE, values), rival)
 
 
+def _usual_gain(joint: Followed, base: Explanation, best: Relation) -> bool:
+    """Whether a servo of a usual gain explains the readings about as well.
+
+    A slow servo of a large gain moves as a fast one that a limit holds back, and on a single tone
+    as any other.
+    """
+
+    def usual(gain: NDArray | float) -> NDArray[np.bool_]:
+        return (np.abs(gain) < _TOO_LARGE) & (np.abs(gain) > _SMALL)
+
+    inside = usual(np.tensordot(base.weight, base.gains, axes=1))
+    inside &= (base.lags_s >= -0.5 * base.grid_s) & (base.lags_s <= _LONGEST_LAG_S)
+    sign = float(np.sign(best.servo.gain))
+    left = base.best(sign, inside).unexplained if inside.any() else 1.0
+    if not best.code and usual(float(joint.fit.values[0])):
+        left = min(left, joint.unexplained)
+    return base.nats(left) < base.nats(best.servo.unexplained) + CLEAR_NATS
+
+
 def _scale(base: Explanation, servo: Servo) -> Finding | None:
     """A position of another unit or scale than the command, whatever its sign."""
     gain = abs(servo.gain)
@@ -254,19 +276,22 @@ def _at_once(trials: Sequence[Trial], base: Explanation, servo: Servo) -> Findin
     return Finding("at_once", REFUSE, {"lag_ms": 1e3 * lag})
 
 
-def _loose(trials: Sequence[Trial], base: Explanation, servo: Servo) -> list[Finding]:
-    found, share = [], 1 - servo.unexplained
+def _loose(
+    trials: Sequence[Trial], joint: Followed, base: Explanation, best: Relation
+) -> list[Finding]:
+    found, servo = [], best.servo
+    share = 1 - servo.unexplained
     if base.explained < _LOOSE:
         found.append(Finding("loosely_related", CARE, {"percent": 100 * base.explained}))
     elif base.explained - share > _NO_ONE_LAG:
         found.append(Finding("no_one_lag", CARE))
     # a known load is held at a part of the command, the lower the P gain the less
-    if any(t.load is not None for t in trials):
+    if any(t.load is not None for t in trials) or _usual_gain(joint, base, best):
         return found
     gains = np.abs(base.gains[:, servo.filter, _at(base, servo)])
-    middle, best = float(np.median(gains)), float(gains.max())
-    if middle > _TOO_LARGE or best < _SMALL:
-        shown = middle if middle > _TOO_LARGE else best
+    middle, most = float(np.median(gains)), float(gains.max())
+    if middle > _TOO_LARGE or most < _SMALL:
+        shown = middle if middle > _TOO_LARGE else most
         found.append(Finding("scale_asks_care", CARE, {"gain": shown}))
     return found
 
