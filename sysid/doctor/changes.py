@@ -43,13 +43,13 @@ _FAR = 1e6  # levels that nothing reaches [rad]
 _DAMPED = np.array([0.2, 1.0, 5.0, 25.0, 125.0])  # times the damping before, tried abreast
 _NO_LOAD, _NO_INTEGRAL = np.zeros(3), 0.01  # [1/s]
 _LOWEST = np.array([*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.01, 1e-3]), 0, -0.03, *[-_FAR] * 4])
-_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 1, 30]), 0.8, 0.03, *[_FAR] * 4])
+_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 30, 30]), 0.8, 0.03, *[_FAR] * 4])
 _STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.002, 2e-4, *[0.01] * 4])
 """Bounds of a servo's terms, and differences for their derivatives; of levels in units of the
 command's range."""
 _ALONE = tuple(range(_GROWTH))
 _DRAWN, _DRAWN_FROM = 200, (
-    (10, 90), (0.5, 1.3), (1.5, 6), (8, 80), (0.002, 0.04), (0.1, 1), (0.1, 1), (0.3, 5),
+    (10, 90), (0.5, 1.3), (1.5, 6), (8, 80), (0.002, 0.04), (0.1, 1), (0.3, 10), (0.3, 5),
     (0.003, 0.08),
 )  # fmt: skip
 """Servos tried, and ranges of their terms, the lag last; friction and effort of the range."""
@@ -93,9 +93,9 @@ class Follower:
 
     terms: NDArray[np.float64]
     """Logarithms of natural frequency [rad/s], damping ratio, speed [rad/s] and acceleration
-    [rad/s²] of the set-point, friction and effort limit [rad of command], share of the damping
-    that is back-EMF, and integral gain [1/s]; lag [s] and its growth per second; lowest and highest
-    goal and place [rad of command]."""
+    [rad/s²] of the set-point, friction and effort limit [rad of command], damping beyond the
+    effort limit over that within, integral gain [1/s]; lag [s] and its growth per second; lowest
+    and highest goal and place [rad of command]."""
     path_rad: NDArray[np.float64]
     """The command as it is followed, at each reading."""
     cost: float
@@ -193,7 +193,7 @@ class Followed:
         terms = np.tile(fit.terms, (8, 1))
         for row, change in zip(terms, (
             {_INTEGRAL: 1.5}, {_INTEGRAL: 0.01}, {_EFFORT: effort, _BACK_EMF: 1.0},
-            {_EFFORT: effort, _BACK_EMF: 0.1}, {_SPEED: 5.0, _RAMP: 25.0},
+            {_EFFORT: 3 * effort, _BACK_EMF: 5.0}, {_SPEED: 5.0, _RAMP: 25.0},
             {_SPEED: 300.0, _RAMP: 2e4}, {_FRICTION: 0.05 * self.reach},
             {_FRICTION: 0.004 * self.reach},
         ), strict=True):  # fmt: skip
@@ -393,7 +393,11 @@ def _servos(numbers: NDArray) -> NDArray[np.float64]:
 
 
 def _columns(terms: NDArray) -> NDArray[np.float64]:
-    """Servos as the kernel has them: their inertia is 1."""
+    """Servos as the kernel has them, of an inertia of 1.
+
+    Torque that a current loop holds until the voltage runs out has less damping within the limit
+    than the back-EMF beyond: that of the loop is negative there.
+    """
     limits = np.exp(terms[:, _LOGARITHMS].T)
     natural, damping, speed, ramp, friction, effort, share, integral = limits
     square, brakes = natural**2, 2 * damping * natural

@@ -503,7 +503,7 @@ def _standing_out(trial: Trial, position: NDArray[np.float64], held: bool) -> ND
     usual = out[out < _LARGE * span]
     least = _STEPS * float(np.min(moves[moves > 1e-9], initial=np.inf))
     limit = max(
-        _TIMES * float(np.quantile(usual, _USUAL)) if len(usual) else 0.0, min(least, 0.01),
+        _TIMES * float(np.quantile(usual, _USUAL)) if len(usual) else 0.0, least,
         (_OF_RANGE_HELD if np.mean(np.diff(value) == 0) > _HELD else _OF_RANGE) * span,
     )  # fmt: skip
     beside = np.maximum(np.abs(before - before2), np.abs(after2 - after))
