@@ -278,7 +278,8 @@ class Followed:
                 paths[abreast, a:b] = kernel.residuals(
                     kernel.SERVO, servos, terms[abreast, _LAG] / step, mean[None],
                     kernel.edges_of(mean, end), 1.0, _NO_LOAD, mean[0], _rest_steps(step), step,
-                    step=np.maximum((late[a:b] - start) / step, 0.0), reading=np.zeros(b - a),
+                    step=np.clip((late[a:b] - start) / step, 0.0, len(mean) - _rest_steps(step)),
+                    reading=np.zeros(b - a),
                 )  # fmt: skip
         return np.clip(paths, terms[:, _BOTTOM, None], terms[:, _TOP, None])
 

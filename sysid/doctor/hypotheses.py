@@ -340,7 +340,7 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     best = min(left, key=lambda name: left[name])
     turn = 2 * np.pi
     near = min(abs(jump - k * turn / 6) for k in (5, 6))  # servos of 300 and of 360 degrees
-    if near > 0.1 * turn and (not best or left[best] > _FITS):
+    if near > 0.1 * turn and (not best or left[best] > max(_FITS, 0.5 * left[""])):
         return []  # it is no turn that jumps, and put back no servo explains it
     if not best or left[best] > 0.7 * left[""]:
         best = "shifted"
