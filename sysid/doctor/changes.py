@@ -79,7 +79,6 @@ _NO_GAIN, _OTHER_GAIN, _OPPOSITE, _GAIN_DRIFT, _LAG_DRIFT_S, _EARLY_S = (
 )
 _MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
 _GROWTHS = tuple(sign * size for size in (0.0015, 0.003, 0.006, 0.012) for sign in (-1, 1))
-_SHIFTS_S = (-0.04, 0.0, 0.04)
 _LATER_S, _PER_GROWTH = (-0.06, -0.025, 0.025, 0.06), 0.1  # growth [1] of a lag by as many seconds
 _FEW_LEVELS = 4
 _SERVOS, _LEVELS = 4, np.linspace(0.15, 0.95, 9)  # of the command's range
@@ -689,12 +688,13 @@ def _gain_drifts(joint: Followed) -> _Change | None:
 def _lag_drifts(joint: Followed) -> _Change | None:
     """A lag that grows steadily: clocks that drift apart."""
     # a servo without a drift may have become another one for it
-    servos = [joint.fit, *sorted(joint.screen, key=_cost)[:3]]
+    servos = [joint.fit, *sorted(joint.screen, key=_cost)]
     middle = float(np.mean(joint.later))
     tried = []
-    for growth, shift, servo in product(_GROWTHS, _SHIFTS_S, servos):
+    for growth, late, servo in product(_GROWTHS, (-0.04, 0.0, 0.04, None), servos):
         moved = servo.terms.copy()
-        moved[[_LAG, _GROWTH]] += shift - growth * middle, growth
+        # about the middle, or from clocks that are together at the start
+        moved[[_LAG, _GROWTH]] += 0.0 if late is None else late - growth * middle, growth
         tried.append(moved)
 
     def finding(fit: Follower) -> Finding | None:
