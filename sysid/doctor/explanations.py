@@ -375,8 +375,6 @@ def echo(trials: Sequence[Trial], step: float) -> Finding | None:
     travels = [np.cumsum(np.abs(np.diff(t.command_rad, prepend=t.command_rad[0]))) for t in trials]
     if max(float(np.ptp(t.command_rad)) for t in trials) < _ECHO_TRAVEL * step:
         return None
-    if all(_follows_within(t, near) for t in trials):
-        return None  # a fast servo is as near to so slow a command
     for shift in range(min(round(_LONGEST_ECHO_S / max(loop, 1e-4)), _MOST_SHIFTS) + 1):
         parts = []
         for t, travel in zip(trials, travels, strict=True):
@@ -394,17 +392,6 @@ def echo(trials: Sequence[Trial], step: float) -> Finding | None:
             late = f"{shift} row{'s' if shift != 1 else ''} late" if shift else "in the same row"
             return Finding("echo", REFUSE, {"late": late})
     return _delayed(trials, near, loop)
-
-
-def _follows_within(trial: Trial, near: float) -> bool:
-    """Whether a fast servo, but for its lag, is as near to the command as an echo is."""
-    hz, damping = FILTERS[-1]
-    time = np.arange(trial.send_time_s[0], trial.send_time_s[-1], _FINEST_S)[: 4 * _MOST_POINTS]
-    command = np.interp(time, trial.send_time_s, trial.command_rad)
-    late = round(servo_delay(len(FILTERS) - 1) / _FINEST_S)
-    away = _low_pass(command, hz, damping, _FINEST_S)[late:] - command[: len(command) - late]
-    moves = np.abs(away) > 0
-    return bool(moves.any()) and float(np.mean(np.abs(away[moves]) <= near)) >= _ECHO_SHARE
 
 
 def _delayed(trials: Sequence[Trial], near: float, loop: float) -> Finding | None:
