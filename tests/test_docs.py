@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+import pupper_sysid
 from support import docs_conf, docs_outputs, golden
 from support.command_line import run_program
 from support.package import MODULES, ROOMS, ROOT, public_names
@@ -143,6 +144,11 @@ def test_outputs_of_other_processors_are_the_same_and_others_are_not():
     assert docs_outputs.differs(shown, "lag 99.1 ms, use\nRecorded 4 trials in 0.3 s.")
     assert docs_outputs.differs(shown, "lag 80.1 ms, do not use\nRecorded 4 trials in 0.3 s.")
     assert len(list(docs_outputs.BLOCK.finditer((DOCS / "tutorial.md").read_text()))) >= 6
+
+
+def test_the_page_of_public_names_has_them_all():
+    page = docs_conf._front_door()
+    assert all(f"pupper_sysid.{name}`" in page for name in pupper_sysid.__all__)
 
 
 @pytest.fixture(scope="module")
