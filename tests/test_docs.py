@@ -147,7 +147,7 @@ def test_outputs_of_other_processors_are_the_same_and_others_are_not():
 
 
 def test_the_page_of_public_names_has_them_all():
-    page = docs_conf._front_door()
+    page = docs_conf.front_door()
     assert all(f"pupper_sysid.{name}`" in page for name in pupper_sysid.__all__)
 
 

@@ -18,3 +18,4 @@ sys.path[:] = _path  # conf.py adds the folder of its extensions
 
 subcommands = cache(_conf.subcommands)
 help_text = cache(_conf.help_text)
+front_door = _conf._front_door
