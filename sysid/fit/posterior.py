@@ -382,7 +382,8 @@ def with_date_errors(
     jacobian, bent = slopes_at(problem, best.point, _CURVATURE_STEP)
     errors = np.array([off(latch_s, PHASE_SD_S if polled else 0.0) for _ in range(_DATE_DRAWS)])
     weighted = errors / (1.0 + plain**2) ** 0.25
-    apart = -np.linalg.solve(bent, jacobian @ weighted.T).T
+    # a number without a slope and without a prior is moved by nothing
+    apart = -(np.linalg.pinv(bent, hermitian=True) @ (jacobian @ weighted.T)).T
     return draws + apart[rng.integers(0, len(apart), len(draws))]
 
 
