@@ -158,6 +158,7 @@ def _run(options: Options, given: list[str]) -> None:
     if options.resume is not None and not options.resume.is_dir():
         refuse_other_kind(options.resume, "pupper-run")
         raise InputError(f"{options.resume} does not exist. Give the folder of a run.")
+    servos = []
     if options.resume is None:
         refuse_taken(folder)
         servos = [servo_ranges(run.actuator, run.feedback, run.task.body)]

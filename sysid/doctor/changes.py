@@ -563,7 +563,8 @@ def _split(
     windows = [
         (k, end) for n, k in enumerate(moments) for end in ([ends(k)] if ends else moments[n + 1:])
     ]  # fmt: skip
-    begin, around = joint.fit, (high - low) / (joint.time_s[-1] - joint.time_s[0]) * count
+    (first, end), begin = windows[0], joint.fit
+    around = (high - low) / (joint.time_s[-1] - joint.time_s[0]) * count
     around /= len(moments)
     for _ in range(2):
         tried = [
@@ -825,6 +826,7 @@ def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, 
     size = np.abs(fit.residuals_rad) + joint.step / 4 + 1e-9
     edges = np.unique(np.linspace(0, count, _CELLS + 1).astype(int))
     cells, times, inside = np.diff(edges), _TIMES_LARGER, np.zeros(count, bool)
+    scaled, gains, larger, share = size, np.zeros(len(cells)), np.zeros(len(cells), bool), 1.0
     for _ in range(_ROUNDS):
         usual = float(np.median(size[~inside]))
         scaled = np.minimum(size, 20 * usual)

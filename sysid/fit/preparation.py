@@ -272,21 +272,22 @@ def _in_free_air(joint: str, trials: Sequence[Trial]) -> Scales:
     speed = no_load_speed(model, supply) if model else None
     if model is None and joint in JOINT_NAMES:
         speed = NO_LOAD_SPEED_RAD_S
-    scales = Scales(**_stated_limits(trials))
+    scales = _with_stated_limits(Scales(), trials)
     return scales if speed is None else replace(scales, top_speed_rad_s=speed)
 
 
-def _stated_limits(trials: Sequence[Trial]) -> dict[str, float]:
-    """Limits on the set-point that headers state, for `Scales`; NaN if none."""
+def _with_stated_limits(scales: Scales, trials: Sequence[Trial]) -> Scales:
+    """Scales with the limits on the set-point that headers state; NaN if none."""
 
     def median(limits: Iterable[float | None]) -> float:
         stated = [limit for limit in limits if limit is not None and np.isfinite(limit)]
         return float(np.median(stated)) if stated else float("nan")
 
-    return {
-        "acceleration_rad_s2": median(t.servo.set_point_acceleration_rad_s2 for t in trials),
-        "set_point_speed_rad_s": median(t.servo.set_point_speed_rad_s for t in trials),
-    }
+    return replace(
+        scales,
+        acceleration_rad_s2=median(t.servo.set_point_acceleration_rad_s2 for t in trials),
+        set_point_speed_rad_s=median(t.servo.set_point_speed_rad_s for t in trials),
+    )
 
 
 def scales_of(trials: Sequence[Trial], runs: Sequence[Run]) -> Scales:
@@ -295,11 +296,11 @@ def scales_of(trials: Sequence[Trial], runs: Sequence[Run]) -> Scales:
     inertia = max(float(r.load[0]) for r in runs) if known else 1.0
     # without gravity the scale is a torque that would reach 10 rad/s within 0.1 s
     torque = max(max(float(r.load[1]) for r in runs), 100.0 * inertia) if known else 1.0
-    return Scales(
+    scales = Scales(
         torque=torque, inertia=inertia, p_gain=reference_gain(trials).value or 1.0, free_air=False,
         known_load=known, torque_off=any((r.torque_on < 0.5).any() for r in runs),
-        **_stated_limits(trials),
     )  # fmt: skip
+    return _with_stated_limits(scales, trials)
 
 
 def _lag(
