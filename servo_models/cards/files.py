@@ -341,9 +341,9 @@ def bam_card(calibration: Calibration) -> ServoCard:
     block = joint.under_load
     if block is None or not block.known_load:
         raise InputError(
-            f"{name} was fitted without a known load, which tells torques only relative to the "
-            "inertia that it moved, and BAM's kt and R are not among what it tells: record it with "
-            "`pupper-sysid sweep` and a `load`, or give a servo card."
+            f"{name} was fitted without a known load: its torques are known only relative to the "
+            "inertia that it moved, so that BAM's kt and R are not. Record it as it swings a known "
+            "pendulum (`pupper-sysid sweep`), or give a servo card."
         )
     if others:
         raise InputError(

@@ -24,7 +24,7 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sysid.fit.goodness import LEAST_NOISE_RAD
 from pupper_sysid.sysid.fit.run import with_late_commands
 from pupper_sysid.sysid.fit.scores import rms
-from pupper_sysid.sysid.fit.search import Fit, Problem, curvatures, local, slopes_at
+from pupper_sysid.sysid.fit.search import Fit, Problem, curvatures, jacobians, local
 from pupper_sysid.sysid.fit.structure import Structure
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -359,7 +359,7 @@ def with_date_errors(
     whether readings are dated by a poll's lattice.
     """
     runs, point = problem.runs, best.point[None]
-    plain = problem.scaled(point)[0]
+    (plain,), (jacobian,) = jacobians(problem, point, _CURVATURE_STEP)
     ends = np.cumsum([len(run.sample_step) for run in runs])[:-1]
 
     def off(latch_s: Sequence[float], phase_s: float) -> NDArray[np.float64]:
@@ -379,11 +379,11 @@ def with_date_errors(
         LATCH_SD_S * min(1.0, rms([own]) / max(rms([of_latch]), 1e-12))
         for own, of_latch in zip(np.split(plain, ends), np.split(moved, ends), strict=True)
     ]
-    jacobian, bent = slopes_at(problem, best.point, _CURVATURE_STEP)
     errors = np.array([off(latch_s, PHASE_SD_S if polled else 0.0) for _ in range(_DATE_DRAWS)])
-    weighted = errors / (1.0 + plain**2) ** 0.25
+    weighted = jacobian / np.sqrt(1.0 + plain**2)
+    bent = weighted @ jacobian.T + problem.structure.prior_precision
     # a number without a slope and without a prior is moved by nothing
-    apart = -(np.linalg.pinv(bent, hermitian=True) @ (jacobian @ weighted.T)).T
+    apart = -(np.linalg.pinv(bent, hermitian=True) @ (weighted @ errors.T)).T
     return draws + apart[rng.integers(0, len(apart), len(draws))]
 
 

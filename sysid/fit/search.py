@@ -415,38 +415,36 @@ def curvatures(problem: Problem, points: NDArray[np.float64], difference: float)
     return _slopes(problem, points, difference)[2]
 
 
-def slopes_at(
-    problem: Problem, point: NDArray[np.float64], difference: float
+def jacobians(
+    problem: Problem, points: NDArray[np.float64], difference: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Slopes of the weighted residuals at a point, (parameters, samples), and the curvature."""
-    structure = problem.structure
+    """Scaled residuals at points (starts, samples), and their slopes (starts, parameters, samples).
+
+    `points` of shape (starts, parameters).
+    """
+    structure, k = problem.structure, points.shape[1]
     step = difference * structure.scale
-    away = np.where(point + step > structure.box[1], -1.0, 1.0) * step
-    r = problem.scaled(np.concatenate([point[None], point + np.diag(away)]))
-    jacobian = (r[1:] - r[0]) / away[:, None] / (1.0 + r[0] ** 2) ** 0.25
-    return jacobian, jacobian @ jacobian.T + structure.prior_precision
+    away = np.where(points + step > structure.box[1], -1.0, 1.0) * step
+    cloud = np.repeat(points[:, None, :], k + 1, axis=1)
+    cloud[:, 1:] += away[:, None, :] * np.eye(k)
+    r = problem.scaled(cloud.reshape(-1, k)).reshape(len(cloud), k + 1, -1)
+    return r[:, 0], (r[:, 1:] - r[:, :1]) / away[:, :, None]
 
 
 def _slopes(problem: Problem, points: NDArray, difference: float) -> tuple[NDArray, ...]:
     """Cost, gradient and curvature at points (starts, parameters)."""
     structure, k = problem.structure, points.shape[1]
-    _, high = structure.box
-    step = difference * structure.scale
-    away = np.where(points + step > high, -1.0, 1.0) * step
     pull = structure.prior_slope(points)
     cost, gradient = problem.prior(points), np.empty(points.shape)
     bent = np.empty((len(points), k, k))
     together = max(1, _LARGEST_BATCH // max(problem.samples * (k + 1), 1))
     for first in range(0, len(points), together):
         at = slice(first, first + together)
-        cloud = np.repeat(points[at, None, :], k + 1, axis=1)
-        cloud[:, 1:] += away[at, None, :] * np.eye(k)
-        r = problem.scaled(cloud.reshape(-1, k)).reshape(len(cloud), k + 1, -1)
-        jacobian = (r[:, 1:] - r[:, :1]) / away[at][:, :, None]
-        root = np.sqrt(1.0 + r[:, 0] ** 2)
+        residuals, jacobian = jacobians(problem, points[at], difference)
+        root = np.sqrt(1.0 + residuals**2)
         weighted = jacobian / root[:, None]
         cost[at] += np.sum(root - 1.0, axis=-1)
-        gradient[at] = (weighted @ r[:, 0, :, None])[..., 0] + pull[at]
+        gradient[at] = (weighted @ residuals[:, :, None])[..., 0] + pull[at]
         bent[at] = weighted @ jacobian.mT + structure.prior_precision
     return cost, gradient, bent
 

@@ -373,7 +373,9 @@ def overlay_figure(result: JointCalibrationResult, runs: list[Track] | None = No
         _overlay(axes, track, result.joint, 1.0)
         axes.set_ylabel("from rest [rad]")
     grid[-1].set_xlabel("time in the trial [s]")
-    figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    figure.legend(
+        *grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, columnspacing=1.0
+    )
     return figure
 
 
