@@ -11,8 +11,9 @@ the tone f, are sampled down onto it, the strongest with an amplitude of f / (f_
 tone's, damped by the servo. At 30 Hz that is up to some milliseconds of lag.
 
 The ripple is computed from the recording's own staircase and read times for every servo of a grid
-of dead times, natural frequencies and damping ratios, each weighted by how well it predicts the
-tones as they were read, ripple included. What the tones leave open becomes the draws' spread.
+of dead times, natural frequencies and damping ratios, finer where servos are likely, each weighted
+by how well it predicts the tones as they were read, ripple included. What the tones leave open
+becomes the draws' spread.
 
 Lags follow from phases (`slope`): whole periods settled, tones weighted, one lag for a joint.
 
@@ -192,8 +193,9 @@ _FINEST_S = 0.001
 _GROWTH = 1.1
 _BEYOND_S = 0.1
 _TIME_CONSTANTS_S = np.geomspace(0.001, 0.3, 16)
-_DAMPING = (0.3, 0.5, 0.7, 1.0, 1.5, 2.5)
+_DAMPING = np.geomspace(0.3, 2.5, 6)
 _DEAD_STEP_S, _DEAD_REACH_S = 0.002, 0.04
+_SPLIT, _SPLITS = 128, 5
 _NOT_LINEAR = 0.01  # of a tone's response: no servo is nearer to a linear one
 _DRAWS = 400
 
@@ -211,8 +213,8 @@ def without_ripple(
     lags = tone_lags(np.array([t.response for t in tones]), frequency, near_s)
     latest = max(float(lags.max()), 0.0) + _BEYOND_S
     edges = past_bins(max(loop / _PER_LOOP, _FINEST_S), latest, _GROWTH)
-    masses = _servos(edges, frequency, lags)
-    if not len(masses):
+    servos = _servos(frequency, lags)
+    if not len(servos):
         return list(tones)  # a position that precedes its command: the lags as they are
     by_number = {t.number: (t, r) for t, r in zip(trials, read, strict=True)}
     turn = -2j * np.pi * np.outer(frequency, edges)
@@ -235,58 +237,101 @@ def without_ripple(
 
     ripple = np.stack([row(t) for t in tones])
     held = np.array([t.command_held for t in tones])
-    predicted = masses @ (ripple + held[:, None] * own_means).T
-    chance, gain = _chances(predicted, tones)
-    seen = gain[:, None] * (masses @ ripple.T)
+    chance, seen = _likely_ripple(servos, edges, ripple, held[:, None] * own_means, tones)
     drawn = seen[rng.choice(len(chance), _DRAWS, p=chance)]
+    # of two kinds of servo the likelier one, not what lies between them
+    middle = np.median(np.stack([drawn.real, drawn.imag], axis=-1), axis=0)
     picked = [rng.integers(_DRAWS, size=len(t.fresh_draws)) for t in tones]
     return [
-        replace(t, ripple=complex(chance @ seen[:, k]), ripple_draws=drawn[picked[0], k])
+        replace(t, ripple=complex(*middle[k]), ripple_draws=drawn[picked[0], k])
         for k, t in enumerate(tones)
     ]
 
 
-def _servos(edges: NDArray, frequency: NDArray, lags: NDArray) -> NDArray[np.float64]:
-    """Masses per bin of second-order servos whose lag may be the one seen, shape (servos, bins)."""
-    masses = []
-    for constant in _TIME_CONSTANTS_S:
-        for damping in _DAMPING:
-            s = 2j * np.pi * frequency * constant
-            dynamics = -np.angle(1 / (s * s + 2 * damping * s + 1)) / (2 * np.pi * frequency)
-            centre = float(np.mean(lags - dynamics))
-            reach = np.arange(-_DEAD_REACH_S, _DEAD_REACH_S, _DEAD_STEP_S)
-            dead_time = centre + reach
-            dead_time = dead_time[dead_time >= 0]
-            past = np.maximum(edges - dead_time[:, None], 0.0) / constant
-            masses.append(np.diff(_second_order(past, damping), axis=1))
-    return np.concatenate(masses)
+def _servos(frequency: NDArray, lags: NDArray) -> NDArray[np.float64]:
+    """Second-order servos whose lags may be the ones seen.
+
+    Returns shape (servos, 3): logarithms of time constant [s] and damping ratio, dead time [s].
+    """
+    constant, damping = (x.ravel() for x in np.meshgrid(_TIME_CONSTANTS_S, _DAMPING))
+    s = 2j * np.pi * constant[:, None] * frequency
+    dynamics = -np.angle(1 / (s * s + 2 * damping[:, None] * s + 1)) / (2 * np.pi * frequency)
+    reach = np.arange(-_DEAD_REACH_S, _DEAD_REACH_S, _DEAD_STEP_S)
+    dead_time = np.mean(lags - dynamics, axis=1)[:, None] + reach
+    grid = np.broadcast_arrays(np.log(constant)[:, None], np.log(damping)[:, None], dead_time)
+    servos = np.stack(grid, axis=-1).reshape(-1, 3)
+    return servos[servos[:, 2] >= 0]
 
 
-def _second_order(past: NDArray, damping: float) -> NDArray[np.float64]:
+def _likely_ripple(
+    servos: NDArray, edges: NDArray, ripple: NDArray, tone: NDArray, tones: Sequence[ToneResponse]
+) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+    """Probabilities of servos and the ripple that each makes in the tones, shape (servos, tones).
+
+    The servos of the grid are the middles of cells. The likeliest cells are divided again and
+    again, because the tones say more about a servo than the grid resolves: of its servos alone, a
+    resonance at the ripple's rate may fit best, where a servo between two of them fits better.
+    `ripple` and `tone` of shape (tones, bins): phasors per unit of mass in each bin.
+    """
+    half = 0.5 * np.array(
+        [*(np.log(x[1] / x[0]) for x in (_TIME_CONSTANTS_S, _DAMPING)), _DEAD_STEP_S]
+    )
+    corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), axis=-1).reshape(-1, 3)
+    cells, size = servos, np.zeros(len(servos), int)  # how often each was divided
+
+    def evaluated(cells: NDArray) -> tuple[NDArray, NDArray]:
+        masses = _masses(cells, edges)
+        misfit, gain = _misfits(masses @ (ripple + tone).T, tones)
+        return misfit, gain[:, None] * (masses @ ripple.T)
+
+    misfit, seen = evaluated(cells)
+    for turn in range(_SPLITS + 1):
+        scale = max(1.0, float(misfit.min()) / max(2 * len(tones) - 4, 1))
+        chance = 8.0**-size * np.exp(-0.5 * (misfit - misfit.min()) / scale)
+        if turn == _SPLITS:
+            break
+        likely = np.argsort(-chance)[:_SPLIT]
+        halved = size[likely, None, None] + 1
+        parts = cells[likely, None] + corners * half * 2.0 ** (1 - halved)
+        parts, depth = parts.reshape(-1, 3), np.repeat(size[likely] + 1, len(corners))
+        inside = parts[:, 2] >= 0
+        of_parts = evaluated(parts[inside])
+        cells, size, misfit, seen = (
+            np.concatenate([np.delete(old, likely, axis=0), new])
+            for old, new in zip(
+                (cells, size, misfit, seen), (parts[inside], depth[inside], *of_parts), strict=True
+            )
+        )
+    return chance / chance.sum(), seen
+
+
+def _masses(servos: NDArray, edges: NDArray) -> NDArray[np.float64]:
+    """Masses per bin of second-order servos as in `_servos`, shape (servos, bins)."""
+    constant, damping = np.exp(servos[:, :1]), np.exp(servos[:, 1:2])
+    past = np.maximum(edges - servos[:, 2:], 0.0) / constant
+    return np.diff(_second_order(past, damping), axis=1)
+
+
+def _second_order(past: NDArray, damping: NDArray) -> NDArray[np.float64]:
     """Step response at times in units of 1 / (natural frequency)."""
-    if damping == 1.0:
-        return 1 - np.exp(-past) * (1 + past)
+    damping = np.where(np.abs(damping - 1) < 1e-4, 1.0001, damping)  # two roots, nearly one
     root = np.emath.sqrt(damping**2 - 1)
     slow, fast = -damping + root, -damping - root
     step = 1 + (fast * np.exp(slow * past) - slow * np.exp(fast * past)) / (slow - fast)
     return np.real(step)
 
 
-def _chances(
+def _misfits(
     predicted: NDArray, tones: Sequence[ToneResponse]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Probability of each servo and its static gain, from the tones as they were read."""
+    """Misfit of each servo to the tones as they were read, and the static gain it has with it."""
     seen = np.array([t.fresh for t in tones])
     spread = np.array([np.std(t.fresh_draws) for t in tones])
     weight = 1.0 / (spread**2 + (_NOT_LINEAR * np.abs(seen)) ** 2)
     cross = np.sum(weight * np.real(np.conj(predicted) * seen), axis=1)
     square = np.sum(weight * np.abs(predicted) ** 2, axis=1)
     gain = np.maximum(cross / np.maximum(square, 1e-300), 0.0)
-    misfit = np.sum(weight * np.abs(seen - gain[:, None] * predicted) ** 2, axis=1)
-    freedom = max(2 * len(tones) - 4, 1)
-    scale = max(1.0, float(misfit.min()) / freedom)
-    chance = np.exp(-0.5 * (misfit - misfit.min()) / scale)
-    return chance / chance.sum(), gain
+    return np.sum(weight * np.abs(seen - gain[:, None] * predicted) ** 2, axis=1), gain
 
 
 _ONE_TONE_HZ = 0.05  # closer than that is one tone, twice

@@ -18,7 +18,8 @@ from pupper_sysid.sysid.lag.tone import (
     tone_weights,
     without_ripple,
 )
-from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.recordings.recording import Recording, Trial
+from support import wide_servo
 from support.refusals import assert_each_refused
 from support.synthetic import LOOP_S, first_order_trial, held_trial, tone_trials
 
@@ -190,6 +191,23 @@ def test_ripple_is_taken_out_of_live_tones_and_what_is_left_is_in_the_interval()
     assert clean.low < lag < clean.high
     for f in b.by_frequency:
         assert f.lag_s.low < tone_lag(f.frequency_hz) < f.lag_s.high
+
+
+def test_a_servo_without_a_resonance_is_not_given_one_at_the_loops_rate():
+    # one servo of the grid resonates with the ripple of this loop and fits best of the grid
+    twin, path, sent, commands = wide_servo.draw_twin("dead_zone", "tones", 1, 301)
+    rows = wide_servo.readings(twin, path)
+    recording = Recording.from_arrays(
+        rows.sent_s, {"knee": rows.command}, {"knee": rows.position}, read_time_s=rows.read_s,
+        trial=rows.trial, frequency_hz=rows.frequency_hz, metadata={"readings": "live"},
+    )  # fmt: skip
+    b = lag_budget("knee", recording.trials("knee"), np.random.default_rng(0))
+    truths = {t["trial"]: t for t in wide_servo.tone_truths(twin, path, sent, commands)}
+    for f in b.by_frequency:
+        truth = truths[f.trial]
+        assert f.lag_s.low < truth["truth"] < f.lag_s.high
+        assert abs(f.lag_s.value - truth["truth"]) < 3e-3
+        assert f.gain == pytest.approx(truth["gain"], rel=0.1)
 
 
 def test_ripple_of_a_fast_loop_is_next_to_nothing():
