@@ -469,6 +469,9 @@ def intervals(fitted: Fitted, dead_time_s: float | None = None) -> dict[str, Int
         name: interval_of(name, float(v), own)
         for name, v, own in zip(structure.names, values, draws.T, strict=True)
     }
+    dead, box = found["dead_time_s"], structure.parameters[0]
+    if box.near(dead.low, box.low):  # where the search ends nothing speaks against none
+        found["dead_time_s"] = replace(dead, low=0.0)
     if {"no_load_speed_rad_s", "effort_rad_s2"} <= found.keys():
         at = [structure.names.index(n) for n in ("effort_rad_s2", "no_load_speed_rad_s")]
         value = float(values[at[0]] / values[at[1]])
@@ -493,7 +496,7 @@ def settled(
     goodness, plain = goodness_of(ready, choice.carried), _explained(ready, choice)
     profiled, gained = with_profile(ready, choice.carried)
     stated = bool(np.isfinite(ready.scales.acceleration_rad_s2))
-    enough = -TELLING_NATS if stated else _PROFILE_NATS  # a register is believed unless refuted
+    enough = -_PROFILE_NATS if stated else _PROFILE_NATS  # a register is believed unless refuted
     if gained > enough and not stated:  # it was searched for, so what else there may be is, too
         plain = _explained(ready, choice, anew=True)
     # in cost, because likelihoods are counted at temperatures of their own
@@ -610,7 +613,7 @@ def with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]:
     tried = {carried.structure.features: carried}
     fitted = _fitted(ready, structure, tried, ready.fit_rng(), short=True)
     gained = _gained(ready, carried, fitted)
-    if gained < -TELLING_NATS:
+    if gained < -TELLING_NATS and unnamed:  # of a servo that may have none
         return fitted, gained
     quieter = ready.with_noise_of(structure, fitted.fit)
     if max(map(operator.truediv, quieter.noise_rad, ready.noise_rad)) < _QUIETER:

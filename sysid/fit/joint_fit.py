@@ -66,6 +66,7 @@ from pupper_sysid.sysid.fit.search import (
 )
 from pupper_sysid.sysid.fit.servo_prior import ServoPrior
 from pupper_sysid.sysid.fit.structure import (
+    AT_BOUND,
     CANDIDATES,
     LIMITS,
     PREFERRED,
@@ -90,8 +91,6 @@ _FOREIGN = 3.0
 _SHARP_DEAD_TIME_S = 0.015
 _POLL_SD_S = 1e-3
 """Standard deviation of a poll's instant about its lattice: jitter of the bus and drift."""
-_AT_BOUND = 0.03
-"""Distance from a bound, in fitted coordinates, that counts as on it."""
 _CUT_SHARE = 0.1
 """The same as a share of a 90 % interval: a bound within two standard deviations cuts the draws."""
 _COMMAND_WINDOW_S = 0.05
@@ -516,19 +515,20 @@ def _why_unidentified(
     limit = p.name in ("velocity_limit_rad_s", "no_load_speed_rad_s")
     if limit and speed < 0.8 * value:
         return f"commands reach {speed:.1f} rad/s only, so the limit was never reached"
+    delay = p.name == "dead_time_s"
+    if delay and interval.high - interval.low < _SHARP_DEAD_TIME_S:
+        return None  # a short one may well be close to none
     for bound, end in ((p.low, min(value, interval.low)), (p.high, max(value, interval.high))):
-        end = max(end, p.low)
-        near = _AT_BOUND
-        if p.logarithmic and p.name != "dead_time_s" and interval.low > 0:
+        near = AT_BOUND
+        if p.logarithmic and not delay and interval.low > 0:
             near = max(near, _CUT_SHARE * float(np.log(interval.high / interval.low)))
-        on = float(abs(p.encode(end) - p.encode(bound))) < near
-        if on and (p.logarithmic or abs(value - bound) < _AT_BOUND):
+        if p.near(end, bound, near) and (p.logarithmic or abs(value - bound) < AT_BOUND):
+            if delay and bound == p.low:
+                return f"the recording says only that it is at most {1e3 * interval.high:.0f} ms"
             return f"on its bound, {bound:g}: the recording does not limit it on that side"
     if sd > 0.7 * p.marginal_sd:
         whose = f"that of {p.prior_source}" if p.prior_source else "the prior's"
         return f"these recordings do not excite it; the value is {whose}"
-    if p.name == "dead_time_s" and interval.high - interval.low < _SHARP_DEAD_TIME_S:
-        return None  # a short one may well be close to none
     if interval.low <= 0 and p.logarithmic:
         return "it cannot be distinguished from none"
     if p.logarithmic and interval.high > _WIDE * interval.low:

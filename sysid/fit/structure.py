@@ -26,6 +26,10 @@ from pupper_sysid.sysid.fit.servo_prior import PER_INERTIA, ServoPrior
 LONGEST_DEAD_TIME_S = 0.4
 
 
+AT_BOUND = 0.03
+"""Distance from a bound, in fitted coordinates, that counts as on it."""
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One number of a structure, fitted as its logarithm unless it may be negative.
@@ -71,6 +75,11 @@ class Parameter:
     def decode(self, coordinate):
         """Value of a fitted coordinate."""
         return np.exp(coordinate) if self.logarithmic else np.asarray(coordinate, float)
+
+    def near(self, value: float, bound: float, within: float = AT_BOUND) -> bool:
+        """Whether a value is on a bound, or beyond the lower end of the box."""
+        distance = self.encode(max(value, self.low)) - self.encode(bound)
+        return abs(float(distance)) < within
 
 
 @dataclass(frozen=True)
