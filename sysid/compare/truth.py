@@ -175,16 +175,16 @@ def truth_table(
     return TruthTable(quantities=tuple(rows), definitions=tuple(definitions))
 
 
-def read_truth(recording: Path) -> dict[str, Any]:
-    """True parameters of an emulated recording (`.csv`), from the `.truth.yaml` beside it."""
-    path = recording
-    if not recording.name.endswith(ENDING):
+def read_truth(recording: Path, truth: Path | None = None) -> dict[str, Any]:
+    """True parameters of an emulated recording (`.csv`): `truth`, or the `.truth.yaml` beside it."""
+    path = truth or recording
+    if not path.name.endswith(ENDING) and truth is None:
         path = recording.with_name(recording.name.removesuffix(".csv") + ENDING)
     if not path.exists():
         raise InputError(
             f"{path} does not exist, so the true parameters of {recording.name} are not known. "
             "Only recordings of an emulated robot have them: `pupper-sysid sweep --truth` writes "
-            "them."
+            "them, and `pupper-sysid emulate ... --truth FILE` those of a robot behind a protocol."
         )
     data, lines = read_yaml(path)
     return validated(_Truth, data, path, lines).model_dump(exclude_none=True)

@@ -392,8 +392,8 @@ def _candidate_fit(
     vague = "no_load_speed_rad_s" in undecided or _ratio_of(parameters, "effort_rad_s2") > _REACHED
     if vague:
         undecided |= _inseparable(parameters)
-    if why := _undated(ready.lag.feedback):
-        undecided["dead_time_s"] = why
+    if "dead_time_s" in undecided and (why := _undated(ready.lag.feedback)):
+        undecided["dead_time_s"] = why  # it is what makes the interval wide
     doubt_s = max(t.read_time_doubt_s for t in ready.recorded)
     if fitted_s.value < doubt_s and _wants_less_than_none(ready, fitted, doubt_s):
         why = (
@@ -537,7 +537,7 @@ def _why_unidentified(
 
 
 def _undated(lattice: PollLattice) -> str | None:
-    """Why the dates of readings do not let the dead time be known."""
+    """What in the dates of readings widens the interval of the dead time; None if nothing does."""
     if lattice.time_doubt_s <= 0:
         return None
     if lattice.readings == "polled":
@@ -726,8 +726,8 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: Choice) -
         # back-EMF stands for both: what tells them apart is a motor at its limit
         both = _only_the_sum(numbers["braking"], "N·m·s/rad" if scales.known_load else "1/s")
         undecided |= {"back_emf": both, "no_load_speed_rad_s": both}
-    if why := _undated(ready.lag.feedback):
-        undecided["dead_time_s"] = why
+    if "dead_time_s" in undecided and (why := _undated(ready.lag.feedback)):
+        undecided["dead_time_s"] = why  # it is what makes the interval wide
     labels = [r.label for r in runs]
     per_run = [float(np.mean(np.abs(r))) for r in fresh_residuals(structure, carried.values, runs)]
     return LoadedFit(

@@ -65,16 +65,19 @@ class Compare(OfRecordings):
 class CompareTruth:
     """Each calibrated number beside the true one of an emulated robot.
 
-    `sweep --truth` writes the truth beside the recording. Where the interval holds it, the last
-    column says yes; of many robots that should be nine in ten.
+    `sweep --truth` writes the truth beside the recording, `emulate ... --truth FILE` that of a robot
+    behind a real protocol. Where the interval holds it, the last column says yes; of many robots
+    that should be nine in ten.
 
     Example: pupper-sysid compare-truth sweep.csv calibrated.yaml
     """
 
     recording: tyro.conf.Positional[Path]
-    """Recording of an emulated robot, with its .truth.yaml beside it."""
+    """Recording of an emulated robot."""
     calibration: tyro.conf.Positional[Path | None] = None
     """Calibration file; by default the recording is calibrated now."""
+    truth: Path | None = None
+    """File of the true parameters; by default the .truth.yaml beside the recording."""
     joints: str = "all"
     """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
     json: bool = False
@@ -89,7 +92,7 @@ class CompareTruth:
         from pupper_sysid.sysid.compare.truth import compared_with_truth, read_truth
         from pupper_sysid.sysid.fit.calibrate import calibrate
 
-        truth = read_truth(self.recording)  # before the work, not after it
+        truth = read_truth(self.recording, self.truth)  # before the work, not after it
         (recording,) = terminal.load_all([self.recording])
         joints = terminal.pick_joints([recording], self.joints)
         if self.calibration:

@@ -159,6 +159,9 @@ def test_the_truth_is_read_beside_its_recording_and_refused_in_a_sentence(swept,
         (tmp_path / f"{name}.truth.yaml").write_text(yaml.safe_dump({"joints": {JOINT: truth}}))
     read = read_truth(tmp_path / "bench.truth.yaml")["joints"][JOINT]
     assert read["registers"]["p"] == 32 and read["loaded_servo"]["armature_kg_m2"] == 0.011
+    elsewhere = tmp_path / "of_the_emulator.yaml"
+    (tmp_path / "bench.truth.yaml").rename(elsewhere)
+    assert read_truth(recording.path, elsewhere) == {"joints": {JOINT: read}}
     cases = [
         ("a.csv", "a.truth.yaml does not exist"), ("a.csv", "sweep --truth"),
         ("b.csv", "b.truth.yaml"), ("b.csv", "actuator"),
