@@ -191,7 +191,7 @@ def _in_free_air(
         results[carried.name] = replace(
             results[carried.name], parameters={**parameters, "offset_rad": offset}
         )
-        if _hardly_known(lag):
+        if _hardly_known(lag, choice):
             fit = results[carried.name]
             undecided = {"dead_time_s": why} | fit.undecided
             results[carried.name] = replace(fit, undecided=undecided)
@@ -322,11 +322,15 @@ def _unconverged(carried: Fitted) -> str | None:
     return "its draws have not converged"
 
 
-def _hardly_known(lag: LagBudget) -> bool:
-    """Whether a dead time that was widened is not identified any more: see `_why_unidentified`."""
-    assert lag.dead_time_s is not None
+def _hardly_known(lag: LagBudget, choice: Choice) -> bool:
+    """Whether a dead time that was widened is not identified any more: see `_why_unidentified`.
+
+    A model that is in doubt and would have no dead time, or less, makes up for something else.
+    """
+    assert lag.dead_time_s is not None and choice.lag.dead_time_s is not None
     low, high = lag.dead_time_s.low, lag.dead_time_s.high
-    return high - low >= _SHARP_DEAD_TIME_S and high > _WIDE * max(low, 0.0)
+    wide = high - low >= _SHARP_DEAD_TIME_S and high > _WIDE * max(low, 0.0)
+    return wide or choice.lag.dead_time_s.low <= 0
 
 
 def _foreign(joint: str, carried: Fitted) -> Iterator[str]:
@@ -615,7 +619,7 @@ def _under_load(
         doubted = {n: why for n in loaded.numbers if n not in kept}
         lag = _lag(ready, choice, goodness)
         assert lag.dead_time_s is not None
-        doubted |= {"dead_time_s": why} if _hardly_known(lag) else {}
+        doubted |= {"dead_time_s": why} if _hardly_known(lag, choice) else {}
         hidden = _hidden_rad(ready, choice, goodness)
         offset = _as_wide_as_misfit(loaded.numbers["offset_rad"], goodness, hidden)
         loaded = replace(
