@@ -37,6 +37,7 @@ from pupper_sysid.sysid.fit.run import free_run
 from pupper_sysid.sysid.fit.scores import Scores, score
 from pupper_sysid.sysid.fit.structure import SIMULATED
 from pupper_sysid.sysid.fit.structure import candidate as structure
+from pupper_sysid.sysid.lag.frequency_response import joint_response
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Trial
 from pupper_sysid.sysid.report.sections import Findings, sections
@@ -96,7 +97,6 @@ def write_report(
         cannot be written, or if the calibration was made from other recordings.
     """
     from pupper_sysid.sysid.doctor.examination import examine
-    from pupper_sysid.sysid.lag.frequency_response import joint_response
 
     refuse_overwrite(Path(folder) / PAGE, force)  # before the work, not after it
     recordings, names = checks.as_sequence(recordings), checks.chosen_joints(recordings, joints)
