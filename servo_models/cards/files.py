@@ -433,7 +433,6 @@ def _first(*values: float | None) -> float | None:
 
 
 def _name(stem: str) -> str:
-    """A file's name as the name of a card."""
     plain = "".join(c if c.isascii() and c.isalnum() else "-" for c in stem.lower()).strip("-")
     return plain[:64] or "bam"
 

@@ -204,7 +204,6 @@ def pooled(parts: Sequence[dict[str, Errors]]) -> dict[str, Errors]:
 
 
 def _joined(parts: Sequence[Errors]) -> Errors:
-    """Errors one after the other."""
     arrays = {
         name: np.concatenate([getattr(p, name) for p in parts])
         for name in ("free_run", "one_step", "speed", "held", "raw")

@@ -160,6 +160,5 @@ class Backlash(OfRecordings):
 
 
 def _degrees(value: Interval) -> str:
-    """Value and interval in degrees."""
     best, low, high = np.degrees(astuple(value))
     return f"{best:.2f} ({low:.2f} to {high:.2f})"

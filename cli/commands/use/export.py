@@ -246,7 +246,6 @@ class Export:
             terminal.err.print(sentence)
 
     def _simulator(self, path: Path, calibration: Calibration, links: dict[str, float]) -> Path:
-        """The calibration for another simulator."""
         from pupper_sysid.servo_models.cards.card import CardCalibration
         from pupper_sysid.sim.export.export import exported_text
         from pupper_sysid.sim.export.shared import INCLUDES_LINK
