@@ -158,7 +158,6 @@ def _text(action: argparse.Action) -> tuple[str, str]:
 
 
 def _row(name: str, text: str, width: int) -> list[str]:
-    """Lines of one option."""
     wrapped = textwrap.wrap(text, width - _COLUMN, break_on_hyphens=False) or [""]
     indent = " " * _COLUMN
     head = f"  {name}"

@@ -38,6 +38,10 @@ class Interval:
         low, high = np.quantile(draws, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
         return cls(float(value), float(low), float(high))
 
+    def times(self, factor: float) -> Interval:
+        """The estimate and its interval times a positive `factor`."""
+        return Interval(factor * self.value, factor * self.low, factor * self.high)
+
     def widened(self, by: float) -> Interval:
         """The interval with `by` added on either side."""
         return Interval(self.value, self.low - by, self.high + by)

@@ -403,7 +403,9 @@ class DynamixelLine(SerialLine):
     model_bytes = 3  # model number and firmware, in the reply to a ping
     rates_in_words = "57600, 115200, 1000000, 2000000, 3000000 or 4000000"
     unused_id = HIGHEST_ID
+    echo_probe = Frame(HIGHEST_ID, PING, b"").encode()
     torque_address = _TORQUE
+    all_off = Frame(BROADCAST_ID, WRITE, _TORQUE.to_bytes(2, "little") + b"\0").encode()
 
     def __init__(self, device: str, baud: int, exclusive: bool = True):
         super().__init__(device, baud, exclusive)
@@ -488,13 +490,6 @@ class DynamixelLine(SerialLine):
         """Send a ping, whose reply holds the model number; 0 if sent."""
         request = [0, 0, 0, 0, servo, 3, 0, PING, 0, 0]
         return self._packets.txPacket(self._port, request)
-
-    def _all_off(self) -> bytes:
-        return Frame(BROADCAST_ID, WRITE, _TORQUE.to_bytes(2, "little") + b"\0").encode()
-
-    def echo_probe(self) -> bytes:
-        """A request to which no servo answers."""
-        return Frame(self.unused_id, PING, b"").encode()
 
     def _reader(self, accepted: Callable[[int, int], bool]) -> FrameReader:
         return FrameReader(accepted, status=True)

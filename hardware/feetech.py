@@ -344,7 +344,9 @@ class FeetechLine(SerialLine):
     model_bytes = 2
     rates_in_words = "1000000, 500000, 250000, 128000, 115200, 57600 or 38400"
     unused_id = HIGHEST_ID
+    echo_probe = Frame(HIGHEST_ID, PING, b"").encode()
     torque_address = TORQUE_ADDRESS
+    all_off = Frame(BROADCAST_ID, WRITE, bytes([TORQUE_ADDRESS, 0])).encode()
 
     def __init__(self, device: str, baud: int, exclusive: bool = True):
         super().__init__(device, baud, exclusive)
@@ -367,13 +369,6 @@ class FeetechLine(SerialLine):
     def ask_model(self, servo: int) -> int:
         """Send the request whose reply holds the model number; 0 if sent."""
         return self._packets.readTx(self._port, servo, MODEL_ADDRESS, 2)
-
-    def _all_off(self) -> bytes:
-        return Frame(BROADCAST_ID, 3, bytes([TORQUE_ADDRESS, 0])).encode()
-
-    def echo_probe(self) -> bytes:
-        """A request to which no servo answers."""
-        return Frame(self.unused_id, PING, b"").encode()
 
     def _reader(self, accepted: Callable[[int, int], bool]) -> FrameReader:
         return FrameReader(lambda servo, length: accepted(servo, length - 2))

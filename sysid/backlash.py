@@ -22,7 +22,7 @@ friction and stiffness, and none is given.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -83,7 +83,7 @@ class JointBacklash(Result):
 
 
 def _degrees(value: Interval) -> str:
-    best, low, high = np.degrees([value.value, value.low, value.high])
+    best, low, high = np.degrees(astuple(value))
     return f"{best:.2f}° [{low:.2f}, {high:.2f}]"
 
 
@@ -202,7 +202,7 @@ def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> J
     zone = None
     if several:  # from the highest gain, where friction holds back least
         top = measured[-1]
-        half = Interval(*(x / 2 for x in vars(top.hysteresis_rad).values()))
+        half = top.hysteresis_rad.times(0.5)
         # the servo moves on when the error exceeds the zone: by up to a whole count
         low, value = max(half.low - quantum, 0.0), max(half.value - quantum / 2, 0.0)
         zone = Interval(value, low, half.high)

@@ -231,7 +231,6 @@ def _numbers(target: Path) -> dict[str, dict[str, float]]:
 
 
 def _calibrated(path: Path, target: Path, settings: Settings) -> None:
-    """Calibrate one robot."""
     made = calibrate(load(path), None, settings.seed, settings.stall_torque_nm, workers=1)
     made.save(target, force=True)
 
@@ -390,5 +389,4 @@ def _is_servo_of(target: Path, path: Path, settings: ServoSettings) -> bool:
 
 
 def _fitted(path: Path, target: Path, settings: ServoSettings) -> None:
-    """Fit one robot's model."""
     fit_servo(load(path), **vars(settings), keep_unfinished=False).save(target, force=True)

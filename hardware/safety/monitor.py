@@ -319,6 +319,5 @@ class Monitor:
 
 
 def _first(flags: NDArray[np.bool_]) -> int | None:
-    """Index of the first true flag."""
     found = np.flatnonzero(flags)
     return int(found[0]) if len(found) else None

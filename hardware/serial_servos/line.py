@@ -107,6 +107,10 @@ class SerialLine(ABC):
     """At which no servo is expected."""
     torque_address: int
     """Of the register that switches a servo's torque."""
+    all_off: bytes
+    """The request that switches the torque of all servos off."""
+    echo_probe: bytes
+    """A request to which no servo answers."""
     _packets: Any
     """The SDK's packet handler."""
 
@@ -151,20 +155,12 @@ class SerialLine(ABC):
         """Send the request whose reply holds the model number; 0 if sent."""
 
     @abstractmethod
-    def echo_probe(self) -> bytes:
-        """A request to which no servo answers."""
-
-    @abstractmethod
     def ping(self, servo: int) -> LineFrame | None:
         """Status frame of `servo`, or None if it does not answer."""
 
     @abstractmethod
     def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
         """The same bytes of several servos with one request."""
-
-    @abstractmethod
-    def _all_off(self) -> bytes:
-        """The request that switches the torque of all servos off."""
 
     def sync_read_s(self, delays_s: Sequence[float], size: int) -> float:
         """Time that replies of `size` bytes to the last `sync_read` need on the wire [s].
@@ -189,7 +185,7 @@ class SerialLine(ABC):
     def torque_off(self, servos: Sequence[int] | None = None) -> None:
         """Switch the torque of these (default: all) off at once; unacknowledged."""
         if servos is None:
-            self._sync_written(lambda: self._send_raw(self._all_off()))
+            self._sync_written(lambda: self._send_raw(self.all_off))
         else:
             self.sync_write(self.torque_address, {servo: b"\0" for servo in servos})
 
@@ -209,16 +205,14 @@ class SerialLine(ABC):
 
     def detect_echo(self) -> bool:
         """Whether the adapter echoes requests; the echo is removed from then on."""
-        request = self.echo_probe()
+        request = self.echo_probe
         self.echoes = False
         if not self._sent(lambda: self._send_raw(request)):
             return False
         self.echoes = self._arrived(len(request)).startswith(request)
         return self.echoes
 
-    def roll_call(
-        self, servos: Iterable[int], advance: Callable[[int], None] = lambda servo: None
-    ) -> dict[int, tuple[int, float]]:
+    def roll_call(self, servos: Iterable[int]) -> dict[int, tuple[int, float]]:
         """Model number (its bytes as little endian) and latency [s] of each servo that answers.
 
         Requests go out as soon as a servo would have answered on a fast adapter, or earlier if it
@@ -243,7 +237,6 @@ class SerialLine(ABC):
                         models.setdefault(frame.id, (model, max(late_s, 0.0)))
 
         for servo in servos:
-            advance(servo)
             if not self._sent(lambda servo=servo: self.ask_model(servo)):
                 continue
             self._port.keeps_old = True  # until all have been asked

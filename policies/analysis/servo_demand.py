@@ -248,7 +248,6 @@ def _top_speed(servo: Mapping[str, Array]) -> Array:
 
 
 def _verdict(demand: ServoDemand) -> str:
-    """The result in a sentence or two."""
     servo, joints = demand.servo.rpartition("/")[2], demand.joints
     bound = f"{'at least ' if demand.tolerated_at_least else ''}" + (
         f"{1e3 * demand.tolerated_dead_time_s:.0f} ms with which the gait walks"

@@ -156,7 +156,6 @@ def _walk(
     watchers: Sequence[Callable[[Tick], None]],
     outcome: Outcome,
 ) -> None:
-    """The control loop."""
     period = controller.period_s
     loop = FixedRateLoop(bus, period, most_misses=max(round(STALL_S / period) - 1, 1))
     spent = loop.spent

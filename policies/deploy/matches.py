@@ -321,10 +321,10 @@ def servo_match(trained: TrainedServo, here: ServoRanges) -> ServoMatch | None:
             measured = of(servo, _NOTHING, _NOTHING)
             if expected is not None and measured is not None:
                 compared += 1
-                expected, measured = _times(expected, factor), _times(measured, factor)
+                expected, measured = expected.times(factor), measured.times(factor)
                 outside += _outside(quantity, unit, relative, name, expected, measured)
     jitter = 1e3 * here.command_jitter_s
-    measured, expected = Interval(jitter, jitter, jitter), _times(trained.command_jitter_s, 1e3)
+    measured, expected = Interval(jitter, jitter, jitter), trained.command_jitter_s.times(1e3)
     outside += _outside("command jitter", "ms", False, None, expected, measured)
     return ServoMatch(
         trained=trained.actuator, here=here.source, compared=compared + 1, outside=tuple(outside)
@@ -389,16 +389,12 @@ def _top_speed(servo: ServoNumbers, voltage: Range) -> Interval:
 
 
 def _age(feedback: ServoFeedback, poll: Range) -> Interval:
-    return _times(poll, feedback.poll_period_s * (0.5 + feedback.loss / (1.0 - feedback.loss)))
-
-
-def _times(range_: Range | Interval, factor: float) -> Interval:
-    return Interval(factor * range_.value, factor * range_.low, factor * range_.high)
+    return poll.times(feedback.poll_period_s * (0.5 + feedback.loss / (1.0 - feedback.loss)))
 
 
 Quantity = Callable[[ServoNumbers, Range, Range], Interval | None]
 _QUANTITIES: tuple[tuple[str, str, float, bool, Quantity], ...] = (
-    ("dead time", "ms", 1e3, False, lambda s, voltage, poll: _times(s.dead_time_s, 1.0)),
+    ("dead time", "ms", 1e3, False, lambda s, voltage, poll: s.dead_time_s.times(1.0)),
     (
         "stiffness per inertia", "1/s²", 1.0, True,
         lambda s, voltage, poll: _quotient(_product(s.stiffness, voltage), s.armature),

@@ -40,6 +40,7 @@ from pupper_sysid.common.files import (
     write_bytes,
     write_text,
 )
+from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.common.reading.content import refuse_large_header
 from pupper_sysid.policies.network.hyperparameters import Kind
@@ -80,6 +81,10 @@ class Range(_Part):
         if not self.low <= self.value <= self.high:
             raise ValueError("low, value and high must not fall")
         return self
+
+    def times(self, factor: float) -> Interval:
+        """The range times a positive `factor`."""
+        return Interval(factor * self.value, factor * self.low, factor * self.high)
 
 
 class DeadTimeRange(Range):

@@ -374,7 +374,6 @@ def refuse_impossible(run: Run) -> None:
 
 
 def _numbers(settings: Any, before: str) -> Iterator[tuple[str, float]]:
-    """Dotted names and values of all numbers."""
     for setting in fields(settings):
         value, name = getattr(settings, setting.name), f"{before}{setting.name}"
         if is_dataclass(value):

@@ -45,7 +45,7 @@ from pupper_sysid.policies.twin.playing import (
     play,
     sequences,
 )
-from pupper_sysid.servo_models.calibration.calibration import PRESETS, Calibration
+from pupper_sysid.servo_models.calibration.calibration import Calibration, preset_notes
 from pupper_sysid.sim.robot.replay import ServoRobot
 from pupper_sysid.sysid.doctor.checks import chosen_joints
 from pupper_sysid.sysid.fit.predict import ReadingRule, in_words, rule_of
@@ -388,12 +388,7 @@ def _notes(
                 f"{ground.first_fall_s:.1f} s). On its back it moves as in the air, so air "
                 "and ground cannot be distinguished."
             )
-    if presets := [name for name in actuators if name in PRESETS]:
-        notes.append(
-            f"{', '.join(presets)}: published with ideal feedback. Where its delay stands for the "
-            "age of readings, too, that age counts twice here."
-        )
-    return notes
+    return notes + preset_notes(actuators)
 
 
 def _listed(numbers: Sequence[int]) -> str:

@@ -14,7 +14,7 @@ it, `release` the one in the training configuration its authors released. Neithe
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from importlib import import_module, resources
 from pathlib import Path
@@ -290,6 +290,17 @@ class Calibration(Part):
 def is_shipped(name: Path | str) -> bool:
     """Whether `name` is a preset's or a shipped servo card's, rather than a file's."""
     return str(name) in PRESETS or str(name) in _cards().card_names()
+
+
+def preset_notes(names: Iterable[str]) -> list[str]:
+    """What is to be said of the presets among `names` where readings have an age."""
+    presets = [name for name in names if name in PRESETS]
+    if not presets:
+        return []
+    return [
+        f"{', '.join(presets)}: published with ideal feedback. Where its delay stands for the "
+        "age of readings, too, that age counts twice here."
+    ]
 
 
 def _cards() -> Any:

@@ -112,6 +112,12 @@ class Quantity(Part):
         ends = "" if self.low is None or self.high is None else f", {self.low:.4g}…{self.high:.4g}"
         return f"Quantity({self.value:.4g}{ends}, identified: {self.identified})"
 
+    @property
+    def interval(self) -> Interval:
+        """The number with its ends; an end that it does not have is the number itself."""
+        low, high = (self.value if end is None else end for end in (self.low, self.high))
+        return Interval(self.value, low, high)
+
     def scaled(self, factor: float) -> Quantity:
         """The number and its interval times a positive `factor`."""
         ends = (self.value, self.low, self.high)

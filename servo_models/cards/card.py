@@ -236,11 +236,7 @@ class ServoCard(Part):
         pd = self.pd(name)
         armature = pd.armature_kg_m2.value
         dead = pd.dead_time_s or Quantity(value=0.0, identified="no", why="the source has none")
-        ends = (
-            dead.value if dead.low is None else dead.low,
-            dead.value if dead.high is None else dead.high,
-        )
-        low, high = whole_steps(*ends, TIME_STEP_S)
+        low, high = whole_steps(dead.interval.low, dead.interval.high, TIME_STEP_S)
         torques = {
             "stiffness": pd.stiffness_nm_per_rad,
             "damping": pd.damping_nm_s_per_rad or _absent(),

@@ -21,7 +21,6 @@ zero of the test bench, no number of the servo. The largest duty clips the torqu
 from __future__ import annotations
 
 import difflib
-import json
 import math
 from datetime import UTC, datetime
 from importlib import resources
@@ -222,11 +221,6 @@ def to_bam(card: ServoCard, specimen: str | None = None) -> dict[str, Any]:
     made["friction_viscous"] = numbers.viscous_friction_nm_s_per_rad or stated(0.0)
     plain = {k: getattr(v, "value", v) for k, v in made.items() if v is not None}
     return plain | {"model": model, "actuator": name}
-
-
-def to_bam_json(card: ServoCard, specimen: str | None = None) -> str:
-    """Text of a parameter file, as BAM's `load_model(json_file=…)` reads it; see `to_bam`."""
-    return json.dumps(to_bam(card, specimen), indent=4) + "\n"
 
 
 def not_in_bam(card: ServoCard) -> list[str]:
@@ -439,7 +433,6 @@ def _first(*values: float | None) -> float | None:
 
 
 def _name(stem: str) -> str:
-    """A file's name as the name of a card."""
     plain = "".join(c if c.isascii() and c.isalnum() else "-" for c in stem.lower()).strip("-")
     return plain[:64] or "bam"
 

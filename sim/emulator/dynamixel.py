@@ -75,12 +75,10 @@ class DynamixelEmulator(LineEmulator):
     """A line of Dynamixel servos; parameters are those of `LineEmulator`."""
 
     family = FAMILY
+    reader = FrameReader
     memory_bytes = table.MEMORY_BYTES
     rates = table.BAUD_RATES
     factory: ClassVar = {name: _factory(name) for name in table.MODELS.values()}
-
-    def _new_reader(self) -> FrameReader:
-        return FrameReader()
 
     def _status(self, servo_id: int, error: int, data: bytes) -> bytes:
         return Frame(servo_id, error, data, is_status=True).encode()

@@ -37,6 +37,7 @@ class FeetechEmulator(LineEmulator):
     """A line of Feetech servos; parameters are those of `LineEmulator`."""
 
     family = FAMILY
+    reader = FrameReader
     memory_bytes = 80
     rates = table.BAUD_RATES
     factory: ClassVar = {
@@ -47,9 +48,6 @@ class FeetechEmulator(LineEmulator):
         else _STS3215
         for series in FAMILY.series.values()
     } | {"HD-1910": _HLS | {"mode": 4}}
-
-    def _new_reader(self) -> FrameReader:
-        return FrameReader()
 
     def _status(self, servo_id: int, error: int, data: bytes) -> bytes:
         return Frame(servo_id, error, data).encode()

@@ -28,6 +28,22 @@ _STILL_RAD_S2 = 1e-4
 _STEPS_BETWEEN_LOOKS = 50
 
 
+def held_over(
+    since: float, stop: float, goal: float, queue: deque[tuple[float, float]]
+) -> tuple[float, float]:
+    """Integral of a held command over a time, and the command at its end.
+
+    `queue` has the times of the commands to come; those before `stop` are taken off it.
+    """
+    integral = 0.0
+    while queue and queue[0][0] < stop:
+        at, following = queue.popleft()
+        at = max(at, since)
+        integral += goal * (at - since)
+        since, goal = at, following
+    return integral + goal * (stop - since), goal
+
+
 class FreeAirServo:
     """A servo in free air; time starts at 0 and must not go backwards.
 
@@ -105,21 +121,12 @@ class FreeAirServo:
                     mujoco.mj_step(self._model, self._data, nstep=steps)
                 self._step += steps
             else:
-                self._data.ctrl[0] = self._mean_of_last_step()
+                since, stop = (self._step - 1) * self._dt, self._step * self._dt
+                integral, self._goal = held_over(since, stop, self._goal, self._queue)
+                self._data.ctrl[0] = integral / self._dt
                 mujoco.mj_step(self._model, self._data)
                 self._changed = self._step
                 self._step += 1
-
-    def _mean_of_last_step(self) -> float:
-        """Mean of the command over the step before the present one; takes it off the queue."""
-        since, stop = (self._step - 1) * self._dt, self._step * self._dt
-        mean = 0.0
-        while self._queue and self._queue[0][0] < stop:
-            at, goal = self._queue.popleft()
-            at = max(at, since)
-            mean += self._goal * (at - since)
-            since, self._goal = at, goal
-        return (mean + self._goal * (stop - since)) / self._dt
 
     def _resting(self) -> bool:
         """Whether another step would change nothing."""

@@ -38,6 +38,7 @@ from pupper_sysid.hardware.dynamixel import SERIES, profile
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.emulator.bench import AMBIENT_C, SUPPLY_V, ServosOnStand
+from pupper_sysid.sim.emulator.free_air import held_over
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, directly_read, draw_robot
 from pupper_sysid.sim.robot.servo_mjcf import (
     FRICTION_SOLIMP,
@@ -300,17 +301,12 @@ class PendulumServo:
 
     def _mean_goal(self) -> float:
         """Mean of the delayed command over the present step; ended ones leave the queue."""
-        queue, since = self._queue, self._step * self._dt
+        since = self._step * self._dt
         stop = since + self._dt
-        if not queue or queue[0][0] >= stop:
+        if not self._queue or self._queue[0][0] >= stop:
             return self._goal
-        mean = 0.0
-        while queue and queue[0][0] < stop:
-            at, goal = queue.popleft()
-            at = max(at, since)
-            mean += self._goal * (at - since)
-            since, self._goal = at, goal
-        return (mean + self._goal * (stop - since)) / self._dt
+        integral, self._goal = held_over(since, stop, self._goal, self._queue)
+        return integral / self._dt
 
     def _follow(self, goal: float) -> None:
         """Move the set-point to `goal`, on a ramp if the registers ask for one."""

@@ -78,6 +78,8 @@ class LineEmulator(ABC):
     """
 
     family: ClassVar[Family]
+    reader: ClassVar[Callable[[], Any]]
+    """Makes a reader of requests."""
     memory_bytes: int
     factory: ClassVar[Mapping[str, Mapping[str, int]]]
     """Registers as a servo leaves the factory, by series' name."""
@@ -99,7 +101,7 @@ class LineEmulator(ABC):
         self.bench, self.series, self.echo = bench, series, echo
         self.faults = faults or BusFaults({}, rng)
         self._rng, self.baud, self._doubled = rng, baud, set(doubled)
-        self._reader = self._new_reader()
+        self._reader = self.reader()
         self._free_at = 0.0
         self._brown_out_until = -np.inf
         self._heard_at = baud
@@ -159,10 +161,6 @@ class LineEmulator(ABC):
         self._set(servo_id, "goal_position", goal)
 
     # ----- what a vendor's emulator adds
-
-    @abstractmethod
-    def _new_reader(self) -> Any:
-        """Reader of requests."""
 
     @abstractmethod
     def _execute(self, frame: Any, byte_s: float) -> Pieces:

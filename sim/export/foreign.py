@@ -76,15 +76,13 @@ def position_servos(path: Path) -> dict[str, Servo]:
 
 def _compiled(path: Path) -> tuple[Any, dict[str, int]]:
     """The model, and the position actuator of each joint that has one."""
-    from pupper_sysid.sim.robot.engine import mujoco
+    from pupper_sysid.sim.robot.engine import in_a_line, mujoco
 
     hinges_of(path)  # refuses what takes too much memory or time
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        raise InputError(
-            f"{path} cannot be compiled by MuJoCo: {' '.join(str(error).split())}."
-        ) from None
+        raise InputError(f"{path} cannot be compiled by MuJoCo: {in_a_line(error)}.") from None
     driven: dict[str, int] = {}
     for i in range(model.nu):
         affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE

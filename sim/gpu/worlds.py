@@ -45,7 +45,6 @@ def _engine() -> SimpleNamespace:
 
 
 def _kernels(wp: Any) -> dict[str, Any]:
-    """The kernels, by name."""
     ten = wp.types.vector(length=10, dtype=float)
 
     @wp.kernel(enable_backward=False)

@@ -9,3 +9,8 @@ from importlib import import_module
 from typing import Any
 
 mujoco: Any = import_module("mujoco")
+
+
+def in_a_line(error: Exception) -> str:
+    """What MuJoCo says of a model, without line breaks and full stop."""
+    return " ".join(str(error).split()).rstrip(".")

@@ -25,7 +25,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
 from pupper_sysid.sim.robot import servo_mjcf
-from pupper_sysid.sim.robot.engine import mujoco
+from pupper_sysid.sim.robot.engine import in_a_line, mujoco
 from pupper_sysid.sim.robot.hinges import hinges_of
 from pupper_sysid.sim.robot.mini_pupper import EVALUATION_SOLVER, Knee, default_pose, robot_xml
 from pupper_sysid.sim.robot.robot_batch import gravity_direction
@@ -155,9 +155,8 @@ def _compile(spec: Any, name: str) -> Any:
     try:
         return spec.compile()
     except ValueError as error:
-        reason = " ".join(str(error).split()).rstrip(".")
         raise InputError(
-            f"{name} cannot be simulated with servos on its joints: {reason}."
+            f"{name} cannot be simulated with servos on its joints: {in_a_line(error)}."
         ) from None
 
 

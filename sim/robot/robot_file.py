@@ -30,7 +30,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.robot.body import Body, fixed_offsets
-from pupper_sysid.sim.robot.engine import mujoco
+from pupper_sysid.sim.robot.engine import in_a_line, mujoco
 from pupper_sysid.sim.robot.hinges import driven_joints, leaders
 from pupper_sysid.sim.robot.mini_pupper import EVALUATION_SOLVER, Physics
 from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
@@ -100,7 +100,7 @@ class _Reader:
         try:
             self.spec = mujoco.MjSpec.from_file(str(path))
         except ValueError as error:
-            raise InputError(f"{path} is no MJCF that MuJoCo reads: {_line(error)}.") from None
+            raise InputError(f"{path} is no MJCF that MuJoCo reads: {in_a_line(error)}.") from None
         self._without_shown()
         free = [j for j in self.spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
         if not free or free[0].parent.parent.name != self.spec.worldbody.name:
@@ -313,7 +313,7 @@ class _Reader:
             return self.spec.copy().compile()
         except ValueError as error:
             raise InputError(
-                " ".join([f"{self.path} cannot be simulated: {_line(error)}.", *self.notes])
+                " ".join([f"{self.path} cannot be simulated: {in_a_line(error)}.", *self.notes])
             ) from None
 
     # ------------------------------------------------------------------------- pose
@@ -779,7 +779,3 @@ def _some(names: Sequence[str]) -> str:
     """The first names of a list."""
     names = list(dict.fromkeys(names))
     return ", ".join(names[:6]) + (", …" if len(names) > 6 else "")
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()).rstrip(".")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,6 @@ from pupper_sysid.servo_models.calibration.parts import (
     PARAMETER_KEYS,
     JointCalibration,
 )
-from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, TORQUES, DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.networks import JointArrays
@@ -159,10 +158,8 @@ def _from_calibration(
         parts.append(calibration.joint(nearest))
     low, value, high = {}, {}, {}
     for field, key in PARAMETER_KEYS.items():
-        found: list[Quantity] = [getattr(p.actuator, key) for p in parts]
-        value[field] = np.array([q.value for q in found])
-        low[field] = np.array([q.value if q.low is None else q.low for q in found])
-        high[field] = np.array([q.value if q.high is None else q.high for q in found])
+        ends = [astuple(getattr(p.actuator, key).interval) for p in parts]
+        value[field], low[field], high[field] = np.array(ends).T.copy()
     delays = np.array([p.actuator.dead_time_interval_s for p in parts])
     low["dead_time_s"], high["dead_time_s"] = delays[:, 0], delays[:, 1]
     # the armature is the torque's scale, drawn for the robot as a whole

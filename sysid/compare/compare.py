@@ -30,6 +30,7 @@ from pupper_sysid.servo_models.calibration.calibration import (
     Calibration,
     is_shipped,
     load_calibration,
+    preset_notes,
 )
 from pupper_sysid.servo_models.cards.card import CardCalibration
 from pupper_sysid.servo_models.cards.files import card_names
@@ -274,11 +275,7 @@ def compare(
     if learned and _loaded(runs):
         folders = ", ".join(n for n in made if n not in predictions and n != scores.LINEAR)
         notes.append(f"{folders}: knows neither the load nor the P gain of a run.")
-    if presets := [str(m) for m in models if str(m) in PRESETS]:
-        notes.append(
-            f"{', '.join(presets)}: published with ideal feedback. Where its delay stands for the "
-            "age of readings, too, that age counts twice here."
-        )
+    notes += preset_notes(map(str, models))
     shown = iter(n for n in made if n not in predictions and n != scores.LINEAR)
     named = iter(predictions)
     order = [next(shown if any(m is one for one in learned) else named) for m in models]  # as given

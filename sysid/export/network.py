@@ -260,10 +260,6 @@ def _metadata(
 
 def _write_network(saved: SavedModel, to: Literal["onnx", "torchscript"], path: Path, force: bool):
     """The model's step as a file, which must repeat a free run of the model."""
-    import torch  # slow to import
-
-    from pupper_sysid.sysid.export.network import ServoStep, export_module
-
     model = saved.model
     if not isinstance(model, CommandNetwork | RecurrentNetwork):
         raise InputError(

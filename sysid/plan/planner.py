@@ -31,6 +31,7 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
+from scipy.optimize import nnls
 
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.common.results import Result
@@ -584,8 +585,6 @@ def fitted_noise(
     Least squares of each trial's mean squared residual over floor² + jitter² · mean squared speed,
     relative to the former; both not negative.
     """
-    from scipy.optimize import nnls
-
     square, speed = [], []
     for trial, track in zip(trials, free_run(model, values, trials), strict=True):
         off = at_steps(track, trial.sample_step) - trial.sample_rad

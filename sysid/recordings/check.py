@@ -185,7 +185,6 @@ def _refuse_degrees(
 
 
 def _words(unit: str) -> str:
-    """A unit in words."""
     name, _, turn = unit.partition(":")
     if name != "counts":
         return {"deg": "degrees", "rad": "radians"}.get(name, name)

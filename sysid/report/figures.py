@@ -9,7 +9,7 @@ lattice.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -33,7 +33,7 @@ from pupper_sysid.common.figure_style import (
     axes_grid,
     styled,
 )
-from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
+from pupper_sysid.common.interval import HALF_WIDTH_SD
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.kernel import COLUMNS
 from pupper_sysid.sysid.backlash import JointBacklash
@@ -513,7 +513,7 @@ def hysteresis_figure(joints: Mapping[str, JointBacklash]) -> Figure:
         gains = np.array([g.p_gain for g in backlash.gains])
         known = np.isfinite(gains).all()
         place = gains if known else np.arange(len(gains), dtype=float)
-        best, low, high = np.degrees([_ends(g.hysteresis_rad) for g in backlash.gains]).T
+        best, low, high = np.degrees([astuple(g.hysteresis_rad) for g in backlash.gains]).T
         axes.errorbar(
             place, best, [best - low, high - best], fmt="o", color=BLUE, capsize=3,
             label="hysteresis, 90 %",
@@ -536,12 +536,8 @@ def hysteresis_figure(joints: Mapping[str, JointBacklash]) -> Figure:
         verdict = (
             "not determined"
             if play is None
-            else "{:.2f}° [{:.2f}, {:.2f}]".format(*np.degrees(_ends(play)))
+            else "{:.2f}° [{:.2f}, {:.2f}]".format(*np.degrees(astuple(play)))
         )
         axes.set_title(f"{joint}: backlash {verdict}")
         axes.legend()
     return figure
-
-
-def _ends(interval: Interval) -> tuple[float, float, float]:
-    return interval.value, interval.low, interval.high

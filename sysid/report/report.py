@@ -37,6 +37,7 @@ from pupper_sysid.sysid.fit.run import free_run
 from pupper_sysid.sysid.fit.scores import Scores, score
 from pupper_sysid.sysid.fit.structure import SIMULATED
 from pupper_sysid.sysid.fit.structure import candidate as structure
+from pupper_sysid.sysid.lag.frequency_response import joint_response
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 from pupper_sysid.sysid.recordings.recording import Trial
 from pupper_sysid.sysid.report.sections import Findings, sections
@@ -96,7 +97,6 @@ def write_report(
         cannot be written, or if the calibration was made from other recordings.
     """
     from pupper_sysid.sysid.doctor.examination import examine
-    from pupper_sysid.sysid.lag.frequency_response import joint_response
 
     refuse_overwrite(Path(folder) / PAGE, force)  # before the work, not after it
     recordings, names = checks.as_sequence(recordings), checks.chosen_joints(recordings, joints)
@@ -210,7 +210,7 @@ def _joint(
         model=known.selection.model,
         simulated_model=carried,
         structure_nats={carried: 0.0},
-        command_jitter_s=_interval(a.command_jitter_s),
+        command_jitter_s=a.command_jitter_s.interval,
         candidate_models=fits,
         lag=_lag(ready.lag, known),
         presets={n: score_preset(parameters, ready.runs) for n, parameters in presets.items()},
@@ -223,7 +223,7 @@ def _lag(measured: LagBudget, known: JointCalibration) -> LagBudget:
     """The lag budget with the numbers of the file: other dates move the last digits."""
     stated_lag = known.lag
     lags = {
-        name: getattr(measured, name) if (q := getattr(stated_lag, name)) is None else _interval(q)
+        name: getattr(measured, name) if (q := getattr(stated_lag, name)) is None else q.interval
         for name in ("lag_s", "raw_lag_s", "fresh_lag_s")
     }
     lattice = measured.feedback
@@ -240,7 +240,7 @@ def _lag(measured: LagBudget, known: JointCalibration) -> LagBudget:
         command_hold_s=lags["fresh_lag_s"].value - lags["lag_s"].value,
         feedback=lattice,
     )
-    dead_time = _interval(known.actuator.dead_time_s)
+    dead_time = known.actuator.dead_time_s.interval
     return budget.with_dead_time(dead_time, known.feedback.offset_rad.value)
 
 
@@ -259,7 +259,7 @@ def _fit(
     model = structure(candidate.model)
     quantities = {} if carried is None else _quantities(carried)
     parameters = {
-        name: _interval(quantities[name], value)
+        name: quantities[name].model_copy(update={"value": value}).interval
         if name in quantities
         else Interval(value, value, value)
         for name, value in candidate.parameters.items()
@@ -292,9 +292,3 @@ def _quantities(joint: JointCalibration) -> dict[str, Quantity]:
         "back_emf_per_s": ratios.back_emf,
         "offset_rad": joint.feedback.offset_rad,
     }
-
-
-def _interval(quantity: Quantity, value: float | None = None) -> Interval:
-    best = quantity.value if value is None else value
-    low = best if quantity.low is None else quantity.low
-    return Interval(best, low, best if quantity.high is None else quantity.high)

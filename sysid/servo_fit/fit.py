@@ -12,7 +12,7 @@ first reading to the part's readings at their own times (`sysid.fit.search`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -354,9 +354,7 @@ def verdict(
         return "This is the linear model itself."
     name = {"delayed-pd": "DelayedPD", "sindy": "sparse equation"}.get(arch, arch.upper())
     linear = scores["linear"].mean.rmse_free_run_rad
-    gain, low, high = (
-        100 * x / linear for x in (difference.value, difference.low, difference.high)
-    )
+    gain, low, high = (100 * x / linear for x in astuple(difference))
     how = "better" if high < 0 else "worse" if low > 0 else "not better"
     text = (
         f"The {name} is {how} than the linear model on this data "

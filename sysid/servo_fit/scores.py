@@ -22,6 +22,7 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import nnls
 
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.common.results import internal
@@ -203,7 +204,6 @@ def pooled(parts: Sequence[dict[str, Errors]]) -> dict[str, Errors]:
 
 
 def _joined(parts: Sequence[Errors]) -> Errors:
-    """Errors one after the other."""
     arrays = {
         name: np.concatenate([getattr(p, name) for p in parts])
         for name in ("free_run", "one_step", "speed", "held", "raw")
@@ -308,8 +308,6 @@ def band(errors_of: Errors) -> Band:
     squares = np.minimum(squares, 25 * 2.198 * np.median(squares))
     weight = 1.0 / np.maximum(squares.mean() + 0 * speed, 1e-12)
     a = np.column_stack([np.ones_like(speed), speed**2]) * weight[:, None]
-    from scipy.optimize import nnls  # slow to import
-
     noise, timing = nnls(a, squares * weight)[0]
     return float(np.sqrt(noise)), float(np.sqrt(timing))
 

@@ -33,7 +33,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pupper_sysid.common.border import read_text, validated
 from pupper_sysid.common.errors import BusError, InputError, SafetyStop
 from pupper_sysid.common.files import sha256
-from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, in_order
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_ROWS, read_table
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, header_entries
@@ -186,9 +186,7 @@ def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
         for name in (f"{joint}{_ENDING}", joint):
             if name in table.columns and joint not in columns:
                 columns[joint] = name
-    # those of a Mini Pupper in its order, whatever the order of the columns
-    order = [j for j in JOINT_NAMES if j in columns] + [j for j in columns if j not in JOINT_NAMES]
-    moving = list(dict.fromkeys(order if joints is None else joints))
+    moving = in_order(columns) if joints is None else list(dict.fromkeys(joints))
     missing = [j for j in moving if j not in columns]
     if "time_s" not in table.columns or not moving or missing or not len(table):
         wanted = f"{(missing or ['LF_hip'])[0]}{_ENDING}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -160,6 +160,5 @@ class Backlash(OfRecordings):
 
 
 def _degrees(value: Interval) -> str:
-    """Value and interval in degrees."""
-    best, low, high = np.degrees([value.value, value.low, value.high])
+    best, low, high = np.degrees(astuple(value))
     return f"{best:.2f} ({low:.2f} to {high:.2f})"

@@ -285,7 +285,6 @@ class Sweep:
             raise InputError(f"--load and --{other}: give one of the two.")
 
     def _registers(self, bus: str) -> dict[str, int]:
-        """Registers of emulated servos."""
         if self.registers and (self.load is not None or bus != EMULATED):
             raise InputError(
                 "--registers: sets those of an emulated robot. A real one's are recorded as they "

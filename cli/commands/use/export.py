@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -203,7 +204,7 @@ class Export:
             calibration = load_calibration(self.source)
             servo_card, lost = files.bam_card(calibration), files.lost_in_bam(calibration)
         target = self.out or Path(f"{path.name.removesuffix(path.suffix)}_bam.json")
-        write_text(target, files.to_bam_json(servo_card), self.force)
+        write_text(target, json.dumps(files.to_bam(servo_card), indent=4) + "\n", self.force)
         terminal.warn(*files.not_in_bam(servo_card), *lost)
         return target
 
@@ -245,7 +246,6 @@ class Export:
             terminal.err.print(sentence)
 
     def _simulator(self, path: Path, calibration: Calibration, links: dict[str, float]) -> Path:
-        """The calibration for another simulator."""
         from pupper_sysid.servo_models.cards.card import CardCalibration
         from pupper_sysid.sim.export.export import exported_text
         from pupper_sysid.sim.export.shared import INCLUDES_LINK

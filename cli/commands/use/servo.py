@@ -258,7 +258,6 @@ def _motion(comparison: Comparison) -> str:
 
 
 def _verdict(differences: Sequence[Difference]) -> str:
-    """The largest difference in words."""
     known = [row for row in differences if row.ratio is not None]
     if not known:
         raise InputError("The two have no number in common.")
