@@ -223,14 +223,22 @@ class _Prior:
     moment: NDArray[np.float64]
     variance: NDArray[np.float64]
     complexity: NDArray[np.float64]
+    gain_square: float
+    """About the static gain's square: variance of the motion over that of the command."""
 
     def inverse(self, k: int) -> NDArray[np.float64]:
         """Posterior covariance over the noise's variance, whitened, at the k-th size."""
         return np.linalg.inv(self.gram + np.eye(len(self.gram)) / _SIZES[k])
 
     def score(self, count: float) -> NDArray[np.float64]:
-        """Logarithm of the marginal likelihood of `count` effective readings, per size."""
-        return -0.5 * (count * np.log(self.variance) + self.complexity)
+        """Logarithm of the posterior of each size, from `count` effective readings.
+
+        The squares of a servo's masses add up to the square of its gain at most, nearly. A larger
+        response hides between readings: at one phase of the loop they see only the sum of the
+        bins that one command fills.
+        """
+        larger = _SIZES * self.variance / self.gain_square
+        return -0.5 * (count * np.log(self.variance) + self.complexity + larger)
 
 
 def joint_stretches(
@@ -388,7 +396,8 @@ def _fit(
     # fewer ways to have it: all places of a jump are equally likely only with this prior
     complexity = complexity + 2 * np.log(decay_s)
     variance = np.maximum(square - fitted, _TINY * square) / count
-    return _Prior(dead_time_s, bins, root, whitened, projected, variance, complexity)
+    gain_square = square / count  # in units of the command's variance
+    return _Prior(dead_time_s, bins, root, whitened, projected, variance, complexity, gain_square)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
