@@ -176,7 +176,7 @@ def truth_table(
 
 
 def read_truth(recording: Path, truth: Path | None = None) -> dict[str, Any]:
-    """True parameters of an emulated recording (`.csv`): `truth`, or the `.truth.yaml` beside it."""
+    """True parameters of an emulated recording: `truth`, or the `.truth.yaml` beside the `.csv`."""
     path = truth or recording
     if not path.name.endswith(ENDING) and truth is None:
         path = recording.with_name(recording.name.removesuffix(".csv") + ENDING)

@@ -65,9 +65,9 @@ class Compare(OfRecordings):
 class CompareTruth:
     """Each calibrated number beside the true one of an emulated robot.
 
-    `sweep --truth` writes the truth beside the recording, `emulate ... --truth FILE` that of a robot
-    behind a real protocol. Where the interval holds it, the last column says yes; of many robots
-    that should be nine in ten.
+    `sweep --truth` writes the truth beside the recording, `emulate ... --truth FILE` that of a
+    robot behind a real protocol. Where the interval holds it, the last column says yes; of many
+    robots that should be nine in ten.
 
     Example: pupper-sysid compare-truth sweep.csv calibrated.yaml
     """
