@@ -18,6 +18,11 @@ from support.real_recordings import case, real_recording
 from support.strange_servos import ACCUSING, FAULTS, draw_recording, draw_world, simulated
 
 
+def slow(case):
+    """A case of the slow tests."""
+    return pytest.param(case, marks=pytest.mark.slow)
+
+
 def recorded(table) -> ps.Recording:
     return ps.Recording.from_arrays(
         table.send_time_s.to_numpy(), {"joint": table.command_rad.to_numpy()},
@@ -62,7 +67,7 @@ def test_a_joint_that_rests_in_slow_strokes_is_held_by_friction_and_not_dead():
     assert found["held_by_friction"].verdict == CARE
 
 
-@pytest.mark.parametrize("rate_hz", [50.0, pytest.param(500.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("rate_hz", [50.0, slow(500.0)])
 def test_a_servo_that_settles_after_each_step_is_no_echo(rate_hz):
     """At rest the position is the command, a while late; on its way it is not."""
     rng = np.random.default_rng(4)
@@ -143,7 +148,7 @@ def test_clocks_that_drift_are_no_early_position_and_no_swapped_columns():
     assert found["lag_drifts"].values["drift_ms"] == pytest.approx(-6, rel=0.1)
 
 
-@pytest.mark.parametrize("motion", ["prbs", "steps", "tones", "chirp"])
+@pytest.mark.parametrize("motion", ["prbs", *map(slow, ("steps", "tones", "chirp"))])
 def test_clocks_that_drift_are_found_in_any_motion(motion):
     """All readings together show what the lags of short windows, or of one tone, do not."""
     world = replace(
@@ -183,7 +188,7 @@ def test_a_set_point_that_ramps_is_a_position_servo():
     assert not {"unrelated", "not_a_position_servo", "sign_inverted"} & set(codes(log))
 
 
-@pytest.mark.parametrize("motion", ["teleoperation", "steps"])
+@pytest.mark.parametrize("motion", ["teleoperation", slow("steps")])
 def test_a_joint_that_falls_for_a_while_is_no_other_servo(motion):
     """A supply that breaks down for two seconds: the joint falls to its stop and comes back."""
     world = replace(
@@ -259,16 +264,20 @@ SOUND = {
     "real/c05_mx106_2hz_quantised.csv": "joint",
     "real/c07_mx106_telemetry_takes_ticks.csv": "joint",
 }
+LONG = {  # beside shorter ones of the same kind
+    "made/L4_failed_zero_0.005.csv", "real/c06b_ankle_two_columns.csv", "made/B6_trials_14bit.csv",
+    "made/L5_freq_no_trial.csv", "real/c02_mx106_four_sines_no_freq_column.csv",
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [slow(n) if n in LONG else n for n in CASES])
 def test_the_fault_of_a_stranger_s_log_is_named(name):
     joint, code, verdict = CASES[name]
     found = codes(ps.load(case(name)), joint)
     assert code in found and found[code].verdict == verdict
 
 
-@pytest.mark.parametrize("name", SOUND)
+@pytest.mark.parametrize("name", [slow(n) if n in LONG else n for n in SOUND])
 def test_a_stranger_s_sound_log_is_not_accused(name):
     assert set(codes(ps.load(case(name)), SOUND[name])) & set(ACCUSING) == set()
 
