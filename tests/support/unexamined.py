@@ -1,4 +1,4 @@
-"""The doctor finds nothing: for tests of what is computed after it, whose numbers it does not change.
+"""The doctor finds nothing: for tests of what is computed after it, with the same numbers.
 
 An examination costs most of a second, and every function of `sysid` begins with one.
 """
