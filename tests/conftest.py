@@ -4,6 +4,7 @@ import gc
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 # modules are compiled once, not by every worker and every program that a test starts
@@ -57,6 +58,15 @@ def fitted_once(monkeypatch) -> None:
     from support.fitted_once import fit_once
 
     fit_once(monkeypatch)
+
+
+@pytest.fixture
+def unexamined() -> Iterator[None]:
+    """The doctor finds nothing, and takes no time."""
+    from support import unexamined
+
+    with unexamined.unexamined():
+        yield
 
 
 @pytest.fixture(scope="session")
