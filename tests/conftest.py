@@ -17,7 +17,7 @@ import hypothesis
 import pytest
 
 import support.avx2  # noqa: F401
-from support.compiled_once import compile_kernel
+from support.compiled_once import compile_estimator
 from support.package import ROOT
 from support.real_recordings import real_recording
 
@@ -36,7 +36,7 @@ hypothesis.settings.load_profile("repeatable")
 def pytest_sessionstart() -> None:
     """The first worker compiles while the others collect: no test begins before both are done."""
     if os.environ.get("PYTEST_XDIST_WORKER") == "gw0":
-        compile_kernel()
+        compile_estimator()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
