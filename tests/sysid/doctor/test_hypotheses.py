@@ -53,7 +53,7 @@ def test_sound_recordings_are_not_accused():
 
 def test_a_joint_that_rests_in_slow_strokes_is_held_by_friction_and_not_dead():
     """A backlash test: the joint follows a slow triangle at the distance of its friction."""
-    time = 0.02 * np.arange(2500)
+    time = 0.02 * np.arange(1500)
     command = 0.06 * (2 * np.abs((0.1 * time) % 2 - 1) - 1)
     position, now = np.empty_like(command), command[0]
     for k, goal in enumerate(command):
@@ -93,10 +93,10 @@ def test_a_servo_that_settles_after_each_step_is_no_echo(rate_hz):
 
 def test_an_echo_is_told_from_a_fast_servo_by_the_time_that_it_had():
     """A servo that is read before the next command may have arrived, and one at once has not."""
-    rng, sent = np.random.default_rng(0), 0.02 * np.arange(650)
-    command = np.repeat(0.2 * rng.standard_normal(65), 10)
+    rng, sent = np.random.default_rng(0), 0.02 * np.arange(350)
+    command = np.repeat(0.2 * rng.standard_normal(35), 10)
     before = np.concatenate([command[:1], command[:-1]])
-    noise = 2e-3 * rng.standard_normal(650)
+    noise = 2e-3 * rng.standard_normal(350)
     for position, read, since in ((before, sent - 0.005, 0.015), (command, sent + 0.001, 0.001)):
         log = ps.Recording.from_arrays(
             sent, {"joint": command}, {"joint": position + noise}, read_time_s=read
@@ -123,7 +123,7 @@ def test_free_motion_shows_what_happened_within_a_trial(fault, code):
     rng = np.random.default_rng(3)
     world = replace(
         draw_world(rng, "smart", "teleoperation", 3e-4), amplitude_rad=0.3, rate_hz=50.0,
-        poll_s=0.0, friction_rad=0.0, gravity_rad=0.0, duration_s=24.0, quantum_rad=0.0015,
+        poll_s=0.0, friction_rad=0.0, gravity_rad=0.0, duration_s=14.0, quantum_rad=0.0015,
     )  # fmt: skip
     assert code not in codes(recorded(simulated(world)))
     assert code in codes(recorded(FAULTS[fault][0](world, rng)[1]))
