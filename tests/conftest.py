@@ -4,6 +4,7 @@ import gc
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 # modules are compiled once, not by every worker and every program that a test starts
@@ -16,7 +17,7 @@ import hypothesis
 import pytest
 
 import support.avx2  # noqa: F401
-from support.compiled_once import compile_kernel
+from support.compiled_once import compile_estimator
 from support.package import ROOT
 from support.real_recordings import real_recording
 
@@ -35,7 +36,7 @@ hypothesis.settings.load_profile("repeatable")
 def pytest_sessionstart() -> None:
     """The first worker compiles while the others collect: no test begins before both are done."""
     if os.environ.get("PYTEST_XDIST_WORKER") == "gw0":
-        compile_kernel()
+        compile_estimator()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -57,6 +58,15 @@ def fitted_once(monkeypatch) -> None:
     from support.fitted_once import fit_once
 
     fit_once(monkeypatch)
+
+
+@pytest.fixture
+def unexamined() -> Iterator[None]:
+    """The doctor finds nothing, and takes no time."""
+    from support import unexamined
+
+    with unexamined.unexamined():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -27,6 +27,7 @@ SWEEP = ROOT / "data" / "samples" / "sweep.csv"
 pytestmark = pytest.mark.usefixtures("here")
 
 
+@pytest.mark.usefixtures("unexamined")
 def test_one_tone_is_calibrated_with_a_warning_and_written_as_printed_and_never_over(
     capsys, tmp_path
 ):

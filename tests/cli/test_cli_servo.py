@@ -17,7 +17,7 @@ from support.command_line import json_of, ran, run
 SAMPLE = Path(__file__).parents[2] / "data" / "samples"
 
 
-pytestmark = pytest.mark.usefixtures("here")
+pytestmark = pytest.mark.usefixtures("here", "unexamined")
 
 
 @pytest.fixture

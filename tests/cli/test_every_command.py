@@ -313,6 +313,7 @@ WITH_JSON = {
 }
 
 
+@pytest.mark.usefixtures("unexamined")
 def test_keys_of_an_object_are_the_documented_ones(capsys, tmp_path, monkeypatch, hip):
     monkeypatch.chdir(tmp_path)
     for command, given in WITH_JSON.items():

@@ -31,7 +31,7 @@ from support.servo_servers import on_a_port
 FORMATS = (ROOT / "docs/formats.md").read_text()
 
 
-pytestmark = pytest.mark.usefixtures("here")
+pytestmark = pytest.mark.usefixtures("here", "unexamined")
 
 
 @pytest.fixture

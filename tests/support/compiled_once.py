@@ -1,7 +1,7 @@
 """A function is compiled by one process of the tests; the others wait for it and load it.
 
 On a fresh clone every worker would compile the same functions at the same time. Programs and
-processes that tests start do not wait: for them the kernel, by far the largest, is there before.
+processes that tests start do not wait: for them the estimator is compiled before.
 """
 
 import fcntl
@@ -32,10 +32,15 @@ def _compile_alone(dispatcher: Dispatcher, signature: object) -> object:
 Dispatcher.compile = _compile_alone
 
 
-def compile_kernel() -> None:
-    """Compile the kernel of the fits, or load what was compiled before."""
-    from pupper_sysid.servo_models import kernel
-    from pupper_sysid.sysid.fit.run import simulate
-    from support.runs import run_of
+def compile_estimator() -> None:
+    """Compile what the lag of polled steps needs, or load what was compiled before.
 
-    simulate(kernel.ABSENT[None], np.zeros(1), run_of(np.zeros(4)))
+    The kernel of the fits, the doctor's regression, the search for the poll and the evidence of a
+    response: all that takes long, so that no program or pool compiles it once more.
+    """
+    from pupper_sysid.sysid.lag.lag_budget import lag_budget
+    from support.made_recordings import JOINT, USUAL_SERVO, Setup, record
+
+    rng = np.random.default_rng(0)
+    steps = record(Setup(USUAL_SERVO, kind="steps", poll_s=0.027, loss=0.3, trial_s=1.5), rng)
+    lag_budget(JOINT, steps.trials(JOINT), rng)

@@ -103,6 +103,7 @@ def test_the_mini_pupper_s_own_model_has_its_twelve_joints(read_here):
     assert layout.joint_names == JOINT_NAMES and left_out == []
 
 
+@pytest.mark.usefixtures("unexamined")
 def test_an_arm_goes_from_its_model_to_a_calibration_networks_and_exports(capsys, read_here):
     for words in (
         "init-robot arm.xml",

@@ -88,8 +88,8 @@ def exact_recording(
 
 def test_exact_readings_of_a_servo_at_its_limit_are_fitted_in_shorter_steps():
     exact, coarse = (
-        prepare_joint(JOINT, exact_recording(noise, effort).trials(JOINT), 0)
-        for noise, effort in ((5e-5, 300.0), (0.02, 5000.0))
+        prepare_joint(JOINT, exact_recording(noise, effort, loop_s).trials(JOINT), 0)
+        for noise, effort, loop_s in ((5e-5, 300.0, 0.005), (0.02, 5000.0, 0.02))
     )
     assert {run.step_s for run in exact.runs} <= {0.001, 0.0005}
     assert {run.step_s for run in coarse.runs} == {TIME_STEP_S}
@@ -123,7 +123,7 @@ def result():
     return calibrate(servo_recording(1, (1.0, 2.5, 4.0)))[JOINT]
 
 
-@pytest.mark.parametrize("doubt_s", [0.0, 0.006])
+@pytest.mark.parametrize("doubt_s", [pytest.param(0.0, marks=pytest.mark.slow), 0.006])
 def test_gains_make_up_for_dates_that_leave_no_dead_time(doubt_s):
     """Commands of a servo of 3 ms, dated 4 ms too late."""
     (trial,) = exact_recording(1e-3, 450.0, 0.02, "live", 0.003).trials(JOINT)
