@@ -36,21 +36,27 @@ _MOST_READINGS, _STEP_S = 1500, 0.005
 _UNFILTERED_HZ = 15.0  # natural frequency of a servo that no low-pass explains better
 _LONGEST_LAG_S = 0.5
 
-(_NATURAL, _DAMPING, _SPEED, _RAMP, _FRICTION, _EFFORT, _BACK_EMF, _INTEGRAL,
- _LAG, _GROWTH, _LOW, _HIGH, _BOTTOM, _TOP) = range(14)  # fmt: skip
-_LOGARITHMS = slice(0, 8)
+(_NATURAL, _DAMPING, _SPEED, _RAMP, _FRICTION, _EFFORT, _BACK_EMF, _INTEGRAL, _PLAY,
+ _LAG, _LOAD, _GROWTH, _LOW, _HIGH, _BOTTOM, _TOP) = range(16)  # fmt: skip
+_LOGARITHMS = slice(0, 9)
+_HANGING = kernel.COLUMNS.index("hanging_rad")
 _FAR = 1e6  # levels that nothing reaches [rad]
 _DAMPED = np.array([0.2, 1.0, 5.0, 25.0, 125.0])  # times the damping before, tried abreast
-_NO_LOAD, _NO_INTEGRAL = np.zeros(3), 0.01  # [1/s]
-_LOWEST = np.array([*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.01, 1e-3]), 0, -0.03, *[-_FAR] * 4])
-_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 30, 30]), 0.8, 0.03, *[_FAR] * 4])
-_STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.002, 2e-4, *[0.01] * 4])
-"""Bounds of a servo's terms, and differences for their derivatives; of levels in units of the
-command's range."""
+_NO_LOAD, _NO_INTEGRAL, _NO_PLAY = np.zeros(3), 0.01, 1e-3  # [1/s], [rad]
+_LOWEST = np.array(
+    [*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.01, 1e-3, 1e-4]), 0, -1, -0.03, *[-_FAR] * 4]
+)
+_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 30, 30, 0.3]), 0.8, 1, 0.03, *[_FAR] * 4])
+_STEPS = np.array(
+    [0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.3, 0.002, 0.01, 2e-4, *[0.01] * 4]
+)
+"""Bounds of a servo's terms, and differences for their derivatives; of load and levels in units of
+the command's range."""
+_OF_REACH = np.isin(np.arange(len(_STEPS)), [_LOAD, _LOW, _HIGH, _BOTTOM, _TOP])
 _ALONE = tuple(range(_GROWTH))
 _DRAWN, _DRAWN_FROM = 200, (
     (10, 90), (0.5, 1.3), (1.5, 6), (8, 80), (0.002, 0.04), (0.1, 1), (0.3, 10), (0.3, 5),
-    (0.003, 0.08),
+    (5e-4, 0.02), (0.003, 0.08),
 )  # fmt: skip
 """Servos tried, and ranges of their terms, the lag last; friction and effort of the range."""
 _OF_A_KIND = 2
@@ -93,8 +99,8 @@ class Follower:
     terms: NDArray[np.float64]
     """Logarithms of natural frequency [rad/s], damping ratio, speed [rad/s] and acceleration
     [rad/s²] of the set-point, friction and effort limit [rad of command], damping beyond the
-    effort limit over that within, integral gain [1/s]; lag [s] and its growth per second; lowest
-    and highest goal and place [rad of command]."""
+    effort limit over that within, integral gain [1/s], play [rad]; lag [s], load [rad of command]
+    and growth of the lag per second; lowest and highest goal and place [rad of command]."""
     path_rad: NDArray[np.float64]
     """The command as it is followed, at each reading."""
     cost: float
@@ -163,7 +169,7 @@ class Followed:
         """The linear servo, and the best of many drawn from what servos are."""
         hz, damping = FILTERS[self.servo.filter]
         natural, lag = 2 * np.pi * (hz or _UNFILTERED_HZ), max(self.servo.lag_s, 0.0)
-        linear = [natural, damping, 300.0, 2e4, 0.004 * self.reach, 20.0, 1.0, 0.01, lag]
+        linear = [natural, damping, 300.0, 2e4, 0.004 * self.reach, 20.0, 1.0, 0.01, 1e-3, lag]
         servos = []
         for kind in (np.array([linear]), *_drawn(self.reach)):
             servos += sorted(self.followers(_servos(kind)), key=_cost)[:_OF_A_KIND]
@@ -200,14 +206,35 @@ class Followed:
         return sorted(self.followers(terms), key=_cost)[:_TRIED]
 
     @cached_property
+    def unsure_rad(self) -> NDArray[np.float64]:
+        """Error that a servo as good as the fit may have, at each reading [rad].
+
+        Where a small change of a limit ends in another motion, such as that of a profile far above
+        its acceleration, no fit comes nearer. There, paths are not straight in their terms: the
+        second differences of the fit's.
+        """
+        free = np.array(_ALONE)
+        changes = np.eye(len(_STEPS))[free] * steps_of(self)
+        terms = np.concatenate([self.fit.terms + changes, self.fit.terms - changes])
+        paths = self.paths(np.clip(terms, _LOWEST, _HIGHEST)).reshape(2, len(free), -1)
+        bends = paths.sum(axis=0) - 2 * self.fit.path_rad
+        return abs(float(self.fit.values[0])) * np.sqrt(np.sum(bends**2, axis=0))
+
+    @cached_property
+    def unsure(self) -> float:
+        """The same as a cost."""
+        bound = _BOUND * self.scale
+        return float(np.mean(bound * self.unsure_rad / (self.unsure_rad + bound))) / self.scale
+
+    @cached_property
     def disturbed(self) -> float:
-        """Cost of the fit beyond what readings of unknown age explain."""
+        """Cost of the fit beyond what limits, and readings of unknown age, explain."""
         gaps = np.concatenate([np.diff(t.send_time_s) for t in self.trials])
         age = 0.25 * float(np.median(gaps)) * (staleness(self.trials).kind != "live")
         rate = np.abs(
             np.gradient(self.fit.path_rad, self.time_s + 1e-9 * np.arange(len(self.time_s)))
         )
-        return self.fit.cost - age * float(np.median(rate)) / self.scale
+        return self.fit.cost - self.unsure - age * float(np.median(rate)) / self.scale
 
     @cached_property
     def friction_rad(self) -> float:
@@ -270,6 +297,7 @@ class Followed:
             abreast = (terms[:, _GROWTH : _HIGH + 1] == (growth, low, high)).all(axis=1)
             unlike &= ~abreast
             servos, late = _columns(terms[abreast]), self.time_s - growth * self.later
+            servos[:, _HANGING] = self.base.samples[0].rest_rad - np.pi / 2  # held level
             for (mean, end, step, start), a, b in zip(
                 self._inputs, self.starts[:-1], self.starts[1:], strict=True
             ):
@@ -279,7 +307,7 @@ class Followed:
                     kernel.edges_of(mean, end), 1.0, _NO_LOAD, mean[0], _rest_steps(step), step,
                     step=np.clip((late[a:b] - start) / step, 0.0, len(mean) - _rest_steps(step)),
                     reading=np.zeros(b - a),
-                )  # fmt: skip
+                ) - servos[:, kernel.OFFSET, None]  # fmt: skip
         return np.clip(paths, terms[:, _BOTTOM, None], terms[:, _TOP, None])
 
     def path_of_trial(self, number: int) -> NDArray[np.float64]:
@@ -338,11 +366,11 @@ def followed(trials: Sequence[Trial], step: float) -> Followed | None:
 
 def _drawn(reach: float) -> list[NDArray[np.float64]]:
     """Terms of servos with the lag last: ramped, weak, held by friction, and with none of these."""
-    u = np.random.default_rng(0).random((_DRAWN, 10))
+    u = np.random.default_rng(0).random((_DRAWN, 11))
     low, high = np.array(_DRAWN_FROM).T
-    terms = np.exp(np.log(low) + u[:, :9] * np.log(high / low))
+    terms = np.exp(np.log(low) + u[:, :10] * np.log(high / low))
     terms[:, [_FRICTION, _EFFORT]] *= reach
-    kind = np.minimum((5 * u[:, 9]).astype(int), 3)
+    kind = np.minimum((5 * u[:, 10]).astype(int), 3)
     terms[kind != 3, _SPEED : _RAMP + 1] = 300.0, 2e4  # two in five ramp
     terms[kind != 1, _EFFORT] = 20.0
     terms[kind == 2, _FRICTION] *= 10
@@ -388,7 +416,7 @@ def _rest_steps(step_s: float) -> int:
 
 def _servos(numbers: NDArray) -> NDArray[np.float64]:
     """Terms of servos without levels from their limits and lags."""
-    others = np.tile([0.0, -_FAR, _FAR, -_FAR, _FAR], (len(numbers), 1))
+    others = np.tile([0.0, 0.0, -_FAR, _FAR, -_FAR, _FAR], (len(numbers), 1))
     return np.column_stack([np.log(numbers[:, :-1]), numbers[:, -1], others])
 
 
@@ -399,8 +427,8 @@ def _columns(terms: NDArray) -> NDArray[np.float64]:
     than the back-EMF beyond: that of the loop is negative there.
     """
     limits = np.exp(terms[:, _LOGARITHMS].T)
-    natural, damping, speed, ramp, friction, effort, share, integral = limits
-    square, brakes = natural**2, 2 * damping * natural
+    natural, damping, speed, ramp, friction, effort, share, integral, play = limits
+    square, brakes, load = natural**2, 2 * damping * natural, terms[:, _LOAD]
     servos = np.tile(kernel.ABSENT, (len(terms), 1))
     for name, value in {
         "stiffness": square, "damping": brakes * (1 - share), "effort_limit": square * effort,
@@ -408,9 +436,16 @@ def _columns(terms: NDArray) -> NDArray[np.float64]:
         "velocity_limit": np.where(terms[:, _SPEED] < _HIGHEST[_SPEED], speed, np.inf),
         "acceleration_limit": np.where(terms[:, _RAMP] < _HIGHEST[_RAMP], ramp, np.inf),
         "integral_per_s": np.where(integral > _NO_INTEGRAL, integral, 0.0),
+        "backlash_rad": np.where(play > _NO_PLAY, play, 0.0), "gravity_nm": square * load,
+        "offset_rad": np.clip(load, -effort, effort),  # it rests where its load lets it sag to
     }.items():  # fmt: skip
         servos[:, kernel.COLUMNS.index(name)] = value
     return servos
+
+
+def steps_of(joint: Followed) -> NDArray[np.float64]:
+    """Differences for derivatives."""
+    return np.where(_OF_REACH, joint.reach, 1.0) * _STEPS
 
 
 def _cost(fit: Follower) -> float:
@@ -425,8 +460,7 @@ def fitted(
     best, damping = joint.follower(begin.terms, columns), 0.03
     free = [k for k in free if k < _LOW or abs(begin.terms[k]) < _FAR]  # levels that are set
     bound, floor = _BOUND * joint.scale, 0.01 * joint.scale + 0.25 * joint.step
-    steps = _STEPS.copy()
-    steps[_LOW:] *= joint.reach
+    steps = steps_of(joint)
     terms_free = np.array(free)
     for _ in range(rounds):
         size = np.abs(best.residuals_rad)
@@ -539,7 +573,7 @@ def comparisons(joint: Followed) -> list[Compared]:
             if tried.usual:
                 begins = joint.fit, joint.follower(alone)
                 plain = min(plain, *(fitted(joint, b, tried.usual).cost for b in begins))
-            nats = fit.independent * np.log(plain / fit.cost)
+            nats = fit.independent * np.log((plain + joint.unsure) / (fit.cost + joint.unsure))
             nats -= 0.5 * tried.values * np.log(len(joint.time_s))
             found.append(Compared(float(nats), plain, fit, tried.finding(fit)))
     return found
@@ -822,7 +856,7 @@ def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, 
         shapes.append([maximum_filter1d(np.abs(x), min(width, 2 * (b - a) - 1))
                        for x in (rate, bend)])  # fmt: skip
     tones = np.searchsorted([t.send_time_s[0] for t in named_tones(joint.trials)], joint.time_s)
-    causes = [*np.concatenate(shapes, axis=1), *(1.0 * (tones == n) for n in np.unique(tones)[1:])]
+    causes = [*np.concatenate(shapes, axis=1), joint.unsure_rad, *(1.0 * (tones == n) for n in np.unique(tones)[1:])]
     size = np.abs(fit.residuals_rad) + joint.step / 4 + 1e-9
     edges = np.unique(np.linspace(0, count, _CELLS + 1).astype(int))
     cells, times, inside = np.diff(edges), _TIMES_LARGER, np.zeros(count, bool)
