@@ -61,7 +61,7 @@ _DRAWN, _DRAWN_FROM = 200, (
 """Servos tried, and ranges of their terms, the lag last; friction and effort of the range."""
 _OF_A_KIND = 2
 _REFINED, _HOPS, _TRIED, _WELL = 3, 3, 5, 0.02
-_BOUND, _CRUDE = 0.25, 0.004  # of the position's mean deviation
+_CRUDE = 0.004  # of the position's mean deviation
 EXPLAINED = 0.06
 """Of the position's mean deviation: a servo that leaves less explains nearly all."""
 _WELL_EXPLAINED = 0.008  # of the same: nothing is left that a change could explain
@@ -153,6 +153,8 @@ class Followed:
     """First reading of each trial, and the end."""
     later: NDArray[np.float64]
     """What the lag's growth goes with: time since the start [s]."""
+    bound: float = 0.25
+    """Largest cost of an error, of the position's mean deviation."""
 
     @property
     def explained(self) -> bool:
@@ -223,7 +225,7 @@ class Followed:
     @cached_property
     def unsure(self) -> float:
         """The same as a cost."""
-        bound = _BOUND * self.scale
+        bound = self.bound * self.scale
         return float(np.mean(bound * self.unsure_rad / (self.unsure_rad + bound))) / self.scale
 
     @cached_property
@@ -256,12 +258,36 @@ class Followed:
         """
         if self.fit.cost < _WELL_EXPLAINED:
             return None
-        nats, whiles = whiles_away(self, self.fit)
+        nats, whiles, _ = self.away
         best = max((c for c in comparisons(self) if c.finding), key=lambda c: c.nats, default=None)
         best = best if best and best.nats > CLEAR_NATS else None
         if nats < CLEAR_NATS or (best and whiles_away(self, best.fit)[0] < 0.5 * nats):
             return best
         return Compared(nats, self.fit.cost, self.fit, left_path(self, whiles))
+
+    @cached_property
+    def away(self) -> tuple[float, list[tuple[int, int]], Follower]:
+        """Whiles away from the path of the servo that explains the rest: nats, rows, servo."""
+        fit = self.fit
+        nats, whiles = whiles_away(self, fit)
+        servos = sorted(self.screen, key=_cost)[:_REFINED]
+        for _ in range(2 if whiles else 0):
+            inside = np.any([_within(self, *w) for w in whiles], axis=0)
+            position = np.where(inside, self.position_rad - fit.residuals_rad, self.position_rad)
+            rest = replace(self, position_rad=position)
+            fit = min((fitted(rest, f) for f in (fit, *servos)), key=_cost)
+            residuals = fit.residuals_rad + self.position_rad - position
+            fit = replace(fit, residuals_rad=residuals)
+            nats, whiles = whiles_away(self, fit)
+            if not whiles:
+                break
+        if nats > CLEAR_NATS:  # the bounded cost may have given them up for a little elsewhere
+            wide = replace(self, bound=1.0)
+            other = min((fitted(wide, f, rounds=20) for f in (self.fit, *servos)), key=_cost)
+            nats, whiles, fit = min(
+                (nats, whiles, fit), (*whiles_away(self, other), other), key=lambda w: w[0]
+            )
+        return nats, whiles, fit
 
     @property
     def changes(self) -> list[Finding]:
@@ -334,7 +360,7 @@ class Followed:
         design = np.column_stack([path, *(columns(path) if columns else ())])
         floor = 0.01 * self.scale + 0.25 * self.step
         cost, values, rest = _regression(
-            design, self.position_rad, self.starts, _BOUND * self.scale, floor
+            design, self.position_rad, self.starts, self.bound * self.scale, floor
         )
         cost = cost / self.scale + _CRUDE + 0.05 * self.step / self.scale
         return Follower(terms, path, cost, np.asarray(values, np.float64), rest)
@@ -428,14 +454,16 @@ def _columns(terms: NDArray) -> NDArray[np.float64]:
     """
     limits = np.exp(terms[:, _LOGARITHMS].T)
     natural, damping, speed, ramp, friction, effort, share, integral, play = limits
-    square, brakes, load = natural**2, 2 * damping * natural, terms[:, _LOAD]
+    square, brakes = natural**2, 2 * damping * natural
+    integral = np.where(integral > _NO_INTEGRAL, integral, 0.0)
+    load = np.where(integral > 0, 0.0, terms[:, _LOAD])  # which an integral holds
     servos = np.tile(kernel.ABSENT, (len(terms), 1))
     for name, value in {
         "stiffness": square, "damping": brakes * (1 - share), "effort_limit": square * effort,
         "back_emf": brakes * share, "friction_loss": square * friction,
         "velocity_limit": np.where(terms[:, _SPEED] < _HIGHEST[_SPEED], speed, np.inf),
         "acceleration_limit": np.where(terms[:, _RAMP] < _HIGHEST[_RAMP], ramp, np.inf),
-        "integral_per_s": np.where(integral > _NO_INTEGRAL, integral, 0.0),
+        "integral_per_s": integral,
         "backlash_rad": np.where(play > _NO_PLAY, play, 0.0), "gravity_nm": square * load,
         "offset_rad": np.clip(load, -effort, effort),  # it rests where its load lets it sag to
     }.items():  # fmt: skip
@@ -459,7 +487,7 @@ def fitted(
     """Fit the `free` terms of a servo by Levenberg-Marquardt, reweighted for the bounded cost."""
     best, damping = joint.follower(begin.terms, columns), 0.03
     free = [k for k in free if k < _LOW or abs(begin.terms[k]) < _FAR]  # levels that are set
-    bound, floor = _BOUND * joint.scale, 0.01 * joint.scale + 0.25 * joint.step
+    bound, floor = joint.bound * joint.scale, 0.01 * joint.scale + 0.25 * joint.step
     steps = steps_of(joint)
     terms_free = np.array(free)
     for _ in range(rounds):
@@ -814,22 +842,19 @@ def _clipped(joint: Followed) -> _Change | None:
             return None
         return Finding("clipped", CARE, {"level_rad": best[1], "percent": 100 * best[0]})
 
-    def curve(path: NDArray) -> list[NDArray]:
-        """As of gravity, or of a bent potentiometer."""
-        about = (path - np.median(path)) / joint.reach
-        return [about**2, about**3]
-
-    return _Change(begins, finding, free=range(_LOW, _TOP + 1), values=2, usual=curve)
+    return _Change(begins, finding, free=range(_LOW, _TOP + 1), values=2)
 
 
-def left_path(joint: Followed, whiles: Sequence[tuple[int, int]]) -> Finding | None:
+def left_path(joint: Followed, whiles: Sequence[tuple[int, int]]) -> Finding:
     """Whiles in which the joint is elsewhere; where it rests, it does not answer."""
     a, b = max(whiles, key=lambda w: joint.time_s[w[1] - 1] - joint.time_s[w[0]])
     longest = float(joint.time_s[b - 1] - joint.time_s[a])
     middle = joint.position_rad[a + (b - a) // 6 : b - (b - a) // 6]
     if np.ptp(middle) <= max(1.5 * joint.step, 0.02 * joint.scale):
-        if len(whiles) > 1:
-            return None  # what stops it again and again, such as an object, is in its way
+        if len(whiles) > 1:  # what stops it again and again, such as an object, is in its way
+            share = sum(b - a for a, b in whiles) / len(joint.time_s)
+            values = {"trials": 1, "of": len(joint.trials), "percent": 100 * share}
+            return Finding("pinned", CARE, values)
         values = {"trials": 1, "of": len(joint.trials), "longest_s": longest}
         return Finding("frozen", CARE, values)
     values = {"times": len(whiles), "longest_s": longest,
@@ -840,8 +865,8 @@ def left_path(joint: Followed, whiles: Sequence[tuple[int, int]]) -> Finding | N
 def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, int]]]:
     """Whiles whose residuals are larger than those of the same motion elsewhere: nats, rows.
 
-    Errors of a sound servo are of its noise, its speed and its force: their mean is a sum of
-    positive shares of these and of the tone, and they are exponential about it. In a while with a
+    Errors of a sound servo are of its noise, its speed and its force, its state before the first
+    motion and its tone: their mean is a sum of positive shares of these, and they are exponential about it. In a while with a
     mean `times` as large, a reading of size x is likelier by x (1 - 1 / times) - log times. The
     share of independent readings is what the means of parts of the rest show. Whiles count that
     hold most of what the servo leaves, and are as far away as a zero that matters.
@@ -853,8 +878,11 @@ def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, 
         time = joint.time_s[a:b] + 1e-9 * np.arange(b - a)
         rate = np.gradient(fit.path_rad[a:b], time) if b - a > 2 else np.zeros(b - a)
         bend = np.gradient(rate, time) if b - a > 2 else rate
-        shapes.append([maximum_filter1d(np.abs(x), min(width, 2 * (b - a) - 1))
-                       for x in (rate, bend)])  # fmt: skip
+        away = np.abs(fit.path_rad[a:b] - fit.path_rad[a]) > 0.01 * joint.reach
+        since = joint.time_s[a:b] - joint.time_s[a + np.argmax(away)]
+        shapes.append([*(maximum_filter1d(np.abs(x), min(width, 2 * (b - a) - 1))
+                         for x in (rate, bend)),
+                       1.0 * (np.abs(since) < _EDGE_S)])  # fmt: skip
     tones = np.searchsorted([t.send_time_s[0] for t in named_tones(joint.trials)], joint.time_s)
     causes = [*np.concatenate(shapes, axis=1), joint.unsure_rad, *(1.0 * (tones == n) for n in np.unique(tones)[1:])]
     size = np.abs(fit.residuals_rad) + joint.step / 4 + 1e-9
