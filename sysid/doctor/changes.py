@@ -42,14 +42,13 @@ _LOGARITHMS = slice(0, 9)
 _HANGING = kernel.COLUMNS.index("hanging_rad")
 _FAR = 1e6  # levels that nothing reaches [rad]
 _DAMPED = np.array([0.2, 1.0, 5.0, 25.0, 125.0])  # times the damping before, tried abreast
-_NO_LOAD, _NO_INTEGRAL, _NO_PLAY = np.zeros(3), 0.01, 1e-3  # [1/s], [rad]
+_SMALL_STEP = 0.2  # of those for derivatives
+_NO_LOAD, _NO_INTEGRAL, _NO_PLAY, _LONG_S = np.zeros(3), 0.01, 1e-3, 20.0  # [1/s], [rad]
 _LOWEST = np.array(
     [*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.01, 1e-3, 1e-4]), 0, -1, -0.03, *[-_FAR] * 4]
 )
 _HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 30, 30, 0.3]), 0.8, 1, 0.03, *[_FAR] * 4])
-_STEPS = np.array(
-    [0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.3, 0.002, 0.01, 2e-4, *[0.01] * 4]
-)
+_STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.3, 0.002, 0.01, 2e-4, *[0.01] * 4])
 """Bounds of a servo's terms, and differences for their derivatives; of load and levels in units of
 the command's range."""
 _OF_REACH = np.isin(np.arange(len(_STEPS)), [_LOAD, _LOW, _HIGH, _BOTTOM, _TOP])
@@ -64,7 +63,6 @@ _REFINED, _HOPS, _TRIED, _WELL = 3, 3, 5, 0.02
 _CRUDE = 0.004  # of the position's mean deviation
 EXPLAINED = 0.06
 """Of the position's mean deviation: a servo that leaves less explains nearly all."""
-_WELL_EXPLAINED = 0.008  # of the same: nothing is left that a change could explain
 _FOLLOWS, _LITTLE = 0.12, 0.3  # of the same; of a friction
 CLEAR_NATS = 20.0
 """Advantage of a fault over a servo without it: of 96 sound recordings drawn afresh (servos of six
@@ -110,14 +108,19 @@ class Follower:
     residuals_rad: NDArray[np.float64]
 
     @property
-    def independent(self) -> float:
-        """Residuals that count as independent, by `_independent_share` and by the motion.
+    def readings(self) -> float:
+        """Readings that the motion makes independent.
 
         A joint at rest has been read once however often it is: motion over the range gives some.
         """
         travel = np.sum(np.abs(np.diff(self.path_rad))) / (np.ptp(self.path_rad) + 1e-12)
+        return min(len(self.path_rad), _OF_TRAVEL * float(travel))
+
+    @property
+    def independent(self) -> float:
+        """Residuals that count as independent, by `_independent_share` and by the motion."""
         count = len(self.residuals_rad) * _independent_share(self.residuals_rad)
-        return min(count, _OF_TRAVEL * float(travel))
+        return min(count, self.readings)
 
     @property
     def settles_s(self) -> float:
@@ -215,11 +218,11 @@ class Followed:
         its acceleration, no fit comes nearer. There, paths are not straight in their terms: the
         second differences of the fit's.
         """
-        free = np.array(_ALONE)
-        changes = np.eye(len(_STEPS))[free] * steps_of(self)
-        terms = np.concatenate([self.fit.terms + changes, self.fit.terms - changes])
-        paths = self.paths(np.clip(terms, _LOWEST, _HIGHEST)).reshape(2, len(free), -1)
-        bends = paths.sum(axis=0) - 2 * self.fit.path_rad
+        step = _SMALL_STEP * steps_of(self)
+        inside = (self.fit.terms - step > _LOWEST) & (self.fit.terms + step < _HIGHEST)
+        changes = (np.eye(len(step)) * step)[[k for k in _ALONE if inside[k]]]
+        paths = self.paths(np.concatenate([self.fit.terms + changes, self.fit.terms - changes]))
+        bends = paths.reshape(2, len(changes), -1).sum(axis=0) - 2 * self.fit.path_rad
         return abs(float(self.fit.values[0])) * np.sqrt(np.sum(bends**2, axis=0))
 
     @cached_property
@@ -227,6 +230,15 @@ class Followed:
         """The same as a cost."""
         bound = self.bound * self.scale
         return float(np.mean(bound * self.unsure_rad / (self.unsure_rad + bound))) / self.scale
+
+    @property
+    def explainable(self) -> float:
+        """Nats that a change would have which leaves what differs from reading to reading alone."""
+        rest = self.fit.residuals_rad
+        noise = np.abs(np.diff(rest, append=rest[-1])) / np.sqrt(2)
+        bound = self.bound * self.scale
+        white = _CRUDE + float(np.mean(bound * noise / (noise + bound))) / self.scale + self.unsure
+        return self.fit.readings * float(np.log((self.fit.cost + self.unsure) / white))
 
     @cached_property
     def disturbed(self) -> float:
@@ -256,10 +268,9 @@ class Followed:
 
         Whiles away from the path have no cause yet: what explains most of them is one.
         """
-        if self.fit.cost < _WELL_EXPLAINED:
-            return None
         nats, whiles, _ = self.away
-        best = max((c for c in comparisons(self) if c.finding), key=lambda c: c.nats, default=None)
+        changes = comparisons(self) if self.explainable > CLEAR_NATS else []
+        best = max((c for c in changes if c.finding), key=lambda c: c.nats, default=None)
         best = best if best and best.nats > CLEAR_NATS else None
         if nats < CLEAR_NATS or (best and whiles_away(self, best.fit)[0] < 0.5 * nats):
             return best
@@ -455,8 +466,8 @@ def _columns(terms: NDArray) -> NDArray[np.float64]:
     limits = np.exp(terms[:, _LOGARITHMS].T)
     natural, damping, speed, ramp, friction, effort, share, integral, play = limits
     square, brakes = natural**2, 2 * damping * natural
-    integral = np.where(integral > _NO_INTEGRAL, integral, 0.0)
-    load = np.where(integral > 0, 0.0, terms[:, _LOAD])  # which an integral holds
+    integral = np.maximum(integral - _NO_INTEGRAL, 0.0)
+    load = terms[:, _LOAD] / (1 + _LONG_S * integral)  # an integral holds it since long
     servos = np.tile(kernel.ABSENT, (len(terms), 1))
     for name, value in {
         "stiffness": square, "damping": brakes * (1 - share), "effort_limit": square * effort,
@@ -464,7 +475,7 @@ def _columns(terms: NDArray) -> NDArray[np.float64]:
         "velocity_limit": np.where(terms[:, _SPEED] < _HIGHEST[_SPEED], speed, np.inf),
         "acceleration_limit": np.where(terms[:, _RAMP] < _HIGHEST[_RAMP], ramp, np.inf),
         "integral_per_s": integral,
-        "backlash_rad": np.where(play > _NO_PLAY, play, 0.0), "gravity_nm": square * load,
+        "backlash_rad": np.maximum(play - _NO_PLAY, 0.0), "gravity_nm": square * load,
         "offset_rad": np.clip(load, -effort, effort),  # it rests where its load lets it sag to
     }.items():  # fmt: skip
         servos[:, kernel.COLUMNS.index(name)] = value
@@ -884,7 +895,11 @@ def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, 
                          for x in (rate, bend)),
                        1.0 * (np.abs(since) < _EDGE_S)])  # fmt: skip
     tones = np.searchsorted([t.send_time_s[0] for t in named_tones(joint.trials)], joint.time_s)
-    causes = [*np.concatenate(shapes, axis=1), joint.unsure_rad, *(1.0 * (tones == n) for n in np.unique(tones)[1:])]
+    causes = [
+        *np.concatenate(shapes, axis=1),
+        joint.unsure_rad,
+        *(1.0 * (tones == n) for n in np.unique(tones)[1:]),
+    ]
     size = np.abs(fit.residuals_rad) + joint.step / 4 + 1e-9
     edges = np.unique(np.linspace(0, count, _CELLS + 1).astype(int))
     cells, times, inside = np.diff(edges), _TIMES_LARGER, np.zeros(count, bool)
