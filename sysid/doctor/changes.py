@@ -28,7 +28,6 @@ from scipy.optimize import nnls
 from pupper_sysid.servo_models import kernel
 from pupper_sysid.sysid.doctor.explanations import FILTERS, Explanation, Servo, explain
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding
-from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.excitation import named_tones, remembered
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -42,8 +41,8 @@ _LOGARITHMS = slice(0, 9)
 _HANGING = kernel.COLUMNS.index("hanging_rad")
 _FAR = 1e6  # levels that nothing reaches [rad]
 _DAMPED = np.array([0.2, 1.0, 5.0, 25.0, 125.0])  # times the damping before, tried abreast
-_SMALL_STEP = 0.2  # of those for derivatives
-_NO_LOAD, _NO_INTEGRAL, _NO_PLAY, _LONG_S = np.zeros(3), 0.01, 1e-3, 20.0  # [1/s], [rad]
+_NO_LOAD, _SMALL_STEP = np.zeros(3), 0.2  # of the differences for derivatives
+_NO_INTEGRAL, _NO_PLAY, _LONG_S = 0.01, 1e-3, 20.0  # [1/s], [rad], and before the recording
 _LOWEST = np.array(
     [*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.01, 1e-3, 1e-4]), 0, -1, -0.03, *[-_FAR] * 4]
 )
@@ -73,14 +72,8 @@ _OF_TRAVEL = 2 * 4.0
 """Independent readings of one motion over the range: a servo settles within four of its time
 constants, and does so twice, when it starts and when it stops."""
 _EDGE_S, _EDGE_SHARE = 1.0, 0.125  # from either end: an integral settles at the beginning
-_NO_GAIN, _OTHER_GAIN, _OPPOSITE, _GAIN_DRIFT, _LAG_DRIFT_S, _EARLY_S = (
-    0.1,
-    0.75,
-    0.5,
-    0.2,
-    0.008,
-    0.02,
-)
+_NO_GAIN, _OTHER_GAIN, _OPPOSITE, _GAIN_DRIFT = 0.1, 0.75, 0.5, 0.2
+_LAG_DRIFT_S, _EARLY_S = 0.008, 0.02
 _MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
 _GROWTHS = tuple(sign * size for size in (0.0015, 0.003, 0.006, 0.012) for sign in (-1, 1))
 _LATER_S, _PER_GROWTH = (-0.06, -0.025, 0.025, 0.06), 0.1  # growth [1] of a lag by as many seconds
@@ -160,9 +153,14 @@ class Followed:
     """Largest cost of an error, of the position's mean deviation."""
 
     @property
+    def share(self) -> NDArray[np.float64]:
+        """Time over the recording, from about -0.5 to 0.5."""
+        return (self.time_s - self.time_s.mean()) / max(float(np.ptp(self.time_s)), 1e-9)
+
+    @property
     def explained(self) -> bool:
-        """Whether a servo with limits explains nearly all."""
-        return self.fit.cost < EXPLAINED
+        """Whether a servo with limits explains nearly all that limits let a fit explain."""
+        return self.fit.cost - self.unsure < EXPLAINED
 
     @property
     def unexplained(self) -> float:
@@ -228,27 +226,28 @@ class Followed:
     @cached_property
     def unsure(self) -> float:
         """The same as a cost."""
-        bound = self.bound * self.scale
-        return float(np.mean(bound * self.unsure_rad / (self.unsure_rad + bound))) / self.scale
+        return self.cost_of(self.unsure_rad)
+
+    def cost_of(self, errors: NDArray[np.float64]) -> float:
+        """Mean bounded error over the mean deviation."""
+        share = np.abs(errors) / self.scale
+        return float(np.mean(self.bound * share / (share + self.bound)))
+
+    @property
+    def noise(self) -> float:
+        """Cost of what differs from reading to reading alone: noise, and readings of any age."""
+        return self.cost_of(np.diff(self.fit.residuals_rad) / np.sqrt(2))
 
     @property
     def explainable(self) -> float:
-        """Nats that a change would have which leaves what differs from reading to reading alone."""
-        rest = self.fit.residuals_rad
-        noise = np.abs(np.diff(rest, append=rest[-1])) / np.sqrt(2)
-        bound = self.bound * self.scale
-        white = _CRUDE + float(np.mean(bound * noise / (noise + bound))) / self.scale + self.unsure
-        return self.fit.readings * float(np.log((self.fit.cost + self.unsure) / white))
+        """Nats that a change would have which leaves the noise alone."""
+        least = _CRUDE + self.noise + self.unsure
+        return self.fit.readings * float(np.log((self.fit.cost + self.unsure) / least))
 
-    @cached_property
+    @property
     def disturbed(self) -> float:
-        """Cost of the fit beyond what limits, and readings of unknown age, explain."""
-        gaps = np.concatenate([np.diff(t.send_time_s) for t in self.trials])
-        age = 0.25 * float(np.median(gaps)) * (staleness(self.trials).kind != "live")
-        rate = np.abs(
-            np.gradient(self.fit.path_rad, self.time_s + 1e-9 * np.arange(len(self.time_s)))
-        )
-        return self.fit.cost - self.unsure - age * float(np.median(rate)) / self.scale
+        """Cost of the fit beyond its noise and what it is unsure of."""
+        return self.fit.cost - self.noise - self.unsure
 
     @cached_property
     def friction_rad(self) -> float:
@@ -268,7 +267,7 @@ class Followed:
 
         Whiles away from the path have no cause yet: what explains most of them is one.
         """
-        nats, whiles, _ = self.away
+        nats, whiles = self.away
         changes = comparisons(self) if self.explainable > CLEAR_NATS else []
         best = max((c for c in changes if c.finding), key=lambda c: c.nats, default=None)
         best = best if best and best.nats > CLEAR_NATS else None
@@ -277,28 +276,23 @@ class Followed:
         return Compared(nats, self.fit.cost, self.fit, left_path(self, whiles))
 
     @cached_property
-    def away(self) -> tuple[float, list[tuple[int, int]], Follower]:
-        """Whiles away from the path of the servo that explains the rest: nats, rows, servo."""
-        fit = self.fit
-        nats, whiles = whiles_away(self, fit)
+    def away(self) -> tuple[float, list[tuple[int, int]]]:
+        """Whiles away from the path of the servo that explains the rest: nats, rows."""
+        fit, (nats, whiles) = self.fit, whiles_away(self, self.fit)
         servos = sorted(self.screen, key=_cost)[:_REFINED]
-        for _ in range(2 if whiles else 0):
+        for _ in range(2):
+            if not whiles:
+                return nats, whiles
             inside = np.any([_within(self, *w) for w in whiles], axis=0)
             position = np.where(inside, self.position_rad - fit.residuals_rad, self.position_rad)
             rest = replace(self, position_rad=position)
             fit = min((fitted(rest, f) for f in (fit, *servos)), key=_cost)
-            residuals = fit.residuals_rad + self.position_rad - position
-            fit = replace(fit, residuals_rad=residuals)
+            fit = replace(fit, residuals_rad=fit.residuals_rad + self.position_rad - position)
             nats, whiles = whiles_away(self, fit)
-            if not whiles:
-                break
-        if nats > CLEAR_NATS:  # the bounded cost may have given them up for a little elsewhere
-            wide = replace(self, bound=1.0)
-            other = min((fitted(wide, f, rounds=20) for f in (self.fit, *servos)), key=_cost)
-            nats, whiles, fit = min(
-                (nats, whiles, fit), (*whiles_away(self, other), other), key=lambda w: w[0]
-            )
-        return nats, whiles, fit
+        # the bounded cost may have given them up for a little elsewhere
+        wide = replace(self, bound=1.0)
+        other = min((fitted(wide, f, rounds=20) for f in (self.fit, *servos)), key=_cost)
+        return min((nats, whiles), whiles_away(self, other), key=lambda w: w[0])
 
     @property
     def changes(self) -> list[Finding]:
@@ -571,7 +565,7 @@ class _Change:
     """A hypothesis, and how it is fitted."""
 
     begins: Sequence[Follower]
-    """Servos to begin with."""
+    """Servos to begin with; else the fit, and that of the screen that it makes best."""
     finding: Callable[[Follower], Finding | None]
     """What it is once it is fitted; None where it is too small to matter."""
     columns: Columns | None = None
@@ -604,7 +598,11 @@ def comparisons(joint: Followed) -> list[Compared]:
     for change in (_lag_drifts, _lag_changes) if loaded else CHANGES:
         if tried := change(joint):
             part, free = tried.joint or joint, (*_ALONE, *tried.free)
-            fits = [fitted(part, b, tried.columns, free) for b in tried.begins]
+            begins = tried.begins or (joint.fit, min(
+                (joint.regressed(f.terms, f.path_rad, tried.columns) for f in joint.screen),
+                key=_cost,
+            ))  # fmt: skip
+            fits = [fitted(part, b, tried.columns, free) for b in begins]
             fit = min(fits, key=_cost)
             alone = fit.terms.copy()
             alone[_GROWTH:] = joint.fit.terms[_GROWTH:]
@@ -688,18 +686,13 @@ def _moves(joint: Followed, moved: float) -> bool:
 
 def _zero_drifts(joint: Followed) -> _Change | None:
     """A zero that moves steadily."""
-    share = (joint.time_s - joint.time_s.mean()) / max(float(np.ptp(joint.time_s)), 1e-9)
 
     def finding(fit: Follower) -> Finding | None:
         moved = float(fit.values[1])
         values = {"offset_rad": moved}
         return Finding("zero_drifts", CARE, values) if _moves(joint, abs(moved)) else None
 
-    def columns(path: NDArray) -> list[NDArray]:
-        return [share]
-
-    servos = [joint.regressed(f.terms, f.path_rad, columns) for f in joint.screen]
-    return _Change([joint.fit, min(servos, key=_cost)], finding, columns)
+    return _Change((), finding, lambda path: [joint.share])
 
 
 def _gain_changes(joint: Followed) -> _Change | None:
@@ -745,18 +738,13 @@ def _another_gain(
 
 def _gain_drifts(joint: Followed) -> _Change | None:
     """A gain that grows or shrinks steadily."""
-    share = (joint.time_s - joint.time_s.mean()) / max(float(np.ptp(joint.time_s)), 1e-9)
 
     def finding(fit: Follower) -> Finding | None:
         change = float(fit.values[1] / max(fit.values[0], 1e-9))
         values = {"percent": 100 * change}
         return None if abs(change) < _GAIN_DRIFT else Finding("gain_drifts", CARE, values)
 
-    def columns(path: NDArray) -> list[NDArray]:
-        return [path * share, share]
-
-    servos = [joint.regressed(f.terms, f.path_rad, columns) for f in joint.screen]
-    return _Change([joint.fit, min(servos, key=_cost)], finding, columns, values=2)
+    return _Change((), finding, lambda path: [path * joint.share, joint.share], values=2)
 
 
 def _lag_drifts(joint: Followed) -> _Change | None:
@@ -877,10 +865,11 @@ def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, 
     """Whiles whose residuals are larger than those of the same motion elsewhere: nats, rows.
 
     Errors of a sound servo are of its noise, its speed and its force, its state before the first
-    motion and its tone: their mean is a sum of positive shares of these, and they are exponential about it. In a while with a
-    mean `times` as large, a reading of size x is likelier by x (1 - 1 / times) - log times. The
-    share of independent readings is what the means of parts of the rest show. Whiles count that
-    hold most of what the servo leaves, and are as far away as a zero that matters.
+    motion, its tone and what the fit is unsure of: their mean is a sum of positive shares of these,
+    and they are exponential about it. In a while with a mean `times` as large, a reading of size x
+    is likelier by x (1 - 1 / times) - log times. The share of independent readings is what the
+    means of parts of the rest show. Whiles count that hold most of what the servo leaves, and are
+    as far away as a zero that matters.
     """
     count, dt = len(joint.time_s), float(np.median(np.diff(joint.time_s)))
     width = max(3, 1 + 2 * round(min(fit.settles_s, 1.0) / max(dt, 1e-4)))
@@ -891,15 +880,11 @@ def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, 
         bend = np.gradient(rate, time) if b - a > 2 else rate
         away = np.abs(fit.path_rad[a:b] - fit.path_rad[a]) > 0.01 * joint.reach
         since = joint.time_s[a:b] - joint.time_s[a + np.argmax(away)]
-        shapes.append([*(maximum_filter1d(np.abs(x), min(width, 2 * (b - a) - 1))
-                         for x in (rate, bend)),
-                       1.0 * (np.abs(since) < _EDGE_S)])  # fmt: skip
+        around = [maximum_filter1d(np.abs(x), min(width, 2 * (b - a) - 1)) for x in (rate, bend)]
+        shapes.append([*around, 1.0 * (np.abs(since) < _EDGE_S)])
     tones = np.searchsorted([t.send_time_s[0] for t in named_tones(joint.trials)], joint.time_s)
-    causes = [
-        *np.concatenate(shapes, axis=1),
-        joint.unsure_rad,
-        *(1.0 * (tones == n) for n in np.unique(tones)[1:]),
-    ]
+    causes = [*(1.0 * (tones == n) for n in np.unique(tones)[1:]), joint.unsure_rad]
+    causes += list(np.concatenate(shapes, axis=1))
     size = np.abs(fit.residuals_rad) + joint.step / 4 + 1e-9
     edges = np.unique(np.linspace(0, count, _CELLS + 1).astype(int))
     cells, times, inside = np.diff(edges), _TIMES_LARGER, np.zeros(count, bool)

@@ -239,7 +239,8 @@ def _scale(base: Explanation, servo: Servo) -> Finding | None:
         if unit:
             values = {"factor": value, "large": large, "small": small, "unit": unit}
             return Finding("wrong_unit", REFUSE, values)
-    if gain > _FAR_TOO_LARGE:
+    moves = max(float(np.ptp(s.position_rad) / np.ptp(s.command_rad)) for s in base.samples)
+    if gain > _FAR_TOO_LARGE and moves > 1:  # a slow servo of a large gain is as likely a fast one
         return Finding("scale_too_large", REFUSE, {"gain": gain})
     # where a servo cannot follow it moves less: the scale is what it shows at its best
     best = float(np.abs(base.gains[:, servo.filter, _at(base, servo)]).max())
