@@ -44,13 +44,12 @@ _DAMPED = np.array([0.2, 1.0, 5.0, 25.0, 125.0])  # times the damping before, tr
 _NO_LOAD, _SMALL_STEP = np.zeros(3), 0.2  # of the differences for derivatives
 _NO_INTEGRAL, _NO_PLAY, _LONG_S = 0.01, 1e-3, 20.0  # [1/s], [rad], and before the recording
 _LOWEST = np.array(
-    [*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.01, 1e-3, 1e-4]), 0, -1, -0.03, *[-_FAR] * 4]
+    [*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.01, 1e-3, 1e-4]), 0, -0.3, -0.03, *[-_FAR] * 4]
 )
-_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 30, 30, 0.3]), 0.8, 1, 0.03, *[_FAR] * 4])
+_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 30, 30, 0.3]), 0.8, 0.3, 0.03, *[_FAR] * 4])
 _STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.3, 0.002, 0.01, 2e-4, *[0.01] * 4])
-"""Bounds of a servo's terms, and differences for their derivatives; of load and levels in units of
-the command's range."""
-_OF_REACH = np.isin(np.arange(len(_STEPS)), [_LOAD, _LOW, _HIGH, _BOTTOM, _TOP])
+"""Bounds of a servo's terms, and differences for their derivatives; of levels in units of the
+command's range."""
 _ALONE = tuple(range(_GROWTH))
 _DRAWN, _DRAWN_FROM = 200, (
     (10, 90), (0.5, 1.3), (1.5, 6), (8, 80), (0.002, 0.04), (0.1, 1), (0.3, 10), (0.3, 5),
@@ -90,8 +89,9 @@ class Follower:
     terms: NDArray[np.float64]
     """Logarithms of natural frequency [rad/s], damping ratio, speed [rad/s] and acceleration
     [rad/s²] of the set-point, friction and effort limit [rad of command], damping beyond the
-    effort limit over that within, integral gain [1/s], play [rad]; lag [s], load [rad of command]
-    and growth of the lag per second; lowest and highest goal and place [rad of command]."""
+    effort limit over that within, integral gain [1/s], play [rad]; lag [s], load [of the
+    command's range] and growth of the lag per second; lowest and highest goal and place [rad of
+    command]."""
     path_rad: NDArray[np.float64]
     """The command as it is followed, at each reading."""
     cost: float
@@ -269,11 +269,13 @@ class Followed:
         """
         nats, whiles = self.away
         changes = comparisons(self) if self.explainable > CLEAR_NATS else []
-        best = max((c for c in changes if c.finding), key=lambda c: c.nats, default=None)
-        best = best if best and best.nats > CLEAR_NATS else None
+        clear = [c for c in changes if c.finding and c.nats > CLEAR_NATS]
+        count = min((c.fit.independent for c in clear), default=1.0)  # of one judge of them all
+        cost = 0.5 * np.log(len(self.time_s)) / count
+        best = min(clear, key=lambda c: np.log(c.fit.cost) + cost * c.values, default=None)
         if nats < CLEAR_NATS or (best and whiles_away(self, best.fit)[0] < 0.5 * nats):
             return best
-        return Compared(nats, self.fit.cost, self.fit, left_path(self, whiles))
+        return Compared(nats, 0, self.fit, left_path(self, whiles))
 
     @cached_property
     def away(self) -> tuple[float, list[tuple[int, int]]]:
@@ -327,7 +329,7 @@ class Followed:
             growth, low, high = terms[np.argmax(unlike), _GROWTH : _HIGH + 1]
             abreast = (terms[:, _GROWTH : _HIGH + 1] == (growth, low, high)).all(axis=1)
             unlike &= ~abreast
-            servos, late = _columns(terms[abreast]), self.time_s - growth * self.later
+            servos, late = _columns(terms[abreast], self.reach), self.time_s - growth * self.later
             servos[:, _HANGING] = self.base.samples[0].rest_rad - np.pi / 2  # held level
             for (mean, end, step, start), a, b in zip(
                 self._inputs, self.starts[:-1], self.starts[1:], strict=True
@@ -451,7 +453,7 @@ def _servos(numbers: NDArray) -> NDArray[np.float64]:
     return np.column_stack([np.log(numbers[:, :-1]), numbers[:, -1], others])
 
 
-def _columns(terms: NDArray) -> NDArray[np.float64]:
+def _columns(terms: NDArray, reach: float) -> NDArray[np.float64]:
     """Servos as the kernel has them, of an inertia of 1.
 
     Torque that a current loop holds until the voltage runs out has less damping within the limit
@@ -461,7 +463,7 @@ def _columns(terms: NDArray) -> NDArray[np.float64]:
     natural, damping, speed, ramp, friction, effort, share, integral, play = limits
     square, brakes = natural**2, 2 * damping * natural
     integral = np.maximum(integral - _NO_INTEGRAL, 0.0)
-    load = terms[:, _LOAD] / (1 + _LONG_S * integral)  # an integral holds it since long
+    load = reach * terms[:, _LOAD] / (1 + _LONG_S * integral)  # an integral holds it since long
     servos = np.tile(kernel.ABSENT, (len(terms), 1))
     for name, value in {
         "stiffness": square, "damping": brakes * (1 - share), "effort_limit": square * effort,
@@ -478,7 +480,7 @@ def _columns(terms: NDArray) -> NDArray[np.float64]:
 
 def steps_of(joint: Followed) -> NDArray[np.float64]:
     """Differences for derivatives."""
-    return np.where(_OF_REACH, joint.reach, 1.0) * _STEPS
+    return np.where(np.arange(len(_STEPS)) < _LOW, 1.0, joint.reach) * _STEPS
 
 
 def _cost(fit: Follower) -> float:
@@ -585,7 +587,8 @@ class Compared:
 
     nats: float
     """Advantage of the change."""
-    alone: float
+    values: float
+    """How many numbers it adds."""
     fit: Follower
     finding: Finding | None
 
@@ -612,7 +615,7 @@ def comparisons(joint: Followed) -> list[Compared]:
                 plain = min(plain, *(fitted(joint, b, tried.usual).cost for b in begins))
             nats = fit.independent * np.log((plain + joint.unsure) / (fit.cost + joint.unsure))
             nats -= 0.5 * tried.values * np.log(len(joint.time_s))
-            found.append(Compared(float(nats), plain, fit, tried.finding(fit)))
+            found.append(Compared(float(nats), tried.values, fit, tried.finding(fit)))
     return found
 
 
@@ -634,14 +637,15 @@ def _split(
     windows = [
         (k, end) for n, k in enumerate(moments) for end in ([ends(k)] if ends else moments[n + 1:])
     ]  # fmt: skip
-    (first, end), begin = windows[0], joint.fit
+    (first, end), begin, others = windows[0], joint.fit, joint.screen if ends else ()
     around = (high - low) / (joint.time_s[-1] - joint.time_s[0]) * count
     around /= len(moments)
     for _ in range(2):
         tried = [
-            (joint.regressed(begin.terms, begin.path_rad, columns(*w)).cost, w) for w in windows
-        ]
-        first, end = min(tried)[1]
+            (_cost(joint.regressed(f.terms, f.path_rad, columns(*w))), w)
+            for f in (begin, *others) for w in windows
+        ]  # fmt: skip
+        (first, end), others = min(tried)[1], ()
         servos = [joint.regressed(f.terms, f.path_rad, columns(first, end)) for f in joint.screen]
         best = [begin, *sorted(servos, key=_cost)[:2]]
         begin = min((fitted(joint, f, columns(first, end), rounds=4) for f in best), key=_cost)
@@ -680,8 +684,9 @@ def _zero_moves(joint: Followed) -> _Change | None:
 
 
 def _moves(joint: Followed, moved: float) -> bool:
-    """Whether a zero moves by more than where friction lets a joint rest."""
-    return moved > max(_MOVED_RAD, _MOVED_SHARE * joint.reach, 2 * joint.friction_rad)
+    """Whether a zero moves by more than where friction and play let a joint rest."""
+    rest = 2 * joint.friction_rad + float(np.exp(joint.fit.terms[_PLAY]))
+    return moved > max(_MOVED_SHARE * joint.reach, rest)
 
 
 def _zero_drifts(joint: Followed) -> _Change | None:
@@ -850,7 +855,8 @@ def left_path(joint: Followed, whiles: Sequence[tuple[int, int]]) -> Finding:
     longest = float(joint.time_s[b - 1] - joint.time_s[a])
     middle = joint.position_rad[a + (b - a) // 6 : b - (b - a) // 6]
     if np.ptp(middle) <= max(1.5 * joint.step, 0.02 * joint.scale):
-        if len(whiles) > 1:  # what stops it again and again, such as an object, is in its way
+        places = [np.median(joint.position_rad[a:b]) for a, b in whiles]
+        if len(whiles) > 1 and np.ptp(places) < _MOVED_SHARE * joint.reach:  # in its way
             share = sum(b - a for a, b in whiles) / len(joint.time_s)
             values = {"trials": 1, "of": len(joint.trials), "percent": 100 * share}
             return Finding("pinned", CARE, values)
