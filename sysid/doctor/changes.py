@@ -53,7 +53,7 @@ command's range."""
 _ALONE = tuple(range(_GROWTH))
 _DRAWN, _DRAWN_FROM = 200, (
     (10, 90), (0.5, 1.3), (1.5, 6), (8, 80), (0.002, 0.04), (0.1, 1), (0.3, 10), (0.3, 5),
-    (5e-4, 0.02), (0.003, 0.08),
+    (0.003, 0.08),
 )  # fmt: skip
 """Servos tried, and ranges of their terms, the lag last; friction and effort of the range."""
 _OF_A_KIND = 2
@@ -62,9 +62,9 @@ _CRUDE = 0.004  # of the position's mean deviation
 EXPLAINED = 0.06
 """Of the position's mean deviation: a servo that leaves less explains nearly all."""
 _FOLLOWS, _LITTLE = 0.12, 0.3  # of the same; of a friction
-CLEAR_NATS = 20.0
-"""Advantage of a fault over a servo without it: of 96 sound recordings drawn afresh (servos of six
-kinds, six motions, 15 to 400 Hz, with and without polls) no change has as much."""
+CLEAR_NATS = 15.0
+"""Advantage of a fault over a servo without it, beyond what its numbers cost."""
+_GOOD_PART = 0.3  # of what the servo alone leaves and a change could explain
 _SPLITS, _WHILES, _CELLS = 30, 14, 128
 _FEWEST_PARTS = 8
 _OF_TRAVEL = 2 * 4.0
@@ -228,7 +228,7 @@ class Followed:
         """The same as a cost."""
         return self.cost_of(self.unsure_rad)
 
-    def cost_of(self, errors: NDArray[np.float64]) -> float:
+    def cost_of(self, errors: NDArray[np.float64] | np.float64) -> float:
         """Mean bounded error over the mean deviation."""
         share = np.abs(errors) / self.scale
         return float(np.mean(self.bound * share / (share + self.bound)))
@@ -241,7 +241,8 @@ class Followed:
     @property
     def explainable(self) -> float:
         """Nats that a change would have which leaves the noise alone."""
-        least = _CRUDE + self.noise + self.unsure
+        usual = np.median(np.abs(np.diff(self.fit.residuals_rad)))  # of Gaussian ones, not of edges
+        least = _CRUDE + self.cost_of(0.8 / 0.67 / np.sqrt(2) * usual) + self.unsure
         return self.fit.readings * float(np.log((self.fit.cost + self.unsure) / least))
 
     @property
@@ -251,15 +252,16 @@ class Followed:
 
     @cached_property
     def friction_rad(self) -> float:
-        """Error of the command that friction holds against; 0 where a servo needs none."""
+        """Error of the command that friction and play hold; 0 where a servo needs none."""
         if self.fit.cost > _FOLLOWS:
             return 0.0
         terms = self.fit.terms.copy()
-        terms[_FRICTION] += np.log(_LITTLE)
-        free = [k for k in _ALONE if k != _FRICTION]
+        terms[[_FRICTION, _PLAY]] += np.log(_LITTLE)
+        free = [k for k in _ALONE if k not in (_FRICTION, _PLAY)]
         without = fitted(self, self.follower(terms), free=free)
         nats = self.fit.independent * np.log(without.cost / self.fit.cost)
-        return float(np.exp(self.fit.terms[_FRICTION])) if nats > CLEAR_NATS else 0.0
+        friction, play = np.exp(self.fit.terms[[_FRICTION, _PLAY]])
+        return float(friction + play / 2) if nats > CLEAR_NATS else 0.0
 
     @cached_property
     def changed(self) -> Compared | None:
@@ -269,7 +271,8 @@ class Followed:
         """
         nats, whiles = self.away
         changes = comparisons(self) if self.explainable > CLEAR_NATS else []
-        clear = [c for c in changes if c.finding and c.nats > CLEAR_NATS]
+        most = self.fit.cost - _GOOD_PART * (self.fit.cost - self.noise - _CRUDE)
+        clear = [c for c in changes if c.finding and c.nats > CLEAR_NATS and c.fit.cost < most]
         count = min((c.fit.independent for c in clear), default=1.0)  # of one judge of them all
         cost = 0.5 * np.log(len(self.time_s)) / count
         best = min(clear, key=lambda c: np.log(c.fit.cost) + cost * c.values, default=None)
@@ -399,15 +402,16 @@ def followed(trials: Sequence[Trial], step: float) -> Followed | None:
 
 def _drawn(reach: float) -> list[NDArray[np.float64]]:
     """Terms of servos with the lag last: ramped, weak, held by friction, and with none of these."""
-    u = np.random.default_rng(0).random((_DRAWN, 11))
+    u = np.random.default_rng(0).random((_DRAWN, 10))
     low, high = np.array(_DRAWN_FROM).T
-    terms = np.exp(np.log(low) + u[:, :10] * np.log(high / low))
+    terms = np.exp(np.log(low) + u[:, :9] * np.log(high / low))
     terms[:, [_FRICTION, _EFFORT]] *= reach
-    kind = np.minimum((5 * u[:, 10]).astype(int), 3)
+    kind = np.minimum((5 * u[:, 9]).astype(int), 3)
     terms[kind != 3, _SPEED : _RAMP + 1] = 300.0, 2e4  # two in five ramp
     terms[kind != 1, _EFFORT] = 20.0
     terms[kind == 2, _FRICTION] *= 10
     terms[u[:, 0] * 7 % 1 < 0.7, _INTEGRAL] = 0.01
+    terms = np.insert(terms, _PLAY, _NO_PLAY, axis=1)
     return [terms[kind == k] for k in range(4)]
 
 
@@ -685,8 +689,7 @@ def _zero_moves(joint: Followed) -> _Change | None:
 
 def _moves(joint: Followed, moved: float) -> bool:
     """Whether a zero moves by more than where friction and play let a joint rest."""
-    rest = 2 * joint.friction_rad + float(np.exp(joint.fit.terms[_PLAY]))
-    return moved > max(_MOVED_SHARE * joint.reach, rest)
+    return moved > max(_MOVED_SHARE * joint.reach, 2 * joint.friction_rad)
 
 
 def _zero_drifts(joint: Followed) -> _Change | None:
