@@ -335,14 +335,15 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     bottom = min(float(np.nanmin(t.position_rad)) for t in trials)  # count 0, or next to it
     mirrored = [_beyond(t, middle, lambda v: bottom + edge - v) for t in trials]
     when = min(float(time[0] - trials[0].send_time_s[0]) for size, time in jumps if len(size))
+    turn = 2 * np.pi
+    near = min(abs(jump - k * turn / 6) for k in (5, 6))  # servos of 300 and of 360 degrees
     sign = np.log2(max(edge - bottom, 1e-6) / step) if step > 0 else 0.0
-    others = {"shifted": shifted} | ({"mirrored": mirrored} if _is_bit(sign) else {})
+    signed = _is_bit(sign) if step > 0 else near > 0.1 * turn
+    others = {"shifted": shifted} | ({"mirrored": mirrored} if signed else {})
     left = {name: _unexplained(t, step) for name, t in {"": list(trials), **others}.items()}
     if left[""] < _FITS:
         return []  # a fast joint, or one in another unit
     best = min(left, key=lambda name: left[name])
-    turn = 2 * np.pi
-    near = min(abs(jump - k * turn / 6) for k in (5, 6))  # servos of 300 and of 360 degrees
     if near > 0.1 * turn and (not best or left[best] > max(_FITS, 0.5 * left[""])):
         return []  # it is no turn that jumps, and put back no servo explains it
     if not best or left[best] > 0.7 * left[""]:
