@@ -28,7 +28,6 @@ from scipy.optimize import nnls
 from pupper_sysid.servo_models import kernel
 from pupper_sysid.sysid.doctor.explanations import FILTERS, Explanation, Servo, explain
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding
-from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.excitation import named_tones, remembered
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -36,15 +35,19 @@ _MOST_READINGS, _STEP_S = 1500, 0.005
 _UNFILTERED_HZ = 15.0  # natural frequency of a servo that no low-pass explains better
 _LONGEST_LAG_S = 0.5
 
-(_NATURAL, _DAMPING, _SPEED, _RAMP, _FRICTION, _EFFORT, _BACK_EMF, _INTEGRAL,
- _LAG, _GROWTH, _LOW, _HIGH, _BOTTOM, _TOP) = range(14)  # fmt: skip
-_LOGARITHMS = slice(0, 8)
+(_NATURAL, _DAMPING, _SPEED, _RAMP, _FRICTION, _EFFORT, _BACK_EMF, _INTEGRAL, _PLAY,
+ _LAG, _LOAD, _GROWTH, _LOW, _HIGH, _BOTTOM, _TOP) = range(16)  # fmt: skip
+_LOGARITHMS = slice(0, 9)
+_HANGING = kernel.COLUMNS.index("hanging_rad")
 _FAR = 1e6  # levels that nothing reaches [rad]
 _DAMPED = np.array([0.2, 1.0, 5.0, 25.0, 125.0])  # times the damping before, tried abreast
-_NO_LOAD, _NO_INTEGRAL = np.zeros(3), 0.01  # [1/s]
-_LOWEST = np.array([*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.01, 1e-3]), 0, -0.03, *[-_FAR] * 4])
-_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 30, 30]), 0.8, 0.03, *[_FAR] * 4])
-_STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.002, 2e-4, *[0.01] * 4])
+_NO_LOAD, _SMALL_STEP = np.zeros(3), 0.2  # of the differences for derivatives
+_NO_INTEGRAL, _NO_PLAY, _LONG_S = 0.01, 1e-3, 20.0  # [1/s], [rad], and before the recording
+_LOWEST = np.array(
+    [*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.01, 1e-3, 1e-4]), 0, -0.3, -0.03, *[-_FAR] * 4]
+)
+_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 30, 30, 0.3]), 0.8, 0.3, 0.03, *[_FAR] * 4])
+_STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.3, 0.002, 0.01, 2e-4, *[0.01] * 4])
 """Bounds of a servo's terms, and differences for their derivatives; of levels in units of the
 command's range."""
 _ALONE = tuple(range(_GROWTH))
@@ -55,28 +58,21 @@ _DRAWN, _DRAWN_FROM = 200, (
 """Servos tried, and ranges of their terms, the lag last; friction and effort of the range."""
 _OF_A_KIND = 2
 _REFINED, _HOPS, _TRIED, _WELL = 3, 3, 5, 0.02
-_BOUND, _CRUDE = 0.25, 0.004  # of the position's mean deviation
+_CRUDE = 0.004  # of the position's mean deviation
 EXPLAINED = 0.06
 """Of the position's mean deviation: a servo that leaves less explains nearly all."""
-_WELL_EXPLAINED = 0.008  # of the same: nothing is left that a change could explain
 _FOLLOWS, _LITTLE = 0.12, 0.3  # of the same; of a friction
-CLEAR_NATS = 20.0
-"""Advantage of a fault over a servo without it: of 96 sound recordings drawn afresh (servos of six
-kinds, six motions, 15 to 400 Hz, with and without polls) no change has as much."""
+CLEAR_NATS = 15.0
+"""Advantage of a fault over a servo without it, beyond what its numbers cost."""
+_GOOD_PART = 0.3  # of what the servo alone leaves and a change could explain
 _SPLITS, _WHILES, _CELLS = 30, 14, 128
 _FEWEST_PARTS = 8
 _OF_TRAVEL = 2 * 4.0
 """Independent readings of one motion over the range: a servo settles within four of its time
 constants, and does so twice, when it starts and when it stops."""
 _EDGE_S, _EDGE_SHARE = 1.0, 0.125  # from either end: an integral settles at the beginning
-_NO_GAIN, _OTHER_GAIN, _OPPOSITE, _GAIN_DRIFT, _LAG_DRIFT_S, _EARLY_S = (
-    0.1,
-    0.75,
-    0.5,
-    0.2,
-    0.008,
-    0.02,
-)
+_NO_GAIN, _OTHER_GAIN, _OPPOSITE, _GAIN_DRIFT = 0.1, 0.75, 0.5, 0.2
+_LAG_DRIFT_S, _EARLY_S = 0.008, 0.02
 _MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
 _GROWTHS = tuple(sign * size for size in (0.0015, 0.003, 0.006, 0.012) for sign in (-1, 1))
 _LATER_S, _PER_GROWTH = (-0.06, -0.025, 0.025, 0.06), 0.1  # growth [1] of a lag by as many seconds
@@ -93,8 +89,9 @@ class Follower:
     terms: NDArray[np.float64]
     """Logarithms of natural frequency [rad/s], damping ratio, speed [rad/s] and acceleration
     [rad/s²] of the set-point, friction and effort limit [rad of command], damping beyond the
-    effort limit over that within, integral gain [1/s]; lag [s] and its growth per second; lowest
-    and highest goal and place [rad of command]."""
+    effort limit over that within, integral gain [1/s], play [rad]; lag [s], load [of the
+    command's range] and growth of the lag per second; lowest and highest goal and place [rad of
+    command]."""
     path_rad: NDArray[np.float64]
     """The command as it is followed, at each reading."""
     cost: float
@@ -104,14 +101,19 @@ class Follower:
     residuals_rad: NDArray[np.float64]
 
     @property
-    def independent(self) -> float:
-        """Residuals that count as independent, by `_independent_share` and by the motion.
+    def readings(self) -> float:
+        """Readings that the motion makes independent.
 
         A joint at rest has been read once however often it is: motion over the range gives some.
         """
         travel = np.sum(np.abs(np.diff(self.path_rad))) / (np.ptp(self.path_rad) + 1e-12)
+        return min(len(self.path_rad), _OF_TRAVEL * float(travel))
+
+    @property
+    def independent(self) -> float:
+        """Residuals that count as independent, by `_independent_share` and by the motion."""
         count = len(self.residuals_rad) * _independent_share(self.residuals_rad)
-        return min(count, _OF_TRAVEL * float(travel))
+        return min(count, self.readings)
 
     @property
     def settles_s(self) -> float:
@@ -147,11 +149,18 @@ class Followed:
     """First reading of each trial, and the end."""
     later: NDArray[np.float64]
     """What the lag's growth goes with: time since the start [s]."""
+    bound: float = 0.25
+    """Largest cost of an error, of the position's mean deviation."""
+
+    @property
+    def share(self) -> NDArray[np.float64]:
+        """Time over the recording, from about -0.5 to 0.5."""
+        return (self.time_s - self.time_s.mean()) / max(float(np.ptp(self.time_s)), 1e-9)
 
     @property
     def explained(self) -> bool:
-        """Whether a servo with limits explains nearly all."""
-        return self.fit.cost < EXPLAINED
+        """Whether a servo with limits explains nearly all that limits let a fit explain."""
+        return self.fit.cost - self.unsure < EXPLAINED
 
     @property
     def unexplained(self) -> float:
@@ -163,7 +172,7 @@ class Followed:
         """The linear servo, and the best of many drawn from what servos are."""
         hz, damping = FILTERS[self.servo.filter]
         natural, lag = 2 * np.pi * (hz or _UNFILTERED_HZ), max(self.servo.lag_s, 0.0)
-        linear = [natural, damping, 300.0, 2e4, 0.004 * self.reach, 20.0, 1.0, 0.01, lag]
+        linear = [natural, damping, 300.0, 2e4, 0.004 * self.reach, 20.0, 1.0, 0.01, 1e-3, lag]
         servos = []
         for kind in (np.array([linear]), *_drawn(self.reach)):
             servos += sorted(self.followers(_servos(kind)), key=_cost)[:_OF_A_KIND]
@@ -200,26 +209,59 @@ class Followed:
         return sorted(self.followers(terms), key=_cost)[:_TRIED]
 
     @cached_property
+    def unsure_rad(self) -> NDArray[np.float64]:
+        """Error that a servo as good as the fit may have, at each reading [rad].
+
+        Where a small change of a limit ends in another motion, such as that of a profile far above
+        its acceleration, no fit comes nearer. There, paths are not straight in their terms: the
+        second differences of the fit's.
+        """
+        step = _SMALL_STEP * steps_of(self)
+        inside = (self.fit.terms - step > _LOWEST) & (self.fit.terms + step < _HIGHEST)
+        changes = (np.eye(len(step)) * step)[[k for k in _ALONE if inside[k]]]
+        paths = self.paths(np.concatenate([self.fit.terms + changes, self.fit.terms - changes]))
+        bends = paths.reshape(2, len(changes), -1).sum(axis=0) - 2 * self.fit.path_rad
+        return abs(float(self.fit.values[0])) * np.sqrt(np.sum(bends**2, axis=0))
+
+    @cached_property
+    def unsure(self) -> float:
+        """The same as a cost."""
+        return self.cost_of(self.unsure_rad)
+
+    def cost_of(self, errors: NDArray[np.float64] | np.float64) -> float:
+        """Mean bounded error over the mean deviation."""
+        share = np.abs(errors) / self.scale
+        return float(np.mean(self.bound * share / (share + self.bound)))
+
+    @property
+    def noise(self) -> float:
+        """Cost of what differs from reading to reading alone: noise, and readings of any age."""
+        return self.cost_of(np.diff(self.fit.residuals_rad) / np.sqrt(2))
+
+    @property
+    def explainable(self) -> float:
+        """Nats that a change would have which leaves the noise alone."""
+        usual = np.median(np.abs(np.diff(self.fit.residuals_rad)))  # of Gaussian ones, not of edges
+        least = _CRUDE + self.cost_of(0.8 / 0.67 / np.sqrt(2) * usual) + self.unsure
+        return self.fit.readings * float(np.log((self.fit.cost + self.unsure) / least))
+
+    @property
     def disturbed(self) -> float:
-        """Cost of the fit beyond what readings of unknown age explain."""
-        gaps = np.concatenate([np.diff(t.send_time_s) for t in self.trials])
-        age = 0.25 * float(np.median(gaps)) * (staleness(self.trials).kind != "live")
-        rate = np.abs(
-            np.gradient(self.fit.path_rad, self.time_s + 1e-9 * np.arange(len(self.time_s)))
-        )
-        return self.fit.cost - age * float(np.median(rate)) / self.scale
+        """Cost of the fit beyond its noise and what it is unsure of."""
+        return self.fit.cost - self.noise - self.unsure
 
     @cached_property
     def friction_rad(self) -> float:
-        """Error of the command that friction holds against; 0 where a servo needs none."""
+        """Error of the command that friction and play hold; 0 where a servo needs none."""
         if self.fit.cost > _FOLLOWS:
             return 0.0
         terms = self.fit.terms.copy()
-        terms[_FRICTION] += np.log(_LITTLE)
-        free = [k for k in _ALONE if k != _FRICTION]
+        terms[[_FRICTION, _PLAY]] += np.log(_LITTLE)
+        free = [k for k in _ALONE if k not in (_FRICTION, _PLAY)]
         without = fitted(self, self.follower(terms), free=free)
         nats = self.fit.independent * np.log(without.cost / self.fit.cost)
-        return float(np.exp(self.fit.terms[_FRICTION])) if nats > CLEAR_NATS else 0.0
+        friction, play = np.exp(self.fit.terms[[_FRICTION, _PLAY]])
+        return float(friction + play / 2) if nats > CLEAR_NATS else 0.0
 
     @cached_property
     def changed(self) -> Compared | None:
@@ -227,14 +269,35 @@ class Followed:
 
         Whiles away from the path have no cause yet: what explains most of them is one.
         """
-        if self.fit.cost < _WELL_EXPLAINED:
-            return None
-        nats, whiles = whiles_away(self, self.fit)
-        best = max((c for c in comparisons(self) if c.finding), key=lambda c: c.nats, default=None)
-        best = best if best and best.nats > CLEAR_NATS else None
+        nats, whiles = self.away
+        changes = comparisons(self) if self.explainable > CLEAR_NATS else []
+        most = self.fit.cost - _GOOD_PART * (self.fit.cost - self.noise - _CRUDE)
+        clear = [c for c in changes if c.finding and c.nats > CLEAR_NATS and c.fit.cost < most]
+        count = min((c.fit.independent for c in clear), default=1.0)  # of one judge of them all
+        cost = 0.5 * np.log(len(self.time_s)) / count
+        best = min(clear, key=lambda c: np.log(c.fit.cost) + cost * c.values, default=None)
         if nats < CLEAR_NATS or (best and whiles_away(self, best.fit)[0] < 0.5 * nats):
             return best
-        return Compared(nats, self.fit.cost, self.fit, left_path(self, whiles))
+        return Compared(nats, 0, self.fit, left_path(self, whiles))
+
+    @cached_property
+    def away(self) -> tuple[float, list[tuple[int, int]]]:
+        """Whiles away from the path of the servo that explains the rest: nats, rows."""
+        fit, (nats, whiles) = self.fit, whiles_away(self, self.fit)
+        servos = sorted(self.screen, key=_cost)[:_REFINED]
+        for _ in range(2):
+            if not whiles:
+                return nats, whiles
+            inside = np.any([_within(self, *w) for w in whiles], axis=0)
+            position = np.where(inside, self.position_rad - fit.residuals_rad, self.position_rad)
+            rest = replace(self, position_rad=position)
+            fit = min((fitted(rest, f) for f in (fit, *servos)), key=_cost)
+            fit = replace(fit, residuals_rad=fit.residuals_rad + self.position_rad - position)
+            nats, whiles = whiles_away(self, fit)
+        # the bounded cost may have given them up for a little elsewhere
+        wide = replace(self, bound=1.0)
+        other = min((fitted(wide, f, rounds=20) for f in (self.fit, *servos)), key=_cost)
+        return min((nats, whiles), whiles_away(self, other), key=lambda w: w[0])
 
     @property
     def changes(self) -> list[Finding]:
@@ -269,7 +332,8 @@ class Followed:
             growth, low, high = terms[np.argmax(unlike), _GROWTH : _HIGH + 1]
             abreast = (terms[:, _GROWTH : _HIGH + 1] == (growth, low, high)).all(axis=1)
             unlike &= ~abreast
-            servos, late = _columns(terms[abreast]), self.time_s - growth * self.later
+            servos, late = _columns(terms[abreast], self.reach), self.time_s - growth * self.later
+            servos[:, _HANGING] = self.base.samples[0].rest_rad - np.pi / 2  # held level
             for (mean, end, step, start), a, b in zip(
                 self._inputs, self.starts[:-1], self.starts[1:], strict=True
             ):
@@ -279,7 +343,7 @@ class Followed:
                     kernel.edges_of(mean, end), 1.0, _NO_LOAD, mean[0], _rest_steps(step), step,
                     step=np.clip((late[a:b] - start) / step, 0.0, len(mean) - _rest_steps(step)),
                     reading=np.zeros(b - a),
-                )  # fmt: skip
+                ) - servos[:, kernel.OFFSET, None]  # fmt: skip
         return np.clip(paths, terms[:, _BOTTOM, None], terms[:, _TOP, None])
 
     def path_of_trial(self, number: int) -> NDArray[np.float64]:
@@ -306,7 +370,7 @@ class Followed:
         design = np.column_stack([path, *(columns(path) if columns else ())])
         floor = 0.01 * self.scale + 0.25 * self.step
         cost, values, rest = _regression(
-            design, self.position_rad, self.starts, _BOUND * self.scale, floor
+            design, self.position_rad, self.starts, self.bound * self.scale, floor
         )
         cost = cost / self.scale + _CRUDE + 0.05 * self.step / self.scale
         return Follower(terms, path, cost, np.asarray(values, np.float64), rest)
@@ -347,6 +411,7 @@ def _drawn(reach: float) -> list[NDArray[np.float64]]:
     terms[kind != 1, _EFFORT] = 20.0
     terms[kind == 2, _FRICTION] *= 10
     terms[u[:, 0] * 7 % 1 < 0.7, _INTEGRAL] = 0.01
+    terms = np.insert(terms, _PLAY, _NO_PLAY, axis=1)
     return [terms[kind == k] for k in range(4)]
 
 
@@ -388,29 +453,38 @@ def _rest_steps(step_s: float) -> int:
 
 def _servos(numbers: NDArray) -> NDArray[np.float64]:
     """Terms of servos without levels from their limits and lags."""
-    others = np.tile([0.0, -_FAR, _FAR, -_FAR, _FAR], (len(numbers), 1))
+    others = np.tile([0.0, 0.0, -_FAR, _FAR, -_FAR, _FAR], (len(numbers), 1))
     return np.column_stack([np.log(numbers[:, :-1]), numbers[:, -1], others])
 
 
-def _columns(terms: NDArray) -> NDArray[np.float64]:
+def _columns(terms: NDArray, reach: float) -> NDArray[np.float64]:
     """Servos as the kernel has them, of an inertia of 1.
 
     Torque that a current loop holds until the voltage runs out has less damping within the limit
     than the back-EMF beyond: that of the loop is negative there.
     """
     limits = np.exp(terms[:, _LOGARITHMS].T)
-    natural, damping, speed, ramp, friction, effort, share, integral = limits
+    natural, damping, speed, ramp, friction, effort, share, integral, play = limits
     square, brakes = natural**2, 2 * damping * natural
+    integral = np.maximum(integral - _NO_INTEGRAL, 0.0)
+    load = reach * terms[:, _LOAD] / (1 + _LONG_S * integral)  # an integral holds it since long
     servos = np.tile(kernel.ABSENT, (len(terms), 1))
     for name, value in {
         "stiffness": square, "damping": brakes * (1 - share), "effort_limit": square * effort,
         "back_emf": brakes * share, "friction_loss": square * friction,
         "velocity_limit": np.where(terms[:, _SPEED] < _HIGHEST[_SPEED], speed, np.inf),
         "acceleration_limit": np.where(terms[:, _RAMP] < _HIGHEST[_RAMP], ramp, np.inf),
-        "integral_per_s": np.where(integral > _NO_INTEGRAL, integral, 0.0),
+        "integral_per_s": integral,
+        "backlash_rad": np.maximum(play - _NO_PLAY, 0.0), "gravity_nm": square * load,
+        "offset_rad": np.clip(load, -effort, effort),  # it rests where its load lets it sag to
     }.items():  # fmt: skip
         servos[:, kernel.COLUMNS.index(name)] = value
     return servos
+
+
+def steps_of(joint: Followed) -> NDArray[np.float64]:
+    """Differences for derivatives."""
+    return np.where(np.arange(len(_STEPS)) < _LOW, 1.0, joint.reach) * _STEPS
 
 
 def _cost(fit: Follower) -> float:
@@ -424,9 +498,8 @@ def fitted(
     """Fit the `free` terms of a servo by Levenberg-Marquardt, reweighted for the bounded cost."""
     best, damping = joint.follower(begin.terms, columns), 0.03
     free = [k for k in free if k < _LOW or abs(begin.terms[k]) < _FAR]  # levels that are set
-    bound, floor = _BOUND * joint.scale, 0.01 * joint.scale + 0.25 * joint.step
-    steps = _STEPS.copy()
-    steps[_LOW:] *= joint.reach
+    bound, floor = joint.bound * joint.scale, 0.01 * joint.scale + 0.25 * joint.step
+    steps = steps_of(joint)
     terms_free = np.array(free)
     for _ in range(rounds):
         size = np.abs(best.residuals_rad)
@@ -498,7 +571,7 @@ class _Change:
     """A hypothesis, and how it is fitted."""
 
     begins: Sequence[Follower]
-    """Servos to begin with."""
+    """Servos to begin with; else the fit, and that of the screen that it makes best."""
     finding: Callable[[Follower], Finding | None]
     """What it is once it is fitted; None where it is too small to matter."""
     columns: Columns | None = None
@@ -518,7 +591,8 @@ class Compared:
 
     nats: float
     """Advantage of the change."""
-    alone: float
+    values: float
+    """How many numbers it adds."""
     fit: Follower
     finding: Finding | None
 
@@ -531,7 +605,11 @@ def comparisons(joint: Followed) -> list[Compared]:
     for change in (_lag_drifts, _lag_changes) if loaded else CHANGES:
         if tried := change(joint):
             part, free = tried.joint or joint, (*_ALONE, *tried.free)
-            fits = [fitted(part, b, tried.columns, free) for b in tried.begins]
+            begins = tried.begins or (joint.fit, min(
+                (joint.regressed(f.terms, f.path_rad, tried.columns) for f in joint.screen),
+                key=_cost,
+            ))  # fmt: skip
+            fits = [fitted(part, b, tried.columns, free) for b in begins]
             fit = min(fits, key=_cost)
             alone = fit.terms.copy()
             alone[_GROWTH:] = joint.fit.terms[_GROWTH:]
@@ -539,9 +617,9 @@ def comparisons(joint: Followed) -> list[Compared]:
             if tried.usual:
                 begins = joint.fit, joint.follower(alone)
                 plain = min(plain, *(fitted(joint, b, tried.usual).cost for b in begins))
-            nats = fit.independent * np.log(plain / fit.cost)
+            nats = fit.independent * np.log((plain + joint.unsure) / (fit.cost + joint.unsure))
             nats -= 0.5 * tried.values * np.log(len(joint.time_s))
-            found.append(Compared(float(nats), plain, fit, tried.finding(fit)))
+            found.append(Compared(float(nats), tried.values, fit, tried.finding(fit)))
     return found
 
 
@@ -563,14 +641,15 @@ def _split(
     windows = [
         (k, end) for n, k in enumerate(moments) for end in ([ends(k)] if ends else moments[n + 1:])
     ]  # fmt: skip
-    (first, end), begin = windows[0], joint.fit
+    (first, end), begin, others = windows[0], joint.fit, joint.screen if ends else ()
     around = (high - low) / (joint.time_s[-1] - joint.time_s[0]) * count
     around /= len(moments)
     for _ in range(2):
         tried = [
-            (joint.regressed(begin.terms, begin.path_rad, columns(*w)).cost, w) for w in windows
-        ]
-        first, end = min(tried)[1]
+            (_cost(joint.regressed(f.terms, f.path_rad, columns(*w))), w)
+            for f in (begin, *others) for w in windows
+        ]  # fmt: skip
+        (first, end), others = min(tried)[1], ()
         servos = [joint.regressed(f.terms, f.path_rad, columns(first, end)) for f in joint.screen]
         best = [begin, *sorted(servos, key=_cost)[:2]]
         begin = min((fitted(joint, f, columns(first, end), rounds=4) for f in best), key=_cost)
@@ -609,24 +688,19 @@ def _zero_moves(joint: Followed) -> _Change | None:
 
 
 def _moves(joint: Followed, moved: float) -> bool:
-    """Whether a zero moves by more than where friction lets a joint rest."""
-    return moved > max(_MOVED_RAD, _MOVED_SHARE * joint.reach, 2 * joint.friction_rad)
+    """Whether a zero moves by more than where friction and play let a joint rest."""
+    return moved > max(_MOVED_SHARE * joint.reach, 2 * joint.friction_rad)
 
 
 def _zero_drifts(joint: Followed) -> _Change | None:
     """A zero that moves steadily."""
-    share = (joint.time_s - joint.time_s.mean()) / max(float(np.ptp(joint.time_s)), 1e-9)
 
     def finding(fit: Follower) -> Finding | None:
         moved = float(fit.values[1])
         values = {"offset_rad": moved}
         return Finding("zero_drifts", CARE, values) if _moves(joint, abs(moved)) else None
 
-    def columns(path: NDArray) -> list[NDArray]:
-        return [share]
-
-    servos = [joint.regressed(f.terms, f.path_rad, columns) for f in joint.screen]
-    return _Change([joint.fit, min(servos, key=_cost)], finding, columns)
+    return _Change((), finding, lambda path: [joint.share])
 
 
 def _gain_changes(joint: Followed) -> _Change | None:
@@ -672,18 +746,13 @@ def _another_gain(
 
 def _gain_drifts(joint: Followed) -> _Change | None:
     """A gain that grows or shrinks steadily."""
-    share = (joint.time_s - joint.time_s.mean()) / max(float(np.ptp(joint.time_s)), 1e-9)
 
     def finding(fit: Follower) -> Finding | None:
         change = float(fit.values[1] / max(fit.values[0], 1e-9))
         values = {"percent": 100 * change}
         return None if abs(change) < _GAIN_DRIFT else Finding("gain_drifts", CARE, values)
 
-    def columns(path: NDArray) -> list[NDArray]:
-        return [path * share, share]
-
-    servos = [joint.regressed(f.terms, f.path_rad, columns) for f in joint.screen]
-    return _Change([joint.fit, min(servos, key=_cost)], finding, columns, values=2)
+    return _Change((), finding, lambda path: [path * joint.share, joint.share], values=2)
 
 
 def _lag_drifts(joint: Followed) -> _Change | None:
@@ -780,22 +849,20 @@ def _clipped(joint: Followed) -> _Change | None:
             return None
         return Finding("clipped", CARE, {"level_rad": best[1], "percent": 100 * best[0]})
 
-    def curve(path: NDArray) -> list[NDArray]:
-        """As of gravity, or of a bent potentiometer."""
-        about = (path - np.median(path)) / joint.reach
-        return [about**2, about**3]
-
-    return _Change(begins, finding, free=range(_LOW, _TOP + 1), values=2, usual=curve)
+    return _Change(begins, finding, free=range(_LOW, _TOP + 1), values=2)
 
 
-def left_path(joint: Followed, whiles: Sequence[tuple[int, int]]) -> Finding | None:
+def left_path(joint: Followed, whiles: Sequence[tuple[int, int]]) -> Finding:
     """Whiles in which the joint is elsewhere; where it rests, it does not answer."""
     a, b = max(whiles, key=lambda w: joint.time_s[w[1] - 1] - joint.time_s[w[0]])
     longest = float(joint.time_s[b - 1] - joint.time_s[a])
     middle = joint.position_rad[a + (b - a) // 6 : b - (b - a) // 6]
     if np.ptp(middle) <= max(1.5 * joint.step, 0.02 * joint.scale):
-        if len(whiles) > 1:
-            return None  # what stops it again and again, such as an object, is in its way
+        places = [np.median(joint.position_rad[a:b]) for a, b in whiles]
+        if len(whiles) > 1 and np.ptp(places) < _MOVED_SHARE * joint.reach:  # in its way
+            share = sum(b - a for a, b in whiles) / len(joint.time_s)
+            values = {"trials": 1, "of": len(joint.trials), "percent": 100 * share}
+            return Finding("pinned", CARE, values)
         values = {"trials": 1, "of": len(joint.trials), "longest_s": longest}
         return Finding("frozen", CARE, values)
     values = {"times": len(whiles), "longest_s": longest,
@@ -806,11 +873,12 @@ def left_path(joint: Followed, whiles: Sequence[tuple[int, int]]) -> Finding | N
 def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, int]]]:
     """Whiles whose residuals are larger than those of the same motion elsewhere: nats, rows.
 
-    Errors of a sound servo are of its noise, its speed and its force: their mean is a sum of
-    positive shares of these and of the tone, and they are exponential about it. In a while with a
-    mean `times` as large, a reading of size x is likelier by x (1 - 1 / times) - log times. The
-    share of independent readings is what the means of parts of the rest show. Whiles count that
-    hold most of what the servo leaves, and are as far away as a zero that matters.
+    Errors of a sound servo are of its noise, its speed and its force, its state before the first
+    motion, its tone and what the fit is unsure of: their mean is a sum of positive shares of these,
+    and they are exponential about it. In a while with a mean `times` as large, a reading of size x
+    is likelier by x (1 - 1 / times) - log times. The share of independent readings is what the
+    means of parts of the rest show. Whiles count that hold most of what the servo leaves, and are
+    as far away as a zero that matters.
     """
     count, dt = len(joint.time_s), float(np.median(np.diff(joint.time_s)))
     width = max(3, 1 + 2 * round(min(fit.settles_s, 1.0) / max(dt, 1e-4)))
@@ -819,10 +887,13 @@ def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, 
         time = joint.time_s[a:b] + 1e-9 * np.arange(b - a)
         rate = np.gradient(fit.path_rad[a:b], time) if b - a > 2 else np.zeros(b - a)
         bend = np.gradient(rate, time) if b - a > 2 else rate
-        shapes.append([maximum_filter1d(np.abs(x), min(width, 2 * (b - a) - 1))
-                       for x in (rate, bend)])  # fmt: skip
+        away = np.abs(fit.path_rad[a:b] - fit.path_rad[a]) > 0.01 * joint.reach
+        since = joint.time_s[a:b] - joint.time_s[a + np.argmax(away)]
+        around = [maximum_filter1d(np.abs(x), min(width, 2 * (b - a) - 1)) for x in (rate, bend)]
+        shapes.append([*around, 1.0 * (np.abs(since) < _EDGE_S)])
     tones = np.searchsorted([t.send_time_s[0] for t in named_tones(joint.trials)], joint.time_s)
-    causes = [*np.concatenate(shapes, axis=1), *(1.0 * (tones == n) for n in np.unique(tones)[1:])]
+    causes = [*(1.0 * (tones == n) for n in np.unique(tones)[1:]), joint.unsure_rad]
+    causes += list(np.concatenate(shapes, axis=1))
     size = np.abs(fit.residuals_rad) + joint.step / 4 + 1e-9
     edges = np.unique(np.linspace(0, count, _CELLS + 1).astype(int))
     cells, times, inside = np.diff(edges), _TIMES_LARGER, np.zeros(count, bool)

@@ -48,7 +48,7 @@ _NOT_LINEAR = 0.006  # of the variance
 _USUAL_LAG_S, _LAG_SCALE_S = 0.06, 0.05  # dead time with the age of a reading: usual, and beyond
 _USUAL_GAIN, _MOST_GAIN_NATS = 0.3, 12.0  # of the logarithm
 
-_HELD_S, _HELD_GAPS = 0.12, 5.0  # seconds, and usual times between new readings
+_HELD_S, _BY_CHANCE = 0.12, 0.01  # rest; probability that lost reads alone hold a value for longer
 
 Filtered = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
@@ -238,12 +238,18 @@ def _samples(trial: Trial, live: bool, grid: float) -> Samples:
 
 
 def _resting(trial: Trial, fresh: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows in which the joint rests: their value has stayed for longer than any poll holds one."""
+    """Rows in which the joint rests: their value has stayed for longer than any poll holds one.
+
+    Each read is lost with one probability, so that the tail of the holds is exponential: half of
+    the longer ones are over after each further `half_life`.
+    """
     seen = np.flatnonzero(np.isfinite(trial.position_rad))
     time = trial.read_time_s
     if len(fresh) < 3 or not len(seen):
         return np.zeros(0, np.int64)
-    held = max(_HELD_S, _HELD_GAPS * float(np.median(np.diff(time[fresh]))))
+    usual, longer = np.quantile(np.diff(time[fresh]), [0.5, 0.75])
+    half_life = max(longer - usual, 0.5 * usual)  # half of the reads lost at least
+    held = max(_HELD_S, usual + half_life * float(np.log2(len(fresh) / _BY_CHANCE)))
     last = np.searchsorted(fresh, seen, "right") - 1
     since = time[seen] - time[fresh[np.maximum(last, 0)]]
     return seen[(last >= 0) & (since > held)]

@@ -35,6 +35,7 @@ from pupper_sysid.sysid.recordings.recording import Trial
 _UNRELATED, _HALF, _LOOSE, _FOLLOWS = 0.25, 0.5, 0.6, 0.75  # share of the position's variance
 _FOLLOWS_LATE, _LATEST_S = 0.9, 0.35  # what swings at a load's own frequency is late
 _NO_ONE_LAG = 0.3
+_FEWEST_BITS, _NEARLY = 8, 0.15  # of a bit
 _FITS = 0.1  # of the position's variance left: nothing jumps
 _TURNS, _TURN_SHARE = 4, 0.2
 _FAR_TOO_LARGE, _TOO_LARGE, _SMALL, _STILL = 2.0, 1.5, 0.4, 0.1
@@ -98,7 +99,7 @@ def relation_findings(
     joint = followed(trials, step)
     assert joint is not None
     # a set-point that ramps is late by a part of the motion; a fault may explain the rest
-    sound, changes = joint.explained, joint.changes
+    sound, changes = joint.explained or joint.unexplained < 1 - _FOLLOWS, joint.changes
     if base.explained < _UNRELATED:
         values = {"percent": 100 * base.explained}
         found = changes or [Finding("unrelated", REFUSE, values)]
@@ -238,7 +239,8 @@ def _scale(base: Explanation, servo: Servo) -> Finding | None:
         if unit:
             values = {"factor": value, "large": large, "small": small, "unit": unit}
             return Finding("wrong_unit", REFUSE, values)
-    if gain > _FAR_TOO_LARGE:
+    moves = max(float(np.ptp(s.position_rad) / np.ptp(s.command_rad)) for s in base.samples)
+    if gain > _FAR_TOO_LARGE and moves > 1:  # a slow servo of a large gain is as likely a fast one
         return Finding("scale_too_large", REFUSE, {"gain": gain})
     # where a servo cannot follow it moves less: the scale is what it shows at its best
     best = float(np.abs(base.gains[:, servo.filter, _at(base, servo)]).max())
@@ -333,29 +335,33 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     bottom = min(float(np.nanmin(t.position_rad)) for t in trials)  # count 0, or next to it
     mirrored = [_beyond(t, middle, lambda v: bottom + edge - v) for t in trials]
     when = min(float(time[0] - trials[0].send_time_s[0]) for size, time in jumps if len(size))
-    left = {name: _unexplained(put_back, step) for name, put_back in
-            (("", list(trials)), ("shifted", shifted), ("mirrored", mirrored))}  # fmt: skip
+    turn = 2 * np.pi
+    near = min(abs(jump - k * turn / 6) for k in (5, 6))  # servos of 300 and of 360 degrees
+    sign = np.log2(max(edge - bottom, 1e-6) / step) if step > 0 else 0.0
+    signed = _is_bit(sign) if step > 0 else near > 0.1 * turn
+    others = {"shifted": shifted} | ({"mirrored": mirrored} if signed else {})
+    left = {name: _unexplained(t, step) for name, t in {"": list(trials), **others}.items()}
     if left[""] < _FITS:
         return []  # a fast joint, or one in another unit
     best = min(left, key=lambda name: left[name])
-    turn = 2 * np.pi
-    near = min(abs(jump - k * turn / 6) for k in (5, 6))  # servos of 300 and of 360 degrees
     if near > 0.1 * turn and (not best or left[best] > max(_FITS, 0.5 * left[""])):
         return []  # it is no turn that jumps, and put back no servo explains it
     if not best or left[best] > 0.7 * left[""]:
         best = "shifted"
     values = {"times": len(sizes), "time_s": when}
-    reach = edge - bottom if best == "mirrored" else jump
-    bits = np.log2(max(reach, 1e-6) / step) if step > 0 else 0.0
+    bits = np.log2(jump / step) if step > 0 else 0.0
     if best == "mirrored":
-        values |= {"jump_rad": jump, "bit": round(bits)}
+        values |= {"jump_rad": jump, "bit": round(sign)}
         return [Finding("sign_bit", REFUSE, values)]
-    if bits > 8 and abs(jump - turn) > 0.15 * turn and near > 0.1 * turn:
-        exact = step * 2.0 ** round(bits)
-        if abs(exact - jump) < 0.1 * jump:
-            values |= {"jump_rad": exact, "bits": round(bits)}
-            return [Finding("encoder_overflow", REFUSE, values)]
+    if _is_bit(bits) and abs(jump - turn) > 0.15 * turn and near > 0.1 * turn:
+        values |= {"jump_rad": step * 2.0 ** round(bits), "bits": round(bits)}
+        return [Finding("encoder_overflow", REFUSE, values)]
     return [Finding("angle_wrapped", REFUSE, values)]
+
+
+def _is_bit(bits: float) -> bool:
+    """Whether a number of counts is a power of 2, as far as readings next to it tell."""
+    return bits > _FEWEST_BITS and abs(bits - round(bits)) < _NEARLY
 
 
 def _jumps(trial: Trial, step: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
