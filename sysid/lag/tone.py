@@ -277,31 +277,32 @@ def _likely_ripple(
         [*(np.log(x[1] / x[0]) for x in (_TIME_CONSTANTS_S, _DAMPING)), _DEAD_STEP_S]
     )
     corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), axis=-1).reshape(-1, 3)
-    cells, size = servos, np.zeros(len(servos), int)  # how often each was divided
 
     def evaluated(cells: NDArray) -> tuple[NDArray, NDArray]:
         masses = _masses(cells, edges)
         misfit, gain = _misfits(masses @ (ripple + tone).T, tones)
         return misfit, gain[:, None] * (masses @ ripple.T)
 
-    misfit, seen = evaluated(cells)
-    for turn in range(_SPLITS + 1):
+    def chances(misfit: NDArray, halved: NDArray) -> NDArray[np.float64]:
         scale = max(1.0, float(misfit.min()) / max(2 * len(tones) - 4, 1))
-        chance = 8.0**-size * np.exp(-0.5 * (misfit - misfit.min()) / scale)
-        if turn == _SPLITS:
-            break
-        likely = np.argsort(-chance)[:_SPLIT]
-        halved = size[likely, None, None] + 1
-        parts = cells[likely, None] + corners * half * 2.0 ** (1 - halved)
-        parts, depth = parts.reshape(-1, 3), np.repeat(size[likely] + 1, len(corners))
-        inside = parts[:, 2] >= 0
-        of_parts = evaluated(parts[inside])
-        cells, size, misfit, seen = (
-            np.concatenate([np.delete(old, likely, axis=0), new])
-            for old, new in zip(
-                (cells, size, misfit, seen), (parts[inside], depth[inside], *of_parts), strict=True
-            )
+        return 8.0**-halved * np.exp(-0.5 * (misfit - misfit.min()) / scale)
+
+    cells, halved = servos, np.zeros(len(servos))  # how often each was halved
+    misfit, seen = evaluated(cells)
+    for _ in range(_SPLITS):
+        likely = np.argsort(-chances(misfit, halved))[:_SPLIT]
+        often = np.repeat(halved[likely] + 1, len(corners))
+        parts = (cells[likely, None] + corners * half * 2.0 ** -halved[likely, None, None]).reshape(
+            -1, 3
         )
+        inside = parts[:, 2] >= 0
+        parts, often = parts[inside], often[inside]
+        misfit_of_parts, seen_of_parts = evaluated(parts)
+        cells = np.concatenate([np.delete(cells, likely, axis=0), parts])
+        halved = np.concatenate([np.delete(halved, likely), often])
+        misfit = np.concatenate([np.delete(misfit, likely), misfit_of_parts])
+        seen = np.concatenate([np.delete(seen, likely, axis=0), seen_of_parts])
+    chance = chances(misfit, halved)
     return chance / chance.sum(), seen
 
 
