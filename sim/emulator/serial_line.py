@@ -78,8 +78,8 @@ class LineEmulator(ABC):
     """
 
     family: ClassVar[Family]
-    reader: ClassVar[Callable[[], Any]]
-    """Makes a reader of requests."""
+    reader: ClassVar[type[Any]]
+    """Of requests."""
     memory_bytes: int
     factory: ClassVar[Mapping[str, Mapping[str, int]]]
     """Registers as a servo leaves the factory, by series' name."""
