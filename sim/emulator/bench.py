@@ -16,6 +16,7 @@ silently.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from threading import RLock
 from typing import Any, Protocol
@@ -30,6 +31,22 @@ from pupper_sysid.sim.emulator.robot import EmulatedRobot
 _CHUNK = 256
 _DRIFT_MEMORY_S = 5.0  # recordings of 3 s see different mean periods, so it wanders over seconds
 _WARM_UP_ROUNDS = 64
+
+
+def held_over(
+    since: float, stop: float, goal: float, queue: deque[tuple[float, float]]
+) -> tuple[float, float]:
+    """Integral of a held command over a time, and the command at its end.
+
+    `queue` has the times of the commands to come; those before `stop` are taken off it.
+    """
+    integral = 0.0
+    while queue and queue[0][0] < stop:
+        at, following = queue.popleft()
+        at = max(at, since)
+        integral += goal * (at - since)
+        since, goal = at, following
+    return integral + goal * (stop - since), goal
 
 
 class PollSchedule:

@@ -12,6 +12,7 @@ from collections import deque
 import numpy as np
 
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
+from pupper_sysid.sim.emulator.bench import held_over
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.servo_mjcf import (
     for_commands_between_steps,
@@ -26,22 +27,6 @@ PHYSICS_STEP_S = 0.001
 _STILL_RAD_S = 1e-4  # MuJoCo's dry friction creeps at up to 3e-5 rad/s: invisible
 _STILL_RAD_S2 = 1e-4
 _STEPS_BETWEEN_LOOKS = 50
-
-
-def held_over(
-    since: float, stop: float, goal: float, queue: deque[tuple[float, float]]
-) -> tuple[float, float]:
-    """Integral of a held command over a time, and the command at its end.
-
-    `queue` has the times of the commands to come; those before `stop` are taken off it.
-    """
-    integral = 0.0
-    while queue and queue[0][0] < stop:
-        at, following = queue.popleft()
-        at = max(at, since)
-        integral += goal * (at - since)
-        since, goal = at, following
-    return integral + goal * (stop - since), goal
 
 
 class FreeAirServo:

@@ -37,8 +37,7 @@ from pupper_sysid.common.data_sheet import no_load_speed, stall_torque
 from pupper_sysid.hardware.dynamixel import SERIES, profile
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-from pupper_sysid.sim.emulator.bench import AMBIENT_C, SUPPLY_V, ServosOnStand
-from pupper_sysid.sim.emulator.free_air import held_over
+from pupper_sysid.sim.emulator.bench import AMBIENT_C, SUPPLY_V, ServosOnStand, held_over
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, directly_read, draw_robot
 from pupper_sysid.sim.robot.servo_mjcf import (
     FRICTION_SOLIMP,

@@ -284,7 +284,7 @@ def test_a_stack_that_cannot_be_is_refused(policy):
             lambda: assemble(policy, STACKS["lstm-servo"], JOINTS, CALIBRATION, Path("nowhere")),
             "no such folder",
         ),
-        # out of range: `cli/test_refusals.py`
+        # out of range: `tests/cli/test_refusals.py`
         (lambda: Stack(scale_rad=np.nan), "scale_rad"),
         (lambda: constant((0, np.nan, 0)), "`command`"),
     ]  # fmt: skip
