@@ -637,10 +637,14 @@ def _split(
     if low >= high:
         return None
     count, splits = len(joint.time_s), _SPLITS if ends else _WHILES
-    moments = np.searchsorted(joint.time_s, np.linspace(low, high, splits)).tolist()
+    # between trials several moments have one reading
+    moments = np.unique(np.searchsorted(joint.time_s, np.linspace(low, high, splits))).tolist()
     windows = [
         (k, end) for n, k in enumerate(moments) for end in ([ends(k)] if ends else moments[n + 1:])
+        if end - k > 2
     ]  # fmt: skip
+    if not windows:
+        return None
     (first, end), begin, others = windows[0], joint.fit, joint.screen if ends else ()
     around = (high - low) / (joint.time_s[-1] - joint.time_s[0]) * count
     around /= len(moments)

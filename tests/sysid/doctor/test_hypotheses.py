@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pupper_sysid as ps
-from pupper_sysid.sysid.doctor.changes import followed
+from pupper_sysid.sysid.doctor.changes import _gain_for_a_while, followed
 from pupper_sysid.sysid.doctor.checks import findings
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, RIVALS, USE, WORDS, Finding, rivalled
 from pupper_sysid.sysid.doctor.hypotheses import _since_command_s
@@ -16,6 +16,7 @@ from pupper_sysid.sysid.feedback.staleness import staleness
 from pupper_sysid.sysid.recordings.excitation import named_tones
 from support.real_recordings import case, real_recording
 from support.strange_servos import ACCUSING, FAULTS, draw_recording, draw_world, simulated
+from support.synthetic import first_order_trial
 
 
 def slow(case):
@@ -127,6 +128,31 @@ def test_free_motion_shows_what_happened_within_a_trial(fault, code):
     )  # fmt: skip
     assert code not in codes(recorded(simulated(world)))
     assert code in codes(recorded(FAULTS[fault][0](world, rng)[1]))
+
+
+@pytest.mark.parametrize("pause_s", [4.0, 1000.0])
+def test_a_gain_that_changes_in_a_pause_is_named_at_the_first_reading_after_it(pause_s):
+    def strokes(time):
+        return 0.3 * np.sin(7 * time) + 0.1 * np.sin(14 * time + 1)
+
+    trials = []
+    for number, gain in enumerate((1.0, 0.5)):
+        trial = first_order_trial(
+            strokes, 0.02, 0.03, loop_s=0.02, duration_s=6.0, number=number, gain=gain
+        )
+        start = number * (6.0 + pause_s)
+        noise = 1e-3 * np.random.default_rng(number).standard_normal(len(trial.position_rad))
+        trials.append(
+            replace(
+                trial, send_time_s=trial.send_time_s + start, read_time_s=trial.read_time_s + start,
+                position_rad=trial.position_rad + noise,
+            )
+        )  # fmt: skip
+    (finding,) = findings(trials)
+    assert finding.code == "gain_changed"
+    assert finding.values["time_s"] == pytest.approx(6.0 + pause_s, abs=0.1)
+    if pause_s > 100:  # no while is tried that has no reading
+        assert _gain_for_a_while(followed(trials, 1e-3)) is None
 
 
 def test_windows_that_differ_by_themselves_are_no_drift():
