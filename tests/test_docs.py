@@ -151,46 +151,33 @@ def test_the_page_of_public_names_has_them_all():
     assert all(f"pupper_sysid.{name}`" in page for name in pupper_sysid.__all__)
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory) -> Path:
-    """The documentation as HTML, built without a warning."""
+@pytest.mark.slow
+def test_the_built_pages_have_every_command_and_public_name_and_need_no_network(tmp_path):
+    # one test: the gallery is written into the sources, by one build at a time
     pytest.importorskip("sphinx")
-    pages = tmp_path_factory.mktemp("html")
     done = subprocess.run(
-        [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", DOCS, pages],
+        [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", DOCS, tmp_path],
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-4000:]
-    return pages
 
-
-@pytest.mark.slow
-def test_the_page_of_commands_names_every_command(site):
-    commands = (site / "commands.html").read_text()
+    commands = (tmp_path / "commands.html").read_text()
     for program in ("pupper-sysid", "pupper-train", "pupper-analyze"):
-        assert program in commands
         for name in docs_conf.subcommands(program.replace("-", "_")):
             assert f">{program} {name}<" in commands
 
-
-@pytest.mark.slow
-def test_every_public_name_is_in_the_reference(site):
     anchors: set[str] = set()
-    for page in (site / "reference").glob("*.html"):
+    for page in (tmp_path / "reference").glob("*.html"):
         anchors |= set(re.findall(r'id="(?:module-)?([^"]+)"', page.read_text()))
     wanted = {name for module in MODULES for name in public_names(module)}
     assert sorted(name for name in wanted if name not in anchors) == []
 
-
-@pytest.mark.slow
-def test_pages_need_no_network(site):
-    """No script, style or picture comes from elsewhere, and formulas are MathML."""
     tag = re.compile(r'<(?:script|link|img|iframe)\b[^>]*?(?:src|href)="(?:https?:)?//([^"]+)"')
-    for page in site.rglob("*.html"):
+    for page in tmp_path.rglob("*.html"):
         assert tag.findall(page.read_text()) == [], page
-    theory = (site / "theory/lag.html").read_text()
+    theory = (tmp_path / "theory/lag.html").read_text()
     formulas = re.findall(r"<math\b.*?</math>", theory, re.DOTALL)
-    assert len(formulas) > 5
+    assert len(formulas) > 5  # as MathML
     assert not any("\\" in html.unescape(re.sub("<[^>]+>", "", f)) for f in formulas)
 
 
