@@ -219,7 +219,7 @@ def test_a_joint_that_falls_for_a_while_is_no_other_servo(motion):
     """A supply that breaks down for two seconds: the joint falls to its stop and comes back."""
     world = replace(
         draw_world(np.random.default_rng(3), "smart", motion, 3e-4), amplitude_rad=0.3,
-        rate_hz=50.0, poll_s=0.0, friction_rad=0.0, gravity_rad=0.0, duration_s=12.0,
+        rate_hz=80.0, poll_s=0.0, friction_rad=0.0, gravity_rad=0.0, duration_s=14.0,
         quantum_rad=0.0015,
     )  # fmt: skip
     table = simulated(world)
