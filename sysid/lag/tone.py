@@ -195,7 +195,7 @@ _BEYOND_S = 0.1
 _TIME_CONSTANTS_S = np.geomspace(0.001, 0.3, 16)
 _DAMPING = np.geomspace(0.3, 2.5, 6)
 _DEAD_STEP_S, _DEAD_REACH_S = 0.002, 0.04
-_SPLIT, _SPLITS = 128, 5
+_SPLIT, _SPLITS = 128, 5  # cells divided at once, and how often
 _NOT_LINEAR = 0.01  # of a tone's response: no servo is nearer to a linear one
 _DRAWS = 400
 
@@ -292,9 +292,8 @@ def _likely_ripple(
     for _ in range(_SPLITS):
         likely = np.argsort(-chances(misfit, halved))[:_SPLIT]
         often = np.repeat(halved[likely] + 1, len(corners))
-        parts = (cells[likely, None] + corners * half * 2.0 ** -halved[likely, None, None]).reshape(
-            -1, 3
-        )
+        apart = corners * half * 2.0 ** -halved[likely, None, None]
+        parts = (cells[likely, None] + apart).reshape(-1, 3)
         inside = parts[:, 2] >= 0
         parts, often = parts[inside], often[inside]
         misfit_of_parts, seen_of_parts = evaluated(parts)

@@ -98,7 +98,7 @@ def _lag(results: Mapping[str, JointCalibrationResult]) -> Section:
     picture = Picture(
         "lag_budget",
         "Lag budget: the time from sending a command to the row in which its motion is read. The "
-        "black line is the raw lag, which is the sum.",
+        "line across each bar is the raw lag, which is the sum.",
         figures.lag_budget_figure(budgets),
     )
     notes = shared({joint: r.lag.warnings for joint, r in results.items()})
