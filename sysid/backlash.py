@@ -156,12 +156,12 @@ def backlash(recordings: Recordings, joints: Joints = None, seed: int = 0) -> Ba
     >>> print(found)  # doctest: +SKIP
     bench: hysteresis 1.50° [1.48, 1.51] at P 8, …, backlash 1.92° [1.83, 2.00]
     """
-    given = checks.as_sequence(recordings)
-    found = {
-        joint: _measure(joint, checks.recorded_trials(given, joint), checks.joint_rng(seed, joint))
-        for joint in checks.chosen_joints(given, joints)
+    inputs = checks.as_sequence(recordings)
+    measured = {
+        joint: _measure(joint, checks.recorded_trials(inputs, joint), checks.joint_rng(seed, joint))
+        for joint in checks.chosen_joints(inputs, joints)
     }
-    return Backlash(joints=found)
+    return Backlash(joints=measured)
 
 
 def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> JointBacklash:
@@ -169,11 +169,11 @@ def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> J
     for trial in trials:
         groups.setdefault(trial.p_gain, []).extend(_strokes(trial))
     groups = {
-        g: own
-        for g, own in sorted(groups.items())
-        if len(own) >= _LEAST_STROKES
-        and len({round(s.speed_rad_s, 3) for s in own}) > 1
-        and len({s.side for s in own}) > 1
+        g: strokes_at_gain
+        for g, strokes_at_gain in sorted(groups.items())
+        if len(strokes_at_gain) >= _LEAST_STROKES
+        and len({round(s.speed_rad_s, 3) for s in strokes_at_gain}) > 1
+        and len({s.side for s in strokes_at_gain}) > 1
     }
     if not groups:
         raise InputError(
@@ -182,7 +182,7 @@ def _measure(joint: str, trials: Sequence[Trial], rng: np.random.Generator) -> J
             "kind reversal."
         )
     loaded = all(t.load is not None and t.load.gravity_nm > 0 for t in trials)
-    fits = {g: _Fit(own, loaded, rng) for g, own in groups.items()}
+    fits = {g: _Fit(strokes_at_gain, loaded, rng) for g, strokes_at_gain in groups.items()}
     gains = np.array(list(fits))
     quantum = max(t.truncation.quantum_rad for t in trials)
     notes: list[str] = []
@@ -241,7 +241,7 @@ def _strokes(trial: Trial) -> list[_Stroke]:
     rate = np.diff(command) / np.diff(time)
     edges = np.flatnonzero(np.abs(np.diff(rate)) > 0.1 * np.abs(rate[1:]) + 1e-4) + 1
     bounds = [0, *edges.tolist(), len(rate)]
-    found = []
+    strokes = []
     for first, last in pairwise(bounds):
         speed = float(np.median(rate[first:last])) if last > first else 0.0
         if not 0 < abs(speed) <= FASTEST_RAD_S or time[last] - time[first] < _LEAST_STROKE_S:
@@ -249,8 +249,8 @@ def _strokes(trial: Trial) -> list[_Stroke]:
         rows = np.arange(first, last + 1)
         rows = rows[np.isfinite(position[rows])]
         if len(rows) > 20:
-            found.append(_stroke(trial, rows, speed))
-    return [stroke for stroke in found if stroke is not None]
+            strokes.append(_stroke(trial, rows, speed))
+    return [stroke for stroke in strokes if stroke is not None]
 
 
 def _stroke(trial: Trial, rows: NDArray[np.intp], speed: float) -> _Stroke | None:
@@ -310,9 +310,9 @@ class _Fit:
         kinds = [(round(s.speed_rad_s, 3), s.side) for s in strokes]
         weights = np.zeros((_DRAWS, self.count))
         for kind in set(kinds):
-            own = np.array([k for k, other in enumerate(kinds) if other == kind])
-            drawn = rng.integers(0, len(own), (_DRAWS, len(own)))
-            for k, stroke in enumerate(own):
+            of_kind = np.array([k for k, other in enumerate(kinds) if other == kind])
+            drawn = rng.integers(0, len(of_kind), (_DRAWS, len(of_kind)))
+            for k, stroke in enumerate(of_kind):
                 weights[:, stroke] = (drawn == k).sum(axis=1)
         self.weights = weights
         self.best = self._solve(np.ones(self.count))
@@ -328,10 +328,10 @@ class _Fit:
     def play(self, solved: _Array, weights: _Array, dead_time_s: float) -> float:
         """Backlash [rad]; the mean over the crossings."""
         gravity, lag = solved[-2:]
-        own = max(lag - dead_time_s, 1e-4)
+        slope_lag = max(lag - dead_time_s, 1e-4)
         total = least = 0.0
         for k, (sine, trailing) in self._crossings:
-            total += weights[k] * (trailing - gravity * sine) / own
+            total += weights[k] * (trailing - gravity * sine) / slope_lag
             least += weights[k]
         return total / least if least else np.nan
 
@@ -348,14 +348,14 @@ def _play(
     fits: dict[float, _Fit], damped: bool, rng: np.random.Generator, notes: list[str]
 ) -> Interval | None:
     """Backlash over the gains at which friction sets the hysteresis."""
-    gains, own = np.array(list(fits)), list(fits.values())
-    if not any(f._crossings for f in own):
+    gains, fits_by_gain = np.array(list(fits)), list(fits.values())
+    if not any(f._crossings for f in fits_by_gain):
         notes.append("no stroke passes the hanging position far enough to show backlash.")
         return None
-    if len(own) > 1:
+    if len(fits_by_gain) > 1:
         inverse = np.stack([np.ones(len(gains)), 1 / gains], axis=1)
-        lags = np.stack([np.array([f.best[-1] for f in own]), *(
-            np.array([f.draws[d, -1] for f in own]) for d in range(_DRAWS))])  # fmt: skip
+        lags = np.stack([np.array([f.best[-1] for f in fits_by_gain]), *(
+            np.array([f.draws[d, -1] for f in fits_by_gain]) for d in range(_DRAWS))])  # fmt: skip
         sd = np.maximum(lags[1:].std(axis=0), 1e-4)
         solved = np.linalg.lstsq(inverse / sd[:, None], (lags / sd).T, rcond=None)[0]
         dead = np.clip(solved[0], 0.0, 2 * LONGEST_DEAD_TIME_S)
@@ -365,14 +365,17 @@ def _play(
             "one P gain: the dead time cannot be separated from the motor's lag, and the interval "
             f"of the backlash allows any up to {1e3 * LONGEST_DEAD_TIME_S:.0f} ms."
         )
-    values = np.array([f.play(f.best, np.ones(f.count), dead[0]) for f in own])
+    values = np.array([f.play(f.best, np.ones(f.count), dead[0]) for f in fits_by_gain])
     draws = np.array(
-        [[f.play(f.draws[d], f.weights[d], dead[d + 1]) for f in own] for d in range(_DRAWS)]
+        [
+            [f.play(f.draws[d], f.weights[d], dead[d + 1]) for f in fits_by_gain]
+            for d in range(_DRAWS)
+        ]
     )
     if damped:
         values *= 1 + _DAMPED_SHARE
         draws *= 1 + _DAMPED_SHARE * rng.uniform(0, 2, (_DRAWS, 1))
     weight = 1 / np.maximum(draws.var(axis=0), 1e-12)
     weight /= weight.sum()
-    found = _interval(float(values @ weight), draws @ weight, sum(f.count for f in own))
-    return Interval(max(found.value, 0.0), max(found.low, 0.0), max(found.high, 0.0))
+    play = _interval(float(values @ weight), draws @ weight, sum(f.count for f in fits_by_gain))
+    return Interval(max(play.value, 0.0), max(play.low, 0.0), max(play.high, 0.0))

@@ -104,19 +104,19 @@ class Fleet:
 
 def robots_in(root: Path) -> dict[Path, str]:
     """Recordings in a folder and the folders in it, and what their robots are called."""
-    found = sorted(
+    recordings = sorted(
         path
         for path in root.rglob("*.csv")
         if not path.name.endswith(".truth.csv") and path.name != TABLE
     )
-    if not found:
+    if not recordings:
         raise InputError(f"{root} holds no recording (.csv). Give the folder of your sweeps.")
     # a robot is called as its file, after its folder where there are folders
-    names = ["_".join(path.relative_to(root).with_suffix("").parts) for path in found]
+    names = ["_".join(path.relative_to(root).with_suffix("").parts) for path in recordings]
     twice = {n for n in names if names.count(n) > 1}
     if twice:
         raise InputError(f"{root}: two recordings would be called {min(twice)}. Rename one.")
-    return dict(zip(found, names, strict=True))
+    return dict(zip(recordings, names, strict=True))
 
 
 def calibrate_fleet(
@@ -214,13 +214,13 @@ def _called(target: Path) -> str:
 
 def _is_of(target: Path, path: Path, settings: Settings) -> bool:
     """Whether a calibration was made from these bytes with these settings."""
-    made = load_calibration(target)
-    scales = [j.actuator.scale for j in made.joints.values()]
-    given = {s.value_nm if s.source == GIVEN_TORQUE else None for s in scales}
+    calibration = load_calibration(target)
+    scales = [j.actuator.scale for j in calibration.joints.values()]
+    torques = {s.value_nm if s.source == GIVEN_TORQUE else None for s in scales}
     return (
-        [i.sha256 for i in made.inputs] == [sha256(path)]
-        and made.seed == settings.seed
-        and given == {settings.stall_torque_nm}
+        [i.sha256 for i in calibration.inputs] == [sha256(path)]
+        and calibration.seed == settings.seed
+        and torques == {settings.stall_torque_nm}
     )
 
 
@@ -231,8 +231,8 @@ def _numbers(target: Path) -> dict[str, dict[str, float]]:
 
 
 def _calibrated(path: Path, target: Path, settings: Settings) -> None:
-    made = calibrate(load(path), None, settings.seed, settings.stall_torque_nm, workers=1)
-    made.save(target, force=True)
+    calibration = calibrate(load(path), None, settings.seed, settings.stall_torque_nm, workers=1)
+    calibration.save(target, force=True)
 
 
 def _one(
@@ -252,8 +252,8 @@ def _one(
 
 def trust(cluster: str) -> str:
     """What is risked by computing on a cluster (address of a Dask scheduler), as a sentence."""
-    found = _ADDRESS.fullmatch(cluster)
-    if found is None:
+    address = _ADDRESS.fullmatch(cluster)
+    if address is None:
         raise InputError(
             f"`cluster` is '{printable(cluster)[:60]}'; write out the scheduler's address, such as "
             "tls://host:8786. Schedulers are never searched for, since they execute code."
@@ -262,7 +262,7 @@ def trust(cluster: str) -> str:
         f"{cluster} is trusted: it executes code, and its answers are unpickled here, so control "
         "of it is enough to run programs on this computer."
     )
-    if found[1] == "tls":
+    if address[1] == "tls":
         return risk
     return (
         f"{risk} tcp:// neither authenticates nor encrypts: use it within a network of your "
@@ -304,7 +304,7 @@ def _on(cluster: str, tasks: Sequence[tuple[Any, ...]]) -> Iterator[tuple[str, s
 
 def _outliers(table: pd.DataFrame, quantities: Sequence[str]) -> list[str]:
     """Per row the quantities that are far from the same joint's on the other robots."""
-    found: list[list[str]] = [[] for _ in range(len(table))]
+    outlying: list[list[str]] = [[] for _ in range(len(table))]
     for _, rows in table.groupby("joint").groups.items():
         if len(rows) < FEWEST:
             continue
@@ -317,8 +317,8 @@ def _outliers(table: pd.DataFrame, quantities: Sequence[str]) -> list[str]:
                 continue
             for row, value in zip(rows, values, strict=True):
                 if abs(value - middle) > OUTLIER * spread:
-                    found[row].append(key)
-    return [";".join(names) for names in found]
+                    outlying[row].append(key)
+    return [";".join(names) for names in outlying]
 
 
 def _ms(quantity) -> float:
@@ -369,22 +369,23 @@ def fit_servo_fleet(
 
 def _servo_numbers(target: Path) -> dict[str, dict[str, float]]:
     """Scores of each joint of a model; NaN where it has no such score."""
-    found = {}
+    numbers = {}
     for joint, known in load_servo_model(target).contract.joints.items():
         errors = {name: known.scores.get(key) for name, key in SERVO_QUANTITIES.items()}
-        found[joint] = {k: float("nan") if e is None else 1e3 * e for k, e in errors.items()}
-    return found
+        numbers[joint] = {k: float("nan") if e is None else 1e3 * e for k, e in errors.items()}
+    return numbers
 
 
 def _is_servo_of(target: Path, path: Path, settings: ServoSettings) -> bool:
     """Whether a model was fitted to this file with these settings."""
-    made = load_servo_model(target).contract
+    contract = load_servo_model(target).contract
     return (
-        [r.sha256 for r in made.recordings] == [sha256(path)]
-        and (made.arch, made.preset, made.seed) == (settings.arch, settings.preset, settings.seed)
-        and made.split == settings.split.name
-        and made.readings_counted
-        == servo_data([load(path)], list(made.joints), settings.readings, settings.seed).modes
+        [r.sha256 for r in contract.recordings] == [sha256(path)]
+        and (contract.arch, contract.preset, contract.seed)
+        == (settings.arch, settings.preset, settings.seed)
+        and contract.split == settings.split.name
+        and contract.readings_counted
+        == servo_data([load(path)], list(contract.joints), settings.readings, settings.seed).modes
     )
 
 

@@ -168,10 +168,10 @@ def sparse_equations(
     ready = checks.each_joint(partial(prepare_joint, seed=seed), recordings, joints, workers)
     runs = {joint: r.runs for joint, r in ready.items()}
     noise_rad = {joint: r.noise_rad for joint, r in ready.items()}
-    found = fit_equations(runs, noise_rad, seed, workers, progress)
+    equations = fit_equations(runs, noise_rad, seed, workers, progress)
     equations = {
         joint: replace(result, warnings=(*ready[joint].lag.warnings, *result.warnings))
-        for joint, result in found.items()
+        for joint, result in equations.items()
     }
     return Equations(joints=equations)
 
@@ -205,9 +205,9 @@ def _fit_joint(
     candidates: list[Candidate] = []
     chosen: Support = ()
     best = dict(zip(pd.names, pd.decode(pd_fits[0].point), strict=True))
-    wanted = propose(runs, best)
-    while wanted:
-        for support in wanted:
+    supports = propose(runs, best)
+    while supports:
+        for support in supports:
             model = equation_model(support)
             near = [model.encode(np.array(_starts(model, pd.decode(f.point)))) for f in pd_fits]
             problem = Problem(model, runs, noise)
@@ -229,7 +229,7 @@ def _fit_joint(
         if np.isfinite(candidates[0].rmse_leave_one_frequency_out_rad):
             chosen = min(close, key=lambda c: (len(c.terms), c.error())).terms
         around = _neighbours(chosen) + _neighbours(candidates[0].terms)
-        wanted = [s for s in dict.fromkeys(around) if s not in tried]
+        supports = [s for s in dict.fromkeys(around) if s not in tried]
     model, fits = equation_model(chosen), tried[chosen][1]
     # the fit to all readings may start from the folds' fits, never the other way round
     ends = np.array([f.point for f in fits])
@@ -309,10 +309,10 @@ def _with_folds(
     `near` has further starts of each, in fitted coordinates. A fold does not start from the fit to
     all runs.
     """
-    whole = search(problem, rng, None if near is None else near[0])[0]
+    to_all = search(problem, rng, None if near is None else near[0])[0]
     if near is None:
-        return [whole, *fit_folds(problem, folds, rng)]
-    fits = [whole]
+        return [to_all, *fit_folds(problem, folds, rng)]
+    fits = [to_all]
     for out, starts in zip(folds.values(), near[1:], strict=True):
         fits.append(search(problem.only(~out), rng, starts)[0])
     return fits
@@ -338,30 +338,30 @@ def _neighbours(support: Support) -> list[Support]:
 
 
 def _warnings(r: EquationResult) -> list[str]:
-    found = []
+    warnings = []
     if not r.leave_one_out_ranges:
-        found.append(
+        warnings.append(
             f"{r.joint}: one frequency only, so the terms were chosen on the data they were "
             "fitted to (BIC); record more tones to test them on unseen motion."
         )
     for name, (low, high) in r.leave_one_out_ranges.items():
         if high > 2 * max(low, 1e-12):
-            found.append(
+            warnings.append(
                 f"{r.joint}: {name} is not identified: {digits(low)} to {digits(high)} depending "
                 "on which frequency is left out."
             )
     for name, value in r.coefficients.items():
         p = _PARAMETERS[name]
         if value <= p.low * 1.01 or value >= p.high / 1.01:
-            found.append(f"{r.joint}: {name} is at the bound of its search, {digits(value)}.")
-    own, pd = (s.rmse_unseen_rad for s in (r.scores, r.delayed_pd))
-    if own > _WITHIN * pd:
-        found.append(
+            warnings.append(f"{r.joint}: {name} is at the bound of its search, {digits(value)}.")
+    unseen_rad, pd = (s.rmse_unseen_rad for s in (r.scores, r.delayed_pd))
+    if unseen_rad > _WITHIN * pd:
+        warnings.append(
             f"{r.joint}: DelayedPD predicts unseen frequencies better ({1e3 * pd:.1f} against "
-            f"{1e3 * own:.1f} mrad). Its set-point has a speed limit, a state that an equation of "
-            "error and speed cannot have."
+            f"{1e3 * unseen_rad:.1f} mrad). Its set-point has a speed limit, a state that an "
+            "equation of error and speed cannot have."
         )
-    return found
+    return warnings
 
 
 Support = tuple[str, ...]
@@ -449,7 +449,7 @@ def _regress(trials: Sequence[tuple[NDArray, NDArray, NDArray]], limit: float) -
     error, speed, acceleration = (np.concatenate(parts) for parts in zip(*trials, strict=True))
     scale = {n: max(float(np.sqrt(np.mean(f(speed, error) ** 2))), 1e-9) for n, f in terms.items()}
     unit = max(float(np.sqrt(np.mean(acceleration**2))), 1e-9)
-    found = set()
+    supports = set()
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         import pysindy  # seconds, and scikit-learn with it: only who needs it waits
@@ -472,5 +472,5 @@ def _regress(trials: Sequence[tuple[NDArray, NDArray, NDArray]], limit: float) -
             if PULLS[1] in kept:
                 kept.add("saturation_error_rad")
             if kept & set(PULLS):  # without a pull toward the command it is no servo
-                found.add(ordered(kept))
-    return found
+                supports.add(ordered(kept))
+    return supports

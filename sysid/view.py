@@ -53,7 +53,7 @@ class Channel:
 
 def channels(recording: Recording) -> list[Channel]:
     """All channels of a recording, joint by joint."""
-    found = []
+    channels_of = []
     for joint in in_order(list(recording.table["joint"].unique())):
         rows = recording.table.loc[recording.table["joint"] == joint]
         rows = rows.iloc[np.lexsort([rows["send_time_s"], rows["trial"]])]
@@ -63,14 +63,16 @@ def channels(recording: Recording) -> list[Channel]:
                 f"{recording.name}, {joint}: its trials overlap in time, and a viewer has one time "
                 "axis. View a recording whose times go on from trial to trial."
             )
-        found.append(Channel(joint, "command_rad", sent, rows["command_rad"].to_numpy(float)))
-        found.append(Channel(joint, "position_rad", read, rows["position_rad"].to_numpy(float)))
-        found.append(Channel(joint, "reading_age_s", read, _ages(recording, joint)))
+        channels_of.append(Channel(joint, "command_rad", sent, rows["command_rad"].to_numpy(float)))
+        channels_of.append(
+            Channel(joint, "position_rad", read, rows["position_rad"].to_numpy(float))
+        )
+        channels_of.append(Channel(joint, "reading_age_s", read, _ages(recording, joint)))
         for name in READ:
             values = rows[name].to_numpy(float) if name in rows else np.array([])
             if np.isfinite(values).any():
-                found.append(Channel(joint, name, read, values))
-    return found
+                channels_of.append(Channel(joint, name, read, values))
+    return channels_of
 
 
 def guard_events(recording: Recording, last_s: float) -> list[tuple[float, str]]:
@@ -80,12 +82,12 @@ def guard_events(recording: Recording, last_s: float) -> list[tuple[float, str]]
     """
     footer = recording.metadata.get("completed") or {}
     counts, events = footer.get("guard") or {}, footer.get("guard_events") or []
-    found = []
+    changed = []
     for event in events if isinstance(events, list) else []:
         time_s, kind = event if isinstance(event, list) and len(event) == 2 else (None, None)
         if isinstance(time_s, int | float) and np.isfinite(time_s) and kind in _GUARD:
-            found.append((float(time_s), guard_text(kind)))
-    return found + [(last_s, text) for text in guard_counts(counts)]
+            changed.append((float(time_s), guard_text(kind)))
+    return changed + [(last_s, text) for text in guard_counts(counts)]
 
 
 def guard_text(kind: str) -> str:
@@ -167,18 +169,27 @@ class TickChannels:
         values = self._values(rows)
         age = self._ages(rows[:, 0], values["read_time_s"], values["position_rad"])
         sent = rows[:, 1]
-        found = []
+        channels = []
         for k, joint in enumerate(self._joints):
             read = values["read_time_s"][:, k]
             parts = {"position_rad": values["position_rad"][:, k], "reading_age_s": age[:, k]}
-            made = [(name, read, own, np.isfinite(read)) for name, own in parts.items()]
+            columns = [
+                (name, read, joint_values, np.isfinite(read))
+                for name, joint_values in parts.items()
+            ]
             command = values["command_rad"][:, k]
-            made.insert(0, ("command_rad", sent, command, np.isfinite(sent) & np.isfinite(command)))
+            columns.insert(
+                0, ("command_rad", sent, command, np.isfinite(sent) & np.isfinite(command))
+            )
             for name in READ:
-                own = values[name][:, k]
-                made.append((name, read, own, np.isfinite(read) & np.isfinite(own)))
-            found += [Channel(joint, n, t[here], v[here]) for n, t, v, here in made if here.any()]
-        return found
+                joint_values = values[name][:, k]
+                columns.append(
+                    (name, read, joint_values, np.isfinite(read) & np.isfinite(joint_values))
+                )
+            channels += [
+                Channel(joint, n, t[here], v[here]) for n, t, v, here in columns if here.any()
+            ]
+        return channels
 
     def poses(self, rows: Array) -> tuple[Array, Array, Array]:
         """Latest reading of each joint at each tick, held; NaN before the first.
@@ -240,11 +251,11 @@ def write_rerun(
     """Write a recording as a Rerun file, with the robot's `bodies` at times `time_s` [s]."""
     refuse_overwrite(path, force)
     stream = RerunStream(recording.sha256)
-    found = channels(recording)
+    recorded = channels(recording)
     with replacing(path, force) as temporary:
         stream.save(temporary)
-        last_s = max(channel.time_s[-1] for channel in found)
-        stream.add(found, guard_events(recording, last_s))
+        last_s = max(channel.time_s[-1] for channel in recorded)
+        stream.add(recorded, guard_events(recording, last_s))
         stream.show(bodies)
         stream.move(time_s, bodies)
         stream.close()
@@ -277,10 +288,10 @@ class RerunStream:
         except (RuntimeError, ValueError) as error:
             raise InputError(f"{url} is no address of a Rerun viewer: {error}.") from error
 
-    def add(self, found: Sequence[Channel], events: Sequence[tuple[float, str]] = ()) -> None:
+    def add(self, recorded: Sequence[Channel], events: Sequence[tuple[float, str]] = ()) -> None:
         """Write what follows: channels, and sentences with their times [s]."""
         rr = self._rr
-        for channel in found:
+        for channel in recorded:
             self._send(
                 f"joints/{channel.joint}/{channel.name}", channel.time_s,
                 rr.Scalars.columns(scalars=channel.values),
@@ -344,8 +355,8 @@ def write_mcap(recording: Recording, path: Path, force: bool = False) -> None:
     refuse_overwrite(path, force)
     file = io.BytesIO()
     stream = McapStream(file)
-    found = channels(recording)
-    stream.add(found, guard_events(recording, max(channel.time_s[-1] for channel in found)))
+    recorded = channels(recording)
+    stream.add(recorded, guard_events(recording, max(channel.time_s[-1] for channel in recorded)))
     stream.close()
     write_bytes(path, file.getvalue(), force)
 
@@ -364,9 +375,9 @@ class McapStream:
         self._schemas = {k: self._writer.register_msgdef(k, t) for k, t in _DEFINITIONS.items()}
         self._shift_ns: int | None = None
 
-    def add(self, found: Sequence[Channel], events: Sequence[tuple[float, str]] = ()) -> None:
+    def add(self, recorded: Sequence[Channel], events: Sequence[tuple[float, str]] = ()) -> None:
         """Write what follows: channels, and sentences with their times [s]."""
-        messages = sorted(_messages(found, events), key=lambda m: m[0])
+        messages = sorted(_messages(recorded, events), key=lambda m: m[0])
         if messages and self._shift_ns is None:
             self._shift_ns = -min(0, messages[0][0])  # a time stamp of MCAP has no sign
         for time_ns, topic, kind, content in messages:
@@ -383,9 +394,11 @@ class McapStream:
         self._writer.finish()
 
 
-def _messages(found: Sequence[Channel], events: Sequence[tuple[float, str]]) -> Iterator[_Message]:
+def _messages(
+    recorded: Sequence[Channel], events: Sequence[tuple[float, str]]
+) -> Iterator[_Message]:
     joined: dict[tuple[int, str], dict[str, float]] = {}
-    for channel in found:
+    for channel in recorded:
         times_ns = np.rint(channel.time_s * 1e9).astype(np.int64).tolist()
         for time_ns, value in zip(times_ns, channel.values.tolist(), strict=True):
             if topic := _TOPICS.get(channel.name):

@@ -84,7 +84,7 @@ class ComparedModel(scores.ModelScores):
     @classmethod
     def scored(
         cls,
-        own: scores.ModelScores,
+        model_scores: scores.ModelScores,
         offset_rad: dict[str, float],
         age_spread_rad: dict[str, float],
         readings: dict[str, predict.ReadingRule] | None = None,
@@ -92,15 +92,15 @@ class ComparedModel(scores.ModelScores):
         """The scores with the offset, the spread and the rules that belong to them."""
         joints = {
             joint: ComparedScores(
-                **vars(found),
-                mae_held_rad=_mean_absolute(own.errors[joint].held),
-                mae_raw_rad=_mean_absolute(own.errors[joint].raw),
+                **vars(joint_scores),
+                mae_held_rad=_mean_absolute(model_scores.errors[joint].held),
+                mae_raw_rad=_mean_absolute(model_scores.errors[joint].raw),
             )
-            for joint, found in own.joints.items()
+            for joint, joint_scores in model_scores.joints.items()
         }
         more = {"joints": joints, "mean": scores.mean(joints)}
         return cls(
-            **vars(own) | more,  # pyright: ignore[reportArgumentType]
+            **vars(model_scores) | more,  # pyright: ignore[reportArgumentType]
             offset_rad=offset_rad,
             age_spread_rad=age_spread_rad,
             readings=readings or {},
@@ -153,7 +153,11 @@ class Comparison(Result):
 
     def reading_notes(self) -> list[str]:
         """How readings were predicted, one sentence per rule, and which offsets were taken out."""
-        known = [j for j, own in self.runs.items() if all(r.offset_known for r in own)]
+        known = [
+            j
+            for j, runs_of_joint in self.runs.items()
+            if all(r.offset_known for r in runs_of_joint)
+        ]
         said = [f"{', '.join(known)}: no offset is taken out, the load is known."] if known else []
         if len(known) < len(self.data.joints):
             said.append(OFFSET_RULE)
@@ -161,15 +165,23 @@ class Comparison(Result):
         if len(rules) > 1:  # calibrations say when readings were measured
             rules = rules[1:]
         return list(
-            dict.fromkeys([*said, *(text for own in rules for text in predict.in_words(own))])
+            dict.fromkeys(
+                [
+                    *said,
+                    *(text for runs_of_joint in rules for text in predict.in_words(runs_of_joint)),
+                ]
+            )
         )
 
     def plot(self, joints: Sequence[str] | None = None) -> Figure:
         """Figure of the models in free run beside commands and readings, a panel per joint."""
         from pupper_sysid.sysid.servo_fit.figures import free_run_figure
 
-        every = [own for runs in self.runs.values() for own in runs]
-        gains, loads = {own.run.p_gain for own in every}, [own.trial.load for own in every]
+        every = [compared_run for runs in self.runs.values() for compared_run in runs]
+        gains, loads = (
+            {compared_run.run.p_gain for compared_run in every},
+            [compared_run.trial.load for compared_run in every],
+        )
         if not self.data.runs or len(gains) > 1 or any(loads):
             return predict.run_figure(self.runs, self.run_tracks, joints)
         errors = {name: model.errors for name, model in self.models.items()}
@@ -251,48 +263,51 @@ def compare(
     for name, calibration in calibrations.items():
         notes += _fitted_here(name, [file.sha256 for file in calibration.inputs], recordings)
     notes += predict.notes(calibrations, runs)
-    made = {name: _scored(own, seed) for name, own in predictions.items()}
+    scored = {name: _scored(predicted, seed) for name, predicted in predictions.items()}
     data, tracks, bands = None, {}, {}
     try:
         data = merged_groups(servo_data(recordings, names, readings, seed, polls))
         opened, fitted_to = _opened(learned, data, recordings)
         notes += fitted_to
-        for name, own in opened.items():
-            rows = scores.as_rows(data, own.of_rows)
-            track, offset = scores.run_with_offset(scores.learned_run(own.model, rows), rows)
-            errors = scores.errors(own.model, track, rows, everything)
-            made[name] = ComparedModel.scored(scores.ModelScores.of(errors, seed), offset, {})
+        for name, servo in opened.items():
+            rows = scores.as_rows(data, servo.of_rows)
+            track, offset = scores.run_with_offset(scores.learned_run(servo.model, rows), rows)
+            errors = scores.errors(servo.model, track, rows, everything)
+            scored[name] = ComparedModel.scored(scores.ModelScores.of(errors, seed), offset, {})
             tracks[name] = track
-        bands = {name: own.band for name, own in opened.items() if own.band}
+        bands = {name: servo.band for name, servo in opened.items() if servo.band}
         tracks[scores.LINEAR], errors = _linear(data, seed)
-        made[scores.LINEAR] = ComparedModel.scored(scores.ModelScores.of(errors, seed), {}, {})
-        for name, own in predictions.items():
-            tracks[name] = {j: _on_ticks(data, j, runs[j], p.tracks) for j, p in own.items()}
+        scored[scores.LINEAR] = ComparedModel.scored(scores.ModelScores.of(errors, seed), {}, {})
+        for name, predicted in predictions.items():
+            tracks[name] = {j: _on_ticks(data, j, runs[j], p.tracks) for j, p in predicted.items()}
     except InputError as error:
         if learned:
             raise
         notes.append(f"No linear filter beside, it cannot be fitted to these runs: {error}")
     if learned and _loaded(runs):
-        folders = ", ".join(n for n in made if n not in predictions and n != scores.LINEAR)
+        folders = ", ".join(n for n in scored if n not in predictions and n != scores.LINEAR)
         notes.append(f"{folders}: knows neither the load nor the P gain of a run.")
     notes += preset_notes(map(str, models))
-    shown = iter(n for n in made if n not in predictions and n != scores.LINEAR)
+    learned_names = iter(n for n in scored if n not in predictions and n != scores.LINEAR)
     named = iter(predictions)
-    order = [next(shown if any(m is one for one in learned) else named) for m in models]  # as given
-    made = {
-        name: made[name] for name in (*order, *([scores.LINEAR] if scores.LINEAR in made else []))
+    order = [
+        next(learned_names if any(m is one for one in learned) else named) for m in models
+    ]  # as given
+    scored = {
+        name: scored[name]
+        for name in (*order, *([scores.LINEAR] if scores.LINEAR in scored else []))
     }
     period = float(np.median([r.loop_period_s for r in recordings]))
     if data is None:
         data = ServoData(tuple(names), period, {}, (), {}, polls)
-        persistence = {joint: predict.persistence(own) for joint, own in runs.items()}
+        persistence = {joint: predict.persistence(compared) for joint, compared in runs.items()}
         repeatability = dict.fromkeys(names, float("nan"))
     else:
         persistence = scores.persistence(data, everything)
         repeatability = scores.repeatability(data, everything)
     rules = {joint: predict.rule_of(joint, polls[joint], source) for joint in names}
     return Comparison(
-        models=made,
+        models=scored,
         readings=rules,
         persistence_rmse_rad=persistence,
         repeatability_rad=repeatability,
@@ -303,8 +318,8 @@ def compare(
         bands=bands,
         runs=runs,
         run_tracks={
-            name: {joint: p.tracks for joint, p in own.items()}
-            for name, own in predictions.items()
+            name: {joint: p.tracks for joint, p in predicted.items()}
+            for name, predicted in predictions.items()
         },
     )  # fmt: skip
 
@@ -312,17 +327,17 @@ def compare(
 def _scored(predictions: Mapping[str, predict.Prediction], seed: int) -> ComparedModel:
     """Scores of a calibration's predictions by joint."""
     errors = {}
-    for joint, own in predictions.items():
-        e = own.errors()
+    for joint, prediction in predictions.items():
+        e = prediction.errors()
         nothing = np.zeros(len(e["counted"]))
         errors[joint] = scores.Errors(
-            e["counted"], own.one_step(), nothing, own.blocks(), e["held"], e["raw"]
+            e["counted"], prediction.one_step(), nothing, prediction.blocks(), e["held"], e["raw"]
         )
     return ComparedModel.scored(
         scores.ModelScores.of(errors, seed),
-        {joint: own.offset_rad for joint, own in predictions.items()},
-        {joint: own.age_spread_rad() for joint, own in predictions.items()},
-        {joint: own.rule for joint, own in predictions.items()},
+        {joint: prediction.offset_rad for joint, prediction in predictions.items()},
+        {joint: prediction.age_spread_rad() for joint, prediction in predictions.items()},
+        {joint: prediction.rule for joint, prediction in predictions.items()},
     )
 
 
@@ -340,9 +355,9 @@ def _fitted_here(name: str, hashes: Sequence[str], recordings: Sequence[Recordin
 def _loaded(runs: Mapping[str, Sequence[predict.ComparedRun]]) -> bool:
     """Whether runs differ in gain, or carry a load."""
     return any(
-        own.trial.load is not None or own.run.p_gain != every[0].run.p_gain
+        compared_run.trial.load is not None or compared_run.run.p_gain != every[0].run.p_gain
         for every in runs.values()
-        for own in every
+        for compared_run in every
     )
 
 
@@ -353,8 +368,11 @@ def _on_ticks(
     tracks: Sequence[NDArray[np.float64]],
 ) -> list[NDArray[np.float64]]:
     """Tracks of physics steps at the ticks of the data's runs, which may join trials."""
-    place = {(own.recording, own.trial.number): n for n, own in enumerate(runs)}
-    made = []
+    place = {
+        (compared_run.recording, compared_run.trial.number): n
+        for n, compared_run in enumerate(runs)
+    }
+    positions = []
     for run in data.runs[joint]:
         position = np.full(len(run.command_rad) + 1, np.nan)
         for number in np.unique(run.number):
@@ -366,8 +384,8 @@ def _on_ticks(
             position[rows] = at_steps(tracks[n], step)
             last = step[-1] + data.period_s / runs[n].run.step_s
             position[rows[-1] + 1] = at_steps(tracks[n], np.array([last]))[0]
-        made.append(position)
-    return made
+        positions.append(position)
+    return positions
 
 
 def _each(models: Model | Sequence[Model]) -> Sequence[str | Path | Calibration | ServoFit]:
@@ -380,8 +398,8 @@ def _each(models: Model | Sequence[Model]) -> Sequence[str | Path | Calibration 
     return each
 
 
-def _is_folder(given: str | Path | Calibration) -> TypeGuard[str | Path]:
-    return not isinstance(given, Calibration) and Path(given).is_dir()
+def _is_folder(model: str | Path | Calibration) -> TypeGuard[str | Path]:
+    return not isinstance(model, Calibration) and Path(model).is_dir()
 
 
 def _opened(
@@ -392,14 +410,14 @@ def _opened(
     """Models by label, and which of them were fitted to one of the recordings."""
     opened: dict[str, _Opened] = {}
     notes = []
-    for given in models:
-        found = _open(given, data)
-        called = given if isinstance(given, str | Path) else found.name
-        name = found.name
+    for model in models:
+        servo = _open(model, data)
+        called = model if isinstance(model, str | Path) else servo.name
+        name = servo.name
         if name in opened:
             name = f"{name} ({called if called != name else len(opened) + 1})"
-        opened[name] = found
-        notes += _fitted_here(str(called), found.fitted_to, recordings)
+        opened[name] = servo
+        notes += _fitted_here(str(called), servo.fitted_to, recordings)
     return opened, notes
 
 
@@ -407,30 +425,30 @@ def _calibrations(
     models: Sequence[str | Path | Calibration | ServoFit],
 ) -> dict[str, Calibration]:
     """Calibrations and cards among the models, by label."""
-    found: dict[str, Calibration] = {}
-    for given in models:
-        if isinstance(given, Calibration):
-            calibration, called = given, ""
-        elif isinstance(given, ServoFit) or _is_folder(given):
+    calibrations: dict[str, Calibration] = {}
+    for model in models:
+        if isinstance(model, Calibration):
+            calibration, called = model, ""
+        elif isinstance(model, ServoFit) or _is_folder(model):
             continue
-        elif not is_shipped(given) and Path(given).suffix.lower() not in _ENDINGS:
-            refuse_other_kind(Path(given), "pupper-calibration")
-            near = difflib.get_close_matches(str(given), (*PRESETS, *card_names()), n=1)
+        elif not is_shipped(model) and Path(model).suffix.lower() not in _ENDINGS:
+            refuse_other_kind(Path(model), "pupper-calibration")
+            near = difflib.get_close_matches(str(model), (*PRESETS, *card_names()), n=1)
             usual = "Make one with `pupper-sysid fit-servo` or `calibrate`."
             raise InputError(
-                f"{given} is neither a servo model's folder, nor a calibration (.yaml), nor a "
+                f"{model} is neither a servo model's folder, nor a calibration (.yaml), nor a "
                 "servo card (`pupper-sysid servo list`), nor one of the presets "
                 f"{', '.join(PRESETS)}. {f'Did you mean {near[0]}?' if near else usual}"
             )
         else:
-            calibration, called = load_calibration(given), Path(given).name
+            calibration, called = load_calibration(model), Path(model).name
         loaded = any(j.under_load for j in calibration.joints.values())
         kind = "servo under load" if loaded else "DelayedPD"
         label = f"{kind} ({called})" if called else kind
-        if label in found:
-            label = f"{kind} ({given if called else len(found) + 1})"
-        found[label] = calibration
-    return found
+        if label in calibrations:
+            label = f"{kind} ({model if called else len(calibrations) + 1})"
+        calibrations[label] = calibration
+    return calibrations
 
 
 @dataclass(frozen=True)
@@ -444,14 +462,14 @@ class _Opened:
     of_rows: tuple[str, ...] = ()  # joints fitted to rows as logged
 
 
-def _open(given: str | Path | ServoFit, data: ServoData) -> _Opened:
-    if isinstance(given, ServoFit):
-        if missing := [j for j in data.joints if j not in given.joints]:
-            raise InputError(f"The {given.arch} model has no joint {', '.join(missing)}.")
+def _open(model: str | Path | ServoFit, data: ServoData) -> _Opened:
+    if isinstance(model, ServoFit):
+        if missing := [j for j in data.joints if j not in model.joints]:
+            raise InputError(f"The {model.arch} model has no joint {', '.join(missing)}.")
         with TemporaryDirectory() as folder:
-            given.save(folder, force=True)
+            model.save(folder, force=True)
             return _open(folder, data)
-    saved = load_servo_model(Path(given), data.joints, data.period_s)
+    saved = load_servo_model(Path(model), data.joints, data.period_s)
     contract = saved.contract
     name = contract.arch.upper() if contract.arch in ("mlp", "lstm", "fir") else contract.arch
     name += " (paper)" if contract.preset == "paper" else ""
@@ -465,15 +483,15 @@ def _open(given: str | Path | ServoFit, data: ServoData) -> _Opened:
 def _linear(data: ServoData, seed: int) -> tuple[scores.Tracks, dict[str, scores.Errors]]:
     """The linear baseline, each group by a filter fitted to the others."""
     # where all rows count it is fitted to them as logged, their age included
-    own = scores.as_rows(data, [j for j in data.joints if data.modes[j] == "all"])
-    cut, _ = grouped(own, everything)
+    rows = scores.as_rows(data, [j for j in data.joints if data.modes[j] == "all"])
+    cut, _ = grouped(rows, everything)
     ready = samples(cut, everything, past_ticks(data.period_s))
     fit = fit_network("fir", data.joints, data.period_s, ready, seed)
     parts = [
         scores.errors(model, scores.tracks(model, cut), cut, only(group))
         for group, model in fit.held_out.items()
     ]
-    return scores.tracks(fit.model, own), scores.pooled(parts)
+    return scores.tracks(fit.model, rows), scores.pooled(parts)
 
 
 PUBLISHED, FITTED = "DelayedPD, published", "DelayedPD, fitted here"
@@ -519,7 +537,10 @@ def four_way(
     fitted |= {arch.upper(): fit.scored[arch] for arch, fit in fits.items()}
     return Comparison(
         models={PUBLISHED: ComparedModel.scored(published, offset, {})}
-        | {name: ComparedModel.scored(own, {}, {}) for name, own in fitted.items()},
+        | {
+            name: ComparedModel.scored(model_scores, {}, {})
+            for name, model_scores in fitted.items()
+        },
         readings=rules,
         persistence_rmse_rad={j: s.persistence_rmse_rad for j, s in mlp.joints.items()},
         repeatability_rad={j: s.repeatability_rad for j, s in mlp.joints.items()},
@@ -538,10 +559,10 @@ def calibrated_run(calibration: Calibration, data: ServoData) -> scores.FreeRun:
         tracks: scores.Tracks = {}
         for n, joint in enumerate(data.joints):
             tracks[joint] = []
-            for e, own in enumerate(data.runs[joint]):
-                physics = own.on_physics(np.ones(len(own.tick), bool))
+            for e, joint_run in enumerate(data.runs[joint]):
+                physics = joint_run.on_physics(np.ones(len(joint_run.tick), bool))
                 track = predict.track_of(calibration, joint, physics, offset[e, n]) - offset[e, n]
-                tracks[joint].append(scores.on_ticks(track, own, data.period_s))
+                tracks[joint].append(scores.on_ticks(track, joint_run, data.period_s))
         return tracks
 
     return run

@@ -160,15 +160,15 @@ def truth_table(
     rows: list[TruthRow] = []
     definitions = []
     for joint in both:
-        found, true = calibration.joint(joint), truth["joints"][joint]
-        feedback, point = true["feedback"], found.holds_at
-        stepped = defined_as(point, true, found.actuator.fitted_step_s)
+        fitted, true = calibration.joint(joint), truth["joints"][joint]
+        feedback, point = true["feedback"], fitted.holds_at
+        stepped = defined_as(point, true, fitted.actuator.fitted_step_s)
         definitions.append(f"{joint}: {point}.")
-        if recordings is not None and found.lag.lag_s is not None:
+        if recordings is not None and fitted.lag.lag_s is not None:
             trials = checks.joint_trials(recordings, joint)
             moved = true | {"actuator": _at_gain(true, trials[0].p_gain)}
-            rows.append(_row(joint, "lag_s", found.lag.lag_s, true_lag_s(trials, moved, seed)))
-        for name, (quantity, known) in _pairs(found, stepped, feedback).items():
+            rows.append(_row(joint, "lag_s", fitted.lag.lag_s, true_lag_s(trials, moved, seed)))
+        for name, (quantity, known) in _pairs(fitted, stepped, feedback).items():
             # a part that neither servo has, and a limit that is infinite, are nothing to find
             if np.isfinite(known) and (known or quantity.value):
                 rows.append(_row(joint, name, quantity, known))
@@ -203,14 +203,14 @@ def true_lag_s(trials: Sequence[Trial], truth: Mapping[str, Any], seed: int = 0)
     for trial in trials:
         moved = _true_motion(trial, truth)
         dense.append(moved)
-        own = tone_response(trial, readings(trial, lattice), rng, draws=2)
+        tone_lag = tone_response(trial, readings(trial, lattice), rng, draws=2)
         everything = Readings(
             np.arange(len(moved.read_time_s)), moved.read_time_s, moved.position_rad,
             moved.read_time_s, 0.0,
         )  # fmt: skip
         true = tone_response(trial, everything, rng, draws=2)
-        if own is not None and true is not None:
-            measured.append(own)
+        if tone_lag is not None and true is not None:
+            measured.append(tone_lag)
             clean.append(true.response)
     if not measured:
         return lag_budget(joint, dense, rng).lag_s.value
@@ -257,8 +257,10 @@ def defined_as(
     """
     actuator = _at_gain(truth, math.nan if point.p_gain is None else point.p_gain)
     step = truth.get("physics_step_s", _EMULATOR_STEP_S)
-    own = at_step(_parameters(actuator), fitted_step_s, step).arrays()
-    actuator |= {name: float(np.squeeze(own[name])) for name in own.keys() & actuator.keys()}
+    stepped = at_step(_parameters(actuator), fitted_step_s, step).arrays()
+    actuator |= {
+        name: float(np.squeeze(stepped[name])) for name in stepped.keys() & actuator.keys()
+    }
     bench = truth.get("loaded_servo")
     if bench is not None and point.armature == "servo":
         actuator["armature"] = bench["armature_kg_m2"]
@@ -271,19 +273,19 @@ def _at_gain(truth: Mapping[str, Any], p_gain: float) -> dict[str, float]:
     The bench's derivative gain is a register of its own, so its damping does not change.
     """
     actuator = dict(truth["actuator"])
-    own = (truth.get("registers") or {}).get("p")
-    if own and np.isfinite(p_gain):
-        actuator["stiffness"] *= p_gain / own
+    register_gain = (truth.get("registers") or {}).get("p")
+    if register_gain and np.isfinite(p_gain):
+        actuator["stiffness"] *= p_gain / register_gain
     return actuator
 
 
-def _row(joint: str, name: str, found: Quantity, truth: float) -> TruthRow:
-    low, high = (math.nan if end is None else end for end in (found.low, found.high))
+def _row(joint: str, name: str, fitted: Quantity, truth: float) -> TruthRow:
+    low, high = (math.nan if end is None else end for end in (fitted.low, fitted.high))
     known = not math.isnan(low + high)
     rounding = _ROUNDING * abs(truth)
     return TruthRow(
-        joint=joint, quantity=name, found=Interval(found.value, low, high),
-        identified=found.identified, truth=float(truth),
+        joint=joint, quantity=name, found=Interval(fitted.value, low, high),
+        identified=fitted.identified, truth=float(truth),
         held=bool(low - rounding <= truth <= high + rounding) if known else None,
     )  # fmt: skip
 

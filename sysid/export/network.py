@@ -73,15 +73,15 @@ def export_module(
     """
     refuse_overwrite(path, force)
     module = module.eval()
-    given: dict[str, Any] = {"args": tuple(example_inputs), "kwargs": {}}
+    example: dict[str, Any] = {"args": tuple(example_inputs), "kwargs": {}}
     if set(names[0]) <= set(inspect.signature(module.forward).parameters):
-        given = {"args": (), "kwargs": dict(zip(names[0], example_inputs, strict=True))}
+        example = {"args": (), "kwargs": dict(zip(names[0], example_inputs, strict=True))}
     with warnings.catch_warnings(), torch.inference_mode():
         # both are deprecated in favour of torch.export, whose files older runtimes cannot load
         warnings.filterwarnings("ignore", category=DeprecationWarning)
         warnings.filterwarnings("ignore", category=FutureWarning)
         make = _onnx if to == "onnx" else _torchscript
-        data, run = make(module, given, names, dict(metadata or {}), batch, opset)
+        data, run = make(module, example, names, dict(metadata or {}), batch, opset)
     worst = difference(run)
     if not worst <= CLOSE:
         raise PupperError(
@@ -91,9 +91,9 @@ def export_module(
     return worst
 
 
-def _torchscript(module, given, names, metadata, batch, opset) -> tuple[bytes, Run]:
-    by_name = {"example_kwarg_inputs": given["kwargs"]} if given["kwargs"] else {}
-    traced: Any = torch.jit.trace(module, given["args"] or None, **by_name)
+def _torchscript(module, example, names, metadata, batch, opset) -> tuple[bytes, Run]:
+    by_name = {"example_kwarg_inputs": example["kwargs"]} if example["kwargs"] else {}
+    traced: Any = torch.jit.trace(module, example["args"] or None, **by_name)
     extra = {"metadata.json": json.dumps(metadata, ensure_ascii=False)} if metadata else {}
     extra |= {"contract.json": metadata["contract"]} if "contract" in metadata else {}
     buffer = io.BytesIO()
@@ -102,8 +102,8 @@ def _torchscript(module, given, names, metadata, batch, opset) -> tuple[bytes, R
 
     def run(*inputs: Tensor) -> Sequence[Tensor]:
         with torch.inference_mode():
-            found = loaded(*inputs)
-        return found if isinstance(found, tuple) else (found,)
+            outputs = loaded(*inputs)
+        return outputs if isinstance(outputs, tuple) else (outputs,)
 
     return buffer.getvalue(), run
 
@@ -123,31 +123,31 @@ def onnx_library() -> Any:
     return onnx
 
 
-def _onnx(module, given, names, metadata, batch, opset) -> tuple[bytes, Run]:
+def _onnx(module, example, names, metadata, batch, opset) -> tuple[bytes, Run]:
     onnx = onnx_library()
     ins, outs = names
     buffer = io.BytesIO()
     export: Any = torch.onnx.export  # its annotations lack buffers
     export(
-        module, given["args"], buffer, kwargs=given["kwargs"] or None, input_names=list(ins),
+        module, example["args"], buffer, kwargs=example["kwargs"] or None, input_names=list(ins),
         output_names=list(outs), opset_version=opset, dynamo=False,
         dynamic_axes={name: {0: batch} for name in (*ins, *outs)} if batch else None,
     )  # fmt: skip
-    made = onnx.load_from_string(buffer.getvalue())
-    found = module(*given["args"], **given["kwargs"])
-    shown = found if isinstance(found, tuple) else (found,)
-    for port, value in zip(made.graph.output, shown, strict=True):
+    onnx_model = onnx.load_from_string(buffer.getvalue())
+    result = module(*example["args"], **example["kwargs"])
+    outputs = result if isinstance(result, tuple) else (result,)
+    for port, value in zip(onnx_model.graph.output, outputs, strict=True):
         for axis, size in list(zip(port.type.tensor_type.shape.dim, value.shape, strict=True))[1:]:
             axis.dim_value = size  # the exporter forgets them where the first axis is free
-    onnx.helper.set_model_props(made, metadata)
-    onnx.checker.check_model(made, full_check=True)
-    evaluator = onnx.reference.ReferenceEvaluator(made)
+    onnx.helper.set_model_props(onnx_model, metadata)
+    onnx.checker.check_model(onnx_model, full_check=True)
+    evaluator = onnx.reference.ReferenceEvaluator(onnx_model)
 
     def run(*inputs: Tensor) -> Sequence[Tensor]:
-        found = evaluator.run(None, {n: v.numpy() for n, v in zip(ins, inputs, strict=True)})
-        return [torch.from_numpy(np.asarray(f)) for f in found]
+        outputs = evaluator.run(None, {n: v.numpy() for n, v in zip(ins, inputs, strict=True)})
+        return [torch.from_numpy(np.asarray(f)) for f in outputs]
 
-    return made.SerializeToString(), run
+    return onnx_model.SerializeToString(), run
 
 
 class ServoStep(nn.Module):
@@ -271,11 +271,11 @@ def _write_network(saved: SavedModel, to: Literal["onnx", "torchscript"], path: 
     def state(rest: NDArray[np.float32]) -> dict[str, torch.Tensor]:
         """Inputs after a reset at `rest`, shape (environments, joints)."""
         at = torch.from_numpy(rest)
-        found = {"command_history_rad": at[..., None].repeat(1, 1, model.taps)}
+        state_of = {"command_history_rad": at[..., None].repeat(1, 1, model.taps)}
         if isinstance(model, RecurrentNetwork):
             zeros = torch.zeros(*rest.shape, *model.parameters["weight_out"].shape[1:])
-            found |= {"hidden": zeros, "cell": zeros.clone()}
-        return found | ({"position_rad": at} if model.feedback else {})
+            state_of |= {"hidden": zeros, "cell": zeros.clone()}
+        return state_of | ({"position_rad": at} if model.feedback else {})
 
     def difference(run: Run) -> float:
         rng = np.random.default_rng(0)

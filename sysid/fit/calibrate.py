@@ -199,10 +199,17 @@ def side_by_side(
     fitted: dict[str, dict[str, list[Fitted]]] = {joint: {} for joint in trials}
     results: dict[str, JointCalibrationResult] = {}
     with Workers(workers, __name__) as pool:
-        for joint, own in trials.items():
+        for joint, joint_trials in trials.items():
             prior = None if priors is None else priors.get(joint)
             pool.submit(
-                (joint, PREPARATION), prepare_joint, joint, own, seed, free_air[joint], None, prior
+                (joint, PREPARATION),
+                prepare_joint,
+                joint,
+                joint_trials,
+                seed,
+                free_air[joint],
+                None,
+                prior,
             )
         for (joint, stage), result in pool.results():
             if staged:  # before `progress`, which ends the joint

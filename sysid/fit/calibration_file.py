@@ -94,9 +94,9 @@ def to_calibration(
     kinds = {str(bus.get("kind", "unknown bus")) for bus in buses}
     maps = {str(bus["joint_map"]) for bus in buses if bus.get("joint_map")}
     pupper = set(results) <= set(JOINT_NAMES)
-    own = "Mini Pupper 2" if pupper else ", ".join(sorted(maps)) or "another robot"
+    robot = "Mini Pupper 2" if pupper else ", ".join(sorted(maps)) or "another robot"
     return Calibration(
-        robot=f"{own} ({', '.join(sorted(kinds))})",
+        robot=f"{robot} ({', '.join(sorted(kinds))})",
         created=utc_now(),
         inputs=tuple(
             InputFile(name=r.path.name if r.path else r.name, sha256=r.sha256) for r in recordings
@@ -319,14 +319,14 @@ def _block(loaded: LoadedFit, torque: float) -> UnderLoad:
     def number(name: str) -> Quantity | None:
         if name not in loaded.numbers:
             return None
-        scale, own = factor.get(name, 1.0), loaded.numbers[name]
-        scaled = Interval(scale * own.value, scale * own.low, scale * own.high)
+        scale, interval = factor.get(name, 1.0), loaded.numbers[name]
+        scaled = Interval(scale * interval.value, scale * interval.low, scale * interval.high)
         absolute = known or name not in factor
         return quantity_of(scaled, "yes" if absolute else "ratio only", loaded.undecided.get(name))
 
-    own = {key: number(name) for name, key in LOADED_KEYS.items()}
+    numbers = {key: number(name) for name, key in LOADED_KEYS.items()}
     if not known:
-        own["armature_kg_m2"] = Quantity(
+        numbers["armature_kg_m2"] = Quantity(
             value=torque, identified="ratio only", why="scale from the anchor; holds the load's"
         )
     volts = loaded.reference_voltage_v
@@ -341,7 +341,7 @@ def _block(loaded: LoadedFit, torque: float) -> UnderLoad:
             for inertia, gravity in (loaded.loads if known else ())
         ),
         reference_voltage_v=volts if np.isfinite(volts) else None,
-        **own,
+        **numbers,
         gravity_nm=number("gravity_nm"),
         hanging_rad=number("hanging_rad"),
     )
@@ -349,8 +349,8 @@ def _block(loaded: LoadedFit, torque: float) -> UnderLoad:
 
 def _covering(result: JointCalibrationResult) -> CandidateFit:
     """The fit that is carried, its intervals widened to the other structure if it may be that."""
-    own, rival = result.delayed_pd, result.rival
-    parameters, undecided = dict(own.parameters), dict(own.undecided)
+    fitted, rival = result.delayed_pd, result.rival
+    parameters, undecided = dict(fitted.parameters), dict(fitted.undecided)
     if rival is not None:
         for name in parameters.keys() & rival.parameters.keys():
             mine, other = parameters[name], rival.parameters[name]
@@ -367,7 +367,7 @@ def _covering(result: JointCalibrationResult) -> CandidateFit:
         elif name not in parameters:
             undecided[name] = "the chosen model has none"
         parameters[name] = mine
-    return replace(own, parameters=parameters, undecided=undecided)
+    return replace(fitted, parameters=parameters, undecided=undecided)
 
 
 def _candidate(fit: CandidateFit) -> CandidateModel:
@@ -388,8 +388,8 @@ def _ratio(
     pd: CandidateFit, name: str, factor: float, known: Literal["yes", "ratio only"] = "yes"
 ) -> Quantity:
     """A fitted number times `factor`, with its interval and whether the data settled it."""
-    own = pd.parameters[name]
-    scaled = Interval(own.value * factor, own.low * factor, own.high * factor)
+    parameter = pd.parameters[name]
+    scaled = Interval(parameter.value * factor, parameter.low * factor, parameter.high * factor)
     return quantity_of(scaled, known, pd.undecided.get(name))
 
 
@@ -425,15 +425,15 @@ def _feedback(lag: LagBudget, offset_rad: Quantity) -> Feedback:
 
 
 def _jitter(result: JointCalibrationResult) -> Quantity:
-    found = result.command_jitter_s
-    if not np.isfinite(found.value):
+    jitter = result.command_jitter_s
+    if not np.isfinite(jitter.value):
         return Quantity(value=0.0, identified="no", why="it takes several tones to see it")
     why = "an upper bound: friction that the model lacks grows with the tone, too"
-    if found.low <= 0:
+    if jitter.low <= 0:
         why = "it cannot be distinguished from none"
     if result.lag.feedback.kind == "unresolved":
         why = "readings are dated to half a loop only"
-    return quantity_of(found, why=why)
+    return quantity_of(jitter, why=why)
 
 
 def _finite(number: float) -> float | None:
@@ -443,10 +443,10 @@ def _finite(number: float) -> float | None:
 @cache
 def preset_parameters() -> dict[str, dict[str, DelayedPDParameters]]:
     """The published settings per preset and joint, to be scored beside a fit; read once."""
-    found = {}
+    presets = {}
     for preset in PRESETS:
         calibration = load_calibration(preset)
-        found[preset] = {
+        presets[preset] = {
             joint: calibration.delayed_pd([joint]).parameters for joint in calibration.joint_names
         }
-    return found
+    return presets

@@ -326,7 +326,7 @@ def _nats(ready: PreparedJoint, fitted: Iterable[Fitted]) -> dict[str, float]:
 
 def joined(stages: Mapping[str, Sequence[Fitted]]) -> list[Fitted]:
     """The fits of all stages, each structure once."""
-    return list({f.structure.name: f for own in stages.values() for f in own}.values())
+    return list({f.structure.name: f for of_stage in stages.values() for f in of_stage}.values())
 
 
 # ------------------------------------------------------------------------------- choice
@@ -465,21 +465,21 @@ def intervals(fitted: Fitted, dead_time_s: float | None = None) -> dict[str, Int
     draws = structure.decode(fitted.draws)
     if dead_time_s is not None:
         values[0] = dead_time_s
-    found = {
-        name: interval_of(name, float(v), own)
-        for name, v, own in zip(structure.names, values, draws.T, strict=True)
+    ends = {
+        name: interval_of(name, float(value), of_number)
+        for name, value, of_number in zip(structure.names, values, draws.T, strict=True)
     }
-    dead, box = found["dead_time_s"], structure.parameters[0]
+    dead, box = ends["dead_time_s"], structure.parameters[0]
     if box.near(dead.low, box.low):  # where the search ends nothing speaks against none
-        found["dead_time_s"] = replace(dead, low=0.0)
-    if {"no_load_speed_rad_s", "effort_rad_s2"} <= found.keys():
+        ends["dead_time_s"] = replace(dead, low=0.0)
+    if {"no_load_speed_rad_s", "effort_rad_s2"} <= ends.keys():
         at = [structure.names.index(n) for n in ("effort_rad_s2", "no_load_speed_rad_s")]
         value = float(values[at[0]] / values[at[1]])
-        own = draws[:, at[0]] / draws[:, at[1]]
-        found["back_emf_per_s"] = interval_of("back_emf_per_s", value, own)
+        ratio = draws[:, at[0]] / draws[:, at[1]]
+        ends["back_emf_per_s"] = interval_of("back_emf_per_s", value, ratio)
     if fitted.structure.scales.free_air and fitted.structure.kind == kernel.SERVO:
-        found["braking_per_s"] = braking(fitted)
-    return found
+        ends["braking_per_s"] = braking(fitted)
+    return ends
 
 
 def settled(
@@ -564,15 +564,15 @@ def _rivals(
         (carried.structure.names.index(name), k)
         for k, name in enumerate(fitted.structure.names) if name in carried.structure.names
     ]  # fmt: skip
-    found = []
+    rivals = []
     for one in tried:
         assert one.point is not None
         point = carried.fit.point.copy()
         for place, k in shared:
             point[place] = one.point[k]
         weight = min(one.weight * float(np.exp(-below)), 1.0)
-        found.append(replace(one, nats=one.nats - below, weight=weight, point=point))
-    return found
+        rivals.append(replace(one, nats=one.nats - below, weight=weight, point=point))
+    return rivals
 
 
 def _stacked(ready: PreparedJoint, choice: Choice, rivals: Sequence[Explanation]) -> Choice:

@@ -123,7 +123,7 @@ def _size_notes(
     Raises InputError if it is much smaller, by what the named servo can be.
     """
     values = dict(zip(structure.names, structure.decode(fit.point), strict=True))
-    told = f"{joint}: the load of {loads_in_words(trials)} that the header claims"
+    stated_load = f"{joint}: the load of {loads_in_words(trials)} that the header claims"
     plausible = _plausible(trials, structure)
     low, high = _low(plausible, "stall_torque"), _high(plausible, "stall_torque")
     if not low <= values["stall_torque"] <= high:
@@ -133,16 +133,16 @@ def _size_notes(
             stall = f"{values['stall_torque']:.2g} N·m"
             if values["stall_torque"] > high:
                 raise InputError(
-                    f"{told} is not there: the recording shows at most "
+                    f"{stated_load} is not there: the recording shows at most "
                     f"{100 * high / values['stall_torque']:.2g} % of its weight, because with all "
                     f"of it the servo's stall torque would be {stall}, and by its data sheet "
                     f"{high:.2g} N·m is more than it can have. Weigh and measure the load again "
                     "and correct `loads` in the header, or take it out."
                 )
             return (
-                f"{told} is probably too small: with it the servo's stall torque is {stall}, where "
-                f"its data sheet leads to expect {low:.2g} to {high:.2g}. Weigh and measure it "
-                "again: all torques scale with it.",
+                f"{stated_load} is probably too small: with it the servo's stall torque is "
+                f"{stall}, where its data sheet leads to expect {low:.2g} to {high:.2g}. Weigh and "
+                "measure it again: all torques scale with it.",
             )
     if values["armature"] < _LIGHT_ARMATURE * structure.scales.inertia:
         doubled = replace(
@@ -151,8 +151,8 @@ def _size_notes(
         near = search.refine(doubled, fit.point[None])
         if _data_cost(claim, fit) - _data_cost(doubled, near) > _TELLING_NATS * temperature:
             return (
-                f"{told} has less weight for its inertia than the recording shows: twice its "
-                "weight fits better. Weigh arm and mass again: all torques scale with it.",
+                f"{stated_load} has less weight for its inertia than the recording shows: twice "
+                "its weight fits better. Weigh arm and mass again: all torques scale with it.",
             )
     return ()
 

@@ -160,10 +160,10 @@ def goodness_of_fit(
     kinds = [f"{r.tone:g} Hz" if r.tone > 0 else r.label for r in runs]
     ratios = {}
     for kind in dict.fromkeys(kinds):
-        own = [n for n, k in enumerate(kinds) if k == kind]
-        parts = [residuals[n] for n in own]
+        members = [n for n, k in enumerate(kinds) if k == kind]
+        parts = [residuals[n] for n in members]
         size = np.sqrt(_clipped_square(np.concatenate(parts)))
-        noise = reading_noise([runs[n] for n in own], parts)
+        noise = reading_noise([runs[n] for n in members], parts)
         ratios[kind] = float(size / max(noise, least)) if np.isfinite(noise) else np.nan
     return ratios
 

@@ -355,13 +355,13 @@ def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: Choice) -> 
         yield f"{joint}: too few readings to say how well the model describes this servo."
     if choice.misfit is not None:
         yield choice.misfit.sentence(joint)
-    own = choice.carried
-    yield from _foreign(joint, own)
+    carried = choice.carried
+    yield from _foreign(joint, carried)
     yield from _differences(joint, choice)
-    if not (own.r_hat <= R_HAT and own.effective >= EFFECTIVE):
+    if not (carried.r_hat <= R_HAT and carried.effective >= EFFECTIVE):
         yield (
-            f"{joint}: the draws have not converged (R̂ {own.r_hat:.2f}, {own.effective:.0f} "
-            "effective); intervals may be too narrow."
+            f"{joint}: the draws have not converged (R̂ {carried.r_hat:.2f}, "
+            f"{carried.effective:.0f} effective); intervals may be too narrow."
         )
 
 
@@ -580,14 +580,14 @@ def _free_warnings(
         )
     gains = ("effort_rad_s2", "friction_rad_s2", "stiffness_per_s2", "damping_per_s")
     yield from unidentified(joint, {n: pd.undecided[n] for n in gains if n in pd.undecided})
-    own = pd.scores.rmse_unseen_rad
+    unseen_rad = pd.scores.rmse_unseen_rad
     if chosen != carried:
         best = results[chosen].scores.rmse_unseen_rad
         yield (
             f"{joint}: {chosen} predicts unseen motion better ({1e3 * best:.1f} against "
-            f"{1e3 * own:.1f} mrad); simulators still get DelayedPD, the model they can run."
+            f"{1e3 * unseen_rad:.1f} mrad); simulators still get DelayedPD, the model they can run."
         )
-    if not np.isfinite(own):
+    if not np.isfinite(unseen_rad):
         only = "frequency" if any(run.tone > 0 for run in ready.runs) else "motion"
         yield f"{joint}: one {only} only, so no model was tested on unseen motion."
 
@@ -684,19 +684,19 @@ def _sag_rad(structure: Structure, values: NDArray[np.float64], runs: Sequence[R
 def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: Choice) -> LoadedFit:
     carried, runs = choice.carried, ready.runs
     structure, scales = carried.structure, ready.scales
-    own = {name: x[0] for name, x in numbers_of(structure, carried.values[None]).items()}
-    ends: dict[str, list[Interval]] = {name: [] for name in own}
+    numbers = {name: x[0] for name, x in numbers_of(structure, carried.values[None]).items()}
+    ends: dict[str, list[Interval]] = {name: [] for name in numbers}
     spread: dict[str, NDArray] = {}
     for f in choice.likely:
         assert f.draws is not None
         draws = f.structure.decode(f.draws)
         drawn = numbers_of(f.structure, draws)
-        for name in own.keys() & drawn.keys():
-            ends[name].append(interval_of(name, float(own[name]), drawn[name]))
+        for name in numbers.keys() & drawn.keys():
+            ends[name].append(interval_of(name, float(numbers[name]), drawn[name]))
         if f.structure.name == structure.name:
             spread = {n: f.draws[:, j] for j, n in enumerate(f.structure.names)}
     numbers = {
-        name: Interval(float(own[name]), min(e.low for e in x), max(e.high for e in x))
+        name: Interval(float(numbers[name]), min(e.low for e in x), max(e.high for e in x))
         for name, x in ends.items()
     }
     assert choice.lag.dead_time_s is not None
@@ -767,7 +767,7 @@ def numbers_of(structure: Structure, values: NDArray[np.float64]) -> dict[str, N
         "duty_s_per_rad": by_column["damping"] / stall,
     }  # fmt: skip
     fitted, scales = {_shown(name) for name in structure.names}, structure.scales
-    shown = {"dead_time_s": values[:, 0]}
+    numbers = {"dead_time_s": values[:, 0]}
     also = {"duty_per_rad", "stall_torque", "back_emf", "friction_loss"}
     also |= {"armature"} if scales.known_load else set()
     also |= {"off_brake"} if scales.torque_off else set()
@@ -776,15 +776,15 @@ def numbers_of(structure: Structure, values: NDArray[np.float64]) -> dict[str, N
         also |= {column} if name in fitted else set()
     for name in (f.name for f in fields(LoadedServoParameters) if f.name in by_column):
         if name in also or name in fitted:
-            shown[name] = by_column[name]
-    shown["stiffness_nm_per_rad"] = scales.p_gain * by_column["stiffness"]
-    shown["no_load_speed_rad_s"] = stall / by_column["back_emf"]
+            numbers[name] = by_column[name]
+    numbers["stiffness_nm_per_rad"] = scales.p_gain * by_column["stiffness"]
+    numbers["no_load_speed_rad_s"] = stall / by_column["back_emf"]
     if scales.gravity:
-        shown["gravity_nm"] = by_column["gravity_nm"]
-    shown["braking"] = by_column["damping"] + by_column["back_emf"]
-    shown["hanging_rad"] = by_column["hanging_rad"]
-    shown["offset_rad"] = by_column["offset_rad"]
-    return shown
+        numbers["gravity_nm"] = by_column["gravity_nm"]
+    numbers["braking"] = by_column["damping"] + by_column["back_emf"]
+    numbers["hanging_rad"] = by_column["hanging_rad"]
+    numbers["offset_rad"] = by_column["offset_rad"]
+    return numbers
 
 
 def _shown(name: str) -> str:

@@ -18,11 +18,12 @@ def loaded_joints(trials: Mapping[str, Sequence[Trial]]) -> list[str]:
     Droop counts in motions without tones of servos with a known P gain, and then for all of them:
     the joints of an arm are calibrated in one way.
     """
-    stated = [j for j, own in trials.items() if tells_of_load(own)]
+    stated = [j for j, joint_trials in trials.items() if tells_of_load(joint_trials)]
     arm = [
         j
-        for j, own in trials.items()
-        if j not in stated and all(not t.frequency_hz > 0 and np.isfinite(t.p_gain) for t in own)
+        for j, joint_trials in trials.items()
+        if j not in stated
+        and all(not t.frequency_hz > 0 and np.isfinite(t.p_gain) for t in joint_trials)
     ]
     return [*stated, *arm] if any(droops(trials[j]) for j in arm) else stated
 
@@ -61,8 +62,8 @@ def droops(trials: Sequence[Trial]) -> bool:
     if not design or sum(map(len, error)) < 100:
         return False
     a, e = np.concatenate(design), np.concatenate(error)
-    found = np.linalg.lstsq(a, e, rcond=None)[0]
-    of_gravity = a[:, :2] @ found[:2]
-    left = e - a @ found
+    coefficients = np.linalg.lstsq(a, e, rcond=None)[0]
+    of_gravity = a[:, :2] @ coefficients[:2]
+    unexplained = e - a @ coefficients
     spread = float(np.quantile(of_gravity, 0.95) - np.quantile(of_gravity, 0.05))
-    return spread > _DROOP_RAD and float(np.std(of_gravity)) > float(np.std(left))
+    return spread > _DROOP_RAD and float(np.std(of_gravity)) > float(np.std(unexplained))

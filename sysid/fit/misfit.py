@@ -231,14 +231,14 @@ def _end(problem: Problem, fit: Fit, temperature: float, room: float, way: float
 def filtered(run: Run, time_constant_s: float) -> Run:
     """The run with its command behind a first-order low-pass filter, at rest before."""
     ratio = time_constant_s / run.step_s
-    left = np.exp(-1.0 / ratio)
+    decay = np.exp(-1.0 / ratio)
     command = run.held[0]
     rest = command[0]
     end = rest + filters.filtered(
-        np.array([1.0 - left, 0.0]), np.array([1.0, -left]), command - rest
+        np.array([1.0 - decay, 0.0]), np.array([1.0, -decay]), command - rest
     )
     before = np.concatenate([[rest], end[:-1]])
-    mean = command + (before - command) * ratio * (1.0 - left)
+    mean = command + (before - command) * ratio * (1.0 - decay)
     held = np.concatenate([mean[None], run.held[1:]])
     return replace(run, held=held, edges=kernel.edges_of(mean, end))
 
@@ -268,8 +268,8 @@ def _low_pass(
     # gains make up for a part of a filter, so that its own lie along a ridge
     fits[middle] = from_about(behind[middle], fits[middle], rng)
     for factors, least_nats in ((_BETWEEN, -np.inf), (_NEAR_BY, _NATS)):
-        own = min(temperature, temperature_at(behind[middle], fits[middle]))
-        if best.cost - fits[middle].cost < least_nats * own:
+        shared_temperature = min(temperature, temperature_at(behind[middle], fits[middle]))
+        if best.cost - fits[middle].cost < least_nats * shared_temperature:
             break
         for factor in factors:
             between = middle * factor
@@ -329,10 +329,10 @@ def _with_feature(
     carried = wider.decode(wider.adopt(structure, best.point))
     values = np.repeat(carried[None], 3, axis=0)
     for number, starts in feature.starts.items():
-        whole = 1.0
+        full_value = 1.0
         if feature.of and not number.endswith("_rad_s"):
-            whole = carried[wider.names.index(feature.of)]
-        values[:, wider.names.index(number)] = whole * np.array(starts)
+            full_value = carried[wider.names.index(feature.of)]
+        values[:, wider.names.index(number)] = full_value * np.array(starts)
     place = wider.names.index(next(iter(feature.starts)))
     if name in _TRADED and {"friction_rad_s2", "stiffness_per_s2"} <= {*wider.names}:
         # what friction holds back at the carried stiffness may be this in its place

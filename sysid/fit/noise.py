@@ -93,8 +93,8 @@ def command_jitter(
     for t, track in zip(runs, plain, strict=True):
         speeds[t.tone].append(at_steps(np.gradient(track) / t.step_s, t.sample_step))
     dating = np.array([np.mean(np.concatenate(speeds[t]) ** 2) for t in tones]) * date_sd_s**2
-    own = {t.tone: n for t, n in zip(runs, noise_rad, strict=True)}
-    square = np.array([own[t] ** 2 for t in tones])
+    noise_of = {t.tone: n for t, n in zip(runs, noise_rad, strict=True)}
+    square = np.array([noise_of[t] ** 2 for t in tones])
     count = [sum(len(t.sample_step) for t in runs if t.tone == tone) for tone in tones]
     freedom = np.maximum(np.array(count) / _SAMPLES_PER_INDEPENDENT, 2.0)
 
@@ -106,8 +106,8 @@ def command_jitter(
 
     draws = square * rng.chisquare(freedom, (_DRAWS, len(tones))) / freedom
     dates = rng.uniform(*_DATES, _DRAWS)
-    found = [jitter(s, d) for s, d in zip(draws, dates, strict=True)]
-    return Interval.of_draws(jitter(square, 1.0), np.array(found))
+    jitters = [jitter(s, d) for s, d in zip(draws, dates, strict=True)]
+    return Interval.of_draws(jitter(square, 1.0), np.array(jitters))
 
 
 def temperature_of(

@@ -130,12 +130,14 @@ def sample(
     weight, r_hat, effective = np.empty(0), float("inf"), 1.0
     for turn in range(rounds):
         drawn = mixture.draw(_POPULATION, rng)
-        own = target.cost(drawn)
-        first = int(np.argmin(own))
-        if not np.isfinite(own[first]):  # all beyond the bounds
+        drawn_cost = target.cost(drawn)
+        first = int(np.argmin(drawn_cost))
+        if not np.isfinite(drawn_cost[first]):  # all beyond the bounds
             mixture = replace(mixture, roots=0.5 * mixture.roots)
             continue
-        if own[first] < least - _BETTER and turn < rounds // 2:  # an optimum beside: begin there
+        if (
+            drawn_cost[first] < least - _BETTER and turn < rounds // 2
+        ):  # an optimum beside: begin there
             start = target.fitted(drawn[first : first + 1])
             fit = local(problem, start, _ITERATIONS, _CURVATURE_STEP)[0]
             begin = target.straight(fit.point[None])
@@ -146,7 +148,7 @@ def sample(
         density = np.logaddexp(density, mixture.log_density(points))
         mixtures.append(mixture)
         of_drawn = np.asarray(logsumexp([m.log_density(drawn) for m in mixtures], axis=0))
-        points, cost = np.concatenate([points, drawn]), np.concatenate([cost, own])
+        points, cost = np.concatenate([points, drawn]), np.concatenate([cost, drawn_cost])
         density = np.concatenate([density, of_drawn])
         weight = np.exp(-cost - density - np.max(-cost - density))
         weight /= weight.sum()
@@ -157,11 +159,11 @@ def sample(
     if not len(points):
         return Posterior(np.repeat(best.point[None], _DRAWS, axis=0), best, r_hat, effective)
     likeliest = target.fitted(points[int(np.argmin(cost))])
-    whole = float(problem.costs(likeliest[None])[0])
+    least_cost = float(problem.costs(likeliest[None])[0])
     # truncated, so that few points do not stand for all where there was no convergence
     weight = np.minimum(weight, 1.0 / np.sqrt(len(weight)))
     draws = target.fitted(points[rng.choice(len(points), _DRAWS, p=weight / weight.sum())])
-    return Posterior(draws, Fit(likeliest, whole), r_hat, effective)
+    return Posterior(draws, Fit(likeliest, least_cost), r_hat, effective)
 
 
 @dataclass(frozen=True)
@@ -333,8 +335,8 @@ def convergence(points: NDArray[np.float64], weight: NDArray[np.float64]) -> tup
     effective = np.minimum(effective, 1.0 / np.sum(weight**2))  # one heavy point has no variance
     means = []
     for part in range(_GROUPS):
-        own = weight[part::_GROUPS]
-        means.append(own @ points[part::_GROUPS] / max(own.sum(), 1e-300))
+        group_weight = weight[part::_GROUPS]
+        means.append(group_weight @ points[part::_GROUPS] / max(group_weight.sum(), 1e-300))
     between = np.var(means, axis=0, ddof=1)
     return float(np.sqrt(1.0 + between / variance).max()), float(effective.min())
 
@@ -376,8 +378,8 @@ def with_date_errors(
 
     moved = off([LATCH_SD_S] * len(runs), 0.0)
     latch_s = [
-        LATCH_SD_S * min(1.0, rms([own]) / max(rms([of_latch]), 1e-12))
-        for own, of_latch in zip(np.split(plain, ends), np.split(moved, ends), strict=True)
+        LATCH_SD_S * min(1.0, rms([noise]) / max(rms([of_latch]), 1e-12))
+        for noise, of_latch in zip(np.split(plain, ends), np.split(moved, ends), strict=True)
     ]
     errors = np.array([off(latch_s, PHASE_SD_S if polled else 0.0) for _ in range(_DATE_DRAWS)])
     weighted = jacobian / np.sqrt(1.0 + plain**2)
@@ -421,8 +423,8 @@ def as_wide_as_folds(
 
     def wider(centre: NDArray, values: NDArray, of_folds: NDArray) -> NDArray[np.float64]:
         apart = np.median(np.abs(of_folds - centre), axis=0) / _MEDIAN_OF_NORMAL
-        own = np.sqrt(np.mean((values - centre) ** 2, axis=0))
-        factor = np.sqrt(groups - 1.0) * apart / np.maximum(own, 1e-12)
+        spread = np.sqrt(np.mean((values - centre) ** 2, axis=0))
+        factor = np.sqrt(groups - 1.0) * apart / np.maximum(spread, 1e-12)
         return centre + (values - centre) * np.maximum(1.0, factor)
 
     left_out = np.array([f.point for f in folds])
@@ -442,8 +444,8 @@ def interval_of(name: str, value: float, draws: NDArray) -> Interval:
 
     `value`: as fitted. `draws` of shape (draws,).
     """
-    own = Interval.of_draws(value, draws)
-    low, high = min(value, own.low), max(value, own.high)
+    interval = Interval.of_draws(value, draws)
+    low, high = min(value, interval.low), max(value, interval.high)
     if name == "dead_time_s":
         grain = _Z * STEPPING_SD_S
     elif name.endswith("offset_rad"):

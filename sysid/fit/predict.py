@@ -91,13 +91,13 @@ def in_words(rules: Mapping[str, ReadingRule]) -> list[str]:
     ]
 
 
-def _sentence(rule: str, source: str, own: Sequence[ReadingRule]) -> str:
+def _sentence(rule: str, source: str, rules: Sequence[ReadingRule]) -> str:
     parts = {"poll": ("poll_period_s", 1e3, 1, " ms"), "loss": ("loss", 1, 2, ""),
              "mean age": ("mean_age_s", 1e3, 1, " ms")}  # fmt: skip
     known = [
         f"{what} {_span(values, digits)}{unit}"
         for what, (key, scale, digits, unit) in parts.items()
-        if (values := [scale * v for r in own if math.isfinite(v := getattr(r, key))])
+        if (values := [scale * v for r in rules if math.isfinite(v := getattr(r, key))])
     ]
     poll = ", ".join(known)
     return {
@@ -166,8 +166,8 @@ def ages(poll_period_s: float, loss: float, count: int = _INSTANTS) -> NDArray[n
     # 1 - lossᵏ: the age is at most k periods with this probability
     k = np.zeros(count) if loss <= 0 else np.floor(np.log1p(-chance) / math.log(loss))
     within = (chance - (1 - loss**k)) / ((1 - loss) * loss**k)
-    found = poll_period_s * (k + within)
-    return found * (HeldFeedback(poll_period_s, loss).mean_age_s / found.mean())
+    ages_s = poll_period_s * (k + within)
+    return ages_s * (HeldFeedback(poll_period_s, loss).mean_age_s / ages_s.mean())
 
 
 @dataclass(frozen=True)
@@ -242,8 +242,8 @@ class Prediction:
     def errors(self) -> dict[str, NDArray[np.float64]]:
         """Prediction minus reading [rad]: `counted` readings, all rows `raw` and `held`."""
         parts: dict[str, list[NDArray[np.float64]]] = {"counted": [], "raw": [], "held": []}
-        for own, track in zip(self.runs, self.tracks, strict=True):
-            run = own.run
+        for compared, track in zip(self.runs, self.tracks, strict=True):
+            run = compared.run
             parts["raw"].append(known(_shown(track, run, self.rule)[0] - run.row_rad))
             held = at_steps(track, run.held_step) - run.row_rad
             parts["held"].append(parts["raw"][-1] if self._undated else known(held))
@@ -253,15 +253,15 @@ class Prediction:
     def one_step(self) -> NDArray[np.float64]:
         """The model's move from reading to reading, less the readings' own [rad]."""
         return np.concatenate([
-            np.diff(self._counted(track, own.run))
-            for own, track in zip(self.runs, self.tracks, strict=True)
+            np.diff(self._counted(track, compared.run))
+            for compared, track in zip(self.runs, self.tracks, strict=True)
         ])  # fmt: skip
 
     def blocks(self) -> list[tuple[str, int, int]]:
         """Stretch of time of each counted reading, for a bootstrap."""
         blocks = []
-        for n, own in enumerate(self.runs):
-            run = own.run
+        for n, compared in enumerate(self.runs):
+            run = compared.run
             step = run.row_step[np.isfinite(run.row_rad)] if self.count_all else run.sample_step
             blocks += [("", n, int(s * run.step_s / _BLOCK_S)) for s in step]
         return blocks
@@ -273,8 +273,8 @@ class Prediction:
         reading may have been measured; 0 where the instants are known.
         """
         spread = [
-            _shown(track, own.run, self.rule)[1]
-            for own, track in zip(self.runs, self.tracks, strict=True)
+            _shown(track, compared.run, self.rule)[1]
+            for compared, track in zip(self.runs, self.tracks, strict=True)
         ]
         return float(np.sqrt(np.nanmean(np.concatenate(spread) ** 2)))
 
@@ -300,25 +300,25 @@ def predict(
     `readings`: which readings count; `auto`: those that are dated, else all rows.
     """
     servo = _Servo.of(calibration, joint)
-    runs = tuple(_at_voltage(own, servo.reference_voltage_v) for own in runs)
+    runs = tuple(_at_voltage(compared, servo.reference_voltage_v) for compared in runs)
     count_all = readings == "all" or (readings == "auto" and rule.rule in ("expected", "as logged"))
-    offset = dict.fromkeys((own.recording for own in runs), 0.0)
-    free = {own.recording for own in runs if not own.offset_known}
+    offset = dict.fromkeys((compared.recording for compared in runs), 0.0)
+    free = {compared.recording for compared in runs if not compared.offset_known}
     for place in free:  # near enough to begin with: reading less command
         apart = [o.run.row_rad - o.trial.command_rad for o in runs if o.recording == place]
         offset[place] = float(np.nanmedian(np.concatenate(apart)))
-    tracks = [servo.track(own.run, offset[own.recording]) for own in runs]
+    tracks = [servo.track(compared.run, offset[compared.recording]) for compared in runs]
     for _ in range(3 if free else 0):  # the offset moves the start, and with it a little itself
-        made = Prediction(runs, rule, tracks, 0.0, count_all)
+        prediction = Prediction(runs, rule, tracks, 0.0, count_all)
         for place in free:
             errors = [
-                made._counted(track, own.run)
-                for own, track in zip(runs, tracks, strict=True)
-                if own.recording == place
+                prediction._counted(track, compared.run)
+                for compared, track in zip(runs, tracks, strict=True)
+                if compared.recording == place
             ]
             every = np.concatenate(errors)
             offset[place] -= float(np.median(every)) if len(every) else 0.0
-        tracks = [servo.track(own.run, offset[own.recording]) for own in runs]
+        tracks = [servo.track(compared.run, offset[compared.recording]) for compared in runs]
     return Prediction(runs, rule, tracks, float(np.mean(list(offset.values()))), count_all)
 
 
@@ -331,7 +331,7 @@ def track_of(
 
 def persistence(runs: Sequence[ComparedRun]) -> float:
     """RMS of the readings' moves [rad]."""
-    moves = np.concatenate([np.diff(own.run.sample_rad) for own in runs])
+    moves = np.concatenate([np.diff(compared.run.sample_rad) for compared in runs])
     return float(np.sqrt(np.mean(moves**2))) if len(moves) else float("nan")
 
 
@@ -341,9 +341,9 @@ def notes(
     """What a reader must know of gains and loads, in sentences."""
     sentences = []
     for name, calibration in calibrations.items():
-        for joint, own in runs.items():
-            sentences += _torque_off_notes(name, calibration, joint, own)
-            gains = sorted({b.run.p_gain for b in own if np.isfinite(b.trial.p_gain)})
+        for joint, joint_runs in runs.items():
+            sentences += _torque_off_notes(name, calibration, joint, joint_runs)
+            gains = sorted({b.run.p_gain for b in joint_runs if np.isfinite(b.trial.p_gain)})
             block = calibration.joint(joint).under_load
             if block is not None:
                 sentences += [
@@ -363,7 +363,9 @@ def _torque_off_notes(
     name: str, calibration: Calibration, joint: str, runs: Sequence[ComparedRun]
 ) -> list[str]:
     """A sentence if a model is scored with the torque off, though it was never fitted there."""
-    off_s = sum(np.count_nonzero(own.run.torque_on < 0.5) * own.run.step_s for own in runs)
+    off_s = sum(
+        np.count_nonzero(compared.run.torque_on < 0.5) * compared.run.step_s for compared in runs
+    )
     block = calibration.joint(joint).under_load
     if not off_s or (block is not None and block.off_brake is not None):
         return []
@@ -387,20 +389,20 @@ class _Servo:
 
     @classmethod
     def of(cls, calibration: Calibration, joint: str) -> _Servo:
-        own = calibration.joint(joint)
+        fitted = calibration.joint(joint)
         # the servo's own numbers, of an older file, too
-        fitted_step_s = own.actuator.fitted_step_s
-        numbers = at_step(own.actuator.parameters, CONTINUOUS_S, fitted_step_s)
+        fitted_step_s = fitted.actuator.fitted_step_s
+        numbers = at_step(fitted.actuator.parameters, CONTINUOUS_S, fitted_step_s)
         pd = {name: float(np.squeeze(x)) for name, x in numbers.arrays().items()}
         dead_time = pd["dead_time_s"]
-        slowest = own.actuator.velocity_limit_rad_s.value
+        slowest = fitted.actuator.velocity_limit_rad_s.value
         limit = slowest if slowest < NO_SPEED_LIMIT_RAD_S else np.inf
-        block = own.under_load
+        block = fitted.under_load
         if block is not None:
             gravity = block.gravity_nm.value if block.gravity_nm else 0.0
             hanging = block.hanging_rad.value if block.hanging_rad else 0.0
             volts = block.reference_voltage_v or math.nan
-            stated = own.actuator.dead_time_s.value  # the numbers of a block are the servo's own
+            stated = fitted.actuator.dead_time_s.value  # the numbers of a block are the servo's own
             return cls(block.servo(stated), None, (gravity, hanging), limit, volts)
         stall = min(pd["effort_limit"], _NO_LIMIT_NM)
         parameters = LoadedServoParameters(
@@ -432,11 +434,11 @@ class _Servo:
         return simulate(columns[None], dead_time, replace(run, p_gain=gain))[:, 0]
 
 
-def _at_voltage(own: ComparedRun, reference_v: float) -> ComparedRun:
+def _at_voltage(compared: ComparedRun, reference_v: float) -> ComparedRun:
     """The run with its supply voltage over a reference, where torques scale with it."""
     if not np.isfinite(reference_v):
-        return own
-    return replace(own, run=with_voltage(own.run, own.trial, reference_v))
+        return compared
+    return replace(compared, run=with_voltage(compared.run, compared.trial, reference_v))
 
 
 def _shown(
@@ -464,24 +466,24 @@ def run_figure(
     """
     from matplotlib.figure import Figure
 
-    shown = [(j, n) for j in joints or runs for n in range(len(runs[j]))][:16]
-    columns = min(len(shown), 2)
-    rows = -(-len(shown) // columns)
+    panels = [(j, n) for j in joints or runs for n in range(len(runs[j]))][:16]
+    columns = min(len(panels), 2)
+    rows = -(-len(panels) // columns)
     drawn = Figure(figsize=(6.4 * columns, 2.6 * rows), layout="constrained")
     axes = np.atleast_1d(drawn.subplots(rows, columns, squeeze=False)).ravel()
-    for axis, (joint, n) in zip(axes, shown, strict=False):
+    for axis, (joint, n) in zip(axes, panels, strict=False):
         run = runs[joint][n].run
         step = run.step_s
         command = run.command
         axis.plot(step * np.arange(len(command)), command, "0.7", lw=0.8, label="command")
         axis.plot(step * run.row_step, run.row_rad, "k.", ms=1.5, label="reading")
-        for name, own in tracks.items():
-            track = own[joint][n]
+        for name, model_tracks in tracks.items():
+            track = model_tracks[joint][n]
             axis.plot(step * np.arange(len(track)), track, lw=1.0, label=name)
         axis.set_title(f"{joint}, {run.label}", fontsize="small")
         axis.set_xlabel("time [s]")
         axis.set_ylabel("position [rad]")
     axes[0].legend(fontsize="x-small")
-    for axis in axes[len(shown) :]:
+    for axis in axes[len(panels) :]:
         axis.set_visible(False)
     return drawn

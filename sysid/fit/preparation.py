@@ -322,12 +322,14 @@ def _lag(
         )  # fmt: skip
     if free_air:
         return budget
-    own = tuple(w for w in budget.warnings if "mechanical stop clips" not in w)  # friction holds it
+    warnings = tuple(
+        w for w in budget.warnings if "mechanical stop clips" not in w
+    )  # friction holds it
     gains = {t.p_gain for t in trials if np.isfinite(t.p_gain)}
     if len(gains) > 1 or len({str(t.load) for t in trials}) > 1:
-        own = (*own, f"{joint}: the lag is a mean over gains and loads; only the dead time is "
-                     "the servo's own.")  # fmt: skip
-    return replace(budget, warnings=own)
+        mean = "the lag is a mean over gains and loads; only the dead time is the servo's own."
+        warnings = (*warnings, f"{joint}: {mean}")
+    return replace(budget, warnings=warnings)
 
 
 def _upsets(
@@ -428,10 +430,10 @@ def _without(run: Run, touched: Sequence[int]) -> Run:
         return run
     kept = np.ones(len(run.sample_step), bool)
     kept[touched] = False
-    shown = np.isin(run.held_step, run.sample_step[~kept])
+    dropped = np.isin(run.held_step, run.sample_step[~kept])
     return replace(
         run, sample_step=run.sample_step[kept], sample_rad=run.sample_rad[kept],
-        row_rad=np.where(shown, np.nan, run.row_rad),
+        row_rad=np.where(dropped, np.nan, run.row_rad),
     )  # fmt: skip
 
 
@@ -445,10 +447,10 @@ def _first_fits(
     )
     first: dict[str, tuple[Structure, Fit]] = {}
     for s in structures:
-        problem, own = Problem(s, runs, noise), deepcopy(rng)
+        problem, generator = Problem(s, runs, noise), deepcopy(rng)
         near = [s.adopt(t, fit.point) for t, fit in first.values() if s.contains(t)]
         # the noise follows from this fit, and with it which fits count as equally good
-        first[s.name] = s, search_widely(problem, own, np.array(near), short=True)
+        first[s.name] = s, search_widely(problem, generator, np.array(near), short=True)
     return first
 
 

@@ -110,11 +110,11 @@ def compare_repeats(
     if sum(rich) < 2:
         return None
     sources = [s for s, enough in zip(sources, rich, strict=True) if enough]
-    own = [part for part, enough in zip(parts, rich, strict=True) if enough]
-    apart = [_apart(part, best.point, least_rad, quantum_rad) for part in own]
+    rich_parts = [part for part, enough in zip(parts, rich, strict=True) if enough]
+    apart = [_apart(part, best.point, least_rad, quantum_rad) for part in rich_parts]
     named = []
     # of two, either differs from the other
-    for k in range(1 if len(own) == 2 else 0, len(own)):
+    for k in range(1 if len(rich_parts) == 2 else 0, len(rich_parts)):
         others = [one for n, one in enumerate(apart) if n != k]
         difference = _difference(sources[k], apart[k], others)
         named += [difference] if difference is not None else []
@@ -165,9 +165,9 @@ def _directions(names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
     at = {name: np.array([n == name for n in names], float) for name in names[:-1]}
     several = {"gains (stiffness and damping)": GAINS, "torques over inertia": PER_INERTIA}
     for name, members in several.items():
-        own = [at[member] for member in members if member in at]
-        if len(own) > 1:
-            at[name] = np.sum(own, axis=0)
+        member_directions = [at[member] for member in members if member in at]
+        if len(member_directions) > 1:
+            at[name] = np.sum(member_directions, axis=0)
     return at
 
 

@@ -137,10 +137,12 @@ class LoadedFit(Result):
 
     def relative(self, source: str, value: float) -> Interval:
         """`value` with the relative interval of the number `source` that it follows from."""
-        own = self.numbers.get(source)
-        if own is None or own.value <= 0:
+        reference = self.numbers.get(source)
+        if reference is None or reference.value <= 0:
             return Interval(value, value, value)
-        return Interval(value, value * own.low / own.value, value * own.high / own.value)
+        return Interval(
+            value, value * reference.low / reference.value, value * reference.high / reference.value
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

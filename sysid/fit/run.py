@@ -243,8 +243,8 @@ def _commanded(
     mean = averaged(sent_s, command, len(rest) - pad, step_s)
     ends = step_s * (1.0 + np.arange(len(mean)))
     last = np.searchsorted(sent_s, ends, side="left") - 1
-    whole = np.concatenate([rest[:pad], command[np.maximum(last, 0)]])
-    return kernel.edges_of(np.concatenate([rest[:pad], mean]), whole), mean
+    at_edges = np.concatenate([rest[:pad], command[np.maximum(last, 0)]])
+    return kernel.edges_of(np.concatenate([rest[:pad], mean]), at_edges), mean
 
 
 def averaged(

@@ -537,12 +537,12 @@ def in_blocks(problem: Problem) -> tuple[Problem, dict[str, NDArray[np.bool_]]]:
     and folds as from `folds_of`.
     """
     runs, noise = [], []
-    for run, own in zip(problem.runs, problem.noise_rad, strict=True):
+    for run, run_noise in zip(problem.runs, problem.noise_rad, strict=True):
         for block in np.array_split(np.arange(len(run.sample_step)), _BLOCKS):
             runs.append(
                 replace(run, sample_step=run.sample_step[block], sample_rad=run.sample_rad[block])
             )
-            noise.append(own)
+            noise.append(run_noise)
     place = np.arange(len(runs)) % _BLOCKS
     folds = {f"block {k + 1}": place == k for k in range(_BLOCKS)}
     return replace(problem, runs=tuple(runs), noise_rad=tuple(noise)), folds
@@ -586,10 +586,10 @@ def fit_folds(
             crowd = [starts.best(~out, _KEEP)]
         else:
             assert draws is not None and by_run is not None
-            whole = by_run[~out].sum(axis=0) + problem.prior(draws)
-            crowd = [draws[np.argsort(whole)[:_FOLD_STARTS]]]
-        for parent, own in parents:
-            crowd.append(problem.structure.adopt(parent, own[n].point[None]))
+            cost_without = by_run[~out].sum(axis=0) + problem.prior(draws)
+            crowd = [draws[np.argsort(cost_without)[:_FOLD_STARTS]]]
+        for parent, parent_folds in parents:
+            crowd.append(problem.structure.adopt(parent, parent_folds[n].point[None]))
         rough = refined(part.coarse, np.concatenate(crowd), _REFINED)[:_REFINED]
         fits.append(refine(part, np.array([f.point for f in rough])))
     return fits

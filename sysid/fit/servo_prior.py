@@ -80,13 +80,13 @@ def servo_prior(
     names = dict.fromkeys(name for row in rows for name in row)
     logarithms = {}
     for name in names:
-        own = [
+        other_units = [
             (row[name][0] - (link if name in PER_INERTIA else 0.0), row[name][1])
             for row, link in zip(rows, links, strict=True)
             if name in row
         ]
         spread = _DEAD_TIME_SD if name == "dead_time_s" else _UNIT_SD
-        logarithms[name] = _pooled(own, spread)
+        logarithms[name] = _pooled(other_units, spread)
     shared = math.sqrt((_LINK_SD**2 * _WEIGHT + sum(x * x for x in links)) / (
         _WEIGHT + len(links) - 1
     ))  # fmt: skip

@@ -371,19 +371,19 @@ class Structure:
         if self.kind != kernel.SERVO:
             return values[:, 1:].copy()
         by_name = dict(zip(self.names, values.T, strict=True))
-        own = {_TERM[name].name: value for name, value in by_name.items()}
-        effort, zero = own["stall_torque"], np.zeros(len(values))
-        sine, cosine = own.get("gravity_sin", zero), own.get("gravity_cos", zero)
-        numbers = {SERVO_TERMS[name].column: value for name, value in own.items()}
+        by_term = {_TERM[name].name: value for name, value in by_name.items()}
+        effort, zero = by_term["stall_torque"], np.zeros(len(values))
+        sine, cosine = by_term.get("gravity_sin", zero), by_term.get("gravity_cos", zero)
+        numbers = {SERVO_TERMS[name].column: value for name, value in by_term.items()}
         numbers |= {
-            "stiffness": own["stiffness"] / self.scales.p_gain,
+            "stiffness": by_term["stiffness"] / self.scales.p_gain,
             "gravity_nm": np.hypot(sine, cosine),
-            "hanging_rad": own.get("hanging_rad", zero) + np.arctan2(cosine, sine),
+            "hanging_rad": by_term.get("hanging_rad", zero) + np.arctan2(cosine, sine),
         }
-        if "no_load_speed_rad_s" in own:
-            numbers["back_emf"] = effort / own["no_load_speed_rad_s"]
-        if "torque_limit_share" in own:
-            numbers["torque_limit"] = own["torque_limit_share"] * effort
+        if "no_load_speed_rad_s" in by_term:
+            numbers["back_emf"] = effort / by_term["no_load_speed_rad_s"]
+        if "torque_limit_share" in by_term:
+            numbers["torque_limit"] = by_term["torque_limit_share"] * effort
         columns = np.tile(kernel.ABSENT, (len(values), 1))
         for j, name in enumerate(kernel.COLUMNS):
             if name in numbers:
@@ -428,16 +428,16 @@ def servo_structure(
 
     `features`: of `FEATURES`. `name`: by default the features in words.
     """
-    wanted = [n for n in _BASE if n != "damping"]
-    wanted += dict.fromkeys(n for f in features for n in FEATURES[f])
+    names = [n for n in _BASE if n != "damping"]
+    names += dict.fromkeys(n for f in features for n in FEATURES[f])
     if scales.known_load:
-        wanted += ["armature", "hanging_rad"]
+        names += ["armature", "hanging_rad"]
     if scales.torque_off:
-        wanted.append("off_brake")
+        names.append("off_brake")
     if scales.gravity:
-        wanted += ["gravity_sin", "gravity_cos"]
-    wanted.append("offset_rad")
-    parameters = tuple(_parameter(t, scales) for n, t in SERVO_TERMS.items() if n in wanted)
+        names += ["gravity_sin", "gravity_cos"]
+    names.append("offset_rad")
+    parameters = tuple(_parameter(t, scales) for n, t in SERVO_TERMS.items() if n in names)
     words = " + ".join(f for f in features if f not in ("back-EMF", "damping")) or "base"
     return Structure(name or words, parameters, features=tuple(features), scales=scales)
 
@@ -523,25 +523,26 @@ def candidate(name: str, scales: Scales = FREE_AIR) -> Structure:
 
 def loaded_servo(columns: NDArray[np.float64], dead_time_s: float) -> LoadedServoParameters:
     """The servo of one row of the kernel's columns; its stiffness is per unit of the P gain."""
-    own = {name: float(x) for name, x in zip(kernel.COLUMNS, columns, strict=True)}
-    stall = own["effort_limit"]
-    shared = {f.name for f in fields(LoadedServoParameters)} & own.keys()
+    by_column = {name: float(x) for name, x in zip(kernel.COLUMNS, columns, strict=True)}
+    stall = by_column["effort_limit"]
+    shared = {f.name for f in fields(LoadedServoParameters)} & by_column.keys()
     return LoadedServoParameters(
-        duty_per_rad=own["stiffness"] / stall, duty_s_per_rad=own["damping"] / stall,
-        stall_torque=stall, dead_time_s=dead_time_s, **{name: own[name] for name in shared},
+        duty_per_rad=by_column["stiffness"] / stall, duty_s_per_rad=by_column["damping"] / stall,
+        stall_torque=stall, dead_time_s=dead_time_s, **{name: by_column[name] for name in shared},
     )  # fmt: skip
 
 
 def loaded_columns(servo: LoadedServoParameters) -> NDArray[np.float64]:
     """The kernel's columns of a servo, shape (columns,): stiffness per unit of the P gain."""
-    own = {name: float(x) for name, x in servo.arrays().items()}
-    stall = own["stall_torque"]
-    own |= {
-        "stiffness": own["duty_per_rad"] * stall, "damping": own["duty_s_per_rad"] * stall,
+    by_column = {name: float(x) for name, x in servo.arrays().items()}
+    stall = by_column["stall_torque"]
+    by_column |= {
+        "stiffness": by_column["duty_per_rad"] * stall,
+        "damping": by_column["duty_s_per_rad"] * stall,
         "effort_limit": stall,
-    }  # fmt: skip
+    }
     columns = kernel.ABSENT.copy()
     for j, name in enumerate(kernel.COLUMNS):
-        if name in own:
-            columns[j] = own[name]
+        if name in by_column:
+            columns[j] = by_column[name]
     return columns

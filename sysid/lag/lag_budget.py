@@ -478,9 +478,9 @@ def _peaks(score: NDArray, shift: NDArray) -> NDArray[np.float64]:
     """Position of the maximum of each row, refined by the parabola through its top."""
     k = np.clip(np.argmax(score, axis=1), 1, len(shift) - 2)
     row = np.arange(len(score))
-    left, top, right = score[row, k - 1], score[row, k], score[row, k + 1]
-    bend = left - 2 * top + right
-    part = 0.5 * (left - right) / np.where(bend < 0, bend, -np.inf)
+    before, top, after = score[row, k - 1], score[row, k], score[row, k + 1]
+    bend = before - 2 * top + after
+    part = 0.5 * (before - after) / np.where(bend < 0, bend, -np.inf)
     return shift[k] + np.clip(part, -1.0, 1.0) * (shift[1] - shift[0])
 
 

@@ -93,13 +93,13 @@ def check(
     if again.any():
         warnings.append(f"{int(again.sum())} rows with a repeated time stamp were left out.")
         table = table.loc[~again]
-    own = table.groupby(["joint", "trial"], sort=False).ngroup().to_numpy()
-    rows = np.bincount(own)
+    trial_of = table.groupby(["joint", "trial"], sort=False).ngroup().to_numpy()
+    rows = np.bincount(trial_of)
     refuse_more(path, len(rows), MOST_TRIALS, "trials", "Split it by joint or by trial.")
-    first = table.iloc[np.unique(own, return_index=True)[1]]  # a row of each trial
-    _refuse_disorder(path, table, own)
+    first = table.iloc[np.unique(trial_of, return_index=True)[1]]  # a row of each trial
+    _refuse_disorder(path, table, trial_of)
     warnings += _short(first, rows)
-    usable = rows[own] >= _SHORTEST_TRIAL
+    usable = rows[trial_of] >= _SHORTEST_TRIAL
     if usable.sum() < _LEAST_ROWS:
         raise InputError(
             f"{path} has {len(table)} usable rows; at least {_LEAST_ROWS} are needed. "
@@ -159,8 +159,8 @@ def _refuse_degrees(
             f"{path}, column {place}: values reach {largest:.4g} rad, more than a hundred turns. "
             "Check the unit, or take the start's angle off."
         )
-    own = table.loc[table["joint"] == joint, ["command_rad", "position_rad"]].to_numpy(float)
-    units = likely_of_pair(*(values[np.isfinite(values)] for values in own.T))
+    angles = table.loc[table["joint"] == joint, ["command_rad", "position_rad"]].to_numpy(float)
+    units = likely_of_pair(*(values[np.isfinite(values)] for values in angles.T))
     if units == ["deg"] and str(source).endswith(".pos") and largest <= 100:
         units.append("percent:3.5")  # LeRobot's, of a range that it does not log
     word, _, of_position = units[0].partition(",")
@@ -206,13 +206,13 @@ def _in_two_places(values: NDArray[np.float64]) -> bool:
     )  # fmt: skip
 
 
-def _refuse_disorder(path: Path | str, table: pd.DataFrame, own: NDArray[np.int64]) -> None:
+def _refuse_disorder(path: Path | str, table: pd.DataFrame, trial_of: NDArray[np.int64]) -> None:
     """Refuse trials whose time runs backwards, or that have several frequencies.
 
     `own` is the number of each row's trial.
     """
-    order = np.argsort(own, kind="stable")
-    same = np.diff(own[order]) == 0
+    order = np.argsort(trial_of, kind="stable")
+    same = np.diff(trial_of[order]) == 0
     for column in ("send_time_s", "read_time_s"):
         time = table[column].to_numpy(float)[order]
         back = np.flatnonzero((np.diff(time) < 0) & same)
@@ -223,20 +223,20 @@ def _refuse_disorder(path: Path | str, table: pd.DataFrame, own: NDArray[np.int6
                 f"after {time[back[0]]:.4f} s. Sort the rows, or give each pass its own trial "
                 "number."
             )
-    tones = table["frequency_hz"].groupby(own).nunique().to_numpy()
+    tones = table["frequency_hz"].groupby(trial_of).nunique().to_numpy()
     if (tones > 1).any():
-        rows = table.loc[own == np.argmax(tones > 1)]
+        rows = table.loc[trial_of == np.argmax(tones > 1)]
         joint, trial = rows[["joint", "trial"]].iloc[0]
-        found = rows["frequency_hz"].dropna().unique()
+        frequencies = rows["frequency_hz"].dropna().unique()
         raise InputError(
-            f"{path}, column frequency_hz: trial {trial:g} of {joint} has {found[0]:g} and "
-            f"{found[1]:g} Hz. Give each frequency its own trial number."
+            f"{path}, column frequency_hz: trial {trial:g} of {joint} has {frequencies[0]:g} and "
+            f"{frequencies[1]:g} Hz. Give each frequency its own trial number."
         )
 
 
 def _short(first: pd.DataFrame, rows: NDArray[np.int64]) -> list[str]:
     """Sentences on trials with few rows; `first` has a row of each trial, `rows` their numbers."""
-    found = []
+    notes = []
     for few, each, all_of_them in (
         (rows < _SHORTEST_TRIAL, "is too short to use and was left out",
          "are too short to use and were left out"),
@@ -244,8 +244,10 @@ def _short(first: pd.DataFrame, rows: NDArray[np.int64]) -> list[str]:
          f"have fewer than {_LEAST_ROWS} rows"),
     ):  # fmt: skip
         if few.sum() > _FEW_TRIALS:
-            found.append(f"{few.sum()} trials {all_of_them}.")
+            notes.append(f"{few.sum()} trials {all_of_them}.")
             continue
-        own = zip(first.loc[few, "joint"], first.loc[few, "trial"], rows[few], strict=True)
-        found += [f"trial {trial:g} of {joint} {each.format(n)}." for joint, trial, n in own]
-    return found
+        short_trials = zip(first.loc[few, "joint"], first.loc[few, "trial"], rows[few], strict=True)
+        notes += [
+            f"trial {trial:g} of {joint} {each.format(n)}." for joint, trial, n in short_trials
+        ]
+    return notes

@@ -119,14 +119,14 @@ def segments(trial: Trial) -> list[Segment]:
     if len(time) < 8 or np.ptp(command) < _SMALLEST_RAD:
         return [Segment("rest", 0, len(time))]
     tones = _tones(time, command)
-    found, begin = [], 0
+    parts, begin = [], 0
     for tone in [*tones, Segment("", len(time), len(time))]:
         if tone.first > begin:
-            found.append(_other(trial, begin, tone.first))
+            parts.append(_other(trial, begin, tone.first))
         if tone.kind:
-            found.append(tone)
+            parts.append(tone)
         begin = tone.stop
-    return found
+    return parts
 
 
 def split_tones(trial: Trial, at_rests: bool = False) -> list[Trial]:
@@ -140,16 +140,16 @@ def split_tones(trial: Trial, at_rests: bool = False) -> list[Trial]:
     """
     if trial.frequency_hz > 0:
         return [trial]
-    found = segments(trial)
-    tones = [s for s in found if s.kind == "tone"]
-    moving = sum(s.stop - s.first for s in found if s.kind != "rest")
+    motions = segments(trial)
+    tones = [s for s in motions if s.kind == "tone"]
+    moving = sum(s.stop - s.first for s in motions if s.kind != "rest")
     if not tones or sum(s.stop - s.first for s in tones) < _COVERED * moving:
         return [trial]
     if at_rests and len(tones) > 1:
-        tones = _grouped(trial, found)
+        tones = _grouped(trial, motions)
         if len(tones) == 1 and not tones[0].frequency_hz > 0:
             return [trial]
-    if len(tones) == 1 and len(found) == 1:
+    if len(tones) == 1 and len(motions) == 1:
         return [replace(trial, frequency_hz=tones[0].frequency_hz)]
     parts, end = [], 0
     for tone in tones:
@@ -165,26 +165,26 @@ def named_tones(trials: Sequence[Trial]) -> list[Trial]:
 
 def describe(trials: Sequence[Trial]) -> dict[str, list[float]]:
     """Kinds of motion in the commands of `trials`, with the frequencies of tones [Hz]."""
-    found: dict[str, list[float]] = {}
+    kinds: dict[str, list[float]] = {}
     for trial in trials:
         if trial.frequency_hz > 0:
-            found.setdefault("tone", []).append(trial.frequency_hz)
+            kinds.setdefault("tone", []).append(trial.frequency_hz)
             continue
         parts = split_tones(trial)
         if len(parts) > 1 or parts[0].frequency_hz > 0:
-            found.setdefault("tone", []).extend(p.frequency_hz for p in parts)
+            kinds.setdefault("tone", []).extend(p.frequency_hz for p in parts)
             continue
         for segment in segments(trial):
             if segment.kind not in ("rest", "tone"):
-                found.setdefault(segment.kind, [])
-    return found
+                kinds.setdefault(segment.kind, [])
+    return kinds
 
 
-def _grouped(trial: Trial, found: Sequence[Segment]) -> list[Segment]:
+def _grouped(trial: Trial, parts: Sequence[Segment]) -> list[Segment]:
     """Tones, those without a rest between them as one segment of several frequencies."""
     groups: list[Segment] = []
     rested = True
-    for s in found:
+    for s in parts:
         if s.kind == "tone":
             if groups and not rested:
                 groups[-1] = Segment("tone", groups[-1].first, s.stop)
@@ -284,7 +284,7 @@ def _tones(time: NDArray[np.float64], command: NDArray[np.float64]) -> list[Segm
     turns = _turning_points(command, _TURN * float(np.ptp(command)))
     if not _SEED < len(turns) + 1 <= _MOST_TURNS:
         return []
-    found: list[Segment] = []
+    tones: list[Segment] = []
     k, end = 0, 0
     while k + _SEED < len(turns):
         first, last = int(turns[k]), int(turns[k + _SEED])
@@ -295,11 +295,11 @@ def _tones(time: NDArray[np.float64], command: NDArray[np.float64]) -> list[Segm
         if tone is None:
             k += 1
             continue
-        found.append(tone)
+        tones.append(tone)
         end = tone.stop
         k = int(np.searchsorted(turns, tone.stop - 1))
-    found = _joined(found, time, command)
-    return [] if _is_chirp(found, time) else found
+    tones = _joined(tones, time, command)
+    return [] if _is_chirp(tones, time) else tones
 
 
 @dataclass(frozen=True)
@@ -321,9 +321,9 @@ class _Sine:
         t, value = clock[first:stop:every], command[first:stop:every]
         if len(t) < 6:
             return None
-        frequency, solution, left = _sine_fit(t, value, frequency)
+        frequency, solution, unexplained = _sine_fit(t, value, frequency)
         amplitude = float(np.hypot(solution[1], solution[2]))
-        if not amplitude > _SMALLEST_RAD or left > _IMPURE * amplitude**2 / 2:
+        if not amplitude > _SMALLEST_RAD or unexplained > _IMPURE * amplitude**2 / 2:
             return None
         return cls(clock, command, frequency, solution, amplitude)
 
@@ -344,8 +344,10 @@ def _grown(time: NDArray, command: NDArray, first: int, last: int, end: int) -> 
     fit = _Sine.of(clock, command, first, last + 1, _SEED / 2 / float(clock[last]))
     if fit is None:
         return None
-    left = 0  # how often the command left the sine: a frequency that is not exact yet, or its end
-    while left < _TIMES_LEFT:
+    departures = (
+        0  # how often the command left the sine: a frequency that is not exact yet, or its end
+    )
+    while departures < _TIMES_LEFT:
         # as far as one doubles the stretch: there the frequency's error shows as a phase
         reach = min(last + max(last - first, 8), len(time) - 1)
         wrong = fit.away(last + 1, reach + 1)
@@ -355,7 +357,7 @@ def _grown(time: NDArray, command: NDArray, first: int, last: int, end: int) -> 
         longer = _Sine.of(clock, command, first, later, fit.frequency)
         if longer is None:
             break
-        left += later <= reach
+        departures += later <= reach
         last, fit = later - 1, longer
     while first > end:
         reach = max(end, first - max(last - first, 8))
@@ -416,10 +418,10 @@ def _solved(design: NDArray[np.float64], value: NDArray[np.float64]) -> NDArray[
     return np.asarray(np.linalg.solve(regular, design.T @ value), np.float64)
 
 
-def _joined(found: list[Segment], time: NDArray, command: NDArray) -> list[Segment]:
+def _joined(tones: list[Segment], time: NDArray, command: NDArray) -> list[Segment]:
     """Neighbouring tones that are one sine, as one."""
     kept: list[Segment] = []
-    for tone in found:
+    for tone in tones:
         if kept and abs(tone.frequency_hz - kept[-1].frequency_hz) < _SAME_HZ:
             first = kept[-1].first
             clock = time - time[first]
@@ -431,13 +433,13 @@ def _joined(found: list[Segment], time: NDArray, command: NDArray) -> list[Segme
     return kept
 
 
-def _is_chirp(found: Sequence[Segment], time: NDArray) -> bool:
+def _is_chirp(tones: Sequence[Segment], time: NDArray) -> bool:
     """Many short pieces whose frequency goes one way in small steps are of a chirp."""
-    if len(found) < 3:
+    if len(tones) < 3:
         return False
-    hz = np.array([s.frequency_hz for s in found])
-    periods = np.array([(time[s.stop - 1] - time[s.first]) * s.frequency_hz for s in found])
-    adjacent = np.array([b.first - a.stop for a, b in itertools.pairwise(found)]) <= 3
+    hz = np.array([s.frequency_hz for s in tones])
+    periods = np.array([(time[s.stop - 1] - time[s.first]) * s.frequency_hz for s in tones])
+    adjacent = np.array([b.first - a.stop for a, b in itertools.pairwise(tones)]) <= 3
     small = np.abs(np.diff(np.log(hz))) < 0.3
     short = np.median(periods) < 4.5
     return bool(short and np.mean(adjacent & small) > 0.6)
@@ -470,15 +472,15 @@ def bad_rows(trial: Trial) -> NDArray[np.int64]:
     [20]
     """
     position = trial.position_rad.copy()
-    found = np.zeros(0, np.int64)
+    bad = np.zeros(0, np.int64)
     for _ in range(_PASSES):  # one hides another beside it
         rows = _standing_out(trial, position, False)
         rows = rows if len(rows) else _standing_out(trial, position, True)
         if not len(rows):
             break
         position[rows] = np.nan
-        found = np.union1d(found, rows)
-    return found
+        bad = np.union1d(bad, rows)
+    return bad
 
 
 def _standing_out(trial: Trial, position: NDArray[np.float64], held: bool) -> NDArray[np.int64]:

@@ -101,13 +101,13 @@ def plain_stem(path: Path) -> str:
 
 def newest_recording(folder: Path = FOLDER) -> Path:
     """The newest recording in `folder`."""
-    found = [p for p in folder.glob("*.csv") if not p.name.endswith(".truth.csv")]
-    if not found:
+    recordings = [p for p in folder.glob("*.csv") if not p.name.endswith(".truth.csv")]
+    if not recordings:
         raise InputError(
             f"No recording was named and there is none in {folder}/. "
             "Make one with `pupper-sysid sweep`, or name a file."
         )
-    return max(found, key=lambda p: p.stat().st_mtime)
+    return max(recordings, key=lambda p: p.stat().st_mtime)
 
 
 def read_bytes(path: Path) -> bytes:
@@ -162,13 +162,13 @@ class RecordingWriter:
         comment line; an incomplete last line is removed.
         """
         text = as_text(path, read_bytes(path))
-        whole = text[: text.rfind("\n") + 1]
-        lines = [line for line in whole.splitlines() if line.strip() and line[0] != "#"]
-        made = cls.__new__(cls)
-        made._columns = tuple(lines[0].split(",")) if lines else ()
-        made._file = SyncedText(path, append_at=len(whole.encode()), advice=_ADVICE)
-        made._file.write([comment("resumed", {"trial": trial, "at": _now()})])
-        return made
+        complete = text[: text.rfind("\n") + 1]
+        lines = [line for line in complete.splitlines() if line.strip() and line[0] != "#"]
+        writer = cls.__new__(cls)
+        writer._columns = tuple(lines[0].split(",")) if lines else ()
+        writer._file = SyncedText(path, append_at=len(complete.encode()), advice=_ADVICE)
+        writer._file.write([comment("resumed", {"trial": trial, "at": _now()})])
+        return writer
 
     def append(self, rows: Sequence[dict[str, Any]] | dict[str, Any]) -> None:
         """Write rows, each a dict of columns; the first row sets which optional columns exist."""

@@ -52,11 +52,11 @@ def convert(path: Path | str, table: Table, options: LogOptions | None = None) -
         require(path, table, SWEEP)
         options.refuse("Mini Pupper sweep", ())
         return _sweep(path, table)
-    own = [j for j in JOINT_NAMES if {f"{j}_command_rad", f"{j}_position_rad"} & names]
-    if own and not options.command:
+    joints = [j for j in JOINT_NAMES if {f"{j}_command_rad", f"{j}_position_rad"} & names]
+    if joints and not options.command:
         require(path, table, PLAYBACK)
         options.refuse("Mini Pupper playback", ())
-        return _playback(path, table, own)
+        return _playback(path, table, joints)
     table = spread(path, table, options)
     if not options.command:
         if table.numbered:
@@ -107,12 +107,12 @@ def _sweep(path: Path | str, table: Table) -> Log:
     refuse_more(path, len(starts), MOST_TRIALS, "trials", "Split it by joint or by trial.")
     trial, shift, last = np.zeros(len(time)), np.zeros(len(time)), 0.0
     for n, (start, stop) in enumerate(pairwise([*starts, len(time)])):
-        own = time[start:stop]
-        if not np.isfinite(own).any():  # `check` leaves rows without a time out
+        trial_time = time[start:stop]
+        if not np.isfinite(trial_time).any():  # `check` leaves rows without a time out
             continue
         trial[start:stop] = n
-        shift[start:stop] = last - np.nanmin(own) if n else 0.0
-        last = float(np.nanmax(own) + shift[start]) + PAUSE_S
+        shift[start:stop] = last - np.nanmin(trial_time) if n else 0.0
+        last = float(np.nanmax(trial_time) + shift[start]) + PAUSE_S
     sent = time + shift
     pose = np.array([DEFAULT_POSE[name] for name in names])
     joints = [j for j in JOINT_NAMES if j in names]
@@ -126,9 +126,9 @@ def _playback(path: Path | str, table: Table, joints: list[str]) -> Log:
     time, loop = table.numbers(path, "time_s"), table.numbers(path, "loop")
     parts = []
     for joint in joints:
-        own = (f"{joint}_command_rad", f"{joint}_position_rad")
-        require(path, table, own)
-        command, position = (table.numbers(path, name) for name in own)
+        columns = (f"{joint}_command_rad", f"{joint}_position_rad")
+        require(path, table, columns)
+        command, position = (table.numbers(path, name) for name in columns)
         parts.append(rows(joint, time, time + READ_AFTER_SEND_S, command, position, loop))
     metadata = _metadata("12-joint playback", joints, None)
     return Log(pd.concat(parts, ignore_index=True), metadata, [*table.notes])

@@ -235,7 +235,9 @@ class Recording:
                 )
         distinct(name, map(str, command_rad), "joints")
         if set(command_rad) != set(position_rad) or not command_rad:
-            commanded, read = (", ".join(map(str, own)) for own in (command_rad, position_rad))
+            commanded, read = (
+                ", ".join(map(str, arrays)) for arrays in (command_rad, position_rad)
+            )
             raise InputError(
                 f"{name}: command_rad has joints {commanded}, position_rad has {read}; they must "
                 "be the same, at least one."
@@ -245,9 +247,9 @@ class Recording:
         shared |= {} if read_time_s is None else {"read_time_s": read_time_s}
         parts = []
         for joint, command in command_rad.items():
-            own = shared | {"command_rad": command, "position_rad": position_rad[joint]}
+            arrays = shared | {"command_rad": command, "position_rad": position_rad[joint]}
             columns: dict[str, Any] = {"send_time_s": time_s, "joint": joint}
-            for key, values in own.items():
+            for key, values in arrays.items():
                 columns[key] = _numbers(f"{name}, {joint}", key, values)
                 free = key in ("trial", "frequency_hz") and columns[key].ndim == 0
                 if not free and columns[key].shape != time_s.shape:
@@ -285,12 +287,12 @@ class Recording:
             )
         if metadata is not None and not isinstance(metadata, Mapping):
             raise InputError(f"{name}: metadata is a {type(metadata).__name__}, not a dictionary.")
-        given: dict[str, Any] = {"imported_from": "a table in memory"} | dict(metadata or {})
-        check_metadata(name, given)
+        stated: dict[str, Any] = {"imported_from": "a table in memory"} | dict(metadata or {})
+        check_metadata(name, stated)
         distinct(name, map(str, table.columns))
         columns = {str(column): table[column] for column in table}
         timed = "read_time_s" in columns
-        after = given.get("read_after_send_s")
+        after = stated.get("read_after_send_s")
         if "send_time_s" in columns:
             rest = {"trial": 0, "frequency_hz": np.nan}
             columns = {c: pd.Series(v, table.index) for c, v in rest.items()} | columns
@@ -322,24 +324,24 @@ class Recording:
         if "send_time_s" in numbers and not timed:
             apart = READ_AFTER_SEND_S if after is None else after
             numbers["read_time_s"] = numbers["send_time_s"] + apart
-        log = convert(name, Table(numbers, texts, faults, metadata=given), options)
+        log = convert(name, Table(numbers, texts, faults, metadata=stated), options)
         tidy, known, warnings = log.table, log.metadata, log.warnings
         if "send_time_s" in columns and not timed and after is None:
-            given["read_after_send_s"] = READ_AFTER_SEND_S
+            stated["read_after_send_s"] = READ_AFTER_SEND_S
             first = tidy["joint"] == tidy["joint"].iloc[0] if len(tidy) else slice(0)
             doubt, text = doubt_of_a_turn(tidy.loc[first, "send_time_s"].to_numpy(float))
-            given["bus"] = {"read_time_doubt_s": doubt} | dict(given.get("bus") or {})
+            stated["bus"] = {"read_time_doubt_s": doubt} | dict(stated.get("bus") or {})
             warnings = [
                 *warnings,
                 text.split(" If you know")[0]
                 + " If you know, pass `read_time_s`, or `read_after_send_s` in `metadata`.",
             ]
-            known = known | given
+            known = known | stated
         others = tidy.columns.difference(REQUIRED_COLUMNS, sort=False)
         tidy = tidy.reindex(columns=[*REQUIRED_COLUMNS, *others])
-        tidy, more = check(name, tidy, given | known)
+        tidy, more = check(name, tidy, stated | known)
         digest = hashlib.sha256(tidy.to_csv(index=False).encode()).hexdigest()
-        return cls(tidy, given | known, name, None, digest, (*warnings, *more))
+        return cls(tidy, stated | known, name, None, digest, (*warnings, *more))
 
     def to_frame(self) -> pd.DataFrame:
         """A copy of `table`."""
@@ -391,7 +393,7 @@ class Recording:
         servos = {j: ServoSetup(**s) for j, s in (self.metadata.get("servos") or {}).items()}
         loads = {j: PendulumLoad(**s) for j, s in (self.metadata.get("loads") or {}).items()}
         quantum = bus.get("command_quantum_rad") or 0.0
-        found: dict[str, list[Trial]] = {}
+        trials: dict[str, list[Trial]] = {}
         for _, rows in self.table.groupby(["joint", "trial"], sort=True):
             columns = {c: rows[c].to_numpy() for c in rows.columns}
             joint, number = str(columns["joint"][0]), columns["trial"][0]
@@ -399,7 +401,7 @@ class Recording:
             servo = servos.get(joint, ServoSetup())
             gain = columns.get("p_gain", [np.nan])[0]
             torque = columns.get("torque_enabled")
-            found.setdefault(joint, []).append(
+            trials.setdefault(joint, []).append(
                 Trial(
                     joint,
                     int(number),
@@ -429,7 +431,7 @@ class Recording:
                     self.metadata.get("angle_unit") == "stated",
                 )
             )
-        return in_servo_coordinates(on_one_clock(found), bus)
+        return in_servo_coordinates(on_one_clock(trials), bus)
 
 
 def on_one_clock(trials: Mapping[str, list[Trial]]) -> dict[str, list[Trial]]:
@@ -505,22 +507,23 @@ def in_servo_coordinates(
     linkage = bus.get("linkage", preset.linkage if preset else "none")
     if linkage == "none":
         return dict(trials)
-    found = dict(trials)
-    for joint, own in trials.items():
+    turned = dict(trials)
+    for joint, joint_trials in trials.items():
         thigh = joint.replace("calf", "thigh")
         if joint.endswith("_calf") and thigh in trials:
             known = preset.joints[thigh].neutral_rad if preset else DEFAULT_POSE.get(thigh, 0.0)
             partners = {trial.number: trial for trial in trials[thigh]}
-            found[joint] = [
-                _joined(t, partners[t.number], known) if t.number in partners else t for t in own
+            turned[joint] = [
+                _joined(t, partners[t.number], known) if t.number in partners else t
+                for t in joint_trials
             ]
-    return found
+    return turned
 
 
 def _joined(calf: Trial, thigh: Trial, neutral: float) -> Trial:
     """The calf's trial in servo coordinates."""
-    _, own, other = np.intersect1d(calf.send_time_s, thigh.send_time_s, return_indices=True)
-    rows, beside = calf.at(own), thigh.at(other)
+    _, of_calf, of_thigh = np.intersect1d(calf.send_time_s, thigh.send_time_s, return_indices=True)
+    rows, beside = calf.at(of_calf), thigh.at(of_thigh)
     return replace(
         rows,
         command_rad=rows.command_rad + beside.command_rad - neutral,

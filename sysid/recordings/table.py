@@ -111,39 +111,41 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Table:
     if columns[0] == "" and not has_time(columns):
         texts.append("")  # a frame's index, which is its time unless it counts rows
     # killed in the middle of a line: of ours the last one has no end
-    found = read_table(path, opened.text, texts, strict, whole_lines=ours, columns=opened.columns)
-    entries = _entries(path, text, found.comments)
+    csv_table = read_table(
+        path, opened.text, texts, strict, whole_lines=ours, columns=opened.columns
+    )
+    entries = _entries(path, text, csv_table.comments)
     metadata = _metadata(path, text, entries)
     warnings: list[str] = list(opened.notes)
-    keep = np.ones(len(found), bool)
-    for trial, rows in _cancelled(path, found, entries) if ours else []:
+    keep = np.ones(len(csv_table), bool)
+    for trial, rows in _cancelled(path, csv_table, entries) if ours else []:
         warnings.append(
             f"trial {trial} was interrupted and recorded again; the second one is used."
         )
         keep[rows] = False
-    if found.cut:
+    if csv_table.cut:
         warnings.append("its last line was cut short and has been left out.")
     if not ours:
-        _refuse_other_names(path, opened.text, columns, found.broken)
-    if found.broken:
+        _refuse_other_names(path, opened.text, columns, csv_table.broken)
+    if csv_table.broken:
         warnings.append(
-            f"{len(found.broken)} lines that are no rows of the table were left out, the first of "
-            f"them line {min(found.broken)}."
+            f"{len(csv_table.broken)} lines that are no rows of the table were left out, the first "
+            f"of them line {min(csv_table.broken)}."
         )
     if text.startswith(TITLE) and "completed" not in metadata:
         warnings.append("it was not recorded to its end; what is there is used.")
-    if not len(found):
+    if not len(csv_table):
         raise InputError(f"{path} has column names but no rows. Record it again.")
-    numbers, texts = dict(found.numbers), dict(found.texts)
+    numbers, texts = dict(csv_table.numbers), dict(csv_table.texts)
     for name in [name for name in texts if name not in TEXT_COLUMNS]:
         with suppress(InputError):  # where a column of joints numbers them
-            numbers[name] = numbers_of(path, name, texts[name], found.line)
+            numbers[name] = numbers_of(path, name, texts[name], csv_table.line)
             del texts[name]
     if "" in texts:
         texts["time"] = texts.pop("")
     head = text[:_HEAD]
     table = Table(
-        {name: numbers[name] for name in columns if name in numbers}, texts, found.faults,
+        {name: numbers[name] for name in columns if name in numbers}, texts, csv_table.faults,
         numbered=opened.numbered, notes=warnings, metadata=metadata,
         rate=rate_in(head.split("\n")), tick_s=tick_in(head), units=units_in(head, columns),
     )  # fmt: skip
@@ -202,7 +204,7 @@ def header(path: Path, text: str) -> dict[str, Any]:
 
 def _entries(path: Path, text: str, lines: list[tuple[int, str]]) -> list[tuple[int, str, Any]]:
     """Line, name and value of the entries in comment lines."""
-    found = []
+    entries = []
     # the last line of a file may be cut short
     last = lines[-1][0] if lines and text.endswith(lines[-1][1]) else None
     for n, line in lines:
@@ -211,11 +213,11 @@ def _entries(path: Path, text: str, lines: list[tuple[int, str]]) -> list[tuple[
         key, _, value = line[2:].partition(": ")
         name = f"{path}, line {n}: the value of '{printable(key)[:60]}'"
         try:
-            found.append((n, key.strip(), parse_json(value, name, "Mend or remove the line.")))
+            entries.append((n, key.strip(), parse_json(value, name, "Mend or remove the line.")))
         except InputError:
             if text.startswith(TITLE) and n != last:
                 raise
-    return found
+    return entries
 
 
 def _metadata(path: Path, text: str, entries: list[tuple[int, str, Any]]) -> dict[str, Any]:
@@ -245,8 +247,8 @@ def comments(title: str, entries: dict[str, Any]) -> str:
 def comment(key: str, value: Any) -> str:
     """One comment line; NumPy values become plain ones, other objects text."""
 
-    def plain(found: Any) -> Any:
-        return found.tolist() if hasattr(found, "tolist") else str(found)
+    def plain(value: Any) -> Any:
+        return value.tolist() if hasattr(value, "tolist") else str(value)
 
     text = json.dumps(value, ensure_ascii=False, default=plain)
     # what else ends a line for `splitlines`, and JSON leaves as it is
@@ -254,7 +256,7 @@ def comment(key: str, value: Any) -> str:
 
 
 def _cancelled(
-    path: Path, found: CsvTable, entries: list[tuple[int, str, Any]]
+    path: Path, csv_table: CsvTable, entries: list[tuple[int, str, Any]]
 ) -> list[tuple[int, slice]]:
     """Trials, and their rows, that a later line `# resumed` cancels."""
     resumed: dict[int, int] = {}
@@ -268,14 +270,14 @@ def _cancelled(
                 "line."
             )
         resumed[trial] = n
-    if not resumed or "trial" not in found.numbers:
+    if not resumed or "trial" not in csv_table.numbers:
         return []
-    order = np.argsort(found.numbers["trial"], kind="stable")  # rows of a trial in their order
-    trials = found.numbers["trial"][order]
+    order = np.argsort(csv_table.numbers["trial"], kind="stable")  # rows of a trial in their order
+    trials = csv_table.numbers["trial"][order]
     cancelled = []
     for trial, n in resumed.items():
-        own = order[np.searchsorted(trials, trial) : np.searchsorted(trials, trial, "right")]
-        own = own[found.line[own] < n]
-        if len(own):
-            cancelled.append((trial, slice(own[0], own[-1] + 1)))
+        rows = order[np.searchsorted(trials, trial) : np.searchsorted(trials, trial, "right")]
+        rows = rows[csv_table.line[rows] < n]
+        if len(rows):
+            cancelled.append((trial, slice(rows[0], rows[-1] + 1)))
     return cancelled

@@ -269,25 +269,25 @@ def fit_servo(
     data = servo_data(recordings, joints, readings, seed)
     recorded = ", ".join(data.groups)
     notes = [text for j in joints for text in checks.cautions(j, trials[j])]
-    whole = split.train or windows.everything
-    data, note = windows.grouped(data, whole)
+    training = split.train or windows.everything
+    data, note = windows.grouped(data, training)
     notes += [note] if note else []
     data = windows.merged_groups(data)
     if split.test is None:
-        data = _with_two_groups(data, whole)
+        data = _with_two_groups(data, training)
         folds = [(windows.without(g), windows.only(g)) for g in range(len(data.groups))]
     else:
-        folds = [(whole, split.test)]
+        folds = [(training, split.test)]
         if not any(windows.chosen(r, split.test).any() for j in joints for r in data.runs[j]):
             raise InputError(
                 f"There is nothing to test on: {split.name}. What was recorded: {recorded}. "
                 "Without a split every part is predicted by a model fitted to the others."
             )
     say = progress or (lambda what, share: None)
-    ready = windows.samples(data, whole, past_ticks(data.period_s))
+    ready = windows.samples(data, training, past_ticks(data.period_s))
     count = dict(zip(joints, (int(n) for n in ready.used.sum((1, 2))), strict=True))
 
-    ours = _fit(arch, preset, data, ready, whole, folds, split, seed, say, keep_unfinished)
+    ours = _fit(arch, preset, data, ready, training, folds, split, seed, say, keep_unfinished)
     linear = physics = ours.folds
     if arch != "fir":
         fir = fit_network("fir", joints, data.period_s, ready, seed)
@@ -412,7 +412,7 @@ def _fit(
     preset: str,
     data: ServoData,
     ready: windows.Samples,
-    whole: windows.Part,
+    training: windows.Part,
     folds: list[tuple[windows.Part, windows.Part]],
     split: Split,
     seed: int,
@@ -423,13 +423,13 @@ def _fit(
         same = split.test is not None  # the one fold is the whole training part
         parts = [train for train, _ in folds]
         fits = delayed_pd_fits if arch == "delayed-pd" else sindy_fits
-        values = fits(data, parts if same else [whole, *parts], seed)
+        values = fits(data, parts if same else [training, *parts], seed)
         models: list[ServoModel] = [physical_model(arch, v, data.period_s) for v in values]
         return _Fitted(models[0], values[0], models if same else models[1:], {}, None, 0)
     if preset == "paper":
         published = [
             fit_published(arch, data, part, seed, lambda share: say(f"{arch} as published", share))
-            for part in ([f[0] for f in folds] + ([] if split.test is not None else [whole]))
+            for part in ([f[0] for f in folds] + ([] if split.test is not None else [training]))
         ]
         size = sum(
             v[0].size for k, v in published[-1].parameters.items() if "weight" in k or "bias" in k
@@ -444,7 +444,7 @@ def _fit(
     if fit.interrupted and not keep_unfinished:
         raise KeyboardInterrupt
     held = [
-        scores.errors(m, scores.tracks(m, data), data, _both(whole, windows.only(g)))
+        scores.errors(m, scores.tracks(m, data), data, _both(training, windows.only(g)))
         for g, m in fit.held_out.items()
     ]
     size = sum(

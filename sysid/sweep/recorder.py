@@ -151,10 +151,10 @@ def resume_point(path: Path, plan: Plan, period_s: float) -> Resume:
             f"{path} was recorded with another plan than its header gives today: the played file, "
             "the joint map or the limits have changed since. Record it again."
         )
-    whole = text[: text.rfind("\n") + 1]
-    if sum(bool(line.strip()) and line[0] != "#" for line in whole.splitlines()) < 2:
+    complete = text[: text.rfind("\n") + 1]
+    if sum(bool(line.strip()) and line[0] != "#" for line in complete.splitlines()) < 2:
         return Resume(0, 0, 0.0, written_at)
-    columns = parse(path, whole).columns
+    columns = parse(path, complete).columns
     last = float(np.nanmax([columns["send_time_s"], columns["read_time_s"]]))
     rows = 0
     for number, trial in enumerate(plan.trials):
@@ -189,9 +189,9 @@ def playback(path: Path, joints: Sequence[str] | None = None) -> Plan:
     moving = in_order(columns) if joints is None else list(dict.fromkeys(joints))
     missing = [j for j in moving if j not in columns]
     if "time_s" not in table.columns or not moving or missing or not len(table):
-        wanted = f"{(missing or ['LF_hip'])[0]}{_ENDING}"
+        example = f"{(missing or ['LF_hip'])[0]}{_ENDING}"
         raise InputError(
-            f"{path} is not a file of commands: it needs rows with columns time_s and {wanted}; "
+            f"{path} is not a file of commands: it needs rows with columns time_s and {example}; "
             f"it has {len(table)} rows of {', '.join(map(str, table.columns[:8]))}."
         )
     if table.cut:
@@ -467,8 +467,8 @@ class _Session:
             if np.isfinite(sample.position_rad).all():
                 recent.append((bus.now(), sample.position_rad))
             recent = [(t, q) for t, q in recent if t >= bus.now() - REST_FOR_S]
-            whole = recent and bus.now() - recent[0][0] > 0.8 * REST_FOR_S and len(recent) > 5
-            if whole and np.ptp([q for _, q in recent], axis=0).max() < REST_SPREAD_RAD:
+            observed = recent and bus.now() - recent[0][0] > 0.8 * REST_FOR_S and len(recent) > 5
+            if observed and np.ptp([q for _, q in recent], axis=0).max() < REST_SPREAD_RAD:
                 bus.torque(True)
                 self._sent = bus.sent
                 return

@@ -139,12 +139,12 @@ def _members(path: Path, data: bytes) -> list[zipfile.ZipInfo]:
 def _loaded(path: Path, data: bytes) -> Any:
     """What NumPy loads: an array, or the arrays of an archive by name."""
     try:
-        found = np.load(io.BytesIO(data), allow_pickle=False)
-        if isinstance(found, np.ndarray):
-            return found
-        with found:
-            distinct(path, found.files, "arrays")
-            arrays = {name: found[name] for name in found.files}
+        content = np.load(io.BytesIO(data), allow_pickle=False)
+        if isinstance(content, np.ndarray):
+            return content
+        with content:
+            distinct(path, content.files, "arrays")
+            arrays = {name: content[name] for name in content.files}
             return {name: a for name, a in arrays.items() if isinstance(a, np.ndarray)}
     except InputError:
         raise

@@ -144,9 +144,9 @@ def column(name: str) -> Column:
     name = str(name)[:_LONGEST]
     if not (part := _PARTS_OF.search(name)) or not float(part[1]) > 0:
         return _column(name)
-    found = _column(name.replace(part[0], part[2]))
+    plain = _column(name.replace(part[0], part[2]))
     return replace(
-        found, name=name, template=name, unit=f"scale:{float(part[1]) * _RAD[part[2]]:.9g}"
+        plain, name=name, template=name, unit=f"scale:{float(part[1]) * _RAD[part[2]]:.9g}"
     )
 
 
@@ -223,16 +223,16 @@ def columns_of(names: Iterable[str]) -> list[Column]:
 
     In `hip_cmd, hip` and `phi_ref, phi` the name of a joint alone is its position.
     """
-    found = [column(name) for name in names]
-    commands = {c.key for c in found if c.kind == "command"}
-    if any(c.kind == "command" and c.name.lower().startswith("p_") for c in found):  # p_des
-        found = [replace(c, kind="position", rank=(0, 0, 1, 1)) if c.name == "p" else c
-                 for c in found]  # fmt: skip
-    placed = {c.key for c in found if c.kind == "position"}
+    columns = [column(name) for name in names]
+    commands = {c.key for c in columns if c.kind == "command"}
+    if any(c.kind == "command" and c.name.lower().startswith("p_") for c in columns):  # p_des
+        columns = [replace(c, kind="position", rank=(0, 0, 1, 1)) if c.name == "p" else c
+                 for c in columns]  # fmt: skip
+    placed = {c.key for c in columns if c.kind == "position"}
     return [
         replace(c, kind="position", template=_template(c.name, [c.name]))
         if c.kind == "unknown" and c.key in commands - placed else c
-        for c in found
+        for c in columns
     ]  # fmt: skip
 
 
@@ -242,17 +242,17 @@ def _parts(word: str) -> list[str]:
         return [word]
     pieces = _CAMEL.findall(word)
     if len(pieces) > 1 and any(_known(piece) for piece in pieces):
-        found: list[str] = []
+        words: list[str] = []
         rest = ""
         for piece in pieces:
             if split := _known(piece):
-                found += [rest, *split] if rest else split
+                words += [rest, *split] if rest else split
                 rest = ""
             elif piece == "d" and rest.isdigit():  # q1d, the desired q1
-                found, rest = [*found, rest, "d"], ""
+                words, rest = [*words, rest, "d"], ""
             else:
                 rest += piece
-        return [*found, rest] if rest else found
+        return [*words, rest] if rest else words
     return _known(word) or [word]
 
 
@@ -283,23 +283,23 @@ def _template(name: str, joint: Sequence[str]) -> str:
     """The name with `{joint}` for the words that name a joint, where they stand together."""
     if not joint:
         return name
-    found = re.search(r"[^0-9A-Za-z]+".join(map(re.escape, joint)), name)
-    return f"{name[: found.start()]}{{joint}}{name[found.end() :]}" if found else name
+    match = re.search(r"[^0-9A-Za-z]+".join(map(re.escape, joint)), name)
+    return f"{name[: match.start()]}{{joint}}{name[match.end() :]}" if match else name
 
 
 def time_columns(names: Sequence[str]) -> list[str]:
     """Columns of times, the likeliest first: plain names, then those of a clock or an event."""
-    found = []
+    ranked = []
     for name in names:
-        own = column(name)
+        parsed = column(name)
         lower = [w.lower() for w in _SEPARATORS.split(name) if w]
-        if own.kind == "time" and not own.words:
+        if parsed.kind == "time" and not parsed.words:
             bare = [w for w in lower if WORDS.get(w) == TIME and w not in SECONDS] or lower
             place = TIMES.index(bare[0]) if bare[0] in TIMES else len(TIMES)
-            found.append(((len(own.key) > 0, place, len(lower)), name))
+            ranked.append(((len(parsed.key) > 0, place, len(lower)), name))
         elif lower[:3] == ["time", "since", "start"] or name.lower() == "x_value":  # LabVIEW's
-            found.append(((False, 4, 3), name))
-    return [name for _, name in sorted(found, key=lambda pair: pair[0])]
+            ranked.append(((False, 4, 3), name))
+    return [name for _, name in sorted(ranked, key=lambda pair: pair[0])]
 
 
 def has_time(names: Sequence[str]) -> bool:

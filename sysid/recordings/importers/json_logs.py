@@ -196,8 +196,8 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
         if all(isinstance(v, str) for v in texts_only) and (word := unit_behind(texts_only)):
             lists[with_unit(name, word)] = [v and v.removesuffix(word).strip() for v in values]
             del lists[name]
-    found = {name: _numbers(values) for name, values in lists.items() if len(values) > 1}
-    arrays = {name: values for name, values in found.items() if values is not None}
+    columns = {name: _numbers(values) for name, values in lists.items() if len(values) > 1}
+    arrays = {name: values for name, values in columns.items() if values is not None}
     texts = {
         n: list(map(str, v))
         for n, v in lists.items()
@@ -259,8 +259,8 @@ def _records(data: Any) -> list[Any] | None:
     lists = [data] if isinstance(data, list) else []
     if isinstance(data, Mapping):
         lists = [value for value in data.values() if isinstance(value, list)]
-    own = [v for v in lists if v and all(isinstance(row, Mapping) for row in v)]
-    return max(own, key=len, default=None)
+    tables = [v for v in lists if v and all(isinstance(row, Mapping) for row in v)]
+    return max(tables, key=len, default=None)
 
 
 def _numbers(values: Any) -> NDArray[np.float64] | None:
@@ -280,7 +280,7 @@ def _numbers(values: Any) -> NDArray[np.float64] | None:
     if not all(isinstance(v, int | float | None) for v in inside):
         return None
     try:
-        found = np.array(values, dtype=float)
+        array = np.array(values, dtype=float)
     except (TypeError, ValueError, OverflowError):  # lists of several lengths
         return None
-    return found if found.ndim in (1, 2) else None
+    return array if array.ndim in (1, 2) else None

@@ -70,9 +70,11 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
     of_key = {key: names.get(f"{key}, flat", [key]) for key in _KEYS}
     parts: dict[str, list[NDArray[np.float64]]] = {key: [] for key in _KEYS}
     for path in data_paths:
-        read = read_columns(path, contents[path], [c for own in of_key.values() for c in own])
-        for key, own in of_key.items():
-            parts[key].append(np.column_stack([read[c] for c in own]))
+        read = read_columns(
+            path, contents[path], [c for key_columns in of_key.values() for c in key_columns]
+        )
+        for key, key_columns in of_key.items():
+            parts[key].append(np.column_stack([read[c] for c in key_columns]))
     refuse_more(folder, sum(p.size for p in parts[_STATE]), MOST_CELLS, "values",
                 "Give a part of it.")  # fmt: skip
     columns = {}
@@ -99,8 +101,8 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
     one_scale, texts = _scales(positions, joints)
     scales = np.column_stack([one_scale, one_scale])  # of commands, of positions
     for k, joint in enumerate(joints):
-        if given := options.unit_of(names["joints"][k], joint):
-            scales[k] = [unit.scale for unit in given]
+        if pair := options.unit_of(names["joints"][k], joint):
+            scales[k] = [unit.scale for unit in pair]
             texts[joint] = f"{scales[k, 1]:.5f} (given)"
     metadata: dict[str, Any] = {
         "imported_from": LAYOUT,
@@ -125,7 +127,7 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
     by_text: dict[str, list[str]] = {}
     for joint, text in texts.items():
         by_text.setdefault(text, []).append(joint)
-    units = "; ".join(f"{', '.join(own)}: {text}" for text, own in by_text.items())
+    units = "; ".join(f"{', '.join(key_columns)}: {text}" for text, key_columns in by_text.items())
     warnings = [
         f"its times are frame numbers over {fps:g} Hz, not clock readings: lag and dead time scale "
         "with that rate (`pupper-sysid import --rate` gives another), and when a state was read "
@@ -142,14 +144,14 @@ def _names(path: Path, info: Any) -> dict[str, list[str]]:
     features = info.get("features") if isinstance(info, dict) else None
     if not isinstance(features, dict):
         raise InputError(f"{path}: features is missing, so this is no LeRobot dataset.")
-    found: dict[str, list[str]] = {}
+    names_of: dict[str, list[str]] = {}
     for key in (_ACTION, _STATE):
         feature = features.get(key)
         flat = [name for name in features if str(name).startswith(f"{key}.")]
         if feature is None and flat:  # a column per joint
-            found[key] = [name.removeprefix(f"{key}.") for name in flat]
-            found[f"{key}, flat"] = flat
-            distinct(f"{path}, {key}", found[key], "joints")
+            names_of[key] = [name.removeprefix(f"{key}.") for name in flat]
+            names_of[f"{key}, flat"] = flat
+            distinct(f"{path}, {key}", names_of[key], "joints")
             continue
         if not isinstance(feature, dict):
             raise InputError(
@@ -161,16 +163,16 @@ def _names(path: Path, info: Any) -> dict[str, list[str]]:
             shape = feature.get("shape")
             count = shape[0] if isinstance(shape, list) and shape else 0
             names = [f"joint_{k}" for k in range(count if isinstance(count, int) else 0)][:1000]
-        found[key] = [str(name) for name in names]
-        distinct(f"{path}, {key}", found[key], "joints")
-    both = [name for name in found[_STATE] if name in found[_ACTION]]
+        names_of[key] = [str(name) for name in names]
+        distinct(f"{path}, {key}", names_of[key], "joints")
+    both = [name for name in names_of[_STATE] if name in names_of[_ACTION]]
     positions = [name for name in both if name.endswith(".pos")]
     if not both:
         raise InputError(
             f"{path}: no joint has both {_ACTION} and {_STATE}; action has "
-            f"{printable(', '.join(found[_ACTION])[:200])}."
+            f"{printable(', '.join(names_of[_ACTION])[:200])}."
         )
-    return found | {"joints": positions or both}
+    return names_of | {"joints": positions or both}
 
 
 def _flat(names: Any) -> list[str]:
@@ -186,15 +188,15 @@ def _scales(
 ) -> tuple[list[float], dict[str, str]]:
     """Radians per unit of each joint, and in words where the scale is from."""
     steps = [smallest_step(positions[:, k]) for k in range(len(joints))]
-    found = [COUNT_RAD / step if step > 0 else 0.0 for step in steps]
+    by_step = [COUNT_RAD / step if step > 0 else 0.0 for step in steps]
     farthest = float(np.nanmax(np.abs(positions))) if positions.size else 0.0
     scales, texts = [], {}
     for k, joint in enumerate(joints):
         span = 100.0 if positions[:, k].min() >= 0 and "gripper" in joint else 200.0
-        if abs(found[k] - 1) < 0.02:
+        if abs(by_step[k] - 1) < 0.02:
             scale, text = 1.0, "1 (rad: readings are whole counts of 4096 a turn apart)"
-        elif 0.2 <= span * found[k] <= 2 * np.pi:
-            scale = found[k]
+        elif 0.2 <= span * by_step[k] <= 2 * np.pi:
+            scale = by_step[k]
             text = f"{scale:.5f} (readings are {steps[k]:.4g} units apart, taken for 1/4096 turn)"
         elif farthest <= np.pi:
             scale, text = 1.0, "1 (assumed: no value is beyond ±π)"

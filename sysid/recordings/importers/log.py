@@ -67,13 +67,13 @@ class Table:
 
     def numbers(self, path: Path | str, name: str) -> NDArray[np.float64]:
         """Finite or missing numbers of a column."""
-        shown = printable(name)[:60]
+        printed = printable(name)[:60]
         if name not in self.columns:
-            fault = f"{path}, column {shown}: its values are not numbers."
+            fault = f"{path}, column {printed}: its values are not numbers."
             raise InputError(self.faults.get(name, fault))
         values = np.asarray(self.columns[name], float)
         if np.isinf(values).any():
-            raise InputError(f"{path}, column {shown}: a value is infinite.")
+            raise InputError(f"{path}, column {printed}: a value is infinite.")
         return values
 
     def known(self, name: str) -> NDArray[np.float64]:
@@ -136,8 +136,8 @@ def expanded(
         parts = {key: values}
         if values.ndim == 2:
             width = min(values.shape[1], 10_000)
-            own = names if len(names) == width else [f"joint_{k}" for k in range(width)]
-            parts = {f"{key}.{own[k]}": values[:, k] for k in range(width)}
+            labels = names if len(names) == width else [f"joint_{k}" for k in range(width)]
+            parts = {f"{key}.{labels[k]}": values[:, k] for k in range(width)}
             widths[key] = width
         if len(values) == rows:
             columns |= parts
@@ -178,19 +178,19 @@ def rows(
     return pd.DataFrame(columns | optional)
 
 
-def joint_names(path: Path | str, given: Sequence[str]) -> list[str]:
+def joint_names(path: Path | str, wanted: Sequence[str]) -> list[str]:
     """Joints' names as this project can use them: letters, digits and `_`.
 
     >>> joint_names("log", ["shoulder pan.pos", "2nd/wrist"])
     ['shoulder_pan', 'joint_2nd_wrist']
     """
-    refuse_more(path, len(given), MOST_JOINTS, "joints", "Name those to read with `joints`.")
-    found = []
-    for name in given:
+    refuse_more(path, len(wanted), MOST_JOINTS, "joints", "Name those to read with `joints`.")
+    cleaned = []
+    for name in wanted:
         text = re.sub(r"[^A-Za-z0-9]+", "_", bare_name(str(name))).strip("_")
-        found.append((text if text[:1].isalpha() else f"joint_{text}".rstrip("_"))[:64])
-    distinct(path, found, "joints")
-    return found
+        cleaned.append((text if text[:1].isalpha() else f"joint_{text}".rstrip("_"))[:64])
+    distinct(path, cleaned, "joints")
+    return cleaned
 
 
 def bare_name(name: str) -> str:
@@ -202,40 +202,40 @@ def numbers(
     path: Path | str, entries: Sequence[Any], key: str, where: str, missing: bool = False
 ) -> NDArray[np.float64]:
     """Numbers `entries[k][key]`; with `missing`, an absent or empty one is NaN."""
-    found = np.full(len(entries), np.nan)
+    values = np.full(len(entries), np.nan)
     for k, entry in enumerate(entries):
         value = entry.get(key) if isinstance(entry, Mapping) else None
         if value is None and missing:
             continue
-        found[k] = number(path, value, f"{where}[{k}].{key}")
-    return found
+        values[k] = number(path, value, f"{where}[{k}].{key}")
+    return values
 
 
 def number(path: Path | str, value: Any, place: str) -> float:
     """`value` as a float."""
     if isinstance(value, int | float):
         try:
-            found = float(value)
+            parsed = float(value)
         except OverflowError:
-            found = float("inf")
-        if abs(found) != float("inf"):
-            return found
-    shown = "missing" if value is None else f"{printable(str(value))[:40]}, not a finite number"
-    raise InputError(f"{path}, {place} is {shown}. Mend the log, or leave the row out.")
+            parsed = float("inf")
+        if abs(parsed) != float("inf"):
+            return parsed
+    printed = "missing" if value is None else f"{printable(str(value))[:40]}, not a finite number"
+    raise InputError(f"{path}, {place} is {printed}. Mend the log, or leave the row out.")
 
 
 def read_files(root: Path, files: Iterable[Path]) -> tuple[dict[Path, bytes], str]:
     """Content of a log's files within the budget of bytes, and the SHA-256 of names and content."""
-    found: dict[Path, bytes] = {}
+    contents: dict[Path, bytes] = {}
     total, digest = 0, hashlib.sha256()
     remedy = "Give a part of the log, or split it by joint or by episode."
     for path in sorted(files):
-        found[path] = border.read_bytes(path, LARGEST_BYTES, remedy)
-        total += len(found[path])
+        contents[path] = border.read_bytes(path, LARGEST_BYTES, remedy)
+        total += len(contents[path])
         refuse_more(root, total, LARGEST_BYTES, "bytes", remedy, exact=False)
-        digest.update(f"{path.relative_to(root).as_posix()}\0{len(found[path])}\0".encode())
-        digest.update(found[path])
-    return found, digest.hexdigest()
+        digest.update(f"{path.relative_to(root).as_posix()}\0{len(contents[path])}\0".encode())
+        digest.update(contents[path])
+    return contents, digest.hexdigest()
 
 
 def held_commands(

@@ -56,10 +56,10 @@ def scale_by_step(positions: ArrayLike, nominal: float) -> tuple[float, str]:
     was assumed, for a warning.
     """
     step = smallest_step(np.asarray(positions, float))
-    found = COUNT_RAD / step if step > 0 else 0.0
-    if _NARROWEST_RAD <= found <= _WIDEST_RAD:
-        return found, (
-            f"its range was taken as {found:.3f} rad, since its readings are steps of 1/"
+    scale = COUNT_RAD / step if step > 0 else 0.0
+    if _NARROWEST_RAD <= scale <= _WIDEST_RAD:
+        return scale, (
+            f"its range was taken as {scale:.3f} rad, since its readings are steps of 1/"
             f"{1 / step:.0f} of it apart and a step was taken for one count of 4096 a turn"
         )
     return nominal, f"its range was assumed to be {nominal:.3f} rad"
@@ -78,8 +78,8 @@ def smallest_step(values: NDArray[np.float64]) -> float:
         return 0.0
     least = float(np.median(steps[: len(steps) // 100 + 1]))
     # the smallest difference may be several steps
-    found = (_refined(steps, least / divisor) for divisor in range(1, 7))
-    return next((step for step in found if step > 0), 0.0)
+    candidates = (_refined(steps, least / divisor) for divisor in range(1, 7))
+    return next((step for step in candidates if step > 0), 0.0)
 
 
 def _refined(steps: NDArray[np.float64], guess: float) -> float:
@@ -271,8 +271,8 @@ class LogOptions:
 
     def refuse(self, layout: str, allowed: tuple[str, ...] = ("joints",)) -> None:
         """Refuse options that a layout has no use for."""
-        given = [f.name for f in fields(self) if getattr(self, f.name) not in (None, {})]
-        useless = [name for name in given if name not in allowed]
+        stated = [f.name for f in fields(self) if getattr(self, f.name) not in (None, {})]
+        useless = [name for name in stated if name not in allowed]
         if useless:
             raise InputError(
                 f"This is a {layout}, which says itself what `{useless[0]}` would say. Leave it "
@@ -296,16 +296,16 @@ _MappingFile = create_model(
 def read_mapping(path: Path) -> LogOptions:
     """Options from a mapping file."""
     data, lines = read_yaml(path)
-    found = validated(_MappingFile, data, path, lines).model_dump()
-    if isinstance(found["joints"], list):
-        found["joints"] = {name: name for name in found["joints"]}
-    return LogOptions(**found)
+    mapping = validated(_MappingFile, data, path, lines).model_dump()
+    if isinstance(mapping["joints"], list):
+        mapping["joints"] = {name: name for name in mapping["joints"]}
+    return LogOptions(**mapping)
 
 
 def merged(first: LogOptions, second: LogOptions) -> LogOptions:
     """Options of `first`, and of `second` where `first` has none."""
     values: dict[str, Any] = {}
     for f in fields(LogOptions):
-        own = getattr(first, f.name)
-        values[f.name] = getattr(second, f.name) if own in (None, {}) else own
+        value = getattr(first, f.name)
+        values[f.name] = getattr(second, f.name) if value in (None, {}) else value
     return LogOptions(**values)

@@ -61,21 +61,21 @@ class Pair:
     def as_sure(self, other: Pair) -> bool:
         """Whether words and marks of both pairs tell as much."""
         return all(
-            own.rank[:2] == theirs.rank[:2]
-            for own, theirs in ((self.command, other.command), (self.position, other.position))
+            ours.rank[:2] == theirs.rank[:2]
+            for ours, theirs in ((self.command, other.command), (self.position, other.position))
         )
 
 
 def pairs(path: Path | str, table: Table, options: LogOptions) -> tuple[dict[str, Pair], list[str]]:
     """Columns by joint, as the log names it, and what was assumed."""
     if options.command and options.position:
-        found, notes = _stated(path, table, options), []
+        chosen, notes = _stated(path, table, options), []
     else:
-        found, notes = _by_words(path, table, options)
+        chosen, notes = _by_words(path, table, options)
     if not options.joints:
-        used = [c.name for pair in found.values() for c in (pair.command, pair.position)]
+        used = [c.name for pair in chosen.values() for c in (pair.command, pair.position)]
         table.check_joints(path, used)
-    return found, notes
+    return chosen, notes
 
 
 def _by_words(
@@ -89,14 +89,16 @@ def _by_words(
         return _lone(path, table, commands, positions)
     used = Counter(c.template for c in every)
     of_drive = any(map(_DRIVES.search, table.names))
-    found: list[Pair] = []
+    chosen: list[Pair] = []
     notes: dict[str, str] = {}  # one of a kind
     for key in keys:
         ranked = [
-            sorted((c for c in own if c.key == key), key=lambda c: (c.rank, -used[c.template]))
-            for own in (commands, positions)
+            sorted(
+                (c for c in candidates if c.key == key), key=lambda c: (c.rank, -used[c.template])
+            )
+            for candidates in (commands, positions)
         ]
-        choices = product(*(own[:_COMPARED] for own in ranked))
+        choices = product(*(candidates[:_COMPARED] for candidates in ranked))
         best = sorted((Pair(*pair) for pair in choices), key=lambda pair: pair.cost(used))
         pair = _decided(path, table, best, used)
         both = f"{pair.command.name} and {pair.position.name}"
@@ -119,15 +121,15 @@ def _by_words(
             )
             if of_drive:
                 pair = Pair(*(replace(c, unit="turns") for c in (pair.command, pair.position)))
-        found.append(pair)
+        chosen.append(pair)
     # a joint is called as both columns have it, else without further words
-    joints = [min(pair.command.joint, pair.position.joint, key=len) for pair in found]
-    names = [bare_name(j or p.command.key) or SOLE for j, p in zip(joints, found, strict=True)]
+    joints = [min(pair.command.joint, pair.position.joint, key=len) for pair in chosen]
+    names = [bare_name(j or p.command.key) or SOLE for j, p in zip(joints, chosen, strict=True)]
     distinct(path, names, "joints")
     if names == ["d"]:  # ref_d, meas_d
-        both = f"{found[0].command.name} and {found[0].position.name}"
+        both = f"{chosen[0].command.name} and {chosen[0].position.name}"
         notes["d"] = f"{both} were taken for radians of a joint d; for degrees give `unit='deg'`."
-    return dict(zip(names, found, strict=True)), [*notes.values()]
+    return dict(zip(names, chosen, strict=True)), [*notes.values()]
 
 
 def _decided(path: Path | str, table: Table, best: Sequence[Pair], used: Mapping[str, int]) -> Pair:
@@ -135,15 +137,15 @@ def _decided(path: Path | str, table: Table, best: Sequence[Pair], used: Mapping
     first = best[0]
     alike = [pair for pair in best if pair.cost(used) == first.cost(used)]
     for kind in ("command", "position"):
-        own = getattr(first, kind)
+        chosen = getattr(first, kind)
         twice = {getattr(pair, kind).name for pair in best
                  if pair.cost(used)[:4] == first.cost(used)[:4]
-                 and getattr(pair, kind).words == own.words}  # fmt: skip
-        distinct(path, [bare_name(own.joint or SOLE)] * len(twice), "joints")
+                 and getattr(pair, kind).words == chosen.words}  # fmt: skip
+        distinct(path, [bare_name(chosen.joint or SOLE)] * len(twice), "joints")
         values = [table.columns.get(n) for n in dict.fromkeys(getattr(p, kind).name for p in alike)]
         if any(v is None or values[0] is None or not np.array_equal(v, values[0], equal_nan=True)
                for v in values[1:]):  # fmt: skip
-            why = f"{len(values)} columns may be the {kind} of {own.joint or 'the joint'}"
+            why = f"{len(values)} columns may be the {kind} of {chosen.joint or 'the joint'}"
             _refuse_choices(path, why, alike)
     return first
 
@@ -163,16 +165,19 @@ def _lone(
             f"{refusals.listed(table.names)}.{which}"
         )
     first = [
-        [c for c in own if c.rank[:3] == min(c.rank for c in own)[:3]]
-        for own in (commands, positions)
+        [c for c in candidates if c.rank[:3] == min(c.rank for c in candidates)[:3]]
+        for candidates in (commands, positions)
     ]
     choices = [Pair(*pair) for pair in product(*first)]
     if len(choices) > 1:
-        table.check_joints(path, [c.name for own in first for c in own])
+        table.check_joints(path, [c.name for candidates in first for c in candidates])
         if len(first[0]) == len(first[1]):  # one line for all
-            joined = [",".join(c.name for c in own) for own in first]
-            choices = [Pair(*(replace(own[0], name=names, template=names)
-                              for own, names in zip(first, joined, strict=True)))]  # fmt: skip
+            joined = [",".join(c.name for c in candidates) for candidates in first]
+            both = (
+                replace(candidates[0], name=names, template=names)
+                for candidates, names in zip(first, joined, strict=True)
+            )
+            choices = [Pair(*both)]
         _refuse_choices(path, "no joint has both a command and a position by its name", choices)
     (pair,) = choices
     name = bare_name(pair.command.joint or pair.position.joint or SOLE)
@@ -198,7 +203,7 @@ def _stated(path: Path | str, table: Table, options: LogOptions) -> dict[str, Pa
     for option in ("command", "position"):
         text = str(getattr(options, option))
         if "{joint}" not in text and text not in table.names:
-            found = {str(k): column_named(path, table, option, name.strip())
+            stated = {str(k): column_named(path, table, option, name.strip())
                      for k, name in enumerate(text.split(","))}  # fmt: skip
         else:
             before, stated, after = text.partition("{joint}")
@@ -207,13 +212,13 @@ def _stated(path: Path | str, table: Table, options: LogOptions) -> dict[str, Pa
             fits = [m for name in table.names if (m := pattern.fullmatch(name[:200]))]
             joints = [bare_name(m.groupdict().get("joint") or "0") for m in fits]
             distinct(path, joints, "joints")
-            found = dict(zip(joints, (m[0] for m in fits), strict=True))
-        if not found:
+            stated = dict(zip(joints, (m[0] for m in fits), strict=True))
+        if not stated:
             raise InputError(
                 f"{path}: `{option}` is {printable(text)}, which fits no column; it has "
                 f"{refusals.listed(table.names)}."
             )
-        matched.append(found)
+        matched.append(stated)
     commands, positions = matched
     named = "{joint}" in str(options.command)
     names = both = [joint for joint in commands if joint in positions]

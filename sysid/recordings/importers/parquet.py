@@ -88,9 +88,9 @@ def read_columns(path: Path, data: bytes, names: Sequence[str]) -> dict[str, NDA
     try:
         chunks = (meta.row_group(g).column(c) for g in range(meta.num_row_groups)
                   for c in range(meta.num_columns))  # fmt: skip
-        own = [c for c in chunks if c.path_in_schema.split(".list.")[0] in names]
-        values = sum(c.num_values for c in own)
-        unpacked = sum(c.total_uncompressed_size for c in own)
+        wanted = [c for c in chunks if c.path_in_schema.split(".list.")[0] in names]
+        values = sum(c.num_values for c in wanted)
+        unpacked = sum(c.total_uncompressed_size for c in wanted)
     except (OSError, ValueError, OverflowError) as error:
         raise InputError(f"{path} is a damaged parquet file: {_first(error)}.") from error
     refuse_more(path, values, MOST_CELLS, "values", "Split the log.")
@@ -116,19 +116,19 @@ def _texts(path: Path, data: bytes) -> dict[str, list[str]]:
         return {}
     file = _open(path, data, names)
     refuse_more(path, file.metadata.num_rows, MOST_ROWS, "rows", "Split the log.")
-    found: dict[str, list[str]] = {}
+    columns: dict[str, list[str]] = {}
     try:
         table = file.read(columns=names, use_threads=False)
         for name in names:
-            found[name] = []
+            columns[name] = []
             for chunk in table.column(name).chunks:
                 refuse_more(f"{path}, column {name}", len(chunk.dictionary), MOST_JOINTS, "joints")
                 texts = [*(str(t)[:LONGEST_CELL] for t in chunk.dictionary.to_pylist()), "None"]
                 codes = chunk.indices.fill_null(len(texts) - 1).to_numpy()
-                found[name] += [texts[k] for k in codes.tolist()]
+                columns[name] += [texts[k] for k in codes.tolist()]
     except (pa.ArrowException, OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as parquet: {_first(error)}.") from error
-    return found
+    return columns
 
 
 def _open(path: Path, data: bytes, texts: Sequence[str] = ()) -> Any:

@@ -54,10 +54,10 @@ def logs_in(path: Path) -> list[Path]:
     if not path.is_dir() or is_log_folder(path):
         return [path]
     refuse_other_kind(path, RECORDING)
-    found = [p for p in sorted(path.iterdir()) if is_log_folder(p) or _may_be_log(p)]
-    if not found:
+    logs = [p for p in sorted(path.iterdir()) if is_log_folder(p) or _may_be_log(p)]
+    if not logs:
         raise InputError(f"{path}: {unknown_folder(p.name for p in path.iterdir())}")
-    return found
+    return logs
 
 
 def is_fleet(path: Path) -> bool:
@@ -125,13 +125,13 @@ def read_content(path: Path, data: bytes, options: LogOptions) -> Log | None:
         )
     if not _JSON.match(start) or _STAMP.match(start) or _ROW.match(data):
         return None
-    found = border.parse_json(_whole_json(decoded(path, data)), str(path), "Give it as written.")
-    known = json_logs.read_known(path, found, options)
+    content = border.parse_json(_whole_json(decoded(path, data)), str(path), "Give it as written.")
+    known = json_logs.read_known(path, content, options)
     if known is not None:
         return chosen(path, replace(known, sha256=digest), options)
-    log = json_logs.read_json_table(path, found, options)
+    log = json_logs.read_json_table(path, content, options)
     if log is None:
-        raise InputError(f"{path}: {unknown_json(found if isinstance(found, dict) else [])}")
+        raise InputError(f"{path}: {unknown_json(content if isinstance(content, dict) else [])}")
     return replace(log, sha256=digest)
 
 
@@ -154,9 +154,9 @@ def _whole_json(text: str) -> str:
     bare = [line.strip() for line in lines[:20] if line.strip() and line[:1] != "#"][:2]
     if len(lines) > 1 and all(line[:1] + line[-1:] == "{}" for line in bare):
         full = [line for line in lines if line.strip() and line[:1] != "#"]
-        whole = [line for line in full if line.strip()[:1] + line.strip()[-1:] == "{}"]
-        few = len(full) - len(whole) <= max(0.01 * len(full), 1)  # one or the last may be cut
-        return f"[{','.join(whole if few else full)}]"
+        complete = [line for line in full if line.strip()[:1] + line.strip()[-1:] == "{}"]
+        few = len(full) - len(complete) <= max(0.01 * len(full), 1)  # one or the last may be cut
+        return f"[{','.join(complete if few else full)}]"
     return text
 
 

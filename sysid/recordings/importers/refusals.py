@@ -204,10 +204,12 @@ def _unit_of(table: Table, names: Iterable[str]) -> dict[str, str]:
     pair = []
     for name in names:
         pattern = re.escape(name).replace(re.escape("{joint}"), ".+")
-        own = next((n for n in table.columns if re.fullmatch(pattern, n)), name.split(",")[0])
-        if column(own).unit:
+        column_name = next(
+            (n for n in table.columns if re.fullmatch(pattern, n)), name.split(",")[0]
+        )
+        if column(column_name).unit:
             return {}
-        pair.append(table.known(own))
+        pair.append(table.known(column_name))
     largest = max(float(np.abs(values).max()) for values in pair)
     return {"unit": likely_of_pair(*pair)[0]} if largest > LARGEST_RAD else {}
 
@@ -239,25 +241,25 @@ def _likeness(table: Table, pair: Sequence[str]) -> tuple[float, list[str]]:
 
 def unknown_json(keys: Iterable[str]) -> str:
     """Why JSON has no known layout."""
-    own = set(map(str, keys))
+    present = set(map(str, keys))
     return (
-        f"it is JSON of no known layout; it has {listed(sorted(own)) or 'no keys'}. BAM or "
-        f"K-Scale: {_lack(own, 'entries')}; ktune: {_lack(own, 'config', 'data')}. Other "
+        f"it is JSON of no known layout; it has {listed(sorted(present)) or 'no keys'}. BAM or "
+        f"K-Scale: {_lack(present, 'entries')}; ktune: {_lack(present, 'config', 'data')}. Other "
         f"layouts: {FILES}; a table as CSV."
     )
 
 
 def unknown_folder(names: Iterable[str]) -> str:
     """Why a folder has no known layout."""
-    own = set(names)
+    present = set(names)
     return (
-        f"it is a folder without a log: it has {listed(sorted(own)[:20]) or 'nothing'}. SAGE: "
-        f"{_lack(own, 'control.csv', 'state_motor.csv', 'joint_list.txt')}; LeRobot: "
-        f"{_lack(own, 'meta', 'data')}; rosbag2: {_lack(own, 'metadata.yaml')}. Give a log's file "
-        "or folder."
+        f"it is a folder without a log: it has {listed(sorted(present)[:20]) or 'nothing'}. SAGE: "
+        f"{_lack(present, 'control.csv', 'state_motor.csv', 'joint_list.txt')}; LeRobot: "
+        f"{_lack(present, 'meta', 'data')}; rosbag2: {_lack(present, 'metadata.yaml')}. Give a "
+        "log's file or folder."
     )
 
 
-def _lack(own: set[str], *wanted: str) -> str:
-    lacking = [name for name in wanted if name not in own]
+def _lack(present: set[str], *wanted: str) -> str:
+    lacking = [name for name in wanted if name not in present]
     return f"{', '.join(lacking)} missing" if lacking else "not as expected inside"

@@ -107,30 +107,31 @@ def _log(path: Path, raw: Sequence[Raw], options: LogOptions) -> Log:
     state_s = (state_s - start) * 1e-9
     positions = _by_joint(f"{path}, topic {printable(state_name)[:80]}", state, ())
     order = tuple(dict.fromkeys(joint for m in state.messages for joint in m.names))
-    found: dict[str, tuple[NDArray[np.float64], NDArray[np.float64], str]] = {}
+    commanded_of: dict[str, tuple[NDArray[np.float64], NDArray[np.float64], str]] = {}
     clocks = {f"{state_name}: {state_by}"}
     several = 0
     for name, topic in commanded.items():
-        own = tuple(options.joints) or order
+        joint_order = tuple(options.joints) or order
         if topic.kind == MULTI_ARRAY:
             lengths = {len(m.positions) for m in topic.messages}
-            if lengths != {len(own)} and len(commanded) > 1:
+            if lengths != {len(joint_order)} and len(commanded) > 1:
                 warnings.append(
-                    f"{name} has {min(lengths)} values for {len(own)} joints and was left out."
+                    f"{name} has {min(lengths)} values for {len(joint_order)} joints and was left "
+                    "out."
                 )
                 continue
             warnings.append(
                 f"{name} does not name its joints; they were taken in the order "
-                f"{', '.join(map(printable, own))[:200]}. Give `joints` if it is another."
+                f"{', '.join(map(printable, joint_order))[:200]}. Give `joints` if it is another."
             )
         times, by = _times(topic, one_clock)
         clocks.add(f"{name}: {by}")
         several = max(several, max(m.points for m in topic.messages))
         place = f"{path}, topic {printable(name)[:80]}"
-        for joint, values in _by_joint(place, topic, own).items():
-            if joint in positions and joint not in found:
-                found[joint] = (times - start) * 1e-9, values, by
-    if not found:
+        for joint, values in _by_joint(place, topic, joint_order).items():
+            if joint in positions and joint not in commanded_of:
+                commanded_of[joint] = (times - start) * 1e-9, values, by
+    if not commanded_of:
         raise InputError(
             f"{path}: no joint of {printable(state_name)} has a command. {_needs(topics)}"
         )
@@ -139,15 +140,15 @@ def _log(path: Path, raw: Sequence[Raw], options: LogOptions) -> Log:
             "its trajectories have several points, between which the controller interpolates; the "
             "first point of each was taken as the command. Record the topic that the servo gets."
         )
-    chosen = [j for j in order if j in found and (not options.joints or j in options.joints)]
+    chosen = [j for j in order if j in commanded_of and (not options.joints or j in options.joints)]
     if not chosen:
         raise InputError(
-            f"{path}: `joints` names none of {', '.join(map(printable, found))[:200]}."
+            f"{path}: `joints` names none of {', '.join(map(printable, commanded_of))[:200]}."
         )
     ours = joint_names(path, [options.joints.get(j) or j for j in chosen])
     parts, lost = [], 0.0
     for theirs, name in zip(chosen, ours, strict=True):
-        times, values, _ = found[theirs]
+        times, values, _ = commanded_of[theirs]
         held = np.isfinite(values)
         # a message may be of some joints only, as where they move one after the other
         named = np.array([theirs in message.names for message in state.messages])
@@ -163,7 +164,7 @@ def _log(path: Path, raw: Sequence[Raw], options: LogOptions) -> Log:
             f"{100 * lost:.0f} % of the commands were replaced before the next reading and have no "
             "row. Record the positions at least as often as the commands."
         )
-    by_log = any(by == "log" for _, _, by in found.values()) or state_by == "log"
+    by_log = any(by == "log" for _, _, by in commanded_of.values()) or state_by == "log"
     doubt = _LOG_TIME_DOUBT_S if by_log else _HEADER_DOUBT_S
     if by_log:
         warnings.append(
@@ -182,7 +183,7 @@ def _log(path: Path, raw: Sequence[Raw], options: LogOptions) -> Log:
 
 def _topics(path: Path, raw: Sequence[Raw]) -> dict[str, _Topic]:
     """Decoded messages by topic."""
-    found: dict[str, _Topic] = {}
+    topics: dict[str, _Topic] = {}
     values = 0
     for name, kind, log_ns, data in raw:
         if kind not in KINDS:
@@ -198,21 +199,21 @@ def _topics(path: Path, raw: Sequence[Raw]) -> dict[str, _Topic]:
             ) from error
         values += len(message.positions)
         refuse_more(path, values, MOST_CELLS, "positions", "Split it.", exact=False)
-        own = found.setdefault(name, _Topic(kind))
+        topic_of = topics.setdefault(name, _Topic(kind))
         if message.positions:
-            own.log_ns.append(log_ns)
-            own.messages.append(message)
-    found = {name: topic for name, topic in found.items() if topic.messages}
-    for topic in found.values():
+            topic_of.log_ns.append(log_ns)
+            topic_of.messages.append(message)
+    topics = {name: topic for name, topic in topics.items() if topic.messages}
+    for topic in topics.values():
         order = np.argsort(topic.log_ns, kind="stable")
         topic.log_ns = [topic.log_ns[k] for k in order]
         topic.messages = [topic.messages[k] for k in order]
-    if not found:
+    if not topics:
         kinds = ", ".join(sorted({k for _, k, _, _ in raw})[:8]) or "nothing"
         raise InputError(
             f"{path} has no messages of joints; it has {printable(kinds)}. {_needs({})}"
         )
-    return found
+    return topics
 
 
 def _state(path: Path, topics: Mapping[str, _Topic]) -> str:
@@ -225,12 +226,12 @@ def _state(path: Path, topics: Mapping[str, _Topic]) -> str:
 
 def _commands(topics: Mapping[str, _Topic], state: str) -> list[str]:
     """Topics of commands, those with most messages first."""
-    found = [
+    commands = [
         name
         for name, topic in topics.items()
         if name != state and (topic.kind != JOINT_STATE or _COMMANDS.search(name))
     ]
-    return sorted(found, key=lambda n: -len(topics[n].messages))
+    return sorted(commands, key=lambda n: -len(topics[n].messages))
 
 
 def _named(path: Path, topics: Mapping[str, _Topic], name: str, option: str) -> _Topic:
@@ -250,8 +251,8 @@ def _needs(topics: Mapping[str, _Topic]) -> str:
 
 def _headers(topic: _Topic) -> NDArray[np.int64] | None:
     """Times of the headers [ns]; None where there are none, or they run backwards."""
-    found = np.array([m.stamp_ns for m in topic.messages], np.int64)
-    return found if found.any() and (np.diff(found) >= 0).all() else None
+    stamps = np.array([m.stamp_ns for m in topic.messages], np.int64)
+    return stamps if stamps.any() and (np.diff(stamps) >= 0).all() else None
 
 
 def _times(topic: _Topic, one_clock: bool) -> tuple[NDArray[np.int64], str]:
@@ -269,20 +270,22 @@ def _times(topic: _Topic, one_clock: bool) -> tuple[NDArray[np.int64], str]:
 
 def _by_joint(place: str, topic: _Topic, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
     """Positions over the messages by joint; `names` where the messages have none."""
-    found: dict[str, NDArray[np.float64]] = {}
+    by_joint: dict[str, NDArray[np.float64]] = {}
     every = {joint for message in topic.messages for joint in message.names}
     refuse_more("A topic of the log", len(every), MOST_JOINTS, "joints")
-    for own, count in {(m.names or tuple(names), len(m.positions)) for m in topic.messages}:
-        distinct(place, own, "joints")
+    for joints, count in {(m.names or tuple(names), len(m.positions)) for m in topic.messages}:
+        distinct(place, joints, "joints")
         one_each(
-            place, {"a message": count, "its list of joints": len(own)}, "Name them with `joints`."
+            place,
+            {"a message": count, "its list of joints": len(joints)},
+            "Name them with `joints`.",
         )
     for k, message in enumerate(topic.messages):
         for joint, value in zip(message.names or names, message.positions, strict=True):
-            if joint not in found:
-                found[joint] = np.full(len(topic.messages), np.nan)
-            found[joint][k] = value
-    return found
+            if joint not in by_joint:
+                by_joint[joint] = np.full(len(topic.messages), np.nan)
+            by_joint[joint][k] = value
+    return by_joint
 
 
 MAGIC = b"\x89MCAP"
@@ -300,15 +303,15 @@ _STEPS = 100_000  # between two looks at them
 def _messages(path: Path, data: bytes, warnings: list[str]) -> list[Raw]:
     """All messages of a file; `warnings` gets a sentence if it is cut off."""
     of_sqlite = data.startswith(SQLITE) or path.suffix == ".db3"
-    found: list[Raw] = []
+    messages: list[Raw] = []
     total = 0
     for message in sqlite_messages(path) if of_sqlite else mcap_messages(path, data, warnings):
-        found.append(message)
+        messages.append(message)
         total += len(message[3])
         # a database may say of one place that it is the content of many messages
         refuse_more(path, total, LARGEST_BYTES, "bytes", "Split it.", exact=False)
-        refuse_more(path, len(found), _MOST_MESSAGES, "messages", "Split it.", exact=False)
-    return found
+        refuse_more(path, len(messages), _MOST_MESSAGES, "messages", "Split it.", exact=False)
+    return messages
 
 
 def mcap_messages(path: Path, data: bytes, warnings: list[str]) -> Iterator[Raw]:
@@ -327,15 +330,15 @@ def mcap_messages(path: Path, data: bytes, warnings: list[str]) -> Iterator[Raw]
         ) from None
     schemas: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}
-    left = int(allowed(LARGEST_BYTES))
+    budget = int(allowed(LARGEST_BYTES))
     try:
-        stream = StreamReader(io.BytesIO(data), emit_chunks=True, record_size_limit=left)
+        stream = StreamReader(io.BytesIO(data), emit_chunks=True, record_size_limit=budget)
         for record in stream.records:
             inside: Sequence[Any] = [record]
             if isinstance(record, Chunk):
-                record.data = _unpacked(path, record.compression, record.data, left)
+                record.data = _unpacked(path, record.compression, record.data, budget)
                 record.compression = ""
-                left -= len(record.data)
+                budget -= len(record.data)
                 inside = breakup_chunk(record)
             for one in inside:
                 if isinstance(one, Schema):
@@ -360,19 +363,19 @@ def _unpacked(path: Path, compression: str, data: bytes, most: int) -> bytes:
         import zstandard
 
         try:
-            found = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data)).read(most + 1)
+            unpacked = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data)).read(most + 1)
         except zstandard.ZstdError as error:
             raise ValueError(str(error)) from error
     elif compression == "lz4":
         import lz4.frame
 
-        found = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most + 1)
+        unpacked = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most + 1)
     else:
-        found = data
-    if len(found) > most:
+        unpacked = data
+    if len(unpacked) > most:
         refuse_more(f"{path}, unpacked,", allowed(LARGEST_BYTES) + 1, LARGEST_BYTES, "bytes",
                     "Keep the topics of joints only (`mcap filter`).", exact=False)  # fmt: skip
-    return found
+    return unpacked
 
 
 def sqlite_messages(path: Path) -> Iterator[Raw]:
@@ -396,11 +399,11 @@ def sqlite_messages(path: Path) -> Iterator[Raw]:
                     f"SELECT id, name, type FROM topics LIMIT {_MOST_TOPICS}"
                 )
             }
-            wanted = [n for n, (_, kind) in topics.items() if kind in KINDS]
-            marks = ",".join("?" * len(wanted[:500]))
+            topic_ids = [n for n, (_, kind) in topics.items() if kind in KINDS]
+            marks = ",".join("?" * len(topic_ids[:500]))
             for n, time_ns, data in database.execute(
                 f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks})",
-                wanted[:500],
+                topic_ids[:500],
             ):
                 topic, kind = topics[n]
                 if type(time_ns) is not int or not isinstance(data, bytes):
@@ -416,12 +419,12 @@ def sqlite_messages(path: Path) -> Iterator[Raw]:
 def _refuse_computed(database: sqlite3.Connection) -> None:
     """Refuse tables that are views or programs: those may compute without end."""
     for name in ("topics", "messages"):
-        found = database.execute(
+        computed = database.execute(
             "SELECT type, sql FROM sqlite_master WHERE name = ? COLLATE NOCASE", (name,)
         ).fetchall()
         hidden = database.execute(f"SELECT 1 FROM pragma_table_xinfo('{name}') WHERE hidden != 0")
         tables = [kind == "table" and not str(sql).upper().startswith("CREATE VIRTUAL")
-                  for kind, sql in found]  # fmt: skip
+                  for kind, sql in computed]  # fmt: skip
         if tables != [True] or hidden.fetchone():
             raise ValueError(f"{name} is no plain table")
 

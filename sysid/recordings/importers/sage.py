@@ -107,11 +107,11 @@ def _table(path: Path, data: bytes, joints: int) -> tuple[NDArray[np.float64], N
             f"{path}: column {', '.join(lacking)} is missing; it has "
             f"{printable(', '.join(names)[:200])}. A SAGE table needs timestamp and positions."
         )
-    found = read_table(path, text, [name for name in names if name != "timestamp"])
-    if not len(found):
+    parsed = read_table(path, text, [name for name in names if name != "timestamp"])
+    if not len(parsed):
         raise InputError(f"{path} has column names but no rows. Record it again.")
-    times, values = found.numbers["timestamp"], []
-    for line, time, cell in zip(found.line, times, found.texts["positions"], strict=True):
+    times, values = parsed.numbers["timestamp"], []
+    for line, time, cell in zip(parsed.line, times, parsed.texts["positions"], strict=True):
         try:
             angles = np.array(json.loads(cell), float)
             if angles.shape != (joints,) or not np.isfinite([time, *angles]).all():

@@ -113,14 +113,14 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
     if table.rate and options.rate is None and not (options.time or has_time(table.moving)):
         options = replace(options, rate=table.rate)
     notes = list(table.notes)
-    found, texts = pairs(path, table, options)
+    pair_of, texts = pairs(path, table, options)
     notes += texts
-    table, texts = _without_failed(path, table, found)
+    table, texts = _without_failed(path, table, pair_of)
     notes += texts
     read_s, send_s, texts = _times(path, table, options)
     notes += texts
     groups = _groups(path, table)
-    if any(times.scrambled(read_s[own]) for own in groups.values() or [slice(None)]):
+    if any(times.scrambled(read_s[of_joint]) for of_joint in groups.values() or [slice(None)]):
         first = table.first(_TRIALS)
         trial = np.zeros(len(read_s)) if first is None else table.columns[first]
         order = np.lexsort((read_s, trial))
@@ -128,29 +128,29 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
         table = table.taken(order)
         groups = _groups(path, table)
         notes.append("its rows, which were in no order of time or the newest first, were sorted.")
-    if not (len(groups) > 1 or (groups and [*found] == [SOLE])):
+    if not (len(groups) > 1 or (groups and [*pair_of] == [SOLE])):
         groups = {"": np.ones(len(read_s), bool)}
-    wanted = {  # by the log's own name
-        "_".join(w for w in (group, "" if name == SOLE and group else name) if w): (own, pair)
-        for (group, own), (name, pair) in product(groups.items(), found.items())
+    joints = {  # by the log's own name
+        "_".join(w for w in (group, "" if name == SOLE and group else name) if w): (of_joint, pair)
+        for (group, of_joint), (name, pair) in product(groups.items(), pair_of.items())
     }  # fmt: skip
-    if options.joints and [*wanted] == [SOLE] and len(options.joints) == 1:
-        wanted = {next(iter(options.joints)): wanted[SOLE]}
+    if options.joints and [*joints] == [SOLE] and len(options.joints) == 1:
+        joints = {next(iter(options.joints)): joints[SOLE]}
     for joint in options.joints:
-        if joint not in wanted:
+        if joint not in joints:
             raise InputError(
                 f"{path}: `joints` names {printable(joint)}, which has no command and position; "
-                f"{refusals.listed(wanted)} have."
+                f"{refusals.listed(joints)} have."
             )
-    theirs = [*options.joints] or [*wanted]
+    theirs = [*options.joints] or [*joints]
     names = joint_names(path, [options.joints.get(j) or j for j in theirs])
     metadata: dict[str, Any] = {"imported_from": layout, "joints": names, "bus": {}}
     if options.readings:
         metadata["readings"] = options.readings
     parts = []
     for joint, name in zip(theirs, names, strict=True):
-        part, texts = _joint(path, table, options, wanted[joint][1], (read_s, send_s),
-                             wanted[joint][0], (joint, name), metadata)  # fmt: skip
+        part, texts = _joint(path, table, options, joints[joint][1], (read_s, send_s),
+                             joints[joint][0], (joint, name), metadata)  # fmt: skip
         parts.append(part)
         notes += [text for text in texts if text not in notes]
     return Log(pd.concat(parts, ignore_index=True), metadata, notes)
@@ -158,12 +158,12 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
 
 def is_flag(name: str) -> tuple[str, bool] | None:
     """Whose readings a column says to be good or failed, and whether 1 is good; None for others."""
-    found = _FLAG.fullmatch(name[:100])
-    return None if found is None else (column(found[1]).key, bool(found[2]))
+    match = _FLAG.fullmatch(name[:100])
+    return None if match is None else (column(match[1]).key, bool(match[2]))
 
 
 def _without_failed(
-    path: Path | str, table: Table, found: Mapping[str, Pair]
+    path: Path | str, table: Table, pair_of: Mapping[str, Pair]
 ) -> tuple[Table, list[str]]:
     """The table without the positions of rows that a column says to have failed, and notes."""
     columns, notes = dict(table.columns), []
@@ -183,10 +183,10 @@ def _without_failed(
                 continue
         else:
             continue
-        own = [pair for pair in found.values() if flag[0] in ("", pair.position.key)]
-        if not own or not failed.any() or failed.mean() > _MOST_FAILED:
+        flagged = [pair for pair in pair_of.values() if flag[0] in ("", pair.position.key)]
+        if not flagged or not failed.any() or failed.mean() > _MOST_FAILED:
             continue
-        for position in {pair.position.name for pair in own}:
+        for position in {pair.position.name for pair in flagged}:
             columns[position] = np.where(failed, np.nan, table.numbers(path, position))
         notes.append(
             f"{int(failed.sum())} readings failed by the column {printable(name)[:40]}, and were "
@@ -208,22 +208,22 @@ def _times(
     names = table.moving if has_time(table.moving) else table.names
     names = [name for name in names if name in table.columns or name in table.texts]
     steps = next((n for n in names if TIME_STEP.fullmatch(n)), None)
-    found = [n for n in time_columns(names) if n != steps]
-    if not found and table.tick_s is not None:
-        found = [n for n in names if TIMER.search(n)]
+    candidates = [n for n in time_columns(names) if n != steps]
+    if not candidates and table.tick_s is not None:
+        candidates = [n for n in names if TIMER.search(n)]
     sent = [n for n in names if (c := column(n)).kind == "time" and c.words & _SENT]
     read = [n for n in names if (c := column(n)).kind == "time" and c.words and n not in sent]
     time, command_time, notes = options.time, options.command_time, []
     if time is not None and time not in table.names and time.count(",") == 1:
-        whole, below = (column_named(path, table, "time", n.strip()) for n in time.split(","))
-        return _of_two(path, table, whole, below)[0], None, []
+        seconds, below = (column_named(path, table, "time", n.strip()) for n in time.split(","))
+        return _of_two(path, table, seconds, below)[0], None, []
     if time is not None:
         time = column_named(path, table, "time", time)
-    elif not found and len(sent) == 1 and len(read) == 1:
+    elif not candidates and len(sent) == 1 and len(read) == 1:
         time, command_time = read[0], command_time or sent[0]
         notes.append(f"commands were taken as sent at {command_time}, positions as read at {time}.")
-    elif found or read:
-        time = (found or read)[0]
+    elif candidates or read:
+        time = (candidates or read)[0]
     elif steps is not None:
         total = np.cumsum(table.numbers(path, steps))
         found_clock = times.clock(steps.lower().removeprefix("d"), total)
@@ -261,12 +261,12 @@ def _seconds(
         return seconds, 0.0, []
     values = times.unwrapped(table.numbers(path, name))
     lower = {n.lower(): n for n in table.columns}
-    whole = re.fullmatch(r"(.*?)(?:secs?|seconds?)", name.lower())
-    rest = [lower[n] for end in _SUBSECONDS if whole and (n := whole[1] + end) in lower]
+    match = re.fullmatch(r"(.*?)(?:secs?|seconds?)", name.lower())
+    rest = [lower[n] for end in _SUBSECONDS if match and (n := match[1] + end) in lower]
     if rest:
         return *_of_two(path, table, name, rest[0]), []
-    found = times.clock(name, values, table.tick_s)
-    return found.seconds(values), found.zero * found.scale, found.notes
+    clock = times.clock(name, values, table.tick_s)
+    return clock.seconds(values), clock.zero * clock.scale, clock.notes
 
 
 def _of_two(
@@ -292,18 +292,20 @@ def spread(path: Path | str, table: Table, options: LogOptions) -> Table:
     by_case = {n.lower(): n for n in table.texts}
     value = table.first(_VALUES)
     if value is None:
-        own = [n for n in table.columns if column(n).kind != "time" and n.lower() not in LABELS]
-        if len(own) != 1:
+        value_columns = [
+            n for n in table.columns if column(n).kind != "time" and n.lower() not in LABELS
+        ]
+        if len(value_columns) != 1:
             return table
-        value = own[0]
+        value = value_columns[0]
     for series in (by_case[n] for n in SERIES if n in by_case):
-        codes, found = pd.factorize(np.array(table.texts[series], object))
-        if len(found) > MOST_COLUMNS or refusals.missing([*map(str, found)]):
+        codes, labels = pd.factorize(np.array(table.texts[series], object))
+        if len(labels) > MOST_COLUMNS or refusals.missing([*map(str, labels)]):
             continue
-        refuse_more(path, len(codes) * len(found), MOST_CELLS, "cells", "Split it by joint.")
+        refuse_more(path, len(codes) * len(labels), MOST_CELLS, "cells", "Split it by joint.")
         values = table.numbers(path, value)
         columns = {n: v for n, v in table.columns.items() if n != value}
-        columns |= {str(n): np.where(codes == k, values, np.nan) for k, n in enumerate(found)}
+        columns |= {str(n): np.where(codes == k, values, np.nan) for k, n in enumerate(labels)}
         texts = {n: t for n, t in table.texts.items() if n != series}
         note = f"each row holds one value, named by {series}."
         return replace(table, columns=columns, texts=texts, notes=(*table.notes, note))
@@ -312,28 +314,31 @@ def spread(path: Path | str, table: Table, options: LogOptions) -> Table:
 
 def _groups(path: Path | str, table: Table) -> dict[str, NDArray[np.bool_]]:
     """Rows by joint, where columns name or number it; by leg and joint where both do."""
-    found: dict[str, NDArray[np.bool_]] = {}
+    groups: dict[str, NDArray[np.bool_]] = {}
     texts = {n.lower(): n for n in table.texts}
     numbers = {n.lower(): n for n in table.columns}
     for name in GROUPS:
         if name in texts:
             codes, values = pd.factorize(np.array(table.texts[texts[name]], object))
             refuse_more(f"{path}, column {name}", len(values), MOST_JOINTS, "joints")
-            own: dict[str, NDArray[np.bool_]] = {}
+            by_label: dict[str, NDArray[np.bool_]] = {}
             for code, value in enumerate(values):
                 if word := value.strip():
-                    own[word] = own.get(word, False) | (codes == code)
+                    by_label[word] = by_label.get(word, False) | (codes == code)
         elif name in numbers and column(name).kind in ("", "unknown"):
-            own = _numbered(path, table, numbers[name])
+            by_label = _numbered(path, table, numbers[name])
         else:
             continue
-        if len(found) > 1 and len(own) > 1:
-            found = {f"{one}_{other}": both for (one, a), (other, b) in
-                     product(found.items(), own.items()) if (both := a & b).any()}  # fmt: skip
-            refuse_more(f"{path}, column {name}", len(found), MOST_JOINTS, "joints")
-        elif len(own) > len(found):
-            found = own
-    return found
+        if len(groups) > 1 and len(by_label) > 1:
+            groups = {
+                f"{group}_{label}": both
+                for (group, a), (label, b) in product(groups.items(), by_label.items())
+                if (both := a & b).any()
+            }
+            refuse_more(f"{path}, column {name}", len(groups), MOST_JOINTS, "joints")
+        elif len(by_label) > len(groups):
+            groups = by_label
+    return groups
 
 
 def _numbered(path: Path | str, table: Table, name: str) -> dict[str, NDArray[np.bool_]]:
@@ -353,16 +358,16 @@ def _joint(
     options: LogOptions,
     pair: Pair,
     times_s: tuple[NDArray[np.float64], NDArray[np.float64] | None],
-    own: NDArray[np.bool_],
+    of_joint: NDArray[np.bool_],
     names: tuple[str, str],
     metadata: dict[str, Any],
 ) -> tuple[pd.DataFrame, list[str]]:
     """Rows of one joint; its doubt and its columns go into the header."""
-    own, sent, held = _apart(path, table, times_s, pair, own)
-    stamp = times_s[0][own]
+    of_joint, sent, held = _apart(path, table, times_s, pair, of_joint)
+    stamp = times_s[0][of_joint]
     if options.rate is not None:
         stamp = np.arange(len(stamp)) / options.rate
-    trial, tone, warnings = _trials(path, table, options, own)
+    trial, tone, warnings = _trials(path, table, options, of_joint)
     if held is not None and sent is not None:
         warnings.append(
             "commands and positions stand in rows of their own: each row's time is that of what "
@@ -390,8 +395,8 @@ def _joint(
     metadata["read_after_send_s"] = apart
     used = {"command": pair.command.name, "position": pair.position.name}
     metadata.setdefault("columns", {})[names[1]] = used
-    commands = table.numbers(path, pair.command.name)[own]
-    positions = table.numbers(path, pair.position.name)[own]
+    commands = table.numbers(path, pair.command.name)[of_joint]
+    positions = table.numbers(path, pair.position.name)[of_joint]
     stated, units = options.unit_of(*names), table.units
     columns: dict[str, Any] = {}
     for kind, source, values in (
@@ -423,7 +428,9 @@ def _joint(
         if said:
             metadata["angle_unit"] = "stated"
     angles = columns.pop("command_rad"), columns.pop("position_rad")
-    columns |= {name: table.numbers(path, name)[own] for name in _KEPT if name in table.columns}
+    columns |= {
+        name: table.numbers(path, name)[of_joint] for name in _KEPT if name in table.columns
+    }
     part = rows(names[1], send, read, *angles, number, **columns)
     if tone is not None:
         part["frequency_hz"] = tone
@@ -437,7 +444,7 @@ def _apart(
     table: Table,
     times_s: tuple[NDArray[np.float64], NDArray[np.float64] | None],
     pair: Pair,
-    own: NDArray[np.bool_],
+    of_joint: NDArray[np.bool_],
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64] | None, NDArray[np.float64] | None]:
     """Rows of a joint, when their commands were sent if known, and commands that were held.
 
@@ -447,25 +454,25 @@ def _apart(
     """
     stamp, send = times_s
     if send is not None:
-        return own, send[own], None
+        return of_joint, send[of_joint], None
     command, position = (table.numbers(path, c.name) for c in (pair.command, pair.position))
-    sent, read = own & np.isfinite(command), own & np.isfinite(position)
+    sent, read = of_joint & np.isfinite(command), of_joint & np.isfinite(position)
     apart = (sent & read).sum() < _TOGETHER * min(sent.sum(), read.sum())
     if not (apart or (read & ~sent).sum() > _MOSTLY_BLANK * read.sum()):
-        return own, None, None
-    rows_of = np.flatnonzero(read if apart else own)
+        return of_joint, None, None
+    rows_of = np.flatnonzero(read if apart else of_joint)
     order = np.flatnonzero(sent)[np.argsort(stamp[sent], kind="stable")]
     send, held, kept = held_commands(stamp[order], command[order], stamp[rows_of])
     if not kept.any():
-        return own, None, None
-    chosen = np.zeros(len(own), bool)
+        return of_joint, None, None
+    chosen = np.zeros(len(of_joint), bool)
     chosen[rows_of[kept]] = True
     one_stamp = not apart or np.isin(stamp[chosen], stamp[sent]).mean() > _ONE_STAMP
     return chosen, None if one_stamp else send, held
 
 
 def _trials(
-    path: Path | str, table: Table, options: LogOptions, own: NDArray[np.bool_]
+    path: Path | str, table: Table, options: LogOptions, of_joint: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None, list[str]]:
     """Number of each row's trial, its frequency, and notes; None where there is none.
 
@@ -477,19 +484,19 @@ def _trials(
     if options.trial:
         name = column_named(path, table, "trial", options.trial)
     if name is not None and options.trial is None and name in table.columns:
-        runs = np.count_nonzero(np.diff(table.numbers(path, name)[own]))
-        name = None if runs > _COUNTING * own.sum() else name
+        runs = np.count_nonzero(np.diff(table.numbers(path, name)[of_joint]))
+        name = None if runs > _COUNTING * of_joint.sum() else name
     if name is not None and name in table.texts:
         codes, labels = pd.factorize(np.array(table.texts[name], object))
-        trial = codes[own].astype(float)
+        trial = codes[of_joint].astype(float)
         listed = ", ".join(f"{k}: {printable(str(v))[:30]}" for k, v in enumerate(labels[:12]))
         notes.append(f"trials are the runs of rows with one {name} ({listed}).")
     elif name is not None:
-        trial = table.numbers(path, name)[own]
+        trial = table.numbers(path, name)[of_joint]
     tone_name = table.first(_TONES)
     if tone_name is None:
         return trial, None, notes
-    tone = table.numbers(path, tone_name)[own]
+    tone = table.numbers(path, tone_name)[of_joint]
     with np.errstate(invalid="ignore"):
         change = np.diff(np.nan_to_num(tone)) != 0
     edges = np.concatenate([[0], 1 + np.flatnonzero(change), [len(tone)]])

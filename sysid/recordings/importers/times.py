@@ -88,41 +88,43 @@ def clock(name: str, values: NDArray[np.float64], tick_s: float | None = None) -
 
     `tick_s` is that of a tick by a remark of the log.
     """
-    shown = printable(name)[:60]
+    printed = printable(name)[:60]
     steps = np.diff(np.sort(values) if scrambled(values) else values)
     steps = steps[steps > 0]
-    found = _UNIT.search(name)
-    stated = SECONDS[found[1].lower()] if found else 0.0
+    unit_match = _UNIT.search(name)
+    stated = SECONDS[unit_match[1].lower()] if unit_match else 0.0
     loop = float(np.median(steps)) if len(steps) else 0.0
     if (several := _TICKS_OF.search(name)) is not None:  # t_100us
         stated = float(several[1]) * SECONDS[several[2].lower()]
         if _LOOP_S[0] < loop * stated <= _LOOP_S[1]:
             return Clock(stated, float(values[0]))
-    if not found and tick_s is not None and _LOOP_S[0] < loop * tick_s <= _LOOP_S[1]:
-        text = f"ticks of {tick_s:.4g} s were taken for the times in {shown}, as a remark says."
+    if not unit_match and tick_s is not None and _LOOP_S[0] < loop * tick_s <= _LOOP_S[1]:
+        text = f"ticks of {tick_s:.4g} s were taken for the times in {printed}, as a remark says."
         return Clock(tick_s, float(values[0]), [text])
     if len(values) and any(low < values[0] < high for low, high in _OF_100_NS):
-        return Clock(1e-7, float(values[0]), [f"{shown} counts steps of 100 ns, as Windows does."])
+        return Clock(
+            1e-7, float(values[0]), [f"{printed} counts steps of 100 ns, as Windows does."]
+        )
     usual = [float(of(steps)) * stated for of in (np.median, np.mean)] if len(steps) else [1.0]
-    if found and any(_LOOP_S[0] <= step < _SLOW_S for step in usual):
+    if unit_match and any(_LOOP_S[0] <= step < _SLOW_S for step in usual):
         return Clock(stated)
     if not len(steps):
         raise InputError(
-            f"column {shown}: its values do not increase, so they are no times. Give the rows a "
+            f"column {printed}: its values do not increase, so they are no times. Give the rows a "
             "second with `rate`, or another column with `time`."
         )
-    for unit, scale in _GUESSED[: 4 if found else None]:
-        if found and _LOOP_S[0] < loop * scale <= _LOOP_S[1]:
+    for unit, scale in _GUESSED[: 4 if unit_match else None]:
+        if unit_match and _LOOP_S[0] < loop * scale <= _LOOP_S[1]:
             return Clock(scale, float(values[0]), [
-                f"the values of column {shown} are {loop:.4g} apart, which in {found[1]} is no "
-                f"servo's loop; they were taken as {unit}. Rename it if that is wrong."
+                f"the values of column {printed} are {loop:.4g} apart, which in {unit_match[1]} is "
+                f"no servo's loop; they were taken as {unit}. Rename it if that is wrong."
             ])  # fmt: skip
         if _LOOP_S[0] < loop * scale <= _LOOP_S[1]:
             if unit == "s":
                 break
             return Clock(scale, float(values[0]), [
-                f"column {shown} names no unit; its values were taken as {unit}, since they are "
-                f"{loop:.4g} apart. Call it {shown}_s, _ms, _us or _ns if that is wrong."
+                f"column {printed} names no unit; its values were taken as {unit}, since they are "
+                f"{loop:.4g} apart. Call it {printed}_s, _ms, _us or _ns if that is wrong."
             ])  # fmt: skip
     return Clock(stated or 1.0)
 
@@ -156,9 +158,9 @@ def times_of_day(path: object, name: str, cells: Sequence[str]) -> NDArray[np.fl
             afternoon = np.array([m is not None and m[1] == "P" for m in halves])
             seconds = seconds % (_DAY_S / 2) + _DAY_S / 2 * afternoon
     except (ValueError, TypeError, OverflowError):
-        shown = printable(others[0])[:40] if others else "a cell"
+        printed = printable(others[0])[:40] if others else "a cell"
         raise InputError(
-            f"{path}, column {printable(name)[:60]}: '{shown}' is no time. Write seconds, or "
+            f"{path}, column {printable(name)[:60]}: '{printed}' is no time. Write seconds, or "
             "2026-05-04T12:30:01.25."
         ) from None
     midnights = np.cumsum(np.concatenate([[0], np.diff(seconds) < -_DAY_S / 2]))
@@ -176,9 +178,9 @@ def stated_rate(values: Mapping[str, float]) -> float | None:
 def rate_in(lines: Iterable[str]) -> float | None:
     """Rows a second by the remarks above a table: `# fs = 100 Hz`, `dt: 10 ms`, `Rate,100`."""
     heads = [line[:200] for line in lines]
-    found = (m for line in heads for m in _STATED.finditer(line))
+    matches = (m for line in heads for m in _STATED.finditer(line))
     stated = {m[1]: float(m[2]) * _STATED_IN[(m[3] or "").lower()]
-              for m in found if m[2].count(".") < 2}  # fmt: skip
+              for m in matches if m[2].count(".") < 2}  # fmt: skip
     for m in (m for line in heads if line[:1] in "#%/!;" for m in _EVERY.finditer(line)):
         name, value, word = ("period", m[1], m[2]) if m[1] else ("fps", m[3], m[4])
         if value.strip(".") and value.count(".") < 2:
@@ -210,13 +212,13 @@ def units_in(text: str, names: Iterable[str]) -> dict[str, str]:
 
     By the column's name, or by "" for all; without those of which there are several.
     """
-    found: dict[str, set[str]] = {"": {UNITS[w.lower()] for w in _ANGLES_IN.findall(text)}}
+    units_of: dict[str, set[str]] = {"": {UNITS[w.lower()] for w in _ANGLES_IN.findall(text)}}
     for name in names:
         if len(name) > 1 and name in text:
             pattern = rf"(?<![\w.]){re.escape(name)}{_SAYS}{_UNIT_WORD}"
             said = re.findall(pattern, text, re.IGNORECASE)
-            found[name] = {UNITS[word.lower()] for word in said}
-    return {name: units.pop() for name, units in found.items() if len(units) == 1}
+            units_of[name] = {UNITS[word.lower()] for word in said}
+    return {name: units.pop() for name, units in units_of.items() if len(units) == 1}
 
 
 def tick_in(text: str) -> float | None:
@@ -300,11 +302,11 @@ def one_after_another(
     starts = [0, *(1 + np.flatnonzero(new)).tolist()]
     refuse_more("The log", len(starts), MOST_TRIALS, "trials", "Check its times, or split it.")
     for start, end in pairwise([*starts, len(stamp)]):
-        own = shifted[start:end]
-        if not np.isfinite(own).any():
+        part = shifted[start:end]
+        if not np.isfinite(part).any():
             continue
-        first = float(np.nanmin(own))
+        first = float(np.nanmin(part))
         if first <= last:
-            own += last + PAUSE_S - first
-        last = float(np.nanmax(own))
+            part += last + PAUSE_S - first
+        last = float(np.nanmax(part))
     return runs.astype(float), shifted
