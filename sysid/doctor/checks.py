@@ -113,6 +113,8 @@ _CHECKS = (
     register_findings,
 )  # fmt: skip
 _SERVOS_ALONE = (frozen_findings, hypothesis_findings)  # a joint held by friction is explained
+_OF_ONE_SERVO = (held_findings, hypothesis_findings)
+"""Checks that compare all trials with one servo: with another P gain or load it is another one."""
 
 
 def long_enough(trials: Sequence[Trial]) -> list[Trial]:
@@ -140,8 +142,19 @@ def findings(recorded: Sequence[Trial]) -> list[Finding]:
         if check in _SERVOS_ALONE and any(f.code == "held_by_friction" for f in found):
             continue
         step = quantum(trials) if step < 0 else step
-        found += check(trials, step)
+        points = by_operating_point(trials) if check in _OF_ONE_SERVO else [trials]
+        for point in points:
+            known = {finding.code for finding in found} if len(points) > 1 else set()
+            found += [finding for finding in check(point, step) if finding.code not in known]
     return found
+
+
+def by_operating_point(trials: Sequence[Trial]) -> list[list[Trial]]:
+    """The trials in groups of one P gain and one load."""
+    points: dict[str, list[Trial]] = {}
+    for trial in trials:
+        points.setdefault(f"{trial.p_gain}, {trial.load}", []).append(trial)
+    return [*points.values()]
 
 
 def refuse_unusable(trials_by_joint: Mapping[str, Sequence[Trial]]) -> None:

@@ -726,6 +726,9 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: Choice) -
         undecided = {_shown(name): why for name, why in slight.items()} | undecided
     if why := undecided.get("no_load_speed_rad_s"):
         undecided["back_emf"] = why  # a speed on its bound stands for none
+    limited = numbers["effort_limit"].value < numbers["stall_torque"].value
+    if why := undecided.get("torque_limit" if limited else "stall_torque"):
+        undecided["effort_limit"] = why
     if "stall_torque" in undecided and "damping" not in structure.features:
         # back-EMF stands for both: what tells them apart is a motor at its limit
         both = _only_the_sum(numbers["braking"], "N·m·s/rad" if scales.known_load else "1/s")
@@ -777,6 +780,7 @@ def numbers_of(structure: Structure, values: NDArray[np.float64]) -> dict[str, N
     for name in (f.name for f in fields(LoadedServoParameters) if f.name in by_column):
         if name in also or name in fitted:
             numbers[name] = by_column[name]
+    numbers["effort_limit"] = np.minimum(stall, by_column["torque_limit"])
     numbers["stiffness_nm_per_rad"] = scales.p_gain * by_column["stiffness"]
     numbers["no_load_speed_rad_s"] = stall / by_column["back_emf"]
     if scales.gravity:

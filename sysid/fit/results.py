@@ -26,7 +26,7 @@ RATIO_SOURCES = {
     "stiffness_per_s2": ("stiffness_nm_per_rad", "stiffness"),
     "damping_per_s": ("duty_s_per_rad", "damping"),
     "friction_rad_s2": ("friction_loss", "friction_loss"),
-    "effort_rad_s2": ("stall_torque", "effort_limit"),
+    "effort_rad_s2": ("effort_limit", "effort_limit"),
     "back_emf_per_s": ("back_emf", "back_emf"),
 }
 """Numbers per inertia of DelayedPD: where `LoadedFit.numbers` has their interval, and the field."""

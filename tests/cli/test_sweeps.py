@@ -20,6 +20,7 @@ from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.pendulum import BENCH_MAP, Pendulum, PendulumBench, draw_bench
 from pupper_sysid.sysid.doctor import checks as joints
+from pupper_sysid.sysid.doctor.examination import examine
 from pupper_sysid.sysid.plan.plan_file import load_plan
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import json_of, ran, run
@@ -189,6 +190,11 @@ def test_an_interrupted_bench_is_continued_at_its_gain(capsys, tmp_path):
     assert "trial 2 of 2" in err
     gains = [t.p_gain for t in load(tmp_path / "a.csv").trials("bench")]
     assert gains == [8.0, 32.0]
+
+
+def test_a_servo_at_two_gains_is_no_lag_that_drifts(capsys, tmp_path):
+    assert sweep(capsys, "--gains", "16,32", "--kind", "steps", "--out", "a.csv")[0] == 0
+    assert examine(load(tmp_path / "a.csv")).joints["bench"].verdict == "use"
 
 
 @pytest.mark.wall_clock

@@ -16,6 +16,8 @@ from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
 from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.fit.calibrate import calibrate
+from pupper_sysid.sysid.fit.joint_fit import numbers_of
+from pupper_sysid.sysid.fit.structure import Scales, servo_structure
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.report import report
 from pupper_sysid.sysid.report.figures import tracks
@@ -193,3 +195,11 @@ def test_the_file_keeps_the_servo_under_load(tmp_path: Path):
     assert high / low == pytest.approx(32.0 / read.under_load.p_gain)
     with pytest.raises(InputError, match="p_gain"):
         read.at_p_gain(0.0)
+
+
+def test_the_effort_limit_is_the_smaller_of_stall_torque_and_torque_limit():
+    structure = servo_structure(("back-EMF", "torque limit"), Scales(free_air=False))
+    values = structure.decode(np.mean(structure.box, axis=0)[None])
+    share = structure.names.index("torque_limit_share")
+    numbers = numbers_of(structure, values)
+    assert numbers["effort_limit"] == pytest.approx(values[0, share] * numbers["stall_torque"])
