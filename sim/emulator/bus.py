@@ -196,8 +196,8 @@ class EmulatedBus:
     def servo_setups(self) -> dict[str, dict[str, Any]]:
         """By joint, what a recording's header says of its servo; empty where nothing is known."""
         plant: Any = self._plant
-        own = self.robot.joint_map.servo_setups()
-        return own | getattr(plant, "servo_setups", lambda joints: {})(self.joint_names)
+        setups = self.robot.joint_map.servo_setups()
+        return setups | getattr(plant, "servo_setups", lambda joints: {})(self.joint_names)
 
     def register(self, joint: str, name: str) -> int:
         """Present value of a register, by the name that its family has for it."""

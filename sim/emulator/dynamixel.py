@@ -32,10 +32,10 @@ _XL430 = {"min_voltage_limit": 60, "max_voltage_limit": 140, "temperature_limit"
 
 
 def _factory(name: str) -> dict[str, int]:
-    own = _COMMON | (_SMALL if name.startswith(("XL330", "XC330-M")) else _LARGE)
+    registers = _COMMON | (_SMALL if name.startswith(("XL330", "XC330-M")) else _LARGE)
     p, i, d = DYNAMIXEL_GAINS.get(name, (800, 0, 0))
     gains = {"position_p_gain": p, "position_i_gain": i, "position_d_gain": d}
-    return own | (_XL430 if name == "XL430-W250" else {}) | gains
+    return registers | (_XL430 if name == "XL430-W250" else {}) | gains
 
 
 _CHOICES = {
@@ -133,9 +133,9 @@ class DynamixelEmulator(LineEmulator):
         line, pieces = table.fast_head([size for _, _, size, _ in parts]), []
 
         def block(servo_id: int, error: int, data: bytes) -> bytes:
-            own = bytes([error, servo_id]) + data
+            body = bytes([error, servo_id]) + data
             head = b"" if pieces else line
-            return head + own + table.crc16(own, table.crc16(line)).to_bytes(2, "little")
+            return head + body + table.crc16(body, table.crc16(line)).to_bytes(2, "little")
 
         for servo_id, address, size, _ in parts:
             if (

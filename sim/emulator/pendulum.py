@@ -482,11 +482,11 @@ class BenchRobot(EmulatedRobot):
 
     def truth(self) -> dict[str, Any]:
         """All true parameters as plain numbers and strings, ready for YAML."""
-        found = super().truth()
+        truth = super().truth()
         for servo, loaded in zip(self.servos, self.loaded, strict=True):
-            found["joints"][servo.joint]["loaded_servo"] = loaded.truth()
-            found["joints"][servo.joint]["registers"] = self.registers
-        return found
+            truth["joints"][servo.joint]["loaded_servo"] = loaded.truth()
+            truth["joints"][servo.joint]["registers"] = self.registers
+        return truth
 
 
 class PendulumBench(ServosOnStand):
@@ -506,15 +506,15 @@ class PendulumBench(ServosOnStand):
 
     def servo_setups(self, joints: Sequence[str]) -> dict[str, dict[str, Any]]:
         """By joint, what a recording's header says of its servo."""
-        found = {}
+        setups = {}
         for joint, servo in zip(joints, self._servos, strict=True):
-            own = {name: servo.register(name) for name in self.acting_registers}
-            prefix = "position_" if "position_p_gain" in own else ""
+            registers = {name: servo.register(name) for name in self.acting_registers}
+            prefix = "position_" if "position_p_gain" in registers else ""
             names = {f"{k}_gain": f"{prefix}{k}_gain" if prefix else k for k in ("p", "i", "d")}
-            gains = {key: own.pop(name) for key, name in names.items()}
-            found[joint] = {"model": self._model, **gains, "supply_voltage_v": self._supply_v}
-            found[joint] |= {"temperature_c": AMBIENT_C, "registers": own}
-        return found
+            gains = {key: registers.pop(name) for key, name in names.items()}
+            setups[joint] = {"model": self._model, **gains, "supply_voltage_v": self._supply_v}
+            setups[joint] |= {"temperature_c": AMBIENT_C, "registers": registers}
+        return setups
 
     def register(self, index: int, name: str) -> int:
         """Value of a register that acts on the motion."""
@@ -571,7 +571,7 @@ def draw_bench(
     for servo in drawn.servos:
         factors = np.exp(spec.spread * rng.standard_normal(len(_SPREAD)))
         late = spec.dead_time_s + spec.dead_time_sd_s * rng.standard_normal()
-        own = PendulumServoParameters(
+        parameters = PendulumServoParameters(
             **{n: float(getattr(spec, n) * f) for n, f in zip(_SPREAD, factors, strict=True)},
             **asdict(load),
             dead_time_s=float(max(late, 2 * PHYSICS_STEP_S)),
@@ -579,17 +579,17 @@ def draw_bench(
             backlash_rad=spec.backlash_rad,
             output_friction_nm=spec.output_friction_nm,
         )
-        loaded.append(own)
-        loop = spec.loop(registers, own)
+        loaded.append(parameters)
+        loop = spec.loop(registers, parameters)
         equivalent = DelayedPDParameters(  # moves alike for small errors
-            stiffness=own.torque_nm * loop.p,
-            damping=own.torque_nm * loop.d,
-            friction_loss=own.friction_nm,
-            armature=own.armature_kg_m2 + own.load_inertia_kg_m2,
-            effort_limit=own.torque_nm * loop.most,
+            stiffness=parameters.torque_nm * loop.p,
+            damping=parameters.torque_nm * loop.d,
+            friction_loss=parameters.friction_nm,
+            armature=parameters.armature_kg_m2 + parameters.load_inertia_kg_m2,
+            effort_limit=parameters.torque_nm * loop.most,
             velocity_limit=math.inf,
-            dead_time_s=own.dead_time_s,
-            back_emf=own.back_emf_nm_s_rad,
+            dead_time_s=parameters.dead_time_s,
+            back_emf=parameters.back_emf_nm_s_rad,
         )
         servos.append(replace(servo, actuator=equivalent))
     return BenchRobot(reading, tuple(servos), layout, tuple(loaded), spec)

@@ -220,8 +220,8 @@ class LineEmulator(ABC):
         """Whether a servo goes to the positions that it is commanded, by its mode."""
         mode = self._get(servo_id, "mode") if self.series.has("mode") else None
         if mode is not None:
-            own = {self.family.position_mode, *self.series.more_position_modes}
-            return mode in own or mode in self.family.turns_freely
+            position_modes = {self.family.position_mode, *self.series.more_position_modes}
+            return mode in position_modes or mode in self.family.turns_freely
         return bool(self._get(servo_id, "min_angle") or self._get(servo_id, "max_angle"))
 
     def _offset(self, servo_id: int) -> int:

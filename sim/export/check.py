@@ -98,7 +98,7 @@ def check(servos: ExportedServos) -> Check:
     parts = step_costs(servos, tones)
     for n, name in enumerate(names):
         joint = servos.moving.joint(name)
-        own_at, own = _own_motion(joint, tones)
+        fitted_at, fitted = _own_motion(joint, tones)
         walk_at, walked = _own_motion(joint, walk)
         pd = joint.actuator
         pd_at, pd_moved = in_loop(pd.parameters, pd.fitted_step_s, tones)
@@ -108,10 +108,10 @@ def check(servos: ExportedServos) -> Check:
         feedback = servos.calibration.held_feedback(name)
         torque = pd.effort_limit_nm.value / pd.armature_kg_m2.value
         joints[name] = JointCheck(
-            tones_rad=_apart(at[0], on_tones[:, n], own_at, own),
+            tones_rad=_apart(at[0], on_tones[:, n], fitted_at, fitted),
             walk_rad=_apart(at[1], on_walk[:, n], walk_at, walked),
             same_steps_rad=_apart(at[0], on_tones[:, n], at[0], same[1:, 0]),
-            not_carried_rad=_apart(pd_at, pd_moved[:, 0], own_at, own),
+            not_carried_rad=_apart(pd_at, pd_moved[:, 0], fitted_at, fitted),
             step_rad={part: errors[n] for part, errors in parts.items()},
             step_of_full_torque_rad=torque * servos.physics_step_s**2,
             reading_counts=_counts_apart(feedback, on_walk[:, n], at[1], walk_at, walked),
@@ -176,18 +176,18 @@ def _notes(servos: ExportedServos, joints: Mapping[str, JointCheck]) -> Iterator
         "0.3 rad: simulators on torch get a class with delays of any fraction."
     )
     h = servos.physics_step_s
-    fitted = {joint.actuator.fitted_step_s for joint in servos.calibration.joints.values()}
-    if fitted != {h}:
-        continuous = min(fitted) <= CONTINUOUS_S
-        basis = "in continuous time" if continuous else f"for steps of {1e3 * min(fitted):g} ms"
+    steps_s = {joint.actuator.fitted_step_s for joint in servos.calibration.joints.values()}
+    if steps_s != {h}:
+        continuous = min(steps_s) <= CONTINUOUS_S
+        basis = "in continuous time" if continuous else f"for steps of {1e3 * min(steps_s):g} ms"
         worst = max(joints, key=lambda name: joints[name].step_rad[WHOLE])
         here = 1e3 * joints[worst].step_rad[WHOLE]
         far = 1e3 * joints[worst].step_of_full_torque_rad
         actuator = servos.moving.joint(worst).actuator
         half = nearest_in_loop(actuator.parameters, h / 2, actuator.fitted_step_s, MUJOCO_PID)
-        own = in_loop(actuator.parameters, actuator.fitted_step_s, unseen_tones())
+        fitted = in_loop(actuator.parameters, actuator.fitted_step_s, unseen_tones())
         at, moved = in_loop(half, h / 2, unseen_tones())
-        there = 1e3 * _apart(at, moved[:, 0], own[0], own[1][:, 0])
+        there = 1e3 * _apart(at, moved[:, 0], fitted[0], fitted[1][:, 0])
         yield (
             f"The servos' numbers are {basis}, and no numbers of an actuator make up for steps of "
             f"{1e3 * h:g} ms: in one, the largest torque moves {worst} by {far:.2g} mrad, and "
@@ -280,17 +280,17 @@ def unseen_tones() -> NDArray[np.float64]:
 
 
 def _counts_apart(
-    feedback: HeldFeedback, exported: NDArray, at: NDArray, own_at: NDArray, own: NDArray
+    feedback: HeldFeedback, exported: NDArray, at: NDArray, fitted_at: NDArray, fitted: NDArray
 ) -> float:
     """RMS difference of readings in counts: stepped on the export, polled on the calibration."""
     period, quantum = feedback.poll_period_s, feedback.quantum_rad or 2 * np.pi / 4096
     if period <= 0:
-        return float(np.sqrt(np.mean((exported - np.interp(at, own_at, own)) ** 2)) / quantum)
+        return float(np.sqrt(np.mean((exported - np.interp(at, fitted_at, fitted)) ** 2)) / quantum)
     without_loss = HeldFeedback(poll_period_s=period, quantum_rad=quantum)
     without_loss.reset(exported[0], float(at[1] - at[0]), until_poll_s=period / 2)
     there = np.array([without_loss.step(x) for x in exported])
     polls = period / 2 + period * np.arange(int(at[-1] / period) + 1)
-    reported = np.round(np.interp(polls, own_at, own) / quantum) * quantum
+    reported = np.round(np.interp(polls, fitted_at, fitted) / quantum) * quantum
     here = reported[np.clip(np.searchsorted(polls, at + 1e-12, side="right") - 1, 0, None)]
     late = at > _SETTLE_S
     return float(np.sqrt(np.mean(((there - here)[late] / quantum) ** 2)))

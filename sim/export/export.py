@@ -30,7 +30,7 @@ def to_json(servos: ExportedServos) -> str:
     calibration, stepped = servos.calibration, servos.actuators()
     joints = {}
     for name, joint in calibration.joints.items():
-        own, f, a = joint.actuator, joint.feedback, stepped[name]
+        actuator, f, a = joint.actuator, joint.feedback, stepped[name]
         low, high = whole_steps(*a.dead_time_interval_s, servos.physics_step_s)
         keys = (*TORQUE_KEYS, "velocity_limit_rad_s", "command_jitter_s")
         joints[name] = {
@@ -38,11 +38,11 @@ def to_json(servos: ExportedServos) -> str:
             "link_taken_off_kg_m2": servos.links.get(name, 0.0),
             "actuator": {key: getattr(a, key).model_dump(mode="json") for key in keys}
             | {
-                "dead_time_s": own.dead_time_s.model_dump(mode="json"),
+                "dead_time_s": actuator.dead_time_s.model_dump(mode="json"),
                 "delay_s": a.dead_time_s.value, "delay_steps_min": low, "delay_steps_max": high,
             },
             "feedback": {key: getattr(f, key).model_dump(mode="json") for key in FEEDBACK_KEYS},
-            "torque_scale": own.scale.model_dump(mode="json"),
+            "torque_scale": actuator.scale.model_dump(mode="json"),
         }  # fmt: skip
     return json.dumps(
         {

@@ -293,11 +293,11 @@ def _put_servos(root: Element, servos: ExportedServos, model: Path, group: str) 
             if target in counts:
                 counts[target] += 1
                 section.remove(element)
-                if own := element.get("name"):
-                    removed[own] = pids[target]
+                if actuator_name := element.get("name"):
+                    removed[actuator_name] = pids[target]
                 if counts[target] == 1:
-                    unnamed.extend([target] * (not own))
-                    pids[target].set("name", own or target)
+                    unnamed.extend([target] * (not actuator_name))
+                    pids[target].set("name", actuator_name or target)
                     section.insert(
                         place - sum(max(n - 1, 0) for n in counts.values()), pids[target]
                     )
@@ -446,7 +446,7 @@ def compiled_numbers(model: Any, servos: ExportedServos) -> dict[str, tuple[Any,
 
     of_joints = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT  # ids of tendons count apart
     driven = {int(model.actuator_trnid[i, 0]): i for i in np.flatnonzero(of_joints)}
-    found: dict[str, tuple[Any, Any]] = {}
+    numbers: dict[str, tuple[Any, Any]] = {}
     for name, actuator in servos.actuators(MUJOCO_PID).items():
         servo = actuator.parameters
         j, dof = model.joint(name).id, int(model.joint(name).dofadr[0])
@@ -470,8 +470,8 @@ def compiled_numbers(model: Any, servos: ExportedServos) -> dict[str, tuple[Any,
             "armature of the actuator": (model.actuator_armature[i], 0.0),
             "damping of the actuator": (model.actuator_damping[i], 0.0),
         }
-        found |= {f"{name}: {key}": pair for key, pair in pairs.items()}
-    return found
+        numbers |= {f"{name}: {key}": pair for key, pair in pairs.items()}
+    return numbers
 
 
 # ------------------------------------------------------------------------- texts

@@ -203,12 +203,12 @@ class ServoBank:
         # MuJoCo's is that half a step later or, where it runs, has run for all of its first step
         later = {}
         for name in joint_names:
-            own = servos[name]
-            part = (own["dead_time_s"] / own["step_s"] + 1e-6) % 1.0
-            runs = own["velocity_limit_rad_s"] < 1000.0  # which stands for none
-            ahead = own["step_s"] * (1 + part if runs else 0.5)
-            delay = max(own["dead_time_s"] + physics_dt / 2 - ahead, 0.0)
-            later[name] = {**own, "dead_time_s": delay}
+            servo = servos[name]
+            part = (servo["dead_time_s"] / servo["step_s"] + 1e-6) % 1.0
+            runs = servo["velocity_limit_rad_s"] < 1000.0  # which stands for none
+            ahead = servo["step_s"] * (1 + part if runs else 0.5)
+            delay = max(servo["dead_time_s"] + physics_dt / 2 - ahead, 0.0)
+            later[name] = {**servo, "dead_time_s": delay}
         self.set_point = SetPoint(later, joint_names, num_envs, physics_dt, device)
         self.feedback = HeldFeedback(feedback, joint_names, num_envs, physics_dt, device)
         self.effort, self.velocity = torch.zeros((2, num_envs, len(joint_names)), device=device)

@@ -110,24 +110,24 @@ class WarpRobots(RobotBatch):
     def _rollout(self, part: int, start: Array, control: Array | None) -> Moved:
         ahead = np.flatnonzero(self._ahead)
         if len(ahead):
-            self._worlds.write(ahead, {name: own[ahead] for name, own in self._host.items()})
+            self._worlds.write(ahead, {name: values[ahead] for name, values in self._host.items()})
             self._ahead[:] = False
         self._worlds.write_fields(self._fields)
         commands = self._control if control is None else control
-        found = {
-            name: own.astype(float)
-            for name, own in self._worlds.advance(self.qpos, self.qvel, commands).items()
+        moved = {
+            name: values.astype(float)
+            for name, values in self._worlds.advance(self.qpos, self.qvel, commands).items()
         }
         if control is not None:
             self._control[:] = control[:, -1]
-        self.qpos[:], self.qvel[:] = found["qpos"][:, -1], found["qvel"]
-        self._activation[:], self._site_position[:] = found["act"], found["site_xpos"]
-        self._mend(found)
-        touch = found["sensordata"][:, -self._touch_steps :, self._touch].max(axis=1)
+        self.qpos[:], self.qvel[:] = moved["qpos"][:, -1], moved["qvel"]
+        self._activation[:], self._site_position[:] = moved["act"], moved["site_xpos"]
+        self._mend(moved)
+        touch = moved["sensordata"][:, -self._touch_steps :, self._touch].max(axis=1)
         feet = self._site_position[:, None, self._feet_sites]
-        return Moved(self._parts[part], start, found["qpos"], found["actuator_force"], touch, feet)
+        return Moved(self._parts[part], start, moved["qpos"], moved["actuator_force"], touch, feet)
 
-    def _mend(self, found: dict[str, Array]) -> None:
+    def _mend(self, moved: dict[str, Array]) -> None:
         """Reset robots that became NaN, as MuJoCo does."""
         self._broken = ~np.isfinite(self.qpos.sum(axis=1) + self.qvel.sum(axis=1))
         ids = np.flatnonzero(self._broken)
@@ -135,5 +135,5 @@ class WarpRobots(RobotBatch):
             self.batch.reset(ids)
             self._ahead[ids] = True
             self._site_position[ids] = self._host_sites[ids]
-            found["qpos"][ids] = self.model.qpos0
-            found["actuator_force"][ids] = found["sensordata"][ids] = 0.0
+            moved["qpos"][ids] = self.model.qpos0
+            moved["actuator_force"][ids] = moved["sensordata"][ids] = 0.0

@@ -63,11 +63,11 @@ def _kernels(wp: Any) -> dict[str, Any]:
         """Torques and set-points of servos; `setpoint_rate` comes in as the delayed command."""
         world, servo = wp.tid()
         step = time_step[world % time_step.shape[0]]
-        own = address[servo]
-        before = setpoint[world, own]
+        servo_address = address[servo]
+        before = setpoint[world, servo_address]
         reach = speeds[world, servo][1] * step
-        moved = wp.clamp(setpoint_rate[world, own] - before, -reach, reach)
-        setpoint_rate[world, own] = moved / step
+        moved = wp.clamp(setpoint_rate[world, servo_address] - before, -reach, reach)
+        setpoint_rate[world, servo_address] = moved / step
         gain = gains[world, servo]
         torque = gain[2] * velocity[world, servo]
         torque -= gain[1] * (before + moved - length[world, servo])
@@ -113,13 +113,13 @@ class Worlds:
         self.device, self._substeps = device_of(device), substeps
         self._graph, self._warm = None, False
         self._written: dict[str, NDArray[np.float32]] = {}
-        own = _without_pid(model)
+        bare, sizes = _without_pid(model), dict.fromkeys(fields, worlds)
         with self._wp.ScopedDevice(self.device):
-            self._model = self._engine.mjw.put_model(own, batch_sizes=dict.fromkeys(fields, worlds))
+            self._model = self._engine.mjw.put_model(bare, batch_sizes=sizes)
             self._model.opt.tolerance.fill_(_TOLERANCE)
             # robots that tumble reach the limit in most steps, and each would be a printed line
             self._model.opt.warn_overflow &= ~self._engine.mjw.OverflowType.ITERATIONS
-            self._data = self._engine.mjw.make_data(own, worlds)
+            self._data = self._engine.mjw.make_data(bare, worlds)
             self._commands = self._wp.zeros((substeps, worlds, model.nu), dtype=float)
             self._records = {
                 name: self._wp.zeros((substeps, *getattr(self._data, name).shape), dtype=float)
@@ -143,8 +143,8 @@ class Worlds:
         with self._wp.ScopedDevice(self.device):
             rows = self._wp.array(ids, dtype=int)
             for name in _STATE:
-                own = getattr(self._data, name)
-                out = own.reshape((own.shape[0], -1))
+                field = getattr(self._data, name)
+                out = field.reshape((field.shape[0], -1))
                 values = self._wp.array(state[name].reshape(len(ids), -1), dtype=float)
                 self._wp.launch(
                     self._engine.overwrite, values.shape, inputs=[rows, values], outputs=[out]
@@ -170,8 +170,8 @@ class Worlds:
         data.qvel.assign(np.asarray(qvel, np.float32))
         with self._wp.ScopedDevice(self.device):
             self._run()
-        found = {name: own.numpy().swapaxes(0, 1) for name, own in self._records.items()}
-        return found | {name: getattr(data, name).numpy() for name in ("qvel", "act", "site_xpos")}
+        moved = {name: record.numpy().swapaxes(0, 1) for name, record in self._records.items()}
+        return moved | {name: getattr(data, name).numpy() for name in ("qvel", "act", "site_xpos")}
 
     def _run(self) -> None:
         """The physics steps; on CUDA one graph of kernels, once all are loaded."""
@@ -195,13 +195,13 @@ class Worlds:
 
 def _without_pid(model: Any) -> Any:
     """The model with what mujoco-warp has: integrators for servos, and Newton."""
-    own = copy(model)
-    own.actuator_dyntype[:] = mujoco.mjtDyn.mjDYN_INTEGRATOR
-    own.actuator_gaintype[:] = mujoco.mjtGain.mjGAIN_FIXED
-    own.actuator_biastype[:] = mujoco.mjtBias.mjBIAS_AFFINE  # its damping is integrated implicitly
-    own.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    own.opt.iterations, own.opt.ls_iterations = _ITERATIONS, _LINE_SEARCH
-    return own
+    bare = copy(model)
+    bare.actuator_dyntype[:] = mujoco.mjtDyn.mjDYN_INTEGRATOR
+    bare.actuator_gaintype[:] = mujoco.mjtGain.mjGAIN_FIXED
+    bare.actuator_biastype[:] = mujoco.mjtBias.mjBIAS_AFFINE  # damping is integrated implicitly
+    bare.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    bare.opt.iterations, bare.opt.ls_iterations = _ITERATIONS, _LINE_SEARCH
+    return bare
 
 
 def _servos(model: Any, data: Any) -> None:

@@ -119,11 +119,11 @@ class Body:
             return {kind: np.arange(k, len(self.joints), 3) for k, kind in enumerate(KINDS)}
         place = np.zeros(len(self.joints), int)
         for leg in range(len(self.feet)):
-            own = np.flatnonzero(self.leg_of == leg)
-            place[own] = np.arange(1, len(own) + 1)
-        found = {f"joint {k}": np.flatnonzero(place == k) for k in range(1, place.max() + 1)}
+            leg_joints = np.flatnonzero(self.leg_of == leg)
+            place[leg_joints] = np.arange(1, len(leg_joints) + 1)
+        kinds = {f"joint {k}": np.flatnonzero(place == k) for k in range(1, place.max() + 1)}
         other = np.flatnonzero(self.leg_of < 0)
-        return found | ({"other": other} if len(other) else {})
+        return kinds | ({"other": other} if len(other) else {})
 
     @cached_property
     def hips(self) -> NDArray[np.intp]:
@@ -225,7 +225,7 @@ def fixed_offsets(feet_at: Array) -> Array:
     """
     offsets = np.zeros(len(feet_at))
     for right in (False, True):
-        own = np.flatnonzero((feet_at[:, 1] < 0) == right)
-        ahead = own[np.argsort(-feet_at[own, 0], kind="stable")]
-        offsets[ahead] = 0.5 * ((np.arange(len(own)) + right) % 2)
+        side_feet = np.flatnonzero((feet_at[:, 1] < 0) == right)
+        ahead = side_feet[np.argsort(-feet_at[side_feet, 0], kind="stable")]
+        offsets[ahead] = 0.5 * ((np.arange(len(side_feet)) + right) % 2)
     return offsets

@@ -63,20 +63,20 @@ def hinges_of(path: Path) -> list[Hinge]:
     try:
         ended = subprocess.run(command, capture_output=True, timeout=_PATIENCE_S, check=False)
         lines = ended.stdout.decode(errors="replace").splitlines()
-        found: dict[str, Any] = json.loads(lines[-1]) if lines else {"out_of": "memory or time"}
+        reply: dict[str, Any] = json.loads(lines[-1]) if lines else {"out_of": "memory or time"}
     except (subprocess.TimeoutExpired, ValueError):
-        found = {"out_of": "time"}
-    if "out_of" in found:
+        reply = {"out_of": "time"}
+    if "out_of" in reply:
         raise InputError(
             f"{path} takes MuJoCo more than {_MEMORY_BYTES >> 30} GB or {_TIME_S} s to read. A "
             "joint map needs joints and actuators only: take height fields, textures, replicated "
             "bodies and includes out."
         )
-    if "reason" in found:
-        reason = "".join(c if c.isprintable() else " " for c in found["reason"])
+    if "reason" in reply:
+        reason = "".join(c if c.isprintable() else " " for c in reply["reason"])
         reason = " ".join(reason.split()).rstrip(".")
         raise InputError(f"{path} cannot be read as a robot: {reason}. {_ADVICE}")
-    return [Hinge(**hinge) for hinge in found["hinges"]]
+    return [Hinge(**hinge) for hinge in reply["hinges"]]
 
 
 def _limit_this_process() -> None:
@@ -100,14 +100,14 @@ def _read(path: str) -> list[Hinge]:
     led = leaders(model)
     driven = driven_joints(model) if model.nu else set(hinges) - set(led)
     zero = set() if root is None else _zero_ranges(root)
-    found = []
+    read = []
     for j in hinges:
         low, high = (float(x) if abs(x) < 1e6 else None for x in model.jnt_range[j])
         limited = bool(model.jnt_limited[j])
         name = model.joint(j).name
         follows = model.joint(led[j]).name if j in led else ""
-        found.append(Hinge(name, limited, low, high, j in driven, follows, name in zero))
-    return found
+        read.append(Hinge(name, limited, low, high, j in driven, follows, name in zero))
+    return read
 
 
 def _of_urdf(root: Element) -> list[Hinge]:
@@ -120,7 +120,7 @@ def _of_urdf(root: Element) -> list[Hinge]:
         "${" in v for v in values
     ):
         raise ValueError("it is a xacro file, to be expanded: `xacro FILE > robot.urdf`")
-    found: list[Hinge] = []
+    hinges: list[Hinge] = []
     for joint in _from_the_base_on(root.findall("joint")):
         kind, limit = joint.get("type"), joint.find("limit")
         if kind not in ("revolute", "continuous"):
@@ -133,21 +133,21 @@ def _of_urdf(root: Element) -> list[Hinge]:
         mimic = joint.find("mimic")
         follows = "" if mimic is None else mimic.get("joint", "")
         zero = not free and low == high == 0.0
-        if joint.get("name") in {hinge.name for hinge in found}:
+        if joint.get("name") in {hinge.name for hinge in hinges}:
             raise ValueError(f"two joints are called '{joint.get('name')}'")
-        found.append(
+        hinges.append(
             Hinge(joint.get("name", ""), not free, 0.0 if free else low, 0.0 if free else high,
                   not follows, follows, zero)
         )  # fmt: skip
-    return found
+    return hinges
 
 
 def _from_the_base_on(joints: list[Element]) -> list[Element]:
     """Joints depth first, as MuJoCo has them; those that belong to no tree are the last."""
 
     def link(joint: Element, end: str) -> str | None:
-        found = joint.find(end)
-        return None if found is None else found.get("link")
+        element = joint.find(end)
+        return None if element is None else element.get("link")
 
     moved = {link(joint, "child") for joint in joints}
     waiting = [joint for joint in joints if link(joint, "parent") not in moved][::-1]
@@ -238,29 +238,29 @@ def driven_joints(model: Any) -> set[int]:
     """Joints that an actuator drives, by itself or through a tendon."""
     from pupper_sysid.sim.robot.engine import mujoco
 
-    found: set[int] = set()
+    driven: set[int] = set()
     trn = mujoco.mjtTrn
     for kind, (target, _) in zip(model.actuator_trntype, model.actuator_trnid, strict=True):
         if kind == trn.mjTRN_JOINT or kind == trn.mjTRN_JOINTINPARENT:
-            found.add(int(target))
+            driven.add(int(target))
         elif kind == trn.mjTRN_TENDON:
             first = model.tendon_adr[target]
             for wrap in range(first, first + model.tendon_num[target]):
                 if model.wrap_type[wrap] == mujoco.mjtWrap.mjWRAP_JOINT:
-                    found.add(int(model.wrap_objid[wrap]))
-    return found
+                    driven.add(int(model.wrap_objid[wrap]))
+    return driven
 
 
 def _main() -> None:
     try:
-        found = {"hinges": [asdict(hinge) for hinge in _read(sys.argv[1])]}
+        reply = {"hinges": [asdict(hinge) for hinge in _read(sys.argv[1])]}
     except MemoryError:
-        found = {"out_of": "memory"}
+        reply = {"out_of": "memory"}
     except Exception as error:  # whatever MuJoCo raises is about the file
         # a failed allocation comes in MuJoCo's own words or as pybind11's "unknown exception"
         memory = any(words in str(error) for words in ("allocate memory", "unknown exception"))
-        found = {"out_of": "memory"} if memory else {"reason": str(error)}
-    print(json.dumps(found))
+        reply = {"out_of": "memory"} if memory else {"reason": str(error)}
+    print(json.dumps(reply))
 
 
 if __name__ == "__main__":

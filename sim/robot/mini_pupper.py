@@ -106,18 +106,18 @@ def robot_xml(
     legs = "".join(_leg(leg, servos, time_step_s, knee, whole) for leg in LEGS)
     tendons = ""
     if knee == "linkage":
-        each = {leg: joint_attributes(servos[f"{leg}_calf"], time_step_s) for leg in LEGS}
+        calves = {leg: joint_attributes(servos[f"{leg}_calf"], time_step_s) for leg in LEGS}
         tendons = "".join(
-            f'<fixed name="{leg}_calf_servo" {attributes(own)}><joint joint="{leg}_thigh" '
+            f'<fixed name="{leg}_calf_servo" {attributes(calf)}><joint joint="{leg}_thigh" '
             f'coef="1"/><joint joint="{leg}_calf" coef="1"/></fixed>'
-            for leg, own in each.items()
+            for leg, calf in calves.items()
         )
         tendons = f"<tendon>{tendons}</tendon>"
     actuators = []
     for name in JOINT_NAMES:
         at = "tendon" if knee == "linkage" and name.endswith("calf") else "joint"
-        own = {"name": name, at: name if at == "joint" else f"{name}_servo"}
-        actuators.append(pid_element(own, servos[name], time_step_s))
+        names = {"name": name, at: name if at == "joint" else f"{name}_servo"}
+        actuators.append(pid_element(names, servos[name], time_step_s))
     sensors = "".join(f'<touch name="{leg}_foot_touch" site="{leg}_foot"/>' for leg in LEGS)
     if imu:
         sensors += '<gyro name="gyro" site="imu"/><accelerometer name="accelerometer" site="imu"/>'
@@ -315,13 +315,13 @@ def lowest_points(joints: Array) -> tuple[Array, Array]:
     top[..., 0], top[..., 1] = THIGH_X_M, (_SIDE * THIGH_Y_M)[:, None]
     top[:, :, 1, 0] -= THIGH_M * np.sin(thigh)
     top[:, :, 1, 2] -= THIGH_M * np.cos(thigh)
-    own = np.concatenate([corner, top], axis=2)  # in the hips' frames
+    leg_points = np.concatenate([corner, top], axis=2)  # in the hips' frames
     c, s = np.cos(angles[:, :, :1]), np.sin(angles[:, :, :1])
-    y, z = own[..., 1].copy(), own[..., 2].copy()
-    own[..., 1], own[..., 2] = c * y - s * z, s * y + c * z
-    own += _HIPS_M[:, None]
+    y, z = leg_points[..., 1].copy(), leg_points[..., 2].copy()
+    leg_points[..., 1], leg_points[..., 2] = c * y - s * z, s * y + c * z
+    leg_points += _HIPS_M[:, None]
     trunk = np.broadcast_to(_lower_corners(TRUNK_BOX_AT_M, TRUNK_BOX_M), (len(joints), 4, 3))
-    points = np.concatenate([trunk, own.reshape(len(joints), 24, 3)], axis=1)
+    points = np.concatenate([trunk, leg_points.reshape(len(joints), 24, 3)], axis=1)
     radius = np.zeros(points.shape[1])
     radius[4:].reshape(4, 6)[:, 4:] = THIGH_RADIUS_M
     return points, radius

@@ -141,8 +141,8 @@ class RobotBatch:
         longest_s += _LATEST * float(self._jitter_s.max()) * config.differences.command_jitter[1]
         # every buffer holds the longest delay that can be drawn
         longest = {
-            name: replace(own, dead_time_s=np.array(longest_s))
-            for name, own in servos.nominal().items()
+            name: replace(servo, dead_time_s=np.array(longest_s))
+            for name, servo in servos.nominal().items()
         }
         xml = body.xml(longest, config.physics_step_s, ground, config.physics)
         self.model = mujoco.MjModel.from_xml_string(xml)

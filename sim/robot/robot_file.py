@@ -81,20 +81,20 @@ def body_from_file(path: Path, config: Path | None) -> Body:
     """
     if not path.is_file():
         raise InputError(f"There is no {path}. Give the robot's MJCF as `robot`.")
-    own = RobotFile()
+    settings = RobotFile()
     if config is not None:
         if not config.is_file():
             raise InputError(f"There is no {config}. Give the robot's YAML as `robot_config`.")
         content, lines = read_yaml(config)
-        own = validated(RobotFile, content or {}, config, lines)
-    return _Reader(path, config, own).body()
+        settings = validated(RobotFile, content or {}, config, lines)
+    return _Reader(path, config, settings).body()
 
 
 class _Reader:
     """One robot's file on its way to a `Body`."""
 
-    def __init__(self, path: Path, config: Path | None, own: RobotFile):
-        self.path, self.config, self.own = path, config, own
+    def __init__(self, path: Path, config: Path | None, settings: RobotFile):
+        self.path, self.config, self.settings = path, config, settings
         self.where = str(config or path)
         self.notes: list[str] = []
         try:
@@ -116,11 +116,11 @@ class _Reader:
                 "; a robot has one. Take the others out."
             )
         self.root = free[0].parent
-        for k, own_body in enumerate(self.spec.bodies):
-            own_body.name = own_body.name or ("trunk" if own_body is self.root else f"body {k}")
-            own_body.gravcomp = 0.0
-        if own.forward != "x":
-            self._face(_QUARTERS[own.forward])
+        for k, body in enumerate(self.spec.bodies):
+            body.name = body.name or ("trunk" if body is self.root else f"body {k}")
+            body.gravcomp = 0.0
+        if settings.forward != "x":
+            self._face(_QUARTERS[settings.forward])
         whole = self._compiled()
         self.joints = self._servo_joints(whole)
         self.resting = self._keyframe(whole)
@@ -199,20 +199,20 @@ class _Reader:
 
     def _keyframe(self, whole: Any) -> Array:
         """All positions of the file's joints in the keyframe that is the pose, or at rest."""
-        names, wanted = [whole.key(k).name for k in range(whole.nkey)], self.own.pose
-        if isinstance(wanted, str):
-            if wanted not in names:
+        names, pose = [whole.key(k).name for k in range(whole.nkey)], self.settings.pose
+        if isinstance(pose, str):
+            if pose not in names:
                 raise InputError(
-                    f"{self.where}: {self.path.name} has no keyframe '{wanted}'; it has "
+                    f"{self.where}: {self.path.name} has no keyframe '{pose}'; it has "
                     f"{', '.join(names) or 'none'}. Give angles by joint as `pose` instead."
                 )
-            return whole.key_qpos[names.index(wanted)].copy()
-        found = whole.qpos0.copy()
-        if isinstance(wanted, dict):
+            return whole.key_qpos[names.index(pose)].copy()
+        positions = whole.qpos0.copy()
+        if isinstance(pose, dict):
             hinges = [whole.joint(j).name for j in _hinges(whole)]
-            for pattern, angle in wanted.items():
+            for pattern, angle in pose.items():
                 for name in self._matching(pattern, hinges, "pose", "hinge"):
-                    found[whole.joint(name).qposadr[0]] = angle
+                    positions[whole.joint(name).qposadr[0]] = angle
         elif names:
             self.notes.append(f"The default pose is the keyframe '{names[0]}' of {self.path.name}.")
             return whole.key_qpos[0].copy()
@@ -221,7 +221,7 @@ class _Reader:
                 f"{self.path.name} has no keyframe and there is no `pose`: the default pose is all "
                 "joints at 0, or at the limit next to it, with which few robots can stand."
             )
-        return found
+        return positions
 
     def _servo_joints(self, whole: Any) -> tuple[str, ...]:
         hinges = _hinges(whole)
@@ -232,9 +232,9 @@ class _Reader:
         names = [whole.joint(j).name for j in hinges]
         if "" in names:
             raise InputError(f"{self.path} has a hinge without a name. Give every joint a name.")
-        if self.own.joints is not None:
+        if self.settings.joints is not None:
             chosen = {
-                n for w in self.own.joints for n in self._matching(w, names, "joints", "hinge")
+                n for w in self.settings.joints for n in self._matching(w, names, "joints", "hinge")
             }
         elif driven := driven_joints(whole) & set(hinges):
             chosen = {whole.joint(j).name for j in driven}
@@ -304,9 +304,9 @@ class _Reader:
             mujoco.mju_negQuat(back, data.xquat[above])
             mujoco.mju_rotVecQuat(place, data.xpos[at] - data.xpos[above], back)
             mujoco.mju_mulQuat(turn, back, data.xquat[at])
-            own_body = self.spec.body(name)
-            own_body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-            own_body.pos, own_body.quat = place, turn
+            body = self.spec.body(name)
+            body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            body.pos, body.quat = place, turn
 
     def _compiled(self) -> Any:
         try:
@@ -332,7 +332,7 @@ class _Reader:
             for n, p, a, b in zip(self.joints, pose, low, high, strict=True)
             if not a - 1e-6 <= p <= b + 1e-6
         ]
-        if outside and isinstance(self.own.pose, dict):
+        if outside and isinstance(self.settings.pose, dict):
             raise InputError(
                 f"{self.where}: pose is beyond the limits of {_some(outside)}. Angles are in "
                 "radians."
@@ -384,10 +384,10 @@ class _Reader:
         by_body: dict[int, list[int]] = {}
         for g in sorted(of_robot, key=self._lowest):
             by_body.setdefault(int(model.geom_bodyid[g]), []).append(g)
-        if self.own.feet is None:
+        if self.settings.feet is None:
             return self._lowest_bodies(by_body)
         feet = {}
-        for name in self.own.feet:
+        for name in self.settings.feet:
             body, geom = self._body_of(name)
             if body not in by_body:
                 raise InputError(
@@ -451,7 +451,7 @@ class _Reader:
                 "that walks has two or more. Give `feet` in the YAML."
             )
         feet_at = self._middles()
-        soles = np.array([self._lowest(own[0]) for own in self.feet.values()])
+        soles = np.array([self._lowest(geoms[0]) for geoms in self.feet.values()])
         height = -float(soles.min())
         if not height > 0:
             raise InputError(f"{self.path}: the feet are not below the trunk in the default pose.")
@@ -478,7 +478,7 @@ class _Reader:
                     else ""
                 )
             )
-        commands = self.own.commands.model_dump(exclude_none=True)
+        commands = self.settings.commands.model_dump(exclude_none=True)
         xml = self._xml_writer(names)
         hashes = {"robot": sha256(self.path)}
         if self.config is not None:
@@ -497,7 +497,7 @@ class _Reader:
             standing_height_m=height, mass_kg=float(model.body_mass.sum()), xml=xml,
             feet_in_trunk=kinematics, joints_at=self._inverse(kinematics, chains, height),
             touches_ground=fallen,
-            foot_geoms=tuple(model.geom(g).name for own in self.feet.values() for g in own),
+            foot_geoms=tuple(model.geom(g).name for geoms in self.feet.values() for g in geoms),
             trunk=self.root.name, servo_of=self._servo_of(),
             commands={name: (ends[0], ends[1]) for name, ends in commands.items()},
             notes=tuple(self.notes), hashes=hashes,
@@ -517,11 +517,11 @@ class _Reader:
     @property
     def foot_bodies(self) -> list[int]:
         """Of each foot."""
-        return [int(self.model.geom_bodyid[own[0]]) for own in self.feet.values()]
+        return [int(self.model.geom_bodyid[geoms[0]]) for geoms in self.feet.values()]
 
     def _middles(self) -> Array:
         """Each foot's place in the world: the middle of the geoms that it stands on."""
-        return np.array([self.data.geom_xpos[own].mean(axis=0) for own in self.feet.values()])
+        return np.array([self.data.geom_xpos[geoms].mean(axis=0) for geoms in self.feet.values()])
 
     def _kinematics(self, away: Sequence[float] = (0.0, 0.0, 0.0)):
         """Feet in the trunk's frame as a function of joint angles, without MuJoCo.
@@ -530,10 +530,11 @@ class _Reader:
         """
         model, data, bodies = self.model, self.data, self.foot_bodies
         self._place(self.pose)
-        own = np.array(away) @ data.xmat[bodies].reshape(-1, 3, 3)  # in the frames of their bodies
+        # in the frames of their bodies
+        offsets = np.array(away) @ data.xmat[bodies].reshape(-1, 3, 3)
         self._place(np.zeros(len(self.joints)))
         turns = data.xmat[bodies].reshape(-1, 3, 3)
-        feet = self._middles() + (turns @ own[..., None])[..., 0]
+        feet = self._middles() + (turns @ offsets[..., None])[..., 0]
         # the joint next to the foot turns it first
         chains = [self._above(b)[::-1] for b in bodies]
         rounds = []
@@ -545,10 +546,10 @@ class _Reader:
         self._place(self.pose)
 
         def feet_in_trunk(joints: Array) -> Array:
-            found = np.repeat(feet[None], len(joints), axis=0)
-            for legs, own, axes, anchors in rounds:
-                arm = found[:, legs] - anchors
-                c, s = np.cos(joints[:, own, None]), np.sin(joints[:, own, None])
+            places = np.repeat(feet[None], len(joints), axis=0)
+            for legs, columns, axes, anchors in rounds:
+                arm = places[:, legs] - anchors
+                c, s = np.cos(joints[:, columns, None]), np.sin(joints[:, columns, None])
                 along = (arm * axes).sum(axis=-1, keepdims=True) * axes
                 # Rodrigues; np.cross is slow for few robots
                 turned = np.stack(
@@ -558,8 +559,8 @@ class _Reader:
                     ],
                     axis=-1,
                 )
-                found[:, legs] = anchors + c * (arm - along) + s * turned + along
-            return found
+                places[:, legs] = anchors + c * (arm - along) + s * turned + along
+            return places
 
         return feet_in_trunk
 
@@ -616,7 +617,7 @@ class _Reader:
         images = -axes * plane  # an axis is axial: the plane turns it the other way
         near = _SAME_PLACE * height
         before = np.array([len(self._above(int(model.jnt_bodyid[j]))) for j in ids])
-        found, signs = np.zeros(len(ids), int), np.zeros(len(ids))
+        images_of, signs = np.zeros(len(ids), int), np.zeros(len(ids))
         for k in range(len(ids)):
             # where on its axis a joint is placed says nothing
             apart = at - at[k] * plane
@@ -629,14 +630,14 @@ class _Reader:
             )
             if not len(fits):
                 return None, None
-            found[k] = fits[np.argmin(np.linalg.norm(apart[fits], axis=1))]
-            signs[k] = np.sign(along[found[k]])
-        if (found[found] != np.arange(len(ids))).any():
+            images_of[k] = fits[np.argmin(np.linalg.norm(apart[fits], axis=1))]
+            signs[k] = np.sign(along[images_of[k]])
+        if (images_of[images_of] != np.arange(len(ids))).any():
             return None, None
-        return found, signs
+        return images_of, signs
 
     def _offsets(self, names: tuple[str, ...], feet_at: Array) -> Array:
-        gait = self.own.gait
+        gait = self.settings.gait
         if isinstance(gait, dict):
             missing = [n for n in names if n not in gait] or [n for n in gait if n not in names]
             if missing:
@@ -656,25 +657,25 @@ class _Reader:
         return fixed_offsets(feet_at)
 
     def _servo_of(self) -> dict[str, str]:
-        own = self.own.servos
-        if own is None:
+        servos = self.settings.servos
+        if servos is None:
             return {}
-        if isinstance(own, str):
-            return dict.fromkeys(self.joints, own)
-        found = {}
-        for wanted, servo in own.items():
-            for name in self._matching(wanted, self.joints, "servos", "joint with a servo"):
-                found[name] = servo
-        return found
+        if isinstance(servos, str):
+            return dict.fromkeys(self.joints, servos)
+        servo_of = {}
+        for pattern, servo in servos.items():
+            for name in self._matching(pattern, self.joints, "servos", "joint with a servo"):
+                servo_of[name] = servo
+        return servo_of
 
     def _xml_writer(self, names: tuple[str, ...]):
         """Function that writes the MJCF with servos on a ground."""
         spec, model = self.spec, self.model
-        feet_geoms = {model.geom(g).name for own in self.feet.values() for g in own}
+        feet_geoms = {model.geom(g).name for geoms in self.feet.values() for g in geoms}
         for site in list(spec.sites):
             spec.delete(site)
-        for name, body_id, own in zip(names, self.foot_bodies, self.feet.values(), strict=True):
-            places, reach = model.geom_pos[own], model.geom_rbound[own]
+        for name, body_id, geoms in zip(names, self.foot_bodies, self.feet.values(), strict=True):
+            places, reach = model.geom_pos[geoms], model.geom_rbound[geoms]
             middle = places.mean(axis=0)
             radius = (np.linalg.norm(places - middle, axis=1) + _TOUCH * reach).max()
             spec.body(model.body(body_id).name).add_site(
@@ -690,15 +691,15 @@ class _Reader:
             servos: Mapping[str, DelayedPDParameters], step_s: float, ground: Ground,
             physics: Physics,
         ) -> str:  # fmt: skip
-            own = spec.copy()
-            for geom in own.geoms:
+            robot = spec.copy()
+            for geom in robot.geoms:
                 foot = geom.name in feet_geoms
                 collides = bool(geom.contype or geom.conaffinity)
                 on = foot or (collides and physics == "evaluation")
                 geom.contype, geom.conaffinity = int(on), 0
                 if foot:
                     geom.priority, geom.condim = 1, max(geom.condim, 3)  # 1 is without friction
-            option = own.option
+            option = robot.option
             option.timestep = step_s
             option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
             option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
@@ -711,12 +712,12 @@ class _Reader:
                 option.iterations = _TRAINING_ITERATIONS
             for joint_name in self.joints:
                 servo = {name: float(x) for name, x in servos[joint_name].arrays().items()}
-                joint = own.joint(joint_name)
+                joint = robot.joint(joint_name)
                 joint.armature, joint.frictionloss = servo["armature"], servo["friction_loss"]
                 joint.damping = np.array([servo["back_emf"], 0.0, 0.0])
                 joint.solref_friction = list(friction_solref(step_s))
                 joint.solimp_friction = list(FRICTION_SOLIMP)
-                actuator = own.add_actuator(
+                actuator = robot.add_actuator(
                     name=joint_name, target=joint_name, trntype=mujoco.mjtTrn.mjTRN_JOINT
                 )
                 speed, effort = servo["velocity_limit"], servo["effort_limit"]
@@ -730,8 +731,8 @@ class _Reader:
                 actuator.delay = servo["dead_time_s"]
                 if np.isfinite(effort):
                     actuator.forcelimited, actuator.forcerange = 1, [-effort, effort]
-            own.compile()
-            text = own.to_xml()
+            robot.compile()
+            text = robot.to_xml()
             at = text.index("<worldbody>") + len("<worldbody>")
             below = ground.xml.replace('material="grid"', f'material="{_GROUND}"')
             text = text[:at] + below + text[at:]
@@ -762,8 +763,8 @@ def _hinges(model: Any) -> list[int]:
 def _images(places: Array, near: float) -> NDArray[np.intp] | None:
     """Which place each place is the mirror image of; None if one has none."""
     distance = np.linalg.norm(places[:, None] * [1, -1, 1] - places[None], axis=-1)
-    found = distance.argmin(axis=1)
-    return found if (distance.min(axis=1) < near).all() else None
+    image = distance.argmin(axis=1)
+    return image if (distance.min(axis=1) < near).all() else None
 
 
 def _states_mass(spec: Any, body: Any) -> bool:

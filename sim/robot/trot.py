@@ -121,12 +121,12 @@ class Trot:
 
     def _cycle(self, phase: NDArray[np.float64], body: Body) -> tuple[NDArray, NDArray]:
         """Where feet are in their strokes, 1 to -1, and how high [m], each shape (4, n)."""
-        own = (phase / (2 * np.pi) + body.offsets[:, None]) % 1.0
-        stands = own < self.duty
-        swing = np.pi * (own - self.duty) / (1.0 - self.duty)
+        foot_phase = (phase / (2 * np.pi) + body.offsets[:, None]) % 1.0
+        stands = foot_phase < self.duty
+        swing = np.pi * (foot_phase - self.duty) / (1.0 - self.duty)
         even, round_ = 2.0 / np.pi * swing - 1.0, -np.cos(swing)
         back = round_ + self.even_swing * (even - round_)
-        along = np.where(stands, 1.0 - 2.0 * own / self.duty, back)
+        along = np.where(stands, 1.0 - 2.0 * foot_phase / self.duty, back)
         return along, np.where(stands, 0.0, self.lift_m * np.sin(swing))
 
     def _strokes(
@@ -135,9 +135,9 @@ class Trot:
         """Half of each foot's stroke along x and y [m], shape (n, 4, 2)."""
         x, y = centre[:, 0], centre[:, 1]
         ahead = self.gain * np.where(command[:, :1] < 0, self.back_gain, 1.0)
-        forward, left = ahead * command[:, :1], self.gain * self.side_gain * command[:, 1:2]
+        forward, sideways = ahead * command[:, :1], self.gain * self.side_gain * command[:, 1:2]
         turn = self._turn(command)[:, None]
-        speed = np.stack([forward - turn * y, left + turn * x], axis=-1)
+        speed = np.stack([forward - turn * y, sideways + turn * x], axis=-1)
         # from +A to -A while it stands
         return speed * self.duty / (2 * self.frequency_hz)
 

@@ -38,20 +38,20 @@ def calibrated_robot(
     """
     feedback = servos.feedback
     spec = RobotSpec(
-        poll_period_s=float(np.median([own.poll_period_s for own in feedback])),
-        loss=float(np.median([own.loss for own in feedback])),
+        poll_period_s=float(np.median([servo.poll_period_s for servo in feedback])),
+        loss=float(np.median([servo.loss for servo in feedback])),
         command_jitter_s=servos.command_jitter_s,
     )
     layout = None
     if body is not None and not body.is_mini_pupper:
         layout = body_joint_map(body)
-        quantum = float(np.median([own.quantum_rad for own in feedback]))
+        quantum = float(np.median([servo.quantum_rad for servo in feedback]))
         spec = replace(spec, quantum_rad=quantum, reading_noise_rad=quantum / 2)
     drawn = draw_robot(rng, spec, layout)
-    own = servos.in_steps_of(PHYSICS_STEP_S).nominal()
+    parameters = servos.in_steps_of(PHYSICS_STEP_S).nominal()
     emulated = []
     for servo in drawn.servos:
-        values = {name: float(np.asarray(x)) for name, x in asdict(own[servo.joint]).items()}
+        values = {name: float(np.asarray(x)) for name, x in asdict(parameters[servo.joint]).items()}
         # an emulated servo's dead time is without the mean latency of commands
         late = values["dead_time_s"] - spec.command_jitter_s
         values["dead_time_s"] = max(late, SHORTEST_DELAY_S)

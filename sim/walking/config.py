@@ -330,22 +330,22 @@ def for_robot(task: Walking, robot: str | Path, robot_config: str | Path | None)
     )  # fmt: skip
 
 
-def _commands(own: Commands, body: Body) -> Commands:
+def _commands(commands: Commands, body: Body) -> Commands:
     names, sizes = ("forward_m_s", "sideways_m_s", "yaw_rad_s"), body.command_scale.tolist()
-    found = {
-        n: tuple(s * end for end in getattr(own, n)) for n, s in zip(names, sizes, strict=True)
+    ranges = {
+        n: tuple(s * end for end in getattr(commands, n)) for n, s in zip(names, sizes, strict=True)
     }
     speed, _, rate = sizes
-    dead_band = (speed * own.dead_band[0], rate * own.dead_band[1])
-    return replace(own, dead_band=dead_band, **found | body.commands)
+    dead_band = (speed * commands.dead_band[0], rate * commands.dead_band[1])
+    return replace(commands, dead_band=dead_band, **ranges | body.commands)
 
 
-def _rewards(own: Rewards, body: Body) -> Rewards:
+def _rewards(rewards: Rewards, body: Body) -> Rewards:
     length, speed, _, rate = body.scale, *body.command_scale.tolist()
     time, torque = speed, body.mass_kg / MASS_KG * length
     # feet of a robot whose commands are slower have shorter strokes, and they are summed over feet
-    usual, asked = speed * max(Commands().forward_m_s), _commands(Commands(), body)
-    fastest = max(map(abs, (*asked.forward_m_s, *asked.sideways_m_s)))
+    usual, commands = speed * max(Commands().forward_m_s), _commands(Commands(), body)
+    fastest = max(map(abs, (*commands.forward_m_s, *commands.sideways_m_s)))
     strokes = min(max(fastest / usual, 0.25), 1.0) * (len(body.feet) / len(LEGS)) ** 0.5
     factors = (
         dict.fromkeys(_LENGTHS, length) | dict.fromkeys(_SPEEDS, speed)
@@ -359,4 +359,4 @@ def _rewards(own: Rewards, body: Body) -> Rewards:
             "air_time": rate,
         }
     )  # fmt: skip
-    return replace(own, **{name: getattr(own, name) * f for name, f in factors.items()})
+    return replace(rewards, **{name: getattr(rewards, name) * f for name, f in factors.items()})

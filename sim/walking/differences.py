@@ -159,36 +159,37 @@ class Bodies:
         `servos` are theirs, by field of `DelayedPDParameters`, shape (len(ids), 12); they are
         weakened in place.
         """
-        own, n = self._settings, len(ids)
+        settings, n = self._settings, len(ids)
         differ = np.ones(n, bool)
-        if own.as_calibrated:
-            differ = rng.random(n) >= own.as_calibrated
+        if settings.as_calibrated:
+            differ = rng.random(n) >= settings.as_calibrated
             self.as_calibrated[ids] = ~differ
-        if own.servo_spread:
+        if settings.servo_spread:
+            spread = settings.servo_spread
             for name in OF_UNIT:
-                share = rng.uniform(-own.servo_spread, own.servo_spread, servos[name].shape)
+                share = rng.uniform(-spread, spread, servos[name].shape)
                 servos[name] *= 1.0 + share * differ[:, None]
-        if own.joint_zero_rad:
-            error = rng.uniform(
-                -own.joint_zero_rad, own.joint_zero_rad, (n, len(self._body.joints))
-            )
+        if settings.joint_zero_rad:
+            most = settings.joint_zero_rad
+            error = rng.uniform(-most, most, (n, len(self._body.joints)))
             self.zero_rad[ids] = error * differ[:, None]
-        if any(own.centre_of_mass_m):
-            shift = rng.uniform(-1, 1, (n, 3)) * own.centre_of_mass_m
+        if any(settings.centre_of_mass_m):
+            shift = rng.uniform(-1, 1, (n, 3)) * settings.centre_of_mass_m
             self.centre_m[ids] = shift * differ[:, None]
         for name, values in (("command_jitter", self.jitter), ("poll_period", self.poll)):
-            ends = getattr(own, name)
+            ends = getattr(settings, name)
             if ends != (1.0, 1.0):
                 values[ids] = np.where(differ, rng.uniform(ends[0], ends[1], n), 1.0)
-        if own.without_effort:
-            self.effort[ids] = (rng.random(n) >= own.without_effort) | ~differ
-        if own.battery != (1.0, 1.0):
-            voltage = np.where(differ[:, None], rng.uniform(*own.battery, (n, 1)), 1.0)
+        if settings.without_effort:
+            self.effort[ids] = (rng.random(n) >= settings.without_effort) | ~differ
+        if settings.battery != (1.0, 1.0):
+            voltage = np.where(differ[:, None], rng.uniform(*settings.battery, (n, 1)), 1.0)
             for name in _OF_VOLTAGE:
                 servos[name] *= voltage
-        if own.weak_leg_share and own.weak_leg != (1.0, 1.0):
-            weak = differ & (rng.random(n) < own.weak_leg_share)
-            leg, factor = rng.integers(0, len(self._body.feet), n), rng.uniform(*own.weak_leg, n)
+        if settings.weak_leg_share and settings.weak_leg != (1.0, 1.0):
+            weak = differ & (rng.random(n) < settings.weak_leg_share)
+            leg = rng.integers(0, len(self._body.feet), n)
+            factor = rng.uniform(*settings.weak_leg, n)
             strength = np.ones((n, len(self._body.feet) + 1))  # the last of joints of no leg
             strength[weak, leg[weak]] = factor[weak]
             for name in _OF_MOTOR:

@@ -287,10 +287,10 @@ class PupperEnv:
     @property
     def state(self) -> dict[str, Any]:
         """Everything that changes, as arrays and strings; `restore` takes it back exactly."""
-        found = self.robots.state | {name: value.copy() for name, value in self._live.items()}
-        found["counters"] = np.array([self.nan_resets, self.steps])
-        found["rng"] = json.dumps([rng.bit_generator.state for rng in self._rngs])
-        return found
+        state = self.robots.state | {name: value.copy() for name, value in self._live.items()}
+        state["counters"] = np.array([self.nan_resets, self.steps])
+        state["rng"] = json.dumps([rng.bit_generator.state for rng in self._rngs])
+        return state
 
     def restore(self, state: dict[str, Any]) -> bool:
         """Go back to a `state` of an environment with the same settings.
@@ -309,8 +309,8 @@ class PupperEnv:
         for name, value in self._live.items():
             value[:] = state[name]
         self.nan_resets, self.steps = (int(x) for x in state["counters"])
-        for rng, own in zip(self._rngs, json.loads(state["rng"]), strict=True):
-            rng.bit_generator.state = own
+        for rng, rng_state in zip(self._rngs, json.loads(state["rng"]), strict=True):
+            rng.bit_generator.state = rng_state
         self._grow()
         return exact
 
@@ -320,8 +320,8 @@ class PupperEnv:
         senses = self._senses
         parts = {"readings": senses.readings, "imu": senses.imu, "strides": self._strides}
         parts["effort"] = self._effort
-        found = {f"{part}.{k}": v for part, its in parts.items() for k, v in its.state.items()}
-        return found | {name: getattr(self, name) for name in _ARRAYS} | {"_seen": senses.kept}
+        arrays = {f"{part}.{k}": v for part, its in parts.items() for k, v in its.state.items()}
+        return arrays | {name: getattr(self, name) for name in _ARRAYS} | {"_seen": senses.kept}
 
     @property
     def _rngs(self) -> tuple[np.random.Generator, ...]:
@@ -463,14 +463,14 @@ class PupperEnv:
             noise, observation,
         )  # fmt: skip
         height = qpos[:, 2] - self.ground.height(qpos[:, 0], qpos[:, 1])
-        left = 1 - self.episode_step[rows] / self.config.episode_steps
+        remaining = 1 - self.episode_step[rows] / self.config.episode_steps
         privileged = privileged_of(
             [
                 velocity, qpos[:, 7:] - self.default, qvel[:, 6:], height[:, None],
                 strides.air_s[rows], strides.stance_s[rows], self.robots.friction[rows, None],
                 self.robots.drawn["dead_time_s"][rows], *self._differing(rows),
                 qvel[:, 3:6], gravity, strides.velocity[rows], self.last_action[rows],
-                strides.clock(rows), left[:, None],
+                strides.clock(rows), remaining[:, None],
             ],
             privileged,
         )  # fmt: skip

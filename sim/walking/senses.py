@@ -150,11 +150,11 @@ class HeldReadings:
             before = np.minimum(place.astype(np.intp), steps - 1)
             share = place - before
             angle = _between(flat, at + before * width, width, start, before, share)
-            own = self._linked
-            if len(own):
-                angle[:, own] += _between(
-                    flat, at[:, own - 1] + before[:, own] * width, width, start[:, own - 1],
-                    before[:, own], share[:, own],
+            calf = self._linked
+            if len(calf):
+                angle[:, calf] += _between(
+                    flat, at[:, calf - 1] + before[:, calf] * width, width, start[:, calf - 1],
+                    before[:, calf], share[:, calf],
                 )  # fmt: skip
             read = due & (lost >= self._loss)
             np.copyto(held, self._reported(angle), where=read)
@@ -214,16 +214,16 @@ class Imu:
         self, ids: NDArray[np.intp], rate: Array, gravity: Array, rng: np.random.Generator
     ) -> None:
         """Draw the IMU of some robots that have long been as they are; nothing that is off."""
-        own, n = self._settings, len(ids)
-        if own.imu_mounting_rad:
-            most = own.imu_mounting_rad
+        settings, n = self._settings, len(ids)
+        if settings.imu_mounting_rad:
+            most = settings.imu_mounting_rad
             self.mounting_rad[ids] = rng.uniform(-most, most, (n, 3))
-        if own.gyro_bias_rad_s:
-            most = own.gyro_bias_rad_s
+        if settings.gyro_bias_rad_s:
+            most = settings.gyro_bias_rad_s
             self.bias_rad_s[ids] = rng.uniform(-most, most, (n, 3))
-        if own.imu_late:
-            self.latency_s[ids] = rng.uniform(*own.imu_latency_s, n)
-            self.period_s[ids] = rng.uniform(*own.imu_period_s, n)
+        if settings.imu_late:
+            self.latency_s[ids] = rng.uniform(*settings.imu_latency_s, n)
+            self.period_s[ids] = rng.uniform(*settings.imu_period_s, n)
             self._since[ids] = rng.random(n) * self.period_s[ids]
             self._kept[:, ids, :3], self._kept[:, ids, 3:] = rate, gravity
 
@@ -243,8 +243,8 @@ class Imu:
         self, rows: slice | NDArray[np.intp], rate: Array, gravity: Array
     ) -> tuple[Array, Array]:
         """Measured rates [rad/s] and direction of gravity, shape (k, 3) each; given the true."""
-        own = self._settings
-        if own.imu_late:
+        settings = self._settings
+        if settings.imu_late:
             age = (self.latency_s[rows] + self._since[rows]) / self._span
             whole = age.astype(int)
             share, size = (age - whole)[:, None], len(self._kept)
@@ -253,12 +253,12 @@ class Imu:
             older = self._kept[(self._at[rows] - whole - 1) % size, each]
             seen = newer + share * (older - newer)
             rate, gravity = seen[:, :3], seen[:, 3:]
-        if own.imu_askew:
+        if settings.imu_askew:
             turn = self.mounting_rad[rows]
             # small angles: axes of the IMU turned by +θ see vectors turned by -θ
             rate = rate - np.cross(turn, rate) + self.bias_rad_s[rows]
             gravity = gravity - np.cross(turn, gravity)
-        if own.imu_late or own.imu_askew:
+        if settings.imu_late or settings.imu_askew:
             gravity = gravity / np.linalg.norm(gravity, axis=1, keepdims=True)
         return rate, gravity
 

@@ -78,8 +78,8 @@ class ServoRanges:
         """The same servos, every dead time longer by `extra_s` [s], one or twelve; none below 0."""
         moved = {}
         for name in ("low", "value", "high"):
-            own = getattr(self, name)
-            moved[name] = {**own, "dead_time_s": np.maximum(own["dead_time_s"] + extra_s, 0.0)}
+            bound = getattr(self, name)
+            moved[name] = {**bound, "dead_time_s": np.maximum(bound["dead_time_s"] + extra_s, 0.0)}
         return replace(self, **moved)
 
     def in_steps_of(self, time_step_s: float) -> ServoRanges:
@@ -127,17 +127,17 @@ def servo_ranges(
     servo_of = {} if body is None else body.servo_of
     as_path(actuator, "An actuator")
     if str(actuator) == IDEAL or is_servo_model(actuator):
-        found = _ideal(str(actuator), joints)
+        ranges = _ideal(str(actuator), joints)
     else:
-        found = _from_calibration(load_calibration(actuator), str(actuator), joints, servo_of)
+        ranges = _from_calibration(load_calibration(actuator), str(actuator), joints, servo_of)
     if str(feedback) == "held":
-        return found
+        return ranges
     if str(feedback) == "ideal":
         held = (HeldFeedback(),) * len(joints)
     else:
-        other = load_calibration(feedback)
-        held = _from_calibration(other, str(feedback), joints, servo_of).feedback
-    return replace(found, feedback=held)
+        feedback_source = load_calibration(feedback)
+        held = _from_calibration(feedback_source, str(feedback), joints, servo_of).feedback
+    return replace(ranges, feedback=held)
 
 
 def _from_calibration(
@@ -164,19 +164,20 @@ def _from_calibration(
     low["dead_time_s"], high["dead_time_s"] = delays[:, 0], delays[:, 1]
     # the armature is the torque's scale, drawn for the robot as a whole
     low["armature"] = high["armature"] = value["armature"]
-    own = np.array([p.actuator.numbers_in == "continuous time" for p in parts])
-    if own.any():  # what a simulation in steps needs, as older files have it
+    continuous = np.array([p.actuator.numbers_in == "continuous time" for p in parts])
+    if continuous.any():  # what a simulation in steps needs, as older files have it
         stepped = at_step(DelayedPDParameters(**value), TIME_STEP_S).arrays()
         for field, number in value.items():
-            more = np.where(own, stepped[field] - number, 0.0)
-            longer = np.where(own & (number > 0), stepped[field] / np.maximum(number, 1e-12), 1.0)
+            more = np.where(continuous, stepped[field] - number, 0.0)
+            grows, positive = continuous & (number > 0), np.maximum(number, 1e-12)
+            longer = np.where(grows, stepped[field] / positive, 1.0)
             for ends in (low, high):
                 ends[field] = (
                     np.maximum(ends[field] + more, 0.0)
                     if field == "dead_time_s"
                     else ends[field] * longer
                 )
-        value = {field: np.where(own, stepped[field], value[field]) for field in value}
+        value = {field: np.where(continuous, stepped[field], value[field]) for field in value}
     feedback = tuple(
         calibration.held_feedback(servo_of.get(n) or fallbacks.get(n, n)) for n in joints
     )
@@ -202,11 +203,11 @@ def nearest_joint(name: str, known: Sequence[str]) -> str:
 
 def _ideal(source: str, joints: tuple[str, ...]) -> ServoRanges:
     """Servos that follow their command, as nearly as a 2 ms step can hold."""
-    own = dict.fromkeys(PARAMETER_KEYS, 0.0) | {
+    ideal = dict.fromkeys(PARAMETER_KEYS, 0.0) | {
         "stiffness": 20.0, "damping": 0.25, "armature": 8e-4,
         "effort_limit": _NO_LIMIT_NM, "velocity_limit": NO_SPEED_LIMIT_RAD_S,
     }  # fmt: skip
-    value = {f: np.full(len(joints), x) for f, x in own.items()}
+    value = {f: np.full(len(joints), x) for f, x in ideal.items()}
     held = (HeldFeedback(),) * len(joints)
     return ServoRanges(source, value, value, value, held, {}, joints=joints)
 

@@ -145,16 +145,16 @@ def empty_facts(
     body: Body, command: Array, action: Array, last_action: Array, earlier_action: Array
 ) -> dict[str, Any]:
     """Arrays of a `Step` that are to be filled in; the given ones are copied."""
-    found: dict[str, Any] = {
+    facts: dict[str, Any] = {
         "command": command.copy(), "action": action.copy(), "last_action": last_action.copy(),
         "earlier_action": earlier_action.copy(),
     }  # fmt: skip
     for names, size in (
         (_VECTORS, 3), (_OF_JOINTS, len(body.joints)), (_OF_FEET, len(body.feet)),
     ):  # fmt: skip
-        found |= {name: np.empty((len(command), size)) for name in names}
-    found |= {name: np.empty(len(command)) for name in _NUMBERS}
-    return found | {name: np.empty((len(command), len(body.feet)), bool) for name in _FLAGS}
+        facts |= {name: np.empty((len(command), size)) for name in names}
+    facts |= {name: np.empty(len(command)) for name in _NUMBERS}
+    return facts | {name: np.empty((len(command), len(body.feet)), bool) for name in _FLAGS}
 
 
 def unforeseen_of(

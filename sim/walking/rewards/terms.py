@@ -116,16 +116,16 @@ def foot_paths(s: Step, p: Rewards) -> Array:
     """
     cycle = np.arctan2(s.clock[:, 1], s.clock[:, 0])[:, None] / (2 * np.pi)
     # since the middle of a foot's swing, -0.5 to 0.5 cycles
-    own = (cycle + s.body.offsets + 0.25) % 1.0 - 0.5
+    phase = (cycle + s.body.offsets + 0.25) % 1.0 - 0.5
     half = 0.5 * (1.0 - p.clock_duty)
-    swings = np.abs(own) < half
-    along = np.where(swings, own / half, np.sign(own) * (0.5 - np.abs(own)) / (0.5 - half))
+    swings = np.abs(phase) < half
+    along = np.where(swings, phase / half, np.sign(phase) * (0.5 - np.abs(phase)) / (0.5 - half))
     x, y, turn = s.command.T[:, :, None]
     at = s.body.feet_at
     speed = np.stack([x - turn * at[:, 1], y + turn * at[:, 0]], axis=-1)
     away = _feet_away(s)
     away[..., :2] -= along[..., None] * speed * p.clock_duty / (2 * p.clock_hz)
-    away[..., 2] -= np.where(swings, p.clock_height * np.cos(0.5 * np.pi * own / half), 0.0)
+    away[..., 2] -= np.where(swings, p.clock_height * np.cos(0.5 * np.pi * phase / half), 0.0)
     away[..., 0::2] -= away[..., 0::2].mean(axis=1, keepdims=True)
     # a gait that sways carries the trunk from foot to foot
     free = np.ones(len(at)) if s.body.sways else s.body.sides
@@ -239,13 +239,13 @@ def weighted(
     factors: dict[str, float] = {
         **dict.fromkeys(GUIDES, guides), **dict.fromkeys(PROGRESS, progress),
     }  # fmt: skip
-    found = {}
+    terms = {}
     for name, term in TERMS.items():
         weight = getattr(rewards, name)
         factor = penalties if weight < 0 else factors.get(name, 1.0)
         if weight:
-            found[name] = weight * factor * term(step, rewards)
-    return found
+            terms[name] = weight * factor * term(step, rewards)
+    return terms
 
 
 def _norm(values: Array) -> Array:
