@@ -321,12 +321,12 @@ def push_response(policy: Policy, trial: Trial) -> tuple[PushTest, ...]:
         shifts, phases, survived = [], [], []
         for at, pushed in zip(times, walks, strict=False):
             survived.append(pushed.alive[-1][robots].mean())
-            both = [i for i in robots if pushed.alive[-1, i]]
+            walking = [i for i in robots if pushed.alive[-1, i]]
             shifts += [
                 [_shift(plain, pushed, at, w, i, rates[i]) for w in (_EARLY_S, _LATE_S)]
-                for i in both
+                for i in walking
             ]
-            phases += [_phase(plain, at, i, rates[i]) for i in both]
+            phases += [_phase(plain, at, i, rates[i]) for i in walking]
         early, late = np.array(shifts).reshape(-1, 2).T
         results.append(
             PushTest(
@@ -368,7 +368,7 @@ def _driven(
 ) -> Array:
     """Actions of a policy on a recording with a part of the observation frozen from `start` on.
 
-    With `own_action` its last action is its own, else that of the recording (or frozen part).
+    With `own_action` the last action is that of this run, else the recorded (or frozen) one.
     """
     player = copy(policy)
     seen = plain.observation
@@ -407,8 +407,8 @@ def _shift(
     end = min(end, len(plain.action))  # the last pushes of a slow gait come late
     carrier = _carrier(rate, begin, end, plain.step_s)
     before, after = (r.action_rad[begin:end, robot] for r in (plain, pushed))
-    one, other = (carrier @ (x - x.mean(axis=0)) for x in (before, after))
-    return float(np.angle(np.vdot(one, other)) / (2 * np.pi))
+    phasor, pushed_phasor = (carrier @ (x - x.mean(axis=0)) for x in (before, after))
+    return float(np.angle(np.vdot(phasor, pushed_phasor)) / (2 * np.pi))
 
 
 def _phase(plain: Rollout, at: int, robot: int, rate: float) -> float:

@@ -45,17 +45,17 @@ def delay_figure(curves: Mapping[str, Sequence[DelayPoint]]) -> Figure:
     # walks too short for a rhythm have none to show
     names = {n: t for n, t in titles.items() if any(np.isfinite(getattr(r, n)) for r in points)}
     figure, axes = axes_column(len(names), 2.2 * len(names))
-    for (name, title), one in zip(names.items(), axes, strict=True):
+    for (name, title), panel in zip(names.items(), axes, strict=True):
         for k, (policy, rows) in enumerate(curves.items()):
             colour = _colour(k)
             for mode, line in _MODES.items():
                 chosen = [r for r in rows if r.mode == mode and np.isfinite(getattr(r, name))]
                 if chosen:
-                    one.plot(
+                    panel.plot(
                         [r.extra_delay_ms for r in chosen], [getattr(r, name) for r in chosen],
                         line, color=colour, marker="o", ms=3, label=f"{policy}, {mode}",
                     )  # fmt: skip
-        one.set_ylabel(title)
+        panel.set_ylabel(title)
     if "survival" in names:
         axes[0].set_ylim(-0.05, 1.05)
     axes[-1].set_xlabel("more delay [ms]")
@@ -67,19 +67,19 @@ def delay_figure(curves: Mapping[str, Sequence[DelayPoint]]) -> Figure:
 def ablation_figure(tables: Mapping[str, Sequence[AblationPoint]]) -> Figure:
     """Gait correlation in replay against noise, with the level of zeros as a line."""
     figure, axes = axes_column(len(tables), 2.6 * len(tables))
-    for (policy, rows), one in zip(tables.items(), axes, strict=True):
+    for (policy, rows), panel in zip(tables.items(), axes, strict=True):
         channels = list(dict.fromkeys(r.channel for r in rows))
         for channel, colour in zip(channels, JOINT_COLOURS, strict=False):
             noise = [r for r in rows if r.channel == channel and r.kind == "noise"]
             zero = next(r for r in rows if r.channel == channel and r.kind == "zero")
             label = channel.replace("_", " ")
-            one.semilogx(
+            panel.semilogx(
                 [r.level for r in noise], [r.correlation for r in noise], color=colour,
                 marker="o", ms=3, label=label,
             )  # fmt: skip
-            one.axhline(zero.correlation, color=colour, ls=":", lw=1)
-        one.set_title(policy)
-        one.set_ylabel("correlation of actions")
+            panel.axhline(zero.correlation, color=colour, ls=":", lw=1)
+        panel.set_title(policy)
+        panel.set_ylabel("correlation of actions")
     axes[-1].set_xlabel("noise, share of the channel's own deviation (dotted: zeros)")
     axes[0].legend(fontsize=7)
     return figure
@@ -92,10 +92,10 @@ def orbit_figure(orbits: Mapping[str, Sequence[NDArray[np.floating]]], delays_ms
     axes = figure.subplots(len(orbits), len(delays_ms), squeeze=False)
     for row, (name, conditions) in zip(axes, orbits.items(), strict=True):
         reach = max(np.abs(c[:, :2]).max() for c in conditions)
-        for one, condition, delay in zip(row, conditions, delays_ms, strict=True):
-            one.plot(condition[:, 0], condition[:, 1], color=BLUE, lw=0.6)
-            one.set(xlim=(-reach, reach), ylim=(-reach, reach), xticks=[], yticks=[])
-            one.set_title(f"{name}, +{delay:g} ms", fontsize=8)
+        for panel, condition, delay in zip(row, conditions, delays_ms, strict=True):
+            panel.plot(condition[:, 0], condition[:, 1], color=BLUE, lw=0.6)
+            panel.set(xlim=(-reach, reach), ylim=(-reach, reach), xticks=[], yticks=[])
+            panel.set_title(f"{name}, +{delay:g} ms", fontsize=8)
     return figure
 
 
@@ -161,14 +161,14 @@ def terrain_figure(tables: Mapping[str, Sequence[GroundPoint]]) -> Figure:
     """Survival and forward error on every kind of ground, a group of bars per ground."""
     names = {"survival": "share still up", "mae_vx_m_s": "forward error [m/s]"}
     figure, axes = axes_column(len(names), 2.4 * len(names))
-    for one, (key, title) in zip(axes, names.items(), strict=True):
+    for panel, (key, title) in zip(axes, names.items(), strict=True):
         for k, (policy, rows) in enumerate(tables.items()):
             places = np.arange(len(rows)) + 0.8 * k / len(tables)
             heights, width = [getattr(r, key) for r in rows], 0.8 / len(tables)
-            one.bar(places, heights, width, color=_colour(k), label=policy)
+            panel.bar(places, heights, width, color=_colour(k), label=policy)
         grounds = [r.ground for r in next(iter(tables.values()))]
-        one.set_xticks(np.arange(len(grounds)) + 0.4 * (len(tables) - 1) / len(tables), grounds)
-        one.set_ylabel(title)
+        panel.set_xticks(np.arange(len(grounds)) + 0.4 * (len(tables) - 1) / len(tables), grounds)
+        panel.set_ylabel(title)
     axes[-1].legend(fontsize=7, loc="lower right")
     return figure
 
@@ -177,14 +177,14 @@ def terrain_figure(tables: Mapping[str, Sequence[GroundPoint]]) -> Figure:
 def compliance_figure(tables: Mapping[str, Sequence[DirectionWalk]]) -> Figure:
     """Paths of one robot in six directions seen from above, a panel per policy."""
     figure, axes = axes_column(len(tables), 3.4 * len(tables))
-    for one, (policy, rows) in zip(axes, tables.items(), strict=True):
+    for panel, (policy, rows) in zip(axes, tables.items(), strict=True):
         for row, colour in zip(rows, JOINT_COLOURS, strict=False):
             path = np.asarray(row.path)
             if len(path):
                 # forward is up, left is left
-                one.plot(-path[:, 1], path[:, 0], color=colour, lw=1.2, label=row.direction)
-        one.set_aspect("equal")
-        one.set(title=policy, xlabel="to the right [m]", ylabel="forward [m]")
+                panel.plot(-path[:, 1], path[:, 0], color=colour, lw=1.2, label=row.direction)
+        panel.set_aspect("equal")
+        panel.set(title=policy, xlabel="to the right [m]", ylabel="forward [m]")
     if axes[0].lines:
         axes[0].legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
@@ -201,20 +201,20 @@ _SHOWN = 4000
 def demand_figure(demand: ServoDemand) -> Figure:
     """Needed torque over speed, by kind of joint; the line is what the servo has."""
     figure, axes = axes_column(len(demand.kinds), 2.3 * len(demand.kinds))
-    for (kind, names), one in zip(demand.kinds.items(), axes, strict=True):
+    for (kind, names), panel in zip(demand.kinds.items(), axes, strict=True):
         speed = np.concatenate([demand.samples[name][0] for name in names])
         torque = np.concatenate([demand.samples[name][1] for name in names])
-        every = max(1, len(speed) // _SHOWN)
-        one.plot(speed[::every], torque[::every], ".", ms=1.5, color=BLUE, rasterized=True)
+        stride = max(1, len(speed) // _SHOWN)
+        panel.plot(speed[::stride], torque[::stride], ".", ms=1.5, color=BLUE, rasterized=True)
         servo = demand.joints[names[0]]
         stall, top = servo.stall_torque_nm, servo.top_speed_rad_s
         end = float(speed.max())
         last = end if top is None else top
         at_last = stall if top is None else servo.torque_at_top_nm
         # driving the torque left falls with speed, braking it rises by as much
-        one.plot([0, last, last, 0], [stall, at_last, at_last - 2 * stall, -stall], color=RED)
-        one.set_title(kind if kind in KINDS else ", ".join(names))
-        one.set_ylabel("N·m")
+        panel.plot([0, last, last, 0], [stall, at_last, at_last - 2 * stall, -stall], color=RED)
+        panel.set_title(kind if kind in KINDS else ", ".join(names))
+        panel.set_ylabel("N·m")
     axes[0].plot([], [], color=RED, label=demand.servo)
     axes[0].legend(loc="center right")
     axes[-1].set_xlabel("speed [rad/s]; torque is positive where it drives")

@@ -244,13 +244,13 @@ class ForeignPolicy:
         values = known | {k: getattr(stated, k) for k in stated.model_fields_set}
         lacking = [k for k in _KEYS if values.get(k) is None]
         if lacking:
-            parts = [
+            remedies = [
                 f"`{_KEYS[k][1]}`" + (f" (metadata key {_KEYS[k][0]})" if _KEYS[k][0] else "")
                 for k in lacking
             ]
             raise InputError(
                 f"{network.path} does not state {', '.join(lacking)}. Put into {beside.name} "
-                f"beside it: {'; '.join(parts)}."
+                f"beside it: {'; '.join(remedies)}."
                 + (f" Terms are {', '.join(TERMS)}." if "observation" in lacking else "")
             )
         about = validated(PolicyYaml, values, network.path)
@@ -296,8 +296,8 @@ class ForeignPolicy:
         return task
 
     def _refuse_unknown(self, body: Body, name: str) -> None:
-        wanted = [*self.joints, *(j for t in self.terms for j in t.joints or ())]
-        if lost := sorted(set(wanted) - set(body.joints)):
+        needed = [*self.joints, *(j for t in self.terms for j in t.joints or ())]
+        if lost := sorted(set(needed) - set(body.joints)):
             raise InputError(
                 f"{self.network.path} moves the joints {', '.join(map(printable, lost[:6]))}"
                 f"{', …' if len(lost) > 6 else ''}, but {name} has no such joint with a servo. It "
@@ -358,24 +358,24 @@ class ForeignPolicy:
 
     def observe(self, observation: NDArray[np.floating]) -> Row:
         """The policy's own observation, shape (n, size); takes the values into the histories."""
-        parts = {name: observation[:, place] for name, place in self._places.items()}
-        self._angles.append(parts["joint_position_relative"].astype(np.float32))
+        values = {name: observation[:, place] for name, place in self._places.items()}
+        self._angles.append(values["joint_position_relative"].astype(np.float32))
         columns = []
-        for term, kept in zip(self.terms, self._histories, strict=True):
-            value = np.asarray(self._value(term, parts), np.float32)
+        for term, history in zip(self.terms, self._histories, strict=True):
+            value = np.asarray(self._value(term, values), np.float32)
             if term.clip is not None:
                 value = np.clip(value, *np.array(term.clip, np.float32))
             value = value * np.array(term.scale, np.float32)
-            kept.extend([value] * (kept.maxlen if not kept and kept.maxlen else 1))
-            columns.append(_in_order(list(kept)[: term.history], term.newest))
+            history.extend([value] * (history.maxlen if not history and history.maxlen else 1))
+            columns.append(_in_order(list(history)[: term.history], term.newest))
         missing = 1 if self._frames else self.about.frames
         self._frames.extend([np.concatenate(columns, axis=1)] * missing)
         return _in_order(list(self._frames), self.about.newest_frame)
 
-    def _value(self, term: Term, parts: Mapping[str, NDArray[np.floating]]) -> NDArray:
+    def _value(self, term: Term, values: Mapping[str, NDArray[np.floating]]) -> NDArray:
         name, count = term.term, len(self._angles[-1])
         if name in ("command", "base_lin_vel", "base_ang_vel", "projected_gravity"):
-            return parts[_NATIVE[name]]
+            return values[_NATIVE[name]]
         if name == "constant":
             return np.tile(np.array(term.values, np.float32), (count, 1))
         if name == "phase":
@@ -393,12 +393,12 @@ class ForeignPolicy:
         if term.joints is not None:
             at = np.array([self._body.joints.index(j) for j in term.joints])
         if name == "joint_vel":
-            if term.steps == VELOCITY_STEPS:  # the task's own, which knows the time before
-                return parts["joint_velocity"][:, at]
+            if term.steps == VELOCITY_STEPS:  # the task's difference, which covers the time before
+                return values["joint_velocity"][:, at]
             past = self._angles[max(len(self._angles) - 1 - term.steps, 0)]
             return ((self._angles[-1] - past) / np.float32(term.steps * self._step_s))[:, at]
         if name == "joint_effort":
-            return parts["joint_effort"][:, at]
+            return values["joint_effort"][:, at]
         angles = self._angles[-1][:, at]
         away = self._body.pose[at].astype(np.float32)
         if name == "joint_pos_rel":
@@ -493,8 +493,8 @@ def _metadata_terms(network: OnnxNetwork, names: list[str]) -> list[dict[str, An
     metadata, path = network.metadata, network.path
     lists = {}
     for key in ("scale", "clip", "history_length", "flatten_history_dim"):
-        whole = f"observation_terms_{key}"
-        values = lists[key] = _listed(metadata.get(whole), whole, path)
+        key_name = f"observation_terms_{key}"
+        values = lists[key] = _listed(metadata.get(key_name), key_name, path)
         if values is not None and len(values) != len(names):
             raise InputError(
                 f"{path}: its metadata have {len(names)} observation_names and {len(values)} "

@@ -60,16 +60,16 @@ def frequency(signal: Signal, step_s: float) -> Interval:
     steps, time = len(y), times(len(y), step_s)
     angle = 2 * np.pi * best * time
     design = sine_design(angle, 2 * angle)
-    whole = least_squares(design, y)
-    y = y - design[:, 3:] @ whole[3:]
-    phasor = whole[1] - 1j * whole[2]
+    coefficients = least_squares(design, y)
+    y = y - design[:, 3:] @ coefficients[3:]
+    phasor = coefficients[1] - 1j * coefficients[2]
     strides = max(_FEWEST_PHASES, int(steps * step_s * best))
-    parts = np.array_split(np.arange(steps), strides)
+    chunks = np.array_split(np.arange(steps), strides)
     ahead = np.zeros(strides, complex)
-    for k, part in enumerate(parts):
+    for k, part in enumerate(chunks):
         # with its own offset, or slow noise would leak into the phases
         ahead[k] = (fit_sine(angle[part], y[part]).phasor * phasor.conj()).sum()
-    middle = np.array([time[part].mean() for part in parts])
+    middle = np.array([time[part].mean() for part in chunks])
     slope, error = _slope(np.unwrap(np.angle(ahead)), middle)
     rate, half = best + slope / (2 * np.pi), t_quantile(strides - 2) * error / (2 * np.pi)
     return Interval(rate, rate - half, rate + half)
@@ -265,11 +265,11 @@ def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
         )
         for i, now in walked.items()
     ]  # fmt: skip
-    each = {name: np.array([f[name] for f in reports]) for name in reports[0]}
-    rate, null, phase = (each.pop(name) for name in ("frequency_hz", "null_r2", "phase"))
-    action_r2, joint_r2 = (each[f"{x}_r2_by_joint"].mean(axis=1) for x in ("action", "joint"))
-    rest: dict[str, Any] = {
-        name: mean_of(v) if v.ndim == 1 else tuple(map(mean_of, v.T)) for name, v in each.items()
+    by_name = {name: np.array([f[name] for f in reports]) for name in reports[0]}
+    rate, null, phase = (by_name.pop(name) for name in ("frequency_hz", "null_r2", "phase"))
+    action_r2, joint_r2 = (by_name[f"{x}_r2_by_joint"].mean(axis=1) for x in ("action", "joint"))
+    means: dict[str, Any] = {
+        name: mean_of(v) if v.ndim == 1 else tuple(map(mean_of, v.T)) for name, v in by_name.items()
     }
     return GaitReport(
         robots=len(walked),
@@ -280,7 +280,7 @@ def describe(rollout: Rollout, rng: np.random.Generator) -> GaitReport:
         joint_r2=mean_of(joint_r2),
         null_r2=float(null.mean()),
         phase=tuple(_mean_phase(p) for p in phase.T),
-        **rest,
+        **means,
     )
 
 

@@ -5,7 +5,7 @@ fed altered recordings, and its actions have no effect; in *closed loop* the rob
 acts on them. Replay shows how a network reacts, closed loop whether it walks.
 
 Directional compliance is speed, drift and arc of a walk in each direction. The published test has
-no numbers. Here each direction is walked by robots with servos of their own, and motion off the
+no numbers. Here each direction is walked by robots with different servos, and motion off the
 command is measured per metre (when turning, per turn), from two seconds on, in the frame of the
 heading at that time.
 """

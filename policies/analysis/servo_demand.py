@@ -1,7 +1,7 @@
 """What a gait needs of its servos, against what a servo has: speed, torque, dead time.
 
 The policy walks on the servos it is given (by default those of its training), and the motion and
-the torques of every servo are kept. The servo in question would make the same motion with its own
+the torques of every servo are kept. The servo in question would make the same motion with its
 inertia and friction, so at each instant it would need the torque
 
     need = force - back_emf * speed + (armature' - armature) * acceleration
@@ -84,7 +84,7 @@ class JointDemand(Result):
     """99 % quantile of needed torque over the torque left at that speed, at most 10; above 1 is too
     much."""
     rotor_nm: float
-    """99 % quantile of the torque that turns its own armature."""
+    """99 % quantile of the torque that accelerates its armature."""
     short: float
     """Share of the time in which it has less torque or speed than needed."""
     walked_short: float
@@ -319,9 +319,9 @@ class _Recorder(StepRecorder):
 
     def arrays(self, now: Moment) -> dict[str, NDArray]:
         to_servo, facts = self.env.robots.to_servo, now.facts
-        wanted = now.command[:, :2]
-        size = np.linalg.norm(wanted, axis=1)
-        along = (planar_velocity(facts)[:, :2] * wanted).sum(axis=1) / np.maximum(size, 1e-9)
+        command = now.command[:, :2]
+        size = np.linalg.norm(command, axis=1)
+        along = (planar_velocity(facts)[:, :2] * command).sum(axis=1) / np.maximum(size, 1e-9)
         return {
             "force": facts.torque.copy(), "speed": to_servo(facts.velocity).copy(),
             "acceleration": to_servo(facts.acceleration).copy(), "along": along,

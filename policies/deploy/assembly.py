@@ -128,26 +128,26 @@ def reassemble(
         if joint_map is None or header["joint_map"] != joint_map.file.name:
             joint_map = load_joint_map(header["joint_map"])
         servo = Path(header["servo"]) if header["servo"] else None
-        parts = assemble(policy, stack, joint_map, header["actuator"], servo, body=body)
+        assembled = assemble(policy, stack, joint_map, header["actuator"], servo, body=body)
         hashes = ("actuator_sha256", "servo_sha256")
-        changed = [key for key in hashes if header[key] != parts.header[key]]
+        changed = [key for key in hashes if header[key] != assembled.header[key]]
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{log}: its header is damaged: {error}.") from error
     if changed:
         file = header[changed[0].removesuffix("_sha256")]
         raise InputError(f"{log} was made with another file at {file}. Restore that file.")
-    return parts.controller
+    return assembled.controller
 
 
-def _servo_match(policy: Policy, here: ServoRanges, trained: str | None) -> ServoMatch | None:
+def _servo_match(policy: Policy, servos: ServoRanges, trained: str | None) -> ServoMatch | None:
     """Compare with the servos in the policy's file, or with the calibration of an older one."""
-    if is_servo_model(here.source):
+    if is_servo_model(servos.source):
         return None
     trained_servos, feedback = policy.contract.servo, policy.contract.feedback
     if trained_servos is None and trained is not None:
         known = feedback if feedback in ("held", "ideal") else "held"
         trained_servos = trained_servo(trained, known, Walking(), servo_ranges(trained, known))
-    return None if trained_servos is None else servo_match(trained_servos, here)
+    return None if trained_servos is None else servo_match(trained_servos, servos)
 
 
 def _hash(path: Path) -> str | None:
@@ -274,10 +274,10 @@ def walk_once(
     joint_map = load_joint_map("mini_pupper_2")
     inner = WalkingBus(truth, np.random.default_rng([seed, noise]))
     with closing(GuardedBus(inner)) as bus, tempfile.TemporaryDirectory() as folder:
-        parts = assemble(policy, stack, joint_map, actuator, servo)
+        assembled = assemble(policy, stack, joint_map, actuator, servo)
         score = WalkScore(bus, inner.robot)
         outcome = deploy(
-            bus, inner, parts.controller, constant(command), seconds,
-            Path(folder) / "walk.csv", parts.header, rows, [score, parts.frozen_readings],
+            bus, inner, assembled.controller, constant(command), seconds,
+            Path(folder) / "walk.csv", assembled.header, rows, [score, assembled.frozen_readings],
         )  # fmt: skip
     return outcome, score

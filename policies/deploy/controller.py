@@ -1,6 +1,6 @@
 """The controller: from a robot's sensors in one tick to its joint targets.
 
-A pure function of its inputs and its own state, without clock or bus: a log of its inputs gives the
+A pure function of its inputs and its state, without clock or bus: a log of its inputs gives the
 same actions again, bit for bit (`policies.deploy.walk_log`).
 
     controller = Controller(policy, stack, observer)
@@ -320,7 +320,7 @@ class Controller:
         return Decision(observation, action, target, self._limits.margin(target))
 
     def to_servo(self, joints: Array) -> Array:
-        """Joint angles as the servos' own (`hardware.joint_map`, servo coordinates)."""
+        """Joint angles in servo coordinates (`hardware.joint_map`)."""
         return _apply(self._to_servo, joints)
 
 

@@ -300,22 +300,22 @@ class ServoMatch(Result):
                 f"({self.trained}; {self.compared} numbers compared)."
             ]
         groups: dict[str, list[Outside]] = {}
-        for one in self.outside:
-            groups.setdefault(one.quantity, []).append(one)
+        for outlier in self.outside:
+            groups.setdefault(outlier.quantity, []).append(outlier)
         return [_sentence(quantity, outliers) for quantity, outliers in groups.items()]
 
 
-def servo_match(trained: TrainedServo, here: ServoRanges) -> ServoMatch | None:
+def servo_match(trained: TrainedServo, servos: ServoRanges) -> ServoMatch | None:
     """Compare a robot's servos with those of a training.
 
-    `here` are those of the calibration of the robot at hand. None if the training's servos were a
+    `servos` are those of the calibration of the robot at hand. None if the training's servos were a
     learned model, which has no numbers.
     """
     if trained.joints is None:
         return None
     outside: list[Outside] = []
     compared = 0
-    for name, servo in joints_of(here).items():
+    for name, servo in joints_of(servos).items():
         for quantity, unit, factor, relative, of in _QUANTITIES:
             expected = of(trained.joints[name], trained.voltage_scale, trained.poll_scale)
             measured = of(servo, _NOTHING, _NOTHING)
@@ -323,11 +323,11 @@ def servo_match(trained: TrainedServo, here: ServoRanges) -> ServoMatch | None:
                 compared += 1
                 expected, measured = expected.times(factor), measured.times(factor)
                 outside += _outside(quantity, unit, relative, name, expected, measured)
-    jitter = 1e3 * here.command_jitter_s
+    jitter = 1e3 * servos.command_jitter_s
     measured, expected = Interval(jitter, jitter, jitter), trained.command_jitter_s.times(1e3)
     outside += _outside("command jitter", "ms", False, None, expected, measured)
     return ServoMatch(
-        trained=trained.actuator, here=here.source, compared=compared + 1, outside=tuple(outside)
+        trained=trained.actuator, here=servos.source, compared=compared + 1, outside=tuple(outside)
     )
 
 
@@ -335,24 +335,24 @@ _SLACK = 1e-3  # of a number: less is of the digits that two files write
 
 
 def _outside(
-    quantity: str, unit: str, relative: bool, joint: str | None, trained: Interval, here: Interval
+    quantity: str, unit: str, relative: bool, joint: str | None, trained: Interval, robot: Interval
 ) -> list[Outside]:
     low, high = trained.low, trained.high
     slack = _SLACK * max(abs(low), abs(high))
-    if here.low <= high + slack and here.high >= low - slack:
+    if robot.low <= high + slack and robot.high >= low - slack:
         return []
-    beyond = here.value - (high if here.low > high else low)
+    beyond = robot.value - (high if robot.low > high else low)
     return [
         Outside(
             quantity=quantity, unit=unit, joint=joint, trained_low=low, trained_high=high,
-            here=here, beyond=beyond, relative=relative,
+            here=robot, beyond=beyond, relative=relative,
         )
     ]  # fmt: skip
 
 
 def _sentence(quantity: str, outliers: Sequence[Outside]) -> str:
-    def distance(one: Outside) -> float:
-        return abs(one.beyond) / max(abs(one.trained_low), abs(one.trained_high), 1e-12)
+    def distance(outlier: Outside) -> float:
+        return abs(outlier.beyond) / max(abs(outlier.trained_low), abs(outlier.trained_high), 1e-12)
 
     worst = max(outliers, key=distance)
     joint = f" ({worst.joint})" if worst.joint else ""
@@ -364,8 +364,8 @@ def _sentence(quantity: str, outliers: Sequence[Outside]) -> str:
     )
 
 
-def _product(one: Range | Interval, other: Range) -> Interval:
-    return Interval(one.value * other.value, one.low * other.low, one.high * other.high)
+def _product(first: Range | Interval, second: Range) -> Interval:
+    return Interval(first.value * second.value, first.low * second.low, first.high * second.high)
 
 
 def _quotient(top: Range | Interval, bottom: Range | Interval) -> Interval | None:

@@ -224,8 +224,8 @@ class _StoppedServo(DelayedPD):
         (1 + h d) z² - (2 + h d - h² k) z + 1 leaves the unit circle at z = -1, where
         h² k = 4 + 2 h d.
         """
-        one = self.parameters.per_inertia()
-        k, d = np.broadcast_arrays(np.asarray(one.stiffness), np.asarray(one.damping))
+        ratios = self.parameters.per_inertia()
+        k, d = np.broadcast_arrays(np.asarray(ratios.stiffness), np.asarray(ratios.damping))
         with np.errstate(divide="ignore", invalid="ignore"):
             longest = (d + np.sqrt(d * d + 4 * k)) / k
         return float(np.min(np.where(k > 0, longest, np.inf)))

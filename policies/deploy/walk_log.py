@@ -172,8 +172,8 @@ def read_walk(path: Path) -> Walk:
     refuse_other_version(path, header.get("schema_version"), SCHEMA_VERSION)
     known = validated(_Start, header, f"{path}, header")
     parts_of = columns_of(known.joints)
-    every = [name for names in parts_of.values() for name in names]
-    if column_names(path, text) != every:
+    expected = [name for names in parts_of.values() for name in names]
+    if column_names(path, text) != expected:
         raise InputError(f"{path}: its columns are not those of a walk. Was it edited?")
     begin = Rest(np.array(known.rest.gravity), np.array(known.rest.bias_rad_s))
     start = np.array(known.start_rad)

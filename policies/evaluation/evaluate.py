@@ -130,8 +130,8 @@ class Walk:
         """Mean velocity after the first second, with falls as standing; shape (episodes, 3)."""
         velocity, counts = counted(self.velocity, self.alive, self.fell)
         first = min(round(START_S / self.step_s), len(velocity) // 2)
-        each = counts[first:, :, None]
-        return (each * velocity[first:]).sum(axis=0) / np.maximum(each.sum(axis=0), 1)
+        weights = counts[first:, :, None]
+        return (weights * velocity[first:]).sum(axis=0) / np.maximum(weights.sum(axis=0), 1)
 
     @property
     def drift_deg(self) -> Array:
@@ -241,9 +241,9 @@ class Recorder(StepRecorder):
         """The walk of a condition's robots."""
         arrays = self.stacked(robots, steps)
         arrays["heading"] = np.unwrap(arrays["heading"], axis=0)
-        rest = len(commands) - steps
+        missing_steps = len(commands) - steps
         padded = {
-            name: np.concatenate([x, np.zeros((rest, *x.shape[1:]), x.dtype)])
+            name: np.concatenate([x, np.zeros((missing_steps, *x.shape[1:]), x.dtype)])
             for name, x in arrays.items()
         }
         step_s, kinds = condition.task.control_step_s, tuple(self.env.body.kinds)
@@ -254,14 +254,14 @@ def figures_of(walk: Walk, command: tuple[float, float, float] | None = None) ->
     """Figures of a number of episodes; `command` is the fixed one, None for random ones."""
     alive = walk.alive
     standing, swings = (walk.contact & alive[..., None]).sum(), walk.swings.sum()
-    each = dict(zip(ERRORS, walk.error.T, strict=True))
-    each |= dict(zip(STRIDE_ERRORS, walk.stride_error.T, strict=True))
+    values_of = dict(zip(ERRORS, walk.error.T, strict=True))
+    values_of |= dict(zip(STRIDE_ERRORS, walk.stride_error.T, strict=True))
     nothing = np.full(len(walk.fell), np.nan)
     size = 0.0 if command is None else float(np.dot(command, command))
-    each["speed_share"] = walk.mean_velocity @ np.array(command) / size if size else nothing
+    values_of["speed_share"] = walk.mean_velocity @ np.array(command) / size if size else nothing
     drifts = command is not None and command[2] == 0
-    each["heading_drift_deg"] = walk.drift_deg if drifts else nothing
-    intervals = {name: mean_of(values) for name, values in each.items()}
+    values_of["heading_drift_deg"] = walk.drift_deg if drifts else nothing
+    intervals = {name: mean_of(values) for name, values in values_of.items()}
     return Figures(
         episodes=len(walk.fell),
         fall_rate=float(walk.fell.mean()),
@@ -287,8 +287,8 @@ def _effort(walk: Walk, travels: bool) -> dict[str, Any]:
     up_s = walk.step_s * alive.sum()
     work, carried = walk.work_j[alive].sum(), walk.carried_j[alive].sum()
 
-    def named(each: NDArray) -> dict[str, float]:
-        means = each[alive].mean(axis=0, dtype=float) if up_s else np.full(len(walk.kinds), nothing)
+    def named(data: NDArray) -> dict[str, float]:
+        means = data[alive].mean(axis=0, dtype=float) if up_s else np.full(len(walk.kinds), nothing)
         return dict(zip(walk.kinds, means.tolist(), strict=True))
 
     return {
@@ -496,7 +496,7 @@ def table(
 ) -> tuple[Case, ...]:
     """Cases of the usual table, after that of random commands.
 
-    Flat ground and no added dead time are those of random commands, and have no rows of their own.
+    Flat ground and no added dead time are those of random commands, and have no other rows.
     """
     return (
         *(Case("direction", name, command) for name, command in DIRECTIONS.items()),

@@ -57,7 +57,7 @@ def tables_of(evaluation: Evaluation) -> list[Table]:
 
 
 def _figures(walker: str, figures: Figures) -> dict[str, float]:
-    """Figures of one walker with their intervals, under names that begin with its own."""
+    """Figures of one walker with their intervals, under names that begin with its name."""
     names = ("fall_rate", *ERRORS, *STRIDE_ERRORS, "speed_share", "heading_drift_deg")
     return {
         key: number
@@ -265,11 +265,11 @@ def _curves(path: Path) -> dict[str, np.ndarray]:
 def _training_figure(curves: Mapping[str, np.ndarray]) -> Figure:
     titles = {key: title for key, title in (_SCORE | _CURVES).items() if key in curves}
     figure, axes = axes_column(len(titles), 1.7 * len(titles))
-    for (key, title), one in zip(titles.items(), axes, strict=True):
-        one.plot(curves["samples"] / 1e6, curves[key], color=BLUE, lw=1.2)
-        one.set_ylabel(title)
+    for (key, title), panel in zip(titles.items(), axes, strict=True):
+        panel.plot(curves["samples"] / 1e6, curves[key], color=BLUE, lw=1.2)
+        panel.set_ylabel(title)
         if key == "falls_per_1000_steps":
-            one.set_ylim(bottom=0)
+            panel.set_ylim(bottom=0)
     axes[-1].set_xlabel("samples [millions]")
     return figure
 
@@ -280,16 +280,16 @@ def _errors_figure(evaluation: Evaluation) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, 1.2 + 0.3 * len(rows)), layout="constrained")
     axes = figure.subplots(1, len(STRIDE_ERRORS), sharey=True)
     place = -np.arange(len(rows))
-    for key, (name, unit), one in zip(STRIDE_ERRORS, ERROR_UNITS.values(), axes, strict=True):
+    for key, (name, unit), panel in zip(STRIDE_ERRORS, ERROR_UNITS.values(), axes, strict=True):
         for off, walker in ((0.15, "policy"), (-0.15, "trot")):
             for at, row in zip(place, rows, strict=True):
                 figures: Figures = getattr(row, walker)
                 colour = FAINT if walker == "trot" else RED if figures.fall_rate > 0 else BLUE
-                _point(one, getattr(figures.intervals, key), at + off, 1.0, colour)
-        one.axvline(getattr(still, key), color=FAINT, ls=":")
-        one.set_title(f"{name}, {unit}", fontsize=9)
-        one.set_xlim(left=0)
-        one.tick_params(axis="x", labelsize=7.5)
+                _point(panel, getattr(figures.intervals, key), at + off, 1.0, colour)
+        panel.axvline(getattr(still, key), color=FAINT, ls=":")
+        panel.set_title(f"{name}, {unit}", fontsize=9)
+        panel.set_xlim(left=0)
+        panel.tick_params(axis="x", labelsize=7.5)
     axes[0].set_yticks(place, [row.name for row in rows], fontsize=7.5)
     return figure
 
@@ -312,7 +312,7 @@ def _falls_figure(evaluation: Evaluation) -> Figure:
 
 
 def _point(axes: Any, value: Interval, at: float, scale: float, colour: str) -> None:
-    """A value with its interval, on a line of its own."""
+    """A value with its interval, on one line."""
     axes.plot(scale * value.value, at, "o", color=colour, ms=4)
     if np.isfinite(value.low):
         axes.plot([scale * max(value.low, 0.0), scale * value.high], [at, at], color=colour, lw=1.2)
@@ -337,10 +337,10 @@ def _settings(policy: Policy, run: Run | None) -> Section:
 def _flat(value: Mapping[str, Any], before: str = "") -> list[tuple[str, str]]:
     """Nested settings as dotted names."""
     values = []
-    for key, one in value.items():
-        if isinstance(one, Mapping):
-            values += _flat(one, f"{before}{key}.")
+    for key, entry in value.items():
+        if isinstance(entry, Mapping):
+            values += _flat(entry, f"{before}{key}.")
         else:
-            words = ", ".join(map(str, one)) if isinstance(one, list | tuple) else str(one)
+            words = ", ".join(map(str, entry)) if isinstance(entry, list | tuple) else str(entry)
             values.append((f"{before}{key}", words))
     return values

@@ -216,9 +216,9 @@ class OnnxNetwork:
         """
         seen = np.random.default_rng(0).standard_normal((_PROBES, self.observation_size))
         inputs = [seen.astype(np.float32), *(s.numpy() for s in self.initial_state(_PROBES))]
-        one = [inputs[0][:1], *(s[:, :1] for s in inputs[1:])]
+        probe = [inputs[0][:1], *(s[:, :1] for s in inputs[1:])]
         try:
-            single = self._evaluate(one)
+            single = self._evaluate(probe)
         except Exception as error:
             raise InputError(f"{self.path} cannot be run: {_line(error)}.") from error
         shapes = [(1, self.actions), *((a, 1, b) for a, b in self._states)]

@@ -126,7 +126,7 @@ def _largest_difference(network: PolicyNetwork, run: Run) -> float:
         seen = torch.randn(1, network.observation_size, generator=generator)
         with torch.inference_mode():
             action, *now = network(seen, *state)
-        other, *next_ = run(seen, *theirs)
-        worst = max(worst, float((action - other).abs().max()))
+        exported, *next_ = run(seen, *theirs)
+        worst = max(worst, float((action - exported).abs().max()))
         state, theirs = tuple(now), tuple(next_)
     return worst

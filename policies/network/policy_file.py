@@ -9,7 +9,7 @@ A walk is learnt for servos with some gains, dead times and readings. So that an
 compared with these long after the calibration has gone, the contract holds them whole
 (`TrainedServo`): the identity of the actuator, and for each joint the plausible range of every
 number of the simulated servo, the jitter of commands and the feedback, in full precision, with a
-schema version of its own.
+separate schema version.
 """
 
 from __future__ import annotations
@@ -287,8 +287,8 @@ class CommandRanges(_Part):
         return within
 
     def __str__(self) -> str:
-        parts = zip(("forward", "left", "turn"), self._ends, ("m/s", "m/s", "rad/s"), strict=True)
-        return ", ".join(f"{name} {low:g} to {high:g} {unit}" for name, (low, high), unit in parts)
+        axes = zip(("forward", "left", "turn"), self._ends, ("m/s", "m/s", "rad/s"), strict=True)
+        return ", ".join(f"{name} {low:g} to {high:g} {unit}" for name, (low, high), unit in axes)
 
 
 class RobotReference(_Part):
@@ -398,7 +398,7 @@ class Policy:
         self._past = np.repeat(np.asarray(action, np.float32)[:, None], history, axis=1)
 
     def for_one(self) -> Policy:
-        """A copy with its own state for one robot: the same bits in half the time."""
+        """A copy with a separate state for one robot: the same bits in half the time."""
         policy = copy(self)
         example = torch.zeros(1, self.contract.observation_size)
         with warnings.catch_warnings(), torch.inference_mode():
@@ -423,9 +423,9 @@ class Policy:
         if past.shape[1]:
             self._past = np.concatenate([actions[:, None], past[:, :-1]], axis=1)
         if missed is not None and missed.any():
-            kept = torch.from_numpy(missed)[:, None]  # states are (layers, n, size)
+            mask = torch.from_numpy(missed)[:, None]  # states are (layers, n, size)
             pairs = zip(before, self._state, strict=True)
-            self._state = tuple(torch.where(kept, old, new) for old, new in pairs)
+            self._state = tuple(torch.where(mask, old, new) for old, new in pairs)
             self._past = np.where(missed[:, None, None], past, self._past)
         return actions
 
@@ -508,11 +508,11 @@ def load_policy(folder: Path | str) -> Policy:
 def refuse_other_observation(contract: Contract) -> None:
     """Refuse a policy of another observation, which would act wrongly without an error."""
     expected = [(p.name, p.size) for p in contract.observation]
-    parts = [(name, size) for name, size, _ in observation_of(contract.actions)]
-    if expected != parts or contract.velocity_steps != VELOCITY_STEPS:
+    given = [(name, size) for name, size, _ in observation_of(contract.actions)]
+    if expected != given or contract.velocity_steps != VELOCITY_STEPS:
         raise InputError(
             "The policy's observation is not the one this version gives "
-            f"({', '.join(name for name, _ in parts)}; velocity over {VELOCITY_STEPS} steps). "
+            f"({', '.join(name for name, _ in given)}; velocity over {VELOCITY_STEPS} steps). "
             "Use the version that trained it, or train it again."
         )
 

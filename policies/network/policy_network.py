@@ -77,10 +77,10 @@ def step(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Latent of one more observation, shape (n, width), and the context after it."""
     now = torch.cat([raw, torch.ones_like(raw[:, :1])], dim=1)
-    whole = torch.cat([context, now[None]], dim=0)
-    rows = whole.transpose(0, 1)
+    window = torch.cat([context, now[None]], dim=0)
+    rows = window.transpose(0, 1)
     latent = attention(normalise(rows[..., :-1]), rows[..., -1] > 0.5, 1)
-    return latent[:, 0], whole[1:]
+    return latent[:, 0], window[1:]
 
 
 _EPSILON = 1e-2  # of rsl_rl's normaliser

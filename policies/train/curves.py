@@ -15,7 +15,7 @@ from pupper_sysid.common.border import read_text
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
 from pupper_sysid.common.reading.content import refuse_more
-from pupper_sysid.common.reading.dialect import whole
+from pupper_sysid.common.reading.dialect import whole_number
 
 LARGEST_BYTES = 100e6
 """Of a table of curves."""
@@ -106,13 +106,13 @@ def _drop_rows(path: Path, last: int) -> None:
     text = read_text(path, LARGEST_BYTES)
     refuse_more(path, text.count("\n"), MOST_ROWS, "rows")
     header, *rows = text.splitlines(keepends=True) or [""]
-    kept = [row for row in rows if _update(row[:_NUMBER]) <= last]
-    if kept != rows:
-        write_text(path, "".join([header, *kept]), force=True)
+    rows_before = [row for row in rows if _update(row[:_NUMBER]) <= last]
+    if rows_before != rows:
+        write_text(path, "".join([header, *rows_before]), force=True)
 
 
 def _update(row: str) -> float:
     """Number of a row's update; infinite where there is none."""
     with suppress(ValueError):
-        return whole(row.split(",")[0])
+        return whole_number(row.split(",")[0])
     return math.inf

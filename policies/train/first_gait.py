@@ -158,7 +158,7 @@ class FirstGait(Result):
     before: GaitScore
     trot: Trot
     after: GaitScore
-    """The same as `before` where nothing better was found."""
+    """The same as `before` where no trot is better."""
     limit: str | None
     """What keeps the servos from walking better; None where the gait is not poor."""
 
@@ -185,10 +185,10 @@ def with_first_gait(
     servos = servo_ranges(run.actuator, run.feedback, run.task.body)
     name = Path(run.actuator).name
     threads = run.threads or os.cpu_count() or 1
-    (own,) = judge_trots([run.task.trot], run.task, servos, run.seed, threads)
-    say(f"First gait, the open-loop trot on the servos of {name}: {own}.")
+    (usual_score,) = judge_trots([run.task.trot], run.task, servos, run.seed, threads)
+    say(f"First gait, the open-loop trot on the servos of {name}: {usual_score}.")
     if run.first_gait == "auto":
-        if not own.poor:
+        if not usual_score.poor:
             return run
         if run.minutes < _LEAST_MINUTES:
             say(
@@ -198,29 +198,29 @@ def with_first_gait(
             )
             return run
     say("Searching a better one for these servos takes about a minute on two cores.")
-    found = fit_trot(run.task, servos, run.seed, threads, progress, ends)
-    if found.trot == run.task.trot:
+    fitted = fit_trot(run.task, servos, run.seed, threads, progress, ends)
+    if fitted.trot == run.task.trot:
         say("Nothing better was found.")
     else:
-        t = found.trot
+        t = fitted.trot
         say(
-            f"Fitted: {found.after}. It has {t.frequency_hz:.1f} Hz, duty {t.duty:.2f}, lift "
+            f"Fitted: {fitted.after}. It has {t.frequency_hz:.1f} Hz, duty {t.duty:.2f}, lift "
             f"{1e3 * t.lift_m:.0f} mm, crouch {1e3 * t.crouch_m:.0f} mm, gain {t.gain:.2f}, "
             f"turning {t.turn_gain:.2f}."
         )
     if ends():
         say("The search was ended before it was complete.")
-    elif found.after.poor:
-        say(_sentence(found))
-    return suited(run, found)
+    elif fitted.after.poor:
+        say(_sentence(fitted))
+    return suited(run, fitted)
 
 
-def _sentence(found: FirstGait) -> str:
+def _sentence(fitted: FirstGait) -> str:
     """What keeps servos from walking well."""
-    own, limit = found.after, found.limit
+    score, limit = fitted.after, fitted.limit
     because = {
         "torque": "their torque: thighs and calves are at its limit "
-        f"{100 * own.saturated_share:.0f} % of the time",
+        f"{100 * score.saturated_share:.0f} % of the time",
         "friction": "their dry friction, in whose dead band small steps get lost",
         "speed": "their speed",
         "stiffness": "their stiffness: feet lag behind what they are commanded under load",
@@ -233,21 +233,21 @@ def _sentence(found: FirstGait) -> str:
     )
 
 
-def suited(run: Run, found: FirstGait) -> Run:
+def suited(run: Run, fitted: FirstGait) -> Run:
     """The run with a fitted trot, and rewards that suit it."""
-    if found.trot == run.task.trot and not found.after.poor:
+    if fitted.trot == run.task.trot and not fitted.after.poor:
         return run
-    trot, own, rewards = found.trot, found.after, run.task.rewards
+    trot, score, rewards = fitted.trot, fitted.after, run.task.rewards
 
     def wider(name: str, error: float) -> float:
         usual = _USUAL[name] * run.task.body.command_scale[2 if "angular" in name else 0]
         return getattr(rewards, name) * float(min(max(error / usual, 1.0), _WIDEST))
 
     changes = {
-        "linear_sigma": wider("linear_sigma", own.speed_error_m_s),
-        "stride_linear_sigma": wider("stride_linear_sigma", own.mean_speed_error_m_s),
-        "angular_sigma": wider("angular_sigma", own.turn_error_rad_s),
-        "stride_angular_sigma": wider("stride_angular_sigma", own.mean_turn_error_rad_s),
+        "linear_sigma": wider("linear_sigma", score.speed_error_m_s),
+        "stride_linear_sigma": wider("stride_linear_sigma", score.mean_speed_error_m_s),
+        "angular_sigma": wider("angular_sigma", score.turn_error_rad_s),
+        "stride_angular_sigma": wider("stride_angular_sigma", score.mean_turn_error_rad_s),
     }
     if run.imitation.teacher == OWN:
         usual = Trot()  # to which the clock of the rewards belongs
@@ -272,7 +272,7 @@ def judge_trots(
     `changes` are, for each trot, factors on numbers of its robots' servos, by field of
     `DelayedPDParameters`.
     """
-    return [_score(one) for one in _judged(trots, task, servos, seed, threads, changes)]
+    return [_score(walk) for walk in _judged(trots, task, servos, seed, threads, changes)]
 
 
 def fit_trot(
@@ -309,7 +309,7 @@ def fit_trot(
         )  # fmt: skip
         if not walked:
             break
-        costs = [_cost(one) for one in walked]
+        costs = [_cost(walk) for walk in walked]
         order = np.argsort(costs, kind="stable")[:_ELITE]
         elite = [_corrected(trots[i], walked[i]) for i in order]
         tried += [(costs[i], trot) for i, trot in zip(order, elite, strict=True)]
@@ -322,14 +322,14 @@ def fit_trot(
     walked = _judged(trots, task, servos, seed, threads)
     before = _score(walked[0])
     # in the physics of evaluation the speeds are a little others
-    more = [_corrected(trot, one) for trot, one in zip(trots, walked, strict=True)]
+    more = [_corrected(trot, walk) for trot, walk in zip(trots, walked, strict=True)]
     walked += _judged(more, task, servos, seed, threads)
     trots += more
-    chosen = int(np.argmax([_merit(_score(one)) for one in walked]))
+    chosen = int(np.argmax([_merit(_score(walk)) for walk in walked]))
     again = _corrected(trots[chosen], walked[chosen])
     trots, walked = [trots[chosen], again], [walked[chosen]]
     walked += _judged([again], task, servos, seed, threads)
-    scores = [_score(one) for one in walked]
+    scores = [_score(walk) for walk in walked]
     chosen = int(np.argmax([_merit(score) for score in scores]))
     trot, after = trots[chosen], scores[chosen]
     poor = after.poor and not ends()
@@ -351,22 +351,22 @@ def _judged(
 
 def _gentle(task: Walking, seconds: float) -> Walking:
     """The task as it is evaluated, on the servos themselves: their scale is not drawn."""
-    found = evaluation_task(task, 2 * seconds)  # longer, so that no episode ends but by a fall
-    random = replace(found.randomisation, torque_scale=(1.0, 1.0))
-    return replace(found, commands=task.commands, randomisation=random)
+    gentle = evaluation_task(task, 2 * seconds)  # longer, so that no episode ends but by a fall
+    random = replace(gentle.randomisation, torque_scale=(1.0, 1.0))
+    return replace(gentle, commands=task.commands, randomisation=random)
 
 
 def _quick(task: Walking, servos: ServoRanges) -> Walking:
     """The task of the search: as evaluated, but in the physics of training and in longer steps."""
-    found = replace(_gentle(task, _SEARCH_S), physics="training")
+    quick = replace(_gentle(task, _SEARCH_S), physics="training")
     steps = task.control_step_s / _SEARCH_STEP_S
     if abs(steps - round(steps)) > 1e-6:
-        return found
-    longer = replace(found, physics_step_s=_SEARCH_STEP_S)
+        return quick
+    longer = replace(quick, physics_step_s=_SEARCH_STEP_S)
     try:
         servos.in_steps_of(longer.physics_step_s)
     except InputError:  # too stiff for them
-        return found
+        return quick
     return longer
 
 
@@ -427,7 +427,7 @@ def _walk(
     env.set_command(np.tile(command, (count, 1)))
     actions = _actions(trots, env, command, steps)
     alive = np.ones(n * count, bool)
-    kept: dict[str, list[NDArray]] = {
+    records: dict[str, list[NDArray]] = {
         name: []
         for name in ("velocity", "stride", "up", "clearance", "saturated", "square", "sway")
     }
@@ -442,23 +442,23 @@ def _walk(
             ("saturated", by_kind(facts.body, facts.saturated)), ("square", facts.torque_square),
             ("sway", facts.angular_velocity[:, :2]),
         ):  # fmt: skip
-            kept[name].append(value.copy())
-    whole = {name: np.stack(values)[first:] for name, values in kept.items()}
+            records[name].append(value.copy())
+    series = {name: np.stack(values)[first:] for name, values in records.items()}
     moves = command.any(axis=1)
-    found = []
+    walked = []
     for k in range(count):
-        own = {name: value[:, k * n : (k + 1) * n] for name, value in whole.items()}
-        walks = own["up"] & moves
-        clearance = own["clearance"][walks]
-        found.append(
+        walk = {name: value[:, k * n : (k + 1) * n] for name, value in series.items()}
+        walking = walk["up"] & moves
+        clearance = walk["clearance"][walking]
+        walked.append(
             _Walked(
-                scale, env.body.scale, command, own["velocity"], own["stride"], own["up"],
+                scale, env.body.scale, command, walk["velocity"], walk["stride"], walk["up"],
                 clearance[np.isfinite(clearance)],
-                _mean(own["saturated"][walks][:, 1:]), _mean(own["square"][walks]),
-                _mean(own["sway"][walks] ** 2) ** 0.5,
+                _mean(walk["saturated"][walking][:, 1:]), _mean(walk["square"][walking]),
+                _mean(walk["sway"][walking] ** 2) ** 0.5,
             )
         )  # fmt: skip
-    return found
+    return walked
 
 
 def _mean(values: Array) -> float:
@@ -479,56 +479,56 @@ def _actions(trots: Sequence[Trot], env: PupperEnv, command: Array, steps: int) 
     return (np.concatenate(joints, axis=1) - env.default) / env.config.action_scale
 
 
-def _shown(one: _Walked) -> tuple[Array, Array]:
+def _velocities(walk: _Walked) -> tuple[Array, Array]:
     """Velocities and those over a stride, with falls as standing."""
-    up = one.up[..., None]
-    return np.where(up, one.velocity, 0.0), np.where(up, one.stride_velocity, 0.0)
+    up = walk.up[..., None]
+    return np.where(up, walk.velocity, 0.0), np.where(up, walk.stride_velocity, 0.0)
 
 
-def _share(one: _Walked, chosen: NDArray[np.bool_]) -> float:
+def _share(walk: _Walked, chosen: NDArray[np.bool_]) -> float:
     """Mean motion of some robots along their commands, over these: least squares; 1 of none."""
-    mean, wanted = _shown(one)[0].mean(axis=0)[chosen], one.command[chosen]
-    size = float((wanted**2).sum())
-    return float((mean * wanted).sum()) / size if size else 1.0
+    mean, commanded = _velocities(walk)[0].mean(axis=0)[chosen], walk.command[chosen]
+    size = float((commanded**2).sum())
+    return float((mean * commanded).sum()) / size if size else 1.0
 
 
-def _relative(one: _Walked) -> dict[str, float]:
+def _relative(walk: _Walked) -> dict[str, float]:
     """Score of walks as if their commands were usual ones, and their errors in proportion."""
-    return scored(one.velocity / one.scale, one.up, one.command / one.scale)
+    return scored(walk.velocity / walk.scale, walk.up, walk.command / walk.scale)
 
 
-def _score(one: _Walked) -> GaitScore:
-    command, found = one.command, _relative(one)
-    forward, _, turn = one.scale * [_FORWARD_M_S, 0.0, _TURN_RAD_S]
+def _score(walk: _Walked) -> GaitScore:
+    command, scores = walk.command, _relative(walk)
+    forward, _, turn = walk.scale * [_FORWARD_M_S, 0.0, _TURN_RAD_S]
     moves = command.any(axis=1)
     ahead = np.asarray(moves & np.isclose(command, [forward, 0, 0]).all(axis=1))
     turning = np.asarray(moves & ~command[:, :2].any(axis=1))
-    instant, stride = (np.abs(v - command)[:, moves] for v in _shown(one))
+    instant, stride = (np.abs(v - command)[:, moves] for v in _velocities(walk))
     planar = [np.linalg.norm(e[..., :2], axis=-1).mean() for e in (instant, stride)]
-    clearance = one.clearance_m
+    clearance = walk.clearance_m
     return GaitScore(
-        score=found["score"], falls=found["score_falls"], forward_share=_share(one, ahead),
-        turn_share=_share(one, turning), forward_m_s=float(forward), turn_rad_s=float(turn),
+        score=scores["score"], falls=scores["score_falls"], forward_share=_share(walk, ahead),
+        turn_share=_share(walk, turning), forward_m_s=float(forward), turn_rad_s=float(turn),
         speed_error_m_s=float(planar[0]), mean_speed_error_m_s=float(planar[1]),
         turn_error_rad_s=float(instant[..., 2].mean()),
         mean_turn_error_rad_s=float(stride[..., 2].mean()),
         clearance_p10_m=float(np.quantile(clearance, 0.1)) if len(clearance) else 0.0,
-        low_swing_share=_low(clearance / one.length), saturated_share=one.saturated,
-        length_scale=one.length,
+        low_swing_share=_low(clearance / walk.length), saturated_share=walk.saturated,
+        length_scale=walk.length,
     )  # fmt: skip
 
 
-def _cost(one: _Walked) -> float:
+def _cost(walk: _Walked) -> float:
     """What is searched: 1 minus the judge's score, and what the gait asks of feet and servos."""
-    clearance = float(np.quantile(one.clearance_m, 0.1)) if len(one.clearance_m) else 0.0
-    parts = {
-        "clearance": _lacking(clearance / one.length),
-        "low": _low(one.clearance_m / one.length), "torque": one.torque_square,
-        "saturation": one.saturated, "sway": one.sway_rad_s / _SWAY_RAD_S,
+    clearance = float(np.quantile(walk.clearance_m, 0.1)) if len(walk.clearance_m) else 0.0
+    terms = {
+        "clearance": _lacking(clearance / walk.length),
+        "low": _low(walk.clearance_m / walk.length), "torque": walk.torque_square,
+        "saturation": walk.saturated, "sway": walk.sway_rad_s / _SWAY_RAD_S,
     }  # fmt: skip
     # robots that fall later are nearer to a gait
-    error = 1.0 - _relative(one)["score"] + float(1.0 - one.up.mean())
-    return error + sum(_WEIGHTS[name] * value for name, value in parts.items())
+    error = 1.0 - _relative(walk)["score"] + float(1.0 - walk.up.mean())
+    return error + sum(_WEIGHTS[name] * value for name, value in terms.items())
 
 
 def _low(clearance_m: Array) -> float:
@@ -541,22 +541,22 @@ def _lacking(clearance_m: float) -> float:
     return 1.0 - min(clearance_m / _CLEARANCE_M, 1.0)
 
 
-def _merit(own: GaitScore) -> float:
+def _merit(score: GaitScore) -> float:
     """By which the finalists are chosen: the same of the judge's walks."""
-    lacking = _lacking(own.clearance_p10_m / own.length_scale)
-    short = max(FORWARD[0] - own.forward_share, own.forward_share - FORWARD[1], 0.0)
-    taken = _WEIGHTS["clearance"] * lacking + _WEIGHTS["low"] * own.low_swing_share
-    taken += _WEIGHTS["saturation"] * own.saturated_share
-    return own.score - taken - 2.0 * short
+    lacking = _lacking(score.clearance_p10_m / score.length_scale)
+    short = max(FORWARD[0] - score.forward_share, score.forward_share - FORWARD[1], 0.0)
+    taken = _WEIGHTS["clearance"] * lacking + _WEIGHTS["low"] * score.low_swing_share
+    taken += _WEIGHTS["saturation"] * score.saturated_share
+    return score.score - taken - 2.0 * short
 
 
-def _corrected(trot: Trot, one: _Walked) -> Trot:
+def _corrected(trot: Trot, walk: _Walked) -> Trot:
     """The trot with gains by which it would have walked at the commanded speeds."""
-    x, y, turn = one.command.T
-    alone = (one.command != 0).sum(axis=1) == 1
+    x, y, turn = walk.command.T
+    alone = (walk.command != 0).sum(axis=1) == 1
 
     def wrong_by(chosen: Any) -> float:
-        share = _share(one, np.asarray(alone & chosen))
+        share = _share(walk, np.asarray(alone & chosen))
         return 1.0 / min(max(share, 1.0 / _MOST_CORRECTION), _MOST_CORRECTION)
 
     ahead, back, aside = wrong_by(x > 0), wrong_by(x < 0), wrong_by(y != 0)
@@ -569,7 +569,7 @@ def _corrected(trot: Trot, one: _Walked) -> Trot:
 
 
 def _limit(
-    trot: Trot, own: GaitScore, task: Walking, servos: ServoRanges, seed: int, threads: int
+    trot: Trot, score: GaitScore, task: Walking, servos: ServoRanges, seed: int, threads: int
 ) -> str | None:
     """Which of the servos' limits the trot would walk best without; None if that is of no use."""
     if servo_model_of(servos.source, task.control_step_s) is not None:
@@ -577,8 +577,8 @@ def _limit(
     names, changes = list(_LIMITS), list(_LIMITS.values())
     walked = _judged([trot] * len(names), task, servos, seed, threads, changes)
     # servos without a limit go farther than the gains expect, which says nothing against them
-    trots = [_corrected(trot, one) for one in walked]
+    trots = [_corrected(trot, walk) for walk in walked]
     walked = _judged(trots, task, servos, seed, threads, changes)
-    merits = [_merit(_score(one)) for one in walked]
+    merits = [_merit(_score(walk)) for walk in walked]
     best = int(np.argmax(merits))
-    return names[best] if merits[best] > _merit(own) + _WORTH else None
+    return names[best] if merits[best] > _merit(score) + _WORTH else None

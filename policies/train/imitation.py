@@ -80,8 +80,8 @@ class Teacher(ABC):
     @property
     def state(self) -> dict[str, torch.Tensor]:
         """All that a teacher of the same environment goes on with, between two rounds."""
-        found = {"correction": self.correction, "since_s": self._since}
-        return {name: torch.from_numpy(value.copy()) for name, value in found.items()}
+        arrays = {"correction": self.correction, "since_s": self._since}
+        return {name: torch.from_numpy(value.copy()) for name, value in arrays.items()}
 
     @abstractmethod
     def actions(self, observations: TensorDict) -> torch.Tensor:
@@ -130,8 +130,8 @@ class TrotTeacher(Teacher):
             trot.phase_of(now, before, span, command, env.body)
             + 2 * np.pi * trot.frequency_hz * span
         )
-        shown = (trot.joints(phase, command, env.body) - env.default) / scale
-        return self._vec_env.tensor(shown.astype(np.float32))
+        target = (trot.joints(phase, command, env.body) - env.default) / scale
+        return self._vec_env.tensor(target.astype(np.float32))
 
 
 class LearnedTeacher(Teacher):
@@ -162,13 +162,13 @@ class LearnedTeacher(Teacher):
         policy[:, _COMMAND] = self._vec_env.tensor(command.astype(np.float32))
         seen = TensorDict({"policy": policy, "privileged": observations["privileged"]}, [n])
         wide = seen.repeat_interleave(count, 0)
-        shown = self._at(wide, self._grid.repeat(n)).view(n, count, -1)
+        candidates = self._at(wide, self._grid.repeat(n)).view(n, count, -1)
         last, earlier = (
             self._vec_env.tensor(a.astype(np.float32))[:, None]
             for a in (self._env.action, self._env.last_action)
         )
-        away = (shown - last).square().sum(-1)
-        away += (shown.roll(_PER_STEP, 1) - earlier).square().sum(-1)
+        away = (candidates - last).square().sum(-1)
+        away += (candidates.roll(_PER_STEP, 1) - earlier).square().sum(-1)
         return self._at(seen, lowest(away) + self._step)
 
     def _at(self, seen: TensorDict, phase: torch.Tensor) -> torch.Tensor:
@@ -186,8 +186,8 @@ def lowest(values: torch.Tensor) -> torch.Tensor:
     Values have the shape (n, k).
     """
     at, rows, count = values.argmin(1), torch.arange(len(values)), values.shape[1]
-    before, here, after = (values[rows, (at + k) % count] for k in (-1, 0, 1))
-    bend = (before - 2 * here + after).clamp(min=1e-12)
+    before, lowest, after = (values[rows, (at + k) % count] for k in (-1, 0, 1))
+    bend = (before - 2 * lowest + after).clamp(min=1e-12)
     return (at + (0.5 * (before - after) / bend).clamp(-0.5, 0.5)) * (2 * np.pi / count)
 
 
@@ -197,9 +197,9 @@ def load_teacher(folder: Path, checkpoint: str, run: Run, seen: TensorDict) -> M
     It is a file in the run's folder, `run` is to learn from it, and `seen` are observations of its
     environment, for their sizes.
     """
-    own = check_teacher(folder, run)
+    teacher = check_teacher(folder, run)
     content = read_checkpoint(folder / checkpoint)
-    network, _ = build(own.architecture, seen, own.learner, own.task.control_step_s)
+    network, _ = build(teacher.architecture, seen, teacher.learner, teacher.task.control_step_s)
     try:
         network.load_state_dict(judged_weights(content))
     except RuntimeError as error:
@@ -248,7 +248,7 @@ def imitate(
     share = max(0.0, 1.0 - 2.0 * round_ / max(how.iterations, 1))
     rollouts = []
     for _ in range(how.rollouts):
-        rollout = _shown(learner, teacher, share, stop_requested)
+        rollout = _taught_rollout(learner, teacher, share, stop_requested)
         if rollout is None:
             return None
         rollouts.append(rollout)
@@ -257,15 +257,15 @@ def imitate(
     for rollout in rollouts:
         for network in networks:
             network.update_normalization(rollout.observations.flatten(0, 1))
-    parts = how.minibatches
+    minibatches = how.minibatches
     if ppo.actor.is_recurrent:
-        parts = min(parts, learner.env.num_envs)  # it divides robots, not steps
-        batches = [r.recurrent_mini_batch_generator(parts, how.epochs) for r in rollouts]
+        minibatches = min(minibatches, learner.env.num_envs)  # it divides robots, not steps
+        batches = [r.recurrent_mini_batch_generator(minibatches, how.epochs) for r in rollouts]
     else:
-        batches = [r.mini_batch_generator(parts, how.epochs) for r in rollouts]
+        batches = [r.mini_batch_generator(minibatches, how.epochs) for r in rollouts]
     # all of them in turn, so that the last is not remembered best
     ordered = chain.from_iterable(zip(*batches, strict=True))
-    steps = parts * how.epochs * how.rollouts
+    steps = minibatches * how.epochs * how.rollouts
     optimisers = _optimisers([p for n in networks for p in n.parameters() if p.requires_grad])
     errors = []
     for step, batch in enumerate(ordered):
@@ -287,10 +287,10 @@ def imitate(
         for optimiser in optimisers:
             optimiser.step()
         errors.append(float(error.detach()))
-    return float(np.sqrt(np.mean(errors[-parts * how.rollouts :])))
+    return float(np.sqrt(np.mean(errors[-minibatches * how.rollouts :])))
 
 
-def _shown(
+def _taught_rollout(
     learner: Learner, teacher: Teacher, share: float, stop_requested: Callable[[], bool]
 ) -> RolloutStorage | None:
     """One rollout, with the teacher's actions in place of those taken; None if it was stopped.
@@ -305,19 +305,19 @@ def _shown(
         for _ in range(learner.hyper.steps_per_environment):
             if stop_requested():
                 return None
-            shown = teacher.actions(learner.observations)
-            targets.append(shown)
+            taught = teacher.actions(learner.observations)
+            targets.append(taught)
             centre = learner.act() - learner.env.noise
             learner.env.noise[quiet] = 0.0
-            actions = torch.where(led[:, None], shown, centre) + learner.env.noise
+            actions = torch.where(led[:, None], taught, centre) + learner.env.noise
             learner.observations, rewards, dones, extras = learner.env.step(actions)
             ppo.process_env_step(learner.observations, rewards, dones, extras)
             teacher.watch()
         ppo.compute_returns(learner.observations)
-    found = copy.deepcopy(ppo.storage)
-    found.actions = torch.stack(targets)
+    rollout = copy.deepcopy(ppo.storage)
+    rollout.actions = torch.stack(targets)
     ppo.storage.clear()
-    return found
+    return rollout
 
 
 def _optimisers(parameters: list[torch.nn.Parameter]) -> list[torch.optim.Optimizer]:

@@ -3,7 +3,7 @@
 - Noise of the actions persists (`policies.network.actor_critic`); its size is scheduled.
 - After each update the KL divergence and the share of clipped ratios are measured at the first step
   of its data; the policy's learning rate follows the former, and a policy that went much too far is
-  taken back. The critic has a rate of its own.
+  taken back. The critic has another rate.
 - The policy that is judged and saved has the mean of the last updates' weights.
 - At a time-out the value of the state reached is added, not that of the state before it; where a
   new command or a push follows a step, the value of the state without them counts.
@@ -11,7 +11,7 @@
   rate, random numbers, recurrent state, environments with their delay lines, the last observation
   and the counters. It is written atomically and read with `weights_only`; a teacher's is also read
   by those who learn from it.
-- Several processes, which `torchrun` starts, each with environments of its own, exchange gradients
+- Several processes, which `torchrun` starts, each with other environments, exchange gradients
   through gloo, on processors, as the physics.
 - Every sample can be learned from as its mirror image, left for right, too. The robot, its task and
   its ground look the same in a mirror: an observation and an action whose left and right are
@@ -81,8 +81,8 @@ def _images(body: Body) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
         signs: list[float] = []
         for name, size in parts:
             first = len(order)
-            own, sign = known.get(name, (list(range(size)), [1.0] * size))
-            order += [first + i for i in own]
+            places, sign = known.get(name, (list(range(size)), [1.0] * size))
+            order += [first + i for i in places]
             signs += sign
         return torch.tensor(order), torch.tensor(signs)
 
@@ -142,8 +142,8 @@ def judged_weights(content: dict[str, Any]) -> dict[str, torch.Tensor]:
     average = content.get("average")
     if average is None or not average["n_averaged"]:
         return content["actor_state_dict"]
-    whole = {name: value for name, value in average.items() if name.startswith(_AVERAGED)}
-    return {name.removeprefix(_AVERAGED): value for name, value in whole.items()}
+    averages = {name: value for name, value in average.items() if name.startswith(_AVERAGED)}
+    return {name.removeprefix(_AVERAGED): value for name, value in averages.items()}
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
@@ -188,32 +188,32 @@ class Ranks:
         size = int(os.environ.get("WORLD_SIZE", "1"))
         if size == 1:
             return cls()
-        found = cls(int(os.environ["RANK"]), size, int(os.environ.get("LOCAL_RANK", "0")))
+        ranks = cls(int(os.environ["RANK"]), size, int(os.environ.get("LOCAL_RANK", "0")))
         if not torch.distributed.is_initialized():
-            torch.distributed.init_process_group("gloo", rank=found.rank, world_size=size)
-        return found
+            torch.distributed.init_process_group("gloo", rank=ranks.rank, world_size=size)
+        return ranks
 
     def same(self, text: str) -> str:
         """The first process's `text`, in all."""
-        found = [text]
+        texts = [text]
         if self.size > 1:
-            torch.distributed.broadcast_object_list(found, src=0)
-        return found[0]
+            torch.distributed.broadcast_object_list(texts, src=0)
+        return texts[0]
 
-    def any(self, here: bool) -> bool:
+    def any(self, value: bool) -> bool:
         """Whether it is so in any process; all must decide alike, or they would deadlock."""
-        return bool(self._reduced(float(here), "MAX"))
+        return bool(self._reduced(float(value), "MAX"))
 
-    def mean(self, here: float) -> float:
+    def mean(self, value: float) -> float:
         """Mean over the processes, the same in all."""
-        return self._reduced(here, "SUM") / self.size
+        return self._reduced(value, "SUM") / self.size
 
-    def _reduced(self, here: float, operation: str) -> float:
+    def _reduced(self, value: float, operation: str) -> float:
         if self.size == 1:
-            return here
-        found = torch.tensor(here, dtype=torch.float64)
-        torch.distributed.all_reduce(found, getattr(torch.distributed.ReduceOp, operation))
-        return float(found)
+            return value
+        reduced = torch.tensor(value, dtype=torch.float64)
+        torch.distributed.all_reduce(reduced, getattr(torch.distributed.ReduceOp, operation))
+        return float(reduced)
 
 
 _TOO_FAR, _TOO_NEAR, _FACTOR = 2.0, 0.5, 1.3
@@ -242,8 +242,8 @@ class TerminalPPO(PPO):
             rewards[late] += self.gamma * reached[:, 0]
         ids = extras["unforeseen_ids"]
         if len(ids):
-            both = extras["unforeseen_observations"], obs[ids]
-            values = [self.critic(o).detach() for o in both]
+            pairs = extras["unforeseen_observations"], obs[ids]
+            values = [self.critic(o).detach() for o in pairs]
             rewards = rewards.clone()
             rewards[ids] += self.gamma * (values[0] - values[1])[:, 0]
         super().process_env_step(obs, rewards, dones, {})
@@ -277,10 +277,10 @@ class _Probe:
     def compare(self, ppo: PPO) -> dict[str, float]:
         """KL divergence of the policy now from that of the data, and share of clipped ratios."""
         actor = ppo.actor
-        kept = actor.get_hidden_state()
+        hidden = actor.get_hidden_state()
         actor.reset(hidden_state=self.hidden)
         actor(self.observations, stochastic_output=True)
-        actor.reset(hidden_state=kept)
+        actor.reset(hidden_state=hidden)
         kl = actor.get_kl_divergence(self.parameters, actor.output_distribution_params)
         ratio = torch.exp(actor.get_output_log_prob(self.actions) - self.log_prob)
         clipped = (ratio - 1.0).abs() > ppo.clip_param
@@ -313,8 +313,8 @@ class Learner:
         task = env.env.config
         first = None
         if task.rewards.stance:
-            wanted = stance(task.body, task.rewards.crouch, task.rewards.spread) - env.env.default
-            first = torch.from_numpy(wanted / task.action_scale)
+            target = stance(task.body, task.rewards.crouch, task.rewards.spread) - env.env.default
+            first = torch.from_numpy(target / task.action_scale)
         actor, critic = build(architecture, self.observations, hyper, task.control_step_s, first)
         # a recurrent policy's minibatches are whole environments
         if actor.is_recurrent and env.num_envs < hyper.minibatches:
@@ -447,10 +447,10 @@ class Learner:
         moments = [copy.deepcopy(ppo.optimizer.state.get(p, {})) for p in ppo.actor.parameters()]
         losses = ppo.update()
         self.iteration += 1
-        found = {name: self.ranks.mean(value) for name, value in probe.compare(ppo).items()}
-        self.taken_back = actor_learns and found["kl"] > _LOST * self.hyper.desired_kl
+        measures = {name: self.ranks.mean(value) for name, value in probe.compare(ppo).items()}
+        self.taken_back = actor_learns and measures["kl"] > _LOST * self.hyper.desired_kl
         if actor_learns:
-            self._adapt(found["kl"])
+            self._adapt(measures["kl"])
             # Adam's first steps are as long as its rate, whatever the gradient
             if self.taken_back:
                 with torch.no_grad():
@@ -461,7 +461,7 @@ class Learner:
                     if state:
                         ppo.optimizer.state[parameter] = state
             self._average.update_parameters(ppo.actor)
-        return losses | found
+        return losses | measures
 
     def _adapt(self, kl: float) -> None:
         """Let the policy's learning rate follow the divergence of an update."""
@@ -494,11 +494,11 @@ class Learner:
         """Whether networks, observations and recurrent state are all numbers."""
         hidden = self.actor.get_hidden_state()
         states = hidden if isinstance(hidden, tuple) else (hidden,)
-        whole: list[Any] = [
+        tensors: list[Any] = [
             *self.ppo.actor.state_dict().values(), *self.ppo.critic.state_dict().values(),
             *self.observations.values(), *(s for s in states if s is not None),
         ]  # fmt: skip
-        return all(bool(torch.isfinite(t).all()) for t in whole)
+        return all(bool(torch.isfinite(t).all()) for t in tensors)
 
     def save(self, path: Path, more: dict[str, Any]) -> None:
         """Write a checkpoint in one atomic step; the one before survives if that fails."""
@@ -554,7 +554,7 @@ class Learner:
         elif hidden is not None:
             hidden = hidden.to(device)
         self.actor.reset(hidden_state=hidden)
-        found = TensorDict(content["observations"], batch_size=[self.env.num_envs])
-        self.observations = found.to(device)
+        observations = TensorDict(content["observations"], batch_size=[self.env.num_envs])
+        self.observations = observations.to(device)
         torch.set_rng_state(content["torch_rng"])
         return content["more"]

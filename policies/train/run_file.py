@@ -147,9 +147,9 @@ def _from_scratch(run: Run) -> Run:
     pushes = {n: getattr(taught.randomisation, n) for n in ("push_m_s", "push_every_s")}
     # of the teacher's rewards only that of its stance goes on: the others hold a policy to the gait
     # that led the teacher to steps
-    kept = {name: getattr(taught.rewards, name) for name in ("crouch", "spread", *CLOCK)}
+    gait = {name: getattr(taught.rewards, name) for name in ("crouch", "spread", *CLOCK)}
     task = replace(
-        run.task, rewards=replace(run.task.rewards, stance=0.5 * taught.rewards.stance, **kept),
+        run.task, rewards=replace(run.task.rewards, stance=0.5 * taught.rewards.stance, **gait),
         randomisation=replace(run.task.randomisation, **pushes),
     )  # fmt: skip
     # a network is learned from more easily than a trot that bends sharply
@@ -183,19 +183,19 @@ def with_robot(run: Run, robot: str | Path, robot_config: str | Path | None) -> 
 
 def teacher_of(run: Run) -> Run:
     """Settings of the teacher that a run trains for itself: for the same robot and actions."""
-    own = _teacher("mlp")
+    base = _teacher("mlp")
     if run.task.robot:
-        own = with_robot(own, run.task.robot, run.task.robot_config)
-    rewards = replace(own.task.rewards, **{n: getattr(run.task.rewards, n) for n in _OF_TEACHER})
-    steps = run.task.control_step_s / own.task.physics_step_s
+        base = with_robot(base, run.task.robot, run.task.robot_config)
+    rewards = replace(base.task.rewards, **{n: getattr(run.task.rewards, n) for n in _OF_TEACHER})
+    steps = run.task.control_step_s / base.task.physics_step_s
     even = abs(steps - round(steps)) < 1e-6
     task = replace(
-        own.task, rewards=rewards,
-        physics_step_s=own.task.physics_step_s if even else run.task.physics_step_s,
+        base.task, rewards=rewards,
+        physics_step_s=base.task.physics_step_s if even else run.task.physics_step_s,
         **{name: getattr(run.task, name) for name in _OF_ACTIONS},
     )  # fmt: skip
     return replace(
-        own, task=task, actuator=run.actuator, feedback=run.feedback, threads=run.threads,
+        base, task=task, actuator=run.actuator, feedback=run.feedback, threads=run.threads,
         device=run.device, learner_device=run.learner_device, seed=run.seed,
         minutes=_TEACHING * run.minutes,
     )  # fmt: skip
@@ -203,14 +203,14 @@ def teacher_of(run: Run) -> Run:
 
 def check_teacher(folder: Path, run: Run) -> Run:
     """Settings of a teacher's run, which `run` is to learn from."""
-    own = load_run(folder)
-    if not own.architecture.privileged_actor:
+    teacher = load_run(folder)
+    if not teacher.architecture.privileged_actor:
         raise InputError(
             f"{folder} is not a teacher: its policy acts by no clock. Give the folder "
             "of a run of `pupper-train --start teacher`."
         )
-    same = [(f"task.{name}", own.task, run.task) for name in _OF_ACTIONS]
-    same += [(f"task.rewards.{name}", own.task.rewards, run.task.rewards) for name in CLOCK]
+    same = [(f"task.{name}", teacher.task, run.task) for name in _OF_ACTIONS]
+    same += [(f"task.rewards.{name}", teacher.task.rewards, run.task.rewards) for name in CLOCK]
     for name, *of in same:
         theirs, ours = (getattr(part, name.rsplit(".", 1)[1]) for part in of)
         if theirs != ours:
@@ -218,7 +218,7 @@ def check_teacher(folder: Path, run: Run) -> Run:
                 f"The teacher in {folder} was trained with {name} {theirs}, this run has {ours}. "
                 "Give both the same."
             )
-    return own
+    return teacher
 
 
 def load_run(folder: Path) -> Run:
@@ -226,8 +226,8 @@ def load_run(folder: Path) -> Run:
     path = folder / RUN_FILE
     model = create_model("File", settings=(_model_of(Run), ...))
     data, lines = _read(path)
-    found: Any = validated(model, data, path, lines)
-    return _dataclass_of(Run, found.settings)
+    file: Any = validated(model, data, path, lines)
+    return _dataclass_of(Run, file.settings)
 
 
 def resume_run(folder: Path, iterations: int | None, minutes: float | None) -> Run:
@@ -257,23 +257,23 @@ def resume_run(folder: Path, iterations: int | None, minutes: float | None) -> R
 def _read(path: Path) -> tuple[dict[str, Any], dict[Place, int]]:
     if not path.exists():
         raise InputError(f"{path.parent} holds no run: there is no {RUN_FILE} in it.")
-    found, lines = read_yaml(path)
-    if not isinstance(found, dict) or found.get("schema") != RUN_SCHEMA:
+    content, lines = read_yaml(path)
+    if not isinstance(content, dict) or content.get("schema") != RUN_SCHEMA:
         raise InputError(f"{path} is not the settings of a training run.")
-    refuse_other_version(path, found.get("schema_version"), RUN_VERSION)
-    return found, lines
+    refuse_other_version(path, content.get("schema_version"), RUN_VERSION)
+    return content, lines
 
 
 @cache
 def _model_of(kind: type) -> type[BaseModel]:
     """Strict pydantic model with the fields of the dataclass `kind`, none of them required."""
     kinds: dict[str, Any] = dict.fromkeys(_DROPPED.get(kind, ()), Any) | _kinds_of(kind)
-    for name, wanted in kinds.items():
-        if is_dataclass(wanted):
-            kinds[name] = _model_of(cast("type", wanted))
-        elif get_origin(wanted) is tuple:
-            kinds[name] = Annotated[wanted, Field(strict=False)]  # files have lists
-    optional: dict[str, Any] = {name: (wanted, None) for name, wanted in kinds.items()}
+    for name, field_type in kinds.items():
+        if is_dataclass(field_type):
+            kinds[name] = _model_of(cast("type", field_type))
+        elif get_origin(field_type) is tuple:
+            kinds[name] = Annotated[field_type, Field(strict=False)]  # files have lists
+    optional: dict[str, Any] = {name: (field_type, None) for name, field_type in kinds.items()}
     config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
     return create_model(kind.__name__, __config__=config, **optional)
 
@@ -283,11 +283,11 @@ _kinds_of = cache(get_type_hints)
 
 def _dataclass_of(kind: type, settings: Any) -> Any:
     """The dataclass `kind` with `settings`; the others have their defaults."""
-    kinds, given = _kinds_of(kind), {}
+    kinds, values = _kinds_of(kind), {}
     for name in settings.model_fields_set & set(kinds):
         value = getattr(settings, name)
-        given[name] = _dataclass_of(kinds[name], value) if is_dataclass(kinds[name]) else value
-    return kind(**given)
+        values[name] = _dataclass_of(kinds[name], value) if is_dataclass(kinds[name]) else value
+    return kind(**values)
 
 
 def save_run(folder: Path, run: Run) -> None:
@@ -307,7 +307,7 @@ def refuse_taken(folder: Path) -> None:
 
 def _write(path: Path, run: Run) -> None:
     source = Path(run.actuator)
-    found = {
+    content = {
         "schema": RUN_SCHEMA,
         "schema_version": RUN_VERSION,
         "settings": plain(run),
@@ -315,7 +315,7 @@ def _write(path: Path, run: Run) -> None:
         "versions": versions("torch", "rsl-rl-lib"),
     }
     text = "# Settings of a training run, written by pupper-train.\n"
-    write_text(path, text + yaml.safe_dump(found, sort_keys=False), force=True)
+    write_text(path, text + yaml.safe_dump(content, sort_keys=False), force=True)
 
 
 _LARGEST = 1e9
@@ -358,8 +358,8 @@ def refuse_impossible(run: Run) -> None:
     for name, value in _numbers(run, ""):
         low, high = _RANGES.get(name, (-_LARGEST, _LARGEST))
         if name != "seed" and not low <= value <= high:  # NaN is in no range
-            shown = str(value)[:20]
-            raise InputError(f"{name} is {shown}; it must be from {low:g} to {high:g}.")
+            text = str(value)[:20]
+            raise InputError(f"{name} is {text}; it must be from {low:g} to {high:g}.")
     if not 0 <= run.seed < 2**63:  # what torch's generators take
         raise InputError(f"seed is {str(run.seed)[:24]}; it must be 0 or more, below 2^63.")
     for name in ("hidden", "critic_hidden"):
@@ -379,6 +379,6 @@ def _numbers(settings: Any, before: str) -> Iterator[tuple[str, float]]:
         if is_dataclass(value):
             yield from _numbers(value, f"{name}.")
             continue
-        for one in value if isinstance(value, tuple) else (value,):
-            if isinstance(one, int | float) and not isinstance(one, bool):
-                yield name, one
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, int | float) and not isinstance(number, bool):
+                yield name, number

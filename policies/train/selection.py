@@ -73,7 +73,7 @@ class Judge:
         """
         env = self._env
         env.restore(self._start)
-        kept = actor.get_hidden_state()
+        hidden = actor.get_hidden_state()
         actor.reset()
         first = round(_IGNORED * self._steps)
         alive, velocity, up = np.ones(env.num_envs, bool), [], []
@@ -89,16 +89,16 @@ class Judge:
                 feet.append((facts.landed[walks].mean(), facts.contact[walks].mean()))
                 up.append(alive.copy())
                 actor.reset(dones)
-        actor.reset(hidden_state=kept)
+        actor.reset(hidden_state=hidden)
         landed, duty = np.mean(feet[first:], axis=0)
         scale = self._scale
-        found = scored(
+        scores = scored(
             np.array(velocity)[first:] / scale, np.array(up)[first:], self._command / scale
         )
         for name, size in zip(("vx_m_s", "vy_m_s", "yaw_rad_s"), scale, strict=True):
-            found[f"score_{name}"] *= float(size)
+            scores[f"score_{name}"] *= float(size)
         rate = float(landed / env.env.config.control_step_s)
-        return found | {"score_steps_hz": rate, "score_duty": float(duty)}
+        return scores | {"score_steps_hz": rate, "score_duty": float(duty)}
 
 
 def scored(
@@ -112,12 +112,12 @@ def scored(
     """
     fell = ~up[-1]
     # a robot that fell has the errors of one that stands, from then on
-    shown = np.where(up[..., None], velocity, 0.0)
-    instant = np.abs(shown - command).mean(axis=(0, 1))
-    mean = np.abs(shown.mean(axis=0) - command).mean(axis=0)
+    followed = np.where(up[..., None], velocity, 0.0)
+    instant = np.abs(followed - command).mean(axis=(0, 1))
+    mean = np.abs(followed.mean(axis=0) - command).mean(axis=0)
     relative = 0.5 * (instant + mean) / _STANDING
     turning = (command[:, 2] != 0) & (command[:, :2] == 0).all(axis=1)
-    turn = shown.mean(axis=0)[turning, 2] / command[turning, 2]
+    turn = followed.mean(axis=0)[turning, 2] / command[turning, 2]
     return {
         "score": float(1.0 - relative.mean() - fell.mean()),
         "score_falls": float(fell.mean()),

@@ -49,9 +49,9 @@ class Paces:
         self._phases = step * np.arange(_STRIDE)
         self._noise = 0.05 * rng.standard_normal((_STRIDE, n, 12))
         self._at = 0
-        self._own(self._actions(5))
+        self._stepped(self._actions(5))
         begun = time.perf_counter()
-        self._own(self._actions(3))
+        self._stepped(self._actions(3))
         self._count = max(round(3 * SLICE_S / (time.perf_counter() - begun)), 1)
 
     def slice(self, bare_first: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -65,20 +65,20 @@ class Paces:
         if bare_first:
             bare = self._bare(controls)
             batch.state[:] = before
-        own = self._own(actions)
+        env_time = self._stepped(actions)
         if not bare_first:
             after = batch.state.copy()
             batch.state[:] = before
             bare = self._bare(controls)
             batch.state[:] = after
         share = 1 / (self._count * self.env.environments)
-        return own * share, bare * share
+        return env_time * share, bare * share
 
     def slices(self, count: int = _SLICES) -> NDArray[np.float64]:
         """Times of slices, shape (count, 2, 2): environment and bare, wall and processor."""
         return np.array([self.slice(bool(i % 2)) for i in range(count)])
 
-    def _own(self, actions: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+    def _stepped(self, actions: list[NDArray[np.float64]]) -> NDArray[np.float64]:
         begun = _now()
         for action in actions:
             self.env.step(action)
@@ -92,24 +92,24 @@ class Paces:
         return _now() - begun
 
     def _actions(self, count: int) -> list[NDArray[np.float64]]:
-        env, found = self.env, []
+        env, actions = self.env, []
         for _ in range(count):
             phase = np.full(env.environments, self._phases[self._at % _STRIDE])
             target = env.trot.joints(phase, env.command, env.body)
             noise = self._noise[self._at % _STRIDE]
-            found.append((target - env.default) / env.config.action_scale + noise)
+            actions.append((target - env.default) / env.config.action_scale + noise)
             self._at += 1
-        return found
+        return actions
 
 
 def ratios(times: NDArray[np.float64]) -> dict[str, float]:
     """Rates and ratios of `Paces.slices`, by their keys in `measure`."""
-    own, bare = times[:, 0], times[:, 1]
-    wall, processor = (bare / own).T
+    env_times, bare_times = times[:, 0], times[:, 1]
+    wall, processor = (bare_times / env_times).T
     low, middle, high = np.quantile(wall, [0.25, 0.5, 0.75])
     return {
-        "bare_env_steps_per_s": float(1 / np.median(bare[:, 0])),
-        "env_steps_per_s": float(1 / np.median(own[:, 0])),
+        "bare_env_steps_per_s": float(1 / np.median(bare_times[:, 0])),
+        "env_steps_per_s": float(1 / np.median(env_times[:, 0])),
         "env_ratio": float(middle),
         "env_ratio_low": float(low),
         "env_ratio_high": float(high),
@@ -144,9 +144,9 @@ def measure(run: Run) -> dict[str, Any]:
         learner.update()
         ended = time.perf_counter()
         rounds.append((ended - between, ended - begun))
-    update, whole = np.median(rounds, axis=0).tolist()
-    found, update_rate = ratios(np.concatenate(times)), samples / update
-    one_after_the_other = 1 / found["env_steps_per_s"] + 1 / update_rate
+    update, total = np.median(rounds, axis=0).tolist()
+    rates, update_rate = ratios(np.concatenate(times)), samples / update
+    one_after_the_other = 1 / rates["env_steps_per_s"] + 1 / update_rate
     return {
         "policy": run.architecture.kind,
         "num_envs": learner.env.num_envs,
@@ -154,10 +154,10 @@ def measure(run: Run) -> dict[str, Any]:
         "actuator": run.actuator,
         "physics": run.task.physics,
         "physics_step_s": run.task.physics_step_s,
-        **found,
+        **rates,
         "update_samples_per_s": update_rate,
-        "end_to_end_samples_per_s": samples / whole,
-        "end_to_end_ratio": samples / whole * one_after_the_other,
+        "end_to_end_samples_per_s": samples / total,
+        "end_to_end_ratio": samples / total * one_after_the_other,
         "load": load(),
         "cores": os.cpu_count(),
     }

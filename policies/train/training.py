@@ -82,15 +82,15 @@ def make_env(run: Run, ranks: Ranks, servos: ServoRanges | None = None) -> Puppe
 
 def learner_device(run: Run, ranks: Ranks) -> str:
     """Torch's name of the device on which the networks of this process learn."""
-    wanted = run.device if run.learner_device == "as-device" else run.learner_device
-    if wanted != "cuda":
+    chosen = run.device if run.learner_device == "as-device" else run.learner_device
+    if chosen != "cuda":
         return "cpu"
     if not torch.cuda.is_available():
         raise InputError(
             "torch finds no CUDA device here. Leave `device` and `learner_device` at cpu, or "
             "install a build of torch for CUDA on a machine that has one."
         )
-    return _local(wanted, ranks)
+    return _local(chosen, ranks)
 
 
 def _local(device: str, ranks: Ranks) -> str:
@@ -265,29 +265,29 @@ class _Session:
         The learning rate falls to 0 with the last round: one that was cut off would walk worse than
         one of fewer rounds.
         """
-        wanted = self.run.imitation.iterations
+        rounds = self.run.imitation.iterations
         remaining_s = 60 * self.run.minutes - (time.monotonic() - self.started)
         fit = 1 + int(_IMITATING * remaining_s / max(self.ranks.mean(round_s), 1e-9))
         planned = int(self.ranks.mean(max(fit, _FEWEST_ROUNDS)))
-        if planned < wanted:
+        if planned < rounds:
             self.counters["rounds"] = planned
             self.notice(
-                f"A round of the first gait takes {round_s:.0f} s, so that {planned} of {wanted} "
+                f"A round of the first gait takes {round_s:.0f} s, so that {planned} of {rounds} "
                 f"are made within {self.run.minutes:g} minutes."
             )
 
     def teacher(self, ends: Callable[[], bool]) -> Teacher | None:
-        """What shows the first gait; a teacher of the run's own is trained first, or to its end.
+        """What shows the first gait; a teacher of the run itself is trained first, or to its end.
 
         None if a stop came first.
         """
-        learner, wanted = self.learner, self.run.imitation.teacher
+        learner, teacher = self.learner, self.run.imitation.teacher
         state = self.counters.get("teacher")
-        if wanted == TROT:
+        if teacher == TROT:
             return TrotTeacher(learner.env, state)
         # a resumed run is to draw what it would have drawn
         with torch.random.fork_rng(devices=[]):
-            folder = Path(wanted) if wanted != OWN else self._train_teacher(ends)
+            folder = Path(teacher) if teacher != OWN else self._train_teacher(ends)
         if ends():
             return None
         with torch.random.fork_rng(devices=[]):
@@ -297,10 +297,10 @@ class _Session:
     def _train_teacher(self, ends: Callable[[], bool]) -> Path:
         folder = self.folder / _TEACHER
         begun = (folder / RUN_FILE).is_file()
-        own = resume_run(folder, None, None) if begun else teacher_of(self.run)
+        teacher = resume_run(folder, None, None) if begun else teacher_of(self.run)
         watch = self.watch
-        shown = watch and (lambda progress: watch(replace(progress, phase="teacher")))
-        session = _Session(folder, own, begun, shown)
+        watcher = watch and (lambda progress: watch(replace(progress, phase="teacher")))
+        session = _Session(folder, teacher, begun, watcher)
         session.go(ends)
         self.ranks.any(False)  # the first has written it
         # its time is this run's, also where that was killed meanwhile
@@ -412,9 +412,9 @@ class _Session:
             self.writer.write(phase, done, row)
         if self.watch and self.ranks.rank == 0:
             steps = max(done - self.done_before[phase], 1)
-            left = (total - done) * (now - self.phase_began) / steps
-            left = min(left, 60 * self.run.minutes - elapsed)
-            self.watch(Progress(phase, done, total, elapsed, row, max(left, 0.0)))
+            remaining_s = (total - done) * (now - self.phase_began) / steps
+            remaining_s = min(remaining_s, 60 * self.run.minutes - elapsed)
+            self.watch(Progress(phase, done, total, elapsed, row, max(remaining_s, 0.0)))
 
     def refuse_nan(self, before: dict[str, Any], numbers: Iterable[float]) -> None:
         """Raise if any value is not finite; the networks `before` are then saved."""

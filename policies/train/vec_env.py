@@ -57,34 +57,34 @@ class WalkingVecEnv:
         up, `unforeseen_ids` and `unforeseen_observations` (see `StepResult.unforeseen`), `terms`,
         the reward terms, and `facts`, what happened.
         """
-        found = self.env.step(actions.detach().cpu().numpy())
+        result = self.env.step(actions.detach().cpu().numpy())
         ended = self._past
         if self._past.shape[1]:
             # of a missed tick, the one before stays
-            ended = np.concatenate([found.facts.action[:, None], self._past[:, :-1]], axis=1)
+            ended = np.concatenate([result.facts.action[:, None], self._past[:, :-1]], axis=1)
             self._past = ended.copy()
-            self._past[found.done] = self.env.action[found.done][:, None]
-        late, noise = found.terminal["ids"], self.noise
-        self.noise = noise * self.tensor(~found.done)[:, None]
-        ids, surprised = self.tensor(late), found.unforeseen["ids"]
+            self._past[result.done] = self.env.action[result.done][:, None]
+        late, noise = result.terminal["ids"], self.noise
+        self.noise = noise * self.tensor(~result.done)[:, None]
+        ids, surprised = self.tensor(late), result.unforeseen["ids"]
         extras: dict[str, Any] = {
-            "terms": found.terms, "facts": found.facts, "terminal_ids": ids,
+            "terms": result.terms, "facts": result.facts, "terminal_ids": ids,
             "unforeseen_ids": self.tensor(surprised),
         }  # fmt: skip
         if len(late):
             extras["terminal_observations"] = self._groups(
-                found.terminal["observation"], found.terminal["privileged"], ended[late],
+                result.terminal["observation"], result.terminal["privileged"], ended[late],
                 noise[ids],
             )  # fmt: skip
         if len(surprised):
             extras["unforeseen_observations"] = self._groups(
-                found.unforeseen["observation"], found.unforeseen["privileged"],
+                result.unforeseen["observation"], result.unforeseen["privileged"],
                 self._past[surprised], self.noise[extras["unforeseen_ids"]],
             )  # fmt: skip
         return (
-            self._groups(found.observation, found.privileged, self._past, self.noise),
-            self.tensor(found.reward.astype(np.float32)),
-            self.tensor(found.done),
+            self._groups(result.observation, result.privileged, self._past, self.noise),
+            self.tensor(result.reward.astype(np.float32)),
+            self.tensor(result.done),
             extras,
         )
 
@@ -97,10 +97,10 @@ class WalkingVecEnv:
 
     def restore(self, state: dict[str, Any]) -> bool:
         """Go back to a `state`; whether exactly, see `PupperEnv.restore`."""
-        own = dict(state)
-        past = own.pop("past_actions", self._past)
-        noise = own.pop("noise", self.noise.cpu().numpy())
-        exact = self.env.restore(own)
+        env_state = dict(state)
+        past = env_state.pop("past_actions", self._past)
+        noise = env_state.pop("noise", self.noise.cpu().numpy())
+        exact = self.env.restore(env_state)
         self._past[:], self.noise = past, self.tensor(np.array(noise, np.float32))
         return exact
 

@@ -1,1 +1,1 @@
-"""A recording's commands on the whole simulated robot, held against the robot's own readings."""
+"""A recording's commands on the whole simulated robot, compared with the robot's readings."""

@@ -124,7 +124,7 @@ def robot_for(recording: Recording, model: Path | None = None) -> ServoRobot:
 Surface = tuple[Array, NDArray[np.int64]]
 
 POSES_PER_S = 30.0
-_VISIBLE_GROUPS = 3  # MuJoCo's own viewer shows groups 0 to 2
+_VISIBLE_GROUPS = 3  # MuJoCo's viewer shows groups 0 to 2
 _ROUND = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 _RING = np.stack([np.cos(_ROUND), np.sin(_ROUND), np.zeros_like(_ROUND)], axis=1)
@@ -213,8 +213,8 @@ def _tilted(bodies: list[Body], gravity: Array) -> list[Body]:
 
 def _surfaces(model: Any) -> dict[int, Surface]:
     """Shapes of the bodies that have one, by their numbers."""
-    every = ((body, _surface_of(model, body)) for body in range(1, model.nbody))
-    return {body: surface for body, surface in every if surface is not None}
+    surfaces = ((body, _surface_of(model, body)) for body in range(1, model.nbody))
+    return {body: surface for body, surface in surfaces if surface is not None}
 
 
 def _joint_angles(model: Any, data: Any, joints: tuple[str, ...], servo: Array) -> Array:

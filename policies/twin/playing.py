@@ -144,7 +144,7 @@ def play(
     """Let copies of the robot do what was commanded, with each of several actuators.
 
     In the air (`fixed`) one copy per actuator is enough: nothing is drawn. On the ground each of
-    the `copies` has a friction and a payload of its own, the same for every actuator. Servos are by
+    the `copies` has another friction and payload, the same for every actuator. Servos are by
     field of `DelayedPDParameters`, shape (joints,), of each actuator.
     """
     count, rng = 1 if fixed else copies, np.random.default_rng(seed)
@@ -171,8 +171,8 @@ def play(
         )  # fmt: skip
         for k in range(len(group)):
             rows = slice(k * total, (k + 1) * total)
-            one = Replayed(moved.servo_rad[rows], moved.fell_s[rows], moved.gyro_rad_s[rows])
-            results.append(_played(one, robot, motions, data, count, fixed))
+            replayed = Replayed(moved.servo_rad[rows], moved.fell_s[rows], moved.gyro_rad_s[rows])
+            results.append(_played(replayed, robot, motions, data, count, fixed))
     return results
 
 
@@ -273,12 +273,12 @@ def evidence(cases: Sequence[Case], data: ServoData, part: Part, seed: int) -> E
     load = [_load_share(case.offsets) for case in cases]
     first = cases[0]
     nothing = [
-        one is not None and -_NONE < one.share.low and one.share.high < _NONE
-        and one.correlation.high < _UNCORRELATED
-        for one in motion
+        m is not None and -_NONE < m.share.low and m.share.high < _NONE
+        and m.correlation.high < _UNCORRELATED
+        for m in motion
     ]  # fmt: skip
     verdict: Verdict = "air" if all(nothing) else "cannot tell"
-    if any(one is not None and one.correlation.low > _CORRELATED for one in motion):
+    if any(m is not None and m.correlation.low > _CORRELATED for m in motion):
         verdict = "ground"
     return Evidence(
         verdict=verdict, motion=motion, load_share=load, why=_WHY[verdict],
@@ -290,9 +290,9 @@ def _motion(case: Case, data: ServoData, part: Part, seed: int) -> Motion | None
     place, draws = block_draws(case.errors, seed)
     sums = np.zeros((3, len(place)))
     for joint, errors in case.errors.items():
-        moved, rest = _unexplained(case, joint, data, part)
-        index, weight = [place[b] for b in errors.block], 1.0 / max(float(rest.var()), 1e-12)
-        for row, product in zip(sums, (rest * moved, moved**2, rest**2), strict=True):
+        moved, error_rad = _unexplained(case, joint, data, part)
+        index, weight = [place[b] for b in errors.block], 1.0 / max(float(error_rad.var()), 1e-12)
+        for row, product in zip(sums, (error_rad * moved, moved**2, error_rad**2), strict=True):
             row += weight * np.bincount(index, product, len(place))
     if not sums[1].sum() > 1e-12 * len(place):
         return None
@@ -319,8 +319,8 @@ def _unexplained(case: Case, joint: str, data: ServoData, part: Part) -> tuple[A
         rows.append(np.vstack([seen, run.position_rad])[:, counts])
     air, speed, acceleration, ground, reading = np.concatenate(rows, axis=1)
     servo, _ = np.linalg.qr(np.stack([np.ones(len(air)), air, speed, acceleration], axis=1))
-    moved, rest = ground - air, reading - air
-    return moved - servo @ (servo.T @ moved), rest - servo @ (servo.T @ rest)
+    effect, error = ground - air, reading - air
+    return effect - servo @ (servo.T @ effect), error - servo @ (servo.T @ error)
 
 
 def _load_share(offsets: Mapping[str, tuple[float, float]]) -> Interval | None:

@@ -115,10 +115,10 @@ def read_imu(path: Path) -> ImuLog:
             "(s and rad/s)."
         )
     values = np.stack([table.numbers[n] for n in needed], axis=1)
-    whole = np.isfinite(values).all(axis=1)
+    finite = np.isfinite(values).all(axis=1)
     nothing = np.full(len(values), np.nan)
     acceleration = np.stack([table.numbers.get(n, nothing) for n in _ACCELERATIONS], axis=1)
-    values, acceleration = values[whole], acceleration[whole]
+    values, acceleration = values[finite], acceleration[finite]
     time = values[:, 0]
     if (np.diff(time) <= 0).any():
         raise InputError(f"{path}: its times do not increase. Give one log per file.")
@@ -280,7 +280,7 @@ def twin(
             robot, place == 0, numbers, motions, data, copies, seed, threads,
             lambda share, done=done, part=part: progress(done + part * share),
         )  # fmt: skip
-        conditions.append([_condition(one, data, test, rest, seed) for one in played])
+        conditions.append([_condition(copy, data, test, rest, seed) for copy in played])
         done += part
     models = {
         name: _twin_of([servos[k :: len(actuators)] for servos in conditions], data, test, seed)
@@ -288,8 +288,8 @@ def twin(
     }
     judges = [
         name for name, actuator in actuators.items()
-        if all(one.sha256 != recording.sha256
-               for one in (actuator.calibration.inputs if actuator.calibration else []))
+        if all(source.sha256 != recording.sha256
+               for source in (actuator.calibration.inputs if actuator.calibration else []))
     ]  # fmt: skip
     judge = min(judges, key=lambda name: models[name].best_rad, default=None)
     judged = models[judge].evidence if judge else None
@@ -359,7 +359,7 @@ def _twin_of(
         Case(
             air=air.tracks, ground=ground.tracks, errors=air.errors, ground_errors=ground.errors,
             offsets={
-                j: (one.offset_rad, ground.joints[j].offset_rad) for j, one in air.joints.items()
+                j: (s.offset_rad, ground.joints[j].offset_rad) for j, s in air.joints.items()
             },
         )
         for air, ground in zip(*conditions, strict=True)

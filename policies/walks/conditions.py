@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import TRUNK_BOX_AT_M, TRUNK_BOX_M
-from pupper_sysid.sim.robot.robot_batch import RobotBatch, own_velocity
+from pupper_sysid.sim.robot.robot_batch import RobotBatch, trunk_velocity
 from pupper_sysid.sim.robot.terrain import STAIRS_M
 from pupper_sysid.sim.walking.config import Commands, Curriculum, Walking
 from pupper_sysid.sim.walking.env import PupperEnv
@@ -76,28 +76,28 @@ class Handicap:
         return (time_s - FIRST_PUSH_S) % PUSH_EVERY_S
 
 
-def impose(robots: RobotBatch, ids: NDArray[np.intp], own: Handicap) -> None:
+def impose(robots: RobotBatch, ids: NDArray[np.intp], handicap: Handicap) -> None:
     """Give robots a handicap, at the start of their walk.
 
     `ids` are robots in the order of their numbers, from 0 on.
     """
-    if own.weak_leg != 1.0:
+    if handicap.weak_leg != 1.0:
         leg_of, legs = robots.body.leg_of, len(robots.body.feet)
         of_weak_leg = leg_of == (np.arange(len(ids)) % legs)[:, None]
         for name in _OF_MOTOR:
-            robots.drawn[name][ids] *= np.where(of_weak_leg, own.weak_leg, 1.0)
-    if own.friction is not None:
-        robots.friction[ids] = own.friction
-    if own.weak_leg != 1.0 or own.friction is not None:
+            robots.drawn[name][ids] *= np.where(of_weak_leg, handicap.weak_leg, 1.0)
+    if handicap.friction is not None:
+        robots.friction[ids] = handicap.friction
+    if handicap.weak_leg != 1.0 or handicap.friction is not None:
         robots.write(ids)
-    if own.payload_kg:
-        _load(robots, ids, own.payload_kg, np.array([*own.payload_at_m, _ABOVE_M]))
-    if own.slope_deg:
+    if handicap.payload_kg:
+        _load(robots, ids, handicap.payload_kg, np.array([*handicap.payload_at_m, _ABOVE_M]))
+    if handicap.slope_deg:
         size = np.linalg.norm(robots.model.opt.gravity)
-        robots.field("opt.gravity")[ids] = size * own.gravity_direction
-    if own.riser_m is not None:
+        robots.field("opt.gravity")[ids] = size * handicap.gravity_direction
+    if handicap.riser_m is not None:
         # pyramids are wider than the square in which robots are placed
-        robots.move(ids, STAIRS_M[own.riser_m] + 3.0 * robots.qpos[ids, :2])
+        robots.move(ids, STAIRS_M[handicap.riser_m] + 3.0 * robots.qpos[ids, :2])
 
 
 def _load(robots: RobotBatch, ids: NDArray[np.intp], mass_kg: float, at: Array) -> None:
@@ -111,46 +111,46 @@ def _load(robots: RobotBatch, ids: NDArray[np.intp], mass_kg: float, at: Array) 
         turn = np.empty(9)
         mujoco.mju_quat2Mat(turn, axes[i, trunk])
         turn = turn.reshape(3, 3)
-        whole = before + mass_kg
+        total_kg = before + mass_kg
         away = at - centre
         # of both about their common centre: parallel axes with the reduced mass
         tensor = turn @ np.diag(inertia[i, trunk]) @ turn.T
-        tensor += before * mass_kg / whole * (away @ away * np.eye(3) - np.outer(away, away))
+        tensor += before * mass_kg / total_kg * (away @ away * np.eye(3) - np.outer(away, away))
         moments, turn = np.linalg.eigh(tensor)
         turn[:, 0] *= np.linalg.det(turn)
         mujoco.mju_mat2Quat(axes[i, trunk], turn.ravel())
-        mass[i, trunk], inertia[i, trunk] = whole, moments
-        place[i, trunk] = centre + mass_kg / whole * away
+        mass[i, trunk], inertia[i, trunk] = total_kg, moments
+        place[i, trunk] = centre + mass_kg / total_kg * away
     robots.batch.set_const(ids)
 
 
 def see_slope(
-    observation: NDArray[np.float32], ids: NDArray[np.intp], robots: RobotBatch, own: Handicap
+    observation: NDArray[np.float32], ids: NDArray[np.intp], robots: RobotBatch, handicap: Handicap
 ) -> None:
     """Tilt the gravity that robots on a slope see; `observation` is theirs, shape (k, 60)."""
-    if own.slope_deg:
+    if handicap.slope_deg:
         flat = np.array([0.0, 0.0, -1.0])
         added = np.zeros((len(ids), 6))
-        added[:, :3] = own.gravity_direction - flat
-        observation[:, _GRAVITY] += own_velocity(robots.qpos[ids], added)
+        added[:, :3] = handicap.gravity_direction - flat
+        observation[:, _GRAVITY] += trunk_velocity(robots.qpos[ids], added)
 
 
 def push_directions(robots: int, steps: int, step_s: float, seed: int) -> dict[int, Array]:
     """Unit vectors, shape (robots, 2), by the control step before which robots are pushed."""
-    first, every = round(FIRST_PUSH_S / step_s), round(PUSH_EVERY_S / step_s)
+    first, interval = round(FIRST_PUSH_S / step_s), round(PUSH_EVERY_S / step_s)
     rng = np.random.default_rng([seed, 5])
-    found = {}
-    for step in range(first, steps, every):
+    directions = {}
+    for step in range(first, steps, interval):
         angle = rng.uniform(-np.pi, np.pi, robots)
-        found[step] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return found
+        directions[step] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return directions
 
 
 def missed_ticks(robots: int, steps: int, seed: int) -> Array:
     """Numbers in 0–1, shape (steps, robots): a tick is missed where they are below its chance."""
-    found = np.random.default_rng([seed, 4]).random((steps, robots))
-    found[0] = 1.0  # the first tick begins the walk
-    return found
+    chances = np.random.default_rng([seed, 4]).random((steps, robots))
+    chances[0] = 1.0  # the first tick begins the walk
+    return chances
 
 
 Kept = TypeVar("Kept", covariant=True)
@@ -266,8 +266,8 @@ class StepRecorder:
 
     def stacked(self, robots: slice, steps: int) -> dict[str, NDArray]:
         """Arrays of some robots over the first steps, (steps, k, …)."""
-        kept = self.steps[:steps]
-        return {name: np.stack([step[name][robots] for step in kept]) for name in kept[0]}
+        first = self.steps[:steps]
+        return {name: np.stack([step[name][robots] for step in first]) for name in first[0]}
 
 
 def evaluation_task(task: Walking, seconds: float | None = None) -> Walking:
@@ -280,11 +280,11 @@ def evaluation_task(task: Walking, seconds: float | None = None) -> Walking:
         base_velocity_m_s=(0.0, 0.0, 0.0), base_rate_rad_s=(0.0, 0.0, 0.0),
     )  # fmt: skip
     commands = RANDOM
-    if task.robot:  # as far within the robot's own ranges
-        own = task.commands
+    if task.robot:  # as far within the robot's ranges
+        ranges = task.commands
         commands = replace(
-            RANDOM, forward_m_s=own.forward_m_s, sideways_m_s=own.sideways_m_s,
-            yaw_rad_s=own.yaw_rad_s, dead_band=own.dead_band,
+            RANDOM, forward_m_s=ranges.forward_m_s, sideways_m_s=ranges.sideways_m_s,
+            yaw_rad_s=ranges.yaw_rad_s, dead_band=ranges.dead_band,
         )  # fmt: skip
     return replace(
         task.evaluated(), commands=commands, curriculum=Curriculum(), randomisation=gentle,
@@ -297,8 +297,8 @@ def share_of_usual(task: Walking) -> Array:
 
     Of the Mini Pupper at most 1; those of another robot are its own, as large as they are.
     """
-    own, usual = (np.abs(_ranges(c)).max(axis=1) for c in (task.commands, RANDOM))
-    share = np.where(own > 0, own / usual, 1.0)
+    largest, usual = (np.abs(_ranges(c)).max(axis=1) for c in (task.commands, RANDOM))
+    share = np.where(largest > 0, largest / usual, 1.0)
     return share if task.robot else np.minimum(share, 1.0)
 
 

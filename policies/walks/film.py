@@ -45,7 +45,7 @@ class Film:
         frame.offheight, frame.offwidth = np.maximum((frame.offheight, frame.offwidth), SIZE)
         try:
             self._renderer = self._mujoco.Renderer(model, *SIZE)
-        except Exception as error:  # EGL, OSMesa and GLFW each fail in their own way
+        except Exception as error:  # EGL, OSMesa and GLFW raise different errors
             raise InputError(
                 f"No frames can be drawn here ({type(error).__name__}: {error}), so there is no "
                 "video. Install EGL or OSMesa, or set MUJOCO_GL."

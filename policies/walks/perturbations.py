@@ -46,8 +46,8 @@ def jittered(part: slice, mean_steps: int, rng: np.random.Generator) -> Change:
             lag = np.full(len(now), mean_steps)
         past.insert(0, now)
         del past[2 * mean_steps + 1 :]
-        wanted = rng.integers(0, 2 * mean_steps + 1, len(lag))
-        lag = np.minimum(np.minimum(wanted, lag + 1), len(past) - 1)
+        drawn = rng.integers(0, 2 * mean_steps + 1, len(lag))
+        lag = np.minimum(np.minimum(drawn, lag + 1), len(past) - 1)
         return np.stack(past)[lag, np.arange(len(lag))]
 
     return _altered(part, value)
@@ -66,12 +66,12 @@ def zeroed(part: slice) -> Change:
 
 def held(part: slice, steps: int) -> Change:
     """Refresh a part only every `steps` control steps: staleness, as slow polls cause it."""
-    kept: list[Observations] = []
+    latest: list[Observations] = []
 
     def value(step: int, now: Observations) -> Observations:
         if step % steps == 0:
-            kept[:] = [now]
-        return kept[0]
+            latest[:] = [now]
+        return latest[0]
 
     return _altered(part, value)
 

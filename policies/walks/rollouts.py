@@ -192,8 +192,8 @@ class _Recorder(StepRecorder):
     ):
         assert policy is not None
         super().__init__(env, policy, conditions)
-        whole = [not (lean and (c.change or c.disturb)) for c in conditions]
-        self._whole = np.flatnonzero(np.repeat(whole, [c.robots for c in conditions]))
+        records_all = [not (lean and (c.change or c.disturb)) for c in conditions]
+        self._whole = np.flatnonzero(np.repeat(records_all, [c.robots for c in conditions]))
         self._seen: list[NDArray[np.float32]] = []
         self._hidden: list[NDArray[np.float32]] = []
         _listen(policy.network, lambda state: self._hidden.append(state.numpy()[self._whole]))
@@ -212,8 +212,8 @@ class _Recorder(StepRecorder):
         arrays = self.stacked(robots, steps)
         arrays["position"][..., 2] = np.unwrap(arrays["position"][..., 2], axis=0)
         inside = np.flatnonzero((self._whole >= robots.start) & (self._whole < robots.stop))
-        for name, kept in (("observation", self._seen), ("hidden", self._hidden)):
-            arrays[name] = np.stack([step[inside] for step in kept[:steps]])
+        for name, recorded in (("observation", self._seen), ("hidden", self._hidden)):
+            arrays[name] = np.stack([step[inside] for step in recorded[:steps]])
         task, command = condition.task, condition.command
         assert command is not None
         arrays["fell"] = self.fell[robots]

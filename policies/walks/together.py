@@ -82,7 +82,7 @@ def walk_together(
     )
     done, lock, stop = 0.0, threading.Lock(), threading.Event()
     total = seconds * sum(c.robots for c in conditions)
-    kept: dict[int, T] = {}
+    results: dict[int, T] = {}
 
     def advance(robot_seconds: float) -> bool:
         """Count what was walked; whether to go on."""
@@ -94,25 +94,25 @@ def walk_together(
 
     def walk(environments: list[list[int]], threads: int) -> None:
         for chosen in environments:
-            some = [conditions[i] for i in chosen]
-            group = _Group(policy, servos, some, seconds, seed, threads, shared, recorder)
+            batch = [conditions[i] for i in chosen]
+            group = _Group(policy, servos, batch, seconds, seed, threads, shared, recorder)
             if not group.walk(advance):
                 return
-            kept.update(zip(chosen, group.found(), strict=True))
+            results.update(zip(chosen, group.results(), strict=True))
 
     shares = _shares(conditions)
     cores = threads or os.cpu_count() or 1
     workers = min(len(shares), cores)
     with ThreadPoolExecutor(workers) as pool:
-        each = [cores // workers + (k < cores % workers) for k in range(workers)]
-        running = [pool.submit(walk, s, each[k % workers]) for k, s in enumerate(shares)]
+        threads_of = [cores // workers + (k < cores % workers) for k in range(workers)]
+        running = [pool.submit(walk, s, threads_of[k % workers]) for k, s in enumerate(shares)]
         try:
             wait(running, return_when="FIRST_EXCEPTION")
         finally:  # after Ctrl-C, or an error in one of them, the others end with their step
             stop.set()
-        for one in running:
-            one.result()
-    return [kept[i] for i in range(len(conditions))]
+        for future in running:
+            future.result()
+    return [results[i] for i in range(len(conditions))]
 
 
 def _refuse_impossible(conditions: Sequence[Condition], seconds: float, threads: int) -> None:
@@ -265,7 +265,7 @@ class _Group:
         action[missed] = env.action[missed]
         return action
 
-    def found(self) -> list:
+    def results(self) -> list:
         """What was kept, by condition."""
         parts = zip(self.conditions, self.robots, self.last.tolist(), strict=True)
         return [self.recorder.of(c, robots, n, self.commands[:, robots]) for c, robots, n in parts]

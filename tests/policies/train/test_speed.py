@@ -27,7 +27,7 @@ def test_bare_physics_takes_the_steps_of_the_environment_and_leaves_it_where_it_
     paces, bare_first
 ):
     batch = paces.env.robots.batch
-    ends, controls, own = [], [], paces._own
+    ends, controls, own = [], [], paces._stepped
     take = paces._bare
 
     def bare(given):
@@ -42,7 +42,7 @@ def test_bare_physics_takes_the_steps_of_the_environment_and_leaves_it_where_it_
         controls.append(batch.bind("ctrl").copy())
         return found
 
-    paces._bare, paces._own = bare, environment
+    paces._bare, paces._stepped = bare, environment
     times = paces.slice(bare_first)
     np.testing.assert_array_equal(controls[0], controls[1])
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
