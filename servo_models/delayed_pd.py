@@ -55,12 +55,12 @@ class DelayedServo(ABC):
     ):
         refuse_time_step(type(self).__name__, time_step_s)
         self.time_step_s = float(time_step_s)
-        self._own = np.broadcast_shapes(*(v.shape for v in values))
+        self._shape = np.broadcast_shapes(*(v.shape for v in values))
         self._delay_line = DelayLine(dead_time_s, self.time_step_s)
-        self.reset(np.zeros(self._own))
+        self.reset(np.zeros(self._shape))
 
     def __repr__(self) -> str:
-        of = f" of {self._own} servos" if self._own else ""
+        of = f" of {self._shape} servos" if self._shape else ""
         return f"{type(self).__name__}{of}, a step every {1e3 * self.time_step_s:g} ms"
 
     def reset(self, position: ArrayLike) -> None:
@@ -69,7 +69,7 @@ class DelayedServo(ABC):
         The batch becomes the shape to which `position` and the parameters broadcast.
         """
         position = np.asarray(position, float)
-        self.batch = np.broadcast_shapes(position.shape, self._own)
+        self.batch = np.broadcast_shapes(position.shape, self._shape)
         position = np.broadcast_to(position, self.batch)
         self._rest(position)
         self._delay_line.reset(position)
@@ -130,13 +130,13 @@ class DelayLine:
         history = np.concatenate([self._past, commands])
         self._past = history[len(history) - self._rows :].copy()
         delay = np.broadcast_to(self._delay_steps, commands.shape[1:]).reshape(-1)
-        whole = np.floor(delay).astype(int)
+        steps = np.floor(delay).astype(int)
         # one row more than requested: each row's successor is the other end of its interpolation
         row = np.arange(len(history) - len(commands) - 1, len(history))[:, None]
         series = len(delay)
-        taken = np.take(history.reshape(-1), row * series + (np.arange(series) - whole * series))
+        taken = np.take(history.reshape(-1), row * series + (np.arange(series) - steps * series))
         arrived = np.subtract(taken[:-1], taken[1:])
-        arrived *= delay - whole
+        arrived *= delay - steps
         arrived += taken[1:]
         return arrived.reshape(commands.shape)
 
@@ -309,9 +309,9 @@ def _steps(
     for k in range(delayed.shape[0]):
         for n in range(delayed.shape[1]):
             setpoint[n] += min(max(delayed[k, n] - setpoint[n], -slew[n]), slew[n])
-            wanted = (setpoint[n] - position[n]) * kp[n] - kd[n] * velocity[n]
-            force = min(max(wanted, -effort[n]), effort[n])
-            gain = inverse[n] if force == wanted else clipped[n]
+            demand = (setpoint[n] - position[n]) * kp[n] - kd[n] * velocity[n]
+            force = min(max(demand, -effort[n]), effort[n])
+            gain = inverse[n] if force == demand else clipped[n]
             if brake[n] != 0.0:
                 force -= brake[n] * velocity[n]
             stop = (velocity[n] * (1.0 / h) + force) * -FRICTION_IMPEDANCE

@@ -105,7 +105,7 @@ class HeldFeedback:
     def step(self, position: ArrayLike) -> NDArray[np.float64]:
         """Readings [rad] after one time step that ended at `position` [rad], of the same shape.
 
-        A poll falls anywhere in a step and reads the position of its own instant.
+        A poll falls anywhere in a step and reads the position of that instant.
 
         Raises
         ------
@@ -119,25 +119,25 @@ class HeldFeedback:
         >>> [round(float(feedback.step(x)), 4) for x in (0.4, 0.8, 1.2)]
         [0.2, 0.2, 1.2]
         """
-        own, now = self._state, np.asarray(position, float)
-        if not own or own["before"].shape != now.shape:
+        state, now = self._state, np.asarray(position, float)
+        if not state or state["before"].shape != now.shape:
             raise InputError(
                 f"HeldFeedback: a step to positions of shape {now.shape} needs `reset` with "
                 "positions of that shape first."
             )
-        own["until"] = own["until"] - own["step"]
-        own["age"] = own["age"] + own["step"]
-        change = (now - own["before"]) / own["step"]
-        while self.poll_period_s > 0 and (due := own["until"] <= 1e-12).any():
-            fresh = due & (own["rng"].random(now.shape) >= self.loss)
-            ago = np.maximum(-own["until"], 0.0)
-            own["reading"] = np.where(fresh, self._reported(now - change * ago), own["reading"])
-            own["age"] = np.where(fresh, ago, own["age"])
-            own["until"] = np.where(due, own["until"] + self.poll_period_s, own["until"])
+        state["until"] = state["until"] - state["step"]
+        state["age"] = state["age"] + state["step"]
+        change = (now - state["before"]) / state["step"]
+        while self.poll_period_s > 0 and (due := state["until"] <= 1e-12).any():
+            fresh = due & (state["rng"].random(now.shape) >= self.loss)
+            ago = np.maximum(-state["until"], 0.0)
+            state["reading"] = np.where(fresh, self._reported(now - change * ago), state["reading"])
+            state["age"] = np.where(fresh, ago, state["age"])
+            state["until"] = np.where(due, state["until"] + self.poll_period_s, state["until"])
         if self.poll_period_s == 0:
-            own["reading"], own["age"] = self._reported(now), np.zeros(now.shape)
-        own["before"] = now.copy()
-        return own["reading"].copy()
+            state["reading"], state["age"] = self._reported(now), np.zeros(now.shape)
+        state["before"] = now.copy()
+        return state["reading"].copy()
 
     @property
     def age_s(self) -> NDArray[np.float64]:

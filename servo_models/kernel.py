@@ -156,14 +156,7 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
     summed, most_summed, mean_error = _lanes(), _lanes(), _lanes()
     braked, clipped, drive, free = _lanes(), _lanes(), _lanes(), _lanes()
     begin, error, acting, pull, limit = _lanes(), _lanes(), _lanes(), _lanes(), _lanes()
-    slew, friction, firmware, profile, gravity, backlash = (
-        False,
-        False,
-        False,
-        False,
-        False,
-        False,
-    )
+    slew = friction = firmware = profile = gravity = backlash = False
     for i in range(LANES):
         w = values[who[i]]
         for j in range(WIDTH):
@@ -210,9 +203,9 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
             command = edges[0, k + earliest]
             for i in range(LANES):
                 middle = y[i] + v[i] * half
-                wanted = (command - middle) * p[0, i] - p[1, i] * v[i]
-                force = clip(wanted, p[2, i])
-                unclipped = 1.0 if force == wanted else 0.0
+                demand = (command - middle) * p[0, i] - p[1, i] * v[i]
+                force = clip(demand, p[2, i])
+                unclipped = 1.0 if force == demand else 0.0
                 step = clipped[i] + (braked[i] - clipped[i]) * unclipped
                 v[i] = _rubbed(v[i], force - p[3, i] * v[i], p[5, i], step)
                 y[i] = middle + v[i] * half
@@ -236,10 +229,10 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
                 inside = 1.0 if old > 0.0 else 0.0
                 old = old if old > 0.0 else 0.0
                 changed = 1.0 if next_cut < end else 0.0
-                kept = next_cut if next_cut < end else end
+                stays = next_cut if next_cut < end else end
                 b = first + (earlier[i] - first) * inside
                 a = first + (later - first) * changed
-                mean = earlier[i] * old + first * (part[i] - old + kept) + later * (end - kept)
+                mean = earlier[i] * old + first * (part[i] - old + stays) + later * (end - stays)
                 apart = b - a
                 apart = apart if abs(apart) > 1e-12 else 1.0
                 x = (mean - a) / apart
@@ -305,10 +298,10 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
                     mean_error[i] += (1.0 - share[i] if part_of else share[i]) * x
             for i in range(LANES):
                 weight = 1.0 - share[i] if part_of else share[i]
-                wanted = error[i] * p[0, i] - p[1, i] * v[i] + begin[i]
-                reached = clip(wanted, p[2, i])
+                demand = error[i] * p[0, i] - p[1, i] * v[i] + begin[i]
+                reached = clip(demand, p[2, i])
                 drive[i] += reached * weight
-                free[i] += weight * (1.0 if reached == wanted else 0.0)
+                free[i] += weight * (1.0 if reached == demand else 0.0)
         if firmware:  # its integral alone commands no more than the effort limit
             for i in range(LANES):
                 summed[i] = clip(summed[i] + p[21, i] * mean_error[i], most_summed[i])
@@ -324,10 +317,10 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
                 _delayed(held, 1, k, shift, part, on)
                 volt = held[2, k + pad]
                 for i in range(LANES):
-                    given = volt * on[i]
+                    supplied = volt * on[i]
                     back = p[3, i] * (p[15, i] + (1.0 - p[15, i]) * on[i])
-                    acting[i] = _acting(h * (p[1, i] * given * free[i] + back), h)
-                    drive[i] = drive[i] * given - back * v[i]
+                    acting[i] = _acting(h * (p[1, i] * supplied * free[i] + back), h)
+                    drive[i] = drive[i] * supplied - back * v[i]
             else:
                 for i in range(LANES):
                     acting[i] = clipped[i] + (braked[i] - clipped[i]) * free[i]
@@ -422,8 +415,8 @@ def _simulate(
 ):  # fmt: skip
     part, shift = _lanes(), np.zeros(LANES, np.int64)
     for i in range(LANES):
-        whole = int(np.floor(dead_time[who[i]]))
-        shift[i], part[i] = pad - whole, dead_time[who[i]] - whole
+        whole_steps = int(np.floor(dead_time[who[i]]))
+        shift[i], part[i] = pad - whole_steps, dead_time[who[i]] - whole_steps
     if kind == SERVO:
         _servo(
             values, who, held, edges, until, gain, load, start, steps, pad, h, shift, part, track

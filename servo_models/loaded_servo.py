@@ -100,10 +100,10 @@ class LoadedServoParameters:
 
     def beyond_delayed_pd(self) -> tuple[str, ...]:
         """Terms of this servo that `DelayedPD`, and with it simulators' actuators, do not have."""
-        own = self.arrays()
-        there = [words for name, words in _BEYOND.items() if np.max(own[name]) > 0]
-        limited = [words for name, words in _LIMITS_BEYOND.items() if np.min(own[name]) < np.inf]
-        return (*there, *limited)
+        values = self.arrays()
+        present = [words for name, words in _BEYOND.items() if np.max(values[name]) > 0]
+        limited = [words for name, words in _LIMITS_BEYOND.items() if np.min(values[name]) < np.inf]
+        return (*present, *limited)
 
     def delayed_pd(
         self, p_gain: ArrayLike, load_inertia_kg_m2: ArrayLike = 0.0, torque_nm: ArrayLike = 0.0
@@ -115,18 +115,19 @@ class LoadedServoParameters:
         of `torque_nm`. `load_inertia_kg_m2` is added to the armature, where no body of the
         simulator has it.
         """
-        own, torque = self.arrays(), np.asarray(torque_nm, float)
-        friction = own["friction_loss"] + own["load_friction_quadratic"] * torque**2
-        friction = friction + (own["load_friction_motor"] + own["load_friction_load"]) * torque
+        values, torque = self.arrays(), np.asarray(torque_nm, float)
+        friction = values["friction_loss"] + values["load_friction_quadratic"] * torque**2
+        per_torque = values["load_friction_motor"] + values["load_friction_load"]
+        friction = friction + per_torque * torque
         return DelayedPDParameters(
-            stiffness=own["duty_per_rad"] * np.asarray(p_gain) * own["stall_torque"],
-            damping=own["duty_s_per_rad"] * own["stall_torque"],
+            stiffness=values["duty_per_rad"] * np.asarray(p_gain) * values["stall_torque"],
+            damping=values["duty_s_per_rad"] * values["stall_torque"],
             friction_loss=friction,
-            armature=own["armature"] + np.asarray(load_inertia_kg_m2),
-            effort_limit=np.minimum(own["stall_torque"], own["torque_limit"]),
-            velocity_limit=own["velocity_limit"],
-            dead_time_s=own["dead_time_s"],
-            back_emf=own["back_emf"],
+            armature=values["armature"] + np.asarray(load_inertia_kg_m2),
+            effort_limit=np.minimum(values["stall_torque"], values["torque_limit"]),
+            velocity_limit=values["velocity_limit"],
+            dead_time_s=values["dead_time_s"],
+            back_emf=values["back_emf"],
         )
 
 
@@ -268,14 +269,14 @@ def _steps(delayed, on, volts, positions, position, velocity, setpoint, rates, t
                 target += min(max(way, -slew * h), slew * h)
             error = target - y
             error -= min(max(error, -zone), zone)
-            wanted = stiffness * error - damper * v
-            wanted += start * min(max(error / START_ERROR_RAD, -1.0), 1.0)
-            duty = min(max(wanted, -1.0), 1.0)
+            demand = stiffness * error - damper * v
+            demand += start * min(max(error / START_ERROR_RAD, -1.0), 1.0)
+            duty = min(max(demand, -1.0), 1.0)
             top = stall * volts[k] * on[k, n]
             back = emf * (off_brake + (1.0 - off_brake) * on[k, n])
             drawn = duty * top - back * v
             motor = min(max(drawn, -torque_limit), torque_limit)
-            damping = (damper * top if duty == wanted else 0.0) + back
+            damping = (damper * top if duty == demand else 0.0) + back
             if motor != drawn:
                 damping = 0.0
             weight = -gravity * math.sin(y - hanging)

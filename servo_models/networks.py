@@ -126,8 +126,8 @@ class JointArrays(ABC):
         joints).
         """
         out = []
-        for command, here in zip(commands, position, strict=True):
-            self._last = self._normal_position(self._arrange(here))
+        for command, position_now in zip(commands, position, strict=True):
+            self._last = self._normal_position(self._arrange(position_now))
             out.append(self.step(command))
         return np.stack(out)
 
@@ -139,9 +139,9 @@ class JointArrays(ABC):
     def _need(self, name: str, shape: tuple[int, ...]) -> None:
         expected = (len(self.joints), *shape)
         if name not in self.parameters or self.parameters[name].shape != expected:
-            found = self.parameters[name].shape if name in self.parameters else "nothing"
+            actual = self.parameters[name].shape if name in self.parameters else "nothing"
             raise InputError(
-                f"A servo model needs {name} of shape {expected}; found {found}. Fit it again."
+                f"A servo model needs {name} of shape {expected}; found {actual}. Fit it again."
             )
 
     def _enter(self, position: ArrayLike) -> NDArray[np.float32]:
@@ -219,12 +219,12 @@ class CommandNetwork(JointArrays):
 
     def reset(self, position: ArrayLike) -> None:
         """Rest at `position` [rad], shape (*environments, joints); it sets how many there are."""
-        here = self._enter(position)
+        initial = self._enter(position)
         # room for as many new commands as are remembered: moving the rest is seldom needed
-        self._room = np.empty((len(self.joints), 2 * self.taps, here.shape[1]), np.float32)
-        self._remember(np.repeat(self._normal_command(here)[:, None], self.taps, axis=1))
-        self._last = self._normal_position(here)
-        self._work = [np.empty((len(w[0]), here.shape[1]), np.float32) for w, _ in self._layers]
+        self._room = np.empty((len(self.joints), 2 * self.taps, initial.shape[1]), np.float32)
+        self._remember(np.repeat(self._normal_command(initial)[:, None], self.taps, axis=1))
+        self._last = self._normal_position(initial)
+        self._work = [np.empty((len(w[0]), initial.shape[1]), np.float32) for w, _ in self._layers]
 
     def step(self, command: ArrayLike) -> NDArray[np.float32]:
         """Advance one time step under `command` [rad]; returns the position after it [rad]."""
@@ -240,9 +240,9 @@ class CommandNetwork(JointArrays):
         commands = np.asarray(commands, np.float32)
         if self.feedback:
             return np.stack([self.step(c) for c in commands])
-        given = np.stack([self._normal_command(self._arrange(c)) for c in commands], axis=1)
+        inputs = np.stack([self._normal_command(self._arrange(c)) for c in commands], axis=1)
         # newest first in the history, oldest first in time: one axis that can be windowed
-        time = np.concatenate([self._history[:, ::-1], given], axis=1)
+        time = np.concatenate([self._history[:, ::-1], inputs], axis=1)
         windows = np.lib.stride_tricks.sliding_window_view(time, self.taps, axis=1)[:, 1:, :, ::-1]
         joints, steps, environments, taps = windows.shape
         x = np.moveaxis(windows, -1, 1).reshape(joints, taps, steps * environments)
@@ -329,13 +329,13 @@ class RecurrentNetwork(JointArrays):
 
     def reset(self, position: ArrayLike) -> None:
         """Rest at `position` [rad], shape (*environments, joints); it sets how many there are."""
-        here = self._enter(position)
+        initial = self._enter(position)
         members, hidden = self._memory
-        shape = (len(self.joints), members, here.shape[1], hidden)
+        shape = (len(self.joints), members, initial.shape[1], hidden)
         self._hidden, self._cell = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        rest = self._normal_command(here)
+        rest = self._normal_command(initial)
         self._history = np.repeat(rest[..., None], self.taps, axis=-1)
-        at_rest = self._normal_position(here)
+        at_rest = self._normal_position(initial)
         for _ in range(self.warm_up):
             self._last = at_rest
             self._advance(rest)

@@ -145,13 +145,13 @@ def save_servo_model(
     for name in (CONTRACT, WEIGHTS):
         refuse_overwrite(folder / name, force)
     data = save_tensors({k: np.ascontiguousarray(v) for k, v in parameters.items()})
-    whole = _validated({**contract, "weights_sha256": hashlib.sha256(data).hexdigest()}, folder)
-    _build(whole, parameters, folder)  # what cannot be read back is not written
-    text = json.dumps(whole.model_dump(mode="json", by_alias=True), indent=2, ensure_ascii=False)
+    complete = _validated({**contract, "weights_sha256": hashlib.sha256(data).hexdigest()}, folder)
+    _build(complete, parameters, folder)  # what cannot be read back is not written
+    text = json.dumps(complete.model_dump(mode="json", by_alias=True), indent=2, ensure_ascii=False)
     with held():  # weights without a contract are no model
         write_bytes(folder / WEIGHTS, data, force)
         write_text(folder / CONTRACT, text + "\n", force)
-    return whole
+    return complete
 
 
 def load_servo_model(
@@ -188,8 +188,8 @@ def load_servo_model(
             "rate: record at the new one and fit again, or fit the architecture delayed-pd."
         )
     names = list(contract.joints)
-    wanted = names if joints is None else list(joints)
-    missing = [j for j in wanted if j not in contract.joints]
+    chosen = names if joints is None else list(joints)
+    missing = [j for j in chosen if j not in contract.joints]
     if missing:
         raise InputError(
             f"{folder} has no model for {', '.join(missing)}; it has {', '.join(names)}. Servos "
@@ -210,10 +210,10 @@ def load_servo_model(
         parameters["dead_time_s"] = parameters.pop("delay_s")  # its name until version 2
     contract = contract.model_copy(update={"schema_version": SCHEMA_VERSION})
     model = _build(contract, parameters, folder)
-    if wanted != names:
-        index = [names.index(j) for j in wanted]
+    if chosen != names:
+        index = [names.index(j) for j in chosen]
         parameters = {k: v[index] for k, v in parameters.items()}
-        contract = contract.model_copy(update={"joints": {j: contract.joints[j] for j in wanted}})
+        contract = contract.model_copy(update={"joints": {j: contract.joints[j] for j in chosen}})
         model = build(contract, parameters)
     return SavedModel(model, contract, parameters, folder)
 
@@ -278,7 +278,7 @@ def _build(contract: Contract, parameters: Mapping[str, NDArray], folder: Path) 
         raise InputError(f"{folder}: {error}") from error
 
 
-def _check_names(arch: str, found: set[str]) -> None:
+def _check_names(arch: str, names: set[str]) -> None:
     """Refuse missing arrays, and those of another architecture."""
     required, optional = set(_LINEAR), frozenset[str]()
     if arch == "delayed-pd":
@@ -287,11 +287,11 @@ def _check_names(arch: str, found: set[str]) -> None:
     elif arch == "sindy":
         required, optional = {"dead_time_s", "offset_rad"}, frozenset(COEFFICIENTS)
     elif arch == "mlp":
-        depth = sum(name.startswith("weight_") for name in found)
+        depth = sum(name.startswith("weight_") for name in names)
         required |= {f"{kind}_{n}" for kind in ("weight", "bias") for n in range(depth)}
-    elif arch == "lstm" and found != _LINEAR:  # training that was ended at once leaves the filter
+    elif arch == "lstm" and names != _LINEAR:  # training that was ended at once leaves the filter
         required |= _RECURRENT
-    missing, foreign = sorted(required - found), sorted(found - required - optional)
+    missing, foreign = sorted(required - names), sorted(names - required - optional)
     if missing or foreign:
         what = f"{missing[0]} is missing" if missing else f"{foreign[0]} is none of its arrays"
         raise InputError(f"the weights are not those of a model of type {arch}: {what}. Fit again.")
@@ -305,15 +305,15 @@ def _read_contract(folder: Path) -> Contract:
             f"{folder} holds no servo model ({CONTRACT} is missing). "
             "Make one with `pupper-sysid fit-servo`."
         )
-    found = read_json(path, remedy=_AGAIN)
-    if not isinstance(found, dict) or found.get("schema") != SCHEMA:
+    contract = read_json(path, remedy=_AGAIN)
+    if not isinstance(contract, dict) or contract.get("schema") != SCHEMA:
         raise InputError(f"{path} is no servo model's contract. Give a folder of `fit-servo`.")
-    refuse_other_version(path, found.get("schema_version"), SCHEMA_VERSION)
-    return _validated(found, path)
+    refuse_other_version(path, contract.get("schema_version"), SCHEMA_VERSION)
+    return _validated(contract, path)
 
 
-def _validated(found: dict[str, Any], path: Path) -> Contract:
-    contract = validated(Contract, found, path, remedy="fit the model again")
+def _validated(content: dict[str, Any], path: Path) -> Contract:
+    contract = validated(Contract, content, path, remedy="fit the model again")
     if strange := strange_joint(contract.joints):
         raise InputError(f"{path}: {strange[0]} is no joint; {strange[1]}")
     return contract

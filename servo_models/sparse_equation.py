@@ -212,12 +212,12 @@ def equation(coefficients: Mapping[str, float], dead_time_s: float) -> str:
         "drag_per_rad": "− {} · q̇|q̇|",
         "friction_rad_s2": "− {} · sign(q̇)",
     }
-    parts = [
+    terms = [
         shape.format(f"{digits(coefficients[name])} {COEFFICIENTS[name].unit}")
         for name, shape in shapes.items()
         if coefficients.get(name)
     ]
-    right = " ".join(parts).removeprefix("+ ")
+    right = " ".join(terms).removeprefix("+ ")
     return f"q̈ = {right or '0'},  e = u(t − {digits(1e3 * dead_time_s)} ms) − q"
 
 

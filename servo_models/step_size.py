@@ -2,7 +2,7 @@
 
 MuJoCo, like most engines, computes set-point and damping of a step with the values at the step's
 end. A stepped servo therefore responds earlier than the same servo in continuous time, by about a
-step: a calibration found with steps of 2 ms and simulated with 5 ms would be 2 to 3 ms too early. A
+step: a calibration fitted in steps of 2 ms and simulated with 5 ms would be 2 to 3 ms too early. A
 simulator without a speed limit on set-points responds earlier, too, and one that computes the PD
 before its step later. `delay_at_step` is the dead time with which another `Engine`, or another
 step, gives the same lag to commands at any time. A calibration holds a servo's own numbers, in
@@ -67,7 +67,7 @@ class Engine:
 
 
 MUJOCO = Engine()
-"""The arithmetic of MuJoCo's `<pid>`, with which calibrations are found."""
+"""The arithmetic of MuJoCo's `<pid>`, with which calibrations are fitted."""
 MUJOCO_PID = Engine(short_delays=False)
 """MuJoCo's `<pid>` itself, whose delay line has nothing between 0 and one step."""
 
@@ -95,19 +95,19 @@ def tones_in_steps_of(
         values["velocity_limit"] = np.full_like(values["velocity_limit"], np.inf)
     batch = (len(values["stiffness"]), len(turn))
     still = (np.zeros(batch), np.zeros(batch), np.zeros(batch))
-    given = np.broadcast_to(commands[:, None], (count, *batch))
-    moved, _ = integrate(given, still, values, time_step_s, implicit=engine.implicit)
+    on_steps = np.broadcast_to(commands[:, None], (count, *batch))
+    moved, _ = integrate(on_steps, still, values, time_step_s, implicit=engine.implicit)
     late = edge[1:] > _WARM_UP_S
-    lags, rests = [], []
+    lags, residues = [], []
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable servo may end anywhere
         for n, w in enumerate(turn):
             at, track = w * edge[1:][late], np.clip(moved[late, :, n], -_FAR_RAD, _FAR_RAD)
             design = sine_design(at)
             tone = least_squares(design, track)
             lags.append(np.arctan2(-tone[1], tone[2]) / w)
-            rest = np.sqrt(np.mean((track - design @ tone) ** 2, axis=0))
-            rests.append(rest / np.hypot(tone[1], tone[2]))
-    return np.mean(lags, axis=0), np.max(rests, axis=0)
+            residue = np.sqrt(np.mean((track - design @ tone) ** 2, axis=0))
+            residues.append(residue / np.hypot(tone[1], tone[2]))
+    return np.mean(lags, axis=0), np.max(residues, axis=0)
 
 
 def at_step(
@@ -133,10 +133,10 @@ def at_step(
     if time_step_s > CONTINUOUS_S:
         moved = _discrete(moved, time_step_s, engine.implicit)
     fitted, usual = tones_in_steps_of(parameters, fitted_step_s)
-    there, rest = tones_in_steps_of(moved, time_step_s, engine)
-    if not (rest - usual < _UNSTABLE).all():
+    in_steps, residue = tones_in_steps_of(moved, time_step_s, engine)
+    if not (residue - usual < _UNSTABLE).all():
         raise InputError(_UNSTABLE_STEP.format(1e3 * time_step_s))
-    delay = np.atleast_1d(parameters.dead_time_s) - (there - fitted)
+    delay = np.atleast_1d(parameters.dead_time_s) - (in_steps - fitted)
     return replace(moved, dead_time_s=np.maximum(delay, 0.0))
 
 
@@ -163,18 +163,18 @@ def nearest_in_loop(
     if not engine.slews or (same and not short.any()):
         return stepped
     stairs = _loop_tones()
-    at, wanted = in_loop(parameters, fitted_step_s, stairs)
+    at, fitted = in_loop(parameters, fitted_step_s, stairs)
     delay, reach = usual, time_step_s
     values = {k: np.broadcast_to(v, len(usual))[:, None] for k, v in stepped.arrays().items()}
     for _ in range(2):  # over a step either way, then between neighbours
         trials = np.maximum(delay + reach * np.linspace(-1.0, 1.0, _TRIALS), 0.0)
         if not engine.short_delays:
-            whole = time_step_s * np.round(trials / time_step_s)
-            trials = np.where(trials < time_step_s, whole, trials)
-        own = DelayedPDParameters(**values | {"dead_time_s": trials})
-        times, moved = in_loop(own, time_step_s, stairs, engine)
-        there = np.stack([np.interp(times, at, track) for track in wanted.T], axis=1)
-        errors = np.mean((moved - there[:, :, None]) ** 2, axis=0)
+            whole_steps = time_step_s * np.round(trials / time_step_s)
+            trials = np.where(trials < time_step_s, whole_steps, trials)
+        candidates = DelayedPDParameters(**values | {"dead_time_s": trials})
+        times, moved = in_loop(candidates, time_step_s, stairs, engine)
+        expected = np.stack([np.interp(times, at, track) for track in fitted.T], axis=1)
+        errors = np.mean((moved - expected[:, :, None]) ** 2, axis=0)
         # where a set-point that runs at its limit makes many dead times alike, the usual one
         errors *= 1.0 + _LIKE_USUAL * ((trials - usual) / time_step_s) ** 2
         delay = np.take_along_axis(trials, np.argmin(errors, axis=1)[:, None], axis=1)
@@ -215,15 +215,15 @@ def in_loop(
     times = time_step_s * np.arange(int(edges[-1] / time_step_s + 1e-9) + 1, dtype=float)
     area = np.append(0.0, np.cumsum(commands) * CONTROL_S)
     means = np.diff(np.interp(times, edges, area)) / time_step_s
-    rest = np.full(batch, float(commands[0]))
+    initial = np.full(batch, float(commands[0]))
     line = DelayLine(values["dead_time_s"], time_step_s)
-    line.reset(rest)
+    line.reset(initial)
     arriving = line.shift(
         np.broadcast_to(means.reshape(-1, *[1] * len(batch)), (len(means), *batch))
     )
-    still = (rest, np.zeros(batch), rest)
+    still = (initial, np.zeros(batch), initial)
     moved, _ = integrate(arriving, still, values, time_step_s, implicit=engine.implicit)
-    return times, np.concatenate([rest[None], moved])
+    return times, np.concatenate([initial[None], moved])
 
 
 def _discrete(parameters: DelayedPDParameters, h: float, implicit: bool) -> DelayedPDParameters:
@@ -280,5 +280,5 @@ def lag_of_steps(
     at their frequencies.
     """
     fitted, usual = tones_in_steps_of(parameters, fitted_step_s)
-    there, rest = tones_in_steps_of(parameters, time_step_s)
-    return np.where(rest - usual < _UNSTABLE, there - fitted, np.nan)
+    in_steps, residue = tones_in_steps_of(parameters, time_step_s)
+    return np.where(residue - usual < _UNSTABLE, in_steps - fitted, np.nan)

@@ -212,8 +212,8 @@ class Calibration(Part):
         InputError
             If this calibration lacks one of the joints.
         """
-        wanted = self.joint_names if joints is None else tuple(joints)
-        actuators = [self.joint(name).actuator for name in wanted]
+        names = self.joint_names if joints is None else tuple(joints)
+        actuators = [self.joint(name).actuator for name in names]
         if not actuators:
             raise InputError("No joint was named. Name at least one.")
         parameters = DelayedPDParameters(
@@ -222,11 +222,11 @@ class Calibration(Part):
                 for field, key in PARAMETER_KEYS.items()
             }
         )
-        own = np.array([a.numbers_in == "continuous time" for a in actuators])
-        if own.any():
+        continuous = np.array([a.numbers_in == "continuous time" for a in actuators])
+        if continuous.any():
             numbers, stepped = parameters.arrays(), at_step(parameters, time_step_s).arrays()
             parameters = DelayedPDParameters(
-                **{name: np.where(own, stepped[name], numbers[name]) for name in numbers}
+                **{name: np.where(continuous, stepped[name], numbers[name]) for name in numbers}
             )
         return DelayedPD(parameters, time_step_s)
 
@@ -269,7 +269,7 @@ class Calibration(Part):
         InputError
             If the target cannot take these servos so, or the file exists.
         """
-        # a room above this one: the file's own room knows no simulator
+        # a room above this one: files import no simulator
         return import_module("pupper_sysid.sim.export.export").export(self, to, out, **options)
 
     def to_yaml(self) -> str:
@@ -389,14 +389,14 @@ def _with_unseen_runs(joints: Any) -> Any:
     """Joints of a version 3 file, whose fits under load had errors under another's name."""
     if not isinstance(joints, dict):
         return joints
-    found, old = dict(joints), "rmse_leave_one_frequency_out_rad"
+    renamed, old = dict(joints), "rmse_leave_one_frequency_out_rad"
     for name, joint in joints.items():
         if isinstance(joint, dict) and joint.get("under_load") is not None:
             # root mean square errors of the model, mean absolute ones of the candidates
             new = {"scores": "rmse_unseen_runs_rad", "selection": "mae_unseen_runs_rad"}
-            parts = {p: _renamed(joint[p], {old: new[p]}) for p in new.keys() & joint.keys()}
-            found[name] = joint | parts
-    return found
+            blocks = {p: _renamed(joint[p], {old: new[p]}) for p in new.keys() & joint.keys()}
+            renamed[name] = joint | blocks
+    return renamed
 
 
 def _renamed(data: Any, names: dict[str, str]) -> Any:

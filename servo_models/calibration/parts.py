@@ -117,12 +117,12 @@ class UnderLoad(Part):
 
     def servo(self, dead_time_s: float) -> LoadedServoParameters:
         """The numbers themselves, without intervals."""
-        own = {
+        values = {
             name: value.value
             for name, key in LOADED_KEYS.items()
             if (value := getattr(self, key)) is not None
         }
-        return LoadedServoParameters(**{"duty_s_per_rad": 0.0, **own}, dead_time_s=dead_time_s)
+        return LoadedServoParameters(**{"duty_s_per_rad": 0.0, **values}, dead_time_s=dead_time_s)
 
     def how_far_tested(self, p_gain: float) -> str:
         """What the recordings say of a P gain, in a sentence.
@@ -350,7 +350,7 @@ class Lag(Part):
     """The lag budget; a preset has none."""
 
     lag_s: Annotated[Quantity | None, LAG] = None
-    """From a command's edge to the motion [s]: the servo's own lag."""
+    """From a command's edge to the motion [s]: the servo's lag."""
     raw_lag_s: Annotated[Quantity | None, LAG] = None
     """Cross-correlation of all rows [s]: lag, stale readings and zero-order hold."""
     fresh_lag_s: Annotated[Quantity | None, LAG] = None
@@ -473,15 +473,16 @@ class JointCalibration(Part):
             )
         refuse_outside("`p_gain`", p_gain, *P_GAINS)
         share = p_gain / self.under_load.p_gain
-        own = self.actuator
-        ratio = own.ratios_to_armature.stiffness.scaled(share)
+        actuator = self.actuator
+        ratios = actuator.ratios_to_armature
+        ratio = {"stiffness": ratios.stiffness.scaled(share)}
         stiffness = {
-            "stiffness_nm_per_rad": own.stiffness_nm_per_rad.scaled(share),
-            "ratios_to_armature": own.ratios_to_armature.model_copy(update={"stiffness": ratio}),
+            "stiffness_nm_per_rad": actuator.stiffness_nm_per_rad.scaled(share),
+            "ratios_to_armature": ratios.model_copy(update=ratio),
         }
         return self.model_copy(
             update={
-                "actuator": own.model_copy(update=stiffness),
+                "actuator": actuator.model_copy(update=stiffness),
                 "under_load": self.under_load.model_copy(update={"p_gain": float(p_gain)}),
                 "operating_point": self.holds_at.at_p_gain(p_gain),
             }

@@ -162,10 +162,10 @@ class ServoCard(Part):
         """
         numbers = self.specimens.get(joint or self.default, self.numbers)
         if not isinstance(numbers, TorquePD):
-            own = self.gains.p if p_gain is None else p_gain
-            assert own is not None
-            refuse_outside("`p_gain`", own, *P_GAINS)
-            return numbers.as_pd(own)
+            gain = self.gains.p if p_gain is None else p_gain
+            assert gain is not None
+            refuse_outside("`p_gain`", gain, *P_GAINS)
+            return numbers.as_pd(gain)
         if p_gain is not None and p_gain != self.gains.p:
             raise InputError(
                 f"{self.name} states torques, not how they follow from the P gain, so they hold "
@@ -221,16 +221,16 @@ class ServoCard(Part):
 
     def _notes(self) -> list[str]:
         kind = "cited from" if self.published else "fitted here to recordings of"
-        told = [
+        notes = [
             f"Servo card {self.name}: {kind} {self.source.title}, {self.source.url}.",
             "A card has no bus: its feedback is ideal, every reading fresh and on time.",
         ]
         numbers = self.numbers
         if not isinstance(numbers, TorquePD) and numbers.left_out_of_pd:
-            told.append(numbers.left_out_of_pd)
+            notes.append(numbers.left_out_of_pd)
         if self.pd().dead_time_s is None:
-            told.append("The source has no dead time; 0 stands for it.")
-        return [*told, *self.notes]
+            notes.append("The source has no dead time; 0 stands for it.")
+        return [*notes, *self.notes]
 
     def _joint(self, name: str) -> JointCalibration:
         pd = self.pd(name)
@@ -282,22 +282,22 @@ class ServoCard(Part):
         numbers, gain = self.specimens[name], self.gains.p
         if isinstance(numbers, TorquePD) or gain is None:
             return None
-        made: dict[str, Any] = {key: getattr(numbers, key, None) for key in LOADED_KEYS.values()}
+        values: dict[str, Any] = {key: getattr(numbers, key, None) for key in LOADED_KEYS.values()}
         if isinstance(numbers, PositionLoop):
-            own = numbers.loaded().arrays()
-            finite = {n: float(x) for n, x in own.items() if np.isfinite(x) and x != 0}
-            made = {key: stated(finite[n]) for n, key in LOADED_KEYS.items() if n in finite}
-            made.setdefault("friction_loss_nm", stated(0.0))
-        made["duty_s_per_rad"] = made.get("duty_s_per_rad") or stated(0.0)
-        made.pop("dead_time_s", None)
+            arrays = numbers.loaded().arrays()
+            finite = {n: float(x) for n, x in arrays.items() if np.isfinite(x) and x != 0}
+            values = {key: stated(finite[n]) for n, key in LOADED_KEYS.items() if n in finite}
+            values.setdefault("friction_loss_nm", stated(0.0))
+        values["duty_s_per_rad"] = values.get("duty_s_per_rad") or stated(0.0)
+        values.pop("dead_time_s", None)
         return UnderLoad(
             structure=f"card {self.name}", known_load=True, p_gain=gain, p_gains_tested=(gain,),
-            reference_voltage_v=self.supply_v, **made,
+            reference_voltage_v=self.supply_v, **values,
         )  # fmt: skip
 
 
 class CardCalibration(Calibration):
-    """A card as a calibration: joints without a specimen of their own take the default's."""
+    """A card as a calibration: joints without a specimen take the default's."""
 
     def joint(self, name: str) -> JointCalibration:
         """Calibration of the joint `name`, whatever its name."""

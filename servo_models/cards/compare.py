@@ -82,8 +82,8 @@ class Difference(Result):
     @derived
     def ratio(self) -> float | None:
         """Second over first; None where one is missing or 0, or they are not comparable."""
-        one, other = (0.0 if q is None else q.value for q in (self.first, self.second))
-        return other / one if one and other and self.comparable else None
+        first, second = (0.0 if q is None else q.value for q in (self.first, self.second))
+        return second / first if first and second and self.comparable else None
 
     @property
     def distance(self) -> float:
@@ -182,9 +182,9 @@ def compared(
     if equal:
         notes.append(f"Both at P gain {one.p_gain:g}.")
     elif file is not None:
-        rest = ", ".join(f"{s.title}: {_gain(s)}" for s in servos if not s.as_it_stands)
+        gains = ", ".join(f"{s.title}: {_gain(s)}" for s in servos if not s.as_it_stands)
         notes.append(
-            f"{file.title} is compared as it stands" + (f" (P gain of {rest})." if rest else ".")
+            f"{file.title} is compared as it stands" + (f" (P gain of {gains})." if gains else ".")
         )
     else:
         stated = "; ".join(f"{s.title}: {_gain(s)}" for s in servos)
@@ -193,11 +193,11 @@ def compared(
     if not alike:
         stated = "; ".join(f"{s.title}: {ARMATURES[s.armature]}" for s in servos)
         notes.append(f"The armatures differ in what they include ({stated}); not compared.")
-        whole, bare = (one, other) if other.armature == "servo" else (other, one)
-        held, least = (s.pd.armature_kg_m2.value for s in (whole, bare))
-        if held < least + bare.link_kg_m2:
+        arm, bare = (one, other) if other.armature == "servo" else (other, one)
+        inertia, least = (s.pd.armature_kg_m2.value for s in (arm, bare))
+        if inertia < least + bare.link_kg_m2:
             notes.append(
-                f"{whole.title}: an arm cannot have less inertia than its servo; {held:.3g} kg·m² "
+                f"{arm.title}: an arm cannot have less inertia than its servo; {inertia:.3g} kg·m² "
                 f"with the link are less than {least + bare.link_kg_m2:.3g} of {bare.title}. One "
                 "of their torque scales is wrong."
             )
@@ -268,17 +268,17 @@ def _gain(servo: Servo) -> str:
 
 def differences(first: Servo, second: Servo) -> list[Difference]:
     """Every number of two servos side by side, in the order of `TorquePD`, and their top speed."""
-    found, servos = [], (first, second)
+    rows, servos = [], (first, second)
     for key in TorquePD.model_fields:
         one, other = (None if key in s.assumed else getattr(s.pd, key) for s in servos)
         if key != "model" and not (one is None and other is None):
-            found.append(Difference(_TITLES[key], unit(key), one, other))
+            rows.append(Difference(_TITLES[key], unit(key), one, other))
     one, other = (
         s.pd.velocity_limit_rad_s if "effort_limit_nm" in s.assumed
         else _quantity(s.pd.top_speed_rad_s)
         for s in servos
     )  # fmt: skip
-    found.append(Difference("top speed", "rad/s", one, other))
+    rows.append(Difference("top speed", "rad/s", one, other))
     if first.link_kg_m2 or second.link_kg_m2:
         one, other = (
             _quantity(
@@ -286,8 +286,8 @@ def differences(first: Servo, second: Servo) -> list[Difference]:
             )
             for s in servos
         )
-        found.append(Difference("armature and link", "kg·m²", one, other))
-    return found
+        rows.append(Difference("armature and link", "kg·m²", one, other))
+    return rows
 
 
 _TITLES = {

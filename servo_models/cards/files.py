@@ -188,9 +188,9 @@ def from_bam(
         "velocity_limit_rad_s": p.max_velocity,
         "dead_time_s": p.command_delay,
     }
-    given = {key: stated(value) for key, value in ours.items() if value is not None}
+    values = {key: stated(value) for key, value in ours.items() if value is not None}
     return validated(
-        PositionLoop, {"model": "position_loop", **given}, name, remedy="Fit it again."
+        PositionLoop, {"model": "position_loop", **values}, name, remedy="Fit it again."
     )
 
 
@@ -209,52 +209,52 @@ def to_bam(card: ServoCard, specimen: str | None = None) -> dict[str, Any]:
     if per_volt == 0 or emf.value == 0:
         raise InputError(f"{card.name} has no stall torque or no back-EMF, so kt is unknown.")
     kt = emf.value / per_volt
-    made: dict[str, Any] = {"kt": kt}
+    values: dict[str, Any] = {"kt": kt}
     if kind.has_ratio:
-        made["error_gain_ratio"] = numbers.duty_per_rad.value / kind.error_gain
-    made |= {"R": kt / per_volt, "armature": numbers.armature_kg_m2.value, "q_offset": 0.0}
+        values["error_gain_ratio"] = numbers.duty_per_rad.value / kind.error_gain
+    values |= {"R": kt / per_volt, "armature": numbers.armature_kg_m2.value, "q_offset": 0.0}
     if kind.has_ratio:
-        made["max_velocity"] = numbers.velocity_limit_rad_s
-    made |= {"command_delay": numbers.dead_time_s, "friction_base": numbers.friction_loss_nm}
+        values["max_velocity"] = numbers.velocity_limit_rad_s
+    values |= {"command_delay": numbers.dead_time_s, "friction_base": numbers.friction_loss_nm}
     model, frictions = _frictions(numbers)
-    made |= frictions
-    made["friction_viscous"] = numbers.viscous_friction_nm_s_per_rad or stated(0.0)
-    plain = {k: getattr(v, "value", v) for k, v in made.items() if v is not None}
+    values |= frictions
+    values["friction_viscous"] = numbers.viscous_friction_nm_s_per_rad or stated(0.0)
+    plain = {k: getattr(v, "value", v) for k, v in values.items() if v is not None}
     return plain | {"model": model, "actuator": name}
 
 
 def not_in_bam(card: ServoCard) -> list[str]:
     """What BAM's class for this servo fixes and the card has otherwise, in sentences."""
     name, kind = class_of(card)
-    numbers, told = card.numbers, []
+    numbers, notes = card.numbers, []
     if isinstance(numbers, PositionLoop):
         gain = numbers.duty_per_rad.value
         if not kind.has_ratio and abs(gain / kind.error_gain - 1) > 1e-6:
-            told.append(
+            notes.append(
                 f"BAM's class {name} has the error gain {kind.error_gain:g} built in; the card's "
                 f"is {gain:.5g}, so its stiffness will differ by that ratio."
             )
         if abs(numbers.duty_limit.value - kind.duty_limit) > 1e-9:
-            told.append(
+            notes.append(
                 f"BAM's class {name} limits the duty to {kind.duty_limit:g}; the card has "
                 f"{numbers.duty_limit.value:g}."
             )
         if not kind.has_ratio and numbers.velocity_limit_rad_s is not None:
-            told.append(f"BAM's class {name} has no limit of the set-point's speed.")
+            notes.append(f"BAM's class {name} has no limit of the set-point's speed.")
     if (card.supply_v, card.gains.p) != (kind.supply_v, kind.p_gain):
-        told.append(
+        notes.append(
             f"BAM's logs state supply voltage and P gain; where one does not, its class takes "
             f"{kind.supply_v:g} V and {kind.p_gain:g}, the card is for {card.supply_v:g} V and "
             f"{card.gains.p:g}."
         )
-    return told
+    return notes
 
 
 def class_of(card: ServoCard) -> tuple[str, Actuator]:
     """BAM's actuator class for the servo of a card."""
-    own = card.as_published.get("actuator")
-    if isinstance(own, str) and own in ACTUATORS:
-        return own, ACTUATORS[own]
+    bam_class = card.as_published.get("actuator")
+    if isinstance(bam_class, str) and bam_class in ACTUATORS:
+        return bam_class, ACTUATORS[bam_class]
     return _class_for(card.servo)
 
 
@@ -374,7 +374,7 @@ def bam_card(calibration: Calibration) -> ServoCard:
             "load_stribeck_motor": motor["load_friction_motor_stribeck"],
             "load_stribeck_load": motor["load_friction_external_stribeck"],
         }
-    given = {key: stated(value) for key, value in ours.items() if value is not None}
+    values = {key: stated(value) for key, value in ours.items() if value is not None}
     return ServoCard(
         name="calibration",
         servo=calibration.robot,
@@ -384,7 +384,7 @@ def bam_card(calibration: Calibration) -> ServoCard:
         published=False,
         source=Source(title="a calibration of this project", url=URL, licence="its owner's"),
         date=str(calibration.created)[:10],
-        specimens={"servo": PositionLoop(model="position_loop", **given)},
+        specimens={"servo": PositionLoop(model="position_loop", **values)},
     )
 
 
@@ -410,19 +410,19 @@ def _frictions(numbers: PositionLoop) -> tuple[str, dict[str, Any]]:
     slow_pair = n.load_stribeck_motor or stated(0.0), n.load_stribeck_load or stated(0.0)
     same = motor == external and slow_pair[0] == slow_pair[1]
     if same and n.load_quadratic_load is None:
-        made = {"load_friction_base": external}
+        frictions = {"load_friction_base": external}
         if not slow:
-            return "m3", made
-        return "m4", stribeck | made | {"load_friction_stribeck": slow_pair[1]}
-    made = stribeck | {
+            return "m3", frictions
+        return "m4", stribeck | frictions | {"load_friction_stribeck": slow_pair[1]}
+    frictions = stribeck | {
         "load_friction_motor": motor,
         "load_friction_external": external,
         "load_friction_motor_stribeck": slow_pair[0],
         "load_friction_external_stribeck": slow_pair[1],
     }
     if n.load_quadratic_load is None:
-        return "m5", made
-    return "m6", made | {
+        return "m5", frictions
+    return "m6", frictions | {
         "load_friction_motor_quad": n.load_quadratic_motor or stated(0.0),
         "load_friction_external_quad": n.load_quadratic_load,
     }

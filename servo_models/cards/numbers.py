@@ -70,11 +70,11 @@ def unit(name: str) -> str:
     return _UNITS.get(name) or unit_of(name)
 
 
-def _bare(given: Any) -> Any:
+def _bare(number: Any) -> Any:
     """A bare number as a quantity without interval."""
-    if isinstance(given, bool) or not isinstance(given, int | float):
-        return given
-    return {"value": float(given), "identified": "no", "why": UNSTATED}
+    if isinstance(number, bool) or not isinstance(number, int | float):
+        return number
+    return {"value": float(number), "identified": "no", "why": UNSTATED}
 
 
 def _plainest(quantity: Quantity) -> Any:
@@ -159,8 +159,8 @@ class TorquePD(Part):
         limits = [] if self.velocity_limit_rad_s is None else [self.velocity_limit_rad_s.value]
         brake = _or(self.back_emf_nm_s_per_rad)
         if brake > 0:
-            left = max(self.effort_limit_nm.value - self.friction_loss_nm.value, 0.0)
-            limits.append(left / brake)
+            spare_torque = max(self.effort_limit_nm.value - self.friction_loss_nm.value, 0.0)
+            limits.append(spare_torque / brake)
         return min(limits, default=None)
 
 
@@ -267,8 +267,8 @@ class PositionLoop(Part):
             "Stribeck friction": self.stribeck_friction_nm,
             "load-dependent friction": self.load_friction_load,
         }
-        left = [name for name, number in names.items() if number is not None]
-        return f"Left out of the PD: {' and '.join(left)}." if left else ""
+        omitted = [name for name, number in names.items() if number is not None]
+        return f"Left out of the PD: {' and '.join(omitted)}." if omitted else ""
 
 
 class LoadedLoop(Part):
@@ -317,12 +317,12 @@ class LoadedLoop(Part):
 
     def loaded(self) -> LoadedServoParameters:
         """The numbers as the servo model takes them; an unknown dead time is 0."""
-        given = {
+        values = {
             name: getattr(self, key).value
             for name, key in LOADED_KEYS.items()
             if getattr(self, key) is not None
         }
-        return LoadedServoParameters(**{"duty_s_per_rad": 0.0, "dead_time_s": 0.0} | given)
+        return LoadedServoParameters(**{"duty_s_per_rad": 0.0, "dead_time_s": 0.0} | values)
 
     def as_pd(self, p_gain: float) -> TorquePD:
         """The same servo as a PD in torque; see `LoadedServoParameters.delayed_pd`."""
@@ -349,8 +349,8 @@ class LoadedLoop(Part):
             "start duty": self.start_duty,
             "limit on the set-point's acceleration": self.acceleration_limit_rad_s2,
         }
-        left = [name for name, number in names.items() if number is not None]
-        return f"Left out of the PD: {', '.join(left)}." if left else ""
+        omitted = [name for name, number in names.items() if number is not None]
+        return f"Left out of the PD: {', '.join(omitted)}." if omitted else ""
 
 
 LOADED_KEYS = parts.LOADED_KEYS | {"dead_time_s": "dead_time_s"}
