@@ -117,8 +117,8 @@ def _depth(text: str) -> int:
     """Levels of brackets in JSON text; 0 where they are certainly few."""
     if text.count("[") + text.count("{") <= allowed(MAX_DEPTH):
         return 0
-    found = _levels(text)
-    return found if found <= allowed(MAX_DEPTH) else _levels(_JSON_TEXT.sub("", text))
+    levels = _levels(text)
+    return levels if levels <= allowed(MAX_DEPTH) else _levels(_JSON_TEXT.sub("", text))
 
 
 def _levels(text: str) -> int:
@@ -130,17 +130,17 @@ def _levels(text: str) -> int:
     return int(np.cumsum(steps).max(initial=0))
 
 
-def refuse_other_version(path: Path | str, found: Any, known: int, oldest: int = 1) -> None:
+def refuse_other_version(path: Path | str, version: Any, known: int, oldest: int = 1) -> None:
     """Refuse a file whose `schema_version` is none that this code reads, `oldest` to `known`."""
-    if type(found) is int and found > known:
+    if type(version) is int and version > known:
         raise InputError(
-            f"{path} was written by a newer version of pupper-sysid (schema_version {found}; "
+            f"{path} was written by a newer version of pupper-sysid (schema_version {version}; "
             f"this one reads {known}). Upgrade pupper-sysid."
         )
-    if type(found) is not int or found < oldest:
+    if type(version) is not int or version < oldest:
         raise InputError(
-            f"{path}: schema_version is {_short(found)}; this version reads {known}. Put the file "
-            "back as it was written."
+            f"{path}: schema_version is {_short(version)}; this version reads {known}. Put the "
+            "file back as it was written."
         )
 
 
@@ -197,9 +197,9 @@ this file holds it in s. Convert it and name it lag_s. (1 more fault in this fil
     at = f", line {lines[known]}" if lines and known else ""
     where = f"{name}{at}: {place_text(place)}" if place else f"{name}{at}"
     more = len({_place(f, data) for f in faults}) - 1
-    rest = f" Or {remedy}." if remedy else ""
-    rest += f" ({more} more fault{'s' if more > 1 else ''} in this file.)" if more else ""
-    raise InputError(printable(f"{where} {_fault(faults[0], model, place)}{rest}")) from invalid
+    advice = f" Or {remedy}." if remedy else ""
+    advice += f" ({more} more fault{'s' if more > 1 else ''} in this file.)" if more else ""
+    raise InputError(printable(f"{where} {_fault(faults[0], model, place)}{advice}")) from invalid
 
 
 def unit_of(name: str) -> str:
@@ -227,7 +227,7 @@ def _place(fault: ErrorDetails, data: Any) -> Place:
 
 
 def _fault(fault: ErrorDetails, top: type[BaseModel], place: Place) -> str:
-    kind, given = fault["type"], fault["input"]
+    kind, value = fault["type"], fault["input"]
     name = str(place[-1]) if place else ""
     siblings = _fields(top, place[:-1])
     if kind == "extra_forbidden":
@@ -238,7 +238,7 @@ def _fault(fault: ErrorDetails, top: type[BaseModel], place: Place) -> str:
     if kind == "missing":
         return f"is missing. Add it{meaning}."
     if kind in _NOT_A_MAPPING:
-        return _not_a_mapping(given, field, meaning)
+        return _not_a_mapping(value, field, meaning)
     if kind == "value_error":
         return f"is not usable: {fault['msg'].removeprefix('Value error, ')}."
     # of the quantity at `place`, whose last part may be value, low or high
@@ -247,21 +247,21 @@ def _fault(fault: ErrorDetails, top: type[BaseModel], place: Place) -> str:
         names.pop()
     unit = f", in {unit_of(names[-1])}" if names and unit_of(names[-1]) else ""
     if kind in ("float_type", "int_type", "int_from_float"):
-        whole = "a whole number" if kind.startswith("int") else "a number"
-        if isinstance(given, str) and given.strip().lower().lstrip("+-.") in ("nan", "inf"):
-            return f"is {given}. Write a finite number{unit}."
-        if isinstance(given, str):
-            return f"is the text '{_short(given)}'. Write the number only{unit}."
-        return f"is {_short(given)}. Write {whole}{unit}."
+        kind_of_number = "a whole number" if kind.startswith("int") else "a number"
+        if isinstance(value, str) and value.strip().lower().lstrip("+-.") in ("nan", "inf"):
+            return f"is {value}. Write a finite number{unit}."
+        if isinstance(value, str):
+            return f"is the text '{_short(value)}'. Write the number only{unit}."
+        return f"is {_short(value)}. Write {kind_of_number}{unit}."
     if kind == "finite_number":
-        return f"is {_short(given)}. Write a finite number{unit}."
+        return f"is {_short(value)}. Write a finite number{unit}."
     if kind == "literal_error":
-        return f"is {_short(given)}. Write {fault.get('ctx', {}).get('expected', 'another word')}."
+        return f"is {_short(value)}. Write {fault.get('ctx', {}).get('expected', 'another word')}."
     if kind in _WANTED:
-        return f"is {_short(given)}. Write {_WANTED[kind]}{meaning}."
+        return f"is {_short(value)}. Write {_WANTED[kind]}{meaning}."
     message = fault["msg"].replace("Input should", "it must").replace(" should ", " must ")
     message = message.replace(" after validation", "")
-    return f"is {_short(given)}; {message[:1].lower()}{message[1:]}{meaning}."
+    return f"is {_short(value)}; {message[:1].lower()}{message[1:]}{meaning}."
 
 
 def _unknown_key(name: str, fields: dict[str, FieldInfo]) -> str:
@@ -281,20 +281,20 @@ def _stem(name: str) -> str:
     return _UNIT_ENDING.sub("", name.lower())
 
 
-def _not_a_mapping(given: Any, field: FieldInfo | None, meaning: str) -> str:
+def _not_a_mapping(value: Any, field: FieldInfo | None, meaning: str) -> str:
     """A model may show in `EXAMPLE` how to write it; its validators may know a `problem`."""
     example = getattr(_part(field.annotation), "EXAMPLE", "") if field else ""
     if not field or not example:
-        return f"is {_short(given)} where a mapping of keys is expected. Fill it in{meaning}."
-    if isinstance(given, bool) or not isinstance(given, int | float) or not math.isfinite(given):
-        return f"is {_short(given)}. Write {example}{meaning}."
+        return f"is {_short(value)} where a mapping of keys is expected. Fill it in{meaning}."
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return f"is {_short(value)}. Write {example}{meaning}."
     checks = (getattr(getattr(entry, "func", None), "problem", None) for entry in field.metadata)
-    problem = next((said for check in checks if check and (said := check(given))), "")
+    problem = next((said for check in checks if check and (said := check(value))), "")
     return f"is a bare number{f' ({problem})' if problem else ''}. Write {example}{meaning}."
 
 
-def _short(given: Any) -> str:
-    text = "null" if given is None else str(given)
+def _short(value: Any) -> str:
+    text = "null" if value is None else str(value)
     # control characters of a file must not reach the terminal
     text = text if text.isprintable() else repr(text)
     return text if len(text) <= 60 else f"{text[:57]}…"
@@ -334,8 +334,8 @@ def described_fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
         except (OSError, TypeError):  # made at run time, or shipped without its source
             continue
         # of a class typed at a prompt, Python 3.13 returns what else was typed with it
-        parts = (p.body for p in source if isinstance(p, ast.ClassDef) and p.name == base.__name__)
-        for line, after in pairwise(next(parts, [])):
+        bodies = (p.body for p in source if isinstance(p, ast.ClassDef) and p.name == base.__name__)
+        for line, after in pairwise(next(bodies, [])):
             if not (isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name)):
                 continue
             if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
@@ -353,6 +353,6 @@ def _part(annotation: Any) -> type[BaseModel] | None:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     if get_origin(annotation) in (Union, UnionType):
-        parts = [_part(argument) for argument in get_args(annotation)]
-        return next((part for part in parts if part is not None), None)
+        models = [_part(argument) for argument in get_args(annotation)]
+        return next((part for part in models if part is not None), None)
     return None

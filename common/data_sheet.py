@@ -244,12 +244,12 @@ def recorded_stall_torque(servos: Iterable[Mapping[str, Any]]) -> tuple[float, s
 
     Examples
     --------
-    >>> found = recorded_stall_torque([{"model": "STS3215", "supply_voltage_v": 12.0}])
-    >>> round(found[0], 2), recorded_stall_torque([{}]) is None
+    >>> torque = recorded_stall_torque([{"model": "STS3215", "supply_voltage_v": 12.0}])
+    >>> round(torque[0], 2), recorded_stall_torque([{}]) is None
     (2.94, True)
     """
-    told = [s for s in servos if s.get("model") and data_sheet(s["model"])]
-    if not told:
+    known = [s for s in servos if s.get("model") and data_sheet(s["model"])]
+    if not known:
         return None
-    volts = next((s["supply_voltage_v"] for s in told if s.get("supply_voltage_v")), None)
-    return stall_torque(told[0]["model"], volts)
+    volts = next((s["supply_voltage_v"] for s in known if s.get("supply_voltage_v")), None)
+    return stall_torque(known[0]["model"], volts)

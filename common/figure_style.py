@@ -114,8 +114,8 @@ def inline_svg(drawing: bytes, words: str) -> str:
     (box,) = re.findall(r'viewBox="[0-9. ]+"', head)
     body = re.sub(r'<g id="part:([\w-]+)">', r'<g class="part-\1">', body)
     body = re.sub(r'<g id="[^"]*">', "<g>", body)
-    own = hashlib.sha256(drawing).hexdigest()[:8]
-    body = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{own}-", body)
+    prefix = hashlib.sha256(drawing).hexdigest()[:8]
+    body = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", body)
     body = re.sub(r"#[0-9a-fA-F]{6}\b", lambda m: _variable(m.group()), body)
     label = html.escape(words, quote=True)
     return f'<svg class="drawing" role="img" aria-label="{label}" {box}>{body}'

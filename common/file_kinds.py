@@ -35,16 +35,16 @@ _OURS = re.compile(rf"# {RECORDING}|[\w,]*\b(send_time_s|motor_idx)\b")
 _EMULATED = re.compile(r"spec:\s+dead_time_s:")
 
 
-def refuse_other_kind(path: Path, wanted: str) -> None:
+def refuse_other_kind(path: Path, expected: str) -> None:
     """Refuse what is another kind of file, or folder, of this project, and name what reads it.
 
-    What is no file of this project, or cannot be read, is left to its reader. `wanted` is
+    What is no file of this project, or cannot be read, is left to its reader. `expected` is
     `RECORDING`, or the schema that the expected kind states.
     """
     kind = _kind_of(path)
-    if kind not in (None, wanted):
+    if kind not in (None, expected):
         what, readers = _KINDS[kind]
-        raise InputError(f"{path} is {what}, not {_KINDS[wanted][0]}: {readers}.")
+        raise InputError(f"{path} is {what}, not {_KINDS[expected][0]}: {readers}.")
 
 
 def _kind_of(path: Path) -> str | None:

@@ -43,15 +43,15 @@ _NUMBER = re.compile(
 
 def in_order(names: Iterable[str]) -> list[str]:
     """Each name once: the Mini Pupper's in its order, then others as they come."""
-    given = list(dict.fromkeys(names))
-    return [n for n in JOINT_NAMES if n in given] + [n for n in given if n not in JOINT_NAMES]
+    once = dict.fromkeys(names)
+    return [n for n in JOINT_NAMES if n in once] + [n for n in once if n not in JOINT_NAMES]
 
 
 def strange_joint(names: Iterable[str], any_robot: bool = False) -> tuple[str, str] | None:
     """The first name that can be no joint's, and what to do; None if all are well.
 
-    Joints are all the Mini Pupper's or none is, so that a misspelt one among them is found; of a
-    log of `any_robot` they may have some of its names.
+    Either all joints are the Mini Pupper's or none is, which reveals a misspelt name; a log of
+    `any_robot` may have some of them.
 
     Examples
     --------
@@ -60,18 +60,18 @@ def strange_joint(names: Iterable[str], any_robot: bool = False) -> tuple[str, s
     >>> strange_joint(["shoulder_pan", "gripper"]) is None
     True
     """
-    given = list(dict.fromkeys(map(str, names)))
-    own = not any_robot and any(n in JOINT_NAMES for n in given)
+    listed = list(dict.fromkeys(map(str, names)))
+    mini_pupper = not any_robot and any(n in JOINT_NAMES for n in listed)
     by_case = {n.lower(): n for n in JOINT_NAMES}
-    for name in given:
+    for name in listed:
         if name in JOINT_NAMES:
             continue
-        # without a sister to tell by, only a slip of one letter is taken for one
-        near = difflib.get_close_matches(name, JOINT_NAMES, n=1, cutoff=0.7 if own else 0.9)
+        # among names of another robot only a slip of one letter is corrected
+        near = difflib.get_close_matches(name, JOINT_NAMES, n=1, cutoff=0.7 if mini_pupper else 0.9)
         meant = by_case.get(name.lower()) or (near[0] if near else None)
         if meant and not any_robot:
             return name, f"did you mean {meant}?"
-        if own:
+        if mini_pupper:
             return name, f"known are {', '.join(JOINT_NAMES)}."
         if not _NAME.fullmatch(name):
             return name, "use letters, digits and _, beginning with a letter."
@@ -92,29 +92,28 @@ def share_sentences(by_joint: Mapping[str, Iterable[str]]) -> list[tuple[str, st
     """
     joints: dict[str, dict[str, str]] = {}
     for joint, sentences in by_joint.items():
-        given = list(sentences)
-        kinds = [_NUMBER.sub("0", sentence) for sentence in given]
-        for sentence, kind in zip(given, kinds, strict=True):
+        listed = list(sentences)
+        kinds = [_NUMBER.sub("0", sentence) for sentence in listed]
+        for sentence, kind in zip(listed, kinds, strict=True):
             # two of a kind about one joint, e.g. on two of its trials, are told apart
             shared = kind if kinds.count(kind) == 1 else sentence
             joints.setdefault(shared, {}).setdefault(joint, sentence)
-    return [
-        ("All joints" if len(own) == len(by_joint) > 2 else ", ".join(own), _ranged(own.values()))
-        for own in joints.values()
-    ]
+    every_joint = ", ".join(by_joint) if len(by_joint) > 2 else None
+    rows = [(", ".join(texts), _ranged(texts.values())) for texts in joints.values()]
+    return [("All joints" if names == every_joint else names, text) for names, text in rows]
 
 
 def _ranged(sentences: Iterable[str]) -> str:
     """One sentence for some that differ in their numbers alone."""
-    given = list(sentences)
-    numbers = zip(*(_NUMBER.findall(sentence) for sentence in given), strict=True)
-    ends = iter([(min(own, key=_value), max(own, key=_value)) for own in numbers])
+    listed = list(sentences)
+    numbers = zip(*(_NUMBER.findall(sentence) for sentence in listed), strict=True)
+    ends = iter([(min(column, key=_value), max(column, key=_value)) for column in numbers])
 
     def written(_: re.Match[str]) -> str:
         low, high = next(ends)
         return low if _value(low) == _value(high) else f"{low} to {high}"
 
-    return _NUMBER.sub(written, given[0])
+    return _NUMBER.sub(written, listed[0])
 
 
 def _value(number: str) -> float:
@@ -136,21 +135,21 @@ def select_joints(text: str, available: Sequence[str] = JOINT_NAMES) -> list[str
         if word.lower() == "all":
             chosen.update(available)
             continue
-        found = [n for n in available if word.lower() in (n.lower(), *n.lower().split("_"))]
-        if not found:
-            own = any(n in JOINT_NAMES for n in available)
-            groups = [*LEGS, *KINDS] if own else []
+        matching = [n for n in available if word.lower() in (n.lower(), *n.lower().split("_"))]
+        if not matching:
+            mini_pupper = any(n in JOINT_NAMES for n in available)
+            groups = [*LEGS, *KINDS] if mini_pupper else []
             if word.lower() in {n.lower() for n in (*JOINT_NAMES, *groups)}:
                 raise InputError(
                     f"`joints`: there is no {word} here; there is {', '.join(available)}."
                 )
-            there = [g for g in groups if any(g in n.split("_") for n in available)]
-            near = difflib.get_close_matches(word, [*available, *there, "all"], n=1, cutoff=0.4)
+            known = [g for g in groups if any(g in n.split("_") for n in available)]
+            near = difflib.get_close_matches(word, [*available, *known, "all"], n=1, cutoff=0.4)
             hint = f" Did you mean {near[0]}?" if near else ""
-            more = ", legs (LF, …), kinds (hip, …)" if own else ""
+            more = ", legs (LF, …), kinds (hip, …)" if mini_pupper else ""
             raise InputError(
-                f"`joints`: '{word}' is no joint{', leg or kind' if own else ''}.{hint} "
+                f"`joints`: '{word}' is no joint{', leg or kind' if mini_pupper else ''}.{hint} "
                 f"Use names ({', '.join(available[:3])}, …){more} or all."
             )
-        chosen.update(found)
+        chosen.update(matching)
     return [n for n in available if n in chosen]

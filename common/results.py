@@ -44,8 +44,8 @@ class Result:
         if type(self).__str__ is not object.__str__:
             first, *more = str(self).splitlines()
             return f"{name}({first}{' …' if more else ''})"
-        shown = (f for f in fields(self) if not f.metadata.get("internal"))  # type: ignore[arg-type]
-        return f"{name}({', '.join(f'{f.name}={_short(getattr(self, f.name))}' for f in shown)})"
+        public = (f for f in fields(self) if not f.metadata.get("internal"))  # type: ignore[arg-type]
+        return f"{name}({', '.join(f'{f.name}={_short(getattr(self, f.name))}' for f in public)})"
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain data: dicts, lists, text, finite numbers and None."""
@@ -111,13 +111,13 @@ def flat(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     >>> flat({"lag_s": {"value": 0.04, "low": 0.03, "high": 0.05}, "scores": {"fit_percent": 98.0}})
     {'lag_s': 0.04, 'lag_s_low': 0.03, 'lag_s_high': 0.05, 'scores_fit_percent': 98.0}
     """
-    found: dict[str, Any] = {}
+    level: dict[str, Any] = {}
     for key, value in data.items():
         if isinstance(value, Mapping):
-            found |= flat(value, f"{prefix}{key}_")
+            level |= flat(value, f"{prefix}{key}_")
         elif not isinstance(value, list):
-            found[prefix[:-1] if key == "value" and prefix else f"{prefix}{key}"] = value
-    return found
+            level[prefix[:-1] if key == "value" and prefix else f"{prefix}{key}"] = value
+    return level
 
 
 def plain(value: Any) -> Any:

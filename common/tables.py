@@ -67,24 +67,24 @@ class Column:
         if not self.is_number:
             return "" if value is None else str(value)
         factor = FACTORS.get(self.unit, 1.0)
-        shown = rounded(value, self.digits, factor)
+        number = rounded(value, self.digits, factor)
         if self.kind == "number":
-            return shown
+            return number
         low, high = (row.get(f"{self.field}_{end}") for end in ("low", "high"))
         if self.kind == "interval":
             # without spaces, at which a narrow table would break it
             ends = (rounded(end, self.digits, factor) for end in (low, high))
-            return f"{shown} ({'…'.join(ends)})"
+            return f"{number} ({'…'.join(ends)})"
         half = None if value is None or high is None else high - value
-        return f"{shown} ±{rounded(half, 0, factor)}" if shown != "–" else shown
+        return f"{number} ±{rounded(half, 0, factor)}" if number != "–" else number
 
 
 def rounded(value: float | None, digits: int, factor: float = 1.0) -> str:
     """A number with these digits, a dash where there is none; zero has no sign."""
     if value is None or not math.isfinite(value):
         return "–"
-    shown = f"{value * factor:.{digits}f}"
-    return shown if float(shown) != 0 else shown.lstrip("-")
+    text = f"{value * factor:.{digits}f}"
+    return text if float(text) != 0 else text.lstrip("-")
 
 
 def ends(name: str, interval: Interval) -> dict[str, float]:

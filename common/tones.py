@@ -23,7 +23,7 @@ def sine_design(*angles_rad: NDArray) -> NDArray[np.float64]:
 
 
 def least_squares(design: NDArray, value: NDArray) -> NDArray[np.float64]:
-    """Coefficients of `design` that fit `value`; a column of `value` is a fit of its own."""
+    """Coefficients of `design` that fit `value`; each column of `value` is fitted alone."""
     return np.linalg.lstsq(design, value, rcond=None)[0]
 
 
@@ -45,8 +45,8 @@ def fit_sine(angle_rad: NDArray, value: NDArray) -> Sine:
     Examples
     --------
     >>> angle = np.linspace(0.0, 9.0, 50)
-    >>> found = fit_sine(angle, 3.0 + 2.0 * np.cos(angle - 0.5))
-    >>> [round(float(x), 9) for x in (found.offset, abs(found.phasor), -np.angle(found.phasor))]
+    >>> sine = fit_sine(angle, 3.0 + 2.0 * np.cos(angle - 0.5))
+    >>> [round(float(x), 9) for x in (sine.offset, abs(sine.phasor), -np.angle(sine.phasor))]
     [3.0, 2.0, 0.5]
     """
     offset, cosine, sine = least_squares(sine_design(angle_rad), value)

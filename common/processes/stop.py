@@ -47,7 +47,7 @@ _SWALLOWED_S = 0.01  # time for a callback that swallowed a KeyboardInterrupt to
 class Stop:
     """Handlers of the three signals, and what the first of them was.
 
-    `ends_process` says whether this process is a program of its own, which may be ended; else only
+    `ends_process` says whether this process is a whole program, which may be ended; else only
     KeyboardInterrupt is raised.
     """
 
@@ -87,11 +87,11 @@ class Stop:
             if signal.getsignal(number) != signal.SIG_IGN:
                 self._take(number)
         if self.ends_process:
-            there, self._wake = os.pipe()
+            wake_end, self._wake = os.pipe()
             os.set_blocking(self._wake, False)
             signal.set_wakeup_fd(self._wake, warn_on_full_buffer=False)
             sys.unraisablehook = self._unraisable
-            threading.Thread(target=self._watch, args=(there,), daemon=True, name="stop").start()
+            threading.Thread(target=self._watch, args=(wake_end,), daemon=True, name="stop").start()
 
     def hold_robot(self) -> None:
         """Park the joints first, from now on, also where a script's `&` has Ctrl-C ignored."""
@@ -241,7 +241,7 @@ _current: Stop | None = None  # the Stop in force. Signals are a process's, so t
 
 
 def stop_process() -> None:
-    """Have signals stop this process, as a program of its own; the first thing that it does."""
+    """Have signals stop this process, which is a whole program; the first thing that it does."""
     global _current
     if _current is None:
         _current = Stop(ends_process=True)

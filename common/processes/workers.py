@@ -177,17 +177,17 @@ class _Server:
 
     def __init__(self) -> None:
         self.owner = os.getpid()
-        self._socket, there = socket.socketpair()
+        self._socket, server_end = socket.socketpair()
         paths = json.dumps([path for path in sys.path if isinstance(path, str)])
         # the kernel would end the server with the thread that started it
         in_main = threading.current_thread() is threading.main_thread()
         parent = str(os.getpid() if in_main else 0)
-        with there, _blocked_signals():
+        with server_end, _blocked_signals():
             try:
                 self._process = subprocess.Popen(
                     # -P: no file of the user's folder is imported before `sys.path` is set
-                    [sys.executable, "-P", "-c", _START, paths, str(there.fileno()), parent],
-                    pass_fds=[there.fileno()], stdin=subprocess.DEVNULL,
+                    [sys.executable, "-P", "-c", _START, paths, str(server_end.fileno()), parent],
+                    pass_fds=[server_end.fileno()], stdin=subprocess.DEVNULL,
                     env=os.environ | _ONE_THREAD,
                 )  # fmt: skip
             except OSError as error:
@@ -195,7 +195,7 @@ class _Server:
 
     @property
     def usable(self) -> bool:
-        """Whether it is there, and this process's own (which may be a fork of the owner)."""
+        """Whether it runs and was started by this process (which may be a fork of the owner)."""
         return self.owner == os.getpid() and self._process.poll() is None
 
     def close(self) -> None:
@@ -217,10 +217,10 @@ class _Server:
 
     def fork(self, modules: Any) -> socket.socket:
         """A new worker, to which a task can be written."""
-        here, there = socket.socketpair()
-        with there:
-            self.order(modules, there.fileno())
-        return here
+        parent_end, worker_end = socket.socketpair()
+        with worker_end:
+            self.order(modules, worker_end.fileno())
+        return parent_end
 
     def death(self) -> str:
         """How the last worker ended, as the server reports it."""

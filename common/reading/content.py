@@ -64,29 +64,29 @@ def allowed(most: float) -> float:
 
 
 def refuse_more(
-    name: Path | str, found: float, most: float, unit: str, remedy: str = "", exact: bool = True
+    name: Path | str, count: float, most: float, unit: str, remedy: str = "", exact: bool = True
 ) -> None:
-    """Refuse what is beyond a limit: `found` of a `unit` such as "rows", where `most` are allowed.
+    """Refuse what is beyond a limit: `count` of a `unit` such as "rows", where `most` are allowed.
 
     `name`: the file, and the place in it where that helps. `most`: before it is raised. `remedy`:
-    what to do, as a sentence. `exact`: whether `found` is all, rather than what was counted until
+    what to do, as a sentence. `exact`: whether `count` is all, rather than what was counted until
     the limit was passed.
     """
     bound = allowed(most)
-    if found <= bound:
+    if count <= bound:
         return
-    times, most_text = 10 * read_limit(), _shown(bound, unit)
+    times, most_text = 10 * read_limit(), _amount(bound, unit)
     amount = f"more than {most_text}"
     if exact:
-        times = max(math.ceil(found / most), 2)
-        amount = f"{_shown(found, unit)}; at most {most_text} are read"
+        times = max(math.ceil(count / most), 2)
+        amount = f"{_amount(count, unit)}; at most {most_text} are read"
     raise InputError(
         f"{name} has {amount}. {f'{remedy} ' if remedy else ''}If it is meant to be so large, "
         f"raise the limits of reading with `read_limit={min(times, MOST_TIMES):.0f}`."
     )
 
 
-def _shown(amount: float, unit: str) -> str:
+def _amount(amount: float, unit: str) -> str:
     if unit != "bytes" or amount < 1e6:
         return f"{amount:,.0f} {unit}"
     return f"{amount / 1e6:,.0f} MB" if amount >= 10e6 else f"{amount / 1e6:.1f} MB"
@@ -153,7 +153,7 @@ def unpacked(path: Path | str, data: bytes, most_bytes: float) -> bytes:
         raise InputError(f"{path} is packed by {foreign}, which is not read. Unpack it first.")
     try:
         if kind is not None:
-            whole = _bounded(path, _pieces(kind, data), most_bytes)
+            content = _bounded(path, _pieces(kind, data), most_bytes)
         elif data.startswith(_ZIP):
             with zipfile.ZipFile(io.BytesIO(data)) as archive:
                 inside = [m for m in archive.infolist() if not m.is_dir()
@@ -171,7 +171,7 @@ def unpacked(path: Path | str, data: bytes, most_bytes: float) -> bytes:
                     )
                 kind = "zip"
                 with archive.open(inside[0]) as file:
-                    whole = _bounded(path, iter(lambda: file.read(_PIECE), b""), most_bytes)
+                    content = _bounded(path, iter(lambda: file.read(_PIECE), b""), most_bytes)
         else:
             return data
     except (OSError, EOFError, ValueError, RuntimeError, NotImplementedError, zlib.error,
@@ -180,9 +180,9 @@ def unpacked(path: Path | str, data: bytes, most_bytes: float) -> bytes:
             f"{path} is damaged: {kind or 'zip'} cannot unpack it. Fetch or save it again."
         ) from error
     again = [*_PACKED, *_FOREIGN, _ZIP]
-    if whole[257:262] == b"ustar" or any(whole.startswith(mark) for mark in again):
+    if content[257:262] == b"ustar" or any(content.startswith(mark) for mark in again):
         raise InputError(f"{path} holds an archive. Unpack it, and give one of its files.")
-    return whole
+    return content
 
 
 def _pieces(kind: str, data: bytes) -> Iterator[bytes]:
@@ -202,12 +202,12 @@ def _pieces(kind: str, data: bytes) -> Iterator[bytes]:
 
 def _bounded(path: Path | str, pieces: Iterable[bytes], most_bytes: float) -> bytes:
     """All pieces of what is being unpacked."""
-    whole, total = [], 0
+    unpacked_pieces, total = [], 0
     for piece in pieces:
-        whole.append(piece)
+        unpacked_pieces.append(piece)
         total += len(piece)
         refuse_more(f"{path}, unpacked,", total, most_bytes, "bytes", exact=False)
-    return b"".join(whole)
+    return b"".join(unpacked_pieces)
 
 
 def _unreadable(path: Path | str, error: Exception, remedy: str) -> InputError:

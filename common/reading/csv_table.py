@@ -133,10 +133,10 @@ def read_table(
     """
     text = one_line_end(text)
     refuse_more(path, text.count("\n"), MOST_ROWS + 2 * MOST_COMMENTS, "lines", _SPLIT)
-    found, first, at = _opening(path, text, columns)
+    table, first, at = _opening(path, text, columns)
     rows = text.count("\n", at)
     refuse_more(path, rows, MOST_ROWS, "rows", _SPLIT)
-    refuse_more(path, rows * len(found.columns), MOST_CELLS, "cells", _SPLIT)
+    refuse_more(path, rows * len(table.columns), MOST_CELLS, "cells", _SPLIT)
     end = len(text)
     if not text.endswith("\n"):  # the last of many lines may be cut where it is the shortest
         *others, last = text[-_TAIL:].split("\n")[1:] or [""]
@@ -145,14 +145,14 @@ def read_table(
         if whole_lines or short:
             end = max(text.rfind("\n") + 1, at)
             last = text[end:].strip()
-            found.cut = bool(last) and last[0] != "#"
-    blocks = _Blocks(path, found, texts, strict)
+            table.cut = bool(last) and last[0] != "#"
+    blocks = _Blocks(path, table, texts, strict)
     while at < end:
         stop = end if at + _BLOCK >= end else text.find("\n", at + _BLOCK, end) + 1 or end
         first += blocks.add(text[at:stop], first, last=stop == end)
         at = stop
     blocks.finish()
-    return found
+    return table
 
 
 def one_line_end(text: str) -> str:
@@ -172,16 +172,16 @@ def comments_of(path: Path | str, text: str) -> list[tuple[int, str]]:
 
 def _comments(path: Path | str, text: str, n: int = 1, known: int = 0) -> list[tuple[int, str]]:
     """Comment lines of text that begins at line `n`, before which `known` ones are."""
-    found: list[tuple[int, str]] = []
+    comments: list[tuple[int, str]] = []
     if text[:1] != "#" and "\n#" not in text:
-        return found
+        return comments
     at = 0
     for match in _COMMENT.finditer(text):
         n, at = n + text.count("\n", at, match.start()), match.start()
-        found.append((n, match[0]))
-        refuse_more(path, known + len(found), MOST_COMMENTS, "comment lines", exact=False)
+        comments.append((n, match[0]))
+        refuse_more(path, known + len(comments), MOST_COMMENTS, "comment lines", exact=False)
         refuse_more(f"{path}, line {n}", len(match[0]), LONGEST_COMMENT, "characters")
-    return found
+    return comments
 
 
 def _opening(
@@ -213,22 +213,22 @@ def _opening(
 class _Blocks:
     """Blocks of lines, one after another, as columns of one table."""
 
-    def __init__(self, path: Path | str, found: CsvTable, texts: Collection[str], strict: bool):
-        self._path, self._found, self._strict = path, found, strict
+    def __init__(self, path: Path | str, table: CsvTable, texts: Collection[str], strict: bool):
+        self._path, self._table, self._strict = path, table, strict
         self._lines: list[NDArray[np.int64]] = []
         self._numbers: dict[str, list[NDArray[np.float64]]] = {}
         self._known: dict[str, str] = {}  # each text once, however often it stands there
-        for name in found.columns:
+        for name in table.columns:
             if name in texts:
-                found.texts[name] = []
+                table.texts[name] = []
             else:
                 self._numbers[name] = []
 
     def add(self, block: str, first: int, last: bool) -> int:
         """Take a block of lines that begins at line `first`; how many lines it has."""
         count = block.count("\n")
-        comments = _comments(self._path, block, first, len(self._found.comments))
-        self._found.comments += comments
+        comments = _comments(self._path, block, first, len(self._table.comments))
+        self._table.comments += comments
         plain = _QUOTED.sub(r"\1", block) if '"' in block else block
         plain, lines = _bare(plain, first, [n for n, _ in comments])
         if len(lines) and not self._plain(plain, lines):
@@ -237,17 +237,17 @@ class _Blocks:
 
     def finish(self) -> None:
         """Put the blocks together."""
-        self._found.line = np.concatenate([np.zeros(0, np.int64), *self._lines])
+        self._table.line = np.concatenate([np.zeros(0, np.int64), *self._lines])
         for name in list(self._numbers):
-            self._found.numbers[name] = np.concatenate([np.zeros(0), *self._numbers.pop(name)])
+            self._table.numbers[name] = np.concatenate([np.zeros(0), *self._numbers.pop(name)])
 
     def _plain(self, block: str, lines: NDArray[np.int64]) -> bool:
         """Take lines of decimal numerals and of texts without quotes; or do not."""
-        found = self._found
-        if '"' in block or not _rectangular(block, len(found.columns)):
+        table = self._table
+        if '"' in block or not _rectangular(block, len(table.columns)):
             return False
-        numeric = {n: name in self._numbers for n, name in enumerate(found.columns)
-                   if name not in found.faults}  # fmt: skip
+        numeric = {n: name in self._numbers for n, name in enumerate(table.columns)
+                   if name not in table.faults}  # fmt: skip
         kinds: Any = {n: float if number else str for n, number in numeric.items()}
         try:
             read = pd.read_csv(
@@ -255,25 +255,25 @@ class _Blocks:
                 na_values=[""], keep_default_na=False, skip_blank_lines=False,
                 quoting=csv.QUOTE_NONE, engine="c", low_memory=False, **_EXACTLY,
             )  # fmt: skip
-        except (ValueError, OverflowError):  # pandas' own errors are ValueErrors
+        except (ValueError, OverflowError):  # pandas raises kinds of ValueError
             return False
         numbers = {n: read[n].to_numpy(float) for n, number in numeric.items() if number}
         if len(read) != len(lines) or any(np.isinf(v).any() for v in numbers.values()):
             return False
         for n, number in numeric.items():
-            name = found.columns[n]
+            name = table.columns[n]
             if number:
                 self._numbers[name].append(numbers[n])
             else:
                 codes, cells = pd.factorize(read[n].fillna(""))
-                own = [self._text(str(cell)) for cell in cells]
-                found.texts[name] += [own[code] for code in codes.tolist()]
+                texts = [self._text(str(cell)) for cell in cells]
+                table.texts[name] += [texts[code] for code in codes.tolist()]
         self._lines.append(lines)
         return True
 
     def _strictly(self, block: str, first: int, last: bool) -> None:
         """Take a block line by line, or refuse it with the place of its fault."""
-        path, found = self._path, self._found
+        path, table = self._path, self._table
         # line by line: a stray quote must not swallow the lines behind it
         rows = {n: _cells(path, n, line) for n, line in enumerate(block.split("\n"), first)
                 if line[:1] != "#" and line.strip()}  # fmt: skip
@@ -282,25 +282,25 @@ class _Blocks:
             remarks = [n for n, row in rows.items()
                        if not any(is_decimal(cell) or is_clock(cell) for cell in row)]  # fmt: skip
             rows = self._without(rows, remarks, len(rows) - 1)
-        if last and rows and len(rows[max(rows)]) < len(found.columns):
-            found.cut = True
+        if last and rows and len(rows[max(rows)]) < len(table.columns):
+            table.cut = True
             rows.popitem()
         if not self._strict:
-            ragged = [n for n, row in rows.items() if len(row) != len(found.columns)]
+            ragged = [n for n, row in rows.items() if len(row) != len(table.columns)]
             rows = self._without(rows, ragged, max(_FEW_BROKEN * len(rows), 1))
         for n, row in rows.items():
-            if len(row) != len(found.columns):
+            if len(row) != len(table.columns):
                 raise InputError(
                     f"{path}, line {n}: {len(row)} cells where the header names "
-                    f"{len(found.columns)} columns; command and position must have the same "
+                    f"{len(table.columns)} columns; command and position must have the same "
                     "number of values. Mend or remove the line."
                 )
         lines = [*rows]
         self._lines.append(np.array(lines, np.int64))
-        for k, name in enumerate(found.columns):
+        for k, name in enumerate(table.columns):
             cells = [row[k] for row in rows.values()]
-            if name in found.texts:
-                found.texts[name] += [self._text(cell) for cell in cells]
+            if name in table.texts:
+                table.texts[name] += [self._text(cell) for cell in cells]
             elif name in self._numbers:
                 try:
                     numbers = numbers_of(path, name, cells, lines, not self._strict)
@@ -308,7 +308,7 @@ class _Blocks:
                 except InputError as error:
                     if self._strict:
                         raise
-                    found.faults[name] = str(error)
+                    table.faults[name] = str(error)
                     del self._numbers[name]
 
     def _without(
@@ -317,7 +317,7 @@ class _Blocks:
         """Rows by line, without those that are broken if these are not more than `most`."""
         if len(broken) > most:
             return rows
-        self._found.broken += broken
+        self._table.broken += broken
         gone = {*broken}
         return {n: row for n, row in rows.items() if n not in gone}
 
@@ -338,7 +338,7 @@ def numbers_of(
     `name`: of the column. `lines`: of the cells, for messages. `words`: whether a word for a
     reading that failed, such as `timeout`, stands for an empty cell.
     """
-    values, shown = np.full(len(cells), np.nan), printable(name)[:60]
+    values, column = np.full(len(cells), np.nan), printable(name)[:60]
     for k, cell in enumerate(cells):
         if not (text := cell.strip()) or (words and is_failure(text)):
             continue
@@ -346,11 +346,11 @@ def numbers_of(
             values[k] = decimal(text)
         except ValueError:
             raise InputError(
-                f"{path}, line {lines[k]}, column {shown}: '{printable(text[:40])}' is not a "
+                f"{path}, line {lines[k]}, column {column}: '{printable(text[:40])}' is not a "
                 "number. Mend the cell, or leave it empty if there was no reading."
             ) from None
         if np.isinf(values[k]):
-            raise InputError(f"{path}, line {lines[k]}, column {shown}: the value is infinite.")
+            raise InputError(f"{path}, line {lines[k]}, column {column}: the value is infinite.")
     return values
 
 

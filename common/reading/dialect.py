@@ -50,7 +50,7 @@ def is_decimal(text: str) -> bool:
     return text.isascii() and _DECIMAL.fullmatch(text) is not None
 
 
-def whole(text: str) -> int:
+def whole_number(text: str) -> int:
     """The whole number that `text` is, of at most 300 digits; ValueError if it is none."""
     text = text.strip(_SPACES)
     if not _WHOLE.fullmatch(text):
@@ -174,7 +174,7 @@ class _Shape:
 
 
 def plain(text: str) -> Plain:
-    """Text of a table in the dialect of `csv_table`; unchanged where no dialect is found."""
+    """Text of a table in the dialect of `csv_table`; unchanged where no dialect is recognised."""
     lines = text[:_SAMPLE].split("\n")
     if len(text) > _SAMPLE:
         lines.pop()
@@ -258,8 +258,8 @@ def _usual_numbers(text: str, rows: Sequence[str]) -> str:
         if _SPACE_GROUPS.search(sample):
             text = _SPACE_GROUPS.sub(lambda m: m[0].replace(" ", ""), text)
         for groups, mark, point in ((_COMMA_GROUPS, ",", "."), (_POINT_GROUPS, ".", ",")):
-            rest = groups.sub("", sample)
-            if rest != sample and mark not in rest and re.search(rf"\d[{point}]\d", rest):
+            bare = groups.sub("", sample)
+            if bare != sample and mark not in bare and re.search(rf"\d[{point}]\d", bare):
                 return groups.sub(lambda m, mark=mark: m[0].replace(mark, ""), text)
     return text
 
@@ -342,27 +342,27 @@ def _hexadecimal(cells: Sequence[Sequence[str]]) -> dict[int, int]:
     columns: dict[int, list[str]] = {}
     marked = set()
     for k, column in enumerate(zip(*cells, strict=True)):
-        found = [_HEX_CELL.fullmatch(cell) for cell in column if cell]
-        if found and all(found):
-            columns[k] = [m[1].lower() for m in found if m]
-            if all(m and m[2] for m in found):
+        matches = [_HEX_CELL.fullmatch(cell) for cell in column if cell]
+        if matches and all(matches):
+            columns[k] = [m[1].lower() for m in matches if m]
+            if all(m and m[2] for m in matches):
                 marked.add(k)
-    widths = {k: {*map(len, own)} for k, own in columns.items()}
+    widths = {k: {*map(len, texts)} for k, texts in columns.items()}
     sure = {
-        k for k, own in columns.items()
-        if (k in marked or any({*cell} & {*"abcdf"} for cell in own))
-        and 2 * sum(map(str.isalpha, own)) < len(own)
-        and ((len(widths[k]) == 1 and min(widths[k]) > 2) or len({*own}) > _LABELS)
+        k for k, texts in columns.items()
+        if (k in marked or any({*cell} & {*"abcdf"} for cell in texts))
+        and 2 * sum(map(str.isalpha, texts)) < len(texts)
+        and ((len(widths[k]) == 1 and min(widths[k]) > 2) or len({*texts}) > _LABELS)
     }  # fmt: skip
     wide = [widths[k] for k in sure if len(widths[k]) == 1]
     signed = {}
-    for k, own in columns.items():
-        like = len(widths[k]) == 1 and widths[k] in wide and own != sorted(own)
+    for k, texts in columns.items():
+        like = len(widths[k]) == 1 and widths[k] in wide and texts != sorted(texts)
         if k in sure or like:
-            turn = 16 ** len(own[0])
-            numbers = [int(cell, 16) for cell in own]
+            turn = 16 ** len(texts[0])
+            numbers = [int(cell, 16) for cell in texts]
             near = all(min(n, turn - n) < turn / 4 for n in numbers)
-            below = len(widths[k]) == 1 and len(own[0]) in (4, 8) and max(numbers) >= turn / 2
+            below = len(widths[k]) == 1 and len(texts[0]) in (4, 8) and max(numbers) >= turn / 2
             signed[k] = turn if near and below else 0
     return signed
 
@@ -378,13 +378,13 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
     first = next((n for n in bare if _is_row(lines[n], shape)), None)
     if first is None:
         return Plain(text)
-    whole = next((n for n in bare if _is_row(lines[n], shape, whole=True)), first)
-    for cells in (_split(lines[n], shape.separator) for n in bare if first < n < whole):
+    complete = next((n for n in bare if _is_row(lines[n], shape, complete=True)), first)
+    for cells in (_split(lines[n], shape.separator) for n in bare if first < n < complete):
         if len(cells) == shape.columns and all(
             cell and not _number(cell, shape.comma)
             for cell, number in zip(cells, shape.numeric, strict=True) if number
         ):  # fmt: skip
-            first = whole  # lines above the names have as many cells, some of them numbers
+            first = complete  # lines above the names have as many cells, some of them numbers
     before = [n for n in bare if n < first]
     notes, columns, units, numbered = [], None, [], ""
     if before and (cells := _units(lines[before[-1]], shape)) and len(before) > 1:
@@ -496,14 +496,14 @@ def _cells(body: str, shape: _Shape) -> str:
 
 def _labels(sample: Sequence[str]) -> tuple[re.Pattern[str], list[str]] | None:
     """How to find the pairs of name and number that most lines have, and their names."""
-    found = []
+    styles = []
     for pattern in (_PAIR, _LONG_PAIR):
         named = Counter(tuple(m[1] for m in pattern.finditer(line)) for line in sample)
         names, count = named.most_common(1)[0]
         times = {*Counter(names).values()}
         if count >= _SAME_SHAPE * len(sample) and len({*names}) > 1 and len(times) == 1:
-            found.append((max(times), pattern, list(names)))
-    return min(found, key=lambda each: each[0])[1:] if found else None
+            styles.append((max(times), pattern, list(names)))
+    return min(styles, key=lambda style: style[0])[1:] if styles else None
 
 
 def _labelled(
@@ -513,8 +513,8 @@ def _labelled(
 
     Names that a line has twice are of several joints, and get numbers.
     """
-    found = [[m.groups() for m in pattern.finditer(line)] for line in sample]
-    alike = [pairs for pairs in found if [name for name, *_ in pairs] == names]
+    labelled = [[m.groups() for m in pattern.finditer(line)] for line in sample]
+    alike = [pairs for pairs in labelled if [name for name, *_ in pairs] == names]
     columns = []
     for k, name in enumerate(names):
         again = f"_{names[:k].count(name) + 1}" if names.count(name) > 1 else ""
@@ -544,20 +544,20 @@ def _labelled(
 
 def _teleplot(text: str) -> Plain:
     """Lines of Teleplot, `>name:milliseconds:value` or `>name:value`, one value each."""
-    found = _TELEPLOT.findall(text)
-    if all(stamp for _, stamp, _ in found):
-        rows = [f"{stamp},{name},{value}" for name, stamp, value in found]
+    readings = _TELEPLOT.findall(text)
+    if all(stamp for _, stamp, _ in readings):
+        rows = [f"{stamp},{name},{value}" for name, stamp, value in readings]
         return Plain("\n".join(rows), ["time_ms", "name", "value"])
-    names = list(dict.fromkeys(name for name, _, _ in found))
-    columns = [[value for own, _, value in found if own == name] for name in names]
+    names = list(dict.fromkeys(name for name, _, _ in readings))
+    columns = [[value for label, _, value in readings if label == name] for name in names]
     return Plain("\n".join(map(",".join, zip(*columns, strict=False))), names)
 
 
 def _unlisted(text: str, lines: list[str], bare: list[int], rows: Sequence[str]) -> str | None:
     """The text with a cell per number where a cell held a list (`"[0.1, 0.2]"`)."""
 
-    def count(found: re.Match[str]) -> str:
-        return f"@{len(_NUMBERS.split(found[1]))}"
+    def count(match: re.Match[str]) -> str:
+        return f"@{len(_NUMBERS.split(match[1]))}"
 
     counted = [_LIST.sub(count, row) for row in rows]
     for separator in _SEPARATORS:
@@ -575,7 +575,7 @@ def _unlisted(text: str, lines: list[str], bare: list[int], rows: Sequence[str])
     ]
     start = sum(len(line) + 1 for line in lines[: bare[0]])
     head, body = text[:start], text[start + len(lines[bare[0]]) :]
-    body = _LIST.sub(lambda found: separator.join(_NUMBERS.split(found[1])), body)
+    body = _LIST.sub(lambda match: separator.join(_NUMBERS.split(match[1])), body)
     return head + separator.join(wide) + body
 
 
@@ -609,15 +609,15 @@ def _number(cell: str, comma: bool) -> bool:
 
 def _numeral(cell: str, k: int, shape: _Shape) -> str | None:
     """The number in a cell of column `k` as a decimal numeral; None if it holds none."""
-    if k in shape.units and (found := _WITH_UNIT.fullmatch(cell)):
-        cell = found[1]
-    elif k in shape.hexed and (found := _HEX_CELL.fullmatch(cell)):
-        number, turn = int(found[1], 16), shape.hexed[k]
+    if k in shape.units and (match := _WITH_UNIT.fullmatch(cell)):
+        cell = match[1]
+    elif k in shape.hexed and (match := _HEX_CELL.fullmatch(cell)):
+        number, turn = int(match[1], 16), shape.hexed[k]
         return str(number - turn if turn and 2 * number >= turn else number)
     return cell.replace(",", ".") if _number(cell, shape.comma) else None
 
 
-def _is_row(line: str, shape: _Shape, whole: bool = False) -> bool:
+def _is_row(line: str, shape: _Shape, complete: bool = False) -> bool:
     """Whether a line is a row of the table rather than its names, units or a remark.
 
     Of a whole row all cells are numbers where the others' are, rather than most of them.
@@ -629,7 +629,7 @@ def _is_row(line: str, shape: _Shape, whole: bool = False) -> bool:
     if any(shape.blank[k] and not _number(c, shape.comma) for k, c in full):
         return False
     numbers = [_numeral(c, k, shape) is not None for k, c in full if shape.numeric[k]]
-    return sum(numbers) > (len(numbers) - 1 if whole else len(numbers) / 2)
+    return sum(numbers) > (len(numbers) - 1 if complete else len(numbers) / 2)
 
 
 def _names(line: str, shape: _Shape) -> list[str] | None:
@@ -668,8 +668,8 @@ def _units(line: str, shape: _Shape) -> list[str]:
     cells = _split(line, shape.separator)
     if len(cells) != shape.columns or not all(_UNIT.fullmatch(c) for c in cells if c):
         return []
-    found = [c.strip("()[]<>{} ") for c in cells]
-    return found if sum(map(bool, found)) > 1 else []
+    units = [c.strip("()[]<>{} ") for c in cells]
+    return units if sum(map(bool, units)) > 1 else []
 
 
 def _units_above(line: str, shape: _Shape) -> list[str]:

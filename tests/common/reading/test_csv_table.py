@@ -13,7 +13,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading import csv_table
 from pupper_sysid.common.reading.content import reading_up_to
 from pupper_sysid.common.reading.csv_table import column_names, comments_of, read_table
-from pupper_sysid.common.reading.dialect import decimal, whole
+from pupper_sysid.common.reading.dialect import decimal, whole_number
 from support.refusals import assert_each_refused
 
 
@@ -139,7 +139,7 @@ def test_a_raised_limit_reads_what_was_refused():
 
 @given(st.text(max_size=12))
 def test_any_text_is_a_number_in_ascii_or_none(text):
-    for read, plain in ((decimal, float), (whole, int)):
+    for read, plain in ((decimal, float), (whole_number, int)):
         try:
             value = read(text)
         except ValueError:
