@@ -55,8 +55,8 @@ class PositionLimits:
         if c is not None:
             thigh = c.sign * allowed[c.thigh]
             # where the two bounds of a calf contradict each other, the box wins
-            wanted = np.clip(allowed[c.calf], c.low_rad - thigh, c.high_rad - thigh)
-            allowed[c.calf] = np.clip(wanted, self.low_rad[c.calf], self.high_rad[c.calf])
+            calf = np.clip(allowed[c.calf], c.low_rad - thigh, c.high_rad - thigh)
+            allowed[c.calf] = np.clip(calf, self.low_rad[c.calf], self.high_rad[c.calf])
         return allowed
 
     def servo_angles(self, position_rad: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -81,8 +81,8 @@ class PositionLimits:
         c = self.coupling
         if c is not None:
             both = pose[c.calf] + c.sign * pose[c.thigh]
-            own = np.minimum(both - c.low_rad, c.high_rad - both)
-            margin[c.calf] = np.minimum(margin[c.calf], own)
+            coupled = np.minimum(both - c.low_rad, c.high_rad - both)
+            margin[c.calf] = np.minimum(margin[c.calf], coupled)
         return np.maximum(margin, 0.0)
 
 

@@ -190,7 +190,7 @@ def profile(series: Series, registers: Mapping[str, int]) -> Profile:
     )
 
 
-def own_faults(series: Series, registers: Mapping[str, int]) -> list[RegisterFault]:
+def family_faults(series: Series, registers: Mapping[str, int]) -> list[RegisterFault]:
     """Faults of registers that only these servos have."""
     faults = []
     if errors := registers["hardware_error_status"]:
@@ -235,10 +235,10 @@ def protections(series: Series, registers: Mapping[str, int]) -> dict[str, int]:
     >>> protections(SERIES[1200], {"shutdown": 52, "bus_watchdog": 0})
     {'bus_watchdog': 100}
     """
-    wanted = {
+    safe = {
         "shutdown": registers["shutdown"] | _OVERLOAD_AND_HEAT, "bus_watchdog": WATCHDOG_UNITS,
     }  # fmt: skip
-    return {name: value for name, value in wanted.items() if value != registers[name]}
+    return {name: value for name, value in safe.items() if value != registers[name]}
 
 
 HEADER = b"\xff\xff\xfd\x00"
@@ -360,30 +360,30 @@ class FrameReader:
                 self._drop(at if at >= 0 else len(buffer) - (len(HEADER) - 1))
                 continue
             length = buffer[5] | buffer[6] << 8
-            whole = length + 7
-            if length < 3 or whole > _LONGEST:
+            size = length + 7
+            if length < 3 or size > _LONGEST:
                 self._drop(1)
                 continue
             # stuffing keeps headers out of a frame: one inside starts the next
-            following = buffer.find(HEADER, 4, min(whole - 2, len(buffer)))
+            following = buffer.find(HEADER, 4, min(size - 2, len(buffer)))
             if following >= 0:
                 self._drop(following)
                 continue
-            if whole > len(buffer):
+            if size > len(buffer):
                 break
-            if crc16(buffer[: whole - 2]) != buffer[whole - 2] | buffer[whole - 1] << 8:
+            if crc16(buffer[: size - 2]) != buffer[size - 2] | buffer[size - 1] << 8:
                 self.crc_errors.append(buffer[4])
                 self._drop(1)
                 continue
-            body = bytes(buffer[7 : whole - 2]).replace(_STUFFING, _STUFFED)
+            body = bytes(buffer[7 : size - 2]).replace(_STUFFING, _STUFFED)
             is_status = body[0] == STATUS
             code, data = body[is_status : is_status + 1], body[is_status + 1 :]
             # one of the other kind, or without a code, is none
             if is_status == self._status and code and self._plausible(buffer[4], len(data)):
                 frames.append(Frame(buffer[4], code[0], data, is_status))
             else:
-                self.rejected_bytes += whole
-            del buffer[:whole]
+                self.rejected_bytes += size
+            del buffer[:size]
         return frames
 
     def _drop(self, count: int) -> None:
@@ -438,7 +438,7 @@ class DynamixelLine(SerialLine):
         """`sync_read` by the fast request, whether or not all servos support it."""
         ids, arrived = list(servos), bytearray()
         head, block = fast_head([size] * len(ids)), size + FAST_BLOCK_BYTES
-        whole, last_s = len(head) + len(ids) * block, 0.0
+        reply_bytes, last_s = len(head) + len(ids) * block, 0.0
         kind = FAST_SYNC_READ, len(ids), 0  # what precedes the blocks depends on no length
 
         def take(data: bytes) -> bool:
@@ -447,16 +447,16 @@ class DynamixelLine(SerialLine):
                 arrived.extend(data)
                 last_s = time.monotonic()
             at = arrived.find(head)
-            return at >= 0 and len(arrived) - at >= whole
+            return at >= 0 and len(arrived) - at >= reply_bytes
 
         begin = self._listen(
             lambda: self._packets.syncReadTx(self._port, address, size, ids, len(ids), True),
-            whole, 1, take,
+            reply_bytes, 1, take,
         )  # fmt: skip
         at = arrived.find(head)
         if begin is None or at < 0:
             return {}
-        frames = fast_replies(bytes(arrived[at : at + whole]), ids, size)
+        frames = fast_replies(bytes(arrived[at : at + reply_bytes]), ids, size)
         # the servos' blocks follow each other without a pause, so each ends at its own byte
         turn_s = block * self._byte_s()
         if len(frames) == len(ids):
@@ -483,8 +483,8 @@ class DynamixelLine(SerialLine):
         """See `SerialLine.sync_read_s`; of a fast one, the first servo's return delay counts."""
         if not self._was_fast:
             return super().sync_read_s(delays_s, size)
-        whole = FAST_HEAD_BYTES + len(delays_s) * (size + FAST_BLOCK_BYTES)
-        return delays_s[0] + whole * self._byte_s()
+        reply_bytes = FAST_HEAD_BYTES + len(delays_s) * (size + FAST_BLOCK_BYTES)
+        return delays_s[0] + reply_bytes * self._byte_s()
 
     def ask_model(self, servo: int) -> int:
         """Send a ping, whose reply holds the model number; 0 if sent."""
@@ -526,7 +526,7 @@ FAMILY = Family(
     turns_freely=frozenset({EXTENDED_POSITION_MODE, CURRENT_BASED_POSITION_MODE}),
     acknowledges=2,
     profile=profile,
-    own_faults=own_faults,
+    family_faults=family_faults,
     protections=protections,
     volt_scale=0.1,
     load=("present_pwm", 1 / FULL_PWM),

@@ -1,4 +1,4 @@
-"""A `ServoBus` through the Mini Pupper 2's own proxy: `esp32-proxy`, a socket on the robot.
+"""A `ServoBus` through the proxy of the Mini Pupper 2: `esp32-proxy`, a socket on the robot.
 
 The proxy shares one block of memory among all its clients: the last writer wins, a client that died
 goes unnoticed, and the feedback is 20 to 100 ms old without a time stamp. Hence one owner at a time
@@ -31,7 +31,7 @@ from pupper_sysid.hardware.address import SOCKET, BusAddress
 from pupper_sysid.hardware.bus import BusSample, Sent, finite_angles
 from pupper_sysid.hardware.imu import ImuSample, from_chip
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
-from pupper_sysid.hardware.lock import own
+from pupper_sysid.hardware.lock import acquire
 from pupper_sysid.hardware.loop import HostClock
 
 SERVOS = 12
@@ -174,7 +174,7 @@ class Esp32Bus(HostClock):
         self._by_id = np.array(self.joint_map.ids) - 1
         if not hasattr(socket, "SOCK_SEQPACKET") or not hasattr(socket, "AF_UNIX"):
             raise BusError("the proxy's socket exists on Linux only; run this on the robot.")
-        self._owner = own(self.path) if exclusive else None
+        self._owner = acquire(self.path) if exclusive else None
         self._socket: socket.socket | None = None
         self._retry_s = 0.0
         self._supply_v: float | None = None
@@ -355,14 +355,14 @@ class Esp32Bus(HostClock):
         if time.monotonic() < self._retry_s:
             return False
         self._retry_s = time.monotonic() + _RECONNECT_S
-        made = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        made.settimeout(TIMEOUT_S)
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        connection.settimeout(TIMEOUT_S)
         try:
-            made.connect(str(self.path))
+            connection.connect(str(self.path))
         except OSError:
-            made.close()
+            connection.close()
             return False
-        self._socket = made
+        self._socket = connection
         return True
 
     def _disconnect(self) -> None:

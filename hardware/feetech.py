@@ -221,12 +221,12 @@ def protections_to_set(series: Series, registers: Mapping[str, int]) -> dict[str
     {'unload_condition': 12}
     """
     blocked = _OVERCURRENT if series.has("goal_current") else _OVERLOAD
-    wanted = {"unload_condition": registers["unload_condition"] | _HEAT | blocked}
+    safe = {"unload_condition": registers["unload_condition"] | _HEAT | blocked}
     for name, most in _MOST.items():
         if name in series.registers:
             off = registers[name] == 0 and name in _OFF_AT_ZERO
-            wanted[name] = most if off else min(registers[name], most)
-    return {name: value for name, value in wanted.items() if value != registers[name]}
+            safe[name] = most if off else min(registers[name], most)
+    return {name: value for name, value in safe.items() if value != registers[name]}
 
 
 def profile(series: Series, registers: Mapping[str, int]) -> Profile:
@@ -248,7 +248,7 @@ def profile(series: Series, registers: Mapping[str, int]) -> Profile:
     )
 
 
-def own_faults(series: Series, registers: Mapping[str, int]) -> list[RegisterFault]:
+def family_faults(series: Series, registers: Mapping[str, int]) -> list[RegisterFault]:
     """Registers with which a servo of these series does not move."""
     faults = []
     if registers.get("goal_current", 1) == 0:
@@ -320,15 +320,15 @@ class FrameReader:
                 start = at
                 continue
             frame_id, length = buffer[start + 2], buffer[start + 3]
-            whole = start + length + 4
+            frame_end = start + length + 4
             possible = frame_id != 0xFF and 2 <= length <= _HIGHEST_LENGTH
             possible = possible and self._plausible(frame_id, length)
-            if possible and whole > end:
+            if possible and frame_end > end:
                 break
-            if possible and checksum(buffer[start + 2 : whole - 1]) == buffer[whole - 1]:
-                data = bytes(buffer[start + 5 : whole - 1])
+            if possible and checksum(buffer[start + 2 : frame_end - 1]) == buffer[frame_end - 1]:
+                data = bytes(buffer[start + 5 : frame_end - 1])
                 frames.append(Frame(frame_id, buffer[start + 4], data))
-                start = whole
+                start = frame_end
             else:
                 start += 1
                 self.rejected_bytes += 1
@@ -416,7 +416,7 @@ FAMILY = Family(
     turns_freely=frozenset(),
     acknowledges=1,
     profile=profile,
-    own_faults=own_faults,
+    family_faults=family_faults,
     protections=protections_to_set,
     volt_scale=0.1,
     load=("present_load", 1e-3),

@@ -88,8 +88,8 @@ class Travel:
 
     def add(self, count: NDArray[np.int64]) -> None:
         """Add one reading, shape (joints,); -1 where there is none."""
-        here = count >= 0
-        sure = here & (self.now >= 0)
+        answered = count >= 0
+        sure = answered & (self.now >= 0)
         lower, higher = np.maximum(count, self.now), np.minimum(count, self.now)
         self.low = np.where(
             sure, np.where(self.low < 0, lower, np.minimum(self.low, lower)), self.low
@@ -98,8 +98,8 @@ class Travel:
         half = self.counts / 2
         stayed = (np.abs(count - self._before) > half) & (np.abs(self.now - self._before) > half)
         self.wrapped |= sure & (self._before >= 0) & stayed
-        self._before = np.where(here, self.now, self._before)
-        self.now = np.where(here, count, self.now)
+        self._before = np.where(answered, self.now, self._before)
+        self.now = np.where(answered, count, self.now)
 
     def forget(self, joint: int) -> None:
         """Reset one joint."""
@@ -126,7 +126,7 @@ class Travel:
         return why
 
     def cut_off(self, names: tuple[str, ...]) -> list[str]:
-        """Joints whose travel reached an end of the encoder before their own end."""
+        """Joints whose travel reached an end of the encoder before its mechanical end."""
         at_end = (self.low == 0) | (self.high >= self.counts - 1)
         return [name for name, cut in zip(names, at_end, strict=True) if cut]
 
@@ -338,8 +338,8 @@ def read_lerobot(path: Path) -> dict[str, LeRobotJoint]:
     joints = {}
     for name, entry in data.items():
         if not isinstance(entry, dict) or not fields & set(entry):
-            wanted = ", ".join(sorted(fields))
-            raise InputError(f"{path} is no calibration of LeRobot: {name} must have {wanted}.")
+            expected = ", ".join(sorted(fields))
+            raise InputError(f"{path} is no calibration of LeRobot: {name} must have {expected}.")
         joints[name] = validated(LeRobotJoint, entry, f"{path}, {name}")
     ids = [joint.id for joint in joints.values()]
     if len(set(ids)) < len(ids):
@@ -393,11 +393,11 @@ def lerobot_calibration(
     for name in joint_map.joint_names:
         entry = joint_map.file.joints[name]
         offset = homing_offsets.get(name)
-        kept = entry.homing_offset if offset is None else offset
+        homing_offset = entry.homing_offset if offset is None else offset
         entries[name] = {
             "id": entry.id,
             "drive_mode": int(entry.sign < 0) if software else 0,
-            "homing_offset": kept or 0,
+            "homing_offset": homing_offset or 0,
             "range_min": entry.limits_counts[0],
             "range_max": entry.limits_counts[1],
         }

@@ -119,14 +119,14 @@ class JointMapFile(BaseModel):
     def _scales(self) -> JointMapFile:
         # every limit of the guard is in radians: a wrong scale would stretch them all
         known = counts_of(self.servo) if self.servo else None
-        whole = (known or self.counts) / (2 * math.pi)
+        expected = (known or self.counts) / (2 * math.pi)
         factor = _KNOWN_FACTOR if known else _SCALE_FACTOR
         what = f"the {self.servo}" if known else f"a servo of {self.counts} counts a turn"
         for joint, entry in self.joints.items():
-            if not 1 / factor <= entry.counts_per_rad / whole <= factor:
+            if not 1 / factor <= entry.counts_per_rad / expected <= factor:
                 raise ValueError(
                     f"{joint}: counts_per_rad is {entry.counts_per_rad:.4g}, but {what} has "
-                    f"{whole:.4g}, and all limits scale with it. Measure it with "
+                    f"{expected:.4g}, and all limits scale with it. Measure it with "
                     "`pupper-sysid calibrate-joints`"
                 )
         return self
@@ -248,24 +248,24 @@ class JointMap:
         servo = np.sort(self._neutral[:, None] + turned, axis=1)
         joint = self._column("limits_rad")
         calf, thigh = self._legs
-        both = np.stack([np.maximum(servo, joint)[:, 0], np.minimum(servo, joint)[:, 1]], axis=1)
+        limits = np.stack([np.maximum(servo, joint)[:, 0], np.minimum(servo, joint)[:, 1]], axis=1)
         if self.coordinates == "servo" and self.file.linkage != "none":
             # a calf without its thigh: the thigh is assumed to be at its neutral
             alone = [i for i in self._calves.tolist() if i not in calf]
-            own = servo[alone] - self._thigh_neutral(alone)[:, None]
-            both[alone, 0] = np.maximum(own, joint[alone])[:, 0]
-            both[alone, 1] = np.minimum(own, joint[alone])[:, 1]
+            calf_travel = servo[alone] - self._thigh_neutral(alone)[:, None]
+            limits[alone, 0] = np.maximum(calf_travel, joint[alone])[:, 0]
+            limits[alone, 1] = np.minimum(calf_travel, joint[alone])[:, 1]
         if not len(calf):
-            return PositionLimits(both[:, 0], both[:, 1])
+            return PositionLimits(limits[:, 0], limits[:, 1])
         if self.coordinates == "joint":
-            both[calf] = joint[calf]
-            other, sign = servo[calf], +1
+            limits[calf] = joint[calf]
+            calf_ends, sign = servo[calf], +1
         else:
             shift = self._thigh_neutral(calf)[:, None]
-            both[calf] = servo[calf] - shift
-            other, sign = joint[calf] - shift, -1
-        coupling = Coupling(calf, thigh, sign, other[:, 0], other[:, 1])
-        return PositionLimits(both[:, 0], both[:, 1], coupling)
+            limits[calf] = servo[calf] - shift
+            calf_ends, sign = joint[calf] - shift, -1
+        coupling = Coupling(calf, thigh, sign, calf_ends[:, 0], calf_ends[:, 1])
+        return PositionLimits(limits[:, 0], limits[:, 1], coupling)
 
     def metadata(self) -> dict[str, Any]:
         """Entries for the header of a recording."""
@@ -345,8 +345,8 @@ class JointMap:
             for i in self._calves.tolist()
             if self.file.linkage != "none" and names[i].replace("calf", "thigh") in names
         ]
-        found = np.array(pairs, np.intp).reshape(-1, 2)
-        return found[:, 0], found[:, 1]
+        indices = np.array(pairs, np.intp).reshape(-1, 2)
+        return indices[:, 0], indices[:, 1]
 
     def _thigh_neutral(self, calf: Sequence[int] | NDArray[np.intp]) -> NDArray[np.float64]:
         """Neutral of the thighs that the calves at these indices hang on."""

@@ -1,4 +1,4 @@
-"""One program at a time: a lock per robot in a folder of the user's own.
+"""One program at a time: a lock per robot in a folder that only the user can write to.
 
 The folder is `$XDG_RUNTIME_DIR/pupper-sysid`, else `/tmp/pupper-sysid-<user id>`; nobody else may
 write there, and files in it are opened without following links and without waiting. A lock is held
@@ -23,17 +23,17 @@ LOG = "watchdog.log"
 
 def runtime_folder() -> Path:
     """The folder, made if missing."""
-    given = os.environ.get("XDG_RUNTIME_DIR", "")
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
     folder = Path(f"/tmp/pupper-sysid-{os.getuid()}")
-    if given and Path(given).is_absolute() and Path(given).is_dir():
-        folder = Path(given) / "pupper-sysid"
+    if runtime and Path(runtime).is_absolute() and Path(runtime).is_dir():
+        folder = Path(runtime) / "pupper-sysid"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
+        status = folder.lstat()
     except OSError as error:
         raise BusError(f"{folder} cannot be made: {error.strerror}. Make it yourself.") from error
-    own = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
-    if not own or stat.S_IMODE(found.st_mode) & 0o022:
+    private = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid()
+    if not private or stat.S_IMODE(status.st_mode) & 0o022:
         raise BusError(
             f"{folder} is not a folder that only you can write to, so what it says of robots in "
             "use cannot be trusted. Remove it."
@@ -60,7 +60,7 @@ def lock_name(robot: Path) -> str:
     return hashlib.sha256(os.fsencode(resolved(robot))).hexdigest()[:16] + ".lock"
 
 
-def own(robot: Path) -> int:
+def acquire(robot: Path) -> int:
     """Descriptor of the lock of a robot at this path, locked until it is closed."""
     descriptor = open_here(lock_name(robot), os.O_RDWR)
     try:

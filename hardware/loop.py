@@ -48,8 +48,8 @@ class HostClock:
 
     def sleep_until(self, time_s: float) -> None:
         """Sleep until `now()` has reached `time_s`."""
-        while (left := time_s - self.now()) > 0:
-            time.sleep(left)
+        while (remaining_s := time_s - self.now()) > 0:
+            time.sleep(remaining_s)
 
 
 _SHORTEST_S, _LONGEST_S, _STEP = 1e-7, 1e3, 0.01
@@ -213,13 +213,13 @@ class FixedRateLoop:
 
     def _culprit(self, late_s: float, before_s: dict[str, float]) -> str:
         """What took most of the last `late_s`, with the cure; `before_s` was spent before them."""
-        parts = {k: v - before_s.get(k, 0.0) for k, v in self.spent.total_s.items()}
-        parts[_HOST] = late_s - sum(parts.values())
-        largest = max(parts, key=lambda k: parts[k])
+        spent_s = {k: v - before_s.get(k, 0.0) for k, v in self.spent.total_s.items()}
+        spent_s[_HOST] = late_s - sum(spent_s.values())
+        largest = max(spent_s, key=lambda k: spent_s[k])
         shares = [
-            f"{1e3 * parts[k]:.0f} ms {_LATE[k][0]}"
-            for k in sorted(parts, key=lambda k: -parts[k])
-            if k == largest or parts[k] > _WORTH_NAMING * late_s
+            f"{1e3 * spent_s[k]:.0f} ms {_LATE[k][0]}"
+            for k in sorted(spent_s, key=lambda k: -spent_s[k])
+            if k == largest or spent_s[k] > _WORTH_NAMING * late_s
         ]
         return f"{_LATE[largest][1][:-1]} ({1e3 * late_s:.0f} ms went by: {', '.join(shares)})."
 

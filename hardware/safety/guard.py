@@ -7,12 +7,12 @@ limits, a speed and an acceleration; the first one must be near the robot's pose
 checked (`hardware.safety.monitor`): a joint that does not follow its command, is overloaded, too
 warm or short of voltage, a servo that reports an error, or a silent bus end in `SafetyStop`.
 
-`park` ends everything: stop, return to the pose in which the robot was found, torque off, each
-bounded in time; after a safety stop the way back is left out. Nothing on the robot notices that its
-host has died, so `hardware.safety.watchdog` does the same from another process.
+`park` ends everything: stop, return to the pose of the start, torque off, each bounded in time;
+after a safety stop the way back is left out. Nothing on the robot notices that its host has died,
+so `hardware.safety.watchdog` does the same from another process.
 
 A servo's register can be set for as long as the guard exists (`set_register`); `close` sets it back
-to what was found, and the watchdog does if this process dies.
+to its original value, and the watchdog does if this process dies.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class RateLimit:
         Both it and the last one `sent`, `since_s` ago, have the shape (joints,) [rad].
         """
         limits = self._limits
-        wanted, here = limits.servo_angles(command), limits.servo_angles(sent)
+        target, previous = limits.servo_angles(command), limits.servo_angles(sent)
         tick = float(np.median(self._ticks)) if self._ticks else _FIRST_TICK_S
         dt = max(min(since_s, _LATE * tick), 1e-4)
         if since_s > _REST_S:
@@ -70,17 +70,17 @@ class RateLimit:
             dt = min(tick, _FIRST_TICK_S)
         else:
             self._ticks.append(min(max(since_s, _SHORTEST_TICK_S), _LONGEST_TICK_S))
-        asked = (wanted - here) / dt
+        requested = (target - previous) / dt
         gain = self._acceleration * dt
         low = np.maximum(np.minimum(self._velocity, 0.0) - gain, -self._speed)
         high = np.minimum(np.maximum(self._velocity, 0.0) + gain, self._speed)
-        velocity = np.clip(asked, low, high)
-        exceeded = velocity != asked
+        velocity = np.clip(requested, low, high)
+        exceeded = velocity != requested
         # over all of a late tick the joint was slower than that
         self._velocity = velocity * min(dt / min(max(since_s, 1e-4), _LONGEST_TICK_S), 1.0)
         if not exceeded.any():
             return command
-        slower = np.where(exceeded, here + velocity * dt, wanted)
+        slower = np.where(exceeded, previous + velocity * dt, target)
         return limits.clip(limits.from_servo_angles(slower))
 
 
@@ -155,10 +155,10 @@ class GuardedBus:
 
     def sleep_until(self, time_s: float) -> None:
         """Sleep until `now()` has reached `time_s`; the watchdog gets its beats meanwhile."""
-        while self._on and (left := time_s - self.bus.now()) > _HEARTBEAT_S:
+        while self._on and (remaining_s := time_s - self.bus.now()) > _HEARTBEAT_S:
             self._beat()
             getattr(self.bus, "keep_alive", lambda: None)()  # servos with a watchdog of their own
-            self.bus.sleep_until(self.bus.now() + min(_HEARTBEAT_S, left))
+            self.bus.sleep_until(self.bus.now() + min(_HEARTBEAT_S, remaining_s))
         self.bus.sleep_until(time_s)
 
     def read(self) -> BusSample:
@@ -189,8 +189,8 @@ class GuardedBus:
             command = np.asarray(position_rad, float)
             # one that is no number would stay in the velocity
             if command.shape != self._present.shape or np.isnan(command).any():
-                wanted = f"{len(self.joint_names)} numbers"
-                raise BusError(f"{self.name}: a command must be {wanted}, got {command}.")
+                expected = f"{len(self.joint_names)} numbers"
+                raise BusError(f"{self.name}: a command must be {expected}, got {command}.")
             allowed = self.limits.clip(command)
             now = self.bus.now()
             if np.any(allowed != command):
@@ -232,7 +232,7 @@ class GuardedBus:
         home = self._locate()
         for joint, protections in getattr(self.bus, "protections_to_set", dict)().items():
             for name, value in protections.items():  # the servos' own, until `close`
-                if name not in self.registers.found.get(joint, {}):
+                if name not in self.registers.originals.get(joint, {}):
                     self.set_register(joint, name, value)
         if self._watchdog:
             # before the first servo is on: a driver killed from here on leaves some that are
@@ -280,7 +280,7 @@ class GuardedBus:
         self.park()
 
     def park(self, pose_rad: Angles | None = None) -> None:
-        """Stop, return to `pose_rad` (by default where the robot was found), torque off.
+        """Stop, return to `pose_rad` (by default the pose of the start), torque off.
 
         Never raises for a faulty bus; torque-off is tried several times. The way back takes at most
         `GuardLimits.park_within_s`, and is left out after a safety stop or if the bus does not
@@ -348,7 +348,7 @@ class GuardedBus:
                 raise
 
     def _locate(self) -> Angles:
-        """Pose in which the robot was found, before anything is sent to it."""
+        """Pose of the robot before anything is sent to it."""
         for _ in range(_LOCATE_TRIES):
             if np.isfinite(self._present).all():
                 break
@@ -391,16 +391,16 @@ class GuardedBus:
         if away[far] <= self.guard.first_command_rad:
             return
         self._stopped_for_safety = True
-        name, here = self.joint_names[far], self._present[far]
-        outside = abs(here - self.limits.clip(self._present)[far])
+        name, at = self.joint_names[far], self._present[far]
+        outside = abs(at - self.limits.clip(self._present)[far])
         if outside > self.guard.first_command_rad:
             raise SafetyStop(
-                f"{name} was found at {here:.2f} rad, {outside:.2f} rad outside its limits, and "
+                f"{name} was found at {at:.2f} rad, {outside:.2f} rad outside its limits, and "
                 "would jump to them. Move it by hand into its limits, then start again."
             )
         raise SafetyStop(
             f"First command refused: it would move {name} by {away[far]:.2f} rad at once (it is "
-            f"at {here:.2f} rad). Start from the present pose."
+            f"at {at:.2f} rad). Start from the present pose."
         )
 
     def _unread(self) -> str:
@@ -418,56 +418,55 @@ _TRIES, _PAUSE_S = 3, 0.02
 
 
 class ChangedRegisters:
-    """Registers of a bus's servos that differ from what was found, in `found` by joint and name.
+    """Registers of a bus's servos that were changed, with their `originals` by joint and name.
 
-    The watchdog sets them back if this process dies. What another driver had `found` is set back,
-    too.
+    The watchdog sets them back if this process dies, those of an earlier driver, too.
     """
 
     def __init__(
         self,
         bus: ServoBus,
         watchdog: Watchdog | None = None,
-        found: Mapping[str, Mapping[str, int]] | None = None,
+        originals: Mapping[str, Mapping[str, int]] | None = None,
     ):
         self._bus: Any = bus
         self._watchdog = watchdog
-        self.found = {joint: dict(own) for joint, own in (found or {}).items()}
+        self.originals = {joint: dict(values) for joint, values in (originals or {}).items()}
         """Values to be set back, by joint and register."""
 
     def set(self, joint: str, name: str, value: int) -> None:
-        """Set a register; the first time, keep what was found."""
+        """Set a register; the first time, keep its original value."""
         if not hasattr(self._bus, "set_register"):
             raise BusError(
                 f"{self._bus.name}: registers of its servos cannot be set over this bus. Leave the "
                 "gains out, or connect the servos to a serial adapter (feetech:DEVICE)."
             )
-        own = self.found.setdefault(joint, {})
-        if name not in own:
-            own[name] = self._bus.register(joint, name)
+        values = self.originals.setdefault(joint, {})
+        if name not in values:
+            values[name] = self._bus.register(joint, name)
             self._tell()
         self._bus.set_register(joint, name, value)
 
     def restore(self) -> bool:
-        """Set all back; whether every one is confirmed. What is not stays in `found`."""
-        if not self.found:
+        """Set all back; whether every one is confirmed. What is not stays in `originals`."""
+        if not self.originals:
             return True
-        for joint, own in self.found.items():
-            for name, value in list(own.items()):
+        for joint, values in self.originals.items():
+            for name, value in list(values.items()):
                 for _ in range(_TRIES):
                     try:
                         self._bus.set_register(joint, name, value)
-                        del own[name]
+                        del values[name]
                         break
                     except BusError:
                         self._bus.sleep_until(self._bus.now() + _PAUSE_S)
-        self.found = {joint: own for joint, own in self.found.items() if own}
+        self.originals = {joint: values for joint, values in self.originals.items() if values}
         self._tell()
-        return not self.found
+        return not self.originals
 
     def _tell(self) -> None:
         if self._watchdog:
-            self._watchdog.restore(self.found)
+            self._watchdog.restore(self.originals)
 
 
 def open_bus(
@@ -492,7 +491,7 @@ def open_guarded(
     try:
         if hasattr(bus, "refuse_unfit"):
             bus.refuse_unfit()
-        # rate and map as found: nothing is to be detected when it is urgent
+        # rate and map as detected: a watchdog has no time to detect them again
         watchdog = Watchdog(replace(address, baud=bus.metadata.get("baud")), bus.joint_map)
     except BaseException:
         bus.close()

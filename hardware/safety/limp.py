@@ -40,8 +40,8 @@ def switch_off(
         limp = bus.torque(False)
     finally:
         bus.close()
-    wanted = joints or (chosen.joint_names if chosen else bus.joint_names)
-    return [name for name in wanted if not limp or name not in bus.joint_names]
+    names = joints or (chosen.joint_names if chosen else bus.joint_names)
+    return [name for name in names if not limp or name not in bus.joint_names]
 
 
 def _all_off(address: BusAddress) -> list[str]:
@@ -52,11 +52,11 @@ def _all_off(address: BusAddress) -> list[str]:
         try:
             line.detect_echo()
             models = line.find(list(line.roll_call(range(family.highest_id + 1))))
-            left = [servo for servo in models if not _is_off(line, servo, family, models[servo])]
+            on = [servo for servo in models if not _is_off(line, servo, family, models[servo])]
         finally:
             line.close()
         if models:
-            return [f"id {servo}" for servo in left]
+            return [f"id {servo}" for servo in on]
     raise BusError(
         f"{address.where}: no servo answers, so nothing confirms that the torque is off. Check the "
         "cable and the power."

@@ -319,5 +319,5 @@ class Monitor:
 
 
 def _first(flags: NDArray[np.bool_]) -> int | None:
-    found = np.flatnonzero(flags)
-    return int(found[0]) if len(found) else None
+    indices = np.flatnonzero(flags)
+    return int(indices[0]) if len(indices) else None

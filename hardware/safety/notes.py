@@ -38,7 +38,7 @@ class Note:
     processes: tuple[tuple[int, int], ...]
     """Ids of driver and watchdog, and when each was started [clock ticks since the system was]."""
     registers: dict[str, dict[str, int]]
-    """Values that the driver had found in registers that it changed, by joint."""
+    """Original values of the registers that the driver changed, by joint."""
 
     @property
     def robot(self) -> str:
@@ -51,7 +51,7 @@ class Note:
 
     def remove(self) -> None:
         """Take the note away, unless another driver has replaced it."""
-        if any(one.processes == self.processes for one in notes()):
+        if any(note.processes == self.processes for note in notes()):
             remove_note(self.address.where)
 
 
@@ -79,14 +79,14 @@ def remove_note(where: str) -> None:
 
 def notes() -> list[Note]:
     """All notes that can be read."""
-    found = []
+    readable = []
     for path in sorted(runtime_folder().glob(f"*{_END}")):
         # half of one, another version's, or removed meanwhile
         with contextlib.suppress(
             PupperError, OSError, ValueError, KeyError, TypeError, AttributeError
         ):
-            found.append(_read(path.name))
-    return found
+            readable.append(_read(path.name))
+    return readable
 
 
 def _read(name: str) -> Note:
@@ -101,7 +101,7 @@ def _read(name: str) -> Note:
         tuple(orders["joints"]),
         int(orders["driver"]),
         tuple((int(number), int(start)) for number, start in orders["processes"]),
-        {j: {n: int(v) for n, v in own.items()} for j, own in registers.items()},
+        {j: {n: int(v) for n, v in values.items()} for j, values in registers.items()},
     )
 
 

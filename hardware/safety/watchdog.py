@@ -62,7 +62,7 @@ class Watchdog:
 
     def _start(self) -> None:
         """Start the process, and wait until it is ready."""
-        # a session of its own: Ctrl-C at the terminal is for the driver
+        # another session: Ctrl-C at the terminal is for the driver
         self._process = subprocess.Popen(
             # -P: a file in the user's folder, such as json.py, must not stand in for a module
             [sys.executable, "-P", "-m", "pupper_sysid.hardware.safety.watchdog_process"],
@@ -140,7 +140,7 @@ class Watchdog:
     def restore(self, registers: Mapping[str, Mapping[str, int]]) -> None:
         """Set these registers back, by joint, if the driver ends without having done so."""
         changed = registers != self._registers
-        self._registers = {joint: dict(own) for joint, own in registers.items()}
+        self._registers = {joint: dict(values) for joint, values in registers.items()}
         self._send({"registers": registers})
         if changed and self._pose:
             self._note()
@@ -179,10 +179,10 @@ class Watchdog:
         if pipe is None or pipe.closed:
             return
         self._unanswered.append(time.monotonic())
-        left = json.dumps(message).encode() + b"\n"
+        unsent = json.dumps(message).encode() + b"\n"
         with contextlib.suppress(OSError):
-            while left:  # the first message is longer than a pipe takes at once
-                left = left[os.write(pipe.fileno(), left) :]
+            while unsent:  # the first message is longer than a pipe takes at once
+                unsent = unsent[os.write(pipe.fileno(), unsent) :]
 
     def _silent(self, now: float) -> bool:
         """Whether a message has not been answered in time."""

@@ -2,7 +2,7 @@
 
 Every message is answered with one byte. When the pipe closes without a message, or no beat comes
 for a second, it kills what is left of the driver, opens the bus itself, stops the joints, takes
-them back to the pose in which the robot was found, switches the torque off, and sets registers back
+them back to the pose of the start, switches the torque off, and sets registers back
 that the driver had changed.
 
 Switching the torque off takes no lock: a program that waits for the driver's end, or a child that
@@ -58,7 +58,7 @@ class _Orders:
     joint_map: JointMap
     driver: int
     pose_rad: dict[str, float] = field(default_factory=dict)
-    """Joints whose torque is on, and where they were found."""
+    """Joints whose torque is on, and their pose at the start."""
     only_limp: bool = False
     """Leave the way back out."""
     registers: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -134,33 +134,33 @@ def park(orders: _Orders) -> None:
     All joints go back together if the bus can be opened soon, and all of them answer; after that
     they are only switched off, those that do not answer too.
     """
-    left, start = list(orders.pose_rad), time.monotonic()
+    joints, start = list(orders.pose_rad), time.monotonic()
     say_s, silence_s, present_s = start + _SOON_S, _SAY_EVERY_S, start
-    while left:
+    while joints:
         now = time.monotonic()
         if is_there(orders.address):
             present_s = now
         elif now - present_s > _GONE_S and not can_come_back(orders.address):
-            say(f"{orders.address.where} is gone for good; {may_be_on(left)}")
+            say(f"{orders.address.where} is gone for good; {may_be_on(joints)}")
             return
         if now > say_s:
-            say(f"{orders.address.where}: {may_be_on(left)} It is tried on.")
+            say(f"{orders.address.where}: {may_be_on(joints)} It is tried on.")
             say_s, silence_s = now + silence_s, min(2 * silence_s, _LONGEST_SILENCE_S)
         try:
             if orders.only_limp or now - start > _OPEN_WITHIN_S:
-                left = switch_off(orders.address, orders.joint_map, left)
+                joints = switch_off(orders.address, orders.joint_map, joints)
             else:
-                left = _go_home(orders)
+                joints = _go_home(orders)
         except Exception:  # of whatever kind, a lack of memory too: the torque may be on
             # the driver's lock goes with its last thread, which can take a moment
             time.sleep(0.02 if now - start < _SOON_S else 1.0)
             continue
-        if left and now - start > _SOON_S:
+        if joints and now - start > _SOON_S:
             time.sleep(1.0)
 
 
 def _go_home(orders: _Orders) -> list[str]:
-    """Park all joints where they were found; those that did not confirm that they are limp."""
+    """Park all joints in the pose of the start; returns those that did not confirm torque off."""
     joints = list(orders.pose_rad)
     guard = GuardedBus(
         open_bus(orders.address, orders.joint_map, joints), GuardLimits(park_within_s=PARK_WITHIN_S)
@@ -187,9 +187,9 @@ def restore(
         except PupperError:
             time.sleep(0.02)
             continue
-        changed = ChangedRegisters(bus, found=registers)
+        changed = ChangedRegisters(bus, originals=registers)
         changed.restore()
-        registers = changed.found
+        registers = changed.originals
         bus.close()
 
 

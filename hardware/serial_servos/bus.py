@@ -56,7 +56,7 @@ class LineServo:
     id: int
     series: Series
     registers: dict[str, int] | None = None
-    """All, as found when the bus was opened; None if they could not be read."""
+    """All, as read when the bus was opened; None if they could not be read."""
     misses: int = 0
     last_s: float = -np.inf
     last_count: int = -1
@@ -89,23 +89,23 @@ class SerialBus(HostClock):
     ):
         self.name = self.family.name
         self.error_bits = self.family.error_bits
-        wanted = joint_map.select(joints) if joint_map and joints else joint_map
-        ids = wanted.ids if wanted else scan.MINI_PUPPER_IDS
+        chosen = joint_map.select(joints) if joint_map and joints else joint_map
+        ids = chosen.ids if chosen else scan.MINI_PUPPER_IDS
         self.line, models = scan.open_line(
-            self.family, device, baud, ids, exclusive, patiently=wanted is not None
+            self.family, device, baud, ids, exclusive, patiently=chosen is not None
         )
         try:
-            named = wanted.file.servo if wanted else None
+            named = chosen.file.servo if chosen else None
             series = scan.known_series(self.family, self.line, models, named)
-            if wanted is None:
-                wanted = scan.default_map(self.family, self.line, series)
-                wanted = wanted.select(joints) if joints else wanted
+            if chosen is None:
+                chosen = scan.default_map(self.family, self.line, series)
+                chosen = chosen.select(joints) if joints else chosen
             else:
                 scan.refuse_other_servos(
-                    wanted, self.family, scan.one_series(series, device), device
+                    chosen, self.family, scan.one_series(series, device), device
                 )
-            self.joint_map = wanted.select(
-                scan.answering_joints(self.family, wanted, series, joints is not None, self.line)
+            self.joint_map = chosen.select(
+                scan.answering_joints(self.family, chosen, series, joints is not None, self.line)
             )
             self._servos = [LineServo(i, series[i]) for i in self.joint_map.ids]
             super().__init__()
@@ -193,7 +193,7 @@ class SerialBus(HostClock):
         size = self.family.reading_bytes[self._turn % len(self.family.reading_bytes)]
         self._turn += 1
         joints = len(self._servos)
-        count, here = np.full(joints, -1), np.zeros(joints, bool)
+        count, answered = np.full(joints, -1), np.zeros(joints, bool)
         volts, temperature, load = (np.full(joints, np.nan) for _ in range(3))
         status = np.full(joints, 0)
         replies = self._poll(size)
@@ -211,7 +211,7 @@ class SerialBus(HostClock):
             reported = decode("present_position", memory, self._first)
             if not self._plausible(servo, k, at, reported):
                 continue
-            time_s[k], count[k], here[k] = at, reported, True
+            time_s[k], count[k], answered[k] = at, reported, True
             status[k] = self._status(servo, reply)
             name, scale = self.family.load
             load[k] = scale * decode(name, memory, self._first)
@@ -221,7 +221,7 @@ class SerialBus(HostClock):
             if self._holds(servo, "present_temperature", memory):
                 servo.temperature_c = float(decode("present_temperature", memory, self._first))
             volts[k], temperature[k] = servo.voltage_v, servo.temperature_c
-        position = self.joint_map.to_angles(np.where(here, count, np.nan))
+        position = self.joint_map.to_angles(np.where(answered, count, np.nan))
         return BusSample(time_s, position, count, volts, temperature, load, status)
 
     def torque(self, on: bool) -> bool:
@@ -250,7 +250,7 @@ class SerialBus(HostClock):
         return self.joint_map.to_angles(np.array([np.nan if x is None else x for x in goals]))
 
     def servo_setups(self) -> dict[str, dict[str, Any]]:
-        """Model, firmware, gains and registers of each servo, as found when the bus was opened."""
+        """Model, firmware, gains and registers of each servo, as read when the bus was opened."""
         return {joint: dict(setup) for joint, setup in self._setups.items()}
 
     def protections_to_set(self) -> dict[str, dict[str, int]]:
@@ -260,7 +260,7 @@ class SerialBus(HostClock):
             for joint, servo in zip(self.joint_names, self._servos, strict=True)
             if servo.registers is not None
         }
-        return {joint: own for joint, own in weak.items() if own}
+        return {joint: registers for joint, registers in weak.items() if registers}
 
     def register(self, joint: str, name: str) -> int:
         """Present value of a register; `BusError` if it cannot be read."""

@@ -40,7 +40,7 @@ except ImportError:  # Windows
 PORT_ERRORS = (OSError, serial.SerialException, _TermiosError)
 
 REPLY_TIMEOUT_S = 0.003
-"""Allowance for the host's own delays, beyond the time that bytes and servos need."""
+"""Allowance for delays of the host, beyond the time that bytes and servos need."""
 SLOWEST_ADAPTER_S = 0.06
 """Longest latency that is waited for: three times the 16 ms of an FTDI's timer, and a margin."""
 SLOW_ADAPTER_S = 0.002
@@ -389,8 +389,8 @@ class SerialLine(ABC):
         self, send: Callable[[], int], servos: Sequence[int], size: int
     ) -> dict[int, Reply]:
         """Send, and collect one reply of `size` parameter bytes from each of `servos`."""
-        wanted = set(servos)
-        reader = self._reader(lambda servo, length: servo in wanted and length == size)
+        expected = set(servos)
+        reader = self._reader(lambda servo, length: servo in expected and length == size)
         replies: dict[int, tuple[LineFrame, float]] = {}
         contradicted: set[int] = set()
         arrived = bytearray()
@@ -401,7 +401,7 @@ class SerialLine(ABC):
                 first = replies.setdefault(frame.id, (frame, time.monotonic()))
                 if first[0] != frame:
                     contradicted.add(frame.id)
-            return len(replies) == len(wanted)
+            return len(replies) == len(expected)
 
         begin = self._listen(send, len(servos) * (size + self.reply_bytes), len(servos), take)
         if begin is None:
@@ -412,7 +412,7 @@ class SerialLine(ABC):
         last = max((k for k, servo in enumerate(servos) if servo in replies), default=0)
         after = max((at for _, at in replies.values()), default=begin)
         share = self._least_s(
-            (size, len(servos)), max(after - begin, 0.0) / (last + 1), len(replies) == len(wanted)
+            (size, len(servos)), max(after - begin, 0.0) / (last + 1), len(replies) == len(expected)
         )
         return {
             servo: Reply(replies[servo][0], begin + k * share, begin + (k + 1) * share)

@@ -88,8 +88,8 @@ def scan_line(
                 continue
             first = first or rate
             servos += [_report(family, line, servo, model) for servo, model in answering.items()]
-            found = (series_of(family, line, servo, m) for servo, m in answering.items())
-            known = next((series for series in found if series), None)
+            candidates = (series_of(family, line, servo, m) for servo, m in answering.items())
+            known = next((series for series in candidates if series), None)
             if known is not None:
                 where, size = known.register(family.present).address, family.reading_bytes[0]
                 doubled = line.doubled(list({*answering, *line.garbled}), where, size)
@@ -147,7 +147,7 @@ def _report(family: Family, line: SerialLine, servo: int, model: int) -> ServoRe
     reply = line.read(servo, series.register(family.present).address, family.reading_bytes[0])
     errors = bits_in_words(reply.frame.code, family.error_bits) if reply else ""
     tries = (memory_of(line, servo, family.memory_pieces) for _ in range(_TRIES))
-    memory = next((one for one in tries if one is not None), None)
+    memory = next((content for content in tries if content is not None), None)
     if memory is None:
         return ServoReport(servo, name, errors, line.baud)
     registers = registers_of(series, memory)
@@ -234,7 +234,7 @@ def known_series(
     family: Family, line: SerialLine, models: dict[int, int], named: str | None = None
 ) -> dict[int, Series]:
     """Series of the servos that answered; `named` is the servo of the joint map."""
-    profile, found = family.profiles.get(named or ""), {}
+    profile, series_of_servo = family.profiles.get(named or ""), {}
     for servo, model in models.items():
         series = family.series.get(model) or profile or family.by_firmware(line, servo, model)
         if series is None:
@@ -250,18 +250,18 @@ def known_series(
                 "firmware tell its series. Registers differ between series, so nothing is sent to "
                 "it."
             )
-        found[servo] = series
-    return found
+        series_of_servo[servo] = series
+    return series_of_servo
 
 
 def answering_joints(
-    family: Family, wanted: JointMap, series: dict[int, Series], all_of_them: bool, line: SerialLine
+    family: Family, chosen: JointMap, series: dict[int, Series], must_answer: bool, line: SerialLine
 ) -> list[str]:
-    """Joints of `wanted` whose servos answer."""
-    servos = dict(zip(wanted.joint_names, wanted.ids, strict=True))
+    """Joints of `chosen` whose servos answer; `BusError` if `must_answer` and one is silent."""
+    servos = dict(zip(chosen.joint_names, chosen.ids, strict=True))
     answering = [j for j, i in servos.items() if i in series]
     silent = [f"{j} (id {i})" for j, i in servos.items() if i not in series]
-    if (silent and all_of_them) or not answering:
+    if (silent and must_answer) or not answering:
         raise BusError(
             f"{line.device}: {', '.join(silent)} does not answer at {line.baud} baud. Check power "
             "and wiring, choose the joints that are there, and list the servos with "
@@ -283,8 +283,8 @@ def one_series(series: dict[int, Series], device: str) -> Series:
 
 def default_map(family: Family, line: SerialLine, series: dict[int, Series]) -> JointMap:
     """Joint map of a line without one: the Mini Pupper layout, if its servos are there."""
-    one = one_series(series, line.device)
-    preset = family.presets.get(one.name)
+    kind = one_series(series, line.device)
+    preset = family.presets.get(kind.name)
     silent = [i for i in MINI_PUPPER_IDS if i not in series]
     if preset is not None and len(silent) <= _NEARLY_ALL:
         series |= known_series(family, line, line.find(silent))
@@ -293,17 +293,17 @@ def default_map(family: Family, line: SerialLine, series: dict[int, Series]) -> 
         return load_joint_map(preset).per_servo()
     ids = ids_in_words([*series, *others])
     raise InputError(
-        f"{line.device}: no joint map says which joint each servo moves, and these ({one.name}, "
+        f"{line.device}: no joint map says which joint each servo moves, and these ({kind.name}, "
         f"{'ids' if len(series) + len(others) > 1 else 'id'} {ids}) are not the Mini Pupper's "
         "twelve. Make a map from your robot's URDF or MJCF with `pupper-sysid init-robot "
-        f"ROBOT.urdf --servo {one.name.lower()}`, or without such a file with `pupper-sysid "
-        f"init-robot --servo {one.name.lower()}` and `joints` as `pan={min(series)}`, and give it "
+        f"ROBOT.urdf --servo {kind.name.lower()}`, or without such a file with `pupper-sysid "
+        f"init-robot --servo {kind.name.lower()}` and `joints` as `pan={min(series)}`, and give it "
         f"as `joint_map`; `pupper-sysid scan --bus {family.name}:{line.device}` lists the servos."
         + (f" A part of a Mini Pupper needs its joint map ({preset}) named, too." if preset else "")
     )
 
 
-def refuse_other_servos(joint_map: JointMap, family: Family, one: Series, device: str) -> None:
+def refuse_other_servos(joint_map: JointMap, family: Family, kind: Series, device: str) -> None:
     """Refuse a joint map that is not of these servos."""
     name, counts = joint_map.file.name, joint_map.file.counts
     if joint_map.frame != "raw":
@@ -311,17 +311,18 @@ def refuse_other_servos(joint_map: JointMap, family: Family, one: Series, device
             f"the joint map {name} holds counts of the robot's proxy, and a direct bus uses raw "
             f"ones. Make a map with `pupper-sysid calibrate-joints --bus {family.name}:{device}`."
         )
-    if counts != one.counts:
+    if counts != kind.counts:
         raise InputError(
-            f"the joint map {name} is for servos of {counts} counts; these {one.name} have "
-            f"{one.counts}. Choose another map."
+            f"the joint map {name} is for servos of {counts} counts; these {kind.name} have "
+            f"{kind.counts}. Choose another map."
         )
-    servo = joint_map.file.servo or one.name
+    servo = joint_map.file.servo or kind.name
     sheet = data_sheet(servo)
     names = {series.name for series in (*family.series.values(), *family.profiles.values())}
-    if one.name != servo and (sheet.model_number != one.model if sheet else servo in names):
+    if kind.name != servo and (sheet.model_number != kind.model if sheet else servo in names):
         raise InputError(
-            f"the joint map {name} is for {servo} servos; these are {one.name}. Choose another map."
+            f"the joint map {name} is for {servo} servos; these are {kind.name}. Choose another "
+            "map."
         )
 
 

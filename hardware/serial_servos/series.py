@@ -154,7 +154,7 @@ class Family:
     """Value of the response level at which every write is answered."""
     profile: Callable[[Series, Mapping[str, int]], Profile]
     """From the registers."""
-    own_faults: Callable[[Series, Mapping[str, int]], list[Any]]
+    family_faults: Callable[[Series, Mapping[str, int]], list[Any]]
     """Faults of registers that only this family has (`serial_servos.settings.RegisterFault`)."""
     protections: Callable[[Series, Mapping[str, int]], dict[str, int]]
     """Registers to set while the torque is on: the servo's own protections."""
@@ -189,5 +189,5 @@ def bits_in_words(status: int, names: Mapping[int, str]) -> str:
     'voltage, overload'
     """
     named = [word for bit, word in names.items() if status & bit]
-    rest = status & ~sum(names)
-    return ", ".join([*named, *([f"unknown bits {rest:#04x}"] if rest else [])])
+    unknown = status & ~sum(names)
+    return ", ".join([*named, *([f"unknown bits {unknown:#04x}"] if unknown else [])])

@@ -154,7 +154,7 @@ def register_faults(
         cure = write(family.acknowledges, "response_level")
         faults.append(RegisterFault("response_level", level, meaning, cure))
     faults += _supply_faults(family, series, registers)
-    faults += family.own_faults(series, registers)
+    faults += family.family_faults(series, registers)
     return faults + _profile_remarks(family, series, registers)
 
 

@@ -10,7 +10,7 @@ import subprocess
 import pytest
 
 from pupper_sysid.common.errors import BusError
-from pupper_sysid.hardware.lock import open_here, own, runtime_folder
+from pupper_sysid.hardware.lock import acquire, open_here, runtime_folder
 
 
 @pytest.fixture(autouse=True)
@@ -55,25 +55,25 @@ def test_one_owner_at_a_time_whatever_the_path_is_called(tmp_path):
     robot = tmp_path / "robot.sock"
     robot.touch()
     (tmp_path / "alias").symlink_to(robot)
-    held = own(robot)
+    held = acquire(robot)
     with pytest.raises(BusError, match="another pupper-sysid is driving"):
-        own(tmp_path / "alias")
+        acquire(tmp_path / "alias")
     os.close(held)
-    os.close(own(tmp_path / "alias"))
+    os.close(acquire(tmp_path / "alias"))
 
 
 def test_a_child_that_inherits_the_lock_keeps_it(tmp_path):
     """As flock does: so nothing that must not wait may need it."""
     robot = tmp_path / "robot.sock"
-    held = own(robot)
+    held = acquire(robot)
     os.set_inheritable(held, True)
     child = subprocess.Popen(["cat"], close_fds=False, stdin=subprocess.PIPE)
     os.close(held)
     try:
         with pytest.raises(BusError):
-            own(robot)
+            acquire(robot)
     finally:
         child.communicate()
-    again = own(robot)
+    again = acquire(robot)
     fcntl.flock(again, fcntl.LOCK_UN)
     os.close(again)

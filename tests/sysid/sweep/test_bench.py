@@ -187,7 +187,7 @@ def test_a_register_that_cannot_be_set_back_is_kept_in_mind():
 
     bus.set_register = refuses
     guard.close()
-    assert guard.registers.found == {"bench": {"p": 32}}
+    assert guard.registers.originals == {"bench": {"p": 32}}
 
 
 def test_a_load_that_does_not_hang_is_not_moved_and_a_bus_without_registers_has_no_gains(tmp_path):
