@@ -147,8 +147,8 @@ class EmulatedBus:
     def write(self, position_rad: NDArray[np.float64]) -> Sent:
         """Send commands [rad], shape (12,)."""
         self._refuse_closed()
-        asked = finite_angles(position_rad, len(self.joint_names), self.name)
-        sent, (goal, _) = self._clock.now(), self._quantised(asked, whole=np.trunc)
+        commanded = finite_angles(position_rad, len(self.joint_names), self.name)
+        sent, (goal, _) = self._clock.now(), self._quantised(commanded, rounding=np.trunc)
         jitter = self.robot.spec.command_jitter_s
         late = jitter * self._latency.exponential() if jitter else 0.0
         self._arrival_s = max(self._arrival_s, sent + late)  # none overtakes another
@@ -158,7 +158,7 @@ class EmulatedBus:
                 self._changes[i].append(sent)
         self._goal = goal
         self._clock.spend(self.robot.spec.write_duration_s)
-        return Sent(sent, asked)
+        return Sent(sent, commanded)
 
     def read(self) -> BusSample:
         """Read all joints once: the values of the last successful poll of each."""
@@ -246,13 +246,13 @@ class EmulatedBus:
         self,
         position: NDArray[np.float64],
         joints: NDArray[np.intp] | slice = slice(None),
-        whole: Callable = np.round,
+        rounding: Callable = np.round,
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Angles of whole counts within the servos' travel, and the counts; -1 without a step."""
         if self._quantum == 0:
             return position, np.full(len(position), -1)
         sign, zero = self._sign[joints], self._zero[joints]
-        count = whole(self._centre + sign * (position - zero) / self._quantum)
+        count = rounding(self._centre + sign * (position - zero) / self._quantum)
         count = np.clip(count, 0, 2 * self._centre - 1)
         return zero + sign * (count - self._centre) * self._quantum, count.astype(int)
 

@@ -57,7 +57,7 @@ _SEVERAL = {table.SYNC_READ, *_WRITES, *_FAST, *_BULK}
 
 def _parts(frame: Frame) -> list[tuple[int, int, int, bytes]]:
     """Id, address, size and data of each servo in a request to several."""
-    params, parts = frame.data, []
+    params, requests = frame.data, []
     writes, bulk = frame.code in _WRITES, frame.code in _BULK
     head = 4 if bulk else 0  # address and size stand behind each id, or once before them
     at, common = (0, b"") if bulk else (4, params[:4])
@@ -66,9 +66,9 @@ def _parts(frame: Frame) -> list[tuple[int, int, int, bytes]]:
         address, size = (int.from_bytes(where[k : k + 2], "little") for k in (0, 2))
         end = at + 1 + head + size * writes
         if end <= len(params):
-            parts.append((params[at], address, size, params[at + 1 + head : end]))
+            requests.append((params[at], address, size, params[at + 1 + head : end]))
         at = end
-    return parts
+    return requests
 
 
 class DynamixelEmulator(LineEmulator):
@@ -113,10 +113,10 @@ class DynamixelEmulator(LineEmulator):
     def _to_several(self, frame: Frame, byte_s: float) -> Pieces:
         """Sync and bulk instructions."""
         pieces: Pieces = []
-        parts = _parts(frame) if frame.id == BROADCAST_ID else []
+        requests = _parts(frame) if frame.id == BROADCAST_ID else []
         if frame.code in _FAST:
-            return self._fast(parts, byte_s)
-        for servo_id, address, size, data in parts:
+            return self._fast(requests, byte_s)
+        for servo_id, address, size, data in requests:
             if not self._hears(servo_id):
                 continue
             if frame.code in _WRITES:
@@ -126,18 +126,18 @@ class DynamixelEmulator(LineEmulator):
                 pieces += self._answer(servo_id, address, 0 if error else size, byte_s, error)
         return pieces
 
-    def _fast(self, parts: list[tuple[int, int, int, bytes]], byte_s: float) -> Pieces:
+    def _fast(self, requests: list[tuple[int, int, int, bytes]], byte_s: float) -> Pieces:
         """One frame from all servos: each adds its block when as many bytes as its turn needs are
         on the line, so one that stays silent silences those behind it.
         """
-        line, pieces = table.fast_head([size for _, _, size, _ in parts]), []
+        line, pieces = table.fast_head([size for _, _, size, _ in requests]), []
 
         def block(servo_id: int, error: int, data: bytes) -> bytes:
             body = bytes([error, servo_id]) + data
             head = b"" if pieces else line
             return head + body + table.crc16(body, table.crc16(line)).to_bytes(2, "little")
 
-        for servo_id, address, size, _ in parts:
+        for servo_id, address, size, _ in requests:
             if (
                 not self._hears(servo_id)
                 or not self._level(servo_id)
@@ -180,9 +180,9 @@ class DynamixelEmulator(LineEmulator):
         elif code in (table.WRITE, table.REG_WRITE):
             error = table.DATA_LENGTH
         elif code == table.ACTION:
-            kept = servo.state.pop("registered", None)
+            registered = servo.state.pop("registered", None)
             self._set(servo_id, "registered_instruction", 0)
-            error = self._try_store(servo_id, kept[0], kept[1], at) if kept else table.RESULT_FAIL
+            error = self._try_store(servo_id, *registered, at) if registered else table.RESULT_FAIL
         elif code == table.CLEAR:  # of the turns; these servos have one
             error = table.RESULT_FAIL if self._get(servo_id, "torque_enable") else 0
         elif code in (table.REBOOT, table.FACTORY_RESET):
@@ -193,10 +193,10 @@ class DynamixelEmulator(LineEmulator):
     def _reply(self, servo_id: int, data: bytes, byte_s: float) -> Pieces:
         """A reply whose data are not in the memory: those of a ping."""
         servo = self.servos[servo_id]
-        kept = bytes(servo.memory[: len(data)])
+        memory = bytes(servo.memory[: len(data)])
         servo.memory[: len(data)] = data
         pieces = self._answer(servo_id, 0, len(data), byte_s)
-        servo.memory[: len(data)] = kept
+        servo.memory[: len(data)] = memory
         return pieces
 
     def _level(self, servo_id: int) -> int:

@@ -125,8 +125,8 @@ class ProxyEmulator:
         """What is sent instead of `reply`: pieces, each with its delay [s]."""
         if kind == "wrong-length":
             return [(0.0, reply + b"\0" if self.rng.random() < 0.5 else reply[:-1] or b"\0")]
-        other = struct.pack("<BB2f", 10, esp32.GET_POWER, self.bench.supply_v, 0.4)
-        return self.faults.apply(kind, reply, other)
+        foreign = struct.pack("<BB2f", 10, esp32.GET_POWER, self.bench.supply_v, 0.4)
+        return self.faults.apply(kind, reply, foreign)
 
     def _imu(self, now: float) -> bytes:
         sample = self.bench.imu(now)
@@ -213,12 +213,12 @@ class ProxySocket:
             wait = min((d[0] for d in self._due), default=self.now() + _IDLE_S) - self.now()
             watched = [self._server, *self._previous]
             ready, _, _ = select.select(watched, [], [], max(min(wait, _IDLE_S), 0))
-            for one in ready:
-                if one is self._server:
+            for connection in ready:
+                if connection is self._server:
                     client, _ = self._server.accept()
                     self._previous[client] = b""
                 else:
-                    self._talk(one)
+                    self._talk(connection)
 
     def stop(self) -> None:
         """End `serve`; may be called from anywhere."""

@@ -75,10 +75,10 @@ class BusFaults:
         self.counts[self._kinds[k]] = self.counts.get(self._kinds[k], 0) + 1
         return self._kinds[k]
 
-    def apply(self, kind: str | None, answer: bytes, other: bytes) -> list[tuple[float, bytes]]:
+    def apply(self, kind: str | None, answer: bytes, foreign: bytes) -> list[tuple[float, bytes]]:
         """What arrives instead of `answer`: pieces, each with its delay [s].
 
-        `other` is the answer to another request.
+        `foreign` is the answer to another request.
         """
         match kind:
             case "lost" | "reboot":
@@ -91,7 +91,7 @@ class BusFaults:
                 return [(0.0, corrupted(answer, self.rng))]
             case "duplicated":
                 return [(0.0, answer), (0.0, answer)]
-        return [(0.0, other if kind == "foreign" else answer)]
+        return [(0.0, foreign if kind == "foreign" else answer)]
 
 
 def corrupted(answer: bytes, rng: np.random.Generator) -> bytes:

@@ -83,8 +83,8 @@ class FeetechEmulator(LineEmulator):
         elif code == table.REG_WRITE and len(params) > 1:
             state["registered"] = params
         elif code == table.ACTION:
-            kept = state.pop("registered", b"\0")
-            self._store(servo_id, kept[0], kept[1:], at)
+            registered = state.pop("registered", b"\0")
+            self._store(servo_id, registered[0], registered[1:], at)
         elif code != table.PING:
             return []
         answers = code == table.PING or self._get(servo_id, "response_level")

@@ -314,18 +314,18 @@ class PendulumServo:
             self._setpoint = goal
             return
         way, before = goal - self._setpoint, self._rate
-        wanted = min(top_speed, abs(way) / self._dt)
+        rate = min(top_speed, abs(way) / self._dt)
         if not math.isinf(acceleration):
             # the rate at which a step may end for the rest of the way to be enough to stop
             gain = acceleration * self._dt
             toward = math.copysign(before, before * way)
             room = gain**2 / 4 + 2 * acceleration * abs(way) - gain * toward
-            wanted = min(wanted, math.sqrt(max(room, gain**2 / 4)) - gain / 2)
-            wanted = math.copysign(wanted, way)
-            self._rate = min(max(wanted, before - gain), before + gain)
+            rate = min(rate, math.sqrt(max(room, gain**2 / 4)) - gain / 2)
+            rate = math.copysign(rate, way)
+            self._rate = min(max(rate, before - gain), before + gain)
             step = (before + self._rate) / 2 * self._dt
         else:
-            self._rate = math.copysign(wanted, way)
+            self._rate = math.copysign(rate, way)
             step = self._rate * self._dt
         if abs(way - step) < 1e-9 or (abs(way) < 1e-4 and abs(self._rate) < 2e-1):
             self._setpoint, self._rate = goal, 0.0

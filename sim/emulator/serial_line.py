@@ -11,7 +11,7 @@ response level, id and rate; gains, ramps and torque limits as far as the bench'
 Commands and torque act on `ServoBench` when the last byte of their frame has arrived, and a
 position is measured when its answer begins.
 
-A pseudo-terminal has no baud rate of its own, so the server holds bytes back for as long as a real
+A pseudo-terminal has no baud rate, so the server holds bytes back for as long as a real
 line would. It keeps one end open itself, or a client that closes would end it; an unplugged adapter
 is a terminal that goes away and comes back behind the same link. A USB adapter collects bytes and
 delivers them with the ticks of its latency timer.
@@ -72,7 +72,7 @@ class EmulatedMemory:
 class LineEmulator(ABC):
     """A line of servos of one series, at the ids of the bench's joint map (`ids`: only these).
 
-    `baud` is the rate at which they listen. With `echo` the adapter returns the host's own bytes.
+    `baud` is the rate at which they listen. With `echo` the adapter returns the host's bytes.
     `registers` differ from the factory's, by id, of all servos under None. Each of the ids
     `doubled` is that of two servos, whose answers destroy each other.
     """
@@ -145,10 +145,10 @@ class LineEmulator(ABC):
         Without its EEPROM it is as it left the factory.
         """
         servo, end = self.servos[servo_id], self.series.eeprom_end * keeps_eeprom
-        k, kept = self.bench.index_of_id[servo_id], bytes(servo.memory[:end])
+        k, eeprom = self.bench.index_of_id[servo_id], bytes(servo.memory[:end])
         servo.memory[end:] = bytes(self.memory_bytes - end)
         self._load(servo_id, {"torque_enable": 0})
-        servo.memory[:end] = kept
+        servo.memory[:end] = eeprom
         for name, limit in (("torque_limit", "max_torque"), ("goal_current", "current_limit")):
             if self.series.has(name) and self.series.has(limit):
                 self._set(servo_id, name, self._get(servo_id, limit))
@@ -188,7 +188,7 @@ class LineEmulator(ABC):
         byte_s, self._free_at = self._byte_s(baud), max(now, self._free_at)
         self._heard_at = self.baud if baud is None else baud
         pieces = [(self._free_at + len(data) * byte_s, data)] if self.echo else []
-        for byte in data:  # a request acts at its own end, however many come at once
+        for byte in data:  # a request acts when its last byte has arrived
             self._free_at += byte_s
             for frame in self._reader.feed(bytes([byte])):
                 pieces += self._execute(frame, byte_s)
@@ -265,7 +265,7 @@ class LineEmulator(ABC):
             self.bench.torque(k, at, bool(self._get(servo_id, "torque_enable")))
 
     def _go(self, servo_id: int, k: int, at: float) -> None:
-        """Move a servo to its goal, within its own angle limits."""
+        """Move a servo to its goal, within its angle limits."""
         low, high = self._get(servo_id, "min_angle"), self._get(servo_id, "max_angle")
         goal = self._get(servo_id, "goal_position")
         if not self._holds_position(servo_id) or self.servos[servo_id].stopped:

@@ -6,7 +6,7 @@ model is the servo that was fitted, in its own steps: under load with all its fr
 export cannot carry. Both run freely on commands that no recording had: tones between the usual
 ones, and a walk.
 
-The distance has three parts, which are simulated on their own: what MuJoCo makes of the written
+The distance has three parts, each simulated alone: what MuJoCo makes of the written
 numbers (the same numbers in the same steps, in the arithmetic of the fit), what an actuator cannot
 carry of a servo fitted under load, and what the length of the physics step costs. For the last,
 terms of the servo are switched off one at a time, in the steps of the fit and in those of the
@@ -95,16 +95,16 @@ def check(servos: ExportedServos) -> Check:
     on_tones = moved_by(model, names, tones, servos.physics_step_s)
     on_walk = moved_by(model, names, walk, servos.physics_step_s)
     at = [servos.physics_step_s * np.arange(1, len(moved) + 1) for moved in (on_tones, on_walk)]
-    parts = step_costs(servos, tones)
+    step_errors = step_costs(servos, tones)
     for n, name in enumerate(names):
         joint = servos.moving.joint(name)
-        fitted_at, fitted = _own_motion(joint, tones)
-        walk_at, walked = _own_motion(joint, walk)
+        fitted_at, fitted = _fitted_motion(joint, tones)
+        walk_at, walked = _fitted_motion(joint, walk)
         pd = joint.actuator
         pd_at, pd_moved = in_loop(pd.parameters, pd.fitted_step_s, tones)
         stepped = servos.actuators(MUJOCO_PID)[name].parameters
-        whole = replace(stepped, armature=pd.parameters.armature)
-        _, same = in_loop(whole, servos.physics_step_s, tones)
+        same_armature = replace(stepped, armature=pd.parameters.armature)
+        _, same = in_loop(same_armature, servos.physics_step_s, tones)
         feedback = servos.calibration.held_feedback(name)
         torque = pd.effort_limit_nm.value / pd.armature_kg_m2.value
         joints[name] = JointCheck(
@@ -112,7 +112,7 @@ def check(servos: ExportedServos) -> Check:
             walk_rad=_apart(at[1], on_walk[:, n], walk_at, walked),
             same_steps_rad=_apart(at[0], on_tones[:, n], at[0], same[1:, 0]),
             not_carried_rad=_apart(pd_at, pd_moved[:, 0], fitted_at, fitted),
-            step_rad={part: errors[n] for part, errors in parts.items()},
+            step_rad={part: errors[n] for part, errors in step_errors.items()},
             step_of_full_torque_rad=torque * servos.physics_step_s**2,
             reading_counts=_counts_apart(feedback, on_walk[:, n], at[1], walk_at, walked),
             whole_steps_rad=costs[name],
@@ -128,9 +128,9 @@ def step_costs(servos: ExportedServos, commands: NDArray) -> dict[str, list[floa
     costs: dict[str, list[float]] = {part: [] for part in SWITCHED_OFF}
     for joint in servos.moving.joints.values():
         fitted_s = joint.actuator.fitted_step_s
-        whole = joint.actuator.parameters
+        all_terms = joint.actuator.parameters
         for part, terms in SWITCHED_OFF.items():
-            servo = replace(whole, **terms)
+            servo = replace(all_terms, **terms)
             at, moved = in_loop(servo, fitted_s, commands)
             stepped_at, stepped = in_loop(
                 nearest_in_loop(servo, h, fitted_s, MUJOCO_PID), h, commands
@@ -139,10 +139,10 @@ def step_costs(servos: ExportedServos, commands: NDArray) -> dict[str, list[floa
     return costs
 
 
-def _own_motion(
+def _fitted_motion(
     joint: JointCalibration, commands: NDArray
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times and positions of the calibration's own model, in the steps of its fit."""
+    """Times and positions of the calibration's model, in the steps of its fit."""
     actuator, loaded = joint.actuator, joint.under_load
     step_s, start = actuator.fitted_step_s, np.array(commands[0])
     servo: DelayedPD | LoadedServo = DelayedPD(actuator.parameters, step_s)
@@ -154,8 +154,8 @@ def _own_motion(
         line.reset(start)
         most = actuator.velocity_limit_rad_s.value * step_s
         targets, target = line.shift(arriving), float(start)
-        for n, wanted in enumerate(targets):
-            targets[n] = target = target + min(max(wanted - target, -most), most)
+        for n, arrived in enumerate(targets):
+            targets[n] = target = target + min(max(arrived - target, -most), most)
         arriving = targets
     servo.reset(start)
     moved = servo.rollout(arriving)

@@ -1,6 +1,6 @@
 """A calibration for Isaac Lab: a Python module of actuators and the feedback.
 
-`to_isaaclab` writes a class on Isaac Lab's own `IdealPDActuator`: delays are any fraction of a
+`to_isaaclab` writes a class based on Isaac Lab's `IdealPDActuator`: delays are any fraction of a
 step, and the speed of set-points is limited; beside it the released `DelayedPDActuatorCfg`, in
 whole steps. `to_isaaclab_bam` writes `BamActuatorCfg`, for servos that were fitted under load.
 
@@ -134,12 +134,12 @@ def to_isaaclab(servos: ExportedServos) -> str:
         "which brakes outside of the effort limit.",
         NOT_CARRIED,
     )
-    whole = (
+    whole_step = (
         block("WHOLE_STEP_ACTUATORS", groups)
         + '"""For `ArticulationCfg(actuators=WHOLE_STEP_ACTUATORS)`, where the class cannot be '
         'used."""\n'
     )
-    return torch_module(servos, "Isaac Lab", notes, _IMPORTS, f"{_CODE}{whole}")
+    return torch_module(servos, "Isaac Lab", notes, _IMPORTS, f"{_CODE}{whole_step}")
 
 
 _BAM_IMPORTS = '''\

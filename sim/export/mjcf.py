@@ -24,7 +24,6 @@ import numpy as np
 
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.servo_models.calibration.parts import JointCalibration
 from pupper_sysid.servo_models.cards.card import CardCalibration
 from pupper_sysid.servo_models.step_size import MUJOCO_PID
 from pupper_sysid.sim.export.shared import FEEDBACK_KEYS, TORQUE_KEYS, ExportedServos, known_text
@@ -66,8 +65,8 @@ def to_mjcf(servos: ExportedServos) -> str:
     """Defaults, actuators and sensors to `<include>` in a model that has joints of these names."""
     names = {name: f"servo_{name}" for name in servos.calibration.joint_names}
     defaults, actuators, sensors = _parts(servos, names)
-    for element, (name, joint) in zip(defaults, servos.calibration.joints.items(), strict=True):
-        element.insert(0, Element("joint", _joint(servos, name, joint)))
+    for element, name in zip(defaults, servos.calibration.joint_names, strict=True):
+        element.insert(0, Element("joint", _joint(servos, name)))
     first = servos.calibration.joint_names[0]
     notes = servos.head(
         MUJOCO_PID,
@@ -112,7 +111,7 @@ def _parts(
         sensor = {"name": f"{name}_reading", "joint": name}
         period, age = joint.feedback.poll_period_s.value, joint.feedback.mean_age_s.value
         if period > 0:
-            # half a period is the sensor's own mean age; what polls are lost adds is a delay
+            # half a period is the sensor's mean age; lost polls add a delay
             late = max(age - period / 2, 0.0)
             length = str(int(np.ceil(late / period)) + 2)
             sensor |= {"nsample": length, "interval": repr(period), "delay": repr(late)}
@@ -120,7 +119,7 @@ def _parts(
     return defaults, actuators, sensors
 
 
-def _joint(servos: ExportedServos, name: str, joint: JointCalibration) -> dict[str, str]:
+def _joint(servos: ExportedServos, name: str) -> dict[str, str]:
     """Every attribute of a joint that the measurement covers."""
     servo = servos.actuators(MUJOCO_PID)[name].parameters
     damping = {"damping": f"{float(np.asarray(servo.back_emf))!r} 0 0"}
@@ -154,33 +153,33 @@ def to_model(
     theirs = mujoco.MjModel.from_xml_path(str(model))
     names, card = [h.name for h in hinges if h.name], isinstance(calibration, CardCalibration)
     if card:
-        wanted = [h.name for h in hinges if h.name and h.driven]
+        chosen = [h.name for h in hinges if h.name and h.driven]
     else:
-        wanted = [name for name in calibration.joint_names if name in names]
-    if not wanted and card:
+        chosen = [name for name in calibration.joint_names if name in names]
+    if not chosen and card:
         raise InputError(
             f"{model} drives none of its hinges ({', '.join(names) or 'it has none'}), and a card "
             "goes into every hinge that is driven. Give the servo's hinge an actuator, such as "
             "<motor joint=...>."
         )
-    if not wanted:
+    if not chosen:
         raise InputError(
             f"{model} has no hinge of the calibration's joints "
             f"({', '.join(calibration.joint_names)}); it has {', '.join(names) or 'none'}. Rename "
             "the joints of one of them."
         )
-    absent = [] if card else [n for n in calibration.joint_names if n not in wanted]
+    absent = [] if card else [n for n in calibration.joint_names if n not in chosen]
     calibration = calibration.model_copy(
-        update={"joints": {name: calibration.joint(name) for name in wanted}}
+        update={"joints": {name: calibration.joint(name) for name in chosen}}
     )
-    if strangers := [name for name in link_inertia or {} if name not in wanted]:
+    if strangers := [name for name in link_inertia or {} if name not in chosen]:
         raise InputError(
             f"{', '.join(strangers)}: a link's inertia was stated, but no servo goes into such a "
-            f"joint of {model}; servos go into {', '.join(wanted)}. Leave it out, or correct the "
+            f"joint of {model}; servos go into {', '.join(chosen)}. Leave it out, or correct the "
             "name."
         )
-    bodies = link_inertias(theirs, wanted)
-    held = [n for n in wanted if calibration.joint(n).holds_at.armature == "servo and load"]
+    bodies = link_inertias(theirs, chosen)
+    held = [n for n in chosen if calibration.joint(n).holds_at.armature == "servo and load"]
     links = {name: bodies[name] for name in held if bodies[name] > 0}
     links |= dict(link_inertia or {})
     step_s = float(theirs.opt.timestep) if physics_step_s is None else physics_step_s
@@ -259,7 +258,7 @@ def _inlined(path: Path, root_folder: Path | None = None, depth: int = 0) -> Ele
 
 
 def _put_servos(root: Element, servos: ExportedServos, model: Path, group: str) -> Iterator[str]:
-    """Write servos at the joints, in place of the joints' own actuators; yield what changed."""
+    """Write servos at the joints, in place of the model's actuators; yield what changed."""
     calibration = servos.calibration
     taken = {e.get("class") for e in root.iter("default")}
     classes = {}
@@ -271,9 +270,9 @@ def _put_servos(root: Element, servos: ExportedServos, model: Path, group: str) 
     for default in defaults:
         default[0].set("group", group)
     joints: dict[str, list[Element]] = {}
-    for body in (e for world in root.iter("worldbody") for e in world.iter("joint")):
-        joints.setdefault(body.get("name", ""), []).append(body)
-    for name, joint in calibration.joints.items():
+    for joint in (e for world in root.iter("worldbody") for e in world.iter("joint")):
+        joints.setdefault(joint.get("name", ""), []).append(joint)
+    for name in calibration.joint_names:
         if len(joints.get(name, ())) != 1:
             raise InputError(
                 f"{model}: the joint {name} is made by <replicate> or <attach>, so it has no "
@@ -281,7 +280,7 @@ def _put_servos(root: Element, servos: ExportedServos, model: Path, group: str) 
                 "that."
             )
         (element,) = joints[name]
-        element.attrib |= _joint(servos, name, joint)
+        element.attrib |= _joint(servos, name)
     counts = dict.fromkeys(calibration.joint_names, 0)
     pids = {a.get("joint"): a for a in actuators}
     names = {e.get("name") for s in root.iter("actuator") for e in s}
@@ -368,12 +367,12 @@ def _place_assets(root: Element, model: Path, out: Path) -> None:
     if model.resolve().parent == out.resolve().parent:
         return
     compilers = list(root.iter("compiler")) or [ElementTree.SubElement(root, "compiler")]
-    both = {k: v for c in compilers for k, v in c.attrib.items()}
+    settings = {k: v for c in compilers for k, v in c.attrib.items()}
     for compiler in compilers:
         for key in ("assetdir", "meshdir", "texturedir"):
             compiler.attrib.pop(key, None)
     for key in ("meshdir", "texturedir"):
-        folder = model.resolve().parent / both.get(key, both.get("assetdir", ""))
+        folder = model.resolve().parent / settings.get(key, settings.get("assetdir", ""))
         compilers[-1].set(key, os.path.relpath(folder, out.resolve().parent))
 
 
@@ -433,10 +432,10 @@ def _compare(text: str, servos: ExportedServos, out: Path) -> None:
         raise PupperError(f"The model with the servos does not compile: {error}") from error
     finally:
         trial.unlink(missing_ok=True)
-    for name, (compiled, wanted) in compiled_numbers(model, servos).items():
-        if not np.allclose(compiled, wanted, rtol=1e-12, atol=0):
+    for name, (compiled, written) in compiled_numbers(model, servos).items():
+        if not np.allclose(compiled, written, rtol=1e-12, atol=0):
             raise PupperError(
-                f"{name} of the model with the servos is {compiled} where {wanted} was written."
+                f"{name} of the model with the servos is {compiled} where {written} was written."
             )
 
 

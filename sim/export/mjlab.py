@@ -14,7 +14,7 @@ from pupper_sysid.sim.export.shared import NOT_CARRIED, ExportedServos, block, c
 from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
 
 BUILTIN_PD = Engine(slews=False)
-"""mjlab's own position actuators: MuJoCo's PD, set-points of unlimited speed."""
+"""Position actuators of mjlab: MuJoCo's PD, set-points of unlimited speed."""
 
 _IMPORTS = """\
 from dataclasses import dataclass
@@ -129,11 +129,11 @@ def to_mjlab(servos: ExportedServos) -> str:
         f"FRICTION_SOLIMP = {list(FRICTION_SOLIMP)!r}\n"
         '"""Friction that stops a joint within one physics step, as gears do."""\n\n'
     )
-    whole = (
+    whole_step = (
         block("WHOLE_STEP_ACTUATORS", groups, "()")
         + '"""For `EntityArticulationInfoCfg(actuators=WHOLE_STEP_ACTUATORS)`, where the class '
         'cannot be used."""\n\n'
         + block("DELAY_STEPS", bounds)
         + '"""Least and greatest delay of each joint, in physics steps."""\n'
     )
-    return torch_module(servos, "mjlab", notes, _IMPORTS, f"{friction}{_CODE}{whole}")
+    return torch_module(servos, "mjlab", notes, _IMPORTS, f"{friction}{_CODE}{whole_step}")

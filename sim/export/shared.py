@@ -32,7 +32,7 @@ from pupper_sysid.servo_models.step_size import MUJOCO, MUJOCO_PID, Engine, near
 FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age_s")
 TORQUE_KEYS = tuple(PARAMETER_KEYS[name] for name in (*TORQUES, "armature"))
 EXPLICIT_PD = Engine(slews=False, implicit=False)
-"""Isaac Lab's own PDs: torque before each step, set-points of unlimited speed."""
+"""PDs of Isaac Lab: torque before each step, set-points of unlimited speed."""
 UNITS = "Units: N·m, rad, s, kg·m²; delays in steps are in physics steps."
 NOT_CARRIED = (
     "The feedback is no part of an actuator, and without it the simulated robot sees more than the "
@@ -111,8 +111,8 @@ class ExportedServos:
         joints = {name: joint.actuator for name, joint in self.moving.joints.items()}
         for fitted_s in {a.fitted_step_s for a in joints.values()}:
             names = [name for name, a in joints.items() if a.fitted_step_s == fitted_s]
-            each = [joints[name].parameters.arrays() for name in names]
-            before = {key: np.array([float(numbers[key]) for numbers in each]) for key in each[0]}
+            arrays = [joints[name].parameters.arrays() for name in names]
+            before = {key: np.array([float(a[key]) for a in arrays]) for key in arrays[0]}
             servos = DelayedPDParameters(**before)
             after = nearest_in_loop(servos, self.physics_step_s, fitted_s, engine).arrays()
             for n, name in enumerate(names):
@@ -188,11 +188,11 @@ class ExportedServos:
 
     def short_delays(self) -> Iterator[str]:
         """Which dead times MuJoCo's delay line cannot hold, in a sentence."""
-        wanted, written = self.actuators(), self.actuators(MUJOCO_PID)
+        exact, written = self.actuators(), self.actuators(MUJOCO_PID)
         texts = [
             f"{name} {1e3 * a.dead_time_s.value:.2g} became "
             f"{1e3 * written[name].dead_time_s.value:.2g} ms"
-            for name, a in wanted.items()
+            for name, a in exact.items()
             if 0 < a.dead_time_s.value < self.physics_step_s
         ]
         if texts:
@@ -285,10 +285,10 @@ def without_link(name: str, joint: JointCalibration, inertia_kg_m2: float) -> Jo
         end: None if value is None else max(value - inertia_kg_m2, 1e-12)
         for end, value in (("low", armature.low), ("high", armature.high))
     }
-    rest = armature.model_copy(update={"value": armature.value - inertia_kg_m2, **ends})
+    servo_armature = armature.model_copy(update={"value": armature.value - inertia_kg_m2, **ends})
     return joint.model_copy(
         update={
-            "actuator": actuator.model_copy(update={"armature_kg_m2": rest}),
+            "actuator": actuator.model_copy(update={"armature_kg_m2": servo_armature}),
             "operating_point": point.model_copy(update={"armature": "servo"}),
         }
     )
@@ -359,10 +359,10 @@ def servos_block(servos: ExportedServos) -> str:
     rows = []
     for name, joint in servos.calibration.joints.items():
         actuator = joint.actuator
-        quantities = {shown: getattr(actuator, key) for shown, key in keys.items()}
+        quantities = {title: getattr(actuator, key) for title, key in keys.items()}
         lines = [
-            f'    "{shown}": {q.value!r},  # {unit_of(keys[shown])}, {known_text(q)}'
-            for shown, q in quantities.items()
+            f'    "{title}": {q.value!r},  # {unit_of(keys[title])}, {known_text(q)}'
+            for title, q in quantities.items()
         ]
         inertia = servos.moving.joint(name).actuator.armature_kg_m2.value
         lines += [

@@ -89,9 +89,9 @@ class SetPoint:
         place = (times > 0).int().argmax(-1, keepdim=True)
         until = times.gather(-1, place)[..., 0]
         before = self.value.gather(-1, place)[..., 0]
-        rest = self.physics_dt - until
-        after = ((self.value * times).sum(-1) - before * until) / rest.clamp(min=1e-9)
-        area = self._run(before, until) + self._run(torch.where(rest > 0, after, before), rest)
+        left_s = self.physics_dt - until
+        after = ((self.value * times).sum(-1) - before * until) / left_s.clamp(min=1e-9)
+        area = self._run(before, until) + self._run(torch.where(left_s > 0, after, before), left_s)
         self.arrival = (self.arrival - self.physics_dt).clamp(min=-1.0)
         return area / self.physics_dt
 

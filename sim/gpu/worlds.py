@@ -90,7 +90,7 @@ def device_of(name: str) -> Any:
     wp = _engine().wp
     try:
         return wp.get_device(name)
-    except Exception:  # Warp raises its own and RuntimeError, by the cause
+    except Exception:  # Warp raises several kinds, RuntimeError among them
         known = ", ".join(str(device) for device in wp.get_devices())
         raise InputError(
             f"There is no device {name} here for the simulation, only {known}. Leave it out to "
@@ -128,7 +128,7 @@ class Worlds:
         self._model.callback.act_bias = _servos
 
     def write_fields(self, fields: dict[str, Array]) -> None:
-        """Give every world its own values of model fields, shape (n, …), where they have changed.
+        """Give every world separate values of model fields, shape (n, …), where they have changed.
 
         Between episodes only the delays change; comparing is cheaper than a transfer.
         """
@@ -164,8 +164,8 @@ class Worlds:
         """
         data = self._data
         held = commands if commands.ndim == 3 else commands[:, None]
-        every = np.broadcast_to(held.swapaxes(0, 1), self._commands.shape)
-        self._commands.assign(np.ascontiguousarray(every, np.float32))
+        by_step = np.broadcast_to(held.swapaxes(0, 1), self._commands.shape)
+        self._commands.assign(np.ascontiguousarray(by_step, np.float32))
         data.qpos.assign(np.asarray(qpos, np.float32))
         data.qvel.assign(np.asarray(qvel, np.float32))
         with self._wp.ScopedDevice(self.device):

@@ -91,7 +91,7 @@ class Body:
     servo_of: dict[str, str] = field(default_factory=dict)
     """The joint of a calibration whose servo each joint has."""
     commands: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Ranges by field of `Commands`, where the robot has its own."""
+    """Ranges by field of `Commands`, where the robot's YAML states them."""
     notes: tuple[str, ...] = ()
     """Sentences about what was assumed."""
     hashes: dict[str, str] = field(default_factory=dict)
@@ -106,10 +106,10 @@ class Body:
         """Pairs of feet that the gait moves in turn."""
         return self._pairs(lambda gap: abs(gap - 0.5) < 0.01)
 
-    def _pairs(self, wanted: Callable[[float], bool]) -> tuple[tuple[int, int], ...]:
+    def _pairs(self, is_pair: Callable[[float], bool]) -> tuple[tuple[int, int], ...]:
         n, sides = len(self.feet), self.sides
         gaps = (self.offsets[:, None] - self.offsets) % 1.0
-        pairs = [(a, b) for a in range(n) for b in range(a + 1, n) if wanted(gaps[a, b])]
+        pairs = [(a, b) for a in range(n) for b in range(a + 1, n) if is_pair(gaps[a, b])]
         return tuple(sorted(pairs, key=lambda pair: bool(sides[pair[0]] == sides[pair[1]])))
 
     @cached_property
@@ -164,7 +164,7 @@ class Body:
 
     @property
     def is_mini_pupper(self) -> bool:
-        """Whether it is this project's own robot."""
+        """Whether it is the Mini Pupper 2."""
         return self.name == MINI_PUPPER
 
 
@@ -180,8 +180,8 @@ def _mini_pupper(knee: Knee) -> Body:
         return robot_xml(servos, step_s, knee, ground.xml, ground.assets, physics, False)
 
     def feet_in_trunk(joints: Array) -> Array:
-        each = joints.reshape(-1, len(LEGS), 3)
-        return np.stack([foot_position(leg, *each[:, i].T) for i, leg in enumerate(LEGS)], axis=1)
+        by_leg = joints.reshape(-1, len(LEGS), 3)
+        return np.stack([foot_position(leg, *by_leg[:, i].T) for i, leg in enumerate(LEGS)], axis=1)
 
     def joints_at(feet: Array, heading: Array) -> Array:
         return np.concatenate([joint_angles(leg, feet[:, i]) for i, leg in enumerate(LEGS)], axis=1)

@@ -5,7 +5,7 @@ other programs use have links without masses, paths of packages or numbers that 
 MJCF has defaults, includes and tendons, so MuJoCo compiles it.
 
 A model file can ask for any amount of memory (height fields, textures, `replicate`) or block (an
-include of a pipe). It is therefore read in a process of its own, which prints the hinges as JSON:
+include of a pipe). It is therefore read in a second process, which prints the hinges as JSON:
 `python -m pupper_sysid.sim.robot.hinges FILE`.
 """
 
@@ -187,8 +187,8 @@ def _model(mujoco, path: str):
         reason = error
     try:
         spec = mujoco.MjSpec.from_file(path)
-        for shown in (*spec.geoms, *spec.sites, *spec.tendons):
-            shown.material = ""
+        for element in (*spec.geoms, *spec.sites, *spec.tendons):
+            element.material = ""
         for geom in list(spec.geoms):
             if geom.meshname or geom.hfieldname:
                 spec.delete(geom)
@@ -257,7 +257,7 @@ def _main() -> None:
     except MemoryError:
         reply = {"out_of": "memory"}
     except Exception as error:  # whatever MuJoCo raises is about the file
-        # a failed allocation comes in MuJoCo's own words or as pybind11's "unknown exception"
+        # a failed allocation is reported by MuJoCo or as pybind11's "unknown exception"
         memory = any(words in str(error) for words in ("allocate memory", "unknown exception"))
         reply = {"out_of": "memory"} if memory else {"reason": str(error)}
     print(json.dumps(reply))

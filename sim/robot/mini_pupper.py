@@ -102,8 +102,8 @@ def robot_xml(
     does not simulate: no geoms but feet and ground, and no light. With `imu` it has the sensors
     `gyro` and `accelerometer`; `<leg>_foot_touch` [N] it always has.
     """
-    whole = physics == "evaluation"
-    legs = "".join(_leg(leg, servos, time_step_s, knee, whole) for leg in LEGS)
+    complete = physics == "evaluation"
+    legs = "".join(_leg(leg, servos, time_step_s, knee, complete) for leg in LEGS)
     tendons = ""
     if knee == "linkage":
         calves = {leg: joint_attributes(servos[f"{leg}_calf"], time_step_s) for leg in LEGS}
@@ -124,7 +124,7 @@ def robot_xml(
     scale = TRUNK_KG / _TRUNK_URDF_KG
     trunk = _inertial(TRUNK_KG, _TRUNK_CENTRE, tuple(scale * x for x in _TRUNK_INERTIA))
     shape = ""
-    if whole:
+    if complete:
         shape = (
             # it goes with the robot, and so does the part of the ground that shadows are drawn on
             '<light mode="trackcom" pos="-0.3 -0.2 1.2" dir="0.25 0.17 -1" directional="true" '
@@ -217,9 +217,9 @@ def limits() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _leg(
-    leg: str, servos: dict[str, DelayedPDParameters], step: float, knee: Knee, whole: bool
+    leg: str, servos: dict[str, DelayedPDParameters], step: float, knee: Knee, complete: bool
 ) -> str:
-    """One leg; not `whole` without what is only seen or only touches the ground in a fall."""
+    """One leg; if not `complete`, without parts that are only seen or touch the ground in falls."""
     side = SIDE[leg]
     joints = {
         kind: f'<joint name="{leg}_{kind}" type="hinge" axis="{axis}" '
@@ -234,7 +234,7 @@ def _leg(
     }
     x, y, z = HIP_BOX_AT_M
     hip = thigh = calf = ""
-    if whole:
+    if complete:
         hip = (
             f'<geom name="{leg}_hip" type="box" size="{_numbers(HIP_BOX_M)}" '
             f'pos="{x} {side * y} {z}" rgba="0.25 0.25 0.28 1"/>'

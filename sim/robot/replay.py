@@ -131,7 +131,7 @@ def compiled(robot: ServoRobot, longest_dead_time_s: float, fixed: bool) -> Any:
 
 
 def _with_servos(spec: Any, joints: Sequence[str]) -> Any:
-    """The description with servos, and without what refers to its own actuators."""
+    """The description with servos, and without what refers to its former actuators."""
     for elements in (spec.actuators, spec.sensors, spec.keys):
         for element in list(elements):
             spec.delete(element)

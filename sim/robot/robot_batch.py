@@ -65,7 +65,7 @@ def gravity_direction(qpos: Array) -> Array:
     return gravity
 
 
-def own_velocity(qpos: Array, qvel: Array) -> Array:
+def trunk_velocity(qpos: Array, qvel: Array) -> Array:
     """Velocity of the trunk in its own frame [m/s], shape (n, 3), from MuJoCo's state."""
     w, x, y, z = qpos[:, 3:7].T.copy()
     a, b, c = qvel[:, :3].T.copy()
@@ -81,7 +81,7 @@ def own_velocity(qpos: Array, qvel: Array) -> Array:
 def planar(velocity: Array, qvel: Array) -> Array:
     """Forward and sideways speed [m/s] and turn rate [rad/s], shape (n, 3).
 
-    `velocity` is that of `own_velocity`.
+    `velocity` is that of `trunk_velocity`.
     """
     return np.column_stack([velocity[:, :2], qvel[:, 5]])
 
@@ -178,13 +178,13 @@ class RobotBatch:
         self.friction, self.payload_kg = np.zeros(environments), np.zeros(environments)
         self.bodies = Bodies(config.differences, environments, body)
         cut = round(_FIRST_PART * environments)
-        whole = self.batch.nthread == 1 or environments < _MANY
-        ends = (0, environments) if whole else (0, cut, environments)
+        undivided = self.batch.nthread == 1 or environments < _MANY
+        ends = (0, environments) if undivided else (0, cut, environments)
         self._parts = [slice(*pair) for pair in pairwise(ends)]
         everyone = np.arange(environments, dtype=np.int32)
-        self._ids = [None if whole else everyone[part] for part in self._parts]
+        self._ids = [None if undivided else everyone[part] for part in self._parts]
         self._records: list[dict[Any, Array]] = [{} for _ in self._parts]
-        self._worker = None if whole else ThreadPoolExecutor(1, "physics")
+        self._worker = None if undivided else ThreadPoolExecutor(1, "physics")
 
     # ------------------------------------------------------------------------- reading
 

@@ -121,12 +121,12 @@ class _Reader:
             body.gravcomp = 0.0
         if settings.forward != "x":
             self._face(_QUARTERS[settings.forward])
-        whole = self._compiled()
-        self.joints = self._servo_joints(whole)
-        self.resting = self._keyframe(whole)
-        self._strip(whole)
+        original = self._compiled()
+        self.joints = self._servo_joints(original)
+        self.resting = self._keyframe(original)
+        self._strip(original)
         self.model = self._compiled()
-        self.pose, self.low, self.high = self._pose(whole)
+        self.pose, self.low, self.high = self._pose(original)
         self.data = mujoco.MjData(self.model)
         self._place(self.pose)
         self.feet = self._feet()
@@ -166,8 +166,8 @@ class _Reader:
         spec.meshdir = ""
         for material in spec.materials:
             material.textures = [""] * len(material.textures)
-        for shown in (*spec.skins, *spec.textures):
-            spec.delete(shown)
+        for element in (*spec.skins, *spec.textures):
+            spec.delete(element)
         if lost:
             self.notes.append(
                 f"Meshes of {self.path.name} that collide are not there ({_some(lost)}); the robot "
@@ -183,9 +183,9 @@ class _Reader:
         """Turn all that the trunk carries about its vertical axis, so that x is forward."""
         root, turn = self.root, np.zeros(4)
         mujoco.mju_axisAngle2Quat(turn, np.array([0.0, 0.0, 1.0]), 0.5 * np.pi * quarters)
-        parts = [e for kind in _PARTS for e in getattr(root, kind) if e.frame is None]
+        carried = [e for kind in _PARTS for e in getattr(root, kind) if e.frame is None]
         frame = root.add_frame(quat=turn)
-        for part in parts:
+        for part in carried:
             part.set_frame(frame)
         if _states_mass(self.spec, root):
             model = self._compiled()
@@ -197,25 +197,25 @@ class _Reader:
             root.fullinertia = np.full(6, np.nan)
             root.ipos, root.iquat, root.inertia = place, axes, model.body_inertia[at]
 
-    def _keyframe(self, whole: Any) -> Array:
+    def _keyframe(self, original: Any) -> Array:
         """All positions of the file's joints in the keyframe that is the pose, or at rest."""
-        names, pose = [whole.key(k).name for k in range(whole.nkey)], self.settings.pose
+        names, pose = [original.key(k).name for k in range(original.nkey)], self.settings.pose
         if isinstance(pose, str):
             if pose not in names:
                 raise InputError(
                     f"{self.where}: {self.path.name} has no keyframe '{pose}'; it has "
                     f"{', '.join(names) or 'none'}. Give angles by joint as `pose` instead."
                 )
-            return whole.key_qpos[names.index(pose)].copy()
-        positions = whole.qpos0.copy()
+            return original.key_qpos[names.index(pose)].copy()
+        positions = original.qpos0.copy()
         if isinstance(pose, dict):
-            hinges = [whole.joint(j).name for j in _hinges(whole)]
+            hinges = [original.joint(j).name for j in _hinges(original)]
             for pattern, angle in pose.items():
                 for name in self._matching(pattern, hinges, "pose", "hinge"):
-                    positions[whole.joint(name).qposadr[0]] = angle
+                    positions[original.joint(name).qposadr[0]] = angle
         elif names:
             self.notes.append(f"The default pose is the keyframe '{names[0]}' of {self.path.name}.")
-            return whole.key_qpos[0].copy()
+            return original.key_qpos[0].copy()
         else:
             self.notes.append(
                 f"{self.path.name} has no keyframe and there is no `pose`: the default pose is all "
@@ -223,23 +223,23 @@ class _Reader:
             )
         return positions
 
-    def _servo_joints(self, whole: Any) -> tuple[str, ...]:
-        hinges = _hinges(whole)
+    def _servo_joints(self, original: Any) -> tuple[str, ...]:
+        hinges = _hinges(original)
         if not hinges:
             raise InputError(
                 f"{self.path} has no hinge joint: there is nothing for a servo to turn."
             )
-        names = [whole.joint(j).name for j in hinges]
+        names = [original.joint(j).name for j in hinges]
         if "" in names:
             raise InputError(f"{self.path} has a hinge without a name. Give every joint a name.")
         if self.settings.joints is not None:
             chosen = {
                 n for w in self.settings.joints for n in self._matching(w, names, "joints", "hinge")
             }
-        elif driven := driven_joints(whole) & set(hinges):
-            chosen = {whole.joint(j).name for j in driven}
+        elif driven := driven_joints(original) & set(hinges):
+            chosen = {original.joint(j).name for j in driven}
         else:
-            chosen = {whole.joint(j).name for j in set(hinges) - set(leaders(whole))}
+            chosen = {original.joint(j).name for j in set(hinges) - set(leaders(original))}
             self.notes.append(
                 f"{self.path.name} has no actuators of hinges: each of its {len(chosen)} hinges "
                 "gets a servo."
@@ -247,7 +247,7 @@ class _Reader:
         fixed = [n for n in names if n not in chosen]
         if fixed:
             self.notes.append(f"Joints without a servo are fixed: {_some(fixed)}.")
-        if whole.neq or whole.ntendon:
+        if original.neq or original.ntendon:
             self.notes.append(
                 f"{self.path.name} couples bodies or joints (<equality>, <tendon>: closed "
                 "linkages, joints that follow others). That is taken out: a leg with such a "
@@ -256,16 +256,16 @@ class _Reader:
             )
         return tuple(n for n in names if n in chosen)
 
-    def _matching(self, wanted: str, names: Sequence[str], key: str, kind: str) -> list[str]:
-        matching = [n for n in names if n == wanted or fnmatchcase(n, wanted)]
+    def _matching(self, pattern: str, names: Sequence[str], key: str, kind: str) -> list[str]:
+        matching = [n for n in names if n == pattern or fnmatchcase(n, pattern)]
         if not matching:
             raise InputError(
-                f"{self.where}: {key} names '{wanted}', but {self.path.name} has no such {kind}. "
+                f"{self.where}: {key} names '{pattern}', but {self.path.name} has no such {kind}. "
                 f"It has {', '.join(n for n in names if n)}."
             )
         return matching
 
-    def _strip(self, whole: Any) -> None:
+    def _strip(self, original: Any) -> None:
         """Take out all but bodies, geoms and joints with a servo; fix the others in their pose."""
         spec, free = self.spec, mujoco.mjtJoint.mjJNT_FREE
         spec.option = mujoco.MjSpec().option
@@ -278,7 +278,7 @@ class _Reader:
             if geom.type in (plane, field):
                 spec.delete(geom)
         fixed = [j for j in spec.joints if j.type != free and j.name not in self.joints]
-        self._turn(whole, {j.parent.name for j in fixed})
+        self._turn(original, {j.parent.name for j in fixed})
         for joint in fixed:
             spec.delete(joint)
         for joint in spec.joints:
@@ -289,17 +289,17 @@ class _Reader:
         for k, geom in enumerate(spec.geoms):
             geom.name = geom.name or f"geom {k}"
 
-    def _turn(self, whole: Any, bodies: set[str]) -> None:
+    def _turn(self, original: Any, bodies: set[str]) -> None:
         """Turn bodies of joints that are fixed as these are in the pose."""
-        data = mujoco.MjData(whole)
+        data = mujoco.MjData(original)
         data.qpos[:] = self.resting
         for name in self.joints:
-            at = whole.joint(name).qposadr[0]
-            data.qpos[at] = whole.qpos0[at]
-        mujoco.mj_kinematics(whole, data)
+            at = original.joint(name).qposadr[0]
+            data.qpos[at] = original.qpos0[at]
+        mujoco.mj_kinematics(original, data)
         for name in bodies:
-            at = whole.body(name).id
-            above = int(whole.body_parentid[at])
+            at = original.body(name).id
+            above = int(original.body_parentid[at])
             back, place, turn = np.zeros(4), np.zeros(3), np.zeros(4)
             mujoco.mju_negQuat(back, data.xquat[above])
             mujoco.mju_rotVecQuat(place, data.xpos[at] - data.xpos[above], back)
@@ -318,7 +318,7 @@ class _Reader:
 
     # ------------------------------------------------------------------------- pose
 
-    def _pose(self, whole: Any) -> tuple[Array, Array, Array]:
+    def _pose(self, original: Any) -> tuple[Array, Array, Array]:
         model = self.model
         low, high = np.full((2, len(self.joints)), 0.0)
         pose = np.zeros(len(self.joints))
@@ -326,7 +326,7 @@ class _Reader:
             joint = model.joint(name)
             limited = bool(joint.limited[0])
             low[k], high[k] = joint.range if limited else (-np.pi, np.pi)
-            pose[k] = self.resting[whole.joint(name).qposadr[0]]
+            pose[k] = self.resting[original.joint(name).qposadr[0]]
         outside = [
             f"{n} ({p:g}, limits {a:g} to {b:g})"
             for n, p, a, b in zip(self.joints, pose, low, high, strict=True)
@@ -578,9 +578,9 @@ class _Reader:
 
         def reached(joints: Array) -> Array:
             """Feet, and the directions of their soles as lengths; shape (n, legs, 3 or 9)."""
-            here = kinematics(joints)
-            axes = [level * (tip(joints) - here) for tip in tips]
-            return np.concatenate([here, *axes], axis=-1)
+            feet = kinematics(joints)
+            axes = [level * (tip(joints) - feet) for tip in tips]
+            return np.concatenate([feet, *axes], axis=-1)
 
         def joints_at(feet: Array, heading: Array) -> Array:
             joints = np.repeat(pose[None], len(feet), axis=0)
@@ -590,15 +590,15 @@ class _Reader:
                 up = np.stack([none, none, one], axis=-1)
                 feet = np.concatenate([feet, level * ahead, level * up], axis=-1)
             for _ in range(_INVERSE_STEPS):
-                here = reached(joints)
-                slopes = np.zeros((*here.shape, longest))
+                current = reached(joints)
+                slopes = np.zeros((*current.shape, longest))
                 for k in range(longest):  # one joint of every leg at a time
                     moved = joints.copy()
                     for chain in chains:
                         if k < len(chain):
                             moved[:, chain[k]] += _NUDGE_RAD
-                    slopes[..., k] = (reached(moved) - here) / _NUDGE_RAD
-                away = (feet - here)[..., None]
+                    slopes[..., k] = (reached(moved) - current) / _NUDGE_RAD
+                away = (feet - current)[..., None]
                 square = slopes.swapaxes(-1, -2) @ slopes
                 square = square + (_DAMPING * height) ** 2 * np.eye(longest)
                 turned = np.linalg.solve(square, slopes.swapaxes(-1, -2) @ away)[..., 0]

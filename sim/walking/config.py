@@ -352,7 +352,7 @@ def _rewards(rewards: Rewards, body: Body) -> Rewards:
         | dict.fromkeys(_RATES, rate) | dict.fromkeys(_TIMES, time)
         | dict.fromkeys(_PER_SPEED, 1.0 / speed)
         | {
-            # the default pose is the robot's own
+            # the default pose is that of the robot's file
             "crouch": 0.0, "spread": 0.0, "stance": 1.0 / length, "gait_sigma": time**2,
             "foot_paths_sigma": strokes * length, "swing_height": 1.0 / (length**2 * speed),
             "joint_torques": 1.0 / torque, "joint_acceleration": time**2, "joint_velocity": time,

@@ -68,7 +68,7 @@ def generator(seed: int | list[int], twins: Twins | None = None) -> np.random.Ge
     """Generator of a seed; with twins, one whose draws for all n robots are theirs.
 
     A draw is for all robots if the first axis of its size is n; others are plain ones of a
-    generator of their own.
+    separate generator.
     """
     plain = np.random.default_rng(seed)
     return plain if twins is None else cast(np.random.Generator, _SharedDraws(plain, twins))

@@ -1,7 +1,7 @@
 """PupperEnv: many robots on a walking task, stepped together by `mujoco.batch`.
 
 One call steps all physics in C++ (`Batch.rollout`, ten steps of 2 ms). Servo delay, gains, limits
-and friction are MuJoCo's own, per environment and joint, drawn per episode from the calibration.
+and friction are those of MuJoCo, per environment and joint, drawn per episode from the calibration.
 The joint angles that a policy sees have passed through the measured feedback
 (`sim.walking.senses`). Arrays are (environments, …) NumPy.
 """
@@ -23,8 +23,8 @@ from pupper_sysid.sim.robot.robot_batch import (
     Moved,
     RobotBatch,
     gravity_direction,
-    own_velocity,
     planar,
+    trunk_velocity,
 )
 from pupper_sysid.sim.robot.terrain import make_ground
 from pupper_sysid.sim.walking.config import PRESETS, Walking, for_robot
@@ -168,8 +168,8 @@ class PupperEnv:
         self.default = body.pose
         self.trot = config.trot
         n = environments
-        self._own_terms, self._own_seen = dict(terms or {}), dict(observations or {})
-        if known := sorted(self._own_terms.keys() & TERMS.keys()):
+        self._user_terms, self._user_parts = dict(terms or {}), dict(observations or {})
+        if known := sorted(self._user_terms.keys() & TERMS.keys()):
             raise InputError(
                 f"A reward term is called {known[0]} already; give yours another name."
             )
@@ -318,10 +318,10 @@ class PupperEnv:
     def _live(self) -> dict[str, NDArray]:
         """All arrays that change, but for those of the physics."""
         senses = self._senses
-        parts = {"readings": senses.readings, "imu": senses.imu, "strides": self._strides}
-        parts["effort"] = self._effort
-        arrays = {f"{part}.{k}": v for part, its in parts.items() for k, v in its.state.items()}
-        return arrays | {name: getattr(self, name) for name in _ARRAYS} | {"_seen": senses.kept}
+        owners = {"readings": senses.readings, "imu": senses.imu, "strides": self._strides}
+        owners["effort"] = self._effort
+        arrays = {f"{part}.{k}": v for part, its in owners.items() for k, v in its.state.items()}
+        return arrays | {name: getattr(self, name) for name in _ARRAYS} | {"_seen": senses.recent}
 
     @property
     def _rngs(self) -> tuple[np.random.Generator, ...]:
@@ -372,7 +372,7 @@ class PupperEnv:
         robots, rows, span = self.robots, moved.rows, self.config.control_step_s
         qpos, qvel = robots.qpos[rows].copy(), robots.qvel[rows].copy()
         self._senses.advance(moved, now.chances, self.steps)
-        gravity, velocity = gravity_direction(qpos), own_velocity(qpos, qvel)
+        gravity, velocity = gravity_direction(qpos), trunk_velocity(qpos, qvel)
         fallen = gravity[:, 2] > -FALLEN_TILT
         fallen |= self.body.touches_ground(qpos, gravity, self.ground)
         now.fallen[rows] = fallen
@@ -388,17 +388,17 @@ class PupperEnv:
         step = Step(body=self.body, **facts)
         level = self.level
         terms = weighted(step, self._rewards, level.penalties, level.guides, level.progress)
-        for name, (weight, term) in self._own_terms.items():
+        for name, (weight, term) in self._user_terms.items():
             terms[name] = weight * term(step, self._rewards)
         for name, term in terms.items():
-            whole = now.terms.setdefault(name, np.empty(self.environments))
-            np.multiply(term, span, out=whole[rows])
+            values = now.terms.setdefault(name, np.empty(self.environments))
+            np.multiply(term, span, out=values[rows])
         first, last = np.searchsorted(now.pushed, (rows.start, rows.stop))
         if last > first:
             ids = now.pushed[first:last]
             robots.push(ids, now.push[first:last])
             qvel = robots.qvel[rows]
-            velocity = own_velocity(qpos, qvel)
+            velocity = trunk_velocity(qpos, qvel)
         self._senses.imu.advance(rows, qvel[:, 3:6], gravity)
         noise = None if now.noise is None else now.noise[rows]
         self._look(
@@ -418,7 +418,7 @@ class PupperEnv:
         angles = self.robots.to_servo(start)
         qpos, qvel = self.robots.qpos[ids], self.robots.qvel[ids]
         self._senses.reset(ids, angles, qvel[:, 3:6], gravity_direction(qpos), self.rng)
-        velocity = planar(own_velocity(qpos, qvel), qvel)
+        velocity = planar(trunk_velocity(qpos, qvel), qvel)
         self._strides.reset(ids, self.robots.feet(ids)[0], velocity)
         self._effort.reset(ids)
         self._until_push[ids] = self.rng.uniform(*self.config.randomisation.push_every_s, len(ids))
@@ -449,7 +449,7 @@ class PupperEnv:
         """
         if state is None:
             qpos, qvel = self.robots.qpos[rows], self.robots.qvel[rows]
-            state = qpos, qvel, gravity_direction(qpos), own_velocity(qpos, qvel)
+            state = qpos, qvel, gravity_direction(qpos), trunk_velocity(qpos, qvel)
         qpos, qvel, gravity, velocity = state
         true, strides = self.config.observation.base_velocity == "true", self._strides
         angle, moved, effort = self._senses.joints(rows, self.steps)
@@ -477,8 +477,8 @@ class PupperEnv:
         return observation, privileged
 
     def _seen(self, rows: Rows) -> list[Array]:
-        """What the user's own parts of an observation give for some robots."""
-        return [np.asarray(part(self, rows), float) for part in self._own_seen.values()]
+        """The user's parts of an observation for some robots."""
+        return [np.asarray(part(self, rows), float) for part in self._user_parts.values()]
 
     def _differing(self, rows: Rows) -> list[Array]:
         """What was drawn for robots, as the critic sees it."""

@@ -80,10 +80,10 @@ def observed(
     """
     if out is None:
         out = np.empty((len(parts[0]), sum(p.shape[1] for p in parts)), np.float32)
-    whole = np.concatenate(parts, axis=1, out=out)
+    row = np.concatenate(parts, axis=1, out=out)
     if noise is not None:
-        whole[:, : noise.shape[1]] += noise  # none on a user's own parts, which come last
-    return whole
+        row[:, : noise.shape[1]] += noise  # none on the parts of a user, which come last
+    return row
 
 
 def privileged_parts(joints: int, feet: int) -> tuple[tuple[str, int], ...]:

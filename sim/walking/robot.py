@@ -60,9 +60,9 @@ class Trunk:
     heading_rad: float
     """Its direction along the ground, to the left of that at time 0; ±pi."""
     velocity_m_s: NDArray[np.float64]
-    """In its own axes: forward, to the left, up; shape (3,)."""
+    """In the axes of the trunk: forward, to the left, up; shape (3,)."""
     yaw_rate_rad_s: float
-    """About its own vertical axis, to the left."""
+    """About its vertical axis, to the left."""
     upright: float
     """Cosine of its tilt: 1 standing level, 0 on its side, -1 on its back."""
 

@@ -166,8 +166,8 @@ class HeldReadings:
     def _reported(self, angle: NDArray[np.float64]) -> NDArray[np.float64]:
         """`angle` as the encoder reports it: with its offset, in whole quantisation steps."""
         shifted = angle + self._offset
-        whole = np.rint(shifted / self._quantum) * self._quantum
-        return np.where(self._exact, shifted, whole) if self._exact.any() else whole
+        quantised = np.rint(shifted / self._quantum) * self._quantum
+        return np.where(self._exact, shifted, quantised) if self._exact.any() else quantised
 
 
 def _between(
@@ -198,7 +198,7 @@ class Imu:
         self._since = np.zeros(robots)  # from a sample to the present step
         oldest = settings.imu_latency_s[1] + settings.imu_period_s[1]
         # in turn, the newest where `_at` says; rates, then gravity
-        self._kept = np.zeros((int(np.ceil(oldest / span_s)) + 2, robots, 6))
+        self._recent = np.zeros((int(np.ceil(oldest / span_s)) + 2, robots, 6))
         self._at = np.zeros(robots, int)
 
     @property
@@ -207,7 +207,7 @@ class Imu:
         return {
             "mounting_rad": self.mounting_rad, "bias_rad_s": self.bias_rad_s,
             "latency_s": self.latency_s, "period_s": self.period_s, "since": self._since,
-            "kept": self._kept, "at": self._at,
+            "kept": self._recent, "at": self._at,
         }  # fmt: skip
 
     def reset(
@@ -225,16 +225,16 @@ class Imu:
             self.latency_s[ids] = rng.uniform(*settings.imu_latency_s, n)
             self.period_s[ids] = rng.uniform(*settings.imu_period_s, n)
             self._since[ids] = rng.random(n) * self.period_s[ids]
-            self._kept[:, ids, :3], self._kept[:, ids, 3:] = rate, gravity
+            self._recent[:, ids, :3], self._recent[:, ids, 3:] = rate, gravity
 
     def advance(self, rows: slice, rate: Array, gravity: Array) -> None:
         """Let one control step pass, at whose end robots `rows` have these rates and gravity."""
         if not self._settings.imu_late:
             return
-        at = (self._at[rows] + 1) % len(self._kept)
+        at = (self._at[rows] + 1) % len(self._recent)
         self._at[rows] = at
-        each = np.arange(rows.start, rows.stop)
-        self._kept[at, each, :3], self._kept[at, each, 3:] = rate, gravity
+        robots = np.arange(rows.start, rows.stop)
+        self._recent[at, robots, :3], self._recent[at, robots, 3:] = rate, gravity
         period = self.period_s[rows]
         since = self._since[rows] + self._span
         self._since[rows] = np.where(period > 0, since % np.where(period > 0, period, 1.0), 0.0)
@@ -246,11 +246,11 @@ class Imu:
         settings = self._settings
         if settings.imu_late:
             age = (self.latency_s[rows] + self._since[rows]) / self._span
-            whole = age.astype(int)
-            share, size = (age - whole)[:, None], len(self._kept)
-            each = np.arange(self._kept.shape[1])[rows]
-            newer = self._kept[(self._at[rows] - whole) % size, each]
-            older = self._kept[(self._at[rows] - whole - 1) % size, each]
+            age_steps = age.astype(int)
+            share, size = (age - age_steps)[:, None], len(self._recent)
+            robots = np.arange(self._recent.shape[1])[rows]
+            newer = self._recent[(self._at[rows] - age_steps) % size, robots]
+            older = self._recent[(self._at[rows] - age_steps - 1) % size, robots]
             seen = newer + share * (older - newer)
             rate, gravity = seen[:, :3], seen[:, 3:]
         if settings.imu_askew:
@@ -284,7 +284,7 @@ class Senses:
             config.differences.poll_period[0],
         )  # fmt: skip
         self.imu = Imu(config.differences, environments, config.control_step_s)
-        self.kept = np.zeros((VELOCITY_STEPS + 1, environments, len(robots.body.joints)))
+        self.recent = np.zeros((VELOCITY_STEPS + 1, environments, len(robots.body.joints)))
 
     def reset(
         self,
@@ -296,13 +296,13 @@ class Senses:
     ) -> None:
         """Start robots that have long been as they are; `rng` draws their IMUs."""
         self.readings.reset(ids, servo_rad, self._robots.bodies.poll[ids])
-        self.kept[:, ids] = self.angles(ids)
+        self.recent[:, ids] = self.angles(ids)
         self.imu.reset(ids, rate, gravity, rng)
 
     def advance(self, moved: Moved, chances: Array, step: int) -> None:
         """Let the bus poll the servos of robots that have moved; `step` counts control steps."""
         self.readings.advance(moved.start, moved.qpos, moved.load, chances, moved.rows)
-        self.kept[step % len(self.kept), moved.rows] = self.angles(moved.rows)
+        self.recent[step % len(self.recent), moved.rows] = self.angles(moved.rows)
 
     def angles(self, rows: Rows) -> Array:
         """Joint angles [rad] as the controller reads them now, shape (k, 12)."""
@@ -314,8 +314,8 @@ class Senses:
 
         Efforts are 0 on buses without load readings.
         """
-        newest = step % len(self.kept)
-        angle = self.kept[newest, rows]
-        rate = angle - self.kept[(newest + 1) % len(self.kept), rows]
+        newest = step % len(self.recent)
+        angle = self.recent[newest, rows]
+        rate = angle - self.recent[(newest + 1) % len(self.recent), rows]
         rate /= VELOCITY_STEPS * self._span
         return angle, rate, self.readings.load[rows] * self._robots.bodies.effort[rows, None]

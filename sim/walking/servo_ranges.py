@@ -143,28 +143,28 @@ def servo_ranges(
 def _from_calibration(
     calibration: Calibration, source: str, joints: tuple[str, ...], servo_of: Mapping[str, str]
 ) -> ServoRanges:
-    parts: list[JointCalibration] = []
+    calibrations: list[JointCalibration] = []
     fallbacks = {}
     for name in joints:
-        wanted = servo_of.get(name)
-        if wanted is not None and wanted not in calibration.joint_names:
+        stated = servo_of.get(name)
+        if stated is not None and stated not in calibration.joint_names:
             raise InputError(
-                f"The robot's YAML gives {name} the servo of '{wanted}' (`servos`), but {source} "
+                f"The robot's YAML gives {name} the servo of '{stated}' (`servos`), but {source} "
                 f"has none of that name. It has {', '.join(calibration.joint_names)}."
             )
-        nearest = wanted or nearest_joint(name, calibration.joint_names)
-        if wanted is None and nearest != name:
+        nearest = stated or nearest_joint(name, calibration.joint_names)
+        if stated is None and nearest != name:
             fallbacks[name] = nearest
-        parts.append(calibration.joint(nearest))
+        calibrations.append(calibration.joint(nearest))
     low, value, high = {}, {}, {}
     for field, key in PARAMETER_KEYS.items():
-        ends = [astuple(getattr(p.actuator, key).interval) for p in parts]
+        ends = [astuple(getattr(p.actuator, key).interval) for p in calibrations]
         value[field], low[field], high[field] = np.array(ends).T.copy()
-    delays = np.array([p.actuator.dead_time_interval_s for p in parts])
+    delays = np.array([p.actuator.dead_time_interval_s for p in calibrations])
     low["dead_time_s"], high["dead_time_s"] = delays[:, 0], delays[:, 1]
     # the armature is the torque's scale, drawn for the robot as a whole
     low["armature"] = high["armature"] = value["armature"]
-    continuous = np.array([p.actuator.numbers_in == "continuous time" for p in parts])
+    continuous = np.array([p.actuator.numbers_in == "continuous time" for p in calibrations])
     if continuous.any():  # what a simulation in steps needs, as older files have it
         stepped = at_step(DelayedPDParameters(**value), TIME_STEP_S).arrays()
         for field, number in value.items():
@@ -181,7 +181,7 @@ def _from_calibration(
     feedback = tuple(
         calibration.held_feedback(servo_of.get(n) or fallbacks.get(n, n)) for n in joints
     )
-    jitters = [p.actuator.command_jitter_s for p in parts]
+    jitters = [p.actuator.command_jitter_s for p in calibrations]
     known = [q.value for q in jitters if q.low]  # seen, if only as an upper bound
     jitter = float(np.median(known)) if known else 0.0
     return ServoRanges(source, low, value, high, feedback, fallbacks, jitter, joints)

@@ -30,7 +30,7 @@ class Step:
     """What happened in one control step, for all environments: robots of 12 joints and 4 feet."""
 
     body: Body
-    """The robot; of another one the numbers of joints and feet are its own."""
+    """The robot, which gives the numbers of joints and feet."""
     command: Array
     """Forward and sideways speed [m/s], turn rate [rad/s]; shape (n, 3)."""
     linear_velocity: Array

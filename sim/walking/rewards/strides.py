@@ -181,6 +181,6 @@ class EffortMeter:
         facts["weight_n"][:] = GRAVITY_M_S2 * robots.field("body_mass")[rows].sum(axis=1)
 
 
-def by_kind(body: Body, each: Array) -> Array:
+def by_kind(body: Body, values: Array) -> Array:
     """Means over the joints of each of `Body.kinds`, shape (n, kinds), of values of all servos."""
-    return np.stack([each[:, joints].mean(axis=1) for joints in body.kinds.values()], axis=1)
+    return np.stack([values[:, joints].mean(axis=1) for joints in body.kinds.values()], axis=1)

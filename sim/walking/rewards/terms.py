@@ -54,9 +54,9 @@ def turn_progress(s: Step, p: Rewards) -> Array:
     return _nearer(s.command[:, 2:], s.stride_velocity[:, 2:], _SLOW[1] * s.body.command_scale[2])
 
 
-def _nearer(wanted: Array, velocity: Array, slow: float) -> Array:
-    speed = np.linalg.norm(wanted, axis=1)
-    gained = speed - np.linalg.norm(wanted - velocity, axis=1)
+def _nearer(command: Array, velocity: Array, slow: float) -> Array:
+    speed = np.linalg.norm(command, axis=1)
+    gained = speed - np.linalg.norm(command - velocity, axis=1)
     # below `slow` the share of a small command would be that of the trunk's sway
     return np.where(speed > 0, np.clip(gained / np.hypot(speed, slow), -1.0, 1.0), 0.0)
 
