@@ -8,7 +8,7 @@ from pathlib import Path
 from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, select_joints
-from pupper_sysid.common.reading.dialect import whole
+from pupper_sysid.common.reading.dialect import whole_number
 from pupper_sysid.hardware.address import EMULATED, KINDS, bus_name, parse_address
 from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
@@ -55,7 +55,7 @@ def connect(
 
 
 def say_remarks(bus: ServoBus) -> None:
-    """Print what a bus found out about its line and its servos' registers."""
+    """Print a bus's remarks on its line and on the registers of its servos."""
     if remarks := getattr(bus, "remarks", None):
         terminal.warn(*remarks())
 
@@ -86,13 +86,13 @@ def _registers(text: str, known: Iterable[str], example: str) -> dict[int | None
         servo, colon, of_servo = name.partition(":")
         name = of_servo if colon else name
         digits = value.removeprefix("-")
-        number = whole(value) if digits.isascii() and digits.isdecimal() else None
-        one = whole(servo) if colon and servo.isascii() and servo.isdecimal() else None
-        whose = bool(colon) == (one is not None) and (":" in example or not colon)
+        number = whole_number(value) if digits.isascii() and digits.isdecimal() else None
+        servo_id = whole_number(servo) if colon and servo.isascii() and servo.isdecimal() else None
+        addressed = bool(colon) == (servo_id is not None) and (":" in example or not colon)
         least = -_LARGEST_REGISTER if ":" in example else 0
         if (
             name not in known
-            or not whose
+            or not addressed
             or number is None
             or not least <= number <= _LARGEST_REGISTER
         ):
@@ -100,5 +100,5 @@ def _registers(text: str, known: Iterable[str], example: str) -> dict[int | None
                 f"--registers: '{part}' sets no register that acts here; write {example}, and of "
                 f"these: {', '.join(known)}."
             )
-        by_id.setdefault(one, {})[name] = number
+        by_id.setdefault(servo_id, {})[name] = number
     return by_id

@@ -61,11 +61,11 @@ class Driver:
                     self._command, self._clipped = np.zeros(3), False
                 elif key in KEYS:
                     axis, sign = KEYS[key]
-                    wanted = self._command.copy()
+                    command = self._command.copy()
                     # rounded: steps back to standing end at 0
-                    wanted[axis] = np.round(wanted[axis] + sign * STEP[axis], 6)
-                    self._command = self._trained.clip(wanted)
-                    self._clipped = bool((self._command != wanted).any())
+                    command[axis] = np.round(command[axis] + sign * STEP[axis], 6)
+                    self._command = self._trained.clip(command)
+                    self._clipped = bool((self._command != command).any())
         return None if self._ended else self._command.copy()
 
     def watching(self, joints: Sequence[str]) -> Callable[[Tick], None]:

@@ -87,8 +87,8 @@ def _page(
         )  # fmt: skip
     if subcommands:
         lines += ["", "commands:"]
-        for name, each in subcommands.items():
-            summary = (each.description or "").strip().split("\n\n")[0]
+        for name, subcommand in subcommands.items():
+            summary = (subcommand.description or "").strip().split("\n\n")[0]
             lines += _row(name, summary, width)
     for title, actions in _groups(parser, nested):
         lines += ["", *([f"{title}:"] if title else [])]

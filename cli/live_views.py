@@ -1,4 +1,4 @@
-"""Rerun and MCAP while a loop runs: the channels of `view`, from a process of its own.
+"""Rerun and MCAP while a loop runs: the channels of `view`, from a second process.
 
 `SideProcess` is a process beside a loop that moves or reads servos, which takes messages and may be
 slow; here it is `cli.live_writer`, which writes. The loop hands it a message per tick and never
@@ -36,7 +36,7 @@ LONGEST_MESSAGE = 65536
 
 
 class SideProcess:
-    """A module in a process of its own, behind a socket whose descriptor is its argument.
+    """A module in a second process, behind a socket whose descriptor is its argument.
 
     Its reading end ends with this process, however that ends.
     """
@@ -111,7 +111,7 @@ def refuse_files(force: bool, **files: Path | None) -> None:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ViewTargets:
     """What a command was asked to show while it runs."""
 
     rerun: str | None
@@ -146,13 +146,13 @@ class Wanted:
 
 
 @contextmanager
-def live_views(bus: ServoBus, wanted: Wanted, waits: bool = False) -> Iterator[LiveViews]:
+def live_views(bus: ServoBus, targets: ViewTargets, waits: bool = False) -> Iterator[LiveViews]:
     """Start the writer, and finish the files at the end of the block.
 
     With `waits` a writer that is behind is awaited: of a bus in virtual time, where that delays
     nothing.
     """
-    views = LiveViews(bus, wanted, waits)
+    views = LiveViews(bus, targets, waits)
     reason = ""
     try:
         yield views
@@ -166,21 +166,21 @@ def live_views(bus: ServoBus, wanted: Wanted, waits: bool = False) -> Iterator[L
 class LiveViews:
     """The loop's side; see `live_views`, which closes it."""
 
-    def __init__(self, bus: ServoBus, wanted: Wanted, waits: bool):
+    def __init__(self, bus: ServoBus, targets: ViewTargets, waits: bool):
         from pupper_sysid.sysid.view import packed
 
         self._packed = packed
-        self._wanted, self._within_s = wanted, _WAIT_S if waits else 0.0
+        self._targets, self._within_s = targets, _WAIT_S if waits else 0.0
         self._report = bus.report if isinstance(bus, GuardedBus) else None
         self.dropped = self._told = 0
         self._last_s = 0.0
         joints = bus.joint_names
         knee = "serial" if bus.metadata.get("linkage") == "none" else "linkage"
         about = {
-            "mcap": wanted.mcap and str(wanted.mcap),
-            "rerun_file": wanted.rerun_file and str(wanted.rerun_file),
-            "rerun_address": wanted.rerun_address,
-            "force": wanted.force,
+            "mcap": targets.mcap and str(targets.mcap),
+            "rerun_file": targets.rerun_file and str(targets.rerun_file),
+            "rerun_address": targets.rerun_address,
+            "force": targets.force,
             "joints": list(joints),
             "live": bus.metadata.get("readings") == "live",
             "knee": knee if set(joints) <= set(JOINT_NAMES) else None,
@@ -239,12 +239,12 @@ class LiveViews:
         except InputError:
             wrong = f"the writer was still behind after {_END_S:.0f} s and was ended."
         self._process.end(1.0 if wrong else _END_S)
-        wanted = self._wanted
-        names = [str(name) for name in (wanted.rerun, wanted.mcap) if name is not None]
+        targets = self._targets
+        names = [str(name) for name in (targets.rerun, targets.mcap) if name is not None]
         if wrong:
             terminal.warn(f"{' and '.join(names)}: {wrong}")
             return
-        for path in filter(None, (wanted.rerun_file, wanted.mcap)):
+        for path in filter(None, (targets.rerun_file, targets.mcap)):
             terminal.err.print(f"Wrote {path}.")
         if self.dropped:
             terminal.warn(

@@ -60,8 +60,8 @@ class Writer:
         self._rerun = RerunStream(uuid.uuid4().hex)
         if address:
             try:  # Rerun itself would wait for a viewer
-                parts = urlsplit(address)
-                where = parts.hostname or "", parts.port or _VIEWER_PORT
+                url = urlsplit(address)
+                where = url.hostname or "", url.port or _VIEWER_PORT
                 socket.create_connection(where, _VIEWER_S).close()
             except (OSError, ValueError) as error:
                 raise InputError(

@@ -1,6 +1,6 @@
 """Terminal oscilloscope: commands and readings of each joint as scrolling traces.
 
-A process of its own draws. The loop that moves or reads the servos only hands it a message per
+A second process draws. The loop that moves or reads the servos only hands it a message per
 tick, which is dropped where the process is behind: a slow terminal delays no servo.
 """
 
@@ -166,9 +166,9 @@ class Screen:
         x = 1 - (time_s[-1] - time_s[inside]) / _WINDOW_S
         command, position = command[inside], position[inside]
         fresh = np.r_[True, np.diff(position) != 0]
-        both = np.concatenate([command, position])
-        both = both[np.isfinite(both)]
-        low, high = (both.min(), both.max()) if len(both) else (0.0, 0.0)
+        shown_rad = np.concatenate([command, position])
+        shown_rad = shown_rad[np.isfinite(shown_rad)]
+        low, high = (shown_rad.min(), shown_rad.max()) if len(shown_rad) else (0.0, 0.0)
         span = max(high - low, _MOVES_RAD)
         low = (low + high - span) / 2
         layers = [
@@ -187,12 +187,12 @@ class Screen:
 
     def _numbers(self, k: int, time_s: Array, data: dict[str, Array]) -> list[str]:
         last = {name: values[-1, k] for name, values in data.items()}
-        parts = [f"{last['position']:+.3f} rad" if np.isfinite(last["position"]) else "silent"]
+        texts = [f"{last['position']:+.3f} rad" if np.isfinite(last["position"]) else "silent"]
         lag = lag_s(time_s, data["command"][:, k], data["position"][:, k]) if self.lag else np.nan
         if np.isfinite(lag):
-            parts.append(f"lag {1e3 * lag:.0f} ms")
-        parts += self.notes[k : k + 1]
-        return parts + [
+            texts.append(f"lag {1e3 * lag:.0f} ms")
+        texts += self.notes[k : k + 1]
+        return texts + [
             text.format(last[name]) for name, text in _SHOWN.items() if np.isfinite(last[name])
         ]
 
@@ -242,8 +242,8 @@ def _line(layers: list[tuple[str, NDArray[np.int64]]]) -> Text:
     line = Text(no_wrap=True)
     for bits in zip(*(cells for _, cells in layers), strict=True):
         style = next((s for (s, _), b in zip(layers, bits, strict=True) if b), "")
-        every = int(np.bitwise_or.reduce(bits))
-        line.append(chr(_BRAILLE + every) if every else " ", style)
+        dots = int(np.bitwise_or.reduce(bits))
+        line.append(chr(_BRAILLE + dots) if dots else " ", style)
     return line
 
 

@@ -86,8 +86,8 @@ def trained_actuator(path: Path, policy: Policy, run: Run | None) -> tuple[str |
     name = run.actuator if run else policy.contract.actuator
     if name == IDEAL or is_shipped(name):
         return name, True
-    wanted, candidates = policy.contract.actuator_sha256, _near(name, path)
-    same = [f for f in candidates if wanted is None or (f.is_file() and sha256(f) == wanted)]
+    expected, candidates = policy.contract.actuator_sha256, _near(name, path)
+    same = [f for f in candidates if expected is None or (f.is_file() and sha256(f) == expected)]
     return (str((same or candidates)[0]) if candidates else None), bool(same)
 
 
@@ -138,18 +138,18 @@ def _of_robot(task: Walking, path: Path, policy: Policy, run: Run | None) -> Wal
     if robot is None:
         return task
     files = {}
-    for key, name, wanted in (
+    for key, name, expected in (
         ("robot", robot.mjcf, robot.mjcf_sha256),
         ("robot_config", robot.config, robot.config_sha256),
     ):  # fmt: skip
-        if name is None or wanted is None:
+        if name is None or expected is None:
             files[key] = ""
             continue
         # where it was, or of that name beside the policy
-        there = [f for f in (Path(name), *_near(Path(name).name, path)) if f.is_file()]
-        same = next((f for f in there if sha256(f) == wanted), None)
+        candidates = [f for f in (Path(name), *_near(Path(name).name, path)) if f.is_file()]
+        same = next((f for f in candidates if sha256(f) == expected), None)
         if same is None:
-            what = f"{there[0]} is not as it was" if there else "is not here"
+            what = f"{candidates[0]} is not as it was" if candidates else "is not here"
             raise InputError(
                 f"The policy at {path} walks {robot.name}, of {name}, which {what}. Put the file "
                 "of its training there, or beside the policy."

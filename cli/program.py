@@ -38,7 +38,7 @@ from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import holding_outputs, versions
 from pupper_sysid.common.processes.stop import STOPPED, Stop, end_politely, stoppable
 from pupper_sysid.common.reading.content import reading_up_to
-from pupper_sysid.common.reading.dialect import decimal, whole
+from pupper_sysid.common.reading.dialect import decimal, whole_number
 
 _COMPLETIONS = {"bash": ".local/share/bash-completion/completions/{}", "zsh": ".zfunc/_{}"}
 _READ_LIMIT = "--read-limit"
@@ -69,7 +69,7 @@ NUMERALS = ConstructorRegistry()
 """Rules for `tyro.cli`: numbers as in files, optional values by their type alone. Its own rules
 take `4_1` for 41 and the digits of every script, and show an optional value as `{None}|STR`."""
 
-_READERS: dict[Any, Callable[[str], float]] = {int: whole, float: decimal}
+_READERS: dict[Any, Callable[[str], float]] = {int: whole_number, float: decimal}
 
 Options = TypeVar("Options")
 
@@ -411,8 +411,8 @@ def run_command(
             return
         if first.startswith("--tyro-"):  # completion, of all words and their options
             words = (Annotated[c.load(), tyro.conf.subcommand(w)] for w, c in commands.items())
-            every: Any = functools.reduce(operator.or_, words)
-            tyro.cli(every, prog=program, args=words_left, config=CONFIG)
+            every_command: Any = functools.reduce(operator.or_, words)
+            tyro.cli(every_command, prog=program, args=words_left, config=CONFIG)
         if first not in commands:
             near = difflib.get_close_matches(first, commands, n=1, cutoff=0.5)
             hint = f" Did you mean `{program} {near[0]}`?" if near else ""
@@ -421,7 +421,7 @@ def run_command(
             )
         chosen = commands[first]
         kind = chosen.load()
-        # a union has no docstring of its own, and Python's would be shown
+        # a union has no docstring, and that of its class in Python would be shown
         described = None if isinstance(kind, type) else chosen.summary
         command = parse(kind, rest, f"{program} {first}", described)
         if chosen.holds_bus:
@@ -451,9 +451,9 @@ def overview(program: str, description: str, commands: Mapping[str, Command]) ->
 
 
 def words(commands: Mapping[str, Command]) -> list[str]:
-    """All commands, those of a command's own as two words."""
+    """All commands; subcommands as two words."""
     names = []
     for word, command in commands.items():
-        inner = (get_args(one)[1].name for one in get_args(command.load()))
+        inner = (get_args(kind)[1].name for kind in get_args(command.load()))
         names += [word, *(f"{word} {name}" for name in inner)]
     return names

@@ -12,7 +12,7 @@ for a caller of the library and at the command line::
     `preset='paper'`     --preset paper
     `learning_rate`      --learner.learning-rate
 
-An option is found by the argument's name, by its name without the unit, or by `_OTHER_NAMES`.
+An option is looked up by the argument's name, by its name without the unit, or by `_OTHER_NAMES`.
 Errors (`program.user_errors`) and warnings (`warn`) are spelled so; a command need not call this.
 """
 
@@ -43,7 +43,7 @@ from rich.text import Text
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import select_joints, share_sentences
-from pupper_sysid.common.reading.dialect import whole
+from pupper_sysid.common.reading.dialect import whole_number
 
 if TYPE_CHECKING:
     from pupper_sysid.common.tables import Table as ResultTable
@@ -67,7 +67,7 @@ class _PlainConsole(Console):
     def print(self, *objects: Any, soft_wrap: bool | None = None, **how: Any) -> None:
         """As rich's."""
         if soft_wrap is None:
-            words = all(isinstance(one, str | Text) for one in objects)
+            words = all(isinstance(item, str | Text) for item in objects)
             command = _COMMAND.search(" ".join(map(str, objects)))
             soft_wrap = words and (command is not None or not self.is_terminal)
         super().print(*objects, soft_wrap=soft_wrap, **how)
@@ -177,10 +177,10 @@ def result_table(results: ResultTable) -> Table:
 
 def print_tables(*tables: ResultTable) -> None:
     """Print tables of results, an empty line between them; those without rows are left out."""
-    for k, one in enumerate(t for t in tables if t.rows):
+    for k, table in enumerate(t for t in tables if t.rows):
         if k:
             out.print()
-        out.print(result_table(one))
+        out.print(result_table(table))
 
 
 def ms(seconds: float | None, digits: int = 1) -> str:
@@ -212,7 +212,7 @@ def cell(value: Any, digits: int) -> str:
 def whole_numbers(option: str, text: str) -> list[int]:
     """Loop numbers that an option names, such as 0,1."""
     try:
-        return [whole(part) for part in text.split(",")]
+        return [whole_number(part) for part in text.split(",")]
     except ValueError:
         raise InputError(f"{option} is '{text}'; write loop numbers with commas: 0,1.") from None
 
@@ -276,7 +276,7 @@ def _bar(label: str, total: float, count: str) -> Iterator[Any]:
 
 _OTHER_NAMES = {"frequencies": "freqs", "address": "bus", "workers": "jobs", "p_gain": "gain"}
 _OF_EVERY_PROGRAM = {"read_limit": "--read-limit"}
-"""Options with a name of their own, by the library's argument (without its unit)."""
+"""Options of another name than the library's argument, by that (without its unit)."""
 
 _ARGUMENT = re.compile(r"`([a-z][a-z0-9_]*)(?:=('?)([^`']*)\2)?`")
 _UNIT = re.compile(r"_(rad_s|m_s|s|ms|hz|rad|nm)$")

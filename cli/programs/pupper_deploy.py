@@ -19,7 +19,7 @@ import tyro
 from pupper_sysid.cli import policy_choice, terminal
 from pupper_sysid.cli.buses import chosen_map
 from pupper_sysid.cli.commands.recording.sweep import Sweep
-from pupper_sysid.cli.live_views import Wanted, live_views
+from pupper_sysid.cli.live_views import ViewTargets, live_views
 from pupper_sysid.cli.program import end_politely, run_program
 from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
 from pupper_sysid.common.errors import InputError
@@ -132,9 +132,9 @@ class Deploy:
     """Replace an existing log."""
 
     @property
-    def views(self) -> Wanted:
+    def views(self) -> ViewTargets:
         """What other viewers show."""
-        return Wanted(self.rerun, self.mcap, self.force)
+        return ViewTargets(self.rerun, self.mcap, self.force)
 
     @property
     def in_real_time(self) -> bool:
@@ -187,7 +187,7 @@ def _run(options: Deploy) -> None:
         actuator = policy_choice.chosen_actuator(options.policy, policy, run, options.actuator)
         bus, imu, joint_map, truth = _open(options, open_things, body, actuator)
         of_training, known = policy_choice.trained_actuator(options.policy, policy, run)
-        parts = assemble(
+        assembled = assemble(
             policy, stack, joint_map, actuator, options.servo, of_training if known else None, body
         )
         if stack.observer == "readings" and options.actuator is None:
@@ -201,15 +201,15 @@ def _run(options: Deploy) -> None:
                 "was not compared with it."
             )
         else:
-            policy_choice.show_match(parts.match)
-        match = parts.servo_match if options.actuator else None
+            policy_choice.show_match(assembled.match)
+        match = assembled.servo_match if options.actuator else None
         if options.actuator:
             policy_choice.show_servos(match, policy.contract.servo is not None)
-        header = parts.header | header_entries(bus) | {
+        header = assembled.header | header_entries(bus) | {
             "policy": str(options.policy), "stack_name": name, "seed": options.seed,
             "servo_match": match and match.to_dict(), "commands": trained.model_dump(mode="json"),
         }  # fmt: skip
-        _walk(options, bus, imu, parts, commands, header, folder, truth)
+        _walk(options, bus, imu, assembled, commands, header, folder, truth)
 
 
 def _commands(options: Deploy, trained: CommandRanges) -> Commands:
@@ -276,8 +276,8 @@ def _open(
     bus = open_things.enter_context(closing(open_guarded(address, joint_map)))
     if isinstance(bus.bus, Imu):
         return bus, bus.bus, joint_map, None
-    other = open_things.enter_context(closing(Esp32Bus(options.imu or SOCKET)))
-    return bus, other, joint_map, None
+    imu = open_things.enter_context(closing(Esp32Bus(options.imu or SOCKET)))
+    return bus, imu, joint_map, None
 
 
 def _map_of(options: Deploy, body: Body) -> JointMap:
@@ -360,7 +360,7 @@ def _replay(path: Path, policy: Any, body: Body) -> None:
 
 
 def _walk(
-    options: Deploy, bus: GuardedBus, imu: Imu, parts: Assembly, commands: Commands,
+    options: Deploy, bus: GuardedBus, imu: Imu, assembled: Assembly, commands: Commands,
     header: dict[str, Any], folder: Path, truth: Any,
 ) -> None:  # fmt: skip
     """Walk, log, and show the result."""
@@ -377,7 +377,7 @@ def _walk(
         priority = open_things.enter_context(real_time_priority())
         if options.bus != EMULATED:
             err.print(f"Running with {priority}.")
-        watchers: list[Any] = [parts.frozen_readings, *([score] if score else [])]
+        watchers: list[Any] = [assembled.frozen_readings, *([score] if score else [])]
         if isinstance(commands, Driver):
             open_things.enter_context(commands.driving())
             watchers.append(commands.watching(bus.joint_names))
@@ -393,10 +393,10 @@ def _walk(
         if options.views:
             waits = not options.in_real_time
             views = open_things.enter_context(live_views(bus, options.views, waits))
-            watchers.append(partial(views.walk_tick, parts.controller.to_servo))
+            watchers.append(partial(views.walk_tick, assembled.controller.to_servo))
         rows = open_things.enter_context(RecordingWriter(table, about, options.force))
         outcome = deploy(
-            bus, imu, parts.controller, commands, options.seconds, log, header, rows, watchers,
+            bus, imu, assembled.controller, commands, options.seconds, log, header, rows, watchers,
             options.force,
         )  # fmt: skip
         if views:

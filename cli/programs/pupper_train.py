@@ -91,20 +91,20 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    with user_errors(given, "pupper-train") as rest:
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    with user_errors(words, "pupper-train") as rest:
         options = _parse(rest)
         begin_work()
         _run(options, rest)
 
 
-def _parse(given: list[str]) -> Options:
+def _parse(words: list[str]) -> Options:
     """Options; --preset, --policy and --start set the defaults of the others."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     kinds = {"start": Start, "preset": Preset, "policy": Kind}
     for name in (*kinds, "robot", "robot-config"):
         parser.add_argument(f"--{name}", nargs="?")
-    typed = vars(parser.parse_known_args(given)[0])
+    typed = vars(parser.parse_known_args(words)[0])
     # a wrong choice is refused by tyro, which then parses them all
     choices = {n: typed[n] if typed[n] in get_args(k) else get_args(k)[0] for n, k in kinds.items()}
     start: Any = choices["start"]
@@ -116,12 +116,12 @@ def _parse(given: list[str]) -> Options:
     if robot is not None:
         begun = with_robot(begun, robot, config)
     return parse(
-        Options, given, "pupper-train", DESCRIPTION,
+        Options, words, "pupper-train", DESCRIPTION,
         default=Options(begun, start=start), config=(tyro.conf.FlagCreatePairsOff,),
     )  # fmt: skip
 
 
-def _run(options: Options, given: list[str]) -> None:
+def _run(options: Options, words: list[str]) -> None:
     run, begun = options.run, time.monotonic()
     if options.print_config:
         print(yaml.safe_dump(plain(run), sort_keys=False), end="")
@@ -140,15 +140,15 @@ def _run(options: Options, given: list[str]) -> None:
     if options.benchmark:
         from pupper_sysid.policies.train.speed import measure, with_sample
 
-        here = with_sample(run)
-        check_actuator(here.actuator)
-        if here is not run:
-            warn(f"There is no {run.actuator} here; measuring with {here.actuator}.")
-        found = measure(here)
+        sample_run = with_sample(run)
+        check_actuator(sample_run.actuator)
+        if sample_run is not run:
+            warn(f"There is no {run.actuator} here; measuring with {sample_run.actuator}.")
+        rates = measure(sample_run)
         if options.json:
-            print_json(found)
+            print_json(rates)
         else:
-            for name, value in found.items():
+            for name, value in rates.items():
                 text = f"{value:,.3g}" if isinstance(value, float) else str(value)
                 out.print(f"{name:28} {text}")
         return
@@ -176,7 +176,7 @@ def _run(options: Options, given: list[str]) -> None:
     with _bar() as watch:
         notice, stopping = (warn, err.print) if ranks.rank == 0 else (lambda text: None,) * 2
         if options.resume:
-            learner = train(folder, None, watch, *_extension(options, given), notice, stopping)
+            learner = train(folder, None, watch, *_extension(options, words), notice, stopping)
         else:
             spent_s = time.monotonic() - begun
             learner = train(folder, run, watch, notice=notice, stopping=stopping, spent_s=spent_s)
@@ -211,14 +211,14 @@ def _with_first_gait(run: Run, ranks: Ranks, until: float) -> Run:
                 run, lambda text: err.print(spell(text)), partial(advance, "searching"),
                 lambda: time.monotonic() > until,
             ).task  # fmt: skip
-    parts = json.loads(ranks.same(json.dumps(plain({"trot": task.trot, "rewards": task.rewards}))))
-    trot, rewards = Trot(**parts["trot"]), Rewards(**parts["rewards"])
+    fitted = json.loads(ranks.same(json.dumps(plain({"trot": task.trot, "rewards": task.rewards}))))
+    trot, rewards = Trot(**fitted["trot"]), Rewards(**fitted["rewards"])
     return replace(run, task=replace(run.task, trot=trot, rewards=rewards))
 
 
-def _extension(options: Options, given: list[str]) -> tuple[int | None, float | None]:
+def _extension(options: Options, words: list[str]) -> tuple[int | None, float | None]:
     """New --iterations and --minutes of a resumed run; anything else would have no effect."""
-    flags = {a.split("=")[0] for a in given if a.startswith("--")}
+    flags = {a.split("=")[0] for a in words if a.startswith("--")}
     other = flags - {"--resume", "--iterations", "--minutes"}
     if other:
         raise InputError(
@@ -252,12 +252,12 @@ def _bar() -> Iterator:
                     f"KL {now.row['kl']:.3f}, clipped {100 * now.row['clip_fraction']:.0f} %"
                 )
             label = {"teacher": "teacher", "imitation": "first gait", "ppo": "PPO"}[now.phase]
-            left = f"{now.left_s / 60:.0f} min left"
+            until = f"{now.left_s / 60:.0f} min left"
             bar.update(
-                task, description=label, completed=now.done, total=now.total, what=what, left=left
+                task, description=label, completed=now.done, total=now.total, what=what, left=until
             )
             if not terminal and (now.done % 10 == 0 or now.done == 1):
-                err.print(f"{label} {now.done}/{now.total}, {left}: {what}")
+                err.print(f"{label} {now.done}/{now.total}, {until}: {what}")
 
         yield watch
 

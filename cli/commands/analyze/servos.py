@@ -141,10 +141,10 @@ class ServoDemand(Commanded):
 
         demands: dict[str, Demand] = self.each(demand_of, self.command)
         (name, demand), *_ = demands.items()
-        wanted = float(np.hypot(*self.command[:2]))
-        if path_is_onnx(self.policies[0]) and demand.speed_m_s < _STROLL * wanted:
+        speed = float(np.hypot(*self.command[:2]))
+        if path_is_onnx(self.policies[0]) and demand.speed_m_s < _STROLL * speed:
             terminal.warn(
-                f"{name} walks at {demand.speed_m_s:.2f} m/s where {wanted:g} are commanded, "
+                f"{name} walks at {demand.speed_m_s:.2f} m/s where {speed:g} are commanded, "
                 "so this may not be its gait: check the order, signs and scales of "
                 "`observation`, the pose, and the command (--command)."
             )
@@ -168,9 +168,9 @@ class ServoDemand(Commanded):
         """The policy of a run or of an ONNX file, and how it is tried."""
         path = self.policies[0]
         if not path_is_onnx(path):
-            if other := next((n for n in _OF_ONNX if getattr(self, n) is not None), None):
+            if key := next((n for n in _OF_ONNX if getattr(self, n) is not None), None):
                 raise InputError(
-                    f"--{other.replace('_', '-')} is for a policy in an ONNX file; {path} is a run "
+                    f"--{key.replace('_', '-')} is for a policy in an ONNX file; {path} is a run "
                     "or a policy of pupper-train, which knows its robot."
                 )
             return tries_of(self, command, *self.size, other_robots=True)

@@ -219,8 +219,8 @@ def tries_of(
         task, servos = policy_choice.simulator(
             path, policy, run, options.actuator, options.feedback
         )
-        wanted = np.array([command], float)
-        within = policy_choice.trained_commands(policy, run).clipped(wanted, warn)[0]
+        commanded = np.array([command], float)
+        within = policy_choice.trained_commands(policy, run).clipped(commanded, warn)[0]
         tries[name] = (
             policy,
             Trial(task, servos, (within[0], within[1], within[2]), robots, seconds, options.seed),
@@ -294,7 +294,8 @@ class Attractor(Commanded):
         from pupper_sysid.policies.analysis.figures import orbit_figure
         from pupper_sysid.policies.analysis.gait import SETTLE_S, SHORTEST_S
 
-        by_policy = {name: one for name, one in self.each(orbits, self.command).items() if one}
+        walks = self.each(orbits, self.command)
+        by_policy = {name: orbits_of for name, orbits_of in walks.items() if orbits_of}
         if not by_policy:
             raise InputError(
                 f"No robot walked for {SETTLE_S + SHORTEST_S:g} s and moved: there is no orbit to "
@@ -306,8 +307,8 @@ class Attractor(Commanded):
             *(f"area +{d:g} ms" for d in DELAYS_MS[1:]),
         )  # fmt: skip
         drawn = {}
-        for name, one in by_policy.items():
-            for states, orbit in one.items():
+        for name, orbits_of in by_policy.items():
+            for states, orbit in orbits_of.items():
                 drawn[f"{name} {states}"] = orbit.orbits
                 table.add_row(
                     f"{name} {states}", number(orbit.explained_3, 3),

@@ -163,8 +163,8 @@ class FitServo(OfRecordings):
         table = terminal.table(
             f"{fit.arch}, {fit.split}; RMS error in mrad", "joint", *(title for _, title in _SCORES)
         )
-        for name, one in fit.joints.items():
-            table.add_row(name, *(terminal.ms(getattr(one, key)) for key, _ in _SCORES))
+        for name, scores in fit.joints.items():
+            table.add_row(name, *(terminal.ms(getattr(scores, key)) for key, _ in _SCORES))
         if len(fit.joints) > 1:
             means = (terminal.ms(getattr(fit.mean, key)) for key, _ in _SCORES)
             table.add_row("mean", *means, style="bold")

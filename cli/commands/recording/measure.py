@@ -144,18 +144,18 @@ class Backlash(OfRecordings):
             "Width between strokes up and down, 90 % intervals",
             "joint", "P gain", "hysteresis °", "lag ms", "strokes",
         )  # fmt: skip
-        for joint, one in results.items():
-            for row in one.gains:
+        for joint, test in results.items():
+            for row in test.gains:
                 table.add_row(
                     joint, terminal.number(row.p_gain, 0), _degrees(row.hysteresis_rad),
                     terminal.ms(row.lag_s.value, 0), str(row.strokes),
                 )  # fmt: skip
         terminal.out.print(table)
-        for joint, one in results.items():
-            for name, value in (("dead zone", one.dead_zone_rad), ("backlash", one.backlash_rad)):
+        for joint, test in results.items():
+            for name, value in (("dead zone", test.dead_zone_rad), ("backlash", test.backlash_rad)):
                 text = "not determined" if value is None else f"{_degrees(value)}°"
                 terminal.out.print(f"{joint}: {name} {text}")
-            for note in one.notes:
+            for note in test.notes:
                 terminal.out.print(f"  {note}")
 
 

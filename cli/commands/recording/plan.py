@@ -37,13 +37,13 @@ def run_rounds(
     request: dict[str, Any],
     *,
     resume: bool,
-    whole: bool,
+    done: bool,
     force: bool,
     as_json: bool,
 ) -> None:
     """Record the first sweep, or what is left of the last round, and go on to the goal.
 
-    `path` is the first recording, or the one that is continued (`resume`), which may be `whole`
+    `path` is the first recording, or the one that is continued (`resume`), which may be `done`
     already; `request` is its. `force` replaces the rounds of an earlier sweep.
     """
     started = time.perf_counter()
@@ -58,14 +58,14 @@ def run_rounds(
         paths = _recorded(first)
         if paths[-1] != path:
             path = paths[-1]
-            whole, request = bool(footer(path)), dict(header_of(path)["sweep"])
+            done, request = bool(footer(path)), dict(header_of(path)["sweep"])
     else:
         paths = [path]
         if force:  # rounds of an earlier sweep of this name are not this one's
             for old in _recorded(first)[1:]:
                 old.unlink()
     written = list(paths)
-    if not whole:
+    if not done:
         written += record(path, request, resume)[1:]
 
     def record_next(plan: SweepPlan, number: int) -> Path:
@@ -262,11 +262,11 @@ class Plan:
         recorded = bus.get("joint_map")
         if self.joint_map is None and recorded:
             try:
-                return load_joint_map(recorded)  # a preset; a file's own name leads nowhere
+                return load_joint_map(recorded)  # a preset; the name inside a file is no path
             except InputError:
                 pass
-        here = str(JOINTS_FILE) if JOINTS_FILE.exists() else _STANDARD_MAP
-        return load_joint_map(self.joint_map or here)
+        default = str(JOINTS_FILE) if JOINTS_FILE.exists() else _STANDARD_MAP
+        return load_joint_map(self.joint_map or default)
 
 
 def margins(joint_map: JointMap) -> dict[str, float]:

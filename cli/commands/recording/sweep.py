@@ -1,6 +1,6 @@
 """`sweep`: move the joints, write down what happens.
 
-`--load` is one servo on a bench, with a bus and a plan of its own. `--until` records and fits in
+`--load` is one servo on a bench, with another bus and plan. `--until` records and fits in
 rounds (`rounds`).
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE, connect, joints_on, parse_registers
 from pupper_sysid.cli.commands.recording.plan import run_rounds, say_how_to_resume
-from pupper_sysid.cli.live_views import Wanted, live_views
+from pupper_sysid.cli.live_views import ViewTargets, live_views
 from pupper_sysid.common.errors import BusError, InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import select_joints
@@ -126,9 +126,9 @@ class Sweep:
         if self.resume:
             path = self.resume
             metadata = header_of(path)
-            request, whole = dict(metadata["sweep"]), "completed" in metadata
+            request, done = dict(metadata["sweep"]), "completed" in metadata
         else:
-            request, whole = self._request(), False
+            request, done = self._request(), False
             name = "playback" if self.playback else "plan" if self.plan else request["kind"]
             path = self.out or FOLDER / f"{name}_{time.strftime('%Y-%m-%d_%H%M%S')}.csv"
             if path.suffix != ".csv":
@@ -148,8 +148,8 @@ class Sweep:
                     "them out, and give the recordings to `pupper-sysid view`."
                 )
             run_rounds(
-                lambda *asked: self._record(*asked)[1], path, request,
-                resume=self.resume is not None, whole=whole, force=self.force, as_json=self.json,
+                lambda *recording: self._record(*recording)[1], path, request,
+                resume=self.resume is not None, complete=done, force=self.force, as_json=self.json,
             )  # fmt: skip
             return
         chosen, written = self._record(path, request, self.resume is not None)
@@ -200,8 +200,8 @@ class Sweep:
         return chosen, written
 
     @property
-    def _views(self) -> Wanted:
-        return Wanted(self.rerun, self.mcap, self.force)
+    def _views(self) -> ViewTargets:
+        return ViewTargets(self.rerun, self.mcap, self.force)
 
     def _request(self) -> dict[str, Any]:
         """Options that define the plan; the recording keeps them, so that it can be continued."""
@@ -222,8 +222,8 @@ class Sweep:
         loop_period_s = 1.0 / rate
         self._refuse_bench_options()
         if self.plan is None:
-            here = JOINTS_FILE if bus != EMULATED and JOINTS_FILE.exists() else None
-            chosen = self._map() or here
+            default = JOINTS_FILE if bus != EMULATED and JOINTS_FILE.exists() else None
+            chosen = self._map() or default
             joint_map = load_joint_map(chosen) if chosen else None
             joints = joints_on(bus, joint_map, self.joints)
         else:
@@ -246,7 +246,7 @@ class Sweep:
         amplitude = self.amplitude
         if amplitude is not None:
             excitation.check_amplitude(amplitude)
-        elif not self.load:  # a bench's kinds of motion have excursions of their own
+        elif not self.load:  # motions on a bench have other excursions
             amplitude = 0.3
         return {
             "bus": bus,
@@ -280,9 +280,9 @@ class Sweep:
                 )
             return
         parse_load(self.load)
-        other = next((n for n in ("plan", "playback", "until") if getattr(self, n)), None)
-        if other:
-            raise InputError(f"--load and --{other}: give one of the two.")
+        option = next((n for n in ("plan", "playback", "until") if getattr(self, n)), None)
+        if option:
+            raise InputError(f"--load and --{option}: give one of the two.")
 
     def _registers(self, bus: str) -> dict[str, int]:
         if self.registers and (self.load is not None or bus != EMULATED):
@@ -296,8 +296,8 @@ class Sweep:
         """The joint map that is named; of a bench, the preset unless there is one in the folder."""
         if self.load is None or self.joint_map is not None:
             return self.joint_map
-        there = JOINTS_FILE.exists() and bus_name(self.bus) != EMULATED
-        return None if there else BENCH_MAP
+        has_map = JOINTS_FILE.exists() and bus_name(self.bus) != EMULATED
+        return None if has_map else BENCH_MAP
 
     def _series(self, joints: list[str]) -> dict[str, Any]:
         """What the recordings of a sweep with `until` have in common, and the number of this."""
@@ -420,7 +420,7 @@ def _plan_of(request: dict[str, Any], bus: ServoBus) -> Plan:
 
 @contextmanager
 def _shown(
-    bus: GuardedBus, chosen: Plan, wanted: Wanted, live: bool, waits: bool
+    bus: GuardedBus, chosen: Plan, targets: ViewTargets, live: bool, waits: bool
 ) -> Iterator[tuple[Progress, Observe]]:
     """What shows the progress, and each tick where live views are on."""
     watchers: list[Observe] = []
@@ -430,8 +430,8 @@ def _shown(
             watch(number, sent, reading, missed)
 
     with ExitStack() as open_things:
-        if wanted:
-            views = open_things.enter_context(live_views(bus, wanted, waits))
+        if targets:
+            views = open_things.enter_context(live_views(bus, targets, waits))
             watchers.append(lambda number, sent, reading, _: views.tick(number, sent, reading))
         if live and terminal.err.is_terminal:
             from pupper_sysid.cli.oscilloscope import Oscilloscope
@@ -482,7 +482,7 @@ def _guard_warnings(path: Path) -> list[str]:
 
 def _say_what_stays(bus: GuardedBus) -> None:
     """Warn of registers that could not be set back."""
-    for joint, registers in bus.registers.found.items():
+    for joint, registers in bus.registers.originals.items():
         for name, value in registers.items():
             terminal.warn(
                 f"{joint}: its register {name} could not be set back to {value}. Switch the "

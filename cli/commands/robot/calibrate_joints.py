@@ -83,19 +83,19 @@ class CalibrateJoints:
                 f"--scale-joint {self.scale_joint}: it is not among the joints that are "
                 f"calibrated ({', '.join(names)})."
             )
-        wanted = None if self.joints == "all" else names
-        bus = open_bus(address, start_map.per_servo() if start_map else None, wanted)
+        chosen = None if self.joints == "all" else names
+        bus = open_bus(address, start_map.per_servo() if start_map else None, chosen)
         try:
             say_remarks(bus)
             start = start_map or load_joint_map(bus.metadata["joint_map"])
             # a line need not have all servos
-            here = [n for n in names if n in bus.joint_names]
-            silent = [n for n in names if n not in here]
+            present = [n for n in names if n in bus.joint_names]
+            silent = [n for n in names if n not in present]
             if silent:
                 terminal.warn(f"{', '.join(silent)}: no answer; their part of the map is kept.")
             if self.scale_joint in silent:
                 raise BusError(f"--scale-joint {self.scale_joint}: it does not answer.")
-            self._calibrate(Guide(bus, start, here, Keyboard()), self.scale_joint or here[0])
+            self._calibrate(Guide(bus, start, present, Keyboard()), self.scale_joint or present[0])
         finally:
             bus.close()
 

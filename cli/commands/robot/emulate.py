@@ -23,7 +23,7 @@ from pupper_sysid.cli.buses import parse_servo_registers
 from pupper_sysid.cli.terminal import terminal_without
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
-from pupper_sysid.common.reading.dialect import whole
+from pupper_sysid.common.reading.dialect import whole_number
 from pupper_sysid.hardware.address import SOCKET
 from pupper_sysid.hardware.feetech import BAUD_RATES, FAMILY, STS3215
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
@@ -261,11 +261,11 @@ class Dynamixel(SerialLine):
         series = _series_of(table.FAMILY, self.model, layout, table.SERIES[1200])
         if own_map is None:
             own_map = f"{place}.joints.yaml"
-            one = load_joint_map(pendulum.BENCH_MAP).file.model_dump(by_alias=True)
+            map_file = load_joint_map(pendulum.BENCH_MAP).file.model_dump(by_alias=True)
             name = f"one {series.name} on a bench"
             source = f"{name}: 360 degrees over 4096 counts; limits: 2.6 rad to both sides"
-            one |= {"servo": series.name, "name": name, "source": source}
-            joint_map_from(one, own_map).save(Path(own_map), force=True)
+            map_file |= {"servo": series.name, "name": name, "source": source}
+            joint_map_from(map_file, own_map).save(Path(own_map), force=True)
         layout = layout or load_joint_map(own_map)
         spec = pendulum.dynamixel_bench(series.name)
         bench = self.on_bench(rng, spec, layout)
@@ -310,7 +310,7 @@ def _bench(
 
 @contextmanager
 def _imu_beside(bench: ServoBench, path: Path | None, rng: np.random.Generator) -> Iterator[None]:
-    """The IMU of the same robot on a socket of its own, if there is a path, during the block."""
+    """Within the block, the IMU of the same robot on another socket, if there is a path."""
     if path is None:
         yield
         return
@@ -377,7 +377,7 @@ def _parse_ids(text: str, known: tuple[int, ...]) -> list[int]:
     for part in (piece.strip() for piece in text.split(",")):
         low, dash, high = part.partition("-")
         try:
-            first, last = whole(low), whole(high if dash else low)
+            first, last = whole_number(low), whole_number(high if dash else low)
         except ValueError:
             raise InputError(f"--ids: '{part}' is no id. Write 1-12 or 4,5,6.") from None
         if not min(known) <= first <= last <= max(known):

@@ -1,4 +1,4 @@
-"""`init-robot`: a joint map and a plan to sweep another robot, from its own model."""
+"""`init-robot`: a joint map and a plan to sweep another robot, from its model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import tyro
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.dialect import whole
+from pupper_sysid.common.reading.dialect import whole_number
 
 _AMPLITUDE_RAD, _SMALLEST_RAD = 0.3, 0.05
 
@@ -59,13 +59,14 @@ class InitRobot:
                 "init-robot needs the robot's MJCF or URDF; or, without one, --joints with the "
                 "servos' ids, such as pan=1,tilt=2 (--lerobot-calibration goes with a model)."
             )
-        found, left_out = robot.joint_map, robot.left_out
+        joint_map, left_out = robot.joint_map, robot.left_out
         target = self.out or usual
-        found.save(target, self.force)
-        servos = found.per_servo()
+        joint_map.save(target, self.force)
+        servos = joint_map.per_servo()
         margin = servos.position_limits().margin(servos.rest_pose())
+        margins = dict(zip(joint_map.joint_names, margin, strict=True))
         joints: dict[float, list[str]] = {}  # by amplitudes that leave a fifth of their margin
-        for name, free in zip(found.joint_names, margin, strict=True):
+        for name, free in margins.items():
             amplitude = max(min(_AMPLITUDE_RAD, np.floor(80 * free) / 100), _SMALLEST_RAD)
             joints.setdefault(float(amplitude), []).append(name)
         sweeps = [
@@ -84,7 +85,7 @@ class InitRobot:
         if robot.following:
             pairs = ", ".join(f"{name} (follows {of})" for name, of in robot.following.items())
             terminal.warn(f"no servo of their own, left out: {pairs}.")
-        narrow = [n for n, r in zip(found.joint_names, margin, strict=True) if r < _SMALLEST_RAD]
+        narrow = [name for name, free in margins.items() if free < _SMALLEST_RAD]
         if narrow:
             terminal.warn(
                 f"{', '.join(narrow)}: less than {_SMALLEST_RAD:g} rad of margin, too little "
@@ -94,27 +95,21 @@ class InitRobot:
         if self.json:
             terminal.print_json(
                 {
-                    "joint_map": target, "joints": found.joint_names, "ids": found.ids,
+                    "joint_map": target, "joints": joint_map.joint_names, "ids": joint_map.ids,
                     "left_out": left_out, "following": robot.following, "doubts": robot.doubts,
-                    "margin_rad": dict(zip(found.joint_names, margin, strict=True)),
+                    "margin_rad": margins,
                     "sweeps": sweeps,
                 }
             )  # fmt: skip
             return
-        table = terminal.table(
-            f"{target}, servos {self.servo}",
-            "joint",
-            "id",
-            "centre rad",
-            "limits rad",
-            "margin rad",
-        )
-        for k, name in enumerate(found.joint_names):
-            entry = found.file.joints[name]
+        headings = ("joint", "id", "centre rad", "limits rad", "margin rad")
+        table = terminal.table(f"{target}, servos {self.servo}", *headings)
+        for name, free in margins.items():
+            entry = joint_map.file.joints[name]
             low, high = entry.limits_rad
             table.add_row(
                 name, str(entry.id), f"{entry.neutral_rad:.2f}", f"{low:.2f} … {high:.2f}",
-                f"{margin[k]:.2f}",
+                f"{free:.2f}",
             )  # fmt: skip
         terminal.out.print(table)
         bus = f"{FAMILIES[self.servo.lower()].name}:/dev/ttyUSB0"
@@ -145,5 +140,5 @@ def _parse_ids(text: str) -> dict[str, int]:
             )
         if name in ids:
             raise InputError(f"--joints: {name} is there twice.")
-        ids[name] = whole(number)
+        ids[name] = whole_number(number)
     return ids

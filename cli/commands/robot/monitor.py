@@ -15,7 +15,7 @@ from rich.text import Text
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import chosen_map, say_remarks
-from pupper_sysid.cli.live_views import LiveViews, Wanted, live_views
+from pupper_sysid.cli.live_views import LiveViews, ViewTargets, live_views
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, error_words
@@ -68,13 +68,13 @@ class Monitor:
         refuse_outside("--rate", self.rate, *_RATES_HZ, "Hz")
         if self.seconds is not None:
             terminal.need_positive("--seconds", self.seconds)
-        wanted = Wanted(self.rerun, self.mcap, self.force)
-        if wanted and (self.once or self.json):
+        targets = ViewTargets(self.rerun, self.mcap, self.force)
+        if targets and (self.once or self.json):
             raise InputError(
                 "--once and --json print one table, and --rerun and --mcap show what follows. "
                 "Give one of the two."
             )
-        wanted.check()
+        targets.check()
         bus = _open(self.bus, self.joint_map)
         try:
             watched = Watched(bus)
@@ -91,7 +91,7 @@ class Monitor:
                 else:
                     terminal.out.print(watched.table(bus_name(self.bus)))
                 return
-            with live_views(bus, wanted) if wanted else nullcontext() as views:
+            with live_views(bus, targets) if targets else nullcontext() as views:
                 self._show(watched, views)
         finally:
             bus.close()
@@ -99,10 +99,10 @@ class Monitor:
     def _show(self, watched: Watched, views: LiveViews | None) -> None:
         """Traces in a terminal, else tables; and what other viewers show."""
 
-        def show(here: Callable[[], None]) -> None:
+        def show(draw: Callable[[], None]) -> None:
             if views:
                 views.tick(0, *watched.tick())
-            here()
+            draw()
 
         until = np.inf if self.seconds is None else self.seconds
         if terminal.err.is_terminal:
@@ -160,13 +160,13 @@ class Watched:
     def look(self) -> None:
         """Read once."""
         sample = self._sample = self.bus.read()
-        here = self._here = np.isfinite(sample.position_rad)
-        changed = here & (sample.position_rad != self._position) & np.isfinite(self._position)
+        answered = self._here = np.isfinite(sample.position_rad)
+        changed = answered & (sample.position_rad != self._position) & np.isfinite(self._position)
         self._has_changed |= changed
-        news = here if self.answers_now else changed | (here & np.isnan(self._seen_s))
+        news = answered if self.answers_now else changed | (answered & np.isnan(self._seen_s))
         self._seen_s = np.where(news, sample.time_s, self._seen_s)
-        self._position = np.where(here, sample.position_rad, self._position)
-        self._count = np.where(here, sample.position_count, self._count)
+        self._position = np.where(answered, sample.position_rad, self._position)
+        self._count = np.where(answered, sample.position_count, self._count)
         self._voltage = _latest(self._voltage, sample.voltage_v)
         self._temperature = _latest(self._temperature, sample.temperature_c)
         goals = getattr(self.bus, "goals", None)

@@ -243,12 +243,12 @@ class Park:
         while True:
             abandoned = {note.processes: note for note in notes() if not note.in_control()}
             now = time.monotonic()
-            since_s = {one: since_s.get(one, now) for one in abandoned}
-            for one, note in abandoned.items():
+            since_s = {driver: since_s.get(driver, now) for driver in abandoned}
+            for driver, note in abandoned.items():
                 # a driver that was stopped for less goes on, and would switch on again
-                if now - since_s[one] > HANG_S:
-                    _take(note, min(self.seconds, _OTHERS_WAIT_S), say=one not in tried)
-                    tried.add(one)
+                if now - since_s[driver] > HANG_S:
+                    _take(note, min(self.seconds, _OTHERS_WAIT_S), say=driver not in tried)
+                    tried.add(driver)
             time.sleep(_LOOK_S)
 
 

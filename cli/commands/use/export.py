@@ -233,14 +233,14 @@ class Export:
             )  # fmt: skip
         terminal.out.print(table)
         if any(row.step_rad[WHOLE] > 0 for row in checked.joints.values()):
-            parts = terminal.table(
+            costs = terminal.table(
                 f"What steps of {1e3 * step:g} ms cost, RMS on the tones [mrad]",
                 "joint", *SWITCHED_OFF,
             )  # fmt: skip
             for name, row in checked.joints.items():
-                parts.add_row(name, *(n(1e3 * cost, 2) for cost in row.step_rad.values()))
+                costs.add_row(name, *(n(1e3 * cost, 2) for cost in row.step_rad.values()))
             terminal.out.print()
-            terminal.out.print(parts)
+            terminal.out.print(costs)
             terminal.out.print()
         for sentence in checked.notes:
             terminal.err.print(sentence)

@@ -50,8 +50,8 @@ class Report(OfRecordings):
                 seed=self.seed, workers=2, force=self.force, progress=advance,
             )  # fmt: skip
         if self.json:
-            parts = ("figures", "drawings", "tables")
-            named = {name: getattr(written, name) for name in parts}
+            kinds = ("figures", "drawings", "tables")
+            named = {name: getattr(written, name) for name in kinds}
             terminal.print_json({"report": written.path} | named)
         else:
             hint = "" if self.open else " Open it in a browser, or add --open."

@@ -134,18 +134,19 @@ class Diff:
 
         if self.gain is not None:
             refuse_outside("--gain", self.gain, *P_GAINS)
-        both = compared(self.first, self.second, self.joint, self.gain, _servo)
+        comparison = compared(self.first, self.second, self.joint, self.gain, _servo)
         if self.json:
-            terminal.print_json(both)
+            terminal.print_json(comparison)
             return
-        table = terminal.table("", "", _column(both.first), _column(both.second), "ratio")
-        for row in both.differences:
+        servos = _column(comparison.first), _column(comparison.second)
+        table = terminal.table("", "", *servos, "ratio")
+        for row in comparison.differences:
             table.add_row(
                 f"{row.quantity} [{row.unit}]", _with_interval(row.first),
                 _with_interval(row.second), terminal.number(row.ratio, 2),
             )  # fmt: skip
         terminal.out.print(table)
-        for sentence in (*both.notes, _verdict(both.differences), _motion(both)):
+        for sentence in (*comparison.notes, _verdict(comparison.differences), _motion(comparison)):
             for line in wrap(sentence, _WIDTH):
                 terminal.out.print(line)
 
@@ -205,11 +206,11 @@ def _numbers(card: ServoCard, name: str, gain: float | None) -> Any:
 
     numbers, pd = card.specimens[name], card.pd(name, gain)
     table = terminal.table(f"\n{name}" if len(card.specimens) > 1 else "", "", "value", "unit")
-    parts: Mapping[str, Any] = {"": pd}
+    models: Mapping[str, Any] = {"": pd}
     if not isinstance(numbers, TorquePD):
         p = card.gains.p if gain is None else gain
-        parts = {"position loop": numbers, f"as PD in torque, P {_plain(p)}": pd}
-    for title, part in parts.items():
+        models = {"position loop": numbers, f"as PD in torque, P {_plain(p)}": pd}
+    for title, part in models.items():
         if title:
             table.add_row(title, "", "")
         for key in type(part).model_fields:
