@@ -53,7 +53,7 @@ def help_page(
         return everything
     for whole in (True, False):
         lines = _page(parser, program, width, whole, nested=False)
-        rest = _left_out(parser)
+        rest = _omission(parser)
         lines += ["", *textwrap.wrap(f"{rest}{program} {ALL} shows every option in full.", width)]
         if len(lines) <= SCREEN_LINES:
             break
@@ -115,7 +115,7 @@ def _groups(
             yield (title or "").removesuffix(" options"), actions
 
 
-def _left_out(parser: argparse.ArgumentParser) -> str:
+def _omission(parser: argparse.ArgumentParser) -> str:
     """Which groups of settings the short page leaves out."""
     names = (name for a in parser._actions for name in a.option_strings if "." in name)
     counts: dict[str, int] = {}

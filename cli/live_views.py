@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +60,7 @@ class SideProcess:
             if within_s:
                 select.select([], [self.here], [], within_s)
             self.here.send(message)
-        except OSError:  # behind, or ended: the loop goes on
+        except OSError:  # the writer is behind, or has ended: the loop continues
             return False
         return True
 
@@ -97,7 +97,7 @@ VIEWER_ADDRESS = "rerun+http://127.0.0.1:9876/proxy"
 _WRITER = "pupper_sysid.cli.live_writer"
 _ENDINGS = {"rerun": ".rrd", "mcap": ".mcap"}
 _START_S = 60.0  # libraries on a slow memory card
-_END_S = 30.0  # for what the writer is behind; the robot is parked by then
+_END_S = 30.0  # for the writer's backlog; the robot is parked by then
 _WAIT_S = 10.0  # in virtual time
 
 
@@ -112,7 +112,7 @@ def refuse_files(force: bool, **files: Path | None) -> None:
 
 @dataclass(frozen=True)
 class ViewTargets:
-    """What a command was asked to show while it runs."""
+    """Viewers and files that a command writes to while it runs."""
 
     rerun: str | None
     mcap: Path | None
@@ -172,7 +172,7 @@ class LiveViews:
         self._packed = packed
         self._targets, self._within_s = targets, _WAIT_S if waits else 0.0
         self._report = bus.report if isinstance(bus, GuardedBus) else None
-        self.dropped = self._told = 0
+        self.dropped = self._events_sent = 0
         self._last_s = 0.0
         joints = bus.joint_names
         knee = "serial" if bus.metadata.get("linkage") == "none" else "linkage"
@@ -209,8 +209,8 @@ class LiveViews:
         row = self._packed(trial + self.dropped, sent, reading, *more)
         self.dropped += not self._process.send(TICK + row.tobytes(), self._within_s)
         self._last_s = float(np.nanmax([sent.time_s, self._last_s, reading.time_s.max()]))
-        if self._report and len(self._report.events) > self._told:
-            self._tell_events()
+        if self._report and len(self._report.events) > self._events_sent:
+            self._send_events()
 
     def walk_tick(self, to_servo: Callable[[Array], Array], tick: Tick) -> None:
         """Show one tick of a walk in servo angles, which `to_servo` makes of joint angles."""
@@ -230,7 +230,7 @@ class LiveViews:
         from pupper_sysid.sysid.view import guard_counts
 
         if self._report:
-            self._tell_events()
+            self._send_events()
         texts = guard_counts(self._report.summary()) if self._report else []
         self.say(*texts, *filter(None, [reason]), within_s=_WAIT_S)
         self._process.send(TEXTS + json.dumps({"events": [], "end": True}).encode(), _WAIT_S)
@@ -252,20 +252,19 @@ class LiveViews:
                 "behind. Recordings of this command are whole."
             )
 
-    def _tell_events(self) -> None:
+    def _send_events(self) -> None:
         """Send what the guard changed since the last time."""
         from pupper_sysid.sysid.view import guard_text
 
         assert self._report is not None
-        events = self._report.events[self._told :]
+        events = self._report.events[self._events_sent :]
         texts = [[time_s, guard_text(kind)] for time_s, kind in events]
         if self._process.send(TEXTS + json.dumps({"events": texts}).encode(), self._within_s):
-            self._told += len(events)
+            self._events_sent += len(events)
 
     def _answer(self, within_s: float) -> str:
         """What the writer says is wrong; empty if nothing is."""
         message = self._process.answer(within_s)
         if not message:
             return "the writer ended by itself; what it printed says why."
-        said: dict[str, Any] = json.loads(message)
-        return said["error"]
+        return json.loads(message)["error"]

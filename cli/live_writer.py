@@ -24,7 +24,7 @@ from pupper_sysid.sysid.view import McapStream, RerunStream, TickChannels
 
 Array = NDArray[np.float64]
 
-_VIEWED_EVERY_S, _FILED_EVERY_S = 0.2, 1.0  # a part for each: in a file few large ones are smaller
+_VIEWED_EVERY_S, _FILED_EVERY_S = 0.2, 1.0  # per part: a file of few large parts is smaller
 _MOST_TOGETHER = 500
 _MOST_WAITING = 20_000  # ticks; minutes of a slow disk
 _NICENESS = 5
@@ -41,13 +41,13 @@ class Writer:
         self._channels = TickChannels(self._joints, about["live"])
         self._rerun: RerunStream | None = None
         self._mcap: McapStream | None = None
-        self._made: list[Path] = []
+        self._files: list[Path] = []
         self._any = False
         self._posed_s = -np.inf
         try:
             self._open(about)
         except BaseException:
-            self._unmake()
+            self._remove_files()
             raise
 
     def _open(self, about: dict[str, Any]) -> None:
@@ -118,7 +118,7 @@ class Writer:
             self._mcap.close()
             self._file.close()
         if not self._any:
-            self._unmake()
+            self._remove_files()
 
     def _new(self, path: Path, force: bool) -> Any:
         try:
@@ -126,18 +126,18 @@ class Writer:
             file = path.open("wb" if force else "xb")
         except OSError as error:
             raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
-        self._made.append(path)
+        self._files.append(path)
         return file
 
-    def _unmake(self) -> None:
-        for path in self._made:
+    def _remove_files(self) -> None:
+        for path in self._files:
             path.unlink(missing_ok=True)
 
 
 def main() -> None:
     """Write what comes through the socket whose descriptor is the argument."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # the loop's, which then ends this
+        signal.signal(number, signal.SIG_IGN)  # Ctrl-C is for the loop, which then ends this
     with contextlib.suppress(OSError):
         os.nice(_NICENESS)
     source = socket.socket(fileno=int(sys.argv[1]))
@@ -185,7 +185,7 @@ def _receive(source: socket.socket, waiting: queue.Queue[bytes], over: threading
 
 
 def _write(writer: Writer, waiting: queue.Queue[bytes], over: threading.Event) -> None:
-    """Write parts until the end is said, or the loop's process has ended."""
+    """Write parts until the message of the end, or until the loop's process has ended."""
     ended = False
     while not ended:
         messages = [waiting.get()]
@@ -202,9 +202,9 @@ def _write(writer: Writer, waiting: queue.Queue[bytes], over: threading.Event) -
             elif message[:1] == TICK:
                 rows.append(np.frombuffer(message[1:]))
             else:
-                said = json.loads(message[1:])
-                events += [(float(at), text) for at, text in said["events"]]
-                ended |= said.get("end", False)
+                content = json.loads(message[1:])
+                events += [(float(at), text) for at, text in content["events"]]
+                ended |= content.get("end", False)
         writer.take(np.array(rows), events)
 
 

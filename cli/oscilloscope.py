@@ -33,7 +33,7 @@ _DRAW_EVERY_S = 0.2
 _STAGE_EVERY_S = 0.5
 _END_S = 2.0  # to draw a last time; a blocked terminal must not hold the command longer
 _LONGEST_LAG_S, _LAG_STEP_S = 0.4, 0.004
-_MOVES_RAD = 0.02  # less is not plotted larger, and has no lag
+_MOVES_RAD = 0.02  # smaller motions are not magnified, and have no lag
 _STILL_RAD = 0.05  # joints that move less have no traces beside others that move more
 _NARROWEST, _GAP = 36, 2  # columns of a joint's traces, and between them
 _FEWEST_ROWS = 2
@@ -273,7 +273,7 @@ def lag_s(time_s: Array, command: Array, position: Array) -> float:
 
 def main() -> None:
     """Draw what comes through the socket whose descriptor is the argument."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the loop's, which then ends this
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the loop, which then ends this
     source = socket.socket(fileno=int(sys.argv[1]))
     source.settimeout(_DRAW_EVERY_S)
     from rich.live import Live

@@ -132,7 +132,7 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
         try:
             with _sentences(arguments, program, stop) as rest:
                 yield rest
-            if stop.number:  # it ended with everything done
+            if stop.number:  # all work was done before the signal took effect
                 _stopped(stop)
         finally:
             stop.phase = "start" if stop.ends_process else "work"
@@ -142,7 +142,7 @@ def user_errors(arguments: Sequence[str], program: str) -> Iterator[list[str]]:
 @contextmanager
 def _sentences(arguments: Sequence[str], program: str, stop: Stop) -> Iterator[list[str]]:
     debug = "--debug" in arguments
-    # a stream that was closed before leads nowhere, or the next file would take its number
+    # a stream that was closed before leads to /dev/null, or the next file would take its number
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode))
@@ -172,7 +172,7 @@ def _sentences(arguments: Sequence[str], program: str, stop: Stop) -> Iterator[l
         sys.exit(error.exit_code)
     except Exception as error:
         stream = error.filename if isinstance(error, OSError) else None
-        if stream in (_OUTPUT, _ERRORS):  # its buffer would fail once more at the exit
+        if stream in (_OUTPUT, _ERRORS):  # flushing its buffer at the exit would fail again
             _silence(sys.stdout if stream == _OUTPUT else sys.stderr)
         if stop.number and (stop.phase != "robot" or _is_interrupt(error)):
             _stopped(stop)
@@ -283,7 +283,7 @@ def _silence(stream: Any) -> None:
 def _print_error(error: str) -> None:
     try:
         err.print(Text.assemble(("error: ", "red"), error))
-    except OSError:  # nowhere to say it; the exit code does
+    except OSError:  # no stream to print to: the exit code remains
         _silence(sys.stderr)
 
 

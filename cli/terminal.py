@@ -157,7 +157,7 @@ def table(title: str, *columns: str) -> Table:
         min_width=min(len(title), out.width),  # a title is broken at the table's width
     )  # fmt: skip
     for k, column in enumerate(columns):
-        # folded where it is too wide, headings between words: a number cut off at … is another
+        # folded where it is too wide, headings between words: a truncated number would be wrong
         empty.add_column(
             column, justify="left" if k == 0 else "right", no_wrap=k == 0, overflow="fold",
             min_width=max(map(len, column.split()), default=0),
@@ -257,16 +257,16 @@ def _bar(label: str, total: float, count: str) -> Iterator[Any]:
         console=err, disable=not err.is_terminal, transient=True,
     ) as bar:  # fmt: skip
         task = bar.add_task(label, total=total)
-        started = said = time.monotonic()
+        started = reported = time.monotonic()
 
         def update(**changes: Any) -> None:
-            nonlocal said
+            nonlocal reported
             bar.update(task, **changes)
-            if not err.is_terminal and time.monotonic() - said >= _LINE_S:
-                said = time.monotonic()
+            if not err.is_terminal and time.monotonic() - reported >= _LINE_S:
+                reported = time.monotonic()
                 state = bar.tasks[0]
                 err.print(f"{state.description}: {state.percentage:.0f} %, "
-                          f"{said - started:.0f} s")  # fmt: skip
+                          f"{reported - started:.0f} s")  # fmt: skip
 
         yield update
 

@@ -267,7 +267,7 @@ def _fault(fault: ErrorDetails, top: type[BaseModel], place: Place) -> str:
 def _unknown_key(name: str, fields: dict[str, FieldInfo]) -> str:
     stem = _stem(name)
     for known in fields:
-        # "delay_steps_min" is no other unit of "delay_s"; the stems must be the same word
+        # the stems must be the same word: "delay_steps_min" is no unit of "delay_s"
         if name not in fields and stem == _stem(known) != known and name.lower() != known:
             had = "has no unit in its name" if stem == name.lower() else "is in another unit"
             return f"{had}: this file holds it in {unit_of(known)}. Convert it and name it {known}."
@@ -289,7 +289,7 @@ def _not_a_mapping(value: Any, field: FieldInfo | None, meaning: str) -> str:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         return f"is {_short(value)}. Write {example}{meaning}."
     checks = (getattr(getattr(entry, "func", None), "problem", None) for entry in field.metadata)
-    problem = next((said for check in checks if check and (said := check(value))), "")
+    problem = next((reason for check in checks if check and (reason := check(value))), "")
     return f"is a bare number{f' ({problem})' if problem else ''}. Write {example}{meaning}."
 
 
@@ -333,7 +333,7 @@ def described_fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
             source = ast.parse(textwrap.dedent(inspect.getsource(base))).body
         except (OSError, TypeError):  # made at run time, or shipped without its source
             continue
-        # of a class typed at a prompt, Python 3.13 returns what else was typed with it
+        # of a class defined at a prompt, Python 3.13 returns the other lines of that input, too
         bodies = (p.body for p in source if isinstance(p, ast.ClassDef) and p.name == base.__name__)
         for line, after in pairwise(next(bodies, [])):
             if not (isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name)):

@@ -1,7 +1,7 @@
 """What a file of this project is, by its first lines, where another kind is expected.
 
 `refuse_other_kind(path, RECORDING)` refuses a calibration in a sentence that names what it is and
-what reads it, instead of what a reader of recordings trips over first.
+what reads it, instead of the first fault that a reader of recordings would meet.
 """
 
 from __future__ import annotations

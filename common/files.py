@@ -26,7 +26,7 @@ from pupper_sysid.common.reading.content import open_regular
 PACKAGE = "pupper-sysid"
 
 _LONGEST_NAME = 100  # bytes; file systems take 255, and endings are added
-_SYNC_S = 1.0  # at most this much is lost with the power
+_SYNC_S = 1.0  # at most this much is lost in a power failure
 
 
 def resolved(path: Path) -> Path:
@@ -184,7 +184,7 @@ class SyncedText:
 
     def _sync(self) -> None:
         while not self._closing.wait(_SYNC_S):
-            with suppress(OSError):  # the next write will say so
+            with suppress(OSError):  # the next write raises the error
                 os.fsync(self._file.fileno())
 
 
@@ -200,7 +200,7 @@ def holding_outputs() -> Iterator[None]:
     long as the process lives, and removed at the end of the block. One that a killed process has
     left behind is not locked, and does not count.
     """
-    if _held.get() is not None:  # a program within a program holds for both
+    if _held.get() is not None:  # an inner program's holder serves both
         yield
         return
     locks: dict[Path, _Lock] = {}
@@ -226,7 +226,7 @@ def hold_output(path: Path) -> None:
     if locks is None:
         _refuse_held(path)
     elif output not in locks:
-        with held():  # a lock that was taken is one that is released
+        with held():  # an interrupt between locking and noting would leave the lock
             locks[output] = _Lock(path, output)
 
 
@@ -259,7 +259,7 @@ def _lock_or_refuse(descriptor: int, path: Path) -> None:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         holder = os.pread(descriptor, 20, 0).decode("ascii", "replace").strip()
-        # a thread does not see what its process holds
+        # this process holds it: another thread does not see `_held`
         if error.errno in _NO_LOCKS or holder == str(os.getpid()):
             return
         raise InputError(

@@ -118,7 +118,7 @@ def write_page(
     pngs = {file.with_name(f"{file.name}.png"): p.png for file, p in drawn}
     svgs = {file.with_name(f"{file.name}.svg"): p.svg for file, p in drawn}
     csvs = {file: table.to_csv() for file, table in tables.items()}
-    with held():  # a page without its pictures is none
+    with held():  # a page needs its pictures
         for file, image in (pngs | svgs).items():
             write_bytes(file, image, force)
         for file, text in csvs.items():

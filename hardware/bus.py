@@ -54,7 +54,7 @@ class PositionLimits:
         c = self.coupling
         if c is not None:
             thigh = c.sign * allowed[c.thigh]
-            # where the two bounds of a calf contradict each other, the box wins
+            # where the two bounds of a calf contradict each other, the box applies
             calf = np.clip(allowed[c.calf], c.low_rad - thigh, c.high_rad - thigh)
             allowed[c.calf] = np.clip(calf, self.low_rad[c.calf], self.high_rad[c.calf])
         return allowed

@@ -364,7 +364,7 @@ class FrameReader:
             if length < 3 or size > _LONGEST:
                 self._drop(1)
                 continue
-            # stuffing keeps headers out of a frame: one inside starts the next
+            # byte stuffing keeps headers out of a frame: a header inside starts the next frame
             following = buffer.find(HEADER, 4, min(size - 2, len(buffer)))
             if following >= 0:
                 self._drop(following)
@@ -378,7 +378,7 @@ class FrameReader:
             body = bytes(buffer[7 : size - 2]).replace(_STUFFING, _STUFFED)
             is_status = body[0] == STATUS
             code, data = body[is_status : is_status + 1], body[is_status + 1 :]
-            # one of the other kind, or without a code, is none
+            # a frame of the other kind, or without a code, is rejected
             if is_status == self._status and code and self._plausible(buffer[4], len(data)):
                 frames.append(Frame(buffer[4], code[0], data, is_status))
             else:
@@ -439,7 +439,7 @@ class DynamixelLine(SerialLine):
         ids, arrived = list(servos), bytearray()
         head, block = fast_head([size] * len(ids)), size + FAST_BLOCK_BYTES
         reply_bytes, last_s = len(head) + len(ids) * block, 0.0
-        kind = FAST_SYNC_READ, len(ids), 0  # what precedes the blocks depends on no length
+        kind = FAST_SYNC_READ, len(ids), 0  # the wait before the blocks depends on no size
 
         def take(data: bytes) -> bool:
             nonlocal last_s

@@ -228,7 +228,7 @@ class Esp32Bus(HostClock):
         count = by_id[self._by_id]
         load = self._ask(GET_LOAD, parse_load)
         if self.now() - self._supply_s > _POWER_EVERY_S:
-            # one that cannot be is none; an older one would hide that the supply has changed
+            # an impossible voltage counts as missing: an older one would hide a change of supply
             self._supply_v = self._ask(GET_POWER, parse_supply)
             self._supply_s = self._supply_s if self._supply_v is None else self.now()
         joints = len(self.joint_names)
@@ -305,7 +305,7 @@ class Esp32Bus(HostClock):
             if counts is None:
                 break
             if last is not None:
-                # the block is refreshed between the two now and then: a third answer decides
+                # the block may be refreshed between the two readings: a third one decides
                 settled = np.where(counts == last, counts, settled)
                 if (counts == last).all():
                     break
@@ -335,7 +335,7 @@ class Esp32Bus(HostClock):
             return None
         assert self._socket is not None
         try:
-            # what is there already answers an earlier request
+            # data that are there already belong to an earlier request
             for _ in range(_MOST_OLD_REPLIES):
                 if not select.select([self._socket], [], [], 0)[0]:
                     break

@@ -168,7 +168,7 @@ SERIES = {
 
 def by_firmware(line: SerialLine, servo: int, model: int) -> Series | None:
     """STS, HLS or SCS, for a servo whose model number is not known; None if its firmware is not."""
-    # again where an answer is lost: the servo would be refused, not the line blamed
+    # repeated after a lost answer, which would otherwise look like an unknown servo
     replies = (line.read(servo, 0, 3) for _ in range(_TRIES))
     reply = next((r for r in replies if r is not None), None)
     if reply is None:

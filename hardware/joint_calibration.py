@@ -163,9 +163,9 @@ def mean_counts(readings: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArr
     """
     known = np.where(readings < 0, np.nan, readings.astype(float))
     mean, strayed = np.full((2, readings.shape[1]), np.nan)
-    some = np.isfinite(known).any(axis=0)
-    mean[some] = np.nanmean(known[:, some], axis=0)
-    strayed[some] = np.nanmax(known[:, some], axis=0) - np.nanmin(known[:, some], axis=0)
+    read = np.isfinite(known).any(axis=0)
+    mean[read] = np.nanmean(known[:, read], axis=0)
+    strayed[read] = np.nanmax(known[:, read], axis=0) - np.nanmin(known[:, read], axis=0)
     return mean, strayed
 
 
@@ -282,7 +282,7 @@ def _place(entry: dict, joint: str, start: JointMapFile, measured: Measured) -> 
     if joint in measured.limits_counts:
         entry["limits_counts"] = measured.limits_counts[joint]
         return ["offset measured", "limits measured"]
-    # the ends of the leg are where they were as seen from the middle pose
+    # the leg's ends keep their distance from the middle pose
     low, high = entry["limits_counts"]
     entry["limits_counts"] = (max(low + shift, 0), min(high + shift, start.counts - 1))
     if entry["limits_counts"][0] >= entry["limits_counts"][1]:

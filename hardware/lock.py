@@ -1,9 +1,9 @@
 """One program at a time: a lock per robot in a folder that only the user can write to.
 
-The folder is `$XDG_RUNTIME_DIR/pupper-sysid`, else `/tmp/pupper-sysid-<user id>`; nobody else may
-write there, and files in it are opened without following links and without waiting. A lock is held
-by whoever opened its file, also by a child that inherited it; so nothing that must not wait, such
-as switching the torque off, takes it.
+The folder is `$XDG_RUNTIME_DIR/pupper-sysid`, else `/tmp/pupper-sysid-<user id>`; only its
+user may write there, and files in it are opened without following links and without waiting. A lock
+is held by each process that has its file open, also by a child that inherited it; actions that must
+not wait, such as switching the torque off, therefore take no lock.
 """
 
 from __future__ import annotations

@@ -311,8 +311,8 @@ def glide(
 ) -> None:
     """Move from `origin` to `goal` [rad], shape (joints,), on a raised cosine.
 
-    `send` takes the pose of each tick. It takes `least_s`, or longer where `GENTLE_RAD_S` asks for
-    it.
+    `send` takes the pose of each tick. It takes `least_s`, or longer where `GENTLE_RAD_S`
+    requires it.
     """
     way = goal - origin
     farthest = float(np.max(np.abs(way)))

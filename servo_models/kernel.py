@@ -131,7 +131,7 @@ def _acting(x, h):
 
 
 @njit(fastmath=SAFE, error_model="numpy", inline="always")
-def _rubbed(v, force, limit, step):
+def _slowed(v, force, limit, step):
     """Velocity after a step under a force and dry friction, which turns where the velocity does."""
     forward = (v > 0.0) | ((v == 0.0) & (force > 0.0))
     slowed = v + (force - limit if forward else force + limit) * step
@@ -144,8 +144,8 @@ def _rubbed(v, force, limit, step):
 
 
 @njit(fastmath=SAFE, error_model="numpy")
-def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, shift, part, track):
-    """Positions of the servos `who` after each step, into rows 1 … `steps` of `track`."""
+def _servo(values, ids, held, edges, until, gain, load, start, steps, pad, h, shift, part, track):
+    """Positions of the servos `ids` after each step, into rows 1 … `steps` of `track`."""
     p = _table()
     y, v, s = _lanes(), _lanes(), _lanes()
     earlier, now, cut = _lanes(), _lanes(), _lanes()
@@ -158,7 +158,7 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
     begin, error, acting, pull, limit = _lanes(), _lanes(), _lanes(), _lanes(), _lanes()
     slew = friction = firmware = profile = gravity = backlash = False
     for i in range(LANES):
-        w = values[who[i]]
+        w = values[ids[i]]
         for j in range(WIDTH):
             p[j, i] = w[j]
         inertia = w[4] + load[0]
@@ -207,7 +207,7 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
                 force = clip(demand, p[2, i])
                 unclipped = 1.0 if force == demand else 0.0
                 step = clipped[i] + (braked[i] - clipped[i]) * unclipped
-                v[i] = _rubbed(v[i], force - p[3, i] * v[i], p[5, i], step)
+                v[i] = _slowed(v[i], force - p[3, i] * v[i], p[5, i], step)
                 y[i] = middle + v[i] * half
                 track[k + 1, i] = y[i]
             continue
@@ -309,7 +309,7 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
             for i in range(LANES):
                 step = clipped[i] + (braked[i] - clipped[i]) * free[i]
                 middle = y[i] + v[i] * half
-                v[i] = _rubbed(v[i], drive[i] - p[3, i] * v[i], p[5, i], step)
+                v[i] = _slowed(v[i], drive[i] - p[3, i] * v[i], p[5, i], step)
                 y[i] = middle + v[i] * half
                 track[k + 1, i] = y[i]
         else:
@@ -341,7 +341,7 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
                     limit[i] += p[12, i] * motor * motor
             for i in range(LANES):
                 middle = y[i] + v[i] * half
-                v[i] = _rubbed(v[i], drive[i] + pull[i], limit[i], acting[i])
+                v[i] = _slowed(v[i], drive[i] + pull[i], limit[i], acting[i])
                 y[i] = middle + v[i] * half
                 track[k + 1, i] = y[i]
         if backlash:
@@ -353,13 +353,13 @@ def _servo(values, who, held, edges, until, gain, load, start, steps, pad, h, sh
 
 
 @njit(fastmath=SAFE, error_model="numpy")
-def _linear(kind, values, who, held, start, steps, h, shift, part, track):
+def _linear(kind, values, ids, held, start, steps, h, shift, part, track):
     """As `_servo`, for the linear models: parameters, then the offset in the last column."""
     last = values.shape[1] - 1
     c, y, v, rest = _lanes(), _lanes(), _lanes(), _lanes()
     p = _table()
     for i in range(LANES):
-        w = values[who[i]]
+        w = values[ids[i]]
         rest[i] = start - w[last]
         track[0, i] = rest[i]
         p[0, i] = w[0]
@@ -384,13 +384,13 @@ def _linear(kind, values, who, held, start, steps, h, shift, part, track):
 
 
 @njit(fastmath=SAFE, error_model="numpy")
-def _sparse(values, who, held, start, steps, h, shift, part, track):
+def _sparse(values, ids, held, start, steps, h, shift, part, track):
     """As `_servo`, for the equation of motion of `servo_models.sparse_equation`."""
     last = values.shape[1] - 1
     c, y, v = _lanes(), _lanes(), _lanes()
     p = _table()
     for i in range(LANES):
-        w = values[who[i]]
+        w = values[ids[i]]
         y[i], v[i] = start - w[last], 0.0
         track[0, i] = y[i]
         p[0, i], p[1, i], p[2, i] = w[0] * h, w[1] * h, w[2]
@@ -411,28 +411,28 @@ def _sparse(values, who, held, start, steps, h, shift, part, track):
 
 @njit(fastmath=SAFE, error_model="numpy")
 def _simulate(
-    kind, values, dead_time, who, held, edges, until, gain, load, start, steps, pad, h, track
+    kind, values, dead_time, ids, held, edges, until, gain, load, start, steps, pad, h, track
 ):  # fmt: skip
     part, shift = _lanes(), np.zeros(LANES, np.int64)
     for i in range(LANES):
-        whole_steps = int(np.floor(dead_time[who[i]]))
-        shift[i], part[i] = pad - whole_steps, dead_time[who[i]] - whole_steps
+        whole_steps = int(np.floor(dead_time[ids[i]]))
+        shift[i], part[i] = pad - whole_steps, dead_time[ids[i]] - whole_steps
     if kind == SERVO:
         _servo(
-            values, who, held, edges, until, gain, load, start, steps, pad, h, shift, part, track
+            values, ids, held, edges, until, gain, load, start, steps, pad, h, shift, part, track
         )
     elif kind == SPARSE:
-        _sparse(values, who, held, start, steps, h, shift, part, track)
+        _sparse(values, ids, held, start, steps, h, shift, part, track)
     else:
-        _linear(kind, values, who, held, start, steps, h, shift, part, track)
+        _linear(kind, values, ids, held, start, steps, h, shift, part, track)
 
 
 @njit(inline="always")
-def _fill_lanes(first, order, who):
-    """Fill `who` with candidates from `first` on, the first repeated where there are too few."""
+def _fill_lanes(first, order, ids):
+    """Fill `ids` with candidates from `first` on, the first repeated where there are too few."""
     used = min(LANES, len(order) - first)
     for i in range(LANES):
-        who[i] = order[first + (i if i < used else 0)]
+        ids[i] = order[first + (i if i < used else 0)]
     return used
 
 
@@ -466,19 +466,19 @@ def _evaluate(
         for n in range(samples):
             last_step = max(last_step, step[n])
         steps = min(int(np.ceil(last_step)) + 2, steps)
-    who, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
+    ids, track = np.zeros(LANES, np.int64), np.empty((steps + 1, LANES))
     offset, cost, error_sum, position = _lanes(), _lanes(), _lanes(), _lanes()
     per_noise = 1.0 / noise
     until = np.full(edges.shape[1], edges.shape[1] - 1)
     for k in range(edges.shape[1] - 2, -1, -1):
         until[k] = until[k + 1] if edges[0, k] == edges[0, k + 1] else k
     for first in range(0, count, LANES):
-        used = _fill_lanes(first, order, who)
+        used = _fill_lanes(first, order, ids)
         _simulate(
             kind,
             values,
             dead_time,
-            who,
+            ids,
             held,
             edges,
             until,
@@ -491,16 +491,16 @@ def _evaluate(
             track,
         )
         for i in range(LANES):
-            offset[i], cost[i] = values[who[i], last], 0.0
+            offset[i], cost[i] = values[ids[i], last], 0.0
         if task == _POSITIONS:
             for k in range(steps + 1):
                 for i in range(used):
-                    out[k, who[i]] = track[k, i] + offset[i]
+                    out[k, ids[i]] = track[k, i] + offset[i]
         elif task == _RESIDUALS:
             for n in range(samples):
                 _positions_at(track, step[n], steps, position)
                 for i in range(used):
-                    out[who[i], n] = position[i] + offset[i] - reading[n]
+                    out[ids[i], n] = position[i] + offset[i] - reading[n]
         elif task == _COSTS:
             for n in range(samples):
                 _positions_at(track, step[n], steps, position)
@@ -509,7 +509,7 @@ def _evaluate(
                     r = (position[i] + offset[i] - read) * per_noise
                     cost[i] += np.sqrt(1.0 + r * r) - 1.0
             for i in range(used):
-                out[0, who[i]] = cost[i]
+                out[0, ids[i]] = cost[i]
         else:
             for m in range(len(later)):
                 for i in range(LANES):
@@ -522,7 +522,7 @@ def _evaluate(
                         error_sum[i] += error
                         cost[i] += error * error
                 for i in range(used):
-                    out[m, who[i]], total[m, who[i]] = error_sum[i], cost[i]
+                    out[m, ids[i]], total[m, ids[i]] = error_sum[i], cost[i]
 
 
 Simulated = tuple[int, NDArray, NDArray, NDArray, NDArray, float, NDArray, float, int, float]
@@ -567,7 +567,7 @@ def edges_of(
     return np.stack([end, np.clip(share, 0.0, 1.0)])
 
 
-def _abreast(simulated: Simulated) -> NDArray[np.int64]:
+def _order(simulated: Simulated) -> NDArray[np.int64]:
     """Candidates in order of their dead time: those abreast meet a command in about one step."""
     return np.argsort(simulated[2])
 
@@ -576,7 +576,7 @@ def positions(*simulated: *Simulated) -> NDArray[np.float64]:
     """Readings at the edges of the steps, shape (steps + 1, candidates) [rad]."""
     values, held, pad = simulated[1], simulated[3], simulated[8]
     out = np.empty((held.shape[1] - pad + 1, len(values)))
-    _evaluate(_POSITIONS, _abreast(simulated), *simulated, _NONE, _NONE, 1.0, _NONE, out, _NO_TABLE)
+    _evaluate(_POSITIONS, _order(simulated), *simulated, _NONE, _NONE, 1.0, _NONE, out, _NO_TABLE)
     return out
 
 
@@ -589,9 +589,7 @@ def residuals(
     measured, in steps, and their values [rad].
     """
     out = np.empty((len(simulated[1]), len(step)))
-    _evaluate(
-        _RESIDUALS, _abreast(simulated), *simulated, step, reading, 1.0, _NONE, out, _NO_TABLE
-    )
+    _evaluate(_RESIDUALS, _order(simulated), *simulated, step, reading, 1.0, _NONE, out, _NO_TABLE)
     return out
 
 
@@ -604,7 +602,7 @@ def costs(
     Parameters as for `residuals`.
     """
     out = np.empty((1, len(simulated[1])))
-    _evaluate(_COSTS, _abreast(simulated), *simulated, step, reading, noise, _NONE, out, _NO_TABLE)
+    _evaluate(_COSTS, _order(simulated), *simulated, step, reading, noise, _NONE, out, _NO_TABLE)
     return out[0]
 
 
@@ -619,5 +617,5 @@ def moments_if_later(
     both of shape (delays, candidates), in rad and rad².
     """
     total, square = np.zeros((2, len(later), len(simulated[1])))
-    _evaluate(_MOMENTS, _abreast(simulated), *simulated, step, reading, 1.0, later, total, square)
+    _evaluate(_MOMENTS, _order(simulated), *simulated, step, reading, 1.0, later, total, square)
     return total, square

@@ -146,9 +146,9 @@ def save_servo_model(
         refuse_overwrite(folder / name, force)
     data = save_tensors({k: np.ascontiguousarray(v) for k, v in parameters.items()})
     complete = _validated({**contract, "weights_sha256": hashlib.sha256(data).hexdigest()}, folder)
-    _build(complete, parameters, folder)  # what cannot be read back is not written
+    _build(complete, parameters, folder)  # check that it can be read back before it is written
     text = json.dumps(complete.model_dump(mode="json", by_alias=True), indent=2, ensure_ascii=False)
-    with held():  # weights without a contract are no model
+    with held():  # both files or none: weights without a contract are no model
         write_bytes(folder / WEIGHTS, data, force)
         write_text(folder / CONTRACT, text + "\n", force)
     return complete

@@ -46,7 +46,7 @@ CONTROL_S = 0.02
 _LOOP_TONES, _LOOP_TONE_S = 24, 1.0
 _TRIALS = 21
 _LIKE_USUAL = 2.0  # in a quarter of a step one eighth of the squared error
-_FAR_RAD = 100.0  # further than a servo goes, near enough to be squared
+_FAR_RAD = 100.0  # beyond any servo's travel; small enough to be squared
 _UNSTABLE_STEP = (
     "a servo of this calibration is not stable in physics steps of {:g} ms; take shorter ones."
 )

@@ -149,7 +149,7 @@ class _Track:
         self._rows.append((sent, env.readings[0].copy(), env.robots.qpos[0].copy()))
 
     def write(self, options: Play) -> None:
-        """Write what was asked for."""
+        """Write the files that the options name."""
         if not self._rows or (options.rerun is None and options.mcap is None):
             return
         from pupper_sysid.policies.twin.drawing import bodies_over_time

@@ -59,7 +59,7 @@ class Stop:
         self._phase: Phase = "start" if ends_process else "work"
         self._begun_s = self._first_s = 0.0  # of the phase, of the first signal
         self._before: dict[int, Any] = {}
-        self._line = threading.Lock()  # taken by whoever writes the last line
+        self._line = threading.Lock()  # acquired by the thread that writes the last line
         self._held, self._pending, self._swallowed = 0, False, False
         self._say: Callable[[str], None] = _write_line
         self._wake, self._seen = -1, 0
@@ -310,5 +310,5 @@ def _write_line(line: str) -> None:
     with suppress(OSError, ValueError):
         # over a progress bar, with the cursor that it has hidden
         start = "\r\x1b[2K\x1b[?25h" if os.isatty(2) else ""
-        if select.select([], [2], [], 0.1)[1]:  # a full pipe must not hold up the end
+        if select.select([], [2], [], 0.1)[1]:  # a full pipe must not delay the end
             os.write(2, f"{start}{line}\n".encode())

@@ -11,9 +11,9 @@ work once. Forking the program itself would copy locks that another of its threa
 server is kept for the next pool.
 
 Each worker has a socket to this process and nothing else in common with it: no semaphore, no
-shared memory, no thread here. When the socket closes, because its pool was left or because this
-process has ended in whatever way, the worker ends in the midst of its work. Workers and server
-ignore the signals of a terminal: what they mean is decided here.
+shared memory, no thread here. When the socket closes, because the block of its pool has
+ended or this process has died, the worker ends at once. Workers and server ignore the signals of a
+terminal, which only this process handles.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ class Workers:
         return self._streams[-1]
 
     def _send(self, stream: socket.socket, task: list[Any]) -> None:
-        data = pickle.dumps(task)  # first: what cannot be pickled is the caller's mistake
+        data = pickle.dumps(task)  # first, so that the caller gets its errors
         try:
             _write(stream, data)
         except OSError:
@@ -304,7 +304,7 @@ def serve(descriptor: int, parent: int) -> None:
         _end_with(parent)
 
     def report(*_: object) -> None:
-        """Say how workers ended, unless they were asked to."""
+        """Report how workers ended, unless their end was requested."""
         with suppress(ChildProcessError):
             while (ended := os.waitpid(-1, os.WNOHANG))[0]:
                 if os.WIFSIGNALED(ended[1]):
@@ -321,7 +321,7 @@ def serve(descriptor: int, parent: int) -> None:
         for line in lines:
             order = json.loads(line)
             for module in order["modules"]:
-                with suppress(Exception):  # what is missing is reported by the work that needs it
+                with suppress(Exception):  # a missing module is reported by the work that needs it
                     import_module(module)
             for _ in range(order["fork"]):
                 _fork(orders, descriptors.popleft(), order["folder"])
@@ -354,7 +354,7 @@ def _end_with(parent: int) -> None:
     """Have the kernel kill this process when its parent ends; only Linux can."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it ended before the kernel was asked
+    if os.getppid() != parent:  # it ended before the call to the kernel
         os._exit(1)
 
 

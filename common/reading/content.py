@@ -1,6 +1,6 @@
 """Content of regular files, within a limit; pipes, devices and folders are refused.
 
-A name may stand for anything: a pipe nobody writes to blocks its reader for ever, a device never
+A name may stand for anything: a pipe without a writer blocks its reader for ever, a device never
 ends, a file under /proc has no size. The file is therefore opened without waiting, and looked at
 before and while it is read. `unpacked` undoes a compression, within the same limit.
 
@@ -124,7 +124,7 @@ def content(path: Path | str, most_bytes: float, remedy: str = "") -> bytes:
             pieces, total = [], 0
             while piece := file.read(max(size - total + 1, _PIECE)):
                 pieces.append(piece)
-                total += len(piece)  # one that grows, or has no size
+                total += len(piece)  # the file grows, or has no size
                 refuse_more(path, total, most_bytes, "bytes", remedy, exact=False)
             if piece is None:
                 raise InputError(f"{path} cannot be read: nothing comes. {remedy}".rstrip())
@@ -211,8 +211,8 @@ def _bounded(path: Path | str, pieces: Iterable[bytes], most_bytes: float) -> by
 
 
 def _unreadable(path: Path | str, error: Exception, remedy: str) -> InputError:
-    said = getattr(error, "strerror", None) or error
-    return InputError(f"{path} cannot be read: {said}. {remedy}".rstrip())
+    reason = getattr(error, "strerror", None) or error
+    return InputError(f"{path} cannot be read: {reason}. {remedy}".rstrip())
 
 
 def _flag(name: str) -> int:

@@ -278,7 +278,7 @@ class _Blocks:
         rows = {n: _cells(path, n, line) for n, line in enumerate(block.split("\n"), first)
                 if line[:1] != "#" and line.strip()}  # fmt: skip
         if not self._strict:
-            # in a table of numbers no remark has a number or a time of day
+            # in a table of numbers, lines without a number or a time of day are remarks
             remarks = [n for n, row in rows.items()
                        if not any(is_decimal(cell) or is_clock(cell) for cell in row)]  # fmt: skip
             rows = self._without(rows, remarks, len(rows) - 1)

@@ -348,17 +348,17 @@ def _hexadecimal(cells: Sequence[Sequence[str]]) -> dict[int, int]:
             if all(m and m[2] for m in matches):
                 marked.add(k)
     widths = {k: {*map(len, texts)} for k, texts in columns.items()}
-    sure = {
+    certain = {
         k for k, texts in columns.items()
         if (k in marked or any({*cell} & {*"abcdf"} for cell in texts))
         and 2 * sum(map(str.isalpha, texts)) < len(texts)
         and ((len(widths[k]) == 1 and min(widths[k]) > 2) or len({*texts}) > _LABELS)
     }  # fmt: skip
-    wide = [widths[k] for k in sure if len(widths[k]) == 1]
+    wide = [widths[k] for k in certain if len(widths[k]) == 1]
     signed = {}
     for k, texts in columns.items():
-        like = len(widths[k]) == 1 and widths[k] in wide and texts != sorted(texts)
-        if k in sure or like:
+        resembles = len(widths[k]) == 1 and widths[k] in wide and texts != sorted(texts)
+        if k in certain or resembles:
             turn = 16 ** len(texts[0])
             numbers = [int(cell, 16) for cell in texts]
             near = all(min(n, turn - n) < turn / 4 for n in numbers)

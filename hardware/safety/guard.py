@@ -76,7 +76,7 @@ class RateLimit:
         high = np.minimum(np.maximum(self._velocity, 0.0) + gain, self._speed)
         velocity = np.clip(requested, low, high)
         exceeded = velocity != requested
-        # over all of a late tick the joint was slower than that
+        # averaged over a late tick the joint was slower than that
         self._velocity = velocity * min(dt / min(max(since_s, 1e-4), _LONGEST_TICK_S), 1.0)
         if not exceeded.any():
             return command
@@ -89,7 +89,7 @@ _MOST_EVENTS = 500  # that a report keeps; all are counted
 _PARK_PERIOD_S = 0.02
 _TORQUE_OFF_TRIES = 10
 _STALE_S = 0.1  # older than any feedback age
-_LOCATE_TRIES = 10  # a lost reading is no reason to leave a robot where its driver died
+_LOCATE_TRIES = 10  # so that a lost reading does not keep the robot from parking
 
 
 @dataclass
@@ -187,7 +187,7 @@ class GuardedBus:
         """
         with self.spent.on(GUARD):
             command = np.asarray(position_rad, float)
-            # one that is no number would stay in the velocity
+            # NaN would stay in the velocity
             if command.shape != self._present.shape or np.isnan(command).any():
                 expected = f"{len(self.joint_names)} numbers"
                 raise BusError(f"{self.name}: a command must be {expected}, got {command}.")
@@ -235,7 +235,7 @@ class GuardedBus:
                 if name not in self.registers.originals.get(joint, {}):
                     self.set_register(joint, name, value)
         if self._watchdog:
-            # before the first servo is on: a driver killed from here on leaves some that are
+            # before the first servo is on: a driver killed from here on leaves servos switched on
             self._watchdog.arm(self.joint_names, home)
         self._on = True
         if not self.bus.torque(True):
@@ -328,7 +328,7 @@ class GuardedBus:
                 if self.bus.torque(False):
                     self._left_on = False
                     break
-                self._beat()  # a faulty line takes its time
+                self._beat()  # exchanges on a faulty line run into time-outs
             except KeyboardInterrupt as pressed:
                 interrupted = pressed
             except Exception:  # of whatever kind: the torque is still on
@@ -444,7 +444,7 @@ class ChangedRegisters:
         values = self.originals.setdefault(joint, {})
         if name not in values:
             values[name] = self._bus.register(joint, name)
-            self._tell()
+            self._update_watchdog()
         self._bus.set_register(joint, name, value)
 
     def restore(self) -> bool:
@@ -461,10 +461,10 @@ class ChangedRegisters:
                     except BusError:
                         self._bus.sleep_until(self._bus.now() + _PAUSE_S)
         self.originals = {joint: values for joint, values in self.originals.items() if values}
-        self._tell()
+        self._update_watchdog()
         return not self.originals
 
-    def _tell(self) -> None:
+    def _update_watchdog(self) -> None:
         if self._watchdog:
             self._watchdog.restore(self.originals)
 

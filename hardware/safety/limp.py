@@ -1,4 +1,4 @@
-"""Switch a robot's torque off from outside, whoever drives it and whatever holds its lock."""
+"""Switch a robot's torque off from outside, whichever program drives it or holds its lock."""
 
 from __future__ import annotations
 

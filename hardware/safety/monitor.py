@@ -257,7 +257,7 @@ class Monitor:
             )
 
     def _why_still(self, k: int, otherwise: str) -> str:
-        """Why a joint does not move, and what to do; asks its servo for its torque."""
+        """Why a joint does not move, and what to do; reads whether its servo lost its torque."""
         ask = getattr(self._bus, "has_lost_torque", None)
         if ask is not None and ask(self._names[k]):
             return (
@@ -292,9 +292,9 @@ class Monitor:
         sent = np.array([x for t, x in self._commands if t >= since] or [goal])
         read = np.array([x for t, x in self._readings if t >= now - 0.3])
         resting = np.ptp(sent, axis=0) < 0.02
-        some = np.isfinite(read).any(axis=0)
+        has_readings = np.isfinite(read).any(axis=0)
         away = np.zeros(len(self._names))
-        away[some] = np.nanmedian(read[:, some], axis=0) - goal[some]
+        away[has_readings] = np.nanmedian(read[:, has_readings], axis=0) - goal[has_readings]
         k = _first(resting & (np.abs(away) > self._limits.astray_rad))
         if k is not None:
             raise SafetyStop(

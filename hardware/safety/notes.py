@@ -1,8 +1,8 @@
-"""Notes of robots whose torque is on, for whoever finds that both of their processes are gone.
+"""Notes of robots whose torque is on, for the case that driver and watchdog both die.
 
 A driver writes one, into the runtime folder (`hardware.lock`), before it switches the torque on; it
-names the bus, the joints, the driver and its watchdog. Whichever of the two has switched the torque
-off removes it. `pupper-sysid park` switches off what notes name whose processes do not run.
+names the bus, the joints, the driver and its watchdog. The process that switches the torque off
+removes it. `pupper-sysid park` switches off the robots of notes whose processes do not run.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def write_note(orders: dict[str, Any], joints: Sequence[str], watchdog: int) -> 
     """
     processes = [[number, _state(number)[1]] for number in (orders["driver"], watchdog)]
     text = json.dumps(orders | {"joints": list(joints), "processes": processes}).encode()
-    with contextlib.suppress(PupperError, OSError):  # it may be impossible, and is not needed
+    with contextlib.suppress(PupperError, OSError):  # may be impossible; not needed
         descriptor = open_here(_name(orders["where"]), os.O_WRONLY | os.O_TRUNC)
         try:
             os.write(descriptor, text)
@@ -81,7 +81,7 @@ def notes() -> list[Note]:
     """All notes that can be read."""
     readable = []
     for path in sorted(runtime_folder().glob(f"*{_END}")):
-        # half of one, another version's, or removed meanwhile
+        # incomplete, of another version, or removed meanwhile
         with contextlib.suppress(
             PupperError, OSError, ValueError, KeyError, TypeError, AttributeError
         ):

@@ -8,8 +8,8 @@ that the driver had changed.
 Switching the torque off takes no lock: a program that waits for the driver's end, or a child that
 inherited its descriptor, holds it. It is tried until every servo has confirmed, also if the line is
 gone for a day. Only a line that cannot come back ends it: a pseudo-terminal, or a socket whose
-folder was removed. What has not succeeded is said in the system's log and in `watchdog.log` of the
-runtime folder (`hardware.lock`).
+folder was removed. Failures are written to the system's log and to `watchdog.log` of the runtime
+folder (`hardware.lock`).
 
     python -P -m pupper_sysid.hardware.safety.watchdog_process    (started by `watchdog.Watchdog`)
 """
@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-# everything that parking needs is loaded at the start, not when it is urgent
+# imported at the start, so that parking does not wait for imports
 from pupper_sysid.common.errors import PupperError
 from pupper_sysid.hardware.address import BusAddress
 from pupper_sysid.hardware.joint_map import JointMap
@@ -52,7 +52,7 @@ _RESTORE_WITHIN_S = 10.0
 
 @dataclass
 class _Orders:
-    """What the driver wants done if it is gone."""
+    """What is to be done when the driver has ended."""
 
     address: BusAddress
     joint_map: JointMap
@@ -71,7 +71,7 @@ class _Orders:
         """Take a message of the driver."""
         try:
             message: dict[str, Any] = json.loads(line)
-        except ValueError:  # half of one: the pipe was full
+        except ValueError:  # incomplete: the pipe was full
             message = {"limp": True}
         self.done |= "bye" in message
         self.patience_s = SWITCH_ON_S if "arm" in message else HANG_S
@@ -152,7 +152,7 @@ def park(orders: _Orders) -> None:
             else:
                 joints = _go_home(orders)
         except Exception:  # of whatever kind, a lack of memory too: the torque may be on
-            # the driver's lock goes with its last thread, which can take a moment
+            # the driver's lock is released with its last thread, which can take a moment
             time.sleep(0.02 if now - start < _SOON_S else 1.0)
             continue
         if joints and now - start > _SOON_S:

@@ -347,7 +347,7 @@ class SerialBus(HostClock):
                 return False
         address = series.register("torque_enable").address
         self.line.write(servo.id, address, bytes([int(on)]))
-        # an acknowledgement could be a late one, a value that is read back cannot
+        # an acknowledgement could belong to an earlier request, a value that is read back cannot
         now = self.line.read(servo.id, address, 1)
         return now is not None and now.frame.data == bytes([int(on)])
 
@@ -388,13 +388,13 @@ class SerialBus(HostClock):
 
     def _plausible(self, servo: LineServo, index: int, at: float, count: int) -> bool:
         """Whether the servo can be there: 1 garbled frame in 256 has a correct checksum."""
-        # outside the encoder's range by a homing offset, or turns: a value, too
+        # valid too: outside the encoder's range by a homing offset, or by full turns
         turns = self._turns * servo.series.counts
         if not -turns <= count < turns + servo.series.counts:
             return False
         per_rad = float(self.joint_map.counts_per_rad()[index])
 
-        def near(since_s: float, from_count: int) -> bool:  # anything is, of long ago
+        def near(since_s: float, from_count: int) -> bool:  # any is, if the last one is old
             farthest = _SLACK_RAD + _FASTEST_RAD_S * (at - since_s)
             return abs(count - from_count) <= per_rad * farthest
 

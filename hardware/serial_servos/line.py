@@ -239,7 +239,7 @@ class SerialLine(ABC):
         for servo in servos:
             if not self._sent(lambda servo=servo: self.ask_model(servo)):
                 continue
-            self._port.keeps_old = True  # until all have been asked
+            self._port.keeps_old = True  # until each has had its request
             sent.add(self._port.sent)
             need_s = len(self._port.sent) * self._byte_s() + wire
             requests[servo] = time.monotonic() + need_s
@@ -255,7 +255,7 @@ class SerialLine(ABC):
     def find(self, servos: Sequence[int], patiently: bool = True) -> dict[int, int]:
         """Those of `servos` that answer, with their model numbers; measures the latency.
 
-        All are asked once (`roll_call`). Silent ones are asked again with the patience that the
+        All are pinged once (`roll_call`). Silent ones are pinged again with the patience that the
         replies show to be needed, and once more with ten times that; not `patiently`, by another
         roll call only.
         """
@@ -541,18 +541,18 @@ def slow_adapter(line: SerialLine) -> str | None:
     """Sentence about an adapter that delays replies, with the cure; None if it is fast."""
     if line.latency_s < SLOW_ADAPTER_S:
         return None
-    said = (
+    late = (
         f"{line.device}: replies come {1e3 * line.latency_s:.0f} ms later than bytes and servos "
         "need, so every reading's time is uncertain by half of that and a loop can be no faster."
     )
     timer_s = latency_timer_s(line.device)
     if timer_s is None:
         return (
-            f"{said} The USB adapter collects bytes, which another adapter or its driver cures, or "
+            f"{late} The USB adapter collects bytes, which another adapter or its driver cures, or "
             "this computer is busy with other work."
         )
     return (
-        f"{said} The adapter's latency timer is {1e3 * timer_s:.0f} ms: "
+        f"{late} The adapter's latency timer is {1e3 * timer_s:.0f} ms: "
         f"`echo 1 | sudo tee {_latency_timer(line.device)}`."
     )
 

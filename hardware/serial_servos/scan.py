@@ -71,8 +71,8 @@ def scan_line(
 ) -> LineReport:
     """Servos of a line, at all rates; `advance` is called with each rate tried, in words.
 
-    Every id is asked until a rate with servos is found; at the remaining rates the ids that robots
-    use. Silent ids are asked again where servos answer, and gaps between ids a third time.
+    Every id is pinged until a rate with servos is found; at the remaining rates the ids that robots
+    use. Silent ids are pinged again where servos answer, and gaps between ids a third time.
     """
     servos: list[ServoReport] = []
     remarks: list[str] = []
@@ -116,10 +116,10 @@ def scan_line(
         )
     delay_us = {s.id: s.return_delay_us for s in servos if s.return_delay_us is not None}
     if slow := [servo for servo, us in delay_us.items() if us > 1e6 * _SLOW_RETURN_S]:
-        whose, have = ("Servos", "have") if len(slow) > 1 else ("Servo", "has")
+        subject, have = ("Servos", "have") if len(slow) > 1 else ("Servo", "has")
         delays = " or ".join(map(str, sorted({delay_us[servo] for servo in slow})))
         remarks.append(
-            f"{whose} {ids_in_words(slow)} {have} a return delay of {delays} µs; 0 would make "
+            f"{subject} {ids_in_words(slow)} {have} a return delay of {delays} µs; 0 would make "
             "reading faster."
         )
     return LineReport(family.name, device, first, servos, remarks)

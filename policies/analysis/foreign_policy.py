@@ -9,7 +9,7 @@
 What the file needs to say: joints in the order of the actions, default pose, action scale, time
 between two actions, and the observation as a list of named terms. mjlab's exporter (and so
 microduck's) writes the first three and the terms into the metadata; the YAML adds what is missing,
-and goes before the metadata::
+and takes precedence over the metadata::
 
     joints: [left_hip_yaw, …]            # joint_names of the metadata
     default_pose_rad: [0, -0.09, …]      # or by joint; default_joint_pos

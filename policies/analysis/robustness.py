@@ -190,7 +190,7 @@ def _replayed(
 def _agreements(policy: Policy, plain: Rollout, changes: Sequence[Change]) -> list[float]:
     """Gait correlation of replayed actions with the walk's, mean over walking robots."""
     agreements = []
-    for start in range(0, len(changes), _REPLAYED):  # a few at a time, for their memory's sake
+    for start in range(0, len(changes), _REPLAYED):  # a few at a time, to limit memory
         for altered in _replayed(policy, plain, changes[start : start + _REPLAYED]):
             alike = [
                 correlation(plain.action[now, i], altered[now, i])
@@ -244,7 +244,7 @@ def _measured(walked: Rollout) -> dict[str, Any]:
     shares = np.zeros(walked.alive.shape[1])
     if not len(robots) or len(walked.position) <= start + 1:
         return {
-            # a fallen robot has share 0; of one that is up, nothing is known yet
+            # a fallen robot has share 0; a walk so short gives none of one that is up
             "share": UNKNOWN if len(robots) else mean_of(shares),
             "drift": UNKNOWN, "arc_rad_m": UNKNOWN, "wander_m": UNKNOWN, "path": np.zeros((0, 2)),
         }  # fmt: skip

@@ -210,7 +210,7 @@ class FrozenReadings:
             return
         moved = np.ptp(np.array(self._moved)[: -self._late], axis=0)
         read = np.array(self._read)
-        # a joint without any reading is the guard's business
+        # the guard stops the robot for a joint without readings
         spread = np.nanmax(read, axis=0, initial=-np.inf) - np.nanmin(read, axis=0, initial=np.inf)
         noise = np.maximum(_FOLLOWS_SHARE * moved, _SAME_RAD)
         frozen = (moved > _MOVED_RAD) & (spread >= 0) & (spread < noise)

@@ -38,7 +38,7 @@ _SHORTEST_S = 1e-3  # least time between samples
 _NO_FORCE_M_S2 = 0.1  # below: free fall, or a failed read of zeros
 _CLIPPED_M_S2 = 0.999 * 2 * STANDARD_GRAVITY  # the highest code is one short of ±2 g
 _MOST_GYRO_SPREAD_RAD_S = 0.03  # 27 counts of the robot's gyro
-_MOST_GYRO_BIAS_RAD_S = 0.3  # 17°/s without spread is an even turn, not a bias
+_MOST_GYRO_BIAS_RAD_S = 0.3  # 17°/s; more without spread is an even rotation, not a bias
 _MOST_FORCE_ERROR_M_S2 = 1.0
 _MOST_TILT_DEG = 30.0
 
@@ -293,7 +293,7 @@ class Controller:
         speed = np.zeros(3)
         if self.policy.contract.base_velocity != "zero":
             speed[:2] = _PUBLISHED_SPEED_SHARE * senses.command[:2]
-        # a reading beyond the range of single precision becomes infinite; the output tells
+        # a reading beyond single precision becomes infinite, which the check of the output detects
         with np.errstate(over="ignore"):
             observation = np.concatenate(
                 [

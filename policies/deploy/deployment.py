@@ -205,7 +205,7 @@ def _walk(
                              loop.missed_deadlines, sent.time_s)
                     )  # fmt: skip
             outcome.seconds = elapsed
-            if not decision.observation[_GRAVITY][2] <= -FALLEN_TILT:  # nor is NaN upright
+            if not decision.observation[_GRAVITY][2] <= -FALLEN_TILT:  # NaN counts as fallen
                 outcome.fell = True
                 raise SafetyStop(f"the robot fell after {elapsed:.2f} s.")
     finally:

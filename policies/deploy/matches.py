@@ -316,9 +316,9 @@ def servo_match(trained: TrainedServo, servos: ServoRanges) -> ServoMatch | None
     outside: list[Outside] = []
     compared = 0
     for name, servo in joints_of(servos).items():
-        for quantity, unit, factor, relative, of in _QUANTITIES:
-            expected = of(trained.joints[name], trained.voltage_scale, trained.poll_scale)
-            measured = of(servo, _NOTHING, _NOTHING)
+        for quantity, unit, factor, relative, number_of in _QUANTITIES:
+            expected = number_of(trained.joints[name], trained.voltage_scale, trained.poll_scale)
+            measured = number_of(servo, _NOTHING, _NOTHING)
             if expected is not None and measured is not None:
                 compared += 1
                 expected, measured = expected.times(factor), measured.times(factor)

@@ -139,7 +139,7 @@ class _Start(BaseModel):
     start_rad: list[float]
 
     @model_validator(mode="after")
-    def _one_each(self) -> Self:
+    def _start_of_each_joint(self) -> Self:
         if len(self.start_rad) != len(self.joints):
             raise ValueError(f"start_rad is not {len(self.joints)} numbers, one per joint")
         return self

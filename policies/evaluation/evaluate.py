@@ -302,12 +302,12 @@ def _effort(walk: Walk, travels: bool) -> dict[str, Any]:
     }
 
 
-def share_interval(some: int, of: int) -> Interval:
+def share_interval(count: int, total: int) -> Interval:
     """Share with its interval by Clopper and Pearson."""
     tail = (1 - LEVEL) / 2
-    low = float(beta.ppf(tail, some, of - some + 1)) if some else 0.0
-    high = float(beta.ppf(1 - tail, some + 1, of - some)) if some < of else 1.0
-    return Interval(some / of, low, high)
+    low = float(beta.ppf(tail, count, total - count + 1)) if count else 0.0
+    high = float(beta.ppf(1 - tail, count + 1, total - count)) if count < total else 1.0
+    return Interval(count / total, low, high)
 
 
 BEFORE_S = 0.2

@@ -281,11 +281,11 @@ def _errors_figure(evaluation: Evaluation) -> Figure:
     axes = figure.subplots(1, len(STRIDE_ERRORS), sharey=True)
     place = -np.arange(len(rows))
     for key, (name, unit), panel in zip(STRIDE_ERRORS, ERROR_UNITS.values(), axes, strict=True):
-        for off, walker in ((0.15, "policy"), (-0.15, "trot")):
+        for offset, walker in ((0.15, "policy"), (-0.15, "trot")):
             for at, row in zip(place, rows, strict=True):
                 figures: Figures = getattr(row, walker)
                 colour = FAINT if walker == "trot" else RED if figures.fall_rate > 0 else BLUE
-                _point(panel, getattr(figures.intervals, key), at + off, 1.0, colour)
+                _point(panel, getattr(figures.intervals, key), at + offset, 1.0, colour)
         panel.axvline(getattr(still, key), color=FAINT, ls=":")
         panel.set_title(f"{name}, {unit}", fontsize=9)
         panel.set_xlim(left=0)
@@ -300,9 +300,9 @@ def _falls_figure(evaluation: Evaluation) -> Figure:
     figure = Figure(figsize=(WIDTH_IN, 1.2 + 0.3 * len(rows)), layout="constrained")
     axes = figure.subplots()
     place = -np.arange(len(rows))
-    for off, walker, colour in ((0.2, "policy", BLUE), (0.0, "trot", FAINT)):
+    for offset, walker, colour in ((0.2, "policy", BLUE), (0.0, "trot", FAINT)):
         for at, row in zip(place, rows, strict=True):
-            _point(axes, getattr(row, walker).intervals.fall_rate, at + off, 100.0, colour)
+            _point(axes, getattr(row, walker).intervals.fall_rate, at + offset, 100.0, colour)
     still = [100 * row.standing.fall_rate for row in rows]
     axes.plot(still, place - 0.2, "o", mfc="none", mec=FAINT, ms=4, ls="none")
     axes.set_xlim(-2, 102)

@@ -204,7 +204,7 @@ class OnnxNetwork:
             raise InputError(f"{self.path} cannot be run: {_line(error)}.") from error
 
     def _evaluate(self, inputs: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
-        # saturated activations overflow on their way; what is no number is refused at the gate
+        # saturated activations overflow in between; the gate refuses outputs that are no numbers
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return self._evaluator.run(self._outputs, dict(zip(self._inputs, inputs, strict=True)))

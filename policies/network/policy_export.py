@@ -120,13 +120,13 @@ def _largest_difference(network: PolicyNetwork, run: Run) -> float:
     """Largest difference of actions over a few steps, each with its own state."""
     generator = torch.Generator().manual_seed(0)
     state = network.initial_state(1)
-    theirs: tuple[torch.Tensor, ...] = state
+    exported_state: tuple[torch.Tensor, ...] = state
     worst = 0.0
     for _ in range(_STEPS):
         seen = torch.randn(1, network.observation_size, generator=generator)
         with torch.inference_mode():
             action, *now = network(seen, *state)
-        exported, *next_ = run(seen, *theirs)
+        exported, *next_ = run(seen, *exported_state)
         worst = max(worst, float((action - exported).abs().max()))
-        state, theirs = tuple(now), tuple(next_)
+        state, exported_state = tuple(now), tuple(next_)
     return worst

@@ -161,7 +161,7 @@ class TrainedServo(_Part):
     joints: dict[str, ServoNumbers] | None
 
     @model_validator(mode="after")
-    def _whole(self) -> Self:
+    def _joints_suit_kind(self) -> Self:
         if (self.joints is None) != (self.kind == "learned"):
             raise ValueError("joints must be null if, and only if, kind is learned")
         return self

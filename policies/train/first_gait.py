@@ -71,7 +71,7 @@ _MOST_CORRECTION = 1.6  # of a gain, in one generation
 
 _BOX = {
     "frequency_hz": (1.8, 5.0), "duty": (0.5, 0.85), "lift_m": (0.009, 0.03),
-    "crouch_m": (-0.015, 0.03),  # straighter legs ask less torque of the knees
+    "crouch_m": (-0.015, 0.03),  # straighter legs need less torque at the knees
     "spread_m": (0.0, 0.015), "gain": (0.5, 2.5), "back_gain": (0.5, 2.0),
     "side_gain": (0.5, 2.0), "turn_gain": (0.4, 2.5),
 }  # fmt: skip
@@ -289,7 +289,7 @@ def fit_trot(
     judged.
     """
     rng = np.random.default_rng([seed, 6])
-    quick = _quick(task, servos)
+    quick = _search_task(task, servos)
     box = _box(task.body)
     low, high = np.array(list(box.values())).T
     mean = np.clip([getattr(task.trot, name) for name in box], low, high)
@@ -321,7 +321,7 @@ def fit_trot(
     trots = [task.trot, _trot(task.trot, box, mean), *best]
     walked = _judged(trots, task, servos, seed, threads)
     before = _score(walked[0])
-    # in the physics of evaluation the speeds are a little others
+    # in the physics of evaluation the speeds differ a little
     more = [_corrected(trot, walk) for trot, walk in zip(trots, walked, strict=True)]
     walked += _judged(more, task, servos, seed, threads)
     trots += more
@@ -344,21 +344,21 @@ def _judged(
 ) -> list[_Walked]:  # fmt: skip
     command = np.repeat(within(task, COMMANDS), _EACH, axis=0)
     return _walk(
-        trots, _gentle(task, _SECONDS), servos, command, _SECONDS, _IGNORED_S, seed, threads,
+        trots, _evaluated(task, _SECONDS), servos, command, _SECONDS, _IGNORED_S, seed, threads,
         changes,
     )  # fmt: skip
 
 
-def _gentle(task: Walking, seconds: float) -> Walking:
+def _evaluated(task: Walking, seconds: float) -> Walking:
     """The task as it is evaluated, on the servos themselves: their scale is not drawn."""
     gentle = evaluation_task(task, 2 * seconds)  # longer, so that no episode ends but by a fall
     random = replace(gentle.randomisation, torque_scale=(1.0, 1.0))
     return replace(gentle, commands=task.commands, randomisation=random)
 
 
-def _quick(task: Walking, servos: ServoRanges) -> Walking:
+def _search_task(task: Walking, servos: ServoRanges) -> Walking:
     """The task of the search: as evaluated, but in the physics of training and in longer steps."""
-    quick = replace(_gentle(task, _SEARCH_S), physics="training")
+    quick = replace(_evaluated(task, _SEARCH_S), physics="training")
     steps = task.control_step_s / _SEARCH_STEP_S
     if abs(steps - round(steps)) > 1e-6:
         return quick
@@ -519,7 +519,7 @@ def _score(walk: _Walked) -> GaitScore:
 
 
 def _cost(walk: _Walked) -> float:
-    """What is searched: 1 minus the judge's score, and what the gait asks of feet and servos."""
+    """Cost of the search: 1 minus the judge's score, and terms of clearance, torque and sway."""
     clearance = float(np.quantile(walk.clearance_m, 0.1)) if len(walk.clearance_m) else 0.0
     terms = {
         "clearance": _lacking(clearance / walk.length),
@@ -576,7 +576,7 @@ def _limit(
         return None  # a learned model has no numbers
     names, changes = list(_LIMITS), list(_LIMITS.values())
     walked = _judged([trot] * len(names), task, servos, seed, threads, changes)
-    # servos without a limit go farther than the gains expect, which says nothing against them
+    # without the limit servos go farther than the gains expect: correct the gains first
     trots = [_corrected(trot, walk) for walk in walked]
     walked = _judged(trots, task, servos, seed, threads, changes)
     merits = [_merit(_score(walk)) for walk in walked]

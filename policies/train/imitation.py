@@ -232,7 +232,7 @@ def _features(share: Array) -> Array:
 def imitate(
     learner: Learner,
     teacher: Teacher,
-    how: Imitation,
+    settings: Imitation,
     round_: int,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> float | None:
@@ -245,36 +245,36 @@ def imitate(
     plays, but learning goes on from what was saved before.
     """
     ppo = learner.ppo
-    share = max(0.0, 1.0 - 2.0 * round_ / max(how.iterations, 1))
+    share = max(0.0, 1.0 - 2.0 * round_ / max(settings.iterations, 1))
     rollouts = []
-    for _ in range(how.rollouts):
+    for _ in range(settings.rollouts):
         rollout = _taught_rollout(learner, teacher, share, stop_requested)
         if rollout is None:
             return None
         rollouts.append(rollout)
-    teacher.adapt(0.0 if share else how.correction_rate)
+    teacher.adapt(0.0 if share else settings.correction_rate)
     networks = (ppo.actor, ppo.critic)
     for rollout in rollouts:
         for network in networks:
             network.update_normalization(rollout.observations.flatten(0, 1))
-    minibatches = how.minibatches
+    minibatches = settings.minibatches
     if ppo.actor.is_recurrent:
-        minibatches = min(minibatches, learner.env.num_envs)  # it divides robots, not steps
-        batches = [r.recurrent_mini_batch_generator(minibatches, how.epochs) for r in rollouts]
+        minibatches = min(minibatches, learner.env.num_envs)  # groups of robots, not of steps
+        batches = [r.recurrent_mini_batch_generator(minibatches, settings.epochs) for r in rollouts]
     else:
-        batches = [r.mini_batch_generator(minibatches, how.epochs) for r in rollouts]
-    # all of them in turn, so that the last is not remembered best
+        batches = [r.mini_batch_generator(minibatches, settings.epochs) for r in rollouts]
+    # rollouts alternate, so that the last one has no more weight than the others
     ordered = chain.from_iterable(zip(*batches, strict=True))
-    steps = minibatches * how.epochs * how.rollouts
+    steps = minibatches * settings.epochs * settings.rollouts
     optimisers = _optimisers([p for n in networks for p in n.parameters() if p.requires_grad])
     errors = []
     for step, batch in enumerate(ordered):
         if stop_requested():
             return None
-        done = (round_ + step / steps) / how.iterations
+        done = (round_ + step / steps) / settings.iterations
         for optimiser in optimisers:
             for group in optimiser.param_groups:
-                group["lr"] = how.learning_rate * (1.0 - done)
+                group["lr"] = settings.learning_rate * (1.0 - done)
         mean = ppo.actor(batch.observations, masks=batch.masks, hidden_state=batch.hidden_states[0])
         value = ppo.critic(batch.observations, masks=batch.masks)
         error = (mean - batch.actions).pow(2).mean()
@@ -287,7 +287,7 @@ def imitate(
         for optimiser in optimisers:
             optimiser.step()
         errors.append(float(error.detach()))
-    return float(np.sqrt(np.mean(errors[-minibatches * how.rollouts :])))
+    return float(np.sqrt(np.mean(errors[-minibatches * settings.rollouts :])))
 
 
 def _taught_rollout(

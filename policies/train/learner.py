@@ -10,7 +10,7 @@
 - A checkpoint holds everything that an exact continuation needs: networks, optimiser, learning
   rate, random numbers, recurrent state, environments with their delay lines, the last observation
   and the counters. It is written atomically and read with `weights_only`; a teacher's is also read
-  by those who learn from it.
+  by the runs that learn from it.
 - Several processes, which `torchrun` starts, each with other environments, exchange gradients
   through gloo, on processors, as the physics.
 - Every sample can be learned from as its mirror image, left for right, too. The robot, its task and
@@ -456,7 +456,7 @@ class Learner:
                 with torch.no_grad():
                     for parameter, value in zip(ppo.actor.parameters(), before, strict=True):
                         parameter.copy_(value)
-                # of its first update Adam keeps the moments: without them the next would be as long
+                # keep the moments of Adam's first update: without them the next would be as long
                 for parameter, state in zip(ppo.actor.parameters(), moments, strict=True):
                     if state:
                         ppo.optimizer.state[parameter] = state

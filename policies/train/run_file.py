@@ -145,8 +145,8 @@ def _first_gait_imitated(kind: Kind) -> Run:
 def _from_scratch(run: Run) -> Run:
     taught = PRESETS["scratch"]
     pushes = {n: getattr(taught.randomisation, n) for n in ("push_m_s", "push_every_s")}
-    # of the teacher's rewards only that of its stance goes on: the others hold a policy to the gait
-    # that led the teacher to steps
+    # only the teacher's reward of its stance is kept: the others hold a policy to the gait by which
+    # the teacher learned to step
     gait = {name: getattr(taught.rewards, name) for name in ("crouch", "spread", *CLOCK)}
     task = replace(
         run.task, rewards=replace(run.task.rewards, stance=0.5 * taught.rewards.stance, **gait),
@@ -163,7 +163,7 @@ def _teacher(kind: Kind) -> Run:
         architecture=Architecture(kind, (128, 64), 64, (256, 128, 64), privileged_actor=True),
         task=PRESETS["scratch"],
         learner=Hyperparameters(
-            # many small updates: how far one may go limits learning, not how sure it is of where
+            # many small updates: the step size limits learning, not the noise of the gradient
             steps_per_environment=8, epochs=3, learning_rate=1e-3, desired_kl=0.025,
             learning_rates=(1e-6, 2e-3), discount=0.97, gae_lambda=0.9,
             # noise that lasts over half a stride would be rewarded for what it does in the other
@@ -212,10 +212,10 @@ def check_teacher(folder: Path, run: Run) -> Run:
     same = [(f"task.{name}", teacher.task, run.task) for name in _OF_ACTIONS]
     same += [(f"task.rewards.{name}", teacher.task.rewards, run.task.rewards) for name in CLOCK]
     for name, *of in same:
-        theirs, ours = (getattr(part, name.rsplit(".", 1)[1]) for part in of)
-        if theirs != ours:
+        trained, value = (getattr(part, name.rsplit(".", 1)[1]) for part in of)
+        if trained != value:
             raise InputError(
-                f"The teacher in {folder} was trained with {name} {theirs}, this run has {ours}. "
+                f"The teacher in {folder} was trained with {name} {trained}, this run has {value}. "
                 "Give both the same."
             )
     return teacher

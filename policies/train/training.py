@@ -203,7 +203,7 @@ class _Session:
     def _begin(self) -> None:
         """Write a first checkpoint, then the settings: from then on the run can be resumed."""
         if self.run.imitation.iterations and self.run.imitation.teacher not in (TROT, OWN):
-            # one that cannot be read is refused while the folder's name is still free
+            # refuse an unreadable file before the folder is made
             with torch.random.fork_rng(devices=[]):
                 teacher = Path(self.run.imitation.teacher)
                 load_teacher(teacher, BEST, self.run, self.learner.observations)
@@ -239,8 +239,8 @@ class _Session:
         self.phase_began = time.monotonic()
         while teacher and self.counters["imitated"] < self.rounds and not ends():
             before, begun = learner.networks(), time.monotonic()
-            how = replace(self.run.imitation, iterations=self.rounds)
-            error = imitate(learner, teacher, how, self.counters["imitated"], ends)
+            settings = replace(self.run.imitation, iterations=self.rounds)
+            error = imitate(learner, teacher, settings, self.counters["imitated"], ends)
             if error is None:
                 self.refuse_nan(before, [])
                 return False
@@ -302,8 +302,8 @@ class _Session:
         watcher = watch and (lambda progress: watch(replace(progress, phase="teacher")))
         session = _Session(folder, teacher, begun, watcher)
         session.go(ends)
-        self.ranks.any(False)  # the first has written it
-        # its time is this run's, also where that was killed meanwhile
+        self.ranks.any(False)  # after the first process has written it
+        # its time counts for this run, also after a kill
         now = time.monotonic()
         elapsed = max(now - self.started, session.counters["elapsed_s"])
         self.counters["elapsed_s"], self.started = elapsed, now - elapsed
@@ -355,7 +355,7 @@ class _Session:
     def stuck(self) -> bool:
         """Whether PPO's updates are taken back again and again, so that the policy stays as it is.
 
-        It is said when they repeat, and what helps when the run ends for it.
+        A notice follows when they repeat, and advice when the run ends because of it.
         """
         self.undone = self.undone + 1 if self.learner.taken_back else 0
         if self.undone not in (_UNDONE_SAID, _UNDONE_END):
@@ -386,7 +386,7 @@ class _Session:
     def write_policy(self, name: str) -> None:
         """Write a policy folder."""
         if self.ranks.rank != 0 or self.run.architecture.privileged_actor:
-            return  # what a robot cannot see is no policy for it
+            return  # a policy that sees privileged observations cannot run on a robot
         servos = self.learner.env.env.servos
         about = {
             "iteration": self.learner.iteration, "imitation_rounds": self.counters["imitated"],

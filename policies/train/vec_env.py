@@ -22,7 +22,7 @@ class WalkingVecEnv:
     """Adapter; `env` is the environment itself.
 
     `action_history` is how many past actions the group `actions` holds, 0 leaves the group out;
-    `device` is torch's name of where the learner wants its tensors. `noise`, shape (n, 12), is that
+    `device` is the torch device of the learner's tensors. `noise`, shape (n, 12), is that
     of the last action, to be set before `step`; an episode begins with none.
     """
 
@@ -60,7 +60,7 @@ class WalkingVecEnv:
         result = self.env.step(actions.detach().cpu().numpy())
         ended = self._past
         if self._past.shape[1]:
-            # of a missed tick, the one before stays
+            # after a missed tick the last action stays
             ended = np.concatenate([result.facts.action[:, None], self._past[:, :-1]], axis=1)
             self._past = ended.copy()
             self._past[result.done] = self.env.action[result.done][:, None]

@@ -380,7 +380,7 @@ def _notes(
         notes.append(f"{robot.name} is fixed to the world in its model: there is no other ground.")
     for name, servos in actuators.items():
         borrowed = {joint: [f"{other}'s numbers"] for joint, other in servos.fallbacks.items()}
-        notes += [f"{name}: {j} have {said}." for j, said in share_sentences(borrowed)]
+        notes += [f"{name}: {j} have {sentence}." for j, sentence in share_sentences(borrowed)]
         ground = models[name].ground
         if ground and not ground.upright:
             notes.append(

@@ -1,4 +1,4 @@
-"""Conditions of a walk: who walks, on which ground, at which command, and what makes it harder.
+"""Conditions of a walk: which walker, on which ground, at which command, and what makes it harder.
 
 Robots walk by the policy, by the open-loop trot, which sees nothing and has a clock, or they stand.
 `policies.walks.together` lets them walk under many conditions at once, and a `Recorder` keeps what
@@ -249,7 +249,7 @@ class Recorder(Protocol[Kept]):
 
 
 class StepRecorder:
-    """A `Recorder` of arrays by name, (n, …) of each control step, and of who fell."""
+    """A `Recorder` of arrays by name, (n, …) of each control step, and of the falls."""
 
     def __init__(self, env: PupperEnv, policy: Actor | None, conditions: Sequence[Condition]):
         self.env, self.fell = env, np.zeros(env.environments, bool)

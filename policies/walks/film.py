@@ -92,7 +92,7 @@ class Film:
         self._writer.close()
 
     def _written(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture with what is said beside the robot."""
+        """The picture with the caption beside the robot."""
         from matplotlib import font_manager
         from PIL import Image, ImageDraw, ImageFont
 

@@ -193,14 +193,14 @@ class _Recorder(StepRecorder):
         assert policy is not None
         super().__init__(env, policy, conditions)
         records_all = [not (lean and (c.change or c.disturb)) for c in conditions]
-        self._whole = np.flatnonzero(np.repeat(records_all, [c.robots for c in conditions]))
+        self._recorded = np.flatnonzero(np.repeat(records_all, [c.robots for c in conditions]))
         self._seen: list[NDArray[np.float32]] = []
         self._hidden: list[NDArray[np.float32]] = []
-        _listen(policy.network, lambda state: self._hidden.append(state.numpy()[self._whole]))
+        _listen(policy.network, lambda state: self._hidden.append(state.numpy()[self._recorded]))
 
     def arrays(self, now: Moment) -> dict[str, NDArray]:
         qpos = self.env.robots.qpos
-        self._seen.append(now.observation[self._whole].astype(np.float32))
+        self._seen.append(now.observation[self._recorded].astype(np.float32))
         return {
             "action": now.action, "contact": now.facts.contact, "alive": now.alive,
             "joint_position": now.facts.position_relative + self.env.default,
@@ -211,7 +211,7 @@ class _Recorder(StepRecorder):
     def of(self, condition: Condition, robots: slice, steps: int, commands: Array) -> Rollout:
         arrays = self.stacked(robots, steps)
         arrays["position"][..., 2] = np.unwrap(arrays["position"][..., 2], axis=0)
-        inside = np.flatnonzero((self._whole >= robots.start) & (self._whole < robots.stop))
+        inside = np.flatnonzero((self._recorded >= robots.start) & (self._recorded < robots.stop))
         for name, recorded in (("observation", self._seen), ("hidden", self._hidden)):
             arrays[name] = np.stack([step[inside] for step in recorded[:steps]])
         task, command = condition.task, condition.command

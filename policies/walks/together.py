@@ -184,7 +184,7 @@ class _Group:
         )  # fmt: skip
         for condition, robots in zip(conditions, self.robots, strict=True):
             impose(self.env.robots, _numbers(robots), condition.handicap)
-        self.policy = deepcopy(policy)  # hooks of a recorder hear this environment only
+        self.policy = deepcopy(policy)  # a recorder's hooks must see this environment only
         self.recorder = recorder(self.env, self.policy, conditions)
         random = random_commands(
             shared.robots, self.steps, step_s, seed, task.commands if task.robot else RANDOM
@@ -209,7 +209,7 @@ class _Group:
         self.last = np.zeros(len(conditions), int)  # steps until none of a condition was up
 
     def walk(self, advance: Callable[[float], bool]) -> bool:
-        """Walk to the end; False if `advance` said to stop."""
+        """Walk to the end; False if `advance` requested a stop."""
         env, n = self.env, self.env.environments
         observation, _ = env.observe()
         alive = np.ones(n, bool)
@@ -254,7 +254,7 @@ class _Group:
         action = np.zeros((env.environments, len(env.default)), np.float32)
         if self.policy and len(self.led):
             late = missed[self.led]
-            # a policy without missed ticks need not know of them
+            # policies need not support missed ticks where there are none
             more = (late,) if late.any() else ()
             action[self.led] = self.policy.act(observation[self.led], *more)
         if len(self.trotting):

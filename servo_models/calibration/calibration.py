@@ -293,7 +293,7 @@ def is_shipped(name: Path | str) -> bool:
 
 
 def preset_notes(names: Iterable[str]) -> list[str]:
-    """What is to be said of the presets among `names` where readings have an age."""
+    """Notes on the presets among `names` where readings have an age."""
     presets = [name for name in names if name in PRESETS]
     if not presets:
         return []

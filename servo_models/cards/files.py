@@ -168,7 +168,7 @@ def from_bam(
         raise InputError(f"{name}: error_gain_ratio is 0; it must be above 0. Fit it again.")
     ratio = 1.0 if p.error_gain_ratio is None else p.error_gain_ratio
     both = p.load_friction_base, p.load_friction_stribeck
-    ours = {
+    numbers = {
         "duty_per_rad": kind.error_gain * ratio,
         "duty_limit": kind.duty_limit,
         "stall_torque_nm": p.kt / p.R * kind.supply_v,
@@ -188,7 +188,7 @@ def from_bam(
         "velocity_limit_rad_s": p.max_velocity,
         "dead_time_s": p.command_delay,
     }
-    values = {key: stated(value) for key, value in ours.items() if value is not None}
+    values = {key: stated(value) for key, value in numbers.items() if value is not None}
     return validated(
         PositionLoop, {"model": "position_loop", **values}, name, remedy="Fit it again."
     )
@@ -350,7 +350,7 @@ def bam_card(calibration: Calibration) -> ServoCard:
         )
     motor, (_, kind) = motor_of(block)[0], _class_for(calibration.robot)
     # our full duty is the largest that the servo's firmware gives
-    ours = {
+    numbers = {
         "duty_per_rad": motor["error_gain"] * kind.duty_limit,
         "duty_limit": kind.duty_limit,
         "stall_torque_nm": block.stall_torque_nm.value / kind.duty_limit,
@@ -362,19 +362,19 @@ def bam_card(calibration: Calibration) -> ServoCard:
         "velocity_limit_rad_s": block.velocity_limit_rad_s and block.velocity_limit_rad_s.value,
     }
     if motor["model"] != "m1":
-        ours |= {
+        numbers |= {
             "stribeck_friction_nm": motor["friction_stribeck"],
             "stribeck_speed_rad_s": motor["dtheta_stribeck"],
             "stribeck_exponent": motor["alpha"],
         }
     if motor["model"] == "m5":
-        ours |= {
+        numbers |= {
             "load_friction_motor": motor["load_friction_motor"],
             "load_friction_load": motor["load_friction_external"],
             "load_stribeck_motor": motor["load_friction_motor_stribeck"],
             "load_stribeck_load": motor["load_friction_external_stribeck"],
         }
-    values = {key: stated(value) for key, value in ours.items() if value is not None}
+    values = {key: stated(value) for key, value in numbers.items() if value is not None}
     return ServoCard(
         name="calibration",
         servo=calibration.robot,

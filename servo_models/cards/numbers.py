@@ -94,7 +94,7 @@ Cited = Annotated[Quantity, BeforeValidator(_bare), PlainSerializer(_plainest)]
 _SHARE_OF_1 = AfterValidator(PlausibleRange(0, 1, "percent", 1e-2))
 
 
-def _or(quantity: Quantity | None, absent: float = 0.0) -> float:
+def _value_or(quantity: Quantity | None, absent: float = 0.0) -> float:
     return absent if quantity is None else quantity.value
 
 
@@ -125,13 +125,13 @@ class TorquePD(Part):
         """The numbers as the servo model takes them; an unknown dead time is 0."""
         return DelayedPDParameters(
             stiffness=self.stiffness_nm_per_rad.value,
-            damping=_or(self.damping_nm_s_per_rad),
+            damping=_value_or(self.damping_nm_s_per_rad),
             friction_loss=self.friction_loss_nm.value,
             armature=self.armature_kg_m2.value,
             effort_limit=self.effort_limit_nm.value,
-            velocity_limit=_or(self.velocity_limit_rad_s, NO_SPEED_LIMIT_RAD_S),
-            dead_time_s=_or(self.dead_time_s),
-            back_emf=_or(self.back_emf_nm_s_per_rad),
+            velocity_limit=_value_or(self.velocity_limit_rad_s, NO_SPEED_LIMIT_RAD_S),
+            dead_time_s=_value_or(self.dead_time_s),
+            back_emf=_value_or(self.back_emf_nm_s_per_rad),
         )
 
     def loaded(self, p_gain: float = 1.0) -> LoadedServoParameters:
@@ -142,12 +142,12 @@ class TorquePD(Part):
         effort = self.effort_limit_nm.value
         return LoadedServoParameters(
             duty_per_rad=self.stiffness_nm_per_rad.value / (p_gain * effort),
-            duty_s_per_rad=_or(self.damping_nm_s_per_rad) / effort,
+            duty_s_per_rad=_value_or(self.damping_nm_s_per_rad) / effort,
             stall_torque=effort,
-            back_emf=_or(self.back_emf_nm_s_per_rad),
+            back_emf=_value_or(self.back_emf_nm_s_per_rad),
             armature=self.armature_kg_m2.value,
             friction_loss=self.friction_loss_nm.value,
-            dead_time_s=_or(self.dead_time_s),
+            dead_time_s=_value_or(self.dead_time_s),
         )
 
     @property
@@ -157,7 +157,7 @@ class TorquePD(Part):
         The set-point's limit if that is lower; None where neither is known.
         """
         limits = [] if self.velocity_limit_rad_s is None else [self.velocity_limit_rad_s.value]
-        brake = _or(self.back_emf_nm_s_per_rad)
+        brake = _value_or(self.back_emf_nm_s_per_rad)
         if brake > 0:
             spare_torque = max(self.effort_limit_nm.value - self.friction_loss_nm.value, 0.0)
             limits.append(spare_torque / brake)
@@ -216,7 +216,7 @@ class PositionLoop(Part):
         A number that is a product of several has no interval.
         """
         stall = self.stall_torque_nm.value
-        velocity = self.back_emf_nm_s_per_rad.value + _or(self.viscous_friction_nm_s_per_rad)
+        velocity = self.back_emf_nm_s_per_rad.value + _value_or(self.viscous_friction_nm_s_per_rad)
         return TorquePD(
             model="delayed_pd",
             stiffness_nm_per_rad=stated(self.duty_per_rad.value * p_gain * stall),
@@ -239,11 +239,11 @@ class PositionLoop(Part):
         the set-point's speed are left out.
         """
         limit = self.duty_limit.value
-        viscous = _or(self.viscous_friction_nm_s_per_rad)
+        viscous = _value_or(self.viscous_friction_nm_s_per_rad)
         brake = self.back_emf_nm_s_per_rad.value + viscous
-        motor, load = _or(self.load_friction_motor), _or(self.load_friction_load)
-        at_rest = _or(self.load_stribeck_motor) + _or(self.load_stribeck_load)
-        half = math.log(2) ** (1 / max(_or(self.stribeck_exponent, 2.0), 1e-3))
+        motor, load = _value_or(self.load_friction_motor), _value_or(self.load_friction_load)
+        at_rest = _value_or(self.load_stribeck_motor) + _value_or(self.load_stribeck_load)
+        half = math.log(2) ** (1 / max(_value_or(self.stribeck_exponent, 2.0), 1e-3))
         return LoadedServoParameters(
             duty_per_rad=self.duty_per_rad.value / limit,
             duty_s_per_rad=0.0,
@@ -251,9 +251,9 @@ class PositionLoop(Part):
             back_emf=brake,
             armature=self.armature_kg_m2.value,
             friction_loss=self.friction_loss_nm.value,
-            dead_time_s=_or(self.dead_time_s),
-            stribeck_friction=_or(self.stribeck_friction_nm),
-            stribeck_speed=max(_or(self.stribeck_speed_rad_s, 0.1) * half, 1e-6),
+            dead_time_s=_value_or(self.dead_time_s),
+            stribeck_friction=_value_or(self.stribeck_friction_nm),
+            stribeck_speed=max(_value_or(self.stribeck_speed_rad_s, 0.1) * half, 1e-6),
             load_friction_motor=motor,
             load_friction_load=load,
             load_friction_static=at_rest / (motor + load) if motor + load else 0.0,
@@ -327,14 +327,14 @@ class LoadedLoop(Part):
     def as_pd(self, p_gain: float) -> TorquePD:
         """The same servo as a PD in torque; see `LoadedServoParameters.delayed_pd`."""
         stall = self.stall_torque_nm.value
-        damping = _or(self.duty_s_per_rad) * stall
+        damping = _value_or(self.duty_s_per_rad) * stall
         return TorquePD(
             model="delayed_pd",
             stiffness_nm_per_rad=stated(self.duty_per_rad.value * p_gain * stall),
             damping_nm_s_per_rad=stated(damping) if damping else None,
             friction_loss_nm=self.friction_loss_nm,
             armature_kg_m2=self.armature_kg_m2,
-            effort_limit_nm=stated(min(stall, _or(self.torque_limit_nm, math.inf))),
+            effort_limit_nm=stated(min(stall, _value_or(self.torque_limit_nm, math.inf))),
             back_emf_nm_s_per_rad=self.back_emf_nm_s_per_rad,
             dead_time_s=self.dead_time_s,
         )

@@ -71,7 +71,7 @@ class PollSchedule:
         servos = len(self._phase)
         self._servo = np.arange(servos)
         self._round = np.zeros(servos, int)
-        self._next_start = -_WARM_UP_ROUNDS * period_s  # readings exist when the host arrives
+        self._next_start = -_WARM_UP_ROUNDS * period_s  # the first readings precede the first read
         self._wander = drift * rng.standard_normal()
         self._instants = np.empty((0, servos))
         self._succeeded = np.empty((0, servos), bool)
@@ -115,8 +115,8 @@ class PollSchedule:
 class ServoPlant(Protocol):
     """Twelve servos and an IMU. Time starts at 0, in the default pose with the torque on.
 
-    Time passes only as far as a call asks. A call may ask for an instant a little before the last
-    one, since servos are not polled at the same time; commands come in order.
+    Time advances only to the instant of a call. That may be a little before the instant of the last
+    call, since servos are not polled at the same time; commands come in order.
     """
 
     def command(self, index: int, time_s: float, angle_rad: float) -> None:
@@ -214,7 +214,7 @@ class ServoBench:
         self.index_of_id = {i: k for k, i in enumerate(self.map.ids)}
         self.supply_v, self.keep_log = SUPPLY_V, keep_log
         self.commands: list[tuple[float, int, int]] = []
-        # a simulation that two threads step at once breaks, and starts anew at zero
+        # two threads that step a simulation at once would corrupt it
         self._alone = RLock()
 
     def command(self, index: int, time_s: float, count: int) -> None:

@@ -151,7 +151,7 @@ class EmulatedBus:
         sent, (goal, _) = self._clock.now(), self._quantised(commanded, rounding=np.trunc)
         jitter = self.robot.spec.command_jitter_s
         late = jitter * self._latency.exponential() if jitter else 0.0
-        self._arrival_s = max(self._arrival_s, sent + late)  # none overtakes another
+        self._arrival_s = max(self._arrival_s, sent + late)  # commands keep their order
         for i in np.flatnonzero(goal != self._goal).tolist():
             self._plant.command(i, self._arrival_s, goal[i])
             if self._keep_log:

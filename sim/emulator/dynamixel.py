@@ -180,10 +180,11 @@ class DynamixelEmulator(LineEmulator):
         elif code in (table.WRITE, table.REG_WRITE):
             error = table.DATA_LENGTH
         elif code == table.ACTION:
-            registered = servo.state.pop("registered", None)
+            address, data = servo.state.pop("registered", (0, None))
             self._set(servo_id, "registered_instruction", 0)
-            error = self._try_store(servo_id, *registered, at) if registered else table.RESULT_FAIL
-        elif code == table.CLEAR:  # of the turns; these servos have one
+            failed = data is None
+            error = table.RESULT_FAIL if failed else self._try_store(servo_id, address, data, at)
+        elif code == table.CLEAR:  # clears the count of turns; these servos have one turn
             error = table.RESULT_FAIL if self._get(servo_id, "torque_enable") else 0
         elif code in (table.REBOOT, table.FACTORY_RESET):
             self.restart(servo_id, at, keeps_eeprom=code == table.REBOOT)
@@ -270,7 +271,7 @@ class DynamixelEmulator(LineEmulator):
         return table.ALERT if status else 0
 
     def _protect(self, servo_id: int, at: float) -> None:
-        """Shutdown by overload, if its register asks for it."""
+        """Shutdown by overload, if its register selects it."""
         servo: Any = self.servos[servo_id]
         loaded = abs(self._get(servo_id, "present_pwm")) > 0.95 * table.FULL_PWM
         servo.loaded_since = min(servo.loaded_since, at) if loaded else float("inf")

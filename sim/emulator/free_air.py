@@ -64,7 +64,7 @@ class FreeAirServo:
             self._asleep = False
 
     def position_at(self, time_s: float) -> float:
-        """True position [rad] at `time_s`, at most one physics step before the latest asked."""
+        """True position [rad] at `time_s`, at most one physics step before the latest call."""
         if time_s <= 0 or self._asleep:
             return float(self._data.qpos[0])
         self._advance(int(np.ceil(time_s / self._dt - 1e-9)))
@@ -75,7 +75,7 @@ class FreeAirServo:
 
     @property
     def load(self) -> float:
-        """Signed share of the effort limit in use at the time last asked for."""
+        """Signed share of the effort limit in use at the time of the last call."""
         if self._limp or self._asleep:
             return 0.0
         return float(self._data.actuator_force[0]) / self._effort

@@ -251,7 +251,7 @@ class PendulumServo:
         self._loop = self._loop_of(self._registers, self.parameters)
 
     def position_at(self, time_s: float) -> float:
-        """True position of the output [rad], at most one step before the latest asked."""
+        """True position of the output [rad], at most one step before the latest call."""
         if time_s > 0:
             last = math.ceil(time_s / self._dt - 1e-9)
             while self._step < last:
@@ -265,7 +265,7 @@ class PendulumServo:
 
     @property
     def load(self) -> float:
-        """Signed duty at the time last asked for."""
+        """Signed duty at the time of the last call."""
         return self._duty
 
     def _output(self) -> tuple[float, float]:

@@ -6,7 +6,7 @@ each servo's return delay. `SerialPty` puts it behind a pseudo-terminal, a seria
 program. A vendor's emulator (`sim.emulator.feetech`, `sim.emulator.dynamixel`) adds frames and
 instructions.
 
-Every servo has its memory table and obeys it: operating mode, angle limits, homing offset,
+Every servo has its memory table and acts by it: operating mode, angle limits, homing offset,
 response level, id and rate; gains, ramps and torque limits as far as the bench's servos have them.
 Commands and torque act on `ServoBench` when the last byte of their frame has arrived, and a
 position is measured when its answer begins.
@@ -115,8 +115,8 @@ class LineEmulator(ABC):
         for servo_id in ids if ids is not None else bench.map.ids:
             self.servos[servo_id] = EmulatedMemory(bytearray(self.memory_bytes))
             changed: dict[str, int] = {}
-            for whose in (None, servo_id):
-                changed |= (registers or {}).get(whose, {})
+            for target in (None, servo_id):
+                changed |= (registers or {}).get(target, {})
             k = bench.index_of_id[servo_id]
             as_built = {name: bench.register(k, name) for name in self._acting}
             self._load(servo_id, {"torque_enable": 1} | as_built)
@@ -248,7 +248,7 @@ class LineEmulator(ABC):
         servo = self.servos.get(servo_id)
         if servo is None or address + len(data) > self.memory_bytes or at < self._brown_out_until:
             return
-        locked = self.series.lock_address  # without one the vendor's emulator has decided
+        locked = self.series.lock_address  # without error the vendor's emulator has decided
         if locked is not None and address < self.series.eeprom_end and servo.memory[locked]:
             return
         servo.memory[address : address + len(data)] = data

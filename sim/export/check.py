@@ -108,13 +108,13 @@ def check(servos: ExportedServos) -> Check:
         feedback = servos.calibration.held_feedback(name)
         torque = pd.effort_limit_nm.value / pd.armature_kg_m2.value
         joints[name] = JointCheck(
-            tones_rad=_apart(at[0], on_tones[:, n], fitted_at, fitted),
-            walk_rad=_apart(at[1], on_walk[:, n], walk_at, walked),
-            same_steps_rad=_apart(at[0], on_tones[:, n], at[0], same[1:, 0]),
-            not_carried_rad=_apart(pd_at, pd_moved[:, 0], fitted_at, fitted),
+            tones_rad=_rms_difference(at[0], on_tones[:, n], fitted_at, fitted),
+            walk_rad=_rms_difference(at[1], on_walk[:, n], walk_at, walked),
+            same_steps_rad=_rms_difference(at[0], on_tones[:, n], at[0], same[1:, 0]),
+            not_carried_rad=_rms_difference(pd_at, pd_moved[:, 0], fitted_at, fitted),
             step_rad={part: errors[n] for part, errors in step_errors.items()},
             step_of_full_torque_rad=torque * servos.physics_step_s**2,
-            reading_counts=_counts_apart(feedback, on_walk[:, n], at[1], walk_at, walked),
+            reading_counts=_rms_counts(feedback, on_walk[:, n], at[1], walk_at, walked),
             whole_steps_rad=costs[name],
         )
     return Check(
@@ -135,7 +135,7 @@ def step_costs(servos: ExportedServos, commands: NDArray) -> dict[str, list[floa
             stepped_at, stepped = in_loop(
                 nearest_in_loop(servo, h, fitted_s, MUJOCO_PID), h, commands
             )
-            costs[part].append(_apart(stepped_at, stepped[:, 0], at, moved[:, 0]))
+            costs[part].append(_rms_difference(stepped_at, stepped[:, 0], at, moved[:, 0]))
     return costs
 
 
@@ -162,7 +162,7 @@ def _fitted_motion(
     return step_s * np.arange(len(moved) + 1, dtype=float), np.append(start, moved)
 
 
-def _apart(at: NDArray, moved: NDArray, other_at: NDArray, other: NDArray) -> float:
+def _rms_difference(at: NDArray, moved: NDArray, other_at: NDArray, other: NDArray) -> float:
     """RMS difference of two motions, after they have settled [rad]."""
     late = at > _SETTLE_S
     return float(np.sqrt(np.mean((moved - np.interp(at, other_at, other))[late] ** 2)))
@@ -187,7 +187,7 @@ def _notes(servos: ExportedServos, joints: Mapping[str, JointCheck]) -> Iterator
         half = nearest_in_loop(actuator.parameters, h / 2, actuator.fitted_step_s, MUJOCO_PID)
         fitted = in_loop(actuator.parameters, actuator.fitted_step_s, unseen_tones())
         at, moved = in_loop(half, h / 2, unseen_tones())
-        there = 1e3 * _apart(at, moved[:, 0], fitted[0], fitted[1][:, 0])
+        there = 1e3 * _rms_difference(at, moved[:, 0], fitted[0], fitted[1][:, 0])
         yield (
             f"The servos' numbers are {basis}, and no numbers of an actuator make up for steps of "
             f"{1e3 * h:g} ms: in one, the largest torque moves {worst} by {far:.2g} mrad, and "
@@ -206,7 +206,7 @@ def _notes(servos: ExportedServos, joints: Mapping[str, JointCheck]) -> Iterator
         for name, row in joints.items()
         if servos.calibration.joint(name).under_load is not None
     }
-    # such a servo without the frictions of the load moves as its actuator to rounding
+    # without frictions of the load such a servo moves like its actuator, up to rounding
     if loaded := [name for name, cost in costs.items() if cost >= _SEEN_MRAD]:
         most = max(costs[name] for name in loaded)
         yield (
@@ -279,7 +279,7 @@ def unseen_tones() -> NDArray[np.float64]:
     return AMPLITUDE_RAD * np.sin(2 * np.pi * np.outer(TONES_HZ, time)).ravel()
 
 
-def _counts_apart(
+def _rms_counts(
     feedback: HeldFeedback, exported: NDArray, at: NDArray, fitted_at: NDArray, fitted: NDArray
 ) -> float:
     """RMS difference of readings in counts: stepped on the export, polled on the calibration."""

@@ -78,7 +78,7 @@ def _compiled(path: Path) -> tuple[Any, dict[str, int]]:
     """The model, and the position actuator of each joint that has one."""
     from pupper_sysid.sim.robot.engine import in_a_line, mujoco
 
-    hinges_of(path)  # refuses what takes too much memory or time
+    hinges_of(path)  # refuses files that take too much memory or time
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:

@@ -150,7 +150,7 @@ def to_model(
 
     hinges = hinges_of(model)
     root = _inlined(model)
-    theirs = mujoco.MjModel.from_xml_path(str(model))
+    compiled = mujoco.MjModel.from_xml_path(str(model))
     names, card = [h.name for h in hinges if h.name], isinstance(calibration, CardCalibration)
     if card:
         chosen = [h.name for h in hinges if h.name and h.driven]
@@ -178,23 +178,23 @@ def to_model(
             f"joint of {model}; servos go into {', '.join(chosen)}. Leave it out, or correct the "
             "name."
         )
-    bodies = link_inertias(theirs, chosen)
+    bodies = link_inertias(compiled, chosen)
     held = [n for n in chosen if calibration.joint(n).holds_at.armature == "servo and load"]
     links = {name: bodies[name] for name in held if bodies[name] > 0}
     links |= dict(link_inertia or {})
-    step_s = float(theirs.opt.timestep) if physics_step_s is None else physics_step_s
+    step_s = float(compiled.opt.timestep) if physics_step_s is None else physics_step_s
     servos = ExportedServos.of(calibration, step_s, gain, links, sha256)
     before = _actuators(root)
     # a group of actuators that the model's options do not disable
-    group = next(n for n in range(31) if not int(theirs.opt.disableactuator) >> n & 1)
+    group = next(n for n in range(31) if not int(compiled.opt.disableactuator) >> n & 1)
     changes = list(_put_servos(root, servos, model, str(group)))
-    changes += _options(root, servos, theirs)
+    changes += _options(root, servos, compiled)
     if absent:
         changes.append(
             f"Servos of joints that the model has not were left out: {', '.join(absent)}."
         )
     _place_assets(root, model, out)
-    _keyframes(root, servos, theirs, before)
+    _keyframes(root, servos, compiled, before)
     notes = servos.head(
         MUJOCO_PID,
         f"The model is {model.name}, with these changes:",
@@ -332,34 +332,34 @@ def _put_servos(root: Element, servos: ExportedServos, model: Path, group: str) 
         yield f"Actuators on tendons drive these joints, too, and were left: {', '.join(driven)}."
 
 
-def _options(root: Element, servos: ExportedServos, theirs: Any) -> Iterator[str]:
+def _options(root: Element, servos: ExportedServos, compiled: Any) -> Iterator[str]:
     """Time step, integrator and flags that the servos need."""
     from pupper_sysid.sim.robot.engine import mujoco
 
     option = ElementTree.SubElement(root, "option")
     option.set("timestep", repr(servos.physics_step_s))
-    if servos.physics_step_s != theirs.opt.timestep:
-        yield f"The time step was {theirs.opt.timestep:g} s."
+    if servos.physics_step_s != compiled.opt.timestep:
+        yield f"The time step was {compiled.opt.timestep:g} s."
     implicit = (mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtIntegrator.mjINT_IMPLICIT)
-    if theirs.opt.integrator not in implicit:
+    if compiled.opt.integrator not in implicit:
         option.set("integrator", INTEGRATOR)
-        name = mujoco.mjtIntegrator(theirs.opt.integrator).name.removeprefix("mjINT_")
+        name = mujoco.mjtIntegrator(compiled.opt.integrator).name.removeprefix("mjINT_")
         yield f"The integrator was {name}; the servos' damping needs {INTEGRATOR}."
     bits = mujoco.mjtDisableBit
     flags = {
         "frictionloss": bits.mjDSBL_FRICTIONLOSS, "damper": bits.mjDSBL_DAMPER,
         "actuation": bits.mjDSBL_ACTUATION,
     }  # fmt: skip
-    off = [name for name, bit in flags.items() if theirs.opt.disableflags & bit]
-    settings = dict.fromkeys(off, "enable")
-    if theirs.opt.disableflags & bits.mjDSBL_CONSTRAINT:
+    disabled = [name for name, bit in flags.items() if compiled.opt.disableflags & bit]
+    settings = dict.fromkeys(disabled, "enable")
+    if compiled.opt.disableflags & bits.mjDSBL_CONSTRAINT:
         # dry friction is a constraint; the others stay off
-        off.append("constraint")
+        disabled.append("constraint")
         settings |= dict.fromkeys(("contact", "limit", "equality"), "disable")
         settings["constraint"] = "enable"
-    if off:
+    if disabled:
         ElementTree.SubElement(option, "flag", settings)
-        yield f"Flags were disabled that the servos need: {', '.join(off)}."
+        yield f"Flags were disabled that the servos need: {', '.join(disabled)}."
 
 
 def _place_assets(root: Element, model: Path, out: Path) -> None:
@@ -381,7 +381,7 @@ def _actuators(root: Element) -> list[Element]:
 
 
 def _keyframes(
-    root: Element, servos: ExportedServos, theirs: Any, before: Sequence[Element]
+    root: Element, servos: ExportedServos, compiled: Any, before: Sequence[Element]
 ) -> None:
     """Commands and set-points of the servos in keyframes, which are there by default 0.
 
@@ -401,13 +401,13 @@ def _keyframes(
             joint = element.get("joint", "")
             if id(element) in places:
                 old = places[id(element)]
-                ctrl.append(float(theirs.key_ctrl[k, old]))
-                first, count = theirs.actuator_actadr[old], theirs.actuator_actnum[old]
-                act += theirs.key_act[k, first : first + count].tolist() if count else []
+                ctrl.append(float(compiled.key_ctrl[k, old]))
+                first, count = compiled.actuator_actadr[old], compiled.actuator_actnum[old]
+                act += compiled.key_act[k, first : first + count].tolist() if count else []
                 continue
-            at = float(theirs.key_qpos[k, theirs.joint(joint).qposadr[0]])
+            at = float(compiled.key_qpos[k, compiled.joint(joint).qposadr[0]])
             if key.get("ctrl") is not None and joint in commanded:
-                at = float(theirs.key_ctrl[k, commanded[joint]])
+                at = float(compiled.key_ctrl[k, commanded[joint]])
             ctrl.append(at)
             servo = servos.calibration.joint(joint).actuator
             act += [at] if np.isfinite(servo.velocity_limit_rad_s.value) else []

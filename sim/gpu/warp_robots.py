@@ -1,7 +1,7 @@
 """WarpRobots: the robots of `sim.robot.robot_batch`, with their physics on a Warp device.
 
-All that is drawn, placed and written is `RobotBatch`'s own, by MuJoCo on the host, so that both
-engines have one task. A control step sends commands, state and servos to the device, takes all
+Drawing, placing and writing robots is inherited from `RobotBatch`, by MuJoCo on the host, so that
+both engines have one task. A control step sends commands, state and servos to the device, takes all
 its physics steps there (on CUDA as one graph) and brings back what `RobotBatch` gives: positions,
 torques and forces on the feet at each physics step. Delay lines and the solver's warm start stay
 on the device. It computes in single precision; on CUDA the order of sums, and so the last bits, may
@@ -122,12 +122,12 @@ class WarpRobots(RobotBatch):
             self._control[:] = control[:, -1]
         self.qpos[:], self.qvel[:] = moved["qpos"][:, -1], moved["qvel"]
         self._activation[:], self._site_position[:] = moved["act"], moved["site_xpos"]
-        self._mend(moved)
+        self._reset_broken(moved)
         touch = moved["sensordata"][:, -self._touch_steps :, self._touch].max(axis=1)
         feet = self._site_position[:, None, self._feet_sites]
         return Moved(self._parts[part], start, moved["qpos"], moved["actuator_force"], touch, feet)
 
-    def _mend(self, moved: dict[str, Array]) -> None:
+    def _reset_broken(self, moved: dict[str, Array]) -> None:
         """Reset robots that became NaN, as MuJoCo does."""
         self._broken = ~np.isfinite(self.qpos.sum(axis=1) + self.qvel.sum(axis=1))
         ids = np.flatnonzero(self._broken)

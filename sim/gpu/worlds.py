@@ -1,10 +1,10 @@
 # pyright: reportInvalidTypeForm=false
 """Worlds: many robots on a Warp device, stepped by mujoco-warp in single precision.
 
-mujoco-warp has no `<pid>` actuator and no PGS. The servo is an integrator whose delay line is
-mujoco-warp's own, and a kernel that limits the set-point's speed and computes the torque, as
-MuJoCo's `<pid>` does; Newton solves the constraints. Warp and
-mujoco-warp, the extra `gpu`, are imported where a device is asked for.
+mujoco-warp has no `<pid>` actuator and no PGS. The servo is an integrator with mujoco-warp's delay
+line, and a kernel that limits the set-point's speed and computes the torque, as MuJoCo's `<pid>`
+does; Newton's method solves the constraints. Warp and mujoco-warp, the extra `gpu`, are imported
+where a device is requested.
 """
 
 from copy import copy
@@ -25,14 +25,14 @@ _ITERATIONS = 30
 """Of Newton: with 10, the default of other trainers, joints are up to 0.02 rad off in a second."""
 _LINE_SEARCH = 50
 _TOLERANCE = 1e-9
-"""Of Newton. mujoco-warp raises what a model asks for to 1e-6, where light links still move: once
-in some thousand steps that is milliradians off."""
+"""Of Newton's solver. mujoco-warp raises it to 1e-6, at which light links still move: an error of
+milliradians once in some thousand steps."""
 _STATE = ("history", "time", "qacc_warmstart", "act")
 
 
 @cache
 def _engine() -> SimpleNamespace:
-    """Warp, mujoco-warp and the kernels; imported where a device is asked for."""
+    """Warp, mujoco-warp and the kernels; imported where a device is requested."""
     try:
         wp, mjw = import_module("warp"), import_module("mujoco_warp")
     except ImportError as error:

@@ -2,8 +2,8 @@
 
 A `Body` is frozen: its servo joints in order, default pose, limits, feet, which servo holds the sum
 of two joints, its mirror image, standing height, and the scales of its motion. `mini_pupper` is
-this project's own robot; `sim.robot.robot_file.body_from_file` makes one of any legged robot's MJCF
-with a few lines of YAML. `body_of` finds either by the names in the settings of a task.
+the Mini Pupper 2; `sim.robot.robot_file.body_from_file` makes one of any legged robot's MJCF with a
+few lines of YAML. `body_of` finds either by the names in the settings of a task.
 
 Robots of other sizes move alike where speeds over √(g·length) are equal (Froude). `scale` is the
 standing height over the Mini Pupper's; speeds grow with its root, as times do.

@@ -121,7 +121,7 @@ def _of_urdf(root: Element) -> list[Hinge]:
     ):
         raise ValueError("it is a xacro file, to be expanded: `xacro FILE > robot.urdf`")
     hinges: list[Hinge] = []
-    for joint in _from_the_base_on(root.findall("joint")):
+    for joint in _depth_first(root.findall("joint")):
         kind, limit = joint.get("type"), joint.find("limit")
         if kind not in ("revolute", "continuous"):
             continue
@@ -142,7 +142,7 @@ def _of_urdf(root: Element) -> list[Hinge]:
     return hinges
 
 
-def _from_the_base_on(joints: list[Element]) -> list[Element]:
+def _depth_first(joints: list[Element]) -> list[Element]:
     """Joints depth first, as MuJoCo has them; those that belong to no tree are the last."""
 
     def link(joint: Element, end: str) -> str | None:

@@ -1,6 +1,6 @@
 """A robot under given commands: many copies at once, each with its own servos and its own ground.
 
-`mini_pupper_robot` is this project's own robot, `robot_of` any other from its MJCF or URDF: its
+`mini_pupper_robot` is the Mini Pupper 2, `robot_of` any other from its MJCF or URDF: its
 actuators are taken out, and each of its joints that is recorded, or that an actuator drove, gets
 the servo of `sim.robot.servo_mjcf` instead. `compiled` gives the model with its trunk free, on the
 ground, or fixed in the air, in the physics in which policies are evaluated.
@@ -232,7 +232,7 @@ def replay(
     qpos = batch.bind("qpos")
     qpos[:, joints] = held @ unmix
     if root is not None:
-        qpos[:, root + 2] += _lift(model, trunk, qpos)
+        qpos[:, root + 2] += _lift_m(model, trunk, qpos)
     before = _down(qpos, root)
     batch.bind("ctrl")[:] = batch.bind("act")[:] = held
     batch.bind("history")[:] = servo_mjcf.delay_lines(servo_mjcf.empty_delay_lines(model), held)
@@ -298,7 +298,7 @@ def _equip(
     batch.set_const()
 
 
-def _lift(model, trunk: int, qpos: Array) -> Array:
+def _lift_m(model, trunk: int, qpos: Array) -> Array:
     """Height by which each copy must be lifted to be just above the ground [m], shape (n,)."""
     touching = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
     touching_trunk = np.flatnonzero(touching & (model.body_rootid[model.geom_bodyid] == trunk))

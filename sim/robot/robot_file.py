@@ -10,7 +10,7 @@
 
 All lines may be left out; names may be patterns. z is up in the trunk's frame. The robot's own
 actuators, sensors and ground are taken out, hinges without a servo fixed; visual meshes are not
-needed. What was assumed is said in `Body.notes`.
+needed. `Body.notes` lists the assumptions.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class _Reader:
             self.spec = mujoco.MjSpec.from_file(str(path))
         except ValueError as error:
             raise InputError(f"{path} is no MJCF that MuJoCo reads: {in_a_line(error)}.") from None
-        self._without_shown()
+        self._remove_visuals()
         free = [j for j in self.spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
         if not free or free[0].parent.parent.name != self.spec.worldbody.name:
             bodies = self.spec.worldbody.bodies
@@ -120,7 +120,7 @@ class _Reader:
             body.name = body.name or ("trunk" if body is self.root else f"body {k}")
             body.gravcomp = 0.0
         if settings.forward != "x":
-            self._face(_QUARTERS[settings.forward])
+            self._turn_forward(_QUARTERS[settings.forward])
         original = self._compiled()
         self.joints = self._servo_joints(original)
         self.resting = self._keyframe(original)
@@ -133,7 +133,7 @@ class _Reader:
 
     # ------------------------------------------------------------------------- the MJCF
 
-    def _without_shown(self) -> None:
+    def _remove_visuals(self) -> None:
         """Take out what is only shown, and meshes whose files are not there."""
         spec, types = self.spec, mujoco.mjtGeom
         folder = (self.path.parent / (spec.meshdir or "")).resolve()
@@ -170,16 +170,16 @@ class _Reader:
             spec.delete(element)
         if lost:
             self.notes.append(
-                f"Meshes of {self.path.name} that collide are not there ({_some(lost)}); the robot "
+                f"Meshes of {self.path.name} that collide are not there ({_list(lost)}); the robot "
                 f"is built without them. They belong into {folder}."
             )
         if massless:
             self.notes.append(
-                f"Masses of {_some(massless)} come from meshes that are not there and count as 0: "
+                f"Masses of {_list(massless)} come from meshes that are not there and count as 0: "
                 f"put them into {folder}, or give these bodies an <inertial>."
             )
 
-    def _face(self, quarters: int) -> None:
+    def _turn_forward(self, quarters: int) -> None:
         """Turn all that the trunk carries about its vertical axis, so that x is forward."""
         root, turn = self.root, np.zeros(4)
         mujoco.mju_axisAngle2Quat(turn, np.array([0.0, 0.0, 1.0]), 0.5 * np.pi * quarters)
@@ -246,7 +246,7 @@ class _Reader:
             )
         fixed = [n for n in names if n not in chosen]
         if fixed:
-            self.notes.append(f"Joints without a servo are fixed: {_some(fixed)}.")
+            self.notes.append(f"Joints without a servo are fixed: {_list(fixed)}.")
         if original.neq or original.ntendon:
             self.notes.append(
                 f"{self.path.name} couples bodies or joints (<equality>, <tendon>: closed "
@@ -334,7 +334,7 @@ class _Reader:
         ]
         if outside and isinstance(self.settings.pose, dict):
             raise InputError(
-                f"{self.where}: pose is beyond the limits of {_some(outside)}. Angles are in "
+                f"{self.where}: pose is beyond the limits of {_list(outside)}. Angles are in "
                 "radians."
             )
         return np.clip(pose, low, high), low, high
@@ -619,7 +619,7 @@ class _Reader:
         before = np.array([len(self._above(int(model.jnt_bodyid[j]))) for j in ids])
         images_of, signs = np.zeros(len(ids), int), np.zeros(len(ids))
         for k in range(len(ids)):
-            # where on its axis a joint is placed says nothing
+            # the place of a joint along its axis is arbitrary
             apart = at - at[k] * plane
             beside = apart - (apart @ images[k])[:, None] * images[k]
             along = (axes * images[k]).sum(axis=1)
@@ -776,7 +776,7 @@ def _states_mass(spec: Any, body: Any) -> bool:
     )
 
 
-def _some(names: Sequence[str]) -> str:
+def _list(names: Sequence[str]) -> str:
     """The first names of a list."""
     names = list(dict.fromkeys(names))
     return ", ".join(names[:6]) + (", …" if len(names) > 6 else "")

@@ -3,12 +3,12 @@
     robot = joint_map_of(Path("arm.xml"), "sts3215")      # robot.joint_map, robot.left_out
     robot = joint_map_of_servos({"pan": 1, "tilt": 2}, "xl330-m288")       # without a model
 
-Each hinge that an actuator drives, by itself or through a tendon, becomes a joint with a servo;
-in a model without actuators, each hinge that does not follow another one (URDF `mimic`, MJCF
-equality). Three things are guesses: ids run from 1 in the file's
-order, a servo's centre is at the joint's zero (or in the middle of its range, if zero is outside),
-and counts grow with the joint's angle. `pupper-sysid calibrate-joints` measures the centres; ids
-and signs are checked in `pupper-sysid monitor` while a joint is moved by hand.
+Each hinge that an actuator drives, by itself or through a tendon, becomes a joint with a servo; in
+a model without actuators, each hinge that does not follow another one (URDF `mimic`, MJCF
+equality). Three things are guesses: ids run from 1 in the file's order, a servo's centre is at the
+joint's zero (or in the middle of its range, if zero is outside), and counts grow with the joint's
+angle. `pupper-sysid calibrate-joints` measures the centres; ids and signs are checked in
+`pupper-sysid monitor` while a joint is moved by hand.
 """
 
 from __future__ import annotations

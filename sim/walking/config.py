@@ -1,6 +1,6 @@
 """Settings of the walking task. Every field is a flag of `pupper-train`; units are in the names.
 
-`PRESETS` are complete sets: `fast` is this project's own, `paper` and `release` follow the
+`PRESETS` are complete sets: `fast` is that of this project, `paper` and `release` follow the
 published task (observation with the true speed of the trunk, wide commands, published rewards).
 """
 
@@ -267,7 +267,7 @@ _SCRATCH = Walking(
 
 PRESETS = {
     "fast": Walking(
-        # half of the robots are as the calibration says: their speeds are to be right
+        # half of the robots are as calibrated, so that speeds are learned exactly
         differences=replace(TYPICAL, as_calibrated=0.5),
         # searched for clearance, torque and few pushed falls beside exact speeds (the cost of
         # `policies.train.first_gait`): feet rise 7 mm instead of 2 at 0.15 m/s. PPO makes up for

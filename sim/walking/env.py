@@ -191,7 +191,7 @@ class PupperEnv:
         )
         self._until_command, self._until_push = zeros(), zeros()
         self._size = sum(size for _, size, _ in observation_of(len(body.joints)))
-        self._size += sum(x.shape[1] for x in self._seen(slice(None)))
+        self._size += sum(x.shape[1] for x in self._user_observations(slice(None)))
         self.reset()
 
     # ------------------------------------------------------------------------- public
@@ -207,7 +207,7 @@ class PupperEnv:
         Draws noise, but does not let time pass.
         """
         n = self.environments
-        return self._look(
+        return self._observe(
             slice(None), noise_of(self.config.observation, len(self.default), n, self.rng)
         )
 
@@ -256,7 +256,7 @@ class PupperEnv:
         if len(over):
             self._restart(over)
             noise = None if now.noise is None else now.noise[over]
-            now.observation[over], now.privileged[over] = self._look(over, noise)
+            now.observation[over], now.privileged[over] = self._observe(over, noise)
         facts = Step(body=self.body, **now.facts)
         return StepResult(
             now.observation, now.privileged, reward, done, timed_out, now.terms, terminal,
@@ -320,7 +320,7 @@ class PupperEnv:
         senses = self._senses
         owners = {"readings": senses.readings, "imu": senses.imu, "strides": self._strides}
         owners["effort"] = self._effort
-        arrays = {f"{part}.{k}": v for part, its in owners.items() for k, v in its.state.items()}
+        arrays = {f"{name}.{k}": v for name, x in owners.items() for k, v in x.state.items()}
         return arrays | {name: getattr(self, name) for name in _ARRAYS} | {"_seen": senses.recent}
 
     @property
@@ -401,7 +401,7 @@ class PupperEnv:
             velocity = trunk_velocity(qpos, qvel)
         self._senses.imu.advance(rows, qvel[:, 3:6], gravity)
         noise = None if now.noise is None else now.noise[rows]
-        self._look(
+        self._observe(
             rows, noise, now.observation[rows], now.privileged[rows],
             (qpos, qvel, gravity, velocity),
         )  # fmt: skip
@@ -435,7 +435,7 @@ class PupperEnv:
 
     # ------------------------------------------------------------------------- what is seen
 
-    def _look(
+    def _observe(
         self,
         rows: Rows,
         noise: NDArray[np.float32] | None,
@@ -458,7 +458,7 @@ class PupperEnv:
             [
                 velocity if true else np.zeros((len(qpos), 3)), rate, down,
                 self.command[rows], angle - self.default, moved, effort, self.action[rows],
-                *self._seen(rows),
+                *self._user_observations(rows),
             ],
             noise, observation,
         )  # fmt: skip
@@ -476,7 +476,7 @@ class PupperEnv:
         )  # fmt: skip
         return observation, privileged
 
-    def _seen(self, rows: Rows) -> list[Array]:
+    def _user_observations(self, rows: Rows) -> list[Array]:
         """The user's parts of an observation for some robots."""
         return [np.asarray(part(self, rows), float) for part in self._user_parts.values()]
 

@@ -1,7 +1,7 @@
 """One emulated robot that walks on flat ground, as a `ServoPlant` with an IMU.
 
-Its servos are those of `sim.emulator`. MuJoCo steps it only as far as a call asks; a robot
-at rest is not stepped until a command moves it. Commands come at any instant, not only on physics
+Its servos are those of `sim.emulator`. MuJoCo steps it only to the instant of a call; a robot at
+rest is not stepped until a command moves it. Commands come at any instant, not only on physics
 steps: each actuator gets the mean of its held command over the step before
 (`sim.robot.servo_mjcf.for_commands_between_steps`). The last two seconds are kept, because servos
 are polled one after the other, each a little before the latest evaluated instant. `trunk` gives the
@@ -135,7 +135,7 @@ class WalkingRobot:
             self._changed = self._step
 
     def angle(self, index: int, time_s: float) -> float:
-        """True angle of a servo [rad], at most two seconds before the latest asked."""
+        """True angle of a servo [rad], at most two seconds before the latest call."""
         with self._lock:
             before, after, share = self._moment(time_s)
             self._asked[index] = after
@@ -184,7 +184,7 @@ class WalkingRobot:
 
     def _stand(self) -> None:
         """Stand at the origin in the default pose, settled, with full delay lines."""
-        if not self.body.is_mini_pupper:  # others stand where their file puts them
+        if not self.body.is_mini_pupper:  # other robots start where their file places them
             self._data.qpos[:7] = [0, 0, self.body.standing_height_m, 1, 0, 0, 0]
         self._data.qpos[7:] = self.body.pose
         for index, held in enumerate(self._goal.copy()):
@@ -234,7 +234,7 @@ class WalkingRobot:
                 self._changed = self._step
                 self._take_step()
             elif self._resting():
-                self._stay(min(event, last))
+                self._rest_until(min(event, last))
             else:
                 self._data.ctrl[:] = self._goal
                 self._take_step()
@@ -252,7 +252,7 @@ class WalkingRobot:
         self._forces[row] = self._force
         chip[:3], chip[3:] = self._acceleration, self._rate
 
-    def _stay(self, until: int) -> None:
+    def _rest_until(self, until: int) -> None:
         """Let time pass without motion until step `until`."""
         now = self._step % _MEMORY_STEPS
         rows = np.arange(max(self._step, until - _MEMORY_STEPS) + 1, until + 1) % _MEMORY_STEPS

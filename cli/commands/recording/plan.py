@@ -61,7 +61,7 @@ def run_rounds(
             done, request = bool(footer(path)), dict(header_of(path)["sweep"])
     else:
         paths = [path]
-        if force:  # rounds of an earlier sweep of this name are not this one's
+        if force:  # rounds of an earlier sweep of this name
             for old in _recorded(first)[1:]:
                 old.unlink()
     written = list(paths)
@@ -72,7 +72,7 @@ def run_rounds(
         file = _of_round(first, number)
         refuse_overwrite(file)
         plan_file = file.with_suffix(".plan.yaml")
-        save_plan(plan, plan_file, force=True)  # of a round that never began, if it is there
+        save_plan(plan, plan_file, force=True)  # may exist, of a round that never began
         again = request | {
             "plan": str(plan_file), "joints": plan.joints, "loop_period_s": plan.loop_period_s,
             "until": series | {"number": number},
@@ -200,7 +200,7 @@ class Plan:
             refuse_outside("--rate", self.rate, *RATES_HZ, "Hz")
         from pupper_sysid.sysid.plan.plan_file import save_plan
 
-        plan = self._made()
+        plan = self._plan()
         if self.out is not None:
             save_plan(plan, self.out, self.force)
         if self.json:
@@ -213,7 +213,7 @@ class Plan:
         else:
             terminal.err.print("Nothing was written; --out plan.yaml keeps it.")
 
-    def _made(self) -> SweepPlan:
+    def _plan(self) -> SweepPlan:
         """The plan from recordings or a calibration, or a first sweep without either."""
         from pupper_sysid.servo_models.calibration.calibration import InputFile, load_calibration
         from pupper_sysid.sysid.plan import proposal

@@ -149,7 +149,7 @@ class Sweep:
                 )
             run_rounds(
                 lambda *recording: self._record(*recording)[1], path, request,
-                resume=self.resume is not None, complete=done, force=self.force, as_json=self.json,
+                resume=self.resume is not None, done=done, force=self.force, as_json=self.json,
             )  # fmt: skip
             return
         chosen, written = self._record(path, request, self.resume is not None)
@@ -186,13 +186,13 @@ class Sweep:
                     force=self.force, resume=point, progress=shows[0], observe=shows[1],
                 )  # fmt: skip
         except (BusError, KeyboardInterrupt):
-            _say_what_stays(bus)
+            _warn_of_unrestored(bus)
             if path.exists() and not existed and path.stat().st_size == 0:
                 path.unlink()  # stopped before its header
             elif path.exists() and (point or not existed or self.force):
                 say_how_to_resume(path)
             raise
-        _say_what_stays(bus)
+        _warn_of_unrestored(bus)
         terminal.warn(*_guard_warnings(path))
         written = [path]
         if self.truth and isinstance(bus.bus, EmulatedBus):
@@ -369,7 +369,7 @@ def _open_bus(request: dict[str, Any]) -> ServoBus:
             "`servo` is STS3215."
         )
     drawn, plant = pendulum.draw_of_map(rng, map_, registers) if map_ else (draw_robot(rng), None)
-    if request.get("plan"):  # the same robot, but not once more the same noise
+    if request.get("plan"):  # the same robot, with other noise
         noise = int(sha256(Path(request["plan"]))[:12], 16)
         rng = np.random.default_rng([request["seed"], noise])
     return EmulatedBus(drawn, rng, real_time, plant)
@@ -480,7 +480,7 @@ def _guard_warnings(path: Path) -> list[str]:
     return [f"{counts[k]} commands {text}" for k, text in sentences.items() if counts.get(k)]
 
 
-def _say_what_stays(bus: GuardedBus) -> None:
+def _warn_of_unrestored(bus: GuardedBus) -> None:
     """Warn of registers that could not be set back."""
     for joint, registers in bus.registers.originals.items():
         for name, value in registers.items():

@@ -186,7 +186,7 @@ class Guide:
                 if by > jc.STILL * self._counts
             ]
             if not moved or self._keep(
-                f"Moved while being measured, in counts: {_some(moved)}. "
+                f"Moved while being measured, in counts: {_list(moved)}. "
                 "Enter to measure again, k to keep this"
             ):
                 break
@@ -220,7 +220,7 @@ class Guide:
         cut = [n for n in travel.cut_off(self.joints) if n not in refused]
         if cut:
             terminal.warn(
-                f"{_some(cut)}: the travel runs into the end of the encoder; an end is not seen."
+                f"{_list(cut)}: the travel runs into the end of the encoder; an end is not seen."
             )
         return {
             name: jc.limits_within(int(travel.low[k]), int(travel.high[k]))
@@ -332,5 +332,5 @@ class Guide:
         return answer
 
 
-def _some(names: list[str]) -> str:
+def _list(names: list[str]) -> str:
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

@@ -229,7 +229,7 @@ class Feetech(SerialLine):
         )
         with _imu_beside(bench, self.imu_socket, rng):
             imu = f"; IMU at {self.imu_socket}." if self.imu_socket else "."
-            # without a map only a whole Mini Pupper is taken for one
+            # without a map only a line of all its servos counts as a Mini Pupper
             part = len(emulator.servos) < len(layout.ids)
             named = self.joint_map or (preset if part and not self.load else None)
             _serve_line(self, emulator, bench, imu, named)
@@ -281,8 +281,8 @@ def _series_of(family: Family, model: str | None, layout: JointMap | None, usual
     known = {s.name.lower(): s for s in (*family.series.values(), *family.profiles.values())}
     name = (model or of_map or usual.name).lower()
     if name not in known or (of_map and name != of_map.lower()):
-        whose = f"; the joint map is of {of_map}" if of_map else ""
-        raise InputError(f"--model {name}: choose one of {', '.join(known)}{whose}.")
+        remark = f"; the joint map is of {of_map}" if of_map else ""
+        raise InputError(f"--model {name}: choose one of {', '.join(known)}{remark}.")
     return known[name]
 
 
@@ -404,7 +404,7 @@ class Hand:
         if key == "n":
             following = 0 if self._chosen is None else self._chosen + 1
             self._chosen = following if following < len(self._names) else None
-            return f"{self._what()}: chosen"
+            return f"{self._chosen_joint()}: chosen"
         if key not in _STEPS_RAD and key != "0":
             return ""
         indices = range(len(self._names)) if self._chosen is None else (self._chosen,)
@@ -412,10 +412,10 @@ class Hand:
         for i in limp:
             self._bench.move_by_hand(i, _STEPS_RAD.get(key))
         if not limp:
-            return f"{self._what()}: holds its position; only a limp joint moves by hand"
-        return f"{self._what()}: {self._bench.hand_rad[limp[0]]:+.2f} rad"
+            return f"{self._chosen_joint()}: holds its position; only a limp joint moves by hand"
+        return f"{self._chosen_joint()}: {self._bench.hand_rad[limp[0]]:+.2f} rad"
 
-    def _what(self) -> str:
+    def _chosen_joint(self) -> str:
         return "all joints" if self._chosen is None else self._names[self._chosen]
 
 
@@ -428,8 +428,8 @@ def keys_move(bench: ServoBench) -> Iterator[None]:
         with suppress(OSError):  # the terminal is gone
             while typed := os.read(fd, 64):
                 for key in typed.decode(errors="ignore"):
-                    if said := hand.press(key):
-                        terminal.err.print(said)
+                    if notice := hand.press(key):
+                        terminal.err.print(notice)
 
     raw = terminal_without(termios.ICANON | termios.ECHO, fd) if os.isatty(fd) else nullcontext()
     with raw:

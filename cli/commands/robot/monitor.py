@@ -249,7 +249,7 @@ class Watched:
             return "–"
         if self.answers_now and seconds < 1:
             return f"{1e3 * seconds:.0f} ms"
-        # it may have been there long before the first reading
+        # its age before the first reading is unknown
         since_before = not self.answers_now and not self._has_changed[joint]
         return ("≥" if since_before else "") + f"{seconds:.1f} s"
 

@@ -80,7 +80,7 @@ class Scan:
         """Try all serial ports, and the proxy's socket."""
         ports = serial_ports()
         with terminal.progress("scanning", 0) as advance:
-            answers = {device: _tried(device, advance) for device in ports}
+            answers = {device: _scanned(device, advance) for device in ports}
         reports = [a for a in answers.values() if isinstance(a, LineReport)]
         silent = {device: a for device, a in answers.items() if isinstance(a, str)}
         proxy = SOCKET.exists()
@@ -151,7 +151,7 @@ def serial_ports() -> list[str]:
     )  # fmt: skip
 
 
-def _tried(device: str, advance: Callable[[str], None]) -> LineReport | str:
+def _scanned(device: str, advance: Callable[[str], None]) -> LineReport | str:
     """What answers at a port, by any protocol; or why nothing does, in words."""
     serial = [kind for kind in KINDS.values() if kind.is_serial]
     for kind in serial:
@@ -245,7 +245,7 @@ class Park:
             now = time.monotonic()
             since_s = {driver: since_s.get(driver, now) for driver in abandoned}
             for driver, note in abandoned.items():
-                # a driver that was stopped for less goes on, and would switch on again
+                # a driver that was stopped for a shorter time resumes, and would switch on again
                 if now - since_s[driver] > HANG_S:
                     _take(note, min(self.seconds, _OTHERS_WAIT_S), say=driver not in tried)
                     tried.add(driver)
@@ -267,7 +267,7 @@ def _take(note: Note, seconds: float, say: bool = True) -> bool:
         terminal.err.print(f"{where}: {outcome}")
     if not on:
         restore(note.address, note.joint_map, note.registers)
-    if settled:  # last: what is interrupted here is said again, not lost
+    if settled:  # last: an interrupt before it repeats the message and loses nothing
         note.remove()
     return settled
 

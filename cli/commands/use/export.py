@@ -182,13 +182,13 @@ class Export:
     @staticmethod
     def _at_gain(calibration: Calibration, gain: float) -> Calibration:
         """The calibration at another P gain; says how far that was tested."""
-        said = {
+        sentences = {
             joint.under_load.how_far_tested(gain)
             for joint in calibration.joints.values()
             if joint.under_load is not None
         }
         at_gain = calibration.at_p_gain(gain)
-        for sentence in sorted(said):
+        for sentence in sorted(sentences):
             terminal.err.print(sentence)
         return at_gain
 

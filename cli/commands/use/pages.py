@@ -36,7 +36,7 @@ class Report(OfRecordings):
 
     def run(self) -> None:
         """Examine, measure, calibrate, write."""
-        # here, because drawing and python-control take a second that --help should not
+        # imported here: drawing and python-control take a second, which --help should not
         from pupper_sysid.servo_models.calibration.calibration import load_calibration
         from pupper_sysid.sysid.report.report import PAGE, write_report
 

@@ -1,8 +1,8 @@
 """Weights and parameters of the walking task's reward terms, and the published sets.
 
 `PAPER` and `RELEASE` hold the weights of the paper's text and of the training configuration its
-authors released; `DEFAULT` are this project's own. A weight is per second: the sum is multiplied by
-the control period, as in Isaac Lab.
+authors released; `DEFAULT` are those of this project. A weight is per second: the sum is multiplied
+by the control period, as in Isaac Lab.
 """
 
 from __future__ import annotations
