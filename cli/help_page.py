@@ -48,11 +48,11 @@ def help_page(
         parser = _subcommands(parser)[word]
         program = f"{program} {word}"
     width = max(_NARROWEST, min(_WIDEST, shutil.get_terminal_size().columns))
-    everything = "\n".join(_page(parser, program, width, whole=True, nested=True))
+    everything = "\n".join(_page(parser, program, width, full=True, nested=True))
     if ALL in arguments or everything.count("\n") < SCREEN_LINES:
         return everything
-    for whole in (True, False):
-        lines = _page(parser, program, width, whole, nested=False)
+    for full in (True, False):
+        lines = _page(parser, program, width, full, nested=False)
         rest = _omission(parser)
         lines += ["", *textwrap.wrap(f"{rest}{program} {ALL} shows every option in full.", width)]
         if len(lines) <= SCREEN_LINES:
@@ -68,7 +68,7 @@ def _subcommands(parser: argparse.ArgumentParser) -> dict[str, argparse.Argument
 
 
 def _page(
-    parser: argparse.ArgumentParser, program: str, width: int, whole: bool, nested: bool
+    parser: argparse.ArgumentParser, program: str, width: int, full: bool, nested: bool
 ) -> list[str]:
     positional = [
         a for a in parser._actions if not (a.option_strings or isinstance(a.choices, dict))
@@ -94,7 +94,7 @@ def _page(
         lines += ["", *([f"{title}:"] if title else [])]
         for action in actions:
             text, end = _text(action)
-            text = text if whole else _first_sentence(text)
+            text = text if full else _first_sentence(text)
             lines += _row(_name(action), text + end, width)
     return lines
 

@@ -80,8 +80,8 @@ class PositionLimits:
         margin = np.minimum(pose - self.low_rad, self.high_rad - pose)
         c = self.coupling
         if c is not None:
-            both = pose[c.calf] + c.sign * pose[c.thigh]
-            coupled = np.minimum(both - c.low_rad, c.high_rad - both)
+            servo_angle = pose[c.calf] + c.sign * pose[c.thigh]
+            coupled = np.minimum(servo_angle - c.low_rad, c.high_rad - servo_angle)
             margin[c.calf] = np.minimum(margin[c.calf], coupled)
         return np.maximum(margin, 0.0)
 

@@ -202,10 +202,10 @@ def family_faults(series: Series, registers: Mapping[str, int]) -> list[Register
         meaning = "its watchdog has stopped the servo, because an earlier program ended"
         cure = "Nothing has to be done: it is cleared before the torque is switched on"
         faults.append(RegisterFault("bus_watchdog", TRIGGERED, meaning, cure, False))
-    if (other := registers["secondary_id"]) <= HIGHEST_ID:
-        meaning = f"the servo also obeys the commands to id {other}"
+    if (second_id := registers["secondary_id"]) <= HIGHEST_ID:
+        meaning = f"the servo also obeys the commands to id {second_id}"
         cure = f"Write 255 into it with {FAMILY.tool}, or leave the servo out of the joint map"
-        faults.append(RegisterFault("secondary_id", other, meaning, cure))
+        faults.append(RegisterFault("secondary_id", second_id, meaning, cure))
     if registers["drive_mode"] & REVERSE:
         meaning = "counts fall as the horn turns counter-clockwise"
         cure = "The signs of the joint map must have been checked with it"

@@ -219,10 +219,10 @@ def _with_first_gait(run: Run, ranks: Ranks, until: float) -> Run:
 def _extension(options: Options, words: list[str]) -> tuple[int | None, float | None]:
     """New --iterations and --minutes of a resumed run; anything else would have no effect."""
     flags = {a.split("=")[0] for a in words if a.startswith("--")}
-    other = flags - {"--resume", "--iterations", "--minutes"}
-    if other:
+    ignored = flags - {"--resume", "--iterations", "--minutes"}
+    if ignored:
         raise InputError(
-            f"A resumed run keeps its own settings, so {sorted(other)[0]} would change nothing. "
+            f"A resumed run keeps its own settings, so {sorted(ignored)[0]} would change nothing. "
             "Leave it out, or start a new run."
         )
     return (

@@ -465,19 +465,19 @@ def _of_metadata(network: OnnxNetwork, stated: PolicyYaml) -> tuple[dict[str, An
     metadata, path, notes = network.metadata, network.path, []
     known: dict[str, Any] = {}
 
-    def wanted(key: str) -> str | None:
+    def unstated(key: str) -> str | None:
         return None if getattr(stated, key) is not None else metadata.get(_KEYS[key][0])
 
-    if (text := wanted("joints")) is not None:
+    if (text := unstated("joints")) is not None:
         known["joints"] = [n.strip() for n in text.split(",") if n.strip()]
     for key in ("default_pose_rad", "action_scale_rad"):
-        if (text := wanted(key)) is not None:
+        if (text := unstated(key)) is not None:
             values = _numbers(text, _KEYS[key][0], path)
             if values is None:
                 continue
             single = key == "action_scale_rad" and len(values) == 1
             known[key] = float(values[0]) if single else values.tolist()
-    if (text := wanted("observation")) is not None:
+    if (text := unstated("observation")) is not None:
         names = [n.strip() for n in text.split(",") if n.strip()]
         known["observation"] = _metadata_terms(network, names)
         if "joint_pos" in names:

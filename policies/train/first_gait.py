@@ -317,7 +317,7 @@ def fit_trot(
         mean = values.mean(axis=0)
         width = np.maximum(values.std(axis=0), _NARROWEST * (high - low))
         progress((generation + 1) / (_GENERATIONS + 1))
-    best = [trot for _, trot in sorted(tried, key=lambda one: one[0])[: _FINALISTS - 1]]
+    best = [trot for _, trot in sorted(tried, key=lambda pair: pair[0])[: _FINALISTS - 1]]
     trots = [task.trot, _trot(task.trot, box, mean), *best]
     walked = _judged(trots, task, servos, seed, threads)
     before = _score(walked[0])

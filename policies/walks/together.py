@@ -172,15 +172,15 @@ class _Group:
         self.robots = [slice(a, b) for a, b in pairwise(ends)]
         number = np.concatenate([np.arange(c.robots) for c in conditions])
 
-        def each(values: Sequence[float]) -> Array:
+        def per_robot(values: Sequence[float]) -> Array:
             return np.repeat(np.array(values), [c.robots for c in conditions])
 
         # a step longer, so that no episode times out within it
         task = replace(conditions[0].task, episode_s=(self.steps + 1) * step_s)
         self.env = PupperEnv(
             task, servos, ends[-1], _SEED + seed, threads, servo_model_of(servos.source, step_s),
-            each([c.extra_dead_time_s for c in conditions]), Twins(number, shared.robots),
-            each([c.handicap.extra_jitter_s for c in conditions]) if shared.jitter else None,
+            per_robot([c.extra_dead_time_s for c in conditions]), Twins(number, shared.robots),
+            per_robot([c.handicap.extra_jitter_s for c in conditions]) if shared.jitter else None,
         )  # fmt: skip
         for condition, robots in zip(conditions, self.robots, strict=True):
             impose(self.env.robots, _numbers(robots), condition.handicap)
@@ -199,7 +199,7 @@ class _Group:
         )  # fmt: skip
         self.commands = at_rest(task.commands, commands.reshape(-1, 3)).reshape(commands.shape)
         self.pushes = push_directions(shared.robots, self.steps, step_s, seed)
-        chance = each([c.handicap.missed_ticks for c in conditions])
+        chance = per_robot([c.handicap.missed_ticks for c in conditions])
         self.missed = missed_ticks(shared.robots, self.steps, seed)[:, number] < chance
         self.led, self.trotting = (
             np.flatnonzero(np.repeat([c.walker == w for c in conditions], np.diff(ends)))
@@ -267,8 +267,8 @@ class _Group:
 
     def results(self) -> list:
         """What was kept, by condition."""
-        parts = zip(self.conditions, self.robots, self.last.tolist(), strict=True)
-        return [self.recorder.of(c, robots, n, self.commands[:, robots]) for c, robots, n in parts]
+        groups = zip(self.conditions, self.robots, self.last.tolist(), strict=True)
+        return [self.recorder.of(c, robots, n, self.commands[:, robots]) for c, robots, n in groups]
 
 
 def _reference(task: Walking) -> Trot:

@@ -241,10 +241,10 @@ def implausible(card: ServoCard, specimen: str | None = None) -> tuple[str, ...]
         return ()
     names = [specimen] if specimen else list(card.specimens)
     bare = {
-        name: other.pd().armature_kg_m2.value
+        name: candidate.pd().armature_kg_m2.value
         for name in card_names()
-        if (other := load_card(name)).servo == card.servo and other.armature == "servo"
-        if isinstance(other.numbers, PositionLoop)
+        if (candidate := load_card(name)).servo == card.servo and candidate.armature == "servo"
+        if isinstance(candidate.numbers, PositionLoop)
     }
     if not bare:
         return ()

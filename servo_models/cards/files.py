@@ -167,7 +167,7 @@ def from_bam(
     if p.error_gain_ratio == 0:
         raise InputError(f"{name}: error_gain_ratio is 0; it must be above 0. Fit it again.")
     ratio = 1.0 if p.error_gain_ratio is None else p.error_gain_ratio
-    both = p.load_friction_base, p.load_friction_stribeck
+    load_frictions = p.load_friction_base, p.load_friction_stribeck
     numbers = {
         "duty_per_rad": kind.error_gain * ratio,
         "duty_limit": kind.duty_limit,
@@ -179,10 +179,10 @@ def from_bam(
         "stribeck_friction_nm": p.friction_stribeck,
         "stribeck_speed_rad_s": p.dtheta_stribeck,
         "stribeck_exponent": p.alpha,
-        "load_friction_motor": _first(p.load_friction_motor, both[0]),
-        "load_friction_load": _first(p.load_friction_external, both[0]),
-        "load_stribeck_motor": _first(p.load_friction_motor_stribeck, both[1]),
-        "load_stribeck_load": _first(p.load_friction_external_stribeck, both[1]),
+        "load_friction_motor": _first(p.load_friction_motor, load_frictions[0]),
+        "load_friction_load": _first(p.load_friction_external, load_frictions[0]),
+        "load_stribeck_motor": _first(p.load_friction_motor_stribeck, load_frictions[1]),
+        "load_stribeck_load": _first(p.load_friction_external_stribeck, load_frictions[1]),
         "load_quadratic_motor": p.load_friction_motor_quad,
         "load_quadratic_load": p.load_friction_external_quad,
         "velocity_limit_rad_s": p.max_velocity,

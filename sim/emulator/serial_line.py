@@ -300,7 +300,7 @@ class LineEmulator(ABC):
         data = bytes(servo.memory[address : address + size])
         answer = encode(servo_id, error, data)
         # the answer of another servo to another request
-        other = self._status((servo_id + 100) % 250, 0, bytes(len(data)))
+        foreign = self._status((servo_id + 100) % 250, 0, bytes(len(data)))
         if kind == "wrong-length":
             shorter = len(data) and self._rng.random() < 0.5
             more = bytes([int(self._rng.integers(256))])
@@ -308,7 +308,7 @@ class LineEmulator(ABC):
         if servo_id in self._doubled:
             answer = self._collided(servo_id, address, data, error, encode)
         arrived = []
-        for late, piece in self.faults.apply(kind, answer, other):
+        for late, piece in self.faults.apply(kind, answer, foreign):
             self._free_at = max(self._free_at, begin) + len(piece) * byte_s
             arrived.append((self._free_at + late, piece))
         if kind == "second-writer":

@@ -181,22 +181,22 @@ def _notes(servos: ExportedServos, joints: Mapping[str, JointCheck]) -> Iterator
         continuous = min(steps_s) <= CONTINUOUS_S
         basis = "in continuous time" if continuous else f"for steps of {1e3 * min(steps_s):g} ms"
         worst = max(joints, key=lambda name: joints[name].step_rad[WHOLE])
-        here = 1e3 * joints[worst].step_rad[WHOLE]
+        error_mrad = 1e3 * joints[worst].step_rad[WHOLE]
         far = 1e3 * joints[worst].step_of_full_torque_rad
         actuator = servos.moving.joint(worst).actuator
         half = nearest_in_loop(actuator.parameters, h / 2, actuator.fitted_step_s, MUJOCO_PID)
         fitted = in_loop(actuator.parameters, actuator.fitted_step_s, unseen_tones())
         at, moved = in_loop(half, h / 2, unseen_tones())
-        there = 1e3 * _rms_difference(at, moved[:, 0], fitted[0], fitted[1][:, 0])
+        half_step_mrad = 1e3 * _rms_difference(at, moved[:, 0], fitted[0], fitted[1][:, 0])
         yield (
             f"The servos' numbers are {basis}, and no numbers of an actuator make up for steps of "
             f"{1e3 * h:g} ms: in one, the largest torque moves {worst} by {far:.2g} mrad, and "
             "torque, friction and set-point change once. The second table says what that costs, "
             "and what it would cost without a term."
             + (
-                f" Steps of {1e3 * h / 2:g} ms would leave {there:.2g} mrad of {worst}'s "
-                f"{here:.2g}."
-                if there < here
+                f" Steps of {1e3 * h / 2:g} ms would leave {half_step_mrad:.2g} mrad of {worst}'s "
+                f"{error_mrad:.2g}."
+                if half_step_mrad < error_mrad
                 else ""
             )
         )
@@ -288,9 +288,11 @@ def _rms_counts(
         return float(np.sqrt(np.mean((exported - np.interp(at, fitted_at, fitted)) ** 2)) / quantum)
     without_loss = HeldFeedback(poll_period_s=period, quantum_rad=quantum)
     without_loss.reset(exported[0], float(at[1] - at[0]), until_poll_s=period / 2)
-    there = np.array([without_loss.step(x) for x in exported])
+    exported_readings = np.array([without_loss.step(x) for x in exported])
     polls = period / 2 + period * np.arange(int(at[-1] / period) + 1)
     reported = np.round(np.interp(polls, fitted_at, fitted) / quantum) * quantum
-    here = reported[np.clip(np.searchsorted(polls, at + 1e-12, side="right") - 1, 0, None)]
+    fitted_reading = reported[
+        np.clip(np.searchsorted(polls, at + 1e-12, side="right") - 1, 0, None)
+    ]
     late = at > _SETTLE_S
-    return float(np.sqrt(np.mean(((there - here)[late] / quantum) ** 2)))
+    return float(np.sqrt(np.mean(((exported_readings - fitted_reading)[late] / quantum) ** 2)))

@@ -122,8 +122,8 @@ class Body:
             leg_joints = np.flatnonzero(self.leg_of == leg)
             place[leg_joints] = np.arange(1, len(leg_joints) + 1)
         kinds = {f"joint {k}": np.flatnonzero(place == k) for k in range(1, place.max() + 1)}
-        other = np.flatnonzero(self.leg_of < 0)
-        return kinds | ({"other": other} if len(other) else {})
+        without_leg = np.flatnonzero(self.leg_of < 0)
+        return kinds | ({"other": without_leg} if len(without_leg) else {})
 
     @cached_property
     def hips(self) -> NDArray[np.intp]:
@@ -187,7 +187,7 @@ def _mini_pupper(knee: Knee) -> Body:
         return np.concatenate([joint_angles(leg, feet[:, i]) for i, leg in enumerate(LEGS)], axis=1)
 
     pose, (low, high) = default_pose(), limits()
-    other = [LEGS.index({"L": "R", "R": "L"}[leg[0]] + leg[1:]) for leg in LEGS]
+    mirrored = [LEGS.index({"L": "R", "R": "L"}[leg[0]] + leg[1:]) for leg in LEGS]
     return Body(
         name=MINI_PUPPER, joints=JOINT_NAMES, feet=tuple(f"{leg}_foot" for leg in LEGS),
         pose=pose, low=low, high=high,
@@ -195,10 +195,10 @@ def _mini_pupper(knee: Knee) -> Body:
         leg_of=np.arange(len(JOINT_NAMES)) // 3, feet_at=feet_in_trunk(pose[None])[0],
         sole_m=np.full(len(LEGS), FOOT_RADIUS_M),
         offsets=np.array([0.0, 0.5, 0.5, 0.0]),
-        mirror_joints=np.array([3 * leg + k for leg in other for k in range(3)]),
+        mirror_joints=np.array([3 * leg + k for leg in mirrored for k in range(3)]),
         # hips turn about the forward axis, thighs and calves about the axis from side to side
         mirror_signs=np.array([-1.0 if name.endswith("hip") else 1.0 for name in JOINT_NAMES]),
-        mirror_feet=np.array(other), standing_height_m=STANDING_HEIGHT_M, mass_kg=MASS_KG,
+        mirror_feet=np.array(mirrored), standing_height_m=STANDING_HEIGHT_M, mass_kg=MASS_KG,
         xml=xml, feet_in_trunk=feet_in_trunk, joints_at=joints_at,
         touches_ground=touches_ground,
         foot_geoms=tuple(f"{leg}_foot" for leg in LEGS),

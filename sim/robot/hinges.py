@@ -158,7 +158,9 @@ def _depth_first(joints: list[Element]) -> list[Element]:
             continue
         ordered.append(joint)
         child = link(joint, "child")
-        waiting += [other for other in joints if link(other, "parent") == child][::-1]
+        waiting += [next_joint for next_joint in joints if link(next_joint, "parent") == child][
+            ::-1
+        ]
     return ordered + [joint for joint in joints if joint not in ordered]
 
 

@@ -139,7 +139,7 @@ class ServoDemand(Commanded):
         def demand_of(policy: Actor, trial: Trial) -> Demand:
             return servo_demand(policy, trial, candidate(trial.task.body), known)
 
-        demands: dict[str, Demand] = self.each(demand_of, self.command)
+        demands: dict[str, Demand] = self.per_policy(demand_of, self.command)
         (name, demand), *_ = demands.items()
         speed = float(np.hypot(*self.command[:2]))
         if path_is_onnx(self.policies[0]) and demand.speed_m_s < _STROLL * speed:

@@ -123,7 +123,7 @@ class OfPolicies(Analysis):
     threads: int = 0
     """Of the physics; 0 for all cores."""
 
-    def each(
+    def per_policy(
         self,
         analyse: Callable[[Policy, Trial], Any],
         command: tuple[float, float, float] = (0.15, 0.0, 0.0),
@@ -265,7 +265,7 @@ class Gait(Commanded):
         from pupper_sysid.policies.analysis.gait import describe
 
         rng = np.random.default_rng(self.seed)
-        walks = self.each(lambda policy, trial: trial.walk(policy), self.command)
+        walks = self.per_policy(lambda policy, trial: trial.walk(policy), self.command)
         reports = {name: describe(walked, rng) for name, walked in walks.items()}
         table = terminal.table(
             self.title("Gait, 90 % intervals over robots"), "policy", "Hz", "sine R² actions",
@@ -294,7 +294,7 @@ class Attractor(Commanded):
         from pupper_sysid.policies.analysis.figures import orbit_figure
         from pupper_sysid.policies.analysis.gait import SETTLE_S, SHORTEST_S
 
-        walks = self.each(orbits, self.command)
+        walks = self.per_policy(orbits, self.command)
         by_policy = {name: orbits_of for name, orbits_of in walks.items() if orbits_of}
         if not by_policy:
             raise InputError(
@@ -330,7 +330,7 @@ class Delay(Commanded):
         from pupper_sysid.policies.analysis.figures import delay_figure
         from pupper_sysid.policies.analysis.robustness import delay_curve
 
-        curves = self.each(delay_curve, self.command)
+        curves = self.per_policy(delay_curve, self.command)
         columns = (
             "extra_delay_ms", "mode", "survival", "frequency_hz", "amplitude_rad", "mae_vx_m_s",
         )  # fmt: skip
@@ -350,7 +350,7 @@ class Ablation(Commanded):
         from pupper_sysid.policies.analysis.figures import ablation_figure
         from pupper_sysid.policies.analysis.robustness import ablation
 
-        points = self.each(ablation, self.command)
+        points = self.per_policy(ablation, self.command)
         columns = ("channel", "kind", "level", "sigma", "correlation", "survival", "mae_vx_m_s")
         table = table_of(self.title("Altered observations"), points, columns)
         return {"ablations": points}, ablation_figure(points), table
@@ -368,7 +368,7 @@ class Autonomy(Commanded):
         from pupper_sysid.policies.analysis.autonomy import autonomy
         from pupper_sysid.policies.analysis.figures import autonomy_figure
 
-        tests_of = self.each(autonomy, self.command)
+        tests_of = self.per_policy(autonomy, self.command)
         table = terminal.table(
             self.title("Autonomy of the rhythm"), "policy", "test", "gait Hz", "share of amplitude",
             "still up", "phase shift", "of it kept",
@@ -403,7 +403,7 @@ class Terrain(Commanded):
         from pupper_sysid.policies.analysis.figures import terrain_figure
         from pupper_sysid.policies.analysis.robustness import terrain
 
-        points = self.each(terrain, self.command)
+        points = self.per_policy(terrain, self.command)
         columns = (
             "ground", "survival", "frequency_hz", "mae_vx_m_s", "mae_vy_m_s", "mae_yaw_rad_s",
         )  # fmt: skip
@@ -423,7 +423,7 @@ class Compliance(OfPolicies):
         from pupper_sysid.policies.analysis.figures import compliance_figure
         from pupper_sysid.policies.analysis.robustness import compliance
 
-        walks = self.each(compliance)
+        walks = self.per_policy(compliance)
         table = terminal.table(
             self.title("Walks by direction, 90 % intervals over robots"), "policy", "direction",
             "still up", "share of speed", "drift m/m", "arc rad/m", "wander m/turn",

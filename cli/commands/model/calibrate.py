@@ -182,9 +182,10 @@ def _mark(quantity: Quantity) -> str:
 
 def _damping(actuator: Actuator) -> str:
     """The damping, or its sum with the back-EMF where only that is known."""
-    damping, both = actuator.damping_nm_s_per_rad, actuator.ratios_to_armature.damping_and_back_emf
-    if damping.identified == "no" and both is not None and both.identified != "no":
-        return f"{terminal.number(actuator.armature_kg_m2.value * both.value, 3)}Σ"
+    damping = actuator.damping_nm_s_per_rad
+    braking = actuator.ratios_to_armature.damping_and_back_emf
+    if damping.identified == "no" and braking is not None and braking.identified != "no":
+        return f"{terminal.number(actuator.armature_kg_m2.value * braking.value, 3)}Σ"
     return _number(damping, 3)
 
 

@@ -137,8 +137,8 @@ class Sweep:
             if request["until"]:
                 request["until"]["first"] = path.name
         stem = path.with_suffix("")
-        for other in (f"{stem}.truth.yaml", f"{stem}.truth.csv") if self.truth else ():
-            refuse_overwrite(Path(other), self.force)
+        for truth_file in (f"{stem}.truth.yaml", f"{stem}.truth.csv") if self.truth else ():
+            refuse_overwrite(Path(truth_file), self.force)
         if self.truth and (self.resume or request["bus"] != EMULATED):
             raise InputError("--truth: only a new recording of the emulated robot has true values.")
         if request.get("until"):
