@@ -291,8 +291,6 @@ def _rms_counts(
     exported_readings = np.array([without_loss.step(x) for x in exported])
     polls = period / 2 + period * np.arange(int(at[-1] / period) + 1)
     reported = np.round(np.interp(polls, fitted_at, fitted) / quantum) * quantum
-    fitted_reading = reported[
-        np.clip(np.searchsorted(polls, at + 1e-12, side="right") - 1, 0, None)
-    ]
-    late = at > _SETTLE_S
-    return float(np.sqrt(np.mean(((exported_readings - fitted_reading)[late] / quantum) ** 2)))
+    last_poll = np.clip(np.searchsorted(polls, at + 1e-12, side="right") - 1, 0, None)
+    errors = (exported_readings - reported[last_poll])[at > _SETTLE_S] / quantum
+    return float(np.sqrt(np.mean(errors**2)))

@@ -158,9 +158,7 @@ def _depth_first(joints: list[Element]) -> list[Element]:
             continue
         ordered.append(joint)
         child = link(joint, "child")
-        waiting += [next_joint for next_joint in joints if link(next_joint, "parent") == child][
-            ::-1
-        ]
+        waiting += [j for j in joints if link(j, "parent") == child][::-1]
     return ordered + [joint for joint in joints if joint not in ordered]
 
 
