@@ -57,7 +57,7 @@ _DRAWN, _DRAWN_FROM = 200, (
 )  # fmt: skip
 """Servos tried, and ranges of their terms, the lag last; friction and effort of the range."""
 _OF_A_KIND = 2
-_REFINED, _HOPS, _TRIED, _WELL = 3, 3, 5, 0.02
+_REFINED, _HOPS, _WELL = 3, 3, 0.02
 _CRUDE = 0.004  # of the position's mean deviation
 EXPLAINED = 0.06
 """Of the position's mean deviation: a servo that leaves less explains nearly all."""
@@ -196,17 +196,32 @@ class Followed:
         return fit
 
     def _varied(self, fit: Follower) -> list[Follower]:
-        """The same servo with another kind of limit: the way to it may lead uphill."""
+        """The same servo with another kind of limit: the way to it may lead uphill.
+
+        A limit that the path does not reach has no derivative, and begins a little within it.
+        """
         effort = min(0.3 * self.reach, 0.5 * float(np.exp(fit.terms[_EFFORT])))
-        terms = np.tile(fit.terms, (8, 1))
-        for row, change in zip(terms, (
+        speed, ramp = (float(np.max(np.abs(x))) + 1e-9 for x in self.rates(fit.path_rad))
+        changes = (
             {_INTEGRAL: 1.5}, {_INTEGRAL: 0.01}, {_EFFORT: effort, _BACK_EMF: 1.0},
-            {_EFFORT: 3 * effort, _BACK_EMF: 5.0}, {_SPEED: 5.0, _RAMP: 25.0},
-            {_SPEED: 300.0, _RAMP: 2e4}, {_FRICTION: 0.05 * self.reach},
-            {_FRICTION: 0.004 * self.reach},
-        ), strict=True):  # fmt: skip
+            {_EFFORT: 3 * effort, _BACK_EMF: 5.0}, {_SPEED: 0.9 * speed},
+            {_SPEED: 0.9 * speed, _RAMP: 0.5 * ramp}, {_SPEED: 300.0, _RAMP: 2e4},
+            {_FRICTION: 0.05 * self.reach}, {_FRICTION: 0.004 * self.reach},
+        )  # fmt: skip
+        terms = np.tile(fit.terms, (len(changes), 1))
+        for row, change in zip(terms, changes, strict=True):
             row[list(change)] = np.log(list(change.values()))
-        return sorted(self.followers(terms), key=_cost)[:_TRIED]
+        return self.followers(terms)
+
+    def rates(self, path: NDArray) -> NDArray[np.float64]:
+        """First and second derivative of a path, shape (2, readings)."""
+        rates = np.zeros((2, len(path)))
+        for a, b in zip(self.starts[:-1], self.starts[1:], strict=True):
+            time = self.time_s[a:b] + 1e-9 * np.arange(b - a)
+            if b - a > 2:
+                rates[0, a:b] = np.gradient(path[a:b], time)
+                rates[1, a:b] = np.gradient(rates[0, a:b], time)
+        return rates
 
     @cached_property
     def unsure_rad(self) -> NDArray[np.float64]:
@@ -376,7 +391,7 @@ class Followed:
         return Follower(terms, path, cost, np.asarray(values, np.float64), rest)
 
 
-Columns = Callable[[NDArray], Sequence[NDArray]]
+Columns = Callable[[NDArray], Sequence[NDArray] | NDArray]
 """What a change adds to the path of a servo, from that path."""
 
 
@@ -601,7 +616,7 @@ def comparisons(joint: Followed) -> list[Compared]:
     """Every change, fitted."""
     # a load that is known sags and swings as its fit finds, and this servo does not
     loaded = any(t.load is not None for t in joint.trials)
-    found = []
+    fits, plain = [], joint.fit.cost
     for change in (_lag_drifts, _lag_changes) if loaded else CHANGES:
         if tried := change(joint):
             part, free = tried.joint or joint, (*_ALONE, *tried.free)
@@ -609,17 +624,18 @@ def comparisons(joint: Followed) -> list[Compared]:
                 (joint.regressed(f.terms, f.path_rad, tried.columns) for f in joint.screen),
                 key=_cost,
             ))  # fmt: skip
-            fits = [fitted(part, b, tried.columns, free) for b in begins]
-            fit = min(fits, key=_cost)
+            fit = min((fitted(part, b, tried.columns, free) for b in begins), key=_cost)
             alone = fit.terms.copy()
             alone[_GROWTH:] = joint.fit.terms[_GROWTH:]
-            plain = min(joint.fit.cost, fitted(joint, joint.follower(alone), rounds=8).cost)
-            if tried.usual:
-                begins = joint.fit, joint.follower(alone)
-                plain = min(plain, *(fitted(joint, b, tried.usual).cost for b in begins))
-            nats = fit.independent * np.log((plain + joint.unsure) / (fit.cost + joint.unsure))
-            nats -= 0.5 * tried.values * np.log(len(joint.time_s))
-            found.append(Compared(float(nats), tried.values, fit, tried.finding(fit)))
+            begins = joint.fit, joint.follower(alone)
+            plain = min(plain, fitted(joint, begins[1], rounds=8).cost)
+            usual = [fitted(joint, b, tried.usual).cost for b in begins] if tried.usual else []
+            fits.append((tried, fit, min(usual, default=np.inf)))
+    found = []
+    for tried, fit, usual in fits:
+        more = (min(plain, usual) + joint.unsure) / (fit.cost + joint.unsure)
+        nats = fit.independent * np.log(more) - 0.5 * tried.values * np.log(len(joint.time_s))
+        found.append(Compared(float(nats), tried.values, fit, tried.finding(fit)))
     return found
 
 
@@ -812,8 +828,7 @@ def _lag_changes(joint: Followed) -> _Change | None:
 
 def _shifted(joint: Followed) -> Columns:
     """What a constant shift in time adds, such as that of a position before its command."""
-    time = joint.time_s + 1e-9 * np.arange(len(joint.time_s))
-    return lambda path: [np.gradient(path, time)]
+    return lambda path: joint.rates(path)[:1]
 
 
 def _clipped(joint: Followed) -> _Change | None:
@@ -886,14 +901,11 @@ def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, 
     """
     count, dt = len(joint.time_s), float(np.median(np.diff(joint.time_s)))
     width = max(3, 1 + 2 * round(min(fit.settles_s, 1.0) / max(dt, 1e-4)))
-    shapes = []
+    shapes, rates = [], joint.rates(fit.path_rad)
     for a, b in zip(joint.starts[:-1], joint.starts[1:], strict=True):
-        time = joint.time_s[a:b] + 1e-9 * np.arange(b - a)
-        rate = np.gradient(fit.path_rad[a:b], time) if b - a > 2 else np.zeros(b - a)
-        bend = np.gradient(rate, time) if b - a > 2 else rate
         away = np.abs(fit.path_rad[a:b] - fit.path_rad[a]) > 0.01 * joint.reach
         since = joint.time_s[a:b] - joint.time_s[a + np.argmax(away)]
-        around = [maximum_filter1d(np.abs(x), min(width, 2 * (b - a) - 1)) for x in (rate, bend)]
+        around = maximum_filter1d(np.abs(rates[:, a:b]), min(width, 2 * (b - a) - 1))
         shapes.append([*around, 1.0 * (np.abs(since) < _EDGE_S)])
     tones = np.searchsorted([t.send_time_s[0] for t in named_tones(joint.trials)], joint.time_s)
     causes = [*(1.0 * (tones == n) for n in np.unique(tones)[1:]), joint.unsure_rad]

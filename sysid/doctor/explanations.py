@@ -241,14 +241,14 @@ def _resting(trial: Trial, fresh: NDArray[np.int64]) -> NDArray[np.int64]:
     """Rows in which the joint rests: their value has stayed for longer than any poll holds one.
 
     Each read is lost with one probability, so that the tail of the holds is exponential: half of
-    the longer ones are over after each further `half_life`.
+    the longer ones are over after each further `half_life`, which is the usual hold at most.
     """
     seen = np.flatnonzero(np.isfinite(trial.position_rad))
     time = trial.read_time_s
     if len(fresh) < 3 or not len(seen):
         return np.zeros(0, np.int64)
     usual, longer = np.quantile(np.diff(time[fresh]), [0.5, 0.75])
-    half_life = max(longer - usual, 0.5 * usual)  # half of the reads lost at least
+    half_life = min(max(longer - usual, 0.5 * usual), usual)  # rests are among the longer ones
     held = max(_HELD_S, usual + half_life * float(np.log2(len(fresh) / _BY_CHANCE)))
     last = np.searchsorted(fresh, seen, "right") - 1
     since = time[seen] - time[fresh[np.maximum(last, 0)]]

@@ -141,7 +141,10 @@ def relation_findings(
         return [_refusal(best, second.code if near else "")], base, None
     if at_once:
         return [at_once], base, None
-    return [] if usual else _loose(trials, joint, base, best), base, best.servo
+    found = [] if usual else _loose(base, best.servo)
+    if not (held or changes or any(t.load is not None for t in trials)):
+        found += _odd_scale(joint, base, best)  # a known load is held at a part of the command
+    return found, base, best.servo
 
 
 def _clocks_drift(joint: Followed, base: Explanation) -> Finding | None:
@@ -222,9 +225,11 @@ def _usual_gain(joint: Followed, base: Explanation, best: Relation) -> bool:
     inside &= (base.lags_s >= -0.5 * base.grid_s) & (base.lags_s <= _LONGEST_LAG_S)
     sign = float(np.sign(best.servo.gain))
     left = base.best(sign, inside).unexplained if inside.any() else 1.0
-    if not best.code and usual(float(joint.fit.values[0])):
-        left = min(left, joint.unexplained)
-    return base.nats(left) < base.nats(best.servo.unexplained) + CLEAR_NATS
+    least = best.servo.unexplained
+    if not best.code:
+        left = min(left, joint.unexplained if usual(float(joint.fit.values[0])) else 1.0)
+        least = min(least, joint.unexplained)
+    return base.nats(left) < base.nats(least) + CLEAR_NATS
 
 
 def _scale(base: Explanation, servo: Servo) -> Finding | None:
@@ -278,24 +283,26 @@ def _at_once(trials: Sequence[Trial], base: Explanation, servo: Servo) -> Findin
     return Finding("at_once", REFUSE, {"lag_ms": 1e3 * lag})
 
 
-def _loose(
-    trials: Sequence[Trial], joint: Followed, base: Explanation, best: Relation
-) -> list[Finding]:
-    found, servo = [], best.servo
-    share = 1 - servo.unexplained
+def _loose(base: Explanation, servo: Servo) -> list[Finding]:
     if base.explained < _LOOSE:
-        found.append(Finding("loosely_related", CARE, {"percent": 100 * base.explained}))
-    elif base.explained - share > _NO_ONE_LAG:
-        found.append(Finding("no_one_lag", CARE))
-    # a known load is held at a part of the command, the lower the P gain the less
-    if any(t.load is not None for t in trials) or _usual_gain(joint, base, best):
-        return found
-    gains = np.abs(base.gains[:, servo.filter, _at(base, servo)])
+        return [Finding("loosely_related", CARE, {"percent": 100 * base.explained})]
+    return (
+        [Finding("no_one_lag", CARE)]
+        if base.explained - 1 + servo.unexplained > _NO_ONE_LAG
+        else []
+    )
+
+
+def _odd_scale(joint: Followed, base: Explanation, best: Relation) -> list[Finding]:
+    """A gain that servos do not have, where none of a usual one explains the readings as well."""
+    if _usual_gain(joint, base, best):
+        return []
+    gains = np.abs(base.gains[:, best.servo.filter, _at(base, best.servo)])
+    gains = np.abs(joint.fit.values[:1]) if joint.explained else gains
     middle, most = float(np.median(gains)), float(gains.max())
-    if middle > _TOO_LARGE or most < _SMALL:
-        shown = middle if middle > _TOO_LARGE else most
-        found.append(Finding("scale_asks_care", CARE, {"gain": shown}))
-    return found
+    if _SMALL <= most and middle <= _TOO_LARGE:
+        return []
+    return [Finding("scale_asks_care", CARE, {"gain": middle if middle > _TOO_LARGE else most})]
 
 
 def _turns(trials: Sequence[Trial]) -> int:
