@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import nnls
 
+from pupper_sysid.common.tones import least_squares
 from pupper_sysid.servo_models import kernel
 from pupper_sysid.sysid.doctor.explanations import FILTERS, Explanation, Servo, explain
-from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding
+from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding, rivalled
 from pupper_sysid.sysid.recordings.excitation import named_tones, remembered
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -79,6 +80,8 @@ _LATER_S, _PER_GROWTH = (-0.06, -0.025, 0.025, 0.06), 0.1  # growth [1] of a lag
 _FEW_LEVELS = 4
 _SERVOS, _LEVELS = 4, np.linspace(0.15, 0.95, 9)  # of the command's range
 _DEEP, _BEYOND = 0.06, 0.03  # of the path's range; of the readings
+_UNSURE = 4.0  # errors that a servo as good as the fit may have: no while away from its path
+_STROKES, _EXPLAINED_THERE = 4.0, 0.25  # over the range of a while; of what is left there
 _MOST_LEFT, _TIMES_LARGER, _ROUNDS = 0.45, 5.0, 4
 
 
@@ -184,34 +187,35 @@ class Followed:
         best: Sequence[Follower] = self.screen
         for count, rounds in ((_REFINED, 4), (1, 20)):
             best = sorted((fitted(self, f, rounds=rounds) for f in best), key=_cost)[:count]
-        fit = best[0]
-        for _ in range(_HOPS):
-            if fit.cost < _WELL:
-                break
-            tried = [fitted(self, f, rounds=5) for f in self._varied(fit)]
-            better = min(tried, key=_cost)
-            if better.cost > 0.97 * fit.cost:
-                break
-            fit = fitted(self, better, rounds=15)
-        return fit
+        return self.hopped(best[0])
 
-    def _varied(self, fit: Follower) -> list[Follower]:
-        """The same servo with another kind of limit: the way to it may lead uphill.
+    def hopped(
+        self, fit: Follower, columns: Columns | None = None, free: Sequence[int] = _ALONE
+    ) -> Follower:
+        """The same servo with another kind of limit, if better: the way to it may lead uphill.
 
         A limit that the path does not reach has no derivative, and begins a little within it.
         """
-        effort = min(0.3 * self.reach, 0.5 * float(np.exp(fit.terms[_EFFORT])))
-        speed, ramp = (float(np.max(np.abs(x))) + 1e-9 for x in self.rates(fit.path_rad))
-        changes = (
-            {_INTEGRAL: 1.5}, {_INTEGRAL: 0.01}, {_EFFORT: effort, _BACK_EMF: 1.0},
-            {_EFFORT: 3 * effort, _BACK_EMF: 5.0}, {_SPEED: 0.9 * speed},
-            {_SPEED: 0.9 * speed, _RAMP: 0.5 * ramp}, {_SPEED: 300.0, _RAMP: 2e4},
-            {_FRICTION: 0.05 * self.reach}, {_FRICTION: 0.004 * self.reach},
-        )  # fmt: skip
-        terms = np.tile(fit.terms, (len(changes), 1))
-        for row, change in zip(terms, changes, strict=True):
-            row[list(change)] = np.log(list(change.values()))
-        return self.followers(terms)
+        for _ in range(_HOPS):
+            if fit.cost < _WELL:
+                break
+            effort = min(0.3 * self.reach, 0.5 * float(np.exp(fit.terms[_EFFORT])))
+            speed, ramp = (float(np.max(np.abs(x))) + 1e-9 for x in self.rates(fit.path_rad))
+            changes = (
+                {_INTEGRAL: 1.5}, {_INTEGRAL: 0.01}, {_EFFORT: effort, _BACK_EMF: 1.0},
+                {_EFFORT: 3 * effort, _BACK_EMF: 5.0}, {_SPEED: 0.9 * speed},
+                {_SPEED: 0.9 * speed, _RAMP: 0.5 * ramp}, {_SPEED: 300.0, _RAMP: 2e4},
+                {_FRICTION: 0.05 * self.reach}, {_FRICTION: 0.004 * self.reach},
+            )  # fmt: skip
+            terms = np.tile(fit.terms, (len(changes), 1))
+            for row, change in zip(terms, changes, strict=True):
+                row[list(change)] = np.log(list(change.values()))
+            begins = self.followers(terms, columns)
+            better = min((fitted(self, f, columns, free, rounds=5) for f in begins), key=_cost)
+            if better.cost > 0.97 * fit.cost:
+                break
+            fit = fitted(self, better, columns, free, rounds=15)
+        return fit
 
     def rates(self, path: NDArray) -> NDArray[np.float64]:
         """First and second derivative of a path, shape (2, readings)."""
@@ -282,27 +286,41 @@ class Followed:
     def changed(self) -> Compared | None:
         """The change that explains most of what the servo alone leaves, if one clearly does.
 
-        Whiles away from the path have no cause yet: what explains most of them is one.
+        Whiles away from the path have no cause yet: the change that explains most of them is one.
         """
-        nats, whiles = self.away
-        changes = comparisons(self) if self.explainable > CLEAR_NATS else []
+        nats, whiles, fit = self.away
         most = self.fit.cost - _GOOD_PART * (self.fit.cost - self.noise - _CRUDE)
-        clear = [c for c in changes if c.finding and c.nats > CLEAR_NATS and c.fit.cost < most]
+        least = CLEAR_NATS if nats < CLEAR_NATS else 0.0  # they show that there is one
+        clear = [c for c in self.compared if c.finding and c.nats > least and c.fit.cost < most]
         count = min((c.fit.independent for c in clear), default=1.0)  # of one judge of them all
         cost = 0.5 * np.log(len(self.time_s)) / count
-        best = min(clear, key=lambda c: np.log(c.fit.cost) + cost * c.values, default=None)
-        if nats < CLEAR_NATS or (best and whiles_away(self, best.fit)[0] < 0.5 * nats):
-            return best
-        return Compared(nats, 0, self.fit, left_path(self, whiles))
+        ranked = sorted(clear, key=lambda c: np.log(c.fit.cost) + cost * c.values)
+        if nats >= CLEAR_NATS:
+            left = 0.5 * nats if ranked and ranked[0].nats > CLEAR_NATS else CLEAR_NATS
+            if not ranked or whiles_away(self, ranked[0].fit)[0] > left:
+                return Compared(nats, 0, self.fit, left_path(self, fit, whiles))
+        return ranked[0] if ranked else None
 
     @cached_property
-    def away(self) -> tuple[float, list[tuple[int, int]]]:
-        """Whiles away from the path of the servo that explains the rest: nats, rows."""
+    def compared(self) -> list[Compared]:
+        """All changes, where there is something to explain."""
+        return comparisons(self) if self.explainable > CLEAR_NATS else []
+
+    def rival(self, finding: Finding, nats: float) -> str:
+        """Code of the change that explains nearly as much as a finding of an advantage."""
+        near = [c for c in self.compared if c.finding and c.finding.code != finding.code
+                and c.nats > max(nats - CLEAR_NATS, 0.0)]  # fmt: skip
+        best = max(near, key=lambda c: c.nats, default=None)
+        return best.finding.code if best and best.finding else ""
+
+    @cached_property
+    def away(self) -> tuple[float, list[tuple[int, int]], Follower]:
+        """Whiles away from the path of the servo that explains the rest: nats, rows, servo."""
         fit, (nats, whiles) = self.fit, whiles_away(self, self.fit)
         servos = sorted(self.screen, key=_cost)[:_REFINED]
         for _ in range(2):
             if not whiles:
-                return nats, whiles
+                return nats, whiles, fit
             inside = np.any([_within(self, *w) for w in whiles], axis=0)
             position = np.where(inside, self.position_rad - fit.residuals_rad, self.position_rad)
             rest = replace(self, position_rad=position)
@@ -312,12 +330,15 @@ class Followed:
         # the bounded cost may have given them up for a little elsewhere
         wide = replace(self, bound=1.0)
         other = min((fitted(wide, f, rounds=20) for f in (self.fit, *servos)), key=_cost)
-        return min((nats, whiles), whiles_away(self, other), key=lambda w: w[0])
+        return min((nats, whiles, fit), (*whiles_away(self, other), other), key=lambda w: w[0])
 
     @property
     def changes(self) -> list[Finding]:
-        """Its finding."""
-        return [self.changed.finding] if self.changed and self.changed.finding else []
+        """Its finding, with the runner-up that is nearly as good."""
+        best = self.changed
+        if best is None or best.finding is None:
+            return []
+        return [rivalled(best.finding, self.rival(best.finding, best.nats))]
 
     @cached_property
     def _inputs(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64], float, float]]:
@@ -531,7 +552,7 @@ def fitted(
             rest[a:b] -= share @ rest[a:b]
         gram = design.T @ (weight[:, None] * design)
         right = design.T @ (weight * rest)
-        size, before = np.diag(gram) + 1e-9 * np.trace(gram) / len(gram), best.cost
+        size, before = np.diag(gram) + 1e-9 * np.trace(gram) / len(gram) + 1e-12, best.cost
         held = np.full((len(_DAMPED), len(gram)), 1e-9)
         held[:, : len(free)] = damping * _DAMPED[:, None]
         ways = np.linalg.solve(gram + held[:, None] * np.diag(size), right[:, None])
@@ -631,39 +652,41 @@ def comparisons(joint: Followed) -> list[Compared]:
             plain = min(plain, fitted(joint, begins[1], rounds=8).cost)
             usual = [fitted(joint, b, tried.usual).cost for b in begins] if tried.usual else []
             fits.append((tried, fit, min(usual, default=np.inf)))
-    found = []
-    for tried, fit, usual in fits:
+
+    def compared(tried: _Change, fit: Follower, usual: float) -> Compared:
         more = (min(plain, usual) + joint.unsure) / (fit.cost + joint.unsure)
         nats = fit.independent * np.log(more) - 0.5 * tried.values * np.log(len(joint.time_s))
-        found.append(Compared(float(nats), tried.values, fit, tried.finding(fit)))
+        return Compared(float(nats), tried.values, fit, tried.finding(fit))
+
+    found = []
+    for tried, fit, usual in fits:
+        one = compared(tried, fit, usual)
+        if one.finding and 0 < one.nats < CLEAR_NATS:  # as well as the servo alone is fitted
+            free = (*_ALONE, *tried.free)
+            fit = (tried.joint or joint).hopped(fit, tried.columns, free)
+            one = compared(tried, fit, usual)
+        found.append(one)
     return found
 
 
 def _split(
-    joint: Followed, columns: Callable[[int, int], Columns], ends: Callable[[int], int] | None
+    joint: Followed, columns: Callable[[int, int], Columns], ends: Callable[[int], int]
 ) -> tuple[int, int, Follower] | None:
     """First reading and end of the change that explains most, and the servo that it begins with.
 
-    It lasts to the one that `ends` names, or to any later moment if that is None. A servo
-    that explains both parts alike has become another one: those of the screen are tried as well,
-    and the moments are found again for the one that the change makes best.
+    It lasts to the one that `ends` names. A servo that explains both parts alike has become another
+    one: those of the screen are tried as well, and the moments are found again for the one that the
+    change makes best.
     """
     edge = max(_EDGE_S, _EDGE_SHARE * float(np.ptp(joint.time_s)))
     low, high = joint.time_s[0] + edge, joint.time_s[-1] - edge
-    if low >= high:
-        return None
-    count, splits = len(joint.time_s), _SPLITS if ends else _WHILES
     # between trials several moments have one reading
-    moments = np.unique(np.searchsorted(joint.time_s, np.linspace(low, high, splits))).tolist()
-    windows = [
-        (k, end) for n, k in enumerate(moments) for end in ([ends(k)] if ends else moments[n + 1:])
-        if end - k > 2
-    ]  # fmt: skip
+    moments = np.unique(np.searchsorted(joint.time_s, np.linspace(low, high, _SPLITS))).tolist()
+    windows = [(k, ends(k)) for k in moments if low < high and ends(k) - k > 2]
     if not windows:
         return None
-    (first, end), begin, others = windows[0], joint.fit, joint.screen if ends else ()
-    around = (high - low) / (joint.time_s[-1] - joint.time_s[0]) * count
-    around /= len(moments)
+    (first, end), begin, others = windows[0], joint.fit, joint.screen
+    around = len(joint.time_s) * (high - low) / np.ptp(joint.time_s) / len(moments)
     for _ in range(2):
         tried = [
             (_cost(joint.regressed(f.terms, f.path_rad, columns(*w))), w)
@@ -673,11 +696,8 @@ def _split(
         servos = [joint.regressed(f.terms, f.path_rad, columns(first, end)) for f in joint.screen]
         best = [begin, *sorted(servos, key=_cost)[:2]]
         begin = min((fitted(joint, f, columns(first, end), rounds=4) for f in best), key=_cost)
-        near = np.linspace(-around, around, 21 if ends else 9).astype(int)
-        windows = [
-            (a, b) for a in (first + near).tolist() for b in ([end] if ends else end + near)
-            if 2 < a < b - 2 < count - 1 and (ends is None or ends(a) == end)
-        ] or [(first, end)]  # fmt: skip
+        near = (first + np.linspace(-around, around, 21).astype(int)).tolist()
+        windows = [(k, end) for k in near if 2 < k < end - 2 and ends(k) == end] or [(first, end)]
     return first, end, begin
 
 
@@ -724,44 +744,33 @@ def _zero_drifts(joint: Followed) -> _Change | None:
 
 
 def _gain_changes(joint: Followed) -> _Change | None:
-    """A gain that changes at a moment."""
-    return _another_gain(joint, lambda k: len(joint.time_s), 3)
-
-
-def _gain_for_a_while(joint: Followed) -> _Change | None:
-    """A gain that changes and changes back."""
-    return _another_gain(joint, None, 4)
-
-
-def _another_gain(
-    joint: Followed, ends: Callable[[int], int] | None, numbers: int
-) -> _Change | None:
-    """A gain that is another one in a part of the recording, about any place."""
+    """A gain that changes at a moment, about any place."""
 
     def columns(first: int, end: int) -> Columns:
         inside = _within(joint, first, end)
         return lambda path: [path * inside, inside]
 
-    best = _split(joint, columns, ends)
+    best = _split(joint, columns, lambda k: len(joint.time_s))
     if best is None:
         return None
     first, end, begin = best
 
     def finding(fit: Follower) -> Finding | None:
-        part = fit.path_rad[first:end]
-        if ends is None and np.abs(np.diff(part)).sum() <= numbers * np.ptp(part):
-            return None  # as many numbers as strokes explain any
         before, more = map(float, fit.values[:2])
-        low, high = sorted((before, before + more))
-        times = joint.time_s[[first, end - 1]] - joint.start_s
-        values = {"time_s": float(times[0]), "until_s": float(times[1]), "before": before,
-                  "after": before + more}  # fmt: skip
-        if low < -_OPPOSITE * high:
-            return Finding("sign_changed", REFUSE, values)
-        usual = _NO_GAIN * high < low < _OTHER_GAIN * high  # a joint without a gain is held or dead
-        return Finding("gain_changed", CARE, values) if usual else None
+        return _other_gain(joint.time_s[[first, end - 1]] - joint.start_s, before, before + more)
 
-    return _Change([begin], finding, columns(first, end), values=numbers)
+    return _Change([begin], finding, columns(first, end), values=3)
+
+
+def _other_gain(times: NDArray, before: float, after: float) -> Finding | None:
+    """A gain of another size or sign from one time to another."""
+    low, high = sorted((before, after))
+    values = {"time_s": float(times[0]), "until_s": float(times[1]), "before": before,
+              "after": after}  # fmt: skip
+    if low < -_OPPOSITE * high:
+        return Finding("sign_changed", REFUSE, values)
+    usual = _NO_GAIN * high < low < _OTHER_GAIN * high  # a joint without a gain is held or dead
+    return Finding("gain_changed", CARE, values) if usual else None
 
 
 def _gain_drifts(joint: Followed) -> _Change | None:
@@ -843,14 +852,15 @@ def _clipped(joint: Followed) -> _Change | None:
         return low + share * (high - low) if term in (_HIGH, _TOP) else high - share * (high - low)
 
     begins: list[Follower] = []
-    for sides in ([(k,) for k in range(_LOW, _TOP + 1)], [(_LOW, _HIGH), (_BOTTOM, _TOP)]):
-        tried = []
-        for servo in (joint.fit, *sorted(joint.screen, key=_cost)[:_SERVOS]):
-            for terms, share in product(sides, _LEVELS):
+    servos = (joint.fit, *sorted(joint.screen, key=_cost)[:_SERVOS])
+    for low_side, high_side in ((_LOW, _HIGH), (_BOTTOM, _TOP)):
+        for sides in ([(low_side,), (high_side,)], [(low_side, high_side)]):
+            tried = []
+            for servo, terms, share in product(servos, sides, _LEVELS):
                 moved = servo.terms.copy()
                 moved[list(terms)] = [level(k, share) for k in terms]
                 tried.append(moved)
-        begins += sorted(joint.followers(np.array(tried)), key=_cost)[:2]
+            begins.append(min(joint.followers(np.array(tried)), key=_cost))
 
     def finding(fit: Follower) -> Finding | None:
         plain = fit.terms.copy()
@@ -871,8 +881,8 @@ def _clipped(joint: Followed) -> _Change | None:
     return _Change(begins, finding, free=range(_LOW, _TOP + 1), values=2)
 
 
-def left_path(joint: Followed, whiles: Sequence[tuple[int, int]]) -> Finding:
-    """Whiles in which the joint is elsewhere; where it rests, it does not answer."""
+def left_path(joint: Followed, fit: Follower, whiles: Sequence[tuple[int, int]]) -> Finding:
+    """Whiles in which the joint is elsewhere: by another gain, at rest, or anywhere."""
     a, b = max(whiles, key=lambda w: joint.time_s[w[1] - 1] - joint.time_s[w[0]])
     longest = float(joint.time_s[b - 1] - joint.time_s[a])
     middle = joint.position_rad[a + (b - a) // 6 : b - (b - a) // 6]
@@ -884,9 +894,30 @@ def left_path(joint: Followed, whiles: Sequence[tuple[int, int]]) -> Finding:
             return Finding("pinned", CARE, values)
         values = {"trials": 1, "of": len(joint.trials), "longest_s": longest}
         return Finding("frozen", CARE, values)
+    if found := _follows_there(joint, fit, whiles):
+        return found
     values = {"times": len(whiles), "longest_s": longest,
               "time_s": float(joint.time_s[whiles[0][0]]) - joint.start_s}  # fmt: skip
     return Finding("left_path", CARE, values)
+
+
+def _follows_there(
+    joint: Followed, fit: Follower, whiles: Sequence[tuple[int, int]]
+) -> Finding | None:
+    """Another gain by which the joint follows its path in some whiles."""
+    inside = np.any([_within(joint, *w) for w in whiles], axis=0)
+    path, away = fit.path_rad[inside], fit.residuals_rad[inside]
+    travel = sum(float(np.abs(np.diff(fit.path_rad[a:b])).sum()) for a, b in whiles)
+    if travel < _STROKES * np.ptp(path):
+        return None  # two numbers explain as many strokes
+    design = np.column_stack([path, np.ones_like(path)])
+    values = least_squares(design, away)
+    left = np.quantile(np.abs(away - design @ values), 0.75)
+    if left > _EXPLAINED_THERE * np.quantile(np.abs(away), 0.75):
+        return None
+    before = float(fit.values[0])
+    times = joint.time_s[[whiles[0][0], whiles[-1][1] - 1]] - joint.start_s
+    return _other_gain(times, before, before + float(values[0]))
 
 
 def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, int]]]:
@@ -901,8 +932,10 @@ def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, 
     """
     count, dt = len(joint.time_s), float(np.median(np.diff(joint.time_s)))
     width = max(3, 1 + 2 * round(min(fit.settles_s, 1.0) / max(dt, 1e-4)))
-    shapes, rates = [], joint.rates(fit.path_rad)
+    shapes, rates, inner = [], joint.rates(fit.path_rad), np.ones(count, bool)
     for a, b in zip(joint.starts[:-1], joint.starts[1:], strict=True):
+        ways = np.ptp(fit.path_rad[a:b]) / (np.max(np.abs(rates[0, a:b])) + 1e-9)
+        inner[a:b] = joint.time_s[a:b] - joint.time_s[a] > fit.settles_s + ways
         away = np.abs(fit.path_rad[a:b] - fit.path_rad[a]) > 0.01 * joint.reach
         since = joint.time_s[a:b] - joint.time_s[a + np.argmax(away)]
         around = maximum_filter1d(np.abs(rates[:, a:b]), min(width, 2 * (b - a) - 1))
@@ -921,12 +954,14 @@ def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, 
         share = _independent_share(scaled[~inside], True)
         mean = np.add.reduceat(scaled, edges[:-1]) / cells
         gains = share * cells * (mean * (1 - 1 / times) - np.log(times))
+        gains[~np.logical_or.reduceat(inner, edges[:-1])] = 0.0  # in any motion, before a trial
         larger = _segments(gains, np.log(count))
         inside = np.repeat(larger, cells)
         if not larger.any() or inside.mean() > _MOST_LEFT:
             return 0.0, []
         times = max(float(scaled[inside].mean()), 2.0)
     small = size[inside].sum() < 0.5 * size.sum()  # of all that the servo leaves
+    small |= size[inside].sum() < _UNSURE * joint.unsure_rad[inside].sum()
     if small or np.quantile(size[inside], 0.9) < max(_MOVED_RAD, _MOVED_SHARE * joint.reach):
         return 0.0, []
     nats = float(gains[larger].sum()) / share * min(share, _independent_share(scaled[~inside]))
@@ -950,6 +985,5 @@ def _segments(gains: NDArray[np.float64], cost: float) -> NDArray[np.bool_]:
 
 
 CHANGES: tuple[Callable[[Followed], _Change | None], ...] = (
-    _zero_moves, _zero_drifts, _lag_drifts, _lag_changes, _gain_drifts, _gain_changes,
-    _gain_for_a_while, _clipped,
+    _zero_moves, _zero_drifts, _lag_drifts, _lag_changes, _gain_drifts, _gain_changes, _clipped,
 )  # fmt: skip

@@ -166,14 +166,7 @@ def examine(
     recorded = {joint: recorded_trials(given, joint) for joint in chosen_joints(given, joints)}
     mixed = crossed({joint: long_enough(trials) for joint, trials in recorded.items()})
     found = {
-        joint: _examine_joint(
-            joint,
-            trials,
-            mixed.get(joint),
-            _speed_limit_rad_s(joint, known),
-            rng,
-            (lags or {}).get(joint),
-        )
+        joint: _examine_joint(joint, trials, mixed.get(joint), known, rng, (lags or {}).get(joint))
         for joint, trials in recorded.items()
     }
     held = any(j.feedback and j.feedback.kind == "lattice" for j in found.values())
@@ -208,10 +201,11 @@ def _examine_joint(
     joint: str,
     recorded: Sequence[Trial],
     mixed: Finding | None,
-    limit_rad_s: float,
+    stated_rad_s: Sequence[float],
     rng: np.random.Generator,
     lag: LagBudget | None,
 ) -> JointExamination:
+    limit_rad_s = _speed_limit_rad_s(joint, stated_rad_s)
     found = [*findings(recorded), *([mixed] if mixed else [])]
     recorded = [without_bad_readings(t) for t in recorded]
     trials = long_enough(recorded)
@@ -279,16 +273,8 @@ def _held(lattice: PollLattice, hold_share: float) -> list[Finding]:
     if lattice.kind == "every read":
         return []
     if lattice.kind == "unresolved":
-        return [
-            Finding(
-                "poll_unresolved",
-                CARE,
-                {
-                    "percent": 100 * lattice.fresh_fraction,
-                    "doubt_ms": 1000.0 * lattice.time_doubt_s,
-                },
-            )
-        ]
+        values = {"percent": 100 * lattice.fresh_fraction, "doubt_ms": 1e3 * lattice.time_doubt_s}
+        return [Finding("poll_unresolved", CARE, values)]
     code, values = "polled", {"period_ms": 1e3 * lattice.poll_period_s}
     if math.isfinite(lattice.loss):
         code += "_loss"
@@ -305,18 +291,9 @@ def _slips(trials: Sequence[Trial], lattice: PollLattice) -> list[Finding]:
     for slip in lattice.slips:
         tone = next(t.frequency_hz for t in trials if t.number == slip.trial)
         where = f"at {tone:g} Hz" if tone > 0 else f"in trial {slip.trial}"
-        found.append(
-            Finding(
-                "poll_slipped",
-                USE,
-                {
-                    "where": where,
-                    "jump_ms": 1000.0 * slip.jump_s,
-                    "time_s": slip.time_s,
-                    "nats": slip.nats,
-                },
-            )
-        )
+        values = {"where": where, "jump_ms": 1e3 * slip.jump_s, "time_s": slip.time_s,
+                  "nats": slip.nats}  # fmt: skip
+        found.append(Finding("poll_slipped", USE, values))
     return found
 
 
@@ -342,11 +319,6 @@ def _coverage(trials: Sequence[Trial], speed: float, limit: float) -> list[Findi
     if short:
         found.append(Finding("short_tones", CARE, {"tones": len(short), "of": len(tones)}))
     if speed < 0.9 * limit:
-        found.append(
-            Finding(
-                "slow_commands",
-                USE,
-                {"speed_rad_s": speed, "limit_rad_s": limit, "percent": 100 * speed / limit},
-            )
-        )
+        values = {"speed_rad_s": speed, "limit_rad_s": limit, "percent": 100 * speed / limit}
+        found.append(Finding("slow_commands", USE, values))
     return found

@@ -28,7 +28,7 @@ from scipy.optimize import minimize_scalar
 
 from pupper_sysid.common.filters import filtered
 from pupper_sysid.sysid.doctor.findings import REFUSE, Finding
-from pupper_sysid.sysid.doctor.signals import clock_findings
+from pupper_sysid.sysid.doctor.signals import COARSEST_RAD, clock_findings
 from pupper_sysid.sysid.feedback.staleness import fresh_rows, quantum, staleness
 from pupper_sysid.sysid.recordings.excitation import remembered
 from pupper_sysid.sysid.recordings.recording import Trial
@@ -376,27 +376,36 @@ def echo(trials: Sequence[Trial], step: float) -> Finding | None:
     loop = float(np.median(np.concatenate([np.diff(t.send_time_s) for t in trials])))
     moves = np.concatenate([np.abs(np.diff(t.command_rad)) for t in trials])
     usual = float(np.median(moves[moves > 0])) if (moves > 0).any() else 0.0
+    step = step if step < COARSEST_RAD else 0.0  # of few commands, and of no encoder
     near = max(0.55 * step + 1e-5, _ECHO_OF_ROW * usual)  # the step may not have been found
     least = _ECHO_STEPS * near
     travels = [np.cumsum(np.abs(np.diff(t.command_rad, prepend=t.command_rad[0]))) for t in trials]
     if max(float(np.ptp(t.command_rad)) for t in trials) < _ECHO_TRAVEL * step:
         return None
+    new = [np.isin(np.arange(len(t.send_time_s)), fresh_rows(t)) for t in trials]
     for shift in range(min(round(_LONGEST_ECHO_S / max(loop, 1e-4)), _MOST_SHIFTS) + 1):
         parts = []
-        for t, travel in zip(trials, travels, strict=True):
+        for t, travel, fresh in zip(trials, travels, new, strict=True):
             # a servo's way from one command to the next lies in the rows before and after a motion
             row = np.arange(max(len(travel) - shift, 0))
             moves = travel[row + shift] - travel[np.maximum(row - _ECHO_PAST_ROWS, 0)] > least
             sent = row[moves]
-            parts.append(t.position_rad[sent + shift] - t.command_rad[sent])
-        left = np.concatenate([np.zeros(0), *parts])
-        left = left[np.isfinite(left)]
-        if len(left) < _ECHO_ROWS:
+            # where each row has another command, those that a poll has yet to see may be left out
+            steady = (np.diff(travel, prepend=-1.0) > 0) & (np.diff(travel, append=np.inf) > 0)
+            left = t.position_rad[sent + shift] - t.command_rad[sent]
+            parts.append(np.array([left, fresh[sent + shift] & steady[sent]]))
+        left, seen = np.concatenate([np.zeros((2, 0)), *parts], axis=1)
+        if np.isfinite(left).sum() < _ECHO_ROWS:
             break
-        middle = 0.5 * float(np.sum(np.quantile(left, (0.01, 0.99))))
-        if np.mean(np.abs(left - middle) <= near) >= _ECHO_SHARE:
-            late = f"{shift} row{'s' if shift != 1 else ''} late" if shift else "in the same row"
-            return Finding("echo", REFUSE, {"late": late})
+        for each in (left[np.isfinite(left)], left[np.isfinite(left) & (seen > 0)]):
+            if len(each) < _ECHO_ROWS:
+                continue
+            middle = 0.5 * float(np.sum(np.quantile(each, (0.01, 0.99))))
+            if np.mean(np.abs(each - middle) <= near) >= _ECHO_SHARE:
+                late = (
+                    f"{shift} row{'s' if shift != 1 else ''} late" if shift else "in the same row"
+                )
+                return Finding("echo", REFUSE, {"late": late})
     return _delayed(trials, near, loop)
 
 

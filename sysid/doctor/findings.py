@@ -387,10 +387,17 @@ WORDS: dict[str, str] = {
 RIVALS = {
     "clipped": "a clamped goal or a stop",
     "columns_swapped": "swapped columns",
+    "gain_changed": "a gain that changes",
+    "gain_drifts": "a gain that drifts",
     "held_by_friction": "friction",
+    "lag_changed": "a lag that changes",
+    "lag_drifts": "clocks that drift apart",
     "position_early": "columns shifted in time",
     "second_writer": "a second program",
+    "sign_changed": "a sign that changes",
     "sign_inverted": "an inverted sign",
+    "zero_drifts": "a zero that drifts",
+    "zero_moves": "a zero that moves",
 }
 """What explains a recording nearly as well, by the code of its finding."""
 

@@ -21,12 +21,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.tones import fit_sine, least_squares
 from pupper_sysid.sysid.doctor.bends import held_findings
 from pupper_sysid.sysid.doctor.changes import CLEAR_NATS, Followed, followed
-from pupper_sysid.sysid.doctor.explanations import (
-    Explanation,
-    Servo,
-    echo,
-    explain,
-)
+from pupper_sysid.sysid.doctor.explanations import Explanation, Servo, echo, explain
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding, rivalled
 from pupper_sysid.sysid.doctor.writers import second_writer
 from pupper_sysid.sysid.recordings.excitation import split_tones
@@ -448,7 +443,7 @@ def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     changes = _trials_differ(joint) or joint.changes
     if 1 - servo.unexplained < _LOOSE and not joint.explained:
         return [*findings, *changes]
-    found = [*findings, *(changes or second_writer(joint))]  # a bent path pushes as well
+    found = [*findings, *(changes or second_writer(joint))]
     loaded = any(t.load is not None for t in trials)
     if joint.disturbed > _DISTURBED and not (found or loaded or held_findings(trials, step)):
         return [Finding("disturbed", CARE, {"percent": 100 * joint.unexplained})]

@@ -18,7 +18,7 @@ from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, Finding
 from pupper_sysid.sysid.feedback.staleness import fresh_rows
 from pupper_sysid.sysid.recordings.recording import Trial
 
-_COARSEST_RAD = 0.055  # no servo has a quantisation step of three degrees
+COARSEST_RAD = 0.055  # no servo has a quantisation step of three degrees
 _LARGEST_RAD = 3.3  # no joint of a legged robot turns further from zero
 _FASTEST_RAD_S, _FAST_RAD_S = 60.0, 20.0  # three times and what a good servo of this size does
 _LEVELS = 10  # values of a reading, from which on a coarse step is that of an encoder
@@ -39,7 +39,7 @@ def motion_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
         return [Finding("no_readings", REFUSE)]
     if np.ptp(command) < 1e-3:
         return [Finding("constant_command", REFUSE, {"joint": trials[0].joint})]
-    if np.ptp(position) < max(3 * min(step, _COARSEST_RAD), 5e-3):
+    if np.ptp(position) < max(3 * min(step, COARSEST_RAD), 5e-3):
         return [Finding("does_not_move", REFUSE)]
     if np.ptp(position) < _FEW_STEPS * step:
         return [Finding("few_steps", CARE, {"steps": np.ptp(position) / step})]
@@ -54,7 +54,7 @@ def unit_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     largest = max(float(np.max(np.abs(t.command_rad))) for t in trials)
     if largest > _LARGEST_RAD:
         text = f"commands reach {largest:.1f}, which no joint can do in radians: they look"
-    elif step > _COARSEST_RAD and _levels(trials) >= _LEVELS:
+    elif step > COARSEST_RAD and _levels(trials) >= _LEVELS:
         text = f"readings come in steps of {step:.3g}, too coarse for radians: they look"
     elif (speed := _speed(trials)) > _FASTEST_RAD_S:
         text = f"the joint moves at {speed:.0f} rad/s, faster than any servo: angles look"
@@ -72,22 +72,12 @@ def frozen_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     longest = [_frozen_s(t) for t in trials]
     found, frozen = [], sum(s > 0 for s in longest)
     if frozen:
-        found.append(
-            Finding(
-                "frozen",
-                REFUSE if 2 * frozen > len(trials) else CARE,
-                {"trials": frozen, "of": len(trials), "longest_s": max(longest)},
-            )
-        )
-    still = _still(trials, step)
-    if still:
-        found.append(
-            Finding(
-                "still_trials",
-                REFUSE if 2 * len(still) > len(trials) else CARE,
-                {"plural": "s" if still[1:] else "", "trials": ", ".join(map(str, still[:5]))},
-            )
-        )
+        values = {"trials": frozen, "of": len(trials), "longest_s": max(longest)}
+        found.append(Finding("frozen", REFUSE if 2 * frozen > len(trials) else CARE, values))
+    if still := _still(trials, step):
+        verdict = REFUSE if 2 * len(still) > len(trials) else CARE
+        values = {"plural": "s" if still[1:] else "", "trials": ", ".join(map(str, still[:5]))}
+        found.append(Finding("still_trials", verdict, values))
     return found
 
 
@@ -203,7 +193,7 @@ def _still(trials: Sequence[Trial], step: float) -> list[int]:
         command = float(np.ptp(t.command_rad))
         moved = float(np.ptp(seen)) if len(seen) else 0.0
         spans.append((t, command, moved))
-    least = max(3 * min(step, _COARSEST_RAD), 2e-3)
+    least = max(3 * min(step, COARSEST_RAD), 2e-3)
     follow = [(t, c) for t, c, m in spans if m > 0.5 * c > 5 * least]
     return [
         t.number
@@ -352,15 +342,11 @@ def _gaps(gaps: NDArray[np.float64], loop: float) -> list[Finding]:
     if lost > _LOST_TIME:
         return [Finding("gaps", REFUSE, {"percent": 100 * lost, "longest_s": late.max()})]
     if np.std(gaps) > _UNEVEN * loop:
-        found.append(
-            Finding(
-                "uneven_loop", CARE, {"jitter_ms": 1000.0 * np.std(gaps), "loop_ms": 1000.0 * loop}
-            )
-        )
+        values = {"jitter_ms": 1e3 * np.std(gaps), "loop_ms": 1e3 * loop}
+        found.append(Finding("uneven_loop", CARE, values))
     if len(late):
-        found.append(
-            Finding("loop_stood_still", CARE, {"times": len(late), "longest_s": late.max()})
-        )
+        values = {"times": len(late), "longest_s": late.max()}
+        found.append(Finding("loop_stood_still", CARE, values))
     return found
 
 
@@ -373,22 +359,14 @@ def tone_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     found = []
     if wrong:
         first, own = wrong[0], _strongest_hz(wrong[0])
-        found.append(
-            Finding(
-                "not_its_tone",
-                REFUSE if 2 * (len(wrong) + len(fast)) > len(tones) else CARE,
-                {"trial": first.number, "called_hz": first.frequency_hz, "strongest_hz": own},
-            )
-        )
+        verdict = REFUSE if 2 * (len(wrong) + len(fast)) > len(tones) else CARE
+        values = {"trial": first.number, "called_hz": first.frequency_hz, "strongest_hz": own}
+        found.append(Finding("not_its_tone", verdict, values))
     if fast:
         highest = max(t.frequency_hz for t in fast)
-        found.append(
-            Finding(
-                "too_few_rows_a_period",
-                REFUSE if len(fast) == len(tones) else CARE,
-                {"frequency_hz": highest, "rows": 1 / max(highest * loop, 1e-300)},
-            )
-        )
+        verdict = REFUSE if len(fast) == len(tones) else CARE
+        values = {"frequency_hz": highest, "rows": 1 / max(highest * loop, 1e-300)}
+        found.append(Finding("too_few_rows_a_period", verdict, values))
     return found
 
 
