@@ -8,7 +8,6 @@ explains them, readings that dwell at an extreme of their trial tell of somethin
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,34 +29,25 @@ def held_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
         return []  # a known load sags, and its friction is fitted
     travel = 0.0 if joint.changes else 2 * joint.friction_rad  # a stop holds as well
     if travel > _HELD * joint.reach:
-        rests = [r for t in trials for r in _rests(t, step, _REST_TRAVEL)]
+        rests = [r for t in trials for r in _rests(t, step)]
         if len(rests) >= _FEWEST_RESTS:
-            values = {"longest_s": max(r.end_s - r.start_s for r in rests), "travel_rad": travel}
+            values = {"longest_s": max(rests), "travel_rad": travel}
             return [Finding("held_by_friction", CARE, values)]
     return [] if joint.explained or joint.changes else _pinned(trials, step)
 
 
-@dataclass(frozen=True)
-class _Rest:
-    """A stretch in which the reading stays and the command moves on."""
-
-    start_s: float
-    end_s: float
-    level_rad: float
-
-
-def _rests(trial: Trial, step: float, least: float) -> list[_Rest]:
-    """Stretches in which the reading stays and the command moves by `least` of its range."""
+def _rests(trial: Trial, step: float) -> list[float]:
+    """Times for which the reading stays and the command moves by much of its range [s]."""
     seen = np.isfinite(trial.position_rad)
     value, time = trial.position_rad[seen], trial.read_time_s[seen]
     command, found, first = trial.command_rad[seen], [], 0
     near = max(1.5 * step, 0.01 * float(np.ptp(value))) if len(value) else 0.0
+    least = _REST_TRAVEL * float(np.ptp(trial.command_rad))
     for k in range(1, len(value) + 1):
         if k < len(value) and abs(value[k] - value[first]) <= near:
             continue
-        if k - first > 3 and first > 0:
-            if np.ptp(command[first:k]) > least * float(np.ptp(command)):
-                found.append(_Rest(float(time[first]), float(time[k - 1]), float(value[first])))
+        if k - first > 3 and first > 0 and np.ptp(command[first:k]) > least:
+            found.append(float(time[k - 1] - time[first]))
         first = k
     return found
 

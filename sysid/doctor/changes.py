@@ -306,12 +306,11 @@ class Followed:
         """All changes, where there is something to explain."""
         return comparisons(self) if self.explainable > CLEAR_NATS else []
 
-    def rival(self, finding: Finding, nats: float) -> str:
-        """Code of the change that explains nearly as much as a finding of an advantage."""
-        near = [c for c in self.compared if c.finding and c.finding.code != finding.code
-                and c.nats > max(nats - CLEAR_NATS, 0.0)]  # fmt: skip
-        best = max(near, key=lambda c: c.nats, default=None)
-        return best.finding.code if best and best.finding else ""
+    def rivalled(self, finding: Finding, nats: float = CLEAR_NATS) -> Finding:
+        """A finding of an advantage, with the change that explains nearly as much."""
+        near = [(c.nats, c.finding.code) for c in self.compared if c.finding
+                and c.finding.code != finding.code and c.nats > nats - CLEAR_NATS]  # fmt: skip
+        return rivalled(finding, max(near, default=(0.0, ""))[1])
 
     @cached_property
     def away(self) -> tuple[float, list[tuple[int, int]], Follower]:
@@ -338,7 +337,7 @@ class Followed:
         best = self.changed
         if best is None or best.finding is None:
             return []
-        return [rivalled(best.finding, self.rival(best.finding, best.nats))]
+        return [self.rivalled(best.finding, max(best.nats, CLEAR_NATS))]
 
     @cached_property
     def _inputs(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64], float, float]]:
@@ -637,7 +636,14 @@ def comparisons(joint: Followed) -> list[Compared]:
     """Every change, fitted."""
     # a load that is known sags and swings as its fit finds, and this servo does not
     loaded = any(t.load is not None for t in joint.trials)
-    fits, plain = [], joint.fit.cost
+    plain = joint.fit.cost
+
+    def compared(tried: _Change, fit: Follower, usual: float = np.inf) -> Compared:
+        more = (min(plain, usual) + joint.unsure) / (fit.cost + joint.unsure)
+        nats = fit.independent * np.log(more) - 0.5 * tried.values * np.log(len(joint.time_s))
+        return Compared(float(nats), tried.values, fit, tried.finding(fit))
+
+    fits = []
     for change in (_lag_drifts, _lag_changes) if loaded else CHANGES:
         if tried := change(joint):
             part, free = tried.joint or joint, (*_ALONE, *tried.free)
@@ -645,25 +651,19 @@ def comparisons(joint: Followed) -> list[Compared]:
                 (joint.regressed(f.terms, f.path_rad, tried.columns) for f in joint.screen),
                 key=_cost,
             ))  # fmt: skip
-            fit = min((fitted(part, b, tried.columns, free) for b in begins), key=_cost)
-            alone = fit.terms.copy()
-            alone[_GROWTH:] = joint.fit.terms[_GROWTH:]
-            begins = joint.fit, joint.follower(alone)
-            plain = min(plain, fitted(joint, begins[1], rounds=8).cost)
-            usual = [fitted(joint, b, tried.usual).cost for b in begins] if tried.usual else []
+            fit, usual = min((fitted(part, b, tried.columns, free) for b in begins), key=_cost), []
+            if compared(tried, fit).nats > 0:  # its servo may explain as much without the change
+                alone = fit.terms.copy()
+                alone[_GROWTH:] = joint.fit.terms[_GROWTH:]
+                begins = joint.fit, joint.follower(alone)
+                plain = min(plain, fitted(joint, begins[1], rounds=8).cost)
+                usual = [fitted(joint, b, tried.usual).cost for b in begins] if tried.usual else []
             fits.append((tried, fit, min(usual, default=np.inf)))
-
-    def compared(tried: _Change, fit: Follower, usual: float) -> Compared:
-        more = (min(plain, usual) + joint.unsure) / (fit.cost + joint.unsure)
-        nats = fit.independent * np.log(more) - 0.5 * tried.values * np.log(len(joint.time_s))
-        return Compared(float(nats), tried.values, fit, tried.finding(fit))
-
     found = []
     for tried, fit, usual in fits:
         one = compared(tried, fit, usual)
         if one.finding and 0 < one.nats < CLEAR_NATS:  # as well as the servo alone is fitted
-            free = (*_ALONE, *tried.free)
-            fit = (tried.joint or joint).hopped(fit, tried.columns, free)
+            fit = (tried.joint or joint).hopped(fit, tried.columns, (*_ALONE, *tried.free))
             one = compared(tried, fit, usual)
         found.append(one)
     return found
@@ -763,14 +763,16 @@ def _gain_changes(joint: Followed) -> _Change | None:
 
 
 def _other_gain(times: NDArray, before: float, after: float) -> Finding | None:
-    """A gain of another size or sign from one time to another."""
+    """A gain of another size or sign from one time to another, or a joint that does not follow."""
     low, high = sorted((before, after))
-    values = {"time_s": float(times[0]), "until_s": float(times[1]), "before": before,
-              "after": after}  # fmt: skip
+    begin, end = map(float, times)
+    values = {"time_s": begin, "until_s": end, "before": before, "after": after}
     if low < -_OPPOSITE * high:
         return Finding("sign_changed", REFUSE, values)
-    usual = _NO_GAIN * high < low < _OTHER_GAIN * high  # a joint without a gain is held or dead
-    return Finding("gain_changed", CARE, values) if usual else None
+    if low > _NO_GAIN * high:
+        return Finding("gain_changed", CARE, values) if low < _OTHER_GAIN * high else None
+    begin, end = (begin, end) if after == low else (0.0, begin)
+    return Finding("left_path", CARE, {"times": 1, "longest_s": end - begin, "time_s": begin})
 
 
 def _gain_drifts(joint: Followed) -> _Change | None:
@@ -888,12 +890,11 @@ def left_path(joint: Followed, fit: Follower, whiles: Sequence[tuple[int, int]])
     middle = joint.position_rad[a + (b - a) // 6 : b - (b - a) // 6]
     if np.ptp(middle) <= max(1.5 * joint.step, 0.02 * joint.scale):
         places = [np.median(joint.position_rad[a:b]) for a, b in whiles]
+        values = {"trials": 1, "of": len(joint.trials)}
         if len(whiles) > 1 and np.ptp(places) < _MOVED_SHARE * joint.reach:  # in its way
             share = sum(b - a for a, b in whiles) / len(joint.time_s)
-            values = {"trials": 1, "of": len(joint.trials), "percent": 100 * share}
-            return Finding("pinned", CARE, values)
-        values = {"trials": 1, "of": len(joint.trials), "longest_s": longest}
-        return Finding("frozen", CARE, values)
+            return Finding("pinned", CARE, {**values, "percent": 100 * share})
+        return Finding("frozen", CARE, {**values, "longest_s": longest})
     if found := _follows_there(joint, fit, whiles):
         return found
     values = {"times": len(whiles), "longest_s": longest,

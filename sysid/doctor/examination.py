@@ -178,13 +178,6 @@ def examine(
     )
 
 
-def _speed_limit_rad_s(joint: str, stated: Sequence[float]) -> float:
-    """The fastest that a joint moves: as its bus states, or of a Mini Pupper; else NaN."""
-    if stated:
-        return max(stated)
-    return NO_LOAD_SPEED_RAD_S if joint in JOINT_NAMES else math.nan
-
-
 def hold_histogram(trials: Sequence[Trial]) -> tuple[int, ...]:
     """How many runs of 1, 2, 3, … rows with one value there are while the joint must move."""
     step = max(quantum(trials), 1e-6)
@@ -205,7 +198,8 @@ def _examine_joint(
     rng: np.random.Generator,
     lag: LagBudget | None,
 ) -> JointExamination:
-    limit_rad_s = _speed_limit_rad_s(joint, stated_rad_s)
+    unstated = NO_LOAD_SPEED_RAD_S if joint in JOINT_NAMES else math.nan
+    limit_rad_s = max(stated_rad_s, default=unstated)
     found = [*findings(recorded), *([mixed] if mixed else [])]
     recorded = [without_bad_readings(t) for t in recorded]
     trials = long_enough(recorded)
@@ -303,10 +297,8 @@ def _excitation(trials: Sequence[Trial]) -> list[Finding]:
         return []
     kinds = describe([t for t in trials if not t.frequency_hz > 0])
     hz = sorted({float(f"{f:.3g}") for f in kinds.get("tone", ())})
-    if not hz:
-        return []
     listed = ", ".join(f"{f:g}" for f in hz)
-    return [Finding("tones_found", USE, {"listed": listed})]
+    return [Finding("tones_found", USE, {"listed": listed})] if hz else []
 
 
 def _coverage(trials: Sequence[Trial], speed: float, limit: float) -> list[Finding]:

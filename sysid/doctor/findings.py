@@ -392,6 +392,7 @@ RIVALS = {
     "held_by_friction": "friction",
     "lag_changed": "a lag that changes",
     "lag_drifts": "clocks that drift apart",
+    "left_path": "a joint that does not follow for a while",
     "position_early": "columns shifted in time",
     "second_writer": "a second program",
     "sign_changed": "a sign that changes",

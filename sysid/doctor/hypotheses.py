@@ -96,8 +96,8 @@ def relation_findings(
     # a set-point that ramps is late by a part of the motion; a fault may explain the rest
     sound, changes = joint.explained or joint.unexplained < 1 - _FOLLOWS, joint.changes
     if base.explained < _UNRELATED:
-        values = {"percent": 100 * base.explained}
-        found = changes or [Finding("unrelated", REFUSE, values)]
+        unrelated = Finding("unrelated", REFUSE, {"percent": 100 * base.explained})
+        found = changes or [joint.rivalled(unrelated)]
         return ([], base, joint.servo) if sound else (found, base, None)
     ranked = relations(trials, step, base)
     servo = next(r.servo for r in ranked if not r.code)
@@ -120,7 +120,8 @@ def relation_findings(
     strange = share < _HALF and not usual and not best.code and _smooth_rest(base, best.servo)
     if strange or (best.code and share < least):
         # a fault explains what is left of a servo, or smooth motion of another cause is left
-        found = changes or [Finding("not_a_position_servo", REFUSE, {"percent": 100 * share})]
+        none = Finding("not_a_position_servo", REFUSE, {"percent": 100 * share})
+        found = changes or [joint.rivalled(none)]
         return found, base, None
     scaled = None
     if best.code != "columns_swapped" and not _usual_gain(joint, base, best):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import least_squares
 from pupper_sysid.sysid.doctor.changes import Followed, likely_spread
-from pupper_sysid.sysid.doctor.findings import CARE, Finding, rivalled
+from pupper_sysid.sysid.doctor.findings import CARE, Finding
 from pupper_sysid.sysid.doctor.signals import interpolation_findings
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, quantum, readings
 from pupper_sysid.sysid.recordings.recording import Trial
@@ -46,8 +46,7 @@ def second_writer(joint: Followed) -> list[Finding]:
     if nats < _PUSHED_NATS or not len(times):
         return []
     values = {"times": len(times), "time_s": float(times.min()) - joint.start_s}
-    found = Finding("second_writer", CARE, values)
-    return [rivalled(found, joint.rival(found, nats))]  # a bent path pushes as well
+    return [joint.rivalled(Finding("second_writer", CARE, values))]  # a bent path pushes as well
 
 
 def pushes(joint: Followed) -> tuple[float, NDArray[np.float64]]:
