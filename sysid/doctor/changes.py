@@ -335,9 +335,8 @@ class Followed:
     def changes(self) -> list[Finding]:
         """Its finding, with the runner-up that is nearly as good."""
         best = self.changed
-        if best is None or best.finding is None:
-            return []
-        return [self.rivalled(best.finding, max(best.nats, CLEAR_NATS))]
+        found = best.finding if best else None
+        return [self.rivalled(found, max(best.nats, CLEAR_NATS))] if best and found else []
 
     @cached_property
     def _inputs(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64], float, float]]:
@@ -767,7 +766,7 @@ def _other_gain(times: NDArray, before: float, after: float) -> Finding | None:
     low, high = sorted((before, after))
     begin, end = map(float, times)
     values = {"time_s": begin, "until_s": end, "before": before, "after": after}
-    if low < -_OPPOSITE * high:
+    if -high / _OPPOSITE < low < -_OPPOSITE * high:
         return Finding("sign_changed", REFUSE, values)
     if low > _NO_GAIN * high:
         return Finding("gain_changed", CARE, values) if low < _OTHER_GAIN * high else None
@@ -874,7 +873,8 @@ def _clipped(joint: Followed) -> _Change | None:
             beyond = path > fit.terms[k] if over else path < fit.terms[k]
             depth = path.max() - fit.terms[k] if over else fit.terms[k] - path.min()
             share = float(beyond.mean())
-            if depth > _DEEP * np.ptp(path) and share > max(_BEYOND, best[0] if best else 0.0):
+            deep = depth > max(_DEEP * np.ptp(path), 2 * joint.friction_rad)  # it rests within
+            if deep and share > max(_BEYOND, best[0] if best else 0.0):
                 best = share, float(np.median(joint.position_rad[beyond]))
         if best is None:
             return None

@@ -52,9 +52,10 @@ def unit_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
         return []
     cure = "Angles must be radians: multiply degrees by 0.0174533."
     largest = max(float(np.max(np.abs(t.command_rad))) for t in trials)
+    position = np.concatenate([t.position_rad for t in trials])
     if largest > _LARGEST_RAD:
         text = f"commands reach {largest:.1f}, which no joint can do in radians: they look"
-    elif step > COARSEST_RAD and _levels(trials) >= _LEVELS:
+    elif step > COARSEST_RAD and len(np.unique(position)) >= _LEVELS:
         text = f"readings come in steps of {step:.3g}, too coarse for radians: they look"
     elif (speed := _speed(trials)) > _FASTEST_RAD_S:
         text = f"the joint moves at {speed:.0f} rad/s, faster than any servo: angles look"
@@ -179,10 +180,6 @@ def _speed(trials: Sequence[Trial]) -> float:
         )
         fastest = max(fastest, float(np.quantile(rate, 0.9)))
     return fastest
-
-
-def _levels(trials: Sequence[Trial]) -> int:
-    return len(np.unique(np.concatenate([t.position_rad for t in trials])))
 
 
 def _still(trials: Sequence[Trial], step: float) -> list[int]:

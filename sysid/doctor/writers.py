@@ -27,7 +27,7 @@ from pupper_sysid.sysid.recordings.recording import Trial
 
 _ORDER, _FEWEST_ROWS = 4, 40  # of the autoregression; of a trial
 _PLACES = np.linspace(-0.5, 1.5, 15)  # of the path's range
-_JUMP = 0.3  # of the command's range in a row
+_JUMP, _STICKS = 0.3, 0.25  # of the command's range: in a row, to and fro
 _LARGEST = 20.0  # innovation that counts, of the median
 _FAR = 4.0  # innovation that shows its direction, of the usual size
 _PUSHED_NATS, _ONE_WAY_NATS = 13.0, 3.0  # of 48 sound recordings the most is 6
@@ -40,7 +40,8 @@ _HARMONICS, _FEWEST_READINGS = 3, 25
 def second_writer(joint: Followed) -> list[Finding]:
     """Pushes towards one place while the command goes on."""
     loaded = any(t.load is not None for t in joint.trials)  # its swings are not this servo's
-    if loaded or interpolation_findings(joint.trials, joint.step):
+    sticks = 2 * joint.friction_rad > _STICKS * joint.reach  # it jumps where friction lets go
+    if loaded or sticks or interpolation_findings(joint.trials, joint.step):
         return []
     nats, times = pushes(joint)
     if nats < _PUSHED_NATS or not len(times):
