@@ -204,7 +204,8 @@ class Followed:
             changes = (
                 {_INTEGRAL: 1.5}, {_INTEGRAL: 0.01}, {_EFFORT: effort, _BACK_EMF: 1.0},
                 {_EFFORT: 3 * effort, _BACK_EMF: 5.0}, {_SPEED: 0.9 * speed},
-                {_SPEED: 0.9 * speed, _RAMP: 0.5 * ramp}, {_SPEED: 300.0, _RAMP: 2e4},
+                {_SPEED: 0.9 * speed, _RAMP: 0.5 * ramp, _EFFORT: 20.0},
+                {_SPEED: 300.0, _RAMP: 2e4},
                 {_FRICTION: 0.05 * self.reach}, {_FRICTION: 0.004 * self.reach},
             )  # fmt: skip
             terms = np.tile(fit.terms, (len(changes), 1))
@@ -328,7 +329,8 @@ class Followed:
             nats, whiles = whiles_away(self, fit)
         # the bounded cost may have given them up for a little elsewhere
         wide = replace(self, bound=1.0)
-        other = min((fitted(wide, f, rounds=20) for f in (self.fit, *servos)), key=_cost)
+        wides = (fitted(wide, f, rounds=20) for f in (self.fit, *servos))
+        other = wide.hopped(min(wides, key=_cost))
         return min((nats, whiles, fit), (*whiles_away(self, other), other), key=lambda w: w[0])
 
     @property
