@@ -72,7 +72,7 @@ _OF_TRAVEL = 2 * 4.0
 """Independent readings of one motion over the range: a servo settles within four of its time
 constants, and does so twice, when it starts and when it stops."""
 _EDGE_S, _EDGE_SHARE = 1.0, 0.125  # from either end: an integral settles at the beginning
-_NO_GAIN, _OTHER_GAIN, _OPPOSITE, _GAIN_DRIFT = 0.1, 0.75, 0.5, 0.2
+_NO_GAIN, _OTHER_GAIN, _GAIN_DRIFT = 0.1, 0.75, 0.2
 _LAG_DRIFT_S, _EARLY_S = 0.008, 0.02
 _MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
 _GROWTHS = tuple(sign * size for size in (0.0015, 0.003, 0.006, 0.012) for sign in (-1, 1))
@@ -768,7 +768,7 @@ def _other_gain(times: NDArray, before: float, after: float) -> Finding | None:
     low, high = sorted((before, after))
     begin, end = map(float, times)
     values = {"time_s": begin, "until_s": end, "before": before, "after": after}
-    if -high / _OPPOSITE < low < -_OPPOSITE * high:
+    if -high / _OTHER_GAIN < low < -_OTHER_GAIN * high:
         return Finding("sign_changed", REFUSE, values)
     if low > _NO_GAIN * high:
         return Finding("gain_changed", CARE, values) if low < _OTHER_GAIN * high else None

@@ -318,6 +318,9 @@ _ECHO_ROWS, _ECHO_SHARE = 30, 0.99
 _ECHO_STEPS, _ECHO_PAST_ROWS = 2.0, 5  # half steps that the command moves within so many rows
 _ECHO_OF_ROW = 0.01  # of the command's motion in a row: no servo is as precise in time
 _ECHO_TRAVEL = 8.0  # steps: within fewer any lag looks like an echo
+_SLOW_ECHO_S, _FASTEST_HZ, _SERVO_GRID_S = 0.02, 30.0, 1e-3
+"""From so late on an echo may be a servo of that natural frequency, faster than hobby servos are,
+which follows a smooth command to within the quantisation step."""
 _DELAYED_STEPS = 10.0  # per row: then a lag that changes by a tenth of a row shows
 _LONGEST_ECHO_S, _MOST_SHIFTS = 0.6, 60
 _MUCH_BETTER = 0.5
@@ -401,12 +404,26 @@ def echo(trials: Sequence[Trial], step: float) -> Finding | None:
             if len(each) < _ECHO_ROWS:
                 continue
             middle = 0.5 * float(np.sum(np.quantile(each, (0.01, 0.99))))
-            if np.mean(np.abs(each - middle) <= near) >= _ECHO_SHARE:
+            agrees = np.mean(np.abs(each - middle) <= near) >= _ECHO_SHARE
+            if agrees and (shift * loop < _SLOW_ECHO_S or _servo_would_show(trials, near)):
                 late = (
                     f"{shift} row{'s' if shift != 1 else ''} late" if shift else "in the same row"
                 )
                 return Finding("echo", REFUSE, {"late": late})
     return _delayed(trials, near, loop)
+
+
+def _servo_would_show(trials: Sequence[Trial], near: float) -> bool:
+    """Whether even a fast servo would leave these commands by more than `near`."""
+    lag_s, away = 1.0 / (np.pi * _FASTEST_HZ), []
+    for t in trials:
+        time = np.arange(t.send_time_s[0], t.send_time_s[-1], _SERVO_GRID_S)
+        held = t.command_rad[np.searchsorted(t.send_time_s, time, side="right") - 1]
+        path = _low_pass(held, _FASTEST_HZ, 1.0, _SERVO_GRID_S)
+        within = t.send_time_s + lag_s <= time[-1]
+        away.append(np.interp(t.send_time_s + lag_s, time, path)[within] - t.command_rad[within])
+    shown = np.concatenate(away)
+    return bool(np.mean(np.abs(shown - np.median(shown)) > near) > 2 * (1 - _ECHO_SHARE))
 
 
 def _delayed(trials: Sequence[Trial], near: float, loop: float) -> Finding | None:
