@@ -45,7 +45,7 @@ _DAMPED = np.array([0.2, 1.0, 5.0, 25.0, 125.0])  # times the damping before, tr
 _NO_LOAD, _SMALL_STEP = np.zeros(3), 0.2  # of the differences for derivatives
 _NO_INTEGRAL, _NO_PLAY, _LONG_S = 0.01, 1e-3, 20.0  # [1/s], [rad], and before the recording
 _LOWEST = np.array(
-    [*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.01, 0.01, 1e-3, 1e-4]), 0, -0.3, -0.03, *[-_FAR] * 4]
+    [*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.002, 0.01, 1e-3, 1e-4]), 0, -0.3, -0.03, *[-_FAR] * 4]
 )
 _HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 30, 30, 0.3]), 0.8, 0.3, 0.03, *[_FAR] * 4])
 _STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.3, 0.002, 0.01, 2e-4, *[0.01] * 4])
@@ -59,6 +59,7 @@ _DRAWN, _DRAWN_FROM = 200, (
 """Servos tried, and ranges of their terms, the lag last; friction and effort of the range."""
 _OF_A_KIND = 2
 _REFINED, _HOPS, _WELL = 3, 3, 0.02
+_ACCELERATION_OVER_S = 0.02  # a quantisation step of 1.5 mrad is 4 rad/s² then
 _CRUDE = 0.004  # of the position's mean deviation
 EXPLAINED = 0.06
 """Of the position's mean deviation: a servo that leaves less explains nearly all."""
@@ -200,10 +201,12 @@ class Followed:
             if fit.cost < _WELL:
                 break
             effort = min(0.3 * self.reach, 0.5 * float(np.exp(fit.terms[_EFFORT])))
+            seen = self.acceleration_rad_s2 * float(np.exp(-2 * fit.terms[_NATURAL]))
             speed, ramp = (float(np.max(np.abs(x))) + 1e-9 for x in self.rates(fit.path_rad))
             changes = (
                 {_INTEGRAL: 1.5}, {_INTEGRAL: 0.01}, {_EFFORT: effort, _BACK_EMF: 1.0},
-                {_EFFORT: 3 * effort, _BACK_EMF: 5.0}, {_SPEED: 0.9 * speed},
+                {_EFFORT: 3 * effort, _BACK_EMF: 5.0}, {_EFFORT: seen, _BACK_EMF: 0.01},
+                {_SPEED: 0.9 * speed},
                 {_SPEED: 0.9 * speed, _RAMP: 0.5 * ramp, _EFFORT: 20.0},
                 {_SPEED: 300.0, _RAMP: 2e4},
                 {_FRICTION: 0.05 * self.reach}, {_FRICTION: 0.004 * self.reach},
@@ -217,6 +220,16 @@ class Followed:
                 break
             fit = fitted(self, better, columns, free, rounds=15)
         return fit
+
+    @cached_property
+    def acceleration_rad_s2(self) -> float:
+        """Acceleration that the readings reach: about the limit of a servo that is often at it."""
+        reached = [np.zeros(1)]
+        for a, b in zip(self.starts[:-1], self.starts[1:], strict=True):
+            grid = np.arange(self.time_s[a], self.time_s[b - 1], _ACCELERATION_OVER_S)
+            position = np.interp(grid, self.time_s[a:b], self.position_rad[a:b])
+            reached.append(np.abs(np.diff(position, 2)) / _ACCELERATION_OVER_S**2)
+        return float(np.quantile(np.concatenate(reached), 0.95)) + 1e-9
 
     def rates(self, path: NDArray) -> NDArray[np.float64]:
         """First and second derivative of a path, shape (2, readings)."""
