@@ -138,27 +138,29 @@ def by(bus, counts):
     return lambda: bus.counts.__iadd__(counts)
 
 
-def test_a_scale_within_three_percent_keeps_the_maps_number(capsys):
-    person = ScriptedPerson()
-    steps, bus = guide(person)
-    person.script = [("first position", ""), ("by 90 degrees", "", by(bus, -270))]
-    measured, use = steps.scale("LF_hip", 90.0)
-    assert measured == pytest.approx(270 / (np.pi / 2)) and not use
-    assert "within 3 % of the map's 175.1, which is kept" in _flat(capsys.readouterr().err)
+DATA_SHEET = 1024 / np.radians(300)
 
 
-@pytest.mark.parametrize(("answer", "use"), [("n", True), ("m", False)])
-def test_a_scale_that_differs_is_shown_beside_the_maps_and_asked_about(capsys, answer, use):
+@pytest.mark.parametrize(
+    ("counts", "answer", "scale", "use", "words"),
+    [
+        (-270, None, 270 / (np.pi / 2), False, ["within 3 % of the map's 175.1, which is kept"]),
+        # 307 counts for 90 degrees: 1024 would be 300.2 degrees
+        (307, "n", DATA_SHEET, True, ["the starting map has 175.1 (+12 %)", "SCS0009's data"]),
+        (307, "m", DATA_SHEET, False, ["the starting map has 175.1 (+12 %)", "SCS0009's data"]),
+    ],
+)
+def test_a_scale_within_three_percent_keeps_the_maps_and_another_is_asked_about(
+    capsys, counts, answer, scale, use, words
+):
     person = ScriptedPerson()
     steps, bus = guide(person)
-    person.script = [
-        ("first position", ""), ("by 90 degrees", "", by(bus, 307)), ("all joints", answer)
-    ]  # fmt: skip
+    person.script = [("first position", ""), ("by 90 degrees", "", by(bus, counts))]
+    person.script += [("all joints", answer)] if answer else []
     measured, used = steps.scale("LF_hip", 90.0)
-    # 307 counts for 90 degrees: 1024 would be 300.2 degrees
-    assert measured == pytest.approx(1024 / np.radians(300), rel=0.002) and used is use
+    assert measured == pytest.approx(scale, rel=0.002) and used is use
     err = _flat(capsys.readouterr().err)
-    assert "the starting map has 175.1 (+12 %)" in err and "the SCS0009's data sheet" in err
+    assert all(word in err for word in words)
 
 
 def test_a_scale_that_no_servo_has_is_not_offered_and_the_step_can_be_skipped(capsys):

@@ -7,14 +7,18 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
+from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.hardware.esp32 import Esp32Bus
-from pupper_sysid.hardware.feetech import SCS0009
+from pupper_sysid.hardware.feetech import SCS0009, FeetechBus
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
 from support.servo_servers import moving_servos, on_a_port, still_servos, wait_until
@@ -25,7 +29,9 @@ SHORT = ("--freqs", "3", "--duration", "1")
 pytestmark = pytest.mark.usefixtures("here")
 
 
-def test_scan_lists_the_servos_and_finds_their_rate(capsys):
+def test_scan_lists_the_servos_and_finds_their_rate(capsys, monkeypatch):
+    few = replace(FeetechBus.family, highest_id=12)
+    monkeypatch.setattr(FeetechBus, "family", few)
     with on_a_port(still_servos(SCS0009, ids=[4, 7], baud=500_000)) as port:
         code, out, _ = run(capsys, "scan", "--bus", f"feetech:{port.device}", "--json")
     found = json.loads(out)
@@ -70,22 +76,18 @@ def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     assert np.nanmax(abs(trial.position_rad - 0.785)) > 0.2
 
 
-@pytest.mark.parametrize("kind", [pytest.param("feetech", marks=pytest.mark.slow), "esp32"])
-def test_an_emulator_prints_the_next_command_and_ends_on_request(tmp_path, kind):
-    place = ("--link", "s") if kind == "feetech" else ("--socket", "s")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid",
-            "emulate", kind, *place, "--truth", "t.yaml"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path, text=True,
-    )  # fmt: skip
-    assert process.stdout is not None
-    out = "".join(process.stdout.readline() for _ in range(5))
-    assert (tmp_path / "s").exists()
-    process.send_signal(signal.SIGTERM)
-    _, err = process.communicate(timeout=60)
+@pytest.mark.parametrize(
+    "place",
+    [
+        pytest.param(("feetech", "--link"), marks=pytest.mark.slow),
+        ("esp32", "--socket"),
+    ],
+    ids=lambda place: place[0],
+)
+def test_an_emulator_prints_the_next_command_and_ends_on_request(tmp_path, place):
+    with emulator(tmp_path, *place, "s", "--truth", "t.yaml", lines=5) as out:
+        assert (tmp_path / "s").exists()
     assert "pupper-sysid sweep --freqs 1-10 --joints LF --bus" in out and "Ctrl-C" in out
-    assert process.returncode == 143 and "Stopped." in err and "Traceback" not in err
-    assert not (tmp_path / "s").exists(), "it leaves nothing behind"
     truth = yaml.safe_load((tmp_path / "t.yaml").read_text())
     assert truth["joints"]["LF_hip"]["actuator"]["dead_time_s"] > 0
 
@@ -106,24 +108,29 @@ def test_an_emulator_that_never_gets_to_serve_leaves_no_device(capsys, monkeypat
 
 
 def test_a_walking_robot_on_a_serial_line_has_its_imu_on_a_socket(tmp_path):
-    process = subprocess.Popen(
-        [sys.executable, "-m", "pupper_sysid.cli.programs.pupper_sysid",
-            "emulate", "feetech", "--walking",
-         "--link", "s", "--imu-socket", "i"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path, text=True,
-        env=os.environ | {"PYTHONUNBUFFERED": "1"},
-    )  # fmt: skip
-    assert process.stdout is not None
-    out = "".join(process.stdout.readline() for _ in range(4))
-    try:
+    words = ("feetech", "--walking", "--link", "s", "--imu-socket", "i")
+    with emulator(tmp_path, *words, lines=4) as out:
         imu = Esp32Bus(tmp_path / "i")
         samples: list = []
         assert wait_until(lambda: bool(samples.append(imu.imu()) or samples[-1]))
         imu.close()
         np.testing.assert_allclose(samples[-1].acceleration_m_s2, [0, 0, 9.81], atol=0.15)
+    assert "IMU at i." in out and "monitor --bus feetech:s" in out and "Ctrl-C" in out
+    assert "sweep" not in out, "a sweep is for legs in free air"
+
+
+@contextmanager
+def emulator(folder: Path, *words: str, lines: int) -> Iterator[str]:
+    """What an emulator says first; it ends on request and leaves nothing behind."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", pupper_sysid.__name__, "emulate", *words], cwd=folder, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    assert process.stdout is not None
+    try:
+        yield "".join(process.stdout.readline() for _ in range(lines))
     finally:
         process.send_signal(signal.SIGTERM)
         _, err = process.communicate(timeout=60)
-    assert "IMU at i." in out and "monitor --bus feetech:s" in out and "Ctrl-C" in out
-    assert "sweep" not in out, "a sweep is for legs in free air"
-    assert "Traceback" not in err and not list(tmp_path.glob("[is]"))
+    assert process.returncode == 143 and "Stopped." in err and "Traceback" not in err
+    assert not list(folder.glob("[is]"))

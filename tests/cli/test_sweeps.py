@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import re
 import shutil
 from contextlib import chdir, redirect_stdout
 from pathlib import Path
@@ -24,12 +23,25 @@ from pupper_sysid.sysid.doctor.examination import examine
 from pupper_sysid.sysid.plan.plan_file import load_plan
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import json_of, ran, run
-from support.json_keys import key_line
-from support.package import ROOT
+from support.json_keys import DOCUMENTED, key_line
 from support.planned_servos import fit_of_half_width
 from support.servo_servers import on_a_port
 
-FORMATS = (ROOT / "docs/formats.md").read_text()
+
+def test_a_planned_sweep_that_was_cut_short_is_continued_unless_its_plan_has_changed(
+    capsys, planned
+):
+    whole = load("a.csv").table.groupby(["joint", "trial"]).size()
+    cut(Path("a.csv"), 0.6)
+    plan = Path("plan.yaml").read_bytes()
+    change_plan()
+    code, _, err = run(capsys, "sweep", "--resume", "a.csv")
+    assert code == 2 and "another plan" in err
+    Path("plan.yaml").write_bytes(plan)
+    ran(capsys, "sweep", "--resume", "a.csv")
+    again = load("a.csv")
+    assert (again.table.groupby(["joint", "trial"]).size() - whole).abs().max() <= 1
+    assert "completed" in again.metadata
 
 
 pytestmark = pytest.mark.usefixtures("here", "unexamined")
@@ -45,12 +57,6 @@ def widths(monkeypatch):
 
     monkeypatch.setattr(joints, "each_joint", fits)
     return given
-
-
-def documented(command: str) -> str:
-    """Keys of a command's object in docs/formats.md."""
-    (keys,) = re.findall(rf"^\| `{re.escape(command)}` \| `([^`]+)` \|$", FORMATS, re.M)
-    return keys
 
 
 @pytest.fixture(scope="module")
@@ -97,22 +103,6 @@ def test_a_first_sweep_is_planned_and_executed_trial_by_trial(planned):
     assert [t.frequency_hz for t in recording.trials("LF_hip")][: len(tones)] == tones
 
 
-def test_a_planned_sweep_that_was_cut_short_is_continued(capsys, planned):
-    whole = load("a.csv").table.groupby(["joint", "trial"]).size()
-    cut(Path("a.csv"), 0.6)
-    ran(capsys, "sweep", "--resume", "a.csv")
-    again = load("a.csv")
-    assert (again.table.groupby(["joint", "trial"]).size() - whole).abs().max() <= 1
-    assert "completed" in again.metadata
-
-
-def test_a_plan_that_has_changed_since_is_not_continued(capsys, planned):
-    cut(Path("a.csv"), 0.6)
-    change_plan()
-    code, _, err = run(capsys, "sweep", "--resume", "a.csv")
-    assert code == 2 and "another plan" in err
-
-
 def test_the_emulated_robot_does_not_repeat_its_noise_in_a_planned_sweep(capsys, planned):
     change_plan()
     for name in "bcd":  # ten held readings of a joint at rest may well be the same ones once
@@ -129,7 +119,7 @@ def test_a_sweep_goes_on_with_planned_rounds_until_the_goal(capsys, widths):
     widths |= {"LF_hip": [1.9], "LF_thigh": [5.0, 1.9]}
     out, err = ran(capsys, "sweep", *SHORT, "--until", "dead_time:2ms", "--json")
     found = json.loads(out)
-    assert key_line(found) == documented("sweep --until")
+    assert key_line(found) == DOCUMENTED["sweep --until"]
     assert found["reached"] and found["recordings"] == ["a.csv", "a_2.csv"]
     assert load("a_2.csv").joints == ["LF_thigh"]
     assert load_plan(Path("a_2.plan.yaml")).joints == ["LF_thigh"]

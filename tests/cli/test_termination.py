@@ -155,9 +155,12 @@ def until(true: Callable[[], bool], seconds: float) -> bool:
     return True
 
 
-def begun(process: subprocess.Popen[bytes]) -> None:
-    assert process.stdout is not None
-    assert process.stdout.readline() == b"begun\n"
+@contextmanager
+def begun(folder: Path, work: str) -> Iterator[subprocess.Popen[bytes]]:
+    """`PROGRAM` at its work."""
+    with started(folder, "-c", PROGRAM.replace("WORK", work)) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"begun\n"
+        yield process
 
 
 def ended(process: subprocess.Popen[bytes]) -> tuple[int, str]:
@@ -169,58 +172,45 @@ def ended(process: subprocess.Popen[bytes]) -> tuple[int, str]:
 
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_stop_is_one_line_and_its_exit_code_and_leaves_no_process(tmp_path, number):
-    with started(tmp_path, "-c", PROGRAM.replace("WORK", "pool")) as process:
-        begun(process)
+    with begun(tmp_path, "pool") as process:
         time.sleep(0.05 * number % 0.3)  # while the workers start, and after
         os.killpg(process.pid, number)
         assert ended(process) == (128 + number, "Stopped.\n")
 
 
-@pytest.mark.parametrize("work", ["swallowed", "caught", "compiled", "passed_on", "writing"])
-def test_no_code_keeps_a_stop_from_ending_a_program(tmp_path, work):
-    with started(tmp_path, "-c", PROGRAM.replace("WORK", work)) as process:
-        begun(process)
+@pytest.mark.parametrize(
+    ("work", "number", "left"),
+    [
+        ("swallowed", signal.SIGINT, []),
+        ("caught", signal.SIGINT, []),
+        ("compiled", signal.SIGINT, []),
+        ("passed_on", signal.SIGINT, []),
+        ("writing", signal.SIGINT, []),
+        ("long_training", signal.SIGTERM, []),  # whose iteration outlasts it
+        ("robot", signal.SIGTERM, ["parked"]),  # however long that takes
+    ],
+)
+def test_no_code_keeps_a_stop_from_ending_a_program(tmp_path, work, number, left):
+    with begun(tmp_path, work) as process:
         time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
-        assert ended(process) == (130, "Stopped.\n")
-    assert list(tmp_path.iterdir()) == []
+        process.send_signal(number)
+        assert ended(process) == (128 + number, "Stopped.\n")
+    assert [path.name for path in tmp_path.iterdir()] == left
 
 
-def test_training_saves_after_the_first_ctrl_c(tmp_path):
-    with started(tmp_path, "-c", PROGRAM.replace("WORK", "training")) as process:
-        begun(process)
+def test_training_saves_after_the_first_ctrl_c_and_ends_at_once_after_the_second(tmp_path):
+    first = "finishing this iteration; again ends at once\n"
+    with begun(tmp_path, "training") as process:
         os.killpg(process.pid, signal.SIGINT)
         process.send_signal(signal.SIGINT)  # as torchrun passes on what its group has received
-        assert ended(process) == (130, "finishing this iteration; again ends at once\n")
-    assert (tmp_path / "saved").exists()
-
-
-def test_a_second_ctrl_c_ends_a_training_at_once(tmp_path):
-    with started(tmp_path, "-c", PROGRAM.replace("WORK", "long_training")) as process:
-        begun(process)
+        assert ended(process) == (130, first)
+    with begun(tmp_path, "long_training") as process:
         process.send_signal(signal.SIGINT)
-        assert process.stderr is not None
-        assert process.stderr.readline() == b"finishing this iteration; again ends at once\n"
+        assert process.stderr is not None and process.stderr.readline() == first.encode()
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)
         assert ended(process) == (130, "Stopped.\n")
-    assert list(tmp_path.iterdir()) == []  # nor the lock file of the run
-
-
-def test_an_iteration_that_outlasts_sigterm_is_given_up(tmp_path):
-    with started(tmp_path, "-c", PROGRAM.replace("WORK", "long_training")) as process:
-        begun(process)
-        process.send_signal(signal.SIGTERM)
-        assert ended(process) == (143, "Stopped.\n")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_robot_is_parked_however_long_that_takes(tmp_path):
-    with started(tmp_path, "-c", PROGRAM.replace("WORK", "robot")) as process:
-        begun(process)
-        process.send_signal(signal.SIGTERM)
-        assert ended(process) == (143, "Stopped.\n")
-    assert (tmp_path / "parked").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["saved"]  # nor the lock file of the run
 
 
 def test_ctrl_c_acts_while_the_libraries_are_imported(tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from itertools import pairwise
 
 import numpy as np
@@ -155,21 +154,6 @@ def test_loads_imu_and_power_of_any_bytes_are_possible_or_missing(words, opcode)
     assert raw is None or (np.isfinite(raw).all() and np.abs(raw).max() <= 2048)
     supply_v = esp32.parse_supply(bytes([10, esp32.GET_POWER]) + words[:8])
     assert supply_v is None or 0 <= supply_v <= 11
-
-
-@SOME
-@given(
-    on=st.lists(st.booleans(), min_size=12, max_size=12),
-    counts=st.lists(st.integers(-5, 1100), min_size=12, max_size=12),
-)
-def test_a_request_holds_what_was_asked_or_is_not_made(on, counts):
-    try:
-        packed = esp32.set_position(np.array(on), np.array(counts))
-    except ValueError:
-        assert min(counts) < 0 or max(counts) > esp32.HIGHEST_COUNT
-        return
-    fields = struct.unpack("<BB12B12H", packed)
-    assert fields == (38, 1, *map(int, on), *counts) and esp32.SAVE_CALIBRATION not in fields[2:14]
 
 
 # ---- addresses ----

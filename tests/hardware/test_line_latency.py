@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
-from threading import Event, Thread
 from types import SimpleNamespace
 
 import numpy as np
@@ -92,36 +90,24 @@ def test_no_servo_is_missed_in_20_scans_whatever_the_adapter(known, latency_ms):
     assert listed == [list(range(1, 13))] * 20
 
 
-@contextmanager
-def chatter(server: SerialPty, text: bytes) -> Iterator[None]:
-    """An adapter whose own firmware writes to the line."""
-    ended = Event()
-
-    def write() -> None:
-        while not ended.wait(0.003):
-            with suppress(OSError):
-                os.write(server._host, text)
-
-    writer = Thread(target=write)
-    writer.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        writer.join()
-
-
 @pytest.mark.parametrize("text", [b"boot ok\r\n", b"\xff\xff\x01", b"\xff\xff\xfd\x00"])
 @pytest.mark.parametrize("family", [FAMILY, DYNAMIXEL_FAMILY], ids=lambda family: family.name)
-def test_a_chatty_adapter_is_no_second_servo_of_an_id(family, text):
+def test_a_chatty_adapter_is_no_second_servo_of_an_id(monkeypatch, family, text):
+    """Its own firmware writes to the line behind whatever is sent and answered."""
     servos = still_servos(ids=[1, 2]) if family is FAMILY else still_dynamixels([1, 2])
+    receive = servos.receive
+
+    def chatty(data: bytes, now: float, baud: int | None = None) -> list[tuple[float, bytes]]:
+        pieces = receive(data, now, baud)
+        return [*pieces, (pieces[-1][0] if pieces else now, text)]
+
+    monkeypatch.setattr(servos, "receive", chatty)
     register = servos.series.register("present_position")
     with on_a_port(servos) as server:
         line = family.open_line(server.device, 1_000_000, True)
-        with chatter(server, text):
-            assert list(line.find([1, 2])) == [1, 2]
-            line.garbled[9] = 5  # as after a scan of the gaps between ids
-            assert line.doubled([1, 2, 9], register.address, register.size) == []
+        assert list(line.find([1, 2])) == [1, 2]
+        line.garbled[9] = 5  # as after a scan of the gaps between ids
+        assert line.doubled([1, 2, 9], register.address, register.size) == []
         assert "bytes come that belong to no reply" in line_remarks(line)[0]
         line.close()
 

@@ -21,23 +21,18 @@ def runtime(tmp_path, monkeypatch):
     return folder / "pupper-sysid"
 
 
-def test_the_folder_is_the_users_own(runtime):
+def test_the_folder_is_the_users_own_and_no_link(runtime, tmp_path, monkeypatch):
     assert runtime_folder() == runtime
     assert stat.S_IMODE(runtime.stat().st_mode) == 0o700
     runtime.chmod(0o777)
     with pytest.raises(BusError, match="only you can write to"):
         runtime_folder()
-
-
-def test_a_folder_that_is_a_link_is_refused(runtime, tmp_path):
+    runtime.rmdir()
     (tmp_path / "elsewhere").mkdir()
     runtime.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(BusError, match="is not a folder that only you"):
         runtime_folder()
-
-
-def test_without_a_runtime_folder_there_is_one_of_the_users_number(monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "relative")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "relative")  # as good as none
     assert runtime_folder().name == f"pupper-sysid-{os.getuid()}"
 
 

@@ -50,13 +50,32 @@ def counts_reply(counts) -> bytes:
 
 
 def answers(request: bytes) -> bytes:
-    """A proxy whose servos stand at 501 to 512."""
+    """A proxy whose servos stand at 501 to 512, with loads of 1 to 12 thousandths."""
     return {
         1: b"\x02\x01",
         2: counts_reply(range(501, 513)),
-        3: bytes([26, 3]) + b"\x0a\x00" * 12,
+        3: bytes([26, 3]) + b"".join(bytes([k, 0]) for k in range(1, 13)),
         5: bytes.fromhex("0a 05 00 00 ec 40 00 00 00 3f"),
     }[request[1]]
+
+
+def test_readings_are_those_of_their_joint_and_a_count_on_which_no_two_answers_agree_is_missing(
+    path, patient
+):
+    third = iter(range(100, 10_000))
+
+    def torn(request: bytes) -> bytes:
+        counts = [*range(501, 512), next(third) % 900] if request[1] == 2 else []
+        return counts_reply(counts) if counts else answers(request)
+
+    with bus_of(ScriptedProxy(torn), path) as bus:
+        sample = bus.read()
+    count = dict(zip(IDS, sample.position_count.tolist(), strict=True))
+    assert count == {i: 500 + i for i in range(1, 12)} | {12: -1}
+    assert sample.load is not None and sample.load == pytest.approx(1e-3 * np.array(IDS))
+    assert sample.voltage_v is not None and sample.voltage_v.tolist() == [7.375] * 12
+    # a left hip turns against its counts, 550 / pi counts to the radian
+    assert sample.position_rad[0] == pytest.approx((512 - 504) * np.pi / 550)
 
 
 # ---- layouts ----
@@ -103,28 +122,6 @@ def test_the_byte_that_stores_a_calibration_is_never_packed_and_only_whole_count
 
 
 # ---- the bus ----
-
-
-def test_readings_are_those_of_their_joint(path, patient):
-    with bus_of(ScriptedProxy(answers), path) as bus:
-        sample = bus.read()
-    assert sample.position_count.tolist() == [500 + i for i in IDS]
-    assert sample.load is not None and sample.load.tolist() == [0.01] * 12
-    assert sample.voltage_v is not None and sample.voltage_v.tolist() == [7.375] * 12
-    # a left hip turns against its counts, 550 / pi counts to the radian
-    assert sample.position_rad[0] == pytest.approx((512 - 504) * np.pi / 550)
-
-
-def test_a_count_on_which_no_two_answers_agree_is_missing(path, patient):
-    third = iter(range(100, 10_000))
-
-    def torn(request: bytes) -> bytes:
-        counts = [*range(501, 512), next(third) % 900] if request[1] == 2 else []
-        return counts_reply(counts) if counts else answers(request)
-
-    with bus_of(ScriptedProxy(torn), path) as bus:
-        count = dict(zip(IDS, bus.read().position_count.tolist(), strict=True))
-    assert count == {i: 500 + i for i in range(1, 12)} | {12: -1}
 
 
 def test_no_write_or_torque_of_the_bus_sends_the_byte_that_stores_a_calibration(path, patient):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pupper_sysid.common.errors import InputError, SafetyStop
+from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
 from pupper_sysid.sim.emulator.bus import EmulatedBus
@@ -123,10 +123,3 @@ def test_no_healthy_emulated_servo_is_stopped_at_any_tone(kind):
         guard.sleep_until(start + (k + 1) * PERIOD_S)
         guard.write(home + amplitude * np.sin(2 * np.pi * hz * (guard.now() - start)))
         guard.read()
-
-
-@pytest.mark.parametrize("name", ["load", "temperature_c", "frozen_after_s", "speed_rad_s"])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
-def test_a_threshold_that_compares_as_false_is_refused(name, value):
-    with pytest.raises(InputError, match=f"GuardLimits: {name} is"):
-        GuardLimits(**{name: value})

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import struct
 from dataclasses import replace
+from math import inf, nan
 
 import numpy as np
 import pytest
 
 from pupper_sysid.common.data_sheet import supply_range
-from pupper_sysid.common.errors import InputError, SafetyStop
+from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.esp32 import Esp32Bus
@@ -19,6 +20,7 @@ from pupper_sysid.hardware.loop import HostClock
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
 from pupper_sysid.hardware.serial_servos.settings import supply_band
 from support.following_bus import FollowingBus
+from support.refusals import assert_each_refused
 
 PERIOD_S = 0.02
 NO_NUMBERS = [np.nan, np.inf, -np.inf]
@@ -116,10 +118,12 @@ def test_a_load_that_is_none_neither_begins_an_overload_nor_ends_one(load):
         hold(bus, 3.0)
 
 
-@pytest.mark.parametrize("volts", [(8.7, 4.2), (np.nan, 8.0), (4.0, np.inf), (5.0, 5.0)])
-def test_a_range_that_no_number_can_leave_or_meet_is_refused(volts):
-    with pytest.raises(InputError, match="voltage_v"):
-        GuardLimits(voltage_v=volts)
+def test_a_threshold_that_compares_as_false_or_a_range_that_no_number_can_leave_is_refused():
+    names = ("load", "temperature_c", "frozen_after_s", "speed_rad_s")
+    cases = [({name: x}, f"GuardLimits: {name} is") for name in names for x in (nan, inf, -1.0)]
+    ranges = ((8.7, 4.2), (nan, 8.0), (4.0, inf), (5.0, 5.0))
+    cases += [({"voltage_v": ends}, "voltage_v") for ends in ranges]
+    assert_each_refused(cases, lambda limits: GuardLimits(**limits))
 
 
 @pytest.mark.parametrize(
