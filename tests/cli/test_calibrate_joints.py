@@ -18,7 +18,8 @@ from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.robot import draw_robot
-from support.servo_servers import bench_of, on_a_port, still_servos, wait_until
+from support.servo_servers import bench_of, on_a_port, still_servos
+from support.stopwatch import wait_until
 from support.virtual_time import VirtualTime
 
 PRESET = load_joint_map("mini_pupper_2")

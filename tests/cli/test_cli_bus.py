@@ -21,7 +21,8 @@ from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.feetech import SCS0009, FeetechBus
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run
-from support.servo_servers import moving_servos, on_a_port, still_servos, wait_until
+from support.servo_servers import moving_servos, on_a_port, still_servos
+from support.stopwatch import wait_until
 
 SHORT = ("--freqs", "3", "--duration", "1")
 

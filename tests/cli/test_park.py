@@ -26,7 +26,8 @@ from pupper_sysid.hardware.safety.guard import open_guarded
 from pupper_sysid.hardware.safety.notes import notes, remove_note, write_note
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from support.served_driver import PATIENT, drive
-from support.servo_servers import driver_orders, limp, robot_behind, wait_until
+from support.servo_servers import driver_orders, limp, robot_behind
+from support.stopwatch import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = f"{PATIENT}from pupper_sysid.cli.programs.pupper_sysid import main; main()"

@@ -10,13 +10,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from support.package import ROOT
+from support.stopwatch import wait_until
 
 SWEEP = ROOT / "data/samples/sweep.csv"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -146,15 +147,6 @@ def session(leader: int) -> list[int]:
     return processes
 
 
-def until(true: Callable[[], bool], seconds: float) -> bool:
-    end = time.monotonic() + seconds
-    while not true():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.01)
-    return True
-
-
 @contextmanager
 def begun(folder: Path, work: str) -> Iterator[subprocess.Popen[bytes]]:
     """`PROGRAM` at its work."""
@@ -166,7 +158,7 @@ def begun(folder: Path, work: str) -> Iterator[subprocess.Popen[bytes]]:
 def ended(process: subprocess.Popen[bytes]) -> tuple[int, str]:
     """Exit code and stderr of a program that has ended with all its processes."""
     _, err = process.communicate(timeout=60)
-    assert until(lambda: session(process.pid) == [], 30.0)
+    assert wait_until(lambda: session(process.pid) == [], 30.0)
     return process.returncode, err.decode()
 
 
@@ -227,7 +219,7 @@ def test_ctrl_c_acts_while_the_libraries_are_imported(tmp_path):
 def test_ctrl_c_at_the_terminal_stops_a_calibration_whose_processes_start(tmp_path):
     program = "pupper_sysid.cli.programs.pupper_sysid"
     with started(tmp_path, "-m", program, "calibrate", str(SWEEP)) as process:
-        assert until(lambda: len(session(process.pid)) >= 2, 60.0)
+        assert wait_until(lambda: len(session(process.pid)) >= 2, 60.0)
         os.killpg(process.pid, signal.SIGINT)
         assert ended(process) == (130, "Stopped.\n")
     assert list(tmp_path.iterdir()) == []

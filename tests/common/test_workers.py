@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,17 +15,9 @@ import pytest
 from pupper_sysid.common.errors import PupperError
 from pupper_sysid.common.processes.workers import Workers
 from support.package import ROOT
+from support.stopwatch import wait_until
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-
-
-def until(true: Callable[[], bool], seconds: float = 60.0) -> bool:
-    end = time.monotonic() + seconds
-    while not true():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 def alive(process: int) -> bool:
@@ -93,7 +84,7 @@ def test_leaving_the_pool_ends_its_processes_in_the_midst_of_their_work():
             workers.submit("c", time.sleep, 60)
             if len(processes) == 2:
                 raise KeyboardInterrupt
-    assert until(lambda: not any(map(alive, processes)))
+    assert wait_until(lambda: not any(map(alive, processes)), 60.0)
 
 
 @linux
@@ -130,4 +121,4 @@ def test_processes_end_with_the_one_that_uses_them_however_it_ends():
         parents = Path(f"/proc/{started[0]}/stat").read_text().rpartition(")")[2].split()[1]
         process.kill()
         process.wait()
-        assert until(lambda: not any(map(alive, [*started, int(parents)])))
+        assert wait_until(lambda: not any(map(alive, [*started, int(parents)])), 60.0)

@@ -27,8 +27,8 @@ from support.servo_servers import (
     on_a_port,
     on_a_socket,
     still_servos,
-    wait_until,
 )
+from support.stopwatch import wait_until
 
 STANDING = np.array([0.0, 0.785, -1.57] * 4)
 

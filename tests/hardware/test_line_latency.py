@@ -20,8 +20,8 @@ from pupper_sysid.hardware.serial_servos.line import line_remarks, slow_adapter
 from pupper_sysid.hardware.serial_servos.scan import scan_line
 from pupper_sysid.sim.emulator.serial_line import SerialPty
 from support.command_line import json_of, run
-from support.servo_servers import map_of, on_a_port, still_dynamixels, still_servos, wait_until
-from support.stopwatch import Stopwatch
+from support.servo_servers import map_of, on_a_port, still_dynamixels, still_servos
+from support.stopwatch import Stopwatch, wait_until
 from support.virtual_time import VirtualTime
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -209,16 +208,6 @@ def _served(server):
         server.stop()
         thread.join(5)
         server.close()
-
-
-def wait_until(true: Callable[[], bool], seconds: float = 30.0) -> bool:
-    """Whether it became true in time; the limit is for machines that do other work."""
-    until = time.monotonic() + seconds
-    while not true():
-        if time.monotonic() > until:
-            return False
-        time.sleep(0.005)
-    return True
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 
@@ -40,3 +41,13 @@ class Stopwatch:
                 except (OSError, IndexError):  # it has just ended
                     continue
         return time.monotonic() - 1e-9 * sum(self._delays.values())
+
+
+def wait_until(true: Callable[[], bool], seconds: float = 30.0) -> bool:
+    """Whether it became true in time; the limit is for machines that do other work."""
+    until = time.monotonic() + seconds
+    while not true():
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.005)
+    return True

@@ -14,7 +14,8 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator, ProxySocket
-from support.servo_servers import ScriptedProxy, StillBench, on_a_socket, wait_until
+from support.servo_servers import ScriptedProxy, StillBench, on_a_socket
+from support.stopwatch import wait_until
 
 IDS = [4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9]
 """Servo ids in the order of the joints (facts/hardware.md D1)."""

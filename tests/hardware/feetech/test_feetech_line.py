@@ -25,8 +25,8 @@ from support.servo_servers import (
     moving_servos,
     on_a_port,
     still_servos,
-    wait_until,
 )
+from support.stopwatch import wait_until
 
 POSITION = 56
 PATIENT_S = 0.4

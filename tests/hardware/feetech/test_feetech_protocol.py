@@ -7,7 +7,8 @@ import scservo_sdk
 from scservo_sdk import scservo_def
 
 from pupper_sysid.hardware.feetech import SCS0009, STS3215, FeetechLine, Frame, FrameReader, Series
-from support.servo_servers import Listening, bench_of, on_a_port, still_servos, wait_until
+from support.servo_servers import Listening, bench_of, on_a_port, still_servos
+from support.stopwatch import wait_until
 
 GOLDEN = {
     "ping 1": ("FF FF 01 02 01 FB", 1, 1, ""),

@@ -30,14 +30,8 @@ from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.hardware.serial_servos.scan import scan_line
 from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
-from support.servo_servers import (
-    bench_of,
-    map_of,
-    on_a_port,
-    spare_this_process,
-    still_servos,
-    wait_until,
-)
+from support.servo_servers import bench_of, map_of, on_a_port, spare_this_process, still_servos
+from support.stopwatch import wait_until
 
 ROOT = Path(__file__).resolve().parents[3]
 

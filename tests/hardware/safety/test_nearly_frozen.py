@@ -74,21 +74,24 @@ def test_a_servo_that_moves_by_more_than_noise_or_is_commanded_little_goes_on(
     sweep_of(Following(quantum, share, noise), amplitude, hz)
 
 
-def test_a_reading_that_is_infinite_is_a_missing_one():
-    bus = Following(FINE, share=1.0, noise_steps=0)
+@pytest.mark.parametrize(
+    ("noise", "amplitude", "reading", "words"),
+    [
+        # an infinite reading is a missing one
+        (0, 0.05, lambda time: {"position_rad": np.full(1, np.inf if time > 3.0 else 0.0)},
+         "silent|did not change"),
+        # a time that is NaN would make every comparison of times false
+        (1, 0.3, lambda time: {"time_s": np.full(1, np.nan)}, STOPS),
+    ],
+)  # fmt: skip
+def test_a_reading_that_is_no_number_or_of_no_time_is_monitored_all_the_same(
+    noise, amplitude, reading, words
+):
+    bus = Following(FINE, share=0.0, noise_steps=noise)
     read = bus.read
-    bus.read = lambda: replace(read(), position_rad=np.full(1, np.inf if bus.time > 3.0 else 0.0))
-    with pytest.raises(SafetyStop, match="silent|did not change"):
-        sweep_of(bus, 0.05, 1.0)
-
-
-def test_a_bus_that_dates_a_reading_at_no_time_is_monitored_all_the_same():
-    """A time that is NaN would make every comparison of times false."""
-    bus = Following(FINE, share=0.0, noise_steps=1)
-    read = bus.read
-    bus.read = lambda: replace(read(), time_s=np.full(1, np.nan))
-    with pytest.raises(SafetyStop, match=STOPS):
-        sweep_of(bus, 0.3, 1.0)
+    bus.read = lambda: replace(read(), **reading(bus.time))
+    with pytest.raises(SafetyStop, match=words):
+        sweep_of(bus, amplitude, 1.0)
 
 
 def emulated(kind: str) -> EmulatedBus:

@@ -26,8 +26,8 @@ from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.bus import WalkingBus, calibrated_robot
 from pupper_sysid.sim.walking.robot import WalkingRobot
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
-from support.servo_servers import exact_spec, on_a_socket, wait_until
-from support.stopwatch import Stopwatch
+from support.servo_servers import exact_spec, on_a_socket
+from support.stopwatch import Stopwatch, wait_until
 from support.tiny_training import CALIBRATION
 
 POSE = np.array([DEFAULT_POSE[name] for name in JOINT_NAMES])
