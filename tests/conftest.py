@@ -6,6 +6,7 @@ import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 # modules are compiled once, not by every worker and every program that a test starts
 os.environ["PYTHONDONTWRITEBYTECODE"] = ""
@@ -67,6 +68,22 @@ def unexamined() -> Iterator[None]:
 
     with unexamined.unexamined():
         yield
+
+
+@pytest.fixture
+def proxy_path() -> Iterator[Path]:
+    """Of a proxy's socket, which must be short."""
+    with TemporaryDirectory(prefix="px", dir="/tmp") as folder:
+        yield Path(folder) / "s"
+
+
+@pytest.fixture
+def patient_proxy(monkeypatch, proxy_path) -> Path:
+    """The same, of a proxy that shares this process and a busy machine."""
+    from pupper_sysid.hardware import esp32
+
+    monkeypatch.setattr(esp32, "TIMEOUT_S", 0.3)
+    return proxy_path
 
 
 @pytest.fixture(scope="session")

@@ -2,10 +2,7 @@
 
 import inspect
 import json
-import os
 import re
-import subprocess
-import sys
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -16,21 +13,11 @@ import pytest
 
 import pupper_sysid as ps
 from pupper_sysid.cli.programs import pupper_sysid
-from support.command_line import run
+from support.command_line import fresh_python, run
 from support.json_keys import DOCUMENTED, key_line
 
 SWEEP = Path("data/samples/sweep.csv")
 pytestmark = pytest.mark.usefixtures("fitted_once")
-
-
-def python(code: str, folder: Path) -> str:
-    """What a fresh interpreter prints in `folder`."""
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=False,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 def test_every_name_is_there_and_no_other():
@@ -97,7 +84,7 @@ def test_export_takes_a_calibration_its_file_and_what_calibrate_returns(tmp_path
 
 def test_importing_the_front_door_imports_nothing_else(tmp_path):
     code = "import sys; a = set(sys.modules); import pupper_sysid; print(*set(sys.modules) - a)"
-    loaded = python(code, tmp_path).split()
+    loaded = fresh_python(code, folder=tmp_path).split()
     assert "numpy" not in loaded and "torch" not in loaded
     assert [m for m in loaded if m.startswith("pupper_sysid.")] == []
 

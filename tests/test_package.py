@@ -19,6 +19,7 @@ import pytest
 import yaml
 
 import pupper_sysid as ps
+from support.command_line import fresh_python
 from support.package import FILES, FOLDERS, MODULES, PROJECT, ROOMS, ROOT
 
 SETUPTOOLS = PROJECT["tool"]["setuptools"]
@@ -173,21 +174,12 @@ def test_the_wheel_works_beside_folders_of_the_same_names(wheel, tmp_path):
         (user / name).mkdir()
         (user / name / "__init__.py").write_text(decoy)
 
-    def run(code: str, *arguments: object) -> str:
-        done = subprocess.run(
-            [sys.executable, "-c", code, *map(str, arguments)],
-            cwd=user, env=os.environ | {"PYTHONPATH": str(installed)},
-            capture_output=True, text=True,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
-
     # its own files first, then what a command reads of its data
     program = (
         "import pupper_sysid; print(pupper_sysid.__file__)\n"
         "from pupper_sysid.cli.programs.pupper_sysid import main; main()"
     )
-    printed = run(program, "servo", "list")
+    printed = fresh_python(program, "servo", "list", folder=user, path=installed)
     assert str(installed) in printed and "sts3215" in printed
 
 

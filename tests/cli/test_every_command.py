@@ -8,8 +8,6 @@ import io
 import json
 import re
 import shlex
-import subprocess
-import sys
 from contextvars import copy_context
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -24,7 +22,7 @@ from pupper_sysid.cli.programs import pupper_analyze, pupper_sysid
 from pupper_sysid.cli.terminal import remember, spell
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import select_joints
-from support.command_line import json_of, ran, refused
+from support.command_line import fresh_python, json_of, ran, refused
 from support.json_keys import DOCUMENTED, key_line
 from support.package import FOLDERS, ROOT
 
@@ -36,12 +34,8 @@ SLOW = ("torch", "rsl_rl", "matplotlib", "pandas", "scipy", "control", "mujoco",
 
 def imported(code: str) -> set[str]:
     """Slow libraries that a fresh interpreter has imported after `code`."""
-    done = subprocess.run(
-        [sys.executable, "-c", f"import sys\n{code}\nprint('AFTER', *sys.modules)"],
-        capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    return set(SLOW) & set(done.stdout.rpartition("AFTER ")[2].split())
+    printed = fresh_python(f"import sys\n{code}\nprint('AFTER', *sys.modules)")
+    return set(SLOW) & set(printed.rpartition("AFTER ")[2].split())
 
 
 def test_help_and_version_of_every_command_import_no_slow_library():

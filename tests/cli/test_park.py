@@ -22,7 +22,7 @@ from pupper_sysid.hardware import loop as clock
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.lock import runtime_folder
 from pupper_sysid.hardware.safety import watchdog
-from pupper_sysid.hardware.safety.guard import open_guarded
+from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
 from pupper_sysid.hardware.safety.notes import notes, remove_note, write_note
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from support.served_driver import PATIENT, drive
@@ -37,10 +37,17 @@ PARK = [sys.executable, "-c", PROGRAM, "park"]
 @pytest.fixture(params=["feetech", "esp32"])
 def robot(request, tmp_path, monkeypatch):
     """A served emulated robot and its address."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.1)
     with robot_behind(request.param, tmp_path) as served:
         yield served
+
+
+def switched_on(address: str) -> GuardedBus:
+    """Of this process, as a walk has it."""
+    bus = open_guarded(parse_address(address))
+    assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
+    bus.torque(True)
+    return bus
 
 
 on_esp32 = pytest.mark.parametrize(
@@ -131,10 +138,7 @@ def test_a_supervisor_switches_off_what_driver_and_watchdog_have_left_on(robot, 
 @on_esp32
 @pytest.mark.wall_clock
 def test_a_driver_that_was_stopped_with_its_watchdog_does_not_go_on(robot):
-    _, address = robot
-    bus = open_guarded(parse_address(address))
-    assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
-    bus.torque(True)
+    bus = switched_on(robot[1])
     assert bus._watchdog is not None
     watchdog = bus._watchdog._process.pid
     os.kill(watchdog, signal.SIGSTOP)
@@ -150,15 +154,18 @@ def test_a_driver_that_was_stopped_with_its_watchdog_does_not_go_on(robot):
 )
 @pytest.mark.wall_clock
 def test_a_machine_that_was_suspended_during_a_walk_does_not_go_on(robot, monkeypatch):
-    _, address = robot
-    bus = open_guarded(parse_address(address))
-    assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
-    bus.torque(True)
+    bus = switched_on(robot[1])
     # an hour passes at once, and monotonic clocks stood still
     monkeypatch.setattr(watchdog, "lasting_s", lambda: clock.lasting_s() + 3600)
     with pytest.raises(SafetyStop, match="this process stood still for 3[56]"):
         bus.write(bus.sent)
     bus.close()
+
+
+@pytest.fixture
+def gone_for_good():
+    """The note of a driver whose serial line is no more."""
+    write_note(driver_orders("feetech", "/dev/pts/99999", "sts3215", 0), ["LF_hip"], 0)
 
 
 def test_the_clock_of_the_watchdog_counts_while_the_machine_is_suspended(monkeypatch):
@@ -167,17 +174,12 @@ def test_the_clock_of_the_watchdog_counts_while_the_machine_is_suspended(monkeyp
     assert clock.lasting_s() == 1.0 and asked == [clock.time.CLOCK_BOOTTIME]
 
 
-def test_a_robot_that_is_gone_for_good_is_settled(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    write_note(driver_orders("feetech", "/dev/pts/99999", "sts3215", 0), ["LF_hip"], 0)
+def test_a_robot_that_is_gone_for_good_is_settled(gone_for_good, capsys):
     Park(seconds=0.1).run()
     assert notes() == [] and "gone for good; the torque of LF_hip" in capsys.readouterr().err
 
 
-def test_a_supervisor_that_is_ended_has_said_what_it_switched_off(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    write_note(driver_orders("feetech", "/dev/pts/99999", "sts3215", 0), ["LF_hip"], 0)
-
+def test_a_supervisor_that_is_ended_has_said_what_it_switched_off(gone_for_good, monkeypatch):
     def ended(text, **_):
         assert "the torque of LF_hip" in text
         raise KeyboardInterrupt
@@ -188,8 +190,7 @@ def test_a_supervisor_that_is_ended_has_said_what_it_switched_off(tmp_path, monk
     assert len(notes()) == 1, "it is settled only once it was said"
 
 
-def test_a_note_is_removed_after_its_device_was_unplugged(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def test_a_note_is_removed_after_its_device_was_unplugged(tmp_path):
     link, device = tmp_path / "by-id", tmp_path / "ttyUSB0"
     link.symlink_to(device)
     write_note(driver_orders("feetech", str(link), "sts3215", os.getpid()), ["LF_hip"], os.getpid())
@@ -200,8 +201,7 @@ def test_a_note_is_removed_after_its_device_was_unplugged(tmp_path, monkeypatch)
     assert notes() == []
 
 
-def test_a_note_that_cannot_be_read_is_left_out(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def test_a_note_that_cannot_be_read_is_left_out():
     for k, text in enumerate(("", "{", "[]", '{"map": 3}', '{"map": {}, "joints": 1}')):
         (runtime_folder() / f"{k}.on").write_text(text)
     os.mkfifo(runtime_folder() / "fifo.on")
@@ -221,3 +221,9 @@ def test_every_command_that_opens_a_bus_is_stopped_as_by_ctrl_c():
         named = {n.name for i in ast.walk(tree) if isinstance(i, ast.ImportFrom) for n in i.names}
         assert command.holds_bus == bool(named & (openers | servers)), word
     assert "end_politely()" in (ROOT / "cli/programs/pupper_deploy.py").read_text()
+
+
+@pytest.fixture(autouse=True)
+def own_notes(tmp_path, monkeypatch):
+    """Notes of robots that are on are those of the test."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))

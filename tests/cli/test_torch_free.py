@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from support.command_line import fresh_python
 
 TESTS = Path(__file__).resolve().parents[1]
 
@@ -25,6 +24,7 @@ class NotInstalled:
 
 sys.meta_path.insert(0, NotInstalled())
 
+from support.command_line import fresh_python
 from pupper_sysid.cli.programs.pupper_sysid import main
 from support.servo_servers import on_a_port, still_servos
 
@@ -51,10 +51,6 @@ assert not set(BANNED) & set(sys.modules)
 
 @pytest.mark.slow
 def test_no_command_on_the_way_to_a_calibration_imports_torch(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", COMMANDS],
-        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(TESTS)}, capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count("DONE") == 10
+    printed = fresh_python(COMMANDS, folder=tmp_path, path=TESTS)
+    assert printed.count("DONE") == 10
     assert (tmp_path / "page/report.html").is_file() and (tmp_path / "bode.png").is_file()

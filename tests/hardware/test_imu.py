@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import struct
-import tempfile
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware import esp32
@@ -84,13 +82,6 @@ def test_a_reply_that_no_chip_could_have_given_is_none():
 # ---- the bus ----
 
 
-@pytest.fixture
-def path(monkeypatch):
-    monkeypatch.setattr(esp32, "TIMEOUT_S", 0.3)  # the proxy shares this process
-    with tempfile.TemporaryDirectory(prefix="px", dir="/tmp") as folder:
-        yield Path(folder) / "s"
-
-
 def read_imu(path: Path, *replies: bytes | None) -> ImuSample | None:
     """What the bus makes of successive answers."""
     # a client that leaves has its last request carried out once more
@@ -105,16 +96,16 @@ def read_imu(path: Path, *replies: bytes | None) -> ImuSample | None:
 GOOD, OTHER, THIRD = (imu_reply(0, 0, -1, x, 0, 0) for x in (1.0, 2.0, 3.0))
 
 
-def test_a_reading_counts_exactly_when_two_answers_agree(path):
+def test_a_reading_counts_exactly_when_two_answers_agree(patient_proxy):
     for replies in ((GOOD, GOOD), (OTHER, GOOD, GOOD), (GOOD, OTHER, GOOD)):
-        sample = read_imu(path, *replies)
+        sample = read_imu(patient_proxy, *replies)
         assert sample is not None, replies
         np.testing.assert_allclose(sample.rate_rad_s, [0.0, np.radians(1.0), 0.0])
         np.testing.assert_allclose(sample.acceleration_m_s2, [0.0, 0.0, G])
         assert 0 <= sample.time_s < 5
     none, failed = (None,), (imu_reply(*[0.0] * 6),) * 2
     for replies in ((GOOD, OTHER, THIRD), failed, none, (GOOD, b"\x1a\x04\x00")):
-        assert read_imu(path, *replies) is None, replies
+        assert read_imu(patient_proxy, *replies) is None, replies
 
 
 def test_a_proxy_for_the_imu_alone_does_not_move_the_servos_or_tell_of_them():

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -43,3 +47,18 @@ def ran(capsys, *arguments, program: ModuleType = pupper_sysid) -> tuple[str, st
 def json_of(capsys, *arguments, program: ModuleType = pupper_sysid) -> Any:
     """What a command prints with `--json`."""
     return json.loads(ran(capsys, *arguments, "--json", program=program)[0])
+
+
+def fresh_python(
+    code: str, *words: object, folder: Path | None = None, path: Path | None = None
+) -> str:
+    """What a new interpreter prints that runs the code in a folder, with modules at a path."""
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    if path is not None:
+        environment["PYTHONPATH"] = str(path)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, words)], cwd=folder, env=environment,
+        capture_output=True, text=True, check=False, timeout=600,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout

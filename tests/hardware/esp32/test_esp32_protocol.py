@@ -1,7 +1,6 @@
 """The robot's proxy: layouts of its datagrams, faults that only it has, its emulator's quirks."""
 
 import socket
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,19 +18,6 @@ from support.stopwatch import wait_until
 
 IDS = [4, 5, 6, 1, 2, 3, 10, 11, 12, 7, 8, 9]
 """Servo ids in the order of the joints (facts/hardware.md D1)."""
-
-
-@pytest.fixture
-def path() -> Iterator[Path]:
-    # a socket's path must be short
-    with tempfile.TemporaryDirectory(prefix="px", dir="/tmp") as folder:
-        yield Path(folder) / "s"
-
-
-@pytest.fixture
-def patient(monkeypatch):
-    """The proxy shares this process and a busy machine; tests of time do without."""
-    monkeypatch.setattr(esp32, "TIMEOUT_S", 0.3)
 
 
 def still_proxy() -> ProxyEmulator:
@@ -61,7 +47,7 @@ def answers(request: bytes) -> bytes:
 
 
 def test_readings_are_those_of_their_joint_and_a_count_on_which_no_two_answers_agree_is_missing(
-    path, patient
+    patient_proxy,
 ):
     third = iter(range(100, 10_000))
 
@@ -69,7 +55,7 @@ def test_readings_are_those_of_their_joint_and_a_count_on_which_no_two_answers_a
         counts = [*range(501, 512), next(third) % 900] if request[1] == 2 else []
         return counts_reply(counts) if counts else answers(request)
 
-    with bus_of(ScriptedProxy(torn), path) as bus:
+    with bus_of(ScriptedProxy(torn), patient_proxy) as bus:
         sample = bus.read()
     count = dict(zip(IDS, sample.position_count.tolist(), strict=True))
     assert count == {i: 500 + i for i in range(1, 12)} | {12: -1}
@@ -125,10 +111,10 @@ def test_the_byte_that_stores_a_calibration_is_never_packed_and_only_whole_count
 # ---- the bus ----
 
 
-def test_no_write_or_torque_of_the_bus_sends_the_byte_that_stores_a_calibration(path, patient):
+def test_no_write_or_torque_of_the_bus_sends_the_byte_that_stores_a_calibration(patient_proxy):
     proxy = ScriptedProxy(answers)
     rng = np.random.default_rng(3)
-    with bus_of(proxy, path) as bus:
+    with bus_of(proxy, patient_proxy) as bus:
         for scale in (0.1, 1.0, 10.0, 99.0, 1e9):
             bus.write(scale * rng.standard_normal(12))
             bus.torque(bool(rng.random() < 0.5))
@@ -139,34 +125,34 @@ def test_no_write_or_torque_of_the_bus_sends_the_byte_that_stores_a_calibration(
     assert words.max() <= 1023
 
 
-def test_an_unanswered_question_does_not_make_the_servos_jump_when_they_go_on(path, patient):
+def test_an_unanswered_question_does_not_make_the_servos_jump_when_they_go_on(patient_proxy):
     lost: list[bytes | None] = [None]
 
     def answer(request: bytes) -> bytes | None:
         return lost.pop() if request[1] == 2 and lost else answers(request)
 
     proxy = ScriptedProxy(answer)
-    with bus_of(proxy, path) as bus:
+    with bus_of(proxy, patient_proxy) as bus:
         assert bus.torque(True)
     on = next(r for r in proxy.requests if r[1] == 1)
     assert np.frombuffer(on[14:], "<u2").tolist() == list(range(501, 513))
 
 
-def test_nothing_is_sent_while_a_servo_does_not_say_where_it_is(path, patient):
+def test_nothing_is_sent_while_a_servo_does_not_say_where_it_is(patient_proxy):
     def without_the_last(request: bytes) -> bytes:
         return counts_reply([*range(501, 512), 0]) if request[1] == 2 else answers(request)
 
     proxy = ScriptedProxy(without_the_last)
-    with bus_of(proxy, path) as bus:
+    with bus_of(proxy, patient_proxy) as bus:
         assert not bus.torque(True)
     assert all(r[1] != 1 for r in proxy.requests)
 
 
 @pytest.mark.wall_clock
-def test_a_hung_server_costs_a_bounded_time_and_everything_is_missing(path):
+def test_a_hung_server_costs_a_bounded_time_and_everything_is_missing(proxy_path):
     hung = False
     proxy = ScriptedProxy(lambda request: None if hung else answers(request))
-    with bus_of(proxy, path) as bus:
+    with bus_of(proxy, proxy_path) as bus:
         hung = True
         took = []
         for _ in range(5):
@@ -182,7 +168,7 @@ def test_a_hung_server_costs_a_bounded_time_and_everything_is_missing(path):
 
 
 @pytest.mark.wall_clock
-def test_an_answer_that_belongs_to_an_earlier_question_is_not_taken(path, monkeypatch):
+def test_an_answer_that_belongs_to_an_earlier_question_is_not_taken(proxy_path, monkeypatch):
     monkeypatch.setattr(esp32, "TIMEOUT_S", 0.05)
 
     class Late(ScriptedProxy):
@@ -192,7 +178,7 @@ def test_an_answer_that_belongs_to_an_earlier_question_is_not_taken(path, monkey
             return [(0.1, reply)] if self.slow else [(0.0, reply)]
 
     proxy = Late(answers)
-    with bus_of(proxy, path) as bus:
+    with bus_of(proxy, proxy_path) as bus:
         proxy.slow = True
         assert np.isnan(bus.read().position_rad).all()
         proxy.slow = False
@@ -201,10 +187,12 @@ def test_an_answer_that_belongs_to_an_earlier_question_is_not_taken(path, monkey
         assert wait_until(lambda: bus.read().position_count.tolist() == [700] * 12)
 
 
-def test_the_emulator_refuses_a_path_where_a_proxy_lives_or_another_file_stands(path, tmp_path):
-    with on_a_socket(still_proxy(), path), pytest.raises(InputError, match="already running"):
-        ProxySocket(still_proxy(), path)
-    assert not path.exists()
+def test_the_emulator_refuses_a_path_where_a_proxy_lives_or_another_file_stands(
+    proxy_path, tmp_path
+):
+    with on_a_socket(still_proxy(), proxy_path), pytest.raises(InputError, match="already running"):
+        ProxySocket(still_proxy(), proxy_path)
+    assert not proxy_path.exists()
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="exists and is no socket"):
         ProxySocket(still_proxy(), tmp_path / "file")
@@ -220,8 +208,8 @@ def connect(path: Path) -> socket.socket:
     return client
 
 
-def test_an_unknown_request_is_answered_with_the_previous_reply(path):
-    with on_a_socket(still_proxy(), path), connect(path) as client:
+def test_an_unknown_request_is_answered_with_the_previous_reply(proxy_path):
+    with on_a_socket(still_proxy(), proxy_path), connect(proxy_path) as client:
         client.send(bytes.fromhex("0205"))
         power = client.recv(64)
         for unknown in ("0209", "0303", "02", "26010101", "0b02" + "00" * 9):

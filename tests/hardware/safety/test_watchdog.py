@@ -29,7 +29,7 @@ from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sysid.recordings.files import load
-from support.command_line import ran
+from support.command_line import fresh_python, ran
 from support.served_driver import PATIENT, drive
 from support.servo_servers import (
     bench_of,
@@ -325,8 +325,7 @@ def test_a_driver_without_its_watchdog_does_not_go_on(tmp_path, monkeypatch):
 def test_the_watchdog_process_starts_without_the_heavy_libraries():
     heavy = "{'torch', 'matplotlib', 'pandas', 'scipy', 'mujoco', 'control', 'numba'}"
     code = f"import sys, {watchdog_process.__name__}; print({heavy} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert done.stdout == "set()\n", done.stderr
+    assert fresh_python(code) == "set()\n"
 
 
 SWEEP = f"{PATIENT}\nfrom pupper_sysid.cli.programs.pupper_sysid import main\nmain()"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import onnx
@@ -33,6 +31,7 @@ from pupper_sysid.sim.walking.observation import (
 )
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from pupper_sysid.sysid.export import network as network_export
+from support.command_line import fresh_python
 from support.tiny_training import (
     ALL_KINDS,
     CALIBRATION,
@@ -182,11 +181,7 @@ def test_a_policy_is_loaded_without_its_trainer(saved_policies):
         "[load_policy(Path(folder)) for folder in sys.argv[1:]]\n"
         "assert 'rsl_rl' not in sys.modules and 'tensordict' not in sys.modules"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, *map(str, saved_policies.values())],
-        capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    fresh_python(code, *saved_policies.values())
 
 
 @pytest.fixture(params=ALL_KINDS)

@@ -50,66 +50,57 @@ def robot_of(text: str, name: str = "arm.urdf") -> robot_map.RobotMap:
     return robot_map.joint_map_of(Path(name), "sts3215")
 
 
-def test_a_urdf_mimic_joint_gets_no_servo_and_is_named():
-    mimic = '<mimic joint="left" multiplier="-1"/>'
-    robot = robot_of(urdf(("left", 0, 0.8, ""), ("right", -0.8, 0, mimic), ("roll", -1, 1, "")))
-    assert robot.joint_map.joint_names == ("left", "roll")
-    assert robot.joint_map.ids == (1, 2)
-    assert robot.following == {"right": "left"} and robot.left_out == []
+PAN, TILT = ("pan", -1, 1, ""), ("tilt", -1, 1, "")
 
 
-def test_a_joint_that_an_mjcf_equality_couples_gets_no_servo_and_is_named():
-    robot = robot_of(
-        f"""<mujoco><worldbody><body><joint name="left" range="0 45"/>{GEOM}</body>
-        <body><joint name="right" range="-45 0"/>{GEOM}</body></worldbody>
-        <equality><joint joint1="right" joint2="left" polycoef="0 -1 0 0 0"/></equality>
-        </mujoco>""",
-        "arm.xml",
-    )
-    assert robot.joint_map.joint_names == ("left",) and robot.following == {"right": "left"}
+MESHES = MESH + MESH.replace("visual", "collision")
 
 
-def test_limits_in_degrees_are_questioned_and_not_taken_for_a_whole_turn():
-    robot = robot_of(urdf(("pan", -90, 90, ""), ("tilt", -1.2, 0.7, "")))
-    pan, tilt = (robot.joint_map.file.joints[name] for name in ("pan", "tilt"))
-    assert pan.limits_rad == pytest.approx((-np.pi / 2, np.pi / 2))
-    assert tilt.limits_rad == pytest.approx((-1.2, 0.7))
-    assert len(robot.doubts) == 1 and "pan (-90 to 90) cannot be radians" in robot.doubts[0]
+INERTIA = 'ixx="1e-4" iyy="1e-4" izz="1e-4"'
 
 
-def test_limits_of_0_to_0_are_questioned_and_allow_little():
-    robot = robot_of(urdf(("pan", 0, 0, ""), ("tilt", -1.2, 0.7, "")))
-    assert robot.joint_map.file.joints["pan"].limits_rad == (-0.5, 0.5)
-    assert "limits of pan are 0 to 0" in robot.doubts[0]
+MIMIC = '<mimic joint="left" multiplier="-1"/>'
 
 
-def test_meshes_need_not_be_there():
-    robot = robot_of(urdf(("pan", -1, 1, ""), mesh=MESH + MESH.replace("visual", "collision")))
-    assert robot.joint_map.joint_names == ("pan",) and robot.doubts == []
-    asset = '<asset><mesh name="m" file="absent.stl"/></asset>'
-    body = '<body><joint name="k" range="-40 40"/><geom type="mesh" mesh="m"/></body>'
-    robot = robot_of(f"<mujoco>{asset}<worldbody>{body}</worldbody></mujoco>", "mesh.xml")
-    assert robot.joint_map.joint_names == ("k",)
+EQUALITY = f"""<mujoco><worldbody><body><joint name="left" range="0 45"/>{GEOM}</body>
+<body><joint name="right" range="-45 0"/>{GEOM}</body></worldbody>
+<equality><joint joint1="right" joint2="left" polycoef="0 -1 0 0 0"/></equality></mujoco>"""
 
 
-def test_a_joint_map_needs_neither_sound_inertias_nor_declared_prefixes():
-    text = urdf(("pan", -1, 1, ""), ("tilt", -1, 1, ""))
-    for unsound in ('ixx="1e-4" iyy="1e-4" izz="9e-4"', 'ixx="1e-4" iyy="-1e-4" izz="1e-4"'):
-        robot = robot_of(text.replace('ixx="1e-4" iyy="1e-4" izz="1e-4"', unsound))
-        assert robot.joint_map.joint_names == ("pan", "tilt")
-    undeclared = text.replace("<limit", '<limit drake:acceleration="2.5"').replace(
-        "</robot>", '<drake:ignored name="a:b"/></robot>'
-    )
-    robot = robot_of(
-        undeclared.replace('lower="-1"', 'lower="0"').replace('upper="1"', 'upper="0"')
-    )
-    assert "limits of pan, tilt are 0 to 0" in robot.doubts[0]
+ASSETS = f"""<mujoco><asset><texture name="t" type="2d" file="absent.png"/>
+<material name="m" texture="t"/><mesh name="s" file="absent.stl"/></asset><worldbody>
+<body><joint name="k" range="-40 40"/>{GEOM.replace("/>", ' material="m"/>')}
+<geom type="mesh" mesh="s"/><site material="m"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "following"),
+    [
+        (urdf(("left", 0, 0.8, ""), ("right", -0.8, 0, MIMIC)), "arm.urdf", {"right": "left"}),
+        (EQUALITY, "arm.xml", {"right": "left"}),
+    ],
+    ids=["mimic", "equality"],
+)
+def test_a_joint_that_follows_another_gets_no_servo_and_is_named(text, name, following):
+    robot = robot_of(text, name)
+    assert robot.joint_map.joint_names == ("left",) and robot.joint_map.ids == (1,)
+    assert robot.following == following and robot.left_out == []
+
+
+def test_files_that_an_mjcf_names_need_not_be_there():
+    robot = robot_of(ASSETS, "arm.xml")
+    assert robot.joint_map.joint_names == ("k",) and robot.doubts == []
 
 
 @pytest.mark.parametrize(
     ("original", "other"),
     [
+        ("", ""),  # absent meshes alone
         ('izz="1e-4"', ""),  # a mass without an inertia
+        (INERTIA, 'ixx="1e-4" iyy="1e-4" izz="9e-4"'),
+        (INERTIA, 'ixx="1e-4" iyy="-1e-4" izz="1e-4"'),
+        ("<limit", '<limit drake:acceleration="2.5"'),  # a prefix that nothing declares
+        ("</robot>", '<drake:ignored name="a:b"/></robot>'),
         ("package://arm/", "package:/arm/"),
         ('<axis xyz="0 0 1"/>', '<origin rpy="0, 0, 1"/><axis xyz="0 0 1"/>'),
         ('<child link="l1"/>', '<child link="missing"/>'),
@@ -117,10 +108,32 @@ def test_a_joint_map_needs_neither_sound_inertias_nor_declared_prefixes():
     ],
 )
 def test_a_urdf_that_mujoco_refuses_still_states_its_joints(original, other):
-    text = urdf(("pan", -1, 1, ""), mesh=MESH)
+    text = urdf(PAN, TILT, mesh=MESHES)
     assert original in text
-    robot = robot_of(text.replace(original, other))
-    assert robot.joint_map.joint_names == ("pan",) and robot.doubts == []
+    robot = robot_of(text.replace(original, other) if original else text)
+    assert robot.joint_map.joint_names == ("pan", "tilt") and robot.doubts == []
+
+
+@pytest.mark.parametrize(
+    ("limits", "kept", "doubt"),
+    [
+        ((-90, 90), (-np.pi / 2, np.pi / 2), "pan (-90 to 90) cannot be radians"),
+        ((0, 0), (-0.5, 0.5), "limits of pan are 0 to 0"),
+        (("-1e16", "1e16"), (-3.11, 3.11), None),
+        (None, (-3.11, 3.11), None),  # a joint that turns on and on
+    ],
+    ids=["degrees", "zero", "endless", "continuous"],
+)
+def test_limits_that_no_servo_has_are_replaced_and_odd_ones_questioned(limits, kept, doubt):
+    text = urdf(("pan", *(limits or (0, 0)), ""), ("tilt", -1.2, 0.7, ""))
+    if limits is None:
+        text = text.replace("revolute", "continuous", 1)
+    robot = robot_of(text)
+    pan, tilt = (robot.joint_map.file.joints[name] for name in ("pan", "tilt"))
+    assert pan.limits_rad == pytest.approx(kept, abs=0.01)
+    assert tilt.limits_rad == pytest.approx((-1.2, 0.7))
+    assert len(robot.doubts) == (doubt is not None)
+    assert all(doubt in said for said in robot.doubts)
 
 
 def test_a_urdf_is_numbered_from_the_base_on_whatever_the_order_of_its_file():
@@ -129,15 +142,6 @@ def test_a_urdf_is_numbered_from_the_base_on_whatever_the_order_of_its_file():
     loop = JOINT.format("e", "l8", "l8", -1, 1, "")
     robot = robot_of(f'<robot name="arm">{loop}{"".join(reversed(joints))}</robot>')
     assert robot.joint_map.joint_names == ("a", "d", "b", "c", "e")
-
-
-def test_a_urdf_joint_without_limits_has_the_servos_own_range():
-    spun = JOINT.format("spun", "l0", "l1", 0, 0, "").replace("revolute", "continuous")
-    endless = JOINT.format("endless", "l1", "l2", "-1e16", "1e16", "")
-    robot = robot_of(f'<robot name="arm">{spun}{endless}</robot>')
-    for entry in robot.joint_map.file.joints.values():
-        assert entry.limits_rad == pytest.approx((-3.11, 3.11), abs=0.01)
-    assert robot.doubts == []
 
 
 @pytest.mark.parametrize(
@@ -154,17 +158,6 @@ def test_a_urdf_that_states_no_robot_is_refused_with_the_reason(text, words):
     with pytest.raises(InputError) as refused:
         robot_of(text)
     assert words in str(refused.value)
-
-
-def test_an_mjcf_is_read_without_its_textures_and_height_fields():
-    robot = robot_of(
-        f"""<mujoco><asset><texture name="t" type="2d" file="absent.png"/>
-        <material name="m" texture="t"/><mesh name="s" file="absent.stl"/></asset><worldbody>
-        <body><joint name="k" range="-40 40"/>{GEOM.replace("/>", ' material="m"/>')}
-        <geom type="mesh" mesh="s"/><site material="m"/></body></worldbody></mujoco>""",
-        "arm.xml",
-    )
-    assert robot.joint_map.joint_names == ("k",)
 
 
 def test_names_that_no_file_or_column_can_have_are_changed_and_said():

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,6 @@ import pytest
 
 from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
-from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.joint_map import load_joint_map
@@ -233,19 +231,12 @@ def test_the_guard_lets_a_trotting_robot_walk():
     assert guard.report.missing == 0 and guard.report.unsent == 0
 
 
-@pytest.fixture
-def path(monkeypatch) -> Iterator[Path]:
-    monkeypatch.setattr(esp32, "TIMEOUT_S", 0.3)  # the proxy shares this process
-    with tempfile.TemporaryDirectory(prefix="px", dir="/tmp") as folder:
-        yield Path(folder) / "s"
-
-
 @pytest.mark.wall_clock
-def test_it_walks_behind_the_robots_proxy_in_real_time(path):
+def test_it_walks_behind_the_robots_proxy_in_real_time(patient_proxy):
     for _ in range(3):
         watch = Stopwatch()
         try:
-            walks_behind_the_proxy(path)
+            walks_behind_the_proxy(patient_proxy)
         except (SafetyStop, AssertionError):
             if watch.waited_s() < 0.5:
                 raise

@@ -178,10 +178,7 @@ def tone_lag(frequency):
 
 def test_ripple_is_taken_out_of_live_tones_and_what_is_left_is_in_the_interval():
     trials, rng = swept(), np.random.default_rng(0)
-    lattice = find_poll_lattice(trials, rng)
-    read = [readings(t, lattice) for t in trials]
-    found = [tone_response(t, r, rng) for t, r in zip(trials, read, strict=True)]
-    tones = [t for t in found if t is not None]
+    lattice, read, tones = tones_of(trials, rng)
     with_ripple = slope(tones, "fresh_held")
     clean = slope(without_ripple(trials, read, tones, rng), "fresh_held")
     b = lag_budget("LF_hip", trials, rng, lattice)
@@ -227,10 +224,15 @@ def test_lags_longer_than_the_lowest_tones_period_come_out_whole():
 def test_polled_tones_have_no_ripple_to_take_out():
     rng = np.random.default_rng(2)
     trials = tone_trials(0.040, rng, (1.0, 4.0))
-    lattice = find_poll_lattice(trials, rng)
-    read = [readings(t, lattice) for t in trials]
-    found = [tone_response(t, r, rng) for t, r in zip(trials, read, strict=True)]
-    tones = [t for t in found if t is not None]
+    lattice, _, tones = tones_of(trials, rng)
     b = lag_budget("LF_hip", trials, np.random.default_rng(0), lattice)
     assert lattice.kind == "lattice"
     assert b.lag_s.value == pytest.approx(slope(tones, "fresh_held").value, abs=1e-9)
+
+
+def tones_of(trials, rng):
+    """Lattice, readings and responses of tones."""
+    lattice = find_poll_lattice(trials, rng)
+    read = [readings(t, lattice) for t in trials]
+    found = [tone_response(t, r, rng) for t, r in zip(trials, read, strict=True)]
+    return lattice, read, [t for t in found if t is not None]

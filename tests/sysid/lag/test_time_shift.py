@@ -151,32 +151,38 @@ def test_a_lag_beyond_the_search_range_is_said_to_be_at_its_end():
     assert any("end of its search range" in w for w in b.warnings)
 
 
-def test_draws_that_begin_at_different_times_do_not_lose_the_lag_they_share():
-    # each a jump with overshoot taken back; the median of every bin is another response
-    edges = 0.01 * np.arange(121)
-    masses = np.zeros((30, 120))
-    for k in range(30):
-        masses[k, 5 + k % 3], masses[k, 8 + k % 3] = 1.6, -0.6
-    rng = np.random.default_rng(7)
-    trial = first_order_trial(minimum_jerk(rng), 0.02, 0.05, loop_s=0.02)
-    stretch = Stretch(HeldCommand.of(trial), trial.read_time_s, trial.position_rad, 8)
-    response = ImpulseResponse(edges, masses, np.ones((30, 8)), (stretch,), 1.0)
-    # 1.6 · 65 - 0.6 · 95 ms in the middle of the three
-    assert np.median(shift_draws(response, rng)) == pytest.approx(0.047, abs=0.01)
+def overshooting(k):
+    """A jump taken back, at other times in each draw: every bin's median is another response."""
+    masses = np.zeros(120)
+    masses[5 + k % 3], masses[8 + k % 3] = 1.6, -0.6
+    return masses
 
 
-def test_a_fast_motion_whose_gain_at_standstill_comes_out_negative_has_its_lag_upright():
-    """A walk tells the gain at its frequencies only: a wide, weak response may take it below 0."""
-    edges = 0.01 * np.arange(121)
-    masses = np.zeros((30, 120))
-    masses[:, 8] = 1.0
-    masses[:, 20:120] = -0.013
-    rng = np.random.default_rng(7)
-    trial = first_order_trial(
-        lambda t: 0.2 * np.sin(2 * np.pi * 2.0 * t) + 0.1 * np.sin(2 * np.pi * 4.0 * t),
-        0.02, 0.05, loop_s=0.02,
-    )  # fmt: skip
+def weak_at_standstill(_):
+    """As a walk tells it, which knows the gain at its frequencies only: it may come out below 0."""
+    masses = np.zeros(120)
+    masses[8], masses[20:] = 1.0, -0.013
+    return masses
+
+
+def two_tones(t):
+    return 0.2 * np.sin(2 * np.pi * 2.0 * t) + 0.1 * np.sin(2 * np.pi * 4.0 * t)
+
+
+@pytest.mark.parametrize(
+    ("masses", "command", "gain", "lag_s"),
+    [
+        # 1.6 · 65 - 0.6 · 95 ms in the middle of the three
+        (overshooting, minimum_jerk(np.random.default_rng(7)), 1.0, 0.047),
+        (weak_at_standstill, two_tones, -0.3, 0.085),
+    ],
+)
+def test_the_lag_of_draws_of_the_response_is_the_one_that_they_share(masses, command, gain, lag_s):
+    trial = first_order_trial(command, 0.02, 0.05, loop_s=0.02)
     stretch = Stretch(HeldCommand.of(trial), trial.read_time_s, trial.position_rad, 8)
-    response = ImpulseResponse(edges, masses, np.ones((30, 8)), (stretch,), 1.0)
-    assert response.gain < 0
-    assert np.median(shift_draws(response, rng)) == pytest.approx(0.085, abs=0.01)
+    draws = np.array([masses(k) for k in range(30)])
+    response = ImpulseResponse(0.01 * np.arange(121), draws, np.ones((30, 8)), (stretch,), 1.0)
+    assert response.gain == pytest.approx(gain)
+    assert np.median(shift_draws(response, np.random.default_rng(7))) == pytest.approx(
+        lag_s, abs=0.01
+    )
