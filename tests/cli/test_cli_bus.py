@@ -79,10 +79,7 @@ def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
 
 @pytest.mark.parametrize(
     "place",
-    [
-        pytest.param(("feetech", "--link"), marks=pytest.mark.slow),
-        ("esp32", "--socket"),
-    ],
+    [pytest.param(("feetech", "--link"), marks=pytest.mark.slow), ("esp32", "--socket")],
     ids=lambda place: place[0],
 )
 def test_an_emulator_prints_the_next_command_and_ends_on_request(tmp_path, place):

@@ -6,12 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pupper_sysid.common.border import (
-    read_yaml,
-    refuse_other_version,
-    unit_of,
-    validated,
-)
+from pupper_sysid.common.border import read_yaml, refuse_other_version, unit_of, validated
 from support.refusals import assert_each_refused, refusal
 
 # ----------------------------------------------------------------------------------- versions

@@ -355,8 +355,7 @@ def gathered(tmp_path, monkeypatch):
     """Policies that walk well are known to, without walks; results go to an empty folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        "reproduction.page.gather",
-        lambda name, policy, *rest: evidence(policy.contract.kind, name),
+        "reproduction.page.gather", lambda name, policy, *rest: evidence(policy.contract.kind, name)
     )
 
 

@@ -10,11 +10,7 @@ import pytest
 
 from pupper_sysid.servo_models import kernel
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
-from pupper_sysid.servo_models.loaded_servo import (
-    Load,
-    LoadedServo,
-    LoadedServoParameters,
-)
+from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
 from pupper_sysid.sim.robot.servo_mjcf import free_air_xml, rest_at
 from pupper_sysid.sysid.fit.structure import loaded_columns
 from support.refusals import assert_each_refused

@@ -21,12 +21,7 @@ import pupper_sysid as ps
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.pendulum import (
-    Pendulum,
-    PendulumBench,
-    draw_bench,
-    draw_of_map,
-)
+from pupper_sysid.sim.emulator.pendulum import Pendulum, PendulumBench, draw_bench, draw_of_map
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sysid.sweep.bench import bench_plan, parse_load
 from pupper_sysid.sysid.sweep.excitation import POLL_RATE_HZ, Plan, TrialPlan, plan

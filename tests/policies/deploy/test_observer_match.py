@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.policies.deploy.matches import FREQUENCIES_HZ, compare
-from pupper_sysid.policies.deploy.stacks import (
-    HeldEncoder,
-    SyntheticPD,
-    Zero,
-)
+from pupper_sysid.policies.deploy.stacks import HeldEncoder, SyntheticPD, Zero
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from support.observer_response import response
 from support.refusals import assert_each_refused

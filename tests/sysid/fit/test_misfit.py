@@ -13,21 +13,10 @@ from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.fit.choice import undescribed
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.joint_fit import unidentified
-from pupper_sysid.sysid.fit.misfit import (
-    Explanation,
-    decided,
-    explanations,
-    filtered,
-    with_delays,
-)
+from pupper_sysid.sysid.fit.misfit import Explanation, decided, explanations, filtered, with_delays
 from pupper_sysid.sysid.fit.run import Run, free_run
 from pupper_sysid.sysid.fit.search import Problem, refine
-from pupper_sysid.sysid.fit.structure import (
-    SIMULATED,
-    Structure,
-    candidate,
-    servo_structure,
-)
+from pupper_sysid.sysid.fit.structure import SIMULATED, Structure, candidate, servo_structure
 from support.runs import fine_run, run_of
 
 NOISE_RAD = 5e-4

@@ -6,10 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pupper_sysid.sysid.feedback.poll_lattice import (
-    find_poll_lattice,
-    readings,
-)
+from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
 from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
 from pupper_sysid.sysid.lag.tone import (
     slope,

@@ -37,14 +37,7 @@ from pupper_sysid.sysid.report.figures import (
 from pupper_sysid.sysid.report.report import write_findings
 from pupper_sysid.sysid.report.sections import Findings, advice
 from support.browser import looks_right, needs_chromium
-from support.joint_results import (
-    AGE_S,
-    LATTICE,
-    LOOP_S,
-    fitted,
-    interval,
-    result_of,
-)
+from support.joint_results import AGE_S, LATTICE, LOOP_S, fitted, interval, result_of
 from support.refusals import assert_each_refused
 from support.undrawn import leave_undrawn
 

@@ -10,12 +10,7 @@ import pytest
 from pupper_sysid.common.errors import BusError, InputError, SafetyStop
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.pendulum import (
-    BenchSpec,
-    Pendulum,
-    PendulumBench,
-    draw_bench,
-)
+from pupper_sysid.sim.emulator.pendulum import BenchSpec, Pendulum, PendulumBench, draw_bench
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
