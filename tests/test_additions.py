@@ -4,8 +4,6 @@ Each test makes its new module and edits the one table that a developer would, a
 the command: whatever else had to be edited would fail here.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from dataclasses import fields, replace

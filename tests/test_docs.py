@@ -1,7 +1,5 @@
 """The documentation holds: its examples run, its pages build, what it refers to exists."""
 
-from __future__ import annotations
-
 import html
 import importlib
 import re

@@ -4,8 +4,6 @@ The checks are those of `[tool.numpydoc_validation]` in pyproject.toml. Beyond t
 named Parameters lists every parameter; names of the front door have all their sections.
 """
 
-from __future__ import annotations
-
 import inspect
 from importlib import import_module
 

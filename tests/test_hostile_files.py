@@ -6,8 +6,6 @@ one printable sentence that ends, and in bounded processor time and memory. `pyt
 --hypothesis-profile search` tries ten times as many.
 """
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import json

@@ -1,7 +1,5 @@
 """Fixtures: commands run in an empty folder, and drive robots in the process of the tests."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

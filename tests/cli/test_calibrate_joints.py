@@ -1,7 +1,5 @@
 """The guided calibration of joints: with a scripted person, and over a port."""
 
-from __future__ import annotations
-
 import os
 import threading
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """Commands that talk to a bus, with emulators behind real ports."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

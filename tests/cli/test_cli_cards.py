@@ -1,7 +1,5 @@
 """`servo list | show | diff`, and cards in the place of calibrations."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

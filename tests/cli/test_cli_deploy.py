@@ -1,7 +1,5 @@
 """pupper-deploy and pupper-analyze as a user meets them, with the shipped policy."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """`import` and the commands that take logs of other projects directly."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

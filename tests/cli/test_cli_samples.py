@@ -1,7 +1,5 @@
 """`samples` gives what the examples of the documentation need, also from an installed wheel."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

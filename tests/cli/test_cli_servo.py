@@ -1,7 +1,5 @@
 """`fit-servo`, `compare` and what they answer to data and files that cannot be used."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """pupper-train, pupper-play and pupper-eval as a user meets them."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

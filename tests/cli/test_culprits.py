@@ -1,7 +1,5 @@
 """An error names what caused it: the stream, the call that was refused, what a loop waited for."""
 
-from __future__ import annotations
-
 import errno
 import multiprocessing.synchronize
 import os

@@ -1,7 +1,5 @@
 """What every command has in common: a quick start, help of one screen, output, messages, keys."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import io

@@ -1,7 +1,5 @@
 """Views while joints move: Rerun and MCAP files equal to the recording, traces in a terminal."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

@@ -1,7 +1,5 @@
 """The monitor: it tells what the servos say, how old that is, and never touches them."""
 
-from __future__ import annotations
-
 import json
 import re
 

@@ -1,7 +1,5 @@
 """`park` switches a robot off whoever holds its lock, and one that nobody drives any more."""
 
-from __future__ import annotations
-
 import ast
 import os
 import signal

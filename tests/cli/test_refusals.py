@@ -3,8 +3,6 @@
 A row is a command and words of its refusal; `[a b]` stands for each of these words.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 import shlex

@@ -1,7 +1,5 @@
 """`plan`, `sweep --plan`, `sweep --until` and `sweep --load`, as typed."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil

@@ -3,8 +3,6 @@
 `benchmarks/stop_anywhere.py` does the same at random moments of real commands.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """From the bus to calibration, report and export, nothing needs torch or rsl_rl."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """0 is a value: an option of 0 means 0 or is refused, and never stands for the default."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Files at the border: limited, of a known version, valid, or refused in a sentence."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator

@@ -1,7 +1,5 @@
 """A file of this project that is of another kind is called what it is, with what reads it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """An output is written by one program at a time, and nothing stays behind that would block one."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

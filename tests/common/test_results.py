@@ -1,7 +1,5 @@
 """A result's fields are its JSON object, its table and nothing else."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """YAML at the border: what is written reads back, and no text does more than be refused."""
 
-from __future__ import annotations
-
 import math
 
 import yaml

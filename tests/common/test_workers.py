@@ -1,7 +1,5 @@
 """The pool of processes: its results, its errors, and that no process outlives its use."""
 
-from __future__ import annotations
-
 import math
 import os
 import signal

@@ -1,7 +1,5 @@
 """Joint maps, Feetech frames and the proxy's datagrams over arbitrary data."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

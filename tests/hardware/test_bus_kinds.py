@@ -1,7 +1,5 @@
 """A bus is one module and one entry: what opens, checks and switches off takes it from there."""
 
-from __future__ import annotations
-
 import pytest
 
 from pupper_sysid.common.errors import InputError

@@ -1,7 +1,5 @@
 """What every bus promises, whatever its servos speak: one table of buses, one test per claim."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

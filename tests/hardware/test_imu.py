@@ -1,7 +1,5 @@
 """The IMU: the trunk's axes and units from the chip's, and a reading that can be missing."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The arithmetic of calibrating joints, worked out by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pupper_sysid.hardware import joint_calibration as jc

@@ -1,7 +1,5 @@
 """How late replies come is measured, and the patience follows; no servo is missed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The lock of a robot: in a folder of the user's own, never through a link, never waiting."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import stat

@@ -1,7 +1,5 @@
 """The loop keeps its rate, says when it does not, and gives up when it cannot."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

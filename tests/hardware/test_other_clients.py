@@ -3,8 +3,6 @@
 It was written in Rust from the manuals, independently of the vendors' SDKs that our lines use.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Registers are judged before the torque is switched on: each fault is named, with its cure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 

@@ -1,7 +1,5 @@
 """Fixtures: policies of every kind, made once, and their copies on disk."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

@@ -4,8 +4,6 @@ Slow and readable. The compiled form is compared with it term by term; DelayedPD
 compared with the compiled form elsewhere, so an error here shows, too.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

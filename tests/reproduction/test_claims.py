@@ -1,7 +1,5 @@
 """Claims are judged by what the evidence says, and unknown evidence is said to be unknown."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Claims about the robot's own walks are judged by logs whose rhythm is known."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Calibration files: what is written reads back, and the presets hold what was published."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict
 from pathlib import Path

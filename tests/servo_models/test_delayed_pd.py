@@ -1,7 +1,5 @@
 """DelayedPD is MuJoCo's native servo, step for step, and free-air data fix only ratios."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The compiled simulation against its NumPy twin, against DelayedPD, and against itself."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from reference.servo import columns, delayed, servo

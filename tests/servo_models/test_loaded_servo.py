@@ -1,7 +1,5 @@
 """The servo under load: against DelayedPD, against MuJoCo, and against its compiled form."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import mujoco

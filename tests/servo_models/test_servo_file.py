@@ -1,7 +1,5 @@
 """Servo model files: what was saved is what runs, and what is not that model is refused."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import pickle

@@ -1,7 +1,5 @@
 """A page in headless Chromium: does it fit, are its pictures drawn, is the console silent?"""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

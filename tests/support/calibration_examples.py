@@ -1,7 +1,5 @@
 """A calibration with every kind of entry at least once, for the tests to save and to spoil."""
 
-from __future__ import annotations
-
 import math
 
 from pupper_sysid.servo_models.calibration.calibration import Calibration, InputFile, utc_now

@@ -1,7 +1,5 @@
 """Checkpoints of training runs, compared; and runs that are stopped at a place."""
 
-from __future__ import annotations
-
 import signal
 
 import torch

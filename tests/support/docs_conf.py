@@ -1,7 +1,5 @@
 """`docs/conf.py`, for the tests: what the documentation knows of the commands."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from functools import cache

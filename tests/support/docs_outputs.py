@@ -1,7 +1,5 @@
 """`docs/outputs.py`, for the tests: what commands print in the pages."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Exported calibrations: field names of the released simulators, and a model around MJCF."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pupper_sysid.sim.robot.engine import mujoco

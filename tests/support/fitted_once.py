@@ -4,8 +4,6 @@
 repeats is held where nothing is kept: by the frozen figures, and by a fleet beside a single robot.
 """
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """A bus of a test in virtual time, whose servos follow at once."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent

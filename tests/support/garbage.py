@@ -4,8 +4,6 @@
 makes the recording, which may be refused right there, as a file would be when it is read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple

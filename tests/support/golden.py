@@ -17,8 +17,6 @@ or another version of NumPy, may move what the data hardly determine by more tha
 `tests/golden/renew.py` is the command that checks, renews and says what changed.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import re

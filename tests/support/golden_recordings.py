@@ -6,8 +6,6 @@ servo. A real recording is a file, a folder, or several files that are pooled, b
 `support.real_recordings`; each file is held to its SHA-256 in `figures.yaml`.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

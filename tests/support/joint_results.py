@@ -1,7 +1,5 @@
 """Results of a joint, made from numbers: nothing is fitted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Keys of a JSON object in one line, as docs/formats.md lists them."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

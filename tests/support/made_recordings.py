@@ -5,8 +5,6 @@ sag, offset, coarse encoders, polled or live buses of 30 to 500 Hz, five kinds o
 faults are in `support.garbage`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frequency response of an observer at any frequencies, as `observer_match` measures it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pupper_sysid.policies.deploy.matches import _drive, _phasors, _sines

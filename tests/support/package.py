@@ -1,7 +1,5 @@
 """The rooms of the package and their modules, as pyproject.toml maps them."""
 
-from __future__ import annotations
-
 import inspect
 import tomllib
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Servos, trials and fits for the tests of planning."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -5,8 +5,6 @@ licence allows it is fetched where there is a network, is held to its SHA-256 an
 cache; any other is skipped with a sentence.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tables of refusals: inputs, and the words by which each refusal names what is wrong."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import Any
 

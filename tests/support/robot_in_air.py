@@ -1,7 +1,5 @@
 """The robot without gravity, ground and weight: where each of its servos should move as fitted."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Runs on the physics clock, made from arrays."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Servo models of every kind with random weights, saved with a contract."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A program that drives a served robot, in a process of its own, with its watchdog."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Servos that several tests simulate."""
 
-from __future__ import annotations
-
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 
 MEASURED = DelayedPDParameters(

@@ -1,7 +1,5 @@
 """Recordings in memory whose commands and readings are written out by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 

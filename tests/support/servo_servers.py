@@ -1,7 +1,5 @@
 """Emulated servos behind a real port or socket, in a thread of the test that talks to them."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 import threading

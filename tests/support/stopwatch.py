@@ -1,7 +1,5 @@
 """Time that a program takes on its own account, however busy the machine is."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable

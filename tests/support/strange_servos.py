@@ -6,8 +6,6 @@ speed limit and gravity, its encoder, its bus and its log, drawn from a wide wor
 simulated, and to the codes of findings that name it rightly.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 

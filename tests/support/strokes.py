@@ -1,7 +1,5 @@
 """Recordings of slow strokes of emulated servos with play in their gears, without a bus."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Synthetic trials with a known truth: a servo's motion, seen through a polled bus."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Training runs that are over in a second: few robots, small networks, short episodes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

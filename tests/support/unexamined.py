@@ -3,8 +3,6 @@
 An examination costs most of a second, and every function of `sysid` begins with one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

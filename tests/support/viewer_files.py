@@ -1,7 +1,5 @@
 """Files of Rerun and MCAP, opened by the libraries of those formats."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

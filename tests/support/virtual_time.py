@@ -1,7 +1,5 @@
 """Time that passes only where a test says so."""
 
-from __future__ import annotations
-
 
 class VirtualTime:
     """Clock of a bus or a loop of a test [s]."""

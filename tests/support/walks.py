@@ -1,7 +1,5 @@
 """Made-up walks of robots, for analyses whose answer is then known."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pupper_sysid.policies.analysis.trial import Trial

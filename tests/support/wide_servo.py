@@ -15,8 +15,6 @@ joint sticks where the other torques are below its friction.
 recording that a host would have. Twin `number` of a kind and motion is the same whatever else runs.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace

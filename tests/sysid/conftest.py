@@ -1,7 +1,5 @@
 """The doctor is asked in its own room, and where its words are read; elsewhere it takes no time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

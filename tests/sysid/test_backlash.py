@@ -3,8 +3,6 @@
 Coverage over 60 servos: `benchmarks/coverage.py --world strokes`.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """CSV tables: the fast path and the strict one agree, faults are named, limits hold."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whatever a name stands for, only regular files are read, up to a limit that one option raises."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

@@ -1,7 +1,5 @@
 """Dynamixel servos behind guard and watchdog: registers set, verified, and set back."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Protocol 2.0 on the wire: the manual's examples, damaged frames, and the vendor's SDK."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import dynamixel_sdk

@@ -1,7 +1,5 @@
 """From sweep to calibration on emulated XL330 and XM430: lag, registers, and the way out."""
 
-from __future__ import annotations
-
 from collections import deque
 from pathlib import Path
 

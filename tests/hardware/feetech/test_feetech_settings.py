@@ -1,7 +1,5 @@
 """What a servo is set to is read once, and what is changed for a while is set back."""
 
-from __future__ import annotations
-
 import math
 import os
 import signal

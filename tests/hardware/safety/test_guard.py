@@ -1,7 +1,5 @@
 """The guard keeps commands inside their bounds, and stops a robot that does not follow them."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The guard and its limits over arbitrary commands: what reaches the bus obeys all bounds."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """A reading stuck but for noise stops a robot; a healthy servo that moves little does not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

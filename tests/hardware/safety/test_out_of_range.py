@@ -1,7 +1,5 @@
 """A voltage or temperature outside its range on either side, or that is no number, is a fault."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
 from math import inf, nan

@@ -1,7 +1,5 @@
 """A robot whose driver dies or hangs is parked by the watchdog; one that is left well is let be."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

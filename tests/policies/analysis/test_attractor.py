@@ -1,7 +1,5 @@
 """Orbits: circles, ellipses, bands and noise, whose shapes are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Policies of other trainers walk here: from an ONNX file, its metadata and a few lines of YAML."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

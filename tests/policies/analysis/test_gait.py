@@ -1,7 +1,5 @@
 """Measures of a gait, on signals whose answers are known."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import astuple
 

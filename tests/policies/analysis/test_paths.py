@@ -1,7 +1,5 @@
 """Paths, terrain, pushes and rates: what the closed-loop analyses say of known motions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Altered observations, and what a walking policy makes of them."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a gait needs of its servos is held against what a servo has."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

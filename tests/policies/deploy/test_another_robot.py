@@ -1,7 +1,5 @@
 """A policy of another robot, deployed on its emulation: with its servos, guard, log and replay."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A policy on the emulated robot: it walks, everything is logged, every fault ends it safely."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Filters of deployment: the low-pass by its formula, attitude against bodies that really turn."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """A frozen hip is found where a model of its servo moves, and nothing is found where none does."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The check before deployment: it measures what theory says, and names what does not fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Observers: the simulated servo is the trained one, the paper's resonates, readings are kept."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A robot's servos beside those of a training: what is outside, and by how much."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Evaluation: falls and tracking errors, by command, ground and added dead time."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

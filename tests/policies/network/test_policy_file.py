@@ -1,7 +1,5 @@
 """Policy files: what is written is read back the same, and what is wrong is refused."""
 
-from __future__ import annotations
-
 import json
 import resource
 import shutil

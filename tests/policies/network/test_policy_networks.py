@@ -1,7 +1,5 @@
 """Networks of the policies: one result in the trainer, in the update, alone, and in other files."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

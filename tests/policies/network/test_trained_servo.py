@@ -1,7 +1,5 @@
 """The servos of a training in the policy's file: whole, exact, and refused where they are wrong."""
 
-from __future__ import annotations
-
 import json
 import time
 from copy import deepcopy

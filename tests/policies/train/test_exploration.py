@@ -1,7 +1,5 @@
 """Exploration that persists, its likelihood and schedule, and which policy is kept."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

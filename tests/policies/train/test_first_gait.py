@@ -1,7 +1,5 @@
 """The first gait: judged on the servos of a run, corrected, searched, and taken over."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

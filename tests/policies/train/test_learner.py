@@ -1,7 +1,5 @@
 """The learner: what it is given (vec_env), what it adds to PPO, and its checkpoints."""
 
-from __future__ import annotations
-
 import copy
 import os
 import pickle

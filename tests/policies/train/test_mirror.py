@@ -1,7 +1,5 @@
 """Mirror images of observations and actions are those of the physics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

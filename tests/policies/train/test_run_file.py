@@ -1,7 +1,5 @@
 """Settings of a training: read back as written, and refused by name before anything is built."""
 
-from __future__ import annotations
-
 import json
 from copy import deepcopy
 from dataclasses import replace

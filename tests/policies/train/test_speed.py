@@ -1,7 +1,5 @@
 """Both sides of a speed ratio do the same work in turns, and need no calibration at hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

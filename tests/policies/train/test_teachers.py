@@ -1,7 +1,5 @@
 """Teachers of a first gait: the trot, networks that see the truth, and who learns from them."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

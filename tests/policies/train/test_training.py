@@ -1,7 +1,5 @@
 """Training runs: stopped and resumed as if they had not been, guarded, alone and together."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import math

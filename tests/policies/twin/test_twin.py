@@ -1,7 +1,5 @@
 """The twin test on readings of the simulated robot itself, in the air and on the ground."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

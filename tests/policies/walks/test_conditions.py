@@ -1,7 +1,5 @@
 """Walks under many conditions at once are the walks under each of them alone."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Handicaps: slopes, loads, weak legs, pushes, missed ticks, jitter, stairs, slippery ground."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

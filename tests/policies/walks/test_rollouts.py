@@ -1,7 +1,5 @@
 """Rollouts: what is recorded is what happened, and looking at a policy does not change it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

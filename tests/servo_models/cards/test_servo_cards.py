@@ -1,7 +1,5 @@
 """Servo cards: cited numbers follow from their sources, and files that are wrong are refused."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

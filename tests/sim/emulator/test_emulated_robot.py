@@ -1,7 +1,5 @@
 """The emulated robot has the errors of its specification, by their size, and is repeatable."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from threading import Thread

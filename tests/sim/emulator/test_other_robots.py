@@ -1,7 +1,5 @@
 """Robots that are no Mini Pupper: an arm of six servos."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

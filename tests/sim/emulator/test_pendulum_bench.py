@@ -1,7 +1,5 @@
 """A loaded servo moves as its numbers and registers say; each claim is one formula."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Servos as other projects' files state them, beside a calibration."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

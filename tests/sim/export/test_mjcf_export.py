@@ -1,7 +1,5 @@
 """MJCF of a calibration inside of models whose own settings would change the servos."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Calibrations in other simulators: they read them, and they move as ours does."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re

@@ -1,7 +1,5 @@
 """Set-points and readings that exports compute on torch, and their twin in NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

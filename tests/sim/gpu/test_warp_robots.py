@@ -1,7 +1,5 @@
 """The robots on mujoco-warp are those of MuJoCo; compiling its kernels takes a minute at first."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Bodies: the Mini Pupper's, and those made from a MJCF and a few lines of YAML."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The robot's model has the masses, sizes, limits, linkage and IMU that were published."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

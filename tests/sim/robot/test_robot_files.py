@@ -1,7 +1,5 @@
 """Robots' own files: URDF and MJCF with followers, odd limits, absent meshes; LeRobot's JSON."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The ground that can be looked up is the ground that MuJoCo simulates."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

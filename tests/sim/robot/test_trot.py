@@ -1,7 +1,5 @@
 """The open-loop trot: diagonal pairs, speed as commanded, a phase that can be read back."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

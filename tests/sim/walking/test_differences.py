@@ -1,7 +1,5 @@
 """What differs between robots and their model: each setting does what it names, and no more."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Readings of many robots are as stale, quantised and biased as the measured feedback."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What `--actuator` means: intervals of twelve servos, from a calibration, a preset or nothing."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The walking environment: what is seen, what delays, what resets, and that it can walk."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

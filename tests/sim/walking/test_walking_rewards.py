@@ -1,7 +1,5 @@
 """Reward terms by hand: tiny examples, and the weights that were published."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """The robot that walks stands, executes commands on time, reports its state, passes the guard."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Comparisons: the age and the offset of a recording's readings, by one rule for all models."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Calibrations beside the truth of an emulated robot."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """Fits under load as servo cards: what sets the scale of torques, and what stays open."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

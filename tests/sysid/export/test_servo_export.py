@@ -4,8 +4,6 @@ Each export is driven as its metadata says: the caller shifts the history and fe
 back, with several environments at once.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import sys

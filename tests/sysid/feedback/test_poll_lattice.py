@@ -1,7 +1,5 @@
 """Live readings are dated at their read, polled ones to their poll; doubt is given in numbers."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

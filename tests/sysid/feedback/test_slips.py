@@ -1,7 +1,5 @@
 """A poll whose phase jumps within a trial: found, placed, and its readings dated again."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

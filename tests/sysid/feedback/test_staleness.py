@@ -1,7 +1,5 @@
 """Live, stale or cannot tell: repeats in the midst of motion are the bus's, others are not."""
 
-from __future__ import annotations
-
 import ast
 import csv
 

@@ -1,7 +1,5 @@
 """A limit on the set-point's acceleration is found in the recordings that have it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Calibration recovers a servo, says what it does not know, and beats the published setting."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

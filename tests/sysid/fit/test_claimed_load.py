@@ -1,7 +1,5 @@
 """A load that the header claims is checked against the weight that the recording shows."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

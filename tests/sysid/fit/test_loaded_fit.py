@@ -1,7 +1,5 @@
 """A servo under load is found from runs of several gains, and predicts one it has not seen."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

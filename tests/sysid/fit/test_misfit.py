@@ -1,7 +1,5 @@
 """Explanations of a misfit: a filter in front, play, a dead zone; none of a servo that has none."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Which P gain, armature and load a calibration is for, and that its files say so."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Draws of a posterior whose ridge bends: damping and back-EMF, of which a motion tells the sum."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Relations that hold whatever the servo is: of fits, their intervals, and their scores."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Recordings of one joint: those that agree are left alone, one that differs is named."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

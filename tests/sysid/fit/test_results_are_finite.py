@@ -1,7 +1,5 @@
 """Results that are not finite, or not plausible, are findings of a calibration and no crash."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

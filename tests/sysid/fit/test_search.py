@@ -1,7 +1,5 @@
 """Search: local fits leave the dents of a ridge, and find limits that have no slope."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

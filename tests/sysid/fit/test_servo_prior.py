@@ -1,7 +1,5 @@
 """Numbers of another unit as the prior: what they say, and what is common to all of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The independent simulator moves as theory says, whatever the length of its step."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

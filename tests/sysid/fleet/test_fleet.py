@@ -1,7 +1,5 @@
 """Many robots: one table, outliers named, failures told, and nothing done twice."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Clocks of commands and readings that drift apart: seen in the stamps, taken out of the dates."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Recordings in joint coordinates: a calf's servo is found again behind the linkage."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Tones are found in a command, and nothing else is taken for one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

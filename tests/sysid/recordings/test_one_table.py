@@ -1,7 +1,5 @@
 """One table, one check: a log with a name twice, or one too few, is refused at every door alike."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -1,7 +1,5 @@
 """Rows with the torque off: kept in the recording, left out where a servo is to follow."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

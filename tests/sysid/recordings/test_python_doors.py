@@ -1,7 +1,5 @@
 """Python's doors: recordings from memory, and what else stands where one belongs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

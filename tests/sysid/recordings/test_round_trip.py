@@ -1,7 +1,5 @@
 """What is written is read back: recordings of any joints, times, readings and header texts."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One quantity has one number: the report's tables, sentences and JSON objects agree."""
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The report: one self-contained page, honest tables, nothing overwritten, names escaped."""
 
-from __future__ import annotations
-
 import csv
 import re
 import shutil

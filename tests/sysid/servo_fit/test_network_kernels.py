@@ -1,7 +1,5 @@
 """Compiled networks against PyTorch's own operations."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """What servo models are fitted to: runs, readings at fractional ticks, windows, linear filters."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

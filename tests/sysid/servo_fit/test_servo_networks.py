@@ -1,7 +1,5 @@
 """Learned servo models: what they compute, that what was trained is what runs, and fitting them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

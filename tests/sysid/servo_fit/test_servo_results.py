@@ -1,7 +1,5 @@
 """Results of fits and comparisons: plain data, tables, figures, and models that are read back."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import astuple
 

@@ -1,7 +1,5 @@
 """A loaded bench: gains and drops are recorded, the mass is handled gently, all is undone."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

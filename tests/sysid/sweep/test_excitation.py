@@ -1,7 +1,5 @@
 """Excitations start and stay where a servo can follow, and ask for what the user asked for."""
 
-from __future__ import annotations
-
 import os
 from itertools import product
 

@@ -1,7 +1,5 @@
 """A recording holds what was sent and read, survives its process, and leaves the robot safe."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """Recordings as MCAP and Rerun files, opened again by the libraries of those formats."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Columns by the words of their names: robots', drives', simulators' and benches' layouts."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One log in the forms that logs have in the wild: each is read, equal to 1e-9."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import io

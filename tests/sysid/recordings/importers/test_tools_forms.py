@@ -4,8 +4,6 @@
 are refused in words that name what they are.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import re
