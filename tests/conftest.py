@@ -18,8 +18,8 @@ import hypothesis
 import pytest
 
 import support.avx2  # noqa: F401
+from pupper_sysid.data import SAMPLES
 from support.compiled_once import compile_estimator
-from support.package import ROOT
 from support.real_recordings import real_recording
 
 sys.dont_write_bytecode = False
@@ -96,7 +96,7 @@ def real_sweeps() -> list[Path]:
 @pytest.fixture(scope="session")
 def hip(tmp_path_factory) -> Path:
     """Two tones (2 and 4 Hz) of one joint of the sample sweep: quick to fit."""
-    lines = (ROOT / "data/samples/sweep.csv").read_text().splitlines(keepends=True)
+    lines = (SAMPLES / "sweep.csv").read_text().splitlines(keepends=True)
     header = [line for line in lines if line[0] == "#" or line.startswith("send_time")]
     rows = [line for line in lines if ",1,LF_hip," in line or ",3,LF_hip," in line]
     path = tmp_path_factory.mktemp("hip") / "hip.csv"
@@ -118,8 +118,7 @@ def walker():
     from pupper_sysid.sim.walking.config import Walking
     from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
-    samples = ROOT / "data/samples"
     trial = Trial(
-        Walking(), servo_ranges(samples / "calibrated.yaml"), robots=2, seconds=7.5, threads=1
+        Walking(), servo_ranges(SAMPLES / "calibrated.yaml"), robots=2, seconds=7.5, threads=1
     )
-    return load_policy(samples / "policies/lstm"), trial
+    return load_policy(SAMPLES / "policies/lstm"), trial

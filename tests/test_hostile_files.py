@@ -29,6 +29,7 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from pupper_sysid.common.errors import PupperError
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.policies.deploy.commands import COLUMNS as SCRIPT_COLUMNS
 from pupper_sysid.policies.deploy.commands import script
@@ -47,7 +48,6 @@ from pupper_sysid.sysid.sweep.recorder import playback
 from support.planned_servos import small_plan
 from support.saved_servo_models import saved
 
-SAMPLES = Path(__file__).parents[1] / "data" / "samples"
 CARDS = Path(__file__).parents[1] / "servo_models" / "cards" / "data"
 EXAMPLES = max(settings.default.max_examples // 12, 1)
 CPU_S = 5.0
@@ -224,7 +224,7 @@ def walk(folder: Path) -> None:
 
 
 def policy(folder: Path) -> None:
-    shutil.copytree(SAMPLES / "policies" / "mlp", folder, dirs_exist_ok=True)
+    shutil.copytree(SAMPLES / "policies/mlp", folder, dirs_exist_ok=True)
 
 
 WIDE = rows("time_s,knee_command,knee_position", lambda t, c, p: f"{t:.3f},{c:.6f},{p:.6f}")

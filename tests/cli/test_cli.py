@@ -15,13 +15,13 @@ from pupper_sysid.cli.commands.analyze.walks import interval, table_of
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import plain
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.report import report
 from support.command_line import json_of, ran, refused, run
 
-ROOT = Path(__file__).resolve().parents[2]
-SWEEP = ROOT / "data" / "samples" / "sweep.csv"
+SWEEP = SAMPLES / "sweep.csv"
 
 
 pytestmark = pytest.mark.usefixtures("here")

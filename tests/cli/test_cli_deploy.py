@@ -12,15 +12,15 @@ import yaml
 
 from pupper_sysid.cli.programs import pupper_analyze, pupper_deploy
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.deploy.walk_log import read_walk
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import json_of, ran, refused, run_program
 from support.json_keys import DOCUMENTED, key_line
-from support.package import ROOT
 from support.undrawn import stand_soon
 
-POLICY = ROOT / "data/samples/policies/lstm"
-CALIBRATION = ROOT / "data/samples/calibrated.yaml"
+POLICY = SAMPLES / "policies/lstm"
+CALIBRATION = SAMPLES / "calibrated.yaml"
 
 
 @pytest.fixture(autouse=True)
@@ -185,7 +185,6 @@ def test_where_it_walks_is_said_per_ground_and_direction(capsys, here, what, cou
 
 # ----- `pupper-analyze twin` as a user meets it
 
-SAMPLES = ROOT / "data/samples"
 WALK, CALIBRATION_TWIN = SAMPLES / "playback.csv", SAMPLES / "calibrated.yaml"
 
 

@@ -7,13 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.servo_fit import networks
 from pupper_sysid.sysid.servo_fit.training import Recipe
 from support.command_line import json_of, ran, run
-
-SAMPLE = Path(__file__).parents[2] / "data" / "samples"
-
 
 pytestmark = pytest.mark.usefixtures("here", "unexamined")
 
@@ -78,10 +76,10 @@ def test_hold_aware_scores_on_the_real_sweeps_keep_what_was_reached(capsys, real
     "kinds", [("fir",), pytest.param(("mlp", "lstm", "delayed-pd"), marks=pytest.mark.slow)]
 )
 def test_what_was_fitted_is_saved_and_compared_with_a_calibration(capsys, quick, kinds):
-    sample = (SAMPLE / "playback.csv", "--joints", "LF_calf")
+    sample = (SAMPLES / "playback.csv", "--joints", "LF_calf")
     for kind in kinds:
         ran(capsys, "fit-servo", *sample, "--arch", kind, "--out", kind)
-    found = json_of(capsys, "compare", *sample, "--models", *kinds, SAMPLE / "calibrated.yaml")
+    found = json_of(capsys, "compare", *sample, "--models", *kinds, SAMPLES / "calibrated.yaml")
     assert len(found["models"]) == len(kinds) + 2 and Path("compare.png").exists()
     assert "too small" in " ".join(found["notes"])
     for model in list(found["models"].values())[: len(kinds)]:
@@ -121,11 +119,11 @@ def test_a_model_for_another_rate_or_joint_is_refused_where_it_would_be_used(cap
     slow = playback("slow.csv", step_s=0.08)
     code, _, err = run(capsys, "compare", slow, "--models", "servo")
     assert code == 2 and "every 40.0 ms" in err and "fit again" in err
-    other = (SAMPLE / "playback.csv", "--joints", "LF_calf")
+    other = (SAMPLES / "playback.csv", "--joints", "LF_calf")
     code, _, err = run(capsys, "compare", *other, "--models", "servo")
     assert code == 2
     code, _, err = run(
-        capsys, "compare", SAMPLE / "playback.csv", "--models", SAMPLE / "calibrated.yaml"
+        capsys, "compare", SAMPLES / "playback.csv", "--models", SAMPLES / "calibrated.yaml"
     )
     assert code == 2 and "only (--joints)" in err and "has no joint" in err
 

@@ -23,9 +23,9 @@ from pupper_sysid.sim.walking import env
 from support.command_line import json_of, ran, refused
 from support.command_line import run_program as run
 from support.json_keys import DOCUMENTED, key_line
+from support.package import ROOT
 from support.tiny_training import CALIBRATION
 
-ROOT = Path(__file__).resolve().parents[2]
 TINY = (
     "--actuator", CALIBRATION, "--environments", "4", "--threads", "1", "--iterations", "2",
     "--imitation.iterations", "2", "--imitation.epochs", "1",

@@ -15,6 +15,7 @@ import pytest
 from pupper_sysid.cli.program import _is_interrupt, user_errors
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import SafetyStop
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import BUS, GUARD, IMU, LOG, POLICY, VIEWS, FixedRateLoop
@@ -29,7 +30,6 @@ from pupper_sysid.sim.walking.bus import WalkingBus
 from support.command_line import refused
 from support.following_bus import FollowingBus
 
-SAMPLES = Path(__file__).parents[2] / "data/samples"
 PERIOD_S, LATE_S = 0.02, 0.055
 
 

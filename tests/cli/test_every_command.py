@@ -20,6 +20,7 @@ from pupper_sysid.cli.programs import pupper_analyze, pupper_sysid
 from pupper_sysid.cli.terminal import remember, spell
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import select_joints
+from pupper_sysid.data import SAMPLES
 from support.command_line import fresh_python, json_of, ran, refused
 from support.json_keys import DOCUMENTED, key_line
 from support.package import FOLDERS, ROOT
@@ -202,7 +203,7 @@ def test_sentences_are_broken_between_words_on_a_terminal_and_commands_are_not(o
 
 def test_a_command_to_run_next_can_be_copied(capsys, tmp_path):
     recording = tmp_path / "my log.csv"
-    _, err = ran(capsys, "import", ROOT / "data/samples/sweep.csv", "--out", recording)
+    _, err = ran(capsys, "import", SAMPLES / "sweep.csv", "--out", recording)
     assert shlex.split(err.split("Next: ")[1]) == ["pupper-sysid", "doctor", str(recording)]
 
 
@@ -291,7 +292,7 @@ def test_no_message_of_the_library_names_an_option(tmp_path):
 
 # ----- the keys of JSON objects are those of docs/formats.md
 
-SAMPLE = ROOT / "data/samples/sweep.csv"
+SAMPLE = SAMPLES / "sweep.csv"
 HIP = object()  # the fixture of that name
 WITH_JSON = {
     "sweep": ("--freqs", "4", "--joints", "LF_hip"),

@@ -24,6 +24,7 @@ from pupper_sysid.cli.oscilloscope import Oscilloscope, Screen, lag_s
 from pupper_sysid.cli.programs import pupper_deploy, pupper_sysid
 from pupper_sysid.common.errors import InputError, SafetyStop
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy.walk_log import read_walk
@@ -234,7 +235,7 @@ def test_a_walk_is_written_as_it_is_recorded_with_the_trunk_as_the_imu_has_it(
     tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    policy = str(Path(__file__).parents[2] / "data/samples/policies/mlp")
+    policy = str(SAMPLES / "policies/mlp")
     words = (policy, "--seconds", "1", "--name", "w", "--mcap", "w.mcap", "--rerun", "w.rrd")
     _, err = ran(capsys, *words, program=pupper_deploy)
     assert "Wrote w.mcap." in err and "dropped" not in err

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,11 +22,11 @@ from pupper_sysid.hardware.safety import watchdog
 from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
 from pupper_sysid.hardware.safety.notes import notes, remove_note, write_note
 from pupper_sysid.hardware.serial_servos import line as serial_line
+from support.package import ROOT
 from support.served_driver import PATIENT, drive
 from support.servo_servers import driver_orders, limp, robot_behind
 from support.stopwatch import wait_until
 
-ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = f"{PATIENT}from pupper_sysid.cli.programs.pupper_sysid import main; main()"
 PARK = [sys.executable, "-c", PROGRAM, "park"]
 

@@ -21,6 +21,7 @@ from pupper_sysid.cli.programs import (
 )
 from pupper_sysid.common.errors import refuse_outside
 from pupper_sysid.common.joints import STALL_TORQUES_NM
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.policies.deploy.commands import checked_command
 from pupper_sysid.policies.deploy.stacks import Stack
@@ -38,11 +39,9 @@ from pupper_sysid.sysid.servo_fit.fit import Split
 from pupper_sysid.sysid.sweep.bench import BENCH, BENCH_KINDS, bench_plan, parse_load
 from pupper_sysid.sysid.sweep.excitation import KINDS, LARGEST_AMPLITUDE_RAD, plan
 from support.command_line import refused
-from support.package import ROOT
 from support.planned_servos import small_plan
 from support.refusals import assert_each_refused
 
-SAMPLES = ROOT / "data/samples"
 NUMBERS = "4_1 ٤١ １０ 0x10 1e 4,1"
 """Which Python's `float` or `int` takes, or nearly."""
 

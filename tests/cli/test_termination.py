@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from support.package import ROOT
+from pupper_sysid.data import SAMPLES
 from support.stopwatch import wait_until
 
-SWEEP = ROOT / "data/samples/sweep.csv"
+SWEEP = SAMPLES / "sweep.csv"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 

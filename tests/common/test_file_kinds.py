@@ -1,10 +1,9 @@
 """A file of this project that is of another kind is called what it is, with what reads it."""
 
-from pathlib import Path
-
 import pytest
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.cards.files import load_card
@@ -12,9 +11,8 @@ from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.plan.plan_file import load_plan
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.importers.recognise import logs_in
+from support.package import ROOT
 
-ROOT = Path(__file__).parents[2]
-SAMPLES = ROOT / "data/samples"
 FILES = {
     "a recording": SAMPLES / "sweep.csv",
     "the truth of an emulated recording": SAMPLES / "sweep.truth.yaml",

@@ -18,9 +18,10 @@ from pupper_sysid.common.files import (
     refuse_overwrite,
     write_text,
 )
+from pupper_sysid.data import SAMPLES
 from support.command_line import refused, run
 
-SWEEP = Path(__file__).parents[2] / "data/samples/sweep.csv"
+SWEEP = SAMPLES / "sweep.csv"
 HOLDER = """
 import os, sys, time
 from pathlib import Path

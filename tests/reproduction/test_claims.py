@@ -18,6 +18,7 @@ from pupper_sysid.cli.programs import pupper_analyze
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.common.interval import Interval
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.analysis.autonomy import (
     DELAYS_MS,
     NUDGE_M_S,
@@ -47,8 +48,6 @@ from reproduction.policies import judge
 from support.command_line import refused, run_program
 from support.walks import walked
 
-ROOT = Path(__file__).resolve().parents[2]
-SAMPLES = ROOT / "data/samples"
 CURVE = np.random.default_rng(0).random((50, 3))
 
 

@@ -1,19 +1,19 @@
 """Training runs that are over in a second: few robots, small networks, short episodes."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.network.actor_critic import build
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters, Imitation
 from pupper_sysid.policies.train.learner import TerminalPPO
 from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.sim.walking.config import Walking
 
-CALIBRATION = str(Path(__file__).resolve().parents[2] / "data" / "samples" / "calibrated.yaml")
+CALIBRATION = str(SAMPLES / "calibrated.yaml")
 ALL_KINDS = ("mlp", "mlp-actions", "lstm", "gru", "transformer")
 WITH_MEMORY = ("lstm", "gru", "transformer")
 PRIVILEGED, HISTORY = 7, 3

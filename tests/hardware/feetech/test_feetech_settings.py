@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -28,10 +27,9 @@ from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.hardware.serial_servos.scan import scan_line
 from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
+from support.package import ROOT
 from support.servo_servers import bench_of, map_of, on_a_port, spare_this_process, still_servos
 from support.stopwatch import wait_until
-
-ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture

@@ -28,6 +28,7 @@ from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import fresh_python, ran
+from support.package import ROOT
 from support.served_driver import PATIENT, drive
 from support.servo_servers import (
     bench_of,
@@ -42,8 +43,6 @@ from support.servo_servers import (
 from support.stopwatch import Stopwatch
 
 pytestmark = pytest.mark.wall_clock  # what the watchdog does within a second
-
-ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture(autouse=True)

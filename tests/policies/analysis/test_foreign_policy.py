@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.analysis.foreign_policy import (
     ForeignPolicy,
     exported_policy,
@@ -23,7 +24,6 @@ from support.refusals import assert_each_refused
 
 onnx = pytest.importorskip("onnx")
 
-SAMPLES = Path(__file__).parents[3] / "data" / "samples"
 DUCK = FOLDER.parent / "robots" / "open_duck_mini_v2.xml"
 OWN_TERMS = """
 control_step_s: 0.02
@@ -85,7 +85,7 @@ def as_mjlab(names: Sequence[str], pose: Sequence[float], terms: str = "") -> di
 def exported(tmp_path) -> Path:
     """The sample MLP as an ONNX file of this project."""
     path = tmp_path / "own.onnx"
-    export_policy(load_policy(SAMPLES / "policies" / "mlp"), "onnx", path)
+    export_policy(load_policy(SAMPLES / "policies/mlp"), "onnx", path)
     return path
 
 
@@ -93,7 +93,7 @@ def exported(tmp_path) -> Path:
 def theirs(exported) -> Path:
     """The same network with another trainer's metadata, and the YAML beside it."""
     model = onnx.load(str(exported))
-    contract = load_policy(SAMPLES / "policies" / "mlp").contract
+    contract = load_policy(SAMPLES / "policies/mlp").contract
     pose = contract.default_pose_rad
     del model.metadata_props[:]
     onnx.helper.set_model_props(model, as_mjlab(list(pose), list(pose.values())))
@@ -122,7 +122,7 @@ def test_an_exported_policy_acts_as_the_one_it_came_from(tmp_path, kind):
 
 
 def test_the_observation_of_terms_is_this_projects_own_where_the_terms_are(theirs):
-    policy = load_policy(SAMPLES / "policies" / "mlp")
+    policy = load_policy(SAMPLES / "policies/mlp")
     foreign = ForeignPolicy.of(OnnxNetwork(theirs))
     foreign.fit(foreign.task(None))
     rng = np.random.default_rng(0)

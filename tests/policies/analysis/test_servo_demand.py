@@ -1,18 +1,18 @@
 """What a gait needs of its servos is held against what a servo has."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pupper_sysid.cli.policy_choice import policy_at, simulator
 from pupper_sysid.common.results import plain
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.analysis.figures import demand_figure
 from pupper_sysid.policies.analysis.servo_demand import _load, _top_speed, servo_demand
 from pupper_sysid.policies.analysis.trial import Trial
 
-SAMPLE = Path(__file__).parents[3] / "data" / "samples" / "policies" / "mlp"
+SAMPLE = SAMPLES / "policies/mlp"
 
 
 def numbers(**changed: float) -> dict[str, np.ndarray]:

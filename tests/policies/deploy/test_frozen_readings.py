@@ -9,6 +9,7 @@ import pytest
 
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
@@ -24,7 +25,7 @@ from pupper_sysid.sim.walking.bus import WalkingBus
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.tiny_training import CALIBRATION
 
-POLICY = Path(__file__).parents[3] / "data/samples/policies/lstm"
+POLICY = SAMPLES / "policies/lstm"
 HIP = JOINT_NAMES.index("RF_hip")
 PERIOD_S = 0.02
 

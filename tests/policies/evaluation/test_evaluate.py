@@ -1,10 +1,9 @@
 """Evaluation: falls and tracking errors, by command, ground and added dead time."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.evaluation.evaluate import (
     BATTERY,
     WALKERS,
@@ -27,7 +26,7 @@ from pupper_sysid.sim.walking.config import Curriculum, Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.walks import walk
 
-CALIBRATION = str(Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml")
+CALIBRATION = str(SAMPLES / "calibrated.yaml")
 
 
 class Scripted:

@@ -7,6 +7,7 @@ import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.twin.drawing import actuator_of, robot_for, spread_over, stronger
 from pupper_sysid.policies.twin.playing import _load_share
 from pupper_sysid.policies.twin.twin import read_imu, spectrum, twin, twin_figure
@@ -15,10 +16,9 @@ from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sim.robot.replay import mini_pupper_robot, replay, robot_of
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sysid.recordings.recording import Recording
-from support.package import ROOT
 from support.refusals import assert_each_refused
 
-CALIBRATION = str(ROOT / "data/samples/calibrated.yaml")
+CALIBRATION = str(SAMPLES / "calibrated.yaml")
 LOOP_STEPS = 20  # a command every 40 ms
 ROWS = 75
 FOUR_LEGS = """

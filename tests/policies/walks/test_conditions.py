@@ -2,11 +2,11 @@
 
 import threading
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.evaluation.evaluate import Recorder
 from pupper_sysid.policies.walks import together as module
 from pupper_sysid.policies.walks.conditions import (
@@ -36,7 +36,7 @@ def test_commands_are_as_far_within_a_robots_ranges_as_usual_ones_within_theirs(
     assert (share_of_usual(task) > 0).all()
 
 
-SERVOS = servo_ranges(Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml")
+SERVOS = servo_ranges(SAMPLES / "calibrated.yaml")
 TASK = evaluation_task(Walking())
 ROUGH = replace(TASK, terrain="rough")
 

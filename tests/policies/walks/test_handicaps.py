@@ -2,11 +2,11 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.evaluation.evaluate import Recorder
 from pupper_sysid.policies.walks import together
 from pupper_sysid.policies.walks.conditions import (
@@ -26,7 +26,7 @@ from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 
-SERVOS = servo_ranges(Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml")
+SERVOS = servo_ranges(SAMPLES / "calibrated.yaml")
 TASK = evaluation_task(Walking())
 ALL = np.arange(4)
 

@@ -24,6 +24,7 @@ from pupper_sysid.servo_models.cards.files import (
 from pupper_sysid.servo_models.cards.numbers import PositionLoop, TorquePD, stated
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
 from pupper_sysid.servo_models.loaded_servo import LoadedServo
+from support.package import ROOT
 from support.refusals import assert_each_refused
 
 SHIPPED = card_names()
@@ -317,7 +318,6 @@ def test_armatures_with_and_without_the_link_are_not_compared():
 
 # ----- the page on STS3215 models shows what its benchmark printed, of the cards as they are
 
-ROOT = Path(__file__).resolve().parents[3]
 FOUND = json.loads((ROOT / "benchmarks" / "which_sts3215.json").read_text())
 PAGE = (ROOT / "docs" / "which_sts3215.md").read_text()
 

@@ -1,13 +1,13 @@
 """Servos as other projects' files state them, beside a calibration."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.cards.compare import differences, implausible, servo_of
 from pupper_sysid.servo_models.cards.files import load_card
@@ -19,7 +19,7 @@ from support.command_line import refused, run_program
 
 pytestmark = pytest.mark.usefixtures("read_here")
 
-CALIBRATED = Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml"
+CALIBRATED = SAMPLES / "calibrated.yaml"
 ROBOT = """<mujoco><compiler angle="radian"/><default><joint damping="0.3" frictionloss="0.02"/>
 <position kp="20" dampratio="1"/><default class="knee"><joint armature="0.01" axis="0 1 0"/>
 <position forcerange="-2 2"/></default></default><worldbody><body><joint name="hip" class="knee"/>

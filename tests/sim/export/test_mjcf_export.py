@@ -7,6 +7,7 @@ import pytest
 
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import CONTROL_S
@@ -19,7 +20,7 @@ from support.real_recordings import real_recording
 
 pytestmark = pytest.mark.usefixtures("read_here")
 
-CALIBRATED = Path(__file__).resolve().parents[3] / "data/samples/calibrated.yaml"
+CALIBRATED = SAMPLES / "calibrated.yaml"
 STEP_RAD = np.append(np.zeros(20), np.full(40, 0.3))  # a step after 0.4 s of a loop of 20 ms
 
 HOSTILE = {

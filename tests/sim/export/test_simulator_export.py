@@ -7,7 +7,6 @@ import sys
 import types
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ import torch
 
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.tones import fit_sine
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
@@ -40,8 +40,7 @@ from pupper_sysid.sysid.recordings.files import load
 from support.command_line import run_program
 from support.exported_servos import ISAACLAB, ISAACLAB_3, MJLAB, in_free_air
 
-ROOT = Path(__file__).resolve().parents[3]
-CALIBRATED = ROOT / "data/samples/calibrated.yaml"
+CALIBRATED = SAMPLES / "calibrated.yaml"
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +56,7 @@ def test_the_mjcf_export_moves_as_our_own_simulation_does_over_the_whole_sweep(c
     names = calibration.joint_names
     model = in_free_air(text_of(calibration, "mjcf", TIME_STEP_S), names)
     data = mujoco.MjData(model)
-    sweep = load(ROOT / "data/samples/sweep.csv")
+    sweep = load(SAMPLES / "sweep.csv")
     trials = [sweep.trials(n) for n in names]
     assert len(trials[0]) >= 4
     for together in zip(*trials, strict=True):

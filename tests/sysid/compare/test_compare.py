@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
@@ -18,12 +19,10 @@ from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import servo_data
 from pupper_sysid.sysid.servo_fit.fit import ServoFit, Split, fit_servo
 from pupper_sysid.sysid.servo_fit.scores import LINEAR, run_with_offset, with_ages
-from support.package import ROOT
 from support.runs import PAD, run_of
 from support.servo_recordings import JOINT, recording, trial
 
 POLL_S, LOSS = 0.027, 0.4
-SAMPLES = ROOT / "data/samples"
 
 
 def calibration(poll_s: float = POLL_S) -> Calibration:

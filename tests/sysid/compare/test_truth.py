@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.calibration.parts import ARMATURES, OperatingPoint
 from pupper_sysid.servo_models.calibration.quantity import Quantity
@@ -30,7 +31,7 @@ from support.package import ROOT
 from support.refusals import assert_each_refused
 
 JOINT = "LF_hip"
-SAMPLE = ROOT / "data/samples/calibrated.yaml"
+SAMPLE = SAMPLES / "calibrated.yaml"
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.interval import Interval
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.servo_models.calibration.calibration import InputFile, load_calibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.sysid.fit.posterior import PHASE_SD_S
@@ -38,7 +39,6 @@ from pupper_sysid.sysid.plan.proposal import (
     unknown_servos,
 )
 from pupper_sysid.sysid.sweep.excitation import plan
-from support.package import ROOT
 from support.planned_servos import (
     NOISE,
     fit_of_half_width,
@@ -214,7 +214,7 @@ def test_models_are_told_apart_by_what_remains_after_the_rival_is_fitted_again()
 
 # ----- what a plan knows of a servo: the fit's own intervals, a calibration's, or the prior
 
-SAMPLE = ROOT / "data/samples/calibrated.yaml"
+SAMPLE = SAMPLES / "calibrated.yaml"
 
 
 def test_a_plan_starts_from_the_interval_that_the_fit_reports_or_from_the_usual_uncertainty():

@@ -8,13 +8,13 @@ import pytest
 
 from pupper_sysid.cli.programs import pupper_play, pupper_sysid
 from pupper_sysid.common.errors import FileExistsRefusal, InputError
+from pupper_sysid.data import SAMPLES
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.view import channels, guard_events, write_mcap, write_rerun
 from support.command_line import refused, run, run_program
 from support.viewer_files import entities_of, topics_of
 
-SAMPLES = Path(__file__).parents[3] / "data/samples"
 ROUNDED_S = 0.6e-9  # both formats keep times in whole nanoseconds
 
 
