@@ -28,7 +28,10 @@ import tyro
 from shared import ROOT
 
 ROOMS = ("common", "servo_models", "hardware", "sysid", "sim", "policies", "cli")
-COPIED = (*ROOMS, "api", "tests", "data", "benchmarks", "reproduction", "pyproject.toml")
+COPIED = (
+    *ROOMS, "api", "tests", "data", "benchmarks", "reproduction", "docs", "pyproject.toml",
+    "Makefile",
+)  # fmt: skip
 
 OPERATORS: dict[type, type] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq,

@@ -19,29 +19,11 @@ from pupper_sysid.sim.walking.config import for_robot
 from pupper_sysid.sim.walking.robot import _model, body_joint_map
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.command_line import run_program
+from support.legged import legged
 from support.tiny_training import CALIBRATION, tiny_run
 
 SERVO = "sts3215-bam-m1"
-LEG = """<body pos="{x} {y} 0"><inertial mass="0.05" pos="0 0 0" diaginertia="1e-5 1e-5 1e-5"/>
-  <joint name="{name}_roll" axis="1 0 0" range="-0.6 0.6"/>
-  <body pos="0 {out} 0"><joint name="{name}_pitch" axis="0 1 0" range="-1 2"/>
-    <inertial mass="0.05" pos="0 0 -0.05" diaginertia="1e-5 1e-5 1e-5"/>
-    <body name="{name}_shank" pos="0 0 -0.1"><joint name="{name}_knee" axis="0 1 0"
-        range="-2.5 2.5"/><inertial mass="0.03" pos="0 0 -0.05" diaginertia="1e-5 1e-5 1e-5"/>
-      <geom type="sphere" size="0.01" pos="0 0 -0.1"/></body></body></body>"""
-"""Two parts of 0.1 m with a foot; out to the side by `out`."""
-
-
-def hexapod() -> str:
-    """MJCF of a robot with six legs and 18 joints."""
-    legs = "".join(
-        LEG.format(name=f"{'LR'[side < 0]}{k}", x=0.12 * (1 - k), y=0.05 * side, out=0.04 * side)
-        for side in (1, -1) for k in range(3)
-    )  # fmt: skip
-    return f"""<mujoco model="hexapod"><compiler angle="radian" autolimits="true"/><worldbody>
-      <body name="torso" pos="0 0 0.2"><freejoint/><inertial mass="1" pos="0 0 0"
-        diaginertia="0.01 0.01 0.01"/><geom type="box" size="0.1 0.04 0.03"/>{legs}</body>
-      </worldbody></mujoco>"""
+HEXAPOD = {f"{'LR'[side < 0]}{k}": (1 - k, side) for side in (1, -1) for k in range(3)}
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +31,7 @@ def policy(tmp_path_factory) -> Path:
     """Folder of a policy that holds the default pose of a hexapod and twitches."""
     folder = tmp_path_factory.mktemp("hexapod")
     robot, config = folder / "hexapod.xml", folder / "hexapod.yaml"
-    robot.write_text(hexapod())
+    robot.write_text(legged(HEXAPOD, mirrored=False))
     config.write_text(
         'pose: {"*_pitch": 0.7, "*_knee": -1.4}\ncommands: {forward_m_s: [-0.1, 0.2]}\n'
     )

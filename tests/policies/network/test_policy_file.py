@@ -273,8 +273,6 @@ def test_files_that_are_absent_altered_or_of_another_kind_are_refused(copied):
         (lambda f: rewrite_weights(f, (pickled / WEIGHTS).read_bytes()), "does not fit"),
     ]
     assert_each_refused(cases, load, names="/policy")
-    with pytest.raises(InputError, match="neither a run nor a policy"):
-        policy_at(pickled.parent)
 
 
 def test_files_that_ask_for_much_memory_or_time_are_refused_before_they_get_it(copied):

@@ -17,40 +17,17 @@ from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import PRESETS, Walking, for_robot
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from support.legged import legged
 
-LEG = """<body name="{name}_hip" pos="{x} {y} 0"><inertial mass="0.05" pos="0 0 0"
-    diaginertia="1e-5 1e-5 1e-5"/><joint name="{name}_roll" axis="1 0 0" range="-0.6 0.6"/>
-  <body name="{name}_thigh" pos="0 {out} 0"><joint name="{name}_pitch" axis="0 1 0" range="-1 2"/>
-    <inertial mass="0.05" pos="0 0 -0.05" diaginertia="1e-5 1e-5 1e-5"/>
-    <body name="{name}_shank" pos="0 0 -0.1"><joint name="{name}_knee" axis="0 {sign} 0"
-        range="-2.5 2.5"/><inertial mass="0.03" pos="0 0 -0.05" diaginertia="1e-5 1e-5 1e-5"/>
-      <geom type="sphere" size="0.01" pos="0 0 -0.1"/></body></body></body>"""
 PLACES = {
-    "front_left": (1, 1),
-    "front_right": (1, -1),
-    "rear_left": (-1, 1),
-    "rear_right": (-1, -1),
-}
-
-
-def mjcf(legs: dict[str, tuple[int, int]], base: str = "<freejoint/>", more: str = "") -> str:
-    """A robot with three joints a leg; right knees turn the other way round."""
-    made = "".join(
-        LEG.format(name=n, x=0.12 * fore, y=0.05 * side, out=0.04 * side, sign=side)
-        for n, (fore, side) in legs.items()
-    )
-    return f"""<mujoco><compiler angle="radian" autolimits="true"/><worldbody>
-      <body name="torso" pos="0 0 0.2">{base}<inertial mass="1" pos="0 0 0"
-        diaginertia="0.01 0.01 0.01"/><geom type="box" size="0.1 0.04 0.03"/>{made}</body>
-      </worldbody>{more}</mujoco>"""
-
-
+    "front_left": (1, 1), "front_right": (1, -1), "rear_left": (-1, 1), "rear_right": (-1, -1)
+}  # fmt: skip
 POSE = 'pose: {"*_pitch": 0.7, "*_left_knee": -1.4, "*_right_knee": 1.4}\n'
 
 
 def body(folder: Path, xml: str | None = None, config: str = POSE) -> Body:
     robot, own = folder / "robot.xml", folder / "robot.yaml"
-    robot.write_text(xml or mjcf(PLACES))
+    robot.write_text(xml or legged(PLACES))
     own.write_text(config)
     body_of.cache_clear()
     return body_of(str(robot), str(own))
@@ -129,7 +106,7 @@ def test_the_mini_puppers_own_file_makes_the_same_body(tmp_path):
 @pytest.mark.parametrize(
     ("xml", "config", "words"),
     [
-        (mjcf(PLACES, base=""), POSE, "no floating base: its first body (torso)"),
+        (legged(PLACES, base=""), POSE, "no floating base: its first body (torso)"),
         ("<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>", POSE,
          "no hinge"),
         (None, "feet: [paw]\n" + POSE, "no site, geom or body 'paw'"),
@@ -138,7 +115,7 @@ def test_the_mini_puppers_own_file_makes_the_same_body(tmp_path):
         (None, 'pose: {"*_roll": 2.0}\n', "beyond the limits of front_left_roll"),
         (None, "gait: gallop\n" + POSE, "gait 'gallop' is not known"),
         (None, "wheels: 4\n", "wheels"),
-        (mjcf(PLACES).replace('size="0.01"', 'size="0.01" contype="0" conaffinity="0"'), POSE,
+        (legged(PLACES).replace('size="0.01"', 'size="0.01" contype="0" conaffinity="0"'), POSE,
          "lowest geom is of the trunk"),
     ],
 )  # fmt: skip
@@ -176,7 +153,7 @@ def test_feet_may_be_meshes_beside_the_file_and_names_of_the_walk_may_be_taken(
         builtin="flat" width="8" height="8"/><texture name="skin" type="2d" file="absent.png"/>
         <material name="grid" texture="grid"/><material name="skin" texture="skin"/></asset>"""
     mesh = '<geom type="mesh" mesh="paw" pos="0 0 -0.1" material="skin"/>'
-    xml = mjcf(PLACES, more=assets).replace(BALL, mesh)
+    xml = legged(PLACES, more=assets).replace(BALL, mesh)
     xml = xml.replace('<body name="torso"', '<site name="foot_rear_left_shank"/><body name="torso"')
     xml = xml.replace("<compiler", '<compiler meshdir="parts"')
     monkeypatch.chdir("/")
@@ -192,13 +169,13 @@ def test_a_mesh_that_is_only_shown_counts_where_it_is_all_of_a_bodys_mass(tmp_pa
     corners = [f"{x} {y} {z}" for x in (0, 0.02) for y in (0, 0.02) for z in (0, 0.02)]
     asset = f'<asset><mesh name="block" vertex="{" ".join(corners)}"/></asset>'
     trunk = '<inertial mass="1" pos="0 0 0"\n        diaginertia="0.01 0.01 0.01"/>'
-    xml = mjcf(PLACES, more=asset).replace(trunk, shown)
+    xml = legged(PLACES, more=asset).replace(trunk, shown)
     own = body(tmp_path, xml)
     assert own.mass_kg == pytest.approx(4 * 0.13 + 8.0 + 0.96, rel=0.01)  # density times volume
 
 
 def test_bodies_need_no_names_and_a_knee_above_a_foot_is_none(tmp_path):
-    xml = mjcf(PLACES).replace(
+    xml = legged(PLACES).replace(
         BALL, f'<body><inertial mass="0.01" pos="0 0 0" diaginertia="1e-6 1e-6 1e-6"/>'
         f"<body>{BALL}</body></body><geom size='0.005' pos='0 0 -0.095'/>"
     )  # fmt: skip
@@ -212,7 +189,7 @@ def test_feet_of_several_geoms_stand_in_their_middle_and_feel_all_of_them(tmp_pa
         f'<geom size="0.01" pos="{x} {y} -0.1"/>' for x in (0.02, -0.02) for y in (0.01, -0.01)
     )
     two = {n: (0, side) for n, (_, side) in list(PLACES.items())[:2]}
-    own = body(tmp_path, mjcf(two).replace(BALL, corners), "gait: biped\n")
+    own = body(tmp_path, legged(two).replace(BALL, corners), "gait: biped\n")
     np.testing.assert_allclose(own.feet_at, [[0, 0.09, -0.2], [0, -0.09, -0.2]], atol=1e-12)
     assert own.mirror_feet is not None
     assert compiled(own).site_size[0, 0] > np.hypot(0.02, 0.01) + 0.01
@@ -225,7 +202,7 @@ ANKLE = """<body pos="0 0 -0.1"><joint name="{}_ankle" axis="0 1 0" range="-2 2"
 
 
 def biped(folder: Path, more: Callable[[str, str], str] = lambda xml, name: xml) -> Body:
-    xml = mjcf(TWO)
+    xml = legged(TWO)
     for name in TWO:
         xml = more(xml.replace(BALL, ANKLE.format(name), 1), name)
     return body(folder, xml, POSE.replace("}", ', "*_left_ankle": 0.7, "*_right_ankle": 0.7}'))
@@ -263,7 +240,7 @@ def test_soles_turn_under_the_trunk_while_they_stand(tmp_path):
 
 def test_a_robot_that_faces_along_y_is_said_to_and_turned(tmp_path):
     tensor = 'fullinertia="0.01 0.02 0.025 0.001 0 0"'
-    xml = mjcf(PLACES).replace('diaginertia="0.01 0.01 0.01"', tensor)
+    xml = legged(PLACES).replace('diaginertia="0.01 0.01 0.01"', tensor)
     usual = body(tmp_path, xml)
     # the same robot, but the trunk's y is forward
     head, inside, tail = (
@@ -290,7 +267,7 @@ def test_a_robot_that_faces_along_y_is_said_to_and_turned(tmp_path):
 
 def test_geoms_that_only_touch_in_pairs_can_be_feet(tmp_path):
     foot = '<geom name="{name}" size="0.01" pos="0 0 -0.1" contype="0" conaffinity="0"/>'
-    xml = mjcf(PLACES)
+    xml = legged(PLACES)
     for n in PLACES:
         xml = xml.replace(BALL, foot.format(name=n), 1)
     ground = '<worldbody><geom name="floor" type="plane" size="1 1 1"/></worldbody>'
@@ -306,7 +283,7 @@ ARM = """<body name="neck" pos="0.1 0 0.05"><joint name="neck" axis="0 1 0" rang
 
 
 def test_joints_that_are_fixed_stay_as_they_are_in_the_pose(tmp_path):
-    xml = mjcf(PLACES, base="<freejoint/>" + ARM)
+    xml = legged(PLACES, base="<freejoint/>" + ARM)
     legs = "joints: ['*_roll', '*_pitch', '*_knee']\n"
     pose = POSE.replace("}", ", neck: -1.5707963}")
     model = compiled(body(tmp_path, xml, legs + pose))
@@ -317,7 +294,7 @@ def test_joints_that_are_fixed_stay_as_they_are_in_the_pose(tmp_path):
 
 
 def test_joints_of_a_chain_that_turn_about_one_line_are_images_of_themselves(tmp_path):
-    own = body(tmp_path, mjcf(PLACES, base="<freejoint/>" + ARM))
+    own = body(tmp_path, legged(PLACES, base="<freejoint/>" + ARM))
     assert own.mirror_joints is not None and own.mirror_signs is not None
     assert {n: own.mirror_signs[own.joints.index(n)] for n in ("neck", "head", "jaw")} == {
         "neck": 1, "head": -1, "jaw": -1,
@@ -332,7 +309,7 @@ def test_linkages_are_taken_out_and_said_and_joints_of_tendons_have_servos(tmp_p
     more = f"""<tendon><fixed name="knees">{knees}</fixed></tendon>
         <actuator>{motors}<motor tendon="knees"/></actuator>
         <equality><connect body1="rod" body2="rear_left_shank" anchor="0 0 0"/></equality>"""
-    own = body(tmp_path, mjcf(PLACES, base="<freejoint/>" + spare, more=more))
+    own = body(tmp_path, legged(PLACES, base="<freejoint/>" + spare, more=more))
     assert len(own.joints) == 12
     assert any("couples bodies or joints" in note for note in own.notes)
     assert compiled(own).nq == 7 + 12
@@ -340,7 +317,7 @@ def test_linkages_are_taken_out_and_said_and_joints_of_tendons_have_servos(tmp_p
 
 def test_gravity_and_friction_are_those_of_a_walk_whatever_the_file_has(tmp_path):
     more = '<option gravity="0 0 0" impratio="100"><flag contact="disable"/></option>'
-    xml = mjcf(PLACES, more=more).replace(BALL, BALL.replace("/>", ' condim="1"/>'))
+    xml = legged(PLACES, more=more).replace(BALL, BALL.replace("/>", ' condim="1"/>'))
     model = compiled(body(tmp_path, xml.replace('name="torso"', 'name="torso" gravcomp="1"')))
     assert (model.opt.gravity[2], model.opt.impratio, model.opt.disableflags) == (-9.81, 1, 0)
     assert not model.body_gravcomp.any() and model.geom("geom 1").condim == 3
@@ -348,7 +325,7 @@ def test_gravity_and_friction_are_those_of_a_walk_whatever_the_file_has(tmp_path
 
 def test_two_legs_walk_by_turns_and_joints_without_a_servo_are_fixed(tmp_path):
     two = {n: (0, side) for n, (_, side) in list(PLACES.items())[:2]}
-    own = body(tmp_path, mjcf(two), "joints: ['*_pitch', '*_knee']\n" + POSE)
+    own = body(tmp_path, legged(two), "joints: ['*_pitch', '*_knee']\n" + POSE)
     assert len(own.joints) == 4 and any("fixed: front_left_roll" in n for n in own.notes)
     np.testing.assert_array_equal(own.offsets, [0.0, 0.5])
     assert own.together == () and own.apart == ((0, 1),)
