@@ -86,9 +86,10 @@ def test_a_register_that_does_not_take_its_value_is_an_error(sts):
 
 
 def test_the_other_series_keeps_its_lock_elsewhere(monkeypatch):
-    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.04)
+    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.04)  # of the search at other rates
     with on_a_port(still_servos(SCS0009, ids=[1], baud=500_000)) as server:
         bus = FeetechBus(server.device, joint_map=map_of(1, series=SCS0009))
+        bus.line.patience_s = 0.4
         bus.set_register("RF_hip", "p", 20)
         assert bus.register("RF_hip", "p") == 20
         assert server.emulator.servos[1].memory[48] == 1
