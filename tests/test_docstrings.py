@@ -4,13 +4,14 @@ The checks are those of `[tool.numpydoc_validation]` in pyproject.toml. Beyond t
 named Parameters lists every parameter; names of the front door have all their sections.
 """
 
+import ast
 import inspect
 from importlib import import_module
 
 import pytest
 
 import pupper_sysid
-from support.package import MODULES, PROJECT, public_names
+from support.package import FILES, MODULES, PROJECT, public_names
 
 numpydoc = pytest.importorskip("numpydoc.validate")
 
@@ -29,6 +30,11 @@ def violations(name: str, checks: set[str]) -> list[str]:
     listed = "\nParameters\n" in inspect.cleandoc(found["docstring"] or "")
     wanted = checks | {"PR01"} if listed else checks
     return [f"{name}: {code} {text}" for code, text in found["errors"] if code in wanted]
+
+
+def test_the_first_line_of_every_module_is_a_sentence():
+    first = {path: ast.get_docstring(ast.parse(path.read_text())) for path in FILES.values()}
+    assert [path for path, text in first.items() if text and text.split("\n\n")[0][-1] != "."] == []
 
 
 @pytest.mark.slow

@@ -1,10 +1,12 @@
-"""A policy that others trained, walking in this project's simulator: ONNX file, YAML, MJCF::
+"""A policy that others trained, walking in this project's simulator: ONNX file, YAML, MJCF.
+
+A walk takes it in the place of a `Policy`::
 
     network = OnnxNetwork(Path("walk.onnx"))
     policy = ForeignPolicy.of(network)                 # and walk.yaml beside it, where there is one
     task = policy.task(Path("robot.xml"), Path("robot.yaml"))
     policy.fit(task)
-    action = policy.act(observation)                   # in the place of a `Policy` in a walk
+    action = policy.act(observation)
 
 What the file needs to say: joints in the order of the actions, default pose, action scale, time
 between two actions, and the observation as a list of named terms. mjlab's exporter (and so

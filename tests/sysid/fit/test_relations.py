@@ -12,11 +12,11 @@ from pupper_sysid.servo_models.kernel import COLUMNS
 from pupper_sysid.sysid.compare.compare import compare
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, find_poll_lattice
 from pupper_sysid.sysid.fit.calibrate import CalibrationResult, calibrate
-from pupper_sysid.sysid.fit.choice import fit_structures, stages
+from pupper_sysid.sysid.fit.choice import fit_structures
 from pupper_sysid.sysid.fit.preparation import prepare_joint
 from pupper_sysid.sysid.fit.run import prepare, simulate
 from pupper_sysid.sysid.fit.search import Problem, folds_of
-from pupper_sysid.sysid.fit.structure import CANDIDATES, candidate, servo_structure
+from pupper_sysid.sysid.fit.structure import CANDIDATES, SIMULATED, candidate, servo_structure
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 from support import wide_servo
 from support.servo_recordings import trial
@@ -110,8 +110,8 @@ def test_the_dead_time_holds_its_truth(servo, motion):
 def test_a_structure_that_contains_another_never_costs_more_with_and_without_left_out_runs():
     trials = tuple(recording("STS3215", "tones").trials(JOINT))
     ready = prepare_joint(JOINT, trials, 0)
-    every = {f.structure.name: f for s in stages(ready) for f in fit_structures(ready, s)}
-    inner, outer = every["dc_servo"], every["delayed_pd_back_emf"]
+    every = {f.structure.name: f for f in fit_structures(ready, SIMULATED[1])}
+    inner, outer = every["dc_servo"], every[SIMULATED[1]]
     assert outer.structure.contains(inner.structure)
     # but for the prior of what it has besides, and the least damping of its box
     more = 0.5 * np.log(90.0 / 0.05) ** 2

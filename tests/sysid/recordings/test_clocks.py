@@ -8,7 +8,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
 from pupper_sysid.sysid.lag.lag_budget import lag_budget
 
 PERIOD_S, LAG_S = 0.01, 0.06
-SENT_S = PERIOD_S * np.arange(3000)
+SENT_S = PERIOD_S * np.arange(1800)
 
 
 def recording(later_s: np.ndarray | float, seed: int = 0) -> ps.Recording:
@@ -43,11 +43,11 @@ def test_the_doctor_names_the_drift_and_the_doubt():
 
 def test_a_growth_within_a_turn_of_the_loop_may_be_two_rates_and_is_a_doubt():
     (trial,) = recording(2e-4 * SENT_S).trials("pan")
-    assert trial.clock_drift == 0 and trial.falls_behind_s == pytest.approx(0.0055, rel=0.05)
+    assert trial.clock_drift == 0 and trial.falls_behind_s == pytest.approx(0.0035, rel=0.1)
     assert trial.read_time_doubt_s == pytest.approx(trial.falls_behind_s)
 
 
-@pytest.mark.parametrize("later_s", [0.0, 0.004 * (SENT_S > 12.0)], ids=["steady", "one jump"])
+@pytest.mark.parametrize("later_s", [0.0, 0.004 * (SENT_S > 8.0)], ids=["steady", "one jump"])
 def test_stamps_of_one_clock_are_left_alone(later_s):
     for seed in range(20):
         (trial,) = recording(later_s, seed).trials("pan")
