@@ -8,7 +8,6 @@ import sys
 import time
 from contextlib import suppress
 
-import numpy as np
 import pytest
 
 from pupper_sysid.cli.commands.robot import scan
@@ -16,15 +15,13 @@ from pupper_sysid.cli.commands.robot.scan import Park
 from pupper_sysid.cli.programs.pupper_sysid import COMMANDS
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.hardware import loop as clock
-from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.lock import runtime_folder
 from pupper_sysid.hardware.safety import watchdog
-from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
 from pupper_sysid.hardware.safety.notes import notes, remove_note, write_note
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from support.package import ROOT
 from support.served_driver import PATIENT, drive
-from support.servo_servers import driver_orders, limp, robot_behind
+from support.servo_servers import driver_orders, limp, robot_behind, switched_on
 from support.stopwatch import wait_until
 
 PROGRAM = f"{PATIENT}from pupper_sysid.cli.programs.pupper_sysid import main; main()"
@@ -37,14 +34,6 @@ def robot(request, tmp_path, monkeypatch):
     monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.1)
     with robot_behind(request.param, tmp_path) as served:
         yield served
-
-
-def switched_on(address: str) -> GuardedBus:
-    """Of this process, as a walk has it."""
-    bus = open_guarded(parse_address(address))
-    assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
-    bus.torque(True)
-    return bus
 
 
 on_esp32 = pytest.mark.parametrize(

@@ -1,13 +1,16 @@
 """Runs on the physics clock, made from arrays."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.servo_models.kernel import edges_of
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
-from pupper_sysid.sysid.fit.run import Run
-from pupper_sysid.sysid.fit.structure import LONGEST_DEAD_TIME_S
+from pupper_sysid.sysid.fit.run import Run, at_steps, free_run
+from pupper_sysid.sysid.fit.search import Problem
+from pupper_sysid.sysid.fit.structure import LONGEST_DEAD_TIME_S, Structure
 
 PAD = int(LONGEST_DEAD_TIME_S / TIME_STEP_S) + 4
 NOTHING = np.empty(0)
@@ -46,3 +49,14 @@ def fine_run(command: NDArray[np.float64], every_s: float = 0.01) -> Run:
         sample_rad=np.zeros(len(step)), row_step=step, held_step=step,
         row_rad=np.full(len(step), np.nan), step_s=CONTINUOUS_S,
     )  # fmt: skip
+
+
+def problem_of(
+    structure: Structure, truth: NDArray[np.float64], run: Run, noise_rad: float,
+    rng: np.random.Generator,
+) -> Problem:  # fmt: skip
+    """To find the numbers of a servo from a run that it makes, read with noise."""
+    (track,) = free_run(structure, truth, (run,))
+    read = at_steps(track, run.sample_step)
+    read += noise_rad * rng.standard_normal(len(read))
+    return Problem(structure, (replace(run, sample_rad=read),), (noise_rad,))

@@ -11,10 +11,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.dynamixel import SERIES as DYNAMIXELS
 from pupper_sysid.hardware.feetech import SCS0009, STS3215, Frame, FrameReader, Series
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
 from pupper_sysid.hardware.safety import watchdog
+from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
 from pupper_sysid.sim.emulator.bench import ServoBench
 from pupper_sysid.sim.emulator.dynamixel import DynamixelEmulator
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator, ProxySocket
@@ -29,6 +31,7 @@ from pupper_sysid.sim.emulator.pendulum import (
 )
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sim.emulator.serial_line import LineEmulator, SerialPty
+from support.stopwatch import wait_until
 
 LAYOUTS = {STS3215.name: "sts3215", SCS0009.name: "mini_pupper_2_direct", "proxy": "mini_pupper_2"}
 
@@ -221,6 +224,14 @@ def robot_behind(kind: str, folder: Path) -> Iterator[tuple[SerialPty | ProxySoc
     with on_a_socket(ProxyEmulator(bench, rng), folder / "s") as server:
         let_go(server)
         yield server, f"esp32:{folder / 's'}"
+
+
+def switched_on(address: str) -> GuardedBus:
+    """The robot at an address, driven by this process: its servos hold where they stand."""
+    bus = open_guarded(parse_address(address))
+    assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
+    bus.torque(True)
+    return bus
 
 
 def driver_orders(kind: str, where: str, preset: str, driver: int = 0) -> dict:

@@ -15,12 +15,11 @@ import pytest
 
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
-from pupper_sysid.hardware.address import BusAddress, parse_address
+from pupper_sysid.hardware.address import BusAddress
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lock import LOG
 from pupper_sysid.hardware.safety import limp as limp_module
 from pupper_sysid.hardware.safety import watchdog_process
-from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
 from pupper_sysid.hardware.safety.watchdog import Watchdog
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.bus import EmulatedBus
@@ -39,6 +38,7 @@ from support.servo_servers import (
     robot_behind,
     spare_this_process,
     still_servos,
+    switched_on,
 )
 from support.stopwatch import Stopwatch
 
@@ -87,15 +87,6 @@ def wait_for(condition, *processes: int) -> float:
         time.sleep(0.005)
         took = watch.seconds()
     return took
-
-
-def switched_on(address: str) -> GuardedBus:
-    """A bus whose servos hold where they stand."""
-    bus = open_guarded(parse_address(address))
-    while not np.isfinite(bus.read().position_rad).all():
-        time.sleep(0.02)
-    bus.torque(True)
-    return bus
 
 
 def test_a_killed_driver_s_robot_is_back_where_it_was_found_and_limp_within_a_second(robot):

@@ -150,6 +150,7 @@ def test_a_urdf_is_numbered_from_the_base_on_whatever_the_order_of_its_file():
         (urdf(("pan", -1, 1, ""), ("pan", -1, 1, "")), "two joints are called 'pan'"),
         (urdf(("pan", "nan", 1, "")), "the range of joint pan is not two rising numbers"),
         (urdf(("pan", 1, -1, "")), "the range of joint pan is not two rising numbers"),
+        (urdf(("pan", 1, 1, "")), "the range of joint pan is not two rising numbers"),
     ],
 )
 def test_a_urdf_that_states_no_robot_is_refused_with_the_reason(text, words):

@@ -9,10 +9,10 @@ import pupper_sysid as ps
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
 from pupper_sysid.sysid.fit.posterior import LATCH_SD_S, _Target, sample, with_date_errors
-from pupper_sysid.sysid.fit.run import at_steps, free_run, prepare
+from pupper_sysid.sysid.fit.run import prepare
 from pupper_sysid.sysid.fit.search import Fit, Problem, refine
 from pupper_sysid.sysid.fit.structure import candidate
-from support.runs import fine_run
+from support.runs import fine_run, problem_of
 
 NOISE_RAD = 5e-4
 STRUCTURE = candidate("delayed_pd_back_emf")
@@ -21,22 +21,19 @@ TRUTH = {
     "friction_rad_s2": 10.0, "effort_rad_s2": 3000.0, "no_load_speed_rad_s": 40.0,
     "offset_rad": 0.0,
 }  # fmt: skip
+NUMBERS = np.array([TRUTH[name] for name in STRUCTURE.names])
 
 
 @pytest.fixture(scope="module")
 def slow() -> Problem:
     """A motion that is far from the limits of effort and speed."""
-    rng = np.random.default_rng(1)
     time = CONTINUOUS_S * np.arange(int(4.0 / CONTINUOUS_S))
     run = fine_run(0.1 * np.sin(2 * np.pi * 1.3 * time) + 0.05 * np.sin(2 * np.pi * 3.1 * time))
-    (track,) = free_run(STRUCTURE, np.array([TRUTH[n] for n in STRUCTURE.names]), (run,))
-    read = np.interp(run.sample_step, np.arange(len(track)), track)
-    read += NOISE_RAD * rng.standard_normal(len(read))
-    return Problem(STRUCTURE, (replace(run, sample_rad=read),), (NOISE_RAD,))
+    return problem_of(STRUCTURE, NUMBERS, run, NOISE_RAD, np.random.default_rng(1))
 
 
 def test_what_a_motion_does_not_show_keeps_its_prior_and_the_sum_is_known(slow):
-    start = STRUCTURE.encode(np.array([TRUTH[n] for n in STRUCTURE.names]))
+    start = STRUCTURE.encode(NUMBERS)
     draws = sample(slow, refine(slow, start[None]), 1.0, np.random.default_rng(0)).points
     values = dict(zip(STRUCTURE.names, STRUCTURE.decode(draws).T, strict=True))
     total = values["damping_per_s"] + values["effort_rad_s2"] / values["no_load_speed_rad_s"]
@@ -53,7 +50,7 @@ def test_what_a_motion_does_not_show_keeps_its_prior_and_the_sum_is_known(slow):
 
 def test_the_change_of_coordinates_has_an_inverse_a_determinant_of_one_and_a_hessian(slow):
     rng, target = np.random.default_rng(2), _Target(slow, 1.0)
-    centre = STRUCTURE.encode(np.array([TRUTH[n] for n in STRUCTURE.names]))
+    centre = STRUCTURE.encode(NUMBERS)
     fitted = centre + 0.3 * rng.standard_normal((5, len(centre)))
     points = target.straight(fitted)
     np.testing.assert_allclose(target.fitted(points), fitted, atol=1e-12)
@@ -80,12 +77,8 @@ def test_a_dead_time_is_no_surer_than_the_turn_of_the_servo_at_which_each_comman
     ).trials("knee")[0]  # fmt: skip
     lattice = find_poll_lattice([trial], rng)
     run = prepare(trial, lattice).in_free_air()
-    values = np.array([TRUTH[n] for n in STRUCTURE.names])
-    (track,) = free_run(STRUCTURE, values, (run,))
-    read = at_steps(track, run.sample_step)
-    read += noise_rad * rng.standard_normal(len(read))
-    problem = Problem(STRUCTURE, (replace(run, sample_rad=read),), (noise_rad,))
-    point = STRUCTURE.encode(values)
+    problem = problem_of(STRUCTURE, NUMBERS, run, noise_rad, rng)
+    point = STRUCTURE.encode(NUMBERS)
     still = np.tile(point, (4000, 1))
     wider = with_date_errors(still, problem, Fit(point, 0.0), [trial], False, rng)
     spread_s = STRUCTURE.decode(wider)[:, 0].std()

@@ -1,6 +1,5 @@
 """Search: local fits leave the dents of a ridge, and find limits that have no slope."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.fit.choice import Fitted
 from pupper_sysid.sysid.fit.joint_fit import _slight_limits
-from pupper_sysid.sysid.fit.run import free_run
 from pupper_sysid.sysid.fit.search import (
     Fit,
     Problem,
@@ -19,7 +17,7 @@ from pupper_sysid.sysid.fit.search import (
     with_limits,
 )
 from pupper_sysid.sysid.fit.structure import candidate
-from support.runs import fine_run
+from support.runs import fine_run, problem_of
 
 NOISE_RAD = 4e-4
 NUMBERS = {
@@ -43,13 +41,10 @@ def test_local_fits_from_points_about_a_fit_find_the_way_along_a_ridge():
         for numbers in (NUMBERS, ALONG_THE_RIDGE)
     )
     run = fine_run(chirp, 0.005)
-    (track,) = free_run(structure, structure.decode(truth), (run,))
-    clean = np.interp(run.sample_step, np.arange(len(track)), track)
     stuck = []
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        read = clean + NOISE_RAD * rng.standard_normal(len(clean))
-        problem = Problem(structure, (replace(run, sample_rad=read),), (NOISE_RAD,))
+        problem = problem_of(structure, structure.decode(truth), run, NOISE_RAD, rng)
         best = refine(problem, truth[None]).cost
         near = refine(problem, far[None])
         stuck.append(near.cost > best + 100)
@@ -66,11 +61,8 @@ def test_a_stiff_servo_that_is_always_at_its_limits_is_found(seed):
     sent = np.floor(time / 0.01) * 0.01
     run = fine_run(0.24 * np.sin(2 * np.pi * (2.0 * sent + 0.4 * sent**2)), 0.008)
     run = run.coarser().coarser()
-    (track,) = free_run(structure, truth, (run,))
-    clean = np.interp(run.sample_step, np.arange(len(track)), track)
     rng = np.random.default_rng(seed)
-    read = clean + noise_rad * rng.standard_normal(len(clean))
-    problem = Problem(structure, (replace(run, sample_rad=read),), (noise_rad,))
+    problem = problem_of(structure, truth, run, noise_rad, rng)
     best = refine(problem, structure.encode(truth)[None]).cost
     # dents near the truth, of up to 34 by eight seeds, are left to the draws
     assert search_widely(problem, rng).cost < best + 50
@@ -82,10 +74,7 @@ def saturating(effort_rad_s2: float, rng: np.random.Generator) -> tuple[Problem,
     truth = np.array([0.03, 1650.0, 40.0, 30.0, effort_rad_s2, 200.0, 0.0])
     time = CONTINUOUS_S * np.arange(int(3.0 / CONTINUOUS_S))
     run = fine_run(0.25 * np.sin(2 * np.pi * (0.5 * time + 0.6 * time**2)), 0.01)
-    (track,) = free_run(structure, truth, (run,))
-    read = np.interp(run.sample_step, np.arange(len(track)), track)
-    read += NOISE_RAD * rng.standard_normal(len(read))
-    problem = Problem(structure, (replace(run, sample_rad=read),), (NOISE_RAD,))
+    problem = problem_of(structure, truth, run, NOISE_RAD, rng)
     return problem, refine(problem, structure.encode(truth)[None])
 
 
