@@ -28,13 +28,6 @@ def moved(servo: PendulumServo, start: float, stop: float, step: float = 0.001) 
     return np.array([servo.position_at(t) for t in np.arange(start, stop, step)])
 
 
-def test_the_free_speed_at_full_duty_is_torque_over_back_emf():
-    servo = PendulumServo(replace(EXACT, friction_nm=0.06), 0.0)
-    servo.command(0.0, 30.0)
-    way = moved(servo, 1.0, 1.2)
-    assert (way[100] - way[0]) / 0.1 == pytest.approx((1.8 - 0.06) / 0.3, rel=2e-3)
-
-
 def test_nothing_moves_before_the_dead_time_has_passed_and_then_at_once():
     servo = PendulumServo(EXACT, 0.0)
     servo.command(0.1004, 0.5)
@@ -86,12 +79,17 @@ def test_goal_speed_and_acceleration_make_the_servo_a_ramp():
     assert ramp < arrived + 0.15 and arrived < ramp + 0.3
 
 
-def test_the_torque_limit_caps_the_duty():
-    servo = PendulumServo(EXACT, 0.0, {"torque_limit": 250})
+@pytest.mark.parametrize(
+    ("registers", "friction_nm", "duty"), [({}, 0.06, 1.0), ({"torque_limit": 250}, 0.0, 0.25)]
+)
+def test_the_free_speed_is_the_torque_of_the_largest_duty_over_back_emf(
+    registers, friction_nm, duty
+):
+    servo = PendulumServo(replace(EXACT, friction_nm=friction_nm), 0.0, registers)
     servo.command(0.0, 30.0)
     way = moved(servo, 1.5, 1.6)
-    assert servo.load == pytest.approx(0.25)
-    assert (way[50] - way[0]) / 0.05 == pytest.approx(0.25 * 1.8 / 0.3, rel=5e-3)
+    assert servo.load == pytest.approx(duty)
+    assert (way[50] - way[0]) / 0.05 == pytest.approx((1.8 * duty - friction_nm) / 0.3, rel=5e-3)
 
 
 def test_inside_the_dead_zone_there_is_no_duty_and_outside_at_least_the_minimum_force():
