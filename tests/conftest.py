@@ -71,6 +71,13 @@ def unexamined() -> Iterator[None]:
 
 
 @pytest.fixture
+def here(tmp_path, monkeypatch) -> Path:
+    """An empty folder, the working directory of the test."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
 def proxy_path() -> Iterator[Path]:
     """Of a proxy's socket, which must be short."""
     with TemporaryDirectory(prefix="px", dir="/tmp") as folder:

@@ -36,8 +36,7 @@ def new_module(monkeypatch, name: str, **content) -> None:
     monkeypatch.setitem(sys.modules, module.__name__, module)
 
 
-def test_an_export_target_is_a_module_and_an_entry(capsys, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
+def test_an_export_target_is_a_module_and_an_entry(capsys, monkeypatch, here):
     new_module(
         monkeypatch, "sim.export.gazebo",
         to_gazebo=lambda servos: f"<servos>{' '.join(servos.calibration.joint_names)}</servos>",
@@ -74,8 +73,7 @@ def test_a_bus_is_a_module_and_an_entry(capsys, monkeypatch):
     assert opened[-1].log == ["torque False", "close"]
 
 
-def test_a_log_in_other_words_is_words_of_one_table(capsys, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
+def test_a_log_in_other_words_is_words_of_one_table(capsys, monkeypatch, here):
     monkeypatch.setitem(WORDS, "beordret", COMMAND)
     monkeypatch.setitem(WORDS, "faktisk", STATE)
     time_s = 0.02 * np.arange(200)

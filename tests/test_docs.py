@@ -52,8 +52,7 @@ EXAMPLES = {
     [p if p.stem == "tutorial" else pytest.param(p, marks=pytest.mark.slow) for p in EXAMPLES],
     ids=lambda p: p.stem,
 )
-def test_every_example_of_a_page_runs_in_an_empty_folder(page, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_every_example_of_a_page_runs_in_an_empty_folder(page, here, monkeypatch, capsys):
     if page.stem == "tutorial":  # what its network predicts is not on the page
         networks = importlib.import_module("pupper_sysid.sysid.servo_fit.networks")
         monkeypatch.setattr(networks, "MLP", replace(networks.MLP, steps=100, check_every=50))
@@ -74,7 +73,7 @@ def test_every_example_of_a_page_runs_in_an_empty_folder(page, tmp_path, monkeyp
         )
     if page.stem == "tutorial":
         made = ("calibrated.yaml", "report/report.html", "calibrated_isaaclab.py", "servo")
-        assert all((tmp_path / name).exists() for name in made)
+        assert all((here / name).exists() for name in made)
 
 
 def test_the_tutorial_leads_from_a_sweep_to_a_servo_model_and_is_run_as_it_stands():
@@ -103,19 +102,17 @@ def execute(page: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [p for p in WRITTEN if python_blocks(p)], ids=lambda p: p.stem)
-def test_python_examples_of_a_page_run_in_the_repository(page, tmp_path, monkeypatch):
-    (tmp_path / "data").symlink_to(ROOT / "data")
-    monkeypatch.chdir(tmp_path)
+def test_python_examples_of_a_page_run_in_the_repository(page, here):
+    (here / "data").symlink_to(ROOT / "data")
     execute(page)
 
 
 @pytest.mark.usefixtures("fitted_once")
-def test_the_readmes_example_runs_on_a_part_of_its_sample(hip, tmp_path, monkeypatch):
-    (tmp_path / "data/samples").mkdir(parents=True)
-    shutil.copy(hip, tmp_path / "data/samples/sweep.csv")
-    monkeypatch.chdir(tmp_path)
+def test_the_readmes_example_runs_on_a_part_of_its_sample(hip, here):
+    (here / "data/samples").mkdir(parents=True)
+    shutil.copy(hip, here / "data/samples/sweep.csv")
     execute(ROOT / "README.md")
-    assert (tmp_path / "calibrated.yaml").exists()
+    assert (here / "calibrated.yaml").exists()
 
 
 def test_the_readme_is_short_and_its_lag_table_is_that_of_the_frozen_figures():

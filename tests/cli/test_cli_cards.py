@@ -68,8 +68,7 @@ def test_a_difference_of_two_cards_and_of_a_card_and_a_calibration(capsys):
     )
 
 
-def test_a_card_is_taken_where_a_calibration_is(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_a_card_is_taken_where_a_calibration_is(here, capsys):
     load_card("sts3215-bam-m1").save("mine.yaml")
     for given in ("sts3215-bam-m1", "mine.yaml"):
         assert load_calibration(given).joint("elbow").actuator.effort_limit_nm.value > 3
@@ -78,11 +77,10 @@ def test_a_card_is_taken_where_a_calibration_is(tmp_path, monkeypatch, capsys):
     assert set(ranges.value["stiffness"]) == {ranges.value["stiffness"][0]}
     for target in ("mjcf", "isaaclab", "mjlab", "json", "csv"):
         main(["export", "sts3215-bam-m1", "--to", target, "--out", f"servo.{target}"])
-    assert 'class="servo_servo"' in (tmp_path / "servo.mjcf").read_text()
+    assert 'class="servo_servo"' in (here / "servo.mjcf").read_text()
 
 
-def test_a_card_goes_to_bam_and_comes_back(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_a_card_goes_to_bam_and_comes_back(capsys, here):
     main(["export", "sts3215-bam-m6", "--to", "bam"])
     back, there = load_card("sts3215-bam-m6_bam.json").pd(), load_card("sts3215-bam-m6").pd()
     assert back.stiffness_nm_per_rad.value == pytest.approx(there.stiffness_nm_per_rad.value)

@@ -211,10 +211,7 @@ def walk(tmp_path) -> Path:
     return path
 
 
-def test_the_twin_of_a_walk_is_drawn_and_has_the_documented_keys(
-    capsys, tmp_path, monkeypatch, walk, imu
-):
-    monkeypatch.chdir(tmp_path)
+def test_the_twin_of_a_walk_is_drawn_and_has_the_documented_keys(capsys, walk, imu, here):
     given = (
         "twin", walk, "--actuator", CALIBRATION_TWIN, "--robots", 1, "--threads", 1, "--imu", imu,
     )  # fmt: skip

@@ -13,8 +13,7 @@ from pupper_sysid.sysid.recordings.files import load
 from support.command_line import ran, refused
 
 
-def test_the_samples_are_copied_whole_and_never_over_other_files(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_the_samples_are_copied_whole_and_never_over_other_files(capsys, here):
     out, _ = ran(capsys, "samples")
     made = {p.relative_to("samples") for p in Path("samples").rglob("*") if p.is_file()}
     assert made == {p.relative_to(SAMPLES) for p in SAMPLES.rglob("*") if p.is_file()}

@@ -304,8 +304,7 @@ WITH_JSON = {
 
 
 @pytest.mark.usefixtures("unexamined")
-def test_keys_of_an_object_are_the_documented_ones(capsys, tmp_path, monkeypatch, hip):
-    monkeypatch.chdir(tmp_path)
+def test_keys_of_an_object_are_the_documented_ones(capsys, hip, here):
     for command, given in WITH_JSON.items():
         typed = [hip if word is HIP else word for word in given]
         found = json_of(capsys, command, *typed)

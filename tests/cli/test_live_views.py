@@ -75,15 +75,14 @@ def same_as_recording(found, recording, name) -> None:
         )
 
 
-def test_a_sweep_writes_both_files_as_it_records(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_a_sweep_writes_both_files_as_it_records(here, capsys):
     _, err = ran(capsys, *SWEEP, "--mcap", "a.mcap", "--rerun", "a.rrd")
     assert "Wrote a.rrd." in err and "Wrote a.mcap." in err
     assert "dropped" not in err
     recording = load(Path("a.csv"))
-    topics, texts = topics_of(tmp_path / "a.mcap")
+    topics, texts = topics_of(here / "a.mcap")
     same_as_recording(topics, recording, lambda c: (c.joint, c.name))
-    entities = entities_of(tmp_path / "a.rrd")
+    entities = entities_of(here / "a.rrd")
     same_as_recording(
         {k: (t, [np.ravel(v) for v in values]) for k, (t, values) in entities.items()},
         recording, lambda c: f"/joints/{c.joint}/{c.name}|scalars",
@@ -219,32 +218,28 @@ def test_a_viewer_gets_what_a_file_would_hold(tmp_path):
 
 
 @pytest.mark.slow
-def test_monitor_writes_what_it_reads_and_sends_nothing(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_monitor_writes_what_it_reads_and_sends_nothing(here, capsys):
     words = ("monitor", "--bus", "emulated", "--seconds", "1", "--mcap", "m.mcap")
     _, err = ran(capsys, *words)
     assert "Wrote m.mcap." in err and "dropped" not in err
-    topics, _ = topics_of(tmp_path / "m.mcap")
+    topics, _ = topics_of(here / "m.mcap")
     assert {joint for joint, name in topics if name == "position_rad"} == set(JOINT_NAMES)
     assert not any(name == "command_rad" for _, name in topics)  # its goals are not known
     assert 5 <= len(topics["RB_calf", "position_rad"][0]) <= 21
 
 
 @pytest.mark.slow
-def test_a_walk_is_written_as_it_is_recorded_with_the_trunk_as_the_imu_has_it(
-    tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
+def test_a_walk_is_written_as_it_is_recorded_with_the_trunk_as_the_imu_has_it(here, capsys):
     policy = str(SAMPLES / "policies/mlp")
     words = (policy, "--seconds", "1", "--name", "w", "--mcap", "w.mcap", "--rerun", "w.rrd")
     _, err = ran(capsys, *words, program=pupper_deploy)
     assert "Wrote w.mcap." in err and "dropped" not in err
-    topics, texts = topics_of(tmp_path / "w.mcap")
+    topics, texts = topics_of(here / "w.mcap")
     same_as_recording(topics, load(Path("walks/w/recording.csv")), lambda c: (c.joint, c.name))
     assert "Walk: time is up" in texts
     walk = read_walk(Path("walks/w/walk.csv"))
     down = walk.observation[:, OBSERVATION_PARTS["projected_gravity"]]
-    entities = entities_of(tmp_path / "w.rrd")
+    entities = entities_of(here / "w.rrd")
     trunk = np.squeeze(entities["/robot/trunk|quaternion"][1])
     seen = Rotation.from_quat(trunk).inv().apply([0.0, 0.0, -1.0])
     # every pose is of a tick: the nearest direction of gravity is that of the controller
@@ -384,7 +379,6 @@ def test_traces_are_drawn_and_the_terminal_is_left_clean(tmp_path, words, last):
     assert text.rstrip().endswith(last)
 
 
-def test_without_a_terminal_a_live_sweep_is_a_plain_one(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_without_a_terminal_a_live_sweep_is_a_plain_one(capsys, here):
     out, err = ran(capsys, *SWEEP_OSCILLOSCOPE, "--live")
     assert "Recorded 1" in out and "needs a terminal" in err

@@ -63,12 +63,11 @@ def test_a_signal_for_the_whole_group_leaves_the_decision_to_the_main_process():
         assert len(dict(workers.results())) == 3
 
 
-def test_work_is_done_in_the_callers_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_work_is_done_in_the_callers_folder(here):
     with Workers(2) as workers:
         workers.submit("a", os.getcwd)
         workers.submit("b", os.getcwd)
-        assert set(dict(workers.results()).values()) == {str(tmp_path)}
+        assert set(dict(workers.results()).values()) == {str(here)}
 
 
 @linux

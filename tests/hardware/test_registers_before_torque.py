@@ -216,9 +216,8 @@ def test_a_servo_without_a_published_model_number_is_driven_by_the_map_that_name
 @pytest.mark.parametrize("kind", ["feetech", "dynamixel"])
 @pytest.mark.parametrize("words", ["sweep --freqs 1-8 --joints", "calibrate-joints --joints"])
 def test_an_unknown_name_on_a_line_without_a_map_is_blamed_on_the_missing_map(
-    capsys, tmp_path, monkeypatch, kind, words
+    capsys, here, kind, words
 ):
-    monkeypatch.chdir(tmp_path)
     servos = still_servos(STS3215, IDS) if kind == "feetech" else still_dynamixels(IDS)
     with on_a_port(servos) as server:
         bus = f"{kind}:{server.device}@1000000"
@@ -226,7 +225,7 @@ def test_an_unknown_name_on_a_line_without_a_map_is_blamed_on_the_missing_map(
         model = servos.series.name.lower()
         assert code and "no joint map says" in err and f"init-robot --servo {model}" in err
         assert "--joint-map" in err and "pupper-sysid scan" in err and "'pan'" not in err
-        dynamixel_map(*IDS, model=servos.series.name).save(tmp_path / "map.yaml")
+        dynamixel_map(*IDS, model=servos.series.name).save(here / "map.yaml")
         code, _, err = run(
             capsys, *words.split(), "LF_tigh", "--bus", bus, "--joint-map", "map.yaml"
         )

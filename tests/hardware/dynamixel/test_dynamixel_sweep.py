@@ -68,9 +68,8 @@ def lag_s(sent, command, read, position, frequency_hz: float) -> float:
 @pytest.mark.wall_clock
 @pytest.mark.parametrize("model", [1200, 1020])
 def test_a_sweep_shows_the_emulated_servos_lag_and_leaves_its_registers(
-    capsys, tmp_path, monkeypatch, model
+    capsys, monkeypatch, model, here
 ):
-    monkeypatch.chdir(tmp_path)
     servos = moving_dynamixel(model)
     servos.bench.map.save(Path("map.yaml"))
     before = bytes(servos.servos[1].memory)

@@ -297,11 +297,10 @@ def test_only_a_line_that_cannot_come_back_is_given_up():
         assert limp_module.can_come_back(BusAddress("feetech", where)) is comes
 
 
-def test_a_driver_without_its_watchdog_does_not_go_on(tmp_path, monkeypatch):
+def test_a_driver_without_its_watchdog_does_not_go_on(here):
     # files in the user's folder do not stand in for the watchdog's modules: it starts
     for name in ("json.py", "common.py"):
-        (tmp_path / name).write_text("raise SystemExit\n")
-    monkeypatch.chdir(tmp_path)
+        (here / name).write_text("raise SystemExit\n")
     lost = Watchdog(BusAddress("esp32", "/tmp/none"), load_joint_map("mini_pupper_2"))
     lost._process.kill()
     lost._process.wait()

@@ -330,15 +330,12 @@ def test_the_actuator_of_the_training_is_found_beside_a_policy_and_known_by_its_
     assert "not the file with which" not in " ".join(capsys.readouterr().err.split())
 
 
-def test_the_shipped_policies_find_their_servos_wherever_the_samples_are_copied(
-    tmp_path, monkeypatch
-):
+def test_the_shipped_policies_find_their_servos_wherever_the_samples_are_copied(here):
     shipped = Path(CALIBRATION).parent
-    (tmp_path / "samples").mkdir()
-    shutil.copy(CALIBRATION, tmp_path / "samples")
-    shutil.copytree(shipped / "policies", tmp_path / "samples/policies")
-    monkeypatch.chdir(tmp_path)
+    (here / "samples").mkdir()
+    shutil.copy(CALIBRATION, here / "samples")
+    shutil.copytree(shipped / "policies", here / "samples/policies")
     for folder in sorted(Path("samples/policies").iterdir()):
         policy, run = policy_at(folder)
-        servos = str(tmp_path / "samples/calibrated.yaml")
+        servos = str(here / "samples/calibrated.yaml")
         assert trained_actuator(folder, policy, run) == (servos, True)

@@ -59,13 +59,10 @@ def test_a_ratio_is_the_median_over_slices_with_their_middle_half():
     assert found["env_steps_per_s"] == pytest.approx(1 / 4)
 
 
-def test_without_a_calibration_the_sample_is_measured_and_another_name_is_kept(
-    tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
+def test_without_a_calibration_the_sample_is_measured_and_another_name_is_kept(here, monkeypatch):
     assert Path(speed.with_sample(Run()).actuator) == Path(CALIBRATION)
     assert speed.with_sample(Run(actuator="mine.yaml")).actuator == "mine.yaml"
-    monkeypatch.setattr(speed, "_SAMPLE", tmp_path / "none.yaml")
+    monkeypatch.setattr(speed, "_SAMPLE", here / "none.yaml")
     assert speed.with_sample(Run()).actuator == "paper"
     Path("calibrated.yaml").write_text("")
     assert speed.with_sample(Run()).actuator == "calibrated.yaml"

@@ -247,28 +247,22 @@ def test_the_links_inertia_is_that_of_the_bodies_whatever_else_the_model_adds():
     assert rod["a"] == pytest.approx(0.2 * 0.3**2 / 3, rel=1e-4)
 
 
-def test_a_free_air_armature_is_exported_with_a_warning_or_without_its_link(
-    capsys, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
+def test_a_free_air_armature_is_exported_with_a_warning_or_without_its_link(capsys, here):
     words = ("export", CALIBRATED, "--to", "mjcf", "--force")
     _, err = ran(capsys, *words)
     assert "counts their inertia twice" in err and "--link-inertia" in err
     links = ("--link-inertia", "LF_hip=2e-4", "LF_thigh=1e-4", "LF_calf=1e-5")
     _, err = ran(capsys, *words, *links)
     assert "twice" not in err and "taken off" in err
-    text = (tmp_path / "calibrated.xml").read_text()
+    text = (here / "calibrated.xml").read_text()
     own = load_calibration(CALIBRATED).joint("LF_hip").actuator.armature_kg_m2.value
     assert f'armature="{own - 2e-4!r}"' in text and "LF_hip 0.0002" in text
 
 
-def test_a_model_that_cannot_take_the_servos_is_refused_with_the_way_out(
-    calibration, tmp_path, capsys, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "other.xml").write_text(robot({"knee": 1e-4}))
-    (tmp_path / "heavy.xml").write_text(robot({"LF_hip": 0.02}))
-    (tmp_path / "a.urdf").write_text(
+def test_a_model_that_cannot_take_the_servos_is_refused_with_the_way_out(calibration, here, capsys):
+    (here / "other.xml").write_text(robot({"knee": 1e-4}))
+    (here / "heavy.xml").write_text(robot({"LF_hip": 0.02}))
+    (here / "a.urdf").write_text(
         '<robot name="a"><link name="b"/><link name="c"><inertial><mass value="1"/><inertia '
         'ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="LF_hip" '
         'type="revolute"><parent link="b"/><child link="c"/><limit lower="-1" upper="1" '
@@ -280,16 +274,15 @@ def test_a_model_that_cannot_take_the_servos_is_refused_with_the_way_out(
         words = ("export", CALIBRATED, "--to", "mjcf", "--model", model)
         assert cure in refused(capsys, pupper_sysid, *words)
     with pytest.raises(InputError, match="model is of"):
-        calibration.export("mjlab", tmp_path, model="other.xml")
+        calibration.export("mjlab", here, model="other.xml")
 
 
-def test_joints_that_a_model_lacks_are_named(tmp_path, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "my.xml").write_text(robot({"LF_hip": 1e-4}, actuators=""))
+def test_joints_that_a_model_lacks_are_named(here, capsys):
+    (here / "my.xml").write_text(robot({"LF_hip": 1e-4}, actuators=""))
     words = ("export", CALIBRATED, "--to", "mjcf", "--model", "my.xml", "--out", "out.xml")
     _, err = ran(capsys, *words)
     assert "my.xml has no joint LF_thigh, LF_calf" in " ".join(err.split())
-    assert "left out: LF_thigh, LF_calf" in " ".join((tmp_path / "out.xml").read_text().split())
+    assert "left out: LF_thigh, LF_calf" in " ".join((here / "out.xml").read_text().split())
     said = refused(capsys, pupper_sysid, *words, "--force", "--link-inertia", "LF_calf=1e-4")
     assert "servos go into LF_hip" in said
 

@@ -434,13 +434,10 @@ def test_the_newton_module_finds_joints_by_name_behind_a_free_base(calibration, 
         space["add_servos"](builder)
 
 
-def test_what_a_target_cannot_carry_of_a_servo_under_load_is_said_in_it(
-    capsys, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
+def test_what_a_target_cannot_carry_of_a_servo_under_load_is_said_in_it(capsys, here):
     for to in ("mjcf", "isaaclab", "mjlab", "newton"):
         run_program(capsys, pupper_sysid, "export", "xl330-m288", "--to", to, "--out", to)
-        said = " ".join((tmp_path / to).read_text().split())
+        said = " ".join((here / to).read_text().split())
         assert "not represented: friction that grows with the motor's torque" in said, to
 
 

@@ -328,10 +328,7 @@ def test_a_finished_recording_is_not_continued_and_one_without_its_footer_only_g
     assert len(load(whole).table) == rows == load(whole).metadata["completed"]["rows"]
 
 
-def test_what_cannot_be_continued_or_was_played_from_a_file_that_changed_is_refused(
-    tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
+def test_what_cannot_be_continued_or_was_played_from_a_file_that_changed_is_refused(capsys, here):
     path = Path("b.csv")
     for text, says in (
         ("time_s,x\n1,2\n", "not a recording of pupper-sysid"),

@@ -146,12 +146,11 @@ def test_the_robot_of_the_rerun_file_stands_where_its_servos_were_read(tmp_path)
         np.testing.assert_allclose(np.squeeze(values), body.position, atol=1e-6)  # 32 bit
 
 
-def test_the_command_writes_both_files_and_says_what_is_wrong(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_the_command_writes_both_files_and_says_what_is_wrong(here, capsys):
     sample = str(SAMPLES / "playback.csv")
     code, out, _ = run(capsys, "view", sample, "--rerun", "a.rrd", "--mcap", "a.mcap")
     assert code == 0 and "rerun a.rrd" in out and Path("a.mcap").stat().st_size > 1000
-    assert any(key.startswith("/robot/") for key in entities_of(tmp_path / "a.rrd"))
+    assert any(key.startswith("/robot/") for key in entities_of(here / "a.rrd"))
     for options, sentence in [
         ((), "Nothing to write"),
         (("--mcap", "a.mcap"), "exists already"),
@@ -161,23 +160,20 @@ def test_the_command_writes_both_files_and_says_what_is_wrong(tmp_path, monkeypa
         assert sentence in refused(capsys, pupper_sysid, "view", sample, *options)
 
 
-def test_a_simulated_walk_is_written_with_its_trunk_moving_as_it_walked(
-    tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
+def test_a_simulated_walk_is_written_with_its_trunk_moving_as_it_walked(here, capsys):
     policy = SAMPLES / "policies/mlp"
     words = (str(policy), "--seconds", "2", "--rerun", "w.rrd", "--mcap", "w.mcap")
     code, out, err = run_program(capsys, pupper_play, *words)
     assert code == 0 and "Wrote w.rrd" in err and "Wrote w.mcap" in err
     away = float(" ".join(out.split()).split("; ")[-1].split(" m ")[0])
     _, values = next(
-        v for k, v in entities_of(tmp_path / "w.rrd").items()
+        v for k, v in entities_of(here / "w.rrd").items()
         if k.startswith("/robot/") and k.endswith("translation") and np.ptp(v[1], axis=0).max() > 0
     )  # fmt: skip
     trunk = np.squeeze(values)
     assert len(trunk) == 100 and 0.05 < away < 0.5
     assert np.linalg.norm(trunk[-1, :2] - trunk[0, :2]) == pytest.approx(away, abs=0.03)
-    found, _ = topics_of(tmp_path / "w.mcap")
+    found, _ = topics_of(here / "w.mcap")
     times, commands = found["LF_thigh", "command_rad"]
     assert len(times) == 100 and np.ptp(commands) > 0.1
     assert np.isfinite(found["LF_thigh", "position_rad"][1]).all()
