@@ -13,7 +13,7 @@ import pytest
 
 import pupper_sysid as ps
 from pupper_sysid.cli.programs import pupper_sysid
-from support.command_line import fresh_python, run
+from support.command_line import fresh_python, ran
 from support.json_keys import DOCUMENTED, key_line
 
 SWEEP = Path("data/samples/sweep.csv")
@@ -106,8 +106,7 @@ def json_of(capsys, monkeypatch):
             return result
 
         monkeypatch.setattr(import_module(function.__module__), function.__name__, called)
-        code, out, err = run(capsys, command, recording, *words, "--json")
-        assert code == 0, err
+        out, _ = ran(capsys, command, recording, *words, "--json")
         printed, ((arguments, result),) = json.loads(out), calls
         ((own,), known) = arguments.pop("recordings"), ps.load(recording)
         assert own.sha256 == known.sha256 and own.joints == known.joints

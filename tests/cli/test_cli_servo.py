@@ -7,11 +7,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.data import SAMPLES
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.servo_fit import networks
 from pupper_sysid.sysid.servo_fit.training import Recipe
-from support.command_line import json_of, ran, run
+from support.command_line import json_of, ran, refused, run
 
 pytestmark = pytest.mark.usefixtures("here", "unexamined")
 
@@ -91,8 +92,8 @@ def test_a_second_model_takes_a_free_name_and_an_old_one_is_never_replaced(capsy
     for _ in range(2):
         assert run(capsys, "fit-servo", log, "--arch", "fir")[0] == 0
     assert Path("servo/contract.json").exists() and Path("servo-2/contract.json").exists()
-    code, _, err = run(capsys, "fit-servo", log, "--arch", "fir", "--out", "servo")
-    assert code == 2 and "--force" in err
+    again = ("fit-servo", log, "--arch", "fir", "--out", "servo")
+    assert "--force" in refused(capsys, pupper_sysid, *again)
 
 
 def test_a_fit_repeats_under_its_seed_and_sees_nothing_of_the_test_loop(capsys, quick):
@@ -115,17 +116,14 @@ def test_one_group_to_learn_from_is_said(capsys):
 
 
 def test_a_model_for_another_rate_or_joint_is_refused_where_it_would_be_used(capsys, quick):
-    assert run(capsys, "fit-servo", playback("log.csv"), "--arch", "fir")[0] == 0
-    slow = playback("slow.csv", step_s=0.08)
-    code, _, err = run(capsys, "compare", slow, "--models", "servo")
-    assert code == 2 and "every 40.0 ms" in err and "fit again" in err
-    other = (SAMPLES / "playback.csv", "--joints", "LF_calf")
-    code, _, err = run(capsys, "compare", *other, "--models", "servo")
-    assert code == 2
-    code, _, err = run(
-        capsys, "compare", SAMPLES / "playback.csv", "--models", SAMPLES / "calibrated.yaml"
-    )
-    assert code == 2 and "only (--joints)" in err and "has no joint" in err
+    ran(capsys, "fit-servo", playback("log.csv"), "--arch", "fir")
+    slow, other = playback("slow.csv", step_s=0.08), SAMPLES / "playback.csv"
+    for words, says in (
+        ((slow, "--models", "servo"), ("every 40.0 ms", "fit again")),
+        ((other, "--models", SAMPLES / "calibrated.yaml"), ("only (--joints)", "has no joint")),
+    ):
+        said = refused(capsys, pupper_sysid, "compare", *words)
+        assert all(part in said for part in says), said
 
 
 # ----- a fleet's results go beside its folder, by whatever name the folder is given

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.cli.programs.pupper_sysid import main
 from pupper_sysid.hardware.feetech import STS3215
 from pupper_sysid.hardware.joint_map import load_joint_map
@@ -20,7 +21,7 @@ from pupper_sysid.sysid.doctor import checks as joints
 from pupper_sysid.sysid.doctor.examination import examine
 from pupper_sysid.sysid.plan.plan_file import load_plan
 from pupper_sysid.sysid.recordings.files import load
-from support.command_line import json_of, ran, run
+from support.command_line import json_of, ran, refused, run
 from support.json_keys import DOCUMENTED, key_line
 from support.planned_servos import fit_of_half_width
 from support.servo_servers import on_a_port
@@ -33,8 +34,7 @@ def test_a_planned_sweep_that_was_cut_short_is_continued_unless_its_plan_has_cha
     cut(Path("a.csv"), 0.6)
     plan = Path("plan.yaml").read_bytes()
     change_plan()
-    code, _, err = run(capsys, "sweep", "--resume", "a.csv")
-    assert code == 2 and "another plan" in err
+    assert "another plan" in refused(capsys, pupper_sysid, "sweep", "--resume", "a.csv")
     Path("plan.yaml").write_bytes(plan)
     ran(capsys, "sweep", "--resume", "a.csv")
     again = load("a.csv")

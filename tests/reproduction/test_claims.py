@@ -45,7 +45,7 @@ from pupper_sysid.sysid.servo_fit.training import Recipe
 from reproduction import servos as servo_claims
 from reproduction.evidence import Claim, PolicyEvidence, ScalePoint, Training, imitated, training
 from reproduction.policies import judge
-from support.command_line import refused, run_program
+from support.command_line import json_of, ran, refused
 from support.walks import walked
 
 CURVE = np.random.default_rng(0).random((50, 3))
@@ -358,8 +358,7 @@ def gathered(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, gathered):
-    code, out, err = run_program(capsys, program, *ARGUMENTS, "--json")
-    assert code == 0, err
+    out, err = ran(capsys, *ARGUMENTS, "--json", program=program)
     assert " ".join(err.split()).count("they take the numbers of") == 1, "said once, not by policy"
     found = json.loads(out)
     assert set(found["claims"][0]) == {
@@ -400,13 +399,11 @@ def test_the_page_has_every_claim_and_its_pictures(capsys, tmp_path, gathered):
 
 def test_claims_that_another_page_judges_otherwise_are_listed_beside(capsys, gathered, monkeypatch):
     monkeypatch.setattr("reproduction.page._draw", lambda *evidence: [])  # drawn above
-    code, out, err = run_program(capsys, program, *ARGUMENTS, "--json", "--out", "a")
-    assert code == 0, err
-    first = {c["id"]: c for c in json.loads(out)["claims"]}
+    found = json_of(capsys, *ARGUMENTS, "--out", "a", program=program)
+    first = {c["id"]: c for c in found["claims"]}
     assert first["C1"]["verdict"] == "holds"
     table = Path("a/tables/claims.csv")
-    code, _, err = run_program(capsys, program, *ARGUMENTS, "--beside", table, "--out", "b")
-    assert code == 0, err
+    ran(capsys, *ARGUMENTS, "--beside", table, "--out", "b", program=program)
     alike = Path("b/claims.md").read_text()
     assert "Every claim that both pages have is judged alike." in alike
     assert not Path("b/tables/beside.csv").exists()
@@ -416,8 +413,7 @@ def test_claims_that_another_page_judges_otherwise_are_listed_beside(capsys, gat
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    code, _, err = run_program(capsys, program, *ARGUMENTS, "--beside", table, "--out", "c")
-    assert code == 0, err
+    ran(capsys, *ARGUMENTS, "--beside", table, "--out", "c", program=program)
     (row,) = csv.DictReader(Path("c/tables/beside.csv").open())
     assert (row["id"], row["verdict"], row["verdict_there"]) == (
         "C1", "holds", "does not hold here"

@@ -1,6 +1,5 @@
 """Calibrations beside the truth of an emulated robot."""
 
-import json
 import math
 
 import numpy as np
@@ -25,7 +24,7 @@ from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
 from pupper_sysid.sysid.sweep.excitation import plan
 from pupper_sysid.sysid.sweep.recorder import record
-from support.command_line import run
+from support.command_line import json_of, ran
 from support.json_keys import key_line
 from support.package import ROOT
 from support.refusals import assert_each_refused
@@ -174,11 +173,9 @@ def test_compare_truth_prints_a_table_and_its_keys_are_the_documented_ones(swept
     recording = swept[2].path
     made = tmp_path / "calibrated.yaml"
     with_numbers().save(made)
-    code, out, err = run(capsys, "compare-truth", recording, made)
-    assert code == 0, err
+    out, err = ran(capsys, "compare-truth", recording, made)
     assert "dead time, ms" in out and "hold the truth" in out and "not compared" in err
-    code, out, err = run(capsys, "compare-truth", recording, made, "--json")
-    keys = key_line(json.loads(out))
+    keys = key_line(json_of(capsys, "compare-truth", recording, made))
     assert f"| `compare-truth` | `{keys}` |" in (ROOT / "docs/formats.md").read_text()
 
 

@@ -1,7 +1,5 @@
 """SINDy finds the terms of a known equation, their numbers, and a real servo's motion."""
 
-import json
-
 import numpy as np
 import pytest
 from scipy.signal import lsim
@@ -16,7 +14,7 @@ from pupper_sysid.servo_models.sparse_equation import (
 from pupper_sysid.sysid.fit.run import free_run
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.sparse import LINEAR, PULLS, equation_model, fit_equations, sparse_equations
-from support.command_line import run
+from support.command_line import json_of
 from support.refusals import assert_each_refused
 from support.runs import run_of
 
@@ -216,9 +214,7 @@ def test_one_frequency_is_judged_in_sample_and_says_so():
 
 
 def test_the_command_prints_one_object(capsys, hip):
-    code, out, said = run(capsys, "sindy", hip, "--json")
-    assert code == 0, said
-    (joint,) = json.loads(out)["joints"].values()
+    (joint,) = json_of(capsys, "sindy", hip)["joints"].values()
     # quantum 5.7 / sqrt(12), reading noise 3, and 0.8 ms of poll jitter and its dating at up to
     # 7 rad/s: 3.4 to 6.5 mrad; the emulated set-point's speed limit is not in the library
     assert 3e-3 < joint["scores"]["rmse_fresh_rad"] < 9e-3
