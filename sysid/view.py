@@ -53,7 +53,7 @@ class Channel:
 
 def channels(recording: Recording) -> list[Channel]:
     """All channels of a recording, joint by joint."""
-    channels_of = []
+    series = []
     for joint in in_order(list(recording.table["joint"].unique())):
         rows = recording.table.loc[recording.table["joint"] == joint]
         rows = rows.iloc[np.lexsort([rows["send_time_s"], rows["trial"]])]
@@ -63,16 +63,14 @@ def channels(recording: Recording) -> list[Channel]:
                 f"{recording.name}, {joint}: its trials overlap in time, and a viewer has one time "
                 "axis. View a recording whose times go on from trial to trial."
             )
-        channels_of.append(Channel(joint, "command_rad", sent, rows["command_rad"].to_numpy(float)))
-        channels_of.append(
-            Channel(joint, "position_rad", read, rows["position_rad"].to_numpy(float))
-        )
-        channels_of.append(Channel(joint, "reading_age_s", read, _ages(recording, joint)))
+        series.append(Channel(joint, "command_rad", sent, rows["command_rad"].to_numpy(float)))
+        series.append(Channel(joint, "position_rad", read, rows["position_rad"].to_numpy(float)))
+        series.append(Channel(joint, "reading_age_s", read, _ages(recording, joint)))
         for name in READ:
             values = rows[name].to_numpy(float) if name in rows else np.array([])
             if np.isfinite(values).any():
-                channels_of.append(Channel(joint, name, read, values))
-    return channels_of
+                series.append(Channel(joint, name, read, values))
+    return series
 
 
 def guard_events(recording: Recording, last_s: float) -> list[tuple[float, str]]:
@@ -169,27 +167,22 @@ class TickChannels:
         values = self._values(rows)
         age = self._ages(rows[:, 0], values["read_time_s"], values["position_rad"])
         sent = rows[:, 1]
-        channels = []
+        series = []
         for k, joint in enumerate(self._joints):
             read = values["read_time_s"][:, k]
             parts = {"position_rad": values["position_rad"][:, k], "reading_age_s": age[:, k]}
-            columns = [
-                (name, read, joint_values, np.isfinite(read))
-                for name, joint_values in parts.items()
-            ]
+            columns = [(name, read, value, np.isfinite(read)) for name, value in parts.items()]
             command = values["command_rad"][:, k]
             columns.insert(
                 0, ("command_rad", sent, command, np.isfinite(sent) & np.isfinite(command))
             )
             for name in READ:
-                joint_values = values[name][:, k]
-                columns.append(
-                    (name, read, joint_values, np.isfinite(read) & np.isfinite(joint_values))
-                )
-            channels += [
+                value = values[name][:, k]
+                columns.append((name, read, value, np.isfinite(read) & np.isfinite(value)))
+            series += [
                 Channel(joint, n, t[here], v[here]) for n, t, v, here in columns if here.any()
             ]
-        return channels
+        return series
 
     def poses(self, rows: Array) -> tuple[Array, Array, Array]:
         """Latest reading of each joint at each tick, held; NaN before the first.
@@ -251,11 +244,11 @@ def write_rerun(
     """Write a recording as a Rerun file, with the robot's `bodies` at times `time_s` [s]."""
     refuse_overwrite(path, force)
     stream = RerunStream(recording.sha256)
-    recorded = channels(recording)
+    series = channels(recording)
     with replacing(path, force) as temporary:
         stream.save(temporary)
-        last_s = max(channel.time_s[-1] for channel in recorded)
-        stream.add(recorded, guard_events(recording, last_s))
+        last_s = max(channel.time_s[-1] for channel in series)
+        stream.add(series, guard_events(recording, last_s))
         stream.show(bodies)
         stream.move(time_s, bodies)
         stream.close()
@@ -288,10 +281,10 @@ class RerunStream:
         except (RuntimeError, ValueError) as error:
             raise InputError(f"{url} is no address of a Rerun viewer: {error}.") from error
 
-    def add(self, recorded: Sequence[Channel], events: Sequence[tuple[float, str]] = ()) -> None:
+    def add(self, series: Sequence[Channel], events: Sequence[tuple[float, str]] = ()) -> None:
         """Write what follows: channels, and sentences with their times [s]."""
         rr = self._rr
-        for channel in recorded:
+        for channel in series:
             self._send(
                 f"joints/{channel.joint}/{channel.name}", channel.time_s,
                 rr.Scalars.columns(scalars=channel.values),
@@ -355,8 +348,8 @@ def write_mcap(recording: Recording, path: Path, force: bool = False) -> None:
     refuse_overwrite(path, force)
     file = io.BytesIO()
     stream = McapStream(file)
-    recorded = channels(recording)
-    stream.add(recorded, guard_events(recording, max(channel.time_s[-1] for channel in recorded)))
+    series = channels(recording)
+    stream.add(series, guard_events(recording, max(channel.time_s[-1] for channel in series)))
     stream.close()
     write_bytes(path, file.getvalue(), force)
 
@@ -375,9 +368,9 @@ class McapStream:
         self._schemas = {k: self._writer.register_msgdef(k, t) for k, t in _DEFINITIONS.items()}
         self._shift_ns: int | None = None
 
-    def add(self, recorded: Sequence[Channel], events: Sequence[tuple[float, str]] = ()) -> None:
+    def add(self, series: Sequence[Channel], events: Sequence[tuple[float, str]] = ()) -> None:
         """Write what follows: channels, and sentences with their times [s]."""
-        messages = sorted(_messages(recorded, events), key=lambda m: m[0])
+        messages = sorted(_messages(series, events), key=lambda m: m[0])
         if messages and self._shift_ns is None:
             self._shift_ns = -min(0, messages[0][0])  # a time stamp of MCAP has no sign
         for time_ns, topic, kind, content in messages:
@@ -394,11 +387,9 @@ class McapStream:
         self._writer.finish()
 
 
-def _messages(
-    recorded: Sequence[Channel], events: Sequence[tuple[float, str]]
-) -> Iterator[_Message]:
+def _messages(series: Sequence[Channel], events: Sequence[tuple[float, str]]) -> Iterator[_Message]:
     joined: dict[tuple[int, str], dict[str, float]] = {}
-    for channel in recorded:
+    for channel in series:
         times_ns = np.rint(channel.time_s * 1e9).astype(np.int64).tolist()
         for time_ns, value in zip(times_ns, channel.values.tolist(), strict=True):
             if topic := _TOPICS.get(channel.name):

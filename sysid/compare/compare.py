@@ -153,11 +153,7 @@ class Comparison(Result):
 
     def reading_notes(self) -> list[str]:
         """How readings were predicted, one sentence per rule, and which offsets were taken out."""
-        known = [
-            j
-            for j, runs_of_joint in self.runs.items()
-            if all(r.offset_known for r in runs_of_joint)
-        ]
+        known = [j for j, runs in self.runs.items() if all(r.offset_known for r in runs)]
         said = [f"{', '.join(known)}: no offset is taken out, the load is known."] if known else []
         if len(known) < len(self.data.joints):
             said.append(OFFSET_RULE)
@@ -165,23 +161,15 @@ class Comparison(Result):
         if len(rules) > 1:  # calibrations say when readings were measured
             rules = rules[1:]
         return list(
-            dict.fromkeys(
-                [
-                    *said,
-                    *(text for runs_of_joint in rules for text in predict.in_words(runs_of_joint)),
-                ]
-            )
+            dict.fromkeys([*said, *(text for rule in rules for text in predict.in_words(rule))])
         )
 
     def plot(self, joints: Sequence[str] | None = None) -> Figure:
         """Figure of the models in free run beside commands and readings, a panel per joint."""
         from pupper_sysid.sysid.servo_fit.figures import free_run_figure
 
-        every = [compared_run for runs in self.runs.values() for compared_run in runs]
-        gains, loads = (
-            {compared_run.run.p_gain for compared_run in every},
-            [compared_run.trial.load for compared_run in every],
-        )
+        every = [r for runs in self.runs.values() for r in runs]
+        gains, loads = {r.run.p_gain for r in every}, [r.trial.load for r in every]
         if not self.data.runs or len(gains) > 1 or any(loads):
             return predict.run_figure(self.runs, self.run_tracks, joints)
         errors = {name: model.errors for name, model in self.models.items()}
@@ -327,17 +315,17 @@ def compare(
 def _scored(predictions: Mapping[str, predict.Prediction], seed: int) -> ComparedModel:
     """Scores of a calibration's predictions by joint."""
     errors = {}
-    for joint, prediction in predictions.items():
-        e = prediction.errors()
+    for joint, p in predictions.items():
+        e = p.errors()
         nothing = np.zeros(len(e["counted"]))
         errors[joint] = scores.Errors(
-            e["counted"], prediction.one_step(), nothing, prediction.blocks(), e["held"], e["raw"]
+            e["counted"], p.one_step(), nothing, p.blocks(), e["held"], e["raw"]
         )
     return ComparedModel.scored(
         scores.ModelScores.of(errors, seed),
-        {joint: prediction.offset_rad for joint, prediction in predictions.items()},
-        {joint: prediction.age_spread_rad() for joint, prediction in predictions.items()},
-        {joint: prediction.rule for joint, prediction in predictions.items()},
+        {joint: p.offset_rad for joint, p in predictions.items()},
+        {joint: p.age_spread_rad() for joint, p in predictions.items()},
+        {joint: p.rule for joint, p in predictions.items()},
     )
 
 
@@ -355,9 +343,9 @@ def _fitted_here(name: str, hashes: Sequence[str], recordings: Sequence[Recordin
 def _loaded(runs: Mapping[str, Sequence[predict.ComparedRun]]) -> bool:
     """Whether runs differ in gain, or carry a load."""
     return any(
-        compared_run.trial.load is not None or compared_run.run.p_gain != every[0].run.p_gain
+        r.trial.load is not None or r.run.p_gain != every[0].run.p_gain
         for every in runs.values()
-        for compared_run in every
+        for r in every
     )
 
 
@@ -368,10 +356,7 @@ def _on_ticks(
     tracks: Sequence[NDArray[np.float64]],
 ) -> list[NDArray[np.float64]]:
     """Tracks of physics steps at the ticks of the data's runs, which may join trials."""
-    place = {
-        (compared_run.recording, compared_run.trial.number): n
-        for n, compared_run in enumerate(runs)
-    }
+    place = {(r.recording, r.trial.number): n for n, r in enumerate(runs)}
     positions = []
     for run in data.runs[joint]:
         position = np.full(len(run.command_rad) + 1, np.nan)
@@ -537,10 +522,7 @@ def four_way(
     fitted |= {arch.upper(): fit.scored[arch] for arch, fit in fits.items()}
     return Comparison(
         models={PUBLISHED: ComparedModel.scored(published, offset, {})}
-        | {
-            name: ComparedModel.scored(model_scores, {}, {})
-            for name, model_scores in fitted.items()
-        },
+        | {name: ComparedModel.scored(of_model, {}, {}) for name, of_model in fitted.items()},
         readings=rules,
         persistence_rmse_rad={j: s.persistence_rmse_rad for j, s in mlp.joints.items()},
         repeatability_rad={j: s.repeatability_rad for j, s in mlp.joints.items()},

@@ -199,13 +199,13 @@ def side_by_side(
     fitted: dict[str, dict[str, list[Fitted]]] = {joint: {} for joint in trials}
     results: dict[str, JointCalibrationResult] = {}
     with Workers(workers, __name__) as pool:
-        for joint, joint_trials in trials.items():
+        for joint, parts in trials.items():
             prior = None if priors is None else priors.get(joint)
             pool.submit(
                 (joint, PREPARATION),
                 prepare_joint,
                 joint,
-                joint_trials,
+                parts,
                 seed,
                 free_air[joint],
                 None,
