@@ -226,7 +226,7 @@ class Followed:
         """Acceleration that the readings reach: about the limit of a servo that is often at it."""
         reached = [np.zeros(1)]
         for a, b in zip(self.starts[:-1], self.starts[1:], strict=True):
-            grid = np.arange(self.time_s[a], self.time_s[b - 1], _ACCELERATION_OVER_S)
+            grid = np.arange(float(self.time_s[a]), float(self.time_s[b - 1]), _ACCELERATION_OVER_S)
             position = np.interp(grid, self.time_s[a:b], self.position_rad[a:b])
             reached.append(np.abs(np.diff(position, 2)) / _ACCELERATION_OVER_S**2)
         return float(np.quantile(np.concatenate(reached), 0.95)) + 1e-9
