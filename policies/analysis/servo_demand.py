@@ -10,9 +10,8 @@ inertia and friction, so at each instant it would need the torque
 with a prime on the numbers of that servo, whose motor has `effort_limit' - back_emf' * speed` left
 in the direction of motion. A joint is *short* while it needs more than that (by 5 %), or turns
 faster than the top speed. A policy that drives its servos into their limits is short on any servo,
-so the same share of the servos that walked stands beside it, and the difference counts. Forces and
-speeds are those at the ends of control steps, accelerations means over them: peaks of impacts
-between are not seen.
+so the share is compared with that of the servos that walked. Forces and speeds are those at the
+ends of control steps, accelerations means over them: peaks of impacts between are not seen.
 
 The dead time that a gait needs is the longest at which it still walks: the servos' own and more,
 until fewer than 90 % of the robots that stay up otherwise do. Last, the policy walks on the servo

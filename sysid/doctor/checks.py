@@ -142,14 +142,18 @@ def findings(recorded: Sequence[Trial]) -> list[Finding]:
         if check in _SERVOS_ALONE and any(f.code == "held_by_friction" for f in found):
             continue
         step = quantum(trials) if step < 0 else step
-        points = by_operating_point(trials) if check in _OF_ONE_SERVO else [trials]
-        for point in points:
-            known = {finding.code for finding in found} if len(points) > 1 else set()
-            found += [finding for finding in check(point, step) if finding.code not in known]
+        if check in _OF_ONE_SERVO:
+            by_code: dict[str, Finding] = {}
+            for point in _operating_points(trials):
+                for finding in check(point, step):
+                    by_code.setdefault(finding.code, finding)
+            found += by_code.values()
+        else:
+            found += check(trials, step)
     return found
 
 
-def by_operating_point(trials: Sequence[Trial]) -> list[list[Trial]]:
+def _operating_points(trials: Sequence[Trial]) -> list[list[Trial]]:
     """The trials in groups of one P gain and one load."""
     points: dict[str, list[Trial]] = {}
     for trial in trials:

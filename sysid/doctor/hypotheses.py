@@ -282,11 +282,8 @@ def _at_once(trials: Sequence[Trial], base: Explanation, servo: Servo) -> Findin
 def _loose(base: Explanation, servo: Servo) -> list[Finding]:
     if base.explained < _LOOSE:
         return [Finding("loosely_related", CARE, {"percent": 100 * base.explained})]
-    return (
-        [Finding("no_one_lag", CARE)]
-        if base.explained - 1 + servo.unexplained > _NO_ONE_LAG
-        else []
-    )
+    several_lags = base.explained - (1 - servo.unexplained) > _NO_ONE_LAG
+    return [Finding("no_one_lag", CARE)] if several_lags else []
 
 
 def _odd_scale(joint: Followed, base: Explanation, best: Relation) -> list[Finding]:
