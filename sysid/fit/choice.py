@@ -404,11 +404,9 @@ def choose(ready: PreparedJoint, fitted: Sequence[Fitted]) -> Choice:
 def _as_repeats(fitted: Fitted, repeats: Repeats, rng: np.random.Generator) -> Fitted:
     """The fit with draws as wide as recordings differ, in the numbers that it has, too."""
     assert fitted.draws is not None
-    spread = dict(zip(repeats.names, repeats.for_the_next, strict=True))
-    sd = np.array([spread.get(name, 0.0) for name in fitted.structure.names])
-    if not sd.any():
-        return fitted
-    draws = fitted.draws + sd * rng.standard_normal(fitted.draws.shape)
+    shift = dict(zip(repeats.names, repeats.of_the_next(rng, len(fitted.draws)).T, strict=True))
+    none = np.zeros(len(fitted.draws))
+    draws = fitted.draws + np.array([shift.get(name, none) for name in fitted.structure.names]).T
     return replace(fitted, draws=np.clip(draws, *fitted.structure.box))
 
 

@@ -3,7 +3,7 @@
 A servo is not the same on two days: its battery, temperature and grease are not, nor may be its
 gain. Each recording is fitted apart, from the fit to all of them, and compared with the others by
 normal approximations of their likelihoods. Where one differs, the one number that explains most of
-it is named, with the factor between it and the others. The variance of each number between
+it is named, with the factor between it and the others. What each number may vary by between
 recordings widens its interval, which then is for the next recording, too.
 """
 
@@ -21,7 +21,8 @@ from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.noise import noise_by_run, temperature_of
 from pupper_sysid.sysid.fit.run import fresh_residuals
 from pupper_sysid.sysid.fit.search import Fit, Problem, curvature, local, refine
-from pupper_sysid.sysid.fit.servo_prior import PER_INERTIA
+from pupper_sysid.sysid.fit.servo_prior import PER_INERTIA, UNIT_SD
+from pupper_sysid.sysid.fit.structure import SERVO_TERMS, Structure
 
 _ITERATIONS = 20  # from a fit to recordings that may differ much
 _STEP = 0.03  # of slopes and curvatures: over a likely error, not of one kink
@@ -37,6 +38,9 @@ _CHANGES = np.linspace(-1.2, 1.2, 121)
 """Logarithms of factors that are tried, from 0.3 to 3.3."""
 _GRAIN = 0.006  # standard deviation of one of them about the true factor
 _MOST = 12  # recordings that are fitted apart
+_SPREADS = np.geomspace(1 / 150, 2.0, 60)
+"""Standard deviations between recordings that are tried, in those between units: from a thousandth
+of a number, which no recording shows, to more than units of one servo differ by."""
 GAINS = ("stiffness_per_s2", "damping_per_s")
 """Numbers that the P gain and the supply voltage scale together."""
 
@@ -78,21 +82,31 @@ class Repeats:
     ----------
     names : tuple of str
         Fitted numbers.
-    between : ndarray, shape (parameters,)
-        Standard deviation between recordings, of fitted coordinates.
+    spreads : ndarray, shape (parameters, spreads)
+        Standard deviations between recordings that are possible, of fitted coordinates.
+    probabilities : ndarray, shape (parameters, spreads)
     recordings : int
     differences : tuple of Difference
     """
 
     names: tuple[str, ...]
-    between: NDArray[np.float64]
+    spreads: NDArray[np.float64]
+    probabilities: NDArray[np.float64]
     recordings: int
     differences: tuple[Difference, ...]
 
     @property
-    def for_the_next(self) -> NDArray[np.float64]:
-        """Standard deviation of the next recording about the mean of these, without its noise."""
-        return self.between * np.sqrt(1.0 + 1.0 / self.recordings)
+    def between(self) -> NDArray[np.float64]:
+        """Medians of the standard deviations, (parameters,)."""
+        half = (self.probabilities.cumsum(axis=1) < 0.5).sum(axis=1)
+        return np.take_along_axis(self.spreads, half[:, None], axis=1)[:, 0]
+
+    def of_the_next(self, rng: np.random.Generator, draws: int) -> NDArray[np.float64]:
+        """Distance of the next recording from the mean of these, (draws, parameters)."""
+        chance = rng.random((draws, len(self.names), 1))
+        drawn = (self.probabilities.cumsum(axis=1)[:, :-1] < chance).sum(axis=2)
+        spread = np.take_along_axis(self.spreads[None], drawn[:, :, None], axis=2)[:, :, 0]
+        return spread * np.sqrt(1.0 + 1.0 / self.recordings) * rng.standard_normal(drawn.shape)
 
 
 def compare_repeats(
@@ -119,7 +133,9 @@ def compare_repeats(
         difference = _difference(sources[k], apart[k], others)
         named += [difference] if difference is not None else []
     named.sort(key=lambda d: -d.nats)
-    return Repeats(structure.names, _between(apart), len(sources), tuple(named))
+    points = np.array([one.point for one in apart])
+    variances = np.array([np.diag(np.linalg.inv(one.precision)) for one in apart])
+    return repeats_of(points, variances, structure, tuple(named))
 
 
 @dataclass(frozen=True)
@@ -206,20 +222,39 @@ def _difference(source: str, one: _Apart, others: Sequence[_Apart]) -> Differenc
     return Difference(source, name, factor, float(nats[name]))
 
 
-def _between(apart: Sequence[_Apart]) -> NDArray[np.float64]:
-    """Standard deviation between recordings by the method of moments.
+def repeats_of(
+    points: NDArray[np.float64],
+    variances: NDArray[np.float64],
+    structure: Structure,
+    differences: tuple[Difference, ...] = (),
+) -> Repeats:
+    """How widely numbers vary between recordings, from fits to each alone.
+
+    A moment estimate (DerSimonian and Laird's) is none half of the time if there are two
+    recordings: intervals with it hold 65 % of the next ones if numbers vary by three standard
+    errors. Here every size of the variation (`_SPREADS`) is as likely as any other before the
+    recordings are seen, and the mean of all recordings is integrated out.
+
+    `points`, `variances`: of the fitted coordinates, (recordings, parameters).
 
     References
     ----------
-    DerSimonian, R. and Laird, N. (1986). Meta-analysis in clinical trials. Controlled Clinical
-    Trials 7: 177–188.
+    Gelman, A. (2006). Prior distributions for variance parameters in hierarchical models. Bayesian
+    Analysis 1: 515–534, section 2.
     """
-    values = np.array([one.point for one in apart])
-    weight = 1.0 / np.array([np.diag(np.linalg.inv(one.precision)) for one in apart])
-    total = weight.sum(axis=0)
-    mean = (weight * values).sum(axis=0) / total
-    spread = (weight * (values - mean) ** 2).sum(axis=0) - (len(values) - 1)
-    return np.sqrt(np.maximum(spread / (total - (weight**2).sum(axis=0) / total), 0.0))
+    units = [
+        UNIT_SD if p.logarithmic
+        else p.marginal_sd if np.isfinite(p.marginal_sd) else SERVO_TERMS[p.name].prior_sd
+        for p in structure.parameters
+    ]  # fmt: skip
+    spreads = np.array(units)[:, None] * _SPREADS
+    weight = 1.0 / (variances[:, :, None] + spreads**2)
+    mean = (weight * points[:, :, None]).sum(axis=0) / weight.sum(axis=0)
+    cost = np.log(weight.sum(axis=0)) - np.log(weight).sum(axis=0)
+    cost += (weight * (points[:, :, None] - mean) ** 2).sum(axis=0)
+    likelihood = np.exp(0.5 * (cost.min(axis=1, keepdims=True) - cost))
+    probabilities = likelihood / likelihood.sum(axis=1, keepdims=True)
+    return Repeats(structure.names, spreads, probabilities, len(points), differences)
 
 
 def by_number(repeats: Repeats | None) -> dict[str, float]:

@@ -25,7 +25,7 @@ PER_INERTIA = ("stiffness_per_s2", "damping_per_s", "friction_rad_s2", "effort_r
 """Numbers of a fit that an unknown inertia divides."""
 
 _AT_GAIN = ("stiffness_per_s2", "damping_per_s", "stiffness", "damping")
-_UNIT_SD = 0.15
+UNIT_SD = 0.15
 """Of the logarithm of a number, between units: a tenth in stall torques and speeds of one batch of
 hobby servos (the default spread in training), more between batches. With 20 s of one joint of an
 SO-101 and the four others as the prior, errors on a chirp are 0.80 to 1.31 of those with 60 s."""
@@ -85,7 +85,7 @@ def servo_prior(
             for row, link in zip(rows, links, strict=True)
             if name in row
         ]
-        spread = _DEAD_TIME_SD if name == "dead_time_s" else _UNIT_SD
+        spread = _DEAD_TIME_SD if name == "dead_time_s" else UNIT_SD
         logarithms[name] = _pooled(other_units, spread)
     shared = math.sqrt((_LINK_SD**2 * _WEIGHT + sum(x * x for x in links)) / (
         _WEIGHT + len(links) - 1

@@ -8,7 +8,7 @@ import pytest
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
-from pupper_sysid.sysid.fit.repeats import Repeats, compare_repeats
+from pupper_sysid.sysid.fit.repeats import Repeats, compare_repeats, repeats_of
 from pupper_sysid.sysid.fit.run import prepare
 from pupper_sysid.sysid.fit.search import Problem, refine
 from pupper_sysid.sysid.fit.structure import SIMULATED, candidate
@@ -59,7 +59,27 @@ def test_one_recording_has_nothing_to_be_compared_with():
 def test_recordings_of_one_servo_agree():
     repeats = compared(recorded("monday", 0), recorded("tuesday", 1), recorded("walk", 2))
     assert repeats is not None and repeats.differences == ()
-    assert repeats.for_the_next[:-1].max() < 0.05  # a tenth would be seen
+    assert repeats.between[:-1].max() < 0.05  # a tenth would be seen
+
+
+@pytest.mark.parametrize("recordings", [2, 3, 5])
+@pytest.mark.parametrize("spread", [0.0, 0.01, 0.03, 0.1])
+def test_intervals_hold_the_next_recording_however_widely_recordings_vary(recordings, spread):
+    rng, structure, error = np.random.default_rng(1), candidate(SIMULATED[0]), 0.005
+    kept, widths = [], []
+    for _ in range(200):
+        truths = spread * rng.standard_normal((recordings + 1, len(structure.names)))
+        points = truths[:-1] + error * rng.standard_normal((recordings, len(structure.names)))
+        repeats = repeats_of(points, np.full(points.shape, error**2), structure)
+        pooled = error / np.sqrt(recordings) * rng.standard_normal((400, points.shape[1]))
+        draws = points.mean(axis=0) + pooled + repeats.of_the_next(rng, 400)
+        low, high = np.quantile(draws, [0.05, 0.95], axis=0)
+        kept.append(((low <= truths[-1]) & (truths[-1] <= high))[:-1])  # without the offset
+        widths.append((high - low)[:-1])
+    assert np.mean(kept) >= 0.75  # a moment estimate: 0.65 of two recordings
+    # 3.3 standard deviations of the next value, and what so few recordings leave open of them
+    next_sd = np.hypot(spread * np.sqrt(1 + 1 / recordings), error)
+    assert np.median(widths) < {2: 3, 3: 1.7, 5: 1.4}[recordings] * 3.29 * next_sd
 
 
 @pytest.mark.parametrize(
@@ -80,5 +100,5 @@ def test_the_recording_that_differs_is_named_with_its_number_and_the_factor(chan
     assert worst.factor.low - 0.03 <= 0.8 <= worst.factor.high + 0.03
     place = repeats.names.index("dead_time_s" if "dead" in named else
                                 "stiffness_per_s2" if "gains" in named else named)  # fmt: skip
-    assert repeats.for_the_next[place] > 0.05
+    assert repeats.between[place] > 0.05
     assert "tuesday differs from the other recordings" in worst.sentence("knee")
