@@ -44,16 +44,13 @@ def test_a_chip_on_the_simulated_trunk_tells_tilt_and_turn_with_the_right_signs(
         np.testing.assert_allclose(sample.rate_rad_s, 0.3 * np.array(axis), atol=1e-12)
 
 
-def test_the_chips_numbers_come_back_from_a_sample_in_words_of_a_16384th_g_and_a_16th_degree():
+def test_the_chips_numbers_come_back_in_words_of_a_16384th_g_and_their_ends_are_marked():
     raw = np.array([0.25, -0.5, -1.25, 30.0, -60.0, 7.5])
     sample = from_chip(0.0, raw)
     assert sample is not None
     np.testing.assert_allclose(to_chip(sample), raw, rtol=1e-15)
     words = as_words(np.array([0.4 / 16384, 0.6 / 16384, -1.0, 0.03, 0.04, -0.1]))
     np.testing.assert_array_equal(words, [0, 1 / 16384, -1, 0, 1 / 16, -2 / 16])
-
-
-def test_a_number_at_the_end_of_its_range_is_marked():
     for g in (1.99, -1.99, 2.3, -2.3):
         sample = from_chip(0.0, as_words(np.array([0.0, g, -1.0, 0.0, 0.0, 0.0])))
         assert sample is not None and sample.clipped is (abs(g) > 2)

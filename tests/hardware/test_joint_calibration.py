@@ -60,16 +60,13 @@ def test_measurements_that_make_no_map_are_refused():
     assert_each_refused(cases, lambda measured: jc.calibrated(PRESET.file, measured, DATE))
 
 
-def test_too_small_a_travel_is_refused_in_proportion_to_the_encoder():
+def test_too_small_a_travel_is_refused_and_one_over_the_encoders_end_until_it_is_forgotten():
     for encoder, least in ((1024, 40), (4096, 160)):
         middle = encoder // 2
         assert "did not move from count" in refusal(travel_of(middle, encoder=encoder))
         short = travel_of(middle, middle + least - 1, encoder=encoder)
         assert f"{least} are the least" in refusal(short)
         assert not refusal(travel_of(middle, middle + least, encoder=encoder))
-
-
-def test_a_travel_over_the_end_of_the_encoder_is_refused_until_it_is_forgotten():
     travel = travel_of(3900, 4080, 20, 300, encoder=4096)
     assert "horn must be mounted nearer to the middle" in refusal(travel)
     travel.forget(0)

@@ -48,14 +48,6 @@ def test_a_slow_adapter_is_waited_for_and_named():
     assert said and "later than bytes and servos need" in said
 
 
-def test_a_fast_adapter_is_not_called_slow():
-    with on_a_port(still_servos(ids=[4])) as server:
-        bus = FeetechBus(server.device, 1_000_000, map_of(4))
-        bus.line.latency_s = 0.0004
-        assert slow_adapter(bus.line) is None
-        bus.close()
-
-
 def test_one_reply_that_a_busy_host_took_late_is_no_slow_adapter(monkeypatch):
     with on_a_port(still_servos(ids=[4])) as server:
         bus = FeetechBus(server.device, 1_000_000, map_of(4))
@@ -137,14 +129,13 @@ def test_what_lies_beside_a_port_is_no_port(monkeypatch, tmp_path):
         assert scan_command.serial_ports() == [str(tmp_path / "ttyUSB0")]
 
 
-def test_scan_without_ports_says_what_to_connect(capsys, monkeypatch):
+def test_scan_without_ports_says_what_to_connect_and_a_boards_port_is_understood(
+    capsys, monkeypatch
+):
     monkeypatch.setattr(scan_command, "serial_ports", list)
     monkeypatch.setattr(scan_command, "SOCKET", scan_command.Path("/nowhere"))
     code, _, err = run(capsys, "scan")
     assert code == 1 and "ports: none" in err and "emulate feetech" in err
-
-
-def test_the_port_of_an_so101_board_is_understood():
-    assert parse_address("feetech:ttyACM0").where == "/dev/ttyACM0"
+    assert parse_address("feetech:ttyACM0").where == "/dev/ttyACM0"  # of an SO-101
     with pytest.raises(InputError, match="feetech:/dev/ttyACM0"):
         parse_address("/dev/ttyACM0")

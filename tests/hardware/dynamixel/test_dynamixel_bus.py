@@ -1,7 +1,7 @@
 """Dynamixel servos behind guard and watchdog: registers set, verified, and set back."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 
@@ -69,7 +69,7 @@ def test_the_header_has_the_registers_that_shape_the_motion(line):
     assert "profile_velocity (address 112) is 100" in remarks
 
 
-def test_the_servos_own_watchdog_is_set_with_the_torque_and_off_again_at_the_end(line):
+def test_the_servos_own_watchdog_is_set_or_cleared_with_the_torque_and_off_again_at_the_end(line):
     servos, device = line
     guard = GuardedBus(opened(device))
     assert servos._get(4, "bus_watchdog") == 0
@@ -80,10 +80,7 @@ def test_the_servos_own_watchdog_is_set_with_the_torque_and_off_again_at_the_end
     guard.close()
     assert (servos._get(4, "bus_watchdog"), servos._get(4, "position_p_gain")) == (0, 400)
     assert bench_of(servos).torques[-1][1] is False
-
-
-def test_a_servo_whose_watchdog_acted_is_cleared_before_it_is_driven(line):
-    servos, device = line
+    # one that acted is cleared before the servo is driven
     servos._set(4, "bus_watchdog", TRIGGERED)
     servos.servos[4].stopped = True
     guard = GuardedBus(opened(device))
@@ -154,38 +151,34 @@ def test_reading_times_are_those_of_the_measurement_within_0_3_ms(firmware, requ
         assert np.percentile(error - held_up, 25) < 3e-4
 
 
-def test_a_servo_that_a_moment_without_supply_left_limp_is_named_as_limp():
+def stop_of(trouble: Callable[[DynamixelEmulator, SerialPty], object]) -> tuple[str, str]:
+    """Sentence of the stop that some trouble makes while a servo moves, and its port."""
     servos = moving_dynamixel()
-    chosen = servos.bench.map.per_servo()
     with on_a_port(servos) as server:
-        line = DynamixelBus(server.device, 1_000_000, chosen)
+        line = DynamixelBus(server.device, 1_000_000, servos.bench.map.per_servo())
         bus = GuardedBus(line, GuardLimits(astray_rad=9.0))
         bus.torque(True)
         here = bus.read().position_rad
         bus.write(here)
-        servos.brown_out(server.now(), 0.05)
+        trouble(servos, server)
         start = bus.now()
-        with pytest.raises(SafetyStop, match="Its torque is off although it was switched on"):
+        with pytest.raises(SafetyStop) as stopped:
             while (elapsed := bus.now() - start) < 8:
                 bus.write(here + 0.4 * np.sin(2 * elapsed))
                 bus.sleep_until(start + elapsed + 0.02)
                 bus.read()
         bus.close()
+    return str(stopped.value), server.device
+
+
+def test_a_servo_that_a_moment_without_supply_left_limp_is_named_as_limp():
+    sentence, _ = stop_of(lambda servos, server: servos.brown_out(server.now(), 0.05))
+    assert "Its torque is off although it was switched on" in sentence
 
 
 def test_an_adapter_that_is_unplugged_is_named_in_one_sentence():
-    servos = moving_dynamixel()
-    with on_a_port(servos) as server:
-        bus = GuardedBus(DynamixelBus(server.device, 1_000_000, servos.bench.map.per_servo()))
-        bus.torque(True)
-        start = bus.now()
-        servos.unplug_for_s = 2.0
-        with pytest.raises(SafetyStop) as stopped:
-            while (elapsed := bus.now() - start) < 8:
-                bus.sleep_until(start + elapsed + 0.02)
-                bus.read()
-        bus.close()
-    assert str(stopped.value).startswith(f"{server.device} is gone: the adapter was unplugged")
+    sentence, device = stop_of(lambda servos, server: setattr(servos, "unplug_for_s", 2.0))
+    assert sentence.startswith(f"{device} is gone: the adapter was unplugged")
 
 
 @contextmanager
@@ -196,32 +189,24 @@ def served(**registers: int) -> Iterator[tuple[DynamixelEmulator, SerialPty]]:
         yield servos, server
 
 
-def test_servos_are_read_by_one_answer_where_all_support_it_and_the_header_says_so():
-    with served() as (servos, server):
-        bus = opened(server.device, 4, 5, 6)
-        bench_of(servos).counts.update({4: 2000, 5: 2100, 6: 2200})
-        counts = bus.read().position_count
-        fast = bus.line.fast
-        bus.close()
-    assert bus.metadata["read_by"] == "fast sync read" and fast == {4, 5, 6}
-    assert counts.tolist() == [2000, 2100, 2200]
-
-
 @pytest.mark.parametrize(
-    ("claimed", "real"),
-    [(45, 45), (46, 45)],
-    ids=["its firmware is too old", "it does not answer though its firmware should"],
+    ("claimed", "real", "request_"),
+    [(46, 46, "fast sync read"), (45, 45, "sync read"), (46, 45, "sync read")],
+    ids=["all support it", "its firmware is too old", "it does not answer though it should"],
 )
-def test_a_servo_without_fast_sync_read_makes_all_be_read_by_sync_read(monkeypatch, claimed, real):
+def test_servos_are_read_by_one_answer_where_all_support_it_and_the_header_says_so(
+    monkeypatch, claimed, real, request_
+):
     with served(firmware=real) as (servos, server):
         if claimed != real:
             monkeypatch.setattr(dynamixel, "has_fast_sync_read", lambda series, firmware: True)
             monkeypatch.setattr(servos, "_fast", partial(silenced, servos))
         bus = opened(server.device, 4, 5, 6)
-        reading = bus.read()
+        bench_of(servos).counts.update({4: 2000, 5: 2100, 6: 2200})
+        counts, fast = bus.read().position_count, bus.line.fast
         bus.close()
-    assert bus.metadata["read_by"] == "sync read"
-    assert reading.position_count.tolist() == [2048, 2048, 2048]
+    assert bus.metadata["read_by"] == request_ and counts.tolist() == [2000, 2100, 2200]
+    assert (fast == {4, 5, 6}) is (request_ == "fast sync read")
 
 
 def silenced(servos: DynamixelEmulator, ids: bytes, *request) -> list:

@@ -68,29 +68,21 @@ def test_readings_are_those_of_their_joint_and_a_count_on_which_no_two_answers_a
 # ---- layouts ----
 
 
-def test_a_setpoint_is_38_bytes_torque_then_little_endian_counts_by_id_and_a_question_two():
-    on = np.array([True, False] * 6)
-    packed = esp32.set_position(on, np.arange(12) + 256)
+def test_datagrams_are_laid_out_as_documented_and_little_endian():
+    """Set-point: 38 bytes, torque then counts by id; questions 2; replies 26, 26 and 10 bytes."""
+    packed = esp32.set_position(np.array([True, False] * 6), np.arange(12) + 256)
     assert packed[:2].hex() == "2601" and len(packed) == 38
     assert packed[2:14] == bytes([1, 0] * 6)
     assert packed[14:].hex() == "".join(f"{k:02x}01" for k in range(12))
     assert [esp32.request(op).hex() for op in (2, 3, 4, 5)] == ["0202", "0203", "0204", "0205"]
-
-
-def test_replies_have_26_26_and_10_bytes_and_are_little_endian():
     counts = esp32.parse_counts(bytes.fromhex("1a02" + "0102" * 12))
     assert counts is not None and counts.tolist() == [0x0201] * 12
     load = esp32.parse_load(bytes.fromhex("1a03" + "18fc" * 6 + "e803" * 6))
     assert load is not None and load.tolist() == [-1.0] * 6 + [1.0] * 6
-    # 7.375 and 0.5 as IEEE 754 single, low byte first
-    assert esp32.parse_supply(bytes.fromhex("0a05" + "0000ec40" + "0000003f")) == 7.375
-
-
-def test_a_voltage_that_is_none_or_beyond_the_divider_is_missing():
-    # NaN, infinity, 11.0 (the largest that passes), -1
-    for volts in ("0000c07f", "0000807f", "00003041", "000080bf"):
-        supply_v = esp32.parse_supply(bytes.fromhex("0a05" + volts + "0000003f"))
-        assert (supply_v is not None) == (volts == "00003041")
+    # volts as IEEE 754 single: 7.375, the largest that passes, then NaN, infinity and -1
+    volts = ("0000ec40", "00003041", "0000c07f", "0000807f", "000080bf")
+    supply = [esp32.parse_supply(bytes.fromhex("0a05" + v + "0000003f")) for v in volts]
+    assert supply == [7.375, 11.0, None, None, None]
 
 
 def test_the_byte_that_stores_a_calibration_is_never_packed_and_only_whole_counts_are():

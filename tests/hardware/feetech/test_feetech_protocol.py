@@ -95,45 +95,45 @@ def test_our_frames_encode_and_parse_the_golden_bytes_also_byte_by_byte():
         assert pieces[:-1] == [[]] * (len(pieces) - 1) and pieces[-1] == [frame], name
 
 
-def test_sdk_ping_and_read_of_an_sts_are_golden_in_both_directions(sts):
+def test_sdk_ping_read_write_and_groups_of_an_sts_are_golden_and_obeyed(sts):
     servos, sdk = sts
-    assert sdk.handler.ping(sdk.port, 1) == (777, scservo_sdk.COMM_SUCCESS, 0)
+    done = scservo_sdk.COMM_SUCCESS
+    assert sdk.handler.ping(sdk.port, 1) == (777, done, 0)
     assert servos.heard == golden("ping 1") + golden("read model 1")
     assert servos.said == golden("ping answer 1") + golden("STS model answer")
     servos.heard = servos.said = b""
-    assert sdk.handler.read2ByteTxRx(sdk.port, 1, 56) == (2053, scservo_sdk.COMM_SUCCESS, 0)
-    assert servos.heard == golden("read position 1")
-    assert servos.said == golden("STS position answer")
+    assert sdk.handler.read2ByteTxRx(sdk.port, 1, 56) == (2053, done, 0)
+    assert (servos.heard, servos.said) == (golden("read position 1"), golden("STS position answer"))
+    servos.heard = servos.said = b""
+    group = scservo_sdk.GroupSyncRead(sdk.port, sdk.handler, 56, 6)
+    assert group.addParam(1) and group.addParam(2) and group.txRxPacket() == done
+    assert [group.getData(i, 56, 2) for i in (1, 2)] == [2053, 1000]
+    assert servos.heard == golden("STS sync read")
+    assert [f.id for f in FrameReader().feed(servos.said)] == [1, 2], "both answer in order"
+    servos.heard = servos.said = b""
+    assert sdk.handler.write2ByteTxRx(sdk.port, 1, 42, 2048) == (done, 0)
+    assert (servos.heard, servos.said) == (golden("write goal 1"), golden("ping answer 1"))
+    assert bench_of(servos).goals.pop() == (1, 2048)
+    assert sdk.handler.regWriteTxRx(sdk.port, 1, 42, 2, word(2100)) == (done, 0)
+    assert bench_of(servos).goals == []
+    assert sdk.handler.action(sdk.port, 254) == done
+    assert wait_until(lambda: bench_of(servos).goals == [(1, 2100)])
 
 
-def test_sdk_ping_and_read_of_an_scs_are_answered_in_its_byte_order(scs):
+def test_sdk_ping_and_reads_of_an_scs_are_answered_in_its_byte_order(scs):
     servos, sdk = scs
     assert sdk.handler.ping(sdk.port, 3) == (1284, scservo_sdk.COMM_SUCCESS, 0)
     assert servos.said.endswith(golden("SCS model answer"))
-    servos.said = b""
+    servos.heard = servos.said = b""
     assert sdk.handler.read2ByteTxRx(sdk.port, 3, 56) == (502, scservo_sdk.COMM_SUCCESS, 0)
     assert servos.said == golden("SCS position answer")
-
-
-def test_firmware_style_read_of_six_bytes_is_golden_and_means_position_speed_load(scs):
-    servos, sdk = scs
+    servos.heard = servos.said = b""
+    # as the firmware of the robot reads: position, speed and load
     data, result, error = sdk.handler.readTxRx(sdk.port, 3, 56, 6)
     assert (result, error) == (scservo_sdk.COMM_SUCCESS, 0)
-    assert servos.heard == golden("firmware read 3")
-    assert servos.said == golden("firmware answer 3")
-    words = [
-        SCS0009.decode(name, bytes(data), 56)
-        for name in ("present_position", "present_speed", "present_load")
-    ]
-    assert words == [502, -20, -55]
-
-
-def test_sdk_write_of_goal_2048_is_golden_acknowledged_and_obeyed(sts):
-    servos, sdk = sts
-    assert sdk.handler.write2ByteTxRx(sdk.port, 1, 42, 2048) == (scservo_sdk.COMM_SUCCESS, 0)
-    assert servos.heard == golden("write goal 1")
-    assert servos.said == golden("ping answer 1")
-    assert bench_of(servos).goals == [(1, 2048)]
+    assert (servos.heard, servos.said) == (golden("firmware read 3"), golden("firmware answer 3"))
+    names = ("present_position", "present_speed", "present_load")
+    assert [SCS0009.decode(name, bytes(data), 56) for name in names] == [502, -20, -55]
 
 
 def sync_write(sdk: SdkClient, address: int, values: dict[int, list[int]]) -> None:
@@ -158,14 +158,6 @@ def test_sdk_sync_write_and_action_are_golden_unanswered_and_obeyed(sts):
     assert servos.said == b""
 
 
-def test_sdk_a_registered_write_is_obeyed_with_the_action(sts):
-    servos, sdk = sts
-    assert sdk.handler.regWriteTxRx(sdk.port, 1, 42, 2, word(2100)) == (0, 0)
-    assert bench_of(servos).goals == []
-    assert sdk.handler.action(sdk.port, 254) == scservo_sdk.COMM_SUCCESS
-    assert wait_until(lambda: bench_of(servos).goals == [(1, 2100)])
-
-
 def test_sdk_sync_writes_to_scs_are_golden_unanswered_and_obeyed(scs):
     servos, sdk = scs
     sync_write(sdk, 42, {i: word(512) for i in range(1, 13)})
@@ -178,16 +170,6 @@ def test_sdk_sync_writes_to_scs_are_golden_unanswered_and_obeyed(scs):
     names = ("goal_position", "goal_time", "goal_speed")
     assert [SCS0009.decode(name, memory) for name in names] == [512, 0, 1000]
     assert servos.said == b""
-
-
-def test_sdk_sync_read_of_two_sts_is_golden_and_both_answer_in_order(sts):
-    servos, sdk = sts
-    group = scservo_sdk.GroupSyncRead(sdk.port, sdk.handler, 56, 6)
-    assert group.addParam(1) and group.addParam(2)
-    assert group.txRxPacket() == scservo_sdk.COMM_SUCCESS
-    assert [group.getData(i, 56, 2) for i in (1, 2)] == [2053, 1000]
-    assert servos.heard == golden("STS sync read")
-    assert [f.id for f in FrameReader().feed(servos.said)] == [1, 2]
 
 
 def test_scs_servos_do_not_know_the_sync_read(scs):
@@ -255,23 +237,16 @@ def test_no_frame_with_one_flipped_bit_is_accepted():
             assert FrameReader().feed(bytes(spoiled)) == [], (at, bit)
 
 
-def test_servos_hear_only_noise_at_another_baud_rate():
+def test_the_emulated_servo_has_its_rate_the_time_of_its_wire_and_its_own_limits():
     servos = still_servos(STS3215)
     assert servos.receive(golden("ping 1"), 0.0, baud=500_000) == []
     assert [p for _, p in servos.receive(golden("ping 1"), 0.1, 1_000_000)] == [
         golden("ping answer 1")
     ]
-
-
-def test_an_answer_comes_after_the_wire_time_and_the_return_delay():
-    servos = still_servos(STS3215)
     [(at, answer)] = servos.receive(golden("read position 1"), 1.0)
     # 8 bytes out and 8 back at 10 us, and 250 units of 2 us in between
     assert len(answer) == 8
     assert at == pytest.approx(1.0 + 80e-6 + 500e-6 + 80e-6, abs=1e-9)
-
-
-def test_a_goal_outside_the_servos_own_limits_clips_there():
     servos = still_servos(SCS0009)
     servos.receive(Frame(1, 3, bytes([42, 0, 5])).encode(), 0.0)
     servos.receive(Frame(1, 3, bytes([42, 3, 0xFF])).encode(), 0.1)
