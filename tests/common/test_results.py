@@ -52,26 +52,20 @@ def test_results_of_joints_are_a_mapping_one_object_and_one_table():
 
 
 @pytest.mark.parametrize("size", [1, 10, 5000])
-def test_they_are_those_of_the_whole(size):
+def test_they_are_those_of_the_whole_and_extremes_find_a_place(size):
     values = np.random.default_rng(0).lognormal(-7.0, 1.0, size)
-    found = Durations()
+    found, extreme = Durations(), Durations()
     for value in values:
         found.add(value)
     assert found.count == size and found.largest_s == values.max()
-    assert found.mean_s == pytest.approx(values.mean()) and found.sd_s == pytest.approx(
-        values.std()
-    )
+    assert (found.mean_s, found.sd_s) == pytest.approx((values.mean(), values.std()))
     for share in (0.5, 0.9, 0.99):
         exact = np.quantile(values, share, method="inverted_cdf")
         assert found.quantile(share) == pytest.approx(exact, rel=0.011)
-
-
-def test_nothing_has_no_quantile_and_extremes_find_a_place():
-    assert np.isnan(Durations().quantile(0.5))
-    found = Durations()
+    assert np.isnan(extreme.quantile(0.5))
     for value in (0.0, 1e-12, 1e6):
-        found.add(value)
-    assert found.largest_s == 1e6 and found.quantile(0.5) < 2e-7
+        extreme.add(value)
+    assert extreme.largest_s == 1e6 and extreme.quantile(0.5) < 2e-7
 
 
 # ----- sentences on several joints, said once

@@ -56,15 +56,11 @@ def test_a_killed_process_is_explained_by_the_memory_and_what_to_do():
             list(workers.results())
 
 
-def test_a_signal_for_the_whole_group_leaves_the_decision_to_the_main_process():
+def test_work_is_done_in_the_callers_folder_and_a_signal_for_the_group_is_left_to_the_caller(here):
     with Workers(2) as workers:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             workers.submit(number, signal.raise_signal, number)
         assert len(dict(workers.results())) == 3
-
-
-def test_work_is_done_in_the_callers_folder(here):
-    with Workers(2) as workers:
         workers.submit("a", os.getcwd)
         workers.submit("b", os.getcwd)
         assert set(dict(workers.results()).values()) == {str(here)}

@@ -3,7 +3,7 @@
 import csv
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -13,7 +13,6 @@ import pytest
 
 import reproduction.__main__ as program
 import reproduction.page
-from pupper_sysid.cli.commands.recording.sweep import Sweep
 from pupper_sysid.cli.programs import pupper_analyze
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
@@ -36,14 +35,13 @@ from pupper_sysid.policies.analysis.robustness import (
     DirectionWalk,
     GroundPoint,
 )
-from pupper_sysid.policies.network.hyperparameters import Imitation
 from pupper_sysid.policies.train.run_file import Run, preset, save_run
 from pupper_sysid.sysid.compare.compare import FITTED, PUBLISHED, four_way
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.servo_fit import networks
 from pupper_sysid.sysid.servo_fit.training import Recipe
 from reproduction import servos as servo_claims
-from reproduction.evidence import Claim, PolicyEvidence, ScalePoint, Training, imitated, training
+from reproduction.evidence import Claim, PolicyEvidence, ScalePoint, Training, training
 from reproduction.policies import judge
 from support.command_line import json_of, ran, refused
 from support.walks import walked
@@ -131,6 +129,16 @@ def verdicts(*policies: PolicyEvidence, played=None, stacks=()) -> dict[str, str
     return {i: c.verdict for i, c in claims(*policies, played=played, stacks=stacks).items()}
 
 
+def assert_judged(cases: Sequence, judged: Callable[..., Sequence[Claim]]) -> None:
+    """Each case: evidence, claim, verdict, and words that its numbers or reasons must have."""
+    problems = []
+    for known, id_, verdict, words in cases:
+        row = next(c for c in judged(known) if c.id == id_)
+        if row.verdict != verdict or words not in row.ours + row.how:
+            problems.append(f"{id_}: {verdict}, {words!r}: {row}")
+    assert not problems, "\n".join(problems)
+
+
 def drifting(row: DelayPoint) -> float:
     """A frequency that grows with the delay."""
     return 3.0 + row.extra_delay_ms / 300
@@ -156,7 +164,6 @@ def test_without_evidence_nothing_is_decided():
 
 
 def test_a_claim_about_policies_is_judged_by_what_its_evidence_says():
-    """Each case: policies, claim, verdict, and words that its numbers or its reasons must have."""
     (mlp, lstm), nan = BOTH, float("nan")
     untestable, contradicted = "not testable here", "does not hold here"
 
@@ -208,12 +215,7 @@ def test_a_claim_about_policies_is_judged_by_what_its_evidence_says():
         *(((mlp, knowing(place, 0.0)), "C1", contradicted, "") for place in (0, 1)),
         *(((replace(mlp, ground=g), lstm), "B3", untestable, "") for g in ("rough", None)),
     ]  # fmt: skip
-    problems = []
-    for policies, id_, verdict, words in cases:
-        row = claims(*policies)[id_]
-        if row.verdict != verdict or words not in row.ours + row.how:
-            problems.append(f"{id_}: {verdict}, {words!r}: {row}")
-    assert not problems, "\n".join(problems)
+    assert_judged(cases, lambda policies: judge(policies, {}, []))
     for place in (0, 1):
         assert "LSTM" not in claims(mlp, knowing(place, nan))["C1"].ours
     assert claims(*BOTH)["B3"].verdict != untestable
@@ -240,12 +242,7 @@ def test_claims_about_training_are_judged_by_trainings_from_random_weights():
     several = [*both, learned("lstm", reward=6.0), gru]
     first = next(c for c in judge(BOTH, {}, [], several) if c.id == "T1")
     assert first.interval["LSTM"] == Interval(6.5, 6.0, 7.0)
-    problems = []
-    for trainings, id_, verdict, words in cases:
-        row = next(c for c in judge(BOTH, {}, [], trainings) if c.id == id_)
-        if row.verdict != verdict or words not in row.ours + row.how:
-            problems.append(f"{id_}: {verdict}, {words!r}: {row}")
-    assert not problems, "\n".join(problems)
+    assert_judged(cases, lambda trainings: judge(BOTH, {}, [], trainings))
 
 
 def test_a_training_is_read_from_its_run(tmp_path):
@@ -264,15 +261,6 @@ def test_a_training_is_read_from_its_run(tmp_path):
     assert (found.kind, found.learned_noise, found.curriculum) == ("gru", True, False)
     assert (found.reward, found.std, found.lasted_s) == pytest.approx((1.5, 0.8, 1.0))
     assert (found.steps_per_s, found.million_samples) == pytest.approx((500.0, 0.002))
-
-
-def test_what_was_imitated_first_is_read_from_the_settings():
-    learned = "a teacher that learned from nothing"
-    for imitation, first in (
-        (Imitation(), "a trot"), (Imitation(iterations=0), None),
-        (Imitation(teacher="own"), learned), (Imitation(teacher="runs/T"), learned),
-    ):  # fmt: skip
-        assert imitated(Run(imitation=imitation)) == first
 
 
 def test_stacks_differ_only_if_the_interval_of_their_difference_says_so():
@@ -296,15 +284,6 @@ def test_servos_that_make_a_saw_tooth_rounder_are_seen_and_drift_is_not_judged_a
     ):  # fmt: skip
         found = claims(*BOTH, played={"LF_thigh": (time, command, reading)})["G1"]
         assert found.verdict == verdict and words in found.ours + found.how
-
-
-def test_the_page_says_what_imitation_decides_and_what_was_not_tested():
-    found = judge(BOTH, {}, [])
-    first, taught, untested = reproduction.page._summary(found, list(BOTH), [])
-    assert first.startswith(f"Of {len(found)} published claims ") and "(C1)" in first
-    assert "(†)" in taught and "are open" in untested
-    alone = [replace(policy, first_gait=None) for policy in BOTH]
-    assert len(reproduction.page._summary(found, alone, [learned("gru")])) == 2
 
 
 @pytest.mark.slow
@@ -331,16 +310,6 @@ def test_four_ways_on_the_sample_playback_score_unseen_readings_only(monkeypatch
     once = replace(found, repeatability_rad={"LF_thigh": float("nan")})
     for c in servo_claims.judge(servo_claims.ServoEvidence(servos=once, played=recording)):
         assert c.id != "S4" or c.verdict == "not testable here"
-
-
-@pytest.mark.slow
-def test_a_sweep_says_how_much_of_the_lag_is_stale_feedback(tmp_path):
-    path = tmp_path / "sweep.csv"
-    Sweep(joints="LF_thigh", freqs="2,4", duration=2.0, out=path, seed=3, json=True).run()
-    found = servo_claims.gather([load(path)], seed=0)
-    claims = {c.id: c for c in servo_claims.judge(found)}
-    assert claims["A1"].verdict == "holds partly" and "bus and stale" in claims["A1"].how
-    assert claims["A3"].verdict == "does not hold here"
 
 
 POLICIES = [SAMPLES / "policies" / kind for kind in ("lstm", "mlp")]

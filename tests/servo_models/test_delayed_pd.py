@@ -68,14 +68,6 @@ def test_numpy_servo_equals_mujocos_native_servo(servo):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 
 
-def test_delay_between_two_steps_is_the_linear_mean_of_the_commands():
-    linear = replace(MEASURED, friction_loss=0.0, effort_limit=np.inf, velocity_limit=np.inf)
-    early, late, between = (
-        ours(replace(linear, dead_time_s=d * H), SINE) for d in (10.0, 11.0, 10.25)
-    )
-    np.testing.assert_allclose(between, 0.75 * early + 0.25 * late, atol=1e-12)
-
-
 def test_step_by_step_equals_rollout_and_reset_forgets_everything():
     model = DelayedPD(MEASURED, H)
     model.reset(np.array(0.2))
@@ -101,19 +93,6 @@ def test_only_ratios_to_the_inertia_matter():
         np.testing.assert_allclose(ours(other, STEPS), ours(MEASURED, STEPS), atol=1e-9)
     assert np.asarray(MEASURED.scaled(0.0055).armature) == 0.0055
     assert MEASURED.per_inertia().effort_limit == pytest.approx(0.35 / 8.08e-4)
-
-
-def test_friction_holds_an_error_smaller_than_friction_over_stiffness():
-    band = MEASURED.friction_loss / MEASURED.stiffness
-    np.testing.assert_allclose(ours(MEASURED, np.full(100, 0.9 * band)), 0.0, atol=1e-4)
-    assert ours(MEASURED, np.full(500, 3 * band))[-1] > band
-
-
-def test_the_setpoints_rate_bounds_the_speed_of_a_long_move():
-    slow = replace(MEASURED, velocity_limit=2.0)
-    position = ours(slow, np.full(500, 1.5))
-    cruising = position[150:300]
-    np.testing.assert_allclose(np.diff(cruising) / H, 2.0, rtol=0.01)
 
 
 def test_impossible_numbers_are_refused_by_name():

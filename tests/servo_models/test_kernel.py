@@ -5,7 +5,6 @@ import pytest
 from reference.servo import columns, delayed, servo
 
 from pupper_sysid.servo_models import kernel
-from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.sparse_equation import SparseEquation
 from pupper_sysid.sysid.fit.run import at_steps
 from pupper_sysid.sysid.fit.structure import candidate
@@ -92,30 +91,6 @@ def test_all_terms_together_under_a_load_with_the_torque_off_and_a_sagging_suppl
     row, load = columns(**numbers), np.array([1.4, 90.0, -0.2])
     expected = servo(row, 4.6, held(3), edges(held(3)), 0.7, load, 0.1, PAD, STEP_S)
     assert np.abs(compiled(row, 4.6, held(3), 0.7, load)[:, 0] - expected).max() < 1e-7
-
-
-@pytest.mark.parametrize("more", [{"velocity_limit": 6.0}, {}, {"friction_loss": 2.0}])
-def test_two_milliseconds_move_as_delayed_pd_does_in_continuous_time(more):
-    numbers = BASE | more
-    parameters = DelayedPDParameters(
-        armature=1.0, dead_time_s=0.0146, **({"velocity_limit": np.inf} | numbers)
-    )
-    signal = held()[0, PAD:]
-    late = (PAD + np.arange(STEPS)) % 3 == 0  # as in `edges`
-    tracks = {}
-    for times in (1, 25):
-        stepped = DelayedPD(parameters, STEP_S / times)
-        stepped.reset(0.1)
-        stairs = np.repeat(signal, times).reshape(STEPS, times)
-        before = np.concatenate([[0.1], signal[:-1]])
-        stairs[late, : round(0.3 * times)] = before[late, None]
-        tracks[times] = stepped.rollout(stairs.ravel())[times - 1 :: times]
-    own = compiled(columns(**numbers), 7.3, held())[1:, 0]
-    assert rms(own - tracks[25]) < 0.2 * rms(tracks[1] - tracks[25])
-
-
-def rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def test_a_scaled_inertia_moves_alike():

@@ -159,18 +159,12 @@ def test_numbers_that_no_servo_has_are_refused_before_they_take_all_memory(tmp_p
 
 def test_a_contract_is_refused_that_says_what_the_model_is_not(tmp_path: Path):
     changes: list[tuple[dict[str, Any], str]] = [
-        ({"colour": "red"}, "colour is not a key of this file"),
         ({"schema_version": 3}, "newer version"),
-        ({"schema_version": "one"}, "schema_version"),
         ({"schema": "pupper-calibration"}, "is a calibration, not a fitted servo model"),
         ({"arch": "transformer"}, "arch"),
-        ({"units": "degrees"}, "units"),
         ({"time_step_s": 0.0}, "time_step_s"),
         ({"time_step_s": float("nan")}, "time_step_s"),
-        ({"time_step_s": "0.02"}, "time_step_s"),
-        ({"weights_sha256": "abc"}, "weights_sha256"),
         ({"joints": {}}, "joints"),
-        ({"joints": []}, "joints"),
         ({"inputs": ["command_rad[t]"]}, "its arrays take command_rad[t], command_rad[t-1]"),
         ({"feedback": True}, "predicted_position_rad"),
     ]

@@ -299,7 +299,7 @@ def test_the_gain_is_the_wanted_one_or_that_of_the_servo_whose_numbers_hold_at_n
     assert_each_refused(cases, lambda ask: ask())
 
 
-def test_without_a_gain_on_one_side_the_stiffness_is_not_compared_and_the_rest_is():
+def test_what_is_of_another_gain_or_holds_the_link_is_not_compared_and_the_rest_is():
     found = compared(LOOP, "paper", "LF_thigh")
     assert found.p_gain is None and "not stated" in found.notes[0]
     stiffness = difference(found, "stiffness")
@@ -307,9 +307,6 @@ def test_without_a_gain_on_one_side_the_stiffness_is_not_compared_and_the_rest_i
     assert difference(found, "effort limit").ratio == pytest.approx(
         5.0 / load_card(LOOP).pd().effort_limit_nm.value
     )
-
-
-def test_armatures_with_and_without_the_link_are_not_compared():
     found = compared(LOOP, "sts3215-12v")
     assert difference(found, "armature").ratio is None
     assert any("armatures differ" in note for note in found.notes)
