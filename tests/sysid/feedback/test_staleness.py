@@ -47,24 +47,21 @@ def polled(position, every=3):
     return np.repeat(position[::every], every)[: len(position)]
 
 
-def test_a_joint_that_sticks_at_reversals_is_live_though_many_readings_repeat():
-    stuck = whole(sticking(WAVE))
-    assert np.mean(np.diff(stuck) == 0) > 0.2
-    found = staleness([trial(WAVE, stuck)])
+def test_a_joint_that_sticks_at_reversals_is_live_and_dated_at_its_reads_though_readings_repeat():
+    position = whole(sticking(WAVE))
+    assert np.mean(np.diff(position) == 0) > 0.2
+    stuck = trial(WAVE, position)
+    found = staleness([stuck])
     assert (found.kind, found.episodes_with_repeat, found.repeat_share) == ("live", 0, 0.0)
-
-
-def test_its_readings_are_all_dated_to_their_reads_and_doctor_claims_no_lost_ones():
-    stuck = trial(WAVE, whole(sticking(WAVE)))
     lattice = find_poll_lattice([stuck], np.random.default_rng(0))
     assert lattice.kind == "every read"
     np.testing.assert_array_equal(readings(stuck, lattice).time_s, TIME)
     recording = Recording.from_arrays(
-        TIME, {"LF_hip": WAVE}, {"LF_hip": stuck.position_rad}, frequency_hz=0.7
+        TIME, {"LF_hip": WAVE}, {"LF_hip": position}, frequency_hz=0.7
     )
-    found = examine(recording)["LF_hip"]
-    assert found.feedback is not None and found.feedback.kind == "every read"
-    assert not [r for r in found.reasons if "fail" in r or "poll" in r or "new reading" in r]
+    joint = examine(recording)["LF_hip"]
+    assert joint.feedback is not None and joint.feedback.kind == "every read"
+    assert not [r for r in joint.reasons if "fail" in r or "poll" in r or "new reading" in r]
 
 
 def test_a_servo_polled_every_third_row_is_stale_and_two_of_three_readings_repeat():

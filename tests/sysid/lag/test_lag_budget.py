@@ -126,22 +126,6 @@ def test_tones_that_the_servo_cannot_follow_are_in_neither_the_lag_nor_its_range
     assert budget.lag_range.startswith("mean over 1–3 Hz; ")
 
 
-def test_motion_without_tones_still_has_a_lag():
-    rng = np.random.default_rng(10)
-    knots = np.cumsum(rng.standard_normal(400)) * 0.05
-    wander = lambda t: np.interp(t, np.arange(400) * 0.05, knots)  # noqa: E731
-    send = np.arange(0.0, 12.0, LOOP_S)
-
-    def held(t):  # what the bus holds of the command
-        row = np.clip(np.floor(t / LOOP_S).astype(int), 0, len(send) - 1)
-        return wander(send[row])
-
-    trial = held_trial(lambda t: held(t - 0.04), wander, rng, duration_s=12.0)
-    b = lag_budget("LF_hip", [trial], rng)
-    assert b.lag_s.value == pytest.approx(0.04, abs=4e-3)
-    assert b.raw_lag_s.value > b.fresh_lag_s.value > b.lag_s.value
-
-
 def test_a_joint_that_does_not_move_or_is_stuck_has_no_lag():
     still = held_trial(np.zeros_like, np.sin, np.random.default_rng(0))
     stuck = tone_trials(
@@ -204,27 +188,11 @@ def test_a_servo_without_a_resonance_is_not_given_one_at_the_loops_rate():
         assert f.gain == pytest.approx(truth["gain"], rel=0.1)
 
 
-def test_ripple_of_a_fast_loop_is_next_to_nothing():
-    trials, rng = swept((1.0, 6.0), loop_s=1 / 200), np.random.default_rng(0)
-    b = lag_budget("LF_hip", trials, rng)
-    for f in b.by_frequency:
-        assert f.lag_s.value == pytest.approx(tone_lag(f.frequency_hz), abs=2e-4)
-
-
 def test_lags_longer_than_the_lowest_tones_period_come_out_whole():
     for tones, lag_s in (((2.0, 3.0, 4.0), 0.7), ((2.0,), 0.6)):
         trials = swept(tones, dead_time_s=lag_s, time_constant_s=1e-4, loop_s=0.01)
         b = lag_budget("LF_hip", trials, np.random.default_rng(1))
         assert b.lag_s.value == pytest.approx(lag_s, abs=0.01)
-
-
-def test_polled_tones_have_no_ripple_to_take_out():
-    rng = np.random.default_rng(2)
-    trials = tone_trials(0.040, rng, (1.0, 4.0))
-    lattice, _, tones = tones_of(trials, rng)
-    b = lag_budget("LF_hip", trials, np.random.default_rng(0), lattice)
-    assert lattice.kind == "lattice"
-    assert b.lag_s.value == pytest.approx(slope(tones, "fresh_held").value, abs=1e-9)
 
 
 def tones_of(trials, rng):

@@ -74,15 +74,11 @@ def test_what_is_wrong_in_a_plan_is_named(path):
         (("schema: pupper-sysid plan", "schema: other"), "is not a plan"),
         (("schema_version: 1", "schema_version: 2"), "newer"),
         (("joint: LF_thigh", "joint: LF_tigh"), "is no joint"),
-        (("kind: square", "kind: saw"), "Write 'sine' or 'square'"),
         (("frequency_hz: 7.0", "frequency_hz: -7.0"), "frequency_hz"),
         (("frequency_hz: 7.0", "frequency_hz: 700.0"), "frequency_hz"),
         (("amplitude_rad: 0.12", "amplitude_rad: 12"), "amplitude_rad"),
-        (("amplitude_rad: 0.12", "amplitude_rad: .nan"), "amplitude_rad"),
         (("amplitude_rad: 0.12", "amplitude_deg: 7"), "amplitude_rad"),
         (("duration_s: 3.0", "duration_s: 1e9"), "duration_s"),
-        (("loop_period_s: 0.019", "loop_period_s: 0"), "loop_period_s"),
-        (("seed: 3", "seed: 3\nmore: 4"), "is not a key of this file"),
         (("0" * 64, "0" * 63), "sha256"), ((trials, "trials: []\n"), "trials"),
     ]  # fmt: skip
 

@@ -10,7 +10,6 @@ from pupper_sysid.data import SAMPLES
 from pupper_sysid.servo_models.calibration.calibration import InputFile, load_calibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.sysid.fit.posterior import PHASE_SD_S
-from pupper_sysid.sysid.fit.run import at_steps, free_run
 from pupper_sysid.sysid.fit.structure import candidate
 from pupper_sysid.sysid.plan.planner import (
     CLEAR_NATS,
@@ -19,14 +18,11 @@ from pupper_sysid.sysid.plan.planner import (
     Noise,
     Servo,
     Setup,
-    candidates,
     fitted_noise,
     now,
     prior_information,
     propose,
-    recorded,
     respond,
-    separation,
     trial_seconds,
     without_shift,
 )
@@ -34,7 +30,6 @@ from pupper_sysid.sysid.plan.proposal import (
     calibrated_servo,
     feedback_setup,
     fitted_servo,
-    plan_first_sweep,
     plan_from_calibration,
     unknown_servos,
 )
@@ -136,27 +131,6 @@ def test_what_cannot_be_seen_or_narrowed_within_the_limits_is_named():
     assert any("no trial within the limits narrows the dead time" in n for n in notes)
 
 
-def test_candidates_are_sent_as_the_guard_lets_them_through():
-    """A square wave of 0.3 rad is slowed to 8 rad/s, one of 0.05 rad steps at once."""
-    setup = Setup(loop_period_s=0.01)
-    for amplitude, fastest in ((0.3, 8.0), (0.03, 6.0)):
-        made = plan("square", ["LF_hip"], [1.0], amplitude, 3.0, 0.01)
-        command = recorded(made.trials[0], setup).command
-        per_tick = np.abs(command[5:] - command[:-5]).max() / 0.01
-        assert per_tick == pytest.approx(fastest, rel=0.02)
-
-
-def test_live_readings_come_with_every_tick_and_polled_ones_with_every_poll():
-    live = candidates(Setup(loop_period_s=0.02, poll_period_s=0.0, loss=0.0), 3.0)[0]
-    polled = candidates(Setup(loop_period_s=0.02, poll_period_s=0.04), 3.0)[0]
-    assert len(live.run.sample_step) == pytest.approx(160, abs=1)
-    assert len(polled.run.sample_step) == pytest.approx(80, abs=1)
-    assert Setup(loop_period_s=0.02, poll_period_s=0.04, loss=0.4).seen == pytest.approx(0.6)
-    # two polls between two reads: one of them succeeds
-    assert Setup(loop_period_s=0.02, poll_period_s=0.01, loss=0.5).seen == pytest.approx(0.75)
-    assert NOISE.floor_rad > 0
-
-
 # ----- information of simulated trials, against formulas
 
 
@@ -172,15 +146,6 @@ def test_a_delay_is_as_uncertain_as_the_bound_of_a_tone_says():
     # about the logarithm of the delay; the rest at the head and the rise say nothing
     sd = delay / np.sqrt(found.information[0, 0])
     assert sd == pytest.approx(bound, rel=0.1)
-
-
-def test_a_longer_dead_time_shows_where_the_joint_moves():
-    own, (trial,) = hypothesis(), tones((2.0,), loop_period_s=0.002)
-    found = respond(own, trial, NOISE)
-    (track,) = free_run(own.model, own.values, [trial])
-    expected = -own.values[0] * at_steps(np.gradient(track) / trial.step_s, trial.sample_step)
-    off = found.sensitivity[:, 0] - expected
-    assert np.sqrt(np.mean(off**2)) < 0.1 * np.sqrt(np.mean(expected**2))
 
 
 def test_however_long_a_tone_is_its_own_shift_in_time_stays_in_doubt():
@@ -199,17 +164,6 @@ def test_noise_of_a_fit_is_told_apart_into_floor_and_jitter_and_not_below_the_qu
     assert found.jitter_s == pytest.approx(truth.jitter_s, rel=0.15)
     exact = [with_readings(own, t, Noise(1e-9, 0.0), rng) for t in tones()]
     assert fitted_noise(own.model, own.values, exact, 0.0017).floor_rad == 0.0017
-
-
-def test_models_are_told_apart_by_what_remains_after_the_rival_is_fitted_again():
-    slew, back_emf = recorded_servo([], structures=2).hypotheses
-    pair = [[respond(h, t, NOISE) for t in tones((4.0, 8.0))] for h in (slew, back_emf)]
-    free = separation(*pair, known=back_emf.known)
-    frozen = separation(*pair, known=1e12 * np.eye(len(back_emf.known)))
-    assert 0 < free < frozen
-    # a parameter that may take any value explains more still
-    assert separation(*pair, known=1e-3 * back_emf.known) <= free
-    assert separation(pair[0], pair[0], slew.known) == pytest.approx(0.0, abs=1e-9)
 
 
 # ----- what a plan knows of a servo: the fit's own intervals, a calibration's, or the prior
@@ -263,15 +217,3 @@ def test_unknown_servos_move_and_depend_on_the_seed_alone():
         slew, back_emf = servo.hypotheses
         assert slew.values[3] < slew.values[4]  # friction below effort
         assert np.array_equal(slew.values[:5], back_emf.values[:5])
-
-
-@pytest.mark.slow
-def test_joints_with_the_same_margin_get_the_same_first_sweep():
-    margins = {"LF_hip": 0.5, "RF_hip": 0.4, "LF_calf": 0.1}
-    plan = plan_first_sweep(list(margins), setup=Setup(), margins=margins, seconds=10.0)
-    tones = {
-        joint: [(t.kind, t.frequency_hz, t.amplitude_rad) for t in plan.trials if t.joint == joint]
-        for joint in margins
-    }
-    assert tones["LF_hip"] == tones["RF_hip"] != tones["LF_calf"]
-    assert max(amplitude for *_, amplitude in tones["LF_calf"]) <= 0.1

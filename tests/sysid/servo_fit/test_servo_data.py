@@ -5,7 +5,6 @@ import pytest
 
 from pupper_sysid.sysid.servo_fit.data import ServoData, look_up, servo_data
 from pupper_sysid.sysid.servo_fit.windows import (
-    WINDOW,
     chosen,
     fit_linear,
     grouped,
@@ -187,20 +186,6 @@ def test_windows_show_each_reading_the_commands_before_it_and_none_of_another_ru
             expected = weight @ np.where(at < 0, -7.0, own)
             assert history[window, n, tap] == pytest.approx(expected, abs=2e-3)
     assert seen == {(run, row) for run, c in enumerate(commands) for row in range(len(c))}
-
-
-def test_windows_start_at_rest_and_end_with_the_last_command():
-    data, commands = identifiable(0.0)
-    found = samples(data, everything, past=6)
-    norm = found.normalisation
-    command = found.command[0] * norm["command_scale"] + norm["command_center"]
-    # 100 ticks are windows from tick 0, 48 and 96; 60 are two
-    assert command.shape == (5, 6 + WINDOW + 2)
-    for window, run in ((0, 0), (3, 1)):
-        np.testing.assert_allclose(command[window, :7], -7.0, atol=1e-3)
-        np.testing.assert_allclose(command[window, 7:], commands[run][: WINDOW + 1], atol=1e-3)
-    np.testing.assert_allclose(command[2, :7], commands[0][96 - 7 : 96], atol=1e-3)
-    np.testing.assert_allclose(command[2, 7 + 4 :], commands[0][-1], atol=1e-3)
 
 
 def test_padding_and_other_parts_never_count():

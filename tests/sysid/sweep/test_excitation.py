@@ -10,7 +10,6 @@ import pytest
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.sysid.sweep.excitation import (
-    KINDS,
     LEAD_IN_S,
     off_harmonics,
     parse_frequencies,
@@ -166,14 +165,6 @@ def test_impossible_excitations_are_refused():
         ({"duration_s": -1.0}, "duration"), ({"speed_limit_rad_s": 0.0}, "speed"),
     ]  # fmt: skip
     assert_each_refused(cases, lambda wrong: plan(**asked | wrong))
-
-
-def test_the_command_of_a_trial_is_its_offset_from_the_start():
-    for kind in KINDS:
-        trial = plan(kind, ["LF_thigh"], [1.0, 3.0]).trials[0]
-        for time in (0.0, 0.1, 0.77, 3.0):
-            command = trial.command(time, np.array([0.785]))
-            np.testing.assert_allclose(command, 0.785 + trial.offset(np.array([time])))
 
 
 def write(path, **columns):

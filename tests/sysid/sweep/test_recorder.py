@@ -15,7 +15,7 @@ import pytest
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import BusError, FileExistsRefusal, InputError, SafetyStop
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
-from pupper_sysid.hardware.bus import BusSample, PositionLimits, Sent
+from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.loop import GENTLE_RAD_S
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
@@ -23,7 +23,7 @@ from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.sweep.excitation import LEAD_IN_S, Plan, plan
 from pupper_sysid.sysid.sweep.recorder import REST_S, record
 from support.command_line import refused
-from support.virtual_time import VirtualTime
+from support.following_bus import FollowingBus
 
 PERIOD = 0.019
 
@@ -37,17 +37,14 @@ def short_sweep(joints=("LF_hip",), frequencies=(2.0, 3.0), **more) -> Plan:
     return plan("sine", list(joints), list(frequencies), duration_s=1.0, **more)
 
 
-class ScriptedBus(VirtualTime):
-    """Perfect servos: a read gives the last goal. Logs calls; is slow or fails on demand."""
+class ScriptedBus(FollowingBus):
+    """Twelve servos, one of whose writes is slow or fails."""
 
     name = "scripted"
-    joint_names = JOINT_NAMES
 
     def __init__(self, start: np.ndarray, slow_at: int = -1, fail_at: int = -1, raises=None):
-        self.metadata = {"kind": "scripted", "readings": "live"}
-        self.limits = PositionLimits(np.full(12, -np.inf), np.full(12, np.inf))
-        self.goal, self.time, self.calls = start.astype(float), 0.0, []
-        self.written: list[tuple[float, np.ndarray]] = []
+        super().__init__(JOINT_NAMES, reach_rad=np.inf)
+        self.metadata, self.goal = {"kind": "scripted", "readings": "live"}, start.astype(float)
         self._slow_at, self._fail_at, self._raises = slow_at, fail_at, raises
 
     def write(self, position_rad):
@@ -55,20 +52,11 @@ class ScriptedBus(VirtualTime):
             self._fail_at = -1
             raise self._raises
         self.time += 0.055 if len(self.written) == self._slow_at else 0.0
-        self.goal = position_rad.copy()
-        self.written.append((self.time, self.goal))
-        return Sent(self.time, self.goal)
+        return super().write(position_rad)
 
     def read(self):
         self.time += 0.001
         return BusSample(np.full(12, self.time), self.goal.copy(), np.arange(12))
-
-    def torque(self, on):
-        self.calls.append(f"torque {on}")
-        return True
-
-    def close(self):
-        self.calls.append("close")
 
 
 POSE = np.array([DEFAULT_POSE[j] for j in JOINT_NAMES])
@@ -106,8 +94,7 @@ def test_a_recording_holds_every_command_and_reading_of_every_trial(tmp_path):
 def test_other_joints_rest_and_moves_between_trials_are_gentle(tmp_path):
     bus = ScriptedBus(POSE + 0.5)
     record(bus, short_sweep(frequencies=[2.3]), tmp_path / "a.csv", loop_period_s=PERIOD)
-    times = np.array([t for t, _ in bus.written])
-    goals = np.stack([g for _, g in bus.written])
+    times, goals = np.array(bus.written_s), np.stack(bus.written)
     recorded = load(tmp_path / "a.csv").trials("LF_hip")[0].send_time_s
     inside = (times >= recorded[0] - 1e-9) & (times <= recorded[-1] + 1e-9)
     np.testing.assert_allclose(goals[inside][:, 1:], np.tile(POSE[1:], (inside.sum(), 1)))
@@ -120,7 +107,7 @@ def test_other_joints_rest_and_moves_between_trials_are_gentle(tmp_path):
     np.testing.assert_allclose(goals[-1], POSE + 0.5, atol=1e-12, err_msg="where it was found")
     # parking ticks every 20 ms and a read takes 1 ms
     assert np.abs(np.diff(goals[~before & ~inside], axis=0)).max() <= 1.01 * GENTLE_RAD_S * 0.021
-    assert bus.calls == ["torque True", "torque False", "close"]
+    assert bus.log == ["torque True", "torque False", "close"]
 
 
 def test_a_late_tick_is_counted_and_the_tone_keeps_its_phase(tmp_path):
@@ -147,12 +134,12 @@ def test_an_interrupted_recording_keeps_its_rows_and_switches_the_torque_off(tmp
     bus = ScriptedBus(POSE, fail_at=at_rest + 60, raises=raises)
     with pytest.raises(type(raises)):
         record(bus, short_sweep(), tmp_path / "a.csv", loop_period_s=PERIOD)
-    assert bus.calls[-2:] == ["torque False", "close"]
+    assert bus.log[-2:] == ["torque False", "close"]
     recording = load(tmp_path / "a.csv")
     assert "completed" not in recording.metadata
     assert len(recording.table) == 60
     if isinstance(raises, KeyboardInterrupt):
-        np.testing.assert_allclose(bus.written[-1][1], POSE, atol=1e-12)
+        np.testing.assert_allclose(bus.written[-1], POSE, atol=1e-12)
     if isinstance(raises, SafetyStop):
         assert len(bus.written) == at_rest + 60, "it was driven on after the stop"
 
@@ -171,23 +158,12 @@ def test_nothing_moves_before_file_plan_and_pose_are_known(tmp_path):
         bus = ScriptedBus(start)
         with pytest.raises(raises, match=says):
             record(bus, made, path)
-        assert bus.written == [] and bus.calls == ["close"]
+        assert bus.written == [] and bus.log == ["close"]
     with pytest.raises(InputError, match="loop_period_s"):
         record(ScriptedBus(POSE), short_sweep(), free, loop_period_s=0.0)
     assert taken.read_text() == "precious" and not free.exists()
     record(ScriptedBus(POSE), short_sweep(), taken, force=True)
     assert len(load(taken).table) > 100
-
-
-def test_progress_runs_from_nothing_to_the_whole(tmp_path):
-    seen = []
-    made = short_sweep()
-    record(ScriptedBus(POSE), made, tmp_path / "a.csv", progress=lambda *call: seen.append(call))
-    done = np.array([d for d, _, _ in seen])
-    assert done[0] == 0 and (np.diff(done) >= 0).all()
-    assert done[-1] == pytest.approx(made.duration_s, abs=0.03)
-    assert {total for _, total, _ in seen} == {made.duration_s}
-    assert "LF_hip at 3 Hz" in {what for _, _, what in seen}
 
 
 def test_each_recorded_row_has_its_truth_and_the_file_does_not_tell_it(tmp_path):
