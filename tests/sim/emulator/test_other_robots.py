@@ -10,13 +10,10 @@ import yaml
 
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sim.robot import hinges, robot_map
-from pupper_sysid.sim.robot.mini_pupper import robot_xml
-from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import json_of, ran, refused, run
 from support.exported_servos import in_free_air
@@ -58,19 +55,6 @@ def test_a_joint_map_has_the_model_s_joints_limits_and_the_servos_counts(capsys)
     assert pose["elbow"] == 0.0 and min(found["margin_rad"].values()) > 0.39
 
 
-def test_what_is_guessed_is_said_with_what_corrects_it(capsys, read_here):
-    code, out, _ = run(capsys, "init-robot", "arm.xml")
-    said = " ".join(out.split())
-    assert code == 0 and "Ids and signs are for you to check" in said
-    # ids first: a centre is measured for the servo that has the joint's id
-    assert 0 < said.find("monitor --joint-map arm.joints.yaml") < said.find("calibrate-joints")
-    # limits in radians, where MuJoCo takes degrees
-    Path("odd_unit.xml").write_text(BODY.format("", "-1.5 1.5", GEOM, ""))
-    _, err = ran(capsys, "init-robot", "odd_unit.xml", "--json")
-    assert "k: less than 0.05 rad of margin" in " ".join(err.split())
-    assert 'angle="radian"' in err
-
-
 def test_hinges_that_an_actuator_drives_by_any_way_are_taken_and_others_named(capsys, read_here):
     driven = """</worldbody><tendon><fixed name="t"><joint joint="elbow" coef="1"/></fixed></tendon>
     <actuator><position joint="base_yaw"/><position jointinparent="shoulder"/>
@@ -92,13 +76,6 @@ def test_servos_without_a_model_file_get_a_map_from_their_names_and_ids(capsys, 
     layout = load_joint_map(Path("joints.yaml"))
     assert layout.joint_names == ("pan", "tilt") and layout.file.servo == "XM430-W350"
     assert layout.file.joints["pan"].limits_rad == (-0.5, 0.5)
-
-
-def test_the_mini_pupper_s_own_model_has_its_twelve_joints(read_here):
-    Path("pupper.xml").write_text(robot_xml(servo_ranges("paper").nominal(), 0.002, "linkage"))
-    robot = robot_map.joint_map_of(Path("pupper.xml"), "scs0009")
-    layout, left_out = robot.joint_map, robot.left_out
-    assert layout.joint_names == JOINT_NAMES and left_out == []
 
 
 @pytest.mark.usefixtures("unexamined")

@@ -4,16 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 
-from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.pendulum import (
-    BenchSpec,
-    Pendulum,
-    PendulumBench,
     PendulumServo,
     PendulumServoParameters,
-    draw_bench,
 )
 
 COUNT = 2 * np.pi / 4096
@@ -115,20 +109,3 @@ def test_gears_with_play_let_the_output_move_by_the_play():
     way = moved(servo, 0.5, 2.0)
     assert 0.03 < way.max() - rest < 0.045
     assert way[-1] == pytest.approx(rest, abs=2e-3)
-
-
-def test_the_truth_beside_a_recording_has_the_numbers_of_servo_and_load(tmp_path):
-    rng = np.random.default_rng(4)
-    robot = draw_bench(rng, Pendulum(0.1, 0.12), BenchSpec(registers=(("p", 16),)))
-    bus = EmulatedBus(robot, rng, plant=PendulumBench(robot))
-    assert bus.joint_names == ("bench",) and bus.metadata["readings"] == "live"
-    assert bus.servo_setups()["bench"]["p_gain"] == 16
-    bus.set_register("bench", "p", 8)
-    assert bus.register("bench", "p") == 8
-    bus.write_truth(tmp_path / "a")
-    truth = yaml.safe_load((tmp_path / "a.truth.yaml").read_text())["joints"]["bench"]
-    assert truth["loaded_servo"]["gravity_nm"] == pytest.approx(0.1 * 0.12 * 9.81)
-    assert truth["registers"]["p"] == 16
-    own = robot.loaded[0]
-    assert truth["actuator"]["stiffness"] == pytest.approx(16 * own.torque_nm * own.duty_per_rad)
-    assert truth["actuator"]["armature"] == pytest.approx(own.armature_kg_m2 + 0.1 * 0.12**2)

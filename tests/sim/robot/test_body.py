@@ -9,12 +9,12 @@ import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.walks.conditions import evaluation_task
-from pupper_sysid.sim.robot.body import Body, body_of, fixed_offsets, mini_pupper
+from pupper_sysid.sim.robot.body import Body, body_of, mini_pupper
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import robot_xml
 from pupper_sysid.sim.robot.terrain import make_ground
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.config import PRESETS, Walking, for_robot
+from pupper_sysid.sim.walking.config import PRESETS, for_robot
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.legged import legged
@@ -74,13 +74,6 @@ def test_a_clocked_trot_carries_a_robot_that_no_one_has_seen_before(tmp_path):
         assert not found.done.any()
         speed.append(found.facts.stride_velocity[:, 0])
     assert np.median(speed[30:]) == pytest.approx(0.2, rel=0.25)
-
-
-def test_the_feet_of_the_mini_pupper_and_its_gait_are_what_the_rule_for_others_gives():
-    own = mini_pupper()
-    np.testing.assert_array_equal(fixed_offsets(own.feet_at), own.offsets)
-    assert (own.scale, own.touch_n, *own.command_scale) == (1.0, 0.25, 1.0, 1.0, 1.0)
-    assert Walking().body is own and Walking(knee="serial").body.linked == ()
 
 
 def test_the_mini_puppers_own_file_makes_the_same_body(tmp_path):
@@ -172,16 +165,6 @@ def test_a_mesh_that_is_only_shown_counts_where_it_is_all_of_a_bodys_mass(tmp_pa
     xml = legged(PLACES, more=asset).replace(trunk, shown)
     own = body(tmp_path, xml)
     assert own.mass_kg == pytest.approx(4 * 0.13 + 8.0 + 0.96, rel=0.01)  # density times volume
-
-
-def test_bodies_need_no_names_and_a_knee_above_a_foot_is_none(tmp_path):
-    xml = legged(PLACES).replace(
-        BALL, f'<body><inertial mass="0.01" pos="0 0 0" diaginertia="1e-6 1e-6 1e-6"/>'
-        f"<body>{BALL}</body></body><geom size='0.005' pos='0 0 -0.095'/>"
-    )  # fmt: skip
-    own = body(tmp_path, xml)
-    assert len(own.feet) == 4 and len(set(own.feet)) == 4
-    assert own.standing_height_m == pytest.approx(0.2 * np.cos(0.7) + 0.01)
 
 
 def test_feet_of_several_geoms_stand_in_their_middle_and_feel_all_of_them(tmp_path):
@@ -291,14 +274,6 @@ def test_joints_that_are_fixed_stay_as_they_are_in_the_pose(tmp_path):
     mujoco.mj_kinematics(model, data)
     head = data.body("head").xpos - data.body("torso").xpos
     np.testing.assert_allclose(head, [0, 0, 0.05], atol=1e-6)
-
-
-def test_joints_of_a_chain_that_turn_about_one_line_are_images_of_themselves(tmp_path):
-    own = body(tmp_path, legged(PLACES, base="<freejoint/>" + ARM))
-    assert own.mirror_joints is not None and own.mirror_signs is not None
-    assert {n: own.mirror_signs[own.joints.index(n)] for n in ("neck", "head", "jaw")} == {
-        "neck": 1, "head": -1, "jaw": -1,
-    }  # fmt: skip
 
 
 def test_linkages_are_taken_out_and_said_and_joints_of_tendons_have_servos(tmp_path):

@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from pupper_sysid.sim.walking.config import PRESETS, Commands, Curriculum, Observation, Walking
+from pupper_sysid.sim.walking.config import Commands, Curriculum, Observation, Walking
 from pupper_sysid.sim.walking.differences import TYPICAL, Differences
 from pupper_sysid.sim.walking.draws import Twins, at_rest, generator
 from pupper_sysid.sim.walking.env import PupperEnv
@@ -43,16 +43,6 @@ def test_a_wrong_zero_is_in_commands_and_readings_alike():
     # stiff servos of 20 N·m/rad give way by milliradians under the robot's weight
     np.testing.assert_allclose(wrong, zero, atol=0.01)
     np.testing.assert_allclose(seen[:, PARTS["joint_position_relative"]], 0.0, atol=0.01)
-
-
-def test_a_robot_that_misses_some_ticks_repeats_the_action_before():
-    env = make(missed_ticks=0.25, count=400)
-    env.step(np.full((400, 12), 0.1))
-    before = env.action.copy()
-    env.step(np.full((400, 12), 0.2))
-    missed = (env.action == before).all(axis=1)
-    assert 0.15 < missed.mean() < 0.35  # five standard deviations
-    assert (env.action[~missed] == 0.2).all()
 
 
 def imu(**settings) -> Imu:
@@ -102,17 +92,6 @@ def test_an_imu_mounted_askew_sees_tilted_gravity_and_biased_rates():
     np.testing.assert_allclose(np.linalg.norm(gravity, axis=1), 1.0)
 
 
-def test_the_observation_has_the_imu_s_readings():
-    env = make(imu_mounting_rad=0.1)
-    seen = stand(env, 30)
-    tilt = seen[:, PARTS["projected_gravity"]][:, :2]
-    level = stand(make(), 30)[:, PARTS["projected_gravity"]][:, :2]
-    np.testing.assert_allclose(
-        tilt[:, 0] - level[:, 0], env._senses.imu.mounting_rad[:, 1], atol=0.01
-    )
-    assert np.abs(tilt).max() > 0.05
-
-
 def test_a_low_battery_takes_stiffness_torque_and_speed_together():
     env = make(MEASURED, battery=(0.5, 0.5))
     servos = env.servos
@@ -152,14 +131,6 @@ def test_the_centre_of_mass_moves_in_the_physics():
     at = env.robots.field("body_ipos")[:, trunk] - env.robots.model.body_ipos[trunk]
     np.testing.assert_allclose(at, env.robots.bodies.centre_m, atol=1e-12)
     assert (at[:, 1] == 0).all() and np.abs(at[:, 0]).max() <= 0.01 and at[:, 2].std() > 0.008
-
-
-def test_some_robots_have_no_effort_readings():
-    env = make(count=200, without_effort=0.4)
-    effort = stand(env, 5)[:, PARTS["joint_effort"]]
-    none = (effort == 0).all(axis=1)
-    assert 0.23 < none.mean() < 0.57
-    np.testing.assert_array_equal(none, env.robots.bodies.effort == 0)
 
 
 def test_a_share_of_robots_is_as_calibrated():
@@ -227,22 +198,6 @@ def test_the_critic_sees_what_was_drawn():
         for column in truth.T:
             assert column.std() > 0
             assert tuple(np.round(column.astype(np.float32), 5)) in sight
-
-
-def test_robots_with_all_differences_go_on_exactly_from_a_saved_state():
-    task = PRESETS["scratch"]
-    env, other = (
-        PupperEnv(task, servo_ranges(MEASURED), 6, seed=seed, threads=1) for seed in (0, 5)
-    )
-    rng = np.random.default_rng(1)
-    actions = rng.uniform(-0.3, 0.3, (8, 6, 12))
-    for action in actions[:4]:
-        env.step(action)
-    assert other.restore(env.state)
-    for action in actions[4:]:
-        a, b = env.step(action), other.step(action)
-        np.testing.assert_array_equal(a.observation, b.observation)
-        np.testing.assert_array_equal(a.privileged, b.privileged)
 
 
 def test_ranges_that_cannot_be_drawn_from_are_refused():

@@ -61,24 +61,18 @@ def test_the_mean_age_is_the_feedbacks():
         assert np.mean(ages) == pytest.approx(feedback.mean_age_s, abs=error), (period, loss)
 
 
-def test_the_share_of_fresh_readings_is_the_share_of_successful_polls():
-    bus = settled(MEASURED)
-    fresh = []
-    for _ in range(50):
-        before = bus.readings.position.copy()
-        bus.step()
-        fresh.append((bus.readings.position != before).mean())
-    # at most one poll fits into a step that is shorter than the period
-    expected = (1 - MEASURED.loss) * SPAN / MEASURED.poll_period_s
-    assert np.mean(fresh) == pytest.approx(expected, abs=0.01)
-
-
-def test_a_reading_is_the_position_at_the_instant_of_its_poll():
+def test_a_reading_is_the_position_at_the_instant_of_its_poll_and_servos_come_in_turn():
     bus = settled(MEASURED, speed=3.0)
     age = bus.readings.age_s
     assert age.min() >= 0
     assert age.max() > 5 * MEASURED.poll_period_s
     np.testing.assert_allclose(bus.time * 3.0 - bus.readings.position, 3.0 * age, atol=1e-9)
+    # a twelfth of a round apart
+    bus = settled(HeldFeedback(poll_period_s=0.0268), environments=300)
+    polled = np.exp(2j * np.pi * np.diff(bus.time - bus.readings.age_s, axis=1) / 0.0268)
+    round_ = np.angle(polled) / (2 * np.pi)
+    assert round_.mean() == pytest.approx(1 / 12, abs=0.005)
+    assert np.abs(round_ - 1 / 12).max() < (2 * JITTER_S + 12e-5) / 0.0268
 
 
 def test_readings_are_whole_counts_of_the_offset_position():
@@ -90,32 +84,6 @@ def test_readings_are_whole_counts_of_the_offset_position():
         assert readings.position[0, 0] == pytest.approx(expected, abs=1e-12)
     readings.reset(np.array([0]), np.array([[0.052]]))
     assert readings.position[0, 0] == pytest.approx(0.06)  # 0.055 rounds to the even count
-
-
-def test_each_servo_has_its_own_feedback():
-    direct, slow = HeldFeedback(offset_rad=0.5), HeldFeedback(poll_period_s=10.0)
-    readings = HeldReadings((direct, slow), 50, H, np.random.default_rng(0))
-    readings.reset(np.arange(50), np.zeros((50, 2)))
-    advance(readings, np.full((50, SUBSTEPS + 1, 2), 1.0), np.zeros((50, SUBSTEPS + 1, 2)))
-    np.testing.assert_allclose(readings.position[:, 0], 1.5)
-    # of 50 robots polled every 10 s, hardly any in 20 ms
-    assert (readings.position[:, 1] == 0.0).mean() > 0.9
-
-
-def test_servos_are_polled_in_turn_a_twelfth_of_a_round_apart():
-    bus = settled(HeldFeedback(poll_period_s=0.0268), environments=300)
-    at = bus.time - bus.readings.age_s
-    round_ = np.angle(np.exp(2j * np.pi * np.diff(at, axis=1) / 0.0268)) / (2 * np.pi)
-    assert round_.mean() == pytest.approx(1 / 12, abs=0.005)
-    assert np.abs(round_ - 1 / 12).max() < (2 * JITTER_S + 12e-5) / 0.0268
-
-
-def test_robots_are_polled_at_their_own_times():
-    bus = settled(HeldFeedback(poll_period_s=0.0268), environments=500)
-    phase = bus.readings.age_s[:, 0] / 0.0268
-    # uniform over the round: mean 1/2, standard deviation 1/√12, five standard errors
-    assert phase.mean() == pytest.approx(0.5, abs=5 / np.sqrt(12 * 500))
-    assert phase.std() == pytest.approx(1 / np.sqrt(12), rel=0.1)
 
 
 def test_resetting_some_robots_leaves_the_others_alone():

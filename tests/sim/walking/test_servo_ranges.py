@@ -116,11 +116,3 @@ def test_the_torque_scale_is_one_factor_per_robot_on_all_torques_and_the_armatur
     # drawing leaves the ranges as they were
     np.testing.assert_array_equal(ranges.value["stiffness"], 70.0)
     np.testing.assert_array_equal(ranges.high["armature"], 0.005)
-
-
-def test_the_nominal_servo_of_a_joint_is_the_middle_of_its_intervals(tmp_path):
-    joints = {name: joint_calibration(5.0 + i) for i, name in enumerate(JOINT_NAMES)}
-    nominal = ranges_of(tmp_path, calibration(**joints)).nominal()
-    assert tuple(nominal) == JOINT_NAMES
-    for i, name in enumerate(JOINT_NAMES):
-        assert (nominal[name].stiffness, nominal[name].dead_time_s) == (5.0 + i, 0.025)
