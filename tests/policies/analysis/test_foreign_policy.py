@@ -172,34 +172,30 @@ def seen(**parts: Sequence[float]) -> np.ndarray:
     return row
 
 
-def test_history_repeats_the_first_value_and_then_moves_oldest_first(tmp_path):
+def test_history_age_clip_frames_and_a_phase_are_taken_from_the_yaml(tmp_path):
+    # history repeats the first value and then moves, the oldest first
     policy = rows_of(tmp_path, 9, "observation: [{term: command, history: 3, scale: [2, 1, 1]}]")
-    first = policy.observe(seen(command=[1, 0, 0]))[0]
-    second = policy.observe(seen(command=[5, 0, 0]))[0]
-    assert first.tolist() == [2, 0, 0] * 3
-    assert second.tolist() == [2, 0, 0, 2, 0, 0, 10, 0, 0]
-
-
-def test_newest_first_age_and_clip_are_taken_from_the_yaml(tmp_path):
-    policy = rows_of(
-        tmp_path,
-        9,
-        "observation:\n- {term: command, history: 2, newest: first, clip: [-1, 3]}\n"
-        "- {term: base_ang_vel, age: 2}\n",
+    first, second = (policy.observe(seen(command=[k, 0, 0]))[0].tolist() for k in (1, 5))
+    assert first == [2, 0, 0] * 3 and second == [2, 0, 0, 2, 0, 0, 10, 0, 0]
+    terms = (
+        "[{term: command, history: 2, newest: first, clip: [-1, 3]}, {term: base_ang_vel, age: 2}]"
     )
+    policy = rows_of(tmp_path, 9, f"observation: {terms}")
     rows = [
         policy.observe(seen(command=[k, 0, 0], rate=[10 * k, 0, 0]))[0].tolist() for k in (1, 2, 7)
     ]
     assert rows[2] == [3, 0, 0, 2, 0, 0, 10, 0, 0]
     assert rows[0][6] == rows[1][6] == 10
-
-
-def test_frames_stack_whole_rows(tmp_path):
-    policy = rows_of(
-        tmp_path, 8, "frames: 2\nobservation: [command, {term: constant, values: [9]}]"
-    )
+    # frames stack whole rows
+    nine = "frames: 2\nobservation: [command, {term: constant, values: [9]}]"
+    policy = rows_of(tmp_path, 8, nine)
     policy.observe(seen(command=[1, 0, 0]))
     assert policy.observe(seen(command=[2, 0, 0]))[0].tolist() == [1, 0, 0, 9, 2, 0, 0, 9]
+    # a phase runs with the actions: a quarter turn after 20 ms
+    clock = "{term: phase, frequency_hz: 12.5, waves: [cos, sin]}"
+    policy = rows_of(tmp_path, 2, f"observation: [{clock}]")
+    policy.act(seen())
+    np.testing.assert_allclose(policy.observe(seen())[0], [0.0, 1.0], atol=1e-6)
 
 
 def test_joints_are_by_name_angles_from_the_policys_pose_and_speeds_over_its_steps(tmp_path):
@@ -226,14 +222,6 @@ def test_set_points_are_the_policys_pose_and_scale_and_other_joints_stay(tmp_pat
     target = task.body.pose + task.action_scale * action
     np.testing.assert_allclose(target[[2, 0]], [-1.0 + 0.25, 0.1 - 0.5], atol=1e-6)
     np.testing.assert_allclose(np.delete(target, [0, 2]), np.delete(task.body.pose, [0, 2]))
-
-
-def test_a_phase_runs_with_the_actions(tmp_path):
-    clock = "{term: phase, frequency_hz: 12.5, waves: [cos, sin]}"
-    policy = rows_of(tmp_path, 2, f"observation: [{clock}]")
-    policy.act(seen())
-    # a quarter turn after 20 ms
-    np.testing.assert_allclose(policy.observe(seen())[0], [0.0, 1.0], atol=1e-6)
 
 
 # ------------------------------------------------------------------------- files of others

@@ -1,12 +1,10 @@
 """Altered observations, and what a walking policy makes of them."""
 
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pupper_sysid.cli.commands.analyze.walks import Delay
 from pupper_sysid.policies.analysis import figures
 from pupper_sysid.policies.analysis.autonomy import (
     Autonomy,
@@ -16,7 +14,6 @@ from pupper_sysid.policies.analysis.autonomy import (
     push_response,
 )
 from pupper_sysid.policies.analysis.robustness import DelayPoint, ablation, delay_curve
-from pupper_sysid.policies.analysis.trial import moving_frequency
 from pupper_sysid.policies.walks import perturbations
 from pupper_sysid.policies.walks.perturbations import JOINTS
 from pupper_sysid.policies.walks.rollouts import Rollout
@@ -85,13 +82,6 @@ def test_an_ablation_hurts_more_the_more_is_taken(walker, monkeypatch):
     assert {r.kind for r in rows} == {"noise", "zero", "hold"}
 
 
-def test_joints_that_stand_apart_but_do_not_move_have_no_frequency():
-    still = np.tile(np.linspace(-1.0, 1.0, 12), (400, 1))
-    assert np.isnan(moving_frequency(still, 0.02))
-    swing = still + 0.1 * np.sin(2 * np.pi * 3.0 * 0.02 * np.arange(400))[:, None]
-    assert moving_frequency(swing, 0.02) == pytest.approx(3.0, abs=0.01)
-
-
 # ------------------------------------------------------------------ policies that do not walk
 
 
@@ -151,15 +141,6 @@ def test_where_all_fell_there_are_no_numbers_and_no_crash(walker):
     )  # fmt: skip
 
 
-def test_a_policy_that_stands_has_no_orbit_and_no_phase(walker):
-    policy, trial = walker
-    plain = trial.walk(policy)
-    standing = recorded(replace(plain, action=np.zeros_like(plain.action)))
-    assert orbits(policy, standing, (0.0, 160.0)) == {} and push_response(policy, standing) == ()
-    assert all(np.isnan(r.share) for r in frozen(policy, standing))
-    assert all(np.isnan(r.correlation) for r in ablation(policy, standing, ("last_action",)))
-
-
 def test_an_eighth_policy_is_drawn_as_well_and_what_no_walk_has_is_not():
     row = DelayPoint(
         mode="fixed", extra_delay_ms=0, survival=1.0, frequency_hz=3.0, amplitude_rad=0.1
@@ -168,11 +149,3 @@ def test_an_eighth_policy_is_drawn_as_well_and_what_no_walk_has_is_not():
     assert [len(axes.lines) for axes in figure.axes] == [9, 9, 9]
     still = replace(row, frequency_hz=np.nan, amplitude_rad=np.nan)
     assert len(figures.delay_figure({"policy": [still]}).axes) == 1
-
-
-def test_a_picture_says_which_policies_walked_on_what_under_which_command():
-    asked = Delay(policies=(Path("runs/a"), Path("b")), actuator="x/mine.yaml", command=(0, 0, 0.4))
-    assert asked.caption("Against more delay (2 robots)") == (
-        "Against more delay (2 robots)\na, b; servos mine.yaml; "
-        "command 0 m/s forward, 0 m/s left, 0.4 rad/s"
-    )

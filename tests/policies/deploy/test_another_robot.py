@@ -16,7 +16,7 @@ from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
 from pupper_sysid.sim.walking.bus import WalkingBus, calibrated_robot
 from pupper_sysid.sim.walking.config import for_robot
-from pupper_sysid.sim.walking.robot import _model, body_joint_map
+from pupper_sysid.sim.walking.robot import _model
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.command_line import run_program
 from support.legged import legged
@@ -123,15 +123,6 @@ def test_the_imu_of_another_robot_measures_in_its_trunks_axes(policy):
     # the trunk stands level in the world: its axes are the world's
     np.testing.assert_allclose(sample.rate_rad_s, [0.1, 0.2, 0.3], atol=1e-3)
     np.testing.assert_allclose(sample.acceleration_m_s2, data.qacc[:3], atol=1e-2)
-
-
-def test_the_joint_map_of_an_emulated_robot_is_centred_between_its_limits(policy):
-    task = for_robot(tiny_run().task, policy.parent / "hexapod.xml", policy.parent / "hexapod.yaml")
-    layout = body_joint_map(task.body)
-    np.testing.assert_allclose(layout.to_counts((task.body.low + task.body.high) / 2), 2048.0)
-    limits = layout.position_limits()
-    np.testing.assert_allclose(limits.low_rad, task.body.low)
-    np.testing.assert_allclose(limits.high_rad, task.body.high)
 
 
 def test_a_policy_without_its_robots_file_says_which_is_missing(deploy, policy, tmp_path):

@@ -71,13 +71,6 @@ def test_a_common_scale_of_all_torques_is_not_seen_and_a_stiffer_servo_is():
     assert one.amount() == f"{factor:.2g} times the largest of the training"
 
 
-def test_more_friction_is_a_wider_dead_band():
-    found = outside(with_joint(0, friction_loss=5.0))
-    (one,) = found["dead band"]
-    value = 1e3 * 5.0 * HERE.value["friction_loss"][0] / HERE.value["stiffness"][0]
-    assert one.here.value == pytest.approx(value) and one.unit == "mrad" and one.beyond > 0
-
-
 def test_what_the_training_drew_is_within():
     drained = {
         name: 0.9 for name in ("stiffness", "effort_limit", "velocity_limit", "friction_loss")

@@ -20,7 +20,7 @@ from pupper_sysid.cli.policy_choice import (
     trained_actuator,
     trained_commands,
 )
-from pupper_sysid.common.errors import FileExistsRefusal, InputError
+from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.policies.network.policy_export import write_policy
@@ -119,20 +119,6 @@ def test_a_policy_for_one_robot_acts_with_the_same_bits_and_keeps_its_own_state(
     assert own.act(seen).shape == (1, 12)
 
 
-def test_a_policy_is_not_written_over_another_unless_asked(copied):
-    folder = copied()
-    with pytest.raises(FileExistsRefusal):
-        write(folder, networks("mlp")[0].state_dict(), force=False)
-
-
-def test_a_contract_of_version_1_has_its_dead_time_under_the_old_name(copied):
-    folder = copied()
-    written = json.loads((folder / CONTRACT).read_text())
-    older = {k.replace("dead_time_s", "delay_s"): v for k, v in written.items()}
-    (folder / CONTRACT).write_text(json.dumps(older | {"schema_version": 1}))
-    assert load_policy(folder).contract.model_dump(mode="json", by_alias=True) == written
-
-
 def test_a_policy_states_the_commands_that_its_training_had_come_to(tmp_path):
     run = tiny_run()
     run = replace(
@@ -181,18 +167,14 @@ def test_a_contract_that_was_tampered_with_is_refused(copied):
 
     cases = [
         ({"schema": "pupper-servo"}, "schema"), ({"schema_version": 5}, "Upgrade pupper-sysid"),
-        ({"schema_version": 0}, "schema_version"), ({"kind": "perceptron"}, "kind"),
-        ({"hidden": []}, "does not fit"), ({"hidden": [32, 17]}, "does not fit"),
+        ({"schema_version": 0}, "schema_version"), ({"hidden": [32, 17]}, "does not fit"),
         ({"hidden": [32, -1]}, "hidden"), ({"kind": "gru"}, "does not fit"),
         ({"action_history": 1}, "does not fit"), ({"action_scale_rad": 0.0}, "action_scale_rad"),
-        ({"control_step_s": "0.02"}, "control_step_s"), ({"extra": 1}, "extra"),
-        ({"control_step_s": 1e-9}, "control_step_s"), ({"base_velocity": "any"}, "base_velocity"),
+        ({"control_step_s": 1e-9}, "control_step_s"),
         ({"default_pose_rad": {"LF_hip": 0.0}}, "default_pose_rad"),
         ({"default_pose_rad": {"LF_hip": 50.0}}, "default_pose_rad"),
         ({"velocity_steps": 10**9}, "velocity_steps"), ({"dead_time_s": []}, "dead_time_s"),
         ({"dead_time_s": [0.01, float("nan")]}, "dead_time_s"),
-        ({"weights_sha256": "0" * 63}, "weights_sha256"),
-        ({"commands": {"forward_m_s": [-0.2, 0.2]}}, "sideways_m_s"),
         ({"commands": commands(forward_m_s=[0.2, -0.2])}, "lower end"),
         ({"commands": commands(yaw_rad_s=[-0.5, float("inf")])}, "yaw_rad_s"),
         *((text, "") for text in ("", "{", "[]", "null", '{"schema": NaN}', "\x00\xff")),

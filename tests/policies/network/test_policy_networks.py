@@ -118,25 +118,6 @@ def test_the_update_sees_the_very_policy_that_acted(kind):
         storage.clear()
 
 
-def test_what_was_before_a_rollout_matters_to_its_first_steps():
-    """Or the test above would say nothing about what is carried over."""
-    learner = ppo("transformer", ROBOTS, STEPS)
-    generator = torch.Generator().manual_seed(3)
-    for _ in range(2):
-        learner.storage.clear()
-        roll(learner, episode_ends(), generator)
-    batch = next(learner.storage.recurrent_mini_batch_generator(1, 1))
-    state = batch.hidden_states[0]
-    now, then = (
-        learner.actor(batch.observations, masks=batch.masks, hidden_state=s).detach()
-        for s in (state, 0 * state)
-    )
-    differ = ((now - then).abs() > 1e-4).any(dim=-1)
-    # robot 2's last episode ended with the rollout before
-    assert differ[0].tolist() == [True, True, False, True]
-    assert not differ[6:, 1].any() and not differ[1:, 3].any()
-
-
 def attention() -> CausalAttention:
     torch.manual_seed(4)
     made = CausalAttention(5)

@@ -13,10 +13,8 @@ from pupper_sysid.policies.network.hyperparameters import Exploration, Hyperpara
 from pupper_sysid.policies.train.learner import Ranks
 from pupper_sysid.policies.train.selection import Judge
 from pupper_sysid.policies.train.training import make_learner
-from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.servo_ranges import servo_ranges
-from support.tiny_training import CALIBRATION, tiny_run
+from support.tiny_training import tiny_run
 
 STEP_S = 0.02
 
@@ -64,17 +62,6 @@ def test_the_standard_deviation_falls_by_equal_factors_between_two_points():
     assert replace(explore, persistence_s=0.0).correlation(STEP_S) == 0.0
     with pytest.raises(InputError, match="std must be positive"):
         Exploration((0.0, 0.1))
-
-
-def test_joints_of_larger_dead_band_get_more_noise():
-    servos = servo_ranges(CALIBRATION)
-    share = servos.dead_band_share
-    assert share.mean() == pytest.approx(1.0) and share.std() > 0
-    band = servos.value["friction_loss"] / servos.value["stiffness"]
-    assert np.argmax(share) == np.argmax(band)
-    learner = make_learner(tiny_run(), Ranks())
-    assert learner.std == pytest.approx(learner.hyper.exploration.std[0], rel=1e-5)
-    assert (servo_ranges("ideal").dead_band_share == 1.0).all()
 
 
 def learning(**changes):
@@ -138,35 +125,6 @@ def test_a_policy_is_judged_without_noise_and_always_on_the_same_walks():
     with torch.no_grad():
         learner.actor.mlp[-1].bias += 0.5
     assert judge(learner.actor) != first
-
-
-class TrotActor:
-    """Open-loop trot in place of a policy's network."""
-
-    def __init__(self, judge: Judge, task: Walking):
-        self._trot, self._command, self._task = task.trot, judge._command, task
-        self._phase = 0.0
-
-    def get_hidden_state(self) -> None:
-        return None
-
-    def reset(self, dones: torch.Tensor | None = None, hidden_state: object = None) -> None:
-        pass
-
-    def __call__(self, observations: object) -> torch.Tensor:
-        self._phase += 2 * np.pi * self._trot.frequency_hz * self._task.control_step_s
-        joints = self._trot.joints(np.full(len(self._command), self._phase), self._command)
-        return torch.from_numpy((joints - default_pose()) / self._task.action_scale).float()
-
-
-def test_the_judge_counts_the_steps_of_a_trot():
-    task = Walking(episode_s=1.2)
-    judge = Judge(task, servo_ranges("paper", "ideal"), 0, 1)
-    found = judge(TrotActor(judge, task))  # type: ignore[arg-type]
-    assert found["score_falls"] == 0
-    # feet that bounce come down twice
-    assert task.trot.frequency_hz <= found["score_steps_hz"] < 1.25 * task.trot.frequency_hz
-    assert 0.5 < found["score_duty"] < 0.9
 
 
 @pytest.mark.slow

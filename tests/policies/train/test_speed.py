@@ -1,16 +1,13 @@
 """Both sides of a speed ratio do the same work in turns, and need no calibration at hand."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from pupper_sysid.policies.train import speed
 from pupper_sysid.policies.train.learner import Ranks
-from pupper_sysid.policies.train.run_file import Run
 from pupper_sysid.policies.train.training import make_env
 from pupper_sysid.sim.walking.config import Walking
-from support.tiny_training import CALIBRATION, tiny_run
+from support.tiny_training import tiny_run
 
 
 @pytest.fixture
@@ -57,12 +54,3 @@ def test_a_ratio_is_the_median_over_slices_with_their_middle_half():
     assert quartiles == (0.5, 0.75, 0.75)
     assert found["env_processor_ratio"] == 0.375
     assert found["env_steps_per_s"] == pytest.approx(1 / 4)
-
-
-def test_without_a_calibration_the_sample_is_measured_and_another_name_is_kept(here, monkeypatch):
-    assert Path(speed.with_sample(Run()).actuator) == Path(CALIBRATION)
-    assert speed.with_sample(Run(actuator="mine.yaml")).actuator == "mine.yaml"
-    monkeypatch.setattr(speed, "_SAMPLE", here / "none.yaml")
-    assert speed.with_sample(Run()).actuator == "paper"
-    Path("calibrated.yaml").write_text("")
-    assert speed.with_sample(Run()).actuator == "calibrated.yaml"

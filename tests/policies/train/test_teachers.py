@@ -164,18 +164,6 @@ def test_a_learned_teacher_continues_its_gait_from_the_last_two_actions():
     assert all(torch.equal(seen[k], before[k]) for k in seen.keys())
 
 
-def test_a_learned_teacher_follows_the_corrected_command():
-    env = WalkingVecEnv(make_env(tiny_run(environments=3), Ranks()))
-    env.env.command[:] = (0.1, 0.0, 0.0)
-    teacher = LearnedTeacher(env, Circle())  # pyright: ignore[reportArgumentType]
-    seen = env.get_observations()
-    slower = teacher.actions(seen).abs().amax(1)
-    teacher.correction[0, 0] = 0.2
-    # 20 % of the range of 0.2 m/s for a command of half of it
-    ratio = teacher.actions(seen).abs().amax(1) / slower
-    torch.testing.assert_close(ratio, torch.full((3,), 0.32 / 0.3), atol=0.02, rtol=0)
-
-
 @pytest.mark.slow
 def test_a_run_from_nothing_trains_its_teacher_first_and_resumes_in_the_midst_of_it(
     tmp_path, monkeypatch
@@ -274,12 +262,3 @@ def test_muon_in_float32_steps_like_torchs_in_bfloat16(shape):
     assert float((moved - expected).norm() / expected.norm()) < 0.1
     values = torch.linalg.svdvals(imitation.orthogonal_factor(ours.grad))
     assert 0.6 < float(values.median()) and float(values.max()) < 1.3
-
-
-def test_processors_without_bfloat16_take_float32(monkeypatch):
-    matrix = [torch.nn.Parameter(torch.ones(2, 2)), torch.nn.Parameter(torch.ones(2))]
-    for has, kind in ((True, torch.optim.Muon), (False, imitation.Float32Muon)):
-        monkeypatch.setattr(imitation, "multiplies_bfloat16", lambda device, has=has: has)
-        assert isinstance(imitation._optimisers(matrix)[0], kind)
-    monkeypatch.undo()
-    assert imitation.multiplies_bfloat16(torch.device("cuda"))

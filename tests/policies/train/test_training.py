@@ -12,7 +12,7 @@ import sys
 import time
 from dataclasses import replace
 from importlib.util import find_spec
-from itertools import count, pairwise
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -298,21 +298,6 @@ def test_updates_that_are_all_taken_back_are_said_and_end_the_run_with_what_help
     assert min(steps) == each and max(steps) == 4 * each, "of the policy, and of the critic"
 
 
-def test_a_watcher_is_told_where_the_run_stands(tmp_path):
-    seen = []
-    train(tmp_path, tiny_run(), seen.append)
-    assert [(p.phase, p.done, p.total) for p in seen] == [
-        ("imitation", 1, 2), ("imitation", 2, 2), ("ppo", 1, 3), ("ppo", 2, 3), ("ppo", 3, 3),
-    ]  # fmt: skip
-    assert all(a.elapsed_s < b.elapsed_s for a, b in pairwise(seen))
-    assert seen[-1].left_s == 0.0 and all(p.left_s >= 0.0 for p in seen)
-    samples = [p.row["samples"] for p in seen[2:]]
-    assert samples == [4 * 6 * k for k in (1, 2, 3)]
-    for p in seen[2:]:
-        terms = [v for k, v in p.row.items() if k.startswith("reward.")]
-        assert p.row["reward"] == pytest.approx(sum(terms))
-
-
 # ------------------------------------------------------------------------------ guards
 
 
@@ -487,12 +472,6 @@ def test_two_processes_learn_one_policy_from_different_robots_and_stop_at_the_sa
     assert two[0]["learning_rate"] == two[1]["learning_rate"]
     for part in ("observations", "environment", "torch_rng"):
         assert different(two[0][part], two[1][part])
-
-
-def test_alone_a_process_decides_for_itself():
-    ranks = Ranks.join()
-    assert ranks == Ranks(0, 1, 0)
-    assert ranks.any(True) and not ranks.any(False) and ranks.mean(2.5) == 2.5
 
 
 # ------------------------------------------------------------------------------ devices

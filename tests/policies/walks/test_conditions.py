@@ -14,27 +14,13 @@ from pupper_sysid.policies.walks.conditions import (
     Condition,
     evaluation_task,
     random_commands,
-    share_of_usual,
-    within,
 )
 from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.config import PRESETS, Commands, Walking
-from pupper_sysid.sim.walking.env import PupperEnv
+from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.refusals import assert_each_refused
-
-
-def test_commands_are_as_far_within_a_robots_ranges_as_usual_ones_within_theirs():
-    own = Commands((0.0, 0.4), (0.0, 0.0), (-1.0, 1.0))
-    usual = np.array([[0.15, 0.08, 0.4], [-0.15, -0.08, -0.4]])
-    task = replace(TASK, commands=own, robot="dog.xml")
-    found = within(task, usual)
-    # never backward, never sideways
-    np.testing.assert_allclose(found, [[0.3, 0.0, 0.8], [0.0, 0.0, -0.8]])
-    assert (share_of_usual(task) > 0).all()
-
 
 SERVOS = servo_ranges(SAMPLES / "calibrated.yaml")
 TASK = evaluation_task(Walking())
@@ -109,15 +95,6 @@ def test_changed_observations_and_pushes_reach_the_robots_of_their_condition_onl
     assert all(len(robots) == 2 for robots in pushed)
 
 
-def test_a_walk_ends_with_the_last_robot_of_its_condition():
-    (fallen,) = together([Condition(TASK, 2)], Stepping(falls=True), seconds=2.0)
-    up = fallen.alive.any(axis=1)
-    assert up.sum() < 60 and fallen.fell.all() and not up[-1]
-    # nothing is known of what was not simulated, but what was commanded
-    assert len(up) == 100 and not fallen.velocity[int(up.sum()) + 1 :].any()
-    assert fallen.command[-1].any()
-
-
 def test_progress_grows_to_its_end_and_an_error_or_interruption_ends_all_walks():
     shares = []
     together(CONDITIONS, seconds=0.2, progress=shares.append)
@@ -154,24 +131,6 @@ def test_robots_walk_on_the_learned_servos_that_were_given(monkeypatch, tmp_path
     with pytest.raises(ZeroDivisionError):
         walk_together(None, servos, [Condition(TASK, 2)], 1.0, 3, 1, Recorder)
     assert (model, str(tmp_path), 0.02) in given
-
-
-def test_robots_and_terrain_are_others_than_those_of_a_training_with_the_seed():
-    seen = []
-
-    def look(step, env, robots):
-        seen.append((env.ground.heights.copy(), env.robots.friction.copy()))
-
-    together([Condition(ROUGH, 2, disturb=look)], seconds=0.04, seed=3)
-    training = PupperEnv(ROUGH, SERVOS, 2, 3, 1)
-    assert (seen[0][0] != training.ground.heights).any()
-    assert (seen[0][1] != training.robots.friction).all()
-
-
-def test_the_trot_beside_a_policy_is_the_usual_one_or_that_fitted_to_its_servos():
-    fitted = replace(TASK, trot=Trot(frequency_hz=2.4, gain=1.3))
-    for task, expected in ((TASK, Trot()), (PRESETS["fast"], Trot()), (fitted, fitted.trot)):
-        assert module._reference(task) == expected
 
 
 def test_policy_trot_and_standing_robots_share_an_environment_and_differ_in_their_actions_only(
