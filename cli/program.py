@@ -374,17 +374,18 @@ class Command(NamedTuple):
 
 def commands_of(
     summaries: Mapping[str, Mapping[str, str]],
-    module: Callable[[str, str], str],
+    modules: Mapping[str, str],
     holding_bus: Collection[str] = (),
 ) -> dict[str, Command]:
     """Commands by word, from their summaries by group; `fit-servo` is a class `FitServo`.
 
-    `module` gives the module of a group's word, below `pupper_sysid.cli.commands`; those
-    `holding_bus` must release a bus before they end.
+    `modules` has the words of each module below `pupper_sysid.cli.commands`; the module of any
+    other word is called as it. Those `holding_bus` must release a bus before they end.
     """
+    module_of = {word: module for module, words in modules.items() for word in words.split()}
     return {
         word: Command(
-            group, summary, f"{module(group, word)}:{word.title().replace('-', '')}",
+            group, summary, f"{module_of.get(word, word)}:{word.title().replace('-', '')}",
             word in holding_bus,
         )
         for group, words in summaries.items()

@@ -49,9 +49,6 @@ if TYPE_CHECKING:
     from pupper_sysid.common.tables import Table as ResultTable
     from pupper_sysid.sysid.recordings.recording import Recording
 
-JOBS = (1, 1024)
-"""Smallest and largest number of robots of a fleet that are computed at the same time."""
-
 _COMMAND = re.compile(r"(^|\s)(pupper-[a-z]+|rerun|python|systemctl) ")
 _LINE_S = 10.0  # between lines of progress where there is no terminal
 _CONTROL = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
@@ -150,19 +147,21 @@ class _FittingTable(Table):
                 column.width = width_of
 
 
-def table(title: str, *columns: str) -> Table:
-    """Empty table; the first column is left-aligned text, the others numbers."""
-    empty = _FittingTable(
+def table(title: str, *columns: str, rows: Iterable[Iterable[Any]] = ()) -> Table:
+    """Table of rows; the first column is left-aligned text, the others numbers."""
+    filled = _FittingTable(
         title=title, title_justify="left", title_style="bold", box=None, pad_edge=False,
         min_width=min(len(title), out.width),  # a title is broken at the table's width
     )  # fmt: skip
     for k, column in enumerate(columns):
         # folded where it is too wide, headings between words: a truncated number would be wrong
-        empty.add_column(
+        filled.add_column(
             column, justify="left" if k == 0 else "right", no_wrap=k == 0, overflow="fold",
             min_width=max(map(len, column.split()), default=0),
         )  # fmt: skip
-    return empty
+    for row in rows:
+        filled.add_row(*(cell if isinstance(cell, Text) else str(cell) for cell in row))
+    return filled
 
 
 def result_table(results: ResultTable) -> Table:
@@ -173,6 +172,11 @@ def result_table(results: ResultTable) -> Table:
         style = "bold" if row.get(results.marked) else None
         filled.add_row(*(column.text(row) for column in columns), style=style)
     return filled
+
+
+def print_table(title: str, *columns: str, rows: Iterable[Iterable[Any]]) -> None:
+    """Print a table of rows."""
+    out.print(table(title, *columns, rows=rows))
 
 
 def print_tables(*tables: ResultTable) -> None:

@@ -37,8 +37,8 @@ class SafetyStop(BusError):
     """The robot was stopped to prevent harm."""
 
 
-def refuse_outside(name: str, value: float, low: float, high: float, unit: str = "") -> None:
-    """Refuse a number that is not between two others, which are included; NaN is not.
+def refuse_outside(name: str, value: float | None, low: float, high: float, unit: str = "") -> None:
+    """Refuse a number that is not between two others, which are included; NaN is not, None passes.
 
     Examples
     --------
@@ -47,6 +47,8 @@ def refuse_outside(name: str, value: float, low: float, high: float, unit: str =
     ...
     pupper_sysid.common.errors.InputError: `seconds` is 1e+09 s; it must be from 0.1 to 600 s.
     """
+    if value is None:
+        return
     if not isinstance(value, SupportsFloat):
         raise InputError(f"{name} is a {type(value).__name__}; write a number.")
     if not low <= value <= high:

@@ -68,7 +68,7 @@ def _run(options: Options) -> None:
         raise InputError("No policy was named: python -m reproduction runs/<name>.")
     import torch
 
-    from pupper_sysid.cli.commands.analyze.walks import tries_of
+    from pupper_sysid.cli.commands.walks import tries_of
     from reproduction.page import write_claims
 
     torch.set_num_threads(1)

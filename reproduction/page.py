@@ -49,7 +49,7 @@ from reproduction.walks import Walker, compare_stacks
 Evidence = tuple[list[PolicyEvidence], list[Training]]
 
 if TYPE_CHECKING:
-    from pupper_sysid.cli.commands.analyze.walks import Tries
+    from pupper_sysid.cli.commands.walks import Tries
     from reproduction.__main__ import Options
 
 _SHOWN_S = 2.0

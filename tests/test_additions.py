@@ -43,7 +43,7 @@ def test_an_export_target_is_a_module_and_an_entry(capsys, monkeypatch, here):
     )  # fmt: skip
     monkeypatch.setitem(TARGETS, "gazebo", Target("gazebo", "gazebo", "to_gazebo", ".sdf"))
     # as in a new process: the command's choices are those of the table
-    monkeypatch.delitem(sys.modules, "pupper_sysid.cli.commands.use.export", raising=False)
+    monkeypatch.delitem(sys.modules, "pupper_sysid.cli.commands.export", raising=False)
     assert "gazebo" in ran(capsys, "export", "--help")[0]
     ran(capsys, "export", "paper", "--to", "gazebo")
     assert Path("paper.sdf").read_text().startswith("<servos>LF_hip")

@@ -33,8 +33,10 @@ _SUMMARIES = {
         "servo-demand": "What a gait needs, against what a servo has.",
     },
 }
-_MODULES = {"servo": "servos", "servo-demand": "servos", "twin": "servos"}
-COMMANDS = commands_of(_SUMMARIES, lambda _, word: f"analyze.{_MODULES.get(word, 'walks')}")
+COMMANDS = commands_of(
+    _SUMMARIES, {"servo_tests": "servo servo-demand twin",
+                 "walks": "gait attractor autonomy delay ablation terrain compliance"},
+)  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -18,7 +18,7 @@ import tyro
 
 from pupper_sysid.cli import policy_choice, terminal
 from pupper_sysid.cli.buses import chosen_map
-from pupper_sysid.cli.commands.recording.sweep import Sweep
+from pupper_sysid.cli.commands.sweep import Sweep
 from pupper_sysid.cli.live_views import ViewTargets, live_views
 from pupper_sysid.cli.program import end_politely, run_program
 from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn

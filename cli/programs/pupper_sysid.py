@@ -46,15 +46,14 @@ _SUMMARIES = {
     },
 }
 _MODULES = {
-    "import": "files", "view": "files", "doctor": "measure", "delay": "measure", "bode": "measure",
-    "backlash": "measure", "park": "scan", "compare-truth": "compare", "sindy": "fit_servo",
-    "report": "pages", "samples": "pages",
+    "bus": "scan monitor park", "joint_maps": "init-robot calibrate-joints", "cards": "servo",
+    "recordings": "import view doctor delay bode backlash report samples",
+    "models": "calibrate sindy fit-servo compare compare-truth",
 }  # fmt: skip
 COMMANDS = commands_of(
-    _SUMMARIES,
-    lambda group, word: f"{group}.{_MODULES.get(word, word.replace('-', '_'))}",
+    _SUMMARIES, _MODULES,
     holding_bus={"scan", "monitor", "park", "calibrate-joints", "emulate", "sweep"},
-)
+)  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -7,8 +7,8 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from pupper_sysid.cli.commands.robot.calibrate_joints import Guide
-from pupper_sysid.cli.commands.robot.emulate import Hand
+from pupper_sysid.cli.commands.emulate import Hand
+from pupper_sysid.cli.commands.joint_maps import Guide
 from pupper_sysid.cli.programs.pupper_sysid import main
 from pupper_sysid.common.errors import BusError
 from pupper_sysid.common.joints import JOINT_NAMES

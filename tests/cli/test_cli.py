@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.analyze.walks import interval, table_of
+from pupper_sysid.cli.commands.walks import interval, table_of
 from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.results import plain

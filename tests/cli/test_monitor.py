@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from pupper_sysid.cli.commands.robot.monitor import Watched
+from pupper_sysid.cli.commands.bus import Watched
 from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.feetech import PING, SYNC_READ, FrameReader
@@ -146,7 +146,7 @@ def test_ctrl_c_ends_it_as_it_should(capsys, monkeypatch):
     def interrupted(self):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pupper_sysid.cli.commands.robot.monitor.Watched.look", interrupted)
+    monkeypatch.setattr("pupper_sysid.cli.commands.bus.Watched.look", interrupted)
     code, _, err = run(capsys, "monitor", "--bus", "emulated")
     assert code == 130 and err == "Stopped."
 

@@ -10,8 +10,8 @@ from contextlib import suppress
 
 import pytest
 
-from pupper_sysid.cli.commands.robot import scan
-from pupper_sysid.cli.commands.robot.scan import Park
+from pupper_sysid.cli.commands import bus as scan
+from pupper_sysid.cli.commands.bus import Park
 from pupper_sysid.cli.programs.pupper_sysid import COMMANDS
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.hardware import loop as clock

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pupper_sysid.cli.commands.robot import scan as scan_command
+from pupper_sysid.cli.commands import bus as scan_command
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware.address import parse_address
 from pupper_sysid.hardware.dynamixel import FAMILY as DYNAMIXEL_FAMILY

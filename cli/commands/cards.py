@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 
 from pupper_sysid.cli import terminal
+from pupper_sysid.cli.commands.common import Json
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.servo_models.calibration.parts import ARMATURES, P_GAINS
-
-if TYPE_CHECKING:
-    from pupper_sysid.servo_models.calibration.quantity import Quantity
-    from pupper_sysid.servo_models.cards.card import ServoCard
-    from pupper_sysid.servo_models.cards.compare import Comparison, Difference
-    from pupper_sysid.servo_models.cards.compare import Servo as Compared
+from pupper_sysid.servo_models.calibration.quantity import Quantity, words_of
+from pupper_sysid.servo_models.cards import compare
+from pupper_sysid.servo_models.cards.card import ServoCard
+from pupper_sysid.servo_models.cards.files import card_names, load_card
+from pupper_sysid.servo_models.cards.numbers import TorquePD, unit
 
 _WIDTH = 78
 
@@ -30,41 +30,35 @@ class List:
     Example: pupper-sysid servo list
     """
 
-    json: bool = False
-    """Print one JSON object and nothing else."""
+    json: Json = False
 
     def run(self) -> None:
         """Read every card and print a table."""
-        from pupper_sysid.servo_models.cards.files import card_names, load_card
-
-        cards = {name: load_card(name) for name in card_names()}
+        cards, n = {name: load_card(name) for name in card_names()}, terminal.number
         if self.json:
-            terminal.print_json({"cards": {n: _summary(c) for n, c in cards.items()}})
-            return
-        from pupper_sysid.servo_models.cards.compare import implausible
-
-        table = terminal.table(
+            return terminal.print_json({"cards": {n: _summary(c) for n, c in cards.items()}})
+        terminal.print_table(
             "Servo cards, as PD in torque", "name", "V", "P", "N·m/rad", "N·m", "kg·m²", "friction",
             "dead ms",
+            rows=(
+                (
+                    name + ("" if card.published else " *"), _plain(card.supply_v),
+                    _plain(card.gains.p),
+                    n(pd.stiffness_nm_per_rad.value, 1), n(pd.effort_limit_nm.value, 2),
+                    n(pd.armature_kg_m2.value, 4) + "+" * (card.armature != "servo"),
+                    n(pd.friction_loss_nm.value, 3),
+                    terminal.ms(pd.dead_time_s.value if pd.dead_time_s else None),
+                )
+                for name, card in cards.items()
+                for pd in [card.pd()]
+            ),
         )  # fmt: skip
-        doubts = [sentence for card in cards.values() for sentence in implausible(card)]
-        for name, card in cards.items():
-            pd, n = card.pd(), terminal.number
-            table.add_row(
-                name + ("" if card.published else " *"), _plain(card.supply_v),
-                _plain(card.gains.p),
-                n(pd.stiffness_nm_per_rad.value, 1), n(pd.effort_limit_nm.value, 2),
-                n(pd.armature_kg_m2.value, 4) + "+" * (card.armature != "servo"),
-                n(pd.friction_loss_nm.value, 3),
-                terminal.ms(pd.dead_time_s.value if pd.dead_time_s else None),
-            )  # fmt: skip
-        terminal.out.print(table)
         ours = any(not card.published for card in cards.values())
         terminal.err.print(
             ("* fitted here, all others cited. " if ours else "All are cited from others. ")
             + "`pupper-sysid servo show NAME` says where from. An armature with + holds the link."
         )
-        terminal.warn(*doubts)
+        terminal.warn(*(text for card in cards.values() for text in compare.implausible(card)))
 
 
 @dataclass(frozen=True)
@@ -80,28 +74,21 @@ class Show:
     """P gain other than the card's, for the PD in torque."""
     yaml: bool = False
     """Print the card's file, and nothing else: a beginning for one of your own."""
-    json: bool = False
-    """Print one JSON object and nothing else."""
+    json: Json = False
 
     def run(self) -> None:
         """Read the card and print it."""
-        from pupper_sysid.servo_models.cards.compare import implausible
-        from pupper_sysid.servo_models.cards.files import load_card
-
         card = load_card(self.card)
-        if self.gain is not None:
-            refuse_outside("--gain", self.gain, *P_GAINS)
+        refuse_outside("--gain", self.gain, *P_GAINS)
         if self.yaml:
-            print(card.to_yaml(), end="")
-            return
+            return print(card.to_yaml(), end="")
         if self.json:
-            terminal.print_json(_summary(card, self.gain) | {"card": card})
-            return
+            return terminal.print_json(_summary(card, self.gain) | {"card": card})
         for line in _head(card):
             terminal.out.print(line)
         for name in card.specimens:
             terminal.out.print(_numbers(card, name, self.gain))
-        for note in (*implausible(card), *card.notes):
+        for note in (*compare.implausible(card), *card.notes):
             for n, line in enumerate(wrap(note, _WIDTH - 2)):
                 terminal.out.print(("- " if n == 0 else "  ") + line)
 
@@ -125,28 +112,27 @@ class Diff:
     gain: float | None = None
     """P gain of both; by default that of a servo whose numbers hold at no other, else the
     first's."""
-    json: bool = False
-    """Print one JSON object and nothing else."""
+    json: Json = False
 
     def run(self) -> None:
         """Read both and print a table."""
-        from pupper_sysid.servo_models.cards.compare import compared
-
-        if self.gain is not None:
-            refuse_outside("--gain", self.gain, *P_GAINS)
-        comparison = compared(self.first, self.second, self.joint, self.gain, _servo)
+        refuse_outside("--gain", self.gain, *P_GAINS)
+        found = compare.compared(self.first, self.second, self.joint, self.gain, _servo)
         if self.json:
-            terminal.print_json(comparison)
-            return
-        servos = _column(comparison.first), _column(comparison.second)
-        table = terminal.table("", "", *servos, "ratio")
-        for row in comparison.differences:
-            table.add_row(
-                f"{row.quantity} [{row.unit}]", _with_interval(row.first),
-                _with_interval(row.second), terminal.number(row.ratio, 2),
-            )  # fmt: skip
-        terminal.out.print(table)
-        for sentence in (*comparison.notes, _verdict(comparison.differences), _motion(comparison)):
+            return terminal.print_json(found)
+        columns = (
+            servo.title + ("" if servo.p_gain is None else f", P {servo.p_gain:g}")
+            for servo in (found.first, found.second)
+        )
+        terminal.print_table(
+            "", "", *columns, "ratio",
+            rows=(
+                (f"{row.quantity} [{row.unit}]", _with_interval(row.first),
+                 _with_interval(row.second), terminal.number(row.ratio, 2))
+                for row in found.differences
+            ),
+        )  # fmt: skip
+        for sentence in (*found.notes, *_verdict(found)):
             for line in wrap(sentence, _WIDTH):
                 terminal.out.print(line)
 
@@ -201,9 +187,6 @@ def _head(card: ServoCard) -> list[str]:
 
 def _numbers(card: ServoCard, name: str, gain: float | None) -> Any:
     """Table of one specimen: as it is stated, and as a PD in torque."""
-    from pupper_sysid.servo_models.calibration.quantity import words_of
-    from pupper_sysid.servo_models.cards.numbers import TorquePD, unit
-
     numbers, pd = card.specimens[name], card.pd(name, gain)
     table = terminal.table(f"\n{name}" if len(card.specimens) > 1 else "", "", "value", "unit")
     models: Mapping[str, Any] = {"": pd}
@@ -229,43 +212,33 @@ def _with_interval(quantity: Quantity | None) -> str:
     return f"{text} [{low:.3g}, {high:.3g}]"
 
 
-def _column(servo: Compared) -> str:
-    return servo.title + ("" if servo.p_gain is None else f", P {servo.p_gain:g}")
-
-
 def _plain(value: float | None) -> str:
     return "–" if value is None else f"{value:g}"
 
 
-def _servo(source: str, part: str | None, gain: float | None) -> Compared:
+def _servo(source: str, part: str | None, gain: float | None) -> compare.Servo:
     """A servo of whatever file states one."""
-    from pupper_sysid.servo_models.cards.compare import servo_of
-
     if Path(source).suffix not in (".xml", ".mjcf", ".py"):
-        return servo_of(source, part, gain)
+        return compare.servo_of(source, part, gain)
     from pupper_sysid.sim.export.foreign import foreign_servo
 
     return foreign_servo(source, part)
 
 
-def _motion(comparison: Comparison) -> str:
-    """Lags and distance of the two motions in words."""
-    motion = comparison.motion
-    numbers = map(terminal.ms, (motion.first_lag_s, motion.second_lag_s, motion.apart_rad))
-    return (
-        "On tones of 1, 2 and 4 Hz, 0.2 rad: lag {} and {} ms, {} mrad apart (RMS), each as it "
-        "stands, with the link that it is known to move."
-    ).format(*numbers)
-
-
-def _verdict(differences: Sequence[Difference]) -> str:
-    known = [row for row in differences if row.ratio is not None]
+def _verdict(found: compare.Comparison) -> Iterator[str]:
+    """The largest difference, then lags and distance of the two motions, in words."""
+    known = [row for row in found.differences if row.ratio is not None]
     if not known:
         raise InputError("The two have no number in common.")
-    most = max(known, key=lambda row: row.distance)
+    most, motion = max(known, key=lambda row: row.distance), found.motion
     if most.distance < 0.02:
-        return "They agree within 2 % in every number that is compared."
-    return (
-        f"They differ most in {most.quantity}: {most.ratio:.3g} times. Numbers that only one "
-        "states show a dash."
-    )
+        yield "They agree within 2 % in every number that is compared."
+    else:
+        yield (
+            f"They differ most in {most.quantity}: {most.ratio:.3g} times. Numbers that only one "
+            "states show a dash."
+        )
+    yield (
+        "On tones of 1, 2 and 4 Hz, 0.2 rad: lag {} and {} ms, {} mrad apart (RMS), each as it "
+        "stands, with the link that it is known to move."
+    ).format(*map(terminal.ms, (motion.first_lag_s, motion.second_lag_s, motion.apart_rad)))

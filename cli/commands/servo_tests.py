@@ -11,14 +11,14 @@ import numpy as np
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.analyze.walks import Analysis, Commanded, Drawn, check_walk, tries_of
+from pupper_sysid.cli.commands.walks import Analysis, Commanded, Drawn, check_walk, tries_of
 from pupper_sysid.cli.terminal import err, ms, need_positive, number
 from pupper_sysid.common.errors import InputError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from pupper_sysid.cli.commands.analyze.walks import Results, Tries
+    from pupper_sysid.cli.commands.walks import Results, Tries
     from pupper_sysid.policies.analysis.servo_demand import ServoDemand as Demand
     from pupper_sysid.policies.analysis.trial import Trial
     from pupper_sysid.policies.twin.twin import Gyro

@@ -1,4 +1,4 @@
-"""`calibrate-joints`: measure the joint map of a limp robot that is moved by hand."""
+"""Joint maps: begun from a robot's model, or measured on a limp robot that is moved by hand."""
 
 from __future__ import annotations
 
@@ -8,20 +8,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import tyro
 from numpy.typing import NDArray
 from rich.console import Group
 from rich.live import Live
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.buses import joints_on, say_remarks
+from pupper_sysid.cli.buses import JOINTS_FILE, joints_on, say_remarks
+from pupper_sysid.cli.commands.common import Json, Replace
 from pupper_sysid.cli.terminal import Keyboard
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.reading.dialect import whole_number
 from pupper_sysid.hardware import joint_calibration as jc
 from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
 from pupper_sysid.hardware.bus import ServoBus
-from pupper_sysid.hardware.joint_calibration import write_lerobot
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.safety.guard import open_bus
 
@@ -55,8 +57,7 @@ class CalibrateJoints:
     """Angle that it is moved through for that [degrees]."""
     lerobot_calibration: Path | None = None
     """Also write LeRobot's calibration (.json), with the homing offsets that the servos have."""
-    force: bool = False
-    """Replace files that exist."""
+    force: Replace = False
 
     def run(self) -> None:
         """Guide through the steps and write the map."""
@@ -115,19 +116,19 @@ class CalibrateJoints:
                 name: setup.get("registers", {}).get("homing_offset", 0)
                 for name, setup in setups.items()
             }
-            write_lerobot(self.lerobot_calibration, new, offsets_there, self.force)
-        table = terminal.table(
-            f"{self.out}: {new.file.name}", "joint", "id", "offset", "limits", "counts/rad"
-        )
-        for name in offsets:
-            entry = new.file.joints[name]
-            low, high = entry.limits_counts
-            table.add_row(
-                name, str(entry.id), f"{entry.offset_counts:+d}",
-                f"{low}–{high}" + ("" if name in limits else " kept"),
-                terminal.number(entry.counts_per_rad, 2),
-            )  # fmt: skip
-        terminal.out.print(table)
+            jc.write_lerobot(self.lerobot_calibration, new, offsets_there, self.force)
+        entries = {name: new.file.joints[name] for name in offsets}
+        terminal.print_table(
+            f"{self.out}: {new.file.name}", "joint", "id", "offset", "limits", "counts/rad",
+            rows=(
+                (
+                    name, e.id, f"{e.offset_counts:+d}",
+                    "{}–{}".format(*e.limits_counts) + ("" if name in limits else " kept"),
+                    terminal.number(e.counts_per_rad, 2),
+                )
+                for name, e in entries.items()
+            ),
+        )  # fmt: skip
         where = ("--bus", self.bus, "--joint-map", self.out)
         sweep = ("sweep", "--freqs", "1-10", "--joints", next(iter(offsets)), *where)
         terminal.out.print(
@@ -334,3 +335,131 @@ class Guide:
 
 def _list(names: list[str]) -> str:
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
+
+
+_AMPLITUDE_RAD, _SMALLEST_RAD = 0.3, 0.05
+
+
+@dataclass(frozen=True)
+class InitRobot:
+    """Make a joint map of another robot with hobby servos, and plan its sweeps.
+
+    Example: pupper-sysid init-robot my_robot.xml --servo sts3215
+
+    Example: pupper-sysid init-robot --servo xl330-m288 --joints pan=1,tilt=2
+    """
+
+    model: tyro.conf.Positional[Path | None] = None
+    """The robot's MJCF or URDF."""
+    joints: str | None = None
+    """Instead of a model file, names of joints and their servos' ids: pan=1,tilt=2."""
+    servo: str = "sts3215"
+    """Which servos it has: sts3215, scs0009, hd-1910, xl330-m288, xm430-w350, mx-28 or another name
+    that scan prints; sts, hls or scs for Feetech servos that it only numbers."""
+    lerobot_calibration: Path | None = None
+    """LeRobot's calibration of this arm (.json): its ids, directions, homing offsets and ranges are
+    taken instead of guesses."""
+    out: Path | None = None
+    """Joint map to write; by default the model's name and .joints.yaml, in this folder; without a
+    model joints.yaml, which the other commands use by default."""
+    force: bool = False
+    """Replace the file if it exists."""
+    json: Json = False
+
+    def run(self) -> None:
+        """Read the model, write the map, print the next commands."""
+        from pupper_sysid.sim.robot.robot_map import FAMILIES, joint_map_of, joint_map_of_servos
+
+        lerobot = jc.read_lerobot(self.lerobot_calibration) if self.lerobot_calibration else None
+        if self.model is not None and self.joints is None:
+            robot = joint_map_of(self.model, self.servo, lerobot)
+            usual = Path(f"{self.model.stem}.joints.yaml")
+        elif self.model is None and self.joints is not None and lerobot is None:
+            robot, usual = joint_map_of_servos(_parse_ids(self.joints), self.servo), JOINTS_FILE
+        else:
+            raise InputError(
+                "init-robot needs the robot's MJCF or URDF; or, without one, --joints with the "
+                "servos' ids, such as pan=1,tilt=2 (--lerobot-calibration goes with a model)."
+            )
+        joint_map, left_out = robot.joint_map, robot.left_out
+        target = self.out or usual
+        joint_map.save(target, self.force)
+        servos = joint_map.per_servo()
+        margin = servos.position_limits().margin(servos.rest_pose())
+        margins = dict(zip(joint_map.joint_names, margin, strict=True))
+        joints: dict[float, list[str]] = {}  # by amplitudes that leave a fifth of their margin
+        for name, free in margins.items():
+            amplitude = max(min(_AMPLITUDE_RAD, np.floor(80 * free) / 100), _SMALLEST_RAD)
+            joints.setdefault(float(amplitude), []).append(name)
+        sweeps = [
+            terminal.command(
+                "pupper-sysid", "sweep", "--joint-map", target, "--joints", ",".join(names),
+                "--freqs", "1-6", "--amplitude", f"{amplitude:g}",
+            )
+            for amplitude, names in sorted(joints.items(), reverse=True)
+        ]  # fmt: skip
+        if left_out:
+            terminal.warn(
+                f"no actuator of {self.model} drives these, left out: {', '.join(left_out)}."
+                " If they have servos, give them actuators there, or take all actuators out."
+            )
+        terminal.warn(*robot.doubts)
+        if robot.following:
+            pairs = ", ".join(f"{name} (follows {of})" for name, of in robot.following.items())
+            terminal.warn(f"no servo of their own, left out: {pairs}.")
+        narrow = [name for name, free in margins.items() if free < _SMALLEST_RAD]
+        if narrow:
+            terminal.warn(
+                f"{', '.join(narrow)}: less than {_SMALLEST_RAD:g} rad of margin, too little "
+                f"for a sweep. Are the limits in {self.model} in another unit? MJCF counts in "
+                'degrees, unless it says <compiler angle="radian"/>; URDF in radians.'
+            )
+        if self.json:
+            terminal.print_json(
+                {
+                    "joint_map": target, "joints": joint_map.joint_names, "ids": joint_map.ids,
+                    "left_out": left_out, "following": robot.following, "doubts": robot.doubts,
+                    "margin_rad": margins, "sweeps": sweeps,
+                }
+            )  # fmt: skip
+            return
+        entries = {name: joint_map.file.joints[name] for name in margins}
+        terminal.print_table(
+            f"{target}, servos {self.servo}",
+            "joint", "id", "centre rad", "limits rad", "margin rad",
+            rows=(
+                (name, e.id, f"{e.neutral_rad:.2f}", "{:.2f} … {:.2f}".format(*e.limits_rad),
+                 f"{margins[name]:.2f}")
+                for name, e in entries.items()
+            ),
+        )  # fmt: skip
+        bus = f"{FAMILIES[self.servo.lower()].name}:/dev/ttyUSB0"
+        quoted = terminal.command(target)
+        terminal.out.print(
+            "Ids, signs and centres are guesses. Ids and signs are for you to check: with the "
+            "servos limp, move one joint after the other by hand to its positive side and watch\n"
+            f"  pupper-sysid monitor --joint-map {quoted} --bus {bus}\n"
+            f"If another row changes, correct the id in {target}; if the angle falls, the sign.\n"
+            "Then measure centres, ranges and scale:\n"
+            f"  pupper-sysid calibrate-joints --joint-map {quoted} --out {quoted} --force "
+            f"--bus {bus}\n"
+            f"Sweep, first without the robot, then with --bus {bus}:\n"
+            + "".join(f"  {line}\n" for line in sweeps)
+            + "Then doctor, delay, calibrate, fit-servo and export, as for any recording."
+        )
+
+
+def _parse_ids(text: str) -> dict[str, int]:
+    """Servo id of each joint: pan=1,tilt=2."""
+    ids: dict[str, int] = {}
+    for part in (piece.strip() for piece in text.split(",")):
+        name, equals, number = (piece.strip() for piece in part.partition("="))
+        if not (name and equals and number.isascii() and number.isdecimal()):
+            raise InputError(
+                f"--joints: '{part}' is not NAME=ID; write pan=1,tilt=2. `pupper-sysid scan` lists "
+                "the ids."
+            )
+        if name in ids:
+            raise InputError(f"--joints: {name} is there twice.")
+        ids[name] = whole_number(number)
+    return ids

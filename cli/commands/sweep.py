@@ -17,7 +17,7 @@ import numpy as np
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE, connect, joints_on, parse_registers
-from pupper_sysid.cli.commands.recording.plan import run_rounds, say_how_to_resume
+from pupper_sysid.cli.commands.plan import run_rounds, say_how_to_resume
 from pupper_sysid.cli.live_views import ViewTargets, live_views
 from pupper_sysid.common.errors import BusError, InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, sha256

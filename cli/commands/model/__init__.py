@@ -1,1 +1,0 @@
-"""Commands that fit and compare servo models."""

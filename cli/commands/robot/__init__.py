@@ -1,1 +1,0 @@
-"""Commands about a robot: its bus, its joints, its emulation."""

@@ -1,1 +1,0 @@
-"""Commands that present results and convert them for other programs."""
