@@ -119,8 +119,7 @@ class SerialLine(Common):
     def refuse_outside(self, rates: tuple[int, ...]) -> None:
         """Refuse numbers that cannot be."""
         refuse_outside("--adapter-ms", self.adapter_ms, 0, 100, "ms")
-        if self.supply is not None:
-            refuse_outside("--supply", self.supply, 0, 25, "V")
+        refuse_outside("--supply", self.supply, 0, 25, "V")
         if self.baud is not None and self.baud not in rates:
             raise InputError(f"--baud {self.baud}: choose {', '.join(map(str, rates))}.")
 
@@ -138,18 +137,15 @@ class SerialLine(Common):
         return bench
 
     def line(
-        self,
-        emulator_class: type[LineEmulator],
-        series: Series,
-        bench: ServoBench,
-        rng: np.random.Generator,
-        baud: int,
-    ) -> LineEmulator:
+        self, emulator_class: type[LineEmulator], series: Series, bench: ServoBench,
+        rng: np.random.Generator, usual_baud: int,
+    ) -> LineEmulator:  # fmt: skip
         """The servos of a bench on a line, with the faults that were chosen."""
         if self.supply is not None:
             bench.supply_v = self.supply
         return emulator_class(
-            bench, series, rng, _parse_ids(self.ids, bench.map.ids), baud,
+            bench, series, rng, _parse_ids(self.ids, bench.map.ids),
+            usual_baud if self.baud is None else self.baud,
             BusFaults.parse(self.faults, rng), self.echo,
             parse_servo_registers(self.registers, series),
             () if self.double_id is None else (self.double_id,),
@@ -196,9 +192,7 @@ class Feetech(SerialLine):
             raise InputError("--backlash is of a bench: add --load (or --load none).")
         layout = layout or load_joint_map(str(preset))
         registers = parse_servo_registers(self.registers, series)
-        moves = any(
-            name in pendulum.FEETECH_REGISTERS for by_name in registers.values() for name in by_name
-        )
+        moves = any(pendulum.FEETECH_REGISTERS.keys() & names for names in registers.values())
         loaded_servos = bool(
             self.load
             or (pendulum.has_registers(layout) and (self.joint_map or moves) and not self.walking)
@@ -223,10 +217,8 @@ class Feetech(SerialLine):
             spec = RobotSpec(poll_period_s=0.0, loss=0.0, quantum_rad=0.0)
             robot = draw_robot(rng, spec, layout if self.joint_map else None)
             bench = _bench(self, robot, layout, rng)
-        usual = 500_000 if series.big_endian else 1_000_000
-        emulator = self.line(
-            FeetechEmulator, series, bench, rng, usual if self.baud is None else self.baud
-        )
+        usual_baud = 500_000 if series.big_endian else 1_000_000
+        emulator = self.line(FeetechEmulator, series, bench, rng, usual_baud)
         with _imu_beside(bench, self.imu_socket, rng):
             imu = f"; IMU at {self.imu_socket}." if self.imu_socket else "."
             # without a map only a line of all its servos counts as a Mini Pupper
@@ -269,9 +261,7 @@ class Dynamixel(SerialLine):
         layout = layout or load_joint_map(own_map)
         spec = pendulum.dynamixel_bench(series.name)
         bench = self.on_bench(rng, spec, layout)
-        emulator = self.line(
-            DynamixelEmulator, series, bench, rng, 1_000_000 if self.baud is None else self.baud
-        )
+        emulator = self.line(DynamixelEmulator, series, bench, rng, 1_000_000)
         _serve_line(replace(self, link=place), emulator, bench, ".", own_map)
 
 
@@ -373,7 +363,7 @@ def _parse_ids(text: str, known: tuple[int, ...]) -> list[int]:
     """Ids that `text` names: 1-12, 4,5,6, or all."""
     if text == "all":
         return sorted(known)
-    ids: list[int] = []
+    ids = set[int]()
     for part in (piece.strip() for piece in text.split(",")):
         low, dash, high = part.partition("-")
         try:
@@ -381,14 +371,12 @@ def _parse_ids(text: str, known: tuple[int, ...]) -> list[int]:
         except ValueError:
             raise InputError(f"--ids: '{part}' is no id. Write 1-12 or 4,5,6.") from None
         if not min(known) <= first <= last <= max(known):
-            ids = []
             break
-        ids += range(first, last + 1)
-    if not ids or not set(ids) <= set(known):
-        raise InputError(
-            f"--ids {text}: the emulated robot has the ids {min(known)} to {max(known)}."
-        )
-    return sorted(set(ids))
+        ids.update(range(first, last + 1))
+    else:
+        if ids <= set(known):
+            return sorted(ids)
+    raise InputError(f"--ids {text}: the emulated robot has the ids {min(known)} to {max(known)}.")
 
 
 class Hand:

@@ -7,13 +7,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE
+from pupper_sysid.cli.commands.common import Joints, Json
+from pupper_sysid.cli.terminal import number
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import select_joints
@@ -26,15 +28,16 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.plan.plan_file import JointOutcome, Outcome
     from pupper_sysid.sysid.plan.proposal import SweepPlan
     from pupper_sysid.sysid.recordings.recording import Recording
+    from pupper_sysid.sysid.sweep.recorder import Request
 
-Record = Callable[[Path, dict[str, Any], bool], list[Path]]
+Record = Callable[[Path, "Request", bool], list[Path]]
 """Records a request, or with True the rest of it, to a file; returns the files written."""
 
 
 def run_rounds(
     record: Record,
     path: Path,
-    request: dict[str, Any],
+    request: Request,
     *,
     resume: bool,
     done: bool,
@@ -50,15 +53,16 @@ def run_rounds(
     from pupper_sysid.sysid.doctor.checks import each_joint
     from pupper_sysid.sysid.fit.joint_fit import fit_joint
     from pupper_sysid.sysid.plan.plan_file import parse_goal, record_until, save_plan
-    from pupper_sysid.sysid.sweep.recorder import footer, header_of
+    from pupper_sysid.sysid.sweep.recorder import request_of
 
-    series = request["until"]
-    first = path.with_name(series["first"])
+    series = request.until
+    assert series is not None
+    first = path.with_name(series.first)
     if resume:
         paths = _recorded(first)
         if paths[-1] != path:
             path = paths[-1]
-            done, request = bool(footer(path)), dict(header_of(path)["sweep"])
+            request, done = request_of(path)
     else:
         paths = [path]
         if force:  # rounds of an earlier sweep of this name
@@ -73,26 +77,25 @@ def run_rounds(
         refuse_overwrite(file)
         plan_file = file.with_suffix(".plan.yaml")
         save_plan(plan, plan_file, force=True)  # may exist, of a round that never began
-        again = request | {
+        again = {
             "plan": str(plan_file), "joints": plan.joints, "loop_period_s": plan.loop_period_s,
-            "until": series | {"number": number},
+            "until": series.model_copy(update={"number": number}),
         }  # fmt: skip
-        written.extend([*record(file, again, False), plan_file])
+        written.extend([*record(file, request.model_copy(update=again), False), plan_file])
         return file
 
     def fit(
         recordings: Sequence[Recording], joints: list[str]
     ) -> dict[str, JointCalibrationResult]:
         with terminal.progress("fitting", len(joints)) as advance:
-            return each_joint(
-                partial(fit_joint, seed=request["seed"]), recordings, joints, 2, advance
-            )
+            work = partial(fit_joint, seed=request.seed)
+            return each_joint(work, recordings, joints, 2, advance)
 
     try:
         outcome = record_until(
-            parse_goal(series["goal"]), paths, series["joints"], fit, record_next,
-            most_seconds=series["most_seconds"], seed=request["seed"],
-            report=lambda outcomes: _say_progress(outcomes, series["goal"]),
+            parse_goal(series.goal), paths, series.joints, fit, record_next,
+            most_seconds=series.most_seconds, seed=request.seed,
+            report=lambda outcomes: _say_progress(outcomes, series.goal),
         )  # fmt: skip
     except KeyboardInterrupt:
         say_how_to_resume(first)
@@ -101,7 +104,7 @@ def run_rounds(
         elapsed = time.perf_counter() - started
         terminal.print_json(outcome.to_dict() | {"written": written, "elapsed_s": elapsed})
     else:
-        _print_outcome(outcome, written, series["goal"])
+        _print_outcome(outcome, written, series.goal)
 
 
 def _of_round(first: Path, number: int) -> Path:
@@ -133,17 +136,18 @@ def _say_progress(outcomes: dict[str, JointOutcome], goal: str) -> None:
 
 
 def _print_outcome(outcome: Outcome, written: list[Path], goal: str) -> None:
-    table = terminal.table(
-        f"Until {goal}", "joint", "rounds", "seconds", "dead time ms", "90 % interval", "goal"
-    )
-    for joint, state in outcome.joints.items():
-        dead = state.dead_time_s
-        table.add_row(
-            joint, str(state.rounds), terminal.number(state.recorded_s, 0),
-            terminal.ms(dead.value), f"{terminal.ms(dead.low)} … {terminal.ms(dead.high)}",
-            "reached" if state.reached else "not reached",
-        )  # fmt: skip
-    terminal.out.print(table)
+    terminal.print_table(
+        f"Until {goal}", "joint", "rounds", "seconds", "dead time ms", "90 % interval", "goal",
+        rows=(
+            (
+                joint, state.rounds, number(state.recorded_s, 0), terminal.ms(dead.value),
+                f"{terminal.ms(dead.low)} … {terminal.ms(dead.high)}",
+                "reached" if state.reached else "not reached",
+            )
+            for joint, state in outcome.joints.items()
+            for dead in [state.dead_time_s]
+        ),
+    )  # fmt: skip
     for joint, state in outcome.joints.items():
         if state.why:
             terminal.warn(f"{joint}: the goal was not reached: {state.why}.")
@@ -159,9 +163,6 @@ def say_how_to_resume(path: Path) -> None:
     terminal.err.print(f"The recording up to here is in {path}; continue it with\n  {resuming}")
 
 
-_STANDARD_MAP = "mini_pupper_2"
-
-
 @dataclass(frozen=True)
 class Plan:
     """Plan the next sweep: the tones, amplitudes and durations that narrow the intervals most.
@@ -174,8 +175,7 @@ class Plan:
     """Recordings, pooled per joint, or one calibration; without any, servos are unknown."""
     out: Path | None = None
     """Plan file to write, for `sweep --plan`."""
-    joints: str = "all"
-    """Names (LF_hip), legs (LF), kinds (hip), several with commas, or all."""
+    joints: Joints = "all"
     seconds: float | None = None
     """Recorded time per joint [s]; by default as long as the recordings, else 20 s."""
     joint_map: str | None = None
@@ -185,8 +185,7 @@ class Plan:
     """Control loop [Hz]; by default the recordings', else 52.63 Hz."""
     force: bool = False
     """Replace the plan file if it exists."""
-    json: bool = False
-    """Print one JSON object and nothing else."""
+    json: Json = False
     seed: int = 0
     """Seed of the fits and of the drawn servos."""
 
@@ -194,18 +193,15 @@ class Plan:
         """Plan, print, write."""
         if self.out is not None:
             refuse_overwrite(self.out, self.force)  # before the work, not after it
-        if self.seconds is not None:
-            refuse_outside("--seconds", self.seconds, *PLANS_S, "s")
-        if self.rate is not None:
-            refuse_outside("--rate", self.rate, *RATES_HZ, "Hz")
+        refuse_outside("--seconds", self.seconds, *PLANS_S, "s")
+        refuse_outside("--rate", self.rate, *RATES_HZ, "Hz")
         from pupper_sysid.sysid.plan.plan_file import save_plan
 
         plan = self._plan()
         if self.out is not None:
             save_plan(plan, self.out, self.force)
         if self.json:
-            terminal.print_json(plain(plan) | {"written": self.out})
-            return
+            return terminal.print_json(plain(plan) | {"written": self.out})
         show(plan)
         if self.out is not None:
             following = terminal.command("pupper-sysid", "sweep", "--plan", self.out)
@@ -228,7 +224,7 @@ class Plan:
             with terminal.progress("fitting", len(joints)) as advance:
                 return proposal.plan_from_recordings(
                     recordings, joints, seconds=self.seconds,
-                    margins=_some_margins(self._map(recordings[0]), joints), seed=self.seed,
+                    margins=margins(self._map(recordings[0]), joints), seed=self.seed,
                     workers=2, progress=advance,
                 )  # fmt: skip
         if more:
@@ -241,7 +237,7 @@ class Plan:
             return proposal.plan_from_calibration(
                 calibration, InputFile(name=first.name, sha256=sha256(first)), joints,
                 seconds=seconds, loop_period_s=period_s,
-                margins=_some_margins(self._map(None), joints), seed=self.seed,
+                margins=margins(self._map(None), joints), seed=self.seed,
             )  # fmt: skip
         joint_map = self._map(None)
         # the Mini Pupper's proxy polls; a serial line answers each read itself
@@ -265,20 +261,20 @@ class Plan:
                 return load_joint_map(recorded)  # a preset; the name inside a file is no path
             except InputError:
                 pass
-        default = str(JOINTS_FILE) if JOINTS_FILE.exists() else _STANDARD_MAP
+        default = JOINTS_FILE if JOINTS_FILE.exists() else "mini_pupper_2"
         return load_joint_map(self.joint_map or default)
 
 
-def margins(joint_map: JointMap) -> dict[str, float]:
-    """Largest excursion of each joint to either side of its rest pose [rad]."""
+def margins(joint_map: JointMap, joints: Sequence[str] | None = None) -> dict[str, float] | None:
+    """Largest excursion of each joint to either side of its rest pose [rad].
+
+    None if the map lacks one of the `joints`, which leaves them to the recording.
+    """
+    if not {*(joints or ())} <= {*joint_map.joint_names}:
+        return None
     servos = joint_map.per_servo()
     margin = servos.position_limits().margin(servos.rest_pose())
     return dict(zip(servos.joint_names, map(float, margin), strict=True))
-
-
-def _some_margins(joint_map: JointMap, joints: list[str]) -> dict[str, float] | None:
-    """Margins if the map has all joints; None leaves them to the recording."""
-    return margins(joint_map) if set(joints) <= set(joint_map.joint_names) else None
 
 
 def show(plan: SweepPlan) -> None:
@@ -286,31 +282,29 @@ def show(plan: SweepPlan) -> None:
     from pupper_sysid.servo_models.calibration.quantity import unit_of, words_of
     from pupper_sysid.sysid.plan.planner import DEAD_TIME, trial_seconds
 
-    trials = terminal.table(
-        "Trials to record", "joint", "motion", "Hz", "amplitude rad", "seconds", "for"
-    )
-    for t in plan.trials:
-        trials.add_row(
-            t.joint, t.kind, terminal.number(t.frequency_hz), terminal.number(t.amplitude_rad, 3),
-            terminal.number(trial_seconds(t.duration_s), 1), t.purpose,
-        )  # fmt: skip
-    terminal.out.print(trials)
+    terminal.print_table(
+        "Trials to record", "joint", "motion", "Hz", "amplitude rad", "seconds", "for",
+        rows=(
+            (t.joint, t.kind, number(t.frequency_hz), number(t.amplitude_rad, 3),
+             number(trial_seconds(t.duration_s), 1), t.purpose)
+            for t in plan.trials
+        ),
+    )  # fmt: skip
     if plan.predictions:
-        expected = terminal.table(
-            "90 % intervals, now and to expect", "joint", "quantity", "value", "now", "after"
-        )
+        rows = []
         for p in plan.predictions:
             scale, unit = (1e3, "ms") if p.quantity == DEAD_TIME else (1.0, unit_of(p.quantity))
             digits = int(np.clip(2 - np.floor(np.log10(scale * p.now.value + 1e-9)), 0, 4))
-            now, after = (
-                f"{terminal.number(scale * i.low, digits)} … "
-                f"{terminal.number(scale * i.high, digits)}"
-                for i in (p.now, p.after)
+            value, *ends = (
+                number(scale * x, digits)
+                for x in (p.now.value, p.now.low, p.now.high, p.after.low, p.after.high)
             )
-            value = terminal.number(scale * p.now.value, digits)
-            name = f"{words_of(p.quantity)}, {unit}"
-            expected.add_row(p.joint, name, value, now, after)
+            now, after = (" … ".join(pair) for pair in (ends[:2], ends[2:]))
+            rows.append((p.joint, f"{words_of(p.quantity)}, {unit}", value, now, after))
         terminal.out.print()
-        terminal.out.print(expected)
+        terminal.print_table(
+            "90 % intervals, now and to expect", "joint", "quantity", "value", "now", "after",
+            rows=rows,
+        )  # fmt: skip
     for note in plan.notes:
         terminal.out.print(note)

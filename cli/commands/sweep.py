@@ -17,6 +17,7 @@ import numpy as np
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE, connect, joints_on, parse_registers
+from pupper_sysid.cli.commands.common import Json, Replace
 from pupper_sysid.cli.commands.plan import run_rounds, say_how_to_resume
 from pupper_sysid.cli.live_views import ViewTargets, live_views
 from pupper_sysid.common.errors import BusError, InputError, refuse_outside
@@ -28,13 +29,13 @@ from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
 from pupper_sysid.hardware.safety.monitor import GuardLimits
-from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
+from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
 from pupper_sysid.sysid.sweep import bench, excitation
 from pupper_sysid.sysid.sweep.bench import bench_plan, parse_load
 from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S, Plan
 
 if TYPE_CHECKING:
-    from pupper_sysid.sysid.sweep.recorder import Observe, Progress
+    from pupper_sysid.sysid.sweep.recorder import Observe, Progress, Request
 
 BENCH_MAP = "bench_sts3215"
 BENCH_RATE_HZ = 100.0
@@ -43,6 +44,13 @@ BENCH_LIMITS = GuardLimits(
     speed_rad_s=6.0, acceleration_rad_s2=400.0, gentle_rad_s=0.6, park_within_s=6.0
 )
 """Of a swinging mass: slower than a leg, and the way back takes its time."""
+_CHANGED = {
+    "clipped": "were outside the joints' limits and were held at them.",
+    "slowed": "were delayed by the guard's speed and acceleration limits; the recording holds "
+    "the commands that were sent.",
+    "unsent": "could not be sent; the servos kept the last set-point.",
+}
+"""What the guard does to commands, by its count."""
 
 
 @dataclass(frozen=True)
@@ -109,61 +117,55 @@ class Sweep:
     this machine), or a viewer's address, rerun+http://HOST:9876/proxy."""
     mcap: Path | None = None
     """Write all joints in ROS 2's messages for Foxglove while they move, .mcap."""
-    force: bool = False
-    """Replace files that exist."""
-    json: bool = False
-    """Print one JSON object and nothing else."""
+    force: Replace = False
+    json: Json = False
     seed: int = 0
     """Seed of the emulated robot: its servos, its lost polls, its noise."""
 
     def run(self) -> None:
         """Plan, record, and name the next commands."""
         from pupper_sysid.sysid.recordings.files import FOLDER
-        from pupper_sysid.sysid.sweep.recorder import header_of
+        from pupper_sysid.sysid.sweep.recorder import request_of
 
         started = time.perf_counter()
         self._views.check()
         if self.resume:
-            path = self.resume
-            metadata = header_of(path)
-            request, done = dict(metadata["sweep"]), "completed" in metadata
+            path, (request, done) = self.resume, request_of(self.resume)
         else:
             request, done = self._request(), False
-            name = "playback" if self.playback else "plan" if self.plan else request["kind"]
+            name = "playback" if self.playback else "plan" if self.plan else request.kind
             path = self.out or FOLDER / f"{name}_{time.strftime('%Y-%m-%d_%H%M%S')}.csv"
             if path.suffix != ".csv":
                 raise InputError(f"--out {path}: a recording is a .csv file.")
             refuse_overwrite(path, self.force)
-            if request["until"]:
-                request["until"]["first"] = path.name
-        stem = path.with_suffix("")
-        for truth_file in (f"{stem}.truth.yaml", f"{stem}.truth.csv") if self.truth else ():
-            refuse_overwrite(Path(truth_file), self.force)
-        if self.truth and (self.resume or request["bus"] != EMULATED):
+            if request.until:
+                request.until.first = path.name
+        for ending in (".truth.yaml", ".truth.csv") if self.truth else ():
+            refuse_overwrite(path.with_suffix(ending), self.force)
+        if self.truth and (self.resume or request.bus != EMULATED):
             raise InputError("--truth: only a new recording of the emulated robot has true values.")
-        if request.get("until"):
+        if request.until:
             if self._views:
                 raise InputError(
                     "--until makes several recordings, and --rerun and --mcap show one. Leave "
                     "them out, and give the recordings to `pupper-sysid view`."
                 )
-            run_rounds(
+            return run_rounds(
                 lambda *recording: self._record(*recording)[1], path, request,
                 resume=self.resume is not None, done=done, force=self.force, as_json=self.json,
             )  # fmt: skip
-            return
         chosen, written = self._record(path, request, self.resume is not None)
-        self._print(request["joints"], chosen, written, time.perf_counter() - started)
+        self._print(request.joints, chosen, written, time.perf_counter() - started)
 
-    def _record(self, path: Path, request: dict[str, Any], resume: bool) -> tuple[Plan, list[Path]]:
+    def _record(self, path: Path, request: Request, resume: bool) -> tuple[Plan, list[Path]]:
         """Record a request, or the rest of it; returns what was executed, and the files written."""
         from pupper_sysid.sim.emulator.bus import EmulatedBus
-        from pupper_sysid.sysid.sweep.recorder import record, resume_point
+        from pupper_sysid.sysid.sweep.recorder import footer, record, resume_point
 
         bus = guarded(_open_bus(request))
         try:
             chosen = _plan_of(request, bus)
-            point = resume_point(path, chosen, request["loop_period_s"]) if resume else None
+            point = resume_point(path, chosen, request.loop_period_s) if resume else None
         except BaseException:
             bus.close()
             raise
@@ -176,13 +178,14 @@ class Sweep:
         try:
             with (
                 _priority_of(request) as priority,
-                _shown(bus, chosen, self._views, self.live, _in_virtual_time(request)) as shows,
+                _shown(bus, chosen, self._views, self.live, request.in_virtual_time) as shows,
             ):
-                about = {"seed": request["seed"], "sweep": request, "priority": priority}
-                if load := _load_of(request):
-                    about["loads"] = dict.fromkeys(request["joints"], load.model_dump())
+                about: dict[str, Any] = {"seed": request.seed, "sweep": request.model_dump()}
+                about["priority"] = priority
+                if load := request.pendulum:
+                    about["loads"] = dict.fromkeys(request.joints, load.model_dump())
                 record(
-                    bus, chosen, path, loop_period_s=request["loop_period_s"], metadata=about,
+                    bus, chosen, path, loop_period_s=request.loop_period_s, metadata=about,
                     force=self.force, resume=point, progress=shows[0], observe=shows[1],
                 )  # fmt: skip
         except (BusError, KeyboardInterrupt):
@@ -193,7 +196,9 @@ class Sweep:
                 say_how_to_resume(path)
             raise
         _warn_of_unrestored(bus)
-        terminal.warn(*_guard_warnings(path))
+        counts = footer(path).get("guard", {})
+        changed = (f"{counts[k]} commands {text}" for k, text in _CHANGED.items() if counts.get(k))
+        terminal.warn(*changed)
         written = [path]
         if self.truth and isinstance(bus.bus, EmulatedBus):
             written += bus.bus.write_truth(path.with_suffix(""), self.force)
@@ -203,29 +208,28 @@ class Sweep:
     def _views(self) -> ViewTargets:
         return ViewTargets(self.rerun, self.mcap, self.force)
 
-    def _request(self) -> dict[str, Any]:
+    def _request(self) -> Request:
         """Options that define the plan; the recording keeps them, so that it can be continued."""
-        rate = self.rate
-        if rate is None:
-            rate = BENCH_RATE_HZ if self.load else round(1 / LOOP_PERIOD_S, 2)
+        from pupper_sysid.sysid.sweep.recorder import Request, Series
+
+        bus, on_bench = bus_name(self.bus), self.load is not None
+        usual_rate = BENCH_RATE_HZ if on_bench else round(1 / LOOP_PERIOD_S, 2)
+        rate = usual_rate if self.rate is None else self.rate
         refuse_outside("--rate", rate, *excitation.RATES_HZ, "Hz")
         refuse_outside("--most-seconds", self.most_seconds, *excitation.TRIAL_S, "s")
-        if self.duration is not None:
-            refuse_outside("--duration", self.duration, *excitation.TRIAL_S, "s")
-        bus = bus_name(self.bus)
-        if not 1 <= self.loops <= excitation.MOST_LOOPS:
-            raise InputError(
-                f"--loops is {self.loops}; it must be from 1 to {excitation.MOST_LOOPS}."
-            )
+        refuse_outside("--duration", self.duration, *excitation.TRIAL_S, "s")
+        refuse_outside("--loops", self.loops, 1, excitation.MOST_LOOPS)
         if self.real_time and bus != EMULATED:
             raise InputError("--real-time: a real bus always runs in real time; leave it out.")
         loop_period_s = 1.0 / rate
         self._refuse_bench_options()
+        in_folder = JOINTS_FILE if bus != EMULATED and JOINTS_FILE.exists() else None
+        joint_map = self.joint_map
+        if on_bench and joint_map is None and in_folder is None:
+            joint_map = BENCH_MAP
         if self.plan is None:
-            default = JOINTS_FILE if bus != EMULATED and JOINTS_FILE.exists() else None
-            chosen = self._map() or default
-            joint_map = load_joint_map(chosen) if chosen else None
-            joints = joints_on(bus, joint_map, self.joints)
+            chosen = joint_map or in_folder
+            joints = joints_on(bus, load_joint_map(chosen) if chosen else None, self.joints)
         else:
             from pupper_sysid.sysid.plan.plan_file import load_plan
 
@@ -234,40 +238,46 @@ class Sweep:
             proposal = load_plan(self.plan)
             joints = select_joints(self.joints, proposal.joints)
             loop_period_s = proposal.loop_period_s
-        if self.load is not None and len(joints) > 1:
+        if on_bench and len(joints) > 1:
             raise InputError(
                 f"--load: a bench is one servo, and {len(joints)} were chosen; name it with "
                 "--joints."
             )
-        if self.freqs is None and self.load is not None:
+        if self.freqs is None and on_bench:
             frequencies = list(bench.FREQUENCIES_HZ)
         else:
             frequencies = excitation.parse_frequencies("1-10" if self.freqs is None else self.freqs)
         amplitude = self.amplitude
         if amplitude is not None:
             excitation.check_amplitude(amplitude)
-        elif not self.load:  # motions on a bench have other excursions
+        elif not on_bench:  # motions on a bench have other excursions
             amplitude = 0.3
-        return {
-            "bus": bus,
-            "joint_map": self._map(),
-            "real_time": self.real_time
-            or (bus == EMULATED and self.live and terminal.err.is_terminal),
-            "seed": self.seed,
-            "loop_period_s": loop_period_s,
-            "kind": self.kind or ("sine" if self.load is None else bench.BENCH),
-            "joints": joints,
-            "frequencies_hz": frequencies,
-            "amplitude_rad": amplitude,
-            "duration_s": self.duration,
-            "playback": str(self.playback) if self.playback else None,
-            "loops": self.loops,
-            "plan": str(self.plan) if self.plan else None,
-            "load": self.load,
-            "gains": [] if self.gains is None else bench.parse_gains(self.gains),
-            "until": self._series(joints) if self.until is not None else None,
-            "registers": self._registers(bus),
-        }
+        until = None
+        if self.until is not None:
+            from pupper_sysid.sysid.plan.plan_file import parse_goal
+
+            parse_goal(self.until)
+            if self.playback:
+                raise InputError("--until and --playback: give one of the two.")
+            until = Series(
+                goal=self.until, most_seconds=self.most_seconds, first="", joints=joints, number=1
+            )
+        if self.registers and (on_bench or bus != EMULATED):
+            raise InputError(
+                "--registers: sets those of an emulated robot. A real one's are recorded as they "
+                "are; on a bench --gains sets the P gain."
+            )
+        watched = bus == EMULATED and self.live and terminal.err.is_terminal
+        return Request(
+            bus=bus, joint_map=joint_map, real_time=self.real_time or watched, seed=self.seed,
+            loop_period_s=loop_period_s,
+            kind=self.kind or (bench.BENCH if on_bench else "sine"), joints=joints,
+            frequencies_hz=frequencies, amplitude_rad=amplitude, duration_s=self.duration,
+            playback=str(self.playback) if self.playback else None, loops=self.loops,
+            plan=str(self.plan) if self.plan else None, load=self.load,
+            gains=[] if self.gains is None else bench.parse_gains(self.gains), until=until,
+            registers=parse_registers(self.registers),
+        )  # fmt: skip
 
     def _refuse_bench_options(self) -> None:
         """Gains, drops and strokes are for a bench, and a bench has no plan or playback."""
@@ -284,45 +294,14 @@ class Sweep:
         if option:
             raise InputError(f"--load and --{option}: give one of the two.")
 
-    def _registers(self, bus: str) -> dict[str, int]:
-        if self.registers and (self.load is not None or bus != EMULATED):
-            raise InputError(
-                "--registers: sets those of an emulated robot. A real one's are recorded as they "
-                "are; on a bench --gains sets the P gain."
-            )
-        return parse_registers(self.registers)
-
-    def _map(self) -> str | None:
-        """The joint map that is named; of a bench, the preset unless there is one in the folder."""
-        if self.load is None or self.joint_map is not None:
-            return self.joint_map
-        has_map = JOINTS_FILE.exists() and bus_name(self.bus) != EMULATED
-        return None if has_map else BENCH_MAP
-
-    def _series(self, joints: list[str]) -> dict[str, Any]:
-        """What the recordings of a sweep with `until` have in common, and the number of this."""
-        from pupper_sysid.sysid.plan.plan_file import parse_goal
-
-        assert self.until is not None
-        parse_goal(self.until)
-        if self.playback:
-            raise InputError("--until and --playback: give one of the two.")
-        return {
-            "goal": self.until, "most_seconds": self.most_seconds, "first": "", "joints": joints,
-            "number": 1,
-        }  # fmt: skip
-
     def _print(self, joints: list[str], chosen: Plan, written: list[Path], elapsed: float) -> None:
         path = written[0]
         if self.json:
-            terminal.print_json(
-                {
-                    "recording": path, "written": written, "joints": joints,
-                    "trials": len(chosen.trials), "recorded_s": chosen.duration_s,
-                    "elapsed_s": elapsed, "warnings": chosen.warnings,
-                }
-            )  # fmt: skip
-            return
+            return terminal.print_json({
+                "recording": path, "written": written, "joints": joints,
+                "trials": len(chosen.trials), "recorded_s": chosen.duration_s,
+                "elapsed_s": elapsed, "warnings": chosen.warnings,
+            })  # fmt: skip
         trials = _counted(len(chosen.trials), "trial")
         terminal.out.print(
             f"Recorded {trials} of {_counted(len(joints), 'joint')}, "
@@ -330,29 +309,29 @@ class Sweep:
         )
         for name in written:
             terminal.out.print(f"  {name}")
-        following: list[tuple[object, ...]] = [("doctor", path), ("delay", path)]
-        following.append(("calibrate", path, "--out", "calibrated.yaml"))
-        if self.kind == "reversal":
-            following[1:] = [("backlash", path)]
+        following: list[tuple[object, ...]] = [("backlash", path)]
+        if self.kind != "reversal":
+            following = [("delay", path), ("calibrate", path, "--out", "calibrated.yaml")]
+        following.insert(0, ("doctor", path))
         terminal.out.print("Next:")
         for words in following:
             terminal.out.print(f"  {terminal.command('pupper-sysid', *words)}")
 
 
-def _open_bus(request: dict[str, Any]) -> ServoBus:
+def _open_bus(request: Request) -> ServoBus:
     """The bus that a request names; that of a bench is guarded with its limits."""
-    joint_map, load = request["joint_map"], request.get("load")
-    if request["bus"] != EMULATED:
+    joint_map, load = request.joint_map, request.load
+    if request.bus != EMULATED:
         limits = BENCH_LIMITS if load else None
-        return connect(request["bus"], joint_map, request["joints"], limits)
+        return connect(request.bus, joint_map, request.joints, limits)
     from pupper_sysid.sim.emulator import pendulum
     from pupper_sysid.sim.emulator.bus import EmulatedBus
     from pupper_sysid.sim.emulator.robot import draw_robot
 
-    rng, real_time = np.random.default_rng(request["seed"]), bool(request["real_time"])
+    rng, real_time = np.random.default_rng(request.seed), request.real_time
     if load:
         terminal.err.print(f"No servo: using an emulated STS3215 on a bench, load {load}.")
-        swung = _load_of(request)
+        swung = request.pendulum
         robot = pendulum.draw_bench(
             rng, pendulum.Pendulum(**(swung.model_dump() if swung else {})),
             joint_map=load_joint_map(joint_map or BENCH_MAP),
@@ -362,31 +341,27 @@ def _open_bus(request: dict[str, Any]) -> ServoBus:
     map_ = load_joint_map(joint_map) if joint_map else None
     what = f"an emulated one with the servos of {map_.file.name}" if map_ else "the emulated one"
     terminal.err.print(f"No robot: using {what}{', in real time' * real_time}.")
-    registers = request.get("registers") or {}
-    if registers and not (map_ and pendulum.has_registers(map_)):
+    if request.registers and not (map_ and pendulum.has_registers(map_)):
         raise InputError(
             "--registers: the servos of this robot have none that act. Give a --joint-map whose "
             "`servo` is STS3215."
         )
+    registers = request.registers
     drawn, plant = pendulum.draw_of_map(rng, map_, registers) if map_ else (draw_robot(rng), None)
-    if request.get("plan"):  # the same robot, with other noise
-        noise = int(sha256(Path(request["plan"]))[:12], 16)
-        rng = np.random.default_rng([request["seed"], noise])
+    if request.plan:  # the same robot, with other noise
+        noise = int(sha256(Path(request.plan))[:12], 16)
+        rng = np.random.default_rng([request.seed, noise])
     return EmulatedBus(drawn, rng, real_time, plant)
 
 
-def _load_of(request: dict[str, Any]) -> PendulumLoad | None:
-    return parse_load(request["load"]) if request.get("load") else None
-
-
-def _plan_of(request: dict[str, Any], bus: ServoBus) -> Plan:
+def _plan_of(request: Request, bus: ServoBus) -> Plan:
     """The plan that a request describes, within the limits of the bus."""
-    joints, load = request["joints"], _load_of(request)
-    if request["playback"]:
+    joints, load = request.joints, request.pendulum
+    if request.playback:
         from pupper_sysid.sysid.sweep.recorder import playback
 
-        chosen = playback(Path(request["playback"]), joints)
-        return replace(chosen, trials=chosen.trials * request.get("loops", 1))
+        chosen = playback(Path(request.playback), joints)
+        return replace(chosen, trials=chosen.trials * request.loops)
     pose = dict(bus.metadata["rest_pose_rad"])
     if load:
         pose[joints[0]] = load.hanging_rad
@@ -398,22 +373,23 @@ def _plan_of(request: dict[str, Any], bus: ServoBus) -> Plan:
     speed_limit = min([bus.metadata["speed_limit_rad_s"], *filter(None, speeds)])
     ramps = [setup.set_point_acceleration_rad_s2 for setup in setups]
     ramp_limit = min([*filter(None, ramps), np.inf])
-    if request.get("load"):
+    if request.load:
         (joint,) = joints
         return bench_plan(
-            joint, load, request["gains"], request["kind"],
-            frequencies_hz=request["frequencies_hz"], amplitude_rad=request["amplitude_rad"],
-            duration_s=request["duration_s"], loop_period_s=request["loop_period_s"],
+            joint, load, request.gains, request.kind,
+            frequencies_hz=request.frequencies_hz, amplitude_rad=request.amplitude_rad,
+            duration_s=request.duration_s, loop_period_s=request.loop_period_s,
             start_rad=pose[joint], margin_rad=margin[joint],
         )  # fmt: skip
-    if request.get("plan"):
+    if request.plan:
         from pupper_sysid.sysid.plan.plan_file import executable, load_plan
 
-        path = Path(request["plan"])
+        path = Path(request.plan)
         return executable(load_plan(path), path, joints, margin, pose, speed_limit, ramp_limit)
+    assert request.amplitude_rad is not None
     return excitation.plan(
-        request["kind"], joints, request["frequencies_hz"], request["amplitude_rad"],
-        request["duration_s"], request["loop_period_s"], speed_limit,
+        request.kind, joints, request.frequencies_hz, request.amplitude_rad,
+        request.duration_s, request.loop_period_s, speed_limit,
         bus.metadata.get("poll_rate_hz", excitation.POLL_RATE_HZ), margin, pose, ramp_limit,
     )  # fmt: skip
 
@@ -450,34 +426,15 @@ def _shown(
         yield open_things.enter_context(progress), observe
 
 
-def _in_virtual_time(request: dict[str, Any]) -> bool:
-    """Whether time passes only for the emulated robot, so that nothing is late."""
-    return request["bus"] == EMULATED and not request["real_time"]
-
-
 @contextmanager
-def _priority_of(request: dict[str, Any]) -> Iterator[str]:
+def _priority_of(request: Request) -> Iterator[str]:
     """Real-time priority during the block, where time is real; yields it in words."""
-    if _in_virtual_time(request):
+    if request.in_virtual_time:
         yield "none: virtual time"
         return
     with real_time_priority() as priority:
         terminal.err.print(f"Control loop at {priority}.")
         yield priority
-
-
-def _guard_warnings(path: Path) -> list[str]:
-    """Sentences on commands that the guard changed."""
-    from pupper_sysid.sysid.sweep.recorder import footer
-
-    counts = footer(path).get("guard", {})
-    sentences = {
-        "clipped": "were outside the joints' limits and were held at them.",
-        "slowed": "were delayed by the guard's speed and acceleration limits; the recording holds "
-        "the commands that were sent.",
-        "unsent": "could not be sent; the servos kept the last set-point.",
-    }
-    return [f"{counts[k]} commands {text}" for k, text in sentences.items() if counts.get(k)]
 
 
 def _warn_of_unrestored(bus: GuardedBus) -> None:

@@ -36,12 +36,15 @@ from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, in_order
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_ROWS, read_table
+from pupper_sysid.hardware.address import EMULATED
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, header_entries
 from pupper_sysid.hardware.loop import LOG, VIEWS, FixedRateLoop, first_pose, glide
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
 from pupper_sysid.sysid.recordings.files import RecordingWriter, as_text, read_bytes
 from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
+from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
 from pupper_sysid.sysid.recordings.table import TITLE, header, parse
+from pupper_sysid.sysid.sweep.bench import parse_load
 from pupper_sysid.sysid.sweep.excitation import (
     LEAD_IN_S,
     LOOP_PERIOD_S,
@@ -92,10 +95,20 @@ class Request(BaseModel):
     """Of a bench: a pendulum, or `none`; absent in sweeps of robots."""
     gains: list[int] = []
     """P gains of a bench."""
-    registers: dict[str, int] = {}
-    """Of emulated servos, where they differ from the factory's."""
     until: Series | None = None
     """Absent unless the sweep goes on until an interval is narrow."""
+    registers: dict[str, int] = {}
+    """Of emulated servos, where they differ from the factory's."""
+
+    @property
+    def pendulum(self) -> PendulumLoad | None:
+        """The load of a bench, if it has one."""
+        return parse_load(self.load) if self.load else None
+
+    @property
+    def in_virtual_time(self) -> bool:
+        """Whether time passes only for the emulated robot, so that nothing is late."""
+        return self.bus == EMULATED and not self.real_time
 
 
 @dataclass(frozen=True)
@@ -117,8 +130,8 @@ class Resume:
         return self.last_time_s + min(max(pause_s, _LEAST_PAUSE_S), _LONGEST_PAUSE_S)
 
 
-def header_of(path: Path) -> dict[str, Any]:
-    """Header of an unfinished recording, from which its plan can be made again."""
+def request_of(path: Path) -> tuple[Request, bool]:
+    """Request of a recording to continue, and whether it is a completed round of several."""
     text = as_text(path, read_bytes(path))
     if not text.startswith(TITLE):
         raise InputError(f"{path} is not a recording of pupper-sysid; only those can be continued.")
@@ -131,8 +144,9 @@ def header_of(path: Path) -> dict[str, Any]:
         raise InputError(
             f"{path} does not hold its plan (an older version wrote it). Record it again."
         )
-    validated(Request, request, f"{path}, header's sweep", remedy="record it again")
-    return metadata
+    remedy = "record it again"
+    request = validated(Request, request, f"{path}, header's sweep", remedy=remedy)
+    return request, "completed" in metadata
 
 
 def footer(path: Path) -> dict[str, Any]:
