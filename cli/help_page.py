@@ -12,6 +12,7 @@ import re
 import shutil
 import textwrap
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -53,7 +54,11 @@ def help_page(
         return everything
     for full in (True, False):
         lines = _page(parser, program, width, full, nested=False)
-        rest = _omission(parser)
+        groups = Counter(
+            name.split(".")[0] for a in parser._actions for name in a.option_strings if "." in name
+        )
+        listed = ", ".join(f"{group}.* ({count})" for group, count in groups.items())
+        rest = f"Settings beside these: {listed}. " if groups else ""
         lines += ["", *textwrap.wrap(f"{rest}{program} {ALL} shows every option in full.", width)]
         if len(lines) <= SCREEN_LINES:
             break
@@ -115,19 +120,6 @@ def _groups(
             yield (title or "").removesuffix(" options"), actions
 
 
-def _omission(parser: argparse.ArgumentParser) -> str:
-    """Which groups of settings the short page leaves out."""
-    names = (name for a in parser._actions for name in a.option_strings if "." in name)
-    counts: dict[str, int] = {}
-    for name in names:
-        group = name.split(".")[0]
-        counts[group] = counts.get(group, 0) + 1
-    if not counts:
-        return ""
-    listed = ", ".join(f"{group}.* ({count})" for group, count in counts.items())
-    return f"Settings beside these: {listed}. "
-
-
 def _name(action: argparse.Action) -> str:
     """An option and what it takes."""
     metavar = action.metavar if isinstance(action.metavar, str) else ""
@@ -158,19 +150,14 @@ def _text(action: argparse.Action) -> tuple[str, str]:
 
 
 def _row(name: str, text: str, width: int) -> list[str]:
+    indent, head = " " * _COLUMN, f"  {name}"
     wrapped = textwrap.wrap(text, width - _COLUMN, break_on_hyphens=False) or [""]
-    indent = " " * _COLUMN
-    head = f"  {name}"
-    if len(head) + 2 > _COLUMN:
-        rows = textwrap.wrap(
-            f"{head}  {text}", width, subsequent_indent=indent, break_on_hyphens=False,
-            drop_whitespace=True,
-        )  # fmt: skip
-        if len(head) + 2 + 16 <= width:
-            return rows
+    if len(head) + 2 <= _COLUMN:
+        first, *rest = wrapped
+        return [f"{head:{_COLUMN}}{first}".rstrip(), *(indent + line for line in rest)]
+    if len(head) + 2 + 16 > width:
         return [head, *(indent + line for line in wrapped)]
-    first, *rest = wrapped
-    return [f"{head:{_COLUMN}}{first}".rstrip(), *(indent + line for line in rest)]
+    return textwrap.wrap(f"{head}  {text}", width, subsequent_indent=indent, break_on_hyphens=False)
 
 
 def _first_sentence(text: str) -> str:

@@ -16,9 +16,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pupper_sysid.cli import terminal
-from pupper_sysid.cli.policy_choice import chosen_actuator, policy_at, run_folder
-from pupper_sysid.cli.terminal import err, out, print_json
+import reproduction.evidence
+from pupper_sysid.cli import policy_choice, terminal
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.figure_style import JOINT_COLOURS, axes_column, styled
 from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_text
@@ -29,22 +28,10 @@ from pupper_sysid.policies.analysis.autonomy import DELAYS_MS
 from pupper_sysid.policies.deploy.stacks import STACKS
 from pupper_sysid.servo_models.servo_file import WEIGHTS
 from pupper_sysid.sysid.report.figures import sweep_figure
+from reproduction import policies as policy_claims
 from reproduction import servos as servo_claims
 from reproduction import walks as walk_claims
-from reproduction.evidence import (
-    A_TROT,
-    KINDS,
-    Claim,
-    PolicyEvidence,
-    Training,
-    differences,
-    gather,
-    over,
-    training,
-)
-from reproduction.policies import TAUGHT, judge
-from reproduction.servos import ServoEvidence
-from reproduction.walks import Walker, compare_stacks
+from reproduction.evidence import A_TROT, KINDS, Claim, PolicyEvidence, Training, gather, over
 
 Evidence = tuple[list[PolicyEvidence], list[Training]]
 
@@ -113,133 +100,119 @@ def write_claims(options: Options, tries: Tries) -> None:
     for name in (PAGE, REPORT, *drawings, *tables):  # before hours of work
         refuse_overwrite(options.out / name, options.force)
     if options.beside is not None:
-        differences([], options.beside)
+        reproduction.evidence.differences([], options.beside)
     for name, (policy, _) in tries.items():
         if policy.contract.kind not in KINDS:
             raise InputError(
                 f"{name} is of the kind {policy.contract.kind}, about which nothing was published. "
                 f"Leave it out; claims are about {', '.join(KINDS)}."
             )
-    trainings = [training(folder) for folder in options.from_nothing]
+    trainings = [reproduction.evidence.training(folder) for folder in options.from_nothing]
     recordings = terminal.load_all(options.recordings) if options.recordings else []
     walks = walk_claims.gather(options.imu)
-    stacks = _stacks(options)  # before hours of work, too: its servo model may not suit
+    stacks: list[dict[str, Any]] = []
+    if options.servo is not None:  # before hours of work, too: its servo model may not suit
+        policy, run = policy_choice.policy_at(options.policies[0])
+        closed = STACKS["closed-loop"]
+        # the same smoothing in both: only the policy's observation differs
+        predicted = replace(closed, observer="servo-model")
+        stacks = walk_claims.compare_stacks(
+            policy, {"encoders": closed, "servo model": predicted},
+            # a servo model is one robot's: the one of --seed
+            [walk_claims.Walker(options.seed, options.servo, k) for k in range(_STACK_ROUNDS)],
+            _STACK_COMMANDS, _STACK_SECONDS,
+            policy_choice.chosen_actuator(options.policies[0], policy, run, options.actuator),
+            _show_step,
+        )  # fmt: skip
     robot = servo_claims.gather(recordings, options.seed, _show_step)
-    evidence = []
-    for (name, (policy, trial)), path in zip(tries.items(), options.policies, strict=True):
-        evidence.append(gather(name, policy, trial, run_folder(path), _show_step))
-    claims = [
-        *servo_claims.judge(robot),
-        *judge(evidence, _played(robot), stacks, trainings),
-        *walk_claims.judge(walks),
+    evidence = [
+        gather(name, policy, trial, policy_choice.run_folder(path), _show_step)
+        for (name, (policy, trial)), path in zip(tries.items(), options.policies, strict=True)
     ]
-    other = differences(claims, options.beside) if options.beside is not None else None
+    played = {}  # the longest trial of each joint
+    for joint in robot.played.joints if robot.played else ():
+        trial = max(robot.played.trials(joint), key=lambda t: len(t.send_time_s))
+        played[joint] = (trial.send_time_s, trial.command_rad, trial.position_rad)
+    claims = [
+        *servo_claims.judge(robot), *policy_claims.judge(evidence, played, stacks, trainings),
+        *walk_claims.judge(walks),
+    ]  # fmt: skip
+    other = None
+    if options.beside is not None:
+        other = reproduction.evidence.differences(claims, options.beside)
     pictures = _draw(evidence, robot, trainings)
     inputs = _inputs(options, tries)
     summary = _summary(claims, evidence, trainings)
-    both = (evidence, trainings)
-    sections = _sections(claims, other, both, pictures, inputs, options, summary[1:])
+    sections = _sections(
+        claims, other, (evidence, trainings), pictures, inputs, options, summary[1:]
+    )
     write_text(page, _markdown(_TITLE, summary[0], sections), options.force)
     write_page(report, _TITLE, summary[0], sections, options.force)
     if options.json:
-        print_json(
-            {
-                "claims": claims, "page": str(page), "report": str(report),
-                "pictures": [_file(p) for p in pictures], "inputs_sha256": inputs,
-                "versions": versions(*_MORE),
-            }
-        )  # fmt: skip
-        return
-    table = terminal.table("Published claims", "", "claim", "paper", "here", "verdict")
-    for c in claims:
-        table.add_row(c.id, c.claim, c.paper, c.ours, c.verdict)
-    out.print(table)
-    err.print(f"Wrote {report}, {page} and {len(pictures)} pictures beside them.", soft_wrap=True)
+        return terminal.print_json({
+            "claims": claims, "page": str(page), "report": str(report),
+            "pictures": [_file(p) for p in pictures], "inputs_sha256": inputs,
+            "versions": versions(*_MORE),
+        })  # fmt: skip
+    terminal.print_table(
+        "Published claims", "", "claim", "paper", "here", "verdict",
+        rows=((c.id, c.claim, c.paper, c.ours, c.verdict) for c in claims),
+    )  # fmt: skip
+    terminal.err.print(
+        f"Wrote {report}, {page} and {len(pictures)} pictures beside them.", soft_wrap=True
+    )
 
 
 def _show_step(what: str) -> None:
-    err.print(f"{what} …", style="dim")
-
-
-def _stacks(options: Options) -> list[dict[str, Any]]:
-    """Closed loop against the servo model's prediction, walked by the first policy."""
-    if options.servo is None:
-        return []
-
-    policy, run = policy_at(options.policies[0])
-    actuator = chosen_actuator(options.policies[0], policy, run, options.actuator)
-    closed = STACKS["closed-loop"]
-    # the same smoothing in both: only the policy's observation differs
-    predicted = replace(closed, observer="servo-model")
-    # a servo model is one robot's: the one of --seed
-    walkers = [Walker(options.seed, options.servo, k) for k in range(_STACK_ROUNDS)]
-    return compare_stacks(
-        policy, {"encoders": closed, "servo model": predicted}, walkers, _STACK_COMMANDS,
-        _STACK_SECONDS, actuator, _show_step,
-    )  # fmt: skip
-
-
-def _played(robot: ServoEvidence) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Longest trial of each joint of the playback."""
-    if robot.played is None:
-        return {}
-    trials_of = {}
-    for joint in robot.played.joints:
-        trial = max(robot.played.trials(joint), key=lambda t: len(t.send_time_s))
-        trials_of[joint] = (trial.send_time_s, trial.command_rad, trial.position_rad)
-    return trials_of
+    terminal.err.print(f"{what} …", style="dim")
 
 
 def _draw(
-    evidence: list[PolicyEvidence], robot: ServoEvidence, trainings: list[Training]
+    evidence: list[PolicyEvidence], robot: servo_claims.ServoEvidence, trainings: list[Training]
 ) -> list[Picture]:
     """What can be shown of the evidence."""
-    drawn_pictures: list[Picture] = []
+    drawn: list[tuple[str, str, Figure]] = []
     if trainings:
         caption = "Trainings from random weights in the published task, each a line."
-        drawn_pictures.append(Picture("training", caption, training_figure(trainings)))
+        drawn.append(("training", caption, training_figure(trainings)))
     if robot.sweep is not None:
-        joint = robot.sweep.joints[-1]
-        trials = [t for t in robot.sweep.trials(joint) if np.isfinite(t.frequency_hz)]
+        trials = robot.sweep.trials(robot.sweep.joints[-1])
+        figure = sweep_figure([t for t in trials if np.isfinite(t.frequency_hz)])
         caption = "As the paper's figure 2: commands and readings by frequency. Faint ones are old."
-        drawn_pictures.append(Picture("sweep", caption, sweep_figure(trials)))
+        drawn.append(("sweep", caption, figure))
     for kind in ("lstm", "mlp"):
-        first = next((e for e in evidence if e.kind == kind), None)
-        if first:
+        for first in [e for e in evidence if e.kind == kind][:1]:
             caption = f"As figure 4: the gait of {first.name}."
-            drawn_pictures.append(Picture(f"gait-{kind}", caption, figures.gait_figure(first.walk)))
+            drawn.append((f"gait-{kind}", caption, figures.gait_figure(first.walk)))
     moving = _one_per_kind([e for e in evidence if e.orbits])
     if moving:
         orbits = {f"{e.name} {k}": v.orbits for e in moving for k, v in e.orbits.items()}
         late = {e.name: e.orbits["actions"].states for e in moving}
-        drawn_pictures += [
-            Picture(
-                "orbits",
-                "As figure 5: orbits of actions and hidden states, joints late by 0, 160, 320 ms.",
-                figures.orbit_figure(orbits, DELAYS_MS),
-            ),
-            Picture(
-                "late",
-                "As figure 6: the LF thigh's action in replay with late joints.",
-                delay_trace_figure(late, DELAYS_MS, moving[0].walk.step_s),
-            ),
-        ]
+        drawn += [
+            ("orbits", "As figure 5: orbits of actions and hidden states, joints late by 0, 160, "
+             "320 ms.", figures.orbit_figure(orbits, DELAYS_MS)),
+            ("late", "As figure 6: the LF thigh's action in replay with late joints.",
+             delay_trace_figure(late, DELAYS_MS, moving[0].walk.step_s)),
+        ]  # fmt: skip
     every = _one_per_kind(evidence)
-    captions = {
-        "ablation":
-            "As figure 7a: correlation of actions against noise in all that comes from the joints.",
-        "delay": "Closed loop and replay against more delay, which the paper shows in replay only.",
-        "autonomy": "Tests that the paper lacks: frozen inputs, pushes, other control rates.",
-        "terrain": "Other ground.",
-        "compliance": "As figure 7b: where one robot goes in six directions in ten seconds.",
-    }  # fmt: skip
-    for name, caption in captions.items():  # each is an analysis, with a figure of its name
-        drawn = getattr(figures, f"{name}_figure")({e.name: getattr(e, name) for e in every})
-        drawn_pictures.append(Picture(name, caption, drawn))
+    for name, caption in _OF_ANALYSES.items():
+        of_policies = {e.name: getattr(e, name) for e in every}
+        drawn.append((name, caption, getattr(figures, f"{name}_figure")(of_policies)))
     if robot.servos is not None:
         caption = "As the extension's figure: four servo models on an unseen loop."
-        drawn_pictures.append(Picture("servos", caption, robot.servos.plot()))
-    return drawn_pictures
+        drawn.append(("servos", caption, robot.servos.plot()))
+    return [Picture(*each) for each in drawn]
+
+
+_OF_ANALYSES = {
+    "ablation":
+        "As figure 7a: correlation of actions against noise in all that comes from the joints.",
+    "delay": "Closed loop and replay against more delay, which the paper shows in replay only.",
+    "autonomy": "Tests that the paper lacks: frozen inputs, pushes, other control rates.",
+    "terrain": "Other ground.",
+    "compliance": "As figure 7b: where one robot goes in six directions in ten seconds.",
+}  # fmt: skip
+"""Captions of the figures that are called as their analyses."""
 
 
 def _file(picture: Picture) -> str:
@@ -260,10 +233,7 @@ def _markdown(title: str, answer: str, sections: list[Section]) -> str:
         for picture in section.figures:
             blocks += [f"![{picture.caption}]({_file(picture)})", picture.caption]
         for table in section.tables:
-            cells = [
-                [column.page_heading for column in table.columns],
-                ["---"] * len(table.columns),
-            ]
+            cells = [[c.page_heading for c in table.columns], ["---"] * len(table.columns)]
             cells += [[column.text(row) for column in table.columns] for row in table.rows]
             blocks.append("\n".join(f"| {' | '.join(row)} |" for row in cells))
     return "\n\n".join(blocks) + "\n"
@@ -274,13 +244,14 @@ def _sections(
     pictures: list[Picture], inputs: dict[str, str], options: Options, summary: list[str],
 ) -> list[Section]:  # fmt: skip
     """The parts of the page."""
-    claims = tuple(
-        {
-            **c.to_dict(), "id": _id(c, evidence[0]),
-            "here": c.ours + (f" ({_bounds(c)})" if c.interval else ""),
-        }
-        for c in claims_found
-    )  # fmt: skip
+    claims = []
+    for c in claims_found:
+        taught = c.id in policy_claims.TAUGHT and any(e.first_gait == A_TROT for e in evidence[0])
+        bounds = "; ".join(
+            f"{k} {_number(v.low)} to {_number(v.high)}" for k, v in (c.interval or {}).items()
+        )
+        here = c.ours + (f" ({bounds})" if bounds else "")
+        claims.append({**c.to_dict(), "id": c.id + (" †" if taught else ""), "here": here})
     columns = (
         Column("", "id", kind="key"),
         *(Column(key, key, kind="prose") for key in ("claim", "paper", "here", "how")),
@@ -291,11 +262,13 @@ def _sections(
     first = Column("", "", kind="words")
     compared = []
     if other is not None:
-        columns_shown = tuple(
-            Column(heading, key, kind="prose" if heading else "key") for heading, key in _OTHER
-        )
-        tables = [Table("beside", "Judged otherwise", columns_shown, tuple(other))] if other else []
-        compared = [Section("beside", _BESIDE, [_other(other)], tables=tables)]
+        text = "Every claim that both pages have is judged alike."
+        if other:
+            text = "Claims that the page given with `--beside` judges otherwise."
+        shown = tuple(Column(head, key, kind="prose" if head else "key") for head, key in _OTHER)
+        tables = [Table("beside", "Judged otherwise", shown, tuple(other))] if other else []
+        compared = [Section("beside", _BESIDE, [text], tables=tables)]
+    made_with = ", ".join(f"{name} {version}" for name, version in versions(*_MORE).items())
     return [
         Section(
             "claims", "Claims", [*summary, _ABOUT],
@@ -310,7 +283,7 @@ def _sections(
         ),
         Section("pictures", "Pictures", figures=pictures),
         Section(
-            "made", _MADE, [f"Made by: `{_command(options)}`", f"{_versions()}."],
+            "made", _MADE, [f"Made by: `{_command(options)}`", f"{made_with}."],
             tables=[Table("inputs", "What it was made from", (
                 Column("input", "input", kind="words"),
                 Column("SHA-256", "digest", kind="prose"),
@@ -338,12 +311,6 @@ _ABOUT = (
     "simulation with a calibrated robot; claims about the physical one are judged by its "
     "recordings and the logs of its IMU."
 )
-
-
-def _other(rows: list[dict[str, str]]) -> str:
-    if not rows:
-        return "Every claim that both pages have is judged alike."
-    return "Claims that the page given with `--beside` judges otherwise."
 
 
 def _summary(
@@ -381,41 +348,28 @@ def _summary(
     return paragraphs
 
 
-def _id(claim: Claim, evidence: list[PolicyEvidence]) -> str:
-    """Its name, marked where the imitated trot decides it."""
-    taught = claim.id in TAUGHT and any(e.first_gait == A_TROT for e in evidence)
-    return claim.id + (" †" if taught else "")
-
-
 def _command(options: Options) -> str:
     """The command that makes the page, with files by their names."""
-    parts = ["python -m reproduction", *(str(p) for p in options.policies)]
-    if options.from_nothing:
-        parts += ["--from-nothing", *(str(p) for p in options.from_nothing)]
-    if options.recordings:
-        parts += ["--recordings", *(p.name for p in options.recordings)]
-    if options.imu:
-        parts += ["--imu", *(f"{kind}={Path(name).name}" for kind, name in _logs(options))]
-    if options.servo:
-        parts += ["--servo", options.servo.name]
-    for flag in ("actuator", "feedback"):
-        if getattr(options, flag):
-            parts += [f"--{flag}", str(getattr(options, flag))]
-    if options.beside:
-        parts += ["--beside", str(options.beside)]
-    parts += ["--command", *(f"{c:g}" for c in options.command)]
-    for flag in ("robots", "seconds", "seed"):
-        parts += [f"--{flag}", f"{getattr(options, flag):g}"]
-    return " ".join([*parts, "--out", str(options.out)])
+    given: dict[str, Sequence[Any]] = {
+        "": options.policies,
+        "--from-nothing": options.from_nothing,
+        "--recordings": [p.name for p in options.recordings],
+        "--imu": [f"{kind}={Path(name).name}" for kind, name in _logs(options)],
+        "--servo": [options.servo.name] if options.servo else (),
+        "--actuator": [options.actuator] if options.actuator else (),
+        "--feedback": [options.feedback] if options.feedback else (),
+        "--beside": [options.beside] if options.beside else (),
+        "--command": [f"{c:g}" for c in options.command],
+        **{f"--{k}": [f"{getattr(options, k):g}"] for k in ("robots", "seconds", "seed")},
+        "--out": [options.out],
+    }
+    words = [str(word) for flag, values in given.items() if values for word in (flag, *values)]
+    return " ".join(["python -m reproduction", *filter(None, words)])
 
 
 def _logs(options: Options) -> list[tuple[str, str]]:
     """Kind of policy and file of each IMU log."""
     return [(kind, name) for kind, _, name in (text.partition("=") for text in options.imu)]
-
-
-def _versions() -> str:
-    return ", ".join(f"{name} {version}" for name, version in versions(*_MORE).items())
 
 
 def _inputs(options: Options, tries: Tries) -> dict[str, str]:
@@ -430,11 +384,6 @@ def _inputs(options: Options, tries: Tries) -> dict[str, str]:
     files += [options.beside] if options.beside else []
     files += [*options.recordings, *(Path(name) for _, name in _logs(options))]
     return hashes | {"/".join(f.parts[-2:]): sha256(f) for f in files if f.is_file()}
-
-
-def _bounds(claim: Claim) -> str:
-    known = (claim.interval or {}).items()
-    return "; ".join(f"{k} {_number(v.low)} to {_number(v.high)}" for k, v in known) or "–"
 
 
 def _table_one(both: Evidence) -> tuple[list[str], list[tuple[str, list[str]]]]:

@@ -13,12 +13,19 @@ from pupper_sysid.cli import terminal
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, resolved, sha256, write_text
 from pupper_sysid.common.reading.dialect import decimal
+from pupper_sysid.servo_models.calibration.calibration import (
+    PRESETS,
+    Calibration,
+    is_shipped,
+    load_calibration,
+)
 from pupper_sysid.servo_models.calibration.parts import P_GAINS
+from pupper_sysid.servo_models.cards import files
+from pupper_sysid.servo_models.cards.card import CardCalibration
+from pupper_sysid.sim.export.shared import INCLUDES_LINK, ExportedServos
 from pupper_sysid.sim.export.targets import TARGETS
 
 if TYPE_CHECKING:
-    from pupper_sysid.servo_models.calibration.calibration import Calibration
-
     Format = str
 else:
     Format = tyro.extras.literal_type_from_choices(["csv", *TARGETS, "bam", "onnx", "torchscript"])
@@ -78,15 +85,23 @@ class Export:
 
     def run(self) -> None:
         """Convert and write."""
-        if self.physics_step is not None:
-            refuse_outside("--physics-step", self.physics_step, *_STEPS_S, "s")
-        if self.gain is not None:
-            refuse_outside("--gain", self.gain, *P_GAINS)
-        links = _links(self.link_inertia)
+        refuse_outside("--physics-step", self.physics_step, *_STEPS_S, "s")
+        refuse_outside("--gain", self.gain, *P_GAINS)
+        links = {}
+        for text in self.link_inertia:
+            joint, _, inertia = text.partition("=")
+            try:
+                links[joint] = decimal(inertia)
+            except ValueError:
+                joint = ""
+            if not joint:
+                raise InputError(
+                    f"--link-inertia {text}: write a joint and its inertia in kg·m², such as "
+                    "LF_thigh=0.0012."
+                )
         if self.model is not None and self.to != "mjcf":
             raise InputError("--model is of `--to mjcf`; for others give --link-inertia.")
         from pupper_sysid.cli.policy_choice import is_policy
-        from pupper_sysid.servo_models.calibration.calibration import is_shipped
 
         path = Path(self.source)
         if not is_shipped(self.source) and path.is_dir():
@@ -95,11 +110,9 @@ class Export:
             target = self._policy(path) if is_policy(path) else self._servo_model(path)
         else:
             target = self._table(path, links)
-        if target is None:
-            return
-        if self.json:
+        if target is not None and self.json:
             terminal.print_json({"written": str(target)})
-        else:
+        elif target is not None:
             terminal.err.print(f"Wrote {target}.")
 
     def _policy(self, folder: Path) -> Path:
@@ -133,18 +146,12 @@ class Export:
         return target
 
     def _table(self, path: Path, links: dict[str, float]) -> Path | None:
-        from pupper_sysid.servo_models.calibration.calibration import (
-            PRESETS,
-            is_shipped,
-            load_calibration,
-        )
-        from pupper_sysid.servo_models.cards.files import is_card
         from pupper_sysid.sysid.export.tidy_table import to_csv
         from pupper_sysid.sysid.recordings.files import load
 
         if path.name in ("contract.json", "weights.safetensors"):
             raise InputError(f"{self.source} is part of a servo model; give its folder.")
-        kind, card = path.suffix.lower(), is_card(self.source)
+        kind, card = path.suffix.lower(), files.is_card(self.source)
         named = is_shipped(self.source) or card
         if not named and kind not in (".yaml", ".yml", ".csv"):
             raise InputError(
@@ -194,9 +201,6 @@ class Export:
 
     def _bam(self, path: Path, card: bool) -> Path:
         """A servo card, or a servo calibrated under load, as a parameter file of BAM."""
-        from pupper_sysid.servo_models.calibration.calibration import load_calibration
-        from pupper_sysid.servo_models.cards import files
-
         lost = []
         if card:
             servo_card = files.load_card(self.source)
@@ -211,44 +215,38 @@ class Export:
     def _check(self, calibration: Calibration, links: dict[str, float]) -> None:
         """Print how far the export is from the calibration."""
         from pupper_sysid.sim.export.check import SWITCHED_OFF, WHOLE, check
-        from pupper_sysid.sim.export.shared import ExportedServos
 
         step = 0.002 if self.physics_step is None else self.physics_step
-        servos = ExportedServos.of(calibration, step, self.gain, links)
-        checked = check(servos)
+        checked = check(ExportedServos.of(calibration, step, self.gain, links))
         if self.json:
-            terminal.print_json(checked)
-            return
-        n = terminal.number
-        table = terminal.table(
-            f"Export in MuJoCo, steps of {1e3 * step:g} ms, beside the calibration, RMS",
+            return terminal.print_json(checked)
+        n, wide = terminal.number, f"{1e3 * step:g} ms"
+        terminal.print_table(
+            f"Export in MuJoCo, steps of {wide}, beside the calibration, RMS",
             "joint", "tones mrad", "walk mrad", "same steps mrad", "readings counts",
             "whole steps mrad",
+            rows=(
+                (name, n(1e3 * row.tones_rad, 2), n(1e3 * row.walk_rad, 2),
+                 n(1e3 * row.same_steps_rad, 2), n(row.reading_counts, 2),
+                 n(1e3 * row.whole_steps_rad, 1))
+                for name, row in checked.joints.items()
+            ),
         )  # fmt: skip
-        for name, row in checked.joints.items():
-            table.add_row(
-                name, n(1e3 * row.tones_rad, 2), n(1e3 * row.walk_rad, 2),
-                n(1e3 * row.same_steps_rad, 2), n(row.reading_counts, 2),
-                n(1e3 * row.whole_steps_rad, 1),
-            )  # fmt: skip
-        terminal.out.print(table)
         if any(row.step_rad[WHOLE] > 0 for row in checked.joints.values()):
-            costs = terminal.table(
-                f"What steps of {1e3 * step:g} ms cost, RMS on the tones [mrad]",
-                "joint", *SWITCHED_OFF,
-            )  # fmt: skip
-            for name, row in checked.joints.items():
-                costs.add_row(name, *(n(1e3 * cost, 2) for cost in row.step_rad.values()))
             terminal.out.print()
-            terminal.out.print(costs)
+            terminal.print_table(
+                f"What steps of {wide} cost, RMS on the tones [mrad]", "joint", *SWITCHED_OFF,
+                rows=(
+                    (name, *(n(1e3 * cost, 2) for cost in row.step_rad.values()))
+                    for name, row in checked.joints.items()
+                ),
+            )  # fmt: skip
             terminal.out.print()
         for sentence in checked.notes:
             terminal.err.print(sentence)
 
     def _simulator(self, path: Path, calibration: Calibration, links: dict[str, float]) -> Path:
-        from pupper_sysid.servo_models.cards.card import CardCalibration
         from pupper_sysid.sim.export.export import exported_text
-        from pupper_sysid.sim.export.shared import INCLUDES_LINK
 
         if self.gain is not None:
             self._at_gain(calibration, self.gain)
@@ -272,20 +270,3 @@ class Export:
                 f"{servos.with_link[0]}=0.0002, or --to mjcf --model robot.xml."
             )
         return target
-
-
-def _links(texts: tuple[str, ...]) -> dict[str, float]:
-    """`LF_thigh=0.0012` by joint."""
-    links = {}
-    for text in texts:
-        joint, equals, number = text.partition("=")
-        try:
-            links[joint] = decimal(number)
-        except ValueError:
-            equals = ""
-        if not (joint and equals):
-            raise InputError(
-                f"--link-inertia {text}: write a joint and its inertia in kg·m², such as "
-                "LF_thigh=0.0012."
-            )
-    return links

@@ -27,10 +27,11 @@ if TYPE_CHECKING:
     from pupper_sysid.sim.robot.body import Body
     from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
-_ONNX = ".onnx"
 _STROLL = 0.5  # of the commanded speed; slower, it is probably not the gait that was trained
-
 _WIDTH = 78
+_OF_ONNX = {
+    "robot": "the robot's MJCF", "robot_config": "its YAML", "policy_config": "the policy's YAML",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -148,17 +149,19 @@ class ServoDemand(Commanded):
                 "so this may not be its gait: check the order, signs and scales of "
                 "`observation`, the pose, and the command (--command)."
             )
-        table = terminal.table(
-            self.title(f"{name} on {Path(self.servo).name}"), "servo", "rad/s 99 %", "peak", "has",
-            "N·m 99 %", "has", "used", "short", "(walked)",
-        )  # fmt: skip
-        for joint, needs in demand.joints.items():
-            table.add_row(
+        rows = (
+            (
                 joint, number(needs.speed_rad_s.p99, 1), number(needs.speed_rad_s.peak, 1),
                 number(needs.top_speed_rad_s, 1), number(needs.torque_nm.p99, 2),
-                number(needs.stall_torque_nm, 2), f"{100 * needs.torque_used:.0f} %",
-                f"{100 * needs.short:.0f} %", f"{100 * needs.walked_short:.0f} %",
-            )  # fmt: skip
+                number(needs.stall_torque_nm, 2),
+                *(f"{100 * x:.0f} %" for x in (needs.torque_used, needs.short, needs.walked_short)),
+            )
+            for joint, needs in demand.joints.items()
+        )  # fmt: skip
+        table = terminal.table(
+            self.title(f"{name} on {Path(self.servo).name}"), "servo", "rad/s 99 %", "peak", "has",
+            "N·m 99 %", "has", "used", "short", "(walked)", rows=rows,
+        )  # fmt: skip
         if not self.json:
             for line in wrap(demand.verdict, _WIDTH):
                 terminal.out.print(line)
@@ -193,11 +196,12 @@ class ServoDemand(Commanded):
         from pupper_sysid.policies.network.onnx_network import OnnxNetwork
         from pupper_sysid.sim.walking.servo_ranges import check_actuator, servo_ranges
 
-        for file, what in (
-            (path, "a policy's ONNX file"), (self.robot, "the robot's MJCF as --robot"),
-            (self.robot_config, "its YAML as --robot-config"),
-            (self.policy_config, "the policy's YAML as --policy-config"),
-        ):  # fmt: skip
+        files = {path: "a policy's ONNX file"}
+        files |= {
+            getattr(self, key): f"{what} as --{key.replace('_', '-')}"
+            for key, what in _OF_ONNX.items()
+        }
+        for file, what in files.items():
             if file is not None and not file.is_file():
                 raise InputError(f"There is no {file}. Give {what}.")
         network = OnnxNetwork(path)
@@ -219,10 +223,7 @@ class ServoDemand(Commanded):
 
 def path_is_onnx(path: Path) -> bool:
     """Whether a policy is named by its ONNX file."""
-    return path.suffix.lower() == _ONNX
-
-
-_OF_ONNX = ("robot", "robot_config", "policy_config")
+    return path.suffix.lower() == ".onnx"
 
 
 _PLACES = (("air", "in the air"), ("ground", "on the ground"))
@@ -275,7 +276,8 @@ class Twin(Drawn):
         logs = {path.name: read_imu(path) for path in self.imu}
         robot = robot_for(recordings[0], self.model)
         actuators = {
-            _short(name): actuator_of(name, robot, recordings[0]) for name in self.actuator
+            Path(name).name or name: actuator_of(name, robot, recordings[0])
+            for name in self.actuator
         }
         loops = terminal.whole_numbers("--test-loops", self.test_loops) if self.test_loops else []
         feedback = {self.feedback.name: load_calibration(self.feedback)} if self.feedback else {}
@@ -296,43 +298,32 @@ class Twin(Drawn):
         )
 
 
-def _short(name: str) -> str:
-    return Path(name).name or name
-
-
 def _explain(result: Result, seen: dict[str, Gyro | None]) -> None:
     """Errors by joint, gyro, notes and the verdict, above the table."""
     best = result.models[result.best]
     conditions = {words: getattr(best, place) for place, words in _PLACES if getattr(best, place)}
     columns = [f"{what} {words}" for words in conditions for what in ("RMS", "mean")]
-    joints = terminal.table(
-        f"Errors of {result.best} by joint, mrad", "joint", *columns, "repeatability"
-    )
+    rows = []
     for joint in result.readings:
-        errors = [
-            e
-            for c in conditions.values()
-            for e in (c.joints[joint].rmse_rad, c.joints[joint].mae_rad)
-        ]
-        joints.add_row(joint, *map(ms, [*errors, result.repeatability_rad[joint]]))
-    terminal.out.print(joints)
+        errors = (c.joints[joint] for c in conditions.values())
+        both = (x for e in errors for x in (e.rmse_rad, e.mae_rad))
+        rows.append((joint, *map(ms, (*both, result.repeatability_rad[joint]))))
+    terminal.print_table(
+        f"Errors of {result.best} by joint, mrad", "joint", *columns, "repeatability", rows=rows
+    )
     if seen:
-        terminal.out.print(_gyro_table(result, seen))
+        simulated = {f"simulated, {n}": m.ground.gyro for n, m in result.models.items() if m.ground}
+        terminal.print_table(
+            "Gyro: deviation rad/s, peak Hz and its share of the variance", "", "x", "y", "z",
+            rows=(
+                (name, *(", ".join(map(number, axis)) for axis in zip(
+                    gyro.deviation_rad_s, gyro.peak_hz, gyro.peak_share, strict=True)))
+                for name, gyro in (seen | simulated).items() if gyro is not None
+            ),
+        )  # fmt: skip
     terminal.warn(*result.notes)
     for line in wrap(result.verdict_in_words, _WIDTH):
         terminal.out.print(line)
-
-
-def _gyro_table(result: Result, seen: dict[str, Gyro | None]) -> Table:
-    table = terminal.table(
-        "Gyro: deviation rad/s, peak Hz and its share of the variance", "", "x", "y", "z"
-    )
-    simulated = {f"simulated, {n}": m.ground.gyro for n, m in result.models.items() if m.ground}
-    for name, gyro in (seen | simulated).items():
-        if gyro is not None:
-            axes = zip(gyro.deviation_rad_s, gyro.peak_hz, gyro.peak_share, strict=True)
-            table.add_row(name, *(", ".join(map(number, axis)) for axis in axes))
-    return table
 
 
 def _table(result: Result) -> Table:

@@ -61,8 +61,7 @@ class Drawn(ABC):
             figure.suptitle(caption, fontsize=8)
         save(figure, picture, self.force)
         if self.json:
-            print_json({**self.about(), **data, "picture": picture})
-            return
+            return print_json({**self.about(), **data, "picture": picture})
         out.print(table)
         err.print(f"Picture: {picture}")
 
@@ -216,15 +215,11 @@ def tries_of(
         policy, run = policy_choice.policy_at(path)
         if not other_robots:
             policy_choice.refuse_other_robot(policy)
-        task, servos = policy_choice.simulator(
-            path, policy, run, options.actuator, options.feedback
-        )
-        commanded = np.array([command], float)
-        within = policy_choice.trained_commands(policy, run).clipped(commanded, warn)[0]
-        tries[name] = (
-            policy,
-            Trial(task, servos, (within[0], within[1], within[2]), robots, seconds, options.seed),
-        )
+        servos = policy_choice.simulator(path, policy, run, options.actuator, options.feedback)
+        trained = policy_choice.trained_commands(policy, run)
+        forward, left, turn = trained.clipped(np.array([command], float), warn)[0]
+        trial = Trial(*servos, (forward, left, turn), robots, seconds, options.seed)
+        tries[name] = policy, trial
     policy_choice.warn_of_fallbacks(trial.servos for _, trial in tries.values())
     return tries
 
@@ -238,12 +233,12 @@ _HEADINGS = {
 
 def table_of(title: str, tables: Mapping[str, Sequence[Any]], columns: Sequence[str]) -> Table:
     """Rows of results by policy, with these fields as columns."""
-    table = terminal.table(title, "policy", *(_HEADINGS.get(c, c) for c in columns))
-    for name, rows in tables.items():
-        for row in rows:
-            cells = (terminal.cell(getattr(row, c), 3) for c in columns)
-            table.add_row(name, *(cell.replace("_", " ") for cell in cells))
-    return table
+    rows = (
+        (name, *(terminal.cell(getattr(row, c), 3).replace("_", " ") for c in columns))
+        for name, rows in tables.items()
+        for row in rows
+    )
+    return terminal.table(title, "policy", *(_HEADINGS.get(c, c) for c in columns), rows=rows)
 
 
 def interval(value: Interval, digits: int) -> str:
@@ -270,14 +265,16 @@ class Gait(Commanded):
         table = terminal.table(
             self.title("Gait, 90 % intervals over robots"), "policy", "Hz", "sine R² actions",
             "of noise", "diagonal", "duty", "jitter rad", "robots",
+            rows=(
+                (
+                    name, interval(gait.frequency_hz, 2), interval(gait.action_r2, 2),
+                    number(gait.null_r2, 2), interval(gait.diagonal, 2),
+                    number(float(np.mean([d.value for d in gait.duty])), 2),
+                    number(gait.jitter_rad.value, 3), f"{gait.robots} of {self.size[0]}",
+                )
+                for name, gait in reports.items()
+            ),
         )  # fmt: skip
-        for name, gait in reports.items():
-            table.add_row(
-                name, interval(gait.frequency_hz, 2), interval(gait.action_r2, 2),
-                number(gait.null_r2, 2), interval(gait.diagonal, 2),
-                number(float(np.mean([d.value for d in gait.duty])), 2),
-                number(gait.jitter_rad.value, 3), f"{gait.robots} of {self.size[0]}",
-            )  # fmt: skip
         return {"gaits": reports}, gait_figure(next(iter(walks.values()))), table
 
 
@@ -301,20 +298,23 @@ class Attractor(Commanded):
                 f"No robot walked for {SETTLE_S + SHORTEST_S:g} s and moved: there is no orbit to "
                 "analyse. Give a policy that walks, or more --seconds."
             )
+        every = {
+            f"{name} {states}": orbit
+            for name, orbits_of in by_policy.items() for states, orbit in orbits_of.items()
+        }  # fmt: skip
         table = terminal.table(
             self.title("Orbits at more delay of the joints, in replay, as published"), "states",
             "variance in 3 PCs", "dimensions", *(f"closure +{d:g} ms" for d in DELAYS_MS),
             *(f"area +{d:g} ms" for d in DELAYS_MS[1:]),
+            rows=(
+                (
+                    name, number(orbit.explained_3, 3), number(orbit.participation_ratio, 1),
+                    *(number(x, 2) for x in (*orbit.closure, *orbit.area_ratio[1:])),
+                )
+                for name, orbit in every.items()
+            ),
         )  # fmt: skip
-        drawn = {}
-        for name, orbits_of in by_policy.items():
-            for states, orbit in orbits_of.items():
-                drawn[f"{name} {states}"] = orbit.orbits
-                table.add_row(
-                    f"{name} {states}", number(orbit.explained_3, 3),
-                    number(orbit.participation_ratio, 1), *(number(c, 2) for c in orbit.closure),
-                    *(number(a, 2) for a in orbit.area_ratio[1:]),
-                )  # fmt: skip
+        drawn = {name: orbit.orbits for name, orbit in every.items()}
         return {"delays_ms": DELAYS_MS, "orbits": by_policy}, orbit_figure(drawn, DELAYS_MS), table
 
 
@@ -369,25 +369,26 @@ class Autonomy(Commanded):
         from pupper_sysid.policies.analysis.figures import autonomy_figure
 
         tests_of = self.per_policy(autonomy, self.command)
+        rows = []
+        for name, tests in tests_of.items():
+            rows += [
+                (name, r.test, number(r.frequency_hz, 2), number(r.share, 2), "", "", "")
+                for r in tests.frozen
+            ]
+            rows += [
+                (name, f"push of {r.push_m_s:g} m/s", "", "", number(r.survival, 2),
+                 number(r.shift_late, 3), number(r.kept, 2))
+                for r in tests.push
+            ]  # fmt: skip
+            rows += [
+                (name, f"control rate {r.rate_hz:.4g} Hz", number(r.frequency_hz, 2), "",
+                 number(r.survival, 2), "", "")
+                for r in tests.rate
+            ]  # fmt: skip
         table = terminal.table(
             self.title("Autonomy of the rhythm"), "policy", "test", "gait Hz", "share of amplitude",
-            "still up", "phase shift", "of it kept",
+            "still up", "phase shift", "of it kept", rows=rows,
         )  # fmt: skip
-        for name, tests in tests_of.items():
-            for r in tests.frozen:
-                table.add_row(
-                    name, r.test, number(r.frequency_hz, 2), number(r.share, 2), "", "", ""
-                )
-            for r in tests.push:
-                table.add_row(
-                    name, f"push of {r.push_m_s:g} m/s", "", "", number(r.survival, 2),
-                    number(r.shift_late, 3), number(r.kept, 2),
-                )  # fmt: skip
-            for r in tests.rate:
-                table.add_row(
-                    name, f"control rate {r.rate_hz:.4g} Hz", number(r.frequency_hz, 2), "",
-                    number(r.survival, 2), "", "",
-                )  # fmt: skip
         return {"autonomy": tests_of}, autonomy_figure(tests_of), table
 
 
@@ -427,12 +428,10 @@ class Compliance(OfPolicies):
         table = terminal.table(
             self.title("Walks by direction, 90 % intervals over robots"), "policy", "direction",
             "still up", "share of speed", "drift m/m", "arc rad/m", "wander m/turn",
+            rows=(
+                (name, row.direction, number(row.survival, 2),
+                 *(interval(m, 2) for m in (row.share, row.drift, row.arc_rad_m, row.wander_m)))
+                for name, rows in walks.items() for row in rows
+            ),
         )  # fmt: skip
-        for name, rows in walks.items():
-            for row in rows:
-                measures = (row.share, row.drift, row.arc_rad_m, row.wander_m)
-                table.add_row(
-                    name, row.direction, number(row.survival, 2),
-                    *(interval(m, 2) for m in measures),
-                )  # fmt: skip
         return {"compliance": walks}, compliance_figure(walks), table

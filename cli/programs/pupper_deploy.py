@@ -36,7 +36,6 @@ from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, Sta
 if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.assembly import Assembly
     from pupper_sysid.policies.deploy.commands import Commands
-    from pupper_sysid.policies.network.policy_file import CommandRanges
     from pupper_sysid.sim.emulator.robot import EmulatedRobot
     from pupper_sysid.sim.robot.body import Body
 
@@ -172,16 +171,22 @@ def _run(options: Deploy) -> None:
     import torch
 
     torch.set_num_threads(1)
+    from pupper_sysid.cli.drive import Driver
     from pupper_sysid.policies.deploy.assembly import assemble
+    from pupper_sysid.policies.deploy.commands import constant, script
 
     policy, run = policy_choice.policy_at(options.policy)
     body = policy_choice.body_at(options.policy, policy, run)
     name, stack = _stack(options, policy.contract)
     if options.replay:
-        _replay(options.replay, policy, body)
-        return
+        return _replay(options.replay, policy, body)
     trained = policy_choice.trained_commands(policy, run)
-    commands = _commands(options, trained)
+    if options.keyboard:
+        commands: Commands = Driver(trained)
+    elif options.script:
+        commands = script(options.script, trained, err.print)
+    else:
+        commands = constant(options.command, trained, err.print)
     folder = Path("walks") / (options.name or time.strftime(f"{options.policy.name}-%H%M%S"))
     with ExitStack() as open_things:
         actuator = policy_choice.chosen_actuator(options.policy, policy, run, options.actuator)
@@ -212,18 +217,6 @@ def _run(options: Deploy) -> None:
         _walk(options, bus, imu, assembled, commands, header, folder, truth)
 
 
-def _commands(options: Deploy, trained: CommandRanges) -> Commands:
-    """Commands within what the policy was trained for."""
-    from pupper_sysid.cli.drive import Driver
-    from pupper_sysid.policies.deploy.commands import constant, script
-
-    if options.keyboard:
-        return Driver(trained)
-    if options.script:
-        return script(options.script, trained, err.print)
-    return constant(options.command, trained, err.print)
-
-
 def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
     """The stack, with the user's changes."""
     name = suited(contract) if options.stack == "auto" else options.stack
@@ -239,12 +232,9 @@ def _stack(options: Deploy, contract: Any) -> tuple[StackName, Stack]:
 
 def _changes(options: Deploy) -> dict[str, Any]:
     """Settings that the user gives instead of the stack's."""
-    lowpass_hz = options.lowpass_hz
-    changes = {
-        "observer": options.observer, "lowpass_hz": lowpass_hz, "fade_in_s": options.fade_in_s,
-        "scale_rad": options.scale_rad, "rate_hz": options.rate,
-    }  # fmt: skip
-    without = {"lowpass_hz": None} if lowpass_hz == 0 else {}
+    named = {"observer", "lowpass_hz", "fade_in_s", "scale_rad"}
+    changes = {name: getattr(options, name) for name in named} | {"rate_hz": options.rate}
+    without = {"lowpass_hz": None} if options.lowpass_hz == 0 else {}
     return {name: value for name, value in changes.items() if value is not None} | without
 
 
@@ -319,13 +309,10 @@ def _emulated(options: Deploy, rng: np.random.Generator, body: Body, trained: st
                 f"{trained} is a learned model, which an emulated {body.name} cannot have. Give a "
                 "calibration with --actuator."
             )
+        whose = f"{trained}."
         if options.actuator is None:
-            err.print(
-                f"The emulated {body.name} has the servos of the training, {Path(trained).name}. "
-                "Give yours with --actuator."
-            )
-        else:
-            err.print(f"The emulated {body.name} has the servos of {trained}.")
+            whose = f"the training, {Path(trained).name}. Give yours with --actuator."
+        err.print(f"The emulated {body.name} has the servos of {whose}")
         servos = servo_ranges(trained, body=body)
         if not is_card(trained):
             policy_choice.warn_of_fallbacks([servos])
@@ -402,34 +389,28 @@ def _walk(
         if views:
             views.say(f"Walk: {outcome.stop_reason}")
         rows.close({"stop_reason": outcome.stop_reason} | bus.report.footer())
-    steps = outcome.steps
     # only the true motion of an emulated robot is known
     motion: dict[str, Any] = score.summary() if score else dict.fromkeys(ERRORS)
+    steps = outcome.steps
     result = {
         "rate_hz": 1 / outcome.loop.get("mean_period_s", float("nan")),
-        "seconds": outcome.seconds,
-        "deadline_misses": outcome.deadline_misses,
+        "seconds": outcome.seconds, "deadline_misses": outcome.deadline_misses,
         "step_ms": {
             "p50": 1e3 * steps.quantile(0.5), "p99": 1e3 * steps.quantile(0.99),
             "max": 1e3 * steps.largest_s,
         },
-        "fell": outcome.fell,
-        **motion,
-        "stop_reason": outcome.stop_reason,
-        "guard": outcome.guard,
+        "fell": outcome.fell, **motion, "stop_reason": outcome.stop_reason, "guard": outcome.guard,
         "imu": {"clipped": outcome.clipped_imu_samples, "missing": outcome.missing_imu_samples},
-        "servo_match": header["servo_match"],
-        "commands": header["commands"],
-        "log": str(log),
+        "servo_match": header["servo_match"], "commands": header["commands"], "log": str(log),
     }  # fmt: skip
     if options.json:
-        print_json(result)
-        return
-    summary = terminal.table(f"{outcome.seconds:.1f} s on {bus.name}", "", "")
+        return print_json(result)
+    known = {label: result.get(key) for key, label in _SHOWN.items()}
+    summary = terminal.table(
+        f"{outcome.seconds:.1f} s on {bus.name}", "", "",
+        rows=((k, terminal.cell(value, 3)) for k, value in known.items() if value is not None),
+    )  # fmt: skip
     summary.show_header = False
-    for key, label in _SHOWN.items():
-        if result.get(key) is not None:  # true motion is known of an emulated robot only
-            summary.add_row(label, terminal.cell(result[key], 3))
     out.print(summary)
     repeat = terminal.command("pupper-deploy", options.policy, "--replay", log)
     err.print(f"Repeat it: {repeat}")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -20,9 +20,6 @@ from pupper_sysid.cli.terminal import err, need_positive, print_json, print_tabl
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, resolved
 from pupper_sysid.sim.robot.terrain import Terrain
-
-if TYPE_CHECKING:
-    from pupper_sysid.policies.evaluation.evaluate import Evaluation
 
 _FULL, _QUICK = (100, 20.0), (30, 10.0)  # episodes, seconds each
 _FULL_BATTERY, _QUICK_BATTERY = (40, 20.0), (10, 8.0)
@@ -108,6 +105,7 @@ def _run(options: Eval) -> None:
         table,
         usual_robots,
     )
+    from pupper_sysid.policies.evaluation.report import tables_of, walking_sections
 
     torch.set_num_threads(1)
     policy, run = policy_at(options.policy)
@@ -123,7 +121,6 @@ def _run(options: Eval) -> None:
         )  # fmt: skip
     if page:
         from pupper_sysid.common.page import write_page
-        from pupper_sysid.policies.evaluation.report import walking_sections
 
         folder = run_folder(options.policy)
         sections = walking_sections(policy, run, folder, evaluation)
@@ -132,25 +129,18 @@ def _run(options: Eval) -> None:
         write_page(page, title, f"{name}, seed {options.seed}", sections, options.force)
     if options.json:
         about = {"quick": options.quick, "battery": options.battery}
-        print_json(about | evaluation.to_dict() | ({"report": page} if page else {}))
-        return
-    _show(evaluation, options.quick)
-    if page:
-        err.print(f"Wrote {page}.")
-
-
-def _show(evaluation: Evaluation, quick: bool) -> None:
-    from pupper_sysid.policies.evaluation.report import tables_of
-
+        return print_json(about | evaluation.to_dict() | ({"report": page} if page else {}))
     first = evaluation.conditions[0].policy
     err.print(
-        f"{'Quick look: ' if quick else ''}{first.episodes} episodes of "
+        f"{'Quick look: ' if options.quick else ''}{first.episodes} episodes of "
         f"{evaluation.episode_s:g} s, actuator {evaluation.actuator}, feedback "
         f"{evaluation.feedback}. The trot is open-loop: it has a clock and sees nothing. Episode k "
         "has the same robot in every row; intervals are of 90 %."
     )
-    for table in tables_of(evaluation):
-        print_tables(table)
+    for results in tables_of(evaluation):
+        print_tables(results)
+    if page:
+        err.print(f"Wrote {page}.")
 
 
 if __name__ == "__main__":
