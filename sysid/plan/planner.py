@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,26 +146,20 @@ def _choices(setup: Setup, duration_s: float) -> Iterator[tuple[Kind, float, flo
     highest = min(excitation.HIGHEST_HZ, 1 / (_COMMANDS_A_PERIOD * setup.loop_period_s))
     largest = min(setup.margin_rad, LARGEST_RAD)
     least = _STEPS_OF_A_READING * setup.quantum_rad
-    for wanted in _TONES_HZ:
-        frequency = excitation.off_harmonics(wanted, rates, duration_s)
-        if frequency > highest or frequency * duration_s < 1:
-            continue
-        fastest = float(excitation.Pace(setup.speed_limit_rad_s).largest_rad(frequency))
-        most = _rounded_down(min(largest, fastest))
-        amplitudes = {a for a in _TONES_RAD if a < 0.9 * most} | {most}
-        for amplitude in sorted(a for a in amplitudes if a >= least):
-            yield "sine", frequency, amplitude
-    for wanted in _SQUARES_HZ:
-        frequency = excitation.off_harmonics(wanted, rates, duration_s)
-        most = _rounded_down(min(largest, _HARDEST_SQUARE_RAD_HZ / frequency))
-        if frequency <= highest and frequency * duration_s >= 1:
-            amplitudes = {a for a in _SQUARES_RAD if a < 0.9 * most} | {most}
-            for amplitude in sorted(a for a in amplitudes if a >= least):
-                yield "square", frequency, amplitude
-
-
-def _rounded_down(angle_rad: float) -> float:
-    return float(np.floor(1e3 * angle_rad + 1e-9) / 1e3)
+    pace = excitation.Pace(setup.speed_limit_rad_s)
+    shapes: tuple[tuple[Kind, Sequence[float], Sequence[float], Any], ...] = (
+        ("sine", _TONES_HZ, _TONES_RAD, pace.largest_rad),
+        ("square", _SQUARES_HZ, _SQUARES_RAD, lambda hz: _HARDEST_SQUARE_RAD_HZ / hz),
+    )
+    for kind, frequencies, amplitudes, largest_at in shapes:
+        for wanted in frequencies:
+            frequency = excitation.off_harmonics(wanted, rates, duration_s)
+            if frequency <= highest and frequency * duration_s >= 1:
+                most = min(largest, float(largest_at(frequency)))
+                most = float(np.floor(1e3 * most + 1e-9) / 1e3)
+                for amplitude in sorted({a for a in amplitudes if a < 0.9 * most} | {most}):
+                    if amplitude >= least:
+                        yield kind, frequency, amplitude
 
 
 def trial_seconds(duration_s: float) -> float:
@@ -186,17 +180,14 @@ _MOST_OF_A_TONE = 2  # no model is right at every tone: a plan does not rest on 
 LEAST_HALF_WIDTH_S = HALF_WIDTH_SD * STEPPING_SD_S
 """Half of a dead time's interval that no number of readings narrows [s]: the model's time step."""
 
-_UNSEEN_SD = (
-    float(np.log(2)) / HALF_WIDTH_SD
-)  # of a logarithm: an interval from half to twice the value
+# of a logarithm: an interval from half to twice the value
+_UNSEEN_SD = float(np.log(2)) / HALF_WIDTH_SD
 _PRIOR_SHARE = 0.7  # of the prior's standard deviation: beyond, the prior decides
 _TELLS = 0.1  # share of `CLEAR_NATS` that makes telling models apart a trial's purpose
 _WORDS = {
-    "dead_time_s": "dead time",
-    "effort_rad_s2": "effort limit",
-    "velocity_limit_rad_s": "speed limit",
-    "no_load_speed_rad_s": "no-load speed",
-}
+    "dead_time_s": "dead time", "effort_rad_s2": "effort limit",
+    "velocity_limit_rad_s": "speed limit", "no_load_speed_rad_s": "no-load speed",
+}  # fmt: skip
 _HELPS = 0.02  # a trial without which every interval stays within this share helps nothing
 
 
@@ -301,14 +292,10 @@ def propose(joint: str, servos: Sequence[Servo], setup: Setup, seconds: float) -
     for k, parameter in enumerate(servos[0].hypotheses[0].model.parameters[1:-1], 1):
         expected[parameter.name] = world.interval(0, k, []), world.interval(0, k, chosen)
     predictions = tuple(
-        Prediction(
-            joint=joint,
-            quantity=name,
-            now=Ends.model_validate(now),
-            after=Ends.model_validate(after),
-        )
+        Prediction(joint=joint, quantity=name, now=Ends.model_validate(now),
+                   after=Ends.model_validate(after))
         for name, (now, after) in expected.items()
-    )
+    )  # fmt: skip
     notes = tuple(_notes(joint, world, choice, chosen))
     return JointPlan(trials=trials, predictions=predictions, notes=notes)
 

@@ -72,13 +72,9 @@ def lag_budget_figure(budgets: Mapping[str, LagBudget]) -> Figure:
 
 
 _LAG_KINDS = (
-    ("command hold", SKY, ""),
-    ("dead time", BLUE, ""),
-    ("dynamics", GREEN, ""),
+    ("command hold", SKY, ""), ("dead time", BLUE, ""), ("dynamics", GREEN, ""),
     ("stale readings (bus poll)", ORANGE, "///"),
-)
-
-
+)  # fmt: skip
 _LIGHT, _DARK = "#fdfdfd", "#111111"  # letters on bars, which stay so on a dark page
 
 
@@ -224,31 +220,30 @@ _SHOWN_PERIODS, _SHOWN_S = 2.5, 3.0  # of a tone, and of other motion
 LONGEST_RUN = 12  # hold runs of this many rows and more share the last bar
 
 
-@dataclass(frozen=True)
 class Track:
-    """One trial: command, model and readings; angles from rest [rad], times [s]."""
+    """One trial: command, model and readings; angles from rest [rad], times [s], speeds [rad/s].
 
-    frequency_hz: float
-    """NaN if the trial is no tone."""
-    time_s: NDArray[np.float64]
-    command_rad: NDArray[np.float64]
-    model_rad: NDArray[np.float64]
-    """`time_s`, `command_rad` and `model_rad`: on the physics clock, from the trial's start, shape
-    (steps,)."""
-    fresh_time_s: NDArray[np.float64]
-    fresh_rad: NDArray[np.float64]
-    """`fresh_time_s` and `fresh_rad`: fresh readings at the time they were measured, shape
-    (fresh,)."""
-    row_time_s: NDArray[np.float64]
-    row_rad: NDArray[np.float64]
-    """Shape (rows,). `row_time_s` and `row_rad`: every reading at the time of its row; NaN where
-    missing."""
-    fresh_error_rad: NDArray[np.float64]
-    row_error_rad: NDArray[np.float64]
-    """`fresh_error_rad` and `row_error_rad`: reading minus model at those times."""
-    fresh_speed_rad_s: NDArray[np.float64]
-    row_speed_rad_s: NDArray[np.float64]
-    """`fresh_speed_rad_s` and `row_speed_rad_s`: speed of the model at those times."""
+    `time_s`, `command_rad` and `model_rad` are on the physics clock, from the trial's start, shape
+    (steps,). What begins with `fresh` is of fresh readings at the time that they were measured,
+    shape (fresh,); with `row`, of every reading at the time of its row, shape (rows,), NaN where it
+    is missing. Errors are reading minus model, speeds those of the model. The frequency is NaN if
+    the trial is no tone.
+    """
+
+    def __init__(self, run: Run, simulated: NDArray):
+        rest = run.rest_rad
+        # over a few steps: dry friction makes the speed of a single one jump
+        smooth = np.convolve(np.pad(simulated, 2, mode="edge"), np.ones(5) / 5, mode="valid")
+        speed = np.gradient(smooth, TIME_STEP_S)
+        self.frequency_hz = run.frequency_hz
+        self.time_s = np.arange(run.steps) * np.float64(TIME_STEP_S)
+        self.command_rad, self.model_rad = run.command - rest, simulated[: run.steps] - rest
+        self.fresh_time_s, self.fresh_rad = TIME_STEP_S * run.sample_step, run.sample_rad - rest
+        self.row_time_s, self.row_rad = TIME_STEP_S * run.row_step, run.row_rad - rest
+        self.fresh_error_rad = run.sample_rad - at_steps(simulated, run.sample_step)
+        self.row_error_rad = run.row_rad - at_steps(simulated, run.row_step)
+        self.fresh_speed_rad_s = at_steps(speed, run.sample_step)
+        self.row_speed_rad_s = at_steps(speed, run.row_step)
 
 
 def tracks(result: JointCalibrationResult, model: str | None = None) -> list[Track]:
@@ -269,23 +264,7 @@ def tracks(result: JointCalibrationResult, model: str | None = None) -> list[Tra
         fitted = candidate(model)
         values = np.array([result.candidate_models[model].values[name] for name in fitted.names])
         simulated = free_run(fitted, values, result.runs)
-    return [_track(*pair) for pair in zip(result.runs, simulated, strict=True)]
-
-
-def _track(run: Run, simulated: NDArray) -> Track:
-    steps, rest = run.steps, run.rest_rad
-    # over a few steps: dry friction makes the speed of a single one jump
-    smooth = np.convolve(np.pad(simulated, 2, mode="edge"), np.ones(5) / 5, mode="valid")
-    speed = np.gradient(smooth, TIME_STEP_S)
-    return Track(
-        run.frequency_hz,
-        np.arange(steps) * np.float64(TIME_STEP_S), run.command - rest, simulated[:steps] - rest,
-        TIME_STEP_S * run.sample_step, run.sample_rad - rest,
-        TIME_STEP_S * run.row_step, run.row_rad - rest,
-        run.sample_rad - at_steps(simulated, run.sample_step),
-        run.row_rad - at_steps(simulated, run.row_step),
-        at_steps(speed, run.sample_step), at_steps(speed, run.row_step),
-    )  # fmt: skip
+    return [Track(*pair) for pair in zip(result.runs, simulated, strict=True)]
 
 
 def window(track: Track) -> tuple[float, float]:

@@ -256,8 +256,15 @@ def _fit(
     carried: JointCalibration | None,
 ) -> CandidateFit:
     """One candidate model; `carried` is the joint if simulators run this one."""
-    model = structure(candidate.model)
-    quantities = {} if carried is None else _quantities(carried)
+    model, quantities = structure(candidate.model), dict[str, Quantity]()
+    if carried is not None:
+        a, ratios = carried.actuator, carried.actuator.ratios_to_armature
+        quantities = {
+            "dead_time_s": a.dead_time_s, "stiffness_per_s2": ratios.stiffness,
+            "damping_per_s": ratios.damping, "friction_rad_s2": ratios.friction_loss,
+            "effort_rad_s2": ratios.effort_limit, "velocity_limit_rad_s": a.velocity_limit_rad_s,
+            "back_emf_per_s": ratios.back_emf, "offset_rad": carried.feedback.offset_rad,
+        }  # fmt: skip
     parameters = {
         name: quantities[name].model_copy(update={"value": value}).interval
         if name in quantities
@@ -267,28 +274,12 @@ def _fit(
     scores = score(free_run(model, values, ready.runs), ready.runs)
     names = {f.name for f in fields(Scores)} & set(type(candidate).model_fields)
     in_file = {n: math.nan if (x := getattr(candidate, n)) is None else x for n in names}
-    return CandidateFit(
-        model=candidate.model,
-        parameters=parameters,
-        undecided={
-            name: quantities[name].why or ""
-            for name in quantities.keys() & parameters.keys()
-            if quantities[name].identified == "no"
-        },
-        scores=replace(scores, **in_file),
-    )
-
-
-def _quantities(joint: JointCalibration) -> dict[str, Quantity]:
-    """Quantities of the file by the names that the fit has for them."""
-    a, ratios = joint.actuator, joint.actuator.ratios_to_armature
-    return {
-        "dead_time_s": a.dead_time_s,
-        "stiffness_per_s2": ratios.stiffness,
-        "damping_per_s": ratios.damping,
-        "friction_rad_s2": ratios.friction_loss,
-        "effort_rad_s2": ratios.effort_limit,
-        "velocity_limit_rad_s": a.velocity_limit_rad_s,
-        "back_emf_per_s": ratios.back_emf,
-        "offset_rad": joint.feedback.offset_rad,
+    undecided = {
+        name: quantity.why or ""
+        for name, quantity in quantities.items()
+        if name in parameters and quantity.identified == "no"
     }
+    return CandidateFit(
+        model=candidate.model, parameters=parameters, undecided=undecided,
+        scores=replace(scores, **in_file),
+    )  # fmt: skip

@@ -119,22 +119,19 @@ _NEGATIVE_S = -5e-5
 
 def shared(by_joint: Mapping[str, Sequence[str]]) -> list[str]:
     """Sentences of joints, each once, behind the names of all joints that it holds for."""
-    bare = {
-        joint: [t.removeprefix(f"{joint}: ") for t in own_texts]
-        for joint, own_texts in by_joint.items()
-    }
+    bare = {j: [t.removeprefix(f"{j}: ") for t in texts] for j, texts in by_joint.items()}
     return [f"{names}: {text}" for names, text in share_sentences(bare)]
 
 
 def _doctor(report: Findings) -> Section:
-    said: dict[str, list[str]] = {}
+    by_joint: dict[str, list[str]] = {}
     for _, examination in report.examinations:
         for name, joint in examination.joints.items():
             if name in report.results:
                 sentences = (f"{joint.verdict}.", *joint.reasons)
-                said.setdefault(name, []).extend(t[:1].upper() + t[1:] for t in sentences)
+                by_joint.setdefault(name, []).extend(t[:1].upper() + t[1:] for t in sentences)
     texts: dict[str, list[str]] = {}
-    for names, sentence in share_sentences(said):
+    for names, sentence in share_sentences(by_joint):
         texts.setdefault(names, []).append(sentence)
     return Section(
         "doctor", "Are the recordings usable?",
@@ -151,7 +148,7 @@ def _free_runs(
     pictures = []
     if len(runs) == 1:
         ((joint, runs_of),) = runs.items()
-        pictures = [_overlay(results[joint], runs_of), _residuals(results[joint], runs_of)]
+        pictures = _of_joint(results[joint], runs_of)
     elif runs:
         pictures = [
             Picture("overlay", _OVERLAY, figures.overlay_grid(runs), wide=True),
@@ -173,15 +170,14 @@ _RESIDUALS = (
 )
 
 
-def _overlay(result: JointCalibrationResult, runs: list[Track]) -> Picture:
-    drawn = figures.overlay_figure(result, runs)
-    return Picture(f"overlay_{result.joint}", f"{result.joint}: {_OVERLAY}", drawn)
-
-
-def _residuals(result: JointCalibrationResult, runs: list[Track]) -> Picture:
-    words = f"{result.joint}, above: {_RESIDUALS} Below, the residuals of fresh rows."
-    drawn = figures.residual_figure(result, runs)
-    return Picture(f"residuals_{result.joint}", words, drawn)
+def _of_joint(result: JointCalibrationResult, runs: list[Track]) -> list[Picture]:
+    """Overlay and residuals of one joint."""
+    joint, over = result.joint, figures.overlay_figure(result, runs)
+    words = f"{joint}, above: {_RESIDUALS} Below, the residuals of fresh rows."
+    return [
+        Picture(f"overlay_{joint}", f"{joint}: {_OVERLAY}", over),
+        Picture(f"residuals_{joint}", words, figures.residual_figure(result, runs)),
+    ]
 
 
 def _joints(report: Findings, runs: Mapping[str, list[Track]], parameters: Table) -> Section:
@@ -191,19 +187,10 @@ def _joints(report: Findings, runs: Mapping[str, list[Track]], parameters: Table
     forms = tables.transfer_table(report.responses)
     folds = []
     for joint, result in report.results.items():
-        drawn_runs = runs.get(joint, [])
-        drawn = (
-            [_overlay(result, drawn_runs), _residuals(result, drawn_runs)]
-            if drawn_runs and len(runs) > 1
-            else []
-        )
+        drawn = _of_joint(result, runs[joint]) if joint in runs and len(runs) > 1 else []
         parts = [t.where("joint", joint) for t in (parameters, models, by_frequency, forms)]
-        folds.append(
-            Fold(
-                joint, figures=drawn, tables=[t for t in parts if t.rows],
-                opened=len(report.results) == 1,
-            )
-        )  # fmt: skip
+        shown = [t for t in parts if t.rows]
+        folds.append(Fold(joint, drawn, shown, opened=len(report.results) == 1))
     return Section(
         "joints", "Joint by joint", folds=folds, files=[models, by_frequency, forms, parameters]
     )
@@ -212,13 +199,10 @@ def _joints(report: Findings, runs: Mapping[str, list[Track]], parameters: Table
 def _holds(report: Findings) -> Section:
     held = {}
     for joint, result in report.results.items():
-        examined = [e.joints[joint] for _, e in report.examinations if joint in e.joints]
-        if examined:
-            held[joint] = hold_runs(
-                [e.hold_histogram for e in examined],
-                [e.loop_period_s for e in examined],
-                result.lag.feedback,
-            )
+        if examined := [e.joints[joint] for _, e in report.examinations if joint in e.joints]:
+            counts = [e.hold_histogram for e in examined]
+            periods_s = [e.loop_period_s for e in examined]
+            held[joint] = hold_runs(counts, periods_s, result.lag.feedback)
     pictures = []
     if held:
         text = (
@@ -305,14 +289,11 @@ def _provenance(report: Findings) -> Section:
     recordings, calibration = report.recordings, report.calibration
     rows = [
         {
-            "recording": r.path.name if r.path else r.name,
-            "sha256": r.sha256,
-            "joints": " ".join(r.joints),
-            "rows": len(r.table),
-            "loop_period_s": r.loop_period_s,
+            "recording": r.path.name if r.path else r.name, "sha256": r.sha256,
+            "joints": " ".join(r.joints), "rows": len(r.table), "loop_period_s": r.loop_period_s,
         }
         for r in recordings
-    ]
+    ]  # fmt: skip
     columns = (
         Column("recording", "recording", kind="words"),
         Column("rows", "rows", digits=0),
@@ -384,11 +365,7 @@ def _gaps(result: JointCalibrationResult, actuator: Actuator) -> list[str]:
     limits = {
         "speed": (actuator.velocity_limit_rad_s, ratios.back_emf), "torque": (ratios.effort_limit,)
     }  # fmt: skip
-    unknown = [
-        name
-        for name, parts in limits.items()
-        if all(quantity.identified == "no" for quantity in parts)
-    ]
+    unknown = [n for n, parts in limits.items() if all(q.identified == "no" for q in parts)]
     if unknown:
         gaps.append(
             f"the limit of its {' and '.join(unknown)} is not identified. Record steps, or tones "

@@ -26,14 +26,10 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.servo_fit.scores import ModelScores
 
 MODEL_NAMES = {
-    "pure_delay": "pure delay",
-    "fopdt": "first order + delay",
-    "sopdt": "second order + delay",
-    "dc_servo": "DC servo",
-    "delayed_pd": "DelayedPD",
-    "delayed_pd_back_emf": "DelayedPD, back-EMF",
+    "pure_delay": "pure delay", "fopdt": "first order + delay", "sopdt": "second order + delay",
+    "dc_servo": "DC servo", "delayed_pd": "DelayedPD", "delayed_pd_back_emf": "DelayedPD, back-EMF",
     "delayed_pd_backlash": "DelayedPD + backlash",
-}
+}  # fmt: skip
 
 _LEVEL = "(90\N{NO-BREAK SPACE}%)"
 KEY = Column("joint", "joint", kind="key")
@@ -101,11 +97,8 @@ def transfer_table(responses: Mapping[str, FrequencyResponse]) -> Table:
     rows = [
         {"joint": joint, "transfer_function": fit.name, "parameter": name}
         | flat(plain(p))
-        | {
-            "chi2_per_dof": fit.chi2_per_dof,
-            "unit": unit_of(name),
-            "at_bound": name in fit.at_bound,
-        }
+        | {"chi2_per_dof": fit.chi2_per_dof, "unit": unit_of(name)}
+        | {"at_bound": name in fit.at_bound}
         for joint, response in responses.items()
         for fit in response.transfer_functions.values()
         for name, p in fit.parameters.items()
@@ -114,16 +107,12 @@ def transfer_table(responses: Mapping[str, FrequencyResponse]) -> Table:
         KEY,
         Column("form", "transfer_function", kind="words"),
         # a form's delay is not the servo's dead time
-        Column(
-            "parameter",
-            "parameter",
-            kind="words",
-            show=lambda row: words_of(row["parameter"]).replace(*_DELAY),
-        ),
+        Column("parameter", "parameter", kind="words",
+               show=lambda row: words_of(row["parameter"]).replace(*_DELAY)),
         Column(f"value {_LEVEL}", "value", show=_value_cell),
         Column("unit", "unit", kind="words"),
         Column("misfit, χ²/dof", "chi2_per_dof"),
-    )
+    )  # fmt: skip
     return Table("transfer_functions", "Fitted transfer functions", columns, rows)
 
 
@@ -146,12 +135,8 @@ def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:
             )
     columns = (
         KEY,
-        Column(
-            "model",
-            "model",
-            kind="words",
-            show=lambda row: model_name(row["model"]) + (", chosen" if row["is_chosen"] else ""),
-        ),
+        Column("model", "model", kind="words",
+               show=lambda row: model_name(row["model"]) + ", chosen" * row["is_chosen"]),
         Column("parameters fitted", "parameter_count", digits=0),
         Column("fresh", "rmse_fresh_rad", "mrad"),
         Column("unseen frequency (under load: run)", "rmse_unseen_rad", "mrad"),
@@ -159,7 +144,7 @@ def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:
         Column("one step", "rmse_one_step_rad", "mrad"),
         Column("fit, %", "fit_percent"),
         Column("positions against rows as logged (misleads)", "rmse_raw_rad", "mrad"),
-    )
+    )  # fmt: skip
     title = "Candidate models, simplest first"
     return Table("candidate_models", title, columns, rows, "is_chosen")
 
@@ -174,11 +159,10 @@ def parameter_table(calibration: Calibration, joints: Sequence[str]) -> Table:
     rows = []
     for joint in joints:
         known = calibration.joint(joint)
+        ratios = known.actuator.ratios_to_armature
         parts = {
-            "actuator": known.actuator,
-            "ratios to armature": known.actuator.ratios_to_armature,
-            "feedback": known.feedback,
-        }
+            "actuator": known.actuator, "ratios to armature": ratios, "feedback": known.feedback
+        }  # fmt: skip
         for part, values in parts.items():
             rows += [
                 {"joint": joint, "part": part, "parameter": name, "unit": unit_of(name)}
@@ -188,17 +172,12 @@ def parameter_table(calibration: Calibration, joints: Sequence[str]) -> Table:
             ]
     columns = (
         KEY,
-        Column(
-            "parameter",
-            "parameter",
-            kind="words",
-            show=lambda row: _readable(row["parameter"], row["part"]),
-        ),
+        Column("parameter", "parameter", kind="words",
+               show=lambda row: _readable(row["parameter"], row["part"])),
         Column(f"value {_LEVEL}", "value", show=_value_cell),
-        Column("unit", "unit", kind="words"),
-        Column("identified", "identified", kind="words"),
+        Column("unit", "unit", kind="words"), Column("identified", "identified", kind="words"),
         Column("why", "why", kind="prose"),
-    )
+    )  # fmt: skip
     return Table("parameters", "Parameters", columns, rows)
 
 
@@ -312,43 +291,29 @@ def doctor_table(
 
 def comparison_tables(comparison: Comparison) -> list[Table]:
     """Errors of servo models in free run by joint, the means of all errors, and the offsets."""
-    models = comparison.models
-    joints: list[Row] = [
-        {"joint": joint}
-        | {name: model.joints[joint].rmse_free_run_rad for name, model in models.items()}
-        | {
-            "persistence": comparison.persistence_rmse_rad[joint],
-            "repeatability": comparison.repeatability_rad[joint],
-        }
-        for joint in comparison.data.joints
-    ]
+    models, joints, offsets = comparison.models, list[Row](), list[Row]()
+    offset_rad = {name: model.offset_rad for name, model in models.items() if model.offset_rad}
+    others = {
+        "persistence": comparison.persistence_rmse_rad,
+        "repeatability": comparison.repeatability_rad,
+    }
+    for joint in comparison.data.joints:
+        errors = {name: model.joints[joint].rmse_free_run_rad for name, model in models.items()}
+        joints.append({"joint": joint} | errors | {k: rmse[joint] for k, rmse in others.items()})
+        offsets.append({"joint": joint} | {k: by[joint] for k, by in offset_rad.items()})
     if len(joints) > 1:
         means = {name: model.mean.rmse_free_run_rad for name, model in models.items()}
         joints.append({"joint": "mean", "is_mean": True} | means)
-    offset_rad = {name: model.offset_rad for name, model in models.items() if model.offset_rad}
-    offsets = [
-        {"joint": joint} | {name: by_joint[joint] for name, by_joint in offset_rad.items()}
-        for joint in comparison.data.joints
-    ]
+
+    def columns(names: Iterable[str]) -> list[Column]:
+        return [KEY, *(Column(name, name, "mrad", short=name) for name in names)]
+
+    offset_title = "Offset of this recording, mrad"
     return [
-        Table(
-            "", "RMS error in free run, mrad",
-            [
-                KEY,
-                *(
-                    Column(name, name, "mrad", short=name)
-                    for name in (*models, "persistence", "repeatability")
-                ),
-            ],
-            joints, "is_mean",
-        ),
+        Table("", "RMS error in free run, mrad", columns((*models, *others)), joints, "is_mean"),
         mean_error_table(models, comparison.persistence_rmse_rad),
-        Table(
-            "", "Offset of this recording, mrad",
-            [KEY, *(Column(name, name, "mrad", short=name) for name in offset_rad)],
-            offsets if offset_rad else [],
-        ),
-    ]  # fmt: skip
+        Table("", offset_title, columns(offset_rad), offsets if offset_rad else []),
+    ]
 
 
 def mean_error_table(

@@ -149,7 +149,16 @@ def bench_plan(
     for each in kinds:
         if each == DROP:
             height = LIFT_RAD if amplitude_rad is None or kind != DROP else amplitude_rad
-            one_gain += [_drop(joint, side * min(height, LIFT_RAD, reach)) for side in (1, -1)]
+            height = min(height, LIFT_RAD, reach)
+            rise = FASTEST_OF_MINIMUM_JERK * abs(height) / LIFT_RAD_S
+            release = LEAD_IN_S + rise + _HOLD_S  # lift, hold, and let go
+            one_gain += [
+                TrialPlan(
+                    (joint,), np.nan, release + _DROP_S,
+                    after(LEAD_IN_S, lift(side * height, rise)), release_s=release,
+                )
+                for side in (1, -1)
+            ]  # fmt: skip
         elif each == REVERSAL:
             size = min(STROKE_RAD if amplitude_rad is None else amplitude_rad, reach)
             offset, time = strokes(size, STROKE_SPEEDS_RAD_S, STROKES)
@@ -174,16 +183,6 @@ def bench_plan(
     return Plan(tuple(trials), {joint: start_rad}, description, tuple(warnings), near)
 
 
-def _drop(joint: str, height: float) -> TrialPlan:
-    """Lift to `height`, hold, and let go."""
-    rise = FASTEST_OF_MINIMUM_JERK * abs(height) / LIFT_RAD_S
-    release = LEAD_IN_S + rise + _HOLD_S
-    return TrialPlan(
-        (joint,), np.nan, release + _DROP_S, after(LEAD_IN_S, lift(height, rise)),
-        release_s=release,
-    )  # fmt: skip
-
-
 def _weigh(load: PendulumLoad | None, gains: Sequence[int]) -> list[str]:
     """Warnings on a load; one that no servo of this class holds is refused."""
     if load is None:
@@ -194,9 +193,10 @@ def _weigh(load: PendulumLoad | None, gains: Sequence[int]) -> list[str]:
             f"{100 * _HEAVIEST:.0f} % of an STS3215's stall torque at 7.4 V ({_NOMINAL_NM} N·m): "
             "it would overheat. Take a lighter mass or a shorter arm."
         )
-    low = [g for g in gains if load.gravity_nm / (_NOMINAL_PER_P * g) > _DEEPEST_SAG_RAD]
+    sags = {g: load.gravity_nm / (_NOMINAL_PER_P * g) for g in gains}
     return [
-        f"P gain {g}: an STS3215 would sag by {load.gravity_nm / (_NOMINAL_PER_P * g):.2f} rad "
-        "under this load; the guard stops at 0.35 rad. Take a higher gain or a lighter mass."
-        for g in low
+        f"P gain {g}: an STS3215 would sag by {sag:.2f} rad under this load; the guard stops at "
+        "0.35 rad. Take a higher gain or a lighter mass."
+        for g, sag in sags.items()
+        if sag > _DEEPEST_SAG_RAD
     ]
