@@ -19,8 +19,7 @@ import subprocess
 import sys
 import threading
 import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -152,28 +151,14 @@ class ViewTargets:
             refuse_overwrite(self.rerun_file, self.force)
 
 
-@contextmanager
-def live_views(bus: ServoBus, targets: ViewTargets, waits: bool = False) -> Iterator[LiveViews]:
-    """Start the writer, and finish the files at the end of the block.
+class LiveViews:
+    """The loop's side: starts the writer, and finishes the files at the end of the block.
 
     With `waits` a writer that is behind is awaited: of a bus in virtual time, where that delays
     nothing.
     """
-    views = LiveViews(bus, targets, waits)
-    reason = ""
-    try:
-        yield views
-    except PupperError as error:
-        reason = str(error)
-        raise
-    finally:
-        views.close(reason)
 
-
-class LiveViews:
-    """The loop's side; see `live_views`, which closes it."""
-
-    def __init__(self, bus: ServoBus, targets: ViewTargets, waits: bool):
+    def __init__(self, bus: ServoBus, targets: ViewTargets, waits: bool = False):
         from pupper_sysid.sysid.view import packed
 
         self._packed = packed
@@ -202,6 +187,12 @@ class LiveViews:
         if refused:
             self._process.end(_END_S)
             raise InputError(refused)
+
+    def __enter__(self) -> LiveViews:
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        self.close(str(error) if isinstance(error, PupperError) else "")
 
     def tick(
         self, trial: int, sent: Sent, reading: BusSample, gravity: Array | None = None

@@ -150,10 +150,10 @@ class Screen:
         columns = next((c for c in range(1, most) if -(-len(moving) // c) * high <= spare), most)
         moving = moving[: max(spare // high, 1) * columns]
         rows = max(spare // max(-(-len(moving) // columns), 1) - 1, 1)
-        across = _across(width, columns)
+        across = (width - _GAP * (columns - 1)) // columns
         blocks = [self._block(k, table[:, 0], data, across, rows) for k in moving]
         _append(text, blocks, columns, across)
-        across = _across(width, most)
+        across = (width - _GAP * (most - 1)) // most
         _append(text, [[self._head(k, table[:, 0], data, across)] for k in still], most, across)
         lines = text.split("\n")[: max(height, 1)]
         return Text("\n", end="").join(lines)
@@ -195,10 +195,6 @@ class Screen:
         return texts + [
             text.format(last[name]) for name, text in _SHOWN.items() if np.isfinite(last[name])
         ]
-
-
-def _across(width: int, columns: int) -> int:
-    return (width - _GAP * (columns - 1)) // columns
 
 
 def _append(text: Text, blocks: list[list[Text]], columns: int, across: int) -> None:

@@ -227,10 +227,8 @@ def show_match(match: Match) -> None:
     warn(match.sentence())
     rows = [row for row in match.table() if row["frequency_hz"] % 1 == 0]
     titles = (name.replace("_", " ") for name in rows[0])
-    response = table("Swing over command, and phase", *titles)
-    for row in rows:
-        response.add_row(*(cell(v, 2) for v in row.values()))
-    err.print(response)
+    cells = ([cell(v, 2) for v in row.values()] for row in rows)
+    err.print(table("Swing over command, and phase", *titles, rows=cells))
 
 
 def show_servos(match: ServoMatch | None, carried: bool) -> None:

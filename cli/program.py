@@ -46,12 +46,6 @@ LARGEST_SEED = 2**63 - 1
 """The largest that every generator takes: torch's are seeded with 64 bits."""
 CONFIG = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
 
-_OF_THE_SYSTEM = (
-    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG,
-    errno.EISDIR, errno.ENOTDIR, errno.EMFILE, errno.ENFILE, errno.ENOMEM,
-)  # fmt: skip
-"""Refusals of the system that are the user's to mend, not defects."""
-
 _MAKE_ROOM = "Make room, or choose another file or folder."
 _CURES = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "Make room there."),
@@ -60,8 +54,9 @@ _CURES = {
     errno.EMFILE: "Raise the limit of open files (`ulimit -n`).",
     errno.ENFILE: "Close other programs.",
     errno.ENOMEM: "Free memory.",
+    **dict.fromkeys((errno.ENAMETOOLONG, errno.EISDIR, errno.ENOTDIR), _MAKE_ROOM),
 }
-"""What helps where the system names no file."""
+"""Refusals of the system that are the user's to mend, and what helps where it names no file."""
 _SHARED, _POOLS = "multiprocessing.synchronize", ("concurrent.futures", "multiprocessing.pool")
 _OUTPUT, _ERRORS = "standard output", "standard error"
 
@@ -79,9 +74,12 @@ def run_program(
     work: Callable[[Options], None],
     program: str,
     description: str,
-    arguments: Sequence[str] | None,
+    arguments: Sequence[str] | None = None,
 ) -> None:
-    """Parse a program's arguments into `options` and run `work`; ends the process on errors."""
+    """Parse a program's arguments into `options` and run `work`.
+
+    Ends the process with 0, 2 (bad input, one sentence) or 1.
+    """
     words_typed = list(sys.argv[1:] if arguments is None else arguments)
     with user_errors(words_typed, program) as rest:
         parsed = parse(options, rest, program, description)
@@ -90,12 +88,9 @@ def run_program(
 
 
 def parse(
-    options: Any,
-    arguments: Sequence[str],
-    program: str,
-    description: str | None = None,
+    options: Any, arguments: Sequence[str], program: str, description: str | None = None,
     **keywords: Any,
-) -> Any:
+) -> Any:  # fmt: skip
     """Parse `arguments` into the dataclass `options` (or a union of some), within `user_errors`.
 
     `keywords` are further ones of `tyro.cli`.
@@ -180,7 +175,7 @@ def _sentences(arguments: Sequence[str], program: str, stop: Stop) -> Iterator[l
             sys.exit(0)  # `| head` closed its end: no error
         if debug:
             raise
-        if isinstance(error, OSError) and error.errno in _OF_THE_SYSTEM:
+        if isinstance(error, OSError) and error.errno in _CURES:
             _print_error(_of_the_system(error))
             sys.exit(InputError.exit_code)
         _print_error(
@@ -241,7 +236,7 @@ def _of_the_system(error: OSError) -> str:
         what = "the system refused what a worker process asked for"
     ours = [(n, c) for n, c in frames[:-1] if n.startswith("pupper_sysid.") and n != __name__]
     where = f" (in {ours[-1][0]}.{ours[-1][1].co_qualname})" if ours else ""
-    return f"{what}{where}: {error.strerror}. {_CURES.get(error.errno or 0, _MAKE_ROOM)}"
+    return f"{what}{where}: {error.strerror}. {_CURES[error.errno or 0]}"
 
 
 class _Stream:
@@ -340,8 +335,8 @@ def optional(type_info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
         return None
     return replace(
         inner,
-        instance_from_str=lambda words: (
-            None if words == ["None"] else inner.instance_from_str(words)
+        instance_from_str=lambda typed: (
+            None if typed == ["None"] else inner.instance_from_str(typed)
         ),
         is_instance=lambda value: value is None or inner.is_instance(value),
         str_from_instance=lambda value: (

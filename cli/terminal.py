@@ -130,11 +130,8 @@ class _FittingTable(Table):
     """Table whose columns give way at spaces before any word or number is broken."""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        self._fit(options.max_width)
-        yield from super().__rich_console__(console, options)
-
-    def _fit(self, width: int) -> None:
-        available = width - 2 * (len(self.columns) - 1)  # a space on both sides of each gap
+        # a space on both sides of each gap
+        available = options.max_width - 2 * (len(self.columns) - 1)
         texts = [[str(text) for text in (c.header, *c.cells)] for c in self.columns]
         words = [[w for t in ts for w in (t.split() if k else [t])] for k, ts in enumerate(texts)]
         natural = [max(map(cell_len, ts)) for ts in texts]
@@ -145,6 +142,7 @@ class _FittingTable(Table):
         if sum(natural) <= available:
             for column, width_of in zip(self.columns, natural, strict=True):
                 column.width = width_of
+        yield from super().__rich_console__(console, options)
 
 
 def table(title: str, *columns: str, rows: Iterable[Iterable[Any]] = ()) -> Table:

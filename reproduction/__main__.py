@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -58,11 +58,6 @@ class Options:
     """Replace existing pages and figures."""
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the suite; ends the process with 0, 2 (bad input, one sentence) or 1."""
-    run_program(Options, _run, "python -m reproduction", DESCRIPTION, arguments)
-
-
 def _run(options: Options) -> None:
     if not options.policies:
         raise InputError("No policy was named: python -m reproduction runs/<name>.")
@@ -74,6 +69,8 @@ def _run(options: Options) -> None:
     torch.set_num_threads(1)
     write_claims(options, tries_of(options, options.command, options.robots, options.seconds))
 
+
+main = partial(run_program, Options, _run, "python -m reproduction", DESCRIPTION)
 
 if __name__ == "__main__":
     main()

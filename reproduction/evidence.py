@@ -146,7 +146,6 @@ SCALES_RAD = (0.45, 0.6, 0.75)
 """Of the published deployments."""
 _EXTRA_DELAYS_MS = (0, 80, 160, 320)
 _LAST_UPDATES = 10
-_CURVES = ("reward", "std", "episode_steps")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,18 +253,16 @@ def training(folder: Path) -> Training:
         )
     if not (folder / PROGRESS).is_file():
         raise InputError(f"{folder} has no {PROGRESS}: nothing was trained yet.")
-    step_s, table = run.task.control_step_s, pd.read_csv(folder / PROGRESS).astype(float)
-    last = {name: float(table[name].to_numpy()[-_LAST_UPDATES:].mean()) for name in _CURVES}
-    took = float(table["collect_s"].to_numpy().sum() + table["update_s"].to_numpy().sum())
+    step_s, columns = run.task.control_step_s, _columns(folder / PROGRESS)
+    reward, std, steps = (columns[name] for name in ("reward", "std", "episode_steps"))
+    samples = 1e-6 * columns["samples"]
+    spent_s = float(columns["collect_s"].sum() + columns["update_s"].sum())
+    recent = slice(-_LAST_UPDATES, None)
     return Training(
-        folder.name, run.architecture.kind, last["reward"] / step_s, last["std"],
-        float(table["samples"].iloc[-1] / took), 1e-6 * float(table["samples"].iloc[-1]),
-        last["episode_steps"] * step_s, run.task.episode_s, run.learner.exploration.learned,
-        run.task.curriculum != Curriculum(),
-        (
-            1e-6 * table["samples"].to_numpy(), table["reward"].to_numpy() / step_s,
-            table["episode_steps"].to_numpy() * step_s,
-        ),
+        folder.name, run.architecture.kind, float(reward[recent].mean()) / step_s,
+        float(std[recent].mean()), 1e6 * float(samples[-1]) / spent_s, float(samples[-1]),
+        float(steps[recent].mean()) * step_s, run.task.episode_s, run.learner.exploration.learned,
+        run.task.curriculum != Curriculum(), (samples, reward / step_s, steps * step_s),
     )  # fmt: skip
 
 
@@ -355,12 +352,18 @@ def _trained(folder: Path | None, step_s: float) -> dict[str, float]:
     file = folder / PROGRESS if folder else None
     if file is None or not file.is_file():
         return {}
-    table = pd.read_csv(file).tail(_LAST_UPDATES).astype(float)
-    columns = {name: table[name].to_numpy() for name in table.columns}
-    samples = np.gradient(columns["samples"]) if len(table) > 1 else np.full(len(table), np.nan)
+    columns = {name: x[-_LAST_UPDATES:] for name, x in _columns(file).items()}
+    samples = columns["samples"]
+    samples = np.gradient(samples) if len(samples) > 1 else np.full(len(samples), np.nan)
     return {
         "reward": float(columns["reward"].mean()) / step_s,
         "std": float(columns["std"].mean()),
         "updates": float(columns["update"][-1]),
         "steps_per_s": float(np.nanmean(samples / (columns["collect_s"] + columns["update_s"]))),
     }
+
+
+def _columns(file: Path) -> dict[str, NDArray[np.float64]]:
+    """Curves of a training, by column of its file."""
+    table = pd.read_csv(file).astype(float)
+    return {name: table[name].to_numpy() for name in table.columns}

@@ -189,7 +189,7 @@ def _delay_frequency(kind: str, id_: str, text: str, paper: str) -> Callable[[Po
     "PCA of states in replay at 0, +160, +320 ms together (`pupper-analyze attractor`).",
 )  # fmt: skip
 def components(policies: Policies) -> Finding:
-    share = of_kinds(policies, lambda e: 100 * _hidden(e, "explained_3"), "mlp", "lstm")
+    share = of_kinds(policies, lambda e: 100 * _orbit(e, "hidden", "explained_3"), "mlp", "lstm")
     return Finding(
         f"{several(share, 0)} %", bounds(share),
         holds(share["lstm"].value > share["mlp"].value),
@@ -203,8 +203,8 @@ def components(policies: Policies) -> Finding:
     "Orbits of actions in replay: closure (0 closed, 1 unrelated) and area left at +320 ms.",
 )  # fmt: skip
 def orbit(policies: Policies) -> Finding:
-    closed = of_kinds(policies, lambda e: _acted(e, "closure")[-1], "mlp", "lstm")
-    area = of_kinds(policies, lambda e: _acted(e, "area_ratio")[-1], "mlp", "lstm")
+    closed = of_kinds(policies, lambda e: _orbit(e, "actions", "closure"), "mlp", "lstm")
+    area = of_kinds(policies, lambda e: _orbit(e, "actions", "area_ratio"), "mlp", "lstm")
     lstm = closed["lstm"].value < 0.3 and area["lstm"].value > 0.5
     mlp = closed["mlp"].value > 0.3 or area["mlp"].value < 0.5
     return Finding(
@@ -408,12 +408,10 @@ def _list(values: Sequence[float]) -> str:
     return ", ".join(f"{v:g}" for v in values)
 
 
-def _hidden(evidence: PolicyEvidence, key: str) -> float:
-    return getattr(evidence.orbits["hidden"], key) if evidence.orbits else float("nan")
-
-
-def _acted(evidence: PolicyEvidence, key: str) -> list[float]:
-    return getattr(evidence.orbits["actions"], key) if evidence.orbits else [float("nan")]
+def _orbit(evidence: PolicyEvidence, states: str, key: str) -> float:
+    """A number of an orbit, of more delays that at the longest; NaN if there is none."""
+    value = getattr(evidence.orbits[states], key) if evidence.orbits else float("nan")
+    return value[-1] if isinstance(value, list) else value
 
 
 def _ablated(evidence: PolicyEvidence, kind: str, key: str) -> float:

@@ -84,8 +84,13 @@ def judge(walks: Sequence[ImuWalk]) -> list[Claim]:
 def rate(walks: Sequence[ImuWalk]) -> Finding:
     lstm = [w.gyro.peak_hz[_YAW] for w in _of(walks, "lstm")]
     near = [abs(hz / _PAPER_HZ - 1) < 0.05 for hz in lstm]
+    by_kind = {kind: [w.gyro for w in walks if w.kind == kind] for kind in KINDS}
     return Finding(
-        "; ".join(_shown(walks, kind) for kind in KINDS if any(w.kind == kind for w in walks)),
+        "; ".join(
+            f"{KINDS[kind]} {span([g.peak_hz[_YAW] for g in gyros], 2)} Hz "
+            f"({span([g.peak_share[_YAW] for g in gyros], 2)} of the variance)"
+            for kind, gyros in by_kind.items() if gyros
+        ),
         None, holds(all(near), any(near)), "Holds if within 5 % of 2.8 Hz in each log.",
     )  # fmt: skip
 
@@ -133,13 +138,6 @@ def _of(walks: Sequence[ImuWalk], kind: str) -> list[ImuWalk]:
     return mine
 
 
-def _shown(walks: Sequence[ImuWalk], kind: str) -> str:
-    mine = _of(walks, kind)
-    hertz = span([w.gyro.peak_hz[_YAW] for w in mine], 2)
-    shares = span([w.gyro.peak_share[_YAW] for w in mine], 2)
-    return f"{KINDS[kind]} {hertz} Hz ({shares} of the variance)"
-
-
 @dataclass(frozen=True)
 class Walker:
     """One robot for one round of walks: its seed, its servo model, and the seed of the noise."""
@@ -184,15 +182,9 @@ def compare_stacks(
             errors.append(np.mean(np.array(each, float), axis=0))
         table = np.array(errors)
         row: dict[str, Any] = {"stack": name, "falls": float(np.mean(falls))}
-        row |= _means("", table)
-        if first is not None:
-            row |= _means("less_", table - first)
+        parts = [("", table)] + ([] if first is None else [("less_", table - first)])
+        for prefix, errors_of in parts:
+            row |= {prefix + k: mean_of(x) for k, x in zip(ERRORS, errors_of.T, strict=True)}
         first = table if first is None else first
         rows.append(row)
     return rows
-
-
-def _means(prefix: str, table: np.ndarray) -> dict[str, Any]:
-    """A mean over walkers per error."""
-    named = zip(ERRORS, table.T, strict=True)
-    return {prefix + key: mean_of(column) for key, column in named}

@@ -18,7 +18,7 @@ from rich.text import Text
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import chosen_map, say_remarks
 from pupper_sysid.cli.commands.common import Json, Replace
-from pupper_sysid.cli.live_views import ViewTargets, live_views
+from pupper_sysid.cli.live_views import LiveViews, ViewTargets
 from pupper_sysid.cli.terminal import number
 from pupper_sysid.common.errors import BusError, InputError, PupperError, refuse_outside
 from pupper_sysid.hardware.address import (
@@ -380,7 +380,7 @@ class Monitor:
 
         name, joints, shown_s = bus_name(self.bus), watched.bus.joint_names, -np.inf
         with ExitStack() as shown:
-            views = shown.enter_context(live_views(watched.bus, targets)) if targets else None
+            views = shown.enter_context(LiveViews(watched.bus, targets)) if targets else None
             scope = None
             if terminal.err.is_terminal:
                 scope = shown.enter_context(Oscilloscope(f"{name}, only read", joints, lag=False))

@@ -52,7 +52,7 @@ def run_rounds(
     started = time.perf_counter()
     from pupper_sysid.sysid.doctor.checks import each_joint
     from pupper_sysid.sysid.fit.joint_fit import fit_joint
-    from pupper_sysid.sysid.plan.plan_file import parse_goal, record_until, save_plan
+    from pupper_sysid.sysid.plan.plan_file import half_width, parse_goal, record_until, save_plan
     from pupper_sysid.sysid.sweep.recorder import request_of
 
     series = request.until
@@ -91,11 +91,19 @@ def run_rounds(
             work = partial(fit_joint, seed=request.seed)
             return each_joint(work, recordings, joints, 2, advance)
 
+    def report(outcomes: dict[str, JointOutcome]) -> None:
+        for joint, state in outcomes.items():
+            dead = state.dead_time_s
+            terminal.err.print(
+                f"{joint}: after {state.recorded_s:.0f} s the dead time is "
+                f"{terminal.ms(dead.value)} ms ± {terminal.ms(half_width(dead))} ({series.goal}): "
+                f"{state.why or 'reached'}."
+            )
+
     try:
         outcome = record_until(
             parse_goal(series.goal), paths, series.joints, fit, record_next,
-            most_seconds=series.most_seconds, seed=request.seed,
-            report=lambda outcomes: _say_progress(outcomes, series.goal),
+            most_seconds=series.most_seconds, seed=request.seed, report=report,
         )  # fmt: skip
     except KeyboardInterrupt:
         say_how_to_resume(first)
@@ -120,19 +128,6 @@ def _recorded(first: Path) -> list[Path]:
         files.append(path)
         number += 1
     return files
-
-
-def _say_progress(outcomes: dict[str, JointOutcome], goal: str) -> None:
-    """One line per joint on stderr."""
-    from pupper_sysid.sysid.plan.plan_file import half_width
-
-    for joint, state in outcomes.items():
-        dead = state.dead_time_s
-        terminal.err.print(
-            f"{joint}: after {state.recorded_s:.0f} s the dead time is "
-            f"{terminal.ms(dead.value)} ms ± {terminal.ms(half_width(dead))} ({goal}): "
-            f"{state.why or 'reached'}."
-        )
 
 
 def _print_outcome(outcome: Outcome, written: list[Path], goal: str) -> None:

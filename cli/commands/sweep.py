@@ -19,7 +19,7 @@ from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE, connect, joints_on, parse_registers
 from pupper_sysid.cli.commands.common import Json, Replace
 from pupper_sysid.cli.commands.plan import run_rounds, say_how_to_resume
-from pupper_sysid.cli.live_views import ViewTargets, live_views
+from pupper_sysid.cli.live_views import LiveViews, ViewTargets
 from pupper_sysid.common.errors import BusError, InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import select_joints
@@ -407,7 +407,7 @@ def _shown(
 
     with ExitStack() as open_things:
         if targets:
-            views = open_things.enter_context(live_views(bus, targets, waits))
+            views = open_things.enter_context(LiveViews(bus, targets, waits))
             watchers.append(lambda number, sent, reading, _: views.tick(number, sent, reading))
         if live and terminal.err.is_terminal:
             from pupper_sysid.cli.oscilloscope import Oscilloscope

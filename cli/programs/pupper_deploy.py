@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import select
+import sys
+import termios
 import time
-from collections.abc import Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,17 +18,28 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import tyro
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 
 from pupper_sysid.cli import policy_choice, terminal
 from pupper_sysid.cli.buses import chosen_map
 from pupper_sysid.cli.commands.sweep import Sweep
-from pupper_sysid.cli.live_views import ViewTargets, live_views
+from pupper_sysid.cli.live_views import LiveViews, ViewTargets
 from pupper_sysid.cli.program import end_politely, run_program
-from pupper_sysid.cli.terminal import err, need_positive, out, print_json, warn
+from pupper_sysid.cli.terminal import (
+    err,
+    need_positive,
+    number,
+    out,
+    print_json,
+    terminal_without,
+    warn,
+)
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_path
 from pupper_sysid.hardware.address import EMULATED, KINDS, SOCKET, bus_name, parse_address
-from pupper_sysid.hardware.bus import header_entries
+from pupper_sysid.hardware.bus import BusSample, header_entries
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.imu import Imu
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
@@ -36,6 +50,8 @@ from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, Sta
 if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.assembly import Assembly
     from pupper_sysid.policies.deploy.commands import Commands
+    from pupper_sysid.policies.deploy.deployment import Tick
+    from pupper_sysid.policies.network.policy_file import CommandRanges
     from pupper_sysid.sim.emulator.robot import EmulatedRobot
     from pupper_sysid.sim.robot.body import Body
 
@@ -141,11 +157,6 @@ class Deploy:
         return self.bus != EMULATED or self.keyboard or (self.live and err.is_terminal)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
-    run_program(Deploy, _run, "pupper-deploy", DESCRIPTION, arguments)
-
-
 def _run(options: Deploy) -> None:
     end_politely()
     options = replace(options, bus=bus_name(options.bus))
@@ -171,7 +182,6 @@ def _run(options: Deploy) -> None:
     import torch
 
     torch.set_num_threads(1)
-    from pupper_sysid.cli.drive import Driver
     from pupper_sysid.policies.deploy.assembly import assemble
     from pupper_sysid.policies.deploy.commands import constant, script
 
@@ -351,7 +361,6 @@ def _walk(
     header: dict[str, Any], folder: Path, truth: Any,
 ) -> None:  # fmt: skip
     """Walk, log, and show the result."""
-    from pupper_sysid.cli.drive import Driver
     from pupper_sysid.policies.deploy.assembly import ERRORS, WalkScore
     from pupper_sysid.policies.deploy.deployment import deploy
     from pupper_sysid.sysid.recordings.files import RecordingWriter
@@ -379,7 +388,7 @@ def _walk(
             warn("--live needs a terminal to draw in; it was left out.")
         if options.views:
             waits = not options.in_real_time
-            views = open_things.enter_context(live_views(bus, options.views, waits))
+            views = open_things.enter_context(LiveViews(bus, options.views, waits))
             watchers.append(partial(views.walk_tick, assembled.controller.to_servo))
         rows = open_things.enter_context(RecordingWriter(table, about, options.force))
         outcome = deploy(
@@ -414,6 +423,101 @@ def _walk(
     out.print(summary)
     repeat = terminal.command("pupper-deploy", options.policy, "--replay", log)
     err.print(f"Repeat it: {repeat}")
+
+
+main = partial(run_program, Deploy, _run, "pupper-deploy", DESCRIPTION)
+
+
+# ----- driving by keys
+
+STEP = np.array([0.05, 0.04, 0.1])
+"""Increment of one key press [m/s, m/s, rad/s]."""
+KEYS = {
+    "w": (0, 1), "s": (0, -1), "a": (1, 1), "d": (1, -1), "q": (2, 1), "e": (2, -1),
+}  # fmt: skip
+CLIPPED = "   clipped to what it was trained for"
+_HELP = "w/s forward  a/d sideways  q/e turn  space stands  x ends"
+_SHOWN_EVERY_S = 0.2
+
+
+class Driver:
+    """Commands from the keyboard, no further than those `trained`, and a live table of the ticks.
+
+    Use it as a context; it is a `policies.deploy.commands.Commands`.
+    """
+
+    def __init__(self, trained: CommandRanges) -> None:
+        self._trained, self._clipped = trained, False
+        self._command = np.zeros(3)
+        self._ended = False
+        self._live = Live(console=terminal.err, auto_refresh=False)
+        self._shown_s = -np.inf
+        self._age = np.zeros(0)
+        self._joints: Sequence[str] = ()
+        self._seen: BusSample | None = None
+        self._seen_s = 0.0
+
+    def __call__(self, elapsed_s: float) -> np.ndarray | None:
+        """Command at this moment, shape (3,); None once x was pressed."""
+        while select.select([sys.stdin], [], [], 0)[0]:
+            typed = os.read(sys.stdin.fileno(), 64).decode(errors="ignore").lower()
+            if not typed:
+                self._ended = True  # the terminal is gone
+                break
+            for key in typed:
+                self._ended |= key == "x"
+                if key == " ":
+                    self._command, self._clipped = np.zeros(3), False
+                elif key in KEYS:
+                    axis, sign = KEYS[key]
+                    command = self._command.copy()
+                    # rounded: steps back to standing end at 0
+                    command[axis] = np.round(command[axis] + sign * STEP[axis], 6)
+                    self._command = self._trained.clip(command)
+                    self._clipped = bool((self._command != command).any())
+        return None if self._ended else self._command.copy()
+
+    def watching(self, joints: Sequence[str]) -> Callable[[Tick], None]:
+        """Watcher of a walk of these joints, for the table."""
+        self._joints, self._age = joints, np.zeros(len(joints))
+        return self.watch
+
+    def watch(self, tick: Tick) -> None:
+        """Show a tick, a few times a second."""
+        if self._seen is not None:
+            changed = tick.reading.position_rad != self._seen.position_rad
+            self._age = np.where(changed, 0.0, self._age + tick.elapsed_s - self._seen_s)
+        self._seen, self._seen_s = tick.reading, tick.elapsed_s
+        if tick.elapsed_s - self._shown_s < _SHOWN_EVERY_S:
+            return
+        self._shown_s = tick.elapsed_s
+        notice = CLIPPED if self._clipped else ""
+        self._live.update(_table(tick, self._joints, self._age, notice), refresh=True)
+
+    @contextmanager
+    def driving(self) -> Iterator[Driver]:
+        """Read keys one by one, without echo, during the block."""
+        if not sys.stdin.isatty():
+            raise InputError("--keyboard needs a terminal to type in; use --command or --script.")
+        with terminal_without(termios.ICANON | termios.ECHO, sys.stdin.fileno()), self._live:
+            yield self
+
+
+def _table(tick: Tick, joints: Sequence[str], age_s: np.ndarray, notice: str) -> Table:
+    forward, left, turn = tick.senses.command
+    return terminal.table(
+        f"{tick.elapsed_s:6.1f} s   {forward:+.2f} m/s forward  {left:+.2f} left  "
+        f"{turn:+.2f} rad/s{notice}\n{_HELP}",
+        "joint", "sent rad", "read rad", "unchanged ms", "load N·m", "margin rad",
+        rows=(
+            (
+                joint, number(tick.sent[i], 3), number(float(tick.reading.position_rad[i]), 3),
+                terminal.ms(age_s[i], 0), number(tick.senses.load[i], 2),
+                Text(f"{margin:.2f}", "red") if margin < 0.02 else number(margin, 2),
+            )
+            for i, (joint, margin) in enumerate(zip(joints, tick.decision.margin, strict=True))
+        ),
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -74,11 +73,6 @@ class Eval:
     """Print one JSON object."""
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
-    run_program(Eval, _run, "pupper-eval", DESCRIPTION, arguments)
-
-
 def _run(options: Eval) -> None:
     quick, full = (_QUICK_BATTERY, _FULL_BATTERY) if options.battery else (_QUICK, _FULL)
     usual = quick if options.quick else full
@@ -142,6 +136,8 @@ def _run(options: Eval) -> None:
     if page:
         err.print(f"Wrote {page}.")
 
+
+main = partial(run_program, Eval, _run, "pupper-eval", DESCRIPTION)
 
 if __name__ == "__main__":
     main()

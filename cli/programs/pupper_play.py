@@ -7,9 +7,9 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -64,11 +64,6 @@ class Play:
     """Of servos, friction, start and ground."""
     force: bool = False
     """Replace an existing video."""
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command; ends the process with 0, 2 (bad input, one sentence) or 1."""
-    run_program(Play, _run, "pupper-play", DESCRIPTION, arguments)
 
 
 def _run(options: Play) -> None:
@@ -177,8 +172,7 @@ class _Screen:
     """A video, a window, or nothing."""
 
     def __init__(self, env: Any, options: Play, files: ExitStack):
-        self._env, self._files = env, files
-        self._path = options.video or Path()
+        self._env, self._path = env, options.video or Path()
         self._film: Any = None
         self._viewer: Any = None
         self._model = env.robots.batch.get_model(0)
@@ -195,20 +189,17 @@ class _Screen:
                 raise InputError(
                     f"No window could be opened ({error}). Use --video walk.mp4 instead."
                 ) from error
-        if options.video:
-            self._open_video(options)
-
-    def _open_video(self, options: Play) -> None:
+        if not options.video:
+            return
         from pupper_sysid.policies.walks.film import Film
 
-        step_s = self._env.config.control_step_s
-        lines = (f"{options.policy.name} on {Path(self._env.servos.source).name}",)
+        step_s, scale = env.config.control_step_s, env.body.scale
+        lines = (f"{options.policy.name} on {Path(env.servos.source).name}",)
         try:
             with ExitStack() as opened:
                 file = opened.enter_context(replacing(self._path, options.force, hold=False))
-                scale = self._env.body.scale
                 self._film = Film(file, self._model, step_s, lines, options.command, scale)
-                self._files.push(opened.pop_all())  # the file is kept if the walk is
+                files.push(opened.pop_all())  # the file is kept if the walk is
         except InputError as error:
             if "imageio" in str(error):
                 raise
@@ -238,6 +229,8 @@ class _Screen:
         if self._viewer is not None:
             self._viewer.close()
 
+
+main = partial(run_program, Play, _run, "pupper-play", DESCRIPTION)
 
 if __name__ == "__main__":
     main()

@@ -28,23 +28,14 @@ from pupper_sysid.sysid.fit.results import CandidateFit, JointCalibrationResult
 from pupper_sysid.sysid.fit.run import Run
 from pupper_sysid.sysid.fit.structure import SIMULATED, Parameter, Structure, candidate
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
+from pupper_sysid.sysid.plan import planner
 from pupper_sysid.sysid.plan.planner import (
-    CLEAR_NATS,
-    DEAD_TIME,
-    LARGEST_RAD,
-    LEAST_HALF_WIDTH_S,
     Hypothesis,
-    JointPlan,
-    Noise,
     PlannedTrial,
     Prediction,
     Servo,
     Setup,
-    fitted_noise,
-    pooled,
-    prior_information,
     propose,
-    respond,
 )
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 from pupper_sysid.sysid.sweep.excitation import LEAST_MARGIN_RAD, LOOP_PERIOD_S, PLANS_S
@@ -160,8 +151,9 @@ def plan_from_calibration(
         fitted = calibration.joint(joint)
         poll = fitted.feedback
         setup = replace(
-            _within(base, joint, margins, LARGEST_RAD), poll_period_s=poll.poll_period_s.value,
-            loss=poll.loss.value, quantum_rad=poll.quantum_rad.value,
+            _within(base, joint, margins, planner.LARGEST_RAD),
+            poll_period_s=poll.poll_period_s.value, loss=poll.loss.value,
+            quantum_rad=poll.quantum_rad.value,
         )  # fmt: skip
         plans.append(propose(joint, [calibrated_servo(fitted)], setup, seconds))
         polls.append(setup.poll_rate_hz)
@@ -180,10 +172,10 @@ def plan_first_sweep(
 
     The trials are the best on average over servos drawn from the prior of `sysid.fit.structure`.
     """
-    servos, by_reach, plans = unknown_servos(seed), dict[float, JointPlan](), []
+    servos, by_reach, plans = unknown_servos(seed), dict[float, planner.JointPlan](), []
     for joint in joints:
-        joint_setup = _within(setup, joint, margins, LARGEST_RAD)
-        reach = min(joint_setup.margin_rad, LARGEST_RAD)
+        joint_setup = _within(setup, joint, margins, planner.LARGEST_RAD)
+        reach = min(joint_setup.margin_rad, planner.LARGEST_RAD)
         if reach not in by_reach:  # joints with the same margin get the same trials
             by_reach[reach] = propose(joint, servos, joint_setup, seconds)
         trials = tuple(t.model_copy(update={"joint": joint}) for t in by_reach[reach].trials)
@@ -192,7 +184,7 @@ def plan_first_sweep(
 
 
 def _pooled(
-    plans: Sequence[JointPlan], sources: tuple[InputFile, ...], seed: int, setup: Setup
+    plans: Sequence[planner.JointPlan], sources: tuple[InputFile, ...], seed: int, setup: Setup
 ) -> SweepPlan:
     return SweepPlan(
         made_from=sources,
@@ -232,7 +224,7 @@ _MOST_INFLATION = 100.0
 
 _DRAWS = 6
 _DEAD_TIMES_S = (0.008, 0.06)
-_USUAL_NOISE = Noise(0.004, 0.001)
+_USUAL_NOISE = planner.Noise(0.004, 0.001)
 
 
 def fitted_servo(result: JointCalibrationResult) -> Servo:
@@ -240,7 +232,7 @@ def fitted_servo(result: JointCalibrationResult) -> Servo:
     trials, nats = result.runs, result.structure_nats
     best = result.candidate_models[min(nats, key=lambda name: nats[name])]
     least = max(result.lag.quantum_rad / math.sqrt(12), LEAST_NOISE_RAD)
-    noise = fitted_noise(candidate(best.model), _values(best), trials, least)
+    noise = planner.fitted_noise(candidate(best.model), _values(best), trials, least)
     # the carried structure first: its value is the one that is reported
     names = sorted(nats, key=lambda name: name != result.simulated_model)
     hypotheses, inflations = [], []
@@ -254,14 +246,18 @@ def fitted_servo(result: JointCalibrationResult) -> Servo:
     )  # fmt: skip
 
 
-def _fitted(fit: CandidateFit, trials: tuple[Run, ...], noise: Noise) -> tuple[Hypothesis, float]:
+def _fitted(
+    fit: CandidateFit, trials: tuple[Run, ...], noise: planner.Noise
+) -> tuple[Hypothesis, float]:
     """A fit as a hypothesis as uncertain as its intervals, and the inflation which that takes.
 
     The information of the trials gives the correlations, the fit's intervals the scales.
     """
     model = candidate(fit.model)
-    bare = Hypothesis(model, _values(fit), prior_information(model))
-    seen = pooled((round(t.frequency_hz, 2), respond(bare, t, noise).information) for t in trials)
+    bare = Hypothesis(model, _values(fit), planner.prior_information(model))
+    seen = planner.pooled(
+        (round(t.frequency_hz, 2), planner.respond(bare, t, noise).information) for t in trials
+    )
     covariance = np.linalg.inv(bare.known + seen)
     ratio = np.ones(len(model.parameters))
     for k, p in enumerate(model.parameters):
@@ -275,9 +271,9 @@ def _fitted(fit: CandidateFit, trials: tuple[Run, ...], noise: Noise) -> tuple[H
 
 def _sd(parameter: Parameter, interval: Interval) -> float:
     """Standard deviation of a fitted coordinate, from the interval of its value."""
-    if parameter.name == DEAD_TIME:
+    if parameter.name == planner.DEAD_TIME:
         half = (interval.high - interval.low) / 2
-        fitted_half = math.sqrt(max(half**2 - LEAST_HALF_WIDTH_S**2, (0.05 * half) ** 2))
+        fitted_half = math.sqrt(max(half**2 - planner.LEAST_HALF_WIDTH_S**2, (0.05 * half) ** 2))
         return fitted_half / (HALF_WIDTH_SD * interval.value)
     low, high = (float(parameter.encode(end)) for end in (interval.low, interval.high))
     return (high - low) / (2 * HALF_WIDTH_SD)
@@ -288,7 +284,7 @@ def calibrated_servo(joint: JointCalibration) -> Servo:
     named = {c.model: c.parameters for c in joint.selection.candidate_models}
     floor = max(joint.feedback.quantum_rad.value / math.sqrt(12), LEAST_NOISE_RAD)
     jitter = joint.actuator.command_jitter_s
-    noise = Noise(
+    noise = planner.Noise(
         max(joint.scores.rmse_free_run_fresh_rad or 0.0, floor),
         _USUAL_NOISE.jitter_s if jitter.identified == "no" else jitter.value,
     )
@@ -297,7 +293,7 @@ def calibrated_servo(joint: JointCalibration) -> Servo:
         model = candidate(name)
         values = named.get(name) or (_preset(joint.actuator) if name == SIMULATED[0] else None)
         if values is not None and set(model.names) <= set(values):
-            known = prior_information(model) + _interval_information(model, joint.actuator)
+            known = planner.prior_information(model) + _interval_information(model, joint.actuator)
             servos.append(Hypothesis(model, np.array([values[n] for n in model.names]), known))
     chosen = joint.selection.model
     servos.sort(key=lambda h: h.model.name != chosen)
@@ -306,7 +302,7 @@ def calibrated_servo(joint: JointCalibration) -> Servo:
     # a calibration tells of its readings no more than the size of the errors: models whose errors
     # differ by less than a tenth count as equally good
     nats = tuple(
-        CLEAR_NATS if best and (scores.get(h.model.name) or best) > 1.1 * best else 0.0
+        planner.CLEAR_NATS if best and (scores.get(h.model.name) or best) > 1.1 * best else 0.0
         for h in servos
     )
     return Servo(tuple(servos), noise, nats)
@@ -330,7 +326,7 @@ def unknown_servos(seed: int) -> list[Servo]:
                     drawn = float(p.decode(centre + sd * rng.standard_normal()))
                 shared.setdefault(p.name, drawn)
             values = np.array([shared[n] for n in model.names])
-            hypotheses.append(Hypothesis(model, values, prior_information(model)))
+            hypotheses.append(Hypothesis(model, values, planner.prior_information(model)))
         if shared["friction_rad_s2"] < 0.7 * shared["effort_rad_s2"]:  # it moves at all
             servos.append(Servo(tuple(hypotheses), _USUAL_NOISE, (0.0,) * len(hypotheses)))
     return servos

@@ -19,7 +19,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pupper_sysid.cli import live_views as module
-from pupper_sysid.cli.live_views import ViewTargets, live_views
+from pupper_sysid.cli.live_views import LiveViews, ViewTargets
 from pupper_sysid.cli.oscilloscope import Oscilloscope, Screen, lag_s
 from pupper_sysid.cli.programs import pupper_deploy, pupper_sysid
 from pupper_sysid.common.errors import InputError, SafetyStop
@@ -110,7 +110,7 @@ def test_a_writer_that_stands_still_delays_no_tick_and_what_it_missed_is_counted
     monkeypatch.setattr(module, "_END_S", 0.5)
     monkeypatch.setattr(module, "_WAIT_S", 0.5)
     bus = emulated()
-    with live_views(bus, ViewTargets(None, tmp_path / "a.mcap")) as views:
+    with LiveViews(bus, ViewTargets(None, tmp_path / "a.mcap")) as views:
         os.kill(views._process.process.pid, signal.SIGSTOP)
         little_room(views)
         bus.torque(True)
@@ -125,7 +125,7 @@ def test_what_the_guard_changed_and_why_it_stopped_is_shown(tmp_path):
     bus = emulated()
     far = bus.limits.clip(np.full(12, 9.0)) + 1.0
     targets = ViewTargets(None, tmp_path / "a.mcap")
-    with pytest.raises(SafetyStop), live_views(bus, targets, waits=True) as views:
+    with pytest.raises(SafetyStop), LiveViews(bus, targets, waits=True) as views:
         bus.torque(True)
         hold(bus, views, 3)
         views.tick(0, bus.write(far), bus.read())
@@ -179,7 +179,7 @@ def test_the_extra_is_named_where_its_libraries_are_missing(tmp_path, monkeypatc
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     targets = ViewTargets(str(tmp_path / "a.rrd"), tmp_path / "a.mcap")
     with pytest.raises(InputError, match=r"pip install 'pupper-sysid\[live\]'"):
-        module.LiveViews(emulated(), targets, False)
+        LiveViews(emulated(), targets)
     assert [p.name for p in tmp_path.iterdir()] == [missing]
 
 
@@ -204,7 +204,7 @@ def test_a_viewer_gets_what_a_file_would_hold(tmp_path):
                     break
             time.sleep(0.1)
         bus = emulated()
-        with live_views(bus, ViewTargets(address, None), waits=True) as views:
+        with LiveViews(bus, ViewTargets(address, None), waits=True) as views:
             bus.torque(True)
             hold(bus, views, 100)
         time.sleep(1.0)

@@ -202,9 +202,19 @@ def test_every_command_that_opens_a_bus_is_stopped_as_by_ctrl_c():
     }  # fmt: skip
     servers = {"SerialPty", "ProxySocket"}
     for word, command in COMMANDS.items():
-        module = command.where.split(":")[0].replace(".", "/")
+        module, name = command.where.split(":")
         tree = ast.parse((ROOT / f"cli/commands/{module}.py").read_text())
-        named = {n.name for i in ast.walk(tree) if isinstance(i, ast.ImportFrom) for n in i.names}
+        # what the class uses, and what of the module it uses, and so on
+        parts = {n.name: n for n in tree.body if isinstance(n, ast.ClassDef | ast.FunctionDef)}
+        parts |= {
+            ast.unparse(n.targets[0]): n for n in tree.body if isinstance(n, ast.Assign)
+        }  # unions
+        named, waiting = set(), [name]
+        while waiting:
+            for node in ast.walk(parts.pop(waiting.pop(), ast.Pass())):
+                if isinstance(node, ast.Name) and node.id not in named:
+                    named.add(node.id)
+                    waiting.append(node.id)
         assert command.holds_bus == bool(named & (openers | servers)), word
     assert "end_politely()" in (ROOT / "cli/programs/pupper_deploy.py").read_text()
 

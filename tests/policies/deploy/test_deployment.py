@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pupper_sysid.cli.drive import Driver
+from pupper_sysid.cli.programs.pupper_deploy import Driver
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import SyncedText
 from pupper_sysid.hardware.joint_map import load_joint_map
