@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Group
 from rich.text import Text
 
@@ -38,6 +37,8 @@ from pupper_sysid.hardware.safety.notes import Note, notes
 from pupper_sysid.hardware.safety.watchdog import HANG_S
 from pupper_sysid.hardware.safety.watchdog_process import restore
 from pupper_sysid.hardware.serial_servos.scan import LineReport
+from pupper_sysid.sim.emulator.bus import EmulatedBus
+from pupper_sysid.sim.emulator.robot import draw_robot
 
 if TYPE_CHECKING:
     from pupper_sysid.cli.oscilloscope import Oscilloscope
@@ -72,8 +73,7 @@ class Scan:
         with terminal.progress("scanning", 0) as advance:
             report = kind.bus_class().scan_address(address, advance)
         if self.json:
-            terminal.print_json(_as_data(report))
-            return
+            return terminal.print_json(_as_data(report))
         self._show(report)
 
     def _show(self, report: LineReport) -> None:
@@ -105,9 +105,8 @@ class Scan:
         proxy = SOCKET.exists()
         if self.json:
             lines = [_as_data(report) for report in reports]
-            where = SOCKET if proxy else None
-            terminal.print_json({"ports": ports, "lines": lines, "silent": silent, "proxy": where})
-            return
+            found = {"ports": ports, "lines": lines, "silent": silent}
+            return terminal.print_json(found | {"proxy": SOCKET if proxy else None})
         for report in reports:
             self._show(report)
             terminal.out.print(f"Use it with --bus {report.family}:{report.device}")
@@ -138,8 +137,7 @@ class Scan:
             )
         ]
         if self.json:
-            terminal.print_json({"voltage_v": volts, "servos": rows})
-            return
+            return terminal.print_json({"voltage_v": volts, "servos": rows})
         terminal.print_table(
             f"the proxy at {path}, {number(volts, 1)} V", "joint", "count", "load %",
             rows=(
@@ -182,11 +180,9 @@ def _scanned(device: str, advance: Callable[[str], None]) -> LineReport | str:
 
 def _as_data(report: LineReport) -> dict[str, object]:
     return {
-        "bus": f"{report.family}:{report.device}",
-        "baud": report.baud,
-        "servos": [asdict(servo) for servo in report.servos],
-        "remarks": report.remarks,
-    }
+        "bus": f"{report.family}:{report.device}", "baud": report.baud,
+        "servos": [asdict(servo) for servo in report.servos], "remarks": report.remarks,
+    }  # fmt: skip
 
 
 _AGAIN_S, _LOOK_S = 0.1, 0.2
@@ -414,7 +410,9 @@ class Watched:
         self._here = np.zeros(joints, bool)
         self._goal_s = -np.inf
         self._sample: BusSample | None = None
-        self._voltage, self._temperature = np.full((2, joints), np.nan)
+        self._latest = dict(
+            zip(("voltage_v", "temperature_c"), np.full((2, joints), np.nan), strict=True)
+        )
 
     def readings(self, rate_hz: float, seconds: float) -> Iterator[None]:
         """Read at a rate for some seconds, once at least."""
@@ -437,8 +435,9 @@ class Watched:
         self._seen_s = np.where(news, sample.time_s, self._seen_s)
         self._position = np.where(answered, sample.position_rad, self._position)
         self._count = np.where(answered, sample.position_count, self._count)
-        self._voltage = _latest(self._voltage, sample.voltage_v)
-        self._temperature = _latest(self._temperature, sample.temperature_c)
+        for name in ("voltage_v", "temperature_c"):  # not in every reply
+            if (now := getattr(sample, name)) is not None:
+                self._latest[name] = np.where(np.isfinite(now), now, self._latest[name])
         goals = getattr(self.bus, "goals", None)
         if goals and self.bus.now() - self._goal_s > _GOALS_EVERY_S:
             self._goal, self._goal_s = goals(), self.bus.now()
@@ -453,7 +452,7 @@ class Watched:
         """Show the last reading as traces, and what there is no trace for beside them."""
         sample = self._sample
         assert sample is not None
-        latest = replace(sample, voltage_v=self._voltage, temperature_c=self._temperature)
+        latest = replace(sample, **self._latest)
         scope.tick(self.now_s, self._goal, latest)
         notes = []
         for k, row in enumerate(self.rows()):
@@ -481,8 +480,7 @@ class Watched:
                     "age_s": since if self.answers_now else None,
                     "unchanged_s": None if self.answers_now else since,
                     "load": None if sample.load is None else _known(sample.load[k]),
-                    "voltage_v": _known(self._voltage[k]),
-                    "temperature_c": _known(self._temperature[k]),
+                    **{name: _known(values[k]) for name, values in self._latest.items()},
                     "errors": None if status is None else error_words(self.bus, status),
                 }
             )
@@ -529,9 +527,6 @@ def _open(bus: str, joint_map: str | None) -> ServoBus:
     if bus_name(bus) == EMULATED:
         if joint_map:
             raise InputError("--joint-map: the emulated robot has its own; leave it out.")
-        from pupper_sysid.sim.emulator.bus import EmulatedBus
-        from pupper_sysid.sim.emulator.robot import draw_robot
-
         rng = np.random.default_rng(0)
         return EmulatedBus(draw_robot(rng), rng, real_time=True, keep_log=False)
     address = parse_address(bus)
@@ -539,10 +534,6 @@ def _open(bus: str, joint_map: str | None) -> ServoBus:
     opened = open_bus(address, chosen.per_servo() if chosen else None)
     say_remarks(opened)
     return opened
-
-
-def _latest(before: NDArray[np.float64], now: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    return before if now is None else np.where(np.isfinite(now), now, before)
 
 
 def _known(value: float) -> float | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
 from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.safety.guard import open_bus
+from pupper_sysid.sim.robot.robot_map import FAMILIES, joint_map_of, joint_map_of_servos
 
 _PERIOD_S = 0.02
 _MEAN_OVER_S = 0.5
@@ -85,8 +86,9 @@ class CalibrateJoints:
                 f"calibrated ({', '.join(names)})."
             )
         chosen = None if self.joints == "all" else names
-        bus = open_bus(address, start_map.per_servo() if start_map else None, chosen)
-        try:
+        with closing(
+            open_bus(address, start_map.per_servo() if start_map else None, chosen)
+        ) as bus:
             say_remarks(bus)
             start = start_map or load_joint_map(bus.metadata["joint_map"])
             # a line need not have all servos
@@ -97,8 +99,6 @@ class CalibrateJoints:
             if self.scale_joint in silent:
                 raise BusError(f"--scale-joint {self.scale_joint}: it does not answer.")
             self._calibrate(Guide(bus, start, present, Keyboard()), self.scale_joint or present[0])
-        finally:
-            bus.close()
 
     def _calibrate(self, guide: Guide, scale_joint: str) -> None:
         guide.go_limp()
@@ -368,21 +368,29 @@ class InitRobot:
 
     def run(self) -> None:
         """Read the model, write the map, print the next commands."""
-        from pupper_sysid.sim.robot.robot_map import FAMILIES, joint_map_of, joint_map_of_servos
-
         lerobot = jc.read_lerobot(self.lerobot_calibration) if self.lerobot_calibration else None
         if self.model is not None and self.joints is None:
             robot = joint_map_of(self.model, self.servo, lerobot)
             usual = Path(f"{self.model.stem}.joints.yaml")
         elif self.model is None and self.joints is not None and lerobot is None:
-            robot, usual = joint_map_of_servos(_parse_ids(self.joints), self.servo), JOINTS_FILE
+            ids: dict[str, int] = {}
+            for part in self.joints.split(","):
+                name, equals, number = (piece.strip() for piece in part.strip().partition("="))
+                if not (name and equals and number.isascii() and number.isdecimal()):
+                    raise InputError(
+                        f"--joints: '{part.strip()}' is not NAME=ID; write pan=1,tilt=2. "
+                        "`pupper-sysid scan` lists the ids."
+                    )
+                if name in ids:
+                    raise InputError(f"--joints: {name} is there twice.")
+                ids[name] = whole_number(number)
+            robot, usual = joint_map_of_servos(ids, self.servo), JOINTS_FILE
         else:
             raise InputError(
                 "init-robot needs the robot's MJCF or URDF; or, without one, --joints with the "
                 "servos' ids, such as pan=1,tilt=2 (--lerobot-calibration goes with a model)."
             )
-        joint_map, left_out = robot.joint_map, robot.left_out
-        target = self.out or usual
+        joint_map, left_out, target = robot.joint_map, robot.left_out, self.out or usual
         joint_map.save(target, self.force)
         servos = joint_map.per_servo()
         margin = servos.position_limits().margin(servos.rest_pose())
@@ -415,14 +423,11 @@ class InitRobot:
                 'degrees, unless it says <compiler angle="radian"/>; URDF in radians.'
             )
         if self.json:
-            terminal.print_json(
-                {
-                    "joint_map": target, "joints": joint_map.joint_names, "ids": joint_map.ids,
-                    "left_out": left_out, "following": robot.following, "doubts": robot.doubts,
-                    "margin_rad": margins, "sweeps": sweeps,
-                }
-            )  # fmt: skip
-            return
+            return terminal.print_json({
+                "joint_map": target, "joints": joint_map.joint_names, "ids": joint_map.ids,
+                "left_out": left_out, "following": robot.following, "doubts": robot.doubts,
+                "margin_rad": margins, "sweeps": sweeps,
+            })  # fmt: skip
         entries = {name: joint_map.file.joints[name] for name in margins}
         terminal.print_table(
             f"{target}, servos {self.servo}",
@@ -447,19 +452,3 @@ class InitRobot:
             + "".join(f"  {line}\n" for line in sweeps)
             + "Then doctor, delay, calibrate, fit-servo and export, as for any recording."
         )
-
-
-def _parse_ids(text: str) -> dict[str, int]:
-    """Servo id of each joint: pan=1,tilt=2."""
-    ids: dict[str, int] = {}
-    for part in (piece.strip() for piece in text.split(",")):
-        name, equals, number = (piece.strip() for piece in part.partition("="))
-        if not (name and equals and number.isascii() and number.isdecimal()):
-            raise InputError(
-                f"--joints: '{part}' is not NAME=ID; write pan=1,tilt=2. `pupper-sysid scan` lists "
-                "the ids."
-            )
-        if name in ids:
-            raise InputError(f"--joints: {name} is there twice.")
-        ids[name] = whole_number(number)
-    return ids

@@ -22,10 +22,12 @@ from pupper_sysid.common.joints import (
     STALL_TORQUE_SOURCE,
     STALL_TORQUES_NM,
 )
+from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of, words_of
+from pupper_sysid.sysid.report.tables import comparison_tables
 from pupper_sysid.sysid.sweep.excitation import TRIAL_S
 
 if TYPE_CHECKING:
-    from pupper_sysid.servo_models.calibration.quantity import Quantity
     from pupper_sysid.sysid.fit.calibrate import CalibrationResult
     from pupper_sysid.sysid.fleet import Fleet
     from pupper_sysid.sysid.servo_fit.fit import ServoFit, Split
@@ -399,7 +401,6 @@ class Compare(OfRecordings):
         """Compare, print, draw."""
         from pupper_sysid.common.figure_style import refuse_picture, save
         from pupper_sysid.sysid.compare.compare import compare
-        from pupper_sysid.sysid.report.tables import comparison_tables
 
         if not self.models:
             raise InputError(
@@ -442,8 +443,6 @@ class CompareTruth:
 
     def run(self) -> None:
         """Calibrate if need be, compare, print."""
-        from pupper_sysid.servo_models.calibration.calibration import load_calibration
-        from pupper_sysid.servo_models.calibration.quantity import unit_of, words_of
         from pupper_sysid.sysid.compare.truth import compared_with_truth, read_truth
         from pupper_sysid.sysid.fit.calibrate import calibrate
 

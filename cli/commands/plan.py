@@ -21,6 +21,8 @@ from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import select_joints
 from pupper_sysid.common.results import plain
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
+from pupper_sysid.servo_models.calibration.calibration import InputFile, load_calibration
+from pupper_sysid.servo_models.calibration.quantity import unit_of, words_of
 from pupper_sysid.sysid.sweep.excitation import LOOP_PERIOD_S, PLANS_S, RATES_HZ
 
 if TYPE_CHECKING:
@@ -206,7 +208,6 @@ class Plan:
 
     def _plan(self) -> SweepPlan:
         """The plan from recordings or a calibration, or a first sweep without either."""
-        from pupper_sysid.servo_models.calibration.calibration import InputFile, load_calibration
         from pupper_sysid.sysid.plan import proposal
         from pupper_sysid.sysid.plan.planner import Setup
 
@@ -274,7 +275,6 @@ def margins(joint_map: JointMap, joints: Sequence[str] | None = None) -> dict[st
 
 def show(plan: SweepPlan) -> None:
     """Print a plan's trials, what to expect of them, and its notes."""
-    from pupper_sysid.servo_models.calibration.quantity import unit_of, words_of
     from pupper_sysid.sysid.plan.planner import DEAD_TIME, trial_seconds
 
     terminal.print_table(

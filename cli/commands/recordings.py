@@ -17,6 +17,8 @@ from pupper_sysid.cli.live_views import refuse_files
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, resolved, write_bytes
 from pupper_sysid.common.joints import JOINT_NAMES, share_sentences
+from pupper_sysid.servo_models.calibration.calibration import load_calibration
+from pupper_sysid.sysid.report import tables
 
 if TYPE_CHECKING:
     from pupper_sysid.common.interval import Interval
@@ -39,15 +41,13 @@ class Doctor:
         """Examine and print."""
         from pupper_sysid.sysid.doctor.examination import examine
         from pupper_sysid.sysid.doctor.findings import USE, Finding, shared
-        from pupper_sysid.sysid.report.tables import doctor_table
 
         recordings = terminal.load_all(self.recordings)
         result = examine(recordings, seed=self.seed)
         if self.json:
-            terminal.print_json(result)
-            return
+            return terminal.print_json(result)
         title = result.recording if len(recordings) < 4 else f"{len(recordings)} recordings"
-        terminal.print_tables(doctor_table([(title, result)], result, title))
+        terminal.print_tables(tables.doctor_table([(title, result)], result, title))
         terminal.out.print()
         nothing = (Finding("nothing_wrong", USE),)
         for joints, text in shared({name: j.findings or nothing for name, j in result.items()}):
@@ -66,15 +66,13 @@ class Delay(OfRecordings):
     def run(self) -> None:
         """Measure and print."""
         from pupper_sysid.sysid.fit.dead_time import lag
-        from pupper_sysid.sysid.report.tables import estimator_table, frequency_table, lag_table
 
         recordings, joints = self.load()
         with terminal.progress("measuring", len(joints)) as advance:
             budgets = lag(recordings, joints, self.seed, workers=2, progress=advance)
         if self.json:
-            terminal.print_json(budgets)
-            return
-        terminal.print_tables(lag_table(budgets))
+            return terminal.print_json(budgets)
+        terminal.print_tables(tables.lag_table(budgets))
         terminal.out.print(
             "Only the dead time is the servo's own; the lag moves with gain, amplitude and load."
         )
@@ -85,7 +83,7 @@ class Delay(OfRecordings):
             terminal.out.print(f"{names}: {text}")
         terminal.out.print()
         first = dict([next(iter(budgets.items()))])  # all joints are too wide
-        terminal.print_tables(frequency_table(budgets), estimator_table(first))
+        terminal.print_tables(tables.frequency_table(budgets), tables.estimator_table(first))
         by_joint = {n: [w.removeprefix(f"{n}: ") for w in b.warnings] for n, b in budgets.items()}
         terminal.warn(*(f"{names}: {text}" for names, text in share_sentences(by_joint)))
 
@@ -116,8 +114,7 @@ class Bode(OfRecordings):
 
             save(responses.plot(), self.plot, self.force)
         if self.json:
-            terminal.print_json(responses)
-            return
+            return terminal.print_json(responses)
         for joint, response in responses.items():
             terminal.out.print(Text(joint, "bold"))
             terminal.out.print(str(response))
@@ -141,8 +138,7 @@ class Backlash(OfRecordings):
 
         results = backlash(*self.load(), self.seed)
         if self.json:
-            terminal.print_json(results)
-            return
+            return terminal.print_json(results)
         terminal.print_table(
             "Width between strokes up and down, 90 % intervals",
             "joint", "P gain", "hysteresis °", "lag ms", "strokes",
@@ -245,14 +241,11 @@ class Import:
         terminal.warn(*recording.warnings)
         layout = recording.metadata.get("imported_from", "recording of this project")
         if self.json:
-            terminal.print_json(
-                {
-                    "written": out, "imported_from": layout, "joints": recording.joints,
-                    "rows": len(recording.table), "loop_period_s": recording.loop_period_s,
-                    "warnings": recording.warnings,
-                }
-            )  # fmt: skip
-            return
+            return terminal.print_json({
+                "written": out, "imported_from": layout, "joints": recording.joints,
+                "rows": len(recording.table), "loop_period_s": recording.loop_period_s,
+                "warnings": recording.warnings,
+            })  # fmt: skip
         by_joint = recording.table.groupby("joint")
         ranges = by_joint[["command_rad", "position_rad"]].agg(["min", "max"])
         counts, rows = by_joint.size(), []
@@ -341,7 +334,6 @@ class Report(OfRecordings):
     def run(self) -> None:
         """Examine, measure, calibrate, write."""
         # imported here: drawing and python-control take a second, which --help should not
-        from pupper_sysid.servo_models.calibration.calibration import load_calibration
         from pupper_sysid.sysid.report.report import PAGE, write_report
 
         recordings = terminal.load_all(self.recordings)
@@ -391,8 +383,7 @@ class Samples:
         for target, source in files.items():
             write_bytes(target, source.read_bytes(), self.force)
         if self.json:
-            terminal.print_json({"files": list(files)})
-            return
+            return terminal.print_json({"files": list(files)})
         for target in files:
             terminal.out.print(f"  {target}")
         terminal.err.print(

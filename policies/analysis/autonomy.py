@@ -187,14 +187,12 @@ def orbits(
         axes = principal_components(conditions, 3)
         paths = [axes.orbit(c) for c in conditions]
         by_kind[name] = Orbits(
-            states=conditions,
-            orbits=paths,
-            explained=axes.explained.tolist(),
+            states=conditions, orbits=paths, explained=axes.explained.tolist(),
             explained_3=float(axes.explained[:3].sum()),
             participation_ratio=float(axes.participation_ratio),
             closure=[closure(path, plain.step_s, rate) for path in paths],
             area_ratio=[area_ratio(path[:, :2], paths[0][:, :2]) for path in paths],
-        )
+        )  # fmt: skip
     return by_kind
 
 
@@ -328,17 +326,12 @@ def push_response(policy: Policy, trial: Trial) -> tuple[PushTest, ...]:
             ]
             phases += [_phase(plain, at, i, rates[i]) for i in walking]
         early, late = np.array(shifts).reshape(-1, 2).T
-        results.append(
-            PushTest(
-                push_m_s=speed,
-                survival=float(np.mean(survived)),
-                shift_early=mean_of(np.abs(early)).value,
-                shift_late=mean_of(np.abs(late)).value,
-                kept=float(early @ late / (early @ early)) if early.any() else NAN,
-                phases=tuple(phases),
-                shifts=tuple(late.tolist()),
-            )
-        )
+        results.append(PushTest(
+            push_m_s=speed, survival=float(np.mean(survived)),
+            shift_early=mean_of(np.abs(early)).value, shift_late=mean_of(np.abs(late)).value,
+            kept=float(early @ late / (early @ early)) if early.any() else NAN,
+            phases=tuple(phases), shifts=tuple(late.tolist()),
+        ))  # fmt: skip
     return tuple(results)
 
 

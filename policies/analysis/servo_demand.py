@@ -186,19 +186,16 @@ def servo_demand(
     at_top = numbers["effort_limit"] - numbers["back_emf"] * np.minimum(top, NO_SPEED_LIMIT_RAD_S)
     joints = {
         name: JointDemand(
-            speed_rad_s=Spread.of(speed[:, i]),
-            torque_nm=Spread.of(need[:, i]),
+            speed_rad_s=Spread.of(speed[:, i]), torque_nm=Spread.of(need[:, i]),
             top_speed_rad_s=None if top[i] >= NO_SPEED_LIMIT_RAD_S else float(top[i]),
-            stall_torque_nm=float(numbers["effort_limit"][i]),
-            torque_at_top_nm=float(at_top[i]),
+            stall_torque_nm=float(numbers["effort_limit"][i]), torque_at_top_nm=float(at_top[i]),
             torque_used=float(np.quantile(used[:, i], 0.99)),
             rotor_nm=float(np.quantile(np.abs(numbers["armature"][i] * acceleration[:, i]), 0.99)),
-            short=float(short[:, i].mean()),
-            walked_short=float(walked_short[:, i].mean()),
+            short=float(short[:, i].mean()), walked_short=float(walked_short[:, i].mean()),
             walked_nm=Spread.of(force[:, i]),
         )
         for i, name in enumerate(body.joints)
-    }
+    }  # fmt: skip
     survived = [walk.survival for walk in walks]
     enough = [s >= STILL_UP * survived[0] for s in survived]
     last = enough.index(False) - 1 if False in enough else len(enough) - 1
@@ -248,16 +245,13 @@ def _top_speed(servo: Mapping[str, Array]) -> Array:
 
 def _verdict(demand: ServoDemand) -> str:
     servo, joints = demand.servo.rpartition("/")[2], demand.joints
-    bound = f"{'at least ' if demand.tolerated_at_least else ''}" + (
-        f"{1e3 * demand.tolerated_dead_time_s:.0f} ms with which the gait walks"
-    )
-    late = demand.dead_time_s is not None and demand.dead_time_s > demand.tolerated_dead_time_s
+    at_least = "at least " if demand.tolerated_at_least else ""
+    bound = f"{at_least}{1e3 * demand.tolerated_dead_time_s:.0f} ms with which the gait walks"
     if demand.dead_time_s is None:
         about = f"its source has no dead time, to hold against the {bound}"
     else:
-        about = f"its dead time of {1e3 * demand.dead_time_s:.0f} ms is " + (
-            f"{'more than' if late else 'within'} the {bound}"
-        )
+        how = "more than" if demand.dead_time_s > demand.tolerated_dead_time_s else "within"
+        about = f"its dead time of {1e3 * demand.dead_time_s:.0f} ms is {how} the {bound}"
     if demand.survival_on_it is None or demand.speed_on_it_m_s is None:
         walk = "it is too stiff to be simulated in the task's physics steps"
     else:

@@ -58,11 +58,9 @@ class Trial:
         task = evaluation_task(replace(self.task, **different))
         return Condition(task, self.robots, command, extra_dead_time_s, change, disturb)
 
-    def walk(
-        self, policy: Policy, change: Change | None = None, disturb: Disturb | None = None
-    ) -> Rollout:
-        """One rollout, perhaps with altered observations or disturbed robots."""
-        return self.walks(policy, [self.condition(change, disturb)])[0]
+    def walk(self, policy: Policy) -> Rollout:
+        """One rollout, with nothing altered."""
+        return self.walks(policy, [self.condition()])[0]
 
     def walks(
         self,

@@ -121,22 +121,13 @@ def executable(
         )
         for t in chosen
     ]  # fmt: skip
-    changes = tuple(
-        dict.fromkeys(
-            f"{t.joint}: {w}" for t, p in zip(chosen, parts, strict=True)
-            for w in p.warnings
-        )
-    )  # fmt: skip
+    remarks = (f"{t.joint}: {w}" for t, p in zip(chosen, parts, strict=True) for w in p.warnings)
+    changes = tuple(dict.fromkeys(remarks))
     description = {
-        "kind": "plan",
-        "file": path.name,
-        "sha256": sha256(path),
-        "joints": list(joints),
-        "made_from": plain(proposal.made_from),
-        "lead_in_s": parts[0].description["lead_in_s"],
-        "speed_limit_rad_s": speed_limit_rad_s,
-        "warnings": list(changes),
-    }
+        "kind": "plan", "file": path.name, "sha256": sha256(path), "joints": list(joints),
+        "made_from": plain(proposal.made_from), "lead_in_s": parts[0].description["lead_in_s"],
+        "speed_limit_rad_s": speed_limit_rad_s, "warnings": list(changes),
+    }  # fmt: skip
     trials = tuple(t for p in parts for t in p.trials)
     return Plan(trials, dict(start_pose_rad), description, changes)
 

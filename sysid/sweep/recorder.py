@@ -323,14 +323,9 @@ class _Session:
     """One recording in progress."""
 
     def __init__(
-        self,
-        bus: GuardedBus,
-        plan: Plan,
-        period_s: float,
-        resume: Resume | None,
-        progress: Progress | None,
-        observe: Observe | None,
-    ):
+        self, bus: GuardedBus, plan: Plan, period_s: float, resume: Resume | None,
+        progress: Progress | None, observe: Observe | None,
+    ):  # fmt: skip
         self._loop = FixedRateLoop(bus, period_s)
         # moves between the trials keep the rate, too, but are not recorded
         self._between = FixedRateLoop(bus, period_s)
@@ -374,7 +369,14 @@ class _Session:
                 )
         first, rows = 0, 0
         if resume is None:
-            writer = RecordingWriter(path, self._header(metadata), force)
+            excitation = {
+                "excitation": dict(self._plan.description),
+                "joints": [j for j in bus.joint_names if j in moving],
+                "start_pose_rad": dict(zip(bus.joint_names, map(float, self._start), strict=True)),
+                "loop": {"period_s": self._loop.period_s},
+            }
+            about = header_entries(bus) | excitation | metadata
+            writer = RecordingWriter(path, about, force)
         else:
             first, rows = resume.next_trial, resume.rows
             self._shift_s = resume.now_s() - bus.now()
@@ -408,21 +410,6 @@ class _Session:
                 {"rows": rows, "loop": self._loop.summary()} | bus.report.footer(self._shift_s)
             )
         return path
-
-    def _header(self, metadata: dict[str, Any]) -> dict[str, Any]:
-        moving = {joint for trial in self._plan.trials for joint in trial.joints}
-        return (
-            header_entries(self._bus)
-            | {
-                "excitation": dict(self._plan.description),
-                "joints": [j for j in self._bus.joint_names if j in moving],
-                "start_pose_rad": dict(
-                    zip(self._bus.joint_names, map(float, self._start), strict=True)
-                ),
-                "loop": {"period_s": self._loop.period_s},
-            }
-            | metadata
-        )
 
     def _trial(self, number: int, trial: TrialPlan, writer: RecordingWriter, done: float) -> int:
         """One trial, recorded; returns its number of rows."""

@@ -81,7 +81,8 @@ def test_the_shift_that_a_push_leaves_is_that_of_the_phases(hz, nudged, pushed, 
 def test_a_push_changes_the_sideways_speed_at_its_step_only(walker):
     policy, trial = walker
     trial = replace(trial, seconds=0.5)
-    plain, pushed = trial.walk(policy), trial.walk(policy, None, _pusher(15, 0.3))
+    plain = trial.walk(policy)
+    (pushed,) = trial.walks(policy, [trial.condition(None, _pusher(15, 0.3))])
     np.testing.assert_array_equal(plain.velocity[:15], pushed.velocity[:15])
     # a foot on the ground takes some of it within the step
     assert (pushed.velocity[15, :, 1] - plain.velocity[15, :, 1]).min() > 0.1
