@@ -129,10 +129,11 @@ def write_claims(options: Options, tries: Tries) -> None:
         gather(name, policy, trial, policy_choice.run_folder(path), _show_step)
         for (name, (policy, trial)), path in zip(tries.items(), options.policies, strict=True)
     ]
-    played = {}  # the longest trial of each joint
-    for joint in robot.played.joints if robot.played else ():
-        trial = max(robot.played.trials(joint), key=lambda t: len(t.send_time_s))
-        played[joint] = (trial.send_time_s, trial.command_rad, trial.position_rad)
+    longest = {
+        joint: max(playback.trials(joint), key=lambda t: len(t.send_time_s))
+        for playback in filter(None, [robot.played]) for joint in playback.joints
+    }  # fmt: skip
+    played = {j: (t.send_time_s, t.command_rad, t.position_rad) for j, t in longest.items()}
     claims = [
         *servo_claims.judge(robot), *policy_claims.judge(evidence, played, stacks, trainings),
         *walk_claims.judge(walks),

@@ -1,6 +1,5 @@
 """Commands that talk to a bus, with emulators behind real ports."""
 
-import json
 import os
 import signal
 import subprocess
@@ -18,7 +17,7 @@ from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.feetech import SCS0009, FeetechBus
 from pupper_sysid.sysid.recordings.files import load
-from support.command_line import refused, run
+from support.command_line import json_of, ran, refused, run
 from support.servo_servers import moving_servos, on_a_port, still_servos
 from support.stopwatch import wait_until
 
@@ -32,9 +31,8 @@ def test_scan_lists_the_servos_and_finds_their_rate(capsys, monkeypatch):
     few = replace(FeetechBus.family, highest_id=12)
     monkeypatch.setattr(FeetechBus, "family", few)
     with on_a_port(still_servos(SCS0009, ids=[4, 7], baud=500_000)) as port:
-        code, out, _ = run(capsys, "scan", "--bus", f"feetech:{port.device}", "--json")
-    found = json.loads(out)
-    assert code == 0 and found["baud"] == 500_000
+        found = json_of(capsys, "scan", "--bus", f"feetech:{port.device}")
+    assert found["baud"] == 500_000
     assert [s["id"] for s in found["servos"]] == [4, 7]
     first = found["servos"][0]
     assert (first["model"], first["firmware"], first["gains"]) == ("SCS0009", "0.16", [15, 15, 0])
@@ -50,12 +48,8 @@ def test_scan_of_a_silent_line_names_what_to_check(capsys):
 @pytest.mark.wall_clock
 def test_a_sweep_of_one_servo_on_a_line_keeps_what_shaped_it(capsys):
     with on_a_port(moving_servos(ids=[5])) as port:
-        bus = f"feetech:{port.device}"
-        code, _, err = run(
-            capsys, "sweep", *SHORT, "--joints", "LF_thigh", "--bus", bus, "--out", "a.csv",
-            "--joint-map", "sts3215",
-        )  # fmt: skip
-    assert code == 0, err
+        words = (*SHORT, "--joints", "LF_thigh", "--out", "a.csv", "--joint-map", "sts3215")
+        _, err = ran(capsys, "sweep", *words, "--bus", f"feetech:{port.device}")
     recording = load(Path("a.csv"))
     bus = recording.metadata["bus"]
     assert recording.joints == ["LF_thigh"] and bus["baud"] == 1_000_000

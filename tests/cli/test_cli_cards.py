@@ -1,40 +1,33 @@
 """`servo list | show | diff`, and cards in the place of calibrations."""
 
-import json
-
 import pytest
 
-from pupper_sysid.cli.programs.pupper_sysid import main
+from pupper_sysid.cli import terminal
+from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import load
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.cards.files import bam_card, card_names, load_card, to_bam
 from pupper_sysid.sim.walking.servo_ranges import check_actuator, servo_ranges
+from support.command_line import json_of, ran, refused
 
-pytestmark = pytest.mark.usefixtures("narrow")
 
-
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def narrow(monkeypatch) -> None:
     """A terminal of 80 columns."""
-    from pupper_sysid.cli import terminal
-
     monkeypatch.setattr(terminal.out, "_width", 80)
 
 
 def lines_of(capsys, *arguments: str) -> list[str]:
     """What a command prints on stdout."""
-    main(list(arguments))
-    return capsys.readouterr().out.splitlines()
+    return ran(capsys, *arguments)[0].splitlines()
 
 
 def test_the_list_names_every_card_and_fits_the_terminal(capsys):
     lines = lines_of(capsys, "servo", "list")
     assert max(map(len, lines)) <= 80
     assert [line.split()[0] for line in lines[2:]] == list(card_names())
-    main(["servo", "list", "--json"])
-    found = json.loads(capsys.readouterr().out)
-    assert list(found["cards"]) == list(card_names())
+    assert list(json_of(capsys, "servo", "list")["cards"]) == list(card_names())
 
 
 @pytest.mark.parametrize("name", card_names())
@@ -47,8 +40,7 @@ def test_every_card_is_shown_with_its_source_within_the_terminal(name, capsys):
 
 
 def test_another_gain_and_the_file_itself(capsys, tmp_path):
-    main(["servo", "show", "sts3215-kscale-m1", "--gain", "16", "--json"])
-    found = json.loads(capsys.readouterr().out)
+    found = json_of(capsys, "servo", "show", "sts3215-kscale-m1", "--gain", "16")
     assert found["pd"]["servo"]["stiffness_nm_per_rad"] == pytest.approx(23.458 / 2, rel=1e-3)
     lines = lines_of(capsys, "servo", "show", "sts3215-open-duck", "--yaml")
     assert load("\n".join(lines))[0]["name"] == "sts3215-open-duck"
@@ -59,8 +51,7 @@ def test_a_difference_of_two_cards_and_of_a_card_and_a_calibration(capsys):
     assert max(map(len, lines)) <= 80
     # 998.22 at P 16 against 23.458 · 16 / 32
     assert any("stiffness" in line and "85.1" in line for line in lines)
-    main(["servo", "diff", "sts3215-bam-m1", "paper", "--joint", "LF_thigh", "--json"])
-    found = json.loads(capsys.readouterr().out)
+    found = json_of(capsys, "servo", "diff", "sts3215-bam-m1", "paper", "--joint", "LF_thigh")
     assert found["second"]["part"] == "LF_thigh" and found["p_gain"] is None
     stiffness = found["differences"][0]
     assert (stiffness["quantity"] == "stiffness" and stiffness["second"] == 70.0) or (
@@ -76,18 +67,17 @@ def test_a_card_is_taken_where_a_calibration_is(here, capsys):
     ranges = servo_ranges("sts3215-bam-m1")
     assert set(ranges.value["stiffness"]) == {ranges.value["stiffness"][0]}
     for target in ("mjcf", "isaaclab", "mjlab", "json", "csv"):
-        main(["export", "sts3215-bam-m1", "--to", target, "--out", f"servo.{target}"])
+        ran(capsys, "export", "sts3215-bam-m1", "--to", target, "--out", f"servo.{target}")
     assert 'class="servo_servo"' in (here / "servo.mjcf").read_text()
 
 
 def test_a_card_goes_to_bam_and_comes_back(capsys, here):
-    main(["export", "sts3215-bam-m6", "--to", "bam"])
+    ran(capsys, "export", "sts3215-bam-m6", "--to", "bam")
     back, there = load_card("sts3215-bam-m6_bam.json").pd(), load_card("sts3215-bam-m6").pd()
     assert back.stiffness_nm_per_rad.value == pytest.approx(there.stiffness_nm_per_rad.value)
-    main(["export", "sts3215-bam-m6_bam.json", "--to", "mjcf"])
-    with pytest.raises(SystemExit):
-        main(["export", "paper", "--to", "bam"])
-    assert "was fitted without a known load" in capsys.readouterr().err
+    ran(capsys, "export", "sts3215-bam-m6_bam.json", "--to", "mjcf")
+    said = refused(capsys, pupper_sysid, "export", "paper", "--to", "bam")
+    assert "was fitted without a known load" in said
 
 
 def test_a_servo_calibrated_under_load_goes_to_bam_and_one_in_free_air_is_told_why_not():

@@ -36,17 +36,14 @@ def test_a_log_is_imported_by_its_columns_and_says_what_was_assumed(capsys, arm)
     assert "pan" in out and "Wrote rec.csv" in err and "half a turn" in err
     (trial,) = load("rec.csv").trials("tilt")
     np.testing.assert_allclose(trial.command_rad, 0.4 * np.sin(2 * np.pi * TIME), atol=1e-9)
-    assert "exists already" in refused(
-        capsys, pupper_sysid, "import", arm, *COLUMNS, "--out", "rec.csv"
-    )
+    again = ("import", arm, *COLUMNS, "--out", "rec.csv")
+    assert "exists already" in refused(capsys, pupper_sysid, *again)
 
 
 def test_joints_order_and_json(capsys, arm):
-    code, out, _ = run(
-        capsys, "import", arm, *COLUMNS, "--joints", "pan", "--send-after", "0.5ms", "--json"
-    )
-    found = json.loads(out)
-    assert code == 0 and found["joints"] == ["pan"] and found["written"] == "arm.csv"
+    words = ("--joints", "pan", "--send-after", "0.5ms")
+    found = json_of(capsys, "import", arm, *COLUMNS, *words)
+    assert found["joints"] == ["pan"] and found["written"] == "arm.csv"
     assert found["rows"] == 200 and found["imported_from"] == "table" and not found["warnings"]
     (trial,) = load("arm.csv").trials("pan")
     assert (trial.read_time_s < trial.send_time_s).all()
@@ -116,13 +113,10 @@ def test_the_log_itself_is_never_written_over(capsys, arm):
 
 
 def test_a_column_that_does_not_exist_is_named(capsys, arm):
-    wrong = [c.replace("y {joint}", "z {joint}") for c in COLUMNS]
-    assert "--position is z {joint}, which fits no column; it has" in refused(
-        capsys, pupper_sysid, "import", arm, *wrong
-    )
-    whole = [c.replace("u {joint}", "u joint") for c in COLUMNS]
-    assert "({joint} stands for a joint's name)" in refused(
-        capsys, pupper_sysid, "import", arm, *whole
-    )
-    other = [c.replace("y {joint}", "y pa{joint}") for c in COLUMNS]
-    assert "no joint has both" in refused(capsys, pupper_sysid, "import", arm, *other)
+    for option, wrong, words in (
+        ("y {joint}", "z {joint}", "--position is z {joint}, which fits no column; it has"),
+        ("u {joint}", "u joint", "({joint} stands for a joint's name)"),
+        ("y {joint}", "y pa{joint}", "no joint has both"),
+    ):
+        columns = [c.replace(option, wrong) for c in COLUMNS]
+        assert words in refused(capsys, pupper_sysid, "import", arm, *columns)

@@ -1,6 +1,5 @@
 """pupper-train, pupper-play and pupper-eval as a user meets them."""
 
-import json
 import os
 import shutil
 import signal
@@ -16,12 +15,12 @@ from pupper_sysid.cli import terminal
 from pupper_sysid.cli.programs import pupper_eval, pupper_play, pupper_train
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.evaluation.evaluate import BATTERY
+from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.train.learner import read_checkpoint
 from pupper_sysid.policies.train.run_file import load_run, preset
 from pupper_sysid.policies.walks.film import SIZE, Film
 from pupper_sysid.sim.walking import env
 from support.command_line import json_of, ran, refused
-from support.command_line import run_program as run
 from support.json_keys import DOCUMENTED, key_line
 from support.package import ROOT
 from support.tiny_training import CALIBRATION
@@ -65,15 +64,15 @@ def test_training_leaves_a_run_with_settings_curves_checkpoint_and_policy(traine
 @pytest.mark.parametrize(("name", "kind"), [("fast", "lstm"), ("paper", "mlp"), ("release", "mlp")])
 def test_all_settings_can_be_printed_and_are_those_of_the_preset(capsys, name, kind):
     arguments = ("--print-config", "--preset", name, f"--policy={kind}", "--seed", "7")
-    code, out, err = run(capsys, pupper_train, *arguments)
-    assert (code, err) == (0, "")
+    out, err = ran(capsys, *arguments, program=pupper_train)
+    assert err == ""
     assert yaml.safe_load(out) == plain(preset(name, kind)) | {"seed": 7}
 
 
 def test_printed_settings_are_not_wrapped_or_coloured(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "40")
     name = "a/very/long/path/[red]with/brackets/" * 4 + "calibrated.yaml"
-    _, out, _ = run(capsys, pupper_train, "--print-config", "--actuator", name)
+    out, _ = ran(capsys, "--print-config", "--actuator", name, program=pupper_train)
     assert yaml.safe_load(out)["actuator"] == name
 
 
@@ -157,15 +156,14 @@ def test_a_quick_look_is_smaller_and_says_so(capsys, trained, monkeypatch):
     ):
         assert quick[0] < full[0] and quick[1] < full[1]
     monkeypatch.setattr(pupper_eval, "_QUICK", (2, 0.2))
-    code, out, _ = run(capsys, pupper_eval, *arguments, "--json")
-    found = json.loads(out)
-    assert code == 0 and found["quick"] and found["episode_s"] == 0.2
+    found = json_of(capsys, *arguments, program=pupper_eval)
+    assert found["quick"] and found["episode_s"] == 0.2
     own = found["conditions"][0]["policy"]
     assert own["episodes"] == 2
     assert {row["policy"]["episodes"] for row in found["conditions"][1:]} == {1}
     error = own["intervals"]["mae_vx_m_s"]
     assert error["low"] < error["value"] == own["mae_vx_m_s"] < error["high"]
-    code, out, err = run(capsys, pupper_eval, *arguments, "--seconds", "0.1")
+    out, err = ran(capsys, *arguments, "--seconds", "0.1", program=pupper_eval)
     assert "Quick look: 2 episodes of 0.1 s" in err and "±" in out
     assert "intervals are of 90 %" in err
 
@@ -187,9 +185,8 @@ def test_the_battery_fits_a_terminal_of_80_columns_and_its_falls_say_what_came_b
     assert "Speed over the commanded" not in out
     monkeypatch.setattr(env, "FALLEN_TILT", np.cos(np.deg2rad(8)))  # the least lean is a fall
     monkeypatch.setattr(pupper_eval, "_QUICK_BATTERY", (1, 1.0))
-    code, out, _ = run(capsys, pupper_eval, trained, "--battery", "--quick", "--json")
-    found = json.loads(out)
-    assert code == 0 and found["battery"] and found["quick"]
+    found = json_of(capsys, trained, "--battery", "--quick", program=pupper_eval)
+    assert found["battery"] and found["quick"]
     assert [row["name"] for row in found["conditions"][1:]] == [case.name for case in BATTERY]
     keys = key_line(found).replace(", command, policy", ", command[], policy")  # none here
     assert keys == DOCUMENTED["pupper-eval"]
@@ -242,10 +239,6 @@ def test_a_walk_is_told_in_numbers(capsys, trained):
 
 def test_a_fall_is_told_with_its_time(capsys, trained, monkeypatch):
     """Folding all legs, the trunk falls 9 cm: within 0.5 s, not at once."""
-    import numpy as np
-
-    from pupper_sysid.policies.network.policy_file import Policy
-
     monkeypatch.setattr(Policy, "act", lambda *_: np.array([[0.0, 4.0, -4.0] * 4]))
     out, _ = ran(capsys, trained, "--seconds", "2", program=pupper_play)
     time = float(out.split("Fell after ")[1].split(" s.")[0])

@@ -8,6 +8,7 @@ import re
 import shlex
 from contextvars import copy_context
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from typing import Annotated, Literal
 
 import pytest
@@ -54,6 +55,12 @@ for program in {PROGRAMS!r}:
                 main([*words.split(), option])
 """
     assert imported(code) == set()
+
+
+def test_every_program_prints_its_version(capsys):
+    for name in PROGRAMS:
+        out = shown(capsys, (name,), "--version")
+        assert out.startswith(f"{name.replace('_', '-')} {version('pupper-sysid')} (numpy ")
 
 
 @pytest.mark.parametrize("program", [pupper_sysid, pupper_analyze])

@@ -1,6 +1,5 @@
 """The monitor: it tells what the servos say, how old that is, and never touches them."""
 
-import json
 import re
 
 import numpy as np
@@ -94,12 +93,9 @@ def test_one_json_object_tells_goal_volts_heat_and_errors_of_serial_servos(capsy
     bench_of(servos).loads[4] = -250
     bench_of(servos).counts[5] = 2048 + 652
     with on_a_port(servos) as port:
-        code, out, _ = run(
-            capsys, "monitor", "--bus", f"feetech:{port.device}@1000000", *MAP, "--json"
-        )
-    told = json.loads(out)
+        told = json_of(capsys, "monitor", "--bus", f"feetech:{port.device}@1000000", *MAP)
     hip, thigh = told["joints"]
-    assert code == 0 and told["coordinates"] == "servo" and told["joint_map"] == "sts3215"
+    assert told["coordinates"] == "servo" and told["joint_map"] == "sts3215"
     assert (hip["joint"], hip["count"], hip["load"]) == ("LF_hip", 2048, -0.25)
     assert (hip["voltage_v"], hip["temperature_c"], hip["errors"]) == (7.4, 27.0, "")
     assert hip["goal_rad"] is not None and 0 <= hip["age_s"] < 0.2
@@ -110,11 +106,9 @@ def test_one_json_object_tells_goal_volts_heat_and_errors_of_serial_servos(capsy
 def test_monitoring_a_line_only_pings_and_reads(capsys):
     servos = still_servos(ids=[4, 5])
     with on_a_port(servos) as port:
-        code, out, _ = run(
-            capsys, "monitor", "--bus", f"feetech:{port.device}@1000000", *MAP, "--once"
-        )
+        out, _ = ran(capsys, "monitor", "--bus", f"feetech:{port.device}@1000000", *MAP, "--once")
     asked = {frame.code for frame in FrameReader().feed(servos.heard)}
-    assert code == 0 and "LF_thigh" in out and "since the last valid reply" in out
+    assert "LF_thigh" in out and "since the last valid reply" in out
     assert asked and asked <= {PING, _READ, SYNC_READ}
     assert bench_of(servos).goals == bench_of(servos).torques == []
 
@@ -122,16 +116,13 @@ def test_monitoring_a_line_only_pings_and_reads(capsys):
 def test_monitoring_the_proxy_only_asks_and_says_what_it_cannot_tell(capsys, tmp_path):
     proxy = Listener()
     with on_a_socket(proxy, tmp_path / "s"):
-        code, out, err = run(capsys, "monitor", "--bus", f"esp32:{tmp_path / 's'}", "--once")
-    assert code == 0, err
+        out, _ = ran(capsys, "monitor", "--bus", f"esp32:{tmp_path / 's'}", "--once")
     assert {r[1] for r in proxy.requests} <= {
         esp32.GET_POSITION, esp32.GET_LOAD, esp32.GET_POWER
     }  # fmt: skip
     words = " ".join(out.split())
-    assert (
-        "unchanged" in words
-        and "the feedback age is unknown, as are goals, temperatures and errors" in words
-    )
+    assert "unchanged" in words
+    assert "the feedback age is unknown, as are goals, temperatures and errors" in words
     row = next(line.split() for line in out.splitlines() if line.startswith("LF_hip"))
     assert row[1] == "–" and row[3] == "512"
 

@@ -55,21 +55,21 @@ def end(processes: tuple[int, int]) -> None:
                 os.kill(number, signalled)
 
 
+def park(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*PARK, *words], cwd=ROOT, capture_output=True, text=True, timeout=60)
+
+
 @on_esp32
 @pytest.mark.wall_clock
 def test_park_switches_off_and_names_the_program_that_drives_the_robot(robot):
     server, address = robot
     processes = driven(address)
     try:
-        done = subprocess.run(
-            [*PARK, "--bus", address], cwd=ROOT, capture_output=True, text=True, timeout=60
-        )
+        done = park("--bus", address)
         assert f"process {processes[0]} drives this robot" in done.stderr
         assert done.returncode == 1
         end(processes)
-        again = subprocess.run(
-            [*PARK, "--bus", address], cwd=ROOT, capture_output=True, text=True, timeout=60
-        )
+        again = park("--bus", address)
         assert again.returncode == 0, again.stderr
         assert limp(server) and notes() == []
     finally:
@@ -86,7 +86,7 @@ def test_park_without_a_bus_switches_off_what_was_left_on_and_nothing_else(robot
         for left_on in (False, True):
             if left_on:
                 end(processes)
-            done = subprocess.run(PARK, cwd=ROOT, capture_output=True, text=True, timeout=60)
+            done = park()
             assert done.returncode == 0, done.stderr
             assert ("No driver that is gone" in done.stderr) is not left_on
             assert limp(server) is left_on
