@@ -73,16 +73,13 @@ def guide(person, joints=JOINT_NAMES, bus=None, start=PRESET):
     return Guide(bus, start, list(joints), person), bus
 
 
-def test_the_servos_go_limp_only_after_enter(capsys):
+def test_the_servos_go_limp_only_after_enter_and_must_confirm_it(capsys):
     bus = ScriptedBus()
     seen: list[bool] = []
     person = ScriptedPerson(("will go limp", "", lambda: seen.append(bus.limp)))
     guide(person, bus=bus)[0].go_limp()
     assert seen == [False] and bus.limp
     assert "added on top of it" in capsys.readouterr().err, "the proxy's counts are told apart"
-
-
-def test_servos_that_do_not_confirm_that_they_are_limp_end_it():
     with pytest.raises(BusError, match="not every servo confirmed"):
         guide(ScriptedPerson(("limp", "")), bus=ScriptedBus(confirms=False))[0].go_limp()
 
@@ -222,24 +219,15 @@ def test_a_whole_calibration_over_a_port_writes_what_was_done_by_hand(
         bench.counts = dict.fromkeys(bench.counts, count)
 
     def person(enter, heard):
-        for words, act in (
-            ("will go limp", lambda: all_to(2100)),
-            ("Hold it still", lambda: None),
-            ("Step 2 of 3", lambda: None),
-        ):
+        for words, *counts in (
+            ("will go limp", 2100), ("Hold it still",), ("Step 2 of 3", 1100, 3100),
+            ("first position", 2000), ("Now move LF_thigh", 2000 + 1024),
+        ):  # fmt: skip
             assert wait_until(lambda words=words: heard(words), 20.0)
-            if words == "Step 2 of 3":
-                for count in (1100, 3100):
-                    all_to(count)
-                    threading.Event().wait(0.2)
-            act()
+            for count in counts:
+                all_to(count)
+                threading.Event().wait(0.2)
             enter("")
-        assert wait_until(lambda: heard("first position"), 20.0)
-        all_to(2000)
-        enter("")
-        assert wait_until(lambda: heard("Now move LF_thigh"), 20.0)
-        all_to(2000 + 1024)
-        enter("")
 
     with on_a_port(servos) as port:
         code, said, err = run(

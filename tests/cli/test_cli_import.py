@@ -92,12 +92,9 @@ def test_a_folder_of_another_projects_logs_is_one_robot(tmp_path):
         pytest.param("lerobot_so101", marks=pytest.mark.slow),
     ],
 )
-def test_folders_of_real_logs_are_examined_without_renaming_anything(capsys, folder):
+def test_folders_of_real_logs_are_examined_as_they_are_but_for_those_of_an_imu(capsys, folder):
     found = json_of(capsys, "doctor", real_folder(folder))
     assert all(j["verdict"] != "do not use" for j in found["joints"].values())
-
-
-def test_a_folder_of_imu_logs_is_answered_in_a_sentence(capsys):
     assert "IMU" in refused(capsys, pupper_sysid, "doctor", real_folder("mini_pupper_imu"))
 
 

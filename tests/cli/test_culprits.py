@@ -52,16 +52,15 @@ def test_a_refused_semaphore_is_blamed_on_dev_shm(capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EMFILE, errno.ENOMEM])
-def test_a_refusal_that_names_no_file_names_the_call(capsys, number):
+def test_a_refused_file_is_named_and_a_refusal_that_names_none_names_the_call(
+    capsys, tmp_path, number
+):
     def ask_the_system():
         raise OSError(number, os.strerror(number))
 
     code, error = said(capsys, ask_the_system)
     assert code == 2 and "ask_the_system" in error and os.strerror(number) in error
     assert "standard output" not in error and "defect" not in error
-
-
-def test_a_refused_file_is_named(capsys, tmp_path):
     code, error = said(capsys, lambda: open(tmp_path / ("a" * 300), "w"))
     assert code == 2 and str(tmp_path) in error and "standard output" not in error
 
