@@ -61,6 +61,7 @@ def whole_number(text: str) -> int:
 _SAMPLE = 500_000  # characters that are looked at
 _SAMPLE_LINES = 400
 _LABELS = 8  # values of a column of labels, at most
+_OFTEN = 0.05  # share of the lines
 _ROWS = 100  # of the table, from which its shape is taken
 _SEPARATORS = ("\t", ";", ",", "|", " ")
 _NAMES_OF = {"\t": "tabs", ";": "semicolons", "|": "bars", " ": "spaces", ",": "commas"}
@@ -85,6 +86,7 @@ _MARKS = (  # around numbers, what to put in their place, and where they must be
     (re.compile("[│┃]"), "|", _IN_TEXT),
     (re.compile("[\u2500-\u257f]"), "-", _IN_TEXT),  # lines around cells
     (re.compile(r"^[ \t|+:]*[-=]{3}[-=+ |:\t]*$", re.MULTILINE), "", _IN_TEXT),  # below names
+    (re.compile(r"^[ \t]*\|[ \t]*|[ \t]*\|[ \t]*$", re.MULTILINE), "", _IN_EACH),  # around rows
     (re.compile(r"\x1b\[[\d;]*m"), "", _IN_TEXT),  # colours of a terminal
     (_NUMPY := re.compile(r"\bnp\.\w+\(([-+.\w]+)\)"), r"\1", _IN_ROWS),
     (re.compile(r"\b(?:tensor|array)\((?:'\w', ?)?(\[[^\]\n]*\])[^()\n]{0,80}\)"), r"\1", _IN_ROWS),
@@ -131,6 +133,9 @@ _BRACKETED = re.compile(
     r"^[ \t]*[\[(<]([^\[\]()<>\n]+|[-+.\deE,; \t\[\]()]+)[\])>][ \t]*[,;]?[ \t]*$",
     re.MULTILINE,
 )
+_LONG_LIST = re.compile(  # NumPy ends lines within long ones
+    r'((?:"\[[^"\]]*\]"[^"\n]*)*"\[[^"\]]*\n[^"\]]*\]"(?:[^"\n]*"\[[^"\]]*\]")*)([^\n]*)'
+)
 _BRACKETS = re.compile(r"[\[\]()]")
 _HEX_CELL = re.compile(r"([0-9a-f]{2,8})(h?)", re.IGNORECASE)
 _DOUBLED = re.compile(r"([+-]?\d+),(\d+)(,|$)", re.MULTILINE)  # 0,1,0,2 of decimal commas
@@ -140,6 +145,9 @@ _NEGATIVE = re.compile(_CELL.format(r"\((\d+(?:[.,]\d+)?)\)"), re.MULTILINE)
 _TELEPLOT = re.compile(
     r"^>([\w./ \[\]-]+):(?:(\d+(?:\.\d+)?):)?([-+]?[\d.]+(?:e[-+]?\d+)?)(?:[§|].*)?$",
     re.IGNORECASE | re.MULTILINE,
+)
+_INFLUX = re.compile(
+    r"^[\w.-]+((?:,[\w.-]+=[\w.-]+)*) ([^ \n]+=[^ \n]+) (\d{10,19})$", re.MULTILINE
 )
 _LIST = re.compile(r'"?[\[(]\s*([-+.\d][-+.\deE,;\s]*?)\s*[\])]"?')
 
@@ -175,6 +183,10 @@ class _Shape:
 
 def plain(text: str) -> Plain:
     """Text of a table in the dialect of `csv_table`; unchanged where no dialect is recognised."""
+    if _LONG_LIST.search(text[:_SAMPLE]):
+        text = _LONG_LIST.sub(
+            lambda m: m[1].replace("\n", " ") + m[2] + "\n" * m[1].count("\n"), text
+        )
     lines = text[:_SAMPLE].split("\n")
     if len(text) > _SAMPLE:
         lines.pop()
@@ -202,6 +214,8 @@ def plain(text: str) -> Plain:
         return _noted(below, "its numbers in parentheses are negative, as in accounts.")
     if all(_TELEPLOT.match(row) for row in rows):
         return _teleplot(text)
+    if all(_INFLUX.match(row) for row in rows):
+        return _influx(text)
     if all(_NAMED_LIST.search(row) for row in rows):
         return plain(_NAMED_LIST.sub(_apart, text))
     if labels := _labels(rows):
@@ -499,7 +513,12 @@ def _labels(sample: Sequence[str]) -> tuple[re.Pattern[str], list[str]] | None:
     styles = []
     for pattern in (_PAIR, _LONG_PAIR):
         named = Counter(tuple(m[1] for m in pattern.finditer(line)) for line in sample)
-        names, count = named.most_common(1)[0]
+        kinds = [kind for kind, n in named.most_common(_LABELS) if n >= _OFTEN * len(sample)]
+        names = kinds[0] if kinds else ()
+        count = named[names]
+        if len(kinds) > 1 and all(kinds) and count < _SAME_SHAPE * len(sample):  # in turn
+            names = tuple(dict.fromkeys(name for kind in kinds for name in kind))
+            count = sum(named[kind] for kind in kinds)
         times = {*Counter(names).values()}
         if count >= _SAME_SHAPE * len(sample) and len({*names}) > 1 and len(times) == 1:
             styles.append((max(times), pattern, list(names)))
@@ -514,11 +533,11 @@ def _labelled(
     Names that a line has twice are of several joints, and get numbers.
     """
     labelled = [[m.groups() for m in pattern.finditer(line)] for line in sample]
-    alike = [pairs for pairs in labelled if [name for name, *_ in pairs] == names]
+    numbered = len({*names}) < len(names)
     columns = []
     for k, name in enumerate(names):
         again = f"_{names[:k].count(name) + 1}" if names.count(name) > 1 else ""
-        units = {pairs[k][2] for pairs in alike}
+        units = {unit for pairs in labelled for label, _, unit in pairs if label == name}
         unit = units.pop() if len(units) == 1 else None
         columns.append(with_unit(f"{name}{again}", unit) if unit else f"{name}{again}")
     ahead = [float(m[1]) for line in sample if (m := _AHEAD.match(line))]
@@ -528,10 +547,14 @@ def _labelled(
     stamped = False
     for line in text.split("\n"):
         pairs = [(m[1], m[2]) for m in pattern.finditer(line)]
-        same = names == [name for name, _ in pairs]
+        line_names = [name for name, _ in pairs]
+        same = line_names == names if numbered else bool(line_names) and {*line_names} <= {*names}
         stamp = (_AHEAD if timed else _STAMPED).match(line) if same else None
         stamped = stamped or (stamp is not None and not any(rows))
         cells = [value for _, value in pairs] if same else []
+        if same and not numbered:
+            by_name = dict(pairs)
+            cells = [by_name.get(name, "") for name in names]
         if stamped and same:
             cells = ["" if stamp is None else stamp[1] if timed else _stamp(stamp), *cells]
         rows.append(",".join(cells))
@@ -551,6 +574,18 @@ def _teleplot(text: str) -> Plain:
     names = list(dict.fromkeys(name for name, _, _ in readings))
     columns = [[value for label, _, value in readings if label == name] for name in names]
     return Plain("\n".join(map(",".join, zip(*columns, strict=False))), names)
+
+
+def _influx(text: str) -> Plain:
+    """Lines of InfluxDB's protocol: `servo,joint=knee goal=0.1,present=0.09 1700000000000000`."""
+    rows = [
+        {name: value for pair in f"{tags[1:]},{fields},time={stamp}".split(",")
+         for name, _, value in [pair.partition("=")] if name}
+        for tags, fields, stamp in _INFLUX.findall(text)
+    ]  # fmt: skip
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    cells = (",".join(re.sub(r"(?<=\d)[iu]$", "", row.get(n, "")) for n in names) for row in rows)
+    return Plain("\n".join(cells), names)
 
 
 def _unlisted(text: str, lines: list[str], bare: list[int], rows: Sequence[str]) -> str | None:
@@ -727,7 +762,8 @@ def decoded(path: object, data: bytes) -> str:
     if wide is None and b"\0" in data[:2]:
         wide = "utf-16-be" if data[:1] == b"\0" else "utf-16-le"
     chinese = all(len(run) % 2 == 0 for run in _HIGH.findall(data[:_SAMPLE]))
-    for coding in (wide,) if wide else ("utf-8-sig", *["gb18030"] * chinese, "cp1252"):
+    others = "cp1252", "cp932", "latin-1"
+    for coding in (wide,) if wide else ("utf-8-sig", *["gb18030"] * chinese, *others):
         try:
             text = data.decode(coding).rstrip("\0")
         except ValueError:

@@ -59,8 +59,10 @@ def check(
         warnings.append(f"{int(lost.sum())} rows without time, trial or command were left out.")
         table = table.loc[~lost]
     _refuse_odd_numbers(path, table)
+    if not len(table):
+        raise InputError(f"{path} has no rows with a time and a command. Record it again.")
     position = table["position_rad"].to_numpy(float)
-    missing = float(np.mean(np.isnan(position))) if len(position) else 1.0
+    missing = float(np.mean(np.isnan(position)))
     if missing == 1.0:
         raise InputError(
             f"{path}, column position_rad: no row has a position, so the bus never answered. "
@@ -83,7 +85,7 @@ def check(
         ticks = np.unique(first)
         rate = len(first) / max(float(np.ptp(ticks) + np.diff(ticks).min(initial=1.0)), 1e-9)
         words = {"rate": f"{rate:.3g}"} | {k: v for k, v in options.words.items() if k != "time"}
-        line = import_line(path, **words) if rate < _FASTEST_HZ else ""
+        line = import_line(path, **words) if rate < _FASTEST_HZ and isinstance(path, Path) else ""
         raise InputError(
             f"{path}, column send_time_s: {100 * again.mean():.0f} % of the rows repeat a time "
             "stamp of their trial: a clock too coarse, or two logs in one. Record with a clock of "

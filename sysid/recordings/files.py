@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any
@@ -25,7 +25,7 @@ from pupper_sysid.common.reading.content import unpacked
 from pupper_sysid.common.reading.dialect import decoded
 from pupper_sysid.sysid.recordings.check import check
 from pupper_sysid.sysid.recordings.importers.log import LARGEST_BYTES
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.options import LogOptions, as_options
 from pupper_sysid.sysid.recordings.importers.recognise import read_content, read_folder
 from pupper_sysid.sysid.recordings.layouts import convert
 from pupper_sysid.sysid.recordings.recording import Recording
@@ -44,7 +44,7 @@ FOLDER = Path("recordings")
 _ADVICE = "; what is there can be continued with `resume`"
 
 
-def load(path: Path | str, options: LogOptions | None = None) -> Recording:
+def load(path: Path | str, options: LogOptions | Mapping[str, Any] | None = None) -> Recording:
     """Read and validate a recording in any known layout.
 
     Parameters
@@ -52,8 +52,9 @@ def load(path: Path | str, options: LogOptions | None = None) -> Recording:
     path : Path or str
         CSV file of this project, or a file or folder of another one's log
         (`sysid.recordings.importers`): the layout is found by content.
-    options : LogOptions, optional
-        Columns, units and joint names of a log that does not say them.
+    options : LogOptions or dict, optional
+        Columns, units and joint names of a log that does not say them, by the keys of a mapping
+        file: `{"unit": "deg", "rate": 100.0}`.
 
     Returns
     -------
@@ -71,7 +72,7 @@ def load(path: Path | str, options: LogOptions | None = None) -> Recording:
             f"load takes the path of one log, not a {kind}. Several: [load(p) for p in paths]; a "
             "table or arrays in memory: Recording.from_frame, Recording.from_arrays."
         )
-    path, options = Path(path), options or LogOptions()
+    path, options = Path(path), as_options(options)
     refuse_other_kind(path, RECORDING)
     if path.name.endswith(".truth.csv"):
         raise InputError(

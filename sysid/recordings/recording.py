@@ -30,8 +30,9 @@ from pupper_sysid.common.joints import DEFAULT_POSE, in_order
 from pupper_sysid.common.reading.csv_table import distinct
 from pupper_sysid.hardware.joint_map import PRESETS, load_joint_map
 from pupper_sysid.sysid.recordings.check import check
+from pupper_sysid.sysid.recordings.importers.columns import has_time
 from pupper_sysid.sysid.recordings.importers.log import Table
-from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.importers.options import LogOptions, as_options
 from pupper_sysid.sysid.recordings.importers.times import READ_AFTER_SEND_S, doubt_of_a_turn
 from pupper_sysid.sysid.recordings.layouts import convert
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
@@ -248,7 +249,7 @@ class Recording:
         parts = []
         for joint, command in command_rad.items():
             arrays = shared | {"command_rad": command, "position_rad": position_rad[joint]}
-            columns: dict[str, Any] = {"send_time_s": time_s, "joint": joint}
+            columns: dict[str, Any] = {"send_time_s": time_s, "joint": str(joint)}
             for key, values in arrays.items():
                 columns[key] = _numbers(f"{name}, {joint}", key, values)
                 free = key in ("trial", "frequency_hz") and columns[key].ndim == 0
@@ -267,11 +268,12 @@ class Recording:
         *,
         metadata: Mapping[str, Any] | None = None,
         name: str = "frame",
-        options: LogOptions | None = None,
+        options: LogOptions | Mapping[str, Any] | None = None,
     ) -> Recording:
         """A recording from a table, validated like a file.
 
-        `table`: columns of a recording file or of another layout that `load` reads. Of the former,
+        `table`: columns of a recording file or of another layout that `load` reads; an index that
+        is no count of the rows, such as one of times, is a column, too. Of the former,
         `read_time_s`, `trial` and `frequency_hz` may be absent: reads then follow
         `READ_AFTER_SEND_S` after the command, in doubt by half a turn (unless `metadata` has
         `read_after_send_s`), all rows are one trial, and no tone is assumed. `metadata`: header
@@ -289,6 +291,7 @@ class Recording:
             raise InputError(f"{name}: metadata is a {type(metadata).__name__}, not a dictionary.")
         stated: dict[str, Any] = {"imported_from": "a table in memory"} | dict(metadata or {})
         check_metadata(name, stated)
+        table = _flat(table)
         distinct(name, map(str, table.columns))
         columns = {str(column): table[column] for column in table}
         timed = "read_time_s" in columns
@@ -324,7 +327,7 @@ class Recording:
         if "send_time_s" in numbers and not timed:
             apart = READ_AFTER_SEND_S if after is None else after
             numbers["read_time_s"] = numbers["send_time_s"] + apart
-        log = convert(name, Table(numbers, texts, faults, metadata=stated), options)
+        log = convert(name, Table(numbers, texts, faults, metadata=stated), as_options(options))
         tidy, known, warnings = log.table, log.metadata, log.warnings
         if "send_time_s" in columns and not timed and after is None:
             stated["read_after_send_s"] = READ_AFTER_SEND_S
@@ -480,10 +483,38 @@ def on_one_clock(trials: Mapping[str, list[Trial]]) -> dict[str, list[Trial]]:
     return {joint: [redated(t) for t in of_joint] for joint, of_joint in trials.items()}
 
 
+def _flat(table: pd.DataFrame) -> pd.DataFrame:
+    """The table with names of one level; an index that does not count the rows is a column.
+
+    A column of lists, such as actions, becomes one per joint.
+    """
+    index = table.index
+    if isinstance(table.columns, pd.MultiIndex):
+        levels = (".".join(map(str, filter(None, names))) for names in table.columns)
+        table = table.set_axis([*levels], axis=1)
+    for name in table.columns[[kind.kind == "O" for kind in table.dtypes]]:
+        cells = table[name].tolist() if table.columns.tolist().count(name) == 1 else []
+        if {*map(type, cells)} <= {list, tuple, np.ndarray} and len({*map(len, cells)}) == 1:
+            each = [f"{name}.joint_{k}" for k in range(len(cells[0]))]
+            parts = pd.DataFrame(np.array(cells), index, each)
+            table = pd.concat([table.drop(columns=name), parts], axis=1)
+    counts = index.nlevels == 1 and pd.api.types.is_integer_dtype(index) and index.name is None
+    timed = not isinstance(index, pd.DatetimeIndex | pd.TimedeltaIndex) and index.nlevels == 1
+    if counts or index.name in table or (timed and has_time([*map(str, table.columns)])):
+        return table
+    return table.reset_index(names=None if index.nlevels > 1 or index.name else "time")
+
+
 def _numbers(place: str, key: str, values: ArrayLike) -> NDArray[np.float64]:
-    """The values as numbers; refused where they are none."""
+    """The values as numbers, times of NumPy or pandas as seconds; refused where they are none."""
+    detached: Any = values.detach().cpu().double() if hasattr(values, "detach") else values
     try:
-        return np.asarray(values, float)
+        array = np.ma.asarray(detached)
+        if array.dtype.kind in "mM":
+            return array.astype(f"{array.dtype.kind}8[ns]").astype(np.int64) / 1e9
+        if array.dtype.kind == "c":
+            raise TypeError
+        return np.ma.filled(array.astype(float), np.nan)
     except (TypeError, ValueError):
         kind = type(values).__name__
         raise InputError(

@@ -143,6 +143,8 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Table:
             del texts[name]
     if "" in texts:
         texts["time"] = texts.pop("")
+    elif "" in numbers and not has_time(columns) and not (np.diff(numbers[""]) == 1).all():
+        numbers["time"], columns = numbers.pop(""), ["time", *columns[1:]]
     head = text[:_HEAD]
     table = Table(
         {name: numbers[name] for name in columns if name in numbers}, texts, csv_table.faults,

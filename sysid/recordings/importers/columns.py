@@ -59,7 +59,8 @@ WORDS: dict[str, str] = {
                   "setpoint setpoints set sp reference references ref refs demand demanded "
                   "requested action actions soll sollwert sv consigne consigna riferimento "
                   "referencia börvärde 目标 目標 指令 给定 设定 목표 명령 "
-                  "zadana zadany referência"),
+                  "zadana zadany referência deseado deseada desejado desejada desiderato gewenst "
+                  "gewenste voulu voulue заданный заданное задание hedef 目標"),
         (MAYBE_COMMAND, "u r ctrl control input inputs send sent tx request planned plan "
                         "expected trajectory traj leader nominal wanted write written order"),
         (STATE, "actual act present pres measured measurement measurements meas msr feedback fb "
@@ -67,10 +68,12 @@ WORDS: dict[str, str] = {
                 "real encoder enc reading readings sensed sensor response resp "
                 "potentiometer pot resolver pv ist istwert ärvärde mesure misura medida "
                 "实际 当前 実測 反馈 現在 測定 测量 현재 측정 "
-                "zmierzona zmierzony medido gemeten"),
+                "zmierzona zmierzony medido gemeten atual mesuré mesurée misurato измеренный "
+                "измеренное gerçek gercek"),
         (MAYBE_STATE, "y output outputs read rx follower receive received recv rcv process"),
         (ANGLE, "position positions pos posn angle angles ang qpos q p theta θ winkel "
-                "角度 位置 각도 위치"),
+                "角度 位置 각도 위치 ángulo posición posicion ângulo posição kąt hoek угол "
+                "angolo posizione açı aci"),
         (OTHER, "v w velocity velocities vel vels speed speeds omega qd dq qdot qvel rate accel "
                 "acceleration accelerations acc qdd ddq torque torques tau effort efforts load "
                 "current currents curr cur amps ampere voltage volt volts temperature temperatures "
@@ -85,7 +88,7 @@ WORDS: dict[str, str] = {
                "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
                "nanosec nanosecs nsecs usec usecs tout minutes days datenum zeit temps tiempo "
                "tempo tid datum fecha uhrzeit hora heure 时间 時間 "
-               "時刻 시간 秒 毫秒 초 czas tijd"),
+               "時刻 시간 秒 毫秒 초 czas tijd время zaman"),
         (UNIT, " ".join(UNITS)),
         (JOINT, "joint joints dof dofs motor motors servo servos actuator actuators axis axes dxl "
                 "group controller controllers data value values val field name names msg body "
@@ -172,6 +175,8 @@ def _column(name: str) -> Column:
     angle = ANGLE in kinds and (lower.count("p") == 0 or kinds & {COMMAND, STATE, UNIT}
                                 or "pos" in "".join(lower))  # fmt: skip
     long_angle = any(k == ANGLE and len(w) > 1 for w, k in zip(lower, known, strict=True))
+    if long_angle and lower[-1] != "status":  # a message's name: Motor_1_Status.Position
+        others(STATE, ("status",))
     if (long_angle or UNIT in kinds) and lower[-1:] != ["current"]:  # not a current of an axis
         others(STATE, ("current", "curr", "cur"))
     unit = next((UNITS[w] for w, k in zip(lower[::-1], known[::-1], strict=True)
@@ -214,6 +219,7 @@ def _column(name: str) -> Column:
     joint = "_".join(p for run in runs for p, _ in run)
     bare = [p for run in runs for p, k in run if k == ""]
     key = "_".join(f"{int(p)}" if p.isascii() and p.isdigit() else p.lower() for p in bare)
+    key = re.sub(r"(?<=[^\W\d])_(?=[^\W\d])", "", key)  # ShoulderPan is shoulder_pan
     template = name if kind == "unknown" else _template(name, bare)
     return Column(name, kind, joint, key, unit, rank, words, template)
 

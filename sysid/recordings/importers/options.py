@@ -218,11 +218,13 @@ class LogOptions:
     """Whether a reading is the present position or the bus's last poll."""
 
     def __post_init__(self) -> None:
+        stated = {f.name: getattr(self, f.name) for f in fields(self)}
+        validated(_MappingFile, {k: v for k, v in stated.items() if v is not None}, "options")
+        if isinstance(self.joints, list):
+            object.__setattr__(self, "joints", {name: name for name in self.joints})
         for text in [self.unit, *self.units.values()]:
             if text is not None:
                 _units(text)
-        if self.stamp not in (None, "start", "middle", "end"):
-            raise InputError(f"`stamp` is {self.stamp}; it must be start, middle or end.")
         if bool(self.command) != bool(self.position):
             raise InputError("`command` and `position` belong together: give both or none.")
         if self.command_time and (self.send_after or self.read_before_send or self.rate):
@@ -234,8 +236,6 @@ class LogOptions:
             raise InputError(
                 f"`rate` is {self.rate:g}; it must be from {_RATES_HZ[0]:g} to {_RATES_HZ[1]:g} Hz."
             )
-        if self.readings not in (None, "live", "polled"):
-            raise InputError(f"`readings` is {self.readings}; it must be live or polled.")
         self.send_after_s  # noqa: B018
         for name in ("command", "position"):
             if (text := getattr(self, name)) and text.count("{joint}") > 1:
@@ -296,10 +296,15 @@ _MappingFile = create_model(
 def read_mapping(path: Path) -> LogOptions:
     """Options from a mapping file."""
     data, lines = read_yaml(path)
-    mapping = validated(_MappingFile, data, path, lines).model_dump()
-    if isinstance(mapping["joints"], list):
-        mapping["joints"] = {name: name for name in mapping["joints"]}
-    return LogOptions(**mapping)
+    return as_options(validated(_MappingFile, data, path, lines).model_dump())
+
+
+def as_options(options: LogOptions | Mapping[str, Any] | None) -> LogOptions:
+    """Options of a log, given as such or as a dictionary with the keys of a mapping file."""
+    if isinstance(options, LogOptions):
+        return options
+    known = validated(_MappingFile, {} if options is None else options, "options")
+    return LogOptions(**known.model_dump())
 
 
 def merged(first: LogOptions, second: LogOptions) -> LogOptions:

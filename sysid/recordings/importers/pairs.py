@@ -85,6 +85,11 @@ def _by_words(
     commands, positions = ([c for c in every if c.kind == k] for k in ("command", "position"))
     placed = {c.key for c in positions}
     keys = [key for key in dict.fromkeys(c.key for c in commands) if key in placed]
+    if not keys and min(len(commands), len(positions)) > 1:
+        commands, positions = _without_common(commands), _without_common(positions)
+        placed = {c.key for c in positions}
+        keys = [key for key in dict.fromkeys(c.key for c in commands) if key in placed]
+        every = [*commands, *positions]
     if not keys:
         return _lone(path, table, commands, positions)
     used = Counter(c.template for c in every)
@@ -132,6 +137,13 @@ def _by_words(
     return dict(zip(names, chosen, strict=True)), [*notes.values()]
 
 
+def _without_common(columns: Sequence[Column]) -> list[Column]:
+    """Columns whose keys lack the words that all of them have, such as a register's address."""
+    common = set.intersection(*({*c.key.split("_")} for c in columns))
+    keys = ("_".join(w for w in c.key.split("_") if w not in common) for c in columns)
+    return [replace(c, key=key, joint=key) for c, key in zip(columns, keys, strict=True)]
+
+
 def _decided(path: Path | str, table: Table, best: Sequence[Pair], used: Mapping[str, int]) -> Pair:
     """The first of the best pairs of a joint; refused where another is as good, of other values."""
     first = best[0]
@@ -160,10 +172,9 @@ def _lone(
         lines = refusals.lines_by_value(path, table)
         note = refusals.rate_note(lines[0], table) if lines else ""
         which = f" Say which is which: {'; or '.join(lines)}{note}." if lines else ""
-        raise InputError(
-            f"{path}: {refusals.missing(table.names)}; it has "
-            f"{refusals.listed(table.names)}.{which}"
-        )
+        if not (why := refusals.missing(table.names)):  # a column of text has the name
+            raise InputError(next(iter(table.faults.values()), f"{path} has no numbers."))
+        raise InputError(f"{path}: {why}; it has {refusals.listed(table.names)}.{which}")
     first = [
         [c for c in candidates if c.rank[:3] == min(c.rank for c in candidates)[:3]]
         for candidates in (commands, positions)

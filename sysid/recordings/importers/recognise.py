@@ -33,7 +33,8 @@ _JSON = re.compile(rb"(?:#[^\n]*\n\s*)*(?:\{|\[[\s\[]*(?:[\"{\d\]-]|true|false|n
 _YAML = re.compile(rb"(?:---\s*\n)?(?:- \w+:|\w+:[ \t]*\r?\n[ \t]+\w+:)")
 _DOCUMENT = re.compile(r"^---[ \t]*\r?$", re.MULTILINE)
 _CAN = re.compile(  # candump's, PEAK's, Vector's
-    rb"^[ \t]*(?:\([\d. :-]+\)[ \t]+)?v?can\d+[ \t]+[0-9A-F]{3,8}(?:#|[ \t]+\[\d+\][ \t])|"
+    rb"^[ \t]*(?:\([\d. :-]+\)[ \t]+)?v?can\d+[ \t]+[0-9A-F]{3,8}(?:#|[ \t]+\[\d+\][ \t])"
+    rb"(?![^\n]*::)|"
     rb"\A;\$FILEVERSION|^[ \t]*[\d.]+[ \t]+\d[ \t]+[0-9A-F]+x?[ \t]+[RT]x[ \t]+d[ \t]",
     re.MULTILINE | re.IGNORECASE,
 )

@@ -55,7 +55,9 @@ _ORDERED = 100_000  # rows
 
 
 def import_line(path: Path | str, **options: str) -> str:
-    """The command that imports a log with these options."""
+    """The command that imports a log with these options; what takes a table in memory with them."""
+    if not isinstance(path, Path):
+        return f"`options={ {k: float(v) if k == 'rate' else v for k, v in options.items()} }`"
     words = [f"pupper-sysid import {shlex.quote(str(path))}"]
     for name, value in (options | {"out": "rec.csv"}).items():
         words.append(f"--{name.replace('_', '-')} {shlex.quote(printable(value)) if value else ''}")
@@ -132,31 +134,35 @@ def _lines_by_name(path: Path | str, table: Table, timed: bool) -> str:
     columns = columns_of(table.names)
     times = time_columns(table.names)[:1]
     times = times or [n for n in table.increasing if column(n).kind != "position"][:1]
+    still = [n for n in table.columns if np.ptp(table.known(n)) == 0]
+    counted = [n for n in table.columns if (np.diff(table.known(n)) == 1).all()]
     if not times and (len(columns) > 2 or timed):  # of another event
-        still = [n for n in table.columns if np.ptp(table.known(n)) == 0]
-        times = [c.name for c in columns if c.kind in ("time", "unknown") and c.name not in still]
+        times = [c.name for c in columns if c.kind in ("time", "unknown")
+                 and c.name not in (*still, *counted)]  # fmt: skip
     when = {"time": times[0]} if times else {"rate": f"{table.rate or 50:g}"}
     of_number = {c.name: re.sub(r"\d+", "{joint}", c.name, count=1) for c in columns}
     several = {each for each, n in Counter(of_number.values()).items() if n > 1}
     by_kind = []
     for kind in ("command", "position"):
-        sure = [c for c in columns if c.kind == kind]
+        sure = [c for c in columns if c.kind == kind and c.name not in still]
         if kind == "command" and not sure:  # qd beside q may be the desired angle
             sure = [c for c in columns if c.name[-1:] == "d" and c.name[:-1] in table.names]
         if kind == "position" and not sure:  # beside a command a bare `current` may be a place
             sure = [c for c in columns if not c.kind and _CURRENT.search(c.name)]
-        chosen = [c.template for c in sure]
+        chosen = [(c.template, c.name) for c in sure]
         for others in ("unknown", "time"):
             chosen = chosen or [
-                of_number[c.name] if of_number[c.name] in several else c.template
+                (of_number[c.name] if of_number[c.name] in several else c.template, c.name)
                 for c in columns if c.kind == others and c.name not in times[:1]
             ]  # fmt: skip
         by_kind.append(chosen)
-    lines = [
-        import_line(path, **when, **_unit_of(table, pair), command=pair[0], position=pair[1])
-        for pair in product(*by_kind)
-        if pair[0] != pair[1]
-    ]
+    lines = []
+    for (command, *name), (position, *other) in product(*by_kind):
+        if ("{joint}" in command) != ("{joint}" in position):  # of one of them a lone word
+            command, position = name[0], other[0]
+        if command != position:
+            unit = _unit_of(table, (command, position))
+            lines.append(import_line(path, **when, **unit, command=command, position=position))
     text = "; or ".join(list(dict.fromkeys(lines or lines_by_value(path, table)))[:3])
     return f" ({text}{rate_note(when, table)})" if text else ""
 

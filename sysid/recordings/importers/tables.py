@@ -74,6 +74,7 @@ _TOGETHER = 0.2  # share of the rows with a command or position that have both
 _FEWEST_ROWS = 3  # of a joint in a table with a row per joint
 _COUNTING = 0.3  # share of rows with another trial than the row before: it counts them
 _SHORTEST_TONE = 20  # rows of one frequency; a chirp changes it sooner
+_SIDE_BY_SIDE = 0.1  # share of the log by which sending and reading may come apart
 _MOSTLY_BLANK, _ONE_STAMP = 0.3, 0.9  # shares of positions without a command, with its time
 _LACKING = {
     "percent": ("percent of a range of motion that the log does not say. Give it, as of 3.5 rad",
@@ -202,13 +203,16 @@ def _times(
     path: Path | str, table: Table, options: LogOptions
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None, list[str]]:
     """Times of the rows, when their commands were sent where that is known, and notes."""
-    count = max(map(len, table.columns.values()), default=0)
+    if not (count := max(map(len, table.columns.values()), default=0)):
+        raise InputError(f"{path} has no rows. Record it again.")
     if options.rate is not None:
         return np.arange(count) / options.rate, None, []  # of each joint's own rows: `_joint`
     names = table.moving if has_time(table.moving) else table.names
     names = [name for name in names if name in table.columns or name in table.texts]
-    steps = next((n for n in names if TIME_STEP.fullmatch(n)), None)
+    rising = [n for n in names if n in table.columns and (np.diff(table.known(n)) > 0).all()]
+    steps = next((n for n in names if TIME_STEP.fullmatch(n) and n not in rising), None)
     candidates = [n for n in time_columns(names) if n != steps]
+    candidates = candidates or [n for n in table.increasing if TIME_STEP.fullmatch(n)]
     if not candidates and table.tick_s is not None:
         candidates = [n for n in names if TIMER.search(n)]
     sent = [n for n in names if (c := column(n)).kind == "time" and c.words & _SENT]
@@ -453,9 +457,20 @@ def _apart(
     that the last one stays in force.
     """
     stamp, send = times_s
-    if send is not None:
-        return of_joint, send[of_joint], None
     command, position = (table.numbers(path, c.name) for c in (pair.command, pair.position))
+    if send is not None:
+        late = (stamp - send)[of_joint & np.isfinite(stamp) & np.isfinite(send)]
+        if np.ptp(late) < _SIDE_BY_SIDE * np.ptp(stamp[of_joint & np.isfinite(stamp)]):
+            return of_joint, send[of_joint], None
+        sent = (
+            of_joint & np.isfinite(command) & np.isfinite(send)
+        )  # a table of each beside the other
+        rows_of = np.flatnonzero(of_joint & np.isfinite(position) & np.isfinite(stamp))
+        order = np.flatnonzero(sent)[np.argsort(send[sent], kind="stable")]
+        in_force, held, kept = held_commands(send[order], command[order], stamp[rows_of])
+        chosen = np.zeros(len(of_joint), bool)
+        chosen[rows_of[kept]] = True
+        return chosen, in_force, held
     sent, read = of_joint & np.isfinite(command), of_joint & np.isfinite(position)
     apart = (sent & read).sum() < _TOGETHER * min(sent.sum(), read.sum())
     if not (apart or (read & ~sent).sum() > _MOSTLY_BLANK * read.sum()):

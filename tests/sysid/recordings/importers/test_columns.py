@@ -241,7 +241,7 @@ def test_the_time_between_reading_and_command_is_taken_as_stated_and_else_said()
     recording = Recording.from_frame(table, options=LogOptions(read_before_send=True))
     assert any("0.5 ms later" in t and "`send_after='3ms'`" in t for t in recording.warnings)
     cases = [({"send_after": "3"}, "with its unit"), ({"send_after": "5s"}, "at most 1 s"),
-             ({"rate": 0.0}, "from 0.1 to"), ({"readings": "new"}, "live or polled"),
+             ({"rate": 0.0}, "from 0.1 to"), ({"readings": "new"}, "'live' or 'polled'"),
              ({"command_time": "t", "rate": 30.0}, "leave `send_after`")]  # fmt: skip
     assert_each_refused(cases, lambda keywords: LogOptions(**keywords))
 
