@@ -103,6 +103,9 @@ def load_all(paths: Sequence[Path]) -> list[Recording]:
         by_name[recording.name] = (*by_name.get(recording.name, ()), *recording.warnings)
     for names, text in share_sentences(by_name):
         warn(f"{'all logs' if names == 'All joints' else names}: {text}")
+    if len(recordings) > 1 and all(recording.joints == ["joint"] for recording in recordings):
+        warn("the logs name no joint: they were taken as runs of one. Give those of several joints "
+             "names, each with `pupper-sysid import LOG --joints NAME`.")  # fmt: skip
     return recordings
 
 

@@ -71,16 +71,34 @@ def pairs(path: Path | str, table: Table, options: LogOptions) -> tuple[dict[str
     if options.command and options.position:
         chosen, notes = _stated(path, table, options), []
     else:
-        chosen, notes = _by_words(path, table, options)
+        chosen, notes = _by_words(path, table)
+        chosen = {name: _of_drive(table, options, pair, notes) for name, pair in chosen.items()}
     if not options.joints:
         used = [c.name for pair in chosen.values() for c in (pair.command, pair.position)]
         table.check_joints(path, used)
     return chosen, notes
 
 
-def _by_words(
-    path: Path | str, table: Table, options: LogOptions
-) -> tuple[dict[str, Pair], list[str]]:
+def _of_drive(table: Table, options: LogOptions, pair: Pair, notes: list[str]) -> Pair:
+    """The pair in turns where the log is of a program that counts them; `notes` get a sentence."""
+    given_away = {*table.names} | pair.command.words | pair.position.words
+    program = next((p for p, marks in _OF_TURNS.items() if marks <= given_away), "")
+    if not program or pair.command.unit or pair.position.unit or options.unit:
+        return pair
+    of_drive = any(map(_DRIVES.search, table.names))
+    taken, other = ("turns", "rad") if of_drive else ("rad", "turns")
+    if not any(program in note for note in notes):
+        notes.append(
+            f"{pair.command.name} and {pair.position.name} are names of {program}, which counts "
+            f"turns; the values were taken as {taken}. If they are {other}, give `unit='{other}'`; "
+            "lag and dead time are the same."
+        )
+    if not of_drive:
+        return pair
+    return Pair(*(replace(c, unit="turns") for c in (pair.command, pair.position)))
+
+
+def _by_words(path: Path | str, table: Table) -> tuple[dict[str, Pair], list[str]]:
     every = columns_of(name for name in table.names if name not in table.texts)
     commands, positions = ([c for c in every if c.kind == k] for k in ("command", "position"))
     placed = {c.key for c in positions}
@@ -93,7 +111,6 @@ def _by_words(
     if not keys:
         return _lone(path, table, commands, positions)
     used = Counter(c.template for c in every)
-    of_drive = any(map(_DRIVES.search, table.names))
     chosen: list[Pair] = []
     notes: dict[str, str] = {}  # one of a kind
     for key in keys:
@@ -106,7 +123,6 @@ def _by_words(
         choices = product(*(candidates[:_COMPARED] for candidates in ranked))
         best = sorted((Pair(*pair) for pair in choices), key=lambda pair: pair.cost(used))
         pair = _decided(path, table, best, used)
-        both = f"{pair.command.name} and {pair.position.name}"
         if sum(map(pair.as_sure, best)) > 1:
             notes.setdefault(
                 "choice",
@@ -114,18 +130,6 @@ def _by_words(
                 f"{pair.position.name} for the position. To take others, name them with "
                 "`command` and `position`.",
             )
-        given_away = {*table.names} | pair.command.words | pair.position.words
-        program = next((p for p, marks in _OF_TURNS.items() if marks <= given_away), "")
-        if program and not (pair.command.unit or pair.position.unit or options.unit):
-            taken, other = ("turns", "rad") if of_drive else ("rad", "turns")
-            notes.setdefault(
-                program,
-                f"{both} are names of {program}, which counts turns; the values were taken as "
-                f"{taken}. If they are {other}, give `unit='{other}'`; lag and dead time are the "
-                "same.",
-            )
-            if of_drive:
-                pair = Pair(*(replace(c, unit="turns") for c in (pair.command, pair.position)))
         chosen.append(pair)
     # a joint is called as both columns have it, else without further words
     joints = [min(pair.command.joint, pair.position.joint, key=len) for pair in chosen]

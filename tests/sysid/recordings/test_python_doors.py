@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 import pupper_sysid as ps
 from pupper_sysid.common.errors import InputError
@@ -43,9 +44,69 @@ def test_arrays_and_paths_of_other_types_are_refused_in_a_sentence():
         (lambda: arrays(TIME, COMMAND, POSITION, read_time_s=late), "read_time_s: row 7"),
         (lambda: arrays(TIME, COMMAND, POSITION, metadata=[1]), "metadata is a list"),
         (lambda: ps.Recording.from_frame({"time": TIME}), "pandas.DataFrame"),
+        (lambda: arrays(TIME, {"knee": COMMAND["knee"] + 0j}, POSITION), "are not numbers"),
+        (lambda: arrays([], {"knee": []}, {"knee": []}), "has no rows"),
+        (lambda: ps.Recording.from_frame(TABLE.head(0)), "has no rows"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=text):
             call()
+
+
+def stacked(**columns):
+    return pd.DataFrame(columns, index=pd.Index(TIME, name="time"))
+
+
+C, P = COMMAND["knee"], POSITION["knee"]
+START = np.datetime64("2026-05-04T12:30")
+ARRAYS = {
+    "lists": (TIME.tolist(), C.tolist(), tuple(P)),
+    "series of other indices": (pd.Series(TIME, TIME), pd.Series(C), pd.Series(P, TIME[::-1])),
+    "objects": (TIME.astype(object), C.astype(object), [*P[:-1], None]),
+    "dates": (pd.Series(START + (1e9 * TIME).astype("m8[ns]")), C, P),
+    "durations": (pd.to_timedelta(TIME, "s"), C, P),
+    "tensors": (torch.tensor(TIME), torch.tensor(C, requires_grad=True), torch.tensor(P)),
+    "masked": (TIME, C, np.ma.masked_array(np.where(P > 0.29, 9.0, P), P > 0.29)),
+}
+FRAMES = {
+    "times as index": stacked(cmd=C, pos=P),
+    "dates as index": pd.DataFrame({"cmd": C, "pos": P}, pd.to_datetime(TIME, unit="s")),
+    "numbers as index": pd.DataFrame({"cmd": C, "pos": P}, TIME),
+    "two levels of names": stacked(**{"a": C, "b": P}).set_axis(
+        pd.MultiIndex.from_tuples([("knee", "cmd"), ("knee", "pos")]), axis=1),
+    "two levels of rows": stacked(cmd=C, pos=P).assign(joint="knee").set_index(
+        "joint", append=True),
+    "lists in cells": pd.DataFrame({"time": TIME, "action": list(C[:, None]),
+                                    "state": P[:, None].tolist()}),
+    "rows by chance": TABLE.sample(frac=1, random_state=0),
+    "nullable numbers": TABLE.convert_dtypes(),
+    "texts of numbers": TABLE.astype(str),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", [*ARRAYS, *FRAMES])
+def test_what_is_in_memory_is_read_in_each_form(form):
+    if form in ARRAYS:
+        time, command, position = ARRAYS[form]
+        recording = ps.Recording.from_arrays(time, {"knee": command}, {"knee": position})
+    else:
+        recording = ps.Recording.from_frame(FRAMES[form])
+    (trial,) = recording.trials(recording.joints[0])
+    read = np.isfinite(trial.position_rad)
+    assert read.sum() > 40
+    np.testing.assert_allclose(trial.send_time_s - trial.send_time_s[0], TIME, atol=1e-6)
+    np.testing.assert_allclose(trial.command_rad, C)
+    np.testing.assert_allclose(trial.position_rad[read], P[read])
+
+
+def test_options_are_a_dictionary_or_refused_in_a_sentence():
+    degrees = TABLE.assign(knee_cmd=np.degrees(C), knee_pos=np.degrees(P))
+    (trial,) = ps.Recording.from_frame(degrees, options={"unit": "deg"}).trials("knee")
+    np.testing.assert_allclose(trial.command_rad, C)
+    cases = [({"rate": "50"}, "rate is the text '50'"), ("deg", "is deg where a mapping"),
+             ({"unit": 3}, "unit is 3"), ({"rte": 3.0}, "Did you mean rate")]  # fmt: skip
+    assert_each_refused(cases, lambda options: ps.Recording.from_frame(TABLE, options=options))
+    with pytest.raises(InputError, match=r"`options=\{'rate': 50.0, 'command': '.joint._cmd'"):
+        ps.Recording.from_frame(TABLE.drop(columns="time"))
 
 
 def test_one_time_stamp_leaves_the_same_doubt_at_every_door(tmp_path):

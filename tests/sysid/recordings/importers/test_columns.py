@@ -114,7 +114,7 @@ def test_a_clock_of_commands_and_one_of_readings_are_taken_as_such():
     (trial,) = Recording.from_frame(with_third, options=named).trials("joint")
     np.testing.assert_allclose(trial.read_time_s - trial.send_time_s, 0.003, atol=1e-12)
     recording = Recording.from_frame(with_third)
-    assert any("--command-time t_cmd" in text for text in recording.warnings)
+    assert any("'command_time': 't_cmd'" in text for text in recording.warnings)
 
 
 def test_a_command_that_stays_in_force_is_sent_once_for_its_first_reading():

@@ -34,7 +34,13 @@ def each(pattern, rows=LOG, head=""):
     """A line a row: `t` or `m` (milliseconds), `c`, `p`; of a second joint `d` and `q`."""
     names = "tcpdq"[: len(rows[0])]
     return f"{head}\n" * bool(head) + "".join(
-        pattern.format(**dict(zip(names, row, strict=True)), m=round(1e3 * row[0]), n=n) + "\n"
+        pattern.format(
+            **dict(zip(names, row, strict=True)),
+            m=round(1e3 * row[0]),
+            n=n,
+            ns=1_700_000_000_000_000_000 + round(1e9 * row[0]),
+        )
+        + "\n"
         for n, row in enumerate(rows)
     )
 
@@ -125,6 +131,16 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "rules of equals signs": (
         "=====  =====  =====\ntime   goal   pos\n=====  =====  =====\n" + each("{t}  {c}  {p}")
         + "=====  =====  =====\n", "joint"),
+    "Markdown": ("|    | time | goal | pos |\n|---:|-----:|-----:|----:|\n"
+                 + each("|  {n} | {t} | {c} | {p} |"), "joint"),
+    "NumPy's long lists": ("time,action,qpos\n" + each(
+        '{t},"[{c}\n  {d}]","[{p}\n  {q}]"', BOTH), "joint_0 joint_1"),
+    "an index without a name": (
+        pd.DataFrame({"cmd": COMMAND, "pos": POSITION}, TIME).to_csv(), "joint"),
+    "names of two levels": (pd.DataFrame(
+        np.column_stack([*JOINTS[0], *JOINTS[1]]), pd.Index(TIME, name="time"),
+        pd.MultiIndex.from_product([["knee", "hip"], ["cmd", "pos"]], names=["joint", "signal"]),
+        ).to_csv(), "knee hip"),
     "a row for each quantity": ("".join(
         f"{name},{','.join(map(str, values))}\n"
         for name, values in (("time", TIME), ("cmd", COMMAND), ("pos", POSITION))), "joint"),
@@ -158,6 +174,8 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
         f"12:30:00:{1e3 * t:03.0f},{c},{p}\n" for t, c, p in LOG), "joint"),
     "milliseconds beside": ("time,ms,goal,present\n" + each("12:30:01,{m},{c},{p}"), "joint"),
     "time between rows": ("dt_us,cmd,pos\n" + each("10000,{c},{p}"), "joint"),
+    "a time step that rises": ("timestep,joint_pos_0,joint_pos_target_0\n" + each("{t},{p},{c}"),
+                               "joint_0"),
     "a rate in a remark": ("# sample rate: 100 Hz\nsample,cmd,pos\n" + each("{n},{c},{p}"),
                            "joint"),
     "a first time column that is empty": (
@@ -180,7 +198,26 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "a melted parquet": (saved(lambda f: LONG.to_parquet(f)), "knee hip"),
     "a parquet of dates": (saved(lambda f: pd.DataFrame({"cmd": COMMAND, "pos": POSITION},
         pd.to_datetime(TIME, unit="s", utc=True)).to_parquet(f)), "joint"),
+    "InfluxDB's lines": (each("servo,joint=knee,robot=a goal={c},present={p} {ns}\n"
+                              "servo,joint=hip,robot=a goal={d},present={q} {ns}", BOTH),
+                         "knee hip"),
+    "messages of a CAN bus, decoded": (each(
+        "(1700000000.{n:02d}) can0 141 [8] 00 11 :: Goal(knee_goal: {c} rad)\n"
+        "(1700000000.{n:02d}) can0 241 [8] 00 11 :: Status(knee_pos: {p} rad, knee_vel: 0 rad/s)"),
+        "knee"),
+    "two tables, one beside the other": ("goal_time,goal,position_time,position\n" + "".join(
+        f"{t},{c},{TIME[n // 2]},{POSITION[n // 2]}\n" for n, (t, c, _) in enumerate(LOG))
+        + "".join(f",,{t},{p}\n" for t, _, p in LOG[40:]), "joint"),
     # drives: what their words mean
+    "a message of a status": ('"timestamps","Motor_1_Cmd.Position [rad]","Motor_1_Status.Position '
+                              '[rad]"\n' + CSV, "Motor_1"),
+    "registers and their addresses": (each(
+        "{t},{c},{p},{d},{q}", BOTH, "Time,[ID:1]Goal Position(116),[ID:1]Present Position(132),"
+        "[ID:2]Goal Position(116),[ID:2]Present Position(132)"), "joint_1 joint_2"),
+    "a joint spelled in two ways": ("time,shoulder_pan_cmd,ShoulderPan_pos\n" + CSV,
+                                    "ShoulderPan"),
+    "moteus's view": (each("{t},{p!r},{c!r},0.5", TURNS, "timestamp,servo_stats.position,"
+                           "servo_control.position,servo_stats.q_current"), "servo_stats"),
     "SimpleFOC": ("time,target,voltage.q,current.q,current.d,angle\n"
                   + each("{t},{c},{p},{p},{c},{p}"), "joint"),
     "ODrive's current": ("time,input_pos,pos_estimate,Iq_setpoint,Iq_measured\n"
@@ -196,6 +233,12 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
                        "joint"),
     "French degrees": (each("{t};{c!r};{p!r}", DEGREES, "temps;consigne (degrés);mesure (degrés)"),
                        "joint"),
+    "Spanish degrees": (each("{t};{c!r};{p!r}", DEGREES, "Tiempo (s);Ángulo deseado (°);Ángulo "
+                             "medido (°)").encode("cp1252"), "joint"),
+    "Dutch degrees": (each("{t};{c!r};{p!r}", DEGREES, "tijd;gewenste hoek (graden);gemeten hoek "
+                           "(graden)"), "joint"),
+    "Japanese degrees": (each("{t},{c!r},{p!r}", DEGREES, "時間[s],目標角度[deg],現在角度[deg]")
+                         .encode("shift_jis"), "joint"),
     "Chinese degrees": (each("{m},{c!r},{p!r}", DEGREES, "时间(ms),目标角度（度）,实际角度(度)"),
                         "joint"),
     "Korean degrees": (each("{m},{c!r},{p!r}", DEGREES, "시간(ms),목표각도(도),현재각도(도)"),
@@ -281,6 +324,12 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
     "arrows": (each("{t}: {c} -> {p}"), "--time 0 --command 1 --position 3"),
     "NMEA": (each("$SRV,{m},{c},{p}*5A"), "--time 1 --command 2 --position 3"),
     "a counter called loop": ("loop,cmd,pos\n" + each("{n},{c},{p}"), "--rate 50 --command cmd"),
+    "control engineering's letters": ("t,w,x,u\n" + each("{t},{c},{p},0.4"),
+                                      "--time t --command w --position x"),
+    "rows that are counted": (each("{n}\t{p:.0f}\t{c:.0f}\t32", COUNTS, "Num\tPosition\tGoal\tT"),
+                              "--rate 50 --unit counts:4096 --command Goal --position Position"),
+    "words that no table has": ("t,Ziel,Lage hier\n" + CSV,
+                                "--time t --command Ziel --position 'Lage hier'"),
     "letters": (each("[2026-05-04 12:30:{t:06.3f}] T:{c} A:{p}", DEGREES),
                 "--time time_of_day --unit deg --command T --position A"),
     "a percent sign": ("time,cmd,pos\n" + "".join(
