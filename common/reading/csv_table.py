@@ -230,8 +230,9 @@ class _Blocks:
         comments = _comments(self._path, block, first, len(self._table.comments))
         self._table.comments += comments
         plain = _QUOTED.sub(r"\1", block) if '"' in block else block
-        plain, lines = _bare(plain, first, [n for n, _ in comments])
-        if len(lines) and not self._plain(plain, lines):
+        rows = {n: line for n, line in enumerate(plain.split("\n"), first)
+                if line and line[0] != "#"}  # fmt: skip
+        if rows and not self._plain(rows):
             self._strictly(block, first, last)
         return count
 
@@ -241,24 +242,25 @@ class _Blocks:
         for name in list(self._numbers):
             self._table.numbers[name] = np.concatenate([np.zeros(0), *self._numbers.pop(name)])
 
-    def _plain(self, block: str, lines: NDArray[np.int64]) -> bool:
-        """Take lines of decimal numerals and of texts without quotes; or do not."""
-        table = self._table
-        if '"' in block or not _rectangular(block, len(table.columns)):
+    def _plain(self, rows: Mapping[int, str]) -> bool:
+        """Take lines, by number, of decimal numerals and of texts without quotes; or do not."""
+        table, commas = self._table, len(self._table.columns) - 1
+        if any(line.count(",") != commas or '"' in line for line in rows.values()):
             return False
         numeric = {n: name in self._numbers for n, name in enumerate(table.columns)
                    if name not in table.faults}  # fmt: skip
         kinds: Any = {n: float if number else str for n, number in numeric.items()}
         try:
             read = pd.read_csv(
-                io.StringIO(block), header=None, index_col=False, usecols=list(kinds), dtype=kinds,
+                io.StringIO("\n".join(rows.values())), header=None, index_col=False,
+                usecols=list(kinds), dtype=kinds,
                 na_values=[""], keep_default_na=False, skip_blank_lines=False,
                 quoting=csv.QUOTE_NONE, engine="c", low_memory=False, **_EXACTLY,
             )  # fmt: skip
         except (ValueError, OverflowError):  # pandas raises kinds of ValueError
             return False
         numbers = {n: read[n].to_numpy(float) for n, number in numeric.items() if number}
-        if len(read) != len(lines) or any(np.isinf(v).any() for v in numbers.values()):
+        if len(read) != len(rows) or any(np.isinf(v).any() for v in numbers.values()):
             return False
         for n, number in numeric.items():
             name = table.columns[n]
@@ -268,7 +270,7 @@ class _Blocks:
                 codes, cells = pd.factorize(read[n].fillna(""))
                 texts = [self._text(str(cell)) for cell in cells]
                 table.texts[name] += [texts[code] for code in codes.tolist()]
-        self._lines.append(lines)
+        self._lines.append(np.array([*rows], np.int64))
         return True
 
     def _strictly(self, block: str, first: int, last: bool) -> None:
@@ -358,32 +360,6 @@ def is_failure(word: str) -> bool:
     """Whether a word, such as `timeout`, stands for a reading that failed."""
     text = word.strip().lower()
     return len(text) < _LONGEST_WORD and _NOTHING.fullmatch(text) is not None
-
-
-def _bare(block: str, first: int, comments: Sequence[int]) -> tuple[str, NDArray[np.int64]]:
-    """A block without its comments and blank lines, and the lines that are left."""
-    lines = np.arange(first, first + block.count("\n") + (not block.endswith("\n")))
-    gone = list(comments)
-    if comments:
-        block = _COMMENT.sub("", block)
-    if "\n\n" in block or block[:1] == "\n":
-        ends = np.flatnonzero(np.frombuffer(block.encode(), np.uint8) == ord("\n"))
-        gone = [*gone, *(first + np.flatnonzero(np.diff(ends, prepend=-1) == 1)).tolist()]
-        block = re.sub("\n\n+", "\n", block).removeprefix("\n")
-    if gone:
-        lines = np.setdiff1d(lines, gone)
-    return block, lines
-
-
-def _rectangular(block: str, columns: int) -> bool:
-    """Whether each line of a block has the same number of cells."""
-    data = np.frombuffer((block if block.endswith("\n") else f"{block}\n").encode(), np.uint8)
-    ends = np.flatnonzero(data == ord("\n"))
-    commas = np.flatnonzero(data == ord(","))
-    if len(commas) != len(ends) * (columns - 1):
-        return False
-    before = np.searchsorted(commas, ends)
-    return bool((before == (columns - 1) * np.arange(1, len(ends) + 1)).all())
 
 
 def _cells(path: Path | str, number: int, line: str) -> list[str]:

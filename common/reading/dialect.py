@@ -19,7 +19,7 @@ import csv
 import io
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -508,53 +508,56 @@ def _cells(body: str, shape: _Shape) -> str:
     return body
 
 
+def _numbered(matches: Iterable[re.Match[str]]) -> dict[str, re.Match[str]]:
+    """Pairs of a line by name; those that it has twice are of several joints, and get numbers."""
+    pairs = [*matches]
+    names = [m[1] for m in pairs]
+    numbers = [f"_{names[:k].count(n) + 1}" * (names.count(n) > 1) for k, n in enumerate(names)]
+    return {m[1] + number: m for m, number in zip(pairs, numbers, strict=True)}
+
+
 def _labels(sample: Sequence[str]) -> tuple[re.Pattern[str], list[str]] | None:
-    """How to find the pairs of name and number that most lines have, and their names."""
+    """How to find the pairs of name and number that most lines have, and their names.
+
+    Lines with a few sets of names may take turns.
+    """
     styles = []
+    enough = _SAME_SHAPE * len(sample)
     for pattern in (_PAIR, _LONG_PAIR):
-        named = Counter(tuple(m[1] for m in pattern.finditer(line)) for line in sample)
-        kinds = [kind for kind, n in named.most_common(_LABELS) if n >= _OFTEN * len(sample)]
-        names = kinds[0] if kinds else ()
-        count = named[names]
-        if len(kinds) > 1 and all(kinds) and count < _SAME_SHAPE * len(sample):  # in turn
-            names = tuple(dict.fromkeys(name for kind in kinds for name in kind))
-            count = sum(named[kind] for kind in kinds)
-        times = {*Counter(names).values()}
-        if count >= _SAME_SHAPE * len(sample) and len({*names}) > 1 and len(times) == 1:
-            styles.append((max(times), pattern, list(names)))
+        labelled = [_numbered(pattern.finditer(line)) for line in sample]
+        named = Counter(map(tuple, labelled)).most_common(_LABELS)
+        named = named[: 1 if named[0][1] >= enough else None]
+        kinds = [kind for kind, n in named if n >= _OFTEN * len(sample)]
+        most = sum(n for kind, n in named if kind in kinds)
+        names = list(dict.fromkeys(name for kind in kinds for name in kind))
+        first = next((pairs for pairs in labelled if [*pairs] == [*kinds[0]]), {}) if kinds else {}
+        times = {*Counter(m[1] for m in first.values()).values()}
+        if most >= enough and all(kinds) and len(names) > len(times) == 1 < len(names) / max(times):
+            styles.append((max(times), pattern, names))
     return min(styles, key=lambda style: style[0])[1:] if styles else None
 
 
 def _labelled(
     text: str, sample: Sequence[str], pattern: re.Pattern[str], names: list[str]
 ) -> Plain:
-    """Lines such as `t:0.1,cmd:0.3` (serial plotters, monitors) as rows; others are left empty.
-
-    Names that a line has twice are of several joints, and get numbers.
-    """
-    labelled = [[m.groups() for m in pattern.finditer(line)] for line in sample]
-    numbered = len({*names}) < len(names)
-    columns = []
-    for k, name in enumerate(names):
-        again = f"_{names[:k].count(name) + 1}" if names.count(name) > 1 else ""
-        units = {unit for pairs in labelled for label, _, unit in pairs if label == name}
-        unit = units.pop() if len(units) == 1 else None
-        columns.append(with_unit(f"{name}{again}", unit) if unit else f"{name}{again}")
+    """Lines such as `t:0.1,cmd:0.3` (serial plotters, monitors) as rows; others are left empty."""
+    labelled = [_numbered(pattern.finditer(line)) for line in sample]
+    units = [{pairs[name][3] for pairs in labelled if name in pairs} for name in names]
+    columns = [
+        with_unit(name, unit) if len(words) == 1 and (unit := next(iter(words))) else name
+        for name, words in zip(names, units, strict=True)
+    ]
     ahead = [float(m[1]) for line in sample if (m := _AHEAD.match(line))]
     steps = {b - a for a, b in pairwise(ahead)}
     timed = len(ahead) == len(sample) and min(steps) >= 0 and not steps <= {0, 1}
     rows, others = [], 0
     stamped = False
     for line in text.split("\n"):
-        pairs = [(m[1], m[2]) for m in pattern.finditer(line)]
-        line_names = [name for name, _ in pairs]
-        same = line_names == names if numbered else bool(line_names) and {*line_names} <= {*names}
+        pairs = _numbered(pattern.finditer(line))
+        same = bool(pairs) and pairs.keys() <= {*names}
         stamp = (_AHEAD if timed else _STAMPED).match(line) if same else None
         stamped = stamped or (stamp is not None and not any(rows))
-        cells = [value for _, value in pairs] if same else []
-        if same and not numbered:
-            by_name = dict(pairs)
-            cells = [by_name.get(name, "") for name in names]
+        cells = [pairs[name][2] if name in pairs else "" for name in names] if same else []
         if stamped and same:
             cells = ["" if stamp is None else stamp[1] if timed else _stamp(stamp), *cells]
         rows.append(",".join(cells))

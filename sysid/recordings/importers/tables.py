@@ -457,33 +457,32 @@ def _apart(
     that the last one stays in force.
     """
     stamp, send = times_s
+    sent_s = stamp if send is None else send
     command, position = (table.numbers(path, c.name) for c in (pair.command, pair.position))
+    sent = of_joint & np.isfinite(command) & np.isfinite(sent_s)
+    read = of_joint & np.isfinite(position) & np.isfinite(stamp)
     if send is not None:
-        late = (stamp - send)[of_joint & np.isfinite(stamp) & np.isfinite(send)]
-        if np.ptp(late) < _SIDE_BY_SIDE * np.ptp(stamp[of_joint & np.isfinite(stamp)]):
+        apart = _range((stamp - send)[of_joint]) > _SIDE_BY_SIDE * _range(stamp[of_joint])
+        if not apart:
             return of_joint, send[of_joint], None
-        sent = (
-            of_joint & np.isfinite(command) & np.isfinite(send)
-        )  # a table of each beside the other
-        rows_of = np.flatnonzero(of_joint & np.isfinite(position) & np.isfinite(stamp))
-        order = np.flatnonzero(sent)[np.argsort(send[sent], kind="stable")]
-        in_force, held, kept = held_commands(send[order], command[order], stamp[rows_of])
-        chosen = np.zeros(len(of_joint), bool)
-        chosen[rows_of[kept]] = True
-        return chosen, in_force, held
-    sent, read = of_joint & np.isfinite(command), of_joint & np.isfinite(position)
-    apart = (sent & read).sum() < _TOGETHER * min(sent.sum(), read.sum())
-    if not (apart or (read & ~sent).sum() > _MOSTLY_BLANK * read.sum()):
-        return of_joint, None, None
+    else:
+        apart = (sent & read).sum() < _TOGETHER * min(sent.sum(), read.sum())
+        if not (apart or (read & ~sent).sum() > _MOSTLY_BLANK * read.sum()):
+            return of_joint, None, None
     rows_of = np.flatnonzero(read if apart else of_joint)
-    order = np.flatnonzero(sent)[np.argsort(stamp[sent], kind="stable")]
-    send, held, kept = held_commands(stamp[order], command[order], stamp[rows_of])
+    order = np.flatnonzero(sent)[np.argsort(sent_s[sent], kind="stable")]
+    in_force, held, kept = held_commands(sent_s[order], command[order], stamp[rows_of])
     if not kept.any():
-        return of_joint, None, None
+        return of_joint, send, None
     chosen = np.zeros(len(of_joint), bool)
     chosen[rows_of[kept]] = True
-    one_stamp = not apart or np.isin(stamp[chosen], stamp[sent]).mean() > _ONE_STAMP
-    return chosen, None if one_stamp else send, held
+    same = not apart or np.isin(stamp[chosen], stamp[sent]).mean() > _ONE_STAMP
+    return chosen, None if send is None and same else in_force, held
+
+
+def _range(values: NDArray[np.float64]) -> float:
+    """Range of the numbers that are not missing."""
+    return float(np.nanmax(values) - np.nanmin(values)) if np.isfinite(values).any() else 0.0
 
 
 def _trials(
