@@ -267,9 +267,7 @@ class _Blocks:
             if number:
                 self._numbers[name].append(numbers[n])
             else:
-                codes, cells = pd.factorize(read[n].fillna(""))
-                texts = [self._text(str(cell)) for cell in cells]
-                table.texts[name] += [texts[code] for code in codes.tolist()]
+                table.texts[name] += map(self._text, read[n].fillna("").tolist())
         self._lines.append(np.array([*rows], np.int64))
         return True
 

@@ -121,16 +121,6 @@ def read_bytes(path: Path) -> bytes:
     return data
 
 
-def as_text(path: Path, data: bytes) -> str:
-    """The file's text, without a byte order mark."""
-    try:
-        if b"\0" in data:
-            raise ValueError
-        return data.decode("utf-8-sig")
-    except ValueError:
-        raise InputError(f"{path} is not a text file; a recording is CSV.") from None
-
-
 class RecordingWriter:
     """Writer of a recording, row by row; appended rows survive the end of the process.
 
@@ -162,7 +152,7 @@ class RecordingWriter:
         `trial`: first trial to write. Its rows that are in the file stay and are cancelled by a
         comment line; an incomplete last line is removed.
         """
-        text = as_text(path, read_bytes(path))
+        text = decoded(path, read_bytes(path))
         complete = text[: text.rfind("\n") + 1]
         lines = [line for line in complete.splitlines() if line.strip() and line[0] != "#"]
         writer = cls.__new__(cls)

@@ -44,7 +44,7 @@ def convert(path: Path | str, table: Table, options: LogOptions | None = None) -
     if {"send_time_s", "read_time_s"} & names and not options.command:
         require(path, table, REQUIRED_COLUMNS)
         options.refuse("recording of this project", ())
-        columns = {**table.columns, **table.texts}
+        columns = {n: table.numbers(path, n) for n in table.columns} | {**table.texts}
         tidy = pd.DataFrame({n: columns[n] for n in dict.fromkeys((*REQUIRED_COLUMNS, *columns))})
         return Log(tidy, {**table.metadata}, [*table.notes])
     sweep = {"signal", "phase"} & names and {"actual_rad", "freq_hz"} & names

@@ -321,8 +321,6 @@ class Recording:
                     f"{name}, column {column}: row {row} has no time (NaN). Leave rows without a "
                     "time out."
                 )
-            if np.isinf(values).any():
-                raise InputError(f"{name}, column {column}: a value is infinite.")
             numbers[column] = values
         if "send_time_s" in numbers and not timed:
             apart = READ_AFTER_SEND_S if after is None else after

@@ -36,11 +36,11 @@ from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, in_order
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_ROWS, read_table
-from pupper_sysid.hardware.address import EMULATED
+from pupper_sysid.common.reading.dialect import decoded
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, header_entries
 from pupper_sysid.hardware.loop import LOG, VIEWS, FixedRateLoop, first_pose, glide
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
-from pupper_sysid.sysid.recordings.files import RecordingWriter, as_text, read_bytes
+from pupper_sysid.sysid.recordings.files import RecordingWriter, read_bytes
 from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad
 from pupper_sysid.sysid.recordings.table import TITLE, header, parse
@@ -130,9 +130,9 @@ class Resume:
         return self.last_time_s + min(max(pause_s, _LEAST_PAUSE_S), _LONGEST_PAUSE_S)
 
 
-def request_of(path: Path) -> tuple[Request, bool]:
-    """Request of a recording to continue, and whether it is a completed round of several."""
-    text = as_text(path, read_bytes(path))
+def header_of(path: Path) -> dict[str, Any]:
+    """Header of an unfinished recording, from which its plan can be made again."""
+    text = decoded(path, read_bytes(path))
     if not text.startswith(TITLE):
         raise InputError(f"{path} is not a recording of pupper-sysid; only those can be continued.")
     metadata = header(path, text)
@@ -151,13 +151,13 @@ def request_of(path: Path) -> tuple[Request, bool]:
 
 def footer(path: Path) -> dict[str, Any]:
     """Footer of a completed recording; empty if it was not completed."""
-    return header(path, as_text(path, read_bytes(path))).get("completed", {})
+    return header(path, decoded(path, read_bytes(path))).get("completed", {})
 
 
 def resume_point(path: Path, plan: Plan, period_s: float) -> Resume:
     """Where `plan`, partly recorded at `path`, continues."""
     written_at = path.stat().st_mtime
-    text = as_text(path, read_bytes(path))
+    text = decoded(path, read_bytes(path))
     planned = header(path, text).get("excitation") or {}
     present = json.loads(json.dumps(dict(plan.description)))
     if {**planned, "warnings": []} != {**present, "warnings": []}:  # their wording may change

@@ -309,8 +309,5 @@ def as_options(options: LogOptions | Mapping[str, Any] | None) -> LogOptions:
 
 def merged(first: LogOptions, second: LogOptions) -> LogOptions:
     """Options of `first`, and of `second` where `first` has none."""
-    values: dict[str, Any] = {}
-    for f in fields(LogOptions):
-        value = getattr(first, f.name)
-        values[f.name] = getattr(second, f.name) if value in (None, {}) else value
-    return LogOptions(**values)
+    names = [f.name for f in fields(LogOptions)]
+    return LogOptions(**{n: getattr(first, n) or getattr(second, n) for n in names})
