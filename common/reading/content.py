@@ -103,8 +103,8 @@ def open_regular(path: Path | str, remedy: str = "") -> BufferedReader:
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):  # opening a device may already do something
             raise InputError(f"{path} is not a file. {remedy or 'Give the name of a file.'}")
-        descriptor = os.open(path, os.O_RDONLY | _flag("O_NONBLOCK") | _flag("O_CLOEXEC")
-                             | _flag("O_BINARY"))  # fmt: skip
+        flags = (getattr(os, f"O_{name}", 0) for name in ("NONBLOCK", "CLOEXEC", "BINARY"))
+        descriptor = os.open(path, os.O_RDONLY | sum(flags))
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):  # it was exchanged in between
             os.close(descriptor)
             raise InputError(f"{path} is not a file. {remedy or 'Give the name of a file.'}")
@@ -213,11 +213,6 @@ def _bounded(path: Path | str, pieces: Iterable[bytes], most_bytes: float) -> by
 def _unreadable(path: Path | str, error: Exception, remedy: str) -> InputError:
     reason = getattr(error, "strerror", None) or error
     return InputError(f"{path} cannot be read: {reason}. {remedy}".rstrip())
-
-
-def _flag(name: str) -> int:
-    """A flag of `os.open`, where the system has it."""
-    return getattr(os, name, 0)
 
 
 LARGEST_HEADER = 1_000_000

@@ -238,18 +238,17 @@ def _refuse_disorder(path: Path | str, table: pd.DataFrame, trial_of: NDArray[np
 
 def _short(first: pd.DataFrame, rows: NDArray[np.int64]) -> list[str]:
     """Sentences on trials with few rows; `first` has a row of each trial, `rows` their numbers."""
-    notes = []
-    for few, each, all_of_them in (
-        (rows < _SHORTEST_TRIAL, "is too short to use and was left out",
-         "are too short to use and were left out"),
-        ((rows >= _SHORTEST_TRIAL) & (rows < _LEAST_ROWS), "has only {} rows",
-         f"have fewer than {_LEAST_ROWS} rows"),
-    ):  # fmt: skip
-        if few.sum() > _FEW_TRIALS:
-            notes.append(f"{few.sum()} trials {all_of_them}.")
-            continue
-        short_trials = zip(first.loc[few, "joint"], first.loc[few, "trial"], rows[few], strict=True)
-        notes += [
-            f"trial {trial:g} of {joint} {each.format(n)}." for joint, trial, n in short_trials
-        ]
+    notes: list[str] = []
+    useless = rows < _SHORTEST_TRIAL
+    for few, each, every in (
+        (useless, "is too short to use and was left out", "are too short to use and were left out"),
+        (
+            ~useless & (rows < _LEAST_ROWS),
+            "has only {} rows",
+            f"have fewer than {_LEAST_ROWS} rows",
+        ),
+    ):
+        trials = zip(first.loc[few, "joint"], first.loc[few, "trial"], rows[few], strict=True)
+        single = [f"trial {trial:g} of {joint} {each.format(n)}." for joint, trial, n in trials]
+        notes += single if len(single) <= _FEW_TRIALS else [f"{len(single)} trials {every}."]
     return notes

@@ -51,7 +51,10 @@ def read_arrays(path: Path, data: bytes, options: LogOptions) -> Log:
     if data.startswith(MAT):
         arrays, layout = _mat_arrays(path, data), "MATLAB file"
     else:
-        inside = _members(path, data)
+        try:
+            inside = zipfile.ZipFile(io.BytesIO(data)).infolist()
+        except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError) as error:
+            raise InputError(_damaged(path)) from error
         if any(member.filename.endswith("/data.pkl") for member in inside):
             arrays, layout = _torch_arrays(path, data), "torch file"
         else:
@@ -127,15 +130,6 @@ def _read_npy(path: Path, data: bytes, options: LogOptions) -> Log:
     return read_table(path, Table(columns), options, "NumPy array")
 
 
-def _members(path: Path, data: bytes) -> list[zipfile.ZipInfo]:
-    """What is in a zip archive, of NumPy or torch."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            return archive.infolist()
-    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError) as error:
-        raise InputError(_damaged(path)) from error
-
-
 def _loaded(path: Path, data: bytes) -> Any:
     """What NumPy loads: an array, or the arrays of an archive by name."""
     try:
@@ -149,12 +143,8 @@ def _loaded(path: Path, data: bytes) -> Any:
     except InputError:
         raise
     except Exception as error:  # damaged ones raise whatever zlib, zipfile and NumPy do
-        pickled = "pickle" in str(error)
-        raise InputError(
-            f"{path} holds Python objects, which are never loaded. Save arrays of numbers."
-            if pickled
-            else _damaged(path)
-        ) from error
+        objects = f"{path} holds Python objects, which are never loaded. Save arrays of numbers."
+        raise InputError(objects if "pickle" in str(error) else _damaged(path)) from error
 
 
 _MAT_HEADER, _MAT_COMPRESSED, _PIECE = 128, 15, 1 << 20  # of MATLAB 5 MAT-files

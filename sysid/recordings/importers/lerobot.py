@@ -70,9 +70,7 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
     of_key = {key: names.get(f"{key}, flat", [key]) for key in _KEYS}
     parts: dict[str, list[NDArray[np.float64]]] = {key: [] for key in _KEYS}
     for path in data_paths:
-        read = read_columns(
-            path, contents[path], [c for key_columns in of_key.values() for c in key_columns]
-        )
+        read = read_columns(path, contents[path], sum(of_key.values(), []))
         for key, key_columns in of_key.items():
             parts[key].append(np.column_stack([read[c] for c in key_columns]))
     refuse_more(folder, sum(p.size for p in parts[_STATE]), MOST_CELLS, "values",
@@ -83,11 +81,8 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
             raise InputError(f"{folder}: {key} has another length in one of the data files.")
         columns[key] = np.concatenate(several)
     for key in (_ACTION, _STATE):
-        counts = {
-            key: columns[key].shape[1],
-            "its list of names in meta/info.json": len(names[key]),
-        }
-        one_each(folder, counts)
+        listed = {"its list of names in meta/info.json": len(names[key])}
+        one_each(folder, {key: columns[key].shape[1]} | listed)
     commands, positions = (
         columns[key][:, [names[key].index(name) for name in names["joints"]]]
         for key in (_ACTION, _STATE)

@@ -40,45 +40,27 @@ _INDEX = "__index_level_0__"  # of pandas, without a name
 
 def read_parquet(path: Path, data: bytes, options: LogOptions) -> Log:
     """A file's columns of numbers as rows."""
-    columns = columns_of(path, data)
-    arrays = read_columns(path, data, [name for name, numeric in columns.items() if numeric])
+    pa, file = _open(path, data)
+    numeric = [field.name for field in file.schema_arrow if _of_numbers(pa, field.type)]
+    arrays = read_columns(path, data, numeric)
     if _INDEX in arrays and not has_time(list(arrays)):
         arrays["time"] = arrays.pop(_INDEX)
     table = replace(expanded(path, arrays, list(options.joints)), texts=_texts(path, data))
     return read_table(path, table, options, LAYOUT)
 
 
-def _library(path: Path) -> Any:
-    try:
-        import pyarrow.parquet
-    except ImportError:
-        raise InputError(
-            f"{path} is a parquet file; reading it needs pyarrow. Install pupper-sysid[logs]."
-        ) from None
-    return pyarrow
-
-
-def columns_of(path: Path, data: bytes) -> dict[str, bool]:
-    """Names of a file's columns, and whether each is of numbers (or lists of numbers)."""
-    pa = _library(path)
-    schema = _open(path, data).schema_arrow
-    refuse_more(path, len(schema), MOST_COLUMNS, "columns", "Split the log.")
-    distinct(path, schema.names)
-
-    def numeric(kind: Any) -> bool:
-        if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
-            kind = kind.value_type
-        of_numbers = pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean
-        return any(test(kind) for test in (*of_numbers, pa.types.is_timestamp))
-
-    return {field.name: numeric(field.type) for field in schema}
+def _of_numbers(pa: Any, kind: Any) -> bool:
+    """Whether a column of this type is of numbers, or of lists of numbers."""
+    if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
+        kind = kind.value_type
+    tests = pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean, pa.types.is_timestamp
+    return any(test(kind) for test in tests)
 
 
 def read_columns(path: Path, data: bytes, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
     """Columns of numbers, shape (rows,), or of equally long lists, shape (rows, length)."""
-    pa = _library(path)
-    file = _open(path, data)
-    known = columns_of(path, data)
+    pa, file = _open(path, data)
+    known = file.schema_arrow.names
     lacking = [name for name in names if name not in known]
     if lacking:
         raise InputError(
@@ -91,34 +73,29 @@ def read_columns(path: Path, data: bytes, names: Sequence[str]) -> dict[str, NDA
         wanted = [c for c in chunks if c.path_in_schema.split(".list.")[0] in names]
         values = sum(c.num_values for c in wanted)
         unpacked = sum(c.total_uncompressed_size for c in wanted)
-    except (OSError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} is a damaged parquet file: {_first(error)}.") from error
-    refuse_more(path, values, MOST_CELLS, "values", "Split the log.")
-    refuse_more(f"{path}, unpacked,", unpacked, LARGEST_BYTES, "bytes", "Split the log.")
-    try:
+        refuse_more(path, values, MOST_CELLS, "values", "Split the log.")
+        refuse_more(f"{path}, unpacked,", unpacked, LARGEST_BYTES, "bytes", "Split the log.")
         table = file.read(columns=list(names), use_threads=False)
-        return {name: _array(path, name, table.column(name)) for name in names}
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as parquet: {_first(error)}.") from error
+        return {name: _array(path, pa, name, table.column(name)) for name in names}
+    except (pa.ArrowException, OSError, ValueError, OverflowError) as error:
+        raise _damaged(path, error) from error
 
 
 def _texts(path: Path, data: bytes) -> dict[str, list[str]]:
     """Columns of text that name joints: each text once, however often a row has it."""
-    pa = _library(path)
+    pa, file = _open(path, data)
 
     def textual(kind: Any) -> bool:
         kind = kind.value_type if pa.types.is_dictionary(kind) else kind
         return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
 
-    schema = _open(path, data).schema_arrow
-    names = [f.name for f in schema if f.name.lower() in LABELS and textual(f.type)]
+    names = [f.name for f in file.schema_arrow if f.name.lower() in LABELS and textual(f.type)]
     if not names:
         return {}
-    file = _open(path, data, names)
     refuse_more(path, file.metadata.num_rows, MOST_ROWS, "rows", "Split the log.")
     columns: dict[str, list[str]] = {}
     try:
-        table = file.read(columns=names, use_threads=False)
+        table = _open(path, data, names)[1].read(columns=names, use_threads=False)
         for name in names:
             columns[name] = []
             for chunk in table.column(name).chunks:
@@ -127,24 +104,30 @@ def _texts(path: Path, data: bytes) -> dict[str, list[str]]:
                 codes = chunk.indices.fill_null(len(texts) - 1).to_numpy()
                 columns[name] += [texts[k] for k in codes.tolist()]
     except (pa.ArrowException, OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as parquet: {_first(error)}.") from error
+        raise _damaged(path, error) from error
     return columns
 
 
-def _open(path: Path, data: bytes, texts: Sequence[str] = ()) -> Any:
-    """The file; columns named `texts` come as dictionaries."""
-    pa = _library(path)
+def _open(path: Path, data: bytes, texts: Sequence[str] = ()) -> tuple[Any, Any]:
+    """pyarrow, and the file; columns named `texts` come as dictionaries."""
     try:
-        return pa.parquet.ParquetFile(pa.BufferReader(data), read_dictionary=list(texts) or None)
-    except (pa.ArrowException, OSError, ValueError) as error:
+        import pyarrow.parquet
+    except ImportError:
         raise InputError(
-            f"{path} is not a parquet file, or is cut off: {_first(error)}. Fetch it again."
-        ) from error
+            f"{path} is a parquet file; reading it needs pyarrow. Install pupper-sysid[logs]."
+        ) from None
+    pa: Any = pyarrow
+    try:
+        file = pa.parquet.ParquetFile(pa.BufferReader(data), read_dictionary=list(texts) or None)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise _damaged(path, error) from error
+    refuse_more(path, len(file.schema_arrow), MOST_COLUMNS, "columns", "Split the log.")
+    distinct(path, file.schema_arrow.names)
+    return pa, file
 
 
-def _array(path: Path, name: str, column: Any) -> NDArray[np.float64]:
+def _array(path: Path, pa: Any, name: str, column: Any) -> NDArray[np.float64]:
     """Numbers of a column; an empty cell is NaN."""
-    pa = _library(path)
     kind = column.type
     if pa.types.is_timestamp(kind):  # seconds from the first, as exact as they are
         ticks = column.cast("int64").to_pandas().to_numpy(float)
@@ -162,6 +145,8 @@ def _array(path: Path, name: str, column: Any) -> NDArray[np.float64]:
     return flat.reshape(rows, width)
 
 
-def _first(error: Exception) -> str:
+def _damaged(path: Path, error: Exception) -> InputError:
     text = printable(str(error).splitlines()[0][:200]) if str(error) else type(error).__name__
-    return text.strip().rstrip(".")
+    return InputError(
+        f"{path} is not a parquet file, or is cut off: {text.strip().rstrip('.')}. Fetch it again."
+    )

@@ -462,14 +462,15 @@ def decode(kind: str, data: bytes) -> Message:
     if kind == MULTI_ARRAY:
         for _ in range(cdr.length()):  # its dimensions
             cdr.text()
-            cdr.values("I", 4, 2)
-        cdr.values("I", 4)
-        return Message(0, (), cdr.doubles())
-    stamp, names = cdr.stamp_ns(), cdr.texts()
-    if kind == JOINT_STATE:
-        return Message(stamp, names, cdr.doubles())
-    points = cdr.length()
-    return Message(stamp, names, cdr.doubles() if points else (), points)
+            cdr.values("I", 2)
+        cdr.values("I")
+        return Message(0, (), cdr.values("d", cdr.length()))
+    seconds, rest = cdr.values("i") + cdr.values("I")
+    stamp = int(seconds) * 10**9 + int(rest)
+    cdr.text()  # its frame
+    names = tuple(cdr.text() for _ in range(cdr.length()))
+    points = 1 if kind == JOINT_STATE else cdr.length()
+    return Message(stamp, names, cdr.values("d", cdr.length()) if points else (), points)
 
 
 class _Cdr:
@@ -481,20 +482,20 @@ class _Cdr:
         self._data, self._at = memoryview(data)[4:], 0
         self._order = "<" if data[1] == 1 else ">"
 
-    def values(self, code: str, size: int, count: int = 1) -> tuple[float, ...]:
-        """`count` numbers of `size` bytes each."""
+    def values(self, code: str, count: int = 1) -> tuple[float, ...]:
+        """`count` numbers of the type that `struct` calls `code`."""
         if count == 0:
             return ()
+        size = struct.calcsize(f"={code}")
         start = -(-self._at // size) * size
-        end = start + size * count
-        if end > len(self._data):
+        self._at = start + size * count
+        if self._at > len(self._data):
             raise ValueError("message is cut short")
-        self._at = end
-        return struct.unpack(f"{self._order}{count}{code}", self._data[start:end])
+        return struct.unpack(f"{self._order}{count}{code}", self._data[start : self._at])
 
     def length(self) -> int:
         """Length of the sequence that follows."""
-        count = int(self.values("I", 4)[0])
+        count = int(self.values("I")[0])
         if count > len(self._data) - self._at:
             raise ValueError("a length in the message is larger than the message")
         return count
@@ -504,17 +505,3 @@ class _Cdr:
         count = self.length()
         start, self._at = self._at, self._at + count
         return bytes(self._data[start : self._at]).rstrip(b"\0").decode("utf-8", "replace")
-
-    def texts(self) -> tuple[str, ...]:
-        """A sequence of texts."""
-        return tuple(self.text() for _ in range(self.length()))
-
-    def doubles(self) -> tuple[float, ...]:
-        """A sequence of numbers."""
-        return self.values("d", 8, self.length())
-
-    def stamp_ns(self) -> int:
-        """Time of a header, whose frame is read over."""
-        seconds, rest = self.values("i", 4)[0], self.values("I", 4)[0]
-        self.text()
-        return int(seconds) * 10**9 + int(rest)
