@@ -435,15 +435,6 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
             twice = next((n for n in named if named.count(n) > 1), "")
             called = f"two columns would be called {twice}. Rename one of them"
             columns, numbered = None, called if twice else "some columns have no names"
-    plain_names = (
-        shape.separator == "," and len(before) == 1 and not units and not shape.comma
-        and not shape.units and not shape.hexed and columns == _split(lines[before[0]], ",")
-        and not any(_COMMENT.match(line) and line[:1] != "#" for line in lines)
-    )  # fmt: skip
-    if plain_names and columns and columns[-1]:
-        name = lines[before[-1]]
-        again = text.find(f"\n{name}\n", sum(len(line) + 1 for line in lines[:first]) - 1)
-        return Plain(text if again < 0 else text[:again] + _unnamed(text[again:], name))
     if columns is None:
         numbered = numbered or "its columns have no names"
         columns = [str(k) for k in range(shape.columns)]

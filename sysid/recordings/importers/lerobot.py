@@ -70,7 +70,7 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
     of_key = {key: names.get(f"{key}, flat", [key]) for key in _KEYS}
     parts: dict[str, list[NDArray[np.float64]]] = {key: [] for key in _KEYS}
     for path in data_paths:
-        read = read_columns(path, contents[path], sum(of_key.values(), []))
+        read = read_columns(path, contents[path], [c for of in of_key.values() for c in of])
         for key, key_columns in of_key.items():
             parts[key].append(np.column_stack([read[c] for c in key_columns]))
     refuse_more(folder, sum(p.size for p in parts[_STATE]), MOST_CELLS, "values",
