@@ -3,8 +3,7 @@
 Logs separate cells by tabs, runs of spaces or semicolons, write decimal commas, begin comments with
 `%`, name their columns in a comment or nowhere, have a row of units, or lines before the table.
 `plain` finds the dialect in the first lines and returns the text in the one that `csv_table`
-reads, line for line, so that messages keep the file's line numbers. A text in that dialect comes
-back as it is.
+reads, line for line, so that messages keep the file's line numbers.
 
 The standard library's `csv` splits cells. The separator is the one by which most cells of the
 table become numbers (`csv.Sniffer` takes the decimal commas of `0,1;0,2` for separators).
@@ -565,9 +564,10 @@ def _teleplot(text: str) -> Plain:
     if all(stamp for _, stamp, _ in readings):
         rows = [f"{stamp},{name},{value}" for name, stamp, value in readings]
         return Plain("\n".join(rows), ["time_ms", "name", "value"])
-    names = list(dict.fromkeys(name for name, _, _ in readings))
-    columns = [[value for label, _, value in readings if label == name] for name in names]
-    return Plain("\n".join(map(",".join, zip(*columns, strict=False))), names)
+    columns: dict[str, list[str]] = {}
+    for name, _, value in readings:
+        columns.setdefault(name, []).append(value)
+    return Plain("\n".join(map(",".join, zip(*columns.values(), strict=False))), [*columns])
 
 
 def _influx(text: str) -> Plain:

@@ -209,10 +209,7 @@ def _in_two_places(values: NDArray[np.float64]) -> bool:
 
 
 def _refuse_disorder(path: Path | str, table: pd.DataFrame, trial_of: NDArray[np.int64]) -> None:
-    """Refuse trials whose time runs backwards, or that have several frequencies.
-
-    `own` is the number of each row's trial.
-    """
+    """Refuse trials whose time runs backwards, or that have several frequencies."""
     order = np.argsort(trial_of, kind="stable")
     same = np.diff(trial_of[order]) == 0
     for column in ("send_time_s", "read_time_s"):

@@ -344,9 +344,8 @@ def _grown(time: NDArray, command: NDArray, first: int, last: int, end: int) -> 
     fit = _Sine.of(clock, command, first, last + 1, _SEED / 2 / float(clock[last]))
     if fit is None:
         return None
-    departures = (
-        0  # how often the command left the sine: a frequency that is not exact yet, or its end
-    )
+    # how often the command left the sine: a frequency that is not exact yet, or its end
+    departures = 0
     while departures < _TIMES_LEFT:
         # as far as one doubles the stretch: there the frequency's error shows as a phase
         reach = min(last + max(last - first, 8), len(time) - 1)

@@ -299,9 +299,7 @@ class Recording:
         if "send_time_s" in columns:
             rest = {"trial": 0, "frequency_hz": np.nan}
             columns = {c: pd.Series(v, table.index) for c, v in rest.items()} | columns
-        faults: dict[str, str] = {}
-        texts: dict[str, list[str]] = {}
-        numbers: dict[str, NDArray[np.float64]] = {}
+        faults, texts, numbers = {}, {}, {}
         strict = "send_time_s" in columns or "motor_idx" in columns
         for column, cells in columns.items():
             try:
@@ -503,9 +501,9 @@ def _flat(table: pd.DataFrame) -> pd.DataFrame:
     return table.reset_index(names=None if index.nlevels > 1 or index.name else "time")
 
 
-def _numbers(place: str, key: str, values: ArrayLike) -> NDArray[np.float64]:
+def _numbers(place: str, key: str, values: Any) -> NDArray[np.float64]:
     """The values as numbers, times of NumPy or pandas as seconds; refused where they are none."""
-    detached: Any = values.detach().cpu().double() if hasattr(values, "detach") else values
+    detached = values.detach().cpu().double() if hasattr(values, "detach") else values
     try:
         array = np.ma.asarray(detached)
         if array.dtype.kind in "mM":

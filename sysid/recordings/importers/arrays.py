@@ -47,8 +47,16 @@ _DEEPEST = 3  # of dictionaries in a torch file, of structures in MATLAB's
 def read_arrays(path: Path, data: bytes, options: LogOptions) -> Log:
     """The arrays of a file as rows."""
     if data.startswith(NPY):
-        return _read_npy(path, data, options)
-    if data.startswith(MAT):
+        values, layout = _loaded(path, data), "NumPy array"
+        if values.dtype.kind in "biuf" and values.ndim == 2:
+            return read_numbered(path, values, options, layout)
+        arrays = {name: values[name].ravel() for name in values.dtype.names or ()}
+        if not arrays:
+            raise InputError(
+                f"{path} holds an array of shape {values.shape}; a log has a row per time and a "
+                "column per quantity. Save time, command and position with numpy.savez."
+            )
+    elif data.startswith(MAT):
         arrays, layout = _mat_arrays(path, data), "MATLAB file"
     else:
         try:
@@ -111,23 +119,6 @@ def _with_names(
                     distinct(f"{path}, the names of {key}", listed)
                     return Table(dict(zip(listed, values.T, strict=True)))
     return None
-
-
-def _read_npy(path: Path, data: bytes, options: LogOptions) -> Log:
-    """The columns of one array, by their numbers, or by its fields' names."""
-    values = _loaded(path, data)
-    columns: dict[str, NDArray[np.float64]] = {}
-    if values.dtype.names:
-        fields = {n: values[n] for n in values.dtype.names}
-        columns = {n: v.ravel().astype(float) for n, v in fields.items() if v.dtype.kind in "biuf"}
-    elif values.dtype.kind in "biuf" and values.ndim == 2:
-        return read_numbered(path, values, options, "NumPy array")
-    if not columns:
-        raise InputError(
-            f"{path} holds an array of shape {values.shape}; a log has a row per time and a column "
-            "per quantity. Save time, command and position with numpy.savez."
-        )
-    return read_table(path, Table(columns), options, "NumPy array")
 
 
 def _loaded(path: Path, data: bytes) -> Any:

@@ -102,25 +102,22 @@ def _read_bam(path: Path, data: dict[str, Any]) -> Log:
     loop = float(np.median(np.diff(stamp)[on[1:]])) if on[1:].any() else 0.0
     each = max(loop - _SLEEP_S, 0.0) / (reads + 1)  # a write and the reads take about as long
     started = stamp - reads * each / 2
-    optional: dict[str, Any] = {}
-    if not on.all():
-        optional["torque_enabled"] = on.astype(float)
-    if np.isfinite(voltage).any():
-        optional["voltage_v"] = voltage
-    gain = known.get("kp")
-    if gain is not None:
-        optional["p_gain"] = gain
+    columns = {
+        "torque_enabled": None if on.all() else on.astype(float),
+        "voltage_v": voltage if np.isfinite(voltage).any() else None,
+        "p_gain": known.get("kp"),
+    }
+    optional: dict[str, Any] = {name: v for name, v in columns.items() if v is not None}
+    servo = {"model": motor} | ({"p_gain": known["kp"]} if "kp" in known else {})
+    if known.get("vin", 0) > 0:
+        servo["supply_voltage_v"] = known["vin"]
     metadata: dict[str, Any] = {
         "imported_from": BAM,
         "joints": [joint],
         "readings": "live",
         "bus": {"read_time_doubt_s": each if reads > 1 else max(loop - _SLEEP_S, 0.0) / 2},
-        "servos": {joint: {"model": motor}},
+        "servos": {joint: servo},
     }
-    if gain is not None:
-        metadata["servos"][joint]["p_gain"] = gain
-    if known.get("vin", 0) > 0:
-        metadata["servos"][joint]["supply_voltage_v"] = known["vin"]
     if "mass" in known and "length" in known:
         arm = number(path, data["arm_mass"], "arm_mass") if data.get("arm_mass") else 0.0
         metadata["loads"] = {

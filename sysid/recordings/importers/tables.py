@@ -462,7 +462,9 @@ def _apart(
     sent = of_joint & np.isfinite(command) & np.isfinite(sent_s)
     read = of_joint & np.isfinite(position) & np.isfinite(stamp)
     if send is not None:
-        apart = _range((stamp - send)[of_joint]) > _SIDE_BY_SIDE * _range(stamp[of_joint])
+        both = of_joint & np.isfinite(stamp) & np.isfinite(send)
+        late = (stamp - send)[both] if both.any() else np.zeros(1)
+        apart = np.ptp(late) > _SIDE_BY_SIDE * (np.nanmax(stamp) - np.nanmin(stamp))
         if not apart:
             return of_joint, send[of_joint], None
     else:
@@ -478,11 +480,6 @@ def _apart(
     chosen[rows_of[kept]] = True
     same = not apart or np.isin(stamp[chosen], stamp[sent]).mean() > _ONE_STAMP
     return chosen, None if send is None and same else in_force, held
-
-
-def _range(values: NDArray[np.float64]) -> float:
-    """Range of the numbers that are not missing."""
-    return float(np.nanmax(values) - np.nanmin(values)) if np.isfinite(values).any() else 0.0
 
 
 def _trials(
