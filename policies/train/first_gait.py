@@ -131,6 +131,8 @@ class GaitScore(Result):
     """Of swings that clear less than 2 mm, on a robot of the Mini Pupper's height."""
     saturated_share: float
     """Share of the time in which thighs and calves are at their torque limit."""
+    standing_falls: float = 0.0
+    """Share of the robots that are to stand that fell."""
     length_scale: float = 1.0
     """Standing height over the Mini Pupper's, by which clearances are judged."""
 
@@ -211,11 +213,11 @@ def with_first_gait(
     if ends():
         say("The search was ended before it was complete.")
     elif fitted.after.poor:
-        say(_sentence(fitted))
+        say(_sentence(fitted, run.task))
     return suited(run, fitted)
 
 
-def _sentence(fitted: FirstGait) -> str:
+def _sentence(fitted: FirstGait, task: Walking) -> str:
     """What keeps servos from walking well."""
     score, limit = fitted.after, fitted.limit
     because = {
@@ -227,9 +229,15 @@ def _sentence(fitted: FirstGait) -> str:
         "dead time": "their dead time",
     }
     why = f" What limits it most is {because[limit]}." if limit else ""
+    if score.standing_falls:
+        why += (
+            " It falls even where it is to stand: its default pose does not balance on its feet, "
+            "or these servos do not hold it there."
+        )
+    slower = " to ".join(f"{end / 2:.2g}" for end in task.commands.forward_m_s)
     return (
-        f"These servos carry no better open-loop trot than this.{why} Training begins with it; "
-        "commands of less speed (`task.commands.forward_m_s` of -0.1 to 0.1) are easier."
+        f"No better open-loop gait was found for these servos.{why} Training begins with it; "
+        f"commands of less speed (`task.commands.forward_m_s` of {slower}) are easier."
     )
 
 
@@ -514,7 +522,7 @@ def _score(walk: _Walked) -> GaitScore:
         mean_turn_error_rad_s=float(stride[..., 2].mean()),
         clearance_p10_m=float(np.quantile(clearance, 0.1)) if len(clearance) else 0.0,
         low_swing_share=_low(clearance / walk.length), saturated_share=walk.saturated,
-        length_scale=walk.length,
+        standing_falls=_mean(~walk.up[-1, ~moves]), length_scale=walk.length,
     )  # fmt: skip
 
 

@@ -293,12 +293,12 @@ def evaluation_task(task: Walking, seconds: float | None = None) -> Walking:
 
 
 def share_of_usual(task: Walking) -> Array:
-    """Largest commands of a task over those of `RANDOM`, shape (3,); 1 where a task has none.
+    """Largest commands of a task over those of `RANDOM`, shape (3,); Froude's where it has none.
 
     Of the Mini Pupper at most 1; those of another robot are its own, as large as they are.
     """
     largest, usual = (np.abs(_ranges(c)).max(axis=1) for c in (task.commands, RANDOM))
-    share = np.where(largest > 0, largest / usual, 1.0)
+    share = np.where(largest > 0, largest / usual, task.body.command_scale)
     return share if task.robot else np.minimum(share, 1.0)
 
 

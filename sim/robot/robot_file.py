@@ -15,6 +15,7 @@ needed. `Body.notes` lists the assumptions.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
@@ -40,13 +41,34 @@ Array = NDArray[np.float64]
 
 _SAME_HEIGHT = 0.1  # feet's lowest points differ by less, in shares of the standing height
 _SAME_SOLE = 0.03  # of the geoms of one foot, likewise
+_LYING = 0.2  # sine of the slope below which an edge of a foot counts as nearly level
 _SAME_PLACE = 0.06  # of a joint and its mirror image, likewise
 _TOUCH = 1.3  # radius of a touch sensor's site, in those of the geom
 _INVERSE_STEPS, _NUDGE_RAD = 6, 1e-4
 _DAMPING, _LEVEL = 0.02, 0.05  # standing heights per rad: of joints, and of a sole's tilt
+_HEIGHTS_M = (0.01, 5.0)  # of robots that walk
+_NEGLIGIBLE = 1e-3  # inertia, in masses of the robot times standing heights squared
+_WIDEST, _USUAL_GYRATION = 2.0, 0.3  # radii of gyration, in standing heights
+_STEP, _REACHED = 0.05, 0.3  # of feet that are tried, in standing heights; share that is enough
+_WAYS = {"forward_m_s": "forward", "sideways_m_s": "sideways"}
 _FALLEN = 0.5  # share of the standing height below which the trunk has come down
 _WALK = (0.0, 0.5, 0.75, 0.25)  # left front, right front, left rear, right rear
+_STANDING = ("home", "stand", "standing", "default")  # names of keyframes to stand in
 _QUARTERS = {"y": -1, "-x": 2, "-y": 1}  # of a turn to the left, to x
+_AXES = ("x", "y", "-x", "-y")
+
+
+def _words(long: str, short: str) -> re.Pattern[str]:
+    """Finds a word, or its letter beside that of the other axis (as in FL, LF, RH)."""
+    return re.compile(rf"({long})|(?<![A-Za-z])({short})(?![A-Za-z])")
+
+
+_SIDES = (
+    {1: _words("[Ff]ront|[Ff]ore", "[LR]F|F[LR]"),
+     -1: _words("[Rr]ear|[Bb]ack|[Hh]ind", "[LR][BH]|LR|[RBH][LR]")},
+    {1: _words("[Ll]eft", "L[FRBH]|[FRBH]L"), -1: _words("[Rr]ight", "R[FBH]|[FRBH]R")},
+)  # fmt: skip
+"""What names say about the front and about the left."""
 _PARTS = ("bodies", "geoms", "sites", "cameras", "lights", "frames")
 _LEFT_RIGHT, _FRONT_BACK = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0])
 _TRAINING_ITERATIONS = 8  # of PGS, as of the Mini Pupper
@@ -101,21 +123,16 @@ class _Reader:
             self.spec = mujoco.MjSpec.from_file(str(path))
         except ValueError as error:
             raise InputError(f"{path} is no MJCF that MuJoCo reads: {in_a_line(error)}.") from None
+        bodies = self.spec.worldbody.bodies
+        if len(bodies) and path.suffix == ".urdf":  # which cannot state that its base is free
+            compiler = self.spec.compiler
+            compiler.fusestatic, compiler.balanceinertia = False, True
+            compiler.boundmass, compiler.boundinertia = 1e-6, 1e-9  # of frames without a mass
+            bodies[0].add_freejoint()
+            for mesh in self.spec.meshes:
+                mesh.file = self._in_package(mesh.file)
+        self.root = self._alone()
         self._remove_visuals()
-        free = [j for j in self.spec.joints if j.type == mujoco.mjtJoint.mjJNT_FREE]
-        if not free or free[0].parent.parent.name != self.spec.worldbody.name:
-            bodies = self.spec.worldbody.bodies
-            first = (bodies[0].name or "without a name") if len(bodies) else "none"
-            raise InputError(
-                f"{path} has no floating base: its first body ({first}) is fixed to the world, so "
-                "the robot cannot walk. Give that body a <freejoint/>."
-            )
-        if len(free) > 1:
-            raise InputError(
-                f"{path} has {len(free)} floating bodies ({', '.join(j.parent.name for j in free)})"
-                "; a robot has one. Take the others out."
-            )
-        self.root = free[0].parent
         for k, body in enumerate(self.spec.bodies):
             body.name = body.name or ("trunk" if body is self.root else f"body {k}")
             body.gravcomp = 0.0
@@ -133,13 +150,49 @@ class _Reader:
 
     # ------------------------------------------------------------------------- the MJCF
 
+    def _alone(self) -> Any:
+        """The robot's trunk; what else is in its world is taken out."""
+        spec, free, hinge = self.spec, mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE
+        world = spec.worldbody
+
+        def has(body: Any, kind: Any) -> bool:
+            return any(j.type == kind for j in body.find_all("joint"))
+
+        floating = [b for b in world.bodies if any(j.type == free for j in b.joints)]
+        robots = [b for b in floating if has(b, hinge)]
+        if len(robots) > 1:
+            raise InputError(
+                f"{self.path} has {len(robots)} floating bodies with hinges "
+                f"({', '.join(b.name for b in robots)}); a robot has one. Take the others out."
+            )
+        if not floating:
+            first = (world.bodies[0].name or "without a name") if len(world.bodies) else "none"
+            raise InputError(
+                f"{self.path} has no floating base: its first body ({first}) is fixed to the "
+                "world, so the robot cannot walk. Give that body a <freejoint/>."
+            )
+        trunk = robots[0] if robots else floating[0]
+        for element in (*world.geoms, *world.sites, *(b for b in world.bodies if b != trunk)):
+            spec.delete(element)
+        return trunk
+
+    def _in_package(self, uri: str) -> str:
+        """File of a `package://` path, looked for in the folders above the robot's file."""
+        parts = Path(uri.partition("://")[2]).parts
+        for folder in self.path.resolve().parents if parts else ():
+            for file in (folder.joinpath(*parts), folder.joinpath(*parts[1:])):
+                if file.is_file():
+                    return str(file)
+        return uri
+
     def _remove_visuals(self) -> None:
         """Take out what is only shown, and meshes whose files are not there."""
         spec, types = self.spec, mujoco.mjtGeom
         folder = (self.path.parent / (spec.meshdir or "")).resolve()
         missing = {
             m.name or Path(m.file).stem
-            for m in spec.meshes if m.file and not (folder / m.file).is_file()
+            for m in spec.meshes
+            if m.file and (m.file.endswith(".dae") or not (folder / m.file).is_file())
         }  # fmt: skip
         touching = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
         lost, massless = [], []
@@ -170,8 +223,8 @@ class _Reader:
             spec.delete(element)
         if lost:
             self.notes.append(
-                f"Meshes of {self.path.name} that collide are not there ({_list(lost)}); the robot "
-                f"is built without them. They belong into {folder}."
+                f"Meshes of {self.path.name} that collide are not there, or not STL or OBJ "
+                f"({_list(lost)}); the robot is built without them. They belong into {folder}."
             )
         if massless:
             self.notes.append(
@@ -214,8 +267,12 @@ class _Reader:
                 for name in self._matching(pattern, hinges, "pose", "hinge"):
                     positions[original.joint(name).qposadr[0]] = angle
         elif names:
-            self.notes.append(f"The default pose is the keyframe '{names[0]}' of {self.path.name}.")
-            return original.key_qpos[0].copy()
+            chosen = next((k for k, n in enumerate(names) if n.lower() in _STANDING), 0)
+            others = [n for n in names if n and n != names[chosen]]
+            name = f"keyframe '{names[chosen]}'" if names[chosen] else "first keyframe"
+            also = f"; it has {_list(others)}, too: `pose` names another" if others else ""
+            self.notes.append(f"The default pose is the {name} of {self.path.name}{also}.")
+            return original.key_qpos[chosen].copy()
         else:
             self.notes.append(
                 f"{self.path.name} has no keyframe and there is no `pose`: the default pose is all "
@@ -283,9 +340,10 @@ class _Reader:
             spec.delete(joint)
         for joint in spec.joints:
             if joint.type != free:
-                # the servo's friction, inertia and damping are all of the joint's
+                # the servo's friction, inertia, damping and torque limit are all of the joint's
                 joint.damping, joint.stiffness = np.zeros(3), np.zeros(3)
                 joint.frictionloss = joint.armature = 0.0
+                joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         for k, geom in enumerate(spec.geoms):
             geom.name = geom.name or f"geom {k}"
 
@@ -325,8 +383,10 @@ class _Reader:
         for k, name in enumerate(self.joints):
             joint = model.joint(name)
             limited = bool(joint.limited[0])
-            low[k], high[k] = joint.range if limited else (-np.pi, np.pi)
             pose[k] = self.resting[original.joint(name).qposadr[0]]
+            low[k], high[k] = joint.range if limited else (-np.pi, np.pi)
+            if high[k] - low[k] > 2 * np.pi + 1e-6:  # no servo turns farther
+                low[k], high[k] = pose[k] - np.pi, pose[k] + np.pi
         outside = [
             f"{n} ({p:g}, limits {a:g} to {b:g})"
             for n, p, a, b in zip(self.joints, pose, low, high, strict=True)
@@ -348,25 +408,38 @@ class _Reader:
 
     def _lowest(self, geom: int) -> float:
         """Height of the lowest point of a geom as it is placed."""
+        return float(self._stands_on(geom)[0][2])
+
+    def _stands_on(self, geom: int) -> tuple[Array, Array]:
+        """Lowest point of a geom as it is placed, and the point about which it rolls there.
+
+        That is the middle of a ball, the lower end of an upright limb, the middle of a lying one.
+        """
         model, data = self.model, self.data
         size, kind = model.geom_size[geom], mujoco.mjtGeom(model.geom_type[geom])
-        down = -data.geom_xmat[geom].reshape(3, 3)[2]  # in the geom's frame
-        types = mujoco.mjtGeom
-        if kind == types.mjGEOM_SPHERE:
-            reach = size[0]
-        elif kind == types.mjGEOM_CAPSULE:
-            reach = size[0] + size[1] * abs(down[2])
-        elif kind == types.mjGEOM_CYLINDER:
-            reach = size[0] * np.hypot(down[0], down[1]) + size[1] * abs(down[2])
-        elif kind == types.mjGEOM_ELLIPSOID:
-            reach = np.linalg.norm(size * down)
-        elif kind == types.mjGEOM_MESH:
+        at, axes = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
+        types, down, radius = mujoco.mjtGeom, -axes[2], 0.0  # down in the geom's frame
+        ends = np.zeros(3)  # half of the straight edges along its axes
+        if kind == types.mjGEOM_MESH:
             mesh = model.geom_dataid[geom]
             first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-            reach = (model.mesh_vert[first : first + count] @ down).max()
+            points = at + model.mesh_vert[first : first + count] @ axes.T
+            low = points[:, 2].min()
+            sole = points[points[:, 2] < low + _SAME_SOLE * np.ptp(points, axis=0).max()]
+            middle = 0.5 * (sole.min(axis=0) + sole.max(axis=0))
+            return np.array([*middle[:2], low]), middle
+        if kind == types.mjGEOM_SPHERE:
+            radius = size[0]
+        elif kind == types.mjGEOM_CAPSULE:
+            radius, ends[2] = size[0], size[1]
+        elif kind == types.mjGEOM_CYLINDER:
+            radius, ends[2] = size[0] * np.hypot(down[0], down[1]), size[1]
+        elif kind == types.mjGEOM_ELLIPSOID:
+            radius = np.linalg.norm(size * down)
         else:
-            reach = np.abs(size * down).sum()
-        return float(data.geom_xpos[geom][2] - reach)
+            ends[:] = size
+        point = at + axes @ (ends * np.clip(down / _LYING, -1.0, 1.0))
+        return np.array([*point[:2], at[2] - radius - np.abs(ends * down).sum()]), point
 
     # ------------------------------------------------------------------------- feet
 
@@ -423,21 +496,37 @@ class _Reader:
         low = {body: self._lowest(geoms[0]) for body, geoms in by_body.items()}
         ground = min(low.values())
         near = [b for b, z in low.items() if z - ground < _SAME_HEIGHT * abs(ground)]
-        above: set[int] = {model.body(self.root.name).id}
-        for b in near:
-            while b:
-                b = int(model.body_parentid[b])
-                above.add(b)
+        above = {int(model.body(self.root.name).id)}
+        above = above.union(*map(self._ancestors, near))
         # of a chain of bodies, the last one that is so low
         ends = sorted(b for b in near if b not in above)
         if not ends:
-            raise InputError(
-                f"{self.path}: in the default pose its lowest geom is of the trunk, so no feet "
-                "were found. Give `feet` and `pose` in the YAML."
+            raise self._no_feet("its lowest geom is of the trunk, so no feet were found")
+        if beyond := [model.body(b).name for b in ends if self._carries_joints(b)]:
+            raise self._no_feet(
+                f"its lowest geoms are of {_list(beyond)}, which carry further joints and are no "
+                "feet"
             )
         feet = {model.body(b).name: self._soles(by_body[b]) for b in ends}
         self.notes.append(f"Feet, by the lowest geoms: {', '.join(feet)}.")
         return feet
+
+    def _no_feet(self, why: str) -> InputError:
+        return InputError(
+            " ".join([f"{self.path}: in the default pose {why}.", *self.notes])
+            + " Give the `pose` in which it stands, or `feet`, in the YAML."
+        )
+
+    def _carries_joints(self, body: int) -> bool:
+        """Whether servos turn bodies that hang on this one."""
+        return any(body in self._ancestors(int(self.model.joint(n).bodyid[0])) for n in self.joints)
+
+    def _ancestors(self, body: int) -> set[int]:
+        above = set()
+        while body:
+            body = int(self.model.body_parentid[body])
+            above.add(body)
+        return above
 
     # ------------------------------------------------------------------------- the body
 
@@ -450,11 +539,22 @@ class _Reader:
                 f"{self.where}: only one foot ({', '.join(names)}) was found; a robot "
                 "that walks has two or more. Give `feet` in the YAML."
             )
-        feet_at = self._middles()
+        feet_at = self.feet_at = np.array(
+            [
+                np.mean([self._stands_on(g)[1] for g in geoms], axis=0)
+                for geoms in self.feet.values()
+            ]
+        )
         soles = np.array([self._lowest(geoms[0]) for geoms in self.feet.values()])
         height = -float(soles.min())
         if not height > 0:
             raise InputError(f"{self.path}: the feet are not below the trunk in the default pose.")
+        if not _HEIGHTS_M[0] < height < _HEIGHTS_M[1]:
+            raise InputError(
+                f"{self.path}: the trunk stands {height:.3g} m above the ground. Lengths are in "
+                "metres: scale the file if they are in another unit."
+            )
+        self._bound_inertias(height)
         chains = [self._above(b) for b in self.foot_bodies]
         shared = Counter(j for chain in chains for j in chain)
         chains = [[j for j in chain if shared[j] == 1] for chain in chains]  # without a spine
@@ -478,12 +578,28 @@ class _Reader:
                     else ""
                 )
             )
+        if idle := [n for n, leg in zip(self.joints, leg_of, strict=True) if leg < 0]:
+            self.notes.append(
+                f"Servos that move no foot alone hold the pose: {_list(idle)}. A leg among them "
+                "is not on the ground in the default pose."
+            )
+        self._compare_names(leg_of, feet_at)
+        kinematics = self._kinematics()
+        joints_at = self._inverse(kinematics, chains, height)
         commands = self.settings.commands.model_dump(exclude_none=True)
+        for axis, (name, way) in enumerate(_WAYS.items()):
+            asked = np.eye(3)[axis] * _STEP * height
+            feet = kinematics(joints_at((feet_at + asked)[None], np.zeros((1, len(names)))))[0]
+            if name not in commands and (feet - feet_at)[:, axis].mean() < _REACHED * asked.max():
+                commands[name] = [0.0, 0.0]
+                self.notes.append(
+                    f"The legs cannot step {way}: no command asks for it. `forward` names the axis "
+                    "in front, `commands` the ranges."
+                )
         xml = self._xml_writer(names)
         hashes = {"robot": sha256(self.path)}
         if self.config is not None:
             hashes["robot_config"] = sha256(self.config)
-        kinematics = self._kinematics()
 
         def fallen(qpos: Array, gravity: Array, ground: Ground) -> NDArray[np.bool_]:
             above = qpos[:, 2] - ground.height(qpos[:, 0], qpos[:, 1])
@@ -495,13 +611,48 @@ class _Reader:
             feet_at=feet_at, sole_m=feet_at[:, 2] - soles, offsets=self._offsets(names, feet_at),
             mirror_joints=joints, mirror_signs=signs, mirror_feet=feet_image,
             standing_height_m=height, mass_kg=float(model.body_mass.sum()), xml=xml,
-            feet_in_trunk=kinematics, joints_at=self._inverse(kinematics, chains, height),
+            feet_in_trunk=kinematics, joints_at=joints_at,
             touches_ground=fallen,
             foot_geoms=tuple(model.geom(g).name for geoms in self.feet.values() for g in geoms),
             trunk=self.root.name, servo_of=self._servo_of(),
             commands={name: (ends[0], ends[1]) for name, ends in commands.items()},
             notes=tuple(self.notes), hashes=hashes,
         )  # fmt: skip
+
+    def _bound_inertias(self, height: float) -> None:
+        """Replace inertias that no body of this robot's size can have, as placeholders are."""
+        model = self.model
+        most = np.maximum(model.body_mass * _WIDEST**2, _NEGLIGIBLE * model.body_mass.sum())
+        most *= height**2
+        wide = [model.body(b).name for b in np.flatnonzero(model.body_inertia.max(axis=1) > most)]
+        for name in wide:
+            part = self.spec.body(name)
+            part.fullinertia = np.full(6, np.nan)
+            part.inertia = np.full(3, model.body(name).mass[0] * (_USUAL_GYRATION * height) ** 2)
+        if wide:
+            self.notes.append(
+                f"Inertias of {_list(wide)} are those of bodies {_WIDEST:g} times as wide as the "
+                "robot is high, or more, and were replaced by those of usual links: state theirs."
+            )
+
+    def _compare_names(self, leg_of: NDArray[np.intp], feet_at: Array) -> None:
+        """Note where legs are called left and front by another axis than the one in front."""
+        signs, places = [], []
+        for leg, place in enumerate(feet_at[:, :2] - feet_at[:, :2].mean(axis=0)):
+            names = [self.joints[j] for j in np.flatnonzero(leg_of == leg)] + [list(self.feet)[leg]]
+            found = [{k for k, w in words.items() if any(map(w.search, names))} for words in _SIDES]
+            if all(len(side) == 1 for side in found):
+                signs.append([side.pop() for side in found])
+                places.append(place)
+        x, y = np.reshape(places, (-1, 2)).T
+        turns = [np.column_stack(pair) for pair in ((x, y), (y, -x), (-x, -y), (-y, x))]
+        fits = [bool((np.sign(p) == signs).all()) for p in turns] if signs else []
+        if any(fits) and not fits[0]:
+            axis = _AXES[(_AXES.index(self.settings.forward) + fits.index(True)) % 4]
+            self.notes.append(
+                f"By the names of its legs the front is where {axis} points: if so, write "
+                f"`forward: {axis}`."
+            )
 
     def _above(self, body: int) -> list[int]:
         """Joints between trunk and a body, its own included, from the trunk on."""
@@ -519,9 +670,11 @@ class _Reader:
         """Of each foot."""
         return [int(self.model.geom_bodyid[geoms[0]]) for geoms in self.feet.values()]
 
-    def _middles(self) -> Array:
-        """Each foot's place in the world: the middle of the geoms that it stands on."""
-        return np.array([self.data.geom_xpos[geoms].mean(axis=0) for geoms in self.feet.values()])
+    def _in_body(self, points: Array) -> Array:
+        """Points of the feet's bodies, in these bodies' frames; shape (feet, 3)."""
+        data, bodies = self.data, self.foot_bodies
+        turns = data.xmat[bodies].reshape(-1, 3, 3)
+        return ((points - data.xpos[bodies])[:, None] @ turns)[:, 0]
 
     def _kinematics(self, away: Sequence[float] = (0.0, 0.0, 0.0)):
         """Feet in the trunk's frame as a function of joint angles, without MuJoCo.
@@ -530,11 +683,10 @@ class _Reader:
         """
         model, data, bodies = self.model, self.data, self.foot_bodies
         self._place(self.pose)
-        # in the frames of their bodies
-        offsets = np.array(away) @ data.xmat[bodies].reshape(-1, 3, 3)
+        fixed = self._in_body(self.feet_at + away)
         self._place(np.zeros(len(self.joints)))
         turns = data.xmat[bodies].reshape(-1, 3, 3)
-        feet = self._middles() + (turns @ offsets[..., None])[..., 0]
+        feet = data.xpos[bodies] + (turns @ fixed[..., None])[..., 0]
         # the joint next to the foot turns it first
         chains = [self._above(b)[::-1] for b in bodies]
         rounds = []
@@ -674,12 +826,13 @@ class _Reader:
         feet_geoms = {model.geom(g).name for geoms in self.feet.values() for g in geoms}
         for site in list(spec.sites):
             spec.delete(site)
-        for name, body_id, geoms in zip(names, self.foot_bodies, self.feet.values(), strict=True):
+        for name, body_id, geoms, point in zip(
+            names, self.foot_bodies, self.feet.values(), self._in_body(self.feet_at), strict=True
+        ):
             places, reach = model.geom_pos[geoms], model.geom_rbound[geoms]
-            middle = places.mean(axis=0)
-            radius = (np.linalg.norm(places - middle, axis=1) + _TOUCH * reach).max()
+            radius = (np.linalg.norm(places - point, axis=1) + _TOUCH * reach).max()
             spec.body(model.body(body_id).name).add_site(
-                name=f"foot_{name}", pos=middle, type=mujoco.mjtGeom.mjGEOM_SPHERE, group=4,
+                name=f"foot_{name}", pos=point, type=mujoco.mjtGeom.mjGEOM_SPHERE, group=4,
                 size=[float(radius), 0, 0],
             )  # fmt: skip
             spec.add_sensor(

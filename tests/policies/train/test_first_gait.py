@@ -183,6 +183,7 @@ def test_a_poor_gait_is_searched_where_there_is_time_and_the_user_reads_why(monk
     cases = (
         (GOOD, tiny_run(), False, "score 0.80, 100 % of 0.15 m/s forward"),
         (BAD, tiny_run(), True, "What limits it most is their dry friction"),
+        (BAD, tiny_run(), True, "`task.commands.forward_m_s` of -0.1 to 0.1"),
         (BAD, tiny_run(minutes=1.0), False, "was left out"),
         (GOOD, tiny_run(first_gait="fit"), True, "2.5 Hz, duty 0.70, lift 20 mm"),
         (replace(GOOD, forward_share=0.85), tiny_run(), True, "Searching"),
@@ -194,3 +195,15 @@ def test_a_poor_gait_is_searched_where_there_is_time_and_the_user_reads_why(monk
         found = with_first_gait(run, said.append)
         assert (found.task.trot == FITTED) == searched and (searched or found is run), sentence
         assert sentence in " ".join(said), sentence
+
+
+def test_a_robot_that_does_not_even_stand_is_said_to():
+    def sentence(**changes: float) -> str:
+        task = Walking(commands=Commands(forward_m_s=(-0.2, 0.6)))
+        after = replace(BAD, **changes)
+        return first_gait._sentence(
+            FirstGait(before=BAD, trot=FITTED, after=after, limit=None), task
+        )
+
+    assert "falls even where it is to stand" in sentence(standing_falls=0.5)
+    assert "stand" not in sentence() and "-0.1 to 0.3) are easier" in sentence()

@@ -153,7 +153,9 @@ def test_feet_may_be_meshes_beside_the_file_and_names_of_the_walk_may_be_taken(
     model = compiled(body(tmp_path, xml))
     assert model.nmesh == 1 and (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).sum() == 4
     (tmp_path / "parts" / "paw.obj").unlink()
-    with pytest.raises(InputError, match=r"are not there \(paw\).* belong into .*parts"):
+    with pytest.raises(
+        InputError, match=r"are not there, or not STL or OBJ \(paw\).* belong into .*parts"
+    ):
         body(tmp_path, xml.replace('<geom type="box"', '<geom contype="0" conaffinity="0"'))
 
 
@@ -304,3 +306,145 @@ def test_two_legs_walk_by_turns_and_joints_without_a_servo_are_fixed(tmp_path):
     assert len(own.joints) == 4 and any("fixed: front_left_roll" in n for n in own.notes)
     np.testing.assert_array_equal(own.offsets, [0.0, 0.5])
     assert own.together == () and own.apart == ((0, 1),)
+
+
+SHANK = '<geom type="{0}" size="{1}" pos="0 0 -0.05"/>'
+
+
+@pytest.mark.parametrize(
+    ("geom", "radius"),
+    [
+        (SHANK.format("capsule", "0.01 0.05"), 0.01),
+        (SHANK.format("box", "0.01 0.01 0.05"), 0.0),
+        (SHANK.format("cylinder", "0.01 0.05"), 0.0),
+    ],
+)
+def test_a_leg_stands_on_the_end_of_its_last_limb_not_on_the_middle_of_it(tmp_path, geom, radius):
+    own = body(tmp_path, legged(PLACES).replace(BALL, geom), "{}")
+    # two limbs of 0.1 m straight down; a capsule's round end is beyond that
+    np.testing.assert_allclose(own.feet_at[:, 2], -0.2)
+    np.testing.assert_allclose(own.sole_m, radius, atol=1e-12)
+    bent = body(tmp_path, legged(PLACES).replace(BALL, geom))
+    ends = body(tmp_path, legged(PLACES))  # with a ball at that end
+    near = np.hypot(0.01, 0.01) if radius == 0.0 else 1e-9
+    assert np.linalg.norm(bent.feet_at - ends.feet_at, axis=1).max() <= near
+
+
+URDF = """<robot name="dog"><link name="base"/><joint name="f" type="fixed"><parent link="base"/>
+<child link="torso"/></joint><link name="torso"><inertial><mass value="1"/><inertia ixx=".01"
+iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>{}</robot>"""
+LIMB = """<link name="{0}"><inertial><mass value=".05"/><inertia ixx="{i}" iyy="{i}" izz="{i}"
+ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="{0}_{axis}" type="revolute"><parent
+link="{1}"/><child link="{0}"/><origin xyz="{at}"/><axis xyz="{turns}"/><limit lower="-1.5"
+upper="1.5" effort="0.01" velocity="1"/></joint>"""
+PAW = """<link name="{0}_paw"><inertial><mass value=".001"/><inertia ixx="1e-7" iyy="1e-7" izz="1e-7"
+ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry><mesh filename="package://dog/meshes/paw.obj"/>
+</geometry></collision></link><joint name="{0}_tip" type="fixed"><parent link="{0}_shank"/><child
+link="{0}_paw"/><origin xyz="0 0 -.1"/></joint>"""
+
+
+def urdf(inertia: float = 1e-5) -> str:
+    """A quadruped whose knees bend, from a base without a mass, with paws that are meshes."""
+    limbs = ""
+    for n, (fore, side) in PLACES.items():
+        at = f"{0.12 * fore} {0.09 * side} 0"
+        for name, above, place, axis, turns in (
+            (f"{n}_hip", "torso", at, "roll", "1 0 0"), (f"{n}_thigh", f"{n}_hip", "0 0 0", "pitch",
+            "0 1 0"), (f"{n}_shank", f"{n}_thigh", "0 0 -.1", "knee", "0 1 0"),
+        ):  # fmt: skip
+            limbs += LIMB.format(name, above, at=place, axis=axis, turns=turns, i=inertia)
+        limbs += PAW.format(n)
+    return URDF.format(limbs)
+
+
+def of_urdf(folder: Path, text: str) -> Body:
+    (folder / "dog" / "meshes").mkdir(parents=True, exist_ok=True)
+    (folder / "dog" / "meshes" / "paw.obj").write_text(CUBE)
+    robot, config = folder / "dog" / "dog.urdf", folder / "dog.yaml"
+    robot.write_text(text)
+    paws = ", ".join(f"{n}_paw" for n in PLACES)
+    config.write_text(f'pose: {{"*_pitch": 0.7, "*_knee": -1.4}}\nfeet: [{paws}]\n')
+    body_of.cache_clear()
+    return body_of(str(robot), str(config))
+
+
+def test_a_urdf_is_a_robot_whose_base_is_free_with_the_torque_of_its_servos(tmp_path):
+    own = of_urdf(tmp_path, urdf())
+    assert len(own.joints) == 12 and own.mirror_joints is not None
+    assert own.mass_kg == pytest.approx(1 + 12 * 0.05 + 4 * 0.001, abs=1e-4)
+    model = compiled(own)
+    assert model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE and model.nmesh == 1
+    assert not model.jnt_actfrclimited.any()  # its efforts of 0.01 N·m are not the servos'
+
+
+def test_inertias_that_are_placeholders_are_replaced_and_said(tmp_path):
+    own = of_urdf(tmp_path, urdf(inertia=1.0))  # of a link of 50 g: 4.5 m in radius
+    assert any("Inertias of front_left_hip" in note for note in own.notes)
+    assert compiled(own).body_inertia.max() <= 0.05
+    assert not any("Inertias" in note for note in of_urdf(tmp_path, urdf()).notes)
+
+
+def test_a_ball_and_stairs_beside_the_robot_are_taken_out(tmp_path):
+    ball = '<worldbody><geom type="box" size="1 1 0.05"/><body name="ball"><freejoint/>{}</body>'
+    key = '<keyframe><key name="up" qpos="{} 0 0 0.2 1 0 0 0 {}"/></keyframe>'
+    bent = [x for n in PLACES for x in ("0", "0.7", "-1.4" if "left" in n else "1.4")]
+    xml = legged(PLACES, more=key.format("1 0 0 1 0 0 0", " ".join(bent)))
+    xml = xml.replace("<worldbody>", ball.format('<geom size="0.05"/>'))
+    own, alone = body(tmp_path, xml, "{}"), body(tmp_path)
+    assert own.joints == alone.joints and own.mass_kg == pytest.approx(alone.mass_kg)
+    np.testing.assert_allclose(own.pose, alone.pose)
+    assert compiled(own).ngeom == compiled(alone).ngeom
+
+
+@pytest.mark.parametrize(
+    ("xml", "config", "words"),
+    [
+        (legged(PLACES).replace("-0.1", "-100"), POSE, "Lengths are in metres"),
+        # thighs up: the lowest geoms are of the hips
+        (legged(PLACES).replace('diaginertia="1e-5 1e-5 1e-5"/><joint name="', 'diaginertia="1e-5 '
+         '1e-5 1e-5"/><geom size="0.04"/><joint name="', 4), 'pose: {"*_pitch": 2.0}\n',
+         "front_left_hip, front_right_hip, rear_left_hip, rear_right_hip, which carry further"),
+    ],
+)  # fmt: skip
+def test_poses_and_lengths_with_which_nothing_walks_are_refused(tmp_path, xml, config, words):
+    with pytest.raises(InputError) as refused:
+        body(tmp_path, xml, config)
+    assert words in str(refused.value)
+
+
+def test_what_the_names_of_legs_say_about_the_front_is_compared_with_the_axis(tmp_path):
+    def noted(**turned: tuple[int, int]) -> list[str]:
+        own = body(tmp_path, legged(turned, mirrored=False), "{}")
+        return [note for note in own.notes if "By the names" in note]
+
+    assert not noted(FL=(1, 1), FR=(1, -1), RL=(-1, 1), RR=(-1, -1))
+    assert not noted(a=(1, 1), b=(1, -1), c=(-1, 1), d=(-1, -1))
+    (note,) = noted(FL=(-1, -1), FR=(-1, 1), RL=(1, -1), RR=(1, 1))
+    assert "`forward: -x`" in note
+    (note,) = noted(left_hind=(-1, -1), right_hind=(1, -1), left_fore=(-1, 1), right_fore=(1, 1))
+    assert "`forward: y`" in note
+
+
+def test_legs_that_only_swing_get_no_commands_sideways(tmp_path):
+    fixed = "joints: ['*_pitch', '*_knee']\n" + POSE
+    own = body(tmp_path, config=fixed)
+    assert own.commands == {"sideways_m_s": (0.0, 0.0)}
+    assert any("cannot step sideways" in note for note in own.notes)
+    stated = body(tmp_path, config=fixed + "commands: {sideways_m_s: [-0.1, 0.1]}\n")
+    assert stated.commands == {"sideways_m_s": (-0.1, 0.1)}
+    assert body(tmp_path).commands == {}
+
+
+def test_a_joint_that_turns_on_and_on_has_a_servos_turn_about_its_pose(tmp_path):
+    own = body(tmp_path, legged(PLACES).replace('range="-1 2"', 'range="-10 30"'))
+    pitch = own.joints.index("front_left_pitch")
+    assert (own.low[pitch], own.high[pitch]) == pytest.approx((0.7 - np.pi, 0.7 + np.pi))
+
+
+def test_of_several_keyframes_that_to_stand_in_is_the_pose(tmp_path):
+    keys = "".join(
+        f'<key name="{name}" qpos="0 0 0.2 1 0 0 0 {" ".join([f"0 {angle} 0"] * 4)}"/>'
+        for name, angle in (("folded", 1.5), ("home", 0.25))
+    )
+    own = body(tmp_path, legged(PLACES, more=f"<keyframe>{keys}</keyframe>"), "{}")
+    assert own.pose[1] == 0.25 and any("it has folded, too" in note for note in own.notes)
