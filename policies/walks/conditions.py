@@ -298,7 +298,9 @@ def share_of_usual(task: Walking) -> Array:
     Of the Mini Pupper at most 1; those of another robot are its own, as large as they are.
     """
     largest, usual = (np.abs(_ranges(c)).max(axis=1) for c in (task.commands, RANDOM))
-    share = np.where(largest > 0, largest / usual, task.body.command_scale)
+    share = largest / usual
+    if not share.all():
+        share = np.where(share > 0, share, task.body.command_scale)
     return share if task.robot else np.minimum(share, 1.0)
 
 
