@@ -20,7 +20,22 @@ from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from support.legged import legged
 from support.refusals import assert_each_refused
+
+
+def test_commands_are_as_far_within_a_robots_ranges_as_usual_ones_within_theirs(tmp_path):
+    dog = tmp_path / "dog.xml"
+    dog.write_text(legged({"a": (1, 1), "b": (1, -1), "c": (-1, 1), "d": (-1, -1)}))
+    own = Commands((0.0, 0.4), (0.0, 0.0), (-1.0, 1.0))
+    usual = np.array([[0.15, 0.08, 0.4], [-0.15, -0.08, -0.4]])
+    task = replace(TASK, commands=own, robot=str(dog))
+    found = within(task, usual)
+    # never backward, never sideways
+    np.testing.assert_allclose(found, [[0.3, 0.0, 0.8], [0.0, 0.0, -0.8]])
+    # errors of what no command asks for count as on a Mini Pupper of this size
+    assert share_of_usual(task)[1] == task.body.command_scale[1] > 1.0
+
 
 SERVOS = servo_ranges(SAMPLES / "calibrated.yaml")
 TASK = evaluation_task(Walking())
