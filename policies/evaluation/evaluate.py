@@ -54,6 +54,7 @@ from pupper_sysid.policies.walks.rollouts import (
     tracking_errors,
 )
 from pupper_sysid.policies.walks.together import walk_together
+from pupper_sysid.sim.robot.mini_pupper import MASS_KG
 from pupper_sysid.sim.robot.terrain import STAIRS_M, Terrain
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.differences import TYPICAL, Differences
@@ -529,13 +530,8 @@ def evaluate(
     """
     plain = evaluation_task(task)
     cases = (RANDOM, *cases)
-    if task.robot:  # commands as far within its ranges as usual ones are within theirs
-        cases = tuple(
-            c
-            if c.command is None
-            else replace(c, command=tuple(within(plain, np.array(c.command)).tolist()))
-            for c in cases
-        )
+    if task.robot:
+        cases = tuple(_for_robot(case, plain) for case in cases)
     conditions = [c.condition(plain, robots(c, w), w) for c in cases for w in WALKERS]
     walks = walk_together(
         policy, servos, conditions, plain.episode_s, seed, threads, Recorder, progress
@@ -554,6 +550,29 @@ def evaluate(
         episode_s=plain.episode_s, seed=seed, actuator=servos.source, feedback=feedback,
         conditions=tuple(rows), falls=tuple(falls),
     )  # fmt: skip
+
+
+def _for_robot(case: Case, task: Walking) -> Case:
+    """A case of another robot than the Mini Pupper, as hard for it by its size and weight.
+
+    Commands are as far within its ranges as usual ones are within theirs.
+    """
+    body, handicap, name = task.body, case.handicap, case.name
+    if case.command is not None:
+        command = within(task, np.array(case.command)).tolist()
+        case = replace(case, command=(command[0], command[1], command[2]))
+    push_m_s = handicap.push_m_s * float(body.command_scale[0])
+    payload_kg = handicap.payload_kg * body.mass_kg / MASS_KG
+    ahead_m, left_m = (body.scale * at for at in handicap.payload_at_m)
+    if push_m_s:
+        name = f"pushes of {push_m_s:.2g} m/s"
+    if payload_kg:
+        side = f"{100 * left_m:.0f} cm left" if left_m else f"{-100 * ahead_m:.0f} cm behind"
+        name = f"{1e3 * payload_kg:.0f} g, {side}"
+    scaled = replace(
+        handicap, push_m_s=push_m_s, payload_kg=payload_kg, payload_at_m=(ahead_m, left_m)
+    )
+    return replace(case, name=name, handicap=scaled)
 
 
 def usual_robots(episodes: int) -> Callable[[Case, Walker], int]:

@@ -91,7 +91,8 @@ def impose(robots: RobotBatch, ids: NDArray[np.intp], handicap: Handicap) -> Non
     if handicap.weak_leg != 1.0 or handicap.friction is not None:
         robots.write(ids)
     if handicap.payload_kg:
-        _load(robots, ids, handicap.payload_kg, np.array([*handicap.payload_at_m, _ABOVE_M]))
+        above_m = _ABOVE_M * robots.body.scale
+        _load(robots, ids, handicap.payload_kg, np.array([*handicap.payload_at_m, above_m]))
     if handicap.slope_deg:
         size = np.linalg.norm(robots.model.opt.gravity)
         robots.field("opt.gravity")[ids] = size * handicap.gravity_direction
@@ -102,7 +103,7 @@ def impose(robots: RobotBatch, ids: NDArray[np.intp], handicap: Handicap) -> Non
 
 def _load(robots: RobotBatch, ids: NDArray[np.intp], mass_kg: float, at: Array) -> None:
     """Fix a point mass to the trunk."""
-    trunk = robots.model.body("trunk").id
+    trunk = robots.model.body(robots.body.trunk).id
     mass, place, axes, inertia = (
         robots.field(name) for name in ("body_mass", "body_ipos", "body_iquat", "body_inertia")
     )

@@ -429,7 +429,7 @@ class RobotBatch:
 
     def _highest_under(self, place: Array) -> Array:
         """Highest ground under a robot at `place`, shape (n,) [m]."""
-        x, y = np.meshgrid([-0.1, 0.0, 0.1], [-0.1, 0.0, 0.1])
+        x, y = np.meshgrid(*[self.body.scale * np.array([-0.1, 0.0, 0.1])] * 2)
         return self.ground.height(place[:, :1] + x.ravel(), place[:, 1:] + y.ravel()).max(axis=1)
 
 

@@ -22,8 +22,9 @@ from pupper_sysid.policies.walks.conditions import DIRECTIONS, RANDOM, Condition
 from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.mini_pupper import MASS_KG
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.config import Curriculum, Walking
+from pupper_sysid.sim.walking.config import Curriculum, Walking, for_robot
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from support.legged import legged
 from support.walks import walk
 
 CALIBRATION = str(SAMPLES / "calibrated.yaml")
@@ -178,3 +179,20 @@ def test_intervals_are_over_episodes():
     half = abs(found.error[0, 2] - found.error[1, 2]) / 2
     assert own.value == pytest.approx(found.error[:, 2].mean())
     assert own.high - own.value == pytest.approx(6.3138 * half, rel=1e-4)
+
+
+def test_the_battery_is_as_hard_for_another_robot_by_its_size_and_weight(tmp_path):
+    dog = tmp_path / "dog.xml"
+    dog.write_text(legged({"a": (1, 1), "b": (1, -1), "c": (-1, 1), "d": (-1, -1)}))
+    task = for_robot(Walking(episode_s=0.1), dog, None)
+    body, groups = task.body, ("push", "payload", "stairs")
+    cases = [case for case in BATTERY if case.group in groups]
+    servos = servo_ranges("ideal", "ideal", body)
+    rows = evaluate(None, task, servos, cases, battery_robots(2), 0, 1).conditions[1:]
+    # loads of a third of the Mini Pupper's weight, in lengths of its height
+    grams = f"{1e3 * 0.15 * body.mass_kg / MASS_KG:.0f} g"
+    assert [row.name for row in rows if row.group == "payload"] == [
+        f"{grams}, {4 * body.scale:.0f} cm left", f"{grams}, {8 * body.scale:.0f} cm behind",
+    ]  # fmt: skip
+    pushed = next(row.name for row in rows if row.group == "push")
+    assert pushed == f"pushes of {0.4 * body.scale**0.5:.2g} m/s"

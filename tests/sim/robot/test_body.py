@@ -340,7 +340,8 @@ upper="1.5" effort="0.01" velocity="1"/></joint>"""
 PAW = """<link name="{0}_paw"><inertial><mass value=".001"/><inertia ixx="1e-7" iyy="1e-7"
 izz="1e-7" ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry>
 <mesh filename="package://dog/meshes/paw.obj"/></geometry></collision></link>
-<joint name="{0}_tip" type="fixed"><parent link="{0}_shank"/><child link="{0}_paw"/><origin xyz="0 0 -.1"/></joint>"""
+<joint name="{0}_tip" type="fixed"><parent link="{0}_shank"/><child link="{0}_paw"/>
+<origin xyz="0 0 -.1"/></joint>"""
 
 
 def urdf(inertia: float = 1e-5) -> str:
