@@ -133,9 +133,10 @@ class Match:
     def table(self) -> list[dict[str, str | float]]:
         """One row per kind of joint, or joint of another robot, and frequency: gain and phase."""
         rows: list[dict[str, str | float]] = []
-        kinds = KINDS if self.joints == JOINT_NAMES else self.joints
-        for kind in kinds:
-            legs = [i for i, name in enumerate(self.joints) if name.endswith(kind)]
+        kinds = {name: [i] for i, name in enumerate(self.joints)}
+        if self.joints == JOINT_NAMES:
+            kinds = {kind: list(range(k, len(self.joints), 3)) for k, kind in enumerate(KINDS)}
+        for kind, legs in kinds.items():
             observer, actuator = (h[:, legs].mean(axis=1) for h in (self.observer, self.actuator))
             phases = [np.degrees(np.unwrap(np.angle(h))) for h in (observer, actuator)]
             rows += [

@@ -279,16 +279,18 @@ class CommandRanges(_Part):
         within = self.clip(commands)
         changed = np.flatnonzero((within != commands).any(axis=1))
         if len(changed):
-            first = (" ".join(f"{v:g}" for v in x[changed[0]]) for x in (commands, within))
-            which = "command {} was clipped to {},".format(*first)
+            first = (" ".join(f"{v:.3g}" for v in x[changed[0]]) for x in (commands, within))
+            which = "The command {} was clipped to {},".format(*first)
             if len(commands) > 1:
                 which = f"{len(changed)} of {len(commands)} commands were clipped to"
-            say(f"The {which} what the policy was trained for ({self}).")
+            say(f"{which} what the policy was trained for ({self}).")
         return within
 
     def __str__(self) -> str:
         axes = zip(("forward", "left", "turn"), self._ends, ("m/s", "m/s", "rad/s"), strict=True)
-        return ", ".join(f"{name} {low:g} to {high:g} {unit}" for name, (low, high), unit in axes)
+        return ", ".join(
+            f"{name} {low:.3g} to {high:.3g} {unit}" for name, (low, high), unit in axes
+        )
 
 
 class RobotReference(_Part):

@@ -47,7 +47,7 @@ class Paces:
         # a trot with noise: robots at rest would have other contacts
         step = 2 * np.pi * env.trot.frequency_hz * env.config.control_step_s
         self._phases = step * np.arange(_STRIDE)
-        self._noise = 0.05 * rng.standard_normal((_STRIDE, n, 12))
+        self._noise = 0.05 * rng.standard_normal((_STRIDE, n, len(env.default)))
         self._at = 0
         self._stepped(self._actions(5))
         begun = time.perf_counter()

@@ -152,26 +152,23 @@ class _Reader:
 
     def _alone(self) -> Any:
         """The robot's trunk; what else is in its world is taken out."""
-        spec, free, hinge = self.spec, mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE
-        world = spec.worldbody
-
-        def has(body: Any, kind: Any) -> bool:
-            return any(j.type == kind for j in body.find_all("joint"))
-
-        floating = [b for b in world.bodies if any(j.type == free for j in b.joints)]
-        robots = [b for b in floating if has(b, hinge)]
-        if len(robots) > 1:
-            raise InputError(
-                f"{self.path} has {len(robots)} floating bodies with hinges "
-                f"({', '.join(b.name for b in robots)}); a robot has one. Take the others out."
-            )
+        spec, world, joint = self.spec, self.spec.worldbody, mujoco.mjtJoint
+        floating = [b for b in world.bodies if any(j.type == joint.mjJNT_FREE for j in b.joints)]
+        hinged = [
+            b for b in floating if any(j.type == joint.mjJNT_HINGE for j in b.find_all("joint"))
+        ]
         if not floating:
             first = (world.bodies[0].name or "without a name") if len(world.bodies) else "none"
             raise InputError(
                 f"{self.path} has no floating base: its first body ({first}) is fixed to the "
                 "world, so the robot cannot walk. Give that body a <freejoint/>."
             )
-        trunk = robots[0] if robots else floating[0]
+        if len(hinged) > 1:
+            raise InputError(
+                f"{self.path} has {len(hinged)} floating bodies with hinges "
+                f"({', '.join(b.name for b in hinged)}); a robot has one. Take the others out."
+            )
+        trunk = (hinged or floating)[0]
         for element in (*world.geoms, *world.sites, *(b for b in world.bodies if b != trunk)):
             spec.delete(element)
         return trunk
@@ -500,26 +497,17 @@ class _Reader:
         above = above.union(*map(self._ancestors, near))
         # of a chain of bodies, the last one that is so low
         ends = sorted(b for b in near if b not in above)
-        if not ends:
-            raise self._no_feet("its lowest geom is of the trunk, so no feet were found")
-        if beyond := [model.body(b).name for b in ends if self._carries_joints(b)]:
-            raise self._no_feet(
-                f"its lowest geoms are of {_list(beyond)}, which carry further joints and are no "
-                "feet"
+        carrying = set().union(*(self._ancestors(model.joint(n).bodyid[0]) for n in self.joints))
+        low_bodies = ends or [int(model.body(self.root.name).id)]
+        if beyond := [model.body(b).name for b in low_bodies if b in carrying]:
+            why = (
+                f"in the default pose its lowest geoms are of {_list(beyond)}, on which joints hang"
             )
+            advice = "Give the `pose` in which it stands on its feet, or `feet`, in the YAML."
+            raise InputError(" ".join([f"{self.path}: {why}.", *self.notes, advice]))
         feet = {model.body(b).name: self._soles(by_body[b]) for b in ends}
         self.notes.append(f"Feet, by the lowest geoms: {', '.join(feet)}.")
         return feet
-
-    def _no_feet(self, why: str) -> InputError:
-        return InputError(
-            " ".join([f"{self.path}: in the default pose {why}.", *self.notes])
-            + " Give the `pose` in which it stands, or `feet`, in the YAML."
-        )
-
-    def _carries_joints(self, body: int) -> bool:
-        """Whether servos turn bodies that hang on this one."""
-        return any(body in self._ancestors(int(self.model.joint(n).bodyid[0])) for n in self.joints)
 
     def _ancestors(self, body: int) -> set[int]:
         above = set()

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pupper_sysid.policies.deploy.matches import FREQUENCIES_HZ, compare
+from pupper_sysid.policies.deploy.matches import FREQUENCIES_HZ, Match, compare
 from pupper_sysid.policies.deploy.stacks import HeldEncoder, SyntheticPD, Zero
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from support.observer_response import response
@@ -107,3 +107,11 @@ def test_table_has_a_row_for_every_kind_of_joint_and_frequency():
     assert last["observer_gain"] == pytest.approx(abs(expected), abs=0.01)
     assert last["actuator_gain"] == pytest.approx(abs(expected), abs=0.03)
     assert last["observer_phase_deg"] == pytest.approx(np.degrees(np.angle(expected)), abs=1)
+
+
+def test_the_table_of_another_robot_has_each_joint_by_its_own_name():
+    own, two = np.ones((1, 2), complex), np.array([[1.0, 3.0]], complex)
+    match = Match(np.array([1.0]), two, own, ("0", "10"))  # one name ends as the other
+    assert [(row["joints"], row["observer_gain"]) for row in match.table()] == [
+        ("0", 1.0), ("10", 3.0),
+    ]  # fmt: skip

@@ -6,8 +6,9 @@ import pytest
 from pupper_sysid.policies.train import speed
 from pupper_sysid.policies.train.learner import Ranks
 from pupper_sysid.policies.train.training import make_env
-from pupper_sysid.sim.walking.config import Walking
-from support.tiny_training import tiny_run
+from pupper_sysid.sim.walking.config import Walking, for_robot
+from support.legged import legged
+from support.tiny_training import CALIBRATION, tiny_run
 
 
 @pytest.fixture
@@ -44,6 +45,14 @@ def test_bare_physics_takes_the_steps_of_the_environment_and_leaves_it_where_it_
     environment_end = ends[1 if bare_first else 0]
     np.testing.assert_array_equal(batch.bind("qpos"), environment_end)
     assert (np.array(times) > 0).all()
+
+
+def test_a_robot_of_other_joints_is_timed_as_well(monkeypatch, tmp_path):
+    monkeypatch.setattr(speed, "SLICE_S", 0.001)
+    hexapod = tmp_path / "hexapod.xml"
+    hexapod.write_text(legged({f"{s}{k}": (1 - k, s) for s in (1, -1) for k in range(3)}))
+    paces = speed.Paces(make_env(tiny_run(task=for_robot(Walking(), hexapod, None)), Ranks()))
+    assert (paces.slices(1) > 0).all() and paces.env.action.shape[1] == 18
 
 
 def test_a_ratio_is_the_median_over_slices_with_their_middle_half():

@@ -109,7 +109,7 @@ def test_the_mini_puppers_own_file_makes_the_same_body(tmp_path):
         (None, "gait: gallop\n" + POSE, "gait 'gallop' is not known"),
         (None, "wheels: 4\n", "wheels"),
         (legged(PLACES).replace('size="0.01"', 'size="0.01" contype="0" conaffinity="0"'), POSE,
-         "lowest geom is of the trunk"),
+         "lowest geoms are of torso, on which joints hang"),
     ],
 )  # fmt: skip
 def test_what_a_robot_lacks_is_said_in_a_sentence(tmp_path, xml, config, words):
@@ -404,7 +404,7 @@ def test_a_ball_and_stairs_beside_the_robot_are_taken_out(tmp_path):
         # thighs up: the lowest geoms are of the hips
         (legged(PLACES).replace('diaginertia="1e-5 1e-5 1e-5"/><joint name="', 'diaginertia="1e-5 '
          '1e-5 1e-5"/><geom size="0.04"/><joint name="', 4), 'pose: {"*_pitch": 2.0}\n',
-         "front_left_hip, front_right_hip, rear_left_hip, rear_right_hip, which carry further"),
+         "front_left_hip, front_right_hip, rear_left_hip, rear_right_hip, on which joints hang"),
     ],
 )  # fmt: skip
 def test_poses_and_lengths_with_which_nothing_walks_are_refused(tmp_path, xml, config, words):
