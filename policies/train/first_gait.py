@@ -236,8 +236,8 @@ def _sentence(fitted: FirstGait, task: Walking) -> str:
         )
     slower = " to ".join(f"{end / 2:.2g}" for end in task.commands.forward_m_s)
     return (
-        f"No better open-loop gait than this was found for these servos.{why} Training begins with it; "
-        f"commands of less speed (`task.commands.forward_m_s` of {slower}) are easier."
+        f"No better open-loop gait than this was found for these servos.{why} Training begins with "
+        f"it; commands of less speed (`task.commands.forward_m_s` of {slower}) are easier."
     )
 
 
