@@ -58,17 +58,11 @@ _QUARTERS = {"y": -1, "-x": 2, "-y": 1}  # of a turn to the left, to x
 _AXES = ("x", "y", "-x", "-y")
 
 
-def _words(long: str, short: str) -> re.Pattern[str]:
-    """Finds a word, or its letter beside that of the other axis (as in FL, LF, RH)."""
-    return re.compile(rf"({long})|(?<![A-Za-z])({short})(?![A-Za-z])")
-
-
-_SIDES = (
-    {1: _words("[Ff]ront|[Ff]ore", "[LR]F|F[LR]"),
-     -1: _words("[Rr]ear|[Bb]ack|[Hh]ind", "[LR][BH]|LR|[RBH][LR]")},
-    {1: _words("[Ll]eft", "L[FRBH]|[FRBH]L"), -1: _words("[Rr]ight", "R[FBH]|[FRBH]R")},
-)  # fmt: skip
-"""What names say about the front and about the left."""
+_WORDS = {
+    "front": "F", "fore": "F", "rear": "B", "back": "B", "hind": "B", "left": "L", "right": "R"
+}  # fmt: skip
+_REAR = {"RL": "BL", "LR": "BL", "RR": "BR"}  # codes in which an R stands for the rear
+_CORNERS = {"FL": (1, 1), "FR": (1, -1), "BL": (-1, 1), "BR": (-1, -1)}
 _PARTS = ("bodies", "geoms", "sites", "cameras", "lights", "frames")
 _LEFT_RIGHT, _FRONT_BACK = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0])
 _TRAINING_ITERATIONS = 8  # of PGS, as of the Mini Pupper
@@ -625,16 +619,17 @@ class _Reader:
 
     def _compare_names(self, leg_of: NDArray[np.intp], feet_at: Array) -> None:
         """Note where legs are called left and front by another axis than the one in front."""
-        signs, places = [], []
-        for leg, place in enumerate(feet_at[:, :2] - feet_at[:, :2].mean(axis=0)):
-            names = [self.joints[j] for j in np.flatnonzero(leg_of == leg)] + [list(self.feet)[leg]]
-            found = [{k for k, w in words.items() if any(map(w.search, names))} for words in _SIDES]
-            if all(len(side) == 1 for side in found):
-                signs.append([side.pop() for side in found])
-                places.append(place)
-        x, y = np.reshape(places, (-1, 2)).T
-        turns = [np.column_stack(pair) for pair in ((x, y), (y, -x), (-x, -y), (-y, x))]
-        fits = [bool((np.sign(p) == signs).all()) for p in turns] if signs else []
+        away, corners = feet_at[:, :2] - feet_at[:, :2].mean(axis=0), {}
+        for leg, foot in enumerate(self.feet):
+            text = " ".join([foot, *(self.joints[j] for j in np.flatnonzero(leg_of == leg))])
+            codes = re.findall(r"(?<![A-Za-z])[FRBHL][LRFBH](?![A-Za-z])", text)
+            letters = {_WORDS[word] for word in re.findall("|".join(_WORDS), text.lower())}
+            letters |= set("".join(_REAR.get(code, code) for code in codes).replace("H", "B"))
+            if (corner := "".join(sorted(letters))) in _CORNERS:
+                corners[leg] = _CORNERS[corner]
+        x, y = away[list(corners)].T
+        turned = [np.column_stack(pair) for pair in ((x, y), (y, -x), (-x, -y), (-y, x))]
+        fits = [np.array_equal(np.sign(at).tolist(), [*corners.values()]) for at in turned]
         if any(fits) and not fits[0]:
             axis = _AXES[(_AXES.index(self.settings.forward) + fits.index(True)) % 4]
             self.notes.append(
