@@ -73,8 +73,8 @@ class Options:
     `teacher`: that teacher alone, for `--imitation.teacher runs/NAME`. The published presets always
     start from nothing."""
     robot: Path | None = None
-    """MJCF of another robot than the Mini Pupper 2: any with legs and position servos. Its task is
-    scaled by its size."""
+    """MJCF or URDF of another robot than the Mini Pupper 2: any with legs and position servos. Its
+    task is scaled by its size."""
     robot_config: Path | None = None
     """YAML beside it: joints, feet, pose, servos, gait, commands (docs/own_robot.md)."""
     name: str | None = None

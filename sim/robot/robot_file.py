@@ -1,4 +1,4 @@
-"""A walking robot from its MJCF and a few lines of YAML, with measured servos on its joints.
+"""A walking robot from its MJCF or URDF and a few lines of YAML, with measured servos on it.
 
     joints: [FR_hip_joint, …]      # by default those that position actuators or motors drive
     feet: [FR, FL, RR, RL]         # sites, geoms or bodies; by default the lowest geoms
@@ -91,12 +91,9 @@ class RobotFile(BaseModel):
 
 
 def body_from_file(path: Path, config: Path | None) -> Body:
-    """The body of a robot's MJCF.
-
-    `config` is its YAML.
-    """
+    """The body of a robot's MJCF or URDF; `config` is its YAML."""
     if not path.is_file():
-        raise InputError(f"There is no {path}. Give the robot's MJCF as `robot`.")
+        raise InputError(f"There is no {path}. Give the robot's MJCF or URDF as `robot`.")
     settings = RobotFile()
     if config is not None:
         if not config.is_file():
@@ -163,7 +160,8 @@ class _Reader:
                 f"({', '.join(b.name for b in hinged)}); a robot has one. Take the others out."
             )
         trunk = (hinged or floating)[0]
-        for element in (*world.geoms, *world.sites, *(b for b in world.bodies if b != trunk)):
+        others = [body for body in world.bodies if body != trunk]
+        for element in (*world.geoms, *world.sites, *spec.cameras, *others):
             spec.delete(element)
         return trunk
 

@@ -157,8 +157,8 @@ class Walking:
     """The walking task."""
 
     robot: str = ""
-    """MJCF of the robot; empty for the Mini Pupper 2. `pupper-train --robot` sets it, and scales
-    the task."""
+    """MJCF or URDF of the robot; empty for the Mini Pupper 2. `pupper-train --robot` sets it, and
+    scales the task."""
     robot_config: str = ""
     """YAML beside it (`sim.robot.robot_file`)."""
     episode_s: float = 20.0

@@ -519,7 +519,7 @@ def make_env(
     actuator : str or Path
         As for `pupper-train`: a calibration, a preset, a servo card, `ideal` or a servo model.
     robot : str or Path, optional
-        MJCF of another robot than the Mini Pupper 2.
+        MJCF or URDF of another robot than the Mini Pupper 2.
     robot_config : str or Path, optional
         YAML beside it (`sim.robot.robot_file`).
     preset : {"fast", "scratch", "paper", "release"}

@@ -386,7 +386,8 @@ def test_inertias_that_are_placeholders_are_replaced_and_said(tmp_path):
 
 
 def test_a_ball_and_stairs_beside_the_robot_are_taken_out(tmp_path):
-    ball = '<worldbody><geom type="box" size="1 1 0.05"/><body name="ball"><freejoint/>{}</body>'
+    ball = """<worldbody><camera mode="targetbody" target="ball"/><geom size="1"/>
+        <body name="ball"><freejoint/>{}</body>"""
     key = '<keyframe><key name="up" qpos="{} 0 0 0.2 1 0 0 0 {}"/></keyframe>'
     bent = [x for n in PLACES for x in ("0", "0.7", "-1.4" if "left" in n else "1.4")]
     xml = legged(PLACES, more=key.format("1 0 0 1 0 0 0", " ".join(bent)))
