@@ -522,7 +522,8 @@ def _score(walk: _Walked) -> GaitScore:
         mean_turn_error_rad_s=float(stride[..., 2].mean()),
         clearance_p10_m=float(np.quantile(clearance, 0.1)) if len(clearance) else 0.0,
         low_swing_share=_low(clearance / walk.length), saturated_share=walk.saturated,
-        standing_falls=_mean(~walk.up[-1, ~moves]), length_scale=walk.length,
+        standing_falls=float((~walk.up[-1, ~moves]).mean()) if not moves.all() else 0.0,
+        length_scale=walk.length,
     )  # fmt: skip
 
 

@@ -620,7 +620,7 @@ class _Reader:
         away, corners = feet_at[:, :2] - feet_at[:, :2].mean(axis=0), {}
         for leg, foot in enumerate(self.feet):
             text = " ".join([foot, *(self.joints[j] for j in np.flatnonzero(leg_of == leg))])
-            codes = re.findall(r"(?<![A-Za-z])[FRBHL][LRFBH](?![A-Za-z])", text)
+            codes: list[str] = re.findall(r"(?<![A-Za-z])[FRBHL][LRFBH](?![A-Za-z])", text)
             letters = {_WORDS[word] for word in re.findall("|".join(_WORDS), text.lower())}
             letters |= set("".join(_REAR.get(code, code) for code in codes).replace("H", "B"))
             if (corner := "".join(sorted(letters))) in _CORNERS:
