@@ -81,7 +81,7 @@ def rises_apart_s(model: mujoco.MjModel, servos: ExportedServos) -> float:
     of_joints = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     by_joint = {int(model.actuator_trnid[i, 0]): int(i) for i in np.flatnonzero(of_joints)}
     driving = [by_joint[model.joint(name).id] for name in names]
-    idle = np.setdiff1d(np.arange(model.nu), driving)
+    idle = np.setdiff1d(np.arange(model.nactuator), driving)
     model.actuator_gainprm[idle], model.actuator_biasprm[idle] = 0.0, 0.0
     data = mujoco.MjData(model)
     mujoco.mj_setConst(model, data)
@@ -91,7 +91,7 @@ def rises_apart_s(model: mujoco.MjModel, servos: ExportedServos) -> float:
         hold(model, data, i, float(position))
     h, moved = servos.physics_step_s, []
     for _ in range(round(LENGTH_S / h)):
-        data.ctrl[driving] = start + STEP_RAD
+        data.ctrl[model.actuator_ctrladr[driving]] = start + STEP_RAD
         mujoco.mj_step(model, data)
         moved.append(data.qpos[places] - start)
     times, wanted = h * np.arange(1, len(moved) + 1), STEP_RAD * (1 - np.exp(-1))

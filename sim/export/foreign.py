@@ -20,9 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from pupper_sysid.common.border import validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.cards.compare import Servo
-from pupper_sysid.servo_models.cards.numbers import TorquePD, stated
+from pupper_sysid.servo_models.cards.numbers import TorquePD
 from pupper_sysid.sim.export.mjcf import link_inertias
 from pupper_sysid.sim.robot.hinges import hinges_of
 
@@ -39,18 +40,18 @@ _WORDS = {
     "back_emf_nm_s_per_rad": ("viscous_friction", "viscous_damping", "back_emf"),
     "dead_time_s": ("dead_time_s",),
 }
-"""Numbers of a PD by the names that configurations have for them."""
+"""Numbers of a PD by the names that configurations have for them, in small letters."""
 _STEPS = (
     ("min_delay", "delay_min_lag", "delay_steps"),
     ("max_delay", "delay_max_lag", "delay_steps"),
 )
-_STEP_S = ("PHYSICS_DT", "SIM_DT", "physics_dt", "sim_dt", "dt", "timestep")
+_STEP_S = ("physics_dt", "sim_dt", "dt", "timestep")
 """A physics step, by the names that it has at the top of a file or in its simulator's settings."""
 _ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul,
     ast.Div: operator.truediv, ast.Pow: math.pow,
 }  # fmt: skip
-_NAMES = ("joint_names_expr", "target_names_expr")
+_NAMES = ("joint_names_expr", "target_names_expr", "joint_names")
 
 
 def foreign_servo(path: Path | str, joint: str | None = None) -> Servo:
@@ -84,7 +85,7 @@ def _compiled(path: Path) -> tuple[Any, dict[str, int]]:
     except ValueError as error:
         raise InputError(f"{path} cannot be compiled by MuJoCo: {in_a_line(error)}.") from None
     driven: dict[str, int] = {}
-    for i in range(model.nu):
+    for i in range(model.nactuator):
         affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
         on_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
         pid = model.actuator_dyntype[i] == getattr(mujoco.mjtDyn, "mjDYN_PID", -1)
@@ -106,9 +107,7 @@ def _driven_servo(path: Path, model: Any, name: str, i: int) -> Servo:
         "stiffness_nm_per_rad": -(gear**2) * model.actuator_biasprm[i, 1],
         "damping_nm_s_per_rad": gear**2 * abs(model.actuator_biasprm[i, 2]),
         "friction_loss_nm": model.dof_frictionloss[dof],
-        "armature_kg_m2": max(
-            float(model.dof_armature[dof]) + gear**2 * float(model.actuator_armature[i]), 1e-9
-        ),
+        "armature_kg_m2": model.dof_armature[dof] + gear**2 * model.actuator_armature[i],
         "effort_limit_nm": min(efforts),
         "back_emf_nm_s_per_rad": model.dof_damping[dof],
         "dead_time_s": model.actuator_delay[i],
@@ -126,7 +125,7 @@ def _driven_servo(path: Path, model: Any, name: str, i: int) -> Servo:
             "no servo has."
         )
     return Servo(
-        path.name, name, None, False, "servo", None, _pd(numbers),
+        path.name, name, None, False, "servo", None, _pd(path, numbers),
         link_kg_m2=link_inertias(model, [name])[name], notes=tuple(notes), as_it_stands=True,
         assumed=tuple(assumed),
     )  # fmt: skip
@@ -138,7 +137,7 @@ def _in_python(path: Path, joint: str | None) -> Servo:
     if not path.is_file() or path.stat().st_size > _LARGEST_BYTES:
         raise InputError(f"{path} is no Python file of a configuration.")
     try:
-        tree = ast.parse(path.read_text(encoding="utf-8"), path.name)
+        tree = ast.parse(path.read_text(encoding="utf-8-sig"), path.name)
     except (SyntaxError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is no Python that can be read: {error}.") from error
     # names at the top of the file that stand for literals, or for arithmetic with such names
@@ -147,7 +146,8 @@ def _in_python(path: Path, joint: str | None) -> Servo:
         name, value = _assigned(node)
         if name and (number := _value(value, literals)) is not None:
             literals[name] = number
-    groups = list(_groups(tree, literals))
+    literals_and_groups = (literals, *_groups(tree, literals))
+    constants, *groups = ({k.lower(): v for k, v in g.items()} for g in literals_and_groups)
     fitting = [
         group for group in groups
         if _first(group, _WORDS["stiffness_nm_per_rad"], joint) and _is_of(group, joint)
@@ -165,7 +165,7 @@ def _in_python(path: Path, joint: str | None) -> Servo:
     ends = [n for words in _STEPS if (n := _first(group, words, joint)) is not None]
     steps, between = float(np.mean(ends or [0.0])), " to ".join(f"{n:g}" for n in sorted({*ends}))
     if steps and numbers["dead_time_s"] is None:
-        lengths = {n for g in (literals, *groups) if (n := _first(g, _STEP_S, None)) is not None}
+        lengths = {n for g in (constants, *groups) if (n := _first(g, _STEP_S, None)) is not None}
         if len(lengths) == 1:
             numbers["dead_time_s"] = steps * lengths.pop()
             notes += [f"{path.name} delays by {between} physics steps; their mean is compared."] * (
@@ -185,15 +185,25 @@ def _in_python(path: Path, joint: str | None) -> Servo:
             numbers[key] = stand_in
             assumed.append(key)
             notes.append(f"{path.name} states no {_WORDS[key][0]}; {stand_in:g} stands for it.")
+    if numbers["effort_limit_nm"] > _NO_LIMIT_NM:
+        notes.append(
+            f"{path.name} limits the effort at {numbers['effort_limit_nm']:g} N·m only; "
+            f"{_NO_LIMIT_NM:g} N·m stand for it."
+        )
+        numbers["effort_limit_nm"] = _NO_LIMIT_NM
+        assumed.append("effort_limit_nm")
     known = {key: value for key, value in numbers.items() if value is not None}
     return Servo(
-        path.name, joint, None, False, "servo", None, _pd(known), notes=tuple(notes),
+        path.name, joint, None, False, "servo", None, _pd(path, known), notes=tuple(notes),
         as_it_stands=True, assumed=tuple(assumed),
     )  # fmt: skip
 
 
-def _pd(numbers: dict[str, Any]) -> TorquePD:
-    return TorquePD(model="delayed_pd", **{k: stated(float(v)) for k, v in numbers.items()})
+def _pd(path: Path, numbers: Mapping[str, float]) -> TorquePD:
+    plain = {key: float(value) for key, value in numbers.items()}
+    # a joint may have no armature, a servo has
+    plain["armature_kg_m2"] = max(plain["armature_kg_m2"], 1e-9)
+    return validated(TorquePD, {"model": "delayed_pd", **plain}, path)
 
 
 def _assigned(node: ast.stmt) -> tuple[str, ast.expr | None]:
@@ -211,8 +221,21 @@ def _value(node: ast.expr | None, literals: Mapping[str, Any]) -> Any:
         return None
     if isinstance(node, ast.Name):
         return literals.get(node.id)
-    if isinstance(node, ast.Attribute) and ast.unparse(node) in ("math.pi", "np.pi", "torch.pi"):
-        return np.pi
+    if isinstance(node, ast.Attribute):
+        if ast.unparse(node) in ("math.pi", "np.pi", "torch.pi"):
+            return np.pi
+        settings = _value(node.value, literals)  # of an object made with keyword arguments
+        return settings.get(node.attr) if isinstance(settings, dict) else None
+    if isinstance(node, ast.Call):
+        keywords = {k.arg: k.value for k in node.keywords if k.arg}
+        if isinstance(made := keywords.get("default_factory"), ast.Lambda):
+            return _value(made.body, literals)
+        if isinstance(node.func, ast.Name) and node.func.id == "reflected_inertia":  # mjlab's
+            sides = [*node.args, *keywords.values()]
+            numbers = [_value(side, literals) for side in sides]
+            if len(sides) == 2 and all(isinstance(n, int | float) for n in numbers):
+                return float(numbers[0]) * float(numbers[1]) ** 2
+        return {name: _value(value, literals) for name, value in keywords.items()} or None
     if isinstance(node, ast.Dict):
         entries = zip(node.keys, node.values, strict=True)
         return {_value(k, literals): _value(v, literals) for k, v in entries if k is not None}
@@ -237,15 +260,29 @@ def _groups(tree: ast.Module, literals: dict[str, Any]) -> Iterator[dict[str, An
     def value_of(node: ast.expr) -> Any:
         return _value(node, literals)
 
+    bodies: dict[ast.ClassDef, dict[str, Any]] = {
+        node: {
+            name: value_of(value)
+            for inner in node.body
+            for name, value in (_assigned(inner),)
+            if name and value is not None
+        }
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+    }
+    gains = {*_WORDS["stiffness_nm_per_rad"]}
+    of_servos = {node.name for node, body in bodies.items() if gains & body.keys()}
+    classes: dict[str, dict[str, Any]] = {}
     for node in tree.body:
         if isinstance(node, ast.ClassDef):  # settings in nested classes, as of legged_gym
-            yield {
-                name: value_of(value)
-                for inner in ast.walk(node)
-                if isinstance(inner, ast.stmt)
-                for name, value in (_assigned(inner),)
-                if name and value is not None
-            }
+            bases = [classes.get(base.id, {}) for base in node.bases if isinstance(base, ast.Name)]
+            settings = {key: value for base in bases[::-1] for key, value in base.items()}
+            for part in ast.walk(node):
+                if isinstance(part, ast.ClassDef):  # others have a ground's friction
+                    other = () if part.name in of_servos else ("friction", "damping")
+                    settings |= {k: v for k, v in bodies[part].items() if k not in other}
+            classes[node.name] = settings
+    yield from reversed(classes.values())
     named = {name: value for node in tree.body for name, value in (_assigned(node),) if name}
 
     def wraps(call: ast.AST) -> ast.Call | None:
@@ -273,22 +310,28 @@ def _groups(tree: ast.Module, literals: dict[str, Any]) -> Iterator[dict[str, An
                     yield value | {"joint_names_expr": [name]}
 
 
-def _is_of(group: dict[str, Any], joint: str | None) -> bool:
-    names = next((group[n] for n in _NAMES if isinstance(group.get(n), list | tuple)), None)
-    if joint is None or names is None:
-        return True
-    return any(_matches(n, joint) for n in names if isinstance(n, str))
+def _names(group: Mapping[str, Any]) -> list[str] | None:
+    """Names or patterns of the joints that a group is of; None if it does not say."""
+    names = next((group[n] for n in _NAMES if isinstance(group.get(n), list | tuple | str)), None)
+    return [names] if isinstance(names, str) else names and [n for n in names if isinstance(n, str)]
 
 
-def _first(group: dict[str, Any], words: tuple[str, ...], joint: str | None) -> float | None:
+def _is_of(group: Mapping[str, Any], joint: str | None) -> bool:
+    names = _names(group)
+    return joint is None or names is None or any(_matches(name, joint) for name in names)
+
+
+def _first(group: Mapping[str, Any], words: tuple[str, ...], joint: str | None) -> float | None:
     """The first of some names that is a number, or one for the joint."""
     for word in words:
-        value = group.get(word)
+        value, names = group.get(word), _names(group) or []
         if isinstance(value, dict):
             fitting = [v for k, v in value.items() if joint is None or _matches(str(k), joint)]
-            # legged_gym's keys are parts of names
-            fitting += [v for k, v in value.items() if joint is not None and str(k) in joint]
+            # legged_gym's keys are parts of names, of which the last counts
+            fitting += [v for k, v in [*value.items()][::-1] if joint and str(k) in joint]
             value = fitting[0] if fitting else None
+        elif isinstance(value, list | tuple) and len(value) == len(names):  # in their order
+            value = next((v for n, v in zip(names, value, strict=True) if n == joint), None)
         if isinstance(value, int | float) and not isinstance(value, bool):
             return float(value)
     return None

@@ -250,7 +250,10 @@ def _inlined(path: Path, root_folder: Path | None = None, depth: int = 0) -> Ele
     for parent in list(root.iter()):
         for place, child in reversed(list(enumerate(parent))):
             if child.tag == "include":
-                included = _inlined(folder / child.get("file", ""), folder, depth + 1)
+                file = folder / child.get("file", "")
+                if not file.exists():  # as MuJoCo, which looks beside the including file then
+                    file = path.parent / child.get("file", "")
+                included = _inlined(file, folder, depth + 1)
                 parent.remove(child)
                 for n, element in enumerate(included):
                     parent.insert(place + n, element)
@@ -292,6 +295,10 @@ def _put_servos(root: Element, servos: ExportedServos, model: Path, group: str) 
             if target in counts:
                 counts[target] += 1
                 section.remove(element)
+                if instance := element.get("instance"):  # of a plugin, which no other can have
+                    for plugin in root.iter("plugin"):
+                        for state in plugin.findall(f"instance[@name='{instance}']"):
+                            plugin.remove(state)
                 if actuator_name := element.get("name"):
                     removed[actuator_name] = pids[target]
                 if counts[target] == 1:
@@ -366,14 +373,17 @@ def _place_assets(root: Element, model: Path, out: Path) -> None:
     """Make the folders of assets relative to the new file."""
     if model.resolve().parent == out.resolve().parent:
         return
+    here, there = model.resolve().parent, out.resolve().parent
+    for attached in root.iter("model"):
+        attached.set("file", os.path.relpath(here / attached.get("file", ""), there))
     compilers = list(root.iter("compiler")) or [ElementTree.SubElement(root, "compiler")]
     settings = {k: v for c in compilers for k, v in c.attrib.items()}
     for compiler in compilers:
         for key in ("assetdir", "meshdir", "texturedir"):
             compiler.attrib.pop(key, None)
     for key in ("meshdir", "texturedir"):
-        folder = model.resolve().parent / settings.get(key, settings.get("assetdir", ""))
-        compilers[-1].set(key, os.path.relpath(folder, out.resolve().parent))
+        folder = here / settings.get(key, settings.get("assetdir", ""))
+        compilers[-1].set(key, os.path.relpath(folder, there))
 
 
 def _actuators(root: Element) -> list[Element]:
@@ -395,19 +405,24 @@ def _keyframes(
     commanded = {
         e.get("joint"): n for n, e in reversed([*enumerate(before)]) if e.tag in ("position", "pid")
     }
+    # those of attached models are in no element, and are behind all others
+    now = [*_actuators(root), *range(len(before), compiled.nactuator)]
     for k, key in enumerate(keys):
         ctrl, act = [], []
-        for element in _actuators(root):
-            joint = element.get("joint", "")
-            if id(element) in places:
-                old = places[id(element)]
-                ctrl.append(float(compiled.key_ctrl[k, old]))
-                first, count = compiled.actuator_actadr[old], compiled.actuator_actnum[old]
-                act += compiled.key_act[k, first : first + count].tolist() if count else []
+        for actuator in now:
+            old = actuator if isinstance(actuator, int) else places.get(id(actuator))
+            if old is not None:
+                # several of each in one actuator, or none
+                for values, kept, kind in ((ctrl, "key_ctrl", "ctrl"), (act, "key_act", "act")):
+                    first, count = (
+                        getattr(compiled, f"actuator_{kind}{end}")[old] for end in ("adr", "num")
+                    )
+                    values += getattr(compiled, kept)[k, first : first + count].tolist()
                 continue
+            joint = actuator.get("joint", "")
             at = float(compiled.key_qpos[k, compiled.joint(joint).qposadr[0]])
             if key.get("ctrl") is not None and joint in commanded:
-                at = float(compiled.key_ctrl[k, commanded[joint]])
+                at = float(compiled.key_ctrl[k, compiled.actuator_ctrladr[commanded[joint]]])
             ctrl.append(at)
             servo = servos.calibration.joint(joint).actuator
             act += [at] if np.isfinite(servo.velocity_limit_rad_s.value) else []
@@ -464,7 +479,7 @@ def compiled_numbers(model: Any, servos: ExportedServos) -> dict[str, tuple[Any,
             "delay": (model.actuator_delay[i], servo.dead_time_s),
             "forcerange": (model.actuator_forcerange[i, 1], servo.effort_limit),
             "gear": (model.actuator_gear[i], np.eye(6)[0]),
-            "ctrllimited": (model.actuator_ctrllimited[i], 0),
+            "ctrllimited": (model.actuator_ctrllimited[model.actuator_ctrladr[i]], 0),
             "actlimited": (model.actuator_actlimited[i], 0),
             "armature of the actuator": (model.actuator_armature[i], 0.0),
             "damping of the actuator": (model.actuator_damping[i], 0.0),

@@ -137,7 +137,7 @@ def hold(model: Any, data: Any, index: int, position_rad: float) -> None:
     """
     from pupper_sysid.sim.robot.engine import mujoco
 
-    data.ctrl[index] = position_rad
+    data.ctrl[model.actuator_ctrladr[index]] = position_rad
     if model.actuator_actnum[index]:
         data.act[model.actuator_actadr[index]] = position_rad
     line = np.full((int(model.actuator_history[index][0]), 1), float(position_rad))

@@ -79,15 +79,47 @@ STYLES = {
         "  class asset:\n    armature = 0.001\n    effort_limit = 1.5\n",
         (9.0, 0.1, 1.5),
     ),
+    "legged_gym of a base, beside the ground's friction": (
+        "class Base:\n  class control:\n    stiffness = {'hip': 7.0, 'LF': 9.0}\n"
+        "    damping = {'LF': 0.2}\n  class terrain:\n    friction = 1.0\n    damping = 3.0\n"
+        "class Mine(Base):\n  class control(Base.control):\n    damping = {'LF': 0.3}\n",
+        (9.0, 0.3, 100.0),
+    ),
+    "one pattern as text, and an effort beyond any hobby servo's": (
+        "A = Cfg(joint_names_expr='.*_hip', stiffness=1.0, damping=1.0)\n"
+        "B = Cfg(joint_names_expr='.*_thigh', stiffness=9.0, damping=0.1, effort_limit=300)\n",
+        (9.0, 0.1, 100.0),
+    ),
+    "mjlab's actuator as an object": (
+        "HIP = ElectricActuator(reflected_inertia=reflected_inertia(1e-4, 6), effort_limit=23.7)\n"
+        "K = HIP.reflected_inertia * 62.8**2\nA = BuiltinPositionActuatorCfg(target_names_expr="
+        "('.*_thigh',), stiffness=K, damping=0.5, effort_limit=HIP.effort_limit)\n",
+        (3.6e-3 * 62.8**2, 0.5, 23.7),
+    ),
+    "playground, with a byte order mark": (
+        "\ufeffdef config():\n  return create(sim_dt=0.004, Kp=35.0, Kd=0.5)\n",
+        (35.0, 0.5, 100.0),
+    ),
+    "lists in the order of names": (
+        "class C:\n  joint_names = ['a', 'LF_thigh']\n  stiffness = [1.0, 2.0]\n"
+        "  damping = [0.1, 0.2]\n  armature = 0\n",
+        (2.0, 0.2, 100.0),
+    ),
+    "dataclass": (
+        "@dataclass\nclass C:\n  stiffness: dict = field(default_factory=lambda: {'LF': 4.0})\n"
+        "  damping: float = 0.4\n  effort_limit: float = 2.0\n",
+        (4.0, 0.4, 2.0),
+    ),
 }
 
 
 @pytest.mark.parametrize("style", STYLES)
 def test_the_common_styles_of_configurations_are_read(style, tmp_path):
     text, wanted = STYLES[style]
-    (tmp_path / "cfg.py").write_text(text)
+    (tmp_path / "cfg.py").write_text(text, encoding="utf-8")
     pd = foreign_servo(tmp_path / "cfg.py", "LF_thigh").pd.parameters
     assert (pd.stiffness, pd.damping, pd.effort_limit) == pytest.approx(wanted)
+    assert pd.friction_loss == 0.0 and pd.armature > 0
 
 
 LEG = "stiffness=20.0, damping=0.5, armature=0.001"
@@ -165,9 +197,10 @@ def test_files_without_a_servo_are_refused_with_the_way_out(tmp_path, capsys):
     (tmp_path / "robot.xml").write_text(ROBOT)
     (tmp_path / "cfg.py").write_text("A = make(stiffness=compute())\n")
     (tmp_path / "broken.py").write_text("def (\n")
+    (tmp_path / "negative.py").write_text("A = Cfg(stiffness=-3.0)\n")
     for name, cure in (
         ("robot.xml", "they drive hip"), ("cfg.py", "keyword arguments"),
-        ("broken.py", "no Python"),
+        ("broken.py", "no Python"), ("negative.py", "stiffness_nm_per_rad is not usable: -3"),
     ):  # fmt: skip
         words = ("servo", "diff", CALIBRATED, tmp_path / name, "--joint", "LF_hip")
         assert cure in refused(capsys, pupper_sysid, *words)

@@ -196,6 +196,59 @@ def test_a_servo_without_a_name_to_take_over_gets_one_that_is_free(calibration, 
     assert [model.actuator(i).name for i in range(model.nu)] == ["first", "LF_calf_", "LF_calf"]
 
 
+GRIPPER = (
+    '<mujoco><worldbody><body name="g"><joint name="finger"/><geom size=".01"/></body></worldbody>'
+    '<actuator><position joint="finger" kp="2"/></actuator></mujoco>'
+)
+ATTACHED = (
+    '<asset><model name="g" file="parts/g.xml"/></asset><worldbody><body><geom size=".1"/>'
+    '<attach model="g" body="g" prefix="r/"/></body></worldbody>'
+)
+PLUGIN = (
+    '<extension><plugin plugin="mujoco.pid"><instance name="p"/></plugin></extension>'
+    '<actuator><plugin joint="LF_hip" plugin="mujoco.pid" instance="p"/></actuator>'
+)
+TWO_COMMANDS = (  # position and velocity, and so two columns of a keyframe
+    '<tendon><fixed name="t"><joint joint="LF_calf" coef="1"/></fixed></tendon>'
+    '<actuator><pid tendon="t" kp="3"/><pid joint="LF_thigh" kp="2"/></actuator>'
+)
+NESTED = '<include file="parts/arm.xml"/>'
+PARTS = {
+    "g.xml": GRIPPER, "arm.xml": f'<mujocoinclude>{NESTED.replace("parts/arm", "own")}'
+    '</mujocoinclude>', "own.xml": f"<mujocoinclude>{OWN}</mujocoinclude>",
+}  # fmt: skip
+
+
+def key(qpos: str, ctrl: str) -> str:
+    return f'<keyframe><key qpos="0 0 0 1 0 0 0 {qpos}" ctrl="{ctrl}"/></keyframe>'
+
+
+@pytest.mark.parametrize(
+    ("extra", "commands"),
+    [
+        (ATTACHED + OWN + key(".1 .2 .3 .9", ".15 0 0 0 .7"), [0.15, 0.3, 0.2, 0.7]),
+        (PLUGIN + key(".1 .2 .3", ".5"), [0.1, 0.2, 0.3]),
+        (TWO_COMMANDS + key(".1 .2 .3", ".4 .5 .6 .7"), [0.4, 0.5, 0.6, 0.1, 0.3]),
+        (NESTED + key(".1 .2 .3", ".15 0 0 0"), [0.15, 0.3, 0.2]),
+    ],
+    ids=["attached gripper", "plugin", "two commands", "include beside an include"],
+)
+def test_models_of_several_parts_keep_what_is_not_the_servos(
+    extra, commands, calibration, tmp_path
+):
+    (tmp_path / "parts").mkdir()
+    for name, text in PARTS.items():
+        (tmp_path / "parts" / name).write_text(text)
+    (tmp_path / "robot.xml").write_text(robot(LINKS, actuators=extra))
+    out = tmp_path / "elsewhere" / "out.xml"
+    text, servos = to_model(calibration, tmp_path / "robot.xml", out)
+    out.write_text(text)
+    model = mujoco.MjModel.from_xml_path(str(out))
+    assert model.key_ctrl[0].tolist() == pytest.approx(commands)
+    for name, (compiled_number, written) in compiled_numbers(model, servos).items():
+        np.testing.assert_array_equal(compiled_number, written, err_msg=name)
+
+
 def test_actuators_on_tendons_are_no_servos_whatever_their_ids(calibration, tmp_path):
     tendon = (
         '<tendon><fixed name="first"><joint joint="LF_hip" coef="1"/></fixed></tendon><actuator>'
