@@ -77,32 +77,7 @@ class InputFile(Part):
 
 
 class Calibration(Part):
-    """Measured servos of one robot. Frozen; see the module's text.
-
-    Parameters
-    ----------
-    schema, schema_version : str, int
-        Kind of the file, and version of its format.
-    robot, created : str
-        Name of the robot; time of the calibration (UTC, ISO 8601).
-    inputs : tuple of InputFile
-        Recordings it was made from.
-    seed : int or None
-        Seed of its random numbers.
-    versions : dict of str to str
-        Versions of this project and of the libraries that shape its numbers.
-    units : str
-        Units of the numbers.
-    notes : tuple of str
-        Notes for the reader.
-    joints : dict of str to JointCalibration
-        The joints, by name.
-
-    Raises
-    ------
-    pydantic.ValidationError
-        If its parts do not fit each other; `load_calibration` raises `InputError`.
-    """
+    """Measured servos of one robot. Frozen; see the module's text."""
 
     schema_name: Annotated[Literal["pupper-calibration"], Field(alias="schema")] = SCHEMA
     """Kind of the file."""

@@ -27,6 +27,7 @@ from pupper_sysid.servo_models.calibration.parts import (
     NO_SPEED_LIMIT_RAD_S,
     NOT_STATED,
     P_GAINS,
+    PARAMETER_KEYS,
     Actuator,
     Armature,
     Feedback,
@@ -237,7 +238,7 @@ class ServoCard(Part):
         armature = pd.armature_kg_m2.value
         dead = pd.dead_time_s or Quantity(value=0.0, identified="no", why="the source has none")
         low, high = whole_steps(dead.interval.low, dead.interval.high, TIME_STEP_S)
-        torques = {
+        torques: dict[str, Any] = {
             "stiffness": pd.stiffness_nm_per_rad,
             "damping": pd.damping_nm_s_per_rad or _absent(),
             "friction_loss": pd.friction_loss_nm,
@@ -255,11 +256,7 @@ class ServoCard(Part):
                 delay_steps_min=low,
                 delay_steps_max=high,
                 physics_step_s=TIME_STEP_S,
-                stiffness_nm_per_rad=torques["stiffness"],
-                damping_nm_s_per_rad=torques["damping"],
-                friction_loss_nm=torques["friction_loss"],
-                effort_limit_nm=torques["effort_limit"],
-                back_emf_nm_s_per_rad=torques["back_emf"],
+                **{PARAMETER_KEYS[name]: quantity for name, quantity in torques.items()},
                 ratios_to_armature=RatiosToArmature(
                     **{n: stated(q.value / armature) for n, q in torques.items()}
                 ),

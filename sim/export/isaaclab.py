@@ -119,6 +119,7 @@ def to_isaaclab(servos: ExportedServos) -> str:
             ("max_delay", high),
         )
         groups.append(f'"{name}": {group}')
+    cost_mrad = 1e3 * max(servos.whole_step_costs().values())
     notes = (
         "ACTUATORS holds one group of CalibratedServo: delays of any fraction of a step, "
         "interpolated linearly, a latency of its own for each command where its jitter is known, "
@@ -127,7 +128,7 @@ def to_isaaclab(servos: ExportedServos) -> str:
         "them.",
         "WHOLE_STEP_ACTUATORS, DelayedPDActuatorCfg as it is released, has delays of whole steps: "
         "the measured interval rounded outward, one delay drawn per robot and reset. The nearest "
-        f"whole step is up to {1e3 * servos.cost_of_whole_steps():.1f} mrad off (RMS) at 4 Hz, "
+        f"whole step is up to {cost_mrad:.1f} mrad off (RMS) at 4 Hz, "
         "0.3 rad, and the set-point's speed is not limited.",
         "friction is a torque from Isaac Sim 5.0 on; 4.5 takes a coefficient there, so leave the "
         "friction lines out with it. viscous_friction of WHOLE_STEP_ACTUATORS is the back-EMF, "
@@ -190,7 +191,7 @@ def to_isaaclab_bam(servos: ExportedServos) -> str:
         "and R follow from stall torque and back-EMF at the supply voltage vin (1 V stands where "
         "the recording states none: only their ratio to it matters then).",
         "Delays are the nearest whole physics step: up to "
-        f"{1e3 * servos.cost_of_whole_steps():.1f} mrad off (RMS) at 4 Hz, 0.3 rad.",
+        f"{1e3 * max(servos.whole_step_costs().values()):.1f} mrad off (RMS) at 4 Hz, 0.3 rad.",
         *(f"Not represented: {words} ({', '.join(names)})." for words, names in lost.items()),
         "Not represented: backlash, which a calibration does not hold (`pupper-sysid backlash` "
         "measures it; give it as a play hinge), and the readings: see FEEDBACK, and HeldFeedback "

@@ -108,6 +108,7 @@ def to_mjlab(servos: ExportedServos) -> str:
         )
         low, high = whole_steps(delays[name].low, delays[name].high, step_s)
         bounds.append(f'"{name}": ({low}, {high}),')
+    cost_mrad = 1e3 * max(servos.whole_step_costs(BUILTIN_PD).values())
     notes = (
         "ACTUATORS holds one CalibratedServoCfg for all joints: delays of any fraction of a step, "
         "interpolated linearly, a latency of its own for each command where its jitter is known, "
@@ -115,7 +116,7 @@ def to_mjlab(servos: ExportedServos) -> str:
         "timestep to PHYSICS_DT and its integrator to implicitfast. Readings for the policy: "
         "`ObservationTermCfg(func=held_joint_pos)`; take velocities from their differences.",
         "WHOLE_STEP_ACTUATORS, BuiltinPositionActuatorCfg as it is released, has delays of the "
-        f"nearest whole step: up to {1e3 * servos.cost_of_whole_steps(BUILTIN_PD):.1f} mrad off "
+        f"nearest whole step: up to {cost_mrad:.1f} mrad off "
         "(RMS) at 4 Hz, 0.3 rad, and set-points of unlimited speed. The interval, rounded outward, "
         "is in DELAY_STEPS. The least and the greatest lag are equal on purpose: with two "
         "different ones mjlab draws a lag in every physics step, so that commands overtake each "

@@ -163,16 +163,12 @@ class ExportedServos:
         joints = self.calibration.joints.items()
         return [name for name, joint in joints if joint.holds_at.armature == "servo and load"]
 
-    def cost_of_whole_steps(self, engine: Engine = EXPLICIT_PD) -> float:
-        """Error of delays in whole steps at the sweeps' fastest tone [rad].
-
-        RMS of the worst joint at 4 Hz and 0.3 rad, of the motion by the nearest whole number of
-        steps beside the motion by the delay itself.
-        """
-        return max(self.whole_step_costs(engine).values())
-
     def whole_step_costs(self, engine: Engine = EXPLICIT_PD) -> dict[str, float]:
-        """The same of each joint [rad]."""
+        """Error of delays in whole steps at the sweeps' fastest tone, by joint [rad].
+
+        RMS at 4 Hz and 0.3 rad of the motion by the nearest whole number of steps beside the
+        motion by the delay itself.
+        """
         delays, h, turn = self.delays(engine), self.physics_step_s, 2 * np.pi * _FASTEST_HZ
         time = TIME_STEP_S * np.arange(round(0.75 / TIME_STEP_S))
         servo = self.moving.delayed_pd()
@@ -391,12 +387,12 @@ def torch_module(
     return (
         f"{docstring(f'Servos for {target}.', servos.head(None, *notes))}\n"
         "from __future__ import annotations\n\n"
-        "import math\nfrom collections.abc import Mapping, Sequence\n\n"
+        "import math\nfrom collections.abc import Callable, Mapping, Sequence\n\n"
         f"import torch\n{imports}\n\n"
         f"PHYSICS_DT = {servos.physics_step_s!r}\n"
         '"""Physics step that the delays below are made for [s]."""\n\n'
         f"{servos_block(servos)}\n"
         f"{feedback_block(servos.calibration)}"
         '"""What makes each joint\'s readings stale and quantised; `HeldFeedback` applies it."""\n'
-        f"\n\n{code[code.index('class SetPoint') :]}\n\n{actuators}"
+        f"\n\n{code[code.index('def _columns') :]}\n\n{actuators}"
     )

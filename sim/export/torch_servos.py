@@ -19,9 +19,16 @@ readings, since such servos measure none (`servo_models.held_feedback`).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
+
+
+def _columns(
+    numbers: Mapping[str, Mapping[str, float]], joint_names: Sequence[str], device: str
+) -> Callable[[str], torch.Tensor]:
+    """Numbers of all joints by their key, each of shape (joints,)."""
+    return lambda key: torch.tensor([numbers[name][key] for name in joint_names], device=device)
 
 
 class SetPoint:
@@ -45,9 +52,7 @@ class SetPoint:
         device: str = "cpu",
         generator: torch.Generator | None = None,
     ):
-        def column(key: str) -> torch.Tensor:
-            return torch.tensor([servos[name][key] for name in joint_names], device=device)
-
+        column = _columns(servos, joint_names, device)
         self.dead_time, self.jitter = column("dead_time_s"), column("jitter_s")
         self.jitter = torch.minimum(self.jitter, self.dead_time)  # its mean is in the dead time
         self.speed = column("velocity_limit_rad_s").clamp(max=1e9)  # beyond, at once
@@ -122,9 +127,7 @@ class HeldFeedback:
         device: str = "cpu",
         generator: torch.Generator | None = None,
     ):
-        def column(key: str) -> torch.Tensor:
-            return torch.tensor([feedback[name][key] for name in joint_names], device=device)
-
+        column = _columns(feedback, joint_names, device)
         self.period, self.loss = column("poll_period_s"), column("loss")
         self.quantum, self.offset = column("quantum_rad"), column("offset_rad")
         self.physics_dt, self.generator = physics_dt, generator
@@ -191,9 +194,7 @@ class ServoBank:
         physics_dt: float,
         device: str = "cpu",
     ):
-        def column(key: str) -> torch.Tensor:
-            return torch.tensor([servos[name][key] for name in joint_names], device=device)
-
+        column = _columns(servos, joint_names, device)
         self.stiffness, self.damping = column("stiffness"), column("damping")
         self.limit, self.brake = column("effort_limit"), column("back_emf")
         # a simulator's velocity is that of half a step ago, and MuJoCo brakes with the next one
