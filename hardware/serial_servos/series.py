@@ -76,10 +76,6 @@ class Series:
         """Entry of a register; `KeyError` if the series has none of this name."""
         return self.registers[self.name_of(name)]
 
-    def word(self, value: int) -> bytes:
-        """Two bytes of a register in this series' byte order; `value` must fit."""
-        return int(value).to_bytes(2, "big" if self.big_endian else "little")
-
     def decode(self, name: str, memory: bytes, start: int = 0) -> int:
         """Value of register `name` in `memory`, which starts at address `start`."""
         register = self.register(name)

@@ -89,7 +89,8 @@ def _compiled(path: Path) -> tuple[Any, dict[str, int]]:
         affine = model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE
         on_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
         pid = model.actuator_dyntype[i] == getattr(mujoco.mjtDyn, "mjDYN_PID", -1)
-        if on_joint and (affine or pid or model.actuator_biasprm[i, 1] < 0):
+        # a velocity actuator has no stiffness
+        if on_joint and (affine or pid) and model.actuator_biasprm[i, 1] < 0:
             driven.setdefault(model.joint(int(model.actuator_trnid[i, 0])).name, i)
     return model, driven
 
@@ -116,6 +117,9 @@ def _driven_servo(path: Path, model: Any, name: str, i: int) -> Servo:
     if 0 < speed < 1000:
         numbers["velocity_limit_rad_s"] = speed
     notes, assumed = [], []
+    on_joints = model.actuator_trntype == model.actuator_trntype[i]
+    if (several := int(np.sum(on_joints & (model.actuator_trnid[:, 0] == j)))) > 1:
+        notes.append(f"{path.name} drives {name} by {several} actuators; one is compared.")
     if min(efforts) == _NO_LIMIT_NM:
         assumed.append("effort_limit_nm")
         notes.append(f"{path.name} does not limit the effort; {_NO_LIMIT_NM:g} N·m stand for it.")
@@ -185,10 +189,10 @@ def _in_python(path: Path, joint: str | None) -> Servo:
             numbers[key] = stand_in
             assumed.append(key)
             notes.append(f"{path.name} states no {_WORDS[key][0]}; {stand_in:g} stands for it.")
-    if numbers["effort_limit_nm"] > _NO_LIMIT_NM:
+    if (effort := numbers["effort_limit_nm"] or 0.0) > _NO_LIMIT_NM:
         notes.append(
-            f"{path.name} limits the effort at {numbers['effort_limit_nm']:g} N·m only; "
-            f"{_NO_LIMIT_NM:g} N·m stand for it."
+            f"{path.name} limits the effort at {effort:g} N·m only; {_NO_LIMIT_NM:g} N·m stand "
+            "for it."
         )
         numbers["effort_limit_nm"] = _NO_LIMIT_NM
         assumed.append("effort_limit_nm")

@@ -405,12 +405,13 @@ def _keyframes(
     commanded = {
         e.get("joint"): n for n, e in reversed([*enumerate(before)]) if e.tag in ("position", "pid")
     }
+    servo_of = {place: e.get("joint", "") for place, e in enumerate(_actuators(root))}
+    now = [places.get(id(e)) for e in _actuators(root)]
     # those of attached models are in no element, and are behind all others
-    now = [*_actuators(root), *range(len(before), compiled.nactuator)]
+    now += range(len(before), compiled.nactuator)
     for k, key in enumerate(keys):
         ctrl, act = [], []
-        for actuator in now:
-            old = actuator if isinstance(actuator, int) else places.get(id(actuator))
+        for place, old in enumerate(now):
             if old is not None:
                 # several of each in one actuator, or none
                 for values, kept, kind in ((ctrl, "key_ctrl", "ctrl"), (act, "key_act", "act")):
@@ -419,7 +420,7 @@ def _keyframes(
                     )
                     values += getattr(compiled, kept)[k, first : first + count].tolist()
                 continue
-            joint = actuator.get("joint", "")
+            joint = servo_of[place]
             at = float(compiled.key_qpos[k, compiled.joint(joint).qposadr[0]])
             if key.get("ctrl") is not None and joint in commanded:
                 at = float(compiled.key_ctrl[k, compiled.actuator_ctrladr[commanded[joint]]])

@@ -106,11 +106,11 @@ def test_b5_3_a_late_reply_is_not_the_answer_to_the_next_read():
 
     def answer(request: Frame) -> list[tuple[float, bytes]]:
         delay = next(late, 0.0)
-        return [(delay, raw(1, STS3215.word(900 if delay else 123)))]
+        return [(delay, raw(1, STS3215.encode("present_position", 900 if delay else 123)))]
 
     with line_of(Scripted(answer), 0.02) as line:
         assert position(line, 1) is None
-        reply = raw(1, STS3215.word(900))
+        reply = raw(1, STS3215.encode("present_position", 900))
         assert wait_until(lambda: line._port.ser.in_waiting == len(reply))
         line.patience_s = 5.0
         assert position(line, 1) == 123
@@ -211,7 +211,7 @@ def test_b5_10_an_echoing_adapter_is_recognised_and_its_echo_is_no_answer(series
 
 
 def test_b5_11_an_error_byte_above_7f_is_read():
-    answer = raw(1, STS3215.word(123), code=0xA1)
+    answer = raw(1, STS3215.encode("present_position", 123), code=0xA1)
     with line_of(Scripted(lambda request: [(0.0, answer)])) as line:
         reply = line.read(1, POSITION, 2)
     assert reply and reply.frame.code == 0xA1

@@ -49,6 +49,18 @@ def test_class_defaults_and_damping_ratios_of_an_mjcf_are_resolved(tmp_path):
     assert servo.parameters.armature == pytest.approx(0.015)
 
 
+def test_a_velocity_actuator_is_no_servo_and_one_of_several_is_named(tmp_path):
+    speed = '<velocity joint="hip" kv="3"/>'
+    several = ROBOT.replace("<actuator>", f"<actuator>{speed}")
+    (tmp_path / "robot.xml").write_text(several)
+    servo = foreign_servo(tmp_path / "robot.xml")
+    assert servo.pd.parameters.stiffness == 20
+    assert any("by 2 actuators; one" in note for note in servo.notes)
+    (tmp_path / "robot.xml").write_text(several.replace('<position joint="hip" class="knee"/>', ""))
+    with pytest.raises(InputError, match="no position actuator drives a joint"):
+        foreign_servo(tmp_path / "robot.xml")
+
+
 def test_a_configuration_is_read_and_not_run(tmp_path):
     (tmp_path / "cfg.py").write_text(CONFIG)
     servo = foreign_servo(tmp_path / "cfg.py", "left_knee")
