@@ -16,6 +16,7 @@ import operator
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -181,6 +182,7 @@ def _in_python(path: Path, joint: str | None) -> Servo:
                 + ("ambiguous" if lengths else "missing")
                 + " there: state it as PHYSICS_DT (s)."
             )
+    numbers["armature_kg_m2"] = numbers["armature_kg_m2"] or None  # 0 stands for none
     for key, stand_in in (
         ("damping_nm_s_per_rad", 0.0), ("friction_loss_nm", 0.0), ("armature_kg_m2", 1e-4),
         ("effort_limit_nm", _NO_LIMIT_NM),
@@ -229,7 +231,7 @@ def _value(node: ast.expr | None, literals: Mapping[str, Any]) -> Any:
         if ast.unparse(node) in ("math.pi", "np.pi", "torch.pi"):
             return np.pi
         settings = _value(node.value, literals)  # of an object made with keyword arguments
-        return settings.get(node.attr) if isinstance(settings, dict) else None
+        return getattr(settings, node.attr, None) if isinstance(settings, SimpleNamespace) else None
     if isinstance(node, ast.Call):
         keywords = {k.arg: k.value for k in node.keywords if k.arg}
         if isinstance(made := keywords.get("default_factory"), ast.Lambda):
@@ -239,7 +241,9 @@ def _value(node: ast.expr | None, literals: Mapping[str, Any]) -> Any:
             numbers = [_value(side, literals) for side in sides]
             if len(sides) == 2 and all(isinstance(n, int | float) for n in numbers):
                 return float(numbers[0]) * float(numbers[1]) ** 2
-        return {name: _value(value, literals) for name, value in keywords.items()} or None
+        return SimpleNamespace(
+            **{name: _value(value, literals) for name, value in keywords.items()}
+        )
     if isinstance(node, ast.Dict):
         entries = zip(node.keys, node.values, strict=True)
         return {_value(k, literals): _value(v, literals) for k, v in entries if k is not None}
