@@ -126,6 +126,22 @@ class BamParameters(Part):
     """Trial of the search, as K-Scale writes it."""
 
 
+_BAM_NAMES = {
+    "armature_kg_m2": "armature", "friction_loss_nm": "friction_base",
+    "viscous_friction_nm_s_per_rad": "friction_viscous",
+    "stribeck_friction_nm": "friction_stribeck", "stribeck_speed_rad_s": "dtheta_stribeck",
+    "stribeck_exponent": "alpha", "load_friction_motor": "load_friction_motor",
+    "load_friction_load": "load_friction_external",
+    "load_stribeck_motor": "load_friction_motor_stribeck",
+    "load_stribeck_load": "load_friction_external_stribeck",
+    "load_quadratic_motor": "load_friction_motor_quad",
+    "load_quadratic_load": "load_friction_external_quad",
+    "velocity_limit_rad_s": "max_velocity", "dead_time_s": "command_delay",
+}  # fmt: skip
+"""Numbers of a `PositionLoop` and BAM's parameters that are the same."""
+_ON_TORQUE = ("load_friction_motor", "load_friction_external")
+
+
 def load_bam(path: Path) -> ServoCard:
     """A card of a BAM parameter file, with the constants of its actuator class."""
     data = read_json(path)
@@ -167,27 +183,17 @@ def from_bam(
     if p.error_gain_ratio == 0:
         raise InputError(f"{name}: error_gain_ratio is 0; it must be above 0. Fit it again.")
     ratio = 1.0 if p.error_gain_ratio is None else p.error_gain_ratio
-    load_frictions = p.load_friction_base, p.load_friction_stribeck
+    shared: dict[str, float | None] = dict.fromkeys(_ON_TORQUE, p.load_friction_base)
+    shared |= {f"{name}_stribeck": p.load_friction_stribeck for name in _ON_TORQUE}  # M3, M4
     numbers = {
         "duty_per_rad": kind.error_gain * ratio,
         "duty_limit": kind.duty_limit,
         "stall_torque_nm": p.kt / p.R * kind.supply_v,
         "back_emf_nm_s_per_rad": p.kt**2 / p.R,
-        "armature_kg_m2": p.armature,
-        "friction_loss_nm": p.friction_base,
-        "viscous_friction_nm_s_per_rad": p.friction_viscous,
-        "stribeck_friction_nm": p.friction_stribeck,
-        "stribeck_speed_rad_s": p.dtheta_stribeck,
-        "stribeck_exponent": p.alpha,
-        "load_friction_motor": _first(p.load_friction_motor, load_frictions[0]),
-        "load_friction_load": _first(p.load_friction_external, load_frictions[0]),
-        "load_stribeck_motor": _first(p.load_friction_motor_stribeck, load_frictions[1]),
-        "load_stribeck_load": _first(p.load_friction_external_stribeck, load_frictions[1]),
-        "load_quadratic_motor": p.load_friction_motor_quad,
-        "load_quadratic_load": p.load_friction_external_quad,
-        "velocity_limit_rad_s": p.max_velocity,
-        "dead_time_s": p.command_delay,
-    }
+    } | {
+        ours: shared.get(theirs) if (value := getattr(p, theirs)) is None else value
+        for ours, theirs in _BAM_NAMES.items()
+    }  # fmt: skip
     values = {key: stated(value) for key, value in numbers.items() if value is not None}
     return validated(
         PositionLoop, {"model": "position_loop", **values}, name, remedy="Fit it again."
@@ -361,19 +367,8 @@ def bam_card(calibration: Calibration) -> ServoCard:
         "dead_time_s": joint.actuator.dead_time_s.value,
         "velocity_limit_rad_s": block.velocity_limit_rad_s and block.velocity_limit_rad_s.value,
     }
-    if motor["model"] != "m1":
-        numbers |= {
-            "stribeck_friction_nm": motor["friction_stribeck"],
-            "stribeck_speed_rad_s": motor["dtheta_stribeck"],
-            "stribeck_exponent": motor["alpha"],
-        }
-    if motor["model"] == "m5":
-        numbers |= {
-            "load_friction_motor": motor["load_friction_motor"],
-            "load_friction_load": motor["load_friction_external"],
-            "load_stribeck_motor": motor["load_friction_motor_stribeck"],
-            "load_stribeck_load": motor["load_friction_external_stribeck"],
-        }
+    prefixes = {"m1": (), "m2": ("stribeck",), "m5": ("stribeck", "load_")}[motor["model"]]
+    numbers |= {k: motor.get(bam) for k, bam in _BAM_NAMES.items() if k.startswith(prefixes)}
     values = {key: stated(value) for key, value in numbers.items() if value is not None}
     return ServoCard(
         name="calibration",
@@ -414,22 +409,15 @@ def _frictions(numbers: PositionLoop) -> tuple[str, dict[str, Any]]:
         if not slow:
             return "m3", frictions
         return "m4", stribeck | frictions | {"load_friction_stribeck": slow_pair[1]}
-    frictions = stribeck | {
-        "load_friction_motor": motor,
-        "load_friction_external": external,
-        "load_friction_motor_stribeck": slow_pair[0],
-        "load_friction_external_stribeck": slow_pair[1],
-    }
+    both = dict(zip(_ON_TORQUE, (motor, external), strict=True))
+    both_slow = {f"{k}_stribeck": q for k, q in zip(_ON_TORQUE, slow_pair, strict=True)}
+    frictions = stribeck | both | both_slow
     if n.load_quadratic_load is None:
         return "m5", frictions
     return "m6", frictions | {
         "load_friction_motor_quad": n.load_quadratic_motor or stated(0.0),
         "load_friction_external_quad": n.load_quadratic_load,
     }
-
-
-def _first(*values: float | None) -> float | None:
-    return next((v for v in values if v is not None), None)
 
 
 def _name(stem: str) -> str:

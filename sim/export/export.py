@@ -78,15 +78,15 @@ def exported_text(
     target = TARGETS.get(to)
     if target is None:
         raise InputError(f"There is no export to {to}; there are {', '.join(TARGETS)}.")
+    if model is not None:
+        if to != "mjcf":
+            raise InputError(f"A model is of the export to mjcf; {to} takes link inertias.")
+        return to_model(calibration, model, out, physics_step_s, gain, link_inertia, sha256)
     if link_inertia and (unknown := [n for n in link_inertia if n not in calibration.joints]):
         raise InputError(
             f"`link_inertia` names {', '.join(unknown)}; the calibration has "
             f"{', '.join(calibration.joint_names)}."
         )
-    if model is not None:
-        if to != "mjcf":
-            raise InputError(f"A model is of the export to mjcf; {to} takes link inertias.")
-        return to_model(calibration, model, out, physics_step_s, gain, link_inertia, sha256)
     step_s = target.physics_step_s if physics_step_s is None else physics_step_s
     servos = ExportedServos.of(calibration, step_s, gain, link_inertia, sha256)
     return target.text(servos), servos

@@ -97,10 +97,9 @@ ACTUATORS = {
 def to_isaaclab(servos: ExportedServos) -> str:
     """A Python module with a class of servos, its configuration, and the feedback."""
     step_s = servos.physics_step_s
-    delays = servos.delays(EXPLICIT_PD)
     groups = []
     for name, a in servos.actuators(EXPLICIT_PD).items():
-        low, high = whole_steps(delays[name].low, delays[name].high, step_s)
+        low, high = whole_steps(*a.dead_time_interval_s, step_s)
         group = call(
             "DelayedPDActuatorCfg",
             ("joint_names_expr", [name]),
@@ -162,7 +161,7 @@ def _servo(motor, **settings):
 
 def to_isaaclab_bam(servos: ExportedServos) -> str:
     """A Python module with Isaac Lab's `BamActuatorCfg` per joint: motor, friction, delay."""
-    step_s, delays, groups = servos.physics_step_s, servos.delays(), []
+    step_s, stepped, groups = servos.physics_step_s, servos.actuators(), []
     lost: dict[str, list[str]] = {}
     for name, joint in servos.calibration.joints.items():
         if joint.under_load is None:
@@ -174,7 +173,7 @@ def to_isaaclab_bam(servos: ExportedServos) -> str:
         motor, beyond = motor_of(loaded)
         for words in beyond:
             lost.setdefault(words, []).append(name)
-        steps = round(delays[name].value / step_s)
+        steps = round(stepped[name].dead_time_s.value / step_s)
         group = call(
             "_servo",
             call("motor=dict", *motor.items()),

@@ -85,10 +85,9 @@ ACTUATORS = (CalibratedServoCfg(),)
 def to_mjlab(servos: ExportedServos) -> str:
     """A Python module with a class of servos, its configuration, and the feedback."""
     step_s = servos.physics_step_s
-    delays = servos.delays(BUILTIN_PD)
     groups, bounds = [], []
     for name, a in servos.actuators(BUILTIN_PD).items():
-        steps = round(delays[name].value / step_s)
+        steps = round(a.dead_time_s.value / step_s)
         groups.append(
             call(
                 "BuiltinPositionActuatorCfg",
@@ -106,7 +105,7 @@ def to_mjlab(servos: ExportedServos) -> str:
                 ("delay_per_env_phase", False),
             )
         )
-        low, high = whole_steps(delays[name].low, delays[name].high, step_s)
+        low, high = whole_steps(*a.dead_time_interval_s, step_s)
         bounds.append(f'"{name}": ({low}, {high}),')
     cost_mrad = 1e3 * max(servos.whole_step_costs(BUILTIN_PD).values())
     notes = (

@@ -21,7 +21,6 @@ import numpy as np
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions
-from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, Actuator, JointCalibration
@@ -122,14 +121,6 @@ class ExportedServos:
         self._actuators[engine] = stepped
         return stepped
 
-    def delays(self, engine: Engine = MUJOCO) -> dict[str, Interval]:
-        """Dead times of `actuators` with their intervals [s]."""
-        actuators = self.actuators(engine)
-        return {
-            name: Interval(a.dead_time_s.value, *a.dead_time_interval_s)
-            for name, a in actuators.items()
-        }
-
     def head(self, engine: Engine | None, *target: str) -> list[str]:
         """Sentences of a file's head, those about the `target` last; classes need no engine."""
         calibration = self.calibration
@@ -169,7 +160,7 @@ class ExportedServos:
         RMS at 4 Hz and 0.3 rad of the motion by the nearest whole number of steps beside the
         motion by the delay itself.
         """
-        delays, h, turn = self.delays(engine), self.physics_step_s, 2 * np.pi * _FASTEST_HZ
+        h, turn = self.physics_step_s, 2 * np.pi * _FASTEST_HZ
         time = TIME_STEP_S * np.arange(round(0.75 / TIME_STEP_S))
         servo = self.moving.delayed_pd()
         servo.reset(np.zeros(servo.batch))
@@ -177,8 +168,9 @@ class ExportedServos:
         late = time >= 0.25  # two whole periods of the tone
         amplitudes = np.abs(fit_sine(turn * time[late], moved[late]).phasor)
         costs = {}
-        for (name, delay), amplitude in zip(delays.items(), amplitudes, strict=True):
-            shift = turn * (h * round(delay.value / h) - delay.value)
+        for (name, a), amplitude in zip(self.actuators(engine).items(), amplitudes, strict=True):
+            delay = a.dead_time_s.value
+            shift = turn * (h * round(delay / h) - delay)
             costs[name] = float(2 * abs(np.sin(shift / 2)) * amplitude / np.sqrt(2))
         return costs
 

@@ -35,7 +35,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     readings,
 )
 from pupper_sysid.sysid.fit.run import Run as PhysicsRun
-from pupper_sysid.sysid.fit.run import prepare, whole_counts
+from pupper_sysid.sysid.fit.run import prepare
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 
 _HELD_FRACTION = 0.2  # the doctor's limit, beyond which raw rows mislead
@@ -88,11 +88,6 @@ class Run:
         row = self.readings.rows
         start = self.trial.send_time_s[row] - self.elapsed_s[row]
         return self.readings.time_s - start
-
-    @property
-    def truncated_rad(self) -> NDArray[np.float64]:
-        """Commands as the bus sent them, quantised [rad]."""
-        return whole_counts(self.trial)
 
     def on_physics(self, used: NDArray[np.bool_]) -> PhysicsRun:
         """The run on the clock of physics, with only the readings of `used`, shape (fresh,)."""

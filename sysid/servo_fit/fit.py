@@ -40,7 +40,7 @@ from pupper_sysid.servo_models.step_size import at_step
 from pupper_sysid.sysid.doctor import checks
 from pupper_sysid.sysid.doctor.checks import Joints, Recordings
 from pupper_sysid.sysid.feedback.poll_lattice import quantum
-from pupper_sysid.sysid.fit.run import Run
+from pupper_sysid.sysid.fit.run import Run, whole_counts
 from pupper_sysid.sysid.fit.search import Problem, search
 from pupper_sysid.sysid.fit.structure import PREFERRED, candidate
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT
@@ -552,4 +552,4 @@ def _truncation_shift(data: ServoData, joint: str) -> float:
     The fit uses commands as whole counts; the model that runs gets them unquantised.
     """
     runs = data.runs[joint]
-    return float(np.mean(np.concatenate([r.truncated_rad - r.command_rad for r in runs])))
+    return float(np.mean(np.concatenate([whole_counts(r.trial) - r.command_rad for r in runs])))

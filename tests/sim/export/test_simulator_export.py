@@ -99,9 +99,10 @@ def test_an_export_lags_as_long_as_the_calibration_says_in_any_steps_and_engine(
     for step_s in (0.005, 0.001):
         np.testing.assert_allclose(lags_s(calibration, step_s), expected, atol=6e-4)
     # what the step of 5 ms alone would have done
-    more = ExportedServos.of(calibration, 0.005).delays()
+    stepped = ExportedServos.of(calibration, 0.005).actuators()
     for name, joint in calibration.joints.items():
-        assert 0.0015 < more[name].value - joint.actuator.dead_time_s.value < 0.004
+        later_s = stepped[name].dead_time_s.value - joint.actuator.dead_time_s.value
+        assert 0.0015 < later_s < 0.004
     own = ExportedServos.actuators
     for engine in (EXPLICIT_PD, BUILTIN_PD):  # which do not limit the speed of set points
 
@@ -270,8 +271,7 @@ def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
     text = text_of(calibration, "isaaclab")
     space = isaac_lab(text, monkeypatch)
     assert list(space["WHOLE_STEP_ACTUATORS"]) == list(calibration.joint_names)
-    exported = ExportedServos.of(calibration, 0.005)
-    delays, actuators = exported.delays(EXPLICIT_PD), exported.actuators(EXPLICIT_PD)
+    actuators = ExportedServos.of(calibration, 0.005).actuators(EXPLICIT_PD)
     servos = space["ACTUATORS"]["servos"]
     for name, made in space["WHOLE_STEP_ACTUATORS"].items():
         whole, own = actuators[name], calibration.joint(name).actuator
@@ -279,8 +279,8 @@ def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
         assert made["stiffness"] == whole.stiffness_nm_per_rad.value
         assert servos.stiffness[name] == own.stiffness_nm_per_rad.value
         assert made["armature"] == servos.armature[name] == own.armature_kg_m2.value
-        assert made["min_delay"] * 0.005 <= delays[name].low
-        assert delays[name].high <= made["max_delay"] * 0.005
+        low_s, high_s = whole.dead_time_interval_s
+        assert made["min_delay"] * 0.005 <= low_s and high_s <= made["max_delay"] * 0.005
         assert made["max_delay"] - made["min_delay"] <= 2
     feedback = calibration.joint("LF_hip").feedback
     assert feedback.offset_rad.value  # of the recording's zero: not exported
@@ -297,11 +297,11 @@ def test_the_isaac_lab_export_runs_with_its_field_names_and_bounds_the_delay(
 def test_the_mjlab_export_avoids_delays_that_are_redrawn_or_begin_at_zero(calibration, monkeypatch):
     space = mjlab(text_of(calibration, "mjlab"), monkeypatch)
     servos = ExportedServos.of(calibration, 0.005)
-    delays = servos.delays(BUILTIN_PD)
     for made, (name, actuator) in zip(
         space["WHOLE_STEP_ACTUATORS"], servos.actuators(BUILTIN_PD).items(), strict=True
     ):
-        assert made["delay_min_lag"] == made["delay_max_lag"] == round(delays[name].value / 0.005)
+        steps = round(actuator.dead_time_s.value / 0.005)
+        assert made["delay_min_lag"] == made["delay_max_lag"] == steps
         assert made["delay_update_period"] == 0 and made["delay_hold_prob"] == 0.0
         assert made["frictionloss"] == actuator.friction_loss_nm.value
         low, high = space["DELAY_STEPS"][name]
