@@ -77,7 +77,27 @@ class InputFile(Part):
 
 
 class Calibration(Part):
-    """Measured servos of one robot. Frozen; see the module's text."""
+    """Measured servos of one robot. Frozen; see the module's text.
+
+    Parameters
+    ----------
+    schema, schema_version : str, int
+        Kind of the file, and version of its format.
+    robot, created : str
+        Name of the robot; time of the calibration (UTC, ISO 8601).
+    inputs : tuple of InputFile
+        Recordings it was made from.
+    seed : int or None
+        Seed of its random numbers.
+    versions : dict of str to str
+        Versions of this project and of the libraries that shape its numbers.
+    units : str
+        Units of the numbers.
+    notes : tuple of str
+        Notes for the reader.
+    joints : dict of str to JointCalibration
+        The joints, by name.
+    """
 
     schema_name: Annotated[Literal["pupper-calibration"], Field(alias="schema")] = SCHEMA
     """Kind of the file."""
@@ -181,11 +201,6 @@ class Calibration(Part):
         -------
         DelayedPD
             Its batch has shape (joints,), in the order of `joints`.
-
-        Raises
-        ------
-        InputError
-            If this calibration lacks one of the joints.
         """
         names = self.joint_names if joints is None else tuple(joints)
         actuators = [self.joint(name).actuator for name in names]
@@ -210,11 +225,6 @@ class Calibration(Part):
 
         Without an offset: `feedback.offset_rad` is that of the recordings that were calibrated
         (their zero), and neither the servo's nor another recording's.
-
-        Raises
-        ------
-        InputError
-            If this calibration lacks that joint.
         """
         feedback = self.joint(joint).feedback
         return HeldFeedback(

@@ -183,6 +183,8 @@ def _in_python(path: Path, joint: str | None) -> Servo:
                 + " there: state it as PHYSICS_DT (s)."
             )
     numbers["armature_kg_m2"] = numbers["armature_kg_m2"] or None  # 0 stands for none
+    if (numbers["effort_limit_nm"] or 0.0) > _NO_LIMIT_NM:
+        numbers["effort_limit_nm"] = None
     for key, stand_in in (
         ("damping_nm_s_per_rad", 0.0), ("friction_loss_nm", 0.0), ("armature_kg_m2", 1e-4),
         ("effort_limit_nm", _NO_LIMIT_NM),
@@ -190,14 +192,8 @@ def _in_python(path: Path, joint: str | None) -> Servo:
         if numbers[key] is None:
             numbers[key] = stand_in
             assumed.append(key)
-            notes.append(f"{path.name} states no {_WORDS[key][0]}; {stand_in:g} stands for it.")
-    if (effort := numbers["effort_limit_nm"] or 0.0) > _NO_LIMIT_NM:
-        notes.append(
-            f"{path.name} limits the effort at {effort:g} N·m only; {_NO_LIMIT_NM:g} N·m stand "
-            "for it."
-        )
-        numbers["effort_limit_nm"] = _NO_LIMIT_NM
-        assumed.append("effort_limit_nm")
+            word = _WORDS[key][0] + f" up to {stand_in:g} N·m" * (key == "effort_limit_nm")
+            notes.append(f"{path.name} states no {word}; {stand_in:g} stands for it.")
     known = {key: value for key, value in numbers.items() if value is not None}
     return Servo(
         path.name, joint, None, False, "servo", None, _pd(path, known), notes=tuple(notes),
