@@ -2,34 +2,32 @@
 
 A linear servo (`explanations`) says what the pair of columns is. What a sound servo does beyond it,
 a set-point that ramps, a motor that saturates, friction, a load, looks like a fault to whatever
-compares its readings with a straight line. `fitted` fits a second-order servo with these limits by
-Levenberg-Marquardt at a bounded cost: what happens in a part of a recording does not bend the
-whole.
+compares its readings with a straight line. `Followed.fit` is a second-order servo with these
+limits, by Levenberg-Marquardt at a bounded cost: what happens in a part of a recording does not
+bend the whole.
 
-`comparisons` then fits it again with what may have come on top: a zero or a gain that moves at a
-moment, a gain or a lag that drifts, a clamped goal, a stop, a while in which the joint leaves its
-path. The best is named if the servo alone explains the readings much less: residuals that agree
-with those beside them count as one.
+`comparisons` fits it again with one number of it that changes, a zero, a gain or a lag, steadily,
+from a moment on or for a while, or with levels at which it ends. One rule judges all of them, the
+difference of log-likelihoods (n log of the ratio of mean errors, n independent residuals of the
+best fit) less half the logarithm of the readings for each number that the change adds
+(Schwarz, 1978).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from itertools import product
+from functools import cached_property
+from itertools import combinations, product
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
-from scipy.optimize import nnls
 
-from pupper_sysid.common.tones import least_squares
 from pupper_sysid.servo_models import kernel
 from pupper_sysid.sysid.doctor.explanations import FILTERS, Explanation, Servo, explain
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding, rivalled
-from pupper_sysid.sysid.recordings.excitation import named_tones, remembered
+from pupper_sysid.sysid.recordings.excitation import remembered
 from pupper_sysid.sysid.recordings.recording import Trial
 
 _MOST_READINGS, _STEP_S = 1500, 0.005
@@ -44,11 +42,13 @@ _FAR = 1e6  # levels that nothing reaches [rad]
 _DAMPED = np.array([0.2, 1.0, 5.0, 25.0, 125.0])  # times the damping before, tried abreast
 _NO_LOAD, _SMALL_STEP = np.zeros(3), 0.2  # of the differences for derivatives
 _NO_INTEGRAL, _NO_PLAY, _LONG_S = 0.01, 1e-3, 20.0  # [1/s], [rad], and before the recording
-_LOWEST = np.array(
-    [*np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.002, 0.01, 1e-3, 1e-4]), 0, -0.3, -0.03, *[-_FAR] * 4]
-)
-_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 30, 30, 0.3]), 0.8, 0.3, 0.03, *[_FAR] * 4])
-_STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.3, 0.002, 0.01, 2e-4, *[0.01] * 4])
+_EARLY_S = 0.02  # that stamps may be early
+_LOWEST = np.array([
+    *np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.002, 0.01, 1e-3, 1e-4]), -_EARLY_S, -0.3, -0.3,
+    *[-_FAR] * 4,
+])  # fmt: skip
+_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 30, 30, 0.3]), 0.8, 0.3, 0.3, *[_FAR] * 4])
+_STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.3, 2e-3, 0.01, 2e-3, *[0.01] * 4])
 """Bounds of a servo's terms, and differences for their derivatives; of levels in units of the
 command's range."""
 _ALONE = tuple(range(_GROWTH))
@@ -59,31 +59,22 @@ _DRAWN, _DRAWN_FROM = 200, (
 """Servos tried, and ranges of their terms, the lag last; friction and effort of the range."""
 _OF_A_KIND = 2
 _REFINED, _HOPS, _WELL = 3, 3, 0.02
-_ACCELERATION_OVER_S = 0.02  # a quantisation step of 1.5 mrad is 4 rad/s² then
 _CRUDE = 0.004  # of the position's mean deviation
 EXPLAINED = 0.06
 """Of the position's mean deviation: a servo that leaves less explains nearly all."""
 _FOLLOWS, _LITTLE = 0.12, 0.3  # of the same; of a friction
 CLEAR_NATS = 15.0
 """Advantage of a fault over a servo without it, beyond what its numbers cost."""
-_GOOD_PART = 0.3  # of what the servo alone leaves and a change could explain
-_SPLITS, _WHILES, _CELLS = 30, 14, 128
+_SPLITS = 24
 _FEWEST_PARTS = 8
 _OF_TRAVEL = 2 * 4.0
 """Independent readings of one motion over the range: a servo settles within four of its time
 constants, and does so twice, when it starts and when it stops."""
-_EDGE_S, _EDGE_SHARE = 1.0, 0.125  # from either end: an integral settles at the beginning
-_NO_GAIN, _OTHER_GAIN, _GAIN_DRIFT = 0.1, 0.75, 0.2
-_LAG_DRIFT_S, _EARLY_S = 0.008, 0.02
-_MOVED_RAD, _MOVED_SHARE = 0.03, 0.08  # the latter of the command's range
-_GROWTHS = tuple(sign * size for size in (0.0015, 0.003, 0.006, 0.012) for sign in (-1, 1))
-_LATER_S, _PER_GROWTH = (-0.06, -0.025, 0.025, 0.06), 0.1  # growth [1] of a lag by as many seconds
-_FEW_LEVELS = 4
+_EDGE_SHARE = 0.125  # of the readings, from either end: an integral settles at the beginning
+_NO_GAIN, _FEW_READINGS = 0.1, 2
+_MATTERS = 0.1  # of the mean deviation: a smaller change hardly alters what is measured
+_LATER_S = (-0.06, -0.02, 0.02, 0.06)  # of a lag that changes
 _SERVOS, _LEVELS = 4, np.linspace(0.15, 0.95, 9)  # of the command's range
-_DEEP, _BEYOND = 0.06, 0.03  # of the path's range; of the readings
-_UNSURE = 4.0  # errors that a servo as good as the fit may have: no while away from its path
-_STROKES, _EXPLAINED_THERE = 4.0, 0.25  # over the range of a while; of what is left there
-_MOST_LEFT, _TIMES_LARGER, _ROUNDS = 0.45, 5.0, 4
 
 
 @dataclass(frozen=True)
@@ -94,7 +85,7 @@ class Follower:
     """Logarithms of natural frequency [rad/s], damping ratio, speed [rad/s] and acceleration
     [rad/s²] of the set-point, friction and effort limit [rad of command], damping beyond the
     effort limit over that within, integral gain [1/s], play [rad]; lag [s], load [of the
-    command's range] and growth of the lag per second; lowest and highest goal and place [rad of
+    command's range] and growth of the lag [s]; lowest and highest goal and place [rad of
     command]."""
     path_rad: NDArray[np.float64]
     """The command as it is followed, at each reading."""
@@ -118,13 +109,6 @@ class Follower:
         """Residuals that count as independent, by `_independent_share` and by the motion."""
         count = len(self.residuals_rad) * _independent_share(self.residuals_rad)
         return min(count, self.readings)
-
-    @property
-    def settles_s(self) -> float:
-        """Time after which it is within 2 % of a command [s]: four time constants, and its lag."""
-        natural, damping = np.exp(self.terms[[_NATURAL, _DAMPING]])
-        slow = damping - np.sqrt(max(damping * damping - 1, 0.0))
-        return float(4 / (natural * slow) + self.terms[_LAG])
 
     def unexplained(self, joint: Followed) -> float:
         """Share of the variance of the readings."""
@@ -152,14 +136,9 @@ class Followed:
     starts: NDArray[np.int64]
     """First reading of each trial, and the end."""
     later: NDArray[np.float64]
-    """What the lag's growth goes with: time since the start [s]."""
+    """What the lag's growth goes with, from 0 to 1."""
     bound: float = 0.25
     """Largest cost of an error, of the position's mean deviation."""
-
-    @property
-    def share(self) -> NDArray[np.float64]:
-        """Time over the recording, from about -0.5 to 0.5."""
-        return (self.time_s - self.time_s.mean()) / max(float(np.ptp(self.time_s)), 1e-9)
 
     @property
     def explained(self) -> bool:
@@ -175,7 +154,7 @@ class Followed:
     def screen(self) -> list[Follower]:
         """The linear servo, and the best of many drawn from what servos are."""
         hz, damping = FILTERS[self.servo.filter]
-        natural, lag = 2 * np.pi * (hz or _UNFILTERED_HZ), max(self.servo.lag_s, 0.0)
+        natural, lag = 2 * np.pi * (hz or _UNFILTERED_HZ), self.servo.lag_s
         linear = [natural, damping, 300.0, 2e4, 0.004 * self.reach, 20.0, 1.0, 0.01, 1e-3, lag]
         servos = []
         for kind in (np.array([linear]), *_drawn(self.reach)):
@@ -201,8 +180,13 @@ class Followed:
             if fit.cost < _WELL:
                 break
             effort = min(0.3 * self.reach, 0.5 * float(np.exp(fit.terms[_EFFORT])))
-            seen = self.acceleration_rad_s2 * float(np.exp(-2 * fit.terms[_NATURAL]))
-            speed, ramp = (float(np.max(np.abs(x))) + 1e-9 for x in self.rates(fit.path_rad))
+            time = np.maximum(np.diff(self.time_s), 1e-4)
+            rate = np.diff(fit.path_rad) / time
+            # nearly the fastest, of few rows between trials
+            speed, ramp = (
+                float(np.quantile(np.abs(x), 0.99)) + 1e-9 for x in (rate, np.diff(rate) / time[1:])
+            )
+            seen = 0.5 * ramp * float(np.exp(-2 * fit.terms[_NATURAL]))
             changes = (
                 {_INTEGRAL: 1.5}, {_INTEGRAL: 0.01}, {_EFFORT: effort, _BACK_EMF: 1.0},
                 {_EFFORT: 3 * effort, _BACK_EMF: 5.0}, {_EFFORT: seen, _BACK_EMF: 0.01},
@@ -222,28 +206,8 @@ class Followed:
         return fit
 
     @cached_property
-    def acceleration_rad_s2(self) -> float:
-        """Acceleration that the readings reach: about the limit of a servo that is often at it."""
-        reached = [np.zeros(1)]
-        for a, b in zip(self.starts[:-1], self.starts[1:], strict=True):
-            grid = np.arange(float(self.time_s[a]), float(self.time_s[b - 1]), _ACCELERATION_OVER_S)
-            position = np.interp(grid, self.time_s[a:b], self.position_rad[a:b])
-            reached.append(np.abs(np.diff(position, 2)) / _ACCELERATION_OVER_S**2)
-        return float(np.quantile(np.concatenate(reached), 0.95)) + 1e-9
-
-    def rates(self, path: NDArray) -> NDArray[np.float64]:
-        """First and second derivative of a path, shape (2, readings)."""
-        rates = np.zeros((2, len(path)))
-        for a, b in zip(self.starts[:-1], self.starts[1:], strict=True):
-            time = self.time_s[a:b] + 1e-9 * np.arange(b - a)
-            if b - a > 2:
-                rates[0, a:b] = np.gradient(path[a:b], time)
-                rates[1, a:b] = np.gradient(rates[0, a:b], time)
-        return rates
-
-    @cached_property
-    def unsure_rad(self) -> NDArray[np.float64]:
-        """Error that a servo as good as the fit may have, at each reading [rad].
+    def unsure(self) -> float:
+        """Cost of the error that a servo as good as the fit may have.
 
         Where a small change of a limit ends in another motion, such as that of a profile far above
         its acceleration, no fit comes nearer. There, paths are not straight in their terms: the
@@ -254,12 +218,7 @@ class Followed:
         changes = (np.eye(len(step)) * step)[[k for k in _ALONE if inside[k]]]
         paths = self.paths(np.concatenate([self.fit.terms + changes, self.fit.terms - changes]))
         bends = paths.reshape(2, len(changes), -1).sum(axis=0) - 2 * self.fit.path_rad
-        return abs(float(self.fit.values[0])) * np.sqrt(np.sum(bends**2, axis=0))
-
-    @cached_property
-    def unsure(self) -> float:
-        """The same as a cost."""
-        return self.cost_of(self.unsure_rad)
+        return self.cost_of(self.fit.values[0] * np.sqrt(np.sum(bends**2, axis=0)))
 
     def cost_of(self, errors: NDArray[np.float64] | np.float64) -> float:
         """Mean bounded error over the mean deviation."""
@@ -278,11 +237,6 @@ class Followed:
         least = _CRUDE + self.cost_of(0.8 / 0.67 / np.sqrt(2) * usual) + self.unsure
         return self.fit.readings * float(np.log((self.fit.cost + self.unsure) / least))
 
-    @property
-    def disturbed(self) -> float:
-        """Cost of the fit beyond its noise and what it is unsure of."""
-        return self.fit.cost - self.noise - self.unsure
-
     @cached_property
     def friction_rad(self) -> float:
         """Error of the command that friction and play hold; 0 where a servo needs none."""
@@ -297,61 +251,27 @@ class Followed:
         return float(friction + play / 2) if nats > CLEAR_NATS else 0.0
 
     @cached_property
-    def changed(self) -> Compared | None:
-        """The change that explains most of what the servo alone leaves, if one clearly does.
-
-        Whiles away from the path have no cause yet: the change that explains most of them is one.
-        """
-        nats, whiles, fit = self.away
-        most = self.fit.cost - _GOOD_PART * (self.fit.cost - self.noise - _CRUDE)
-        least = CLEAR_NATS if nats < CLEAR_NATS else 0.0  # they show that there is one
-        clear = [c for c in self.compared if c.finding and c.nats > least and c.fit.cost < most]
-        count = min((c.fit.independent for c in clear), default=1.0)  # of one judge of them all
-        cost = 0.5 * np.log(len(self.time_s)) / count
-        ranked = sorted(clear, key=lambda c: np.log(c.fit.cost) + cost * c.values)
-        if nats >= CLEAR_NATS:
-            left = 0.5 * nats if ranked and ranked[0].nats > CLEAR_NATS else CLEAR_NATS
-            if not ranked or whiles_away(self, ranked[0].fit)[0] > left:
-                return Compared(nats, 0, self.fit, left_path(self, fit, whiles))
-        return ranked[0] if ranked else None
-
-    @cached_property
     def compared(self) -> list[Compared]:
-        """All changes, where there is something to explain."""
-        return comparisons(self) if self.explainable > CLEAR_NATS else []
+        """All changes that matter, the likeliest first, where there is something to explain."""
+        every = comparisons(self) if self.explainable > CLEAR_NATS else []
+        matter = [c for c in every if c.moved > _MATTERS]
+        return sorted(matter, key=lambda c: -c.nats)
+
+    @property
+    def changed(self) -> Compared | None:
+        """The likeliest change, if it clearly explains more than the servo alone."""
+        return next((c for c in self.compared if c.nats > CLEAR_NATS), None)
 
     def rivalled(self, finding: Finding, nats: float = CLEAR_NATS) -> Finding:
-        """A finding of an advantage, with the change that explains nearly as much."""
-        near = [(c.nats, c.finding.code) for c in self.compared if c.finding
-                and c.finding.code != finding.code and c.nats > nats - CLEAR_NATS]  # fmt: skip
-        return rivalled(finding, max(near, default=(0.0, ""))[1])
-
-    @cached_property
-    def away(self) -> tuple[float, list[tuple[int, int]], Follower]:
-        """Whiles away from the path of the servo that explains the rest: nats, rows, servo."""
-        fit, (nats, whiles) = self.fit, whiles_away(self, self.fit)
-        servos = sorted(self.screen, key=_cost)[:_REFINED]
-        for _ in range(2):
-            if not whiles:
-                return nats, whiles, fit
-            inside = np.any([_within(self, *w) for w in whiles], axis=0)
-            position = np.where(inside, self.position_rad - fit.residuals_rad, self.position_rad)
-            rest = replace(self, position_rad=position)
-            fit = min((fitted(rest, f) for f in (fit, *servos)), key=_cost)
-            fit = replace(fit, residuals_rad=fit.residuals_rad + self.position_rad - position)
-            nats, whiles = whiles_away(self, fit)
-        # the bounded cost may have given them up for a little elsewhere
-        wide = replace(self, bound=1.0)
-        wides = (fitted(wide, f, rounds=20) for f in (self.fit, *servos))
-        other = wide.hopped(min(wides, key=_cost))
-        return min((nats, whiles, fit), (*whiles_away(self, other), other), key=lambda w: w[0])
+        """A finding of an advantage, with the likeliest other change that is nearly as good."""
+        near = (c.finding.code for c in self.compared if c.nats > nats - CLEAR_NATS)
+        return rivalled(finding, next((code for code in near if code != finding.code), ""))
 
     @property
     def changes(self) -> list[Finding]:
         """Its finding, with the runner-up that is nearly as good."""
         best = self.changed
-        found = best.finding if best else None
-        return [self.rivalled(found, max(best.nats, CLEAR_NATS))] if best and found else []
+        return [self.rivalled(best.finding, best.nats)] if best else []
 
     @cached_property
     def _inputs(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64], float, float]]:
@@ -363,10 +283,12 @@ class Followed:
         for s in self.base.samples:
             every = max(1, int(_STEP_S / s.grid_s))
             command = s.command_rad[: len(s.command_rad) // every * every].reshape(-1, every)
-            rest = np.full(_rest_steps(every * s.grid_s), s.rest_rad)
+            step = every * s.grid_s
+            rest = np.full(_rest_steps(step), s.rest_rad)
+            after = np.full(int(_EARLY_S / step) + 1, command[-1, -1])
             inputs.append((
-                np.concatenate([rest, command.mean(axis=1)]),
-                np.concatenate([rest, command[:, -1]]), every * s.grid_s, s.start_s,
+                np.concatenate([rest, command.mean(axis=1), after]),
+                np.concatenate([rest, command[:, -1], after]), step, s.start_s,
             ))  # fmt: skip
         return inputs
 
@@ -381,14 +303,15 @@ class Followed:
             growth, low, high = terms[np.argmax(unlike), _GROWTH : _HIGH + 1]
             abreast = (terms[:, _GROWTH : _HIGH + 1] == (growth, low, high)).all(axis=1)
             unlike &= ~abreast
-            servos, late = _columns(terms[abreast], self.reach), self.time_s - growth * self.later
+            servos = _columns(terms[abreast], self.reach)
+            late = self.time_s + _EARLY_S - growth * self.later
             servos[:, _HANGING] = self.base.samples[0].rest_rad - np.pi / 2  # held level
             for (mean, end, step, start), a, b in zip(
                 self._inputs, self.starts[:-1], self.starts[1:], strict=True
             ):
                 mean, end = np.clip(mean, low, high), np.clip(end, low, high)
                 paths[abreast, a:b] = kernel.residuals(
-                    kernel.SERVO, servos, terms[abreast, _LAG] / step, mean[None],
+                    kernel.SERVO, servos, (terms[abreast, _LAG] + _EARLY_S) / step, mean[None],
                     kernel.edges_of(mean, end), 1.0, _NO_LOAD, mean[0], _rest_steps(step), step,
                     step=np.clip((late[a:b] - start) / step, 0.0, len(mean) - _rest_steps(step)),
                     reading=np.zeros(b - a),
@@ -401,8 +324,8 @@ class Followed:
         base = replace(self.base, samples=(sample,))
         ends = np.array([0, len(sample.time_s)])
         time = sample.time_s
-        later = time - self.start_s
-        return replace(self, base=base, time_s=time, starts=ends, later=later).path(self.fit.terms)
+        part = replace(self, base=base, time_s=time, starts=ends, later=np.zeros(len(time)))
+        return part.path(self.fit.terms)
 
     def follower(self, terms: NDArray, columns: Columns | None = None) -> Follower:
         """Regress the position on the path, what is added to it, and a constant per trial."""
@@ -435,8 +358,7 @@ def followed(trials: Sequence[Trial], step: float) -> Followed | None:
     base = explain(trials, step)
     if base is None:
         return None
-    causal = (base.lags_s >= -0.5 * base.grid_s) & (base.lags_s <= _LONGEST_LAG_S)
-    servo = base.best(1.0, np.broadcast_to(causal, base.total_s.shape))
+    servo = base.best(1.0, base.causal(_LONGEST_LAG_S))
     every = -(-sum(len(s.time_s) for s in base.samples) // _MOST_READINGS)
     times = [s.time_s[::every] for s in base.samples]
     position = [s.position_rad[::every] for s in base.samples]
@@ -445,7 +367,7 @@ def followed(trials: Sequence[Trial], step: float) -> Followed | None:
     return Followed(
         tuple(trials), step, base, servo, float(trials[0].send_time_s[0]),
         max(float(away.mean()), 1e-9), reach, np.concatenate(times), np.concatenate(position),
-        np.cumsum([0, *map(len, times)]), np.concatenate(times) - trials[0].send_time_s[0],
+        np.cumsum([0, *map(len, times)]), np.zeros(sum(map(len, times))),
     )  # fmt: skip
 
 
@@ -464,40 +386,18 @@ def _drawn(reach: float) -> list[NDArray[np.float64]]:
     return [terms[kind == k] for k in range(4)]
 
 
-def _independent_share(values: NDArray[np.float64], some_apart: bool = False) -> float:
-    """Share of values that are independent, by what their means over longer parts still vary.
-
-    `some_apart`: a part of the values is not of the others' kind, and the median leaves it out.
-    """
-
-    def variance(x: NDArray) -> float:
-        away = (x - np.median(x)) ** 2 if some_apart else (x - x.mean()) ** 2
-        return float(np.median(away) / 0.455 if some_apart else away.mean()) + 1e-18
-
-    count, spread, shares, m = len(values), variance(values), [1.0], 4
-    if some_apart:
-        spread = (float(np.median(values)) / np.log(2)) ** 2  # of exponential values
-    while _FEWEST_PARTS * (4 if some_apart else 1) * m <= count:
-        shares.append(spread / (m * variance(values[: count // m * m].reshape(-1, m).mean(axis=1))))
+def _independent_share(values: NDArray[np.float64]) -> float:
+    """Share of values that are independent, by what their means over longer parts still vary."""
+    count, spread, shares, m = len(values), float(np.var(values)) + 1e-18, [1.0], 4
+    while _FEWEST_PARTS * m <= count:
+        means = values[: count // m * m].reshape(-1, m).mean(axis=1)
+        shares.append(spread / (m * (float(np.var(means)) + 1e-18)))
         m *= 2
     return min(shares)
 
 
-def likely_spread(
-    size: NDArray, usual: float, causes: Sequence[NDArray], rows: NDArray | slice = slice(None)
-) -> NDArray[np.float64]:
-    """Mean of exponential sizes as a sum of positive shares of 1 and `causes`, by some `rows`."""
-    design = np.column_stack([np.ones_like(size), *causes])
-    design = design / np.maximum(design[rows].mean(axis=0), 1e-12)
-    spread = np.full_like(size, usual)
-    for _ in range(3):
-        weighted = design[rows] / spread[rows, None]
-        spread = np.maximum(design @ nnls(weighted, size[rows] / spread[rows])[0], 0.3 * usual)
-    return spread
-
-
 def _rest_steps(step_s: float) -> int:
-    return int(_HIGHEST[_LAG] / step_s) + 4
+    return int((_HIGHEST[_LAG] + _EARLY_S) / step_s) + 4
 
 
 def _servos(numbers: NDArray) -> NDArray[np.float64]:
@@ -615,391 +515,230 @@ def _regression(design, position, starts, bound, floor):
 
 
 # ----- hypotheses
-@dataclass(frozen=True)
-class _Change:
-    """A hypothesis, and how it is fitted."""
-
-    begins: Sequence[Follower]
-    """Servos to begin with; else the fit, and that of the screen that it makes best."""
-    finding: Callable[[Follower], Finding | None]
-    """What it is once it is fitted; None where it is too small to matter."""
-    columns: Columns | None = None
-    free: Sequence[int] = ()
-    """Terms of the servo that it adds."""
-    values: float = 1
-    """How many numbers it adds."""
-    joint: Followed | None = None
-    """The readings with times of their own."""
-    usual: Columns | None = None
-    """What of a sound servo looks like it."""
+Span = tuple[int, int] | None
+"""First reading and end of a change; None where it goes steadily through the recording."""
 
 
 @dataclass(frozen=True)
 class Compared:
     """A change against the servo alone."""
 
-    nats: float
-    """Advantage of the change."""
-    values: float
-    """How many numbers it adds."""
     fit: Follower
-    finding: Finding | None
+    nats: float
+    """Advantage over the servo alone, less what its numbers cost."""
+    moved: float
+    """Mean of what it adds to the readings, over their mean deviation."""
+    finding: Finding
+
+
+@dataclass(frozen=True)
+class _Change:
+    """How a number of the servo changes."""
+
+    number: str
+    """Which: its zero, gain or lag, or the levels at which it ends."""
+    moments: int
+    """0 where it changes steadily, 1 from a moment on, 2 for a while."""
+
+    @property
+    def values(self) -> int:
+        """How many numbers that takes: another gain is one about any place."""
+        return self.moments + (1 if self.number in ("zero", "lag") else 2)
+
+    def spans(self, joint: Followed) -> list[Span]:
+        """Where it may change."""
+        edges, count = _edges(joint), len(joint.time_s)
+        several: list[list[Span]] = [[None], [(k, count) for k in edges], [*combinations(edges, 2)]]
+        return several[self.moments]
+
+    def columns(self, joint: Followed, span: Span) -> Columns:
+        """What it adds to the path of the servo."""
+        profile = _profile(joint, span)
+        if self.number == "gain":
+            return lambda path: [path * profile, profile]  # about any place
+        return lambda path: [profile] if self.number == "zero" else ()
+
+    def begins(self, joint: Followed, servos: Sequence[Follower], span: Span) -> list[Follower]:
+        """Servos with the change, before they are fitted."""
+        if self.number != "lag":
+            columns = self.columns(joint, span)
+            return [joint.regressed(s.terms, s.path_rad, columns) for s in servos]
+        profile, tried = _profile(joint, span), []
+        for later, servo in product(_LATER_S, servos):
+            terms = servo.terms.copy()
+            terms[[_LAG, _GROWTH]] += -later * float(profile.mean()), later
+            tried.append(terms)
+        return replace(joint, later=profile).followers(np.array(tried))
+
+    def screened(self, joint: Followed) -> tuple[Span, list[Follower]]:
+        """The span that explains most, and servos with the change, the best first.
+
+        A servo that explains both parts alike has become another one: some of the screen are tried
+        as well.
+        """
+        servos = (joint.fit, *sorted(joint.screen, key=_cost)[:_SERVOS])
+        tried = [(s, f) for s in self.spans(joint) for f in self.begins(joint, servos, s)]
+        span = min(tried, key=lambda t: _cost(t[1]))[0]
+        return span, sorted((f for s, f in tried if s == span), key=_cost)[:_REFINED]
+
+    def fitted(
+        self, joint: Followed, worth: Callable[[_Change, Follower], bool]
+    ) -> tuple[Span, Follower]:
+        """The servo with the change, and where it is `worth` it the span found again for it."""
+        span, begins = self.screened(joint)
+        best = min((self.refined(joint, f, span, 6) for f in begins), key=_cost)
+        for width, rounds in ((1.0, 4), (1 / 7, 8), (1 / 7, 4)) if worth(self, best) else ():
+            near, servos = _near(joint, span, width), (best, begins[0])
+            tried = [(s, f) for s in near for f in self.begins(joint, servos, s)]
+            span, best = min([(span, best), *tried], key=lambda t: _cost(t[1]))
+            best = self.refined(joint, best, span, rounds)
+        return span, best
+
+    def refined(self, joint: Followed, begin: Follower, span: Span, rounds: int) -> Follower:
+        """The servo with the change, fitted."""
+        if self.number == "lag":
+            joint = replace(joint, later=_profile(joint, span))
+        free = (*_ALONE, _GROWTH) if self.number == "lag" else (*_ALONE, *range(_LOW, _TOP + 1))
+        return fitted(joint, begin, self.columns(joint, span), free, rounds)
+
+
+def _profile(joint: Followed, span: Span) -> NDArray[np.float64]:
+    """From 0 to 1: share of the readings before, or whether a reading is within."""
+    row = np.arange(len(joint.time_s))
+    if span is None:
+        return row / len(row)
+    return ((row >= span[0]) & (row < span[1])).astype(np.float64)
+
+
+def _edges(joint: Followed) -> list[int]:
+    """Readings at which a change may begin or end: at either end a servo settles."""
+    count = len(joint.time_s)
+    ends = np.array([_EDGE_SHARE, 1 - _EDGE_SHARE]) * count
+    return np.unique(np.linspace(*ends, _SPLITS).astype(int)).tolist()
+
+
+def _near(joint: Followed, span: Span, width: float) -> list[Span]:
+    """Spans whose ends lie within a part of the distance of those that were tried first."""
+    if span is None:
+        return [None]
+    edges, count = _edges(joint), len(joint.time_s)
+    around = width * np.linspace(-1, 1, 15) * max(np.diff(edges), default=1)
+    firsts, ends = ((row + around).astype(int).tolist() for row in span)
+    ends = ends if span[1] < count else [count]
+    spans = [(a, b) for a, b in product(firsts, ends) if 2 < a < b - 2 <= count - 2]
+    return [*spans] or [span]
+
+
+class _Levels(_Change):
+    """A goal that is clamped, or a motion that ends at a stop, above, below or both."""
+
+    def screened(self, joint: Followed) -> tuple[Span, list[Follower]]:
+        """Servos with the levels of each side that explain most."""
+        command = np.concatenate([s.command_rad for s in joint.base.samples])
+        low, high = float(command.min()), float(command.max())
+        servos = (joint.fit, *sorted(joint.screen, key=_cost)[:_SERVOS])
+        begins = []
+        for sides in ((_LOW,), (_HIGH,), (_LOW, _HIGH), (_BOTTOM,), (_TOP,), (_BOTTOM, _TOP)):
+            tried = []
+            for servo, share in product(servos, _LEVELS):
+                terms = servo.terms.copy()
+                depth = share * (high - low)
+                terms[[*sides]] = [low + depth if k in (_HIGH, _TOP) else high - depth
+                                   for k in sides]  # fmt: skip
+                tried.append(terms)
+            begins.append(min(joint.followers(np.array(tried)), key=_cost))
+        return None, sorted(begins, key=_cost)[:_REFINED]
+
+
+CHANGES = (
+    *(_Change(number, moments) for number in ("zero", "gain", "lag") for moments in (0, 1)),
+    _Change("gain", 2), _Levels("levels", 0),
+)  # fmt: skip
+"""What may change, and how: a new one is a row here and its words in `_finding`."""
 
 
 def comparisons(joint: Followed) -> list[Compared]:
-    """Every change, fitted."""
-    # a load that is known sags and swings as its fit finds, and this servo does not
+    """Every change, fitted.
+
+    A load that is known sags and swings as its fit finds, and this servo does not: of such a joint
+    the lag alone is compared.
+    """
     loaded = any(t.load is not None for t in joint.trials)
+    changes = [c for c in CHANGES if c.number == "lag" or not loaded]
+
+    def nats(change: _Change, plain: float, fit: Follower, count: float) -> float:
+        more = (plain + joint.unsure) / (fit.cost + joint.unsure)
+        return count * float(np.log(more)) - 0.5 * change.values * np.log(len(joint.time_s))
+
     plain = joint.fit.cost
 
-    def compared(tried: _Change, fit: Follower, usual: float = np.inf) -> Compared:
-        more = (min(plain, usual) + joint.unsure) / (fit.cost + joint.unsure)
-        nats = fit.independent * np.log(more) - 0.5 * tried.values * np.log(len(joint.time_s))
-        return Compared(float(nats), tried.values, fit, tried.finding(fit))
+    def worth(change: _Change, fit: Follower) -> bool:
+        return nats(change, plain, fit, joint.fit.readings) > 0  # if all were independent
 
-    fits = []
-    for change in (_lag_drifts, _lag_changes) if loaded else CHANGES:
-        if tried := change(joint):
-            part, free = tried.joint or joint, (*_ALONE, *tried.free)
-            begins = tried.begins or (joint.fit, min(
-                (joint.regressed(f.terms, f.path_rad, tried.columns) for f in joint.screen),
-                key=_cost,
-            ))  # fmt: skip
-            fit, usual = min((fitted(part, b, tried.columns, free) for b in begins), key=_cost), []
-            if compared(tried, fit).nats > 0:  # its servo may explain as much without the change
-                alone = fit.terms.copy()
-                alone[_GROWTH:] = joint.fit.terms[_GROWTH:]
-                begins = joint.fit, joint.follower(alone)
-                plain = min(plain, fitted(joint, begins[1], rounds=8).cost)
-                usual = [fitted(joint, b, tried.usual).cost for b in begins] if tried.usual else []
-            fits.append((tried, fit, min(usual, default=np.inf)))
-    found = []
-    for tried, fit, usual in fits:
-        one = compared(tried, fit, usual)
-        if one.finding and 0 < one.nats < CLEAR_NATS:  # as well as the servo alone is fitted
-            fit = (tried.joint or joint).hopped(fit, tried.columns, (*_ALONE, *tried.free))
-            one = compared(tried, fit, usual)
-        found.append(one)
-    return found
+    fits = [(change, *change.fitted(joint, worth)) for change in changes]
+    for _, _, fit in sorted(fits, key=lambda f: _cost(f[2]))[:_REFINED]:
+        alone = fit.terms.copy()  # its servo may explain as much without the change
+        alone[_GROWTH:] = joint.fit.terms[_GROWTH:]
+        plain = min(plain, fitted(joint, joint.follower(alone)).cost)
+    # the residuals of the best tell how many readings are independent
+    count = min((joint.fit, *(fit for *_, fit in fits)), key=_cost).independent
+    compared = []
+    for change, span, fit in fits:
+        without = fit.terms.copy()
+        without[_GROWTH:] = joint.fit.terms[_GROWTH:]
+        added = joint.position_rad - fit.residuals_rad - fit.values[0] * joint.path(without)
+        moved = np.concatenate([x - x.mean() for x in np.split(added, joint.starts[1:-1])])
+        moved = float(np.mean(np.abs(moved))) / joint.scale
+        if finding := _finding(joint, change.number, span, fit):
+            compared.append(Compared(fit, nats(change, plain, fit, count), moved, finding))
+    return compared
 
 
-def _split(
-    joint: Followed, columns: Callable[[int, int], Columns], ends: Callable[[int], int]
-) -> tuple[int, int, Follower] | None:
-    """First reading and end of the change that explains most, and the servo that it begins with.
-
-    It lasts to the one that `ends` names. A servo that explains both parts alike has become another
-    one: those of the screen are tried as well, and the moments are found again for the one that the
-    change makes best.
-    """
-    edge = max(_EDGE_S, _EDGE_SHARE * float(np.ptp(joint.time_s)))
-    low, high = joint.time_s[0] + edge, joint.time_s[-1] - edge
-    # between trials several moments have one reading
-    moments = np.unique(np.searchsorted(joint.time_s, np.linspace(low, high, _SPLITS))).tolist()
-    windows = [(k, ends(k)) for k in moments if low < high and ends(k) - k > 2]
-    if not windows:
-        return None
-    (first, end), begin, others = windows[0], joint.fit, joint.screen
-    around = len(joint.time_s) * (high - low) / np.ptp(joint.time_s) / len(moments)
-    for _ in range(2):
-        tried = [
-            (_cost(joint.regressed(f.terms, f.path_rad, columns(*w))), w)
-            for f in (begin, *others) for w in windows
-        ]  # fmt: skip
-        (first, end), others = min(tried)[1], ()
-        servos = [joint.regressed(f.terms, f.path_rad, columns(first, end)) for f in joint.screen]
-        best = [begin, *sorted(servos, key=_cost)[:2]]
-        begin = min((fitted(joint, f, columns(first, end), rounds=4) for f in best), key=_cost)
-        near = (first + np.linspace(-around, around, 21).astype(int)).tolist()
-        windows = [(k, end) for k in near if 2 < k < end - 2 and ends(k) == end] or [(first, end)]
-    return first, end, begin
-
-
-def _end(joint: Followed, at: int) -> int:
-    """End of the trial of a reading."""
-    return int(joint.starts[min(np.searchsorted(joint.starts, at, "right"), len(joint.starts) - 1)])
-
-
-def _within(joint: Followed, first: int, end: int) -> NDArray[np.float64]:
-    """1 for the readings from `first` up to `end`."""
-    row = np.arange(len(joint.time_s))
-    return ((row >= first) & (row < end)).astype(np.float64)
-
-
-def _zero_moves(joint: Followed) -> _Change | None:
-    """A zero that moves at a moment."""
-    best = _split(joint, lambda a, b: lambda path: [_within(joint, a, b)], partial(_end, joint))
-    if best is None:
-        return None
-    first, end, begin = best
-
-    def finding(fit: Follower) -> Finding | None:
-        moved = abs(float(fit.values[1]))
-        values = {"offset_rad": moved, "time_s": float(joint.time_s[first]) - joint.start_s}
-        return Finding("zero_moves", CARE, values) if _moves(joint, moved) else None
-
-    return _Change([begin], finding, lambda path: [_within(joint, first, end)], values=2)
-
-
-def _moves(joint: Followed, moved: float) -> bool:
-    """Whether a zero moves by more than where friction and play let a joint rest."""
-    return moved > max(_MOVED_SHARE * joint.reach, 2 * joint.friction_rad)
-
-
-def _zero_drifts(joint: Followed) -> _Change | None:
-    """A zero that moves steadily."""
-
-    def finding(fit: Follower) -> Finding | None:
+def _finding(joint: Followed, number: str, span: Span, fit: Follower) -> Finding | None:
+    """The words of a change."""
+    seconds = float(np.ptp(joint.time_s))
+    begin, end = (0, len(joint.time_s)) if span is None else span
+    time = joint.time_s - joint.start_s
+    # one reading before the next trial tells nothing
+    next_trial = int(joint.starts[np.argmin(np.abs(joint.starts - begin))])
+    begin = next_trial if 0 < next_trial - begin <= _FEW_READINGS < end - next_trial else begin
+    since, until = float(time[begin]), float(time[end - 1])
+    if number == "zero":
         moved = float(fit.values[1])
-        values = {"offset_rad": moved}
-        return Finding("zero_drifts", CARE, values) if _moves(joint, abs(moved)) else None
-
-    return _Change((), finding, lambda path: [joint.share])
-
-
-def _gain_changes(joint: Followed) -> _Change | None:
-    """A gain that changes at a moment, about any place."""
-
-    def columns(first: int, end: int) -> Columns:
-        inside = _within(joint, first, end)
-        return lambda path: [path * inside, inside]
-
-    best = _split(joint, columns, lambda k: len(joint.time_s))
-    if best is None:
-        return None
-    first, end, begin = best
-
-    def finding(fit: Follower) -> Finding | None:
-        before, more = map(float, fit.values[:2])
-        return _other_gain(joint.time_s[[first, end - 1]] - joint.start_s, before, before + more)
-
-    return _Change([begin], finding, columns(first, end), values=3)
-
-
-def _other_gain(times: NDArray, before: float, after: float) -> Finding | None:
-    """A gain of another size or sign from one time to another, or a joint that does not follow."""
-    low, high = sorted((before, after))
-    begin, end = map(float, times)
-    values = {"time_s": begin, "until_s": end, "before": before, "after": after}
-    if -high / _OTHER_GAIN < low < -_OTHER_GAIN * high:
+        if span is None:
+            return Finding("zero_drifts", CARE, {"offset_rad": moved})
+        return Finding("zero_moves", CARE, {"offset_rad": abs(moved), "time_s": since})
+    if number == "lag":
+        later = float(fit.terms[_GROWTH])
+        if span is not None:
+            return Finding("lag_changed", CARE, {"more_ms": 1e3 * later, "time_s": since})
+        # early is what no servo is
+        verdict = REFUSE if fit.terms[_LAG] + min(later, 0.0) < -_EARLY_S else CARE
+        values = {"drift_ms": 1e3 * later / seconds, "percent": 100 * later / seconds}
+        return Finding("lag_drifts", verdict, values)
+    if number == "levels":
+        without = fit.terms.copy()
+        without[_LOW:] = joint.fit.terms[_LOW:]
+        path, levels = joint.path(without), fit.terms[_LOW:]
+        low, high = max(levels[[0, 2]]), min(levels[[1, 3]])
+        beyond = max(path < low, path > high, key=np.mean)
+        if not beyond.any():
+            return None
+        values = {"level_rad": float(np.median(joint.position_rad[beyond])),
+                  "percent": 100 * float(beyond.mean())}  # fmt: skip
+        return Finding("clipped", CARE, values)
+    before, after = float(fit.values[0]), float(fit.values[:2].sum())
+    if span is None:
+        return Finding("gain_drifts", CARE, {"percent": 100 * (after / before - 1)})
+    values = {"time_s": since, "until_s": until, "before": before, "after": after}
+    if after < -_NO_GAIN * before:
         return Finding("sign_changed", REFUSE, values)
-    if low > _NO_GAIN * high:
-        return Finding("gain_changed", CARE, values) if low < _OTHER_GAIN * high else None
-    begin, end = (begin, end) if after == low else (0.0, begin)
-    return Finding("left_path", CARE, {"times": 1, "longest_s": end - begin, "time_s": begin})
-
-
-def _gain_drifts(joint: Followed) -> _Change | None:
-    """A gain that grows or shrinks steadily."""
-
-    def finding(fit: Follower) -> Finding | None:
-        change = float(fit.values[1] / max(fit.values[0], 1e-9))
-        values = {"percent": 100 * change}
-        return None if abs(change) < _GAIN_DRIFT else Finding("gain_drifts", CARE, values)
-
-    return _Change((), finding, lambda path: [path * joint.share, joint.share], values=2)
-
-
-def _lag_drifts(joint: Followed) -> _Change | None:
-    """A lag that grows steadily: clocks that drift apart."""
-    # a servo without a drift may have become another one for it
-    servos = [joint.fit, *sorted(joint.screen, key=_cost)]
-    middle = float(np.mean(joint.later))
-    tried = []
-    for growth, late, servo in product(_GROWTHS, (-0.04, 0.0, 0.04, None), servos):
-        moved = servo.terms.copy()
-        # about the middle, or from clocks that are together at the start
-        moved[[_LAG, _GROWTH]] += 0.0 if late is None else late - growth * middle, growth
-        tried.append(moved)
-
-    def finding(fit: Follower) -> Finding | None:
-        growth = float(fit.terms[_GROWTH])
-        if abs(growth) * np.ptp(joint.time_s) < _LAG_DRIFT_S:
-            return None
-        lags = fit.terms[_LAG] + growth * joint.later
-        verdict = REFUSE if lags.min() < -_EARLY_S else CARE  # early is what no servo is
-        return Finding("lag_drifts", verdict, {"drift_ms": 1e3 * growth, "percent": 100 * growth})
-
-    begins = sorted(joint.followers(np.array(tried)), key=_cost)[:2]
-    return _Change(begins, finding, free=(_GROWTH,), usual=_shifted(joint))
-
-
-def _lag_changes(joint: Followed) -> _Change | None:
-    """A lag that changes at a moment."""
-    edge = _EDGE_SHARE * float(np.ptp(joint.time_s))
-    moments = np.linspace(joint.time_s[0] + edge, joint.time_s[-1] - edge, _WHILES)
-    tried = []
-    for moment in moments:
-        later = replace(joint, later=(joint.time_s > moment) / _PER_GROWTH)
-        for size in _LATER_S:
-            moved = joint.fit.terms.copy()
-            moved[[_LAG, _GROWTH]] += -size / 2, size * _PER_GROWTH
-            tried.append((later.follower(np.clip(moved, _LOWEST, _HIGHEST)).cost, moment, moved))
-    _, moment, moved = min(tried, key=lambda t: t[0])
-    around = np.linspace(-1, 1, 9) * (moments[1] - moments[0])
-    joints = [replace(joint, later=(joint.time_s > moment + d) / _PER_GROWTH) for d in around]
-    later = min(joints, key=lambda j: j.follower(moved).cost)
-
-    def finding(fit: Follower) -> Finding | None:
-        more = float(fit.terms[_GROWTH]) / _PER_GROWTH
-        if abs(more) < _LAG_DRIFT_S:
-            return None
-        at = float(joint.time_s[np.argmax(later.later > 0)]) - joint.start_s
-        return Finding("lag_changed", CARE, {"more_ms": 1e3 * more, "time_s": at})
-
-    return _Change([later.follower(moved)], finding, free=(_GROWTH,), values=2, joint=later,
-                   usual=_shifted(joint))  # fmt: skip
-
-
-def _shifted(joint: Followed) -> Columns:
-    """What a constant shift in time adds, such as that of a position before its command."""
-    return lambda path: joint.rates(path)[:1]
-
-
-def _clipped(joint: Followed) -> _Change | None:
-    """A goal that is clamped, or a motion that ends at a stop, above, below or both."""
-    command = np.concatenate([s.command_rad for s in joint.base.samples])
-    low, high = float(command.min()), float(command.max())
-    rows = np.sort(np.bincount(((command - low) / (0.02 * joint.reach + 1e-12)).astype(int)))
-    if rows[-_FEW_LEVELS:].sum() > 0.9 * len(command):
-        return None  # clamped, a command of few levels is one of others
-
-    def level(term: int, share: float) -> float:
-        return low + share * (high - low) if term in (_HIGH, _TOP) else high - share * (high - low)
-
-    begins: list[Follower] = []
-    servos = (joint.fit, *sorted(joint.screen, key=_cost)[:_SERVOS])
-    for low_side, high_side in ((_LOW, _HIGH), (_BOTTOM, _TOP)):
-        for sides in ([(low_side,), (high_side,)], [(low_side, high_side)]):
-            tried = []
-            for servo, terms, share in product(servos, sides, _LEVELS):
-                moved = servo.terms.copy()
-                moved[list(terms)] = [level(k, share) for k in terms]
-                tried.append(moved)
-            begins.append(min(joint.followers(np.array(tried)), key=_cost))
-
-    def finding(fit: Follower) -> Finding | None:
-        plain = fit.terms.copy()
-        plain[_LOW:] = joint.fit.terms[_LOW:]
-        path = joint.path(plain)
-        best: tuple[float, float] | None = None
-        for k in np.flatnonzero(np.abs(fit.terms[_LOW:]) < _FAR) + _LOW:
-            over = k in (_HIGH, _TOP)
-            beyond = path > fit.terms[k] if over else path < fit.terms[k]
-            depth = path.max() - fit.terms[k] if over else fit.terms[k] - path.min()
-            share = float(beyond.mean())
-            deep = depth > max(_DEEP * np.ptp(path), 2 * joint.friction_rad)  # it rests within
-            if deep and share > max(_BEYOND, best[0] if best else 0.0):
-                best = share, float(np.median(joint.position_rad[beyond]))
-        if best is None:
-            return None
-        return Finding("clipped", CARE, {"level_rad": best[1], "percent": 100 * best[0]})
-
-    return _Change(begins, finding, free=range(_LOW, _TOP + 1), values=2)
-
-
-def left_path(joint: Followed, fit: Follower, whiles: Sequence[tuple[int, int]]) -> Finding:
-    """Whiles in which the joint is elsewhere: by another gain, at rest, or anywhere."""
-    a, b = max(whiles, key=lambda w: joint.time_s[w[1] - 1] - joint.time_s[w[0]])
-    longest = float(joint.time_s[b - 1] - joint.time_s[a])
-    middle = joint.position_rad[a + (b - a) // 6 : b - (b - a) // 6]
-    if np.ptp(middle) <= max(1.5 * joint.step, 0.02 * joint.scale):
-        places = [np.median(joint.position_rad[a:b]) for a, b in whiles]
-        values = {"trials": 1, "of": len(joint.trials)}
-        if len(whiles) > 1 and np.ptp(places) < _MOVED_SHARE * joint.reach:  # in its way
-            share = sum(b - a for a, b in whiles) / len(joint.time_s)
-            return Finding("pinned", CARE, {**values, "percent": 100 * share})
-        return Finding("frozen", CARE, {**values, "longest_s": longest})
-    if found := _follows_there(joint, fit, whiles):
-        return found
-    values = {"times": len(whiles), "longest_s": longest,
-              "time_s": float(joint.time_s[whiles[0][0]]) - joint.start_s}  # fmt: skip
-    return Finding("left_path", CARE, values)
-
-
-def _follows_there(
-    joint: Followed, fit: Follower, whiles: Sequence[tuple[int, int]]
-) -> Finding | None:
-    """Another gain by which the joint follows its path in some whiles."""
-    inside = np.any([_within(joint, *w) for w in whiles], axis=0)
-    path, away = fit.path_rad[inside], fit.residuals_rad[inside]
-    travel = sum(float(np.abs(np.diff(fit.path_rad[a:b])).sum()) for a, b in whiles)
-    if travel < _STROKES * np.ptp(path):
-        return None  # two numbers explain as many strokes
-    design = np.column_stack([path, np.ones_like(path)])
-    values = least_squares(design, away)
-    left = np.quantile(np.abs(away - design @ values), 0.75)
-    if left > _EXPLAINED_THERE * np.quantile(np.abs(away), 0.75):
-        return None
-    before = float(fit.values[0])
-    times = joint.time_s[[whiles[0][0], whiles[-1][1] - 1]] - joint.start_s
-    return _other_gain(times, before, before + float(values[0]))
-
-
-def whiles_away(joint: Followed, fit: Follower) -> tuple[float, list[tuple[int, int]]]:
-    """Whiles whose residuals are larger than those of the same motion elsewhere: nats, rows.
-
-    Errors of a sound servo are of its noise, its speed and its force, its state before the first
-    motion, its tone and what the fit is unsure of: their mean is a sum of positive shares of these,
-    and they are exponential about it. In a while with a mean `times` as large, a reading of size x
-    is likelier by x (1 - 1 / times) - log times. The share of independent readings is what the
-    means of parts of the rest show. Whiles count that hold most of what the servo leaves, and are
-    as far away as a zero that matters.
-    """
-    count, dt = len(joint.time_s), float(np.median(np.diff(joint.time_s)))
-    width = max(3, 1 + 2 * round(min(fit.settles_s, 1.0) / max(dt, 1e-4)))
-    shapes, rates, inner = [], joint.rates(fit.path_rad), np.ones(count, bool)
-    for a, b in zip(joint.starts[:-1], joint.starts[1:], strict=True):
-        ways = np.ptp(fit.path_rad[a:b]) / (np.max(np.abs(rates[0, a:b])) + 1e-9)
-        inner[a:b] = joint.time_s[a:b] - joint.time_s[a] > fit.settles_s + ways
-        away = np.abs(fit.path_rad[a:b] - fit.path_rad[a]) > 0.01 * joint.reach
-        since = joint.time_s[a:b] - joint.time_s[a + np.argmax(away)]
-        around = maximum_filter1d(np.abs(rates[:, a:b]), min(width, 2 * (b - a) - 1))
-        shapes.append([*around, 1.0 * (np.abs(since) < _EDGE_S)])
-    tones = np.searchsorted([t.send_time_s[0] for t in named_tones(joint.trials)], joint.time_s)
-    causes = [*(1.0 * (tones == n) for n in np.unique(tones)[1:]), joint.unsure_rad]
-    causes += list(np.concatenate(shapes, axis=1))
-    size = np.abs(fit.residuals_rad) + joint.step / 4 + 1e-9
-    edges = np.unique(np.linspace(0, count, _CELLS + 1).astype(int))
-    cells, times, inside = np.diff(edges), _TIMES_LARGER, np.zeros(count, bool)
-    scaled, gains, larger, share = size, np.zeros(len(cells)), np.zeros(len(cells), bool), 1.0
-    for _ in range(_ROUNDS):
-        usual = float(np.median(size[~inside]))
-        scaled = np.minimum(size, 20 * usual)
-        scaled = scaled / likely_spread(scaled, usual, causes, ~inside)
-        share = _independent_share(scaled[~inside], True)
-        mean = np.add.reduceat(scaled, edges[:-1]) / cells
-        gains = share * cells * (mean * (1 - 1 / times) - np.log(times))
-        gains[~np.logical_or.reduceat(inner, edges[:-1])] = 0.0  # in any motion, before a trial
-        larger = _segments(gains, np.log(count))
-        inside = np.repeat(larger, cells)
-        if not larger.any() or inside.mean() > _MOST_LEFT:
-            return 0.0, []
-        times = max(float(scaled[inside].mean()), 2.0)
-    small = size[inside].sum() < 0.5 * size.sum()  # of all that the servo leaves
-    small |= size[inside].sum() < _UNSURE * joint.unsure_rad[inside].sum()
-    if small or np.quantile(size[inside], 0.9) < max(_MOVED_RAD, _MOVED_SHARE * joint.reach):
-        return 0.0, []
-    nats = float(gains[larger].sum()) / share * min(share, _independent_share(scaled[~inside]))
-    flips = np.flatnonzero(np.diff(np.concatenate([[0], larger, [0]])))
-    whiles = [(int(edges[a]), int(edges[b])) for a, b in flips.reshape(-1, 2)]
-    return nats - len(whiles) * float(np.log(count)), whiles
-
-
-def _segments(gains: NDArray[np.float64], cost: float) -> NDArray[np.bool_]:
-    """Segments of the largest sum of gains, each of which costs something."""
-    outside, inside = 0.0, -np.inf
-    came = np.zeros((len(gains), 2), bool)  # whether from inside, to outside and to inside
-    for k, gain in enumerate(gains):
-        came[k] = inside > outside, inside > outside - cost
-        outside, inside = max(outside, inside), gain + max(inside, outside - cost)
-    states, state = np.zeros(len(gains), bool), inside > outside
-    for k in reversed(range(len(gains))):
-        states[k] = state
-        state = came[k, int(state)]
-    return states
-
-
-CHANGES: tuple[Callable[[Followed], _Change | None], ...] = (
-    _zero_moves, _zero_drifts, _lag_drifts, _lag_changes, _gain_drifts, _gain_changes, _clipped,
-)  # fmt: skip
+    if _NO_GAIN * before < after < before / _NO_GAIN:
+        return Finding("gain_changed", CARE, values)
+    if after > before:  # it does not follow before
+        begin, end, since, until = 0, begin, 0.0, since
+    there = joint.position_rad[begin + (end - begin) // 6 : end - (end - begin) // 6]
+    if np.ptp(there) <= max(1.5 * joint.step, 0.02 * joint.scale):
+        values = {"trials": 1, "of": len(joint.trials), "longest_s": until - since}
+        return Finding("frozen", CARE, values)
+    return Finding("left_path", CARE, {"times": 1, "longest_s": until - since, "time_s": since})

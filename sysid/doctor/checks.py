@@ -24,11 +24,11 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES, in_order, select_joints
 from pupper_sysid.common.processes.workers import Workers, prepare
-from pupper_sysid.sysid.doctor.bends import held_findings
 from pupper_sysid.sysid.doctor.explanations import crossed
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, USE, Finding
 from pupper_sysid.sysid.doctor.hypotheses import (
     encoder_findings,
+    held_findings,
     hypothesis_findings,
     speed_findings,
     stepwise_findings,

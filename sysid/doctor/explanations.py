@@ -17,7 +17,7 @@ follows another joint's command.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -49,8 +49,6 @@ _USUAL_LAG_S, _LAG_SCALE_S = 0.06, 0.05  # dead time with the age of a reading: 
 _USUAL_GAIN, _MOST_GAIN_NATS = 0.3, 12.0  # of the logarithm
 
 _HELD_S, _BY_CHANCE = 0.12, 0.01  # rest; probability that lost reads alone hold a value for longer
-
-Filtered = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,7 @@ class Explanation:
     @cached_property
     def total_s(self) -> NDArray[np.float64]:
         """Delay of low-pass and lag together, shape (filters, lags)."""
-        delays = [servo_delay(k) for k in range(len(FILTERS))]
+        delays = [damping / (np.pi * hz) if hz else 0.0 for hz, damping in FILTERS]
         return self.lags_s + np.array(delays)[:, None]
 
     def best(self, sign: float, inside: NDArray[np.bool_]) -> Servo:
@@ -129,38 +127,14 @@ class Explanation:
             float(self.lags_s[at]), float(self.total_s[f, at]), int(f),
         )  # fmt: skip
 
+    def causal(self, latest_s: float = LATEST_S) -> NDArray[np.bool_]:
+        """Where a servo is not early and not too late, shape (filters, lags)."""
+        inside = (self.lags_s >= -0.5 * self.grid_s) & (self.lags_s <= latest_s)
+        return np.broadcast_to(inside, self.total_s.shape)
+
     def nats(self, unexplained: float) -> float:
         """Score of an unexplained share alone."""
         return 0.5 * self.rows * float(np.log(unexplained + self.floor))
-
-    def predicted(
-        self, servo: Servo, changed: Filtered | None = None, lag_s: float | None = None
-    ) -> list[NDArray[np.float64]]:
-        """The command of each trial as `servo` filters and delays it, at each reading.
-
-        `changed`: what becomes of the command before. `lag_s`: instead of the servo's.
-        """
-        lag = servo.lag_s if lag_s is None else lag_s
-        return [
-            np.interp(s.time_s - lag, *self.path(servo.filter, n, changed))
-            for n, s in enumerate(self.samples)
-        ]
-
-    def path(
-        self, filter_number: int, number: int = 0, changed: Filtered | None = None
-    ) -> tuple[NDArray, NDArray[np.float64]]:
-        """Times, and the command of a trial behind a low-pass without a lag."""
-        s, before = self.samples[number], round(LATEST_S / self.grid_s)
-        command = np.concatenate([np.full(before, s.rest_rad), s.command_rad])
-        command = command if changed is None else changed(command)
-        time = s.start_s + self.grid_s * (np.arange(len(command)) - before)
-        return time, _low_pass(command, *FILTERS[filter_number], self.grid_s)
-
-
-def servo_delay(number: int) -> float:
-    """Delay of slow motion by a low-pass [s]."""
-    hz, damping = FILTERS[number]
-    return damping / (np.pi * hz) if hz else 0.0
 
 
 @remembered(8)
@@ -356,9 +330,7 @@ def crossed(trials_by_joint: Mapping[str, Sequence[Trial]]) -> dict[str, Finding
 def _servo(trials: Sequence[Trial], step: float) -> Servo | None:
     """The best servo of positive gain; None where too little moves."""
     base = explain(trials, step)
-    if base is None:
-        return None
-    return base.best(1.0, np.broadcast_to(base.lags_s >= -0.5 * base.grid_s, base.total_s.shape))
+    return base.best(1.0, base.causal()) if base else None
 
 
 def _simultaneous(one: Sequence[Trial], other: Sequence[Trial]) -> bool:

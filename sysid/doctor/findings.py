@@ -150,9 +150,8 @@ WORDS: dict[str, str] = {
         "another scale. Check that it turns freely."
     ),
     "held_by_friction": (
-        "the joint rests for up to {longest_s:.1f} s while the command moves by "
-        "{travel_rad:.3f} rad, and moves on when it moves by more: friction holds it against so"
-        " small commands. Record with a larger amplitude."
+        "the joint rests until its command has moved by {travel_rad:.3f} rad to and fro: friction "
+        "holds it against so small commands. Record with a larger amplitude."
     ),
     "interpolated": (
         "{percent:.0f} % of the positions lie on straight lines between others: the log was "
@@ -196,11 +195,6 @@ WORDS: dict[str, str] = {
     "most_missing": (
         "{percent:.0f} % of the readings are missing: check wiring and power, then record again."
     ),
-    "no_one_lag": (
-        "no lag below 0.8 s fits all trials: they are of different joints or settings, one "
-        "column is not what it is called, or readings are older than that. Look at the trials "
-        "one by one."
-    ),
     "no_readings": (
         "there is no reading at all: check the servo's plug, id and power, then record again."
     ),
@@ -233,11 +227,6 @@ WORDS: dict[str, str] = {
         "the servo's register {register} is {value} ({limit}): it then moves its set-point by "
         "itself, and what is measured is this trajectory, not the servo. Write {cure} into "
         "{register} and record again."
-    ),
-    "pinned": (
-        "readings stay at their highest or lowest value in {trials} of {of} trials, up to "
-        "{percent:.0f} % of the time more than the command does: a limit or a mechanical stop "
-        "clips the motion. Record with a smaller amplitude."
     ),
     "poll_slipped": (
         "{where} the poll slipped by {jump_ms:.0f} ms at {time_s:.2f} s "

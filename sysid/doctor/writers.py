@@ -17,9 +17,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from pupper_sysid.common.tones import least_squares
-from pupper_sysid.sysid.doctor.changes import Followed, likely_spread
+from pupper_sysid.sysid.doctor.changes import Followed
 from pupper_sysid.sysid.doctor.findings import CARE, Finding
 from pupper_sysid.sysid.doctor.signals import interpolation_findings
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, quantum, readings
@@ -105,6 +106,17 @@ def _spread(size: NDArray, usual: float, *causes: NDArray) -> tuple[float, NDArr
     """Log-likelihood of sizes whose mean is a sum of positive shares of `causes`, and that mean."""
     spread = likely_spread(size, usual, causes)
     return -float(np.sum(np.log(spread) + size / spread)), spread
+
+
+def likely_spread(size: NDArray, usual: float, causes: Sequence[NDArray]) -> NDArray[np.float64]:
+    """Mean of exponential sizes as a sum of positive shares of 1 and `causes`, by some `rows`."""
+    design = np.column_stack([np.ones_like(size), *causes])
+    design = design / np.maximum(design.mean(axis=0), 1e-12)
+    spread = np.full_like(size, usual)
+    for _ in range(3):
+        weighted = design / spread[:, None]
+        spread = np.maximum(design @ nnls(weighted, size / spread)[0], 0.3 * usual)
+    return spread
 
 
 def _one_way(towards: int, of: int) -> float:

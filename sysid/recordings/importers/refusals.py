@@ -118,14 +118,20 @@ def unknown_columns(path: Path | str, table: Table, timed: bool = False) -> str:
         if {*names} & {*columns}:
             parts.append(f"{layout}: {', '.join(c for c in columns if c not in names)} missing")
     lines = _lines_by_name(path, table, timed)
-    rest = "" if lines else f" Other layouts: {FILES}."
+    cure = (
+        f": {lines}."
+        if lines
+        else (
+            " with `pupper-sysid import` --time (or --rate, the rows a second), --command and "
+            f"--position. Other layouts: {FILES}."
+        )
+    )
     ours = [n for n in LAYOUTS["recording of this project"] if n not in names]
     near = ((n, hit) for n in names for hit in difflib.get_close_matches(n, ours, 1, 0.8))
     hint = next((f"Was '{printable(n)[:40]}' meant as {hit}? Rename it. " for n, hit in near), "")
     return (
         f"its columns ({listed(names)}) belong to no known layout. {'; '.join(parts)}. "
-        f"{hint}Name the columns{lines} with `pupper-sysid import` --time (or --rate, the "
-        f"rows a second), --command and --position.{rest}"
+        f"{hint}Name the columns{cure}"
     )
 
 
@@ -164,7 +170,7 @@ def _lines_by_name(path: Path | str, table: Table, timed: bool) -> str:
             unit = _unit_of(table, (command, position))
             lines.append(import_line(path, **when, **unit, command=command, position=position))
     text = "; or ".join(list(dict.fromkeys(lines or lines_by_value(path, table)))[:3])
-    return f" ({text}{rate_note(when, table)})" if text else ""
+    return f"{text}{rate_note(when, table)}" if text else ""
 
 
 def lines_by_value(path: Path | str, table: Table) -> list[str]:
