@@ -613,8 +613,8 @@ def _profile(joint: Followed, span: Span) -> NDArray[np.float64]:
 def _edges(joint: Followed) -> list[int]:
     """Readings at which a change may begin or end: at either end a servo settles."""
     count = len(joint.time_s)
-    ends = np.array([_EDGE_SHARE, 1 - _EDGE_SHARE]) * count
-    return np.unique(np.linspace(*ends, _SPLITS).astype(int)).tolist()
+    rows = np.linspace(_EDGE_SHARE * count, (1 - _EDGE_SHARE) * count, _SPLITS)
+    return np.unique(rows.astype(int)).tolist()
 
 
 def _near(joint: Followed, span: Span, width: float) -> list[Span]:
