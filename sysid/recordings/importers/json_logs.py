@@ -195,13 +195,9 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
             del lists[name]
     columns = {name: _numbers(values) for name, values in lists.items() if len(values) > 1}
     arrays = {name: values for name, values in columns.items() if values is not None}
-    texts = {
-        n: list(map(str, v))
-        for n, v in lists.items()
-        if v
-        and n not in arrays
-        and (has_time([n]) or (n in GROUPS and all(isinstance(each, str) for each in v)))
-    }
+    others = {n: v for n, v in lists.items() if v and n not in arrays}
+    texts = {n: list(map(str, v)) for n, v in others.items()
+             if has_time([n]) or (n in GROUPS and all(isinstance(t, str) for t in v))}  # fmt: skip
     beside = _beside(data)
     scalars = {k: float(v) for k, v in beside if isinstance(v, int | float) and abs(v) < _FAR}
     remarks = "\n".join(f"{k}: {v}" for k, v in beside if isinstance(v, str))

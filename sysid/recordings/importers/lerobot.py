@@ -119,10 +119,8 @@ def read_lerobot(folder: Path, options: LogOptions) -> Log:
         ],
         ignore_index=True,
     )
-    by_text: dict[str, list[str]] = {}
-    for joint, text in texts.items():
-        by_text.setdefault(text, []).append(joint)
-    units = "; ".join(f"{', '.join(key_columns)}: {text}" for text, key_columns in by_text.items())
+    of_text = {text: [j for j in texts if texts[j] == text] for text in texts.values()}
+    units = "; ".join(f"{', '.join(names_of)}: {text}" for text, names_of in of_text.items())
     warnings = [
         f"its times are frame numbers over {fps:g} Hz, not clock readings: lag and dead time scale "
         "with that rate (`pupper-sysid import --rate` gives another), and when a state was read "
