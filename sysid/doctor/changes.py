@@ -142,8 +142,11 @@ class Followed:
 
     @property
     def explained(self) -> bool:
-        """Whether a servo with limits explains nearly all that limits let a fit explain."""
-        return self.fit.cost - self.unsure < EXPLAINED
+        """Whether a servo with limits explains nearly all that limits let a fit explain.
+
+        Doubt about limits excuses a part of the motion, not most of it.
+        """
+        return self.fit.cost - self.unsure < EXPLAINED and self.unexplained < 0.5
 
     @property
     def unexplained(self) -> float:
