@@ -70,7 +70,7 @@ def _cells(trained: str, name: str, rows: dict, episodes: int) -> list[str]:
     cells = [trained, name, f"{100 * figures.fall_rate:.0f}"]
     for kind in ("mae", "stride_mae"):
         for axis in ("vx_m_s", "vy_m_s", "yaw_rad_s"):
-            error = getattr(figures.intervals, f"{kind}_{axis}")
+            error = figures.intervals[f"{kind}_{axis}"]
             cells.append(f"{1e3 * error.value:.0f} ± {1e3 * (error.high - error.low) / 2:.0f}")
     share = {way: 100 * rows[way].speed_share for way in ("forward", "turn left", "turn right")}
     cells += [f"{share['forward']:.0f}", f"{share['turn left']:.0f}, {share['turn right']:.0f}"]

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from statistics import mode
 from typing import Any, Literal
 
 import numpy as np
@@ -148,24 +149,6 @@ class Walk:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Intervals(Result):
-    """90 % intervals over episodes.
-
-    Of the share that fell by Clopper and Pearson, of all else by Student's t.
-    """
-
-    fall_rate: Interval
-    mae_vx_m_s: Interval
-    mae_vy_m_s: Interval
-    mae_yaw_rad_s: Interval
-    stride_mae_vx_m_s: Interval
-    stride_mae_vy_m_s: Interval
-    stride_mae_yaw_rad_s: Interval
-    speed_share: Interval
-    heading_drift_deg: Interval
-
-
-@dataclass(frozen=True, kw_only=True)
 class Figures(Result):
     """Figures of a number of episodes."""
 
@@ -212,10 +195,12 @@ class Figures(Result):
     cost_of_transport: float
     """Positive work over weight times distance, of the mean motion over a stride; NaN where the
     command is to stay in place."""
-    intervals: Intervals
+    intervals: dict[str, Interval]
+    """90 % intervals over episodes, of the share that fell by Clopper and Pearson, of the errors,
+    the share of the speed and the drift by Student's t."""
 
 
-class Recorder(StepRecorder):
+class Recorder(StepRecorder[Walk]):
     """What figures are made of, for the robots of one environment."""
 
     def arrays(self, now: Moment) -> dict[str, NDArray]:
@@ -273,9 +258,7 @@ def figures_of(walk: Walk, command: tuple[float, float, float] | None = None) ->
         swing_s=float(walk.swing_s.sum() / swings) if swings else float("nan"),
         foot_slip_m_s=float(walk.slip_m_s.sum() / max(standing, 1)),
         **_effort(walk, command is None or any(command[:2])),
-        intervals=Intervals(
-            fall_rate=share_interval(int(walk.fell.sum()), len(walk.fell)), **intervals
-        ),
+        intervals={"fall_rate": share_interval(int(walk.fell.sum()), len(walk.fell)), **intervals},
     )
 
 
@@ -356,12 +339,16 @@ def falls_of(
     for i in np.flatnonzero(fell).tolist():
         at = int(alive[:, i].sum())
         x, y, down = gravity[at, i]
+        sides: tuple[Direction, Direction] = ("forward", "backward")
+        along = x
+        if abs(y) > abs(x):  # the trunk tilts to the side of gravity in its frame
+            sides, along = ("left", "right"), y
         time_s = (at + 1) * step_s
         falls.append(
             Fall(
                 row=row, walker=condition.walker, episode=i, time_s=time_s,
                 tilt_before_deg=_tilt_deg(gravity[max(at - before, 0), i]),
-                tilt_deg=_tilt_deg(gravity[at, i]), toward=_toward(float(x), float(y)),
+                tilt_deg=_tilt_deg(gravity[at, i]), toward=sides[0 if along > 0 else 1],
                 tipped=bool(down > -FALLEN_TILT), command=tuple(command[at, i].tolist()),
                 since_push_s=condition.handicap.since_push_s(time_s),
             )
@@ -373,51 +360,26 @@ def _tilt_deg(gravity: Array) -> float:
     return float(np.degrees(np.arccos(np.clip(-gravity[2], -1.0, 1.0))))
 
 
-def _toward(x: float, y: float) -> Direction:
-    """Side of gravity in the trunk's frame, which is that to which it tilts."""
-    if abs(x) >= abs(y):
-        return "forward" if x > 0 else "backward"
-    return "left" if y > 0 else "right"
+def in_short(falls: Sequence[Fall]) -> list[dict[str, Any]]:
+    """Falls by condition and walker, in their order.
 
-
-@dataclass(frozen=True, kw_only=True)
-class FallsOfRow(Result):
-    """Falls of one walker under one condition, in short."""
-
-    row: str
-    walker: Walker
-    falls: int
-    time_s: float
-    """Median."""
-    tilt_before_deg: float
-    """Median."""
-    toward: Direction
-    """Most frequent."""
-    tipped: int
-    after_push: int
-    """Within 1 s of a push."""
-
-
-def in_short(falls: Sequence[Fall]) -> list[FallsOfRow]:
-    """Falls by condition and walker, in their order."""
+    Medians of time and tilt, the most frequent side, and how many tipped over and how many came
+    within 1 s of a push.
+    """
     groups: dict[tuple[str, Walker], list[Fall]] = {}
     for fall in falls:
         groups.setdefault((fall.row, fall.walker), []).append(fall)
-    rows = []
-    for (row, walker), group in groups.items():
-        sides: list[Direction] = [fall.toward for fall in group]
-        pushed = [f.since_push_s for f in group if f.since_push_s is not None]
-        rows.append(
-            FallsOfRow(
-                row=row, walker=walker, falls=len(group),
-                time_s=float(np.median([f.time_s for f in group])),
-                tilt_before_deg=float(np.median([f.tilt_before_deg for f in group])),
-                toward=max(sides, key=lambda side: sides.count(side)),
-                tipped=sum(f.tipped for f in group),
-                after_push=sum(since <= 1.0 for since in pushed),
-            )
-        )  # fmt: skip
-    return rows
+    return [
+        {
+            "row": row, "walker": walker, "falls": len(group),
+            "time_s": float(np.median([f.time_s for f in group])),
+            "tilt_before_deg": float(np.median([f.tilt_before_deg for f in group])),
+            "toward": mode([f.toward for f in group]),
+            "tipped": sum(f.tipped for f in group),
+            "after_push": sum(f.since_push_s is not None and f.since_push_s <= 1 for f in group),
+        }
+        for (row, walker), group in groups.items()
+    ]  # fmt: skip
 
 
 Group = Literal[
@@ -588,49 +550,36 @@ def usual_robots(episodes: int) -> Callable[[Case, Walker], int]:
     return count
 
 
+def _handicapped(group: Group, name: str, shown: float, **values: Sequence[float]) -> list[Case]:
+    """Cases of one handicap, named by its values times `shown`."""
+    ((handicap, sizes),) = values.items()
+    return [
+        Case(group, name.format(shown * size), handicap=Handicap(**{handicap: size}))
+        for size in sizes
+    ]
+
+
 BATTERY: tuple[Case, ...] = (
+    *_handicapped("push", "pushes of {:g} m/s", 1, push_m_s=(0.4, 0.8, 1.2)),
+    *_handicapped("slope", "slope of {:g}°", 1, slope_deg=(10.0, 15.0, 20.0)),
     *(
-        Case("push", f"pushes of {speed:g} m/s", handicap=Handicap(push_m_s=speed))
-        for speed in (0.4, 0.8, 1.2)
-    ),
-    *(
-        Case("slope", f"slope of {slope:g}°", handicap=Handicap(slope_deg=slope))
-        for slope in (10.0, 15.0, 20.0)
+        replace(case, terrain="stairs")
+        for case in _handicapped("stairs", "steps of {:g} mm", 1e3, riser_m=tuple(STAIRS_M))
     ),
     *(
-        Case(
-            "stairs", f"steps of {1e3 * riser:g} mm", terrain="stairs",
-            handicap=Handicap(riser_m=riser),
-        )
-        for riser in STAIRS_M
+        Case("payload", f"150 g, {where}", handicap=Handicap(payload_kg=0.15, payload_at_m=at))
+        for where, at in {"4 cm left": (0.0, 0.04), "8 cm behind": (-0.08, 0.0)}.items()
     ),
-    Case(
-        "payload", "150 g, 4 cm left",
-        handicap=Handicap(payload_kg=0.15, payload_at_m=(0.0, 0.04)),
-    ),
-    Case(
-        "payload", "150 g, 8 cm behind",
-        handicap=Handicap(payload_kg=0.15, payload_at_m=(-0.08, 0.0)),
-    ),
-    *(
-        Case("leg", f"one leg at {100 * torque:g} %", handicap=Handicap(weak_leg=torque))
-        for torque in (0.5, 0.25)
-    ),
-    *(
-        Case("ticks", f"{100 * share:g} % ticks missed", handicap=Handicap(missed_ticks=share))
-        for share in (0.1, 0.3)
-    ),
+    *_handicapped("leg", "one leg at {:g} %", 100, weak_leg=(0.5, 0.25)),
+    *_handicapped("ticks", "{:g} % ticks missed", 100, missed_ticks=(0.1, 0.3)),
     *(
         Case("dead time", f"dead time +{1e3 * extra:g} ms", extra_dead_time_s=extra)
         for extra in (0.04, 0.08)
     ),
-    *(
-        Case("jitter", f"jitter +{1e3 * jitter:g} ms", handicap=Handicap(extra_jitter_s=jitter))
-        for jitter in (0.01, 0.02)
-    ),
-    Case("friction", "friction of 0.15", handicap=Handicap(friction=0.15)),
+    *_handicapped("jitter", "jitter +{:g} ms", 1e3, extra_jitter_s=(0.01, 0.02)),
+    *_handicapped("friction", "friction of {:g}", 1, friction=(0.15,)),
     Case("robot", "unlike its model", differences=TYPICAL),
-)  # fmt: skip
+)
 """Rows of the battery, after that of random commands."""
 
 

@@ -62,7 +62,7 @@ def _figures(walker: str, figures: Figures) -> dict[str, float]:
     return {
         key: number
         for name in names
-        for key, number in ends(f"{walker}.{name}", getattr(figures.intervals, name)).items()
+        for key, number in ends(f"{walker}.{name}", figures.intervals[name]).items()
     }
 
 
@@ -149,7 +149,7 @@ def _before_falls(evaluation: Evaluation) -> Table:
         "Before falls: median time, median tilt 0.2 s before, usual side; pushed: a push in the "
         "last second"
     )
-    return Table("falls", title, columns, [plain(row) for row in in_short(evaluation.falls)])
+    return Table("falls", title, columns, in_short(evaluation.falls))
 
 
 ERROR_UNITS = {
@@ -285,7 +285,7 @@ def _errors_figure(evaluation: Evaluation) -> Figure:
             for at, row in zip(place, rows, strict=True):
                 figures: Figures = getattr(row, walker)
                 colour = FAINT if walker == "trot" else RED if figures.fall_rate > 0 else BLUE
-                _point(panel, getattr(figures.intervals, key), at + offset, 1.0, colour)
+                _point(panel, figures.intervals[key], at + offset, 1.0, colour)
         panel.axvline(getattr(still, key), color=FAINT, ls=":")
         panel.set_title(f"{name}, {unit}", fontsize=9)
         panel.set_xlim(left=0)
@@ -302,7 +302,7 @@ def _falls_figure(evaluation: Evaluation) -> Figure:
     place = -np.arange(len(rows))
     for offset, walker, colour in ((0.2, "policy", BLUE), (0.0, "trot", FAINT)):
         for at, row in zip(place, rows, strict=True):
-            _point(axes, getattr(row, walker).intervals.fall_rate, at + offset, 100.0, colour)
+            _point(axes, getattr(row, walker).intervals["fall_rate"], at + offset, 100.0, colour)
     still = [100 * row.standing.fall_rate for row in rows]
     axes.plot(still, place - 0.2, "o", mfc="none", mec=FAINT, ms=4, ls="none")
     axes.set_xlim(-2, 102)

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.interval import Interval, t_quantile
-from pupper_sysid.common.results import Result
+from pupper_sysid.common.results import Result, internal
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
 from pupper_sysid.sim.robot.replay import Replayed, ServoRobot, replay
 from pupper_sysid.sim.walking.config import Randomisation
@@ -210,6 +210,53 @@ def _shift(run: Run) -> float:
     return float(np.nanmedian(apart)) if np.isfinite(apart).any() else 0.0
 
 
+@dataclass(frozen=True, kw_only=True)
+class Gyro(Result):
+    """Spectrum of a gyro; each number for x, y and z."""
+
+    deviation_rad_s: tuple[float, ...]
+    """Standard deviation; of several robots their mean."""
+    peak_hz: tuple[float, ...]
+    """Frequency of 0.5 to 10 Hz whose sine explains most; NaN of an axis that does not turn."""
+    peak_share: tuple[float, ...]
+    """Share of the variance that this sine explains."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwinErrors(Result):
+    """Errors of the simulated robot on one joint, or their means over joints [rad]."""
+
+    mae_rad: float
+    rmse_rad: float
+    """`mae_rad` and `rmse_rad`: mean absolute and root mean square error of the readings that
+    count: rows as logged against predicted readings, or fresh ones where the recording dates
+    them."""
+    rmse_raw_rad: float
+    """Of rows as logged."""
+    offset_rad: float
+    """Reading minus prediction, taken out of all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Condition(Result):
+    """The simulated robot in the air or on the ground."""
+
+    joints: dict[str, TwinErrors]
+    mean: TwinErrors
+    """Over joints; of the offset, the mean of its size."""
+    rmse_rad: Interval
+    """Of the mean."""
+    copies: int
+    upright: int
+    """`copies` and `upright`: simulated robots, and how many of them stayed up."""
+    first_fall_s: float | None
+    """When the first fell [s]."""
+    gyro: Gyro | None
+    """Of those that stayed up; None in the air, or of less than seven seconds."""
+    errors: dict[str, Errors] = internal()
+    tracks: Tracks = internal()
+
+
 Verdict = Literal["ground", "air", "cannot tell"]
 
 STRONGER = 4.0
@@ -225,20 +272,6 @@ _WHY: dict[Verdict, str] = {
     ),
     "cannot tell": "The motion of the joints does not separate the ground from the air.",
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class Case:
-    """The simulated robot at one scale of its torques, in the air and on the ground."""
-
-    air: Mapping[str, Sequence[Array]]
-    ground: Mapping[str, Sequence[Array]]
-    """`air` and `ground`: tracks by joint and run, with offsets."""
-    errors: Mapping[str, Errors]
-    """In the air, by joint."""
-    ground_errors: Mapping[str, Errors]
-    offsets: Mapping[str, tuple[float, float]]
-    """Reading minus prediction in the air and on the ground [rad], by joint."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,15 +296,20 @@ class Evidence(Result):
     """The verdict's reason, in a sentence."""
 
 
-def evidence(cases: Sequence[Case], data: ServoData, part: Part, seed: int) -> Evidence:
+def evidence(
+    cases: Sequence[tuple[Condition, Condition]], data: ServoData, part: Part, seed: int
+) -> Evidence:
     """What predictions of the same readings in the air and on the ground say.
 
-    Cases are with the torques as they are, and stronger; `part` chooses the readings that count;
-    the seed is the bootstrap's.
+    Cases are in the air and on the ground, with the torques as they are, and stronger; `part`
+    chooses the readings that count; the seed is the bootstrap's.
     """
-    motion = [_motion(case, data, part, seed) for case in cases]
-    load = [_load_share(case.offsets) for case in cases]
-    first = cases[0]
+    motion = [_motion(air, ground, data, part, seed) for air, ground in cases]
+    load = [
+        _load_share({j: (e.offset_rad, ground.joints[j].offset_rad) for j, e in air.joints.items()})
+        for air, ground in cases
+    ]
+    in_air, on_ground = cases[0]
     nothing = [
         m is not None and -_NONE < m.share.low and m.share.high < _NONE
         and m.correlation.high < _UNCORRELATED
@@ -282,34 +320,38 @@ def evidence(cases: Sequence[Case], data: ServoData, part: Part, seed: int) -> E
         verdict = "ground"
     return Evidence(
         verdict=verdict, motion=motion, load_share=load, why=_WHY[verdict],
-        difference_rad=interval(dict(first.ground_errors), seed, dict(first.errors)),
+        difference_rad=interval(on_ground.errors, seed, in_air.errors),
     )  # fmt: skip
 
 
-def _motion(case: Case, data: ServoData, part: Part, seed: int) -> Motion | None:
-    place, draws = block_draws(case.errors, seed)
+def _motion(
+    air: Condition, ground: Condition, data: ServoData, part: Part, seed: int
+) -> Motion | None:
+    place, draws = block_draws(air.errors, seed)
     sums = np.zeros((3, len(place)))
-    for joint, errors in case.errors.items():
-        moved, error_rad = _unexplained(case, joint, data, part)
+    for joint, errors in air.errors.items():
+        moved, error_rad = _unexplained(air.tracks, ground.tracks, joint, data, part)
         index, weight = [place[b] for b in errors.block], 1.0 / max(float(error_rad.var()), 1e-12)
         for row, product in zip(sums, (error_rad * moved, moved**2, error_rad**2), strict=True):
             row += weight * np.bincount(index, product, len(place))
     if not sums[1].sum() > 1e-12 * len(place):
         return None
-    together, ground, error = (np.append(draws @ row, row.sum()) for row in sums)
-    ground = np.maximum(ground, 1e-300)
-    share, correlation = together / ground, together / np.sqrt(ground * np.maximum(error, 1e-300))
+    together, moved, error = (np.append(draws @ row, row.sum()) for row in sums)
+    moved = np.maximum(moved, 1e-300)
+    share, correlation = together / moved, together / np.sqrt(moved * np.maximum(error, 1e-300))
     return Motion(
         share=Interval.of_draws(float(share[-1]), share[:-1]),
         correlation=Interval.of_draws(float(correlation[-1]), correlation[:-1]),
     )
 
 
-def _unexplained(case: Case, joint: str, data: ServoData, part: Part) -> tuple[Array, Array]:
+def _unexplained(
+    in_air: Tracks, on_ground: Tracks, joint: str, data: ServoData, part: Part
+) -> tuple[Array, Array]:
     """Ground less air and reading less air, without what a wrong servo explains, by reading."""
     rows = []
     for n, run in enumerate(data.runs[joint]):
-        air, ground = case.air[joint][n], case.ground[joint][n]
+        air, ground = in_air[joint][n], on_ground[joint][n]
         rate = steps_per_tick(air, run) / data.period_s
         speed = np.gradient(air) * rate
         when = counted_ticks(run, data.modes[joint])

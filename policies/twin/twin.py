@@ -29,7 +29,6 @@ from scipy.signal import lombscargle
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.figure_style import BLUE, FAINT, GREEN, INK, RED, WIDTH_IN, styled
-from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import share_sentences
 from pupper_sysid.common.reading.content import content
 from pupper_sysid.common.reading.csv_table import read_table
@@ -37,9 +36,11 @@ from pupper_sysid.common.results import Result, internal
 from pupper_sysid.policies.twin.drawing import Actuator, stronger
 from pupper_sysid.policies.twin.playing import (
     STRONGER,
-    Case,
+    Condition,
     Evidence,
+    Gyro,
     Played,
+    TwinErrors,
     Verdict,
     evidence,
     play,
@@ -54,8 +55,6 @@ from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
 from pupper_sysid.sysid.servo_fit.figures import busiest
 from pupper_sysid.sysid.servo_fit.scores import (
-    Errors,
-    Tracks,
     mean_known,
     offsets,
     predicted,
@@ -73,18 +72,6 @@ _TIMES, _MOST_BYTES = ("timestamp", "time_s"), 100e6
 _SETTLE_S, _SHORTEST_S = 2.0, 5.0
 _LOW_HZ, _HIGH_HZ = 0.5, 10.0
 _PER_BIN = 8  # frequencies per 1 / duration
-
-
-@dataclass(frozen=True, kw_only=True)
-class Gyro(Result):
-    """Spectrum of a gyro; each number for x, y and z."""
-
-    deviation_rad_s: tuple[float, ...]
-    """Standard deviation; of several robots their mean."""
-    peak_hz: tuple[float, ...]
-    """Frequency of 0.5 to 10 Hz whose sine explains most; NaN of an axis that does not turn."""
-    peak_share: tuple[float, ...]
-    """Share of the variance that this sine explains."""
 
 
 @dataclass(frozen=True)
@@ -155,41 +142,6 @@ def spectrum(time_s: Array, rates_rad_s: Sequence[Array]) -> Gyro | None:
         deviation_rad_s=tuple(map(float, deviation)), peak_hz=peak_hz,
         peak_share=tuple(map(float, peak_share)),
     )  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class TwinErrors(Result):
-    """Errors of the simulated robot on one joint, or their means over joints [rad]."""
-
-    mae_rad: float
-    rmse_rad: float
-    """`mae_rad` and `rmse_rad`: mean absolute and root mean square error of the readings that
-    count: rows as logged against predicted readings, or fresh ones where the recording dates
-    them."""
-    rmse_raw_rad: float
-    """Of rows as logged."""
-    offset_rad: float
-    """Reading minus prediction, taken out of all."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Condition(Result):
-    """The simulated robot in the air or on the ground."""
-
-    joints: dict[str, TwinErrors]
-    mean: TwinErrors
-    """Over joints; of the offset, the mean of its size."""
-    rmse_rad: Interval
-    """Of the mean."""
-    copies: int
-    upright: int
-    """`copies` and `upright`: simulated robots, and how many of them stayed up."""
-    first_fall_s: float | None
-    """When the first fell [s]."""
-    gyro: Gyro | None
-    """Of those that stayed up; None in the air, or of less than seven seconds."""
-    errors: dict[str, Errors] = internal()
-    tracks: Tracks = internal()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -355,18 +307,9 @@ def _twin_of(
     """Conditions of one actuator, its torques as they are and stronger, and what they say."""
     if len(conditions) == 1:
         return ActuatorTwin(air=conditions[0][0], ground=None, evidence=None)
-    cases = [
-        Case(
-            air=air.tracks, ground=ground.tracks, errors=air.errors, ground_errors=ground.errors,
-            offsets={
-                j: (s.offset_rad, ground.joints[j].offset_rad) for j, s in air.joints.items()
-            },
-        )
-        for air, ground in zip(*conditions, strict=True)
-    ]  # fmt: skip
-    return ActuatorTwin(
-        air=conditions[0][0], ground=conditions[1][0], evidence=evidence(cases, data, test, seed)
-    )
+    cases = list(zip(*conditions, strict=True))
+    air, ground = cases[0]
+    return ActuatorTwin(air=air, ground=ground, evidence=evidence(cases, data, test, seed))
 
 
 def _notes(

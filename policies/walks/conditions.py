@@ -1,8 +1,8 @@
 """Conditions of a walk: which walker, on which ground, at which command, and what makes it harder.
 
 Robots walk by the policy, by the open-loop trot, which sees nothing and has a clock, or they stand.
-`policies.walks.together` lets them walk under many conditions at once, and a `Recorder` keeps what
-is wanted of each step.
+`policies.walks.together` lets them walk under many conditions at once, and a `StepRecorder` keeps
+what is wanted of each step.
 
 A handicap makes a walk harder for some robots of a batch. A slope is a plane whose gravity is
 tilted, which is the same physics; the direction of gravity that a policy sees is tilted with it. So
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol, TypeVar
+from typing import Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,7 +154,7 @@ def missed_ticks(robots: int, steps: int, seed: int) -> Array:
     return chances
 
 
-Kept = TypeVar("Kept", covariant=True)
+Kept = TypeVar("Kept")
 
 DIRECTIONS = {
     "forward": (0.15, 0.0, 0.0),
@@ -233,24 +233,8 @@ class Actor(Protocol):
         ...
 
 
-class Recorder(Protocol[Kept]):
-    """Keeps what is wanted of the walks in an environment."""
-
-    def keep(self, now: Moment) -> None:
-        """Take the next control step."""
-        ...
-
-    def of(self, condition: Condition, robots: slice, steps: int, commands: Array) -> Kept:
-        """What was kept of the robots of a condition in the first `steps`.
-
-        `commands` are those of the whole walk, shape (all steps, robots, 3), also of steps that
-        were not taken because no robot was up.
-        """
-        ...
-
-
-class StepRecorder:
-    """A `Recorder` of arrays by name, (n, …) of each control step, and of the falls."""
+class StepRecorder(Generic[Kept]):
+    """Keeps what is wanted of the walks in an environment: arrays of each step, and the falls."""
 
     def __init__(self, env: PupperEnv, policy: Actor | None, conditions: Sequence[Condition]):
         self.env, self.fell = env, np.zeros(env.environments, bool)
@@ -262,7 +246,15 @@ class StepRecorder:
         self.steps.append(self.arrays(now))
 
     def arrays(self, now: Moment) -> dict[str, NDArray]:
-        """What is kept of a step, not to be overwritten."""
+        """What is kept of a step by name, (n, …), not to be overwritten."""
+        raise NotImplementedError
+
+    def of(self, condition: Condition, robots: slice, steps: int, commands: Array) -> Kept:
+        """What was kept of the robots of a condition in the first `steps`.
+
+        `commands` are those of the whole walk, shape (all steps, robots, 3), also of steps that
+        were not taken because no robot was up.
+        """
         raise NotImplementedError
 
     def stacked(self, robots: slice, steps: int) -> dict[str, NDArray]:

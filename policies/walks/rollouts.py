@@ -184,7 +184,7 @@ def collect(
     return walk_together(policy, servos, conditions, seconds, seed, threads, recorder, progress)
 
 
-class _Recorder(StepRecorder):
+class _Recorder(StepRecorder[Rollout]):
     """Rollouts of one environment."""
 
     def __init__(

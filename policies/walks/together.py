@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import TypeVar
 
@@ -29,7 +29,7 @@ from pupper_sysid.policies.walks.conditions import (
     Actor,
     Condition,
     Moment,
-    Recorder,
+    StepRecorder,
     impose,
     missed_ticks,
     push_directions,
@@ -61,7 +61,7 @@ def walk_together(
     seconds: float,
     seed: int,
     threads: int,
-    recorder: Callable[[PupperEnv, PolicyT | None, Sequence[Condition]], Recorder[T]],
+    recorder: Callable[[PupperEnv, PolicyT | None, Sequence[Condition]], StepRecorder[T]],
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[T]:
     """Walk from a gentle start under every condition; what the recorders kept, by condition.
@@ -77,9 +77,9 @@ def walk_together(
     step_s = max(c.task.control_step_s for c in conditions)
     if round(seconds / step_s) < 1:
         raise InputError(f"A rollout of {seconds} s is shorter than one step of {step_s} s.")
-    shared = _Shared(
-        max(c.robots for c in conditions), any(c.handicap.extra_jitter_s for c in conditions)
-    )
+    # environments draw alike: of as many different robots, and with jitter if any condition has it
+    count = max(c.robots for c in conditions)
+    jitter = any(c.handicap.extra_jitter_s for c in conditions)
     done, lock, stop = 0.0, threading.Lock(), threading.Event()
     total = seconds * sum(c.robots for c in conditions)
     results: dict[int, T] = {}
@@ -95,7 +95,7 @@ def walk_together(
     def walk(environments: list[list[int]], threads: int) -> None:
         for chosen in environments:
             batch = [conditions[i] for i in chosen]
-            group = _Group(policy, servos, batch, seconds, seed, threads, shared, recorder)
+            group = _Group(policy, servos, batch, seconds, seed, threads, count, jitter, recorder)
             if not group.walk(advance):
                 return
             results.update(zip(chosen, group.results(), strict=True))
@@ -132,16 +132,6 @@ def _refuse_impossible(conditions: Sequence[Condition], seconds: float, threads:
         )
 
 
-@dataclass(frozen=True)
-class _Shared:
-    """What environments have in common, so that they draw alike."""
-
-    robots: int
-    """Different ones."""
-    jitter: bool
-    """Whether any condition adds jitter."""
-
-
 def _shares(conditions: Sequence[Condition]) -> list[list[list[int]]]:
     """Conditions by worker, of like amounts of work, and by environment."""
     shares: list[list[int]] = [[] for _ in range(_AT_A_TIME)]
@@ -151,11 +141,13 @@ def _shares(conditions: Sequence[Condition]) -> list[list[list[int]]]:
 
     for i in sorted(range(len(conditions)), key=lambda i: -conditions[i].robots):
         min(shares, key=work).append(i)
-    by_task: list[dict[Walking, list[int]]] = [{} for _ in shares]
-    for groups, share in zip(by_task, shares, strict=True):
+    environments = []
+    for share in filter(None, shares):
+        groups: dict[Walking, list[int]] = {}
         for i in sorted(share):
             groups.setdefault(conditions[i].task, []).append(i)
-    return [list(groups.values()) for groups in by_task if groups]
+        environments.append(list(groups.values()))
+    return environments
 
 
 class _Group:
@@ -163,8 +155,8 @@ class _Group:
 
     def __init__(
         self, policy: Actor | None, servos: ServoRanges, conditions: Sequence[Condition],
-        seconds: float, seed: int, threads: int, shared: _Shared,
-        recorder: Callable[..., Recorder],
+        seconds: float, seed: int, threads: int, count: int,
+        jitter: bool, recorder: Callable[..., StepRecorder],
     ):  # fmt: skip
         step_s = conditions[0].task.control_step_s
         self.conditions, self.step_s, self.steps = conditions, step_s, round(seconds / step_s)
@@ -179,15 +171,15 @@ class _Group:
         task = replace(conditions[0].task, episode_s=(self.steps + 1) * step_s)
         self.env = PupperEnv(
             task, servos, ends[-1], _SEED + seed, threads, servo_model_of(servos.source, step_s),
-            per_robot([c.extra_dead_time_s for c in conditions]), Twins(number, shared.robots),
-            per_robot([c.handicap.extra_jitter_s for c in conditions]) if shared.jitter else None,
+            per_robot([c.extra_dead_time_s for c in conditions]), Twins(number, count),
+            per_robot([c.handicap.extra_jitter_s for c in conditions]) if jitter else None,
         )  # fmt: skip
         for condition, robots in zip(conditions, self.robots, strict=True):
             impose(self.env.robots, _numbers(robots), condition.handicap)
         self.policy = deepcopy(policy)  # a recorder's hooks must see this environment only
         self.recorder = recorder(self.env, self.policy, conditions)
         random = random_commands(
-            shared.robots, self.steps, step_s, seed, task.commands if task.robot else RANDOM
+            count, self.steps, step_s, seed, task.commands if task.robot else RANDOM
         )
         commands = np.concatenate(
             [
@@ -198,9 +190,9 @@ class _Group:
             axis=1,
         )  # fmt: skip
         self.commands = at_rest(task.commands, commands.reshape(-1, 3)).reshape(commands.shape)
-        self.pushes = push_directions(shared.robots, self.steps, step_s, seed)
+        self.pushes = push_directions(count, self.steps, step_s, seed)
         chance = per_robot([c.handicap.missed_ticks for c in conditions])
-        self.missed = missed_ticks(shared.robots, self.steps, seed)[:, number] < chance
+        self.missed = missed_ticks(count, self.steps, seed)[:, number] < chance
         self.led, self.trotting = (
             np.flatnonzero(np.repeat([c.walker == w for c in conditions], np.diff(ends)))
             for w in ("policy", "trot")

@@ -151,8 +151,8 @@ def test_the_battery_has_a_row_for_each_condition_and_its_falls_say_what_came_be
     pushed = [f for f in found.falls if f.row == hard[0].name and f.since_push_s is not None]
     assert all(0 <= f.since_push_s <= 0.4 and f.time_s > 3.0 for f in pushed)
     short = in_short(found.falls)
-    assert sum(own.falls for own in short) == len(found.falls)
-    assert sum(own.after_push for own in short) == len(pushed)
+    assert sum(own["falls"] for own in short) == len(found.falls)
+    assert sum(own["after_push"] for own in short) == len(pushed)
 
 
 def test_an_evaluation_has_no_pushes_no_curriculum_gentle_starts_and_walks_of_its_seed():
@@ -175,7 +175,7 @@ def test_intervals_are_over_episodes():
     every = share_interval(30, 30)
     assert every.high == 1.0 and every.low == pytest.approx(0.05 ** (1 / 30))
     found = walk(None, evaluation_task(Walking(), 0.1), servo_ranges("ideal"), 2, 0, threads=1)
-    own = figures_of(found).intervals.mae_yaw_rad_s
+    own = figures_of(found).intervals["mae_yaw_rad_s"]
     half = abs(found.error[0, 2] - found.error[1, 2]) / 2
     assert own.value == pytest.approx(found.error[:, 2].mean())
     assert own.high - own.value == pytest.approx(6.3138 * half, rel=1e-4)
