@@ -96,11 +96,10 @@ def assemble(
     observer = make_observer(
         stack.observer, period, contract.velocity_steps, parameters, ends, model, len(pose)
     )
-    if trained is None or trained == actuator:
-        match = compare(observer, parameters, period, pose=pose)
-    else:
+    of_training = parameters
+    if trained is not None and trained != actuator:
         of_training = DelayedPDParameters(**servo_ranges(trained, body=body).value)
-        match = compare(observer, of_training, period, parameters, pose)
+    match = compare(observer, of_training, period, parameters, pose)
     stall = float(np.median(servos.value["effort_limit"]))  # torque at full duty
     stall = stall if np.isfinite(stall) else 0.0
     controller = Controller(policy, stack, observer, joint_map, stall)
@@ -109,9 +108,9 @@ def assemble(
     header = {
         "policy_sha256": contract.weights_sha256, "stack": asdict(stack),
         "joint_map": joint_map.file.name, "actuator": actuator,
-        "actuator_sha256": _hash(Path(actuator)),
+        "actuator_sha256": sha256(Path(actuator)) if Path(actuator).is_file() else None,
         "servo": str(servo) if model else None,
-        "servo_sha256": _hash(servo / WEIGHTS) if servo and model else None,
+        "servo_sha256": sha256(servo / WEIGHTS) if servo and model else None,
     }  # fmt: skip
     return Assembly(controller, frozen, match, _servo_match(policy, servos, trained), header)
 
@@ -148,10 +147,6 @@ def _servo_match(policy: Policy, servos: ServoRanges, trained: str | None) -> Se
         known = feedback if feedback in ("held", "ideal") else "held"
         trained_servos = trained_servo(trained, known, Walking(), servo_ranges(trained, known))
     return None if trained_servos is None else servo_match(trained_servos, servos)
-
-
-def _hash(path: Path) -> str | None:
-    return sha256(path) if path.is_file() else None
 
 
 Array = NDArray[np.float64]

@@ -87,22 +87,30 @@ class Match:
     @property
     def worst_gain_ratio(self) -> float:
         """The gain ratio that is farthest from 1."""
-        return float(self.gain_ratio[self._worst_gain()])
+        return float(self.gain_ratio.flat[np.abs(self.gain_ratio - 1).argmax()])
 
     @property
     def worst_phase_difference_deg(self) -> float:
         """The phase difference that is farthest from 0."""
-        return float(self.phase_difference_deg[self._worst_phase()])
+        phase = self.phase_difference_deg
+        return float(phase.flat[np.abs(phase).argmax()])
 
     @property
     def fits(self) -> bool:
         """Whether both are within `MOST_GAIN_ERROR` and `MOST_PHASE_DEG`."""
-        return self._gain_fits() and abs(self.worst_phase_difference_deg) <= MOST_PHASE_DEG
+        return (
+            abs(self.worst_gain_ratio - 1) <= MOST_GAIN_ERROR
+            and abs(self.worst_phase_difference_deg) <= MOST_PHASE_DEG
+        )
 
     def sentence(self) -> str:
         """The worst frequency and both values there, as a sentence for the user."""
-        if not self._gain_fits():
-            i, j = self._worst_gain()
+        gain_fits = abs(self.worst_gain_ratio - 1) <= MOST_GAIN_ERROR
+        errors = np.abs(self.phase_difference_deg if gain_fits else self.gain_ratio - 1)
+        i, j = map(int, np.unravel_index(errors.argmax(), errors.shape))
+        alike = all(np.allclose(h[i], h[i, j], atol=0.01) for h in (self.observer, self.actuator))
+        joints = "all joints" if alike else self.joints[j]
+        if not gain_fits:
             estimated, trained = abs(self.observer[i, j]), abs(self.actuator[i, j])
             meaning = (
                 "the policy would follow the observer's resonance instead of its legs"
@@ -112,16 +120,15 @@ class Match:
             return (
                 f"The observer swings {estimated:#.2g} times as far as commanded at "
                 f"{self.frequencies_hz[i]:.1f} Hz where the trained actuator swings "
-                f"{trained:#.2g} times ({self._joints(i, j)}): {meaning}. {_ADVICE}"
+                f"{trained:#.2g} times ({joints}): {meaning}. {_ADVICE}"
             )
         if not self.fits:
-            i, j = self._worst_phase()
             phase = self.phase_difference_deg[i, j]
             late = -phase / 360 / self.frequencies_hz[i]
             return (
                 f"The observer is {1e3 * abs(late):.0f} ms {'later' if late > 0 else 'earlier'} "
                 f"than the trained actuator at {self.frequencies_hz[i]:.1f} Hz, {abs(phase):.0f}° "
-                f"({self._joints(i, j)}): the policy would time its steps by legs that are "
+                f"({joints}): the policy would time its steps by legs that are "
                 f"elsewhere. {_ADVICE}"
             )
         return (
@@ -151,20 +158,6 @@ class Match:
                 for i, f in enumerate(self.frequencies_hz)
             ]
         return rows
-
-    def _gain_fits(self) -> bool:
-        return abs(self.worst_gain_ratio - 1) <= MOST_GAIN_ERROR
-
-    def _worst_gain(self) -> tuple[int, int]:
-        return _largest(np.abs(self.gain_ratio - 1))
-
-    def _worst_phase(self) -> tuple[int, int]:
-        return _largest(np.abs(self.phase_difference_deg))
-
-    def _joints(self, i: int, j: int) -> str:
-        """Joint `j`, or all joints if their responses at frequency `i` are alike."""
-        alike = all(np.allclose(h[i], h[i, j], atol=0.01) for h in (self.observer, self.actuator))
-        return "all joints" if alike else self.joints[j]
 
 
 _ADVICE = (
@@ -199,7 +192,7 @@ def compare(
     nothing = np.full_like(targets, np.nan)
     moved = _drive(SyntheticPD(actuator, period_s, joints=count), targets, nothing)
     readings = moved
-    if robot is not None:
+    if robot is not None and robot is not actuator:
         readings = _drive(SyntheticPD(robot, period_s, joints=count), targets, nothing)
     seen = _drive(observer, targets, readings)
     estimated, trained = (
@@ -245,11 +238,6 @@ def _phasors(positions: Array, frequencies: Array, period_s: float) -> NDArray[n
     return np.array(swings)
 
 
-def _largest(values: Array) -> tuple[int, int]:
-    i, j = np.unravel_index(np.argmax(values), values.shape)
-    return int(i), int(j)
-
-
 _NOTHING = Range(low=1.0, value=1.0, high=1.0)
 
 
@@ -269,16 +257,6 @@ class Outside(Result):
     """Value minus the nearest end of the training's range."""
     relative: bool
     """Whether to speak of it as a factor."""
-
-    def amount(self) -> str:
-        """By how much it is outside, in words."""
-        unit = f" {self.unit}" if self.unit else ""
-        end = self.trained_high if self.beyond > 0 else self.trained_low
-        if self.relative and end > 0:
-            most = "largest" if self.beyond > 0 else "smallest"
-            return f"{self.here.value / end:.2g} times the {most} of the training"
-        more = "more" if self.beyond > 0 else "less"
-        return f"{abs(self.beyond):.3g}{unit} {more} than in the training"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -359,8 +337,14 @@ def _sentence(quantity: str, outliers: Sequence[Outside]) -> str:
     joint = f" ({worst.joint})" if worst.joint else ""
     among = f", and {len(outliers) - 1} more joints differ" if len(outliers) > 1 else ""
     unit = f" {worst.unit}" if worst.unit else ""
+    above = worst.beyond > 0
+    end = worst.trained_high if above else worst.trained_low
+    amount = f"{abs(worst.beyond):.3g}{unit} {'more' if above else 'less'} than in the training"
+    if worst.relative and end > 0:
+        most = "largest" if above else "smallest"
+        amount = f"{worst.here.value / end:.2g} times the {most} of the training"
     return (
-        f"{quantity.capitalize()}{joint}: {worst.here.value:.3g}{unit}, {worst.amount()} "
+        f"{quantity.capitalize()}{joint}: {worst.here.value:.3g}{unit}, {amount} "
         f"({worst.trained_low:.3g} to {worst.trained_high:.3g}{unit}){among}."
     )
 

@@ -14,13 +14,19 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from safetensors.torch import save
 
-from pupper_sysid.common.files import sha256
+from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_bytes, write_text
 from pupper_sysid.policies.network.policy_file import (
+    CONTRACT,
+    SCHEMA,
+    VERSION,
+    WEIGHTS,
     CommandRanges,
+    Contract,
     ObservationPart,
     Policy,
-    save_policy,
+    refuse_bad,
     trained_servo,
 )
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
@@ -70,7 +76,16 @@ def write_policy(
             "config": task.robot_config or None,
             "config_sha256": body.hashes.get("robot_config"),
         }  # fmt: skip
+    refuse_bad(network, "this policy")
+    refuse_overwrite(folder / CONTRACT, force)
+    write_bytes(
+        folder / WEIGHTS,
+        save({name: value.contiguous() for name, value in network.state_dict().items()}),
+        force=True,
+    )
     about = {
+        "schema": SCHEMA,
+        "schema_version": VERSION,
         "kind": shape.kind,
         "hidden": list(shape.hidden),
         "memory": shape.memory,
@@ -94,8 +109,12 @@ def write_policy(
         "servo": servo.model_dump(mode="json", by_alias=True),
         "commands": CommandRanges.of(task.commands, command_share).model_dump(mode="json"),
         "training": training,
+        "versions": versions("torch", "rsl-rl-lib"),
+        "weights_sha256": sha256(folder / WEIGHTS),
     }
-    save_policy(folder, network, about, force)
+    contract = Contract.model_validate(about).model_dump(mode="json", by_alias=True)
+    text = json.dumps(contract, indent=2, ensure_ascii=False)
+    write_text(folder / CONTRACT, text + "\n", force=True)
 
 
 def export_policy(

@@ -15,7 +15,6 @@ separate schema version.
 from __future__ import annotations
 
 import hashlib
-import json
 import warnings
 from collections.abc import Callable
 from copy import copy
@@ -27,19 +26,11 @@ import torch
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, model_validator
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
 
 from pupper_sysid.common.border import read_bytes, read_json, refuse_other_version, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import refuse_other_kind
-from pupper_sysid.common.files import (
-    as_path,
-    refuse_overwrite,
-    sha256,
-    versions,
-    write_bytes,
-    write_text,
-)
+from pupper_sysid.common.files import as_path, sha256
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.common.reading.content import refuse_large_header
@@ -204,24 +195,20 @@ def trained_servo(actuator: str, feedback: str, task: Walking, servos: ServoRang
 
 def joints_of(servos: ServoRanges, spread: float = 0.0) -> dict[str, ServoNumbers]:
     """The numbers of each joint's servo, wider by a share `spread` where units differ."""
-    return {name: _numbers(servos, i, spread) for i, name in enumerate(servos.joints)}
-
-
-def _numbers(servos: ServoRanges, joint: int, spread: float) -> ServoNumbers:
     factors = {"low": 1.0 - spread, "value": 1.0, "high": 1.0 + spread}
-    ranges = {
-        field: {
-            k: float(getattr(servos, k)[field][joint] * (factor if field in OF_UNIT else 1.0))
-            for k, factor in factors.items()
-        }
-        for field in servos.value
+    return {
+        name: ServoNumbers.model_validate(
+            {
+                field: {
+                    k: float(getattr(servos, k)[field][i] * (factor if field in OF_UNIT else 1.0))
+                    for k, factor in factors.items()
+                }
+                for field in servos.value
+            }
+            | {"feedback": {k: float(getattr(reading, k)) for k in ServoFeedback.model_fields}}
+        )
+        for i, (name, reading) in enumerate(zip(servos.joints, servos.feedback, strict=True))
     }
-    reading = servos.feedback[joint]
-    feedback = {
-        "poll_period_s": float(reading.poll_period_s), "loss": float(reading.loss),
-        "quantum_rad": float(reading.quantum_rad), "offset_rad": float(reading.offset_rad),
-    }  # fmt: skip
-    return ServoNumbers.model_validate({**ranges, "feedback": feedback})
 
 
 def _scaled(value: float, ends: tuple[float, float]) -> dict[str, float]:
@@ -430,25 +417,6 @@ class Policy:
             self._state = tuple(torch.where(mask, old, new) for old, new in pairs)
             self._past = np.where(missed[:, None, None], past, self._past)
         return actions
-
-
-def save_policy(
-    folder: Path, network: PolicyNetwork, about: dict[str, Any], force: bool = False
-) -> None:
-    """Write a policy; `about` is the contract without schema, versions and hash."""
-    refuse_bad(network, "this policy")
-    refuse_overwrite(folder / CONTRACT, force)
-    data = save_tensors({k: v.contiguous() for k, v in network.state_dict().items()})
-    write_bytes(folder / WEIGHTS, data, force=True)
-    contract = Contract.model_validate(
-        {
-            "schema": SCHEMA, "schema_version": VERSION, **about,
-            "versions": versions("torch", "rsl-rl-lib"),
-            "weights_sha256": sha256(folder / WEIGHTS),
-        }
-    )  # fmt: skip
-    text = json.dumps(contract.model_dump(mode="json", by_alias=True), indent=2, ensure_ascii=False)
-    write_text(folder / CONTRACT, text + "\n", force=True)
 
 
 def load_policy(folder: Path | str) -> Policy:
