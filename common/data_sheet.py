@@ -12,7 +12,7 @@ voltage of the nearest one, as those of a DC motor are.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pupper_sysid.common.errors import InputError
@@ -61,31 +61,23 @@ class DataSheet:
                 f"{r.stall_torque_nm:.2f} N·m at {r.supply_v:g} V" for r in self.ratings[1:]
             )
             doubt = f"{lowest.source}; the supply voltage is not recorded, and there is {others}"
-            return Rating(
-                lowest.supply_v, lowest.stall_torque_nm, lowest.no_load_speed_rad_s, doubt
-            )
+            return replace(lowest, source=doubt)
         nearest = min(self.ratings, key=lambda r: abs(r.supply_v - supply_v))
-        share = supply_v / nearest.supply_v
+        share, speed = supply_v / nearest.supply_v, nearest.no_load_speed_rad_s
         if share == 1:
             return nearest
-        speed = nearest.no_load_speed_rad_s
         return Rating(
             supply_v, nearest.stall_torque_nm * share, None if speed is None else speed * share,
             f"{nearest.source}; in proportion from {nearest.supply_v:g} V to {supply_v:g} V",
         )  # fmt: skip
 
 
-_Stated = tuple[float, float, float | None]  # supply [V], stall torque [N·m], no-load speed [rpm]
-
-
 def _sheet(
     name: str, number: int, counts: float, supply_v: tuple[float, float] | None,
-    source: str, *stated: _Stated,
+    source: str, *stated: tuple[float, float, float | None],
 ) -> DataSheet:  # fmt: skip
-    ratings = [
-        Rating(supply, torque, None if rpm is None else rpm * _RPM, source)
-        for supply, torque, rpm in stated
-    ]
+    """Stated are supply [V], stall torque [N·m] and no-load speed [rpm]."""
+    ratings = (Rating(v, torque, rpm and rpm * _RPM, source) for v, torque, rpm in stated)
     return DataSheet(name, number, counts, tuple(ratings), supply_v)
 
 

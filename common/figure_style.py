@@ -116,7 +116,11 @@ def inline_svg(drawing: bytes, words: str) -> str:
     body = re.sub(r'<g id="[^"]*">', "<g>", body)
     prefix = hashlib.sha256(drawing).hexdigest()[:8]
     body = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}-", body)
-    body = re.sub(r"#[0-9a-fA-F]{6}\b", lambda m: _variable(m.group()), body)
+    names = {colour.lower(): name for colour, name in _VARIABLES.items()}
+    body = re.sub(
+        r"#[0-9a-fA-F]{6}\b",
+        lambda m: f"var(--{names[m[0].lower()]}, {m[0]})" if m[0].lower() in names else m[0], body,
+    )  # fmt: skip
     label = html.escape(words, quote=True)
     return f'<svg class="drawing" role="img" aria-label="{label}" {box}>{body}'
 
@@ -127,12 +131,6 @@ _VARIABLES = {
     GREEN: "drawing-green", ORANGE: "drawing-orange", RED: "drawing-red",
     PINK: "drawing-pink",
 }  # fmt: skip
-_BY_HEX = {colour.lower(): name for colour, name in _VARIABLES.items()}
-
-
-def _variable(colour: str) -> str:
-    name = _BY_HEX.get(colour.lower())
-    return f"var(--{name}, {colour})" if name else colour
 
 
 def refuse_picture(path: Path, force: bool = False) -> None:

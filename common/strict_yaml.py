@@ -25,12 +25,12 @@ Place = tuple[str | int, ...]  # where a value stands in a file: keys and list i
 
 _INTEGER = re.compile(r"[-+]?[0-9]+")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
-_INFINITE = re.compile(r"[-+]?\.(inf|Inf|INF)")
-_NOT_A_NUMBER = (".nan", ".NaN", ".NAN")
-_WORDS: dict[str, bool | None] = {
+_WORDS: dict[str, bool | float | None] = {
     **{word: None for word in ("", "~", "null", "Null", "NULL")},
     **{word: True for word in ("true", "True", "TRUE")},
     **{word: False for word in ("false", "False", "FALSE")},
+    **{word: math.nan for word in (".nan", ".NaN", ".NAN")},
+    **{f"{s}.{w}": float(f"{s}inf") for s in ("", "+", "-") for w in ("inf", "Inf", "INF")},
 }
 
 if TYPE_CHECKING or not hasattr(yaml, "CSafeLoader"):
@@ -170,10 +170,6 @@ def _plain(text: str) -> Any:
         return int(text)
     if _FLOAT.fullmatch(text):
         return float(text)
-    if _INFINITE.fullmatch(text):
-        return -math.inf if text.startswith("-") else math.inf
-    if text in _NOT_A_NUMBER:
-        return math.nan
     return text
 
 

@@ -36,6 +36,8 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from typing import Any
 
 from pupper_sysid.common.errors import PupperError
@@ -83,7 +85,7 @@ class Workers:
         self._count = count if hasattr(os, "fork") else 1
         self._modules, self._option = set(modules), option
         self._tasks: deque[tuple[Any, Callable[..., Any], tuple[Any, ...]]] = deque()
-        self._streams: list[socket.socket] = []
+        self._streams: list[Connection] = []
         self._server: _Server | None = None
 
     def __enter__(self) -> Workers:
@@ -107,7 +109,7 @@ class Workers:
                 key, work, arguments = self._tasks.popleft()
                 yield key, work(*arguments)
             return
-        busy: dict[socket.socket, Any] = {}
+        busy: dict[Connection, Any] = {}
         with selectors.DefaultSelector() as answers:
             while self._tasks or busy:
                 while self._tasks and (stream := self._idle(busy)):
@@ -123,7 +125,7 @@ class Workers:
                         raise error
                     yield key, result
 
-    def _idle(self, busy: dict[socket.socket, Any]) -> socket.socket | None:
+    def _idle(self, busy: dict[Connection, Any]) -> Connection | None:
         """A worker without work, perhaps a new one."""
         for stream in self._streams:
             if stream not in busy:
@@ -137,16 +139,16 @@ class Workers:
         self._streams.append(self._server.fork(self._modules))
         return self._streams[-1]
 
-    def _send(self, stream: socket.socket, task: list[Any]) -> None:
+    def _send(self, stream: Connection, task: list[Any]) -> None:
         data = pickle.dumps(task)  # first, so that the caller gets its errors
         try:
-            _write(stream, data)
+            stream.send_bytes(data)
         except OSError:
             raise self._death() from None
 
-    def _answer(self, stream: socket.socket) -> tuple[Any, BaseException | None]:
+    def _answer(self, stream: Connection) -> tuple[Any, BaseException | None]:
         try:
-            return pickle.loads(_read(stream))
+            return pickle.loads(stream.recv_bytes())
         except (EOFError, OSError):
             raise self._death() from None
 
@@ -215,9 +217,9 @@ class _Server:
         except OSError:
             raise PupperError("The process that starts workers has ended. Run it again.") from None
 
-    def fork(self, modules: Any) -> socket.socket:
+    def fork(self, modules: Any) -> Connection:
         """A new worker, to which a task can be written."""
-        parent_end, worker_end = socket.socketpair()
+        parent_end, worker_end = Pipe()
         with worker_end:
             self.order(modules, worker_end.fileno())
         return parent_end
@@ -260,26 +262,6 @@ def _folder() -> str:
     with suppress(FileNotFoundError):  # it was removed
         return os.getcwd()
     return "/"
-
-
-def _write(stream: socket.socket, data: bytes) -> None:
-    stream.sendall(len(data).to_bytes(8))
-    stream.sendall(data)
-
-
-def _read(stream: socket.socket) -> bytes:
-    """What the other end wrote at once; EOFError if that has closed."""
-    return _exactly(stream, int.from_bytes(_exactly(stream, 8)))
-
-
-def _exactly(stream: socket.socket, size: int) -> bytes:
-    data, at = bytearray(size), 0
-    while at < size:
-        count = stream.recv_into(memoryview(data)[at:])
-        if not count:
-            raise EOFError
-        at += count
-    return bytes(data)
 
 
 def _ending(number: int) -> str:
@@ -345,7 +327,7 @@ def _fork(orders: socket.socket, descriptor: int, folder: str) -> None:
         _end_with(server)
         with suppress(OSError):
             os.chdir(folder)
-        _work(socket.socket(fileno=descriptor))
+        _work(Connection(descriptor))
     finally:
         os._exit(1)
 
@@ -358,22 +340,22 @@ def _end_with(parent: int) -> None:
         os._exit(1)
 
 
-def _work(tasks: socket.socket) -> None:
+def _work(tasks: Connection) -> None:
     """Do what comes through a socket, until it closes."""
     threading.Thread(target=_end_when_closed, args=(tasks,), daemon=True).start()
     while True:
         try:
-            work, arguments = pickle.loads(_read(tasks))
+            work, arguments = pickle.loads(tasks.recv_bytes())
             answer = pickle.dumps((work(*arguments), None))
         except EOFError:
             os._exit(0)
         except BaseException as error:
             answer = _pickled(error)
         sys.stdout.flush()
-        _write(tasks, answer)
+        tasks.send_bytes(answer)
 
 
-def _end_when_closed(tasks: socket.socket) -> None:
+def _end_when_closed(tasks: Connection) -> None:
     """End this process when the other end of its socket is closed, whatever it is doing."""
     closed = select.poll()
     closed.register(tasks, 0)  # no event but the end, which is always reported

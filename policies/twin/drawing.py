@@ -211,12 +211,6 @@ def _tilted(bodies: list[Body], gravity: Array) -> list[Body]:
     ]  # fmt: skip
 
 
-def _surfaces(model: Any) -> dict[int, Surface]:
-    """Shapes of the bodies that have one, by their numbers."""
-    surfaces = ((body, _surface_of(model, body)) for body in range(1, model.nbody))
-    return {body: surface for body, surface in surfaces if surface is not None}
-
-
 def _joint_angles(model: Any, data: Any, joints: tuple[str, ...], servo: Array) -> Array:
     """Joint angles of servo angles: a servo that turns a tendon turns several joints."""
     at = [int(model.joint(name).qposadr[0]) for name in joints]
@@ -231,20 +225,23 @@ def _joint_angles(model: Any, data: Any, joints: tuple[str, ...], servo: Array) 
     return np.linalg.solve(moment, (servo - zero).T).T.astype(np.float64)
 
 
-def _surface_of(model: Any, body: int) -> Surface | None:
-    """All visible shapes of a body as one surface in its frame; None where it has none."""
-    vertices, triangles, count = [], [], 0
-    first = int(model.body_geomadr[body])
-    for geom in range(first, first + int(model.body_geomnum[body])):
-        if model.geom_group[geom] >= _VISIBLE_GROUPS:
-            continue
-        if (shape := _shape(model, geom)) is not None:
-            turn = np.empty(9)
-            mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-            vertices.append(shape[0] @ turn.reshape(3, 3).T + model.geom_pos[geom])
-            triangles.append(shape[1] + count)
-            count += len(shape[0])
-    return (np.concatenate(vertices), np.concatenate(triangles)) if vertices else None
+def _surfaces(model: Any) -> dict[int, Surface]:
+    """All visible shapes of each body that has one as one surface in its frame, by its number."""
+    surfaces = {}
+    for body in range(1, model.nbody):
+        vertices, triangles, count = [], [], 0
+        first = int(model.body_geomadr[body])
+        for geom in range(first, first + int(model.body_geomnum[body])):
+            shape = None if model.geom_group[geom] >= _VISIBLE_GROUPS else _shape(model, geom)
+            if shape is not None:
+                turn = np.empty(9)
+                mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+                vertices.append(shape[0] @ turn.reshape(3, 3).T + model.geom_pos[geom])
+                triangles.append(shape[1] + count)
+                count += len(shape[0])
+        if vertices:
+            surfaces[body] = np.concatenate(vertices), np.concatenate(triangles)
+    return surfaces
 
 
 def _shape(model: Any, geom: int) -> Surface | None:

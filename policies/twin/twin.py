@@ -261,19 +261,19 @@ def _parts(recording: Recording, test_loops: Sequence[int]) -> tuple[Part, Part,
     loops = sorted({int(n) for n in recording.table["trial"].unique()})
     if strange := [n for n in test_loops if n not in loops]:
         raise InputError(
-            f"{recording.name} has no loop {strange[0]}: its loops are {_listed(loops)}. Name some "
-            "of them in `test_loops`."
+            f"{recording.name} has no loop {strange[0]}: its loops are "
+            f"{', '.join(map(str, loops))}. Name some of them in `test_loops`."
         )
     if set(test_loops) == set(loops):
         raise InputError(
             f"`test_loops` names all loops of {recording.name}: one must be left to estimate the "
             "offsets from. Leave one out, or give no loops."
         )
-    chosen = list(test_loops)
+    chosen, listed = list(test_loops), ", ".join(map(str, test_loops))
     return (
         lambda number, elapsed, group: np.isin(number, chosen),
         lambda number, elapsed, group: ~np.isin(number, chosen),
-        f"loop {_listed(chosen)}, with the offsets of the others",
+        f"loop {listed}, with the offsets of the others",
     )
 
 
@@ -332,10 +332,6 @@ def _notes(
                 "and ground cannot be distinguished."
             )
     return notes + preset_notes(actuators)
-
-
-def _listed(numbers: Sequence[int]) -> str:
-    return ", ".join(map(str, numbers))
 
 
 PLACES = (("air", BLUE, "in the air"), ("ground", RED, "on the ground"))
