@@ -134,7 +134,7 @@ def compare_repeats(
         named += [difference] if difference is not None else []
     named.sort(key=lambda d: -d.nats)
     points = np.array([one.point for one in apart])
-    variances = np.array([np.diag(np.linalg.inv(one.precision)) for one in apart])
+    variances = np.array([np.diag(np.linalg.inv(one.precision)) for one in apart], float)
     return repeats_of(points, variances, structure, tuple(named))
 
 

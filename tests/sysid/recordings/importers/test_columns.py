@@ -153,7 +153,7 @@ def test_refusals_name_what_is_there_and_a_line_that_takes_it(tmp_path):
     cases = [
         (file("a.csv", "time=t|cmd=c|hippo=p"), "a.csv --time time --command cmd --position hippo"),
         (file("b.csv", "when=t|cmd=c|pos=p"), "b.csv --time when --command cmd --position pos"),
-        (file("c.csv", "tick=t|cmd=c|pos=p"), "--rate"),
+        (file("c.csv", "tick=t|cmd=c|pos=p"), "c.csv --time tick --command cmd --position pos"),
         (file("d.csv", "time=t|goal_position=cc|present_position=pc"), "d.csv --unit deg"),
         (file("e.csv", "time=t|cmd_1=c|cmd_2=c|pos_a=p|pos_b=p"),
          "--command cmd_1,cmd_2 --position pos_a,pos_b"),
