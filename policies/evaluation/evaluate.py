@@ -339,16 +339,16 @@ def falls_of(
     for i in np.flatnonzero(fell).tolist():
         at = int(alive[:, i].sum())
         x, y, down = gravity[at, i]
-        sides: tuple[Direction, Direction] = ("forward", "backward")
-        along = x
-        if abs(y) > abs(x):  # the trunk tilts to the side of gravity in its frame
-            sides, along = ("left", "right"), y
+        # the trunk tilts to the side of gravity in its frame
+        toward: Direction = "forward" if x > 0 else "backward"
+        if abs(y) > abs(x):
+            toward = "left" if y > 0 else "right"
         time_s = (at + 1) * step_s
         falls.append(
             Fall(
                 row=row, walker=condition.walker, episode=i, time_s=time_s,
                 tilt_before_deg=_tilt_deg(gravity[max(at - before, 0), i]),
-                tilt_deg=_tilt_deg(gravity[at, i]), toward=sides[0 if along > 0 else 1],
+                tilt_deg=_tilt_deg(gravity[at, i]), toward=toward,
                 tipped=bool(down > -FALLEN_TILT), command=tuple(command[at, i].tolist()),
                 since_push_s=condition.handicap.since_push_s(time_s),
             )
@@ -554,7 +554,7 @@ def _handicapped(group: Group, name: str, shown: float, **values: Sequence[float
     """Cases of one handicap, named by its values times `shown`."""
     ((handicap, sizes),) = values.items()
     return [
-        Case(group, name.format(shown * size), handicap=Handicap(**{handicap: size}))
+        Case(group, name.format(shown * size), handicap=replace(Handicap(), **{handicap: size}))
         for size in sizes
     ]
 
