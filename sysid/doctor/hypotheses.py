@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import fit_sine, least_squares
-from pupper_sysid.sysid.doctor.changes import CLEAR_NATS, Followed, followed
+from pupper_sysid.sysid.doctor.changes import CLEAR_NATS, EXPLAINED, Followed, followed
 from pupper_sysid.sysid.doctor.explanations import Explanation, Servo, echo, explain
 from pupper_sysid.sysid.doctor.findings import CARE, REFUSE, Finding, rivalled
 from pupper_sysid.sysid.doctor.writers import second_writer
@@ -73,11 +73,17 @@ def relations(joint: Followed) -> list[Relation]:
     return sorted(found, key=lambda r: r.servo.nats)
 
 
+def _sound(joint: Followed) -> bool:
+    """Whether a servo with limits follows; a ramped set-point is late by a part of the motion."""
+    return joint.explained or joint.unexplained < 1 - _FOLLOWS
+
+
 def relation_findings(joint: Followed) -> list[Finding]:
     """What the pair of columns is, where it is no servo that follows its command."""
-    trials, base, changes = joint.trials, joint.base, joint.changes
-    # a set-point that ramps is late by a part of the motion; a fault may explain the rest
-    sound = joint.explained or joint.unexplained < 1 - _FOLLOWS
+    trials, base, sound = joint.trials, joint.base, _sound(joint)
+    # a change is the cause where a servo with it explains nearly all
+    change = joint.changed
+    changes = joint.changes if change and change.fit.cost - joint.unsure < EXPLAINED else []
     if base.explained < _UNRELATED:
         unrelated = Finding("unrelated", REFUSE, {"percent": 100 * base.explained})
         return [] if sound or changes else [joint.rivalled(unrelated)]
@@ -85,7 +91,7 @@ def relation_findings(joint: Followed) -> list[Finding]:
     best, second = ranked[:2]
     plain = next(r for r in ranked if not r.code)
     # the servo as it is has limits and may change, which the other relations are not fitted with
-    left = joint.changed.fit.unexplained(joint) if joint.changed else joint.unexplained
+    left = change.fit.unexplained(joint) if change else joint.unexplained
     if best.code and best.servo.nats > min(plain.servo.nats, base.nats(left)) - CLEAR_NATS:
         best = plain
     share = 1 - best.servo.unexplained
@@ -373,10 +379,11 @@ def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
         return found
     found += _trials_differ(joint) or joint.changes or second_writer(joint)
     loaded = any(t.load is not None for t in trials)
-    left = joint.fit.cost - joint.noise - joint.unsure
-    if left > _DISTURBED and not (found or loaded or held_findings(trials, step)):
+    loose = joint.base.explained < _LOOSE and not _sound(joint)
+    disturbed = joint.fit.cost - joint.noise - joint.unsure > _DISTURBED
+    if (loose or disturbed) and not (found or loaded or held_findings(trials, step)):
         code, share = "disturbed", joint.unexplained
-        if joint.base.explained < _LOOSE and not joint.explained:
+        if loose:
             code, share = "loosely_related", joint.base.explained
         return [Finding(code, CARE, {"percent": 100 * share})]
     return found
