@@ -37,6 +37,7 @@ from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, in_order
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.reading.csv_table import MOST_ROWS, read_table
 from pupper_sysid.common.reading.dialect import decoded
+from pupper_sysid.hardware.address import EMULATED
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, header_entries
 from pupper_sysid.hardware.loop import LOG, VIEWS, FixedRateLoop, first_pose, glide
 from pupper_sysid.hardware.safety.guard import GuardedBus, guarded
@@ -130,8 +131,8 @@ class Resume:
         return self.last_time_s + min(max(pause_s, _LEAST_PAUSE_S), _LONGEST_PAUSE_S)
 
 
-def header_of(path: Path) -> dict[str, Any]:
-    """Header of an unfinished recording, from which its plan can be made again."""
+def request_of(path: Path) -> tuple[Request, bool]:
+    """Request of a recording to continue, and whether it is a completed round of several."""
     text = decoded(path, read_bytes(path))
     if not text.startswith(TITLE):
         raise InputError(f"{path} is not a recording of pupper-sysid; only those can be continued.")

@@ -13,7 +13,6 @@ import pytest
 
 import reproduction.__main__ as program
 import reproduction.page
-from pupper_sysid.cli.commands.sweep import Sweep
 from pupper_sysid.cli.programs import pupper_analyze
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256

@@ -5,7 +5,6 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from pupper_sysid.cli.commands.walks import Delay
 from pupper_sysid.policies.analysis import figures
 from pupper_sysid.policies.analysis.autonomy import (
     Autonomy,

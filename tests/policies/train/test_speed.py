@@ -8,7 +8,7 @@ from pupper_sysid.policies.train.learner import Ranks
 from pupper_sysid.policies.train.training import make_env
 from pupper_sysid.sim.walking.config import Walking, for_robot
 from support.legged import legged
-from support.tiny_training import CALIBRATION, tiny_run
+from support.tiny_training import tiny_run
 
 
 @pytest.fixture

@@ -14,11 +14,13 @@ from pupper_sysid.policies.walks.conditions import (
     Condition,
     evaluation_task,
     random_commands,
+    share_of_usual,
+    within,
 )
 from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.config import Walking
+from pupper_sysid.sim.walking.config import Commands, Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.legged import legged
 from support.refusals import assert_each_refused
