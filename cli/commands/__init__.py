@@ -1,1 +1,1 @@
-"""One module per subcommand of `pupper-sysid`."""
+"""Subcommands of the programs; those that are read together share a module."""

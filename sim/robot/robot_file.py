@@ -56,8 +56,6 @@ _WALK = (0.0, 0.5, 0.75, 0.25)  # left front, right front, left rear, right rear
 _STANDING = ("home", "stand", "standing", "default")  # names of keyframes to stand in
 _QUARTERS = {"y": -1, "-x": 2, "-y": 1}  # of a turn to the left, to x
 _AXES = ("x", "y", "-x", "-y")
-
-
 _WORDS = {
     "front": "F", "fore": "F", "rear": "B", "back": "B", "hind": "B", "left": "L", "right": "R"
 }  # fmt: skip

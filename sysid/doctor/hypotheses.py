@@ -382,10 +382,9 @@ def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     loose = joint.base.explained < _LOOSE and not _sound(joint)
     disturbed = joint.fit.cost - joint.noise - joint.unsure > _DISTURBED
     if (loose or disturbed) and not (found or loaded or held_findings(trials, step)):
-        code, share = "disturbed", joint.unexplained
         if loose:
-            code, share = "loosely_related", joint.base.explained
-        return [Finding(code, CARE, {"percent": 100 * share})]
+            return [Finding("loosely_related", CARE, {"percent": 100 * joint.base.explained})]
+        return [Finding("disturbed", CARE, {"percent": 100 * joint.unexplained})]
     return found
 
 

@@ -135,8 +135,10 @@ def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:
             )
     columns = (
         KEY,
-        Column("model", "model", kind="words",
-               show=lambda row: model_name(row["model"]) + ", chosen" * row["is_chosen"]),
+        Column(
+            "model", "model", kind="words",
+            show=lambda row: model_name(row["model"]) + (", chosen" if row["is_chosen"] else ""),
+        ),
         Column("parameters fitted", "parameter_count", digits=0),
         Column("fresh", "rmse_fresh_rad", "mrad"),
         Column("unseen frequency (under load: run)", "rmse_unseen_rad", "mrad"),

@@ -60,7 +60,8 @@ def read_arrays(path: Path, data: bytes, options: LogOptions) -> Log:
         arrays, layout = _mat_arrays(path, data), "MATLAB file"
     else:
         try:
-            inside = zipfile.ZipFile(io.BytesIO(data)).infolist()
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                inside = archive.infolist()
         except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError) as error:
             raise InputError(_damaged(path)) from error
         if any(member.filename.endswith("/data.pkl") for member in inside):
