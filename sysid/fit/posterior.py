@@ -122,7 +122,7 @@ def sample(
     Statistics 17: 295–311.
     """
     target = _Target(problem, temperature)
-    begin = target.straight(best.point[None])
+    begin = target.straight.of(best.point[None])
     least = float(target.cost(begin)[0])
     mixture = _Mixture.about(target, begin)
     mixtures: list[_Mixture] = []
@@ -138,9 +138,9 @@ def sample(
         if (
             drawn_cost[first] < least - _BETTER and turn < rounds // 2
         ):  # an optimum beside: begin there
-            start = target.fitted(drawn[first : first + 1])
+            start = target.straight.fitted(drawn[first : first + 1])
             fit = local(problem, start, _ITERATIONS, _CURVATURE_STEP)[0]
-            begin = target.straight(fit.point[None])
+            begin = target.straight.of(fit.point[None])
             least = float(target.cost(begin)[0])
             mixture, mixtures = _Mixture.about(target, begin), []
             points, cost, density = points[:0], cost[:0], density[:0]
@@ -158,31 +158,30 @@ def sample(
         mixture = _Mixture.of(target, points, weight, rng)
     if not len(points):
         return Posterior(np.repeat(best.point[None], _DRAWS, axis=0), best, r_hat, effective)
-    likeliest = target.fitted(points[int(np.argmin(cost))])
+    likeliest = target.straight.fitted(points[int(np.argmin(cost))])
     least_cost = float(problem.costs(likeliest[None])[0])
     # truncated, so that few points do not stand for all where there was no convergence
     weight = np.minimum(weight, 1.0 / np.sqrt(len(weight)))
-    draws = target.fitted(points[rng.choice(len(points), _DRAWS, p=weight / weight.sum())])
+    draws = target.straight.fitted(points[rng.choice(len(points), _DRAWS, p=weight / weight.sum())])
     return Posterior(draws, Fit(likeliest, least_cost), r_hat, effective)
 
 
 @dataclass(frozen=True)
-class _Target:
-    """The tempered posterior of a problem, in coordinates in which its ridge is straight.
+class Straight:
+    """Coordinates in which the ridges of a structure's posterior are straight.
 
     Of damping and back-EMF a motion inside of the effort limit tells the sum only, so that in the
     logarithms of damping, effort and speed the posterior is a thin bent shell, of which a mixture
-    covers a part. Here the logarithms of the sum and of back-EMF over damping stand for those of
-    damping and speed; the determinant of the change is 1.
+    covers a part, and which a shift of each number leaves. Here the logarithms of the sum and of
+    back-EMF over damping stand for those of damping and speed; the determinant of the change is 1.
     """
 
-    problem: Problem
-    temperature: float
+    structure: Structure
 
     @cached_property
     def _places(self) -> tuple[int, int, int] | None:
         """Of damping, speed and effort in the coordinates; None where they are not all fitted."""
-        names = self.problem.structure.names
+        names = self.structure.names
         for three in (
             ("damping_per_s", "no_load_speed_rad_s", "effort_rad_s2"),
             ("damping", "no_load_speed_rad_s", "stall_torque"),
@@ -192,7 +191,7 @@ class _Target:
                 return damping, speed, effort
         return None
 
-    def straight(self, fitted: NDArray[np.float64]) -> NDArray[np.float64]:
+    def of(self, fitted: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (..., parameters) of fitted coordinates in these."""
         if self._places is None:
             return fitted
@@ -204,7 +203,7 @@ class _Target:
         return points
 
     def fitted(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The inverse of `straight`."""
+        """The inverse of `of`."""
         if self._places is None:
             return points
         damping, speed, effort = self._places
@@ -213,10 +212,36 @@ class _Target:
         fitted[..., speed] = points[..., effort] - fitted[..., damping] - points[..., speed]
         return fitted
 
+    def slope(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Fitted coordinates by these at points (n, parameters), (n, parameters, parameters)."""
+        slope = np.tile(np.eye(points.shape[1]), (len(points), 1, 1))
+        if self._places is None:
+            return slope
+        damping, speed, effort = self._places
+        share = 1.0 / (1.0 + np.exp(-points[:, speed]))  # of back-EMF in the sum
+        slope[:, damping, speed] = -share
+        slope[:, speed, damping] = -1.0
+        slope[:, speed, speed] = share - 1.0
+        slope[:, speed, effort] = 1.0
+        return slope
+
+
+@dataclass(frozen=True)
+class _Target:
+    """The tempered posterior of a problem, in coordinates in which its ridge is straight."""
+
+    problem: Problem
+    temperature: float
+
+    @cached_property
+    def straight(self) -> Straight:
+        """The coordinates."""
+        return Straight(self.problem.structure)
+
     def cost(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Minus the logarithm of the density; infinite outside of the box."""
         low, high = self.problem.structure.box
-        fitted = self.fitted(points)
+        fitted = self.straight.fitted(points)
         inside = ((fitted >= low) & (fitted <= high)).all(axis=1)
         cost = np.full(len(points), np.inf)
         if inside.any():
@@ -227,23 +252,15 @@ class _Target:
 
     def curvature(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Hessian of `cost` at points (n, parameters), Gauss-Newton's."""
-        precision, fitted = self.problem.structure.prior_precision, self.fitted(points)
-        bent = curvatures(self.problem, fitted, _STEP) - precision
-        bent = bent / self.temperature + precision
-        if self._places is None:
-            return bent
-        damping, speed, effort = self._places
-        share = 1.0 / (1.0 + np.exp(-points[:, speed]))  # of back-EMF in the sum
-        slope = np.tile(np.eye(points.shape[1]), (len(points), 1, 1))
-        slope[:, damping, speed] = -share
-        slope[:, speed, damping] = -1.0
-        slope[:, speed, speed] = share - 1.0
-        slope[:, speed, effort] = 1.0
-        return slope.mT @ bent @ slope
+        precision = self.problem.structure.prior_precision
+        bent = curvatures(self.problem, self.straight.fitted(points), _STEP) - precision
+        slope = self.straight.slope(points)
+        return slope.mT @ (bent / self.temperature + precision) @ slope
 
     def inside(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points moved into the box."""
-        return self.straight(np.clip(self.fitted(points), *self.problem.structure.box))
+        straight = self.straight
+        return straight.of(np.clip(straight.fitted(points), *self.problem.structure.box))
 
 
 @dataclass(frozen=True)
@@ -382,11 +399,13 @@ def with_date_errors(
         for noise, of_latch in zip(np.split(plain, ends), np.split(moved, ends), strict=True)
     ]
     errors = np.array([off(latch_s, PHASE_SD_S if polled else 0.0) for _ in range(_DATE_DRAWS)])
-    weighted = jacobian / np.sqrt(1.0 + plain**2)
-    bent = weighted @ jacobian.T + problem.structure.prior_precision
+    straight = Straight(problem.structure)
+    (slope,) = straight.slope(straight.of(point))
+    weighted = slope.T @ (jacobian / np.sqrt(1.0 + plain**2))
+    bent = weighted @ jacobian.T @ slope + slope.T @ problem.structure.prior_precision @ slope
     # a number without a slope and without a prior is moved by nothing
     apart = -(np.linalg.pinv(bent, hermitian=True) @ (weighted @ errors.T)).T
-    return draws + apart[rng.integers(0, len(apart), len(draws))]
+    return straight.fitted(straight.of(draws) + apart[rng.integers(0, len(apart), len(draws))])
 
 
 def as_wide_as_folds(
@@ -428,7 +447,8 @@ def as_wide_as_folds(
         return centre + (values - centre) * np.maximum(1.0, factor)
 
     left_out = np.array([f.point for f in folds])
-    wide = wider(best.point, draws, left_out)
+    straight = Straight(structure)
+    wide = straight.fitted(wider(*(straight.of(x) for x in (best.point, draws, left_out))))
     # a dead time may well be close to none: of it the difference counts, not the ratio
     delay, delays, others = (structure.decode(x)[..., 0] for x in (best.point, draws, left_out))
     first = structure.parameters[0]

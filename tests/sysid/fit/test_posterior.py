@@ -1,16 +1,20 @@
 """Draws of a posterior whose ridge bends: damping and back-EMF, of which a motion tells the sum."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 import pupper_sysid as ps
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
-from pupper_sysid.sysid.fit.posterior import LATCH_SD_S, _Target, sample, with_date_errors
+from pupper_sysid.sysid.fit.posterior import (
+    LATCH_SD_S,
+    _Target,
+    as_wide_as_folds,
+    sample,
+    with_date_errors,
+)
 from pupper_sysid.sysid.fit.run import prepare
-from pupper_sysid.sysid.fit.search import Fit, Problem, refine
+from pupper_sysid.sysid.fit.search import Fit, Problem, curvatures, refine
 from pupper_sysid.sysid.fit.structure import candidate
 from support.runs import fine_run, problem_of
 
@@ -50,18 +54,38 @@ def test_what_a_motion_does_not_show_keeps_its_prior_and_the_sum_is_known(slow):
 
 def test_the_change_of_coordinates_has_an_inverse_a_determinant_of_one_and_a_hessian(slow):
     rng, target = np.random.default_rng(2), _Target(slow, 1.0)
-    centre = STRUCTURE.encode(NUMBERS)
+    straight, centre = target.straight, STRUCTURE.encode(NUMBERS)
     fitted = centre + 0.3 * rng.standard_normal((5, len(centre)))
-    points = target.straight(fitted)
-    np.testing.assert_allclose(target.fitted(points), fitted, atol=1e-12)
+    points = straight.of(fitted)
+    np.testing.assert_allclose(straight.fitted(points), fitted, atol=1e-12)
     away = 1e-6 * np.eye(len(centre))
-    slope = (target.fitted(points[0] + away) - target.fitted(points[0] - away)).T / 2e-6
+    slope = (straight.fitted(points[0] + away) - straight.fitted(points[0] - away)).T / 2e-6
+    np.testing.assert_allclose(straight.slope(points[:1])[0], slope, atol=1e-8)
     assert abs(np.linalg.det(slope)) == pytest.approx(1.0, rel=1e-6)
-    other = replace(target, temperature=1.0)
-    object.__setattr__(other, "_places", None)
-    np.testing.assert_allclose(
-        target.curvature(points[:1])[0], slope.T @ other.curvature(fitted[:1])[0] @ slope, rtol=1e-5
-    )
+    precision = STRUCTURE.prior_precision
+    (bent,) = target.curvature(points[:1])
+    (of_readings,) = curvatures(slow, fitted[:1], 0.01) - precision
+    np.testing.assert_allclose(bent, slope.T @ (of_readings + precision) @ slope, rtol=1e-5)
+
+
+def test_folds_that_disagree_on_back_emf_leave_the_sum_of_damping_and_back_emf_known():
+    # each fit without a tone has another share of back-EMF, all the same sum
+    names = STRUCTURE.names
+    places = [names.index(n) for n in ("damping_per_s", "no_load_speed_rad_s", "effort_rad_s2")]
+
+    def point(back_emf: float) -> np.ndarray:
+        values = STRUCTURE.decode(STRUCTURE.encode(NUMBERS))
+        values[places] = 50.0 - back_emf, 120.0 / back_emf, 120.0
+        return STRUCTURE.encode(values)
+
+    rng, best = np.random.default_rng(4), Fit(point(0.6), 0.0)
+    draws = best.point + 0.01 * rng.standard_normal((2000, len(names)))
+    folds = [Fit(point(back_emf), 0.0) for back_emf in (4.0, 12.0, 30.0, 48.0)]
+    wide = STRUCTURE.decode(as_wide_as_folds(draws, STRUCTURE, best, folds, 4))
+    damping, speed, effort = wide[:, places].T
+    low, high = np.quantile(damping + effort / speed, [0.05, 0.95])
+    assert low < 50.0 < high < 1.1 * low
+    assert np.quantile(effort / speed, 0.95) > 25.0
 
 
 @pytest.mark.parametrize(("jumps", "noise_rad"), [(1, 0.02), (16, 0.02), (1, 1e-5)])
