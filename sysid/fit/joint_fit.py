@@ -86,6 +86,7 @@ _WIDE = 4.0
 _REACHED = 1.25
 """Ends of the effort limit's interval, up to which a motion at that limit tells back-EMF from
 damping. Wider ones gave wrong parts of a right sum on twins (`benchmarks/wide_twins.py`)."""
+_ONLY_THE_SUM = "only the sum of damping and back-EMF can be known: damping_and_back_emf has it"
 _FOREIGN = 3.0
 """Standard deviations of a prior from another unit, beyond which it is of another servo."""
 _SHARP_DEAD_TIME_S = 0.015
@@ -449,15 +450,7 @@ def _inseparable(parameters: Mapping[str, Interval]) -> dict[str, str]:
     """
     if "braking_per_s" not in parameters:
         return {}
-    both = _only_the_sum(parameters["braking_per_s"], "1/s")
-    return {name: both for name in ("back_emf_per_s", "damping_per_s") if name in parameters}
-
-
-def _only_the_sum(total: Interval, unit: str) -> str:
-    return (
-        f"only the sum of damping and back-EMF is known, {total.value:.4g} "
-        f"({total.low:.4g}…{total.high:.4g}) {unit}"
-    )
+    return {n: _ONLY_THE_SUM for n in ("back_emf_per_s", "damping_per_s") if n in parameters}
 
 
 def score_preset(parameters: DelayedPDParameters, runs: Sequence[Run]) -> Scores:
@@ -731,8 +724,7 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: Choice) -
         undecided["effort_limit"] = why
     if "stall_torque" in undecided and "damping" not in structure.features:
         # back-EMF stands for both: what tells them apart is a motor at its limit
-        both = _only_the_sum(numbers["braking"], "N·m·s/rad" if scales.known_load else "1/s")
-        undecided |= {"back_emf": both, "no_load_speed_rad_s": both}
+        undecided |= {"back_emf": _ONLY_THE_SUM, "no_load_speed_rad_s": _ONLY_THE_SUM}
     if "dead_time_s" in undecided and (why := _undated(ready.lag.feedback)):
         undecided["dead_time_s"] = why  # it is what makes the interval wide
     labels = [r.label for r in runs]
