@@ -65,6 +65,8 @@ def test_representations_are_short_and_have_units(hip):
         (lambda: ps.export(3, "mjlab"), r"pupper_sysid\.load_calibration"),
         (lambda: ps.export("paper", "gazebo"), "there are mjcf"),
         (lambda: ps.calibrate(ps.load(SWEEP), stall_torque_nm="0.35"), "is a str; write a number"),
+        (lambda: ps.delay(ps.load(SWEEP), seed="a"), "`seed` is 'a'; give a whole number"),
+        (lambda: ps.calibrate(ps.load(SWEEP), seed=-1), "`seed` is -1; give a whole number"),
     ],
 )  # fmt: skip
 def test_a_wrong_type_is_answered_in_a_sentence(call, says):

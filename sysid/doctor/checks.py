@@ -309,6 +309,8 @@ def usable_trials(recordings: Recordings, joints: Joints = None) -> dict[str, tu
 
 def joint_rng(seed: int, joint: str) -> np.random.Generator:
     """Generator of one joint: repeatable whatever other joints are computed."""
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError(f"`seed` is {seed!r}; give a whole number from 0 on.")
     place = JOINT_NAMES.index(joint) if joint in JOINT_NAMES else crc32(joint.encode())
     return np.random.default_rng([seed, place])
 
