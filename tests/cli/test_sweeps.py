@@ -24,7 +24,7 @@ from pupper_sysid.sysid.recordings.files import load
 from support.command_line import json_of, ran, refused, run
 from support.json_keys import DOCUMENTED, key_line
 from support.planned_servos import fit_of_half_width
-from support.servo_servers import on_a_port
+from support.virtual_line import on_a_virtual_line
 
 
 def test_a_planned_sweep_that_was_cut_short_is_continued_unless_its_plan_has_changed(
@@ -179,16 +179,15 @@ def test_a_servo_at_two_gains_is_no_lag_that_drifts(capsys, tmp_path):
     assert examine(load(tmp_path / "a.csv")).joints["bench"].verdict == "use"
 
 
-@pytest.mark.wall_clock
 def test_a_bench_over_a_serial_line_is_swept_and_its_gain_set_back(capsys, tmp_path):
     rng = np.random.default_rng(2)
     robot = draw_bench(rng, Pendulum(0.1, 0.1))
     plant = PendulumBench(robot)
     bench = ServoBench(robot, load_joint_map(BENCH_MAP), rng.spawn(1)[0], plant=plant)
-    with on_a_port(FeetechEmulator(bench, STS3215, rng)) as server:
+    with on_a_virtual_line(tmp_path, FeetechEmulator(bench, STS3215, rng)) as (device,):
         sweep(
             capsys, "--gains", "8,16", "--kind", "steps", "--duration", "1", "--rate", "40",
-            "--bus", f"feetech:{server.device}", "--out", "a.csv",
+            "--bus", f"feetech:{device}", "--out", "a.csv",
         )  # fmt: skip
     assert plant.register(0, "p") == 32
     assert [t.p_gain for t in load(tmp_path / "a.csv").trials("bench")] == [8.0, 16.0]

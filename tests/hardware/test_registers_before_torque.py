@@ -1,7 +1,7 @@
 """Registers are judged before the torque is switched on: each fault is named, with its cure."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -11,34 +11,28 @@ from pupper_sysid.hardware.dynamixel import DynamixelBus
 from pupper_sysid.hardware.feetech import HD1910, SCS0009, STS3215, FeetechBus
 from pupper_sysid.hardware.joint_map import joint_map_from
 from pupper_sysid.hardware.safety.guard import GuardedBus
-from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.serial_line import LineEmulator
 from support.command_line import run
 from support.servo_servers import (
     bench_of,
     dynamixel_map,
     map_of,
-    on_a_port,
     still_dynamixels,
     still_servos,
 )
+from support.virtual_line import on_a_virtual_line
 
 IDS = (4, 5)
 
 
-@pytest.fixture(autouse=True)
-def patience(monkeypatch):
-    monkeypatch.setattr(serial_line, "REPLY_TIMEOUT_S", 0.1)
-
-
-@pytest.fixture(scope="module")
-def lines() -> Iterator[dict]:
-    """A line of each family, shared: a test changes registers and puts them back."""
+@pytest.fixture
+def lines(tmp_path) -> Iterator[dict]:
+    """A line of each family: a test changes registers."""
     lines = (still_servos(STS3215, IDS), still_servos(SCS0009, IDS), still_dynamixels(IDS))
-    with ExitStack() as ports:
+    with on_a_virtual_line(tmp_path, *lines) as devices:
         yield {
-            servos.series.name: (servos, ports.enter_context(on_a_port(servos)).device)
-            for servos in lines
+            servos.series.name: (servos, device)
+            for servos, device in zip(lines, devices, strict=True)
         }
 
 
@@ -174,14 +168,17 @@ def test_ramps_are_said_and_are_in_the_header(lines):
 
 
 @pytest.mark.parametrize("series", [STS3215, SCS0009, None])
-def test_two_servos_of_one_id_are_named_instead_of_the_cables(series):
+def test_two_servos_of_one_id_are_named_instead_of_the_cables(tmp_path, series):
     ids, bus = (4, 5, 6), FeetechBus if series else DynamixelBus
     if series:
         servos, layout = still_servos(series, ids, doubled=[5]), map_of(*ids, series=series)
     else:
         servos, layout = still_dynamixels(ids, doubled=[5]), dynamixel_map(*ids)
-    with on_a_port(servos) as server, pytest.raises(BusError, match="two servos") as refused:
-        bus(server.device, 1_000_000, layout)
+    with (
+        on_a_virtual_line(tmp_path, servos) as (device,),
+        pytest.raises(BusError, match="two servos") as refused,
+    ):
+        bus(device, 1_000_000, layout)
     assert "id 5 (register id)" in str(refused.value) and "another id" in str(refused.value)
     assert (5, True) not in bench_of(servos).torques
 
@@ -196,17 +193,17 @@ def test_without_a_map_servos_of_another_robot_are_never_moved(lines):
     assert bench_of(servos).goals == []
 
 
-def test_a_servo_without_a_published_model_number_is_driven_by_the_map_that_names_it():
+def test_a_servo_without_a_published_model_number_is_driven_by_the_map_that_names_it(tmp_path):
     servos = still_servos(HD1910, IDS)
     for servo in IDS:
         servos._set(servo, "model", 3333)
         servos.servos[servo].memory[50:52] = bytes([16, 8])  # in use; 21 and 22 are loaded from
     data = map_of(*IDS).file.model_dump(by_alias=True) | {"servo": "HD-1910"}
     layout = joint_map_from(data, "microduck").per_servo().select(["LF_hip", "LF_thigh"])
-    with on_a_port(servos) as server:
+    with on_a_virtual_line(tmp_path, servos) as (device,):
         with pytest.raises(InputError, match="is for STS3215 servos; these are HLS"):
-            FeetechBus(server.device, 1_000_000, map_of(*IDS))
-        bus = GuardedBus(FeetechBus(server.device, 1_000_000, layout))
+            FeetechBus(device, 1_000_000, map_of(*IDS))
+        bus = GuardedBus(FeetechBus(device, 1_000_000, layout))
         assert bus.torque(True)
         setup = bus.servo_setups()["LF_hip"]
         bus.close()
@@ -219,8 +216,8 @@ def test_an_unknown_name_on_a_line_without_a_map_is_blamed_on_the_missing_map(
     capsys, here, kind, words
 ):
     servos = still_servos(STS3215, IDS) if kind == "feetech" else still_dynamixels(IDS)
-    with on_a_port(servos) as server:
-        bus = f"{kind}:{server.device}@1000000"
+    with on_a_virtual_line(here, servos) as (device,):
+        bus = f"{kind}:{device}@1000000"
         code, _, err = run(capsys, *words.split(), "pan", "--bus", bus)
         model = servos.series.name.lower()
         assert code and "no joint map says" in err and f"init-robot --servo {model}" in err
