@@ -278,7 +278,13 @@ class Followed:
 
     @cached_property
     def _inputs(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64], float, float]]:
-        """Mean command of each step and that at its end, the step and the start, of each trial.
+        """Commands of each trial, as nearly all servos take them: see `_clamped`."""
+        return self._clamped(-_FAR, _FAR)
+
+    def _clamped(
+        self, low: float, high: float
+    ) -> list[tuple[NDArray[np.float64], NDArray[np.float64], float, float]]:
+        """Mean command of each step and its edges, the step and the start, of each trial.
 
         A rest as long as the longest lag comes first.
         """
@@ -289,10 +295,11 @@ class Followed:
             step = every * s.grid_s
             rest = np.full(_rest_steps(step), s.rest_rad)
             after = np.full(int(_EARLY_S / step) + 1, command[-1, -1])
-            inputs.append((
-                np.concatenate([rest, command.mean(axis=1), after]),
-                np.concatenate([rest, command[:, -1], after]), step, s.start_s,
-            ))  # fmt: skip
+            mean, end = (
+                np.clip(np.concatenate([rest, x, after]), low, high)
+                for x in (command.mean(axis=1), command[:, -1])
+            )
+            inputs.append((mean, kernel.edges_of(mean, end), step, s.start_s))
         return inputs
 
     def path(self, terms: NDArray) -> NDArray[np.float64]:
@@ -309,13 +316,14 @@ class Followed:
             servos = _columns(terms[abreast], self.reach)
             late = self.time_s + _EARLY_S - growth * self.later
             servos[:, _HANGING] = self.base.samples[0].rest_rad - np.pi / 2  # held level
-            for (mean, end, step, start), a, b in zip(
-                self._inputs, self.starts[:-1], self.starts[1:], strict=True
+            free = (low, high) == (-_FAR, _FAR)
+            inputs = self._inputs if free else self._clamped(low, high)
+            for (mean, edges, step, start), a, b in zip(
+                inputs, self.starts[:-1], self.starts[1:], strict=True
             ):
-                mean, end = np.clip(mean, low, high), np.clip(end, low, high)
                 paths[abreast, a:b] = kernel.residuals(
                     kernel.SERVO, servos, (terms[abreast, _LAG] + _EARLY_S) / step, mean[None],
-                    kernel.edges_of(mean, end), 1.0, _NO_LOAD, mean[0], _rest_steps(step), step,
+                    edges, 1.0, _NO_LOAD, mean[0], _rest_steps(step), step,
                     step=np.clip((late[a:b] - start) / step, 0.0, len(mean) - _rest_steps(step)),
                     reading=np.zeros(b - a),
                 ) - servos[:, kernel.OFFSET, None]  # fmt: skip
@@ -342,7 +350,7 @@ class Followed:
 
     def regressed(self, terms: NDArray, path: NDArray, columns: Columns | None) -> Follower:
         """The same of a path that is known."""
-        design = np.column_stack([path, *(columns(path) if columns else ())])
+        design = np.stack([path, *(columns(path) if columns else ())])
         floor = 0.01 * self.scale + 0.25 * self.step
         cost, values, rest = _regression(
             design, self.position_rad, self.starts, self.bound * self.scale, floor
@@ -484,33 +492,37 @@ def fitted(
     return best
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=kernel.SAFE, error_model="numpy")
 def _regression(design, position, starts, bound, floor):
     """Mean cost, values and residuals of a regression whose errors cost no more than `bound`."""
-    count, columns = design.shape
-    weight, rest = np.ones(count), np.zeros(count)
-    values = np.zeros(columns)
-    x, y = design.copy(), position.copy()
+    # sums in loops: without arrays in between they take half the time
+    rows, count = np.append(design, position).reshape(-1, len(position)), len(position)
+    last = len(design)
+    weight, x, gram = np.ones(count), np.empty_like(rows), np.empty((last + 1, last + 1))
+    values, rest = np.empty(last), np.empty(count)
     for _ in range(6):
         for trial in range(len(starts) - 1):
             a, b = starts[trial], starts[trial + 1]
             total = weight[a:b].sum()
-            for c in range(columns):
-                x[a:b, c] = design[a:b, c] - (weight[a:b] * design[a:b, c]).sum() / total
-            y[a:b] = position[a:b] - (weight[a:b] * position[a:b]).sum() / total
-        gram, right = np.zeros((columns, columns)), np.zeros(columns)
-        for k in range(count):
-            for c in range(columns):
-                right[c] += weight[k] * x[k, c] * y[k]
-                for d in range(columns):
-                    gram[c, d] += weight[k] * x[k, c] * x[k, d]
-        for c in range(columns):
+            for c in range(last + 1):
+                mean = 0.0
+                for k in range(a, b):
+                    mean += weight[k] * rows[c, k]
+                for k in range(a, b):
+                    x[c, k] = rows[c, k] - mean / total
+        for c in range(last + 1):
+            for d in range(min(c + 1, last)):
+                gram[c, d] = 0.0
+                for k in range(count):
+                    gram[c, d] += weight[k] * x[c, k] * x[d, k]
+                gram[d, c] = gram[c, d]
+        for c in range(last):
             gram[c, c] += 1e-12 + 1e-9 * gram[c, c]
-        values = np.linalg.solve(gram, right)
+        values = np.linalg.solve(gram[:last, :last].copy(), gram[last, :last].copy())
+        rest[:] = x[last]
+        for c in range(last):
+            rest -= values[c] * x[c]
         for k in range(count):
-            rest[k] = y[k]
-            for c in range(columns):
-                rest[k] -= values[c] * x[k, c]
             size = abs(rest[k])
             weight[k] = (bound / (size + bound)) ** 2 / max(size, floor)
     size = np.abs(rest)
