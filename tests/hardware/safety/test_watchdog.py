@@ -119,11 +119,14 @@ def test_a_robot_that_was_unplugged_when_it_should_go_limp_does_so_once_it_is_ba
 def test_a_hung_driver_is_ended_and_its_robot_parked(robot):
     server, address = robot
     process, watchdog = drive(address)
+    time.sleep(0.5)  # a quarter of its swing: farthest out
     os.kill(process.pid, signal.SIGSTOP)
-    stopped = time.monotonic()
     assert wait_for(lambda: limp(server), watchdog) < 3.5
-    assert time.monotonic() - stopped > 0.9
     assert process.wait(20.0) == -signal.SIGKILL
+    # by the servos' clock: a busy machine may have held the driver up before it was stopped
+    hip = np.array([goal for goal in server.emulator.bench.commands if goal[1] == 0])
+    moved_s = hip[1:, 0][np.diff(hip[:, 2]) != 0]
+    assert np.diff(moved_s).max() > 0.9, "nothing moves while the driver may still go on"
 
 
 @on_bus("feetech")

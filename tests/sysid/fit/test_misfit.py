@@ -133,16 +133,20 @@ def test_a_low_pass_filter_is_named_and_gains_make_up_for_a_part_of_it():
     ("feature", "numbers", "words", "size"),
     [
         ("backlash", {"backlash_rad": 0.02}, "play of ([0-9.]+) mrad", 20.0),
-        ("dead zone", {"dead_zone_rad": 0.02}, "a dead zone of ([0-9.]+) mrad", 20.0),
+        pytest.param("dead zone", {"dead_zone_rad": 0.02}, "a dead zone of ([0-9.]+) mrad", 20.0,
+                     marks=pytest.mark.slow),
         ("integral", {"integral_per_s": 4.0}, "an integral term .* of ([0-9.]+)/s", 4.0),
         pytest.param(
             "integral", {"integral_per_s": 50.0, "stiffness_per_s2": 2e4, "damping_per_s": 160.0,
                          "effort_rad_s2": 1000.0, "dead_time_s": 0.015},
             "an integral term .* of ([0-9.]+)/s", 50.0, marks=pytest.mark.slow,
         ),
-        ("stribeck", {"stribeck_friction": 90.0, "stribeck_speed_rad_s": 0.5},
-         "more friction at rest than in motion()", 0.0),
-        ("gravity", {"gravity_sin": 150.0, "gravity_cos": 0.0}, "a load whose weight pulls()", 0.0),
+        pytest.param(
+            "stribeck", {"stribeck_friction": 90.0, "stribeck_speed_rad_s": 0.5},
+            "more friction at rest than in motion()", 0.0, marks=pytest.mark.slow,
+        ),
+        pytest.param("gravity", {"gravity_sin": 150.0, "gravity_cos": 0.0},
+                     "a load whose weight pulls()", 0.0, marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_what_a_servo_has_besides_is_named_with_its_size(feature, numbers, words, size):
