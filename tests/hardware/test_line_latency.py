@@ -19,7 +19,7 @@ from pupper_sysid.hardware.serial_servos.scan import scan_line
 from pupper_sysid.sim.emulator.serial_line import SerialPty
 from support.command_line import json_of, run
 from support.servo_servers import map_of, on_a_port, still_dynamixels, still_servos
-from support.stopwatch import Stopwatch, wait_until
+from support.virtual_line import on_a_virtual_line
 from support.virtual_time import VirtualTime
 
 
@@ -31,20 +31,17 @@ def behind_adapter(emulator, latency_s: float) -> Iterator[SerialPty]:
         yield server
 
 
-@pytest.mark.wall_clock
-def test_a_slow_adapter_is_waited_for_and_named():
+def test_a_slow_adapter_is_waited_for_and_named(tmp_path):
     servos = still_servos(ids=[4, 5, 6])
-    with behind_adapter(servos, 0.016) as server:
-        watch = Stopwatch()
-        bus = FeetechBus(server.device, 1_000_000, map_of(4, 5, 6))
-        latest_s = 0.03 + watch.waited_s()
+    with on_a_virtual_line(tmp_path, servos, latency_s=0.016) as (device,):
+        bus = FeetechBus(device, 1_000_000, map_of(4, 5, 6))
         said, latency_s = slow_adapter(bus.line), bus.metadata["latency_s"]
         assert bus.line.patience_s > 0.016
         # with less patience the replies of one reading never all come
-        assert wait_until(lambda: bool(np.isfinite(bus.read().position_rad).all()))
+        assert np.isfinite(bus.read().position_rad).all()
         bus.close()
     # requests right after replies wait for a whole period of the timer
-    assert 0.008 < latency_s < latest_s
+    assert latency_s == pytest.approx(0.016, abs=0.002)
     assert said and "later than bytes and servos need" in said
 
 

@@ -3,6 +3,7 @@
 What a line does in real time, through a terminal of the system, is the matter of other tests.
 """
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,13 +22,22 @@ from support.virtual_time import VirtualTime
 class VirtualSerial:
     """What `serial.Serial` is to the product: bytes of an emulator arrive when they are due."""
 
-    def __init__(self, emulator: LineEmulator, clock: VirtualTime, baud: int, timeout_s: float):
-        self._emulator, self._clock = emulator, clock
+    def __init__(
+        self,
+        emulator: LineEmulator,
+        clock: VirtualTime,
+        latency_s: float,
+        baud: int,
+        timeout_s: float,
+    ):
+        self._emulator, self._clock, self._latency_s = emulator, clock, latency_s
         self._baud, self._timeout_s = baud, timeout_s
         self._due: list[tuple[float, bytes]] = []
 
     def write(self, data: bytes) -> int:
-        self._due += self._emulator.receive(bytes(data), self._clock.time, self._baud)
+        for due, piece in self._emulator.receive(bytes(data), self._clock.time, self._baud):
+            ticks = self._latency_s and math.ceil(due / self._latency_s)
+            self._due.append((ticks * self._latency_s or due, piece))
         self._due.sort(key=lambda piece: piece[0])
         return len(data)
 
@@ -55,13 +65,18 @@ class VirtualSerial:
 
 
 @contextmanager
-def on_a_virtual_line(folder: Path, *emulators: LineEmulator) -> Iterator[list[str]]:
-    """Devices of the servos, whose time passes only while this process waits for them."""
+def on_a_virtual_line(
+    folder: Path, *emulators: LineEmulator, latency_s: float = 0.0
+) -> Iterator[list[str]]:
+    """Devices of the servos, whose time passes only while this process waits for them.
+
+    `latency_s` is the period of the adapter's timer, with whose ticks it delivers.
+    """
     clock = VirtualTime()
     served = {str(folder / f"line{k}"): emulator for k, emulator in enumerate(emulators)}
 
     def opened(device: str, baud: int, timeout: float, **_: object) -> VirtualSerial:
-        return VirtualSerial(served[device], clock, baud, timeout)
+        return VirtualSerial(served[device], clock, latency_s, baud, timeout)
 
     def sleep(seconds: float) -> None:
         clock.time += max(seconds, 1e-6)  # the product's clock tells microseconds apart
