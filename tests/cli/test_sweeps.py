@@ -175,7 +175,7 @@ def test_an_interrupted_bench_is_continued_at_its_gain(capsys, tmp_path):
 
 
 def test_a_servo_at_two_gains_is_no_lag_that_drifts(capsys, tmp_path):
-    sweep(capsys, "--gains", "16,32", "--kind", "steps", "--out", "a.csv")
+    sweep(capsys, "--gains", "16,32", "--kind", "steps", "--duration", "4", "--out", "a.csv")
     assert examine(load(tmp_path / "a.csv")).joints["bench"].verdict == "use"
 
 

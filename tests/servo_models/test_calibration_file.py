@@ -385,7 +385,7 @@ def calibrations(draw) -> Calibration:
     )
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(calibrations())
 def test_any_calibration_that_is_saved_reads_back(path, made):
     made.save(path, force=True)

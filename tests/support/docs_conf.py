@@ -4,16 +4,31 @@ import importlib.util
 import sys
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 
-_spec = importlib.util.spec_from_file_location(
-    "documentation", Path(__file__).resolve().parents[2] / "docs/conf.py"
-)
-assert _spec is not None and _spec.loader is not None
-_conf = importlib.util.module_from_spec(_spec)
-_path = list(sys.path)
-_spec.loader.exec_module(_conf)
-sys.path[:] = _path  # conf.py adds the folder of its extensions
 
-subcommands = cache(_conf.subcommands)
-help_text = cache(_conf.help_text)
-front_door = _conf._front_door
+@cache
+def _conf() -> ModuleType:
+    """The module, once it is asked for: it imports Sphinx, which takes a second."""
+    spec = importlib.util.spec_from_file_location(
+        "documentation", Path(__file__).resolve().parents[2] / "docs/conf.py"
+    )
+    assert spec is not None and spec.loader is not None
+    module, path = importlib.util.module_from_spec(spec), list(sys.path)
+    spec.loader.exec_module(module)
+    sys.path[:] = path  # conf.py adds the folder of its extensions
+    return module
+
+
+@cache
+def subcommands(program: str) -> list[str]:
+    return _conf().subcommands(program)
+
+
+@cache
+def help_text(program: str, *command: str) -> str:
+    return _conf().help_text(program, *command)
+
+
+def front_door() -> str:
+    return _conf()._front_door()

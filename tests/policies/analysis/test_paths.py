@@ -106,7 +106,7 @@ def test_a_policy_goes_where_it_is_commanded(walker, monkeypatch):
     policy, trial = walker
     some = {k: DIRECTIONS[k] for k in ("forward", "turn left", "stand")}
     monkeypatch.setattr("pupper_sysid.policies.analysis.robustness.DIRECTIONS", some)
-    forward, turn = compliance(policy, replace(trial, seconds=5.0))
+    forward, turn = compliance(policy, replace(trial, seconds=3.5))
     assert forward.direction == "forward" and forward.share.value > 0.7
     assert turn.share.value > 0.3 and np.isnan(turn.drift.value)
 

@@ -127,7 +127,7 @@ def replace_robots(rollout: Rollout, robots: list[int]) -> Rollout:
 
 def test_where_all_fell_there_are_no_numbers_and_no_crash(walker):
     policy, trial = walker
-    gone = recorded(fallen(trial.walk(policy), [0, 1], 0.5))
+    gone = recorded(fallen(replace(trial, seconds=2.5).walk(policy), [0, 1], 0.5))
     assert all(np.isnan(r.share) for r in frozen(policy, gone))
     assert all(np.isnan(r.frequency_hz) for r in delay_curve(policy, gone, (0, 80)))
     assert orbits(policy, gone, (0.0, 160.0)) == {} and push_response(policy, gone) == ()
