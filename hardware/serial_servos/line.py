@@ -435,9 +435,10 @@ class SerialLine(ABC):
         deadline = begin + size * self._byte_s() + self.patience_s
         deadline += delays * self.longest_return_delay_s
         owed = self._port.sent if self.echoes else b""
-        complete = take(b"")
+        complete, late = take(b""), False
         try:
-            while not complete and time.monotonic() < deadline:
+            while not (complete or late):
+                late = time.monotonic() >= deadline  # but what a busy host has not read yet
                 data = self._port.read_some()
                 if owed:
                     data, owed = _strip(data, owed)

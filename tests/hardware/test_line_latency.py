@@ -45,6 +45,23 @@ def test_a_slow_adapter_is_waited_for_and_named(tmp_path):
     assert said and "later than bytes and servos need" in said
 
 
+def test_replies_that_came_while_the_host_was_busy_are_read(tmp_path, monkeypatch):
+    servos = still_servos(ids=[4])
+    with on_a_virtual_line(tmp_path, servos) as (device,):
+        bus = FeetechBus(device, 1_000_000, map_of(4))
+        receive = servos.receive
+
+        def busy(data: bytes, now: float, baud: int | None = None) -> list[tuple[float, bytes]]:
+            serial_line.time.sleep(0.2)
+            return receive(data, now, baud)
+
+        monkeypatch.setattr(servos, "receive", busy)
+        assert np.isfinite(bus.read().position_rad).all()
+        monkeypatch.setattr(servos, "receive", lambda *_: [])
+        assert np.isnan(bus.read().position_rad).all()
+        bus.close()
+
+
 def test_one_reply_that_a_busy_host_took_late_is_no_slow_adapter(monkeypatch):
     with on_a_port(still_servos(ids=[4])) as server:
         bus = FeetechBus(server.device, 1_000_000, map_of(4))
