@@ -267,7 +267,9 @@ class _Blocks:
             if number:
                 self._numbers[name].append(numbers[n])
             else:
-                table.texts[name] += map(self._text, read[n].fillna("").tolist())
+                places, distinct_texts = pd.factorize(read[n].fillna(""))
+                known = np.array([*map(self._text, distinct_texts)], object)
+                table.texts[name] += known[places].tolist()
         self._lines.append(np.array([*rows], np.int64))
         return True
 

@@ -468,12 +468,15 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
 
 def _unnamed(body: str, names: str) -> str:
     """Rows without further lines of names, as appended passes have them."""
+    if names not in body:  # one search of the text is cheaper than one per line
+        return body
     return re.sub(rf"^{re.escape(names)}$", "", body, flags=re.MULTILINE)
 
 
 def _cells(body: str, shape: _Shape) -> str:
     """Rows with commas between cells and points in numbers."""
-    body = re.sub(r"^[ \t]*(?:%|//|!).*$", "", body, flags=re.MULTILINE)
+    if any(mark in body for mark in ("%", "//", "!")):
+        body = re.sub(r"^[ \t]*(?:%|//|!).*$", "", body, flags=re.MULTILINE)
     quoted = '"' in body and (shape.separator != "," or shape.comma)
     commas = shape.separator != "," and "," in body and not shape.comma
     if quoted or commas or shape.units or shape.hexed:
