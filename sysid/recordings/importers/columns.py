@@ -83,7 +83,7 @@ WORDS: dict[str, str] = {
                 "frame iteration iter step overrun moving force feedforward ff tff integral prev "
                 "previous last offset home initial init delta diff frequency freq hz cov "
                 "covariance enable enabled reached done warning fault trial episode loop "
-                "strom spannung dot iq uq ud trq torq"),
+                "strom spannung dot iq uq ud trq torq rpm rps"),
         (TIME, "time times timestamp timestamps t ts stamp stamps clock elapsed seconds secs sec "
                "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
                "nanosec nanosecs nsecs usec usecs tout minutes days datenum zeit temps tiempo "

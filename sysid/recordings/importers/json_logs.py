@@ -64,6 +64,10 @@ _REGISTERS = {"xl330": 5}  # reads of one register each, the position first
 _FAR, _LONGEST_NUMBER = 1e9, 40
 _FEW_REMARKS = 4000  # characters
 _LONGER = 10  # times as many values over time as joints
+_WORDS_OF_LISTS = set(
+    "joints servos motors actuators data points samples records rows entries log logs values "
+    "series trajectory trace messages".split()
+)
 _NUMBERS = ("mass", "length", "kp", "vin")
 
 
@@ -158,7 +162,7 @@ def _read_ktune(path: Path, data: dict[str, Any]) -> Log:
 def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     """The log in other JSON as a table; None if it has no columns of a command and a position."""
     lists: dict[str, list[Any]] = {}
-    data = _of_frame(data)
+    data = _of_points(_of_frame(data))
     records = _records(data)
     if records is None and not isinstance(data, Mapping):
         values = _numbers(data)
@@ -236,6 +240,32 @@ def _of_frame(data: Any) -> Any:
             if len(value) <= MOST_JOINTS and max(longest, default=0) > _LONGER * len(value):
                 return {**data, **_by_name(value), name: None}
     return data
+
+
+def _of_points(data: Any) -> Any:
+    """Lists of points, wherever they stand below the names of joints, as one list of points.
+
+    A point is a record with a command and a position. The joint is the last name above the list
+    that is no word for a list. Other data as they are.
+    """
+    of_joint: dict[str, list[Any]] = {}
+    pending = [("", data)] if isinstance(data, Mapping) else []
+    while pending:
+        joint, inside = pending.pop(0)
+        for key, value in inside.items():
+            name = joint if key.lower() in _WORDS_OF_LISTS else str(key)
+            records = isinstance(value, list) and all(isinstance(v, Mapping) for v in value)
+            if records and value and not missing([*map(str, value[0])]):
+                of_joint[name] = [*of_joint.get(name, []), *value]
+            elif records and 0 < len(value) <= MOST_JOINTS:  # a record per joint, with its list
+                pending += [*_by_name(value).items()]
+            elif isinstance(value, Mapping):
+                pending.append((name, value))
+    if not of_joint or (len(of_joint) == 1 and _records(data) is not None):
+        return data
+    named = all("joint" not in point for points in of_joint.values() for point in points)
+    return [point | ({"joint": joint} if joint and named else {})
+            for joint, points in of_joint.items() for point in points]  # fmt: skip
 
 
 def _by_name(value: list[Any]) -> Any:

@@ -11,10 +11,11 @@ import re
 import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import combinations, product
+from itertools import combinations, permutations, product
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pupper_sysid.common.reading.dialect import is_clock
 from pupper_sysid.common.strict_yaml import printable
@@ -52,6 +53,9 @@ _CURRENT = re.compile(r"cur(r|rent)?(?![A-Za-z])", re.IGNORECASE)
 _WIDEST_ANGLE = 1e6  # of a joint, in any unit
 _COMPARED, _ALIKE = 12, 0.7  # columns; concordance of a command and its position
 _ORDERED = 100_000  # rows
+_PULSES = re.compile(r"pwm|pulse|duty", re.IGNORECASE)  # what a hobby servo is commanded by
+_PULSES_US, _OF_PULSES = (400.0, 2700.0), "counts:4000:1500"  # 2,000 µs for half a turn
+_IS_RATE = 0.95  # correlation of a column with another one summed up
 
 
 def import_line(path: Path | str, **options: str) -> str:
@@ -148,18 +152,21 @@ def _lines_by_name(path: Path | str, table: Table, timed: bool) -> str:
     when = {"time": times[0]} if times else {"rate": f"{table.rate or 50:g}"}
     of_number = {c.name: re.sub(r"\d+", "{joint}", c.name, count=1) for c in columns}
     several = {each for each, n in Counter(of_number.values()).items() if n > 1}
-    by_kind = []
+    by_kind, rates = [], _rates(table)
     for kind in ("command", "position"):
         sure = [c for c in columns if c.kind == kind and c.name not in still]
         if kind == "command" and not sure:  # qd beside q may be the desired angle
             sure = [c for c in columns if c.name[-1:] == "d" and c.name[:-1] in table.names]
+        if kind == "command" and not sure:
+            sure = [c for c in columns if not c.kind and _PULSES.search(c.name)]
         if kind == "position" and not sure:  # beside a command a bare `current` may be a place
             sure = [c for c in columns if not c.kind and _CURRENT.search(c.name)]
         chosen = [(c.template, c.name) for c in sure]
         for others in ("unknown", "time"):
             chosen = chosen or [
                 (of_number[c.name] if of_number[c.name] in several else c.template, c.name)
-                for c in columns if c.kind == others and c.name not in times[:1]
+                for c in columns
+                if c.kind == others and c.name not in times[:1] and c.name not in rates
             ]  # fmt: skip
         by_kind.append(chosen)
     lines = []
@@ -180,10 +187,11 @@ def lines_by_value(path: Path | str, table: Table) -> list[str]:
     named = sorted(time_columns(table.names)[:2], key=lambda n: n not in (*rising, *clocks))
     time = next(iter([*named[:1], *rising, *clocks]), "")
     others: list[str] = []  # that move, each once
+    rates = _rates(table)
     for name, values in table.columns.items():
         known = table.known(name)
         same = (np.array_equal(values, table.columns[o], equal_nan=True) for o in others)
-        if name == time or np.ptp(known) == 0 or any(same):
+        if name == time or name in rates or np.ptp(known) == 0 or any(same):
             continue
         if np.ptp(known) < _WIDEST_ANGLE:
             others.append(name)
@@ -208,21 +216,50 @@ def lines_by_value(path: Path | str, table: Table) -> list[str]:
     return [import_line(path, **how, command=c, position=p) for c, p in choices if c != p]
 
 
+def _rates(table: Table) -> set[str]:
+    """Columns that another one is the sum of: speeds beside an angle, whatever they are called.
+
+    None where that leaves no pair: a sine a quarter of a turn late is such a sum, too.
+    """
+    moving = {
+        name: values[:_ORDERED] for name, values in table.columns.items()
+        if name not in table.increasing and np.isfinite(values).all()
+        and 0 < np.ptp(values) < _WIDEST_ANGLE
+    }  # fmt: skip
+    names = [*moving][:_COMPARED]
+
+    def level(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        row = np.arange(len(values))
+        return values - np.polyval(np.polyfit(row, values, 1), row)
+
+    def correlation(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+        return float(one @ other) / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-300)
+
+    summed = {name: level(np.cumsum(moving[name])) for name in names}
+    bare = {name: level(moving[name]) for name in names}
+    rates = {a for a, b in permutations(names, 2) if correlation(summed[a], bare[b]) > _IS_RATE}
+    return rates if len(names) - len(rates) >= 2 else set()
+
+
 def _unit_of(table: Table, names: Iterable[str]) -> dict[str, str]:
     """The option for a command and a position whose values, in radians, are no angles of a joint.
 
     `names` may hold `{joint}`.
     """
-    pair = []
+    pair, pulses = [], False
     for name in names:
         pattern = re.escape(name).replace(re.escape("{joint}"), ".+")
         column_name = next(
             (n for n in table.columns if re.fullmatch(pattern, n)), name.split(",")[0]
         )
-        if column(column_name).unit:
+        pulses = pulses or _PULSES.search(column_name) is not None
+        if column(column_name).unit and not pulses:
             return {}
         pair.append(table.known(column_name))
     largest = max(float(np.abs(values).max()) for values in pair)
+    if _PULSES_US[0] < pair[0].min() <= pair[0].max() < _PULSES_US[1] and pulses:
+        of_position = likely_of_pair(pair[1], pair[1])[0].partition(",")[0]
+        return {"unit": f"{_OF_PULSES},{of_position}"}
     return {"unit": likely_of_pair(*pair)[0]} if largest > LARGEST_RAD else {}
 
 

@@ -5,6 +5,7 @@ import gzip
 import io
 import json
 import lzma
+import re
 import zipfile
 
 import numpy as np
@@ -92,6 +93,7 @@ def repeated():
     return "\n".join([lines[0], *(line for line in lines[1:] for _ in range(4)), ""])
 
 
+POINTS = [{"t": t, "cmd": c, "pos": p} for t, c, p in ROWS_OF]
 FORMS = {
     "commas": joined(","),
     "tabs": joined("\t"),
@@ -208,6 +210,11 @@ FORMS = {
         f"0x{round(1e6 * t):08X},{c},{p}\n" for t, c, p in ROWS_OF),
     "a letter for desired": joined(",", ("t", "theta_d", "theta")),
     "a joint's bare name": joined(",", ("t", "phi_ref", "phi")),
+    **{f"JSON points below {names}": json.dumps(content) for names, content in {
+        "a joint": {"joints": {"knee": POINTS}},
+        "a list of a joint": {"meta": {"robot": "x"}, "data": {"knee": {"samples": POINTS}}},
+        "a record of a joint": {"joints": [{"name": "knee", "data": POINTS}]},
+    }.items()},
     "JSON, rows below names": json.dumps({"columns": ["t", "cmd", "pos"], "rows": ROWS_OF}),
     "JSON Lines of topics": "".join(
         f'{{"topic": "{topic}", "t": {t}, "data": [{value}]}}\n'
@@ -264,6 +271,24 @@ def test_columns_without_names_are_offered_in_the_pairs_and_as_the_times_that_go
         path.write_text("".join(lines))
         assert_each_refused([(path, f"log.txt {line} --out")], load)
     same(load(path, LogOptions("0,1", "3", "4")))
+
+
+def test_pulses_are_offered_as_commands_and_a_speed_as_neither(tmp_path):
+    """What another column is the sum of is no angle, whatever its name and however large."""
+    path = tmp_path / "log.txt"
+    degrees = np.degrees(POSITION)
+    rpm = np.gradient(degrees, TIME) / 6
+    pulses = 1500 + COMMAND / (2 * np.pi / 4000)
+    for names in ("pwm_us,angle_deg,rpm", "pwm,value,n", "pulse,angle,speed"):
+        np.savetxt(path, np.column_stack([TIME, pulses, degrees, rpm]), delimiter=",",
+                   header=f"t,{names}", comments="")  # fmt: skip
+        command, position, speed = names.split(",")
+        with pytest.raises(InputError) as refusal:
+            load(path)
+        line = f"--unit counts:4000:1500,deg --command {command} --position {position} --out"
+        assert line in str(refusal.value)
+        assert not re.search(rf"--(command|position) {speed}\b", str(refusal.value))
+        same(load(path, LogOptions("t", command, position, unit="counts:4000:1500,deg")))
 
 
 def test_an_archive_without_times_takes_its_time_step_for_the_rate(tmp_path):
