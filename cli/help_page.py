@@ -8,12 +8,14 @@ settings (`--task.…`) only by name; its last line says that `--help-all` has t
 from __future__ import annotations
 
 import argparse
+import difflib
 import re
 import shutil
 import textwrap
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from typing import Any
 
 import tyro
@@ -38,16 +40,7 @@ def help_page(
     servo`; the description is by default the dataclass's docstring; `keywords` are those of
     `tyro.cli`.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # since tyro 1.0, without a successor
-        parser: Any = tyro.extras.get_parser(
-            options, prog=program, description=description, **keywords
-        )
-    for word in arguments:
-        if word not in _subcommands(parser):
-            break
-        parser = _subcommands(parser)[word]
-        program = f"{program} {word}"
+    parser, program = _parser(options, arguments, program, description=description, **keywords)
     width = max(_NARROWEST, min(_WIDEST, shutil.get_terminal_size().columns))
     everything = "\n".join(_page(parser, program, width, full=True, nested=True))
     if ALL in arguments or everything.count("\n") < SCREEN_LINES:
@@ -63,6 +56,98 @@ def help_page(
         if len(lines) <= SCREEN_LINES:
             break
     return "\n".join(lines)
+
+
+def _parser(
+    options: Any, arguments: Sequence[str], program: str, **keywords: Any
+) -> tuple[Any, str]:
+    """Parser of the command that `arguments` name, and the command's words."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # since tyro 1.0, without a successor
+        parser: Any = tyro.extras.get_parser(options, prog=program, **keywords)
+    for word in arguments:
+        if word not in _subcommands(parser):
+            break
+        parser = _subcommands(parser)[word]
+        program = f"{program} {word}"
+    return parser, program
+
+
+def correction(
+    options: Any, arguments: Sequence[str], program: str, refusal: str, **keywords: Any
+) -> str:
+    """What to type instead of `arguments`, which tyro refused; empty if that is not known."""
+    parser, program = _parser(options, arguments, program, **keywords)
+    known = {name: action for action in parser._actions for name in action.option_strings}
+    refused = re.search(r"Unrecognized options: ([^\n]*)", " ".join(refusal.split()))
+    starts = [k for k, word in enumerate(arguments) if re.match(r"--?[a-zA-Z]", word)]
+    for start, end in pairwise([*starts, len(arguments)]):
+        typed, equals, value = arguments[start].partition("=")
+        name = typed.replace("_", "-")
+        values = [value] * bool(equals) + list(arguments[start + 1 : end])
+        if name not in known:
+            meant = _MEANT.get(name)
+            near = [meant] if meant in known else _near(name, known)
+            return f"{program} has no option {typed}. {_did_you_mean(near, program)}"
+        action = known[name]
+        if action.choices and values and values[0] not in action.choices:
+            listed = ", ".join(map(str, action.choices))
+            near = _near(values[0], action.choices)
+            meant = f"Did you mean {name} {near[0]}? " if near else ""
+            return f"{name} is '{values[0]}'. {meant}It may be {listed}."
+        if isinstance(action.nargs, int) and action.nargs > 1 and "," in "".join(values):
+            apart = [part for text in values for part in text.split(",") if part]
+            return (
+                f"{name} takes {action.nargs} values with spaces between them: "
+                f"{name} {' '.join(apart[: action.nargs])}."
+            )
+        surplus = values[1:]
+        if refused and surplus and all(word in refused[1] for word in surplus):
+            if _NUMBER.match(_name(action)):
+                return f"{name} takes one number, not {len(values)}: {name} {values[0]}."
+            joined = ",".join(word.strip(",") for word in values)
+            return f"Several values of one option go with commas, without spaces: {name} {joined}."
+        unit = re.search(r"\[([^\[\]]+)\]", action.help or "")
+        if values and "not a" in refusal and re.fullmatch(r"[-+.\d]+ ?(?!e$)[a-zA-Z°%]+", values[0]):
+            kind = f"a number in {unit[1]}" if unit else "a number"
+            return f"{name} is '{values[0]}'. Write {kind}, without its unit."
+    for word in arguments[: starts[0] if starts else None]:
+        if refused and word in refused[1]:
+            name, equals, value = word.partition("=")
+            if equals and f"--{name}" in known:
+                return f"Options begin with two hyphens: --{name} {value}."
+            of = [n for n, action in known.items() if word in (action.choices or ())]
+            if of:
+                return f"'{word}' needs the name of its option: {of[0]} {word}."
+            near = _near(word, _subcommands(parser))
+            return f"{program} does not take '{word}'. {_did_you_mean(near, program)}"
+    return ""
+
+
+_MEANT = {
+    "--output": "--out", "-o": "--out", "--port": "--bus", "--device": "--bus", "--seeds": "--seed",
+    "--joint": "--joints", "--model": "--models", "--amp": "--amplitude", "--format": "--to",
+    "--frequencies": "--freqs", "--frequency": "--freqs", "--freq": "--freqs",
+    "--envs": "--environments", "--num-envs": "--environments",
+}  # fmt: skip
+"""Other programs' words for an option; a word counts where the command has that option."""
+_NUMBER = re.compile(r"\S+ (INT|FLOAT)$")
+
+
+def _near(word: str, names: Iterable[Any]) -> list[str]:
+    """The most similar of some names; case and hyphens count for nothing."""
+
+    def bare(name: Any) -> str:
+        return re.sub(r"[-_ ]", "", str(name)).lower()
+
+    by_letters = {bare(name): str(name) for name in names}
+    nearest = difflib.get_close_matches(bare(word), by_letters, n=1, cutoff=0.7)
+    return [by_letters[name] for name in nearest]
+
+
+def _did_you_mean(names: Sequence[str], program: str) -> str:
+    meant = f"Did you mean {names[0]}? " if names else ""
+    return f"{meant}`{program} --help` lists all."
 
 
 def _subcommands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:

@@ -16,11 +16,12 @@ from __future__ import annotations
 import difflib
 import errno
 import functools
+import io
 import operator
 import os
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import fields, replace
 from importlib import import_module
 from pathlib import Path
@@ -32,7 +33,7 @@ import tyro
 from rich.text import Text
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from pupper_sysid.cli.help_page import ALL, HELP, help_page
+from pupper_sysid.cli.help_page import ALL, HELP, correction, help_page
 from pupper_sysid.cli.terminal import err, forget, out, remember, spell
 from pupper_sysid.common.errors import InputError, PupperError
 from pupper_sysid.common.files import holding_outputs, versions
@@ -96,11 +97,20 @@ def parse(
     `keywords` are further ones of `tyro.cli`.
     """
     settings = {"config": CONFIG, "description": description, "registry": NUMERALS} | keywords
-    if {*HELP, ALL} & {*arguments} and hasattr(tyro.extras, "get_parser"):
-        known = {key: value for key, value in settings.items() if key != "description"}
+    known = {key: value for key, value in settings.items() if key != "description"}
+    if {*HELP, ALL} & {*arguments}:
         print(help_page(options, arguments, program, settings["description"], **known))
         sys.exit(0)
-    parsed = tyro.cli(options, args=arguments, prog=program, **settings)
+    refusal = io.StringIO()
+    try:
+        with redirect_stderr(refusal):
+            parsed = tyro.cli(options, args=arguments, prog=program, **settings)
+    except SystemExit:
+        text = refusal.getvalue()
+        if text and (hint := correction(options, arguments, program, text, **known)):
+            raise InputError(hint) from None
+        sys.stderr.write(text)
+        raise
     remember(parsed)
     seed = getattr(parsed, "seed", 0)
     if not 0 <= seed <= LARGEST_SEED:

@@ -144,6 +144,8 @@ def write_api_pages() -> None:
             continue
         folder = HERE.parent / package.removeprefix("pupper_sysid.").replace(".", "/")
         modules = sorted(path.stem for path in folder.glob("*.py") if path.stem != "__init__")
+        for name in modules:  # before autodoc changes annotations that pydantic reads
+            import_module(f"{package}.{name}")
         if modules:
             title = package.removeprefix("pupper_sysid.")
             (REFERENCE / f"{title}.rst").write_text(_api_page(package, modules))

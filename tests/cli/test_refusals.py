@@ -51,6 +51,15 @@ calibarte | Did you mean `pupper-sysid calibrate`
 delay [nowhere.csv missing.npz] | does not exist
 delay | No recording was named
 delay log.csv --joints LF_hipp | Did you mean LF_hip
+sweep --freqs 1 2 4 8 | with commas, without spaces: --freqs 1,2,4,8
+sweep --amplitude 5deg | --amplitude is '5deg'. Write a number in rad, without its unit
+sweep --amplitude 0.1 0.2 | --amplitude takes one number, not 2: --amplitude 0.1
+sweep --joint LF_hip | Did you mean --joints
+sweep --port /dev/ttyUSB0 | Did you mean --bus
+calibrate log.csv --output c.yaml | Did you mean --out?
+export calibrated.yaml --to isaac-lab | Did you mean --to isaaclab?
+export calibrated.yaml isaaclab | needs the name of its option: --to isaaclab
+servo lst | Did you mean list
 doctor log.csv --read-limit [0 0.5 1001 nan inf x 4_1 ٣ ""] | --read-limit
 doctor log.csv [--read-limit=0 --read-limit] | --read-limit
 [import doctor calibrate fit-servo] loop.csv | loop.csv
