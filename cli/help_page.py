@@ -108,7 +108,11 @@ def correction(
             joined = ",".join(word.strip(",") for word in values)
             return f"Several values of one option go with commas, without spaces: {name} {joined}."
         unit = re.search(r"\[([^\[\]]+)\]", action.help or "")
-        if values and "not a" in refusal and re.fullmatch(r"[-+.\d]+ ?(?!e$)[a-zA-Z°%]+", values[0]):
+        if (
+            values
+            and "not a" in refusal
+            and re.fullmatch(r"[-+.\d]+ ?(?!e$)[a-zA-Z°%]+", values[0])
+        ):
             kind = f"a number in {unit[1]}" if unit else "a number"
             return f"{name} is '{values[0]}'. Write {kind}, without its unit."
     for word in arguments[: starts[0] if starts else None]:
