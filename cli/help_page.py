@@ -86,7 +86,7 @@ def correction(
         name = typed.replace("_", "-")
         values = [value] * bool(equals) + list(arguments[start + 1 : end])
         if name not in known:
-            meant = _MEANT.get(name)
+            meant = _MEANT.get(name, "")
             near = [meant] if meant in known else _near(name, known)
             return f"{program} has no option {typed}. {_did_you_mean(near, program)}"
         action = known[name]

@@ -129,9 +129,10 @@ def test_an_optional_value_is_read_as_its_type_or_as_none():
     assert parse(Optional, [], "x") == Optional(0.3, None)
     read = parse(Optional, ["--amplitude", "None", "--kind", "chirp"], "x")
     assert read == Optional(None, "chirp")
-    for wrong in (["--amplitude", "4_1"], ["--kind", "square"]):
-        with pytest.raises(SystemExit):
-            parse(Optional, wrong, "x")
+    with pytest.raises(SystemExit):
+        parse(Optional, ["--amplitude", "4_1"], "x")
+    with pytest.raises(InputError, match="--kind is 'square'. It may be sine, chirp"):
+        parse(Optional, ["--kind", "square"], "x")
 
 
 def test_what_was_typed_is_never_proposed():
