@@ -120,6 +120,7 @@ class LineEmulator(ABC):
             k = bench.index_of_id[servo_id]
             as_built = {name: bench.register(k, name) for name in self._acting}
             self._load(servo_id, {"torque_enable": 1} | as_built)
+            self._limits_in_force(servo_id)
             for name, value in changed.items():
                 self._set(servo_id, name, value)
                 if name in self._acting:
@@ -139,6 +140,12 @@ class LineEmulator(ABC):
         if self.series.lock_address is not None:
             self.servos[servo_id].memory[self.series.lock_address] = 1
 
+    def _limits_in_force(self, servo_id: int) -> None:
+        """Copy the limits of the EEPROM to where they act, as a servo does when it is powered."""
+        for name, limit in (("torque_limit", "max_torque"), ("goal_current", "current_limit")):
+            if self.series.has(name) and self.series.has(limit):
+                self._set(servo_id, name, self._get(servo_id, limit))
+
     def restart(self, servo_id: int, at: float, keeps_eeprom: bool = True) -> None:
         """Limp, and with the registers of a servo that was switched on, as after its power failed.
 
@@ -149,9 +156,7 @@ class LineEmulator(ABC):
         servo.memory[end:] = bytes(self.memory_bytes - end)
         self._load(servo_id, {"torque_enable": 0})
         servo.memory[:end] = eeprom
-        for name, limit in (("torque_limit", "max_torque"), ("goal_current", "current_limit")):
-            if self.series.has(name) and self.series.has(limit):
-                self._set(servo_id, name, self._get(servo_id, limit))
+        self._limits_in_force(servo_id)
         self.bench.torque(k, at, False)
         servo.stopped = servo.overloaded = False
         servo.state.clear()

@@ -228,3 +228,15 @@ def test_an_unknown_name_on_a_line_without_a_map_is_blamed_on_the_missing_map(
         )
         assert code and "Did you mean LF_thigh?" in err and "no joint map" not in err
     assert bench_of(servos).goals == [] and not any(on for _, on in bench_of(servos).torques)
+
+
+@pytest.mark.parametrize(
+    "servos", [still_dynamixels([4]), still_servos(STS3215, [4]), still_servos(SCS0009, [4])]
+)
+def test_a_servo_that_lost_its_supply_has_the_registers_with_which_it_was_powered(servos):
+    memory = servos.servos[4].memory
+    torque = servos.series.register("torque_enable").address
+    memory[torque] = 0  # all that a supply that fails changes of a servo that nobody wrote to
+    powered = bytes(memory)
+    servos.brown_out(1.0, 0.5)
+    assert bytes(memory) == powered
