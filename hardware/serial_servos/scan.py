@@ -261,6 +261,10 @@ def answering_joints(
     servos = dict(zip(chosen.joint_names, chosen.ids, strict=True))
     answering = [j for j, i in servos.items() if i in series]
     silent = [f"{j} (id {i})" for j, i in servos.items() if i not in series]
+    if silent and (known := next(iter(series.values()), None)):  # two of one id may hide each other
+        where, size = known.register(family.present).address, family.reading_bytes[0]
+        if doubled := line.doubled(list(servos.values()), where, size):
+            raise BusError(" ".join(two_of_one_id(line, servo) for servo in doubled))
     if (silent and must_answer) or not answering:
         raise BusError(
             f"{line.device}: {', '.join(silent)} does not answer at {line.baud} baud. Check power "

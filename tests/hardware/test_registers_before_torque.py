@@ -1,7 +1,8 @@
 """Registers are judged before the torque is switched on: each fault is named, with its cure."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -181,6 +182,13 @@ def test_two_servos_of_one_id_are_named_instead_of_the_cables(tmp_path, series):
         bus(device, 1_000_000, layout)
     assert "id 5 (register id)" in str(refused.value) and "another id" in str(refused.value)
     assert (5, True) not in bench_of(servos).torques
+
+
+def test_two_servos_of_one_id_whose_pings_never_come_through_are_named_as_well():
+    servos = still_dynamixels((4, 5), doubled=[5])
+    servos._rng = SimpleNamespace(integers=lambda low, high: high - 1)  # one clock always is late
+    with on_a_port(servos) as server, pytest.raises(BusError, match="two servos .* id 5"):
+        DynamixelBus(server.device, 1_000_000, dynamixel_map(4, 5))
 
 
 def test_without_a_map_servos_of_another_robot_are_never_moved(lines):
