@@ -123,7 +123,7 @@ class Monitor:
         self._fault_since_s = {
             name: np.full(joints, np.inf) for name in ("voltage", "heat", "status")
         }
-        self._next_s = now_s
+        self._next_s = self._ask_s = now_s
 
     def add_command(self, now_s: float, command: Angles) -> None:
         """Store a command that was sent."""
@@ -247,8 +247,10 @@ class Monitor:
         """Stop if a command moved far, long enough ago, and its readings stayed within noise."""
         limits = self._limits
         moved, spread = self._motion(now - limits.follows_within_s, now - limits.frozen_after_s)
-        noise = np.minimum(limits.follows_share * moved, self._flicker_rad)
-        k = _first((moved >= limits.follows_rad) & (spread <= noise))
+        still = spread <= np.minimum(limits.follows_share * moved, self._flicker_rad)
+        k = _first((moved >= limits.follows_rad) & still)
+        if k is None:  # friction may hold a joint at a small motion, so its servo is asked
+            k = self._limp((moved >= limits.frozen_command_rad) & still, now)
         if k is not None:
             raise SafetyStop(
                 f"{self._names[k]} was commanded to move by {moved[k]:.2f} rad within "
@@ -256,10 +258,21 @@ class Monitor:
                 "rad. " + self._why_still(k, "its reading is stuck but for noise")
             )
 
+    def _limp(self, suspects: NDArray[np.bool_], now: float) -> int | None:
+        """Index of a suspect whose torque is off; one is asked each `frozen_after_s`."""
+        if not suspects.any() or now < self._ask_s:
+            return None
+        self._ask_s = now + self._limits.frozen_after_s
+        k = int(np.argmax(suspects))
+        return k if self._has_lost_torque(k) else None
+
+    def _has_lost_torque(self, k: int) -> bool:
+        ask = getattr(self._bus, "has_lost_torque", None)
+        return ask is not None and ask(self._names[k])
+
     def _why_still(self, k: int, otherwise: str) -> str:
         """Why a joint does not move, and what to do; reads whether its servo lost its torque."""
-        ask = getattr(self._bus, "has_lost_torque", None)
-        if ask is not None and ask(self._names[k]):
+        if self._has_lost_torque(k):
             return (
                 "Its torque is off although it was switched on: its supply failed for a moment, or "
                 "it shut down. Check the supply and the plugs, then start again."

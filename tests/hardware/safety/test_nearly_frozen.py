@@ -124,3 +124,10 @@ def test_no_healthy_emulated_servo_is_stopped_at_any_tone(kind):
         guard.sleep_until(start + (k + 1) * PERIOD_S)
         guard.write(home + amplitude * np.sin(2 * np.pi * hz * (guard.now() - start)))
         guard.read()
+
+
+def test_a_servo_that_reports_its_torque_off_stops_also_a_tone_of_two_tenths_of_a_radian():
+    bus = Following(FINE, share=0.0, noise_steps=1)
+    vars(bus)["has_lost_torque"] = lambda joint: True  # as after a reboot
+    with pytest.raises(SafetyStop, match="LF_hip .* Its torque is off although"):
+        sweep_of(bus, 0.1, 2.0)
