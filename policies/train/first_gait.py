@@ -80,8 +80,11 @@ _SWAYING = {"lift_m": (0.004, 0.03)}
 _FIRST_WIDTH, _NARROWEST = 0.2, 0.02  # standard deviations, in shares of the box
 
 _CLEARANCE_M = 0.006
-_WEIGHTS = {"clearance": 0.5, "low": 0.2, "torque": 0.2, "saturation": 0.2, "sway": 0.1}
-"""Of the parts of the cost beside errors relative to standing and falls, of order 1 each."""
+_OF_SERVOS = {"torque": 0.2, "saturation": 0.2}
+_OF_GAIT = {"speed": 2.0, "clearance": 0.5, "low": 0.2, "sway": 0.1}
+_WEIGHTS = _OF_GAIT | _OF_SERVOS
+"""Of the parts of the cost beside errors relative to standing and falls, of order 1 each: speed is
+what is missing from `FORWARD`."""
 _SWAY_RAD_S = 1.0
 
 _LEAST_MINUTES = 5.0
@@ -101,7 +104,7 @@ _LIMITS: dict[str, dict[str, float]] = {
     "dead time": {"dead_time_s": 0.3},
 }
 """Factors on the servos' numbers that take away one of their limits."""
-_WORTH = 0.05  # of the merit: less is not what limits a gait
+_WORTH = 0.05  # of the cost: less is not what limits a gait
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,8 +136,6 @@ class GaitScore(Result):
     """Share of the time in which thighs and calves are at their torque limit."""
     standing_falls: float = 0.0
     """Share of the robots that are to stand that fell."""
-    length_scale: float = 1.0
-    """Standing height over the Mini Pupper's, by which clearances are judged."""
 
     @property
     def poor(self) -> bool:
@@ -333,15 +334,15 @@ def fit_trot(
     more = [_corrected(trot, walk) for trot, walk in zip(trots, walked, strict=True)]
     walked += _judged(more, task, servos, seed, threads)
     trots += more
-    chosen = int(np.argmax([_merit(_score(walk)) for walk in walked]))
+    chosen = int(np.argmin([_cost(walk) for walk in walked]))
     again = _corrected(trots[chosen], walked[chosen])
     trots, walked = [trots[chosen], again], [walked[chosen]]
     walked += _judged([again], task, servos, seed, threads)
-    scores = [_score(walk) for walk in walked]
-    chosen = int(np.argmax([_merit(score) for score in scores]))
-    trot, after = trots[chosen], scores[chosen]
+    chosen = int(np.argmin([_cost(walk) for walk in walked]))
+    trot, walk = trots[chosen], walked[chosen]
+    after = _score(walk)
     poor = after.poor and not ends()
-    limit = _limit(trot, after, task, servos, seed, threads) if poor else None
+    limit = _limit(trot, walk, task, servos, seed, threads) if poor else None
     progress(1.0)
     return FirstGait(before=before, trot=trot, after=after, limit=limit)
 
@@ -523,21 +524,28 @@ def _score(walk: _Walked) -> GaitScore:
         clearance_p10_m=float(np.quantile(clearance, 0.1)) if len(clearance) else 0.0,
         low_swing_share=_low(clearance / walk.length), saturated_share=walk.saturated,
         standing_falls=float((~walk.up[-1, ~moves]).mean()) if not moves.all() else 0.0,
-        length_scale=walk.length,
     )  # fmt: skip
 
 
-def _cost(walk: _Walked) -> float:
-    """Cost of the search: 1 minus the judge's score, and terms of clearance, torque and sway."""
-    clearance = float(np.quantile(walk.clearance_m, 0.1)) if len(walk.clearance_m) else 0.0
+def _cost(walk: _Walked, weights: dict[str, float] = _WEIGHTS) -> float:
+    """Cost of a gait: 1 minus the judge's score, and terms of speed, clearance, torque and sway."""
+    clearance_m = walk.clearance_m / walk.length
+    lowest_m = float(np.quantile(clearance_m, 0.1)) if len(clearance_m) else 0.0
+    share = _share(walk, np.asarray(_alone(walk) & (walk.command[:, 0] > 0)))
     terms = {
-        "clearance": _lacking(clearance / walk.length),
-        "low": _low(walk.clearance_m / walk.length), "torque": walk.torque_square,
-        "saturation": walk.saturated, "sway": walk.sway_rad_s / _SWAY_RAD_S,
+        "speed": max(FORWARD[0] - share, share - FORWARD[1], 0.0),
+        "clearance": 1.0 - min(lowest_m / _CLEARANCE_M, 1.0), "low": _low(clearance_m),
+        "torque": walk.torque_square, "saturation": walk.saturated,
+        "sway": walk.sway_rad_s / _SWAY_RAD_S,
     }  # fmt: skip
     # robots that fall later are nearer to a gait
     error = 1.0 - _relative(walk)["score"] + float(1.0 - walk.up.mean())
-    return error + sum(_WEIGHTS[name] * value for name, value in terms.items())
+    return error + sum(weight * terms[name] for name, weight in weights.items())
+
+
+def _alone(walk: _Walked) -> NDArray[np.bool_]:
+    """Robots that are to move along one axis only."""
+    return (walk.command != 0).sum(axis=1) == 1
 
 
 def _low(clearance_m: Array) -> float:
@@ -545,27 +553,12 @@ def _low(clearance_m: Array) -> float:
     return float((clearance_m < LOW_SWING_M).mean()) if len(clearance_m) else 1.0
 
 
-def _lacking(clearance_m: float) -> float:
-    """Share of a clearance of `_CLEARANCE_M` that is missing."""
-    return 1.0 - min(clearance_m / _CLEARANCE_M, 1.0)
-
-
-def _merit(score: GaitScore) -> float:
-    """By which the finalists are chosen: the same of the judge's walks."""
-    lacking = _lacking(score.clearance_p10_m / score.length_scale)
-    short = max(FORWARD[0] - score.forward_share, score.forward_share - FORWARD[1], 0.0)
-    taken = _WEIGHTS["clearance"] * lacking + _WEIGHTS["low"] * score.low_swing_share
-    taken += _WEIGHTS["saturation"] * score.saturated_share
-    return score.score - taken - 2.0 * short
-
-
 def _corrected(trot: Trot, walk: _Walked) -> Trot:
     """The trot with gains by which it would have walked at the commanded speeds."""
     x, y, turn = walk.command.T
-    alone = (walk.command != 0).sum(axis=1) == 1
 
     def wrong_by(chosen: Any) -> float:
-        share = _share(walk, np.asarray(alone & chosen))
+        share = _share(walk, np.asarray(_alone(walk) & chosen))
         return 1.0 / min(max(share, 1.0 / _MOST_CORRECTION), _MOST_CORRECTION)
 
     ahead, back, aside = wrong_by(x > 0), wrong_by(x < 0), wrong_by(y != 0)
@@ -578,16 +571,17 @@ def _corrected(trot: Trot, walk: _Walked) -> Trot:
 
 
 def _limit(
-    trot: Trot, score: GaitScore, task: Walking, servos: ServoRanges, seed: int, threads: int
+    trot: Trot, walk: _Walked, task: Walking, servos: ServoRanges, seed: int, threads: int
 ) -> str | None:
     """Which of the servos' limits the trot would walk best without; None if that is of no use."""
     if servo_model_of(servos.source, task.control_step_s) is not None:
         return None  # a learned model has no numbers
     names, changes = list(_LIMITS), list(_LIMITS.values())
-    walked = _judged([trot] * len(names), task, servos, seed, threads, changes)
+    without = _judged([trot] * len(names), task, servos, seed, threads, changes)
     # without the limit servos go farther than the gains expect: correct the gains first
-    trots = [_corrected(trot, walk) for walk in walked]
-    walked = _judged(trots, task, servos, seed, threads, changes)
-    merits = [_merit(_score(walk)) for walk in walked]
-    best = int(np.argmax(merits))
-    return names[best] if merits[best] > _merit(score) + _WORTH else None
+    trots = [_corrected(trot, other) for other in without]
+    without = _judged(trots, task, servos, seed, threads, changes)
+    # shares of a limit are smaller of a larger one, whatever the gait
+    costs = [_cost(other, _OF_GAIT) for other in without]
+    best = int(np.argmin(costs))
+    return names[best] if costs[best] < _cost(walk, _OF_GAIT) - _WORTH else None

@@ -54,11 +54,8 @@ _NOISE = np.repeat([ACCELERATION_NOISE_G, RATE_NOISE_DEG_S], 3)
 class Trunk:
     """True motion of the trunk."""
 
-    time_s: float
     position_m: NDArray[np.float64]
     """Of its origin, from its place at time 0; z above the ground; shape (3,)."""
-    heading_rad: float
-    """Its direction along the ground, to the left of that at time 0; ±pi."""
     velocity_m_s: NDArray[np.float64]
     """In the axes of the trunk: forward, to the left, up; shape (3,)."""
     yaw_rate_rad_s: float
@@ -170,9 +167,8 @@ class WalkingRobot:
             axes = np.empty(9)
             mujoco.mju_quat2Mat(axes, self._data.qpos[3:7])
             axes = axes.reshape(3, 3)  # columns: the trunk's axes in the world
-            heading = float(np.arctan2(axes[1, 0], axes[0, 0]))
             rate, upright = float(self._data.qvel[5]), float(axes[2, 2])
-            return Trunk(self._step * self._dt, position, heading, axes.T @ velocity, rate, upright)
+            return Trunk(position, axes.T @ velocity, rate, upright)
 
     def push(self, velocity_m_s: NDArray[np.float64]) -> None:
         """Give the trunk a horizontal velocity, shape (2,), in the world's axes, now."""

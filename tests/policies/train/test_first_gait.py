@@ -68,6 +68,10 @@ def test_the_cost_of_a_gait_grows_with_errors_low_feet_torque_saturation_and_swa
         replace(one, up=one.up & (np.arange(5) < 4)[:, None]),
     )  # fmt: skip
     assert all(first_gait._cost(other) > cost + 0.02 for other in worse)
+    # six tenths of the speed forward cost 2 * (0.9 - 0.6) beside their errors, whatever the errors
+    # of the other directions: high steps do not pay for that
+    forward = np.where((COMMANDS[:, 0] > 0)[:, None], 0.6, 1.0) * np.ones((len(COMMANDS), 3))
+    assert first_gait._cost(walked(COMMANDS, forward)) > first_gait._cost(worse[1]) + 0.1
 
 
 @pytest.fixture
