@@ -44,10 +44,7 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, s
 Array = NDArray[np.float64]
 
 POOR_SCORE = 0.6
-"""Score below which a trot is fitted to the servos; on the shipped calibration it has 0.7. Fitted,
-it rises from 0.26 to 0.34 on servos of 0.6 of the stiffness and 0.8 of the torque (14 to 60 % of
-the speed forward, clearance 0.6 to 9.9 mm), from 0.40 to 0.70 on `ideal` ones, from 0.51 to 0.73 on
-servos of twice the stiffness and torque, and by at most 0.03 where it was 0.7 or more."""
+"""Score below which a trot is fitted to the servos ("Other servos" in docs/training.md)."""
 FORWARD = (0.9, 1.1)
 """Shares of the commanded forward speed within which a trot need not be fitted."""
 LOW_SWINGS = 0.25

@@ -158,14 +158,9 @@ def measure(run: Run) -> dict[str, Any]:
         "update_samples_per_s": update_rate,
         "end_to_end_samples_per_s": samples / total,
         "end_to_end_ratio": samples / total * one_after_the_other,
-        "load": load(),
+        "load": os.getloadavg()[0],
         "cores": os.cpu_count(),
     }
-
-
-def load() -> float:
-    """How many programs wanted to run in the last minute, this one included."""
-    return os.getloadavg()[0]
 
 
 def _now() -> NDArray[np.float64]:

@@ -26,6 +26,7 @@ from pupper_sysid.sim.robot.mini_pupper import TRUNK_BOX_AT_M, TRUNK_BOX_M
 from pupper_sysid.sim.robot.robot_batch import RobotBatch, trunk_velocity
 from pupper_sysid.sim.robot.terrain import STAIRS_M
 from pupper_sysid.sim.walking.config import Commands, Curriculum, Walking
+from pupper_sysid.sim.walking.differences import OF_MOTOR
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 from pupper_sysid.sim.walking.step import Step
@@ -35,7 +36,6 @@ Array = NDArray[np.float64]
 FIRST_PUSH_S, PUSH_EVERY_S = 3.0, 4.0
 _GRAVITY = OBSERVATION_PARTS["projected_gravity"]
 _ABOVE_M = TRUNK_BOX_AT_M[2] + TRUNK_BOX_M[2]  # loads lie on the trunk
-_OF_MOTOR = ("stiffness", "damping", "effort_limit")
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ def impose(robots: RobotBatch, ids: NDArray[np.intp], handicap: Handicap) -> Non
     if handicap.weak_leg != 1.0:
         leg_of, legs = robots.body.leg_of, len(robots.body.feet)
         of_weak_leg = leg_of == (np.arange(len(ids)) % legs)[:, None]
-        for name in _OF_MOTOR:
+        for name in OF_MOTOR:
             robots.drawn[name][ids] *= np.where(of_weak_leg, handicap.weak_leg, 1.0)
     if handicap.friction is not None:
         robots.friction[ids] = handicap.friction
@@ -274,11 +274,7 @@ def evaluation_task(task: Walking, seconds: float | None = None) -> Walking:
     )  # fmt: skip
     commands = RANDOM
     if task.robot:  # as far within the robot's ranges
-        ranges = task.commands
-        commands = replace(
-            RANDOM, forward_m_s=ranges.forward_m_s, sideways_m_s=ranges.sideways_m_s,
-            yaw_rad_s=ranges.yaw_rad_s, dead_band=ranges.dead_band,
-        )  # fmt: skip
+        commands = replace(task.commands, standing=0.0, single=0.0, every_s=RANDOM.every_s)
     return replace(
         task.evaluated(), commands=commands, curriculum=Curriculum(), randomisation=gentle,
         episode_s=task.episode_s if seconds is None else seconds,

@@ -19,7 +19,8 @@ from pupper_sysid.sim.robot.body import Body
 Array = NDArray[np.float64]
 
 _OF_VOLTAGE = ("stiffness", "effort_limit", "velocity_limit")
-_OF_MOTOR = ("stiffness", "damping", "effort_limit")
+OF_MOTOR = ("stiffness", "damping", "effort_limit")
+"""What a weak motor has less of."""
 OF_UNIT = ("stiffness", "damping", "friction_loss", "effort_limit", "velocity_limit")
 """Numbers of a servo in which units of one type differ."""
 
@@ -192,5 +193,5 @@ class Bodies:
             factor = rng.uniform(*settings.weak_leg, n)
             strength = np.ones((n, len(self._body.feet) + 1))  # the last of joints of no leg
             strength[weak, leg[weak]] = factor[weak]
-            for name in _OF_MOTOR:
+            for name in OF_MOTOR:
                 servos[name] *= strength[:, self._body.leg_of]
