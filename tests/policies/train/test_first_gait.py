@@ -124,10 +124,12 @@ def test_a_trot_is_fitted_to_servos_of_two_thirds_of_the_stiffness_and_torque(mo
     shares = []
     found = fit_trot(preset("fast", "mlp").task, weak, 0, progress=shares.append)
     before, after = found.before, found.after
-    # 7 of 100 % of the speed and a clearance of 0.7 mm before; the score is left to whole searches
-    assert before.poor and abs(after.forward_share - 1) < abs(before.forward_share - 1) - 0.2
-    assert after.clearance_p10_m > before.clearance_p10_m + 0.002
-    assert after.low_swing_share < 0.5 * before.low_swing_share
+    # 7 of 100 % of the speed before. Their friction is more than half of their torque, so that feet
+    # that keep up with the speed are not lifted as high as on other servos: the limit is named
+    low, high = first_gait.FORWARD
+    assert before.poor and low <= after.forward_share <= high
+    assert after.score > before.score + 0.15
+    assert after.poor and found.limit in ("torque", "friction")
     assert shares == sorted(shares) and shares[-1] == 1.0
 
 
