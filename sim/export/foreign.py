@@ -30,7 +30,9 @@ from pupper_sysid.sim.robot.hinges import hinges_of
 
 ENDINGS = (".xml", ".mjcf", ".py")
 _LARGEST_BYTES = 1_000_000
+_MOST_REPEATS = 5  # of a pattern: names of 40 letters take a fraction of a second
 _NO_LIMIT_NM = 100.0  # stands for an effort that is not limited; beyond any hobby servo's
+_NO_LIMIT_RAD_S = 1000.0  # as our exports write it
 
 _WORDS = {
     "stiffness_nm_per_rad": ("stiffness", "kp", "p_gain"),
@@ -40,6 +42,7 @@ _WORDS = {
     "effort_limit_nm": ("effort_limit", "actuator_effort_limit", "effort_limit_sim", "max_effort"),
     "back_emf_nm_s_per_rad": ("viscous_friction", "viscous_damping", "back_emf"),
     "dead_time_s": ("dead_time_s",),
+    "velocity_limit_rad_s": ("velocity_limit_rad_s",),
 }
 """Numbers of a PD by the names that configurations have for them, in small letters."""
 _STEPS = (
@@ -115,7 +118,7 @@ def _driven_servo(path: Path, model: Any, name: str, i: int) -> Servo:
         "dead_time_s": model.actuator_delay[i],
     }
     speed = float(model.actuator_dynprm[i, 1]) if model.actuator_actnum[i] else 0.0
-    if 0 < speed < 1000:
+    if 0 < speed < _NO_LIMIT_RAD_S:
         numbers["velocity_limit_rad_s"] = speed
     notes, assumed = [], []
     on_joints = model.actuator_trntype == model.actuator_trntype[i]
@@ -185,6 +188,8 @@ def _in_python(path: Path, joint: str | None) -> Servo:
     numbers["armature_kg_m2"] = numbers["armature_kg_m2"] or None  # 0 stands for none
     if (numbers["effort_limit_nm"] or 0.0) > _NO_LIMIT_NM:
         numbers["effort_limit_nm"] = None
+    if (numbers["velocity_limit_rad_s"] or 0.0) >= _NO_LIMIT_RAD_S:
+        numbers["velocity_limit_rad_s"] = None
     for key, stand_in in (
         ("damping_nm_s_per_rad", 0.0), ("friction_loss_nm", 0.0), ("armature_kg_m2", 1e-4),
         ("effort_limit_nm", _NO_LIMIT_NM),
@@ -342,6 +347,16 @@ def _first(group: Mapping[str, Any], words: tuple[str, ...], joint: str | None) 
 
 
 def _matches(pattern: str, joint: str) -> bool:
+    if "(" not in pattern and "|" in pattern:
+        return any(_matches(part, joint) for part in pattern.split("|"))
+    # a search of `re` has no time limit: without repeated groups it takes at most a power of the
+    # name's length, whose exponent is the number of repeats
+    repeats = re.sub(r"\\.|\[\]?[^]]*\]", "x", pattern).replace("(?", "(")
+    if re.search(r"\)[*+{]", repeats) or len(re.findall(r"[*+?{]", repeats)) > _MOST_REPEATS:
+        raise InputError(
+            f"The joint pattern {pattern[:80]!r} repeats a group or has more than {_MOST_REPEATS} "
+            "repeats, and may take forever to match. Write the names of the joints instead."
+        )
     try:
         return re.fullmatch(pattern, joint) is not None
     except re.error:

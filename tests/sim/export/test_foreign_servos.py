@@ -183,6 +183,23 @@ def test_arithmetic_that_grows_without_end_is_no_number(tmp_path):
         foreign_servo(tmp_path / "cfg.py")
 
 
+@pytest.mark.parametrize("pattern", ["(a+)+b", "(a|aa)*b", "a?" * 30 + "a" * 30, ".*" * 12 + "b"])
+def test_a_joint_pattern_that_could_be_matched_for_ever_is_refused(pattern, tmp_path):
+    config = f'LEG = IdealPDActuatorCfg(joint_names_expr=["{pattern}"], stiffness=20.0)'
+    (tmp_path / "cfg.py").write_text(config)
+    with pytest.raises(InputError, match="may take forever to match"):
+        foreign_servo(tmp_path / "cfg.py", "a" * 30)
+
+
+@pytest.mark.parametrize(
+    "pattern", [r"(?:.*/)?(left|right)_(hip|knee)[0-9]+\.*", ".*_hip.*|.*_toe.*|.*_knee.*"]
+)
+def test_usual_joint_patterns_are_matched(pattern, tmp_path):
+    config = f'LEG = IdealPDActuatorCfg(joint_names_expr=[r"{pattern}"], stiffness=20.0)'
+    (tmp_path / "cfg.py").write_text(config)
+    assert foreign_servo(tmp_path / "cfg.py", "left_knee2").pd.parameters.stiffness == 20.0
+
+
 @pytest.mark.parametrize(("target", "engine"), [("isaaclab", EXPLICIT_PD), ("mjlab", BUILTIN_PD)])
 def test_our_own_exports_are_read_back_as_they_were_written(target, engine, tmp_path):
     calibration = load_calibration(CALIBRATED)
