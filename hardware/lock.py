@@ -12,6 +12,8 @@ import fcntl
 import hashlib
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from pupper_sysid.common.errors import BusError
@@ -72,3 +74,33 @@ def acquire(robot: Path) -> int:
             "whichever command arrived last, so only one program may command them."
         ) from None
     return descriptor
+
+
+@contextmanager
+def announced(device: str | Path) -> Iterator[None]:
+    """Within the block, `announced_devices` of other programs has this emulated device."""
+    name = f"{os.getpid()}.emulated"
+    descriptor = open_here(name, os.O_RDWR | os.O_TRUNC)
+    try:
+        # held until this process ends, however it ends; another terminal may have the device then
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        os.write(descriptor, os.fsencode(Path(device).absolute()))
+        yield
+    finally:
+        (runtime_folder() / name).unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def announced_devices() -> list[Path]:
+    """Devices and sockets of this user's emulators that run now."""
+    devices = []
+    for path in sorted(runtime_folder().glob("*.emulated")):
+        descriptor = open_here(path.name, os.O_RDWR)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink(missing_ok=True)  # of an emulator that was killed
+        except OSError:
+            devices.append(Path(os.fsdecode(path.read_bytes())))
+        finally:
+            os.close(descriptor)
+    return devices

@@ -31,6 +31,7 @@ from pupper_sysid.hardware.address import (
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, error_words
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.joint_map import JointMap
+from pupper_sysid.hardware.lock import announced_devices
 from pupper_sysid.hardware.safety.guard import open_bus
 from pupper_sysid.hardware.safety.limp import can_come_back, is_there, may_be_on, switch_off
 from pupper_sysid.hardware.safety.notes import Note, notes
@@ -50,8 +51,8 @@ _SERVO_PORTS = ("ttyUSB", "ttyACM", "ttyAMA", "ttySC", "cu.usb", "COM")
 class Scan:
     """List the servos on a bus: id, model, firmware, voltage, temperature, limits, error bits.
 
-    Without --bus it lists the serial ports, tries every protocol and rate on each, and says what
-    answers where. Nothing moves and nothing is written.
+    Without --bus it lists the serial ports and the lines of `emulate`, tries every protocol and
+    rate on each, and says what answers where. Nothing moves and nothing is written.
     Example: pupper-sysid scan --bus feetech:/dev/ttyUSB0
     """
 
@@ -102,18 +103,20 @@ class Scan:
             answers = {device: _scanned(device, advance) for device in ports}
         reports = [a for a in answers.values() if isinstance(a, LineReport)]
         silent = {device: a for device, a in answers.items() if isinstance(a, str)}
-        proxy = SOCKET.exists()
+        proxies = [path for path in (SOCKET, *announced_devices()) if path.is_socket()]
+        proxy = next(iter(proxies), None)
         if self.json:
             lines = [_as_data(report) for report in reports]
             found = {"ports": ports, "lines": lines, "silent": silent}
-            return terminal.print_json(found | {"proxy": SOCKET if proxy else None})
+            return terminal.print_json(found | {"proxy": proxy})
         for report in reports:
             self._show(report)
             terminal.out.print(f"Use it with --bus {report.family}:{report.device}")
         for device, why in silent.items():
             terminal.err.print(f"{device}: {why}")
         if proxy:
-            terminal.out.print("A Mini Pupper 2's proxy is here: --bus esp32")
+            name = "esp32" if proxy == SOCKET else f"esp32:{proxy}"
+            terminal.out.print(f"A Mini Pupper 2's proxy is here: --bus {name}")
         if not reports and not proxy:
             listed = ", ".join(ports) or "none"
             raise BusError(
@@ -153,14 +156,12 @@ class Scan:
 
 
 def serial_ports() -> list[str]:
-    """Serial ports to which a servo adapter may be connected."""
+    """Serial ports to which a servo adapter may be connected, and lines of emulators."""
     from serial.tools.list_ports import comports
 
-    paths = [Path(port.device) for port in comports()]
-    return sorted(
-        str(path) for path in paths
-        if path.name.startswith(_SERVO_PORTS) and (os.name == "nt" or path.is_char_device())
-    )  # fmt: skip
+    ports = (Path(port.device) for port in comports())
+    paths = [path for path in ports if path.name.startswith(_SERVO_PORTS)] + announced_devices()
+    return sorted(str(path) for path in paths if os.name == "nt" or path.is_char_device())
 
 
 def _scanned(device: str, advance: Callable[[str], None]) -> LineReport | str:

@@ -27,6 +27,7 @@ from pupper_sysid.common.reading.dialect import whole_number
 from pupper_sysid.hardware.address import SOCKET
 from pupper_sysid.hardware.feetech import BAUD_RATES, FAMILY, STS3215
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
+from pupper_sysid.hardware.lock import announced
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.serial_servos.series import Family, Series
 from pupper_sysid.sim.emulator import pendulum
@@ -349,7 +350,8 @@ def _serve(
     options: Common, server: ProxySocket | SerialPty, bench: ServoBench, what: str, commands: str
 ) -> None:
     """Serve until Ctrl-C, with keys that move joints if they are wanted."""
-    with keys_move(bench) if options.by_hand else nullcontext():
+    place = server.path if isinstance(server, ProxySocket) else server.device
+    with announced(place), keys_move(bench) if options.by_hand else nullcontext():
         if options.truth:
             text = yaml.safe_dump(bench.truth(seed=options.seed), sort_keys=False)
             write_text(options.truth, text, options.force)

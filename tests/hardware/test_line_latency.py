@@ -120,6 +120,7 @@ def test_scan_without_a_bus_tries_every_port_and_says_what_answers_where(capsys,
     with on_a_port(still_servos(ids=[3])) as server, on_a_port(still_servos(ids=[])) as empty:
         ports = [server.device, empty.device]
         monkeypatch.setattr(scan_command, "serial_ports", lambda: ports)
+        monkeypatch.setattr(scan_command, "announced_devices", list)
         monkeypatch.setattr(scan_command, "SOCKET", scan_command.Path("/nowhere"))
         for kind in scan_command.KINDS.values():
             if kind.is_serial:
@@ -140,13 +141,15 @@ def test_what_lies_beside_a_port_is_no_port(monkeypatch, tmp_path):
         (tmp_path / "ttyUSB0.joints.yaml").touch()
         listed = [SimpleNamespace(device=str(path)) for path in tmp_path.iterdir()]
         monkeypatch.setattr("serial.tools.list_ports.comports", lambda: listed)
+        monkeypatch.setattr(scan_command, "announced_devices", list)
         assert scan_command.serial_ports() == [str(tmp_path / "ttyUSB0")]
 
 
 def test_scan_without_ports_says_what_to_connect_and_a_boards_port_is_understood(
     capsys, monkeypatch
 ):
-    monkeypatch.setattr(scan_command, "serial_ports", list)
+    monkeypatch.setattr("serial.tools.list_ports.comports", list)
+    monkeypatch.setattr(scan_command, "announced_devices", list)
     monkeypatch.setattr(scan_command, "SOCKET", scan_command.Path("/nowhere"))
     code, _, err = run(capsys, "scan")
     assert code == 1 and "ports: none" in err and "emulate feetech" in err

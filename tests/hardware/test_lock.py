@@ -2,13 +2,24 @@
 
 import fcntl
 import os
+import socket
 import stat
 import subprocess
+import sys
 
 import pytest
 
+from pupper_sysid.cli.commands import bus as scan_command
 from pupper_sysid.common.errors import BusError
-from pupper_sysid.hardware.lock import acquire, open_here, runtime_folder
+from pupper_sysid.hardware.lock import (
+    acquire,
+    announced,
+    announced_devices,
+    open_here,
+    runtime_folder,
+)
+from support.command_line import json_of
+from support.servo_servers import on_a_port, still_servos
 
 
 @pytest.fixture(autouse=True)
@@ -70,3 +81,34 @@ def test_a_child_that_inherits_the_lock_keeps_it(tmp_path):
     again = acquire(robot)
     fcntl.flock(again, fcntl.LOCK_UN)
     os.close(again)
+
+
+def test_an_emulated_line_is_a_port_for_as_long_as_its_program_runs(tmp_path):
+    announce = f"""
+import sys
+from {announced.__module__} import announced
+with announced(sys.argv[1]):
+    print(flush=True)
+    sys.stdin.read()
+"""
+    with on_a_port(still_servos(ids=[1])) as server:
+        for end in ("communicate", "kill"):  # a killed one cannot remove its file
+            process = subprocess.Popen(
+                [sys.executable, "-c", announce, server.device],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+            )
+            assert process.stdout and process.stdout.readline()
+            assert server.device in scan_command.serial_ports()
+            getattr(process, end)()
+            process.communicate()
+            assert announced_devices() == []
+    assert not list(runtime_folder().glob("*.emulated"))
+
+
+def test_scan_names_the_socket_of_an_emulated_proxy(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("serial.tools.list_ports.comports", list)
+    monkeypatch.setattr(scan_command, "SOCKET", tmp_path / "none")
+    with socket.socket(socket.AF_UNIX) as proxy, announced(tmp_path / "proxy"):
+        proxy.bind(str(tmp_path / "proxy"))
+        assert json_of(capsys, "scan")["proxy"] == str(tmp_path / "proxy")
