@@ -46,6 +46,7 @@ SCALE_AGREES = 0.03
 STILL = 8 / 1024
 """Largest motion of a held joint while it is measured, as a fraction of the encoder's range."""
 
+_SILENT_AFTER = 25  # readings: half a second of the command's
 _FAR_OFFSET_DEG = 30.0
 _WHOLE_RANGE_DEG = (150.0, 400.0)  # no servo of this kind has less or more
 _KNOWN_SCALES = {
@@ -69,7 +70,8 @@ class Travel:
 
     An extreme counts once two successive readings have been there: the checksum of a serial frame
     lets one garbled frame in 256 by, and a joint at the end of its travel stands still anyway.
-    `wrapped` joints jumped from one end of the encoder to the other.
+    `wrapped` joints jumped from one end of the encoder to the other; `silent` ones have stopped
+    answering.
 
     Examples
     --------
@@ -85,10 +87,17 @@ class Travel:
         self.now, self._before = np.full(joints, -1), np.full(joints, -1)
         self.low, self.high = np.full(joints, -1), np.full(joints, -1)
         self.wrapped = np.zeros(joints, bool)
+        self._missing = np.zeros(joints, int)
+
+    @property
+    def silent(self) -> NDArray[np.bool_]:
+        """Joints whose last readings are all missing."""
+        return self._missing >= _SILENT_AFTER
 
     def add(self, count: NDArray[np.int64]) -> None:
         """Add one reading, shape (joints,); -1 where there is none."""
         answered = count >= 0
+        self._missing = np.where(answered, 0, self._missing + 1)
         sure = answered & (self.now >= 0)
         lower, higher = np.maximum(count, self.now), np.minimum(count, self.now)
         self.low = np.where(
@@ -114,6 +123,8 @@ class Travel:
             low, high = int(self.low[k]), int(self.high[k])
             if low < 0:
                 why[name] = "did not answer"
+            elif self.silent[k]:
+                why[name] = "does not answer any more; check its cable and power"
             elif self.wrapped[k]:
                 why[name] = (
                     f"went over the end of its encoder (0 and {self.counts - 1} are neighbours "

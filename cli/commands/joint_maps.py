@@ -303,6 +303,7 @@ class Guide:
             low, now, high = (int(x[k]) for x in (travel.low, travel.now, travel.high))
             degrees = np.degrees((high - low) / self.start.file.joints[name].counts_per_rad)
             state = "wraps" if travel.wrapped[k] else "move it" if name in refused else "ok"
+            state = "silent" if travel.silent[k] else state
             cells = ["–" if x < 0 else str(x) for x in (low, now, high, high - low)]
             table.add_row(name, *cells, f"{degrees:.0f}", state)
         return Group(table, Text("Enter when every joint has been at both ends.", style="bold"))

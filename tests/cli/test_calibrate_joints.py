@@ -129,6 +129,20 @@ def test_a_joint_that_was_not_moved_is_named_and_can_be_moved_later_or_left(caps
     assert steps.limits() == {"LF_hip": (406, 694), "LF_thigh": (304, 496)}
 
 
+def test_a_joint_that_stops_answering_is_not_taken_to_have_been_moved(capsys):
+    person = ScriptedPerson()
+    steps, bus = guide(person, ("LF_hip",))
+    index = JOINT_NAMES.index("LF_hip")
+    moved = [lambda c=c: bus.counts.__setitem__(index, c) for c in (400, 400, 700, 700)]
+    unplugged = [lambda: bus.counts.__setitem__(index, -1)] * 30
+    person.motions = [*moved, *unplugged]
+    person.script = [("keep the starting map's limits for it", "k")]
+    assert steps.limits() == {}
+    assert "LF_hip does not answer any more" in _flat(capsys.readouterr().err)
+    person.motions = [*moved, *unplugged[:5], moved[0]]  # a loose contact
+    assert steps.limits() == {"LF_hip": (406, 694)}
+
+
 def by(bus, counts):
     """A motion of all joints by some counts."""
     return lambda: bus.counts.__iadd__(counts)
