@@ -354,8 +354,8 @@ def _open_bus(request: Request) -> ServoBus:
     return EmulatedBus(drawn, rng, real_time, plant)
 
 
-def _plan_of(request: Request, bus: ServoBus) -> Plan:
-    """The plan that a request describes, within the limits of the bus."""
+def _plan_of(request: Request, bus: GuardedBus) -> Plan:
+    """The plan that a request describes, within the limits of the bus and its guard."""
     joints, load = request.joints, request.pendulum
     if request.playback:
         from pupper_sysid.sysid.sweep.recorder import playback
@@ -370,7 +370,8 @@ def _plan_of(request: Request, bus: ServoBus) -> Plan:
     stated = header_entries(bus).get("servos", {})
     setups = [ServoSetup(**stated[joint]) for joint in joints if joint in stated]
     speeds = [setup.set_point_speed_rad_s for setup in setups]
-    speed_limit = min([bus.metadata["speed_limit_rad_s"], *filter(None, speeds)])
+    stated_speed = bus.metadata["speed_limit_rad_s"]
+    speed_limit = min([stated_speed, bus.guard.speed_rad_s, *filter(None, speeds)])
     ramps = [setup.set_point_acceleration_rad_s2 for setup in setups]
     ramp_limit = min([*filter(None, ramps), np.inf])
     if request.load:

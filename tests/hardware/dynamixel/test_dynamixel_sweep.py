@@ -13,6 +13,7 @@ from pupper_sysid.sim.emulator.serial_line import SerialPty
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import ran, run
 from support.servo_servers import moving_dynamixel, on_a_port
+from support.virtual_line import on_a_virtual_line
 
 TONES_HZ = (2.0, 4.0)
 WIRE_S = 19 * 10 / 1_000_000
@@ -109,3 +110,13 @@ def test_a_sweep_shows_the_emulated_servos_lag_and_leaves_its_registers(
     fitted = load_calibration(Path("c.yaml")).joint("bench").actuator.dead_time_s
     truth = float(np.asarray(servos.bench.robot.servos[0].actuator.dead_time_s))
     assert fitted.low <= truth <= fitted.high
+
+
+def test_a_sweep_of_a_fast_servo_asks_for_no_more_speed_than_the_guard_sends(capsys, here):
+    servos = moving_dynamixel(1200)  # 10.8 rad/s without load; the guard sends 8
+    servos.bench.map.save(Path("map.yaml"))
+    with on_a_virtual_line(here, servos) as (device,):
+        words = ("--joint-map", "map.yaml", "--freqs", "8", "--amplitude", "0.2", "--out", "a.csv")
+        _, err = ran(capsys, "sweep", "--bus", f"dynamixel:{device}", "--duration", "1", *words)
+    assert "amplitude reduced" in err and "delayed by the guard" not in err
+    assert load(Path("a.csv")).metadata["completed"]["guard"]["slowed"] == 0
