@@ -384,7 +384,6 @@ def apply_lerobot(data: dict[str, Any], joints: Mapping[str, LeRobotJoint], path
             "source": "LeRobot's calibration: id, direction, homing offset and range; limits_rad "
             "of the model; the zero is the pose in which LeRobot homed it",
         }
-    data["source"] += "; ids, directions, offsets and ranges of LeRobot's calibration"
 
 
 def _reversed_by_software(servo: str | None) -> bool:

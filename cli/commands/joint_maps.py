@@ -441,15 +441,26 @@ class InitRobot:
         )  # fmt: skip
         bus = f"{FAMILIES[self.servo.lower()].name}:/dev/ttyUSB0"
         quoted = terminal.command(target)
+        origin, measure = (
+            "Ids, signs and centres are guesses.",
+            (
+                "Then measure centres, ranges and scale:\n"
+                f"  pupper-sysid calibrate-joints --joint-map {quoted} --out {quoted} --force "
+                f"--bus {bus}\n"
+            ),
+        )
+        if lerobot is not None:
+            origin, measure = (
+                "Ids, directions and ranges are those of LeRobot's calibration; a joint's zero is "
+                "the pose in which LeRobot homed it.",
+                "",
+            )
         terminal.out.print(
-            "Ids, signs and centres are guesses. Ids and signs are for you to check: with the "
-            "servos limp, move one joint after the other by hand to its positive side and watch\n"
+            f"{origin} Ids and signs are for you to check: with the servos limp, move one joint "
+            "after the other by hand to its positive side and watch\n"
             f"  pupper-sysid monitor --joint-map {quoted} --bus {bus}\n"
             f"If another row changes, correct the id in {target}; if the angle falls, the sign.\n"
-            "Then measure centres, ranges and scale:\n"
-            f"  pupper-sysid calibrate-joints --joint-map {quoted} --out {quoted} --force "
-            f"--bus {bus}\n"
-            f"Sweep, first without the robot, then with --bus {bus}:\n"
+            f"{measure}Sweep, first without the robot, then with --bus {bus}:\n"
             + "".join(f"  {line}\n" for line in sweeps)
             + "Then doctor, delay, calibrate, fit-servo and export, as for any recording."
         )

@@ -87,7 +87,9 @@ def joint_map_of(
         raise InputError(f"{path}: a joint is called '{name}'; {strange[1]} Rename it there.")
     joints, doubts = _with_sound_limits(joints)
     doubts = renamed + doubts
-    source = f"made from {path.name} for {servo} servos; ids, centres and signs are guesses"
+    guesses = "ids, centres and signs are guesses"
+    known = "ids, directions, offsets and ranges of LeRobot's calibration"
+    source = f"made from {path.name} for {servo} servos; {guesses if lerobot is None else known}"
     ids = range(1, len(joints) + 1)
     data = _map_data(path, joints, ids, servo, source, "limits of the model; the rest is a guess")
     if lerobot is not None:

@@ -1,7 +1,8 @@
 """Registers are judged before the torque is switched on: each fault is named, with its cure."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,9 +10,10 @@ import pytest
 
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.hardware.dynamixel import DynamixelBus
-from pupper_sysid.hardware.feetech import HD1910, SCS0009, STS3215, FeetechBus
+from pupper_sysid.hardware.feetech import FAMILY, HD1910, SCS0009, STS3215, FeetechBus
 from pupper_sysid.hardware.joint_map import joint_map_from
 from pupper_sysid.hardware.safety.guard import GuardedBus
+from pupper_sysid.hardware.serial_servos.scan import scan_line
 from pupper_sysid.sim.emulator.serial_line import LineEmulator
 from support.command_line import run
 from support.servo_servers import (
@@ -150,6 +152,15 @@ def test_an_offset_of_a_servo_whose_counts_wrap_is_no_reason_to_refuse(lines):
         assert "wrap there" in remarks and "if the joint map was made with this offset" in remarks
         assert bus.torque(True)
         bus.close()
+        # a map that states the offset was made with it, and a scan has no map
+        stated = map_of(*IDS).file.model_dump(by_alias=True)
+        stated["joints"]["LF_hip"]["homing_offset"] = 1800
+        joints = joint_map_from(stated, "stated").select(["LF_hip", "LF_thigh"])
+        plain = FeetechBus(device, 1_000_000, joints)
+        assert "homing_offset" not in " ".join(plain.remarks())
+        plain.close()
+        scanned = scan_line(replace(FAMILY, highest_id=6), device, 1_000_000).servos
+        assert [servo.faults for servo in scanned] == [(), ()]
         bench_of(servos).counts[4] = 2048
 
 

@@ -178,11 +178,12 @@ def lerobot_files() -> None:
 
 def test_lerobots_calibration_goes_in_and_comes_out_again(capsys):
     lerobot_files()
-    ran(
+    out, _ = ran(
         capsys, "init-robot", "arm.urdf", "--lerobot-calibration", "follower.json", "--out",
         "m.yaml",
     )  # fmt: skip
     chosen = load_joint_map(Path("m.yaml"))
+    assert "guess" not in out + chosen.file.source and "calibrate-joints" not in out
     pan, tilt = chosen.file.joints["pan"], chosen.file.joints["tilt"]
     assert (pan.id, pan.sign, pan.limits_counts, pan.homing_offset) == (3, 1, (900, 3100), -120)
     assert (tilt.id, tilt.sign, tilt.limits_counts, tilt.homing_offset) == (5, -1, (1200, 2900), 87)
