@@ -268,12 +268,30 @@ def answering_joints(
         if doubled := line.doubled(list(servos.values()), where, size):
             raise BusError(" ".join(two_of_one_id(line, servo) for servo in doubled))
     if (silent and must_answer) or not answering:
+        elsewhere = _at_other_rates(family, line, [i for i in servos.values() if i not in series])
         raise BusError(
-            f"{line.device}: {', '.join(silent)} does not answer at {line.baud} baud. Check power "
-            "and wiring, choose the joints that are there, and list the servos with "
-            f"`pupper-sysid scan --bus {family.name}:{line.device}`."
+            f"{line.device}: {', '.join(silent)} does not answer at {line.baud} baud. "
+            f"{elsewhere}Check power and wiring, choose the joints that are there, and list the "
+            f"servos with `pupper-sysid scan --bus {family.name}:{line.device}`."
         )
     return answering
+
+
+def _at_other_rates(family: Family, line: SerialLine, ids: Sequence[int]) -> str:
+    """Sentence about those of `ids` that answer at another rate, or nothing; closes the line."""
+    line.close()
+    for rate in family.rates:
+        if rate == line.baud:
+            continue
+        other = family.open_line(line.device, rate, True)
+        answering = sorted(other.roll_call(ids))
+        other.close()
+        if answering:
+            return (
+                f"At {rate} baud id {ids_in_words(answering)} answers: one program uses one rate, "
+                f"so set one rate with {family.tool}. "
+            )
+    return ""
 
 
 def one_series(series: dict[int, Series], device: str) -> Series:

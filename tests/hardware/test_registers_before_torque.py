@@ -259,3 +259,17 @@ def test_a_servo_that_lost_its_supply_has_the_registers_with_which_it_was_powere
     powered = bytes(memory)
     servos.brown_out(1.0, 0.5)
     assert bytes(memory) == powered
+
+
+@pytest.mark.parametrize("series", ["STS3215", "XL330-M288"])
+def test_a_servo_of_another_rate_is_named_with_its_rate(lines, series):
+    servos, device = lines[series]
+    bus_class, chosen = FeetechBus, map_of(*IDS)
+    if series != "STS3215":
+        bus_class, chosen = DynamixelBus, dynamixel_map(*IDS)
+    with set_to(servos, 5, baud=servos.rates.index(115_200)):
+        with pytest.raises(BusError, match="At 115200 baud id 5 answers"):
+            bus_class(device, joint_map=chosen, joints=["LF_hip", "LF_thigh"])
+    with pytest.raises(BusError, match="does not answer at 1000000 baud. Check"):
+        whole = map_of(4, 6) if series == "STS3215" else dynamixel_map(4, 6)
+        bus_class(device, joint_map=whole, joints=["LF_hip", "LF_calf"])

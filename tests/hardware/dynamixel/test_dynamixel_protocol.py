@@ -16,6 +16,7 @@ from pupper_sysid.hardware.dynamixel import (
     fast_replies,
 )
 from pupper_sysid.hardware.serial_servos import line as serial_line
+from support.damage import damaged
 from support.servo_servers import bench_of, on_a_port, still_dynamixels
 
 # Robotis e-Manual, protocol 2.0: examples of instruction and status packets
@@ -143,29 +144,14 @@ def test_a_header_inside_the_data_is_stuffed_and_comes_out_again():
     assert FrameReader(status=True).feed(frame.encode()) == [frame]
 
 
-def damaged(rng: np.random.Generator, frames: list[bytes]) -> bytes:
-    """A frame with flipped bits, cut, doubled, or with noise around it."""
-    data = bytearray(frames[int(rng.integers(len(frames)))])
-    kind = int(rng.integers(4))
-    if kind == 0:
-        for _ in range(int(rng.integers(1, 4))):
-            data[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
-    elif kind == 1:
-        del data[int(rng.integers(len(data))) :]
-    elif kind == 2:
-        data[3:3] = data[: int(rng.integers(len(data)))]
-    else:
-        data += rng.bytes(int(rng.integers(12)))
-    return bytes(data)
-
-
-def test_damaged_frames_raise_nothing_and_good_ones_between_them_are_found():
+@pytest.mark.parametrize("count", [400, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_damaged_frames_raise_nothing_and_good_ones_between_them_are_found(count):
     rng = np.random.default_rng(0)
     frames = [wire(name) for name in EXAMPLES]
     readers = FrameReader(), FrameReader(status=True)
     servos = still_dynamixels([1, 2])
     whole = 0
-    for _ in range(400):
+    for _ in range(count):
         data = damaged(rng, frames)
         for reader in readers:
             for frame in reader.feed(data):
@@ -173,7 +159,7 @@ def test_damaged_frames_raise_nothing_and_good_ones_between_them_are_found():
                 whole += 1
         servos.receive(data, servos._free_at)
         assert max(len(reader._buffer) for reader in readers) <= 1024
-    assert whole > 50
+    assert whole > count / 8
     reader = FrameReader(status=True)
     assert reader.feed(wire("read answer")[:-3] + wire("sync read answer")) == [
         EXAMPLES["sync read answer"][1]

@@ -13,6 +13,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator, ProxySocket
+from support.damage import damaged
 from support.servo_servers import ScriptedProxy, StillBench, on_a_socket
 from support.stopwatch import wait_until
 
@@ -83,6 +84,23 @@ def test_datagrams_are_laid_out_as_documented_and_little_endian():
     volts = ("0000ec40", "00003041", "0000c07f", "0000807f", "000080bf")
     supply = [esp32.parse_supply(bytes.fromhex("0a05" + v + "0000003f")) for v in volts]
     assert supply == [7.375, 11.0, None, None, None]
+
+
+@pytest.mark.parametrize("count", [400, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_damaged_datagrams_raise_nothing(count):
+    rng, proxy, counted = np.random.default_rng(0), still_proxy(), 0
+    replies = [answers(bytes([2, opcode])) for opcode in (1, 2, 3, 5)]
+    requests = [esp32.request(opcode) for opcode in (2, 3, 4, 5)]
+    for k in range(count):
+        reply = damaged(rng, replies)
+        counts = esp32.parse_counts(reply)
+        assert counts is None or len(counts) == 12
+        counted += counts is not None
+        for parse in (esp32.parse_load, esp32.parse_imu, esp32.parse_supply):
+            values = parse(reply)
+            assert values is None or np.abs(np.nan_to_num(values)).max() <= 2048
+        assert proxy.answer(damaged(rng, requests), b"\x02\x01", 1e-3 * k)
+    assert counted > count / 100
 
 
 def test_the_byte_that_stores_a_calibration_is_never_packed_and_only_whole_counts_are():

@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 import scservo_sdk
 from scservo_sdk import scservo_def
 
 from pupper_sysid.hardware.feetech import SCS0009, STS3215, FeetechLine, Frame, FrameReader, Series
+from support.damage import damaged
 from support.servo_servers import Listening, bench_of, on_a_port, still_servos
 from support.stopwatch import wait_until
 
@@ -93,6 +95,20 @@ def test_our_frames_encode_and_parse_the_golden_bytes_also_byte_by_byte():
         reader = FrameReader()
         pieces = [reader.feed(bytes([byte])) for byte in bytes.fromhex(text)]
         assert pieces[:-1] == [[]] * (len(pieces) - 1) and pieces[-1] == [frame], name
+
+
+@pytest.mark.parametrize("count", [400, pytest.param(100_000, marks=pytest.mark.slow)])
+def test_damaged_frames_raise_nothing(count):
+    rng, reader, servos = np.random.default_rng(0), FrameReader(), still_servos(ids=[1, 2])
+    frames, whole = [golden(name) for name in GOLDEN], 0
+    for _ in range(count):
+        data = damaged(rng, frames)
+        for frame in reader.feed(data):
+            assert sum(frame.encode()[2:]) % 256 == 255
+            whole += 1
+        servos.receive(data, servos._free_at)
+        assert len(reader._buffer) <= 1024
+    assert whole > count / 8
 
 
 def test_sdk_ping_read_write_and_groups_of_an_sts_are_golden_and_obeyed(sts):
