@@ -321,8 +321,8 @@ def default_map(family: Family, line: SerialLine, series: dict[int, Series]) -> 
         f"{'ids' if len(series) + len(others) > 1 else 'id'} {ids}) are not the Mini Pupper's "
         "twelve. Make a map from your robot's URDF or MJCF with `pupper-sysid init-robot "
         f"ROBOT.urdf --servo {kind.name.lower()}`, or without such a file with `pupper-sysid "
-        f"init-robot --servo {kind.name.lower()}` and `joints` as `pan={min(series)}`, and give it "
-        f"as `joint_map`; `pupper-sysid scan --bus {family.name}:{line.device}` lists the servos."
+        f"init-robot --servo {kind.name.lower()} --joints pan={min(series)}`, and give it as "
+        f"`joint_map`; `pupper-sysid scan --bus {family.name}:{line.device}` lists the servos."
         + (f" A part of a Mini Pupper needs its joint map ({preset}) named, too." if preset else "")
     )
 
