@@ -195,11 +195,14 @@ def test_two_servos_of_one_id_are_named_instead_of_the_cables(tmp_path, series):
     assert (5, True) not in bench_of(servos).torques
 
 
-def test_two_servos_of_one_id_whose_pings_never_come_through_are_named_as_well():
+def test_two_servos_of_one_id_whose_pings_never_come_through_are_named_as_well(tmp_path):
     servos = still_dynamixels((4, 5), doubled=[5])
     servos._rng = SimpleNamespace(integers=lambda low, high: high - 1)  # one clock always is late
-    with on_a_port(servos) as server, pytest.raises(BusError, match="two servos .* id 5"):
-        DynamixelBus(server.device, 1_000_000, dynamixel_map(4, 5))
+    with (
+        on_a_virtual_line(tmp_path, servos) as (device,),
+        pytest.raises(BusError, match="two servos .* id 5"),
+    ):
+        DynamixelBus(device, 1_000_000, dynamixel_map(4, 5))
 
 
 def test_without_a_map_servos_of_another_robot_are_never_moved(lines):
