@@ -274,14 +274,20 @@ OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 
 
 def options_in_strings(path):
-    """Options in the strings of a module, but for docstrings and whole lines to type."""
+    """Options in the strings of a module, but for docstrings and those with a line to type."""
     tree = ast.parse(path.read_text())
-    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    others = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    texts = []
     for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            command = re.search(r"pupper-|pip install", node.value)
-            if id(node) not in docstrings and not command:
-                yield from OPTION.findall(node.value)
+        if isinstance(node, ast.JoinedStr):
+            parts = [part for part in node.values if isinstance(part, ast.Constant)]
+            others |= {id(part) for part in parts}
+            texts.append("{}".join(part.value for part in parts))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            texts += [node.value] * (id(node) not in others)
+    for text in texts:
+        if not re.search(r"pupper-|pip install", text):
+            yield from OPTION.findall(text)
 
 
 def test_no_message_of_the_library_names_an_option(tmp_path):
