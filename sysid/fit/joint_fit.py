@@ -86,7 +86,7 @@ _WIDE = 4.0
 _REACHED = 1.25
 """Ends of the effort limit's interval, up to which a motion at that limit tells back-EMF from
 damping. Wider ones gave wrong parts of a right sum on twins (`benchmarks/wide_twins.py`)."""
-_ONLY_THE_SUM = "only the sum of damping and back-EMF can be known: damping_and_back_emf has it"
+_ONLY_THE_SUM = "only the sum of damping and back-EMF can be known (`damping_and_back_emf`)"
 _FOREIGN = 3.0
 """Standard deviations of a prior from another unit, beyond which it is of another servo."""
 _SHARP_DEAD_TIME_S = 0.015
