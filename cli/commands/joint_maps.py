@@ -441,20 +441,19 @@ class InitRobot:
         )  # fmt: skip
         bus = f"{FAMILIES[self.servo.lower()].name}:/dev/ttyUSB0"
         quoted = terminal.command(target)
-        origin, measure = (
-            "Ids, signs and centres are guesses.",
-            (
+        if lerobot is None:
+            origin = "Ids, signs and centres are guesses."
+            measure = (
                 "Then measure centres, ranges and scale:\n"
                 f"  pupper-sysid calibrate-joints --joint-map {quoted} --out {quoted} --force "
                 f"--bus {bus}\n"
-            ),
-        )
-        if lerobot is not None:
-            origin, measure = (
-                "Ids, directions and ranges are those of LeRobot's calibration; a joint's zero is "
-                "the pose in which LeRobot homed it.",
-                "",
             )
+        else:
+            origin = (
+                "Ids, directions and ranges are those of LeRobot's calibration; a joint's zero is "
+                "the pose in which LeRobot homed it."
+            )
+            measure = ""
         terminal.out.print(
             f"{origin} Ids and signs are for you to check: with the servos limp, move one joint "
             "after the other by hand to its positive side and watch\n"

@@ -258,7 +258,7 @@ def test_an_unknown_name_on_a_line_without_a_map_is_blamed_on_the_missing_map(
 def test_a_servo_that_lost_its_supply_has_the_registers_with_which_it_was_powered(servos):
     memory = servos.servos[4].memory
     torque = servos.series.register("torque_enable").address
-    memory[torque] = 0  # all that a supply that fails changes of a servo that nobody wrote to
+    memory[torque] = 0  # the only change that a power failure makes to an unwritten servo
     powered = bytes(memory)
     servos.brown_out(1.0, 0.5)
     assert bytes(memory) == powered

@@ -9,7 +9,7 @@ from types import ModuleType
 
 @cache
 def _conf() -> ModuleType:
-    """The module, once it is asked for: it imports Sphinx, which takes a second."""
+    """The module, imported on first use, because Sphinx takes a second to import."""
     spec = importlib.util.spec_from_file_location(
         "documentation", Path(__file__).resolve().parents[2] / "docs/conf.py"
     )
