@@ -492,24 +492,26 @@ def fitted(
     return best
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, fastmath={"reassoc","contract"}, error_model="numpy")
 def _regression(design, position, starts, bound, floor):
     """Mean cost, values and residuals of a regression whose errors cost no more than `bound`."""
     # sums in loops: without arrays in between they take half the time
-    rows, count = np.append(design, position).reshape(-1, len(position)), len(position)
-    last = len(design)
-    weight, x, gram = np.ones(count), np.empty_like(rows), np.empty((last + 1, last + 1))
-    values, rest = np.empty(last), np.empty(count)
+    last, count = design.shape
+    x, gram = np.empty((last + 1, count)), np.empty((last + 1, last + 1))
+    weight, values, rest = np.ones(count), np.empty(last), np.empty(count)
     for _ in range(6):
         for trial in range(len(starts) - 1):
             a, b = starts[trial], starts[trial + 1]
-            total = weight[a:b].sum()
+            total = 0.0
+            for k in range(a, b):
+                total += weight[k]
             for c in range(last + 1):
+                row = design[c] if c < last else position
                 mean = 0.0
                 for k in range(a, b):
-                    mean += weight[k] * rows[c, k]
+                    mean += weight[k] * row[k]
                 for k in range(a, b):
-                    x[c, k] = rows[c, k] - mean / total
+                    x[c, k] = row[k] - mean / total
         for c in range(last + 1):
             for d in range(min(c + 1, last)):
                 gram[c, d] = 0.0
@@ -518,15 +520,29 @@ def _regression(design, position, starts, bound, floor):
                 gram[d, c] = gram[c, d]
         for c in range(last):
             gram[c, c] += 1e-12 + 1e-9 * gram[c, c]
-        values = np.linalg.solve(gram[:last, :last].copy(), gram[last, :last].copy())
-        rest[:] = x[last]
+        # elimination by hand: to compile LAPACK's solver takes ten seconds
         for c in range(last):
-            rest -= values[c] * x[c]
+            for d in range(c + 1, last):
+                share = gram[d, c] / gram[c, c]
+                for e in range(c, last):
+                    gram[d, e] -= share * gram[c, e]
+                gram[last, d] -= share * gram[last, c]
+        for c in range(last - 1, -1, -1):
+            values[c] = gram[last, c]
+            for d in range(c + 1, last):
+                values[c] -= gram[c, d] * values[d]
+            values[c] /= gram[c, c]
+        for k in range(count):
+            rest[k] = x[last, k]
+        for c in range(last):
+            for k in range(count):
+                rest[k] -= values[c] * x[c, k]
+        cost = 0.0
         for k in range(count):
             size = abs(rest[k])
+            cost += bound * size / (size + bound)
             weight[k] = (bound / (size + bound)) ** 2 / max(size, floor)
-    size = np.abs(rest)
-    return np.mean(bound * size / (size + bound)), values, rest
+    return cost / count, values, rest
 
 
 # ----- hypotheses
