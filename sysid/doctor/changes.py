@@ -492,7 +492,7 @@ def fitted(
     return best
 
 
-@njit(cache=True, fastmath={"reassoc","contract"}, error_model="numpy")
+@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def _regression(design, position, starts, bound, floor):
     """Mean cost, values and residuals of a regression whose errors cost no more than `bound`."""
     # sums in loops: without arrays in between they take half the time

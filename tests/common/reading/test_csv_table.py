@@ -40,7 +40,7 @@ cells = st.one_of(
 )  # fmt: skip
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(rows=st.lists(st.lists(cells, min_size=1, max_size=3), max_size=6), end=st.booleans())
 @example(rows=[["1", "2"], ["4_1", "2"]], end=True)
 @example(rows=[["1", "a"], ["2"]], end=False)

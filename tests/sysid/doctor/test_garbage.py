@@ -12,7 +12,7 @@ import pytest
 import pupper_sysid as ps
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sysid.doctor.checks import cautions, findings, refuse_unusable
-from pupper_sysid.sysid.fit.preparation import prepare_joint
+from pupper_sysid.sysid.lag.lag_budget import lag_budget
 from support.garbage import GARBAGE, good, spoilt
 from support.made_recordings import JOINT, KINDS, USUAL_SERVO, Setup, good_recording, made, record
 from support.refusals import assert_each_refused
@@ -122,7 +122,7 @@ def test_what_asks_for_care_is_a_warning_of_every_number():
     assert examined.verdict == "use with care"
     assert {f"{JOINT}: {reason}" for reason in examined.reasons} >= set(wanted)
     # what lag and calibrate both begin with
-    assert set(prepare_joint(JOINT, trials, 0).lag.warnings) >= set(wanted)
+    assert set(lag_budget(JOINT, trials, np.random.default_rng(0)).warnings) >= set(wanted)
     assert set(ps.frequency_response(recording)[JOINT].warnings) >= set(wanted)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -117,6 +118,21 @@ def test_a_runner_up_is_named_in_words_and_by_its_code():
     )
 
 
+def free_world():
+    """A servo that moves freely for 14 s, and the generator that drew it."""
+    rng = np.random.default_rng(3)
+    world = replace(
+        draw_world(rng, "smart", "teleoperation", 3e-4), amplitude_rad=0.3, rate_hz=50.0,
+        poll_s=0.0, friction_rad=0.0, gravity_rad=0.0, duration_s=14.0, quantum_rad=0.0015,
+    )  # fmt: skip
+    return world, rng
+
+
+@cache
+def healthy_codes() -> frozenset[str]:
+    return frozenset(codes(recorded(simulated(free_world()[0]))))
+
+
 @pytest.mark.parametrize(
     ("fault", "code"),
     [
@@ -125,12 +141,8 @@ def test_a_runner_up_is_named_in_words_and_by_its_code():
     ],
 )  # fmt: skip
 def test_free_motion_shows_what_happened_within_a_trial(fault, code):
-    rng = np.random.default_rng(3)
-    world = replace(
-        draw_world(rng, "smart", "teleoperation", 3e-4), amplitude_rad=0.3, rate_hz=50.0,
-        poll_s=0.0, friction_rad=0.0, gravity_rad=0.0, duration_s=14.0, quantum_rad=0.0015,
-    )  # fmt: skip
-    assert code not in codes(recorded(simulated(world)))
+    world, rng = free_world()
+    assert code not in healthy_codes()
     assert code in codes(recorded(FAULTS[fault][0](world, rng)[1]))
 
 
