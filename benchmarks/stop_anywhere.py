@@ -125,7 +125,7 @@ def stop_at(case: tuple[str, bool, int, bool, float], patience: float) -> dict[s
                 while process.poll() is None and (sum(processes(process.pid).values()) < moment_s):
                     time.sleep(0.01)
                 early = process.poll() is not None
-                took_s, presses = _stop(process, name, number, group, patience)
+                took_s, presses = _stop(process, name, number, group)
                 left = _left_after(process.pid, patience)
             finally:
                 for one in processes(process.pid):
@@ -149,7 +149,7 @@ def stop_at(case: tuple[str, bool, int, bool, float], patience: float) -> dict[s
 
 
 def _stop(
-    process: subprocess.Popen[bytes], name: str, number: int, group: bool, patience: float
+    process: subprocess.Popen[bytes], name: str, number: int, group: bool
 ) -> tuple[float, int]:
     """Send the signal, of training a second one; the time from the last one [s], and how many."""
     for presses in (1, 2):

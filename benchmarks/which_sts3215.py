@@ -65,8 +65,6 @@ SPECIMENS = {
 P_GAIN = 16.0
 SLOW_UNTIL_S = 60.0
 """Up to where `frequency_sweep` is below 0.6 Hz."""
-SHOWN = "Wrist_Roll"
-"""Joint of the picture's jump."""
 AT = {name: place for place, name in enumerate(COLUMNS)}
 NOISE_RAD, ITERATIONS, DIFFERENCE = 0.005, 25, 0.005
 """Where the loss of the arm's fit bends, and its local fit."""
@@ -259,7 +257,6 @@ def evaluate(joint: str) -> dict:
         "robot": slow_motion(sweep, sweep.row_rad),
         "without ramp": score(with_load(free, fitted), runs),
         "models": models,
-        "jump": jump(loaded, runs["prbs_excitation"]) if joint == SHOWN else None,
     }
 
 
@@ -291,20 +288,6 @@ def terms(
         if term == "stiffness":
             found["best stiffness"] = changed.stiffness
     return found
-
-
-def jump(models: Mapping[str, Model], run: Run) -> dict:
-    """One jump that no one fitted: times [s], command, reading and models [rad]."""
-    command, time = _command(run), run.row_step * run.step_s
-    edges = np.flatnonzero(np.abs(np.diff(command)) > 0.1)
-    quiet = [k for k in edges if time[k] > FITTED_S and np.sum(np.abs(edges - k) < 30) == 1]
-    rows = slice(quiet[0] - 3, quiet[0] + 22)
-    found = {"time": time[rows] - time[quiet[0] + 1], "command": command[rows]}
-    found["reading"] = run.row_rad[rows]
-    found["models"] = {
-        name: at_steps(m.track(run), run.row_step)[rows].tolist() for name, m in models.items()
-    }
-    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in found.items()}
 
 
 def _run(trial: Trial, lattice: PollLattice) -> Run:
@@ -443,11 +426,11 @@ TABLES: dict[str, Callable[[Mapping[str, Any]], list[str]]] = {
 
 
 def picture(joints: Mapping[str, Any]) -> None:
-    """Errors by motion, slow motion, and one jump."""
+    """Errors by motion, and slow motion."""
     from matplotlib.figure import Figure
 
-    drawn = Figure(figsize=(11, 4.2), layout="constrained")
-    first, second, third = drawn.subplots(1, 3)
+    drawn = Figure(figsize=(8, 4.2), layout="constrained")
+    first, second = drawn.subplots(1, 2)
     names = _models(joints)
     for n, (name, colour) in enumerate(zip(names, COLOURS, strict=True)):
         own = by_motion(joints, lambda j, m=name: j["models"][m]["errors"])
@@ -465,17 +448,8 @@ def picture(joints: Mapping[str, Any]) -> None:
     second.set_xlabel("lag per speed in slow motion [ms]")
     second.set_ylabel("dead band [mrad]")
     second.legend(fontsize="small")
-    jump = next(j["jump"] for j in joints.values() if j["jump"])
-    time = 1e3 * np.array(jump["time"])
-    third.step(time, jump["command"], color="0.6", where="post", label="command")
-    for name, colour in zip(names, COLOURS, strict=True):
-        third.plot(time, jump["models"][name], color=colour, lw=1.2)
-    third.plot(time, jump["reading"], "k+", ms=6, label="readings")
-    third.set_xlabel("time after a jump of the wrist roll [ms]")
-    third.set_ylabel("position [rad]")
-    third.legend(fontsize="small")
     drawn.legend(
-        *first.get_legend_handles_labels(), loc="outside lower center", ncols=len(names),
+        *first.get_legend_handles_labels(), loc="outside lower center", ncols=3,
         fontsize="small",
     )  # fmt: skip
     drawn.savefig(PICTURE, dpi=130)
