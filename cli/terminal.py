@@ -97,7 +97,11 @@ def load_all(paths: Sequence[Path]) -> list[Recording]:
     if not chosen:
         chosen = [newest_recording()]
         err.print(f"Taking the newest recording, {chosen[0]}.")
-    recordings = [load(log) for path in chosen for log in logs_in(path)]
+    recordings: list[Recording] = []
+    for path in chosen:
+        if not path.exists() and any(str(path) in recording.joints for recording in recordings):
+            raise InputError(f"{path} is a joint, no file: choose it with `--joints {path}`.")
+        recordings += [load(log) for log in logs_in(path)]
     by_name: dict[str, tuple[str, ...]] = {}
     for recording in recordings:
         by_name[recording.name] = (*by_name.get(recording.name, ()), *recording.warnings)

@@ -408,7 +408,12 @@ class Compare(OfRecordings):
             )
         refuse_picture(self.plot, self.force)
         recordings, joints = self.load()
-        result = compare(recordings, self.models, joints, self.readings, self.seed)
+        models = [
+            name
+            for text in self.models
+            for name in ([text] if Path(text).exists() else text.split(","))
+        ]
+        result = compare(recordings, models, joints, self.readings, self.seed)
         save(result.plot(), self.plot, self.force)
         if self.json:
             return terminal.print_json(result.to_dict() | {"written": str(self.plot)})

@@ -51,6 +51,8 @@ calibarte | Did you mean `pupper-sysid calibrate`
 delay [nowhere.csv missing.npz] | does not exist
 delay | No recording was named
 delay log.csv --joints LF_hipp | Did you mean LF_hip
+delay log.csv LF_hip | choose it with `--joints LF_hip`
+compare log.csv --models paper,nowhere.yaml | error: nowhere.yaml does not exist
 sweep --freqs 1 2 4 8 | with commas, without spaces: --freqs 1,2,4,8
 sweep --amplitude 5deg | --amplitude is '5deg'. Write a number in rad, without its unit
 sweep --amplitude 0.1 0.2 | --amplitude takes one number, not 2: --amplitude 0.1
