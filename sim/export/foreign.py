@@ -23,6 +23,7 @@ import numpy as np
 
 from pupper_sysid.common.border import validated
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.servo_models.calibration.parts import ARMATURES, Armature
 from pupper_sysid.servo_models.cards.compare import Servo
 from pupper_sysid.servo_models.cards.numbers import TorquePD
 from pupper_sysid.sim.export.mjcf import link_inertias
@@ -132,8 +133,9 @@ def _driven_servo(path: Path, model: Any, name: str, i: int) -> Servo:
             f"{path.name} has a spring of {model.jnt_stiffness[j]:.3g} N·m/rad on {name}, which "
             "no servo has."
         )
+    text = path.read_text(encoding="utf-8", errors="replace")
     return Servo(
-        path.name, name, None, False, "servo", None, _pd(path, numbers),
+        path.name, name, None, False, _armature(text, name), None, _pd(path, numbers),
         link_kg_m2=link_inertias(model, [name])[name], notes=tuple(notes), as_it_stands=True,
         assumed=tuple(assumed),
     )  # fmt: skip
@@ -145,7 +147,8 @@ def _in_python(path: Path, joint: str | None) -> Servo:
     if not path.is_file() or path.stat().st_size > _LARGEST_BYTES:
         raise InputError(f"{path} is no Python file of a configuration.")
     try:
-        tree = ast.parse(path.read_text(encoding="utf-8-sig"), path.name)
+        text = path.read_text(encoding="utf-8-sig")
+        tree = ast.parse(text, path.name)
     except (SyntaxError, ValueError, RecursionError) as error:
         raise InputError(f"{path} is no Python that can be read: {error}.") from error
     # names at the top of the file that stand for literals, or for arithmetic with such names
@@ -201,9 +204,18 @@ def _in_python(path: Path, joint: str | None) -> Servo:
             notes.append(f"{path.name} states no {word}; {stand_in:g} stands for it.")
     known = {key: value for key, value in numbers.items() if value is not None}
     return Servo(
-        path.name, joint, None, False, "servo", None, _pd(path, known), notes=tuple(notes),
+        path.name, joint, None, False, _armature(text, joint), None, _pd(path, known), notes=tuple(notes),
         as_it_stands=True, assumed=tuple(assumed),
     )  # fmt: skip
+
+
+def _armature(text: str, joint: str | None) -> Armature:
+    """What an armature includes by the head of our own exports, else the servo alone."""
+    heads = re.findall(
+        r"Numbers of ([^;]*) are for [^;]*; armature: ([^;]*);", " ".join(text.split())
+    )
+    said = next((words for names, words in heads if joint in (None, *names.split(", "))), "")
+    return next((kind for kind, words in ARMATURES.items() if words == said), "servo")
 
 
 def _pd(path: Path, numbers: Mapping[str, float]) -> TorquePD:

@@ -25,7 +25,7 @@ from pupper_sysid.common.tones import fit_sine
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, Actuator, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, TORQUES, DelayedPDParameters
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, TORQUES
 from pupper_sysid.servo_models.step_size import MUJOCO, MUJOCO_PID, Engine, nearest_in_loop
 
 FEEDBACK_KEYS = ("poll_period_s", "loss", "quantum_rad", "offset_rad", "mean_age_s")
@@ -107,17 +107,15 @@ class ExportedServos:
         if engine in self._actuators:
             return self._actuators[engine]
         stepped: dict[str, Actuator] = {}
-        joints = {name: joint.actuator for name, joint in self.moving.joints.items()}
-        for fitted_s in {a.fitted_step_s for a in joints.values()}:
-            names = [name for name, a in joints.items() if a.fitted_step_s == fitted_s]
-            arrays = [joints[name].parameters.arrays() for name in names]
-            before = {key: np.array([float(a[key]) for a in arrays]) for key in arrays[0]}
-            servos = DelayedPDParameters(**before)
-            after = nearest_in_loop(servos, self.physics_step_s, fitted_s, engine).arrays()
-            for n, name in enumerate(names):
-                old, new = ({key: float(x[n]) for key, x in y.items()} for y in (before, after))
-                stepped[name] = _changed(self.calibration.joints[name].actuator, old, new)
-        stepped = {name: stepped[name] for name in joints}
+        changes: dict[tuple[float, ...], dict[str, float]] = {}
+        for name, joint in self.moving.joints.items():
+            servo, fitted_s = joint.actuator.parameters, joint.actuator.fitted_step_s
+            old = {key: float(x) for key, x in servo.arrays().items()}
+            kind = (fitted_s, *old.values())
+            if kind not in changes:  # one at a time: a short step of many servos fills the memory
+                after = nearest_in_loop(servo, self.physics_step_s, fitted_s, engine).arrays()
+                changes[kind] = {key: float(np.squeeze(x)) for key, x in after.items()}
+            stepped[name] = _changed(self.calibration.joints[name].actuator, old, changes[kind])
         self._actuators[engine] = stepped
         return stepped
 
