@@ -204,8 +204,8 @@ def _in_python(path: Path, joint: str | None) -> Servo:
             notes.append(f"{path.name} states no {word}; {stand_in:g} stands for it.")
     known = {key: value for key, value in numbers.items() if value is not None}
     return Servo(
-        path.name, joint, None, False, _armature(text, joint), None, _pd(path, known), notes=tuple(notes),
-        as_it_stands=True, assumed=tuple(assumed),
+        path.name, joint, None, False, _armature(text, joint), None, _pd(path, known),
+        notes=tuple(notes), as_it_stands=True, assumed=tuple(assumed),
     )  # fmt: skip
 
 

@@ -209,6 +209,10 @@ def test_our_own_exports_are_read_back_as_they_were_written(target, engine, tmp_
     own = ExportedServos.of(calibration, 0.002).actuators(engine)["LF_thigh"]
     assert servo.pd.stiffness_nm_per_rad.value == own.stiffness_nm_per_rad.value
     assert servo.pd.armature_kg_m2.value == own.armature_kg_m2.value
+    assert servo.armature == "servo and load"
+    path.write_text(exported_text(calibration, target, 0.002, link_inertia={"LF_thigh": 1e-4})[0])
+    parts = {foreign_servo(path, name).armature for name in ("LF_thigh", "LF_hip")}
+    assert parts == {"servo", "servo and load"}
 
 
 def test_a_difference_says_what_differs_in_lag_and_motion(tmp_path, capsys):
