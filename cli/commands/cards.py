@@ -232,7 +232,7 @@ def _verdict(found: compare.Comparison) -> Iterator[str]:
         raise InputError("The two have no number in common.")
     most, motion = max(known, key=lambda row: row.distance), found.motion
     if most.distance < 0.02:
-        yield "They agree within 2 % in every number that is compared."
+        yield "They agree within 2 % in every number that both state."
     else:
         yield (
             f"They differ most in {most.quantity}: {most.ratio:.3g} times. Numbers that only one "

@@ -195,7 +195,9 @@ def compared(
         notes.append(f"The armatures differ in what they include ({stated}); not compared.")
         arm, bare = (one, other) if other.armature == "servo" else (other, one)
         inertia, least = (s.pd.armature_kg_m2.value for s in (arm, bare))
-        if inertia < least + bare.link_kg_m2:
+        # a configuration's number may be this one, rounded
+        largest = max(arm.pd.armature_kg_m2.high or 0.0, 1.02 * inertia)
+        if largest < least + bare.link_kg_m2:
             notes.append(
                 f"{arm.title}: an arm cannot have less inertia than its servo; {inertia:.3g} kg·m² "
                 f"with the link are less than {least + bare.link_kg_m2:.3g} of {bare.title}. One "

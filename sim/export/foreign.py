@@ -155,8 +155,11 @@ def _in_python(path: Path, joint: str | None) -> Servo:
     literals: dict[str, Any] = {}
     for node in tree.body:
         name, value = _assigned(node)
-        if name and (number := _value(value, literals)) is not None:
-            literals[name] = number
+        names, values = [name], [value]
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple):  # A, B = 1, 2
+            names, values = map(ast.unparse, node.targets[0].elts), getattr(node.value, "elts", [])
+        pairs = zip(names, values, strict=False)  # a call gives several, too
+        literals |= {k: v for k, e in pairs if k and (v := _value(e, literals)) is not None}
     literals_and_groups = (literals, *_groups(tree, literals))
     constants, *groups = ({k.lower(): v for k, v in g.items()} for g in literals_and_groups)
     fitting = [
