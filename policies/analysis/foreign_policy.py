@@ -31,6 +31,7 @@ the start; `age` is how many actions ago a value was current. `frames` stacks wh
 from __future__ import annotations
 
 import json
+import re
 import tempfile
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -536,6 +537,8 @@ def _listed(text: str | None, key: str, path: Path) -> list[float | list[float]]
     plain = text.lower()
     for word, number in (("inf", "1e999"), ("true", "1"), ("false", "0"), ("none", "1")):
         plain = plain.replace(word, number)
+    # since 1.6 mjlab has lists as 1;2, before as [1, 2]
+    plain = re.sub(r"[^,]*;[^,]*", lambda some: f"[{some[0].replace(';', ',')}]", plain)
     try:
         values = json.loads(f"[{plain}]")
         return [[float(x) for x in v] if isinstance(v, list) else float(v) for v in values]

@@ -227,11 +227,13 @@ def test_set_points_are_the_policys_pose_and_scale_and_other_joints_stay(tmp_pat
 # ------------------------------------------------------------------------- files of others
 
 
-def test_metadata_of_mjlabs_exporter_are_read(tmp_path):
+@pytest.mark.parametrize("lists", [("[-inf, inf]", "[-1.0, 1.0]"), ("-inf;inf", "-1.000;1.000")])
+def test_metadata_of_mjlabs_exporter_are_read(lists, tmp_path):
+    scale = "[2.0, 2.0, 0.25]" if "[" in lists[0] else "2.000;2.000;0.250"  # since mjlab 1.6
     terms = "base_ang_vel,projected_gravity,joint_pos,joint_vel,actions,command"
     metadata = as_mjlab(JOINT_NAMES, np.linspace(-0.5, 0.6, 12), terms) | {
-        "observation_terms_scale": "0.250,1.000,1.000,0.050,1.000,[2.0, 2.0, 0.25]",
-        "observation_terms_clip": ",".join(["[-inf, inf]"] * 5 + ["[-1.0, 1.0]"]),
+        "observation_terms_scale": f"0.250,1.000,1.000,0.050,1.000,{scale}",
+        "observation_terms_clip": ",".join([lists[0]] * 5 + [lists[1]]),
         "observation_terms_history_length": "0.000,3.000,0.000,0.000,0.000,0.000",
     }
     path = linear(np.eye(12, 51), tmp_path / "walk.onnx", metadata)
