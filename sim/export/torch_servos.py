@@ -96,7 +96,8 @@ class SetPoint:
         before = self.value.gather(-1, place)[..., 0]
         left_s = self.physics_dt - until
         after = ((self.value * times).sum(-1) - before * until) / left_s.clamp(min=1e-9)
-        area = self._run(before, until) + self._run(torch.where(left_s > 0, after, before), left_s)
+        self.goal = torch.where(left_s > 0, after, before)
+        area = self._run(before, until) + self._run(self.goal, left_s)
         self.arrival = (self.arrival - self.physics_dt).clamp(min=-1.0)
         return area / self.physics_dt
 
@@ -202,15 +203,17 @@ class ServoBank:
         self.steps_ahead, self.per_torque = lead / physics_dt, lead / column("inertia")
         # a step's torque is one of its beginning: it takes the mean of the set-points around that;
         # MuJoCo's is that half a step later or, where it runs, has run for all of its first step
-        later = {}
+        later, lead_s = {}, []
         for name in joint_names:
             servo = servos[name]
             part = (servo["dead_time_s"] / servo["step_s"] + 1e-6) % 1.0
             runs = servo["velocity_limit_rad_s"] < 1000.0  # which stands for none
             ahead = servo["step_s"] * (1 + part if runs else 0.5)
-            delay = max(servo["dead_time_s"] + physics_dt / 2 - ahead, 0.0)
-            later[name] = {**servo, "dead_time_s": delay}
+            delay = servo["dead_time_s"] + physics_dt / 2 - ahead
+            later[name] = {**servo, "dead_time_s": max(delay, 0.0)}
+            lead_s.append(max(-delay, 0.0))
         self.set_point = SetPoint(later, joint_names, num_envs, physics_dt, device)
+        self.reach = self.set_point.speed * torch.tensor(lead_s, device=device)
         self.feedback = HeldFeedback(feedback, joint_names, num_envs, physics_dt, device)
         self.effort, self.velocity = torch.zeros((2, num_envs, len(joint_names)), device=device)
         self.new = torch.ones(num_envs, dtype=torch.bool, device=device)
@@ -246,7 +249,11 @@ class ServoBank:
         """
         self.read(position)
         self.has_read = False
-        drive = self.stiffness * (self.set_point.step(command) - position)
+        target = self.set_point.step(command)
+        # where a dead time is too short to be made shorter, the set-point is taken as ahead
+        to_go = self.set_point.goal - target
+        target = target + torch.minimum(torch.maximum(to_go, -self.reach), self.reach)
+        drive = self.stiffness * (target - position)
         change = torch.nan_to_num(velocity - self.velocity, nan=0.0)  # NaN: none before
         now = velocity + self.steps_ahead * change - self.per_torque * self.effort
         brakes = self.damping + self.brake

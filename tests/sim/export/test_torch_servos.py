@@ -1,5 +1,7 @@
 """Set-points and readings that exports compute on torch, and their twin in NumPy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -130,13 +132,13 @@ SERVOS = DelayedPDParameters(  # damped, limited in torque, limited in speed, br
 )
 
 
-def moved_by_torques(commands, step_s: float, fitted_s: float, load: float = 0.0) -> np.ndarray:
+def moved_by_torques(commands, step_s: float, fitted_s: float, servos=SERVOS) -> np.ndarray:
     """Positions of joints that a simulator moves by the bank's torques, shape (steps + 1, 4)."""
     names = list("abcd")
     keys = [
         "stiffness", "damping", "back_emf", "effort_limit", "dead_time_s", "velocity_limit_rad_s",
     ]  # fmt: skip
-    values = SERVOS.arrays() | {"velocity_limit_rad_s": SERVOS.velocity_limit}
+    values = servos.arrays() | {"velocity_limit_rad_s": servos.velocity_limit}
     numbers = {
         name: {key: float(values[key][n]) for key in keys}
         | {"jitter_s": 0.0, "inertia": 1.0, "step_s": fitted_s}
@@ -147,8 +149,8 @@ def moved_by_torques(commands, step_s: float, fitted_s: float, load: float = 0.0
     for command in held(commands, step_s):
         state = (torch.tensor(x, dtype=torch.float32)[None] for x in (position, velocity))
         torque = bank.efforts(torch.full((1, 4), float(command)), *state)[0].numpy()
-        wanted = velocity + step_s * torque / (1.0 + load)
-        most = step_s * SERVOS.friction_loss / (1.0 + load)
+        wanted = velocity + step_s * torque
+        most = step_s * servos.friction_loss
         velocity = np.sign(wanted) * np.maximum(np.abs(wanted) - most, 0.0)
         position = position + step_s * velocity
         track.append(position)
@@ -170,6 +172,17 @@ def test_torques_of_steps_move_a_joint_as_its_servo_in_the_steps_of_its_fit(fitt
     usual = nearest_in_loop(SERVOS, step_s, fitted_s, explicit)
     before = apart_rad(*in_loop(usual, step_s, commands, explicit))
     assert (errors < 0.5 * before).all(), (1e3 * errors, 1e3 * before)
+
+
+@pytest.mark.parametrize("step_s", [0.001, 0.002])
+def test_a_dead_time_shorter_than_the_lead_of_its_steps_costs_a_running_set_point_nothing(step_s):
+    commands = walk_commands()
+    servos = replace(SERVOS, dead_time_s=np.full(4, 0.001))
+    at, own = in_loop(servos, 0.002, commands)
+    there = moved_by_torques(commands, step_s, 0.002, servos)
+    times = step_s * np.arange(len(there))
+    error = there[:, 3] - np.interp(times, at, own[:, 3])
+    assert np.sqrt(np.mean(error**2)) < 0.3e-3
 
 
 def test_torques_hold_a_load_with_the_whole_stiffness():
