@@ -218,7 +218,7 @@ def _armature(text: str, joint: str | None) -> Armature:
         r"Numbers of ([^;]*) are for [^;]*; armature: ([^;]*);", " ".join(text.split())
     )
     said = next((words for names, words in heads if joint in (None, *names.split(", "))), "")
-    return next((kind for kind, words in ARMATURES.items() if words == said), "servo")
+    return "servo and load" if said == ARMATURES["servo and load"] else "servo"
 
 
 def _pd(path: Path, numbers: Mapping[str, float]) -> TorquePD:
