@@ -114,16 +114,16 @@ __all__ = [
 
 def __getattr__(name: str) -> object:
     if name == "__version__":
-        found: object = _import_module("importlib.metadata").version("pupper-sysid")
+        public: object = _import_module("importlib.metadata").version("pupper-sysid")
     elif name in _OLDER_NAMES:
-        found = __getattr__(_OLDER_NAMES[name])
+        public = __getattr__(_OLDER_NAMES[name])
     elif name in _MODULES:
         module, _, attribute = _MODULES[name].partition(":")
-        found = getattr(_import_module(f"pupper_sysid.{module}"), attribute or name)
+        public = getattr(_import_module(f"pupper_sysid.{module}"), attribute or name)
     else:
         raise AttributeError(f"module 'pupper_sysid' has no attribute '{name}'")
-    globals()[name] = found
-    return found
+    globals()[name] = public
+    return public
 
 
 def __dir__() -> list[str]:

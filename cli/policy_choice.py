@@ -231,12 +231,12 @@ def show_match(match: Match) -> None:
     err.print(table("Swing over command, and phase", *titles, rows=cells))
 
 
-def show_servos(match: ServoMatch | None, carried: bool) -> None:
+def show_servos(match: ServoMatch | None, is_learned: bool) -> None:
     """The robot's servos beside those of the training."""
     if match is None:
         err.print(
             "The robot's servos were not compared with those of the training: "
-            + ("a learned model has no numbers." if carried else "the policy's file has none.")
+            + ("a learned model has no numbers." if is_learned else "the policy's file has none.")
         )
     elif match.outside:
         warn(f"{match.here} is not what the policy was trained for:", *match.sentences())

@@ -210,12 +210,12 @@ class CommandNetwork(JointArrays):
             raise InputError(f"A servo network must end in one output; this one has {width}.")
         # relu(h + b) = max(h, -b) + b: the one pass over a layer; b moves on to the next bias
         self._layers: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
-        carried = np.zeros((len(self.joints), self.taps + self.feedback), np.float32)
+        activations = np.zeros((len(self.joints), self.taps + self.feedback), np.float32)
         for n in range(self._depth):
             weight = self.parameters[f"weight_{n}"]
-            bias = self.parameters[f"bias_{n}"] + np.matmul(carried[:, None], weight)[:, 0]
+            bias = self.parameters[f"bias_{n}"] + np.matmul(activations[:, None], weight)[:, 0]
             self._layers.append((np.ascontiguousarray(np.swapaxes(weight, 1, 2)), -bias[..., None]))
-            carried = bias
+            activations = bias
 
     def reset(self, position: ArrayLike) -> None:
         """Rest at `position` [rad], shape (*environments, joints); it sets how many there are."""

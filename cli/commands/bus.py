@@ -107,8 +107,8 @@ class Scan:
         proxy = next(iter(proxies), None)
         if self.json:
             lines = [_as_data(report) for report in reports]
-            found = {"ports": ports, "lines": lines, "silent": silent}
-            return terminal.print_json(found | {"proxy": proxy})
+            scanned = {"ports": ports, "lines": lines, "silent": silent}
+            return terminal.print_json(scanned | {"proxy": proxy})
         for report in reports:
             self._show(report)
             terminal.out.print(f"Use it with --bus {report.family}:{report.device}")
@@ -376,11 +376,11 @@ class Monitor:
         from pupper_sysid.cli.oscilloscope import Oscilloscope
 
         name, joints, shown_s = bus_name(self.bus), watched.bus.joint_names, -np.inf
-        with ExitStack() as shown:
-            views = shown.enter_context(LiveViews(watched.bus, targets)) if targets else None
+        with ExitStack() as stack:
+            views = stack.enter_context(LiveViews(watched.bus, targets)) if targets else None
             scope = None
             if terminal.err.is_terminal:
-                scope = shown.enter_context(Oscilloscope(f"{name}, only read", joints, lag=False))
+                scope = stack.enter_context(Oscilloscope(f"{name}, only read", joints, lag=False))
             for _ in watched.readings(self.rate, np.inf if self.seconds is None else self.seconds):
                 if views:
                     views.tick(0, *watched.tick())

@@ -279,16 +279,16 @@ class Monitor:
             )
         return f"It is blocked, without power, or {otherwise}; switch the servos' power off and on."
 
-    def _motion(self, begin: float, shown: float) -> tuple[Angles, Angles]:
+    def _motion(self, begin: float, visible_at: float) -> tuple[Angles, Angles]:
         """Range of each command from `begin` to `shown`, and of its readings from `begin` on [rad].
 
         That of readings is infinite where there are too few, or none after `shown`: silence is
         another fault.
         """
         nothing = np.zeros(len(self._names))
-        sent = np.array([x for t, x in self._commands if begin <= t <= shown])
+        sent = np.array([x for t, x in self._commands if begin <= t <= visible_at])
         read = np.array([x for t, x in self._readings if t >= begin])
-        late = np.array([x for t, x in self._readings if t >= shown])
+        late = np.array([x for t, x in self._readings if t >= visible_at])
         if len(sent) < 2 or len(read) < _FEWEST_READINGS or not len(late):
             return nothing, nothing + np.inf
         low = np.nanmin(read, axis=0, initial=np.inf)

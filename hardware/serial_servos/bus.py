@@ -420,7 +420,7 @@ class SerialBus(HostClock):
             settings.supply_band(self.family, servo.series, servo.registers or {})
             for servo in self._servos
         )
-        supply = [band for band in bands if band]
+        supply = [limits_v for limits_v in bands if limits_v]
         speeds = [  # by their data sheets, at their supply voltage
             no_load_speed(setup["model"], setup.get("supply_voltage_v")) or SPEED_LIMIT_RAD_S
             for setup in self._setups.values()

@@ -228,15 +228,15 @@ def _supply_faults(
     family: Family, series: Series, registers: Mapping[str, int]
 ) -> list[RegisterFault]:
     raw = registers.get(series.name_of("present_voltage"), 0)
-    band, volts = supply_band(family, series, registers), family.volt_scale * raw
-    if band is None or not raw or band[0] <= volts <= band[1]:
+    limits_v, volts = supply_band(family, series, registers), family.volt_scale * raw
+    if limits_v is None or not raw or limits_v[0] <= volts <= limits_v[1]:
         return []
     cure = (
         "Charge the battery or check the supply"
-        if volts < band[0]
+        if volts < limits_v[0]
         else "Switch the supply off and check it: more destroys the servo"
     )
-    meaning = f"a supply of {volts:.1f} V, outside {band[0]:.1f} to {band[1]:.1f} V"
+    meaning = f"a supply of {volts:.1f} V, outside {limits_v[0]:.1f} to {limits_v[1]:.1f} V"
     return [RegisterFault("present_voltage", raw, meaning, cure)]
 
 

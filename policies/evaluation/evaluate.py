@@ -550,11 +550,11 @@ def usual_robots(episodes: int) -> Callable[[Case, Walker], int]:
     return count
 
 
-def _handicapped(group: Group, name: str, shown: float, **values: Sequence[float]) -> list[Case]:
+def _handicapped(group: Group, name: str, per_unit: float, **values: Sequence[float]) -> list[Case]:
     """Cases of one handicap, named by its values times `shown`."""
     ((handicap, sizes),) = values.items()
     return [
-        Case(group, name.format(shown * size), handicap=replace(Handicap(), **{handicap: size}))
+        Case(group, name.format(per_unit * size), handicap=replace(Handicap(), **{handicap: size}))
         for size in sizes
     ]
 

@@ -478,11 +478,11 @@ def load_policy(folder: Path | str) -> Policy:
 def refuse_other_observation(contract: Contract) -> None:
     """Refuse a policy of another observation, which would act wrongly without an error."""
     expected = [(p.name, p.size) for p in contract.observation]
-    given = [(name, size) for name, size, _ in observation_of(contract.actions)]
-    if expected != given or contract.velocity_steps != VELOCITY_STEPS:
+    channels = [(name, size) for name, size, _ in observation_of(contract.actions)]
+    if expected != channels or contract.velocity_steps != VELOCITY_STEPS:
         raise InputError(
             "The policy's observation is not the one this version gives "
-            f"({', '.join(name for name, _ in given)}; velocity over {VELOCITY_STEPS} steps). "
+            f"({', '.join(name for name, _ in channels)}; velocity over {VELOCITY_STEPS} steps). "
             "Use the version that trained it, or train it again."
         )
 

@@ -322,8 +322,8 @@ def _notes(
     if not robot.free:
         notes.append(f"{robot.name} is fixed to the world in its model: there is no other ground.")
     for name, servos in actuators.items():
-        borrowed = {joint: [f"{source}'s numbers"] for joint, source in servos.fallbacks.items()}
-        notes += [f"{name}: {j} have {sentence}." for j, sentence in share_sentences(borrowed)]
+        sources = {joint: [f"{source}'s numbers"] for joint, source in servos.fallbacks.items()}
+        notes += [f"{name}: {j} have {sentence}." for j, sentence in share_sentences(sources)]
         ground = models[name].ground
         if ground and not ground.upright:
             notes.append(

@@ -223,9 +223,9 @@ class _Reader:
         """Turn all that the trunk carries about its vertical axis, so that x is forward."""
         root, turn = self.root, np.zeros(4)
         mujoco.mju_axisAngle2Quat(turn, np.array([0.0, 0.0, 1.0]), 0.5 * np.pi * quarters)
-        carried = [e for kind in _PARTS for e in getattr(root, kind) if e.frame is None]
+        frameless = [e for kind in _PARTS for e in getattr(root, kind) if e.frame is None]
         frame = root.add_frame(quat=turn)
-        for part in carried:
+        for part in frameless:
             part.set_frame(frame)
         if _states_mass(self.spec, root):
             model = self._compiled()
@@ -566,9 +566,14 @@ class _Reader:
         joints_at = self._inverse(kinematics, chains, height)
         commands = self.settings.commands.model_dump(exclude_none=True)
         for axis, (name, way) in enumerate(_WAYS.items()):
-            asked = np.eye(3)[axis] * _STEP * height
-            feet = kinematics(joints_at((feet_at + asked)[None], np.zeros((1, len(names)))))[0]
-            if name not in commands and (feet - feet_at)[:, axis].mean() < _REACHED * asked.max():
+            displacement = np.eye(3)[axis] * _STEP * height
+            feet = kinematics(joints_at((feet_at + displacement)[None], np.zeros((1, len(names)))))[
+                0
+            ]
+            if (
+                name not in commands
+                and (feet - feet_at)[:, axis].mean() < _REACHED * displacement.max()
+            ):
                 commands[name] = [0.0, 0.0]
                 self.notes.append(
                     f"The legs cannot step {way}: no command asks for it. `forward` names the axis "

@@ -70,9 +70,9 @@ class ServoRanges:
     @property
     def dead_band_share(self) -> NDArray[np.float64]:
         """Friction over stiffness of each joint, relative to their mean; 1 without friction."""
-        band = self.value["friction_loss"] / self.value["stiffness"]
-        mean = band.mean()
-        return band / mean if mean > 0 else np.ones_like(band)
+        dead_zone = self.value["friction_loss"] / self.value["stiffness"]
+        mean = dead_zone.mean()
+        return dead_zone / mean if mean > 0 else np.ones_like(dead_zone)
 
     def later(self, extra_s: ArrayLike) -> ServoRanges:
         """The same servos, every dead time longer by `extra_s` [s], one or twelve; none below 0."""

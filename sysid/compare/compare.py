@@ -154,14 +154,18 @@ class Comparison(Result):
     def reading_notes(self) -> list[str]:
         """How readings were predicted, one sentence per rule, and which offsets were taken out."""
         known = [j for j, runs in self.runs.items() if all(r.offset_known for r in runs)]
-        said = [f"{', '.join(known)}: no offset is taken out, the load is known."] if known else []
+        sentences = (
+            [f"{', '.join(known)}: no offset is taken out, the load is known."] if known else []
+        )
         if len(known) < len(self.data.joints):
-            said.append(OFFSET_RULE)
+            sentences.append(OFFSET_RULE)
         rules = [self.readings, *(m.readings for m in self.models.values() if m.readings)]
         if len(rules) > 1:  # calibrations say when readings were measured
             rules = rules[1:]
         return list(
-            dict.fromkeys([*said, *(text for rule in rules for text in predict.in_words(rule))])
+            dict.fromkeys(
+                [*sentences, *(text for rule in rules for text in predict.in_words(rule))]
+            )
         )
 
     def plot(self, joints: Sequence[str] | None = None) -> Figure:

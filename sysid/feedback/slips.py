@@ -13,11 +13,11 @@ polls count whose position must differ from that of the poll before; without one
 which a joint that follows its command is fast. Friction that holds the joint meanwhile is then
 taken for failed polls, here and there.
 
-Upsets are a few commands that never reached the servo. A line that loses a frame, or a host that
+Lost commands are a few that never reached the servo. A line that loses a frame, or a host that
 stalls, leaves the servo with the command before. Readings behind it then disagree with any model of
-the servo for as long as it takes to catch up. `find_upsets` looks for readings far outside of their
-tone's noise, one after the other, and asks whether 1 to 3 lost commands shortly before explain
-them. A fit leaves out the readings that an upset touches.
+the servo for as long as it takes to catch up. `find_lost_commands` looks for readings far outside
+of their tone's noise, one after the other, and asks whether 1 to 3 lost commands shortly before
+explain them. A fit leaves out the readings that a lost command touches.
 """
 
 from __future__ import annotations
@@ -376,11 +376,11 @@ _MOST_LOST = 3
 _LONGEST_S = 0.3  # from a lost command to the first reading far off
 _LEAST_BULK = 0.3  # of the tone's noise
 _TOUCHED = 0.5  # standard deviations by which lost commands move a reading
-_MOST_UPSETS = 3  # of a trial: more are no upsets but a wrong model
+_MOST_LOST = 3  # of a trial: more are no lost commands but a wrong model
 
 
 @dataclass(frozen=True, kw_only=True)
-class Upset(Result):
+class LostCommands(Result):
     """Commands that never reached the servo."""
 
     trial: int
@@ -402,23 +402,23 @@ def without_commands(trial: Trial, first: int, rows: int) -> NDArray[np.float64]
     return command
 
 
-def find_upsets(
+def find_lost_commands(
     trial: Trial, time_s: NDArray[np.float64], scale_rad: float, simulate: Simulate
-) -> list[Upset]:
+) -> list[LostCommands]:
     """Find commands of a trial that never reached the servo, in time order; most trials have none.
 
     `time_s` is when each fresh reading was measured, on the recording's clock, and `simulate` gives
     residuals at these times. `scale_rad` is the noise of the trial's tone; where the bulk of the
     residuals is smaller, that counts.
     """
-    upsets: list[Upset] = []
+    lost_commands: list[LostCommands] = []
     rest = simulate(trial.command_rad)
-    # an upset is part of the tone's noise, unless that is taken from the bulk
+    # a lost command is part of the tone's noise, unless that is taken from the bulk
     bulk = 1.4826 * float(np.median(np.abs(rest))) if len(rest) else 0.0
     scale_rad = float(np.clip(bulk, _LEAST_BULK * scale_rad, scale_rad))
     rest = rest / scale_rad
     unexplained = np.ones(len(rest), bool)
-    for _ in range(_MOST_UPSETS):
+    for _ in range(_MOST_LOST):
         far = (np.abs(rest) > _FAR) & unexplained
         runs = np.lib.stride_tricks.sliding_window_view(far, _IN_A_ROW).all(axis=1)
         if not runs.any():
@@ -441,13 +441,13 @@ def find_upsets(
             continue
         touched = unexplained & (np.abs(without - rest) > _TOUCHED)
         unexplained &= ~touched
-        upsets.append(
-            Upset(
+        lost_commands.append(
+            LostCommands(
                 trial=trial.number, time_s=float(sent[row] - sent[0]), commands=rows, nats=gain,
                 readings=tuple(int(k) for k in np.flatnonzero(touched)),
             )
         )  # fmt: skip
-    return sorted(upsets, key=lambda u: u.time_s)
+    return sorted(lost_commands, key=lambda u: u.time_s)
 
 
 def _cost(residual: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 PREPARATION, CHOICE = "preparation", "choice"
 STAGES = (PREPARATION, *SIMULATED, CHOICE)
 """Work on one joint in free air: dating its readings, a search, posterior and folds per structure,
-the rest. Under load one stage, the ladder of structures, stands for those in the middle."""
+the rest. Under load one stage, all structures, stands for those in the middle."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -348,7 +348,7 @@ def _block(loaded: LoadedFit, torque: float) -> UnderLoad:
 
 
 def _covering(result: JointCalibrationResult) -> CandidateFit:
-    """The fit that is carried, its intervals widened to the other structure if it may be that."""
+    """The fit that is exported, its intervals widened to the other structure if it may be that."""
     fitted, rival = result.delayed_pd, result.rival
     parameters, undecided = dict(fitted.parameters), dict(fitted.undecided)
     if rival is not None:

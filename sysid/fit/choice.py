@@ -3,12 +3,12 @@
 Every structure is fitted to the readings that count by output error, from seeded global starts and
 from the fits of simpler structures, and scored on what was left out of the fit: a tone, or runs.
 Its numbers are drawn from their posterior. Of the structures that the likelihood does not rule out,
-the simplest whose error on unseen motion is about the smallest is carried; the intervals of its
+the simplest whose error on unseen motion is about the smallest is exported; the intervals of its
 numbers cover all of them (`choose`). A joint in free air is taken for a motor with any load where
 that describes it decidedly better, or a profile of its set-point does (`settled`).
 
 A joint in free air has the candidates of `sysid.fit.structure`; simulators run two of them. Under a
-load or at several gains it is a motor with a ladder of friction terms (`LADDER`).
+load or at several gains it is a motor with these friction terms or those (`FRICTIONS`).
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ from pupper_sysid.sysid.fit.structure import (
 )
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
 
-LADDER = (
+FRICTIONS = (
     (),
     ("stribeck",),
     ("load friction",),
@@ -78,16 +78,16 @@ LADDER = (
     ("load friction", "quadratic", "torque limit"),
 )
 """Friction of a motor under load, simplest first; then `ADDITIONS` to the best of them."""
-SHORT_LADDER = ((), ("load friction",))
+SHORT_FRICTIONS = ((), ("load friction",))
 """For a joint in free air that DelayedPD does not describe."""
 _PROFILE_NATS = 10.0
-"""Log-likelihood by which a limited acceleration is better, from which on all rungs have it."""
+"""Log-likelihood by which a limited acceleration is better, from which all have it."""
 _LEAST_GAIN = 0.05  # of log-likelihood: below it a limit that is a tenth higher is not reached
 _CORRELATED = 4.0
 """Temperature above which residuals are a motion, not noise, however small they are beside it: of
 recordings of the fitted structure (`benchmarks/wide_twins.py`, seed 170) none is above 1.2."""
 _DESCRIBES_BETTER = 0.75
-"""Errors over those of DelayedPD, below which a servo with more terms is carried."""
+"""Errors over those of DelayedPD, below which a servo with more terms is exported."""
 ADDITIONS = ("damping", "acceleration", "slew", "dead zone", "stribeck", "start duty")
 
 _ACCELERATIONS_RAD_S2 = (6.0, 15.0, 40.0, 110.0)
@@ -96,7 +96,7 @@ register counts 0.153 rad/s² from 1 to 254, whose largest is 39."""
 _SHARES_OF_LAG = (0.1, 0.3, 0.5, 0.7)
 _MOST_COMPARED = 3
 _PREFERENCE = 1.02
-"""Error on unseen motion, over the smallest, up to which a simpler structure is carried."""
+"""Error on unseen motion, over the smallest, up to which a simpler structure is exported."""
 _QUIETER = 0.7
 """Noise after a profile over that before it, below which the profile is fitted anew."""
 
@@ -136,14 +136,14 @@ class Fitted:
 
 def stages(ready: PreparedJoint) -> tuple[str, ...]:
     """Fits of a joint that can be made side by side, for `fit_structures`."""
-    return SIMULATED if ready.scales.free_air else ("ladder",)
+    return SIMULATED if ready.scales.free_air else (("under load",))
 
 
 def fit_structures(ready: PreparedJoint, stage: str) -> list[Fitted]:
-    """Fit one of `SIMULATED` in free air, or the ladder of structures under load."""
+    """Fit one of `SIMULATED` in free air, or the structures under load."""
     rng = ready.fit_rng()
     if not ready.scales.free_air:
-        return _ladder(ready, rng)
+        return _under_load(ready, rng)
     structure = candidate(stage, ready.scales)
     tried = {s.features: Fitted(s, fit) for s, fit in ready.first.values() if structure.contains(s)}
     fitted = _fitted(ready, structure, tried, rng, ready.first[stage][1])
@@ -218,10 +218,10 @@ def _without_slight_limits(problem: Problem, best: Fit) -> Fit:
     return best
 
 
-def _ladder(
+def _under_load(
     ready: PreparedJoint,
     rng: np.random.Generator,
-    ladder: Sequence[tuple[str, ...]] = LADDER,
+    frictions: Sequence[tuple[str, ...]] = FRICTIONS,
     most: float = float("inf"),
     profiled: Fitted | None = None,
 ) -> list[Fitted]:
@@ -256,7 +256,7 @@ def _ladder(
         names = [tried["back-EMF", *features].structure.name for features in (stated, limited)]
         if nats[names[0]] - nats[names[1]] > _PROFILE_NATS:
             stated = limited
-    for features in ladder:
+    for features in frictions:
         if servo_structure(("back-EMF", *features, *stated), scales).features not in tried:
             try_out(*features, *stated)
     for addition in ADDITIONS:
@@ -334,14 +334,14 @@ def joined(stages: Mapping[str, Sequence[Fitted]]) -> list[Fitted]:
 
 @dataclass(frozen=True)
 class Choice:
-    """The structure that is carried, and those that the data do not tell from it.
+    """The structure that is exported, and those that the data do not tell from it.
 
     Attributes
     ----------
-    carried : Fitted
+    exported : Fitted
         Fitted to all readings.
     likely : tuple of Fitted
-        With draws, the carried one among them.
+        With draws, the exported one among them.
     nats : dict of str to float
         By how much the log-likelihood of each is below that of the best.
     unseen_rad : dict of str to float
@@ -355,7 +355,7 @@ class Choice:
         One thing more that describes the servo decidedly better.
     """
 
-    carried: Fitted
+    exported: Fitted
     likely: tuple[Fitted, ...]
     nats: dict[str, float]
     unseen_rad: dict[str, float]
@@ -366,7 +366,7 @@ class Choice:
 
 
 def choose(ready: PreparedJoint, fitted: Sequence[Fitted]) -> Choice:
-    """The structure that is carried, among those that were compared.
+    """The structure that is exported, among those that were compared.
 
     `fitted`: all structures, from `fit_structures`.
     """
@@ -377,28 +377,28 @@ def choose(ready: PreparedJoint, fitted: Sequence[Fitted]) -> Choice:
     likely = [f for f in compared if f.structure.name in plausible(nats)]
     if not likely:
         likely = [min(compared, key=lambda f: nats[f.structure.name])]
-    carried = simplest(likely, nats, unseen)
+    exported = simplest(likely, nats, unseen)
     noise = ready.noise_rad
     if not ready.scales.free_air:  # the noise of the first structure was that of a worse one
         for _ in range(2):
-            structure, values = carried.structure, carried.values
+            structure, values = exported.structure, exported.values
             parts = fresh_residuals(structure, values, ready.runs)
             noise = noise_by_run(parts, ready.runs, ready.least_rad)
             problem = replace(ready.problem(structure), noise_rad=noise)
-            carried = replace(carried, fit=refine(problem, carried.fit.point[None]))
-    likely = [carried if f.structure.name == carried.structure.name else f for f in likely]
+            exported = replace(exported, fit=refine(problem, exported.fit.point[None]))
+    likely = [exported if f.structure.name == exported.structure.name else f for f in likely]
     repeats = None
     if not ready.scales.known_load and len({r.p_gain for r in ready.runs}) == 1:
         quantum_rad = ready.lag.quantum_rad
         repeats = compare_repeats(
-            ready.problem(carried.structure), carried.fit, ready.least_rad,
+            ready.problem(exported.structure), exported.fit, ready.least_rad,
             quantum_rad if np.isfinite(quantum_rad) else 0.0,
         )  # fmt: skip
     if repeats is not None:
         likely = [_as_repeats(f, repeats, ready.fit_rng()) for f in likely]
-        carried = next(f for f in likely if f.structure.name == carried.structure.name)
-    lag = ready.lag.with_dead_time(_dead_time(ready, carried, likely), float(carried.values[-1]))
-    return Choice(carried, tuple(likely), nats, unseen, noise, lag, repeats)
+        exported = next(f for f in likely if f.structure.name == exported.structure.name)
+    lag = ready.lag.with_dead_time(_dead_time(ready, exported, likely), float(exported.values[-1]))
+    return Choice(exported, tuple(likely), nats, unseen, noise, lag, repeats)
 
 
 def _as_repeats(fitted: Fitted, repeats: Repeats, rng: np.random.Generator) -> Fitted:
@@ -438,9 +438,9 @@ def _unseen(ready: PreparedJoint, fitted: Fitted) -> float:
     return rms(list(left_out.values()))
 
 
-def _dead_time(ready: PreparedJoint, carried: Fitted, likely: Sequence[Fitted]) -> Interval:
+def _dead_time(ready: PreparedJoint, exported: Fitted, likely: Sequence[Fitted]) -> Interval:
     """Dead time, the interval over all structures that the data allow and the dates' doubt."""
-    value = float(carried.values[0])
+    value = float(exported.values[0])
     ends = [intervals(f, value)["dead_time_s"] for f in likely]
     # readings that were taken later than dated lengthen the dead time, as they do the lag
     doubt = max(t.read_time_doubt_s for t in ready.recorded)
@@ -491,16 +491,16 @@ def settled(
     choice = choose(ready, every)
     if not ready.scales.free_air:
         return ready, every, _explained(ready, choice)
-    goodness, plain = goodness_of(ready, choice.carried), _explained(ready, choice)
-    profiled, gained = with_profile(ready, choice.carried)
+    goodness, plain = goodness_of(ready, choice.exported), _explained(ready, choice)
+    profiled, gained = with_profile(ready, choice.exported)
     stated = bool(np.isfinite(ready.scales.acceleration_rad_s2))
     enough = -_PROFILE_NATS if stated else _PROFILE_NATS  # a register is believed unless refuted
     if gained > enough and not stated:  # it was searched for, so what else there may be is, too
         plain = _explained(ready, choice, anew=True)
     # in cost, because likelihoods are counted at temperatures of their own
-    rival = -np.inf if plain.misfit is None else plain.misfit.nats * plain.misfit.temperature
+    alternative = -np.inf if plain.misfit is None else plain.misfit.nats * plain.misfit.temperature
     most = _DESCRIBES_BETTER * overall(goodness)
-    if gained < enough or choice.carried.fit.cost - profiled.fit.cost < rival:
+    if gained < enough or choice.exported.fit.cost - profiled.fit.cost < alternative:
         plain, profiled = _perhaps_profiled(ready, plain, profiled, gained), None
     elif stated or not undescribed(goodness_of(ready, profiled)):
         most = np.inf
@@ -510,32 +510,34 @@ def settled(
         return ready, every, plain
     any_servo = ready if profiled is None else ready.with_noise_of(profiled.structure, profiled.fit)
     any_servo = any_servo.as_any_servo()
-    ladder = _ladder(any_servo, any_servo.fit_rng(), SHORT_LADDER, most, profiled)
-    if not ladder:
+    loaded = _under_load(any_servo, any_servo.fit_rng(), SHORT_FRICTIONS, most, profiled)
+    if not loaded:
         if profiled is not None:
             plain = _perhaps_profiled(ready, plain, profiled, gained)
         return ready, every, plain
-    wider = choose(any_servo, ladder)
-    if profiled is None and choice.carried.fit.cost - wider.carried.fit.cost < rival:
+    wider = choose(any_servo, loaded)
+    if profiled is None and choice.exported.fit.cost - wider.exported.fit.cost < alternative:
         return ready, every, plain  # that is no term of a servo
     # the noise that `most` is relative to is an upper bound, which a worse fit finds larger
-    smaller = _DESCRIBES_BETTER * _error_rad(ready, choice.carried)
-    if profiled is None and _error_rad(any_servo, wider.carried) > smaller:
+    smaller = _DESCRIBES_BETTER * _error_rad(ready, choice.exported)
+    if profiled is None and _error_rad(any_servo, wider.exported) > smaller:
         return ready, every, plain
-    return any_servo, ladder, _explained(any_servo, wider)
+    return any_servo, loaded, _explained(any_servo, wider)
 
 
 def _explained(ready: PreparedJoint, choice: Choice, anew: bool = False) -> Choice:
     """The choice with what a misfit looks like; `anew` searches for it far from the fit."""
-    carried = choice.carried
-    anew = anew or (ready.scales.free_air and carried.temperature > _CORRELATED)
-    anew = anew or bool(undescribed(goodness_of(ready, carried)))
+    exported = choice.exported
+    anew = anew or (ready.scales.free_air and exported.temperature > _CORRELATED)
+    anew = anew or bool(undescribed(goodness_of(ready, exported)))
     if not (anew or ready.scales.free_air):
         return choice  # a motor under load has enough terms to imitate a filter
     likely = []
     for fitted in choice.likely:
-        if fitted is carried or ready.scales.free_air:
-            likely += _rivals(ready, fitted, carried, choice.nats, anew and fitted is carried)
+        if fitted is exported or ready.scales.free_air:
+            likely += _alternatives(
+                ready, fitted, exported, choice.nats, anew and fitted is exported
+            )
     likely.sort(key=lambda one: -one.nats)
     named = decided(likely)
     if named is not None:
@@ -543,60 +545,61 @@ def _explained(ready: PreparedJoint, choice: Choice, anew: bool = False) -> Choi
         age = ready.lag.feedback.time_doubt_s
         dead, *ends = (max(t - age, 0.0) for t in (named.dead_time_s, *named.delays_s))
         named = replace(named, dead_time_s=dead, delays_s=(ends[0], ends[1]))
-    elif likely and carried.draws is not None and ready.scales.free_air:
+    elif likely and exported.draws is not None and ready.scales.free_air:
         choice = _stacked(ready, choice, likely)
     return replace(choice, misfit=named)
 
 
-def _rivals(
-    ready: PreparedJoint, fitted: Fitted, carried: Fitted, nats: Mapping[str, float], anew: bool
+def _alternatives(
+    ready: PreparedJoint, fitted: Fitted, exported: Fitted, nats: Mapping[str, float], anew: bool
 ) -> list[Explanation]:
-    """What explains the servo beside a likely structure, in the carried one's numbers."""
+    """What explains the servo beside a likely structure, in the exported one's numbers."""
     problem = ready.searched(fitted.structure)
     best = replace(fitted.fit, cost=float(problem.costs(fitted.fit.point[None])[0]))
-    tried = explanations(problem, best, carried.temperature, anew, ready.fit_rng())
-    if fitted is carried:
+    tried = explanations(problem, best, exported.temperature, anew, ready.fit_rng())
+    if fitted is exported:
         return tried
-    below = nats[fitted.structure.name] - nats[carried.structure.name]
+    below = nats[fitted.structure.name] - nats[exported.structure.name]
     shared = [
-        (carried.structure.names.index(name), k)
-        for k, name in enumerate(fitted.structure.names) if name in carried.structure.names
+        (exported.structure.names.index(name), k)
+        for k, name in enumerate(fitted.structure.names) if name in exported.structure.names
     ]  # fmt: skip
-    rivals = []
+    alternatives = []
     for one in tried:
         assert one.point is not None
-        point = carried.fit.point.copy()
+        point = exported.fit.point.copy()
         for place, k in shared:
             point[place] = one.point[k]
         weight = min(one.weight * float(np.exp(-below)), 1.0)
-        rivals.append(replace(one, nats=one.nats - below, weight=weight, point=point))
-    return rivals
+        alternatives.append(replace(one, nats=one.nats - below, weight=weight, point=point))
+    return alternatives
 
 
-def _stacked(ready: PreparedJoint, choice: Choice, rivals: Sequence[Explanation]) -> Choice:
-    """The choice with draws of the carried servo about what its numbers are in each rival, too.
+def _stacked(ready: PreparedJoint, choice: Choice, alternatives: Sequence[Explanation]) -> Choice:
+    """The choice with draws of the exported servo about its numbers in each alternative, too.
 
-    The data do not tell the servo from its rivals: each has draws in proportion to its likelihood.
+    The data do not tell the servo from the alternatives: each has draws in proportion to its
+    likelihood.
     """
-    carried = choice.carried
-    assert carried.draws is not None
-    apart, weights = [np.zeros_like(carried.fit.point)], [1.0]
-    for one in rivals:
+    exported = choice.exported
+    assert exported.draws is not None
+    apart, weights = [np.zeros_like(exported.fit.point)], [1.0]
+    for one in alternatives:
         if one.point is not None:
-            apart.append(one.point - carried.fit.point)
+            apart.append(one.point - exported.fit.point)
             weights.append(one.weight)
     ends = np.cumsum(weights) / np.sum(weights)
-    places = (np.arange(len(carried.draws)) + 0.5) / len(carried.draws)
+    places = (np.arange(len(exported.draws)) + 0.5) / len(exported.draws)
     turn = ready.fit_rng().permutation(np.searchsorted(ends, places))
-    draws = np.clip(carried.draws + np.array(apart)[turn], *carried.structure.box)
-    wider = replace(carried, draws=draws)
-    likely = tuple(wider if f is carried else f for f in choice.likely)
+    draws = np.clip(exported.draws + np.array(apart)[turn], *exported.structure.box)
+    wider = replace(exported, draws=draws)
+    likely = tuple(wider if f is exported else f for f in choice.likely)
     lag = replace(choice.lag, dead_time_s=_dead_time(ready, wider, likely))
-    return replace(choice, carried=wider, likely=likely, lag=lag)
+    return replace(choice, exported=wider, likely=likely, lag=lag)
 
 
-def with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]:
-    """The carried servo with a limit on its set-point's acceleration, and its gain in likelihood.
+def with_profile(ready: PreparedJoint, exported: Fitted) -> tuple[Fitted, float]:
+    """The exported servo with a limit on its set-point's acceleration, and its gain in likelihood.
 
     Damping imitates such a profile within the noise, at a dead time that is wrong by tens of
     milliseconds, so that goodness of fit does not show it. The limit is off in the Mini Pupper's
@@ -605,17 +608,17 @@ def with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]:
     unlimited = [t.servo.set_point_acceleration_rad_s2 == np.inf for t in ready.recorded]
     unnamed = all(t.servo.model is None for t in ready.recorded)
     if all(unlimited) or (unnamed and ready.joint in JOINT_NAMES):
-        return carried, -np.inf
-    features = (*carried.structure.features, *ready.scales.stated_features, "acceleration")
+        return exported, -np.inf
+    features = (*exported.structure.features, *ready.scales.stated_features, "acceleration")
     structure = servo_structure(tuple(dict.fromkeys(features)), ready.scales)
-    tried = {carried.structure.features: carried}
+    tried = {exported.structure.features: exported}
     fitted = _fitted(ready, structure, tried, ready.fit_rng(), short=True)
-    gained = _gained(ready, carried, fitted)
+    gained = _gained(ready, exported, fitted)
     if gained < -TELLING_NATS and unnamed:  # of a servo that may have none
         return fitted, gained
     quieter = ready.with_noise_of(structure, fitted.fit)
     if max(map(operator.truediv, quieter.noise_rad, ready.noise_rad)) < _QUIETER:
-        # the noise was the motion that the carried one cannot make
+        # the noise was the motion that the exported one cannot make
         tried[structure.features] = fitted
         fitted = _fitted(quieter, structure, tried, ready.fit_rng(), short=True)
     problem, rng = quieter.searched(structure), ready.fit_rng()
@@ -625,13 +628,13 @@ def with_profile(ready: PreparedJoint, carried: Fitted) -> tuple[Fitted, float]:
         best = min(best, fit, key=lambda f: f.cost)
     cost = float(ready.searched(structure).costs(best.point[None])[0])
     fitted = replace(fitted, fit=Fit(best.point, cost))
-    return fitted, _gained(ready, carried, fitted)
+    return fitted, _gained(ready, exported, fitted)
 
 
-def _gained(ready: PreparedJoint, carried: Fitted, wider: Fitted) -> float:
-    """Log-likelihood that a wider structure gains over the carried one."""
-    nats = _nats(ready, (carried, wider))
-    return nats[carried.structure.name] - nats[wider.structure.name]
+def _gained(ready: PreparedJoint, exported: Fitted, wider: Fitted) -> float:
+    """Log-likelihood that a wider structure gains over the exported one."""
+    nats = _nats(ready, (exported, wider))
+    return nats[exported.structure.name] - nats[wider.structure.name]
 
 
 def _perhaps_profiled(

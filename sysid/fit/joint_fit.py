@@ -123,7 +123,7 @@ def joint_lag(joint: str, trials: Sequence[Trial], seed: int = 0) -> LagBudget:
     ready = prepare_joint(joint, trials, seed)
     fitted = {stage: fit_structures(ready, stage) for stage in stages(ready)}
     ready, _, choice = settled(ready, joined(fitted))
-    return _lag(ready, choice, goodness_of(ready, choice.carried))
+    return _lag(ready, choice, goodness_of(ready, choice.exported))
 
 
 # ------------------------------------------------------------------------------- results
@@ -174,48 +174,48 @@ def _in_free_air(
         by_name[structure.name] = fitted
         results[structure.name] = _candidate_fit(ready, fitted, folds)
     results = {name: results[name] for name in CANDIDATES}
-    carried = choice.carried.structure
-    goodness = goodness_of(ready, choice.carried)
+    exported = choice.exported.structure
+    goodness = goodness_of(ready, choice.exported)
     lag = choice.lag
-    slight = _slight_limits(ready, choice.carried, goodness)
+    slight = _slight_limits(ready, choice.exported, goodness)
     if "effort_rad_s2" in slight:
-        slight |= _inseparable(results[carried.name].parameters)
-    fit = results[carried.name]
-    results[carried.name] = replace(fit, undecided=slight | fit.undecided)
+        slight |= _inseparable(results[exported.name].parameters)
+    fit = results[exported.name]
+    results[exported.name] = replace(fit, undecided=slight | fit.undecided)
     if why := _doubt(choice, goodness):
         kept = _kept(choice)
         results = {name: _doubted(fit, why, kept) for name, fit in results.items()}
         lag = _lag(ready, choice, goodness)
-        parameters = results[carried.name].parameters
+        parameters = results[exported.name].parameters
         hidden = _hidden_rad(ready, choice, goodness)
         offset = _as_wide_as_misfit(parameters["offset_rad"], goodness, hidden)
-        results[carried.name] = replace(
-            results[carried.name], parameters={**parameters, "offset_rad": offset}
+        results[exported.name] = replace(
+            results[exported.name], parameters={**parameters, "offset_rad": offset}
         )
         if _hardly_known(lag, choice):
-            fit = results[carried.name]
+            fit = results[exported.name]
             undecided = {"dead_time_s": why} | fit.undecided
-            results[carried.name] = replace(fit, undecided=undecided)
-    elif why := _unconverged(choice.carried):
-        fit = _doubted(results[carried.name], why, ("offset_rad",))
-        results[carried.name] = fit
-    # where the carried one errs no more than the noise, differences between models are chance
-    chosen = _best(results, carried.name) if _doubt(choice, goodness) else carried.name
+            results[exported.name] = replace(fit, undecided=undecided)
+    elif why := _unconverged(choice.exported):
+        fit = _doubted(results[exported.name], why, ("offset_rad",))
+        results[exported.name] = fit
+    # where the exported one errs no more than the noise, differences between models are chance
+    chosen = _best(results, exported.name) if _doubt(choice, goodness) else exported.name
     jitter = command_jitter(
-        carried, choice.carried.values, ready.recorded, runs, ready.noise_rad,
+        exported, choice.exported.values, ready.recorded, runs, ready.noise_rad,
         _date_sd_s(ready.lag.feedback), ready.fit_rng(),
     )  # fmt: skip
     return JointCalibrationResult(
         joint=ready.joint,
         model=chosen,
-        simulated_model=carried.name,
+        simulated_model=exported.name,
         structure_nats=choice.nats,
         command_jitter_s=jitter,
         candidate_models=results,
         lag=lag,
         goodness=goodness,
-        r_hat=choice.carried.r_hat,
-        effective_draws=choice.carried.effective,
+        r_hat=choice.exported.r_hat,
+        effective_draws=choice.exported.effective,
         between_recordings=by_number(choice.repeats),
         differences=_differences(ready.joint, choice),
         presets={
@@ -232,13 +232,13 @@ def _in_free_air(
 
 
 def _slight_limits(
-    ready: PreparedJoint, carried: Fitted, goodness: Mapping[str, float]
+    ready: PreparedJoint, exported: Fitted, goodness: Mapping[str, float]
 ) -> dict[str, str]:
     """Why limits are not known that explain less than a number must, or the model leaves over.
 
     A torque that is cut for an instant looks like a link that bends, or play.
     """
-    problem, structure, best = ready.problem(carried.structure), carried.structure, carried.fit
+    problem, structure, best = ready.problem(exported.structure), exported.structure, exported.fit
     unexplained = 0.5 * problem.samples * (1.0 - max(overall(goodness), 1.0) ** -2)
     slight = {}
     for name in (name for name in LIMITS if name in structure.names):
@@ -278,7 +278,7 @@ def _lag(ready: PreparedJoint, choice: Choice, goodness: Mapping[str, float]) ->
     dead, lag_s = choice.lag.dead_time_s, choice.lag.lag_s
     if dead is None:
         return choice.lag
-    tracks = free_run(choice.carried.structure, choice.carried.values, ready.runs)
+    tracks = free_run(choice.exported.structure, choice.exported.values, ready.runs)
     speed = rms([np.gradient(t) / r.step_s for t, r in zip(tracks, ready.runs, strict=True)])
     hidden = _hidden_rad(ready, choice, goodness) / max(speed, 1e-9)
     wide = _as_wide_as_misfit(dead, goodness, hidden)
@@ -295,7 +295,7 @@ def _hidden_rad(ready: PreparedJoint, choice: Choice, goodness: Mapping[str, flo
     """RMS error that is not noise [rad]: a motion in a wrong shape can hide as much."""
     if not undescribed(goodness):
         return 0.0
-    error = rms(fresh_residuals(choice.carried.structure, choice.carried.values, ready.runs))
+    error = rms(fresh_residuals(choice.exported.structure, choice.exported.values, ready.runs))
     return float(error * np.sqrt(1.0 - overall(goodness) ** -2))
 
 
@@ -315,10 +315,10 @@ def _with_other(wide: Interval, interval: Interval, other: float) -> Interval:
     return Interval(wide.value, min(wide.low, other - below), max(wide.high, other + above))
 
 
-def _unconverged(carried: Fitted) -> str | None:
+def _unconverged(exported: Fitted) -> str | None:
     """Why intervals mean little though the model describes the servo; None if they can be used."""
     most, least = HARDLY_CONVERGED
-    if carried.r_hat <= most and carried.effective >= least:
+    if exported.r_hat <= most and exported.effective >= least:
         return None
     return "its draws have not converged"
 
@@ -334,9 +334,9 @@ def _hardly_known(lag: LagBudget, choice: Choice) -> bool:
     return wide or choice.lag.dead_time_s.low <= 0
 
 
-def _foreign(joint: str, carried: Fitted) -> Iterator[str]:
+def _foreign(joint: str, exported: Fitted) -> Iterator[str]:
     """Numbers that are far from those of the unit which was taken as the prior."""
-    for p, value in zip(carried.structure.parameters, carried.values, strict=True):
+    for p, value in zip(exported.structure.parameters, exported.values, strict=True):
         apart = float(p.encode(value) - p.encode(p.nominal))
         if p.prior_source and abs(apart) > _FOREIGN * p.marginal_sd:
             yield (
@@ -356,13 +356,13 @@ def _fit_warnings(joint: str, goodness: Mapping[str, float], choice: Choice) -> 
         yield f"{joint}: too few readings to say how well the model describes this servo."
     if choice.misfit is not None:
         yield choice.misfit.sentence(joint)
-    carried = choice.carried
-    yield from _foreign(joint, carried)
+    exported = choice.exported
+    yield from _foreign(joint, exported)
     yield from _differences(joint, choice)
-    if not (carried.r_hat <= R_HAT and carried.effective >= EFFECTIVE):
+    if not (exported.r_hat <= R_HAT and exported.effective >= EFFECTIVE):
         yield (
-            f"{joint}: the draws have not converged (R̂ {carried.r_hat:.2f}, "
-            f"{carried.effective:.0f} effective); intervals may be too narrow."
+            f"{joint}: the draws have not converged (R̂ {exported.r_hat:.2f}, "
+            f"{exported.effective:.0f} effective); intervals may be too narrow."
         )
 
 
@@ -542,21 +542,21 @@ def _undated(lattice: PollLattice) -> str | None:
     return "it is not known whether readings are live"
 
 
-def _best(results: Mapping[str, CandidateFit], carried: str) -> str:
-    """The model with the smallest error on unseen motion; the one carried where it is as good."""
+def _best(results: Mapping[str, CandidateFit], exported: str) -> str:
+    """The model with the smallest error on unseen motion; the one exported where it is as good."""
     errors = {n: f.scores.rmse_unseen_rad for n, f in results.items()}
     errors = {n: e for n, e in errors.items() if np.isfinite(e)}
-    if carried not in errors:
-        return carried  # one frequency: nothing to choose by
+    if exported not in errors:
+        return exported  # one frequency: nothing to choose by
     best = min(errors, key=lambda name: errors[name])
-    return carried if errors[carried] <= _REPORTED_PREFERENCE * errors[best] else best
+    return exported if errors[exported] <= _REPORTED_PREFERENCE * errors[best] else best
 
 
 def _free_warnings(
     ready: PreparedJoint, results: Mapping[str, CandidateFit], chosen: str, choice: Choice
 ) -> Iterator[str]:
-    joint, carried = ready.joint, choice.carried.structure.name
-    pd = results[carried]
+    joint, exported = ready.joint, choice.exported.structure.name
+    pd = results[exported]
     if why := pd.undecided.get("dead_time_s"):
         yield f"{joint}: the dead time is not identified: {why}."
     limits = {"velocity_limit_rad_s", "no_load_speed_rad_s"} & pd.undecided.keys()
@@ -574,7 +574,7 @@ def _free_warnings(
     gains = ("effort_rad_s2", "friction_rad_s2", "stiffness_per_s2", "damping_per_s")
     yield from unidentified(joint, {n: pd.undecided[n] for n in gains if n in pd.undecided})
     unseen_rad = pd.scores.rmse_unseen_rad
-    if chosen != carried:
+    if chosen != exported:
         best = results[chosen].scores.rmse_unseen_rad
         yield (
             f"{joint}: {chosen} predicts unseen motion better ({1e3 * best:.1f} against "
@@ -602,11 +602,11 @@ def _under_load(
     ready: PreparedJoint, every: Sequence[Fitted], choice: Choice
 ) -> JointCalibrationResult:
     loaded = _loaded_fit(ready, every, choice)
-    structure, values = choice.carried.structure, choice.carried.values
+    structure, values = choice.exported.structure, choice.exported.values
     folds = folds_of(ready.runs)
-    left_out = held_out_residuals(structure, choice.carried.folds or [], folds, ready.runs)
+    left_out = held_out_residuals(structure, choice.exported.folds or [], folds, ready.runs)
     scores = score(free_run(structure, values, ready.runs), ready.runs, left_out)
-    goodness, lag = goodness_of(ready, choice.carried), choice.lag
+    goodness, lag = goodness_of(ready, choice.exported), choice.lag
     if why := _doubt(choice, goodness):
         kept = _kept(choice)
         doubted = {n: why for n in loaded.numbers if n not in kept}
@@ -619,7 +619,7 @@ def _under_load(
             loaded, undecided=doubted | loaded.undecided,
             numbers=loaded.numbers | {"dead_time_s": lag.dead_time_s, "offset_rad": offset},
         )  # fmt: skip
-    elif why := _unconverged(choice.carried):
+    elif why := _unconverged(choice.exported):
         doubted = {n: why for n in loaded.numbers if n != "offset_rad"}
         loaded = replace(loaded, undecided=doubted | loaded.undecided)
     pd = loaded.servo.delayed_pd(loaded.p_gain, 0.0, loaded.motor_torque_nm).arrays()
@@ -652,8 +652,8 @@ def _under_load(
         )},
         lag=lag,
         goodness=goodness,
-        r_hat=choice.carried.r_hat,
-        effective_draws=choice.carried.effective,
+        r_hat=choice.exported.r_hat,
+        effective_draws=choice.exported.effective,
         between_recordings=by_number(choice.repeats),
         differences=_differences(ready.joint, choice),
         presets={},
@@ -675,9 +675,9 @@ def _sag_rad(structure: Structure, values: NDArray[np.float64], runs: Sequence[R
 
 
 def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: Choice) -> LoadedFit:
-    carried, runs = choice.carried, ready.runs
-    structure, scales = carried.structure, ready.scales
-    numbers = {name: x[0] for name, x in numbers_of(structure, carried.values[None]).items()}
+    exported, runs = choice.exported, ready.runs
+    structure, scales = exported.structure, ready.scales
+    numbers = {name: x[0] for name, x in numbers_of(structure, exported.values[None]).items()}
     ends: dict[str, list[Interval]] = {name: [] for name in numbers}
     spread: dict[str, NDArray] = {}
     for f in choice.likely:
@@ -695,14 +695,14 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: Choice) -
     assert choice.lag.dead_time_s is not None
     numbers["dead_time_s"] = choice.lag.dead_time_s
     if "gravity_sin" in structure.names:
-        offset, sag = numbers["offset_rad"], _sag_rad(structure, carried.values, runs)
+        offset, sag = numbers["offset_rad"], _sag_rad(structure, exported.values, runs)
         numbers["offset_rad"] = _with_other(offset, offset, offset.value + sag)
     speed, undecided = max(_command_speed(r) for r in runs), {}
     named = {_shown(p.name): p for p in structure.parameters}
     for name, interval in numbers.items():
         p = named.get(name)
         if p is not None:
-            fitted = float(carried.values[structure.names.index(p.name)])
+            fitted = float(exported.values[structure.names.index(p.name)])
             scale = interval.value / fitted if fitted else 1.0
             scaled = Interval(fitted, *(x / scale for x in (interval.low, interval.high)))
             why = _why_unidentified(p, fitted, float(np.std(spread[p.name])), scaled, speed)
@@ -715,7 +715,7 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: Choice) -
         if why:
             undecided[name] = why
     if not scales.known_load:
-        slight = _slight_limits(ready, carried, goodness_of(ready, carried))
+        slight = _slight_limits(ready, exported, goodness_of(ready, exported))
         undecided = {_shown(name): why for name, why in slight.items()} | undecided
     if why := undecided.get("no_load_speed_rad_s"):
         undecided["back_emf"] = why  # a speed on its bound stands for none
@@ -728,7 +728,7 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: Choice) -
     if "dead_time_s" in undecided and (why := _undated(ready.lag.feedback)):
         undecided["dead_time_s"] = why  # it is what makes the interval wide
     labels = [r.label for r in runs]
-    per_run = [float(np.mean(np.abs(r))) for r in fresh_residuals(structure, carried.values, runs)]
+    per_run = [float(np.mean(np.abs(r))) for r in fresh_residuals(structure, exported.values, runs)]
     return LoadedFit(
         joint=ready.joint,
         structure=structure.name,
@@ -745,10 +745,10 @@ def _loaded_fit(ready: PreparedJoint, every: Sequence[Fitted], choice: Choice) -
             label: float(np.mean([e for e, x in zip(per_run, labels, strict=True) if x == label]))
             for label in dict.fromkeys(labels)
         },
-        motor_torque_nm=typical_torque(structure, carried.values, runs),
-        temperature=carried.temperature,
+        motor_torque_nm=typical_torque(structure, exported.values, runs),
+        temperature=exported.temperature,
         lattice=ready.lag.feedback,
-        servo=structure.servo(carried.values),
+        servo=structure.servo(exported.values),
         runs=runs,
     )
 

@@ -1,9 +1,9 @@
 """What a servo that the model does not describe looks like: explanations, tried one by one.
 
-Each explanation is the carried fit with one thing more, fitted from there: a low-pass filter in
+Each explanation is the exported fit with one thing more, fitted from there: a low-pass filter in
 front of the servo, play, a dead zone or an integral term of the controller, more friction at rest,
 or gravity. The best is named where the likelihood is decidedly better with it. Simulators do not
-run these, so the numbers stay those of the carried fit; but a number that another explanation moves
+run these, so the numbers stay those of the exported fit; but a number that another moves
 is not known better than the two are apart.
 """
 
@@ -104,7 +104,7 @@ class Explanation:
     weight : float
         Its posterior density over that of the fit alone, 1 at most.
     point : ndarray, shape (parameters,), optional
-        The carried structure's numbers in the fit with it, in fitted coordinates.
+        The exported structure's numbers in the fit with it, in fitted coordinates.
     fitted : (Problem, Fit), optional
         With it.
     temperature : float
@@ -142,8 +142,9 @@ def explanations(
 ) -> list[Explanation]:
     """What describes the servo about as well as the fit alone, or better, best first.
 
-    `best`: of the carried structure. `temperature`: how many readings count as one. `anew`: whether
-    a filter is searched for far from the fit, too, as it is where errors are larger than noise.
+    `best`: of the exported structure. `temperature`: how many readings count as one. `anew`:
+    whether a filter is searched for far from the fit, too, as it is where errors are larger than
+    noise.
     """
     tried = _low_pass(problem, best, temperature, anew, rng)
     for feature in _FEATURES:
@@ -156,7 +157,7 @@ def explanations(
 
 @dataclass(frozen=True)
 class _Tried:
-    """A fit with one thing more, the numbers that it adds, and the carried structure's in it."""
+    """A fit with one thing more, the numbers that it adds, and the exported structure's in it."""
 
     words: str
     problem: Problem
@@ -170,7 +171,7 @@ class _Tried:
 def _explanation(
     tried: _Tried, problem: Problem, best: Fit, temperature: float
 ) -> Explanation | None:
-    """What was tried beside the carried fit; None if it is less likely than counts."""
+    """What was tried beside the exported fit; None if it is less likely than counts."""
     fit, behind = tried.fit, tried.problem
     better = _tempered(problem, best, temperature) - _tempered(behind, fit, temperature)
     counted = better
@@ -326,16 +327,16 @@ def _with_feature(
     wider = servo_structure((*structure.features, name), structure.scales)
     if feature.of and feature.of not in wider.names:
         return []
-    carried = wider.decode(wider.adopt(structure, best.point))
-    values = np.repeat(carried[None], 3, axis=0)
+    exported = wider.decode(wider.adopt(structure, best.point))
+    values = np.repeat(exported[None], 3, axis=0)
     for number, starts in feature.starts.items():
         full_value = 1.0
         if feature.of and not number.endswith("_rad_s"):
-            full_value = carried[wider.names.index(feature.of)]
+            full_value = exported[wider.names.index(feature.of)]
         values[:, wider.names.index(number)] = full_value * np.array(starts)
     place = wider.names.index(next(iter(feature.starts)))
     if name in _TRADED and {"friction_rad_s2", "stiffness_per_s2"} <= {*wider.names}:
-        # what friction holds back at the carried stiffness may be this in its place
+        # what friction holds back at the exported stiffness may be this in its place
         traded = values.copy()
         friction = traded[:, wider.names.index("friction_rad_s2")]
         traded[:, place] = _SHARES * friction / traded[:, wider.names.index("stiffness_per_s2")]

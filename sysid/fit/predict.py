@@ -347,9 +347,9 @@ def notes(
             block = calibration.joint(joint).under_load
             if block is not None:
                 sentences += [
-                    f"{name}, {joint}: {said}"
+                    f"{name}, {joint}: {tested}"
                     for g in gains
-                    if "was recorded" not in (said := block.how_far_tested(g))
+                    if "was recorded" not in (tested := block.how_far_tested(g))
                 ]
             elif len(gains) > 1:
                 sentences.append(

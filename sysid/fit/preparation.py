@@ -28,7 +28,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     readings,
     redate,
 )
-from pupper_sysid.sysid.feedback.slips import Motion, Upset, find_upsets
+from pupper_sysid.sysid.feedback.slips import LostCommands, Motion, find_lost_commands
 from pupper_sysid.sysid.fit.claimed_load import check_claimed_load
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, LEAST_NOISE_RAD, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.loads import loaded_joints
@@ -89,7 +89,7 @@ class PreparedJoint:
         Least noise that a run may have [rad].
     first : dict of str to (Structure, Fit)
         First fits, by the structure's name.
-    upsets : tuple of Upset
+    lost_commands : tuple of LostCommands
         Commands that never arrived; the readings that they touch are not in `runs`.
     load_notes : tuple of str
         What the recordings say against the claimed load, in sentences.
@@ -105,7 +105,7 @@ class PreparedJoint:
     noise_rad: tuple[float, ...]
     least_rad: float
     first: dict[str, tuple[Structure, Fit]]
-    upsets: tuple[Upset, ...]
+    lost_commands: tuple[LostCommands, ...]
     load_notes: tuple[str, ...] = ()
 
     def fit_rng(self) -> np.random.Generator:
@@ -136,7 +136,7 @@ class PreparedJoint:
         step_s = _step_for(problem, fit, *dated)
         runs = self.runs
         if step_s < runs[0].step_s:
-            _, runs = _dated(*dated, True, step_s, self.upsets)
+            _, runs = _dated(*dated, True, step_s, self.lost_commands)
         return replace(self, runs=runs, noise_rad=smaller)
 
     def problem(self, structure: Structure) -> Problem:
@@ -162,11 +162,11 @@ class PreparedJoint:
                 f"{1e3 * slip.jump_s:.0f} ms at {slip.time_s:.2f} s "
                 f"(Δ log-likelihood {slip.nats:.0f}); readings behind it are dated anew."
             )
-        for upset in self.upsets:
-            lost = "1 command" if upset.commands == 1 else f"{upset.commands} commands"
+        for lost in self.lost_commands:
+            count = "1 command" if lost.commands == 1 else f"{lost.commands} commands"
             yield (
-                f"{self.joint}: {tone[upset.trial]}, {upset.time_s:.2f} s, {lost} never reached "
-                f"the servo (Δ log-likelihood {upset.nats:.0f}); the {len(upset.readings)} "
+                f"{self.joint}: {tone[lost.trial]}, {lost.time_s:.2f} s, {count} never reached "
+                f"the servo (Δ log-likelihood {lost.nats:.0f}); the {len(lost.readings)} "
                 "readings that this touches are left out."
             )
 
@@ -207,7 +207,7 @@ def prepare_joint(
     else:
         models = {name: candidate(name, scales) for name in known}
         first = {n: (models[n], Fit(models[n].encode(v), 0.0)) for n, v in known.items()}
-    upsets: tuple[Upset, ...] = ()
+    lost_commands: tuple[LostCommands, ...] = ()
     step_s = TIME_STEP_S
     for turn in range(_ROUNDS):
         structure, best = min(first.values(), key=lambda pair: pair[1].cost)
@@ -223,10 +223,12 @@ def prepare_joint(
             lattice = dated
             recorded, runs = _dated(trials, lattice, volts, free_air, step_s)
         noise = noise_by_run(fresh_residuals(structure, values, runs), runs, least)
-        if not upsets and free_air:  # under load, friction that the model lacks looks the same
-            upsets = _upsets(recorded, lattice, noise, structure, values, step_s)
-        if upsets:
-            recorded, runs = _dated(trials, lattice, volts, free_air, step_s, upsets)
+        if (
+            not lost_commands and free_air
+        ):  # under load, friction that the model lacks looks the same
+            lost_commands = _lost_commands(recorded, lattice, noise, structure, values, step_s)
+        if lost_commands:
+            recorded, runs = _dated(trials, lattice, volts, free_air, step_s, lost_commands)
             noise = noise_by_run(fresh_residuals(structure, values, runs), runs, least)
         if known is None:
             first = {
@@ -242,7 +244,8 @@ def prepare_joint(
             joint, recorded, structure, runs, noise, best, least, deepcopy(rng)
         )
     return PreparedJoint(
-        joint, rng, lag, scales, volts, recorded, runs, noise, least, first, upsets, load_notes
+        joint, rng, lag, scales, volts, recorded, runs, noise, least, first, lost_commands,
+        load_notes,
     )  # fmt: skip
 
 
@@ -332,17 +335,17 @@ def _lag(
     return replace(budget, warnings=warnings)
 
 
-def _upsets(
+def _lost_commands(
     recorded: Sequence[Trial],
     lattice: PollLattice,
     noise: Sequence[float],
     structure: Structure,
     values: NDArray[np.float64],
     step_s: float,
-) -> tuple[Upset, ...]:
+) -> tuple[LostCommands, ...]:
     """Commands that never arrived, in all trials; none by a model that errs elsewhere, too."""
 
-    def of_trial(trial: Trial, scale: float) -> list[Upset]:
+    def of_trial(trial: Trial, scale: float) -> list[LostCommands]:
         read = _readings(trial, lattice)
         time = read.time_s[read.time_s >= trial.send_time_s[0]]
 
@@ -350,15 +353,15 @@ def _upsets(
             run = prepare(replace(trial, command_rad=command), read, step_s=step_s).in_free_air()
             return fresh_residuals(structure, values, [run])[0]
 
-        return find_upsets(trial, time, scale, simulate)
+        return find_lost_commands(trial, time, scale, simulate)
 
     of_trials = [of_trial(t, s) for t, s in zip(recorded, noise, strict=True)]
-    upsets = tuple(upset for of_one in of_trials for upset in of_one)
-    if upsets:
-        _, others = _dated(recorded, lattice, float("nan"), True, step_s, upsets)
+    lost_commands = tuple(lost for of_one in of_trials for lost in of_one)
+    if lost_commands:
+        _, others = _dated(recorded, lattice, float("nan"), True, step_s, lost_commands)
         if overall(goodness_of_fit(structure, values, others, quantum(recorded))) > DESCRIBED:
             return ()
-    return upsets
+    return lost_commands
 
 
 def _readings(trial: Trial, lattice: PollLattice) -> Readings:
@@ -376,11 +379,12 @@ def _readings(trial: Trial, lattice: PollLattice) -> Readings:
 
 def _dated(
     trials: Sequence[Trial], lattice: PollLattice, volts: float, free_air: bool,
-    step_s: float = TIME_STEP_S, upsets: Sequence[Upset] = (),
+    step_s: float = TIME_STEP_S, lost_commands: Sequence[LostCommands] = (),
 ) -> tuple[tuple[Trial, ...], tuple[Run, ...]]:  # fmt: skip
     """The trials that have readings that count, as recorded and on the physics clock."""
     touched = {
-        t.number: [k for u in upsets if u.trial == t.number for k in u.readings] for t in trials
+        t.number: [k for u in lost_commands if u.trial == t.number for k in u.readings]
+        for t in trials
     }
     least = 1 if free_air else _LEAST_READINGS + 1
     runs = [prepare(t, _readings(t, lattice), volts, step_s) for t in trials]

@@ -442,13 +442,13 @@ def _evidence(a, b, sizes):
         side[n - 2] = a[n - 2, n - 1]
     fitted, logarithm = np.zeros(len(sizes)), np.zeros(len(sizes))
     for s in range(len(sizes)):
-        pivot, carried = 1.0, 0.0
+        pivot, whitened = 1.0, 0.0
         for k in range(n):
             across = sizes[s] * side[k - 1] if k > 0 else 0.0
             share = across / pivot if k > 0 else 0.0
             pivot = max(1.0 + sizes[s] * diagonal[k] - share * across, 1e-12)
-            carried = b[k] - share * carried
-            fitted[s] += sizes[s] * carried * carried / pivot
+            whitened = b[k] - share * whitened
+            fitted[s] += sizes[s] * whitened * whitened / pivot
             logarithm[s] += np.log(pivot)
     return fitted, logarithm
 

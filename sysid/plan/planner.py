@@ -319,8 +319,8 @@ class _World:
     def covariance(self, which: int, chosen: Sequence[int]) -> NDArray[np.float64]:
         """Expected covariance of a hypothesis' fitted coordinates after `chosen`."""
         hypothesis = self.servo.hypotheses[which]
-        said = pooled((self.tones[k], self.information[which][k]) for k in chosen)
-        known = hypothesis.known + said / self.servo.inflation
+        gained = pooled((self.tones[k], self.information[which][k]) for k in chosen)
+        known = hypothesis.known + gained / self.servo.inflation
         return np.asarray(np.linalg.inv(known), float)
 
     def nats(self, which: int, chosen: Sequence[int]) -> float:
@@ -575,7 +575,7 @@ def fitted_noise(
     square, speed = [], []
     for trial, track in zip(trials, free_run(model, values, trials), strict=True):
         off = at_steps(track, trial.sample_step) - trial.sample_rad
-        bound = 4 * 1.4826 * np.median(np.abs(off)) + 1e-12  # an upset is not the noise
+        bound = 4 * 1.4826 * np.median(np.abs(off)) + 1e-12  # a lost command is not the noise
         square.append(np.mean(np.clip(off, -bound, bound) ** 2))
         speed.append(np.mean(np.gradient(track) ** 2) / trial.step_s**2)
     rows = np.column_stack([np.ones(len(square)), speed]) / np.maximum(square, 1e-12)[:, None]

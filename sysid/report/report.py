@@ -198,18 +198,18 @@ def _joint(
         c.model: np.array([c.parameters[parameter] for parameter in structure(c.model).names])
         for c in known.selection.candidate_models
     }
-    carried, a = _carried(known), known.actuator
-    ready = prepare_joint(name, trials, seed, True, {carried: values[carried]})
+    exported, a = _carried(known), known.actuator
+    ready = prepare_joint(name, trials, seed, True, {exported: values[exported]})
     fits = {
-        c.model: _fit(c, values[c.model], ready, known if c.model == carried else None)
+        c.model: _fit(c, values[c.model], ready, known if c.model == exported else None)
         for c in known.selection.candidate_models
     }
     presets = {n: joints[name] for n, joints in preset_parameters().items() if name in joints}
     return JointCalibrationResult(
         joint=name,
         model=known.selection.model,
-        simulated_model=carried,
-        structure_nats={carried: 0.0},
+        simulated_model=exported,
+        structure_nats={exported: 0.0},
         command_jitter_s=a.command_jitter_s.interval,
         candidate_models=fits,
         lag=_lag(ready.lag, known),
@@ -253,17 +253,17 @@ def _fit(
     candidate: CandidateModel,
     values: np.ndarray,
     ready: PreparedJoint,
-    carried: JointCalibration | None,
+    exported: JointCalibration | None,
 ) -> CandidateFit:
-    """One candidate model; `carried` is the joint if simulators run this one."""
+    """One candidate model; `exported` is the joint if simulators run this one."""
     model, quantities = structure(candidate.model), dict[str, Quantity]()
-    if carried is not None:
-        a, ratios = carried.actuator, carried.actuator.ratios_to_armature
+    if exported is not None:
+        a, ratios = exported.actuator, exported.actuator.ratios_to_armature
         quantities = {
             "dead_time_s": a.dead_time_s, "stiffness_per_s2": ratios.stiffness,
             "damping_per_s": ratios.damping, "friction_rad_s2": ratios.friction_loss,
             "effort_rad_s2": ratios.effort_limit, "velocity_limit_rad_s": a.velocity_limit_rad_s,
-            "back_emf_per_s": ratios.back_emf, "offset_rad": carried.feedback.offset_rad,
+            "back_emf_per_s": ratios.back_emf, "offset_rad": exported.feedback.offset_rad,
         }  # fmt: skip
     parameters = {
         name: quantities[name].model_copy(update={"value": value}).interval

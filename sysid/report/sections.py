@@ -189,8 +189,8 @@ def _joints(report: Findings, runs: Mapping[str, list[Track]], parameters: Table
     for joint, result in report.results.items():
         drawn = _of_joint(result, runs[joint]) if joint in runs and len(runs) > 1 else []
         parts = [t.where("joint", joint) for t in (parameters, models, by_frequency, forms)]
-        shown = [t for t in parts if t.rows]
-        folds.append(Fold(joint, drawn, shown, opened=len(report.results) == 1))
+        with_rows = [t for t in parts if t.rows]
+        folds.append(Fold(joint, drawn, with_rows, opened=len(report.results) == 1))
     return Section(
         "joints", "Joint by joint", folds=folds, files=[models, by_frequency, forms, parameters]
     )

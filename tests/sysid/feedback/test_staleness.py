@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from pupper_sysid.sysid.doctor.examination import examine
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice, readings
-from pupper_sysid.sysid.feedback.slips import find_upsets, without_commands
+from pupper_sysid.sysid.feedback.slips import find_lost_commands, without_commands
 from pupper_sysid.sysid.feedback.staleness import episodes, quantum, staleness
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
@@ -138,8 +138,8 @@ def test_a_real_arm_on_a_direct_bus_is_never_stale():
 # ----- lost commands are found from the readings behind them; slips of the model are not
 
 LOOP, NOISE = 0.02, 0.005
-TIME_UPSETS = LOOP * np.arange(150)
-COMMAND = 0.3 * np.sin(2 * np.pi * 4 * TIME_UPSETS)
+TIME_S = LOOP * np.arange(150)
+COMMAND = 0.3 * np.sin(2 * np.pi * 4 * TIME_S)
 
 
 def servo(command):
@@ -148,22 +148,20 @@ def servo(command):
     return lfilter([0.5], [1, -0.5], late)
 
 
-def trial_of_upsets(command=COMMAND):
-    return Trial(
-        "LF_hip", 3, 4.0, TIME_UPSETS + 7, TIME_UPSETS + 7, command, np.zeros(150), None, 0.0
-    )
+def trial_of_lost_commands(command=COMMAND):
+    return Trial("LF_hip", 3, 4.0, TIME_S + 7, TIME_S + 7, command, np.zeros(150), None, 0.0)
 
 
 def search(position, scale=NOISE):
-    """Upsets of readings of every row."""
-    return find_upsets(
-        trial_of_upsets(), TIME_UPSETS + 7, scale, lambda command: servo(command) - position
+    """Lost commands, where every row has a fresh reading."""
+    return find_lost_commands(
+        trial_of_lost_commands(), TIME_S + 7, scale, lambda command: servo(command) - position
     )
 
 
 def test_lost_commands_are_found_with_their_time_and_number():
     for row, rows in ((62, 1), (75, 2), (87, 3)):
-        lost = servo(without_commands(trial_of_upsets(), row, rows))
+        lost = servo(without_commands(trial_of_lost_commands(), row, rows))
         noise = NOISE * np.random.default_rng(row).standard_normal(150)
         (found,) = search(lost + noise)
         assert (found.trial, found.commands) == (3, rows)
@@ -173,16 +171,16 @@ def test_lost_commands_are_found_with_their_time_and_number():
         assert found.readings == tuple(moved)
 
 
-def test_two_upsets_of_a_trial_are_told_apart():
-    command = without_commands(trial_of_upsets(), 50, 2)
-    command = without_commands(trial_of_upsets(command), 100, 2)
+def test_two_losses_of_a_trial_are_told_apart():
+    command = without_commands(trial_of_lost_commands(), 50, 2)
+    command = without_commands(trial_of_lost_commands(command), 100, 2)
     found = search(servo(command))
     assert [(u.time_s, u.commands) for u in found] == [
         (pytest.approx(1.0), 2), (pytest.approx(2.0), 2)
     ]  # fmt: skip
 
 
-def test_noise_knocks_and_wild_readings_are_no_upsets():
+def test_noise_knocks_and_wild_readings_are_no_lost_commands():
     for seed in range(5):
         noise = NOISE * np.random.default_rng(seed).standard_t(4, 150)
         assert search(servo(COMMAND) + noise) == [], seed

@@ -124,8 +124,8 @@ def test_a_profile_competes_in_free_air_before_a_misfit_asks_for_it(limit):
     trials = usable_trials([recording(JUMPS, limit, 5)])["j"]
     ready = prepare_joint("j", trials, 0, free_air=True)
     stages = {stage: choice.fit_structures(ready, stage) for stage in choice.stages(ready)}
-    carried = choice.choose(ready, choice.joined(stages)).carried
-    profiled, gained = choice.with_profile(ready, carried)
+    exported = choice.choose(ready, choice.joined(stages)).exported
+    profiled, gained = choice.with_profile(ready, exported)
     assert (gained > choice._PROFILE_NATS) == np.isfinite(limit)
     if np.isfinite(limit):
         place = profiled.structure.names.index("acceleration_limit")

@@ -283,4 +283,4 @@ def test_a_slow_recording_with_another_unit_as_the_prior_tells_the_effort_limit(
 def test_a_model_that_errs_everywhere_leaves_no_readings_out():
     trials = usable_trials([load(case("real/c02_mx106_four_sines_no_freq_column.csv"))])
     ((joint, of_joint),) = trials.items()
-    assert prepare_joint(joint, of_joint, 0).upsets == ()
+    assert prepare_joint(joint, of_joint, 0).lost_commands == ()
