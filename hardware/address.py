@@ -34,7 +34,8 @@ class BusKind:
     module: str
     """Module of its class, below the package."""
     class_name: str
-    """Of a `ServoBus` with `open_address`, `scan_address` and `limp_address`."""
+    """Of a `ServoBus` with `joint_map`, `open_address` and `limp_address`; `scan_address` where the
+    place is a serial device."""
     default: str | None = None
     """Place where none is written; None for a serial device, which must be."""
 

@@ -118,14 +118,18 @@ class Sent:
 
 
 class ServoBus(Protocol):
-    """A line of position servos."""
+    """A line of position servos.
+
+    One that is opened by an address also has a `joint_map`, which its watchdog switches off.
+    """
 
     name: str
     joint_names: tuple[str, ...]
     limits: PositionLimits
     metadata: dict[str, Any]
-    """For the header of a recording: kind, model, quantisation step, rounding; `readings` is "live"
-    where the servo itself answers each read, "polled" where a read returns the bus's last poll."""
+    """For the header of a recording: `JointMap.metadata`, `kind`, `speed_limit_rad_s`, and what
+    else is known; `readings` is "live" where the servo itself answers each read, "polled" where a
+    read returns the bus's last poll."""
 
     def now(self) -> float:
         """Time of the bus's clock [s]."""
