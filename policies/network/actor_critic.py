@@ -2,23 +2,8 @@
 
 The critic is an MLP for all of them, so that they differ in the policy alone.
 
-Exploration is persistent: noise that lasts over several control steps, with its exact likelihood.
-White noise of a few milliradians stays within the dead band of a servo with dry friction, and
-larger white noise shakes the friction loose, so that the policy would learn on another robot. Noise
-that lasts moves the joint instead. It is an autoregressive process of first order: with network
-output m, correlation c from step to step and standard deviation s,
-
-    action = m + e,    e = c · e_before + √(1 − c²) · s · z,    z ~ N(0, 1)
-
-so that, given the state and `e_before`, the action is Gaussian about m + c · e_before with standard
-deviation √(1 − c²) · s. `e_before` is the observation group `noise`; it is known to the likelihood
-and to the critic, and never enters the policy's network.
-
-Where steps are to be found, white noise is better. The likelihood takes e from the step before as
-it was, so a change of m counts as if it lasted as the noise does: filtered by 1 / (1 − c·z⁻¹). At
-the 3.6 Hz of a trot, with a time constant of 0.15 s, the gradient of what a joint does within a
-stride is then turned by 61 degrees of the stride and is a third as large, beside that of where the
-joint is on average.
+Actors explore by white noise: where steps are to be found, noise that lasts over half a stride is
+credited with what it did in the other half.
 """
 
 from __future__ import annotations
@@ -37,66 +22,32 @@ from pupper_sysid.policies.network.policy_network import CONTEXT, WIDTH, CausalA
 from pupper_sysid.sim.walking.observation import CLOCK_SEEN, OBSERVATION_PARTS
 
 
-class PersistentGaussian(GaussianDistribution):
-    """Gaussian of an action, given the noise of the step before.
+class ActionNoise(GaussianDistribution):
+    """Gaussian of an action about the network's output, `centre`.
 
-    `correlation` is that of the noise from one step to the next, 0 for white noise; `least_std` is
-    the floor of the standard deviation. `centre` is the network's output m, and `noise_before`, of
-    the same shape (…, output_dim), is to be set before `update`.
+    `least_std` is the floor of the standard deviation.
     """
 
-    def __init__(
-        self, output_dim: int, correlation: float = 0.0, least_std: float = 1e-6, **more: Any
-    ):
+    def __init__(self, output_dim: int, least_std: float = 1e-6, **more: Any):
         super().__init__(output_dim, std_range=(least_std, 1e6), std_type="log", **more)
-        self.correlation = correlation
-        self.centre = self.noise_before = torch.zeros(0)
+        self.centre = torch.zeros(0)
 
     def update(self, mlp_output: torch.Tensor) -> None:
         """Take the network's output."""
         self.centre = mlp_output
-        mean = mlp_output + self.correlation * self.noise_before
-        std = torch.exp(self.log_std_param.clamp(*self.log_std_range))
-        self._distribution = Normal(mean, (1.0 - self.correlation**2) ** 0.5 * std)
+        self._distribution = Normal(mlp_output, self.whole_std)
 
     @property
     def whole_std(self) -> torch.Tensor:
-        """Standard deviation of the noise itself, s, shape (output_dim,)."""
-        return torch.exp(self.log_std_param.detach().clamp(*self.log_std_range))
+        """Standard deviation, shape (output_dim,)."""
+        return torch.exp(self.log_std_param.clamp(*self.log_std_range))
 
     def set_std(self, std: torch.Tensor) -> None:
         """Set the noise's standard deviation, shape (output_dim,)."""
         self.log_std_param.data.copy_(torch.log(std))
 
 
-class _Exploring(MLPModel):
-    """Gives the noise of the step before to the distribution."""
-
-    def forward(
-        self,
-        obs: TensorDict,
-        masks: torch.Tensor | None = None,
-        hidden_state: Any = None,
-        stochastic_output: bool = False,
-    ) -> torch.Tensor:
-        """The action, or its mean without noise."""
-        if stochastic_output:
-            noise = obs["noise"]
-            before = noise if masks is None else unpad_trajectories(noise, masks)
-            assert isinstance(self.distribution, PersistentGaussian)
-            self.distribution.noise_before = before
-        return super().forward(obs, masks, hidden_state, stochastic_output)
-
-
-class MLPActor(_Exploring):
-    """Feed-forward policy."""
-
-
-class RNNActor(_Exploring, RNNModel):
-    """Policy with an LSTM or GRU."""
-
-
-class TransformerActor(_Exploring):
+class TransformerActor(MLPModel):
     """Policy that attends to its past observations, with `CausalAttention` before the head.
 
     An update runs one pass over whole sequences of a rollout instead of one window per sample, at a
@@ -156,7 +107,7 @@ _HARMONICS = torch.tensor([1.0, 2.0, 3.0])
 """Of the clock: feet rise and come down within a quarter of a cycle."""
 
 
-class TeacherActor(MLPActor):
+class TeacherActor(MLPModel):
     """Network of a teacher: a gait by a clock, with little besides that its network could follow.
 
     A teacher learns from nothing, by PPO. Adam moves every weight about as far whether its gradient
@@ -204,7 +155,6 @@ def build(
     architecture: Architecture,
     observations: TensorDict,
     hyper: Hyperparameters,
-    control_step_s: float,
     first_action: torch.Tensor | None = None,
 ) -> tuple[MLPModel, MLPModel]:
     """Actor and critic.
@@ -224,21 +174,20 @@ def build(
     common: dict[str, Any] = {"activation": "elu", "obs_normalization": hyper.normalise}
     explore = hyper.exploration
     gaussian = {
-        "class_name": PersistentGaussian, "init_std": explore.std[0],
+        "class_name": ActionNoise, "init_std": explore.std[0],
         "least_std": explore.std[1] if explore.learned else 1e-6, "learn_std": explore.learned,
-        "correlation": explore.correlation(control_step_s),
     }  # fmt: skip
     of_actor = common | {"hidden_dims": list(architecture.hidden), "distribution_cfg": gaussian}
     actions = observations["noise"].shape[-1]
     if architecture.kind in ("lstm", "gru"):
-        actor: MLPModel = RNNActor(
+        actor: MLPModel = RNNModel(
             observations, groups, "actor", actions, rnn_type=architecture.kind,
             rnn_hidden_dim=architecture.memory, **of_actor,
         )  # fmt: skip
     elif architecture.kind == "transformer":
         actor = TransformerActor(observations, groups, "actor", actions, **of_actor)
     else:
-        network = TeacherActor if architecture.privileged_actor else MLPActor
+        network = TeacherActor if architecture.privileged_actor else MLPModel
         actor = network(observations, groups, "actor", actions, **of_actor)
     # the first policy stands; another wide one would swing through its last action, and fast
     head = [layer for layer in actor.mlp if isinstance(layer, torch.nn.Linear)][-1]

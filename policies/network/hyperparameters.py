@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -54,10 +53,6 @@ class Exploration:
     starts at the first and never falls below the second."""
     anneal_m_samples: tuple[float, float] = (0.0, 20.0)
     """Millions of samples between which it falls, by equal factors."""
-    persistence_s: float = 0.3
-    """Time constant of the noise's correlation; 0 for white noise. Noise that lasts moves joints
-    out of the dead band of their friction. What lasts over half a stride is credited with what it
-    did in the other half, and steps are learned more slowly."""
     by_dead_band: bool = True
     """Whether joints of larger dead band (friction over stiffness) get more noise in proportion."""
     learned: bool = False
@@ -66,14 +61,6 @@ class Exploration:
     def __post_init__(self):
         if not min(self.std) > 0:
             raise InputError("learner.exploration.std must be positive.")
-        if not self.persistence_s >= 0:
-            raise InputError("learner.exploration.persistence_s must be 0 or more.")
-
-    def correlation(self, control_step_s: float) -> float:
-        """Of the noise from one control step to the next."""
-        if self.persistence_s == 0:
-            return 0.0
-        return math.exp(-control_step_s / self.persistence_s)
 
     def std_at(self, samples: float) -> float:
         """Scheduled standard deviation after so many samples."""

@@ -199,7 +199,7 @@ def load_teacher(folder: Path, checkpoint: str, run: Run, seen: TensorDict) -> M
     """
     teacher = check_teacher(folder, run)
     content = read_checkpoint(folder / checkpoint)
-    network, _ = build(teacher.architecture, seen, teacher.learner, teacher.task.control_step_s)
+    network, _ = build(teacher.architecture, seen, teacher.learner)
     try:
         network.load_state_dict(judged_weights(content))
     except RuntimeError as error:

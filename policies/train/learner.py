@@ -43,7 +43,7 @@ from pupper_sysid.common.border import read_bytes, refuse_other_version
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_bytes
 from pupper_sysid.common.reading.content import LARGEST_CHECKPOINT, refuse_bomb
-from pupper_sysid.policies.network.actor_critic import PersistentGaussian, build
+from pupper_sysid.policies.network.actor_critic import ActionNoise, build
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.robot.body import Body, mini_pupper
@@ -315,7 +315,7 @@ class Learner:
         if task.rewards.stance:
             target = stance(task.body, task.rewards.crouch, task.rewards.spread) - env.env.default
             first = torch.from_numpy(target / task.action_scale)
-        actor, critic = build(architecture, self.observations, hyper, task.control_step_s, first)
+        actor, critic = build(architecture, self.observations, hyper, first)
         # a recurrent policy's minibatches are whole environments
         if actor.is_recurrent and env.num_envs < hyper.minibatches:
             raise InputError(
@@ -390,9 +390,9 @@ class Learner:
         return float(self._noise.whole_std.mean())
 
     @property
-    def _noise(self) -> PersistentGaussian:
+    def _noise(self) -> ActionNoise:
         noise = self.actor.distribution
-        assert isinstance(noise, PersistentGaussian)
+        assert isinstance(noise, ActionNoise)
         return noise
 
     def fresh_optimiser(self) -> None:

@@ -48,7 +48,8 @@ _TEACHING = 0.6  # of a run's time: the most that its own teacher may take
 _DROPPED: dict[type, set[str]] = {
     Observation: {"privileged_critic"},
     Hyperparameters: {"initial_std"},
-    Curriculum: {"on", "stages", "stage_steps", "easiest", "action_scale"},
+    Exploration: {"persistence_s"},
+    Curriculum: {"on", "stages", "stage_steps", "easiest", "action_scale", "delay"},
     Rewards: {"clock", "flight", "progress_in_time"},
 }
 """Settings of older files that say nothing of how a policy walks."""
@@ -112,7 +113,7 @@ def preset(
         task=PRESETS[name],
         learner=Hyperparameters(
             epochs=5, learning_rate=1e-3, value_weight=1.0, normalise=False,
-            exploration=Exploration((1.0, 1e-6), persistence_s=0.0, by_dead_band=False,
+            exploration=Exploration((1.0, 1e-6), by_dead_band=False,
                                     learned=True),
             entropy=0.0025 if kind == "mlp" else 0.005,
         ),
@@ -134,7 +135,7 @@ def _first_gait_imitated(kind: Kind) -> Run:
             steps_per_environment=steps, epochs=3, critic_warmup=40, freeze_normaliser=True,
             desired_kl=0.02 if without_memory else 0.01, learning_rate=1e-5, discount=0.97,
             gae_lambda=0.9,
-            exploration=Exploration((0.02, 0.01), (0.0, 2.5), persistence_s=0.0),
+            exploration=Exploration((0.02, 0.01), (0.0, 2.5)),
             mirror=without_memory, averaging=50,
         ),
         imitation=Imitation(rollouts=240 // steps, minibatches=4 if without_memory else 16),
@@ -167,7 +168,7 @@ def _teacher(kind: Kind) -> Run:
             steps_per_environment=8, epochs=3, learning_rate=1e-3, desired_kl=0.025,
             learning_rates=(1e-6, 2e-3), discount=0.97, gae_lambda=0.9,
             # noise that lasts over half a stride would be rewarded for what it does in the other
-            exploration=Exploration((0.06, 0.012), (0.4, 6.0), persistence_s=0.0),
+            exploration=Exploration((0.06, 0.012), (0.4, 6.0)),
             mirror=True,
         ),
         imitation=Imitation(iterations=0), environments=512, iterations=1700, minutes=60.0,

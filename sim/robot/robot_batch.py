@@ -225,15 +225,15 @@ class RobotBatch:
 
     # ------------------------------------------------------------------------- stepping
 
-    def draw_latency(self, delay_share: float, rng: np.random.Generator) -> None:
+    def draw_latency(self, rng: np.random.Generator) -> None:
         """Draw how late each robot's next commands are; nothing is drawn without jitter.
 
         One latency per robot: a frame carries the commands of all its servos. Its mean is in the
         dead time. With an added jitter, no servo goes back to a command before its latest.
         """
-        if (self._added_jitter or self.servos.command_jitter_s > 0) and delay_share > 0:
+        if self._added_jitter or self.servos.command_jitter_s > 0:
             late = np.minimum(rng.exponential(1.0, self.environments), _LATEST) - 1.0
-            late *= self._jitter_s * self.bodies.jitter * delay_share
+            late *= self._jitter_s * self.bodies.jitter
             delay = np.maximum(self.drawn["dead_time_s"] + late[:, None], 0.0)
             now = self._fields["actuator_delay"]
             if self._added_jitter:
@@ -307,11 +307,11 @@ class RobotBatch:
         self.qpos[ids, 2] += rise
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_POS.value)
 
-    def draw(self, ids: NDArray[np.intp], delay_share: float, rng: np.random.Generator) -> None:
-        """Draw servos, friction and payload of some robots; dead times times `delay_share`."""
+    def draw(self, ids: NDArray[np.intp], rng: np.random.Generator) -> None:
+        """Draw servos, friction and payload of some robots."""
         random = self.config.randomisation
         drawn = self.servos.draw(len(ids), random.torque_scale, rng)
-        drawn["dead_time_s"] = (drawn["dead_time_s"] + self._extra_s[ids, None]) * delay_share
+        drawn["dead_time_s"] += self._extra_s[ids, None]
         self.bodies.draw(ids, drawn, rng)
         for name, value in drawn.items():
             self.drawn[name][ids] = value

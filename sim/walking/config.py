@@ -118,8 +118,6 @@ class Curriculum:
 
     commands: Ramp = Ramp()
     """On commanded speeds."""
-    delay: Ramp = Ramp()
-    """On dead times and on their jitter."""
     push: Ramp = Ramp()
     """On the speed that a push gives."""
     penalties: Ramp = Ramp()
@@ -143,7 +141,6 @@ class Level:
     """Factors of a `Curriculum` at one time."""
 
     commands: float = 1.0
-    delay: float = 1.0
     push: float = 1.0
     penalties: float = 1.0
     guides: float = 1.0

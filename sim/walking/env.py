@@ -228,7 +228,7 @@ class PupperEnv:
             missed &= ~self.robots.bodies.as_calibrated
             self.action[missed] = self.last_action[missed]
         before = self.robots.joint_velocity.copy()
-        self.robots.draw_latency(self.level.delay, self.rng)
+        self.robots.draw_latency(self.rng)
         moving = self.robots.step(self.set_points(self.action))
         # what does not need the new state is done while it is computed
         now = self._begin(before)
@@ -409,7 +409,7 @@ class PupperEnv:
     # ------------------------------------------------------------------------- a new episode
 
     def _restart(self, ids: NDArray[np.intp]) -> None:
-        self.robots.draw(ids, self.level.delay, self.rng)
+        self.robots.draw(ids, self.rng)
         self._draw_commands(ids)
         start, speed = draw_pose(
             self.config.randomisation, self.body, self.trot, self.command[ids], self.rng

@@ -46,9 +46,8 @@ def networks(kind: str, seed: int = 0):
     torch.manual_seed(seed)
     hyper = Hyperparameters()
     actor, critic = build(
-        Architecture(kind, (32, 16), 24, (16,)), observations(2, torch.Generator()), hyper,
-        control_step_s=0.02,
-    )  # fmt: skip
+        Architecture(kind, (32, 16), 24, (16,)), observations(2, torch.Generator()), hyper
+    )
     with torch.no_grad():
         for parameter in (*actor.parameters(), *critic.parameters()):
             parameter += 0.1 * torch.randn_like(parameter)

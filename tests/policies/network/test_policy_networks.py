@@ -259,7 +259,7 @@ def test_a_teacher_sees_command_imu_and_the_clock_with_its_harmonics_and_nothing
     np.testing.assert_allclose(shown[0, 16:], strokes.flatten(), atol=1e-6)
 
     architecture = Architecture("mlp", (16,), 8, (16,), privileged_actor=True)
-    actor, critic = build(architecture, seen, Hyperparameters(), 0.02)
+    actor, critic = build(architecture, seen, Hyperparameters())
     actor.update_normalization(seen)
     before, valued = actor(seen), critic(seen)
     other = seen.clone()

@@ -1,4 +1,4 @@
-"""Exploration that persists, its likelihood and schedule, and which policy is kept."""
+"""Exploration, its likelihood and schedule, and which policy is kept."""
 
 import math
 from dataclasses import replace
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.policies.network.actor_critic import PersistentGaussian
+from pupper_sysid.policies.network.actor_critic import ActionNoise
 from pupper_sysid.policies.network.hyperparameters import Exploration, Hyperparameters
 from pupper_sysid.policies.train.learner import Ranks
 from pupper_sysid.policies.train.selection import Judge
@@ -16,50 +16,27 @@ from pupper_sysid.policies.train.training import make_learner
 from pupper_sysid.sim.walking.config import Walking
 from support.tiny_training import tiny_run
 
-STEP_S = 0.02
 
-
-def explored(correlation: float, std: float, steps: int, robots: int = 4000) -> torch.Tensor:
-    """Noise of `steps` steps, shape (steps, robots)."""
+def test_noise_is_about_the_networks_output_with_the_likelihood_of_a_gaussian():
     torch.manual_seed(0)
-    noise = PersistentGaussian(1, correlation, init_std=std, learn_std=False)
-    before, found = torch.zeros(robots, 1), []
-    for _ in range(steps):
-        noise.noise_before = before
-        noise.update(torch.full((robots, 1), 7.0))
-        before = noise.sample() - noise.centre
-        found.append(before[:, 0])
-    return torch.stack(found)
-
-
-def test_noise_has_its_standard_deviation_and_correlation():
-    for correlation in (0.0, 0.8):
-        noise = explored(correlation, 0.3, 60)
-        assert noise[-1].std().item() == pytest.approx(0.3, rel=0.05)
-        between = np.corrcoef(noise[-1], noise[-2])[0, 1]
-        assert between == pytest.approx(correlation, abs=0.04)
-
-
-def test_the_likelihood_is_that_of_the_action_given_the_noise_before():
-    noise = PersistentGaussian(2, 0.6, init_std=0.5, learn_std=False)
-    noise.noise_before = torch.tensor([[0.1, -0.2]])
-    noise.update(torch.tensor([[1.0, 2.0]]))
-    action = torch.tensor([[1.3, 2.1]])
-    sd = math.sqrt(1 - 0.36) * 0.5
+    noise = ActionNoise(2, init_std=0.5, learn_std=False)
+    noise.set_std(torch.tensor([0.3, 0.4]))
+    noise.update(torch.tensor([1.0, 2.0]).expand(4000, 2))
+    drawn = noise.sample() - noise.centre
+    assert drawn.std(0).tolist() == pytest.approx([0.3, 0.4], rel=0.05)
+    action = torch.tensor([1.3, 2.1]).expand(4000, 2)
     by_hand = sum(
-        -0.5 * ((a - m) / sd) ** 2 - math.log(sd * math.sqrt(2 * math.pi))
-        for a, m in ((1.3, 1.06), (2.1, 1.88))
+        -0.5 * (off / sd) ** 2 - math.log(sd * math.sqrt(2 * math.pi))
+        for off, sd in ((0.3, 0.3), (0.1, 0.4))
     )
-    assert noise.log_prob(action).item() == pytest.approx(by_hand, rel=1e-5)
+    assert noise.log_prob(action)[0].item() == pytest.approx(by_hand, rel=1e-5)
 
 
 def test_the_standard_deviation_falls_by_equal_factors_between_two_points():
-    explore = Exploration((0.4, 0.1), (1.0, 3.0), 0.1)
+    explore = Exploration((0.4, 0.1), (1.0, 3.0))
     assert [explore.std_at(1e6 * m) for m in (0, 1, 2, 3, 9)] == pytest.approx(
         [0.4, 0.4, 0.2, 0.1, 0.1]
     )
-    assert explore.correlation(STEP_S) == pytest.approx(math.exp(-0.2))
-    assert replace(explore, persistence_s=0.0).correlation(STEP_S) == 0.0
     with pytest.raises(InputError, match="std must be positive"):
         Exploration((0.0, 0.1))
 

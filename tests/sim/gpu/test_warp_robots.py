@@ -32,7 +32,7 @@ def walked(on_warp: bool, lift_m: float) -> np.ndarray:
     else:
         robots = RobotBatch(EXACT, SERVOS, ground, ROBOTS, 1, None)
     everyone = np.arange(ROBOTS)
-    robots.draw(everyone, 1.0, rng)
+    robots.draw(everyone, rng)
     still = np.zeros((ROBOTS, 12))
     robots.place(everyone, still + default_pose(), still, 0.5, rng)
     robots.qpos[:, 2] += lift_m

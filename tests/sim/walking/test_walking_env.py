@@ -625,7 +625,7 @@ def test_a_ramp_is_linear_between_its_ends_over_the_samples_of_all_processes():
     assert env.level.commands == pytest.approx(0.5)
 
 
-def test_the_curriculum_changes_delay_commands_penalties_progress_and_widths():
+def test_the_curriculum_changes_commands_penalties_progress_and_widths():
     rewards = only(
         alive=1.0, action_rate=-1.0, progress=2.0, base_linear_velocity=1.0, linear_sigma=0.1,
         tracking_shape="exponential",
@@ -635,15 +635,15 @@ def test_the_curriculum_changes_delay_commands_penalties_progress_and_widths():
         QUIET, rewards=rewards,
         commands=Commands((0.2, 0.2), (0.0, 0.0), (0.0, 0.0), 0.0, 0.0),
         curriculum=Curriculum(
-            commands=eased, delay=eased, penalties=eased, progress=eased,
+            commands=eased, penalties=eased, progress=eased,
             linear_sigma=replace(eased, first=2.0),
         ),
     )  # fmt: skip
     env = make(with_delay(0.04, 0.04), config, 1)
 
-    def facts() -> tuple[float, float, float, float]:
+    def facts() -> tuple[float, float, float]:
         env.reset()
-        delay, forward = env.robots.field("actuator_delay")[0, 0], env.command[0, 0]
+        forward = env.command[0, 0]
         env._strides.velocity[:, 0] = 0.02
         found = env.step(still(env) + 0.1)
         speed = found.facts.linear_velocity[0, :2]
@@ -651,15 +651,15 @@ def test_the_curriculum_changes_delay_commands_penalties_progress_and_widths():
         width = -away / np.log(found.terms["base_linear_velocity"][0] / SPAN)
         factor = found.terms["progress"][0] / (SPAN * progress(found.facts, rewards)[0])
         assert factor == pytest.approx(0.5 if env.steps == 1 else 2.0)
-        return delay, forward, found.terms["action_rate"][0], width
+        return forward, found.terms["action_rate"][0], width
 
     full = -1.0 * 12 * 0.1**2 * SPAN
     assert env.level.commands == 0.25
-    assert facts() == pytest.approx((0.01, 0.05, 0.25 * full, 0.2))
+    assert facts() == pytest.approx((0.05, 0.25 * full, 0.2))
     env.step(still(env))
     env.step(still(env))
     assert env.level == Level()
-    assert facts() == pytest.approx((0.04, 0.2, full, 0.1))
+    assert facts() == pytest.approx((0.2, full, 0.1))
 
 
 # -------------------------------------------------------------------------------------- refusals
