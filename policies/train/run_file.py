@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -39,7 +40,7 @@ Device = Literal["cpu", "cuda", "warp-cpu"]
 LearnerDevice = Literal["as-device", "cpu", "cuda"]
 
 RUN_SCHEMA = "pupper-run"
-RUN_VERSION = 2
+RUN_VERSION = 3
 RUN_FILE = "run.yaml"
 _OF_TEACHER = (*CLOCK, "clock_duty", "crouch", "spread")  # parameters of its rewards
 # settings that say what actions mean
@@ -53,6 +54,7 @@ _DROPPED: dict[type, set[str]] = {
     Rewards: {"clock", "flight", "progress_in_time"},
 }
 """Settings of older files that say nothing of how a policy walks."""
+_OLD_RAMP = {"first": 1.0, "last": 1.0, "begin": 0.0, "end": 0.0}  # four settings before version 3
 
 
 @dataclass(frozen=True)
@@ -262,6 +264,12 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[Place, int]]:
     if not isinstance(content, dict) or content.get("schema") != RUN_SCHEMA:
         raise InputError(f"{path} is not the settings of a training run.")
     refuse_other_version(path, content.get("schema_version"), RUN_VERSION)
+    if content["schema_version"] < 3:
+        with suppress(KeyError, TypeError, AttributeError):  # refused later
+            ramps = content["settings"]["task"]["curriculum"]
+            for name, ramp in ramps.items():
+                if isinstance(ramp, dict):
+                    ramps[name] = [{**_OLD_RAMP, **ramp}[key] for key in _OLD_RAMP]
     return content, lines
 
 

@@ -93,47 +93,43 @@ class Randomisation:
             check_range("randomisation", name, getattr(self, name), least)
 
 
-@dataclass(frozen=True)
-class Ramp:
-    """A factor that changes with the samples of a training, linearly between two points."""
-
-    first: float = 1.0
-    """Until `begin`."""
-    last: float = 1.0
-    """From `end` on."""
-    begin: float = 0.0
-    """Millions of samples."""
-    end: float = 0.0
-    """Millions of samples."""
-
-    def at(self, samples: float) -> float:
-        """The factor after so many samples."""
-        share = (1e-6 * samples - self.begin) / max(self.end - self.begin, 1e-9)
-        return self.first + (self.last - self.first) * min(max(share, 0.0), 1.0)
+Ramp = tuple[float, float, float, float]
+"""A factor before and after a part of a training, and the part's ends in millions of samples,
+between which the factor changes linearly."""
+_FULL: Ramp = (1.0, 1.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Curriculum:
-    """From easy to full, as a training goes on: factors on parts of the task; 1 is the task."""
+    """From easy to full, as a training goes on: factors on parts of the task; 1 is the task.
 
-    commands: Ramp = Ramp()
+    Four numbers each: factor at first and at last, millions of samples where it begins and ends to
+    change.
+    """
+
+    commands: Ramp = _FULL
     """On commanded speeds."""
-    push: Ramp = Ramp()
+    push: Ramp = _FULL
     """On the speed that a push gives."""
-    penalties: Ramp = Ramp()
+    penalties: Ramp = _FULL
     """On rewards of negative weight."""
-    guides: Ramp = Ramp()
+    guides: Ramp = _FULL
     """On the rewards that lead to steps: `foot_paths` and `gait`."""
-    progress: Ramp = Ramp()
+    progress: Ramp = _FULL
     """On the rewards that lead to travel: `progress` and `turn_progress`."""
-    linear_sigma: Ramp = Ramp()
+    linear_sigma: Ramp = _FULL
     """On the widths of the speed's tracking terms."""
-    angular_sigma: Ramp = Ramp()
+    angular_sigma: Ramp = _FULL
     """On the widths of the turn rate's tracking terms."""
 
     def at(self, samples: float) -> Level:
         """All factors after so many samples."""
-        return Level(**{f.name: getattr(self, f.name).at(samples) for f in fields(self)})
+        factors = {}
+        for part in fields(self):
+            first, last, begin, end = getattr(self, part.name)
+            share = (1e-6 * samples - begin) / max(end - begin, 1e-9)
+            factors[part.name] = first + (last - first) * min(max(share, 0.0), 1.0)
+        return Level(**factors)
 
 
 @dataclass(frozen=True)
@@ -238,14 +234,14 @@ _SCRATCH = Walking(
     ),
     differences=TYPICAL,
     curriculum=Curriculum(
-        commands=Ramp(0.6, 1.0, 1.0, 4.0),
+        commands=(0.6, 1.0, 1.0, 4.0),
         # first steps by the clock; then they are to travel, then to do so evenly
-        progress=Ramp(0.0, 1.0, 0.3, 0.6),
-        penalties=Ramp(0.3, 1.0, 0.5, 3.0),
-        push=Ramp(0.0, 1.0, 1.5, 5.0),
-        guides=Ramp(1.0, 0.4, 3.0, 7.0),
-        linear_sigma=Ramp(1.5, 0.5, 2.0, 5.0),
-        angular_sigma=Ramp(2.0, 0.5, 2.0, 5.0),
+        progress=(0.0, 1.0, 0.3, 0.6),
+        penalties=(0.3, 1.0, 0.5, 3.0),
+        push=(0.0, 1.0, 1.5, 5.0),
+        guides=(1.0, 0.4, 3.0, 7.0),
+        linear_sigma=(1.5, 0.5, 2.0, 5.0),
+        angular_sigma=(2.0, 0.5, 2.0, 5.0),
     ),
     rewards=Rewards(
         foot_paths=15.0, gait=0.0, stance=-200.0, alive=0.1, progress=8.0, turn_progress=4.0,

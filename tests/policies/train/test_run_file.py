@@ -13,6 +13,7 @@ import yaml
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters, Imitation
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run, preset, save_run
+from pupper_sysid.sim.walking.config import Curriculum
 from support.refusals import assert_each_refused
 from support.tiny_training import ALL_KINDS, CALIBRATION, tiny_run
 
@@ -98,5 +99,10 @@ def test_missing_settings_take_their_defaults_and_older_ones_are_passed_over(tmp
         ("task", "curriculum", "stage_steps", 2400), ("learner", "initial_std", 0.015),
     ):  # fmt: skip
         assert load_run(with_settings(tmp_path, *older)) == tiny_run()
-    (tmp_path / RUN_FILE).write_text("schema: pupper-run\nschema_version: 3\nsettings: {}")
+    (tmp_path / RUN_FILE).write_text(
+        "schema: pupper-run\nschema_version: 2\nsettings:\n task:\n  curriculum:\n   stages: 3\n"
+        "   delay: {first: 0.5}\n   push: {first: 0.0, begin: 1.5, end: 5.0}"
+    )
+    assert load_run(tmp_path).task.curriculum == Curriculum(push=(0.0, 1.0, 1.5, 5.0))
+    (tmp_path / RUN_FILE).write_text("schema: pupper-run\nschema_version: 4\nsettings: {}")
     assert_each_refused([(tmp_path, "Upgrade pupper-sysid")], load_run, names="newer version")

@@ -23,7 +23,6 @@ from pupper_sysid.sim.walking.config import (
     Curriculum,
     Level,
     Observation,
-    Ramp,
     Randomisation,
     Walking,
 )
@@ -615,10 +614,11 @@ def test_pushes_set_the_horizontal_speed_within_their_range_at_their_times():
 
 
 def test_a_ramp_is_linear_between_its_ends_over_the_samples_of_all_processes():
-    ramp = Ramp(0.6, 1.0, begin=1.0, end=3.0)
-    assert [ramp.at(s) for s in (0, 1e6, 2e6, 3e6, 9e6)] == pytest.approx([0.6, 0.6, 0.8, 1, 1])
+    eased = Curriculum(commands=(0.6, 1.0, 1.0, 3.0))
+    factors = [eased.at(s).commands for s in (0, 1e6, 2e6, 3e6, 9e6)]
+    assert factors == pytest.approx([0.6, 0.6, 0.8, 1, 1])
     assert Curriculum().at(0) == Curriculum().at(1e9) == Level()
-    config = replace(QUIET, curriculum=Curriculum(commands=Ramp(0.0, 1.0, 0.0, 8e-6)))
+    config = replace(QUIET, curriculum=Curriculum(commands=(0.0, 1.0, 0.0, 8e-6)))
     env = make(with_delay(0.0, 0.0), config, 2)
     env.processes = 2
     env.step(still(env))
@@ -630,13 +630,13 @@ def test_the_curriculum_changes_commands_penalties_progress_and_widths():
         alive=1.0, action_rate=-1.0, progress=2.0, base_linear_velocity=1.0, linear_sigma=0.1,
         tracking_shape="exponential",
     )  # fmt: skip
-    eased = Ramp(0.25, 1.0, begin=2e-6, end=3e-6)  # from the third sample on as it is
+    eased = (0.25, 1.0, 2e-6, 3e-6)  # from the third sample on as it is
     config = replace(
         QUIET, rewards=rewards,
         commands=Commands((0.2, 0.2), (0.0, 0.0), (0.0, 0.0), 0.0, 0.0),
         curriculum=Curriculum(
             commands=eased, penalties=eased, progress=eased,
-            linear_sigma=replace(eased, first=2.0),
+            linear_sigma=(2.0, *eased[1:]),
         ),
     )  # fmt: skip
     env = make(with_delay(0.04, 0.04), config, 1)
