@@ -274,7 +274,7 @@ class _Lock:
     def __init__(self, path: Path, output: Path):
         self._file = _lock_file(output)
         self._descriptor: int | None = None
-        self._made: list[Path] = []
+        self._created: list[Path] = []
         try:
             while self._descriptor is None:
                 self._descriptor = self._open(path)
@@ -293,7 +293,7 @@ class _Lock:
         folder = self._file.parent
         missing = [p for p in (folder, *folder.parents) if not p.exists()]
         folder.mkdir(parents=True, exist_ok=True)
-        self._made = missing or self._made
+        self._created = missing or self._created
         flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
         try:
             descriptor = os.open(self._file, flags, 0o666)
@@ -332,7 +332,7 @@ class _Lock:
 
     def _remove_folders(self) -> None:
         with suppress(OSError):  # not empty: the output is there
-            for folder in self._made:
+            for folder in self._created:
                 folder.rmdir()
 
 

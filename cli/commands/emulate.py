@@ -249,21 +249,21 @@ class Dynamixel(SerialLine):
             raise InputError("--walking: the Mini Pupper that walks has no Dynamixel servos.")
         self.refuse_outside(table.BAUD_RATES)
         rng = np.random.default_rng(self.seed)
-        place, own_map = self.place(), self.joint_map
-        layout = load_joint_map(own_map) if own_map else None
+        place, map_path = self.place(), self.joint_map
+        layout = load_joint_map(map_path) if map_path else None
         series = _series_of(table.FAMILY, self.model, layout, table.SERIES[1200])
-        if own_map is None:
-            own_map = f"{place}.joints.yaml"
+        if map_path is None:
+            map_path = f"{place}.joints.yaml"
             map_file = load_joint_map(pendulum.BENCH_MAP).file.model_dump(by_alias=True)
             name = f"one {series.name} on a bench"
             source = f"{name}: 360 degrees over 4096 counts; limits: 2.6 rad to both sides"
             map_file |= {"servo": series.name, "name": name, "source": source}
-            joint_map_from(map_file, own_map).save(Path(own_map), force=True)
-        layout = layout or load_joint_map(own_map)
+            joint_map_from(map_file, map_path).save(Path(map_path), force=True)
+        layout = layout or load_joint_map(map_path)
         spec = pendulum.dynamixel_bench(series.name)
         bench = self.on_bench(rng, spec, layout)
         emulator = self.line(DynamixelEmulator, series, bench, rng, 1_000_000)
-        _serve_line(replace(self, link=place), emulator, bench, ".", own_map)
+        _serve_line(replace(self, link=place), emulator, bench, ".", map_path)
 
 
 def _series_of(family: Family, model: str | None, layout: JointMap | None, usual: Series) -> Series:
@@ -307,10 +307,10 @@ def _imu_beside(bench: ServoBench, path: Path | None, rng: np.random.Generator) 
         return
     # a proxy polls its servos, although this one does not return them
     polled = replace(bench.robot, spec=RobotSpec())
-    bench_shown = ServoBench(
+    polled_bench = ServoBench(
         polled, load_joint_map("mini_pupper_2"), rng.spawn(1)[0], keep_log=False, plant=bench.plant
     )
-    with closing(ProxySocket(ImuProxy(bench_shown, rng.spawn(1)[0]), path)) as server:
+    with closing(ProxySocket(ImuProxy(polled_bench, rng.spawn(1)[0]), path)) as server:
         thread = threading.Thread(target=server.serve, daemon=True)
         thread.start()
         try:
@@ -321,7 +321,7 @@ def _imu_beside(bench: ServoBench, path: Path | None, rng: np.random.Generator) 
 
 
 def _serve_line(
-    options: SerialLine, emulator: LineEmulator, bench: ServoBench, also: str, own_map: str | None
+    options: SerialLine, emulator: LineEmulator, bench: ServoBench, also: str, map_path: str | None
 ) -> None:
     """Serve a line of servos until Ctrl-C."""
     with closing(SerialPty(emulator, options.place(), options.adapter_ms / 1e3)) as server:
@@ -329,18 +329,18 @@ def _serve_line(
         what += f"{emulator.baud} baud{also}"
         bus = f"{emulator.family.name}:{server.device}"
         if not options.load:
-            _serve(options, server, bench, what, _commands(options, bus, own_map))
+            _serve(options, server, bench, what, _commands(options, bus, map_path))
             return
-        map_option = f" --joint-map {own_map}" if own_map else ""
+        map_option = f" --joint-map {map_path}" if map_path else ""
         kind = " --gains 8,16,32" if emulator.family.name == "feetech" else ""
         kind = kind if parse_load(options.load) else " --kind reversal"
         sweep = f"  pupper-sysid sweep --load {options.load}{kind}{map_option} --bus {bus}\n"
         _serve(options, server, bench, f"{what} Load: {options.load}.", sweep)
 
 
-def _commands(options: Common, name: str, own_map: str | None = None) -> str:
+def _commands(options: Common, name: str, map_path: str | None = None) -> str:
     """What to type elsewhere while a robot is served at this bus."""
-    which, bus = ("", f"{name} --joint-map {own_map}") if own_map else (" --joints LF", name)
+    which, bus = ("", f"{name} --joint-map {map_path}") if map_path else (" --joints LF", name)
     # a sweep is for legs in free air
     sweep = "" if options.walking else f"  pupper-sysid sweep --freqs 1-10{which} --bus {bus}\n"
     return f"{sweep}  pupper-sysid monitor --bus {bus}\n"

@@ -80,7 +80,7 @@ def _errors(rows: list[dict[str, Any]], of_what: str, names: tuple[str, ...]) ->
 
 
 def _directions(evaluation: Evaluation, rows: list[dict[str, Any]]) -> Table:
-    columns_shown = [
+    visible = [
         row | {"command": ", ".join(f"{c:g}" for c in condition.command or ())}
         for condition, row in zip(evaluation.conditions, rows, strict=True)
         if condition.group == "direction" and any(condition.command or ())
@@ -94,7 +94,7 @@ def _directions(evaluation: Evaluation, rows: list[dict[str, Any]]) -> Table:
         *(Column(w, f"{w}.heading_drift_deg", "°", 1, "margin") for w in ("policy", "trot")),
     )  # fmt: skip
     title = f"Speed over the commanded, %, and change of heading over {evaluation.episode_s:g} s, °"
-    return Table("", title, columns, columns_shown)
+    return Table("", title, columns, visible)
 
 
 def _effort(evaluation: Evaluation) -> Table:

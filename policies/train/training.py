@@ -52,7 +52,7 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, s
 LAST, BEST = "last.pt", "best.pt"
 _TEACHER, _POLICY_LAST = "teacher", "policy_last"
 _SAVE_EVERY = 10
-_UNDONE_SAID, _UNDONE_END = 10, 50  # updates in a row that are taken back
+_UNDONE_WARNS, _UNDONE_END = 10, 50  # updates in a row that are taken back
 _IMITATING, _FEWEST_ROUNDS = 0.75, 3  # of the time after a first round; rounds of imitation
 _JUDGE_EVERY = 50
 
@@ -358,7 +358,7 @@ class _Session:
         A notice follows when they repeat, and advice when the run ends because of it.
         """
         self.undone = self.undone + 1 if self.learner.taken_back else 0
-        if self.undone not in (_UNDONE_SAID, _UNDONE_END):
+        if self.undone not in (_UNDONE_WARNS, _UNDONE_END):
             return False
         ends = self.undone == _UNDONE_END
         kl = self.run.learner.desired_kl

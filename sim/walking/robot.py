@@ -103,7 +103,7 @@ class WalkingRobot:
         self._angles = np.zeros((_MEMORY_STEPS, joints))  # absolute
         self._forces = np.zeros((_MEMORY_STEPS, joints))
         self._chip = np.zeros((_MEMORY_STEPS, 6))  # m/s², rad/s, along the chip's axes
-        self._asked = np.zeros(joints, int)
+        self._sampled = np.zeros(joints, int)
         self._conversion = -1
         self._sample: ImuSample | None = None
         self._step = self._changed = 0
@@ -135,7 +135,7 @@ class WalkingRobot:
         """True angle of a servo [rad], at most two seconds before the latest call."""
         with self._lock:
             before, after, share = self._moment(time_s)
-            self._asked[index] = after
+            self._sampled[index] = after
             first, second = self._angles[before, index], self._angles[after, index]
             # exact inside a step: MuJoCo moves the joints with the velocity at the step's end
             return float(first + share * (second - first) + self._shift[index])
@@ -143,7 +143,7 @@ class WalkingRobot:
     def load(self, index: int) -> float:
         """Signed share of a servo's effort limit in use at the time of the last `angle` call."""
         with self._lock:
-            return float(self._forces[self._asked[index], index] / self._effort[index])
+            return float(self._forces[self._sampled[index], index] / self._effort[index])
 
     def imu(self, time_s: float) -> ImuSample | None:
         """Latest sample of the chip, at most 1/235 s old.

@@ -51,7 +51,7 @@ from pupper_sysid.sysid.feedback.staleness import (
 from pupper_sysid.sysid.recordings.recording import Trial
 
 LONGEST_S = 0.12  # longest poll period that is searched for [s]
-_RIVAL = 5.0  # nats: a period that explains the readings by less worse is not ruled out
+_CLOSE = 5.0  # nats: a period that explains the readings by less worse is not ruled out
 _ALTERNATIVES = 4  # periods of the search that are compared in full
 # of the period from stretch to stretch: usual size, and the stretches that this is worth
 _USUAL_DRIFT, _USUAL_STRETCHES = 0.002, 3.0
@@ -65,7 +65,7 @@ def likeliest_periods(
     loop: float,
     sure: Sequence[Sure],
 ) -> tuple[float, ...]:
-    """The period that explains best which rows changed and which did not [s], and its rivals.
+    """The period that explains best which rows changed and which did not [s], then close ones.
 
     Of the best ones of the search and of their aliases, at which the reads meet instants of
     another lattice in the same rows. A lattice with fewer polls than changes is none.
@@ -91,7 +91,7 @@ def likeliest_periods(
     if not scores:
         return (best,)
     order = sorted(scores, key=lambda p: -scores[p])
-    close = [p for p in order if scores[order[0]] - scores[p] < _RIVAL]
+    close = [p for p in order if scores[order[0]] - scores[p] < _CLOSE]
     return (order[0], *(p for p in close[1:] if abs(p / order[0] - 1) > 2 * poll_search.DRIFT))
 
 
@@ -160,7 +160,7 @@ class PollLattice(Result):
     """Jumps of the poll's phase within a trial."""
     polls: float = internal(default=0.0)
     """Independent polls from which the loss was counted."""
-    rivals_s: tuple[float, ...] = internal(default=())
+    close_s: tuple[float, ...] = internal(default=())
     """Periods that explain the readings about as well [s]: reads meet their instants in the same
     rows."""
     blur_s: float = internal(default=poll_search.BLUR_S)
@@ -185,7 +185,7 @@ class PollLattice(Result):
     def poll_period_interval(self) -> Interval:
         """Poll period with its 90 % interval [s]."""
         reach = HALF_WIDTH_SD * self.poll_period_sd_s
-        near = [self.poll_period_s, *self.rivals_s]
+        near = [self.poll_period_s, *self.close_s]
         return Interval(self.poll_period_s, min(near) - reach, max(near) + reach)
 
     @property
@@ -194,7 +194,7 @@ class PollLattice(Result):
 
         Where none could be counted, that of the prior: nearly 0 to nearly 1.
         """
-        ends = [self._loss_at(period) for period in (self.poll_period_s, *self.rivals_s)]
+        ends = [self._loss_at(period) for period in (self.poll_period_s, *self.close_s)]
         return Interval(
             self.assumed_loss, min(low for low, _ in ends), max(high for _, high in ends)
         )
@@ -204,7 +204,7 @@ class PollLattice(Result):
         """Mean age with its 90 % interval [s], likewise; the period's own error is small."""
         ends = [
             period * (0.5 + p / (1 - p))
-            for period in (self.poll_period_s, *self.rivals_s)
+            for period in (self.poll_period_s, *self.close_s)
             for p in (min(end, 0.999) for end in self._loss_at(period))
         ]
         return Interval(self._age(self.assumed_loss), min(ends), max(ends))
@@ -303,7 +303,7 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
         phases = tuple(poll_search.refine(s, period, blur, possible) for s in stretches)
     lattice = replace(
         nothing, kind="lattice", readings="polled", time_doubt_s=0.0, poll_period_s=period,
-        rivals_s=likely[1:], loss=loss, blur_s=blur, phases=phases,
+        close_s=likely[1:], loss=loss, blur_s=blur, phases=phases,
     )  # fmt: skip
     lattice = _with_segments(trials, stretches, replace(lattice, z_score=z_score), None, sure)
     known = liveness == "stale" and period > _NEAR_LOOP * loop

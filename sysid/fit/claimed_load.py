@@ -83,7 +83,7 @@ def check_claimed_load(
     loaded = Problem(plausible, runs, noise_rad)
     heaviest = _high(plausible, "armature")
     starts = np.array([_scaled(structure, free, heaviest * s) for s in _STARTS])
-    any_servo, best = (_found(p, np.array([fit.point, *starts]), rng) for p in (claim, loaded))
+    any_servo, best = (_best_fit(p, np.array([fit.point, *starts]), rng) for p in (claim, loaded))
     if _data_cost(bare, free) - _data_cost(claim, any_servo) > _TELLING_NATS * temperature:
         return _size_notes(joint, trials, structure, claim, any_servo, temperature)
     nats = (_data_cost(loaded, best) - _data_cost(bare, free)) / temperature
@@ -104,7 +104,7 @@ def check_claimed_load(
     )
 
 
-def _found(problem: Problem, starts: NDArray[np.float64], rng: np.random.Generator) -> Fit:
+def _best_fit(problem: Problem, starts: NDArray[np.float64], rng: np.random.Generator) -> Fit:
     """The best fit from some starts."""
     near = search.refine(problem, np.clip(starts, *problem.structure.box))
     return search.evolve(problem, [near], rng, short=True)

@@ -218,7 +218,7 @@ def without_ripple(
         return list(tones)  # a position that precedes its command: the lags as they are
     by_number = {t.number: (t, r) for t, r in zip(trials, read, strict=True)}
     turn = -2j * np.pi * np.outer(frequency, edges)
-    own_means = np.diff(np.exp(turn)) / np.diff(turn)
+    step_means = np.diff(np.exp(turn)) / np.diff(turn)
     held_means: dict[tuple[float, ...], NDArray[np.float64]] = {}  # of the tones of one trial
 
     def row(tone: ToneResponse) -> NDArray[np.complex128]:
@@ -237,7 +237,7 @@ def without_ripple(
 
     ripple = np.stack([row(t) for t in tones])
     held = np.array([t.command_held for t in tones])
-    chance, seen = _likely_ripple(servos, edges, ripple, held[:, None] * own_means, tones)
+    chance, seen = _likely_ripple(servos, edges, ripple, held[:, None] * step_means, tones)
     drawn = seen[rng.choice(len(chance), _DRAWS, p=chance)]
     # of two kinds of servo the likelier one, not what lies between them
     middle = np.median(np.stack([drawn.real, drawn.imag], axis=-1), axis=0)

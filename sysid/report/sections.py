@@ -300,13 +300,13 @@ def _provenance(report: Findings) -> Section:
         Column("loop", "loop_period_s", "ms", 2),
         Column("SHA-256", "sha256", kind="words"),
     )
-    made_with = ", ".join(f"{name} {version}" for name, version in versions().items())
+    library_versions = ", ".join(f"{name} {version}" for name, version in versions().items())
     return Section(
         "provenance",
         "Where this comes from",
         text=[
             f"Calibration of {calibration.robot}, {calibration.created}, seed {calibration.seed}. "
-            f"Made with {made_with}."
+            f"Made with {library_versions}."
         ],
         tables=[Table("recordings", "Recordings", columns, rows)],
         notes=[*(w for r in recordings for w in r.warnings), *calibration.notes],
@@ -481,18 +481,17 @@ def measured() -> pd.DataFrame:
 
 
 @styled
-def data_curve_figure(curve: pd.DataFrame, own_samples: int | None = None) -> Figure:
-    """Error against samples, a line per model; `own_samples` marks a recording's own number."""
+def data_curve_figure(curve: pd.DataFrame, readings: int) -> Figure:
+    """Error against samples, a line per model; `readings` marks a recording's own number."""
     figure, (axes,) = axes_column(1, 3.6)
     for model, errors in curve.items():
         title, colour, marker, line = MODELS[str(model)]
         axes.loglog(curve.index, 1e3 * errors, marker=marker, color=colour, ls=line, label=title)
-    if own_samples is not None:
-        axes.axvline(own_samples, color=FAINT, lw=1.5, zorder=0)
-        axes.text(
-            own_samples, 0.98, " this recording", transform=axes.get_xaxis_transform(), va="top",
-            fontsize=8,
-        )  # fmt: skip
+    axes.axvline(readings, color=FAINT, lw=1.5, zorder=0)
+    axes.text(
+        readings, 0.98, " this recording", transform=axes.get_xaxis_transform(), va="top",
+        fontsize=8,
+    )  # fmt: skip
     axes.set_xlabel("samples per joint")
     axes.set_ylabel("error in free run [mrad]")
     axes.set_xticks(list(curve.index), [f"{samples:,}" for samples in curve.index])

@@ -164,7 +164,7 @@ def test_the_interval_of_the_loss_is_jeffreys_and_that_of_the_age_follows():
 
 def test_loss_and_age_cover_the_periods_that_are_not_ruled_out():
     # 60 of 80 polls each 20 ms brought a value; each 16 ms it would be 60 of 100
-    found = lattice(poll_period_s=0.02, loss=0.25, polls=80.0, rivals_s=(0.016,))
+    found = lattice(poll_period_s=0.02, loss=0.25, polls=80.0, close_s=(0.016,))
     high = beta(40.5, 60.5).ppf(0.95)
     assert found.loss_interval.low == pytest.approx(beta(20.5, 60.5).ppf(0.05))
     assert found.loss_interval.high == pytest.approx(high)
@@ -179,7 +179,7 @@ def test_a_period_that_explains_as_much_is_inside_the_interval():
     alone = lattice(poll_period_s=0.0216, poll_period_sd_s=1e-5, loss=0.2, polls=128)
     assert alone.poll_period_interval.low == pytest.approx(0.0216 - 1.645e-5, abs=1e-8)
     both = lattice(
-        poll_period_s=0.0216, poll_period_sd_s=1e-5, loss=0.2, polls=128, rivals_s=(0.021,)
+        poll_period_s=0.0216, poll_period_sd_s=1e-5, loss=0.2, polls=128, close_s=(0.021,)
     )
     assert both.poll_period_interval.low < 0.021 < 0.0216 < both.poll_period_interval.high
 
