@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 import reproduction.evidence
 from pupper_sysid.cli import policy_choice, terminal
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.figure_style import JOINT_COLOURS, axes_column, styled
+from pupper_sysid.common.figure_style import BLUE, FAINT, JOINT_COLOURS, RED, axes_column, styled
 from pupper_sysid.common.files import refuse_overwrite, sha256, versions, write_text
 from pupper_sysid.common.page import Picture, Section, write_page
 from pupper_sysid.common.tables import Column, Table
@@ -27,7 +27,8 @@ from pupper_sysid.policies.analysis import figures
 from pupper_sysid.policies.analysis.autonomy import DELAYS_MS
 from pupper_sysid.policies.deploy.stacks import STACKS
 from pupper_sysid.servo_models.servo_file import WEIGHTS
-from pupper_sysid.sysid.report.figures import sweep_figure
+from pupper_sysid.sysid.recordings.recording import Trial
+from pupper_sysid.sysid.report.figures import within
 from reproduction import policies as policy_claims
 from reproduction import servos as servo_claims
 from reproduction import walks as walk_claims
@@ -168,6 +169,26 @@ def _show_step(what: str) -> None:
     terminal.err.print(f"{what} …", style="dim")
 
 
+@styled
+def _sweep_figure(trials: Sequence[Trial]) -> Figure:
+    """Three periods of commands and readings of a joint's tones; stale readings are faint."""
+    figure, panels = axes_column(len(trials), 0.6 + 1.35 * len(trials))
+    for axes, trial in zip(panels, trials, strict=True):
+        start = float(np.median(trial.send_time_s))
+        rows = within(trial.send_time_s, start, start + 3.0 / trial.frequency_hz)
+        time = trial.send_time_s[rows] - start
+        reading = trial.position_rad[rows]
+        fresh = np.diff(reading, prepend=np.nan) != 0
+        axes.plot(time, trial.command_rad[rows], "--", color=BLUE, lw=1.2, label="command")
+        axes.plot(time[~fresh], reading[~fresh], "o", ms=2.5, color=FAINT, label="stale reading")
+        axes.plot(time[fresh], reading[fresh], "o", ms=3.0, color=RED, label="fresh reading")
+        axes.set_title(f"{trial.joint}, {trial.frequency_hz:g} Hz")
+        axes.set_ylabel("rad")
+    panels[0].legend(fontsize=7.5, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    panels[-1].set_xlabel("time [s]")
+    return figure
+
+
 def _draw(
     evidence: list[PolicyEvidence], robot: servo_claims.ServoEvidence, trainings: list[Training]
 ) -> list[Picture]:
@@ -178,7 +199,7 @@ def _draw(
         drawn.append(("training", caption, training_figure(trainings)))
     if robot.sweep is not None:
         trials = robot.sweep.trials(robot.sweep.joints[-1])
-        figure = sweep_figure([t for t in trials if np.isfinite(t.frequency_hz)])
+        figure = _sweep_figure([t for t in trials if np.isfinite(t.frequency_hz)])
         caption = "As the paper's figure 2: commands and readings by frequency. Faint ones are old."
         drawn.append(("sweep", caption, figure))
     for kind in ("lstm", "mlp"):

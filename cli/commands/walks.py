@@ -225,7 +225,7 @@ def tries_of(
 
 
 _HEADINGS = {
-    "extra_delay_ms": "delay ms", "survival": "still up", "frequency_hz": "gait Hz",
+    "extra_delay_ms": "added dead time ms", "survival": "still up", "frequency_hz": "gait Hz",
     "amplitude_rad": "amplitude rad", "mae_vx_m_s": "vx error m/s", "mae_vy_m_s": "vy error m/s",
     "mae_yaw_rad_s": "yaw error rad/s",
 }  # fmt: skip

@@ -58,7 +58,7 @@ class RobotSpec:
     poll_period_s: float = 0.02685
     """Time between two polls of the same servo; 0 for a bus where every reading is fresh."""
     loss: float = 0.42
-    """Probability that a poll fails and leaves the old reading in place."""
+    """Probability that a poll fails and leaves the stale reading in place."""
     poll_jitter_s: float = 0.0008
     """Standard deviation of a poll instant about its lattice."""
     poll_drift: float = 0.002

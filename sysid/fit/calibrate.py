@@ -23,8 +23,11 @@ from pupper_sysid.sysid.doctor.checks import Joints, Recordings, as_sequence, us
 from pupper_sysid.sysid.fit.calibration_file import preset_parameters, to_calibration
 from pupper_sysid.sysid.fit.choice import Fitted, fit_structures, stages
 from pupper_sysid.sysid.fit.joint_fit import Presets, conclude
-from pupper_sysid.sysid.fit.loads import loaded_joints
-from pupper_sysid.sysid.fit.operating_point import reference_gain, with_operating_points
+from pupper_sysid.sysid.fit.operating_point import (
+    loaded_joints,
+    reference_gain,
+    with_operating_points,
+)
 from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
 from pupper_sysid.sysid.fit.results import JointCalibrationResult
 from pupper_sysid.sysid.fit.servo_prior import ServoPrior, servo_prior

@@ -43,7 +43,6 @@ from pupper_sysid.sysid.fit.run import Run, at_steps, free_run, simulate
 from pupper_sysid.sysid.fit.structure import candidate, loaded_columns
 from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
 from pupper_sysid.sysid.lag.lag_budget import LagBudget
-from pupper_sysid.sysid.recordings.recording import Trial
 from pupper_sysid.sysid.servo_fit.figures import busiest
 
 
@@ -194,26 +193,6 @@ def bode_figure(responses: Mapping[str, FrequencyResponse]) -> Figure:
 
 
 _FREQUENCY_TICKS = (0.1, 0.2, 0.5, 1, 2, 3, 4, 5, 7, 10, 15, 20)
-
-
-@styled
-def sweep_figure(trials: Sequence[Trial]) -> Figure:
-    """Three periods of commands and readings of a joint's tones; stale readings are faint."""
-    figure, panels = axes_column(len(trials), 0.6 + 1.35 * len(trials))
-    for axes, trial in zip(panels, trials, strict=True):
-        start = float(np.median(trial.send_time_s))
-        rows = within(trial.send_time_s, start, start + 3.0 / trial.frequency_hz)
-        time = trial.send_time_s[rows] - start
-        reading = trial.position_rad[rows]
-        fresh = np.diff(reading, prepend=np.nan) != 0
-        axes.plot(time, trial.command_rad[rows], "--", color=BLUE, lw=1.2, label="command")
-        axes.plot(time[~fresh], reading[~fresh], "o", ms=2.5, color=FAINT, label="stale reading")
-        axes.plot(time[fresh], reading[fresh], "o", ms=3.0, color=RED, label="fresh reading")
-        axes.set_title(f"{trial.joint}, {trial.frequency_hz:g} Hz")
-        axes.set_ylabel("rad")
-    panels[0].legend(fontsize=7.5, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    panels[-1].set_xlabel("time [s]")
-    return figure
 
 
 _SHOWN_PERIODS, _SHOWN_S = 2.5, 3.0  # of a tone, and of other motion

@@ -12,7 +12,7 @@ import pytest
 
 from pupper_sysid.sysid.fit import calibrate, joint_fit
 from pupper_sysid.sysid.fit.joint_fit import fit_structures
-from pupper_sysid.sysid.fit.loads import loaded_joints
+from pupper_sysid.sysid.fit.operating_point import loaded_joints
 from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
 
 _kept: dict[Any, Any] = {}
