@@ -320,7 +320,7 @@ class Attractor(Commanded):
 
 @dataclass(frozen=True)
 class Delay(Commanded):
-    """Later servos and later readings, in replay and in closed loop.
+    """Servos and readings with added dead time, in replay and in closed loop.
 
     Example: pupper-analyze delay runs/A runs/B
     """
