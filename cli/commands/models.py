@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Readings = Annotated[
     Literal["auto", "fresh", "all"],
     tyro.conf.arg(
-        help="Which readings count: fresh ones at the time they were taken, all rows as logged, or "
+        help="Which readings count: fresh ones at the time they were taken, all raw rows, or "
         "what suits the recording."
     ),
 ]

@@ -229,10 +229,10 @@ class TwinErrors(Result):
     mae_rad: float
     rmse_rad: float
     """`mae_rad` and `rmse_rad`: mean absolute and root mean square error of the readings that
-    count: rows as logged against predicted readings, or fresh ones where the recording dates
+    count: raw rows against predicted readings, or fresh ones where the recording dates
     them."""
     rmse_raw_rad: float
-    """Of rows as logged."""
+    """Of raw rows."""
     offset_rad: float
     """Reading minus prediction, taken out of all."""
 

@@ -363,7 +363,7 @@ class Scores(Part):
     rmse_one_step_rad: NotNegative | None = None
     """Root mean square error one loop period ahead [rad]."""
     rmse_free_run_raw_rad: NotNegative | None = None
-    """Free-run error on all rows as logged (raw) [rad]."""
+    """Free-run error on raw rows [rad]."""
     rmse_free_run_fresh_rad: NotNegative | None = None
     """Free-run error on fresh rows [rad]."""
     rmse_free_run_held_rad: NotNegative | None = None
@@ -395,7 +395,7 @@ class CandidateModel(Part):
     rmse_held_rad: NotNegative | None = None
     """Free-run error on all rows, the model sampled at the poll instants (held) [rad]."""
     rmse_raw_rad: NotNegative | None = None
-    """Free-run error on all rows as logged (raw) [rad]."""
+    """Free-run error on raw rows [rad]."""
     rmse_leave_one_frequency_out_rad: NotNegative | None = None
     """Free-run error on frequencies that were left out of the fit [rad]."""
     mae_unseen_runs_rad: NotNegative | None = None

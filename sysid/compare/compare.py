@@ -448,7 +448,7 @@ class _Opened:
     fitted_to: list[str]  # hashes
     model: ServoModel
     band: dict[str, scores.Band] = field(default_factory=dict)
-    of_rows: tuple[str, ...] = ()  # joints fitted to rows as logged
+    of_rows: tuple[str, ...] = ()  # joints fitted to raw rows
 
 
 def _open(model: str | Path | ServoFit, data: ServoData) -> _Opened:

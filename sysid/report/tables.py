@@ -145,7 +145,7 @@ def model_table(results: Mapping[str, JointCalibrationResult]) -> Table:
         Column("held", "rmse_held_rad", "mrad"),
         Column("one step", "rmse_one_step_rad", "mrad"),
         Column("fit, %", "fit_percent"),
-        Column("positions against rows as logged (misleads)", "rmse_raw_rad", "mrad"),
+        Column("positions against raw rows (misleads)", "rmse_raw_rad", "mrad"),
     )  # fmt: skip
     title = "Candidate models, simplest first"
     return Table("candidate_models", title, columns, rows, "is_chosen")
