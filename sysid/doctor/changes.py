@@ -167,10 +167,7 @@ class Followed:
     @cached_property
     def fit(self) -> Follower:
         """The servo that explains most readings: the best of the screen, refined."""
-        best: Sequence[Follower] = self.screen
-        for count, rounds in ((_REFINED, 4), (1, 20)):
-            best = sorted((fitted(self, f, rounds=rounds) for f in best), key=_cost)[:count]
-        return self.hopped(best[0])
+        return self.hopped(fitted(self, self.screen, (4, 20)))
 
     def hopped(
         self, fit: Follower, columns: Columns | None = None, free: Sequence[int] = _ALONE
@@ -201,11 +198,10 @@ class Followed:
             terms = np.tile(fit.terms, (len(changes), 1))
             for row, change in zip(terms, changes, strict=True):
                 row[list(change)] = np.log(list(change.values()))
-            begins = self.followers(terms, columns)
-            better = min((fitted(self, f, columns, free, rounds=5) for f in begins), key=_cost)
+            better = fitted(self, self.followers(terms, columns), (2, 3), columns, free)
             if better.cost > 0.97 * fit.cost:
                 break
-            fit = fitted(self, better, columns, free, rounds=15)
+            fit = fitted(self, [better], (15,), columns, free)
         return fit
 
     @cached_property
@@ -248,7 +244,7 @@ class Followed:
         terms = self.fit.terms.copy()
         terms[[_FRICTION, _PLAY]] += np.log(_LITTLE)
         free = [k for k in _ALONE if k not in (_FRICTION, _PLAY)]
-        without = fitted(self, self.follower(terms), free=free)
+        without = fitted(self, [self.follower(terms)], free=free)
         nats = self.fit.independent * np.log(without.cost / self.fit.cost)
         friction, play = np.exp(self.fit.terms[[_FRICTION, _PLAY]])
         return float(friction + play / 2) if nats > CLEAR_NATS else 0.0
@@ -309,24 +305,23 @@ class Followed:
     def paths(self, terms: NDArray) -> NDArray[np.float64]:
         """The same of several servos, shape (servos, readings), by the kernel of the fits."""
         paths, unlike = np.empty((len(terms), len(self.time_s))), np.ones(len(terms), bool)
-        while unlike.any():  # servos abreast have one command, and are read at one time
-            growth, low, high = terms[np.argmax(unlike), _GROWTH : _HIGH + 1]
-            abreast = (terms[:, _GROWTH : _HIGH + 1] == (growth, low, high)).all(axis=1)
+        while unlike.any():  # servos abreast have one command
+            low, high = terms[np.argmax(unlike), _LOW : _HIGH + 1]
+            abreast = (terms[:, _LOW : _HIGH + 1] == (low, high)).all(axis=1)
             unlike &= ~abreast
             servos = _columns(terms[abreast], self.reach)
-            late = self.time_s + _EARLY_S - growth * self.later
+            late = self.time_s + _EARLY_S - terms[abreast, _GROWTH, None] * self.later
             servos[:, _HANGING] = self.base.samples[0].rest_rad - np.pi / 2  # held level
             free = (low, high) == (-_FAR, _FAR)
             inputs = self._inputs if free else self._clamped(low, high)
             for (mean, edges, step, start), a, b in zip(
                 inputs, self.starts[:-1], self.starts[1:], strict=True
             ):
-                paths[abreast, a:b] = kernel.residuals(
+                track = kernel.positions(
                     kernel.SERVO, servos, (terms[abreast, _LAG] + _EARLY_S) / step, mean[None],
                     edges, 1.0, _NO_LOAD, mean[0], _rest_steps(step), step,
-                    step=np.clip((late[a:b] - start) / step, 0.0, len(mean) - _rest_steps(step)),
-                    reading=np.zeros(b - a),
-                ) - servos[:, kernel.OFFSET, None]  # fmt: skip
+                ) - servos[:, kernel.OFFSET]  # fmt: skip
+                paths[abreast, a:b] = _read(track, (late[:, a:b] - start) / step)
         return np.clip(paths, terms[:, _BOTTOM, None], terms[:, _TOP, None])
 
     def path_of_trial(self, number: int) -> NDArray[np.float64]:
@@ -452,47 +447,92 @@ def _cost(fit: Follower) -> float:
 
 
 def fitted(
-    joint: Followed, begin: Follower, columns: Columns | None = None,
-    free: Sequence[int] = _ALONE, rounds: int = 12,
+    joint: Followed, begins: Sequence[Follower], rounds: Sequence[int] = (12,),
+    columns: Columns | None = None, free: Sequence[int] = _ALONE,
 ) -> Follower:  # fmt: skip
-    """Fit the `free` terms of a servo by Levenberg-Marquardt, reweighted for the bounded cost."""
-    best, damping = joint.follower(begin.terms, columns), 0.03
-    free = [k for k in free if k < _LOW or abs(begin.terms[k]) < _FAR]  # levels that are set
+    """The best of several servos whose `free` terms are fitted: the few best of a stage go on."""
+    best = joint.followers(np.array([f.terms for f in begins]), columns)
+    for stage, count in enumerate(rounds):
+        best = sorted(best, key=_cost)[:_REFINED] if stage else best
+        best = _fitted_abreast(joint, best, count, columns, free)
+    return min(best, key=_cost)
+
+
+def _fitted_abreast(
+    joint: Followed, begins: Sequence[Follower], rounds: int, columns: Columns | None,
+    terms_free: Sequence[int],
+) -> list[Follower]:  # fmt: skip
+    """Servos by Levenberg-Marquardt, reweighted for the bounded cost."""
+    best, dampings, moving = list(begins), [0.03] * len(begins), list(range(len(begins)))
     bound, floor = joint.bound * joint.scale, 0.01 * joint.scale + 0.25 * joint.step
-    steps = steps_of(joint)
-    terms_free = np.array(free)
+    steps, several = steps_of(joint), len(_DAMPED)
     for _ in range(rounds):
-        size = np.abs(best.residuals_rad)
-        weight = (bound / (size + bound)) ** 2 / np.maximum(size, floor)
-        step = np.where(best.terms + steps <= _HIGHEST, steps, -steps)[terms_free]
-        moved = best.terms + np.eye(len(steps))[terms_free] * step[:, None]
-        slopes = (joint.paths(moved) - best.path_rad) * (best.values[0] / step)[:, None]
-        more = columns(best.path_rad) if columns else ()
-        design = np.column_stack([*slopes, best.path_rad, *more])
-        rest = best.residuals_rad.copy()
-        for a, b in zip(joint.starts[:-1], joint.starts[1:], strict=True):
-            share = weight[a:b] / weight[a:b].sum()
-            design[a:b] -= share @ design[a:b]
-            rest[a:b] -= share @ rest[a:b]
-        gram = design.T @ (weight[:, None] * design)
-        right = design.T @ (weight * rest)
-        size, before = np.diag(gram) + 1e-9 * np.trace(gram) / len(gram) + 1e-12, best.cost
-        held = np.full((len(_DAMPED), len(gram)), 1e-9)
-        held[:, : len(free)] = damping * _DAMPED[:, None]
-        ways = np.linalg.solve(gram + held[:, None] * np.diag(size), right[:, None])
-        ways = np.clip(ways[:, : len(free), 0], -8 * steps[terms_free], 8 * steps[terms_free])
-        terms = np.tile(best.terms, (len(ways), 1))
-        terms[:, terms_free] += ways
-        tried = joint.followers(terms, columns)
-        at = int(np.argmin([_cost(f) for f in tried]))
-        damping = float(np.clip(damping * _DAMPED[at], 1e-4, 1e4))
-        best = tried[at] if _cost(tried[at]) < best.cost else best
-        if best.cost > 0.999 * before:
+        frees = [[k for k in terms_free if _acts(best[n].terms, k)] for n in moving]
+        signs = [np.where(best[n].terms + steps <= _HIGHEST, steps, -steps) for n in moving]
+        moved = [
+            best[n].terms + np.diag(s)[f] for n, s, f in zip(moving, signs, frees, strict=True)
+        ]
+        paths = np.split(
+            joint.paths(np.concatenate(moved)), np.cumsum([len(m) for m in moved])[:-1]
+        )
+        terms = []
+        for n, path, free, step in zip(moving, paths, frees, signs, strict=True):
+            size = np.abs(best[n].residuals_rad)
+            weight = (bound / (size + bound)) ** 2 / np.maximum(size, floor)
+            slopes = (path - best[n].path_rad) * (best[n].values[0] / step[free])[:, None]
+            more = columns(best[n].path_rad) if columns else ()
+            design = np.stack([*slopes, best[n].path_rad, *more, best[n].residuals_rad])
+            for a, b in zip(joint.starts[:-1], joint.starts[1:], strict=True):
+                design[:, a:b] -= (design[:, a:b] @ weight[a:b] / weight[a:b].sum())[:, None]
+            gram = (design * weight) @ design.T
+            gram, right = gram[:-1, :-1], gram[:-1, -1]
+            size = np.diag(gram) + 1e-9 * np.trace(gram) / len(gram) + 1e-12
+            held = np.full((several, len(gram)), 1e-9)
+            held[:, : len(free)] = dampings[n] * _DAMPED[:, None]
+            ways = np.linalg.solve(gram + held[:, None] * np.diag(size), right[:, None])
+            each = np.tile(best[n].terms, (several, 1))
+            each[:, free] += np.clip(ways[:, : len(free), 0], -8 * steps[free], 8 * steps[free])
+            terms.append(each)
+        tried, goes_on = joint.followers(np.concatenate(terms), columns), []
+        for place, n in enumerate(moving):
+            ways = tried[several * place : several * (place + 1)]
+            at, before = int(np.argmin([_cost(f) for f in ways])), best[n].cost
+            dampings[n] = float(np.clip(dampings[n] * _DAMPED[at], 1e-4, 1e4))
+            best[n] = min(best[n], ways[at], key=_cost)
+            goes_on += [n] if best[n].cost <= 0.999 * before else []
+        if not (moving := goes_on):
             break
     return best
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+def _acts(terms: NDArray, number: int) -> bool:
+    """Whether a term is one that the servo has: no speed, ramp or level that nothing reaches."""
+    if number in (_SPEED, _RAMP):
+        return bool(terms[number] < _HIGHEST[number])
+    return number < _LOW or abs(terms[number]) < _FAR
+
+
+@njit(cache=True, error_model="numpy")
+def _read(track, moments):
+    """Positions of each servo (steps, servos) at its moments (servos, readings) [steps].
+
+    On the parabola of the accelerations before and after a step.
+    """
+    steps = len(track) - 1
+    out = np.empty(moments.shape)
+    for i in range(len(moments)):
+        for n in range(moments.shape[1]):
+            moment = min(max(moments[i, n], 0.0), float(steps))
+            row = min(int(moment), steps - 1)
+            part = moment - row
+            bent = 0.25 * part * (1.0 - part)
+            before, after = track[max(row - 1, 0), i], track[min(row + 2, steps), i]
+            near = (1.0 - part + bent) * track[row, i] + (part + bent) * track[row + 1, i]
+            out[i, n] = near - bent * (before + after)
+    return out
+
+
+@njit(cache=True, error_model="numpy")
 def _regression(design, position, starts, bound, floor):
     """Mean cost, values and residuals of a regression whose errors cost no more than `bound`."""
     # sums in loops: without arrays in between they take half the time
@@ -579,7 +619,8 @@ class _Change:
     def spans(self, joint: Followed) -> list[Span]:
         """Where it may change."""
         edges, count = _edges(joint), len(joint.time_s)
-        several: list[list[Span]] = [[None], [(k, count) for k in edges], [*combinations(edges, 2)]]
+        whiles = combinations(edges[::2], 2)
+        several: list[list[Span]] = [[None], [(k, count) for k in edges], [*whiles]]
         return several[self.moments]
 
     def columns(self, joint: Followed, span: Span) -> Columns:
@@ -617,20 +658,24 @@ class _Change:
     ) -> tuple[Span, Follower]:
         """The servo with the change, and where it is `worth` it the span found again for it."""
         span, begins = self.screened(joint)
-        best = min((self.refined(joint, f, span, 6) for f in begins), key=_cost)
-        for width, rounds in ((1.0, 4), (1 / 7, 8), (1 / 7, 4)) if worth(self, best) else ():
+        best = self.refined(joint, begins, span, (3, 3))
+        width = float(max(self.moments, 1))  # edges that were tried lie so far apart
+        stages = ((width, 4), (width / 7, 8), (width / 49, 4))
+        for width, rounds in stages if worth(self, best) else ():
             near, servos = _near(joint, span, width), (best, begins[0])
             tried = [(s, f) for s in near for f in self.begins(joint, servos, s)]
             span, best = min([(span, best), *tried], key=lambda t: _cost(t[1]))
-            best = self.refined(joint, best, span, rounds)
+            best = self.refined(joint, [best], span, (rounds,))
         return span, best
 
-    def refined(self, joint: Followed, begin: Follower, span: Span, rounds: int) -> Follower:
-        """The servo with the change, fitted."""
+    def refined(
+        self, joint: Followed, begins: Sequence[Follower], span: Span, rounds: Sequence[int]
+    ) -> Follower:
+        """The best servo with the change, fitted."""
         if self.number == "lag":
             joint = replace(joint, later=_profile(joint, span))
         free = (*_ALONE, _GROWTH) if self.number == "lag" else (*_ALONE, *range(_LOW, _TOP + 1))
-        return fitted(joint, begin, self.columns(joint, span), free, rounds)
+        return fitted(joint, begins, rounds, self.columns(joint, span), free)
 
 
 def _profile(joint: Followed, span: Span) -> NDArray[np.float64]:
@@ -707,10 +752,9 @@ def comparisons(joint: Followed) -> list[Compared]:
         return nats(change, plain, fit, joint.fit.readings) > 0  # if all were independent
 
     fits = [(change, *change.fitted(joint, worth)) for change in changes]
-    for _, _, fit in sorted(fits, key=lambda f: _cost(f[2]))[:_REFINED]:
-        alone = fit.terms.copy()  # its servo may explain as much without the change
-        alone[_GROWTH:] = joint.fit.terms[_GROWTH:]
-        plain = min(plain, fitted(joint, joint.follower(alone)).cost)
+    alone = np.array([f.terms for f in sorted((f for *_, f in fits), key=_cost)[:_REFINED]])
+    alone[:, _GROWTH:] = joint.fit.terms[_GROWTH:]  # its servo may explain as much by itself
+    plain = min(plain, fitted(joint, joint.followers(alone)).cost)
     # the residuals of the best tell how many readings are independent
     count = min((joint.fit, *(fit for *_, fit in fits)), key=_cost).independent
     compared = []

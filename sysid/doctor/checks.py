@@ -303,8 +303,12 @@ def usable_trials(recordings: Recordings, joints: Joints = None) -> dict[str, tu
     `joints`: which joints; by default all that were recorded.
     """
     chosen = chosen_joints(recordings, joints)
-    refuse_unusable({j: recorded_trials(recordings, j) for j in chosen})
-    return {j: joint_trials(recordings, j) for j in chosen}
+    recorded = {j: recorded_trials(recordings, j) for j in chosen}
+    refuse_unusable(recorded)
+    trials = {j: joint_trials(recordings, j) for j in chosen}
+    for joint, parts in trials.items():  # which are judged as the doctor judges the whole
+        findings.known(parts, findings(recorded[joint]))
+    return trials
 
 
 def joint_rng(seed: int, joint: str) -> np.random.Generator:

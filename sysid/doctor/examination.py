@@ -39,7 +39,7 @@ from pupper_sysid.sysid.feedback.poll_lattice import (
     quantum,
 )
 from pupper_sysid.sysid.feedback.staleness import moving_rows
-from pupper_sysid.sysid.lag.lag_budget import LagBudget, lag_budget
+from pupper_sysid.sysid.lag.lag_budget import LagBudget, raw_and_fresh_lag
 from pupper_sysid.sysid.recordings.excitation import describe, named_tones, without_bad_readings
 from pupper_sysid.sysid.recordings.recording import Trial
 
@@ -76,7 +76,7 @@ class JointExamination(Result):
     """`poll_period_s`, `loss`, `z_score` and `hit_rate`: see
     `sysid.feedback.poll_lattice.PollLattice`."""
     hold_share: float = math.nan
-    """Share of the raw lag that stale readings add."""
+    """Share of the raw lag that stale readings add; NaN where no poll is found."""
     quantum_rad: float = math.nan
     """Quantisation step; 0 if there is none."""
     reading_minus_command_rad: float = math.nan
@@ -255,12 +255,17 @@ def _hold_share(
     rng: np.random.Generator,
     lag: LagBudget | None,
 ) -> float:
+    if lattice.kind != "lattice":  # without a poll that is known nothing tells how old readings are
+        return 0.0 if lattice.kind == "every read" else math.nan
     try:
-        budget = lag or lag_budget(joint, trials, rng, lattice)
+        raw_s, fresh_s = (
+            (lag.raw_lag_s.value, lag.fresh_lag_s.value)
+            if lag
+            else raw_and_fresh_lag(joint, trials, rng, lattice)
+        )
     except InputError:  # too few fresh readings: reported elsewhere
         return math.nan
-    raw = budget.raw_lag_s.value
-    return budget.stale_lag_s / raw if raw > 0 else math.nan
+    return (raw_s - fresh_s) / raw_s if raw_s > 0 else math.nan
 
 
 def _held(lattice: PollLattice, hold_share: float) -> list[Finding]:

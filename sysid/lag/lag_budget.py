@@ -248,6 +248,15 @@ def lag_budget(
     )  # fmt: skip
 
 
+def raw_and_fresh_lag(
+    joint: str, trials: Sequence[Trial], rng: np.random.Generator, lattice: PollLattice
+) -> tuple[float, float]:
+    """The lag of all rows as logged, and of fresh readings at the time they were measured [s]."""
+    read = [readings(t, lattice) for t in trials]
+    seen = _seen(joint, trials, read, rng, lattice.kind == "lattice")
+    return seen.raw.value, seen.fresh.value
+
+
 @dataclass(frozen=True)
 class _Seen:
     """What readings dated in one way show."""

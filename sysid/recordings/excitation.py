@@ -54,6 +54,10 @@ def remembered(most: int) -> Callable[[Callable[..., Found]], Callable[..., Foun
             results.move_to_end(key)
             return results[key]
 
+        def known(trials: Sequence[Trial], result: Found) -> None:
+            results[_digest(trials), ()] = result
+
+        from_memory.known = known  # pyright: ignore[reportAttributeAccessIssue]
         return from_memory
 
     return decorate
