@@ -68,6 +68,7 @@ _USUAL = 0.9  # share of ASCII in tables of numbers that are not in UTF-8
 _FEWEST_TIMES, _LONGEST_TRANSPOSED = 20, 20_000_000  # rows of a log; characters
 _SAME_SHAPE, _NUMERIC = 0.9, 0.9  # shares of rows, of cells
 _COMMENT = re.compile(r"[ \t]*(#|%|//|!)")
+_LABVIEW = re.compile(r"^(Channels|Samples)(\t\d+)+\t*$", re.MULTILINE)  # looks like a row
 _COMMA_NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:,[0-9]*)?|,[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _CLOCK = re.compile(
     r"(\d{4}-\d\d-\d\d[T ]|\d{1,4}([-/.])(?:\d{1,2}|[A-Z][a-z]{2})\2\d{1,4} |\d+ days? )?"
@@ -186,6 +187,7 @@ def plain(text: str) -> Plain:
         text = _LONG_LIST.sub(
             lambda m: m[1].replace("\n", " ") + m[2] + "\n" * m[1].count("\n"), text
         )
+    text = _LABVIEW.sub("", text)
     lines = text[:_SAMPLE].split("\n")
     if len(text) > _SAMPLE:
         lines.pop()

@@ -174,7 +174,13 @@ def refuse_unusable(trials_by_joint: Mapping[str, Sequence[Trial]]) -> None:
 
 def cautions(joint: str, trials: Sequence[Trial]) -> tuple[str, ...]:
     """Warnings that go with every number computed from these trials of `joint`."""
-    return tuple(f"{joint}: {f.text}" for f in findings(trials) if f.verdict != USE)
+    return tuple(f"{joint}: {f.text}" for f in findings(_whole(trials)) if f.verdict != USE)
+
+
+@remembered(64)
+def _whole(trials: Sequence[Trial]) -> Sequence[Trial]:
+    """The trials as they were recorded, where these are their tones (`usable_trials`)."""
+    return trials
 
 
 def _few_fresh(trials: Sequence[Trial], step: float) -> list[Finding]:
@@ -307,7 +313,7 @@ def usable_trials(recordings: Recordings, joints: Joints = None) -> dict[str, tu
     refuse_unusable(recorded)
     trials = {j: joint_trials(recordings, j) for j in chosen}
     for joint, parts in trials.items():  # which are judged as the doctor judges the whole
-        findings.known(parts, findings(recorded[joint]))
+        _whole.known(parts, recorded[joint])
     return trials
 
 

@@ -48,7 +48,8 @@ def motion_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
 
 def unit_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     """Angles that cannot be radians, whatever their amplitude, unless their unit is stated."""
-    if all(t.unit_stated for t in trials):
+    whole_turn = abs(abs(offset(trials)) - 2 * np.pi) < _NOTED_RAD  # the zero, not the unit
+    if whole_turn or all(t.unit_stated for t in trials):
         return []
     cure = "Angles must be radians: multiply degrees by 0.0174533."
     largest = max(float(np.max(np.abs(t.command_rad))) for t in trials)

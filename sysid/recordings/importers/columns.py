@@ -158,8 +158,13 @@ def _column(name: str) -> Column:
     bare_name = _IN_UNIT.sub(" ", name.strip()).replace("μ", "µ")  # the Greek letter
     parts = [part for word in _SEPARATORS.split(bare_name) if word for part in _parts(word)]
     known = [WORDS.get(p.lower(), "") for p in parts]
-    kinds = set(known)
     lower = [p.lower() for p in parts]
+    leaf = _SEPARATORS.split(re.split(r"[./]", bare_name)[-1])
+    of_leaf = [WORDS.get(part.lower(), "") for word in leaf if word for part in _parts(word)]
+    above = len(known) - len(of_leaf)
+    if above > 0 and ANGLE in of_leaf and OTHER not in of_leaf and len(lower[-1]) > 1:
+        known = [JOINT if k == OTHER else k for k in known[:above]] + of_leaf  # pos_vel_mapper.pos
+    kinds = set(known)
 
     def others(kind: str, words: Iterable[str]) -> None:
         """Make these words of another kind."""

@@ -19,7 +19,8 @@ Each row has one time stamp, and the log does not say when in a turn the command
 position read: lag and dead time are in doubt by half a turn.
 
 Others are tables: lists by name, a list of records, or a record a line (JSON Lines); `{"cmd":
-{"knee": 0.1}}` is a column `cmd.knee`, and a list of numbers has a column each.
+{"knee": 0.1}}` is a column `cmd.knee`, and a list of numbers has a column each. `{"cmd": [[t, v],
+…], "pos": [[t, v], …]}` has times of its own for each.
 """
 
 from __future__ import annotations
@@ -162,7 +163,7 @@ def _read_ktune(path: Path, data: dict[str, Any]) -> Log:
 def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     """The log in other JSON as a table; None if it has no columns of a command and a position."""
     lists: dict[str, list[Any]] = {}
-    data = _of_points(_of_frame(data))
+    data = _of_pairs(_of_points(_of_frame(data)))
     records = _records(data)
     if records is None and not isinstance(data, Mapping):
         values = _numbers(data)
@@ -266,6 +267,27 @@ def _of_points(data: Any) -> Any:
     named = all("joint" not in point for points in of_joint.values() for point in points)
     return [point | ({"joint": joint} if joint and named else {})
             for joint, points in of_joint.items() for point in points]  # fmt: skip
+
+
+def _of_pairs(data: Any) -> Any:
+    """Lists of `[time, value, …]`, by the names above them, as a list of records; others as is."""
+    of_name: dict[str, list[Any]] = {}
+    pending = [("", data)] if isinstance(data, Mapping) else []
+    while pending:
+        prefix, inside = pending.pop(0)
+        for key, value in inside.items():
+            name = f"{prefix}.{key}".strip(".")
+            if isinstance(value, Mapping):
+                pending.append((name, value))
+            elif isinstance(value, list) and has_time([str(key)]):
+                return data
+            elif (rows := _numbers(value)) is not None and rows.ndim == 2 and rows.shape[1] > 1:
+                if len(rows) > 1 and (np.diff(rows[:, 0]) > 0).all():
+                    of_name[name] = value
+    if missing([*of_name]):
+        return data
+    return [{"time": row[0], "signal": name, "value": row[1] if len(row) == 2 else row[1:]}
+            for name, each in of_name.items() for row in each]  # fmt: skip
 
 
 def _by_name(value: list[Any]) -> Any:

@@ -30,6 +30,7 @@ _COMPARED = 8  # columns for one purpose
 _OF_TURNS = {
     "ODrive": {"setpoint", "estimate"},
     "ODrive's API": {"input", "estimate"},
+    "ODrive's mapper": {"axis0.pos_vel_mapper.pos_rel"},
     "moteus": {"servo_stats.position"},
     "moteus's decoder": {"command_position", "q_current"},
     "moteus's registers": {"Register.POSITION"},

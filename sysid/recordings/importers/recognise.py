@@ -9,6 +9,8 @@ from pathlib import Path
 from textwrap import indent
 from typing import Any
 
+import pandas as pd
+
 from pupper_sysid.common import border
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import RECORDING, refuse_other_kind
@@ -22,12 +24,16 @@ from pupper_sysid.sysid.recordings.importers import (
     ros,
     sage,
 )
-from pupper_sysid.sysid.recordings.importers.log import Log, joint_names
+from pupper_sysid.sysid.recordings.importers.columns import column, time_columns
+from pupper_sysid.sysid.recordings.importers.log import Log, Table, joint_names, read_files
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
-from pupper_sysid.sysid.recordings.importers.refusals import unknown_folder, unknown_json
+from pupper_sysid.sysid.recordings.importers.refusals import missing, unknown_folder, unknown_json
+from pupper_sysid.sysid.recordings.layouts import convert
+from pupper_sysid.sysid.recordings.table import parse
 
 _ENDINGS = (".csv", ".tsv", ".json", ".jsonl", ".mcap", ".db3", ".npz", ".parquet", ".pt", ".mat")
 _PACKED = (".gz", ".bz2", ".xz")
+_TABLES = (".csv", ".tsv", ".txt", ".log", ".dat")
 _STAMP = re.compile(rb"\[[^\[\]{}\"\n]*\][ \t:]*[A-Za-z(\[\d]")  # before a message: a line of text
 _JSON = re.compile(rb"(?:#[^\n]*\n\s*)*(?:\{|\[[\s\[]*(?:[\"{\d\]-]|true|false|null|NaN|Inf))")
 _YAML = re.compile(rb"(?:---\s*\n)?(?:- \w+:|\w+:[ \t]*\r?\n[ \t]+\w+:)")
@@ -46,8 +52,35 @@ _ROW = re.compile(rb"\[[-+\d.eE, \t\[\]()]+\][ \t]*\r?\n")  # numbers, a whole l
 def is_log_folder(folder: Path) -> bool:
     """Whether a folder is one log, such as a dataset, rather than a folder of recordings."""
     return folder.is_dir() and (
-        sage.is_sage(folder) or lerobot.is_lerobot(folder) or ros.is_bag(folder)
+        sage.is_sage(folder)
+        or lerobot.is_lerobot(folder)
+        or ros.is_bag(folder)
+        or _halves(folder) is not None
     )
+
+
+def _halves(folder: Path) -> tuple[Table, str] | None:
+    """Commands and states that a folder has in a table each, as one table, and their digest."""
+    logs = [p for p in sorted(folder.iterdir()) if p.suffix in _TABLES and _may_be_log(p)]
+    if len(logs) != 2 or {column(p.stem).kind for p in logs} != {"command", "position"}:
+        return None
+    parts, times = [], []
+    try:
+        contents, digest = read_files(folder, logs)
+        for path in logs:
+            table = parse(path, decoded(path, contents[path]))
+            timed = [n for n in time_columns(table.names) if n in table.increasing]
+            if not timed or not missing(table.names):
+                return None
+            times.append(timed[0])
+            named = {n: n if n == timed[0] else f"{path.stem}.{n}" for n in table.columns}
+            parts.append(pd.DataFrame(table.columns).rename(columns=named))
+    except InputError:
+        return None
+    if times[0] != times[1]:
+        return None
+    whole = pd.concat(parts, ignore_index=True).sort_values(times[0], kind="stable")
+    return Table({str(n): whole[n].to_numpy(float) for n in whole}), digest
 
 
 def logs_in(path: Path) -> list[Path]:
@@ -88,6 +121,8 @@ def read_folder(folder: Path, options: LogOptions) -> Log:
         return chosen(folder, lerobot.read_lerobot(folder, options), options)
     if ros.is_bag(folder):
         return ros.read_bag(folder, options)
+    if halves := _halves(folder):
+        return replace(convert(folder, halves[0], options), sha256=halves[1])
     inside = [p.name for p in logs_in(folder)]
     raise InputError(
         f"{folder} holds {len(inside)} logs ({', '.join(inside[:3])} …). Give one of them; "

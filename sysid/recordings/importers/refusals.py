@@ -53,6 +53,7 @@ _CURRENT = re.compile(r"cur(r|rent)?(?![A-Za-z])", re.IGNORECASE)
 _WIDEST_ANGLE = 1e6  # of a joint, in any unit
 _COMPARED, _ALIKE = 12, 0.7  # columns; concordance of a command and its position
 _ORDERED = 100_000  # rows
+_NO_PLACE = re.compile(r"vel|speed|rpm|torque|effort|volt|temp|power|pwm|duty", re.IGNORECASE)
 _PULSES = re.compile(r"pwm|pulse|duty", re.IGNORECASE)  # what a hobby servo is commanded by
 _PULSES_US, _OF_PULSES = (400.0, 2700.0), "counts:4000:1500"  # 2,000 µs for half a turn
 _IS_RATE = 0.95  # correlation of a column with another one summed up
@@ -133,6 +134,11 @@ def unknown_columns(path: Path | str, table: Table, timed: bool = False) -> str:
     ours = [n for n in LAYOUTS["recording of this project"] if n not in names]
     near = ((n, hit) for n in names for hit in difflib.get_close_matches(n, ours, 1, 0.8))
     hint = next((f"Was '{printable(n)[:40]}' meant as {hit}? Rename it. " for n, hit in near), "")
+    if (duty := next(filter(_PULSES.search, names), None)) and not lines:
+        hint = (
+            f"{printable(duty)[:40]} drives the motor and says not where it is to go: a log of a "
+            "position servo needs its goals. "
+        )
     return (
         f"its columns ({listed(names)}) belong to no known layout. {'; '.join(parts)}. "
         f"{hint}Name the columns{cure}"
@@ -158,7 +164,7 @@ def _lines_by_name(path: Path | str, table: Table, timed: bool) -> str:
         if kind == "command" and not sure:  # qd beside q may be the desired angle
             sure = [c for c in columns if c.name[-1:] == "d" and c.name[:-1] in table.names]
         if kind == "command" and not sure:
-            sure = [c for c in columns if not c.kind and _PULSES.search(c.name)]
+            sure = [c for c in columns if _are_pulses(table, c.name)]
         if kind == "position" and not sure:  # beside a command a bare `current` may be a place
             sure = [c for c in columns if not c.kind and _CURRENT.search(c.name)]
         chosen = [(c.template, c.name) for c in sure]
@@ -191,7 +197,8 @@ def lines_by_value(path: Path | str, table: Table) -> list[str]:
     for name, values in table.columns.items():
         known = table.known(name)
         same = (np.array_equal(values, table.columns[o], equal_nan=True) for o in others)
-        if name == time or name in rates or np.ptp(known) == 0 or any(same):
+        other = _NO_PLACE.search(re.split(r"[./]", name)[-1]) and not _are_pulses(table, name)
+        if name == time or name in rates or other or np.ptp(known) == 0 or any(same):
             continue
         if np.ptp(known) < _WIDEST_ANGLE:
             others.append(name)
@@ -257,10 +264,23 @@ def _unit_of(table: Table, names: Iterable[str]) -> dict[str, str]:
             return {}
         pair.append(table.known(column_name))
     largest = max(float(np.abs(values).max()) for values in pair)
-    if _PULSES_US[0] < pair[0].min() <= pair[0].max() < _PULSES_US[1] and pulses:
+    if _are_pulse_widths(pair[0]) and pulses:
         of_position = likely_of_pair(pair[1], pair[1])[0].partition(",")[0]
         return {"unit": f"{_OF_PULSES},{of_position}"}
     return {"unit": likely_of_pair(*pair)[0]} if largest > LARGEST_RAD else {}
+
+
+def _are_pulses(table: Table, name: str) -> bool:
+    """Whether a column holds pulse widths, which command a hobby servo; a duty cycle does not."""
+    return (
+        not column(name).kind
+        and _PULSES.search(name) is not None
+        and _are_pulse_widths(table.known(name))
+    )
+
+
+def _are_pulse_widths(values: NDArray[np.float64]) -> bool:
+    return bool(_PULSES_US[0] < values.min() <= values.max() < _PULSES_US[1])
 
 
 def rate_note(line: str | Mapping[str, str], table: Table) -> str:

@@ -400,3 +400,44 @@ def test_the_log_of_the_forms_without_names_counts_its_repeated_rows_once():
     (trial,) = recording.trials("joint")
     (form,) = load(case("real/forms_of_one_log/tab.txt")).trials("joint")
     np.testing.assert_allclose(trial.position_rad, form.position_rad[:501], atol=1e-9)
+
+
+def test_commands_and_states_in_two_tables_of_a_folder_are_one_log(tmp_path):
+    """Each with times of its own; a folder of two recordings stays one of two."""
+    for name, time, values in (("joint_commands", TIME, COMMAND),
+                               ("joint_states", TIME + 0.001, POSITION)):  # fmt: skip
+        table = pd.DataFrame({"timestamp": time, "joint_0": values, "joint_1": -values})
+        table.to_csv(tmp_path / f"{name}.csv", index=False)
+    recording = load(tmp_path)
+    assert [*recording.joints] == ["joint_0", "joint_1"]
+    for joint, sign in (("joint_0", 1), ("joint_1", -1)):
+        (trial,) = recording.trials(joint)
+        assert trial.read_time_s[0] - trial.send_time_s[0] == pytest.approx(0.001)
+        np.testing.assert_allclose(trial.command_rad, sign * COMMAND, atol=1e-9)
+        np.testing.assert_allclose(trial.position_rad, sign * POSITION, atol=1e-9)
+    (tmp_path / "joint_states.csv").write_text(joined(","))
+    with pytest.raises(InputError, match="holds 2 logs"):
+        load(tmp_path)
+
+
+@pytest.mark.parametrize("under", [(), ("knee",)])
+def test_lists_of_times_and_values_are_read(tmp_path, under):
+    columns = {"target": (TIME, COMMAND), "actual": (TIME + 0.001, POSITION)}
+    lists = {name: np.column_stack(pair).tolist() for name, pair in columns.items()}
+    for name in under:
+        lists = {name: lists}
+    (tmp_path / "log.json").write_text(json.dumps(lists))
+    recording = load(tmp_path / "log.json")
+    assert [*recording.joints] == [*(under or ["joint"])]
+    same(recording)
+
+
+def test_what_drives_a_motor_is_not_offered_as_a_goal(tmp_path):
+    path = tmp_path / "log.csv"
+    for names in ("pwm,position,speed", "duty,rpm,current", "servo_us,rpm,volt"):
+        rows = zip(TIME, 255 * COMMAND, POSITION, 9 * COMMAND, strict=True)
+        text = "\n".join(f"{t},{d:.3f},{p},{s}" for t, d, p, s in rows)
+        path.write_text(f"time,{names}\n{text}\n")
+        with pytest.raises(InputError) as refusal:
+            load(path)
+        assert not re.search(r"--command (?!and)", str(refusal.value))
