@@ -16,6 +16,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Iterator
+from itertools import product
 
 from shared import print_rows  # isort: skip
 
@@ -61,9 +62,13 @@ def judged(fault: str, number: int, seed: int) -> dict:
 
 
 def main(count: int = 14, seed: int = 1, only: tuple[str, ...] = tuple(FAULTS)) -> None:
-    """Print the table of `count` recordings of each fault, and a line of each that is not right."""
+    """Print a line of each recording that is not right, and the table of `count` of each fault."""
     warnings.simplefilter("ignore")
-    rows = [judged(fault, number, seed) for number in range(count) for fault in only]
+    rows = []
+    for number, fault in product(range(count), only):
+        rows.append(r := judged(fault, number, seed))
+        if r["kind"] != "right":
+            print(fault, number, r["motion"], r["codes"], r["rivals"], flush=True)
     kinds = ("right", "undecided", "accused")
 
     def cells() -> Iterator[list[object]]:
@@ -77,9 +82,6 @@ def main(count: int = 14, seed: int = 1, only: tuple[str, ...] = tuple(FAULTS)) 
 
     print_rows(("fault", "recordings", "right", "undecided", "another fault named",
                 "codes where it is not right"), cells())  # fmt: skip
-    for r in rows:
-        if r["kind"] != "right":
-            print(r["fault"], r["number"], r["motion"], r["codes"], r["rivals"])
     total = Counter(r["kind"] for r in rows)
     shares = ", ".join(f"{total[k] / len(rows):.1%} {k}" for k in kinds)
     print(f"\n{len(rows)} recordings: {shares}; {max(r['spent_s'] for r in rows):.1f} s at most")
