@@ -125,7 +125,7 @@ _UNKNOWN_LOSS = 0.5
 _SIGNIFICANT = 4.0  # standard deviations above shuffled rows
 _SIGNIFICANT_ALONE = 8.0  # the same where the motion does not show that there is a slow poll
 _NEAR_LOOP = 1.3  # loops: regular reversals look like a poll that is hardly slower than the loop
-_SHUFFLES, _NULL_PEAKS = 12, 4
+_SHUFFLES = 12
 # each costs as much as the search: where the first few leave no doubt there are no more
 _FEWEST_SHUFFLES, _CLEAR = 4, 20.0
 
@@ -282,7 +282,7 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     z_score = 0.0
     for _ in range(_SHUFFLES):
         by_chance = [poll_search.shuffled(s, rng) for s in informative]
-        null.append(poll_search.best_periods(by_chance, grid, _NULL_PEAKS)[0][1])
+        null.append(poll_search.best_periods(by_chance, grid)[0][1])
         if len(null) >= _FEWEST_SHUFFLES:
             z_score = float((score - np.mean(null)) / max(np.std(null, ddof=1), 1e-9))
             if not 0 <= z_score <= _CLEAR:

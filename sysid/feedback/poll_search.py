@@ -49,29 +49,24 @@ def log_likelihood(begin, end, periods, phases, blur, inside, outside):
 
     An interval holds an instant with probability w, which falls linearly from 1 to 0 over the width
     `blur` [s]; its likelihood is `inside * w + outside`. `begin` and `end` [s], shape (intervals,),
-    are relative to the instant of phase 0; `phases` are evenly spaced over one period, in periods;
-    `outside` has shape (intervals,).
+    are relative to the instant of phase 0; `phases` are in periods; `outside` has shape
+    (intervals,).
     """
-    count, total = len(phases), np.zeros((len(periods), len(phases)))
-    total += np.log(outside).sum()
+    total = np.zeros((len(periods), len(phases)))
     for n in range(len(begin)):
         half = 0.5 * (end[n] - begin[n]) / blur + 0.5
-        none = np.log(outside[n])
-        whole = np.log(inside + outside[n]) - none
+        none, whole = np.log(outside[n]), np.log(inside + outside[n])
         for i in range(len(periods)):
-            # most intervals hold an instant of few phases: no others are looked at
-            place, scale = 0.5 * (begin[n] + end[n]) / periods[i] - phases[0], periods[i] / blur
-            place = (place - np.floor(place)) * count
-            scale /= count
-            reach = min(half / scale, 0.5 * count)
-            first = int(np.ceil(place - reach))
-            for j in range(first, min(int(np.floor(place + reach)), first + count - 1) + 1):
-                share = half - abs(place - j) * scale
-                at = j - count if j >= count else (j + count if j < 0 else j)
-                if share >= 1.0:
-                    total[i, at] += whole
-                elif share > 0.0:
-                    total[i, at] += np.log(inside * share + outside[n]) - none
+            turns, scale = 0.5 * (begin[n] + end[n]) / periods[i] + 0.5, periods[i] / blur
+            for j in range(len(phases)):
+                away = turns - phases[j]
+                share = half - abs(away - np.floor(away) - 0.5) * scale
+                if share <= 0.0:  # most intervals are wholly inside or outside: no logarithm
+                    total[i, j] += none
+                elif share >= 1.0:
+                    total[i, j] += whole
+                else:
+                    total[i, j] += np.log(inside * share + outside[n])
     return total
 
 
@@ -167,7 +162,7 @@ DRIFT = 0.0045
 
 _BINS = 64
 LOCK = 0.125  # how far a phase may be from the one that it refines, in periods
-_APART = 0.02  # of the best periods of the search
+_PEAKS, _APART = 12, 0.02  # best periods of the search, and how far apart
 _MOST_OUTLIERS = 0.4
 
 
@@ -213,17 +208,16 @@ class Phase:
 
 
 def best_periods(
-    stretches: Sequence[Stretch], grid: NDArray[np.float64], most: int = 12
+    stretches: Sequence[Stretch], grid: NDArray[np.float64]
 ) -> list[tuple[float, float]]:
     """Common periods [s] and their scores, the best first: the peaks of a quick search.
 
     Scores are log-likelihoods against intervals placed at random. `grid` has trial periods [s],
-    evenly spaced in their logarithm; `most` peaks are scored. The period is NaN if none is
-    possible.
+    evenly spaced in their logarithm. The period is NaN if none is possible.
     """
     pooled = _pool([_score(s.begin, s.end, grid) for s in stretches], grid)
     peaks = []
-    for _ in range(most):
+    for _ in range(_PEAKS):
         peak = int(np.argmax(pooled))
         if not np.isfinite(pooled[peak]):
             break

@@ -283,7 +283,7 @@ def test_rounds_that_do_not_fit_the_time_are_left_out_and_the_rate_falls_to_zero
 def test_updates_that_are_all_taken_back_are_said_and_end_the_run_with_what_helps(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(training, "_UNDONE_SAID", 2)
+    monkeypatch.setattr(training, "_UNDONE_WARNS", 2)
     monkeypatch.setattr(training, "_UNDONE_END", 4)
     hyper = replace(tiny_run().learner, desired_kl=1e-12, learning_rates=(1e-3, 1e-3))
     said = []
