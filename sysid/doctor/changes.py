@@ -539,6 +539,7 @@ def _regression(design, position, starts, bound, floor):
     last, count = design.shape
     x, gram = np.empty((last + 1, count)), np.empty((last + 1, last + 1))
     weight, values, rest = np.ones(count), np.empty(last), np.empty(count)
+    cost = 0.0
     for _ in range(6):
         for trial in range(len(starts) - 1):
             a, b = starts[trial], starts[trial + 1]

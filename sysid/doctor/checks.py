@@ -13,6 +13,7 @@ each joint in a process of its own, with its own seed.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePath
@@ -44,7 +45,12 @@ from pupper_sysid.sysid.doctor.signals import (
     unit_findings,
 )
 from pupper_sysid.sysid.feedback.staleness import fresh_rows, quantum
-from pupper_sysid.sysid.recordings.excitation import named_tones, remembered, without_bad_readings
+from pupper_sysid.sysid.recordings.excitation import (
+    content_of,
+    named_tones,
+    remembered,
+    without_bad_readings,
+)
 from pupper_sysid.sysid.recordings.recording import Recording, Trial
 from pupper_sysid.sysid.recordings.servo_setup import ServoSetup
 
@@ -172,15 +178,18 @@ def refuse_unusable(trials_by_joint: Mapping[str, Sequence[Trial]]) -> None:
         raise InputError(f"{joint}: {fault.text}{others}")
 
 
+_RECORDED: OrderedDict[bytes, tuple[Trial, ...]] = OrderedDict()
+"""What was recorded, by the tones that `usable_trials` took it apart into: it is judged once, whole.
+
+The last `_MOST_RECORDED`; tones of others are judged by themselves.
+"""
+_MOST_RECORDED = 64
+
+
 def cautions(joint: str, trials: Sequence[Trial]) -> tuple[str, ...]:
     """Warnings that go with every number computed from these trials of `joint`."""
-    return tuple(f"{joint}: {f.text}" for f in findings(_whole(trials)) if f.verdict != USE)
-
-
-@remembered(64)
-def _whole(trials: Sequence[Trial]) -> Sequence[Trial]:
-    """The trials as they were recorded, where these are their tones (`usable_trials`)."""
-    return trials
+    whole = _RECORDED.get(content_of(trials), trials)
+    return tuple(f"{joint}: {f.text}" for f in findings(whole) if f.verdict != USE)
 
 
 def _few_fresh(trials: Sequence[Trial], step: float) -> list[Finding]:
@@ -312,8 +321,10 @@ def usable_trials(recordings: Recordings, joints: Joints = None) -> dict[str, tu
     recorded = {j: recorded_trials(recordings, j) for j in chosen}
     refuse_unusable(recorded)
     trials = {j: joint_trials(recordings, j) for j in chosen}
-    for joint, parts in trials.items():  # which are judged as the doctor judges the whole
-        _whole.known(parts, recorded[joint])
+    for joint, parts in trials.items():
+        _RECORDED[content_of(parts)] = recorded[joint]
+    while len(_RECORDED) > _MOST_RECORDED:
+        _RECORDED.popitem(last=False)
     return trials
 
 

@@ -46,7 +46,7 @@ def remembered(most: int) -> Callable[[Callable[..., Found]], Callable[..., Foun
         @wraps(compute)
         def from_memory(trials: Trial | Sequence[Trial], *arguments: Hashable) -> Found:
             several = [trials] if isinstance(trials, Trial) else trials
-            key = (_digest(several), arguments)
+            key = (content_of(several), arguments)
             if key not in results:
                 results[key] = compute(trials, *arguments)
                 if len(results) > most:
@@ -54,16 +54,13 @@ def remembered(most: int) -> Callable[[Callable[..., Found]], Callable[..., Foun
             results.move_to_end(key)
             return results[key]
 
-        def known(trials: Sequence[Trial], result: Found) -> None:
-            results[_digest(trials), ()] = result
-
-        from_memory.known = known  # pyright: ignore[reportAttributeAccessIssue]
         return from_memory
 
     return decorate
 
 
-def _digest(trials: Sequence[Trial]) -> bytes:
+def content_of(trials: Sequence[Trial]) -> bytes:
+    """Hash of all that trials hold."""
     content = blake2b(digest_size=16)
     for value in (getattr(trial, field.name) for trial in trials for field in fields(trial)):
         array = isinstance(value, np.ndarray)
