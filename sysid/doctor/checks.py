@@ -179,7 +179,7 @@ def refuse_unusable(trials_by_joint: Mapping[str, Sequence[Trial]]) -> None:
 
 
 _RECORDED: OrderedDict[bytes, tuple[Trial, ...]] = OrderedDict()
-"""What was recorded, by the tones that `usable_trials` took it apart into: it is judged once, whole.
+"""What was recorded, by the tones that `usable_trials` took it apart into: it is judged whole.
 
 The last `_MOST_RECORDED`; tones of others are judged by themselves.
 """
