@@ -532,7 +532,7 @@ def _read(track, moments):
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def _regression(design, position, starts, bound, floor):
     """Mean cost, values and residuals of a regression whose errors cost no more than `bound`."""
     # sums in loops: without arrays in between they take half the time
