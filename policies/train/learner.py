@@ -387,7 +387,7 @@ class Learner:
     @property
     def std(self) -> float:
         """Mean standard deviation of the actions' noise."""
-        return float(self._noise.whole_std.mean())
+        return float(self._noise.whole_std.detach().mean())
 
     @property
     def _noise(self) -> ActionNoise:
