@@ -218,11 +218,20 @@ def _plain(value: float | None) -> str:
 
 def _servo(source: str, part: str | None, gain: float | None) -> compare.Servo:
     """A servo of whatever file states one."""
-    if Path(source).suffix not in (".xml", ".mjcf", ".py"):
-        return compare.servo_of(source, part, gain)
-    from pupper_sysid.sim.export.foreign import foreign_servo
+    path = Path(source)
+    if path.suffix in (".xml", ".mjcf", ".py") or _starts_as_xml(path):
+        from pupper_sysid.sim.export.foreign import foreign_servo
 
-    return foreign_servo(source, part)
+        return foreign_servo(path, part)
+    return compare.servo_of(source, part, gain)
+
+
+def _starts_as_xml(path: Path) -> bool:
+    """Whether a file, however named, begins as an MJCF does."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(100).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
 
 
 def _verdict(found: compare.Comparison) -> Iterator[str]:

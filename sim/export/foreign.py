@@ -29,7 +29,6 @@ from pupper_sysid.servo_models.cards.numbers import TorquePD
 from pupper_sysid.sim.export.mjcf import link_inertias
 from pupper_sysid.sim.robot.hinges import hinges_of
 
-ENDINGS = (".xml", ".mjcf", ".py")
 _LARGEST_BYTES = 1_000_000
 _MOST_REPEATS = 5  # of a pattern: names of 40 letters take a fraction of a second
 _NO_LIMIT_NM = 100.0  # stands for an effort that is not limited; beyond any hobby servo's

@@ -59,6 +59,19 @@ def test_a_difference_of_two_cards_and_of_a_card_and_a_calibration(capsys):
     )
 
 
+def test_an_mjcf_is_recognised_by_its_content(here, capsys):
+    ran(capsys, "export", "sts3215-bam-m1", "--to", "mjcf", "--out", "servo.xml")
+    joint = '<joint name="servo" class="servo_servo"/><geom size=".02" mass=".1"/>'
+    robot = f"<worldbody><body>{joint}</body></worldbody>"
+    robot = f'<mujoco><include file="servo.xml"/>{robot}</mujoco>'
+    for name in ("robot.xml", "robot"):
+        (here / name).write_text(robot)
+    plain, unnamed = (
+        json_of(capsys, "servo", "diff", name, "sts3215-bam-m1") for name in ("robot.xml", "robot")
+    )
+    assert plain["differences"] == unnamed["differences"]
+
+
 def test_a_card_is_taken_where_a_calibration_is(here, capsys):
     load_card("sts3215-bam-m1").save("mine.yaml")
     for given in ("sts3215-bam-m1", "mine.yaml"):
