@@ -159,7 +159,7 @@ def _refuse_degrees(
     if stated:
         raise InputError(
             f"{path}, column {place}: values reach {largest:.4g} rad, more than a hundred turns. "
-            "Check the unit, or take the start's angle off."
+            "Say the unit (such as deg, turns or counts:8192:0), or take the start's angle off."
         )
     angles = table.loc[table["joint"] == joint, ["command_rad", "position_rad"]].to_numpy(float)
     units = likely_of_pair(*(values[np.isfinite(values)] for values in angles.T))

@@ -175,6 +175,10 @@ def _column(name: str) -> Column:
     if "d" in lower and ANGLE in kinds and not kinds & {COMMAND, STATE, OTHER}:  # q_d, theta_d
         known[lower.index("d")] = COMMAND
         kinds.add(COMMAND)
+    if lower[-1:] == ["a"] and lower[-2:-1] in (["q"], ["d"], ["i"]):  # q_A, a current
+        others(OTHER, ("q", "d", "i", "a"))
+    if "mapper" in lower:  # pos_rel of ODrive's mapper is its estimate
+        others("", ("rel",))
     if kinds & {COMMAND, STATE, ANGLE}:  # a joint that is called y
         others("", _SOLE_LETTERS)
     angle = ANGLE in kinds and (lower.count("p") == 0 or kinds & {COMMAND, STATE, UNIT}

@@ -30,17 +30,22 @@ _COMPARED = 8  # columns for one purpose
 _OF_TURNS = {
     "ODrive": {"setpoint", "estimate"},
     "ODrive's API": {"input", "estimate"},
-    "ODrive's mapper": {"axis0.pos_vel_mapper.pos_rel"},
-    "moteus": {"servo_stats.position"},
     "moteus's decoder": {"command_position", "q_current"},
-    "moteus's registers": {"Register.POSITION"},
     "moteus's telemetry": {"control_position", "q_current"},
 }
-"""Programs that count turns and do not say so, and what gives their logs away: columns, or words of
-the command's and the position's."""
-_DRIVES = re.compile(r"axis\d|odrv|moteus|servo_stats|Register\.|q_current|(^|[_.])iq(_|$)|"
-                     r"input_pos|vel_(estimate|setpoint)", re.IGNORECASE)  # fmt: skip
-"""Names that only those programs have: with one of them the angles are turns without doubt."""
+"""Programs that count turns and do not say so, and what their logs may be known by: columns, or
+words of the command's and the position's."""
+_DRIVES = {
+    "ODrive": re.compile(r"odrv|axis\d\.(controller|encoder|motor|pos_vel_mapper)\.",
+                         re.IGNORECASE),
+    "moteus": re.compile(r"moteus|servo_stats|Register\.|(^|[_.])[qd]_current", re.IGNORECASE),
+    "": re.compile(r"axis\d|(^|[_.])iq(_|$)|input_pos|vel_(estimate|setpoint)", re.IGNORECASE),
+}  # fmt: skip
+"""Names of columns by which the angles are turns without doubt; those under "" do not tell the
+program, and only beside marks of `_OF_TURNS`."""
+_MOST_TURNS = 100.0
+_COUNTS_OF_DRIVE = "counts:8192:0"
+"""ODrive's default encoder; its firmware before 0.5 has counts where later ones have turns."""
 
 
 @dataclass(frozen=True)
@@ -73,30 +78,55 @@ def pairs(path: Path | str, table: Table, options: LogOptions) -> tuple[dict[str
         chosen, notes = _stated(path, table, options), []
     else:
         chosen, notes = _by_words(path, table)
-        chosen = {name: _of_drive(table, options, pair, notes) for name, pair in chosen.items()}
+        chosen = {
+            name: _of_drive(path, table, options, pair, notes) for name, pair in chosen.items()
+        }
     if not options.joints:
         used = [c.name for pair in chosen.values() for c in (pair.command, pair.position)]
         table.check_joints(path, used)
     return chosen, notes
 
 
-def _of_drive(table: Table, options: LogOptions, pair: Pair, notes: list[str]) -> Pair:
+def _of_drive(
+    path: Path | str, table: Table, options: LogOptions, pair: Pair, notes: list[str]
+) -> Pair:
     """The pair in turns where the log is of a program that counts them; `notes` get a sentence."""
+    sources = pair.command, pair.position
     given_away = {*table.names} | pair.command.words | pair.position.words
+    named = [p for p, names in _DRIVES.items() if any(map(names.search, table.names))]
     program = next((p for p, marks in _OF_TURNS.items() if marks <= given_away), "")
-    if not program or pair.command.unit or pair.position.unit or options.unit:
+    program = program or (named[0] if named else "")
+    counted = [source for source in sources if source.unit == "counts"]
+    if not program or options.unit or any(s.unit not in ("", "counts") for s in sources):
         return pair
-    of_drive = any(map(_DRIVES.search, table.names))
-    taken, other = ("turns", "rad") if of_drive else ("rad", "turns")
+    known = [table.columns[s.name] for s in sources if s.unit == "" and s.name in table.columns]
+    largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in known), default=0.0)
+    if len(counted) == 2 or (counted and not named):
+        return pair
+    if counted or (named and largest > _MOST_TURNS):
+        units = [_COUNTS_OF_DRIVE if s in counted or largest > _MOST_TURNS else "turns"
+                 for s in sources]  # fmt: skip
+        templates = [s.template for s in sources]
+        if not all("{joint}" in template for template in templates):
+            templates = [s.name for s in sources]
+        line = refusals.import_line(
+            path, unit=",".join(dict.fromkeys(units)), command=templates[0], position=templates[1]
+        )
+        raise InputError(
+            f"{path}: {pair.command.name} and {pair.position.name} are names of {program}, whose "
+            "angles are turns, or counts of an encoder in older firmware and in columns of counts. "
+            f"Say how many counts a turn has; with ODrive's default: {line}."
+        )
+    taken, other = ("turns", "rad") if named else ("rad", "turns")
     if not any(program in note for note in notes):
         notes.append(
             f"{pair.command.name} and {pair.position.name} are names of {program}, which counts "
             f"turns; the values were taken as {taken}. If they are {other}, give `unit='{other}'`; "
             "lag and dead time are the same."
         )
-    if not of_drive:
+    if not named:
         return pair
-    return Pair(*(replace(c, unit="turns") for c in (pair.command, pair.position)))
+    return Pair(*(replace(c, unit="turns") for c in sources))
 
 
 def _by_words(path: Path | str, table: Table) -> tuple[dict[str, Pair], list[str]]:

@@ -217,7 +217,10 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "a joint spelled in two ways": ("time,shoulder_pan_cmd,ShoulderPan_pos\n" + CSV,
                                     "ShoulderPan"),
     "moteus's view": (each("{t},{p!r},{c!r},0.5", TURNS, "timestamp,servo_stats.position,"
-                           "servo_control.position,servo_stats.q_current"), "servo_stats"),
+                           "servo_control.position,servo_stats.q_A"), "servo_stats"),
+    "moteus's state": (json.dumps([
+        {"time": t, "cmd": {"position": c, "kp_scale": 1}, "state": {"position": p, "q_current": 0}}
+        for t, c, p in TURNS]), "joint"),
     "SimpleFOC": ("time,target,voltage.q,current.q,current.d,angle\n"
                   + each("{t},{c},{p},{p},{c},{p}"), "joint"),
     "ODrive's current": ("time,input_pos,pos_estimate,Iq_setpoint,Iq_measured\n"
@@ -226,6 +229,9 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "d behind a number": ("t,q1,q2,q1d,q2d\n" + each("{t},{p},{q},{c},{d}", BOTH),
                           "joint_1 joint_2"),
     "a raw angle": ("time,cmd,pos_raw\n" + each("{t},{c},{p}"), "joint"),
+    "ODrive's mapper": (each("{t},{c!r},{p!r},{n}", TURNS, "t,axis0.controller.input_pos,"
+                             "axis0.pos_vel_mapper.pos_rel,axis0.encoder.count_in_cpr"),
+                        "axis_0_controller"),
     "ODrive's tree": ("t,axis0.controller.input_pos,axis0.encoder.pos_estimate\n"
                       + each("{t},{c!r},{p!r}", TURNS), "axis_0"),
     # units: small angles, which a unit that is not understood would leave as they are
@@ -346,6 +352,12 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
     "hexadecimal cells": (each("{m},{c:04X},{p:04X}", COUNTS, "time_ms,goal,pos"),
                           "--unit counts:4096"),
     "one name twice": ("time,angle,angle\n" + CSV, "--time 0 --command 1 --position 2"),
+    "ODrive's older counts": ("t,axis0.controller.pos_setpoint,axis0.encoder.pos_estimate\n"
+        + "".join(f"{t},{8192 * c!r},{8192 * p!r}\n" for t, c, p in TURNS),
+        "--unit counts:8192:0"),
+    "ODrive's counts beside turns": ("t,axis0.controller.input_pos,axis0.encoder.shadow_count\n"
+        + "".join(f"{t},{c!r},{8192 * p:.0f}\n" for t, c, p in TURNS),
+        "--unit turns,counts:8192:0"),
     "steps": (each("{t},{c},{p}", SIGNED, "t,target_steps,actual_steps"), "--unit counts:3200:0"),
     "whole seconds": ("time,cmd,pos\n" + "".join(
         f"12:30:{int(2.5 * t):02d},{c},{p}\n" for t, c, p in LOG), "--rate 40"),
