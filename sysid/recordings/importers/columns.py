@@ -31,7 +31,8 @@ UNITS: dict[str, str] = {
         ("mrad", "mrad"),
         ("deg", "deg degs degree degrees ° grad grados gradi graus graden degré degrés degres "
                 "stopnie stopni 度 도 град градусы градусов"),
-        ("turns", "turn turns rev revs revolution revolutions umdrehungen"),
+        ("turns", "turn turns rev revs revolution revolutions rotation rotations "
+                  "umdrehungen"),
         ("percent", "percent pct"),
         ("counts", "count counts tick ticks pulse pulses"),
         ("steps", "steps microsteps qc inc incs increments lsb"),

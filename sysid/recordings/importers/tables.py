@@ -234,10 +234,12 @@ def _times(
         text = f"times are the sums of {steps}, the time between rows."
         return found_clock.seconds(total), None, [*found_clock.notes, text]
     else:
+        lines = [refusals.import_line(path, time=name) for name in rising[:1]]
+        lines.append(refusals.import_line(path, rate="50"))
         raise InputError(
             f"{path}: no column is a time (time, timestamp, t …, also with _s, _ms, _us or _ns); "
-            f"it has {refusals.listed(table.names)}. Name it with `time`, or give the rows a "
-            "second with `rate`."
+            f"it has {refusals.listed(table.names)}. Name it, or give your rows a second in place "
+            f"of 50: {'; or '.join(lines)}."
         )
     read_s, at, texts = _seconds(path, table, time)
     notes += texts

@@ -234,6 +234,8 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
                         "axis_0_controller"),
     "ODrive's tree": ("t,axis0.controller.input_pos,axis0.encoder.pos_estimate\n"
                       + each("{t},{c!r},{p!r}", TURNS), "axis_0"),
+    "WPILib's rotations": (each("{t},{c!r},{p!r}", TURNS, "Timestamp,/arm/setpoint (rotations),"
+                                "/arm/position (rotations)"), "arm"),
     # units: small angles, which a unit that is not understood would leave as they are
     "German degrees": (each("{t};{c!r};{p!r}", DEGREES, "Zeit;Sollwinkel in Grad;Istwinkel [Grad]"),
                        "joint"),
@@ -352,6 +354,9 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
     "hexadecimal cells": (each("{m},{c:04X},{p:04X}", COUNTS, "time_ms,goal,pos"),
                           "--unit counts:4096"),
     "one name twice": ("time,angle,angle\n" + CSV, "--time 0 --command 1 --position 2"),
+    "Unitree's tick": (json.dumps([{"tick": round(1e3 * t), "motorCmd": [{"q": c, "kp": 20}],
+                                    "motorState": [{"q": p, "dq": 0}]} for t, c, p in LOG]),
+                       "--time tick"),
     "ODrive's older counts": ("t,axis0.controller.pos_setpoint,axis0.encoder.pos_estimate\n"
         + "".join(f"{t},{8192 * c!r},{8192 * p!r}\n" for t, c, p in TURNS),
         "--unit counts:8192:0"),
