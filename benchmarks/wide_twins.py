@@ -6,7 +6,12 @@ number that the calibration file calls identified is compared with the truth.
 
     .venv/bin/python benchmarks/wide_twins.py --kinds profile gravity --motions tones walk \
         --count 4 --seed 1 --out twins.json
+    .venv/bin/python benchmarks/wide_twins.py --repeats changed --kinds slew back_emf --count 5
     .venv/bin/python benchmarks/wide_twins.py --tables before.json after.json
+
+With `--repeats` two recordings of a servo are calibrated together, and the truth is that of the
+next one: `alike`, numbers vary by `BETWEEN` from each to the next; `changed`, they do not, and the
+second recording has 0.8 of the position loop's gains. Who is named as different is counted.
 
 `--out` is a file of JSON lines, one twin each, written as they end; a file that is there goes on.
 Of several files in `--tables` the twins count that all have. Definitions: a number *holds* where
@@ -20,15 +25,17 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import resource
 import tempfile
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from shared import print_rows, share  # isort: skip
 
@@ -49,6 +56,11 @@ DIFFERENCES = {"dead_time_s": "ms", "offset_rad": "mrad", **dict.fromkeys(LAGS, 
 """Quantities whose errors and widths are differences, in thousandths; all others are factors."""
 NO_LIMIT = 300.0
 """A limit from here on, in rad/s or 100 rad/s², counts as none."""
+BETWEEN = 0.03
+"""Standard deviation of the logarithm of each number between recordings: warm and cold grease."""
+MISFIT = re.compile("does not describe|is not described")
+"""What warnings of a file say where the model does not fit."""
+Repeats = Literal["none", "alike", "changed"]
 
 
 # -------------------------------------------------------------------------------------- one twin
@@ -75,19 +87,48 @@ def recording(twin: wide.Twin, rows: wide.Rows, folder: Path) -> ps.Recording:
     )  # fmt: skip
 
 
-def measured(kind: str, motion: str, number: int, seed: int) -> dict[str, Any]:
+def repeated(twin: wide.Twin, repeats: Repeats) -> list[wide.Twin]:
+    """The twin as it is recorded: once, or twice and the next time."""
+    if repeats == "none":
+        return [twin]
+    rng = np.random.default_rng([twin.seed, twin.number, 77])
+    vary = BETWEEN if repeats == "alike" else 0.0
+    twins = []
+    for n in range(3):
+        factors = {
+            name: math.exp(rng.normal(0, vary))
+            for name in ("stiffness", "damping", "back_emf", "friction", "effort", "speed_limit")
+        }
+        if repeats == "changed" and n == 1:
+            factors |= {"stiffness": 0.8, "damping": 0.8}
+        servo = twin.servo._replace(**{k: f * getattr(twin.servo, k) for k, f in factors.items()})
+        twins.append(replace(twin, servo=servo, seed=twin.seed + 100_000 * n))
+    return twins  # fmt: skip
+
+
+def measured(kind: str, motion: str, number: int, seed: int, repeats: Repeats) -> dict[str, Any]:
     """Calibrate one twin: truth, answers, processor time."""
     warnings.simplefilter("ignore")
-    twin, path, sent, commands = wide.draw_twin(kind, motion, number, seed)
-    rows = wide.readings(twin, path)
+    drawn, *_ = wide.draw_twin(kind, motion, number, seed)
+    twins, moves = repeated(drawn, repeats), []
+    for twin in twins:
+        sent, commands, _ = wide.sends(twin)
+        until, rng = sent[-1] + 0.5, wide.sender(twin, "servo")
+        moves.append((wide.simulate(twin.servo, sent, commands, until, rng), sent, commands))
+    twin, (path, sent, commands) = twins[-1], moves[-1]
+    logged = [wide.readings(t, p) for t, (p, *_) in zip(twins, moves, strict=True)]
+    logged = logged[:2] if repeats != "none" else logged
     record: dict[str, Any] = {
-        "kind": kind, "motion": motion, "number": number, "seed": seed,
-        "servo": twin.servo._asdict(), "rows": len(rows.sent_s), "refused": None,
+        "kind": kind, "motion": motion, "number": number, "seed": seed, "repeats": repeats,
+        "servo": twin.servo._asdict(), "rows": sum(len(r.sent_s) for r in logged), "refused": None,
     }  # fmt: skip
     begun = _processor_s()
     try:
         with tempfile.TemporaryDirectory() as folder:
-            result = ps.calibrate(recording(twin, rows, Path(folder)))
+            result = ps.calibrate([
+                replace(recording(t, rows, Path(folder)), name=f"log{n}")
+                for n, (t, rows) in enumerate(zip(twins, logged, strict=False))
+            ])  # fmt: skip
     except ps.PupperError as error:
         record["refused"] = str(error)
     else:
@@ -98,10 +139,14 @@ def measured(kind: str, motion: str, number: int, seed: int) -> dict[str, Any]:
         by_trial = {t["trial"]: t["lag_s"] for t in lag["by_frequency"]}
         lags = [(LAGS[0], by_trial.get(t["trial"]), [t["truth"]] * 2)
                 for t in wide.tone_truths(twin, path, sent, commands)]  # fmt: skip
-        if not by_trial:  # else the lag is a mean over tones, of which no row is named
+        if repeats != "none":
+            lags = []
+            record["named"] = list(result.joints[JOINT].differences)
+        elif not by_trial:  # else the lag is a mean over tones, of which no row is named
             lags = [(LAGS[1], lag["lag_s"], [wide.lag_truth(twin, path, sent, commands)] * 2)]
         record["answers"] += [(q, a | {"identified": "yes"}, t) for q, a, t in lags if a]
         record["calibration"] = joint
+        record["misfit"] = any(map(MISFIT.search, joint["warnings"]))
     record["processor_s"] = _processor_s() - begun
     return finite(record)
 
@@ -246,6 +291,15 @@ def print_tables(records: list[dict[str, Any]]) -> None:
     for record in records:
         if record["refused"]:
             print(f"refused: {record['kind']}, {record['motion']}: {record['refused']}")
+    for repeats in ("alike", "changed"):
+        if of := [r for r in records if r.get("repeats") == repeats and "named" in r]:
+            print(
+                f"repeats, {repeats}: a difference is named in "
+                f"{share(sum(bool(r['named']) for r in of), len(of))}"
+            )
+    fitted = [r for r in records if "misfit" in r]
+    for name, of in grouped(fitted, lambda r: r["kind"]).items():
+        print(f"misfit named, {name}: {share(sum(r['misfit'] for r in of), len(of))}")
     for title, in_class in (("in class", True), ("out of class", False)):
         part = grouped(
             (r for r in every if (r[3]["kind"] in wide.IN_CLASS) is in_class), lambda r: r[0]
@@ -297,6 +351,7 @@ def main(
     motions: tuple[str, ...] = tuple(wide.MOTIONS),
     count: int = 2,
     seed: int = 1,
+    repeats: Repeats = "none",
     jobs: int = 1,
     out: Path = Path("twins.json"),
     tables: tuple[Path, ...] = (),
@@ -312,7 +367,9 @@ def main(
     # number by number, so that a run that is stopped has some of every kind
     wanted = [(k, m, n, seed) for n in range(count) for k in kinds for m in motions]
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool, out.open("a") as file:
-        for future in as_completed(pool.submit(measured, *w) for w in wanted if w not in done):
+        for future in as_completed(
+            pool.submit(measured, *w, repeats) for w in wanted if w not in done
+        ):
             record = future.result()
             done[key(record)] = record
             print(json.dumps(record), file=file, flush=True)
