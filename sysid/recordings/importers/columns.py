@@ -176,7 +176,7 @@ def _column(name: str) -> Column:
     if "d" in lower and ANGLE in kinds and not kinds & {COMMAND, STATE, OTHER}:  # q_d, theta_d
         known[lower.index("d")] = COMMAND
         kinds.add(COMMAND)
-    if lower[-1:] == ["a"] and lower[-2:-1] in (["q"], ["d"], ["i"]):  # q_A, a current
+    if parts[-1:] == ["A"] and lower[-2:-1] in (["q"], ["d"], ["i"]):  # q_A, a current; not q_a
         others(OTHER, ("q", "d", "i", "a"))
     if "mapper" in lower:  # pos_rel of ODrive's mapper is its estimate
         others("", ("rel",))

@@ -228,6 +228,7 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "MIT's letters": ("t,p_des,v_des,p,v,t_ff\n" + each("{t},{c},0,{p},1,0"), "joint"),
     "d behind a number": ("t,q1,q2,q1d,q2d\n" + each("{t},{p},{q},{c},{d}", BOTH),
                           "joint_1 joint_2"),
+    "desired and actual by a letter": ("t,q_d,q_a\n" + each("{t},{c},{p}"), "a"),
     "a raw angle": ("time,cmd,pos_raw\n" + each("{t},{c},{p}"), "joint"),
     "ODrive's mapper": (each("{t},{c!r},{p!r},{n}", TURNS, "t,axis0.controller.input_pos,"
                              "axis0.pos_vel_mapper.pos_rel,axis0.encoder.count_in_cpr"),
