@@ -11,7 +11,7 @@ number that the calibration file calls identified is compared with the truth.
 
 With `--repeats` two recordings of a servo are calibrated together, and the truth is that of the
 next one: `alike`, numbers vary by `BETWEEN` from each to the next; `changed`, they do not, and the
-second recording has 0.8 of the position loop's gains. Who is named as different is counted.
+second recording has 0.8 of the position loop's gains. Differences that are named are counted.
 
 `--out` is a file of JSON lines, one twin each, written as they end; a file that is there goes on.
 Of several files in `--tables` the twins count that all have. Definitions: a number *holds* where
@@ -57,9 +57,9 @@ DIFFERENCES = {"dead_time_s": "ms", "offset_rad": "mrad", **dict.fromkeys(LAGS, 
 NO_LIMIT = 300.0
 """A limit from here on, in rad/s or 100 rad/s², counts as none."""
 BETWEEN = 0.03
-"""Standard deviation of the logarithm of each number between recordings: warm and cold grease."""
-MISFIT = re.compile("does not describe|is not described")
-"""What warnings of a file say where the model does not fit."""
+"""Standard deviation of the logarithm of each number between recordings; an assumption."""
+MISFIT = re.compile("does not describe|moves as if it had|may as well have")
+"""What warnings of a file say where the model does not fit, or another structure fits better."""
 Repeats = Literal["none", "alike", "changed"]
 
 
@@ -103,7 +103,7 @@ def repeated(twin: wide.Twin, repeats: Repeats) -> list[wide.Twin]:
             factors |= {"stiffness": 0.8, "damping": 0.8}
         servo = twin.servo._replace(**{k: f * getattr(twin.servo, k) for k, f in factors.items()})
         twins.append(replace(twin, servo=servo, seed=twin.seed + 100_000 * n))
-    return twins  # fmt: skip
+    return twins
 
 
 def measured(kind: str, motion: str, number: int, seed: int, repeats: Repeats) -> dict[str, Any]:
@@ -335,12 +335,16 @@ def grouped(rows: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[An
 # -------------------------------------------------------------------------------------------- main
 
 
-def key(record: dict[str, Any]) -> tuple[str, str, int, int]:
+Key = tuple[str, str, int, int, Repeats]
+
+
+def key(record: dict[str, Any]) -> Key:
     """What names a twin."""
-    return record["kind"], record["motion"], record["number"], record["seed"]
+    numbered = record["kind"], record["motion"], record["number"], record["seed"]
+    return *numbered, record.get("repeats", "none")
 
 
-def read_records(path: Path) -> dict[tuple[str, str, int, int], dict[str, Any]]:
+def read_records(path: Path) -> dict[Key, dict[str, Any]]:
     """Twins of a file."""
     lines = path.read_text().splitlines() if path.exists() else []
     return {key(record): record for record in map(json.loads, lines)}
@@ -365,11 +369,9 @@ def main(
         return None
     done = read_records(out)
     # number by number, so that a run that is stopped has some of every kind
-    wanted = [(k, m, n, seed) for n in range(count) for k in kinds for m in motions]
+    wanted = [(k, m, n, seed, repeats) for n in range(count) for k in kinds for m in motions]
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool, out.open("a") as file:
-        for future in as_completed(
-            pool.submit(measured, *w, repeats) for w in wanted if w not in done
-        ):
+        for future in as_completed(pool.submit(measured, *w) for w in wanted if w not in done):
             record = future.result()
             done[key(record)] = record
             print(json.dumps(record), file=file, flush=True)

@@ -43,7 +43,7 @@ _DRIVES = {
 }  # fmt: skip
 """Names of columns by which the angles are turns without doubt; those under "" do not tell the
 program, and only beside marks of `_OF_TURNS`."""
-_MOST_TURNS = 100.0
+_MOST_TURNS = 100.0  # beyond which no angle is read, whatever its unit
 _COUNTS_OF_DRIVE = "counts:8192:0"
 """ODrive's default encoder; its firmware before 0.5 has counts where later ones have turns."""
 
@@ -99,10 +99,10 @@ def _of_drive(
     counted = [source for source in sources if source.unit == "counts"]
     if not program or options.unit or any(s.unit not in ("", "counts") for s in sources):
         return pair
-    known = [table.columns[s.name] for s in sources if s.unit == "" and s.name in table.columns]
-    largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in known), default=0.0)
     if len(counted) == 2 or (counted and not named):
         return pair
+    known = [table.columns[s.name] for s in sources if s.unit == "" and s.name in table.columns]
+    largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in known), default=0.0)
     if counted or (named and largest > _MOST_TURNS):
         units = [_COUNTS_OF_DRIVE if s in counted or largest > _MOST_TURNS else "turns"
                  for s in sources]  # fmt: skip
@@ -113,9 +113,9 @@ def _of_drive(
             path, unit=",".join(dict.fromkeys(units)), command=templates[0], position=templates[1]
         )
         raise InputError(
-            f"{path}: {pair.command.name} and {pair.position.name} are names of {program}, whose "
-            "angles are turns, or counts of an encoder in older firmware and in columns of counts. "
-            f"Say how many counts a turn has; with ODrive's default: {line}."
+            f"{path}: {pair.command.name} and {pair.position.name} are names of {program}, which "
+            "counts turns, but these are an encoder's counts. Say how many a turn has; with "
+            f"ODrive's default: {line}."
         )
     taken, other = ("turns", "rad") if named else ("rad", "turns")
     if not any(program in note for note in notes):
