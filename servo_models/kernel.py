@@ -32,11 +32,13 @@ COLUMNS = (
     "velocity_limit", "acceleration_limit", "stribeck_friction", "stribeck_speed",
     "load_friction_motor", "load_friction_load", "load_friction_quadratic",
     "load_friction_static", "torque_limit", "off_brake", "dead_zone_rad", "start_duty",
-    "gravity_nm", "hanging_rad", "backlash_rad", "integral_per_s", "offset_rad",
+    "gravity_nm", "hanging_rad", "backlash_rad", "integral_per_s", "link_share", "link_hz",
+    "link_damping_ratio", "offset_rad",
 )  # fmt: skip
 """A candidate's numbers, in order: those of the servo without its dead time, then the gravity [N·m]
 and hanging position [rad] that are added to the load's, play, the integral gain over the
-proportional one [1/s], and the offset of readings [rad]."""
+proportional one [1/s], a flexible link (its share of the inertia, its frequency and damping ratio
+on a held motor), and the offset of readings [rad]."""
 OFFSET, WIDTH = len(COLUMNS) - 1, len(COLUMNS)
 
 _LIMITS = ("velocity_limit", "acceleration_limit", "torque_limit", "effort_limit")
@@ -156,12 +158,13 @@ def _servo(values, ids, held, edges, until, gain, load, start, steps, pad, h, sh
     summed, most_summed, mean_error = _lanes(), _lanes(), _lanes()
     braked, clipped, drive, free = _lanes(), _lanes(), _lanes(), _lanes()
     begin, error, acting, pull, limit = _lanes(), _lanes(), _lanes(), _lanes(), _lanes()
-    slew = friction = firmware = profile = gravity = backlash = False
+    link, link_speed = _lanes(), _lanes()
+    slew = friction = firmware = profile = gravity = backlash = flexible = False
     for i in range(LANES):
         w = values[ids[i]]
         for j in range(WIDTH):
             p[j, i] = w[j]
-        inertia = w[4] + load[0]
+        inertia = (w[4] + load[0]) * (1.0 - w[22])
         p[0, i] = w[0] * gain / inertia
         for j in (1, 2, 3, 5, 8, 14):  # torques over the inertia
             p[j, i] = w[j] / inertia
@@ -180,6 +183,10 @@ def _servo(values, ids, held, edges, until, gain, load, start, steps, pad, h, sh
         v[i], rate[i], on[i] = 0.0, 0.0, 1.0
         summed[i], most_summed[i] = 0.0, p[2, i] / max(p[0, i], 1e-12)
         p[21, i] = h * w[21]
+        p[22, i] = w[22] / (1.0 - w[22]) / h
+        p[23, i] = h * (2.0 * _PI * w[23]) * (2.0 * _PI * w[23])
+        p[24, i] = 2.0 * h * w[24] * (2.0 * _PI * w[23])
+        link[i], link_speed[i] = y[i], 0.0
         track[0, i] = y[i]
         slew = slew or w[6] < np.inf
         profile = profile or w[7] < np.inf
@@ -187,8 +194,9 @@ def _servo(values, ids, held, edges, until, gain, load, start, steps, pad, h, sh
         firmware = firmware or w[16] + w[17] + w[21] > 0.0
         gravity = gravity or p[18, i] != 0.0
         backlash = backlash or w[20] > 0.0
+        flexible = flexible or w[22] > 0.0
     supply = held.shape[0] > 1
-    plain = not (friction or firmware or gravity or supply)
+    plain = not (friction or firmware or gravity or supply or flexible)
     for i in range(LANES):
         plain = plain and not p[14, i] < np.inf
     earliest, latest = shift[0], shift[0]
@@ -339,6 +347,13 @@ def _servo(values, ids, held, edges, until, gain, load, start, steps, pad, h, sh
                     of_load = p[10, i] * abs(motor) + p[11, i] * abs(pull[i])
                     limit[i] += p[8, i] * standing + (1.0 + p[13, i] * standing) * of_load
                     limit[i] += p[12, i] * motor * motor
+            if flexible:  # the link pulls back at the motor with what accelerates it
+                for i in range(LANES):
+                    bent = y[i] + v[i] * half - (link[i] + link_speed[i] * half)
+                    faster = (link_speed[i] + p[23, i] * bent + p[24, i] * v[i]) / (1.0 + p[24, i])
+                    pull[i] -= p[22, i] * (faster - link_speed[i])
+                    link[i] += (link_speed[i] + faster) * half
+                    link_speed[i] = faster
             for i in range(LANES):
                 middle = y[i] + v[i] * half
                 v[i] = _slowed(v[i], drive[i] + pull[i], limit[i], acting[i])

@@ -349,6 +349,7 @@ def each_joint(
     that were recorded. `workers`: processes. `progress`: called with a joint's name when it is
     done.
     """
+    workers = min(workers, len(chosen_joints(recordings, joints)))  # to start one takes a second
     if workers > 1:  # imports what it needs beside the look at the recordings
         prepare(getattr(work, "func", work).__module__)
     return map_joints(work, usable_trials(recordings, joints), workers, progress)

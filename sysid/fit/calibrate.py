@@ -19,7 +19,13 @@ from pupper_sysid.common.joints import STALL_TORQUES_NM
 from pupper_sysid.common.processes.workers import Workers, prepare
 from pupper_sysid.common.results import JointResults
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
-from pupper_sysid.sysid.doctor.checks import Joints, Recordings, as_sequence, usable_trials
+from pupper_sysid.sysid.doctor.checks import (
+    Joints,
+    Recordings,
+    as_sequence,
+    chosen_joints,
+    usable_trials,
+)
 from pupper_sysid.sysid.fit.calibration_file import preset_parameters, to_calibration
 from pupper_sysid.sysid.fit.choice import Fitted, fit_structures, stages
 from pupper_sysid.sysid.fit.joint_fit import Presets, conclude
@@ -116,13 +122,14 @@ def calibrate(
     """
     if stall_torque_nm is not None:  # before the work, not after it
         refuse_outside("`stall_torque_nm`", stall_torque_nm, *STALL_TORQUES_NM, "N·m")
+    workers = min(workers, len(chosen_joints(recordings, joints)))  # to start one takes a second
     if workers > 1:  # imports what it needs beside the look at the recordings
         prepare(__name__)
     every, presets = usable_trials(recordings, joints), preset_parameters()
     loaded = loaded_joints(every)
     free_air = {joint: joint not in loaded for joint in every}
     priors, note = _priors(prior, every)
-    if workers > 1 and len(every) > 1:  # of one joint, a second process costs what it saves
+    if workers > 1:
         fits = side_by_side(every, free_air, seed, presets, workers, progress, staged, priors)
     else:
         fits = {}

@@ -2,15 +2,16 @@
 
 Each explanation is the exported fit with one thing more, fitted from there: a low-pass filter in
 front of the servo, play, a dead zone or an integral term of the controller, more friction at rest,
-or gravity. The best is named where the likelihood is decidedly better with it. Simulators do not
-run these, so the numbers stay those of the exported fit; but a number that another moves
-is not known better than the two are apart.
+gravity, or a link that bends and whose inertia the motor feels late. The best is named where the
+likelihood is decidedly better with it. Simulators do not run these, so the numbers stay those of
+the exported fit; but a number that another moves is not known better than the two are apart.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from pupper_sysid.sysid.fit.search import (
     Problem,
     from_about,
     refine,
+    refined,
     search_widely,
     temperature_at,
 )
@@ -37,6 +39,7 @@ _CLOSER_S, _SEARCHED = tuple(np.geomspace(0.004, 0.064, 17)), 2
 exact readings a constant that is off by a tenth makes no sense."""
 _BETWEEN, _NEAR_BY = (0.71, 1.41, 0.84, 1.19), (0.92, 1.09, 0.96, 1.04)
 """Factors about the likeliest: all between two that were tried, then more closely."""
+_REFINED = 2  # of the fits in coarse steps, those that are fitted in fine ones
 _NATS = 10.0
 """Log-likelihood by which an explanation is named."""
 _POSSIBLE_NATS = -3.0
@@ -49,6 +52,8 @@ _SHARES = np.array([0.4, 0.7, 0.95])
 """Of what friction holds back: parts that a dead zone or play is given at the start."""
 _LEFT = (0.3, 0.05)
 """Shares of the friction that may be left then."""
+_LINKS_HZ = tuple(np.geomspace(4.0, 40.0, 9))
+_STARTS = 6  # of a feature's, those of the lowest cost
 _TRADED = ("backlash", "dead zone")  # with friction
 
 
@@ -63,6 +68,11 @@ class _Feature:
     """What the starts are shares of."""
     free_air_only: bool = False
     """Whether a servo under load has this, or something alike, among its own terms."""
+
+
+def _grid(**numbers: tuple[float, ...]) -> dict[str, tuple[float, ...]]:
+    """Every combination of some values of numbers."""
+    return dict(zip(numbers, zip(*product(*numbers.values()), strict=True), strict=True))
 
 
 _FEATURES = {
@@ -86,6 +96,11 @@ _FEATURES = {
         "a load whose weight pulls at it",
         {"gravity_sin": (0.1, -0.1, 0.0), "gravity_cos": (0.0, 0.0, 0.1)},
         of="effort_rad_s2", free_air_only=True,
+    ),
+    "flexible": _Feature(
+        "a link that bends, with {:.0f} % of the inertia behind it",
+        _grid(link_share=(0.05, 0.15, 0.35), link_hz=_LINKS_HZ, link_damping_ratio=(0.05, 0.2)),
+        0.01, free_air_only=True,
     ),
 }  # fmt: skip
 
@@ -250,20 +265,21 @@ def _low_pass(
     """The likeliest filter, and those that are about as likely."""
     structure = problem.structure
     anew = anew and structure.scales.free_air  # under load a search takes minutes
+    coarse = {
+        t: refine(_behind(problem.coarse, t), _earlier(structure, best.point, t))
+        for t in (_CLOSER_S if anew else _LOW_PASS_S)
+    }
+    likeliest = sorted(coarse, key=lambda t: coarse[t].cost)
     if anew:
-        coarse = {
-            t: refine(_behind(problem.coarse, t), _earlier(structure, best.point, t))
-            for t in _CLOSER_S
-        }
-        likeliest = sorted(coarse, key=lambda t: coarse[t].cost)[:_SEARCHED]
-        starts = {t: coarse[t].point[None] for t in likeliest}
+        likeliest = likeliest[:_SEARCHED]
     else:
-        starts = {t: _earlier(structure, best.point, t) for t in _LOW_PASS_S}
-    behind = {t: _behind(problem, t) for t in starts}
-    fits = {t: refine(behind[t], points) for t, points in starts.items()}
+        most = coarse[likeliest[0]].cost + 2.0 * _WITHIN_NATS * temperature
+        likeliest = [t for t in likeliest if coarse[t].cost <= most]
+    behind = {t: _behind(problem, t) for t in likeliest}
+    fits = {t: refine(behind[t], coarse[t].point[None]) for t in likeliest}
     if anew:
-        for t, points in starts.items():
-            wide = search_widely(behind[t], rng, points, short=True)
+        for t in likeliest:
+            wide = search_widely(behind[t], rng, coarse[t].point[None], short=True)
             fits[t] = min(wide, fits[t], key=lambda f: f.cost)
     middle = min(fits, key=lambda t: fits[t].cost)
     # gains make up for a part of a filter, so that its own lie along a ridge
@@ -328,7 +344,8 @@ def _with_feature(
     if feature.of and feature.of not in wider.names:
         return []
     exported = wider.decode(wider.adopt(structure, best.point))
-    values = np.repeat(exported[None], 3, axis=0)
+    count = len(next(iter(feature.starts.values())))
+    values = np.repeat(exported[None], count, axis=0)
     for number, starts in feature.starts.items():
         full_value = 1.0
         if feature.of and not number.endswith("_rad_s"):
@@ -344,7 +361,8 @@ def _with_feature(
         values = np.concatenate([values, traded])
     starts = np.clip(wider.encode(values), *wider.box)
     behind = replace(problem, structure=wider)
-    fits = [refine(behind, starts)]
+    starts = starts[np.argsort(behind.coarse.costs(starts))[:_STARTS]]
+    fits = [_from_coarse(behind, starts)]
     if best.cost - fits[0].cost > temperature:  # there is something, so that its size matters
         fits = [from_about(behind, fits[0], rng)]
     if name in _TRADED and {"friction_rad_s2", "stiffness_per_s2"} <= {*wider.names}:
@@ -390,5 +408,11 @@ def _with_less_friction(
     bounded[friction] = replace(limit, high=most)
     structure = replace(wider, parameters=tuple(bounded))
     starts = np.clip(structure.encode(values), *structure.box)
-    fit = refine(replace(behind, structure=structure), starts)
+    fit = _from_coarse(replace(behind, structure=structure), starts)
     return replace(fit, point=np.clip(fit.point, *wider.box))
+
+
+def _from_coarse(problem: Problem, starts: NDArray[np.float64]) -> Fit:
+    """The best local fit from starts that are fitted in coarse steps first."""
+    rough = refined(problem.coarse, starts)[:_REFINED]
+    return refine(problem, np.array([fit.point for fit in rough]))

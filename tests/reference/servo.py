@@ -55,11 +55,14 @@ def servo(
 ) -> NDArray[np.float64]:
     """Readings at the edges of the steps, shape (steps + 1,); parameters as for the kernel."""
     w = dict(zip(COLUMNS, row, strict=True))
-    inertia = w["armature"] + load[0]
+    inertia = (w["armature"] + load[0]) * (1 - w["link_share"])
+    turn = 2 * np.pi * w["link_hz"]
+    link_inertia = (w["armature"] + load[0]) * w["link_share"]
     on = delayed(held[1], dead_time, pad) if len(held) > 1 else np.ones(held.shape[1] - pad)
     volts = held[2, pad:] if len(held) > 1 else np.ones(len(on))
     y = setpoint = shown = start - w["offset_rad"]
-    v = rate = summed = 0.0
+    v = rate = summed = link_speed = 0.0
+    link = y
     out = [shown]
     for k in range(len(on)):
         commands = window(edges, pad + k - dead_time)
@@ -116,13 +119,20 @@ def servo(
         if motor != drawn:
             acting = h
         weight = -(load[1] + w["gravity_nm"]) * np.sin(middle - load[2] - w["hanging_rad"])
+        if link_inertia > 0:
+            bent, damping = middle - (link + link_speed * h / 2), 2 * w["link_damping_ratio"] * turn
+            faster = (link_speed + h * (turn**2 * bent + damping * v)) / (1 + h * damping)
+            pulled = link_inertia * (faster - link_speed) / h
+            link, link_speed = link + h * (link_speed + faster) / 2, faster
+        else:
+            pulled = 0.0
         standing = 1 / (1 + (v / w["stribeck_speed"]) ** 2)
         friction = w["friction_loss"] + w["stribeck_friction"] * standing
         friction += (1 + w["load_friction_static"] * standing) * (
             w["load_friction_motor"] * abs(motor) + w["load_friction_load"] * abs(weight)
         )
         friction += w["load_friction_quadratic"] * motor**2
-        force = motor + weight
+        force = motor + weight - pulled
         way = np.sign(v) if v else np.sign(force)
         slowed = v + (force - way * friction) / inertia * acting
         if v == 0 and abs(force) <= friction:

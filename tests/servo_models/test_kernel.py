@@ -29,6 +29,7 @@ TERMS = {
     "torque limit": {"torque_limit": 250.0},
     "backlash": {"backlash_rad": 0.01},
     "integral": {"integral_per_s": 3.0},
+    "flexible link": {"link_share": 0.3, "link_hz": 9.0, "link_damping_ratio": 0.06},
     "another inertia": {"armature": 2.5},
 }  # fmt: skip
 

@@ -147,6 +147,8 @@ def test_a_low_pass_filter_is_named_and_gains_make_up_for_a_part_of_it():
         ),
         pytest.param("gravity", {"gravity_sin": 150.0, "gravity_cos": 0.0},
                      "a load whose weight pulls()", 0.0, marks=pytest.mark.slow),
+        ("flexible", {"link_share": 0.3, "link_hz": 9.0, "link_damping_ratio": 0.06},
+         "a link that bends, with ([0-9]+) % of the inertia", 30.0),
     ],
 )  # fmt: skip
 def test_what_a_servo_has_besides_is_named_with_its_size(feature, numbers, words, size):
