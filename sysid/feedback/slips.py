@@ -365,15 +365,16 @@ def _expected_speed(
     return np.interp(trial.read_time_s - lags[best], grid, speed)
 
 
-Simulate = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Model minus fresh readings [rad] of a trial, had its rows carried these commands [rad]."""
+Simulate = Callable[[NDArray[np.float64], int], NDArray[np.float64]]
+"""Model minus the first so many fresh readings [rad] of a trial, had its rows carried these
+commands [rad]."""
 
 
 _FAR = 5.0  # standard deviations
 _IN_A_ROW = 2
 _EXPLAINED = 0.5  # share of the cost of the readings far off that lost commands must explain
-_MOST_LOST = 3
 _LONGEST_S = 0.3  # from a lost command to the first reading far off
+_SETTLED_S = 1.0  # from there on until the joint moves as if none had been lost
 _LEAST_BULK = 0.3  # of the tone's noise
 _TOUCHED = 0.5  # standard deviations by which lost commands move a reading
 _MOST_LOST = 3  # of a trial: more are no lost commands but a wrong model
@@ -412,7 +413,7 @@ def find_lost_commands(
     residuals is smaller, that counts.
     """
     lost_commands: list[LostCommands] = []
-    rest = simulate(trial.command_rad)
+    rest = simulate(trial.command_rad, len(time_s))
     # a lost command is part of the tone's noise, unless that is taken from the bulk
     bulk = 1.4826 * float(np.median(np.abs(rest))) if len(rest) else 0.0
     scale_rad = float(np.clip(bulk, _LEAST_BULK * scale_rad, scale_rad))
@@ -426,9 +427,13 @@ def find_lost_commands(
         first = int(np.argmax(runs))
         best: tuple[float, int, int, NDArray[np.float64]] = (-np.inf, 0, 0, rest)
         sent = trial.send_time_s
+        until = int(np.searchsorted(time_s, time_s[first] + _SETTLED_S))
         for row in np.flatnonzero((sent < time_s[first]) & (sent > time_s[first] - _LONGEST_S)):
             for rows in range(1, _MOST_LOST + 1):
-                without = simulate(without_commands(trial, int(row), rows)) / scale_rad
+                commands = without_commands(trial, int(row), rows)
+                if np.array_equal(commands, trial.command_rad):
+                    continue
+                without = np.concatenate([simulate(commands, until) / scale_rad, rest[until:]])
                 gain = float(np.sum((_cost(rest) - _cost(without))[unexplained]))
                 if gain > best[0]:
                     best = gain, int(row), rows, without

@@ -44,6 +44,7 @@ from pupper_sysid.sysid.fit.results import (
 from pupper_sysid.sysid.fit.run import fresh_residuals
 from pupper_sysid.sysid.fit.scores import held_out_residuals, rms
 from pupper_sysid.sysid.fit.search import (
+    LEAVES_MOTION,
     Fit,
     Problem,
     evolved,
@@ -173,10 +174,14 @@ def _fitted(
         for start in list(more):
             for limit in _ACCELERATIONS_RAD_S2:
                 more.append(np.where(np.arange(len(start)) == place, np.log(limit), start))
-    if ready.scales.free_air:
-        best = _without_slight_limits(problem, search_widely(problem, rng, np.array(more), short))
-    else:  # the first structure was searched for
-        best = evolved(problem, np.array(more), rng, short)
+    starts = np.array(more)
+    if not ready.scales.free_air:  # the first structure was searched for
+        best = evolved(problem, starts, rng, short)
+    elif first is not None and temperature_at(problem, refine(problem, starts)) <= LEAVES_MOTION:
+        # a search of the whole box finds nothing that is better
+        best = _without_slight_limits(problem, evolved(problem, starts, rng, short=True))
+    else:
+        best = _without_slight_limits(problem, search_widely(problem, rng, starts, short))
     return Fitted(structure, best)
 
 

@@ -40,6 +40,7 @@ from pupper_sysid.sysid.fit.run import (
     free_run,
     fresh_residuals,
     prepare,
+    with_commands,
 )
 from pupper_sysid.sysid.fit.search import Fit, Problem, refine, search_widely
 from pupper_sysid.sysid.fit.servo_prior import ServoPrior
@@ -348,8 +349,13 @@ def _lost_commands(
         read = _readings(trial, lattice)
         time = read.time_s[read.time_s >= trial.send_time_s[0]]
 
-        def simulate(command: NDArray[np.float64]) -> NDArray[np.float64]:
-            run = prepare(replace(trial, command_rad=command), read, step_s=step_s).in_free_air()
+        as_sent = prepare(trial, read, step_s=step_s).in_free_air()
+
+        def simulate(command: NDArray[np.float64], readings: int) -> NDArray[np.float64]:
+            run = with_commands(as_sent, replace(trial, command_rad=command))
+            run = replace(
+                run, sample_step=run.sample_step[:readings], sample_rad=run.sample_rad[:readings]
+            )
             return fresh_residuals(structure, values, [run])[0]
 
         return find_lost_commands(trial, time, scale, simulate)

@@ -258,6 +258,13 @@ def averaged(
     return np.diff(np.interp(edges, sent, area)) / step_s
 
 
+def with_commands(run: Run, trial: Trial) -> Run:
+    """The run under the commands of a trial, which is the same but for them."""
+    held, sent = run.held.copy(), trial.send_time_s - trial.send_time_s[0]
+    edges, held[0, run.pad :] = _commanded(sent, whole_counts(trial), held[0], run.pad, run.step_s)
+    return replace(run, held=held, edges=edges)
+
+
 def with_voltage(run: Run, trial: Trial, reference_voltage_v: float) -> Run:
     """The run with the trial's supply voltage over another reference."""
     held = np.ones((3, run.held.shape[1]))

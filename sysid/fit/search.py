@@ -35,7 +35,7 @@ _POPULATION, _LEADERS = 48, 12
 _GENERATIONS, _SHORT_GENERATIONS = (600, 60), (200, 20)
 """Members of the population, and those the others move toward. Generations at most, and how many
 without a better member end it: of a search, and of a short one."""
-_CORRELATED, _FINE_ROUNDS = 1.5, 2
+LEAVES_MOTION, _FINE_ROUNDS = 1.5, 2
 """Temperature above which a fit in free air leaves motion, not noise: 0.6 to 1.2 of the best fits
 to servos of the fitted structure. Populations in fine steps then, at most."""
 _NEAR, _NEAR_ROUNDS, _NEAR_ITERATIONS = 12, 12, 12
@@ -215,7 +215,7 @@ def evolved(
     near = np.concatenate([best.point[None], starts[-_FINAL:]])
     best = refine(problem, near[np.argsort(problem.costs(near))[:_REFINED]])
     for _ in range(_FINE_ROUNDS if problem.structure.scales.free_air else 0):
-        if temperature_at(problem, best) <= _CORRELATED:
+        if temperature_at(problem, best) <= LEAVES_MOTION:
             break
         # a stiff servo at its limits moves otherwise in coarse steps
         best = evolve(problem, [best], rng, short, near)
