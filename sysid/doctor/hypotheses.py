@@ -69,7 +69,10 @@ def relations(joint: Followed) -> list[Relation]:
         if other is not None:
             other = replace(other, rows=base.rows)
             late = other.causal(_LONGEST_LAG_S) & (other.total_s > _FASTEST_S)
-            found.append(Relation("columns_swapped", other.best(1.0, late)))
+            swapped = other.best(1.0, late)
+            # a filter takes the noise out of any position, but only ahead of time if it is one
+            if swapped.nats < other.best(1.0, other.total_s < -0.5 * other.grid_s).nats:
+                found.append(Relation("columns_swapped", swapped))
     return sorted(found, key=lambda r: r.servo.nats)
 
 

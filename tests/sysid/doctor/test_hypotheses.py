@@ -69,6 +69,24 @@ def test_a_joint_that_rests_in_slow_strokes_is_held_by_friction_and_not_dead():
     assert found["held_by_friction"].verdict == CARE
 
 
+def test_a_joint_that_hunts_in_its_play_has_no_swapped_columns():
+    """A low-pass takes the oscillation out of the position, so that the command seems to follow."""
+    rng = np.random.default_rng(3)
+    time = 0.005 * np.arange(5000)
+    command = sum(
+        0.05 * np.sin(2 * np.pi * hz * time + phase)
+        for hz, phase in zip(rng.uniform(0.1, 0.8, 5), rng.uniform(0, 6.3, 5), strict=True)
+    )
+    hunting = 0.02 * np.sin(2 * np.pi * 14.0 * time + 3.0 * np.sin(7.0 * time))
+    position = np.interp(time - 0.028, time, command) + hunting
+    position += 1e-3 * rng.standard_normal(len(time))
+
+    recording = ps.Recording.from_arrays(
+        time, {"joint": command}, {"joint": position}, read_time_s=time + 1e-3
+    )
+    assert set(codes(recording)) & set(ACCUSING) == set()
+
+
 @pytest.mark.parametrize("rate_hz", [50.0, slow(500.0)])
 def test_a_servo_that_settles_after_each_step_is_no_echo(rate_hz):
     """At rest the position is the command, a while late; on its way it is not."""
