@@ -41,7 +41,13 @@ def convert(path: Path | str, table: Table, options: LogOptions | None = None) -
     """Rows of a table of any known layout."""
     options = options or LogOptions()
     names = {*table.names}
-    if {"send_time_s", "read_time_s"} & names and not options.command:
+    times = [n for n in ("read_time_s", "send_time_s") if n in names]
+    foreign = not {"joint", "command_rad", "position_rad"} & names
+    if times and foreign and not (options.time or options.command_time):
+        # this project's names of times, and the columns of another
+        both = len(times) == 2
+        options = replace(options, time=times[0], command_time=times[1] if both else None)
+    elif times and not options.command:
         require(path, table, REQUIRED_COLUMNS)
         options.refuse("recording of this project", ())
         columns = {n: table.numbers(path, n) for n in table.columns} | {**table.texts}

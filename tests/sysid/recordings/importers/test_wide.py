@@ -54,6 +54,17 @@ def test_a_joint_is_what_stands_beside_the_words_and_an_ending_names_the_unit():
         agrees(Recording.from_frame(table(command, position, scale=scale)))
 
 
+def test_columns_of_joints_beside_times_named_as_ours_are_read(tmp_path):
+    frame = table("{joint}_command_rad", "{joint}_position_rad", time="send_time_s")
+    frame.to_csv(path := tmp_path / "one.csv", index=False)
+    agrees(load(path))
+    frame.insert(1, "read_time_s", TIME + 0.003)
+    frame.to_csv(path := tmp_path / "both.csv", index=False)
+    agrees(recording := load(path))
+    trial = recording.trials("knee")[0]
+    np.testing.assert_allclose(trial.read_time_s - trial.send_time_s, 0.003)
+
+
 def test_times_are_seconds_by_their_ending_or_their_distance():
     for name, scale, guessed in (
         ("time_ms", 1e3, False), ("timestamp_us", 1e6, False), ("t", 1e3, True),
