@@ -153,6 +153,7 @@ _LEAD = 2.0
 _LONGEST_S = 0.06  # rows farther apart no longer follow the motion
 _HARMLESS_S = 0.004
 _WINDOW, _COUNTS_A_ROW = 7, 2.0
+_NONE_OF_FEW = 0.4  # twice the share of one of the five steps from -2 to 2
 _POLL_REPEATS = 0.2  # share of reads that a poll of 1.25 loops repeats
 
 
@@ -204,6 +205,8 @@ def staleness(trials: Sequence[Trial]) -> Staleness:
     least = max(_COUNTS * step, _NOISES * scatter if scatter > step else 0.0)
 
     repeats = _count(rows, offset, least)
+    if scatter > step > 0 and _repeats_in_noise(values, step):
+        return _verdict("stale", repeats)
     if len(repeated) >= _NEEDED and not _impossible(int(repeated.sum()), len(repeated)):
         return _verdict("live", repeats)  # every row is new, in motion or not
     every = 1
@@ -216,6 +219,21 @@ def staleness(trials: Sequence[Trial]) -> Staleness:
         return _verdict("stale", repeats)
     certain = every == 1 or _follows_rows(values) or _shortest(values) * loop <= _HARMLESS_S
     return _verdict("live" if certain or _new_in_motion(trials, step) else "cannot tell", repeats)
+
+
+def _repeats_in_noise(values: Sequence[NDArray[np.float64]], step: float) -> bool:
+    """Whether values repeat between large steps far more often than they move by a count or two.
+
+    The steps of live readings that scatter by more than a count are as likely to be none as one.
+    """
+    none = few = 0
+    for value in values:
+        counts = np.abs(np.diff(value)) / step
+        between = np.minimum(counts[:-2], counts[2:]) >= _COUNTS
+        middle = counts[1:-1][between]
+        none += int(np.sum(middle < _NEAR))
+        few += int(np.sum((middle >= _NEAR) & (middle < _COUNTS)))
+    return none >= _NEEDED and float(bdtrc(none - 1, none + few, _NONE_OF_FEW)) < _IMPOSSIBLE
 
 
 def _new_in_motion(trials: Sequence[Trial], step: float) -> bool:

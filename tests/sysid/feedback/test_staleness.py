@@ -142,6 +142,22 @@ TIME_S = LOOP * np.arange(150)
 COMMAND = 0.3 * np.sin(2 * np.pi * 4 * TIME_S)
 
 
+def test_values_that_repeat_between_steps_of_noise_are_stale():
+    """The noise hides the motion, in which `episodes` looks for repeats."""
+    rng = np.random.default_rng(8)
+    time = 0.019 * np.arange(900)
+    command = 0.1 * np.sin(2 * np.pi * 1.3 * time)
+
+    def kind(read_s) -> str:
+        position = 0.1 * np.sin(2 * np.pi * 1.3 * (read_s - 0.05))
+        noise = dict(zip(np.unique(read_s), 0.02 * rng.standard_normal(900), strict=False))
+        position = 0.0015 * np.round((position + [noise[t] for t in read_s]) / 0.0015)
+        return staleness([Trial("LF_hip", 0, 1.3, time, time, command, position, None, 0.0)]).kind
+
+    assert kind(0.024 * np.floor(time / 0.024)) == "stale"
+    assert kind(time) != "stale"
+
+
 def servo(command):
     """First-order lag of 30 ms behind two rows of dead time."""
     late = np.concatenate([np.zeros(2), command[:-2]])
