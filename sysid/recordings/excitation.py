@@ -150,8 +150,11 @@ def split_tones(trial: Trial, at_rests: bool = False) -> list[Trial]:
         tones = _grouped(trial, motions)
         if len(tones) == 1 and not tones[0].frequency_hz > 0:
             return [trial]
-    if len(tones) == 1 and len(motions) == 1:
-        return [replace(trial, frequency_hz=tones[0].frequency_hz)]
+    lead_s = trial.send_time_s[tones[0].first] - trial.send_time_s[0]
+    if [m.kind for m in motions if m.kind != "rest" or m.first > 0] == [
+        "tone"
+    ] and lead_s < _LEAD_S:
+        return [replace(trial, frequency_hz=tones[0].frequency_hz)]  # as if it had been named
     parts, end = [], 0
     for tone in tones:
         parts.append(_part(trial, tone, end))
