@@ -159,8 +159,8 @@ def simulated(world: World) -> pd.DataFrame:
     gravity = world.gravity_rad * np.sin(goal / max(world.amplitude_rad, 1e-6))
     goal = world.gain * goal + gravity
     natural = 2 * np.pi * world.bandwidth_hz
-    if world.writer_share > 0:
-        position = _with_writer(world, goal, row, natural, rng)
+    if world.writer_share > 0 or "times_s" in world.values:
+        position = _with_writer(world, clock, send, goal, row, natural, rng)
     else:
         position = _moved(
             goal, natural, world.damping, world.friction_rad, world.speed_rad_s,
@@ -185,12 +185,16 @@ def simulated(world: World) -> pd.DataFrame:
     })  # fmt: skip
 
 
-def _with_writer(world: World, goal, row, natural, rng) -> NDArray:
-    """Some commands are replaced, until the next, by another program's old goal."""
-    rows = int(row.max()) + 2
-    hit = rng.random(rows) < world.writer_share
+def _with_writer(world: World, clock, send, goal, row, natural, rng) -> NDArray:
+    """Another program's goal stands from its writes until the next command."""
     home = world.values["home"]
-    taken = hit[np.maximum(row, 0)]
+    if "times_s" in world.values:
+        times = np.concatenate([[-1.0], world.values["times_s"]])
+        last = times[np.searchsorted(times, clock - world.dead_time_s, "right") - 1]
+        taken = (last > send[np.maximum(row, 0)]) & (row >= 0)
+    else:  # some commands are replaced
+        hit = rng.random(int(row.max()) + 2) < world.writer_share
+        taken = hit[np.maximum(row, 0)]
     return _moved(
         np.where(taken, home, goal), natural, world.damping, world.friction_rad, world.speed_rad_s,
         *world.stop_rad, len(goal), 1.0,
@@ -277,6 +281,26 @@ def _second_writer(world: World, rng):
         world, writer_share=float(rng.uniform(0.04, 0.12)),
         values={"home": float(rng.choice([-1, 1]) * rng.uniform(0.0, 1.0) * world.amplitude_rad)},
     )  # fmt: skip
+    return world, simulated(world)
+
+
+def _other_goal(world: World, rng) -> float:
+    return float(rng.choice([-1, 1]) * rng.uniform(0.0, 1.0) * world.amplitude_rad)
+
+
+def _now_and_then(world: World, rng):
+    """Another program writes its goal every 0.5 to 3 s, overwritten by the next command."""
+    times = 0.5 + np.cumsum(rng.uniform(0.5, 3.0, 40))
+    world = replace(world, values={"home": _other_goal(world, rng), "times_s": times})
+    return world, simulated(world)
+
+
+def _at_its_rate(world: World, rng):
+    """Another program writes its goal all the time, at a rate of its own."""
+    hz = np.exp(rng.uniform(np.log(2.0), np.log(min(20.0, 0.5 * world.rate_hz))))
+    times = rng.uniform(0.1, 0.6) + np.arange(0.0, world.duration_s, 1 / hz)
+    times = times + 0.03 / hz * rng.standard_normal(len(times))
+    world = replace(world, values={"home": _other_goal(world, rng), "times_s": np.sort(times)})
     return world, simulated(world)
 
 
@@ -385,6 +409,8 @@ FAULTS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "loses power": (_rows(_loses_power), ("frozen",)),
     "speed": (_rows(_speed), ("speed_for_position", "fast_joint", "degrees", "unrelated",
                               "not_a_position_servo")),
+    "writer now and then": (_now_and_then, ("second_writer",)),
+    "writer at its rate": (_at_its_rate, ("second_writer",)),
 }  # fmt: skip
 
 ACCUSING = sorted({code for _, codes in FAULTS.values() for code in codes})

@@ -38,7 +38,8 @@ def codes(recording, joint: str = "joint") -> dict[str, Finding]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", [name for name in FAULTS if name not in (
-    "healthy", "scale", "second writer", "friction", "heats", "speed")])  # fmt: skip
+    "healthy", "scale", "second writer", "friction", "heats", "speed", "writer now and then",
+    "writer at its rate")])  # fmt: skip
 def test_a_fault_is_named_by_its_code(fault):
     """Of four recordings (servos and motions in turn) three or more; none names another fault."""
     told = [codes(recorded(draw_recording(fault, n, 5)[1])) for n in (0, 1, 2, 5)]
@@ -329,10 +330,18 @@ def test_the_bit_of_the_sign_is_found_wherever_the_zero_is():
     assert found.values["bit"] == 15
 
 
+WRITERS = {  # that replace commands by chance, write every second or two, and at 8 Hz
+    "by chance": lambda rng: {"writer_share": 0.05},
+    "now and then": lambda rng: {"times_s": 0.5 + np.cumsum(rng.uniform(0.5, 2.0, 30))},
+    "at its rate": lambda rng: {"times_s": np.arange(0.3, 15.0, 0.125)},
+}  # fmt: skip
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("motion", ["teleoperation", "multisine", "walk"])
-def test_pushes_to_one_place_are_a_second_writer(motion):
-    """Of servos whose commands another program replaces now and then, and of the same alone."""
+@pytest.mark.parametrize("motion", ["teleoperation", "multisine", "walk", "steps"])
+@pytest.mark.parametrize("writes", WRITERS)
+def test_pushes_towards_one_goal_are_a_second_writer(motion, writes):
+    """Of servos that another program commands as well, and of the same alone."""
     named, accused = 0, 0
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -340,7 +349,9 @@ def test_pushes_to_one_place_are_a_second_writer(motion):
             draw_world(rng, "hobby", motion, 3e-4), rate_hz=60.0, poll_s=0.0, friction_rad=0.0,
             amplitude_rad=0.4, quantum_rad=0.0015, duration_s=15.0,
         )  # fmt: skip
-        disturbed = replace(world, writer_share=0.05, values={"home": 0.2})
+        changes = WRITERS[writes](rng)
+        share = changes.pop("writer_share", 0.0)
+        disturbed = replace(world, writer_share=share, values={"home": 0.2} | changes)
         named += "second_writer" in codes(recorded(simulated(disturbed)))
         accused += "second_writer" in codes(recorded(simulated(world)))
     assert named >= 3 and accused == 0
