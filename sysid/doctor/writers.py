@@ -40,7 +40,8 @@ _SHAPE = 0.3  # error of a response, of its size
 _ECHO = 3.0  # a pulse beside another so much larger is an error of its response
 _SMALLEST, _EXACT, _FARTHEST = 0.06, 0.15, 1.35  # of the command's range; of the way to the goal
 _GOALS = np.linspace(-0.5, 1.5, 41)  # of the command's range
-_FEWEST, _NATS = 3, 1.3  # pulses; advantage, of 189 sound recordings 0.8 at most
+_FEWEST, _PLACES = 3, 0.1  # pulses; range of their commands, of the whole
+_NATS = 1.3  # advantage, of 189 sound recordings 0.8 at most
 _BY_CHANCE, _MOST_NATS = (0.05, 0.3), 2.5  # share of pulses that another cause has; of a pulse
 
 _HIGHEST_HZ, _LEAST_AMPLITUDE_RAD, _LEAST_STEPS = 4.5, 0.1, 20.0
@@ -79,8 +80,9 @@ def second_writer(joint: Followed) -> list[Finding]:
     ))  # fmt: skip
     every = every.part(np.abs(every.size_rad) > _SMALLEST * joint.reach)
     nats, towards = towards_one_goal(every, joint)
-    if nats < _NATS or towards.sum() < _FEWEST:
-        return []
+    places = float(np.ptp(every.command_rad[towards])) if towards.any() else 0.0
+    if nats < _NATS or towards.sum() < _FEWEST or places < _PLACES * joint.reach:
+        return []  # at one place only, what a servo does there looks like a goal
     times = every.time_s[towards]
     values = {"times": len(times), "time_s": float(times.min()) - joint.start_s}
     return [joint.rivalled(Finding("second_writer", CARE, values))]  # a bent path pushes as well
@@ -132,7 +134,7 @@ def pulses(joint: Followed, number: int) -> Pulses:
     noise = np.full(len(time), np.inf)
     noise[_ORDER:] = np.maximum(
         _noise(innovations, joint.step, np.abs(rate), np.abs(np.gradient(rate, time))),
-        max(joint.step, 1e-6) / np.sqrt(12 * together),
+        max(joint.step, 1e-6) / np.sqrt(12),
     )
     left = np.zeros(len(time))
     left[_ORDER:] = innovations / noise[_ORDER:]
