@@ -17,11 +17,12 @@ by far more than poll and quantisation explain show that something else moves th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.stats import rankdata
 
 from pupper_sysid.common.tones import least_squares
 from pupper_sysid.sysid.doctor.changes import Followed
@@ -42,6 +43,7 @@ _SMALLEST, _EXACT, _FARTHEST = 0.06, 0.15, 1.35  # of the command's range; of th
 _GOALS = np.linspace(-0.5, 1.5, 41)  # of the command's range
 _FEWEST, _PLACES = 3, 0.1  # pulses; range of their commands, of the whole
 _NATS = 1.3  # advantage, of 189 sound recordings 0.8 at most
+_ALIKE, _ELSEWHERE, _MOST_PLACES = 0.1, 0.2, 500  # of the ranks; share of pulses
 _BY_CHANCE, _MOST_NATS = (0.05, 0.3), 2.5  # share of pulses that another cause has; of a pulse
 
 _HIGHEST_HZ, _LEAST_AMPLITUDE_RAD, _LEAST_STEPS = 4.5, 0.1, 20.0
@@ -60,11 +62,21 @@ class Pulses:
     """Beside the command, had they stood for the whole loop."""
     doubt_rad: NDArray[np.float64]
     """Standard deviation."""
+    place: NDArray[np.float64]
+    """Ranks, from 0 to 1, of the command, of the speed of the path and of the time since a step
+    among those of the trial, shape (pulses, 3)."""
 
     def part(self, inside: NDArray) -> Pulses:
         """Those that are `inside`, by mask or number."""
-        columns = (self.time_s, self.command_rad, self.size_rad, self.doubt_rad)
-        return Pulses(*(c[inside] for c in columns))
+        return Pulses(*(getattr(self, f.name)[inside] for f in fields(self)))
+
+    def least(self, joint: Followed) -> NDArray[np.float64]:
+        """Sizes from which they count [rad]."""
+        return np.maximum(_STANDS_OUT * self.doubt_rad, _SMALLEST * joint.reach)
+
+
+def _together(parts: Sequence[Pulses]) -> Pulses:
+    return Pulses(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Pulses)))
 
 
 def second_writer(joint: Followed) -> list[Finding]:
@@ -73,13 +85,10 @@ def second_writer(joint: Followed) -> list[Finding]:
     sticks = 2 * joint.friction_rad > _STICKS * joint.reach  # it jumps where friction lets go
     if loaded or sticks or interpolation_findings(joint.trials, joint.step):
         return []
-    parts = [pulses(joint, number) for number in range(len(joint.base.samples))]
-    every = Pulses(*(
-        np.concatenate([getattr(p, name) for p in parts])
-        for name in ("time_s", "command_rad", "size_rad", "doubt_rad")
-    ))  # fmt: skip
-    every = every.part(np.abs(every.size_rad) > _SMALLEST * joint.reach)
-    nats, towards = towards_one_goal(every, joint)
+    found, none = zip(*(pulses(joint, n) for n in range(len(joint.base.samples))), strict=True)
+    every, none = _together(found), _together(none)
+    every = every.part(np.abs(every.size_rad) > every.least(joint))
+    nats, towards = towards_one_goal(every, none, joint)
     places = float(np.ptp(every.command_rad[towards])) if towards.any() else 0.0
     if nats < _NATS or towards.sum() < _FEWEST or places < _PLACES * joint.reach:
         return []  # at one place only, what a servo does there looks like a goal
@@ -88,17 +97,22 @@ def second_writer(joint: Followed) -> list[Finding]:
     return [joint.rivalled(Finding("second_writer", CARE, values))]  # a bent path pushes as well
 
 
-def towards_one_goal(pulses: Pulses, joint: Followed) -> tuple[float, NDArray[np.bool_]]:
-    """Advantage of one goal over pulses of no direction [nats], and which go towards it."""
+def towards_one_goal(
+    pulses: Pulses, none: Pulses, joint: Followed
+) -> tuple[float, NDArray[np.bool_]]:
+    """Advantage of one goal over pulses of no direction [nats], and which go towards it.
+
+    `none`: commands that no pulse follows.
+    """
     size, far = pulses.size_rad, np.abs(pulses.size_rad)
     if not len(size):
         return 0.0, np.zeros(0, bool)
-    least = np.maximum(_STANDS_OUT * pulses.doubt_rad, _SMALLEST * joint.reach)
+    least = pulses.least(joint)
     usual = max(float(np.mean(far - least)), 0.05 * joint.reach)
     chance = 0.5 / usual * np.exp(-(far - least) / usual)
     command = np.concatenate([s.command_rad for s in joint.base.samples])
     low, high = float(command.min()), float(command.max())
-    best, which = -np.inf, np.zeros(len(size), bool)
+    best, at, which = -np.inf, low, np.zeros(len(size), bool)
     for goal in low + (high - low) * _GOALS:
         way = goal - pulses.command_rad
         most = _FARTHEST * np.abs(way) + 2 * pulses.doubt_rad
@@ -112,22 +126,42 @@ def towards_one_goal(pulses: Pulses, joint: Followed) -> tuple[float, NDArray[np
                 likely = (1 - share) * density + share * chance
                 nats = float(np.minimum(np.log(likely / chance), _MOST_NATS).sum())
                 if nats > best:
-                    best, which = nats, within
-    return best - 0.5 * float(np.log(len(_GOALS))), which
+                    best, at, which = nats, goal, within
+    seen = np.clip(1 - none.least(joint) / (np.abs(at - none.command_rad) + 1e-9), _ELSEWHERE, 1)
+    best -= 0.5 * float(np.log(len(_GOALS))) + _of_one_place(pulses, none.place, seen)
+    return best, which
 
 
-def pulses(joint: Followed, number: int) -> Pulses:
-    """Pulses beside the command of a trial that stand out of the noise."""
-    none = Pulses(*np.zeros((4, 0)))
+def _of_one_place(pulses: Pulses, others: NDArray, seen: NDArray[np.float64]) -> float:
+    """Advantage of pulses that repeat where the joint moves alike over those at any time [nats].
+
+    What a servo does beyond its model it does again there. `seen`: share of pulses at the `others`
+    that would be seen.
+    """
+    apart = np.abs(pulses.time_s[:, None] - pulses.time_s) > _RESPONSE_S
+
+    def near(ends: NDArray) -> NDArray[np.float64]:
+        return np.exp(-0.5 * (((pulses.place[:, None] - ends) / _ALIKE) ** 2).sum(axis=2))
+
+    usual = near(others) @ seen / np.maximum(seen.sum(), 1e-9)
+    again = (near(pulses.place) * apart).sum(axis=1) / np.maximum(apart.sum(axis=1), 1)
+    nats = np.log(_ELSEWHERE + (1 - _ELSEWHERE) * again / np.maximum(usual, 1e-9))
+    return max(float(nats.sum()), 0.0)
+
+
+def pulses(joint: Followed, number: int) -> tuple[Pulses, Pulses]:
+    """Pulses beside the command of a trial that stand out of the noise, and some of no size."""
+    nothing = np.zeros(0)
+    none = Pulses(nothing, nothing, nothing, nothing, np.zeros((0, 3)))
     sample, gain = joint.base.samples[number], joint.fit.values[0]
     trial = next(t for t in joint.trials if t.send_time_s[0] == sample.start_s)
     time, position, path = sample.time_s, sample.position_rad, joint.path_of_trial(number)
     if len(time) < _FEWEST_ROWS or not (np.diff(time) > 0).all():
-        return none
+        return none, none
     together = max(1, int(_FINEST_S / float(np.median(np.diff(time))) + 1e-9))
     time, position, path = (_means(x, together) for x in (time, position, path))
     if len(time) < _FEWEST_ROWS:
-        return none
+        return none, none
     rest = position - gain * path
     weights, innovations = _autoregression(rest - np.median(rest))
     rate = np.gradient(path, time)
@@ -149,7 +183,9 @@ def pulses(joint: Followed, number: int) -> Pulses:
     rows = np.searchsorted(time, at + lag)[:, None] + np.arange(int(np.ceil(lasts / gap)) + 2)
     recorded = rows < len(time)
     rows = np.minimum(rows, len(time) - 1)
-    recorded &= ~_settling(trial, joint.reach, time, lag + max(_SETTLED_S, 4 / slowest))[rows]
+    steps = _steps(trial, joint.reach)
+    since_step = _since(steps, time)
+    recorded &= (since_step >= lag + max(_SETTLED_S, 4 / slowest))[rows]
     since = time[rows] - at[:, None] - lag
     response = gain * (_step(since, natural, damping) - _step(since - loop, natural, damping))
     white = response.copy()
@@ -163,21 +199,28 @@ def pulses(joint: Followed, number: int) -> Pulses:
     seen = power > 0.25 * np.median(power[power > 0]) if (power > 0).any() else power > 0
     power = np.where(seen, power, np.inf)
 
-    found, sizes, doubts = _pursuit(shape, white, power, rows, left)
-    every = Pulses(at[found], command[found], sizes, doubts)
+    doubt = power**-0.5
+    found, sizes = _pursuit(shape, white, power, rows, left)
+    place = np.column_stack(
+        [command, rate[rows[:, 0]], _since(steps, at) if len(steps) else np.zeros(len(at))]
+    )
+    place = (rankdata(place, axis=0) - 0.5) / len(place)
+    some = np.flatnonzero(seen)[:: 1 + int(seen.sum()) // _MOST_PLACES]
+    others = Pulses(at[some], command[some], np.zeros(len(some)), doubt[some], place[some])
+    every = Pulses(at[found], command[found], sizes, doubt[found], place[found])
     beside = np.abs(every.time_s[:, None] - every.time_s) < lasts
     larger = np.abs(every.size_rad) > _ECHO * np.abs(every.size_rad[:, None])
-    return every.part(np.asarray(~(beside & larger).any(axis=1)))
+    return every.part(np.asarray(~(beside & larger).any(axis=1))), others
 
 
 def _pursuit(
     shape: NDArray, white: NDArray, power: NDArray, rows: NDArray, left: NDArray
-) -> tuple[list[int], NDArray[np.float64], NDArray[np.float64]]:
-    """Numbers, sizes and standard deviations of the pulses in what is `left`, the largest first.
+) -> tuple[list[int], NDArray[np.float64]]:
+    """Numbers and sizes of the pulses in what is `left`, the largest first.
 
     `shape`: responses at their `rows`, of that `power`, beside a constant; `white`: with it.
     """
-    found, sizes, doubts = [], [], []
+    found, sizes = [], []
     product = (shape * left[rows]).sum(1)
     for _ in range(_MOST_PULSES):
         k = int(np.argmax(np.abs(product) / np.sqrt(power)))
@@ -186,26 +229,28 @@ def _pursuit(
             break
         found.append(k)
         sizes.append(size)
-        doubts.append(power[k] ** -0.5)
         of, explained = rows[k, white[k] != 0], size * white[k, white[k] != 0]
         left[of] = (left[of] - explained) / np.hypot(1, _SHAPE * explained)
         power[k] = np.inf
         near = np.abs(rows[:, 0] - rows[k, 0]) <= rows.shape[1]
         product[near] = (shape[near] * left[rows[near]]).sum(1)
-    return found, np.array(sizes), np.array(doubts)
+    return found, np.array(sizes)
 
 
 def _means(values: NDArray[np.float64], together: int) -> NDArray[np.float64]:
     return values[: len(values) // together * together].reshape(-1, together).mean(axis=1)
 
 
-def _settling(trial: Trial, reach: float, time: NDArray, lasts_s: float) -> NDArray[np.bool_]:
-    """Rows soon after a step: friction and limits stop a servo on its way."""
+def _steps(trial: Trial, reach: float) -> NDArray[np.float64]:
+    """Times of steps of the command [s]: friction and limits stop a servo on its way."""
     move = np.abs(np.diff(trial.command_rad))
     beside = np.maximum(np.append(0.0, move[:-1]), np.append(move[1:], 0.0))
-    steps = trial.send_time_s[1:][(move > _JUMP * reach) & (beside < _RESTS * move)]
-    last = np.append(-np.inf, steps)[np.searchsorted(steps, time)]
-    return time - last < lasts_s
+    return trial.send_time_s[1:][(move > _JUMP * reach) & (beside < _RESTS * move)]
+
+
+def _since(steps: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Time since the last step [s]."""
+    return time - np.append(-np.inf, steps)[np.searchsorted(steps, time)]
 
 
 def _step(time: NDArray, natural: float, damping: float) -> NDArray[np.float64]:

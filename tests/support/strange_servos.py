@@ -442,7 +442,7 @@ FAULTS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
                               "not_a_position_servo")),
     "writer now and then": (_now_and_then, ("second_writer",)),
     "writer at its rate": (_at_its_rate, ("second_writer",)),
-    "torque fades": (_torque_fades, ("torque_fades", "gain_drifts")),
+    "torque fades": (_torque_fades, ("torque_fades", "torque_changed", "gain_drifts")),
     "held at times": (_held_at_times, ("frozen", "left_path")),
     "unplugged at times": (_rows(_unplugged_at_times), ("frozen", "left_path")),
 }  # fmt: skip
