@@ -56,7 +56,12 @@ from pupper_sysid.sysid.recordings.importers.tables import (
     read_numbered,
     read_table,
 )
-from pupper_sysid.sysid.recordings.importers.times import doubt_of_a_turn, stated_rate, units_in
+from pupper_sysid.sysid.recordings.importers.times import (
+    doubt_of_a_turn,
+    drive_in,
+    stated_rate,
+    units_in,
+)
 
 BAM, KTUNE = "BAM JSON", "ktune JSON"
 
@@ -207,8 +212,9 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     scalars = {k: float(v) for k, v in beside if isinstance(v, int | float) and abs(v) < _FAR}
     remarks = "\n".join(f"{k}: {v}" for k, v in beside if isinstance(v, str))
     table = expanded(path, arrays, list(options.joints))
-    units = units_in(remarks[:_FEW_REMARKS], table.names)
-    table = replace(table, texts=texts, rate=stated_rate(scalars), units=units)
+    remarks = remarks[:_FEW_REMARKS]
+    units, drive = units_in(remarks, table.names), drive_in(remarks)
+    table = replace(table, texts=texts, rate=stated_rate(scalars), units=units, drive=drive)
     if not arrays or (missing(table.names) and not options.command):
         return None
     return read_table(path, table, options, "JSON table")

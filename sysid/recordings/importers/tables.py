@@ -544,7 +544,7 @@ def _of_name(
         )
     if source.unit == "counts":
         known = positions[np.isfinite(positions)]
-        if (known % 1 != 0).any():  # a raw angle
+        if (known % 1 != 0).any() and source.name.lower().endswith("raw"):  # an angle
             return None
         if (commands < 0).any() and (commands[np.isfinite(commands)] % 1 == 0).all():
             return unit("counts:4096:0")

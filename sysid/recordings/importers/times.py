@@ -62,6 +62,9 @@ _ANGLES_IN = re.compile(
     rf"\b(?:angles?|positions|values|(?:angle[ _])?units?|winkel){_SAYS}{_UNIT_WORD}",
     re.IGNORECASE,
 )
+DRIVES = {"ODrive": "turns", "moteus": "turns", "VESC": "deg"}
+"""Drives that do not count radians, and what they count."""
+_DRIVE = re.compile(rf"(?<![\w.])({'|'.join(DRIVES)})(?![\w.])", re.IGNORECASE)
 _TICK = re.compile(
     r"(?:(?<![\w-])(?:\w*ticks?|timer(?: clock)?|clock|time units?)\b *(?:=|:|is|are|of)|"
     r"\btime in (?:units of)?) *([\d.]+) *(ns|us|µs|ms|khz|mhz)\b", re.IGNORECASE,
@@ -219,6 +222,13 @@ def units_in(text: str, names: Iterable[str]) -> dict[str, str]:
             said = re.findall(pattern, text, re.IGNORECASE)
             units_of[name] = {UNITS[word.lower()] for word in said}
     return {name: units.pop() for name, units in units_of.items() if len(units) == 1}
+
+
+def drive_in(text: str) -> tuple[str, str]:
+    """The drive that remarks such as `moteus r4.11` name, and its unit of angles; else empty."""
+    match = _DRIVE.search(text)
+    drive = next((name for name in DRIVES if match and name.lower() == match[0].lower()), "")
+    return drive, DRIVES.get(drive, "")
 
 
 def tick_in(text: str) -> float | None:

@@ -235,6 +235,18 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
                         "axis_0_controller"),
     "ODrive's tree": ("t,axis0.controller.input_pos,axis0.encoder.pos_estimate\n"
                       + each("{t},{c!r},{p!r}", TURNS), "axis_0"),
+    "a drive in a remark": (each("{t},{c!r},{p!r}", TURNS, "# moteus r4.11\ntime,cmd,pos"),
+                            "joint"),
+    "a drive in JSON": (json.dumps({"metadata": {"drive": "ODrive v3.6"}, "data": [
+        {"t": t, "cmd": c, "pos": p} for t, c, p in TURNS]}), "joint"),
+    "a drive beside arrays": (saved(np.savez, time=TIME, cmd=COMMAND / (2 * np.pi),
+                                    pos=POSITION / (2 * np.pi), drive="moteus"), "joint"),
+    "a drive in degrees": (each("{t},{c!r},{p!r}", DEGREES, "# VESC 6 mk5\ntime,cmd,pos"), "joint"),
+    "a drive and its unit": ("# ODrive v3.6, angles in radians\n" + NAMED, "joint"),
+    "a drive's columns and their unit": (each("{t},{c},{p}", LOG, "# angles in rad\nt,"
+                            "axis0.controller.input_pos,axis0.encoder.pos_estimate"), "axis_0"),
+    "ODrive's counts beside its turns": (each("{t},{c!r},{p!r},{n}", TURNS, "t,pos_setpoint,"
+                                         "pos_estimate,pos_estimate_counts"), "joint"),
     "WPILib's rotations": (each("{t},{c!r},{p!r}", TURNS, "Timestamp,/arm/setpoint (rotations),"
                                 "/arm/position (rotations)"), "arm"),
     # units: small angles, which a unit that is not understood would leave as they are
@@ -364,6 +376,8 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
     "ODrive's counts beside turns": ("t,axis0.controller.input_pos,axis0.encoder.shadow_count\n"
         + "".join(f"{t},{c!r},{8192 * p:.0f}\n" for t, c, p in TURNS),
         "--unit turns,counts:8192:0"),
+    "a set-point beside counts": ("t,pos_setpoint,pos_estimate_counts\n" + "".join(
+        f"{t},{c!r},{8192 * p:.1f}\n" for t, c, p in TURNS), "--unit turns,counts:8192:0"),
     "steps": (each("{t},{c},{p}", SIGNED, "t,target_steps,actual_steps"), "--unit counts:3200:0"),
     "whole seconds": ("time,cmd,pos\n" + "".join(
         f"12:30:{int(2.5 * t):02d},{c},{p}\n" for t, c, p in LOG), "--rate 40"),
