@@ -170,6 +170,9 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     lists: dict[str, list[Any]] = {}
     data = _of_pairs(_of_points(_of_frame(data)))
     records = _records(data)
+    head: Any = data
+    if records and not any({*records[0]} & {*r} for r in records[1:4]):  # JSON Lines' header
+        head, records = records[0], records[1:]
     if records is None and not isinstance(data, Mapping):
         values = _numbers(data)
         if values is None or values.ndim != 2:
@@ -208,7 +211,7 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     others = {n: v for n, v in lists.items() if v and n not in arrays}
     texts = {n: list(map(str, v)) for n, v in others.items()
              if has_time([n]) or (n in GROUPS and all(isinstance(t, str) for t in v))}  # fmt: skip
-    beside = _beside(data)
+    beside = _beside(head)
     scalars = {k: float(v) for k, v in beside if isinstance(v, int | float) and abs(v) < _FAR}
     remarks = "\n".join(f"{k}: {v}" for k, v in beside if isinstance(v, str))
     table = expanded(path, arrays, list(options.joints))

@@ -46,6 +46,7 @@ _DRIVES = {
 }  # fmt: skip
 """Names of columns by which the angles are turns without doubt; those under "" do not tell the
 program, and only beside marks of `_OF_TURNS`."""
+_ARRAY = re.compile(r"(data|values?)(_\d+)?", re.IGNORECASE)
 _MOST_TURNS = 100.0  # beyond which no angle is read, whatever its unit
 _COUNTS_OF_DRIVE = "counts:8192:0"
 """ODrive's default encoder; its firmware before 0.5 has counts where later ones have turns."""
@@ -195,7 +196,11 @@ def _decided(path: Path | str, table: Table, best: Sequence[Pair], used: Mapping
         twice = {getattr(pair, kind).name for pair in best
                  if pair.cost(used)[:4] == first.cost(used)[:4]
                  and getattr(pair, kind).words == chosen.words}  # fmt: skip
-        distinct(path, [bare_name(chosen.joint or SOLE)] * len(twice), "joints")
+        if chosen.joint:
+            distinct(path, [bare_name(chosen.joint)] * len(twice), "joints")
+        elif len(twice) > 1:
+            why = f"{len(twice)} columns may be the {kind} of {chosen.joint or 'the joint'}"
+            _refuse_choices(path, why, [p for p in best if getattr(p, kind).name in twice])
         values = [table.columns.get(n) for n in dict.fromkeys(getattr(p, kind).name for p in alike)]
         if any(v is None or values[0] is None or not np.array_equal(v, values[0], equal_nan=True)
                for v in values[1:]):  # fmt: skip
@@ -233,7 +238,10 @@ def _lone(
             choices = [Pair(*both)]
         _refuse_choices(path, "no joint has both a command and a position by its name", choices)
     (pair,) = choices
-    name = bare_name(pair.command.joint or pair.position.joint or SOLE)
+    word = pair.command.joint or pair.position.joint or SOLE
+    if _ARRAY.fullmatch(word):  # /commands/data[0] beside /joint_states/knee/position
+        word = pair.position.joint or word
+    name = bare_name(word)
     return {name: pair}, [
         f"{pair.command.name} and {pair.position.name} were taken for the command and the position "
         "of one joint."

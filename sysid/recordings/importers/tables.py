@@ -44,7 +44,7 @@ from pupper_sysid.sysid.recordings.importers.log import (
     joint_names,
     rows,
 )
-from pupper_sysid.sysid.recordings.importers.options import LogOptions, Unit, unit
+from pupper_sysid.sysid.recordings.importers.options import MOVES_ALIKE, LogOptions, Unit, unit
 from pupper_sysid.sysid.recordings.importers.pairs import SOLE, Pair, column_named, pairs
 
 LAYOUT = "table"
@@ -404,12 +404,17 @@ def _joint(
     commands = table.numbers(path, pair.command.name)[of_joint]
     positions = table.numbers(path, pair.position.name)[of_joint]
     stated, units = options.unit_of(*names), table.units
+    said: set[str] = set()
+    if stated is None and not units:
+        pair, texts = _one_unit(pair, commands if held is None else held, positions)
+        warnings += texts
     columns: dict[str, Any] = {}
     for kind, source, values in (
         ("command", pair.command, commands if held is None else held),
         ("position", pair.position, positions),
     ):
-        said = stated is not None or source.unit not in ("", "rad")
+        if stated is not None or source.unit not in ("", "rad"):
+            said.add(kind)
         if stated is not None:
             factor = stated[kind == "position"]
         else:
@@ -419,7 +424,8 @@ def _joint(
                 and not source.unit
                 and (word := units.get(source.name, units.get("")))
             ):
-                factor, said = unit(word), True
+                factor = unit(word)
+                said.add(kind)
                 warnings.append(f"{source.name} was taken as {word}, as the log says beside it.")
             factor = factor or Unit()
             if factor.counts:
@@ -431,9 +437,9 @@ def _joint(
         columns[f"{kind}_rad"] = factor.radians(values)
         if kind == "position" and factor.counts:
             columns["position_count"] = values
-        if said:
-            metadata["angle_unit"] = "stated"
     angles = columns.pop("command_rad"), columns.pop("position_rad")
+    if len(said) == 2:
+        metadata["angle_unit"] = "stated"
     columns |= {
         name: table.numbers(path, name)[of_joint] for name in _KEPT if name in table.columns
     }
@@ -443,6 +449,27 @@ def _joint(
         several = part.groupby("trial")["frequency_hz"].transform("nunique").to_numpy() > 1
         part.loc[several, "frequency_hz"] = np.nan  # a chirp is no tone
     return part, warnings
+
+
+def _one_unit(
+    pair: Pair, commands: NDArray[np.float64], positions: NDArray[np.float64]
+) -> tuple[Pair, list[str]]:
+    """The pair, one of which names a unit, with that for the other where both move as far by it."""
+    units = pair.command.unit, pair.position.unit
+    if bool(units[0]) == bool(units[1]) or set(units) & {"rad", *_LACKING}:
+        return pair, []
+    if "counts" in units and any((v[np.isfinite(v)] % 1 != 0).any() for v in (commands, positions)):
+        return pair, []
+    ranges = [float(np.ptp(np.nanquantile(v, (0.05, 0.95)))) for v in (commands, positions)]
+    if not min(ranges) > 0 or not 1 / MOVES_ALIKE < ranges[0] / ranges[1] < MOVES_ALIKE:
+        return pair, []
+    word = units[0] or units[1]
+    both = Pair(replace(pair.command, unit=word), replace(pair.position, unit=word))
+    silent, named = (pair.position, pair.command) if units[0] else (pair.command, pair.position)
+    return both, [
+        f"{silent.name} names no unit, and was taken as {word} like {named.name}, since it moves "
+        "as far. If that is wrong, give `unit`, such as deg,rad."
+    ]
 
 
 def _apart(

@@ -44,9 +44,12 @@ _OTHER_DATE = re.compile(r"^(?!\d{4}-\d)\d{1,4}([-/.])(?:\d{1,2}|[A-Z][a-z]{2})\
 _COMPACT = re.compile(r"^(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(?=\d\d)")  # of ISO 8601
 _HALF_DAY = re.compile(r" ?([AP])M$")
 _PERIODS = ("dt", "ts", "timestep", "time_step", "sample_time", "sampling_time", "sample_period",
-            "sampling_period", "period", "delta_x", "delta_t", "wf_increment")  # fmt: skip
+            "sampling_period", "period", "control_dt", "loop_time", "cycle_time", "delta_x",
+            "delta_t", "wf_increment")  # fmt: skip
 _RATES = ("fs", "fps", "rate", "rate_hz", "hz", "frequency_hz", "sample_rate", "sample_rate_hz",
-          "sampling_rate", "sampling_rate_hz", "sampling_frequency")  # fmt: skip
+          "sampling_rate", "sampling_rate_hz", "sampling_frequency", "samplerate", "samplingrate",
+          "control_rate", "control_frequency", "control_hz", "loop_rate", "loop_frequency",
+          "loop_hz", "update_rate", "publish_rate", "sample_frequency")  # fmt: skip
 _EVERY = re.compile(
     r"(?<![\w.])(?:every|alle) +([\d.]+) *(ms|us|µs|s)\b|(?<![\w.])([\d.]+) *(fps|hz|khz)\b",
     re.IGNORECASE,
