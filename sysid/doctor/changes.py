@@ -263,6 +263,17 @@ class Followed:
                 a += 1
         return found
 
+    @property
+    def stays_often(self) -> Finding | None:
+        """That it stays where it is several times."""
+        if len(self.stays) < 2:
+            return None
+        time = self.time_s - self.start_s
+        lasts = max(float(time[b - 1] - time[a]) for a, b in self.stays)
+        values = {"times": len(self.stays), "longest_s": lasts,
+                  "time_s": float(time[self.stays[0][0]])}  # fmt: skip
+        return Finding("left_path", CARE, values)
+
     @cached_property
     def friction_rad(self) -> float:
         """Error of the command that friction and play hold; 0 where a servo needs none."""
@@ -780,8 +791,8 @@ class _Stays(_Change):
     """A joint that stays where it is for a while, several times, and its command goes on."""
 
     def values(self, joint: Followed) -> int:
-        """Of each time its begin and end, a place, and that it does not follow."""
-        return 4 * len(joint.stays)
+        """A place for each time, and that it does not follow; its readings tell begin and end."""
+        return 2 * len(joint.stays)
 
     def columns(self, joint: Followed, span: Span) -> Columns:
         """What each adds to the path of the servo."""
@@ -812,7 +823,7 @@ def comparisons(joint: Followed) -> list[Compared]:
     """
     loaded = any(t.load is not None for t in joint.trials)
     changes = [c for c in CHANGES if c.number == "lag" or not loaded]
-    changes = [c for c in changes if c.number != "stays" or len(joint.stays) > 1]
+    changes = [c for c in changes if c.number != "stays" or joint.stays_often]
 
     def nats(change: _Change, plain: float, fit: Follower, count: float) -> float:
         more = (plain + joint.unsure) / (fit.cost + joint.unsure)

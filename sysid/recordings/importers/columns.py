@@ -34,6 +34,8 @@ UNITS: dict[str, str] = {
         ("turns", "turn turns rev revs revolution revolutions rotation rotations "
                   "umdrehungen"),
         ("percent", "percent pct"),
+        ("share", "norm normalized normalised"),
+        ("length", "mm cm meter meters metre metres inch inches"),
         ("counts", "count counts tick ticks pulse pulses"),
         ("steps", "steps microsteps qc inc incs increments lsb"),
         ("scale:1e-06", "urad µrad"),
@@ -85,7 +87,7 @@ WORDS: dict[str, str] = {
                 "frame iteration iter step overrun moving force feedforward ff tff integral prev "
                 "previous last offset home initial init delta diff frequency freq hz cov "
                 "covariance enable enabled reached done warning fault trial episode loop "
-                "strom spannung dot iq uq ud trq torq rpm rps dps"),
+                "strom spannung dot iq uq ud trq torq rpm rps dps nm newton"),
         (TIME, "time times timestamp timestamps t ts stamp stamps clock elapsed seconds secs sec "
                "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
                "nanosec nanosecs nsecs usec usecs tout minutes days datenum zeit temps tiempo "
@@ -112,7 +114,7 @@ TIME_STEP = re.compile(r"(d_?t|delta_?t(ime)?|time_?(step|delta))([_ (\[].*)?", 
 """Names of times between rows."""
 
 _UNIT_RANK = {"rad": 0, "": 1, "mrad": 2, "deg": 3, "turns": 4, "counts": 5, "steps": 5,
-              "percent": 6}  # fmt: skip
+              "percent": 6, "share": 6, "length": 6}  # fmt: skip
 _SEPARATORS = re.compile(r"[\s_./:\\\[\](){}<>$%#*,;|='\"（）［］【】：，-]+")
 _CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?(?:[^\W\dA-Z_]|°)+|\d+|[^\w°]+")
 _IN_UNIT = re.compile(r"\s+(?:in|en)\s+(?=\S+$)", re.IGNORECASE)  # Winkel in Grad
@@ -123,6 +125,7 @@ _PARTS_OF = re.compile(  # 0.1deg, 1e-3 rad, pi rad; deg/10, deg*100, deg_x10
     r"(?<![^\W_])(?<!\.)(?P<part>\d*\.\d+|\d+e-\d+|pi|π)[\s*·_]*(?P<unit>deg|rad|°)(?![a-z])|"
     r"(?<![a-z])(?P<whole>deg|rad|°)[\s_]*[/*×x][\s_]*(?P<times>10+)(?!\d)"
 )
+_SYMBOL = re.compile(r"\[(m|N|N[·.*]?m|A|mA|V|mV)\]\s*$")  # units of one letter, only in brackets
 _RAD = {"deg": np.pi / 180, "°": np.pi / 180, "rad": 1.0}
 
 
@@ -150,6 +153,16 @@ class Column:
 def column(name: str) -> Column:
     """What the name of a column says."""
     name = str(name)[:_LONGEST]
+    if symbol := _SYMBOL.search(name):
+        plain = _column(name[: symbol.start()])
+        length = symbol[1] == "m"
+        return replace(
+            plain,
+            name=name,
+            template=f"{plain.template}{name[symbol.start() :]}",
+            kind=plain.kind if length else "",
+            unit="length" if length else "",
+        )
     if not (part := _PARTS_OF.search(name)):
         return _column(name)
     word = part["unit"] or part["whole"]

@@ -105,7 +105,7 @@ def _of_drive(
     counted = [source for source in sources if source.unit == "counts"]
     if not program or options.unit or any(s.unit not in ("", "counts") for s in sources):
         return pair
-    if len(counted) == 2 or (counted and counts != "turns") or table.units:
+    if (counted and counts != "turns") or table.units:
         return pair  # beside it the log says its unit
     named = [*named, *([drive] if drive else [])]
     known = [table.columns[s.name] for s in sources if s.unit == "" and s.name in table.columns]

@@ -54,7 +54,8 @@ _WIDEST_ANGLE = 1e6  # of a joint, in any unit
 _COMPARED, _ALIKE = 12, 0.7  # columns; concordance of a command and its position
 _ORDERED = 100_000  # rows
 _NO_PLACE = re.compile(
-    r"vel|speed|rpm|torque|effort|volt|temp|power|pwm|duty|(?:rad|deg|°)[_/ ]?s(?![a-z])|dps",
+    r"vel|speed|rpm|torque|effort|volt|temp|power|pwm|duty|(?:rad|deg|°)[_/ ]?s(?![a-z])|dps|"
+    r"(?<![a-z])nm(?![a-z])|\[[NAV]\]",
     re.IGNORECASE,
 )
 _PULSES = re.compile(
@@ -267,15 +268,20 @@ def _unit_of(table: Table, names: Iterable[str]) -> dict[str, str]:
             (n for n in table.columns if re.fullmatch(pattern, n)), name.split(",")[0]
         )
         pulses = pulses or _PULSES.search(column_name) is not None
-        if column(column_name).unit and not pulses:
-            return {}
         named.append(column(column_name).unit)
         pair.append(table.known(column_name))
+    if all(named) and not pulses:
+        return {}
     largest = max(float(np.abs(values).max()) for values in pair)
     if _are_pulse_widths(pair[0]) and pulses:
         of_position = named[1] or likely_of_pair(pair[1], pair[1])[0].partition(",")[0]
         return {"unit": f"{_OF_PULSES},{of_position}"}
-    return {"unit": likely_of_pair(*pair)[0]} if largest > LARGEST_RAD else {}
+    if not largest > LARGEST_RAD:
+        return {}
+    command, _, position = likely_of_pair(*pair)[0].partition(",")
+    units = [command if named[0] in ("", "counts") else named[0],
+             position or command if named[1] in ("", "counts") else named[1]]  # fmt: skip
+    return {"unit": ",".join(dict.fromkeys(units))}
 
 
 def _are_pulses(table: Table, name: str) -> bool:

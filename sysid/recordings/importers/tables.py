@@ -79,10 +79,15 @@ _MOSTLY_BLANK, _ONE_STAMP = 0.3, 0.9  # shares of positions without a command, w
 _LACKING = {
     "percent": ("percent of a range of motion that the log does not say. Give it, as of 3.5 rad",
                 "percent:3.5"),
+    "share": ("shares of a range that the log does not say. Give the rad that 1 is, as of ±90°",
+              "scale:1.5708"),
+    "length": ("lengths, and no angles. Give the rad of 1, as of mm of a wheel of 20 mm radius",
+               "scale:0.05"),
     "steps": ("the log does not say how many steps make a turn. Give them, as of 3200",
               "counts:3200:0"),
 }  # fmt: skip
 """Units that a name does not say whole, what to do, and an example."""
+_LASTING = re.compile(r"loop|exec|cycle|proc|comput|infer|sleep|duration|latency", re.IGNORECASE)
 _FLAG = re.compile(
     r"(.*?)[_. ]?(?:is|read|pos|rx)?[_. ]?"
     r"(?:(valid|ok|success|status|result)|invalid|timeout|timed_?out|lost|failed|"
@@ -211,12 +216,14 @@ def _times(
     names = [name for name in names if name in table.columns or name in table.texts]
     rising = [n for n in names if n in table.columns and (np.diff(table.known(n)) > 0).all()]
     steps = next((n for n in names if TIME_STEP.fullmatch(n) and n not in rising), None)
-    candidates = [n for n in time_columns(names) if n != steps]
+    lasting = [n for n in names if _LASTING.search(n) and n in table.columns and n not in rising]
+    candidates = [n for n in time_columns(names) if n != steps and n not in lasting]
     candidates = candidates or [n for n in table.increasing if TIME_STEP.fullmatch(n)]
     if not candidates and table.tick_s is not None:
         candidates = [n for n in names if TIMER.search(n)]
     sent = [n for n in names if (c := column(n)).kind == "time" and c.words & _SENT]
-    read = [n for n in names if (c := column(n)).kind == "time" and c.words and n not in sent]
+    read = [n for n in names if (c := column(n)).kind == "time" and c.words
+            and n not in (*sent, *lasting)]  # fmt: skip
     time, command_time, notes = options.time, options.command_time, []
     if time is not None and time not in table.names and time.count(",") == 1:
         seconds, below = (column_named(path, table, "time", n.strip()) for n in time.split(","))
@@ -236,10 +243,11 @@ def _times(
     else:
         lines = [refusals.import_line(path, time=name) for name in rising[:1]]
         lines.append(refusals.import_line(path, rate="50"))
+        how_long = f"{lasting[0]} says how long something takes, not when; " if lasting else ""
         raise InputError(
-            f"{path}: no column is a time (time, timestamp, t …, also with _s, _ms, _us or _ns); "
-            f"it has {refusals.listed(table.names)}. Name it, or give your rows a second in place "
-            f"of 50: {'; or '.join(lines)}."
+            f"{path}: {how_long}no column is a time (time, timestamp, t …, also with _s, _ms, _us "
+            f"or _ns); it has {refusals.listed(table.names)}. Name it, or give your rows a second "
+            f"in place of 50: {'; or '.join(lines)}."
         )
     read_s, at, texts = _seconds(path, table, time)
     notes += texts
