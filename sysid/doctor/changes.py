@@ -73,7 +73,8 @@ _OF_TRAVEL = 2 * 4.0
 """Independent readings of one motion over the range: a servo settles within four of its time
 constants, and does so twice, when it starts and when it stops."""
 _EDGE_SHARE = 0.125  # of the readings, from either end: an integral settles at the beginning
-_NO_GAIN, _FEW_READINGS, _STAYS_S = 0.1, 2, 0.3
+_NO_GAIN, _FEW_READINGS = 0.1, 2
+_STAYS_S, _MOST_STAYS = 0.3, 0.45  # of the readings
 _MATTERS = 0.1  # of the mean deviation: a smaller change hardly alters what is measured
 _GROWS: dict[str, tuple[int, tuple[float, ...]]] = {
     "lag": (_GROWTH, (-0.06, -0.02, 0.02, 0.06)),
@@ -265,8 +266,9 @@ class Followed:
 
     @property
     def stays_often(self) -> Finding | None:
-        """That it stays where it is several times."""
-        if len(self.stays) < 2:
+        """That it stays where it is several times; most of the time is a joint's own motion."""
+        share = sum(b - a for a, b in self.stays) / len(self.time_s)
+        if len(self.stays) < 2 or share > _MOST_STAYS:
             return None
         time = self.time_s - self.start_s
         lasts = max(float(time[b - 1] - time[a]) for a, b in self.stays)
