@@ -171,10 +171,9 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     data = _of_pairs(_of_points(_of_frame(data)))
     records = _records(data)
     head: Any = data
-    if (
-        records and len(records) > 2 and not any({*records[0]} & {*r} for r in records[1:4])
-    ):  # JSON Lines' header
-        head, records = records[0], records[1:]
+    while records and len(records) > 2 and not any({*records[0]} & {*r} for r in records[1:4]):
+        head = {**(head if isinstance(head, Mapping) else {}), **records[0]}  # of JSON Lines
+        records = records[1:]
     if records is None and not isinstance(data, Mapping):
         values = _numbers(data)
         if values is None or values.ndim != 2:

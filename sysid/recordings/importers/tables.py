@@ -150,6 +150,7 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
             )
     theirs = [*options.joints] or [*joints]
     names = joint_names(path, [options.joints.get(j) or j for j in theirs])
+    _refuse_some_without_unit(path, options, {j: joints[j][1] for j in theirs})
     metadata: dict[str, Any] = {"imported_from": layout, "joints": names, "bus": {}}
     if options.readings:
         metadata["readings"] = options.readings
@@ -160,6 +161,26 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
         parts.append(part)
         notes += [text for text in texts if text not in notes]
     return Log(pd.concat(parts, ignore_index=True), metadata, notes)
+
+
+def _refuse_some_without_unit(
+    path: Path | str, options: LogOptions, pair_of: Mapping[str, Pair]
+) -> None:
+    """Refuse joints whose unit does not say how far they turn beside others that it would spoil."""
+    lacking = {
+        joint: next(c for c in (pair.command, pair.position) if c.unit in _LACKING)
+        for joint, pair in pair_of.items()
+        if {pair.command.unit, pair.position.unit} & {*_LACKING} and not options.unit_of(joint)
+    }
+    others = [joint for joint in pair_of if joint not in lacking]
+    if lacking and others:
+        joint, source = next(iter(lacking.items()))
+        text, example = _LACKING[source.unit]
+        raise InputError(
+            f"{path}, column {printable(source.name)[:60]}: {text}, in a mapping file "
+            f"(`units: {{{joint}: '{example}'}}`), or leave {joint} out: "
+            f"{refusals.import_line(path, joints=','.join(others))}."
+        )
 
 
 def is_flag(name: str) -> tuple[str, bool] | None:

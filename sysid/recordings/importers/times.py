@@ -68,6 +68,7 @@ _ANGLES_IN = re.compile(
 DRIVES = {"ODrive": "turns", "moteus": "turns", "VESC": "deg"}
 """Drives that do not count radians, and what they count."""
 _DRIVE = re.compile(rf"(?<![\w.])({'|'.join(DRIVES)})(?![\w.])", re.IGNORECASE)
+_ANGLE = re.compile(r"(?<![^\W_])(rad|radians?|deg|degrees?|°)(?![a-z])", re.IGNORECASE)
 _TICK = re.compile(
     r"(?:(?<![\w-])(?:\w*ticks?|timer(?: clock)?|clock|time units?)\b *(?:=|:|is|are|of)|"
     r"\btime in (?:units of)?) *([\d.]+) *(ns|us|µs|ms|khz|mhz)\b", re.IGNORECASE,
@@ -228,10 +229,14 @@ def units_in(text: str, names: Iterable[str]) -> dict[str, str]:
 
 
 def drive_in(text: str) -> tuple[str, str]:
-    """The drive that remarks such as `moteus r4.11` name, and its unit of angles; else empty."""
-    match = _DRIVE.search(text)
-    drive = next((name for name in DRIVES if match and name.lower() == match[0].lower()), "")
-    return drive, DRIVES.get(drive, "")
+    """The drive that remarks such as `moteus r4.11` name, and its unit of angles.
+
+    Empty where they name none, several, or a unit beside.
+    """
+    named = {match.lower() for match in _DRIVE.findall(text)}
+    if len(named) != 1 or _ANGLE.search(text):
+        return "", ""
+    return next((name, unit) for name, unit in DRIVES.items() if name.lower() in named)
 
 
 def tick_in(text: str) -> float | None:

@@ -242,6 +242,10 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
         {"t": t, "cmd": c, "pos": p} for t, c, p in TURNS]}), "joint"),
     "a drive beside arrays": (saved(np.savez, time=TIME, cmd=COMMAND / (2 * np.pi),
                                     pos=POSITION / (2 * np.pi), drive="moteus"), "joint"),
+    "a drive in prose": ("# compared with ODrive and moteus\n" + NAMED, "joint"),
+    "a drive with its unit behind": ("# VESC, values rad\n" + NAMED, "joint"),
+    "two headers in JSON Lines": ('{"drive": "ODrive"}\n{"unit": "rad"}\n' + each(
+        '{{"t": {t}, "cmd": {c!r}, "pos": {p!r}}}'), "joint"),
     "a drive in degrees": (each("{t},{c!r},{p!r}", DEGREES, "# VESC 6 mk5\ntime,cmd,pos"), "joint"),
     "a drive and its unit": ("# ODrive v3.6, angles in radians\n" + NAMED, "joint"),
     "a drive's columns and their unit": (each("{t},{c},{p}", LOG, "# angles in rad\nt,"
@@ -553,6 +557,19 @@ def test_the_first_line_of_a_refusal_reads_the_log(tmp_path, form):
             "shares",
         ):  # of ranges that the log does not say
             assert np.std(read) == pytest.approx(np.std(true), rel=0.01), line
+
+
+def test_a_length_of_one_joint_leaves_the_angles_of_others_alone(tmp_path):
+    head = "t,knee_cmd,knee_pos,gripper_cmd_mm,gripper_pos_mm"
+    path = written(tmp_path, each("{t},{c},{p},{d},{q}", BOTH, head))
+    with pytest.raises(
+        InputError, match=r"`units: \{gripper: 'scale:0.05'\}`.*--joints knee --out"
+    ):
+        load(path)
+    (trial,) = load(path, {"joints": ["knee"]}).trials("knee")
+    np.testing.assert_allclose(trial.position_rad, POSITION, atol=1e-9)
+    both = load(path, {"units": {"gripper": "scale:0.05"}})
+    np.testing.assert_allclose(both.trials("gripper")[0].position_rad, 0.05 * SECOND[1], atol=1e-9)
 
 
 FAILED = range(11, ROWS, 20)
