@@ -75,6 +75,7 @@ constants, and does so twice, when it starts and when it stops."""
 _EDGE_SHARE = 0.125  # of the readings, from either end: an integral settles at the beginning
 _NO_GAIN, _FEW_READINGS = 0.1, 2
 _STAYS_S, _MOST_STAYS = 0.3, 0.45  # of the readings
+_ELSEWHERE = 0.2  # of the variance, that a servo leaves
 _MATTERS = 0.1  # of the mean deviation: a smaller change hardly alters what is measured
 _GROWS: dict[str, tuple[int, tuple[float, ...]]] = {
     "lag": (_GROWTH, (-0.06, -0.02, 0.02, 0.06)),
@@ -264,11 +265,16 @@ class Followed:
                 a += 1
         return found
 
-    @property
+    @cached_property
     def stays_often(self) -> Finding | None:
-        """That it stays where it is several times; most of the time is a joint's own motion."""
+        """That it stays where it is several times, and is a servo otherwise.
+
+        What stays most of the time moves by itself.
+        """
         share = sum(b - a for a, b in self.stays) / len(self.time_s)
         if len(self.stays) < 2 or share > _MOST_STAYS:
+            return None
+        if _STAYS.fitted(self, lambda *_: False)[1].unexplained(self) > _ELSEWHERE:
             return None
         time = self.time_s - self.start_s
         lasts = max(float(time[b - 1] - time[a]) for a, b in self.stays)
@@ -809,10 +815,11 @@ class _Stays(_Change):
         return None, fitted(joint, servos, (3, 8), self.columns(joint, None))
 
 
+_STAYS = _Stays("stays", 0)
 CHANGES = (
     *(_Change(number, moments) for number in ("zero", "gain", "torque", "lag")
       for moments in (0, 1)),
-    _Change("gain", 2), _Levels("levels", 0), _Stays("stays", 0),
+    _Change("gain", 2), _Levels("levels", 0), _STAYS,
 )  # fmt: skip
 """What may change, and how: a new one is a row here and its words in `_finding`."""
 
