@@ -6,11 +6,11 @@ compares its readings with a straight line. `Followed.fit` is a second-order ser
 limits, by Levenberg-Marquardt at a bounded cost: what happens in a part of a recording does not
 bend the whole.
 
-`comparisons` fits it again with one number of it that changes, a zero, a gain or a lag, steadily,
-from a moment on or for a while, or with levels at which it ends. One rule judges all of them, the
-difference of log-likelihoods (n log of the ratio of mean errors, n independent residuals of the
-best fit) less half the logarithm of the readings for each number that the change adds
-(Schwarz, 1978).
+`comparisons` fits it again with one number of it that changes, a zero, a gain, a torque or a
+lag, steadily, from a moment on or for a while, or with levels at which it ends. One rule judges
+all of them, the difference of log-likelihoods (n log of the ratio of mean errors, n independent
+residuals of the best fit) less half the logarithm of the readings for each number that the change
+adds (Schwarz, 1978).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations, product
+from itertools import combinations, pairwise, product
 
 import numpy as np
 from numba import njit
@@ -35,7 +35,7 @@ _UNFILTERED_HZ = 15.0  # natural frequency of a servo that no low-pass explains 
 _LONGEST_LAG_S = 0.5
 
 (_NATURAL, _DAMPING, _SPEED, _RAMP, _FRICTION, _EFFORT, _BACK_EMF, _INTEGRAL, _PLAY,
- _LAG, _LOAD, _GROWTH, _LOW, _HIGH, _BOTTOM, _TOP) = range(16)  # fmt: skip
+ _LAG, _LOAD, _GROWTH, _FADE, _LOW, _HIGH, _BOTTOM, _TOP) = range(17)  # fmt: skip
 _LOGARITHMS = slice(0, 9)
 _HANGING = kernel.COLUMNS.index("hanging_rad")
 _FAR = 1e6  # levels that nothing reaches [rad]
@@ -45,10 +45,12 @@ _NO_INTEGRAL, _NO_PLAY, _LONG_S = 0.01, 1e-3, 20.0  # [1/s], [rad], and before t
 _EARLY_S = 0.02  # that stamps may be early
 _LOWEST = np.array([
     *np.log([2, 0.2, 0.05, 0.5, 1e-6, 0.002, 0.01, 1e-3, 1e-4]), -_EARLY_S, -0.3, -0.3,
-    *[-_FAR] * 4,
+    np.log(0.1), *[-_FAR] * 4,
 ])  # fmt: skip
-_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 30, 30, 0.3]), 0.8, 0.3, 0.3, *[_FAR] * 4])
-_STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.3, 2e-3, 0.01, 2e-3, *[0.01] * 4])
+_HIGHEST = np.array([*np.log([250, 4, 300, 2e4, 3, 20, 30, 30, 0.3]), 0.8, 0.3, 0.3, np.log(10.0),
+                    *[_FAR] * 4])  # fmt: skip
+_STEPS = np.array([0.03, 0.05, 0.1, 0.1, 0.15, 0.08, 0.2, 0.2, 0.3, 2e-3, 0.01, 2e-3, 0.05,
+                   *[0.01] * 4])  # fmt: skip
 """Bounds of a servo's terms, and differences for their derivatives; of levels in units of the
 command's range."""
 _ALONE = tuple(range(_GROWTH))
@@ -72,8 +74,17 @@ _OF_TRAVEL = 2 * 4.0
 constants, and does so twice, when it starts and when it stops."""
 _EDGE_SHARE = 0.125  # of the readings, from either end: an integral settles at the beginning
 _NO_GAIN, _FEW_READINGS = 0.1, 2
+_STAYS_S, _MOST_STAYS = 0.3, 0.45  # of the readings
+_ELSEWHERE = 0.2  # of the variance, that a servo leaves
 _MATTERS = 0.1  # of the mean deviation: a smaller change hardly alters what is measured
-_LATER_S = (-0.06, -0.02, 0.02, 0.06)  # of a lag that changes
+_GROWS: dict[str, tuple[int, tuple[float, ...]]] = {
+    "lag": (_GROWTH, (-0.06, -0.02, 0.02, 0.06)),
+    "torque": (_FADE, (-0.6, -0.3, 0.3)),
+}
+"""Terms by which a servo becomes another one, and what is tried [s; logarithm]."""
+_OF_TORQUE = np.array([0.5, -0.5, -1.0])
+"""Logarithms of natural frequency, damping ratio and friction in units of the command, as that of
+the torque grows: damping and friction stay."""
 _SERVOS, _LEVELS = 4, np.linspace(0.15, 0.95, 9)  # of the command's range
 
 
@@ -85,8 +96,8 @@ class Follower:
     """Logarithms of natural frequency [rad/s], damping ratio, speed [rad/s] and acceleration
     [rad/s²] of the set-point, friction and effort limit [rad of command], damping beyond the
     effort limit over that within, integral gain [1/s], play [rad]; lag [s], load [of the
-    command's range] and growth of the lag [s]; lowest and highest goal and place [rad of
-    command]."""
+    command's range] and growth of the lag [s]; logarithm by which its torque grows; lowest and
+    highest goal and place [rad of command]."""
     path_rad: NDArray[np.float64]
     """The command as it is followed, at each reading."""
     cost: float
@@ -136,7 +147,7 @@ class Followed:
     starts: NDArray[np.int64]
     """First reading of each trial, and the end."""
     later: NDArray[np.float64]
-    """What the lag's growth goes with, from 0 to 1."""
+    """What the growth of the lag and of the torque goes with, from 0 to 1."""
     bound: float = 0.25
     """Largest cost of an error, of the position's mean deviation."""
 
@@ -237,6 +248,41 @@ class Followed:
         return self.fit.readings * float(np.log((self.fit.cost + self.unsure) / least))
 
     @cached_property
+    def stays(self) -> list[tuple[int, int]]:
+        """First reading and end of each time that it stays where it is while its path goes on."""
+        usual = float(np.median(np.abs(np.diff(self.fit.residuals_rad))))
+        alike = max(1.5 * self.step, 0.02 * self.scale) + 3 * usual
+        found = []
+        for first, end in pairwise(self.starts.tolist()):
+            a = first
+            while a < end:
+                away = np.abs(self.position_rad[a:end] - self.position_rad[a]) > alike
+                b = a + int(np.argmax(away)) if away.any() else end
+                path = self.fit.path_rad[a:b]
+                if self.time_s[b - 1] - self.time_s[a] > _STAYS_S and np.ptp(path) > self.scale:
+                    found.append((a, b))
+                    a = b
+                a += 1
+        return found
+
+    @cached_property
+    def stays_often(self) -> Finding | None:
+        """That it stays where it is several times, and is a servo otherwise.
+
+        What stays most of the time moves by itself.
+        """
+        share = sum(b - a for a, b in self.stays) / len(self.time_s)
+        if len(self.stays) < 2 or share > _MOST_STAYS:
+            return None
+        if _STAYS.fitted(self, lambda *_: False)[1].unexplained(self) > _ELSEWHERE:
+            return None
+        time = self.time_s - self.start_s
+        lasts = max(float(time[b - 1] - time[a]) for a, b in self.stays)
+        values = {"times": len(self.stays), "longest_s": lasts,
+                  "time_s": float(time[self.stays[0][0]])}  # fmt: skip
+        return Finding("left_path", CARE, values)
+
+    @cached_property
     def friction_rad(self) -> float:
         """Error of the command that friction and play hold; 0 where a servo needs none."""
         if self.fit.cost > _FOLLOWS:
@@ -303,7 +349,23 @@ class Followed:
         return self.paths(terms[None])[0]
 
     def paths(self, terms: NDArray) -> NDArray[np.float64]:
-        """The same of several servos, shape (servos, readings), by the kernel of the fits."""
+        """The same of several servos, shape (servos, readings).
+
+        One whose torque changes turns into another one, far more slowly than it moves.
+        """
+        fades = terms[:, _FADE] != 0
+        if not fades.any():
+            return self._steady(terms)
+        fade = terms[fades, _FADE, None]
+        faded = terms[fades]
+        faded[:, [_NATURAL, _DAMPING, _FRICTION]] += fade * _OF_TORQUE
+        faded[:, _LOAD] *= np.exp(-fade[:, 0])
+        paths, ends = np.split(self._steady(np.concatenate([terms, faded])), [len(terms)])
+        paths[fades] += self.later * (ends - paths[fades])
+        return paths
+
+    def _steady(self, terms: NDArray) -> NDArray[np.float64]:
+        """The same of servos that stay what they are, by the kernel of the fits."""
         paths, unlike = np.empty((len(terms), len(self.time_s))), np.ones(len(terms), bool)
         while unlike.any():  # servos abreast have one command
             low, high = terms[np.argmax(unlike), _LOW : _HIGH + 1]
@@ -408,7 +470,7 @@ def _rest_steps(step_s: float) -> int:
 
 def _servos(numbers: NDArray) -> NDArray[np.float64]:
     """Terms of servos without levels from their limits and lags."""
-    others = np.tile([0.0, 0.0, -_FAR, _FAR, -_FAR, _FAR], (len(numbers), 1))
+    others = np.tile([0.0, 0.0, 0.0, -_FAR, _FAR, -_FAR, _FAR], (len(numbers), 1))
     return np.column_stack([np.log(numbers[:, :-1]), numbers[:, -1], others])
 
 
@@ -608,14 +670,13 @@ class _Change:
     """How a number of the servo changes."""
 
     number: str
-    """Which: its zero, gain or lag, or the levels at which it ends."""
+    """Which: its zero, gain, lag or torque, or the levels at which it ends."""
     moments: int
     """0 where it changes steadily, 1 from a moment on, 2 for a while."""
 
-    @property
-    def values(self) -> int:
+    def values(self, joint: Followed) -> int:
         """How many numbers that takes: another gain is one about any place."""
-        return self.moments + (1 if self.number in ("zero", "lag") else 2)
+        return self.moments + (1 if self.number in ("zero", *_GROWS) else 2)
 
     def spans(self, joint: Followed) -> list[Span]:
         """Where it may change."""
@@ -633,13 +694,19 @@ class _Change:
 
     def begins(self, joint: Followed, servos: Sequence[Follower], span: Span) -> list[Follower]:
         """Servos with the change, before they are fitted."""
-        if self.number != "lag":
+        if self.number not in _GROWS:
             columns = self.columns(joint, span)
             return [joint.regressed(s.terms, s.path_rad, columns) for s in servos]
         profile, tried = _profile(joint, span), []
-        for later, servo in product(_LATER_S, servos):
+        term, grown = _GROWS[self.number]
+        for later, servo in product(grown, servos):
             terms = servo.terms.copy()
-            terms[[_LAG, _GROWTH]] += -later * float(profile.mean()), later
+            before = -later * float(profile.mean())
+            if self.number == "lag":
+                terms[_LAG] += before
+            else:
+                terms[[_NATURAL, _DAMPING, _FRICTION]] += before * _OF_TORQUE
+            terms[term] += later
             tried.append(terms)
         return replace(joint, later=profile).followers(np.array(tried))
 
@@ -673,9 +740,10 @@ class _Change:
         self, joint: Followed, begins: Sequence[Follower], span: Span, rounds: Sequence[int]
     ) -> Follower:
         """The best servo with the change, fitted."""
-        if self.number == "lag":
+        free = (*_ALONE, *range(_LOW, _TOP + 1))
+        if self.number in _GROWS:
             joint = replace(joint, later=_profile(joint, span))
-        free = (*_ALONE, _GROWTH) if self.number == "lag" else (*_ALONE, *range(_LOW, _TOP + 1))
+            free = (*_ALONE, _GROWS[self.number][0])
         return fitted(joint, begins, rounds, self.columns(joint, span), free)
 
 
@@ -727,9 +795,31 @@ class _Levels(_Change):
         return None, sorted(begins, key=_cost)[:_REFINED]
 
 
+class _Stays(_Change):
+    """A joint that stays where it is for a while, several times, and its command goes on."""
+
+    def values(self, joint: Followed) -> int:
+        """A place for each time, and that it does not follow; its readings tell begin and end."""
+        return 2 * len(joint.stays)
+
+    def columns(self, joint: Followed, span: Span) -> Columns:
+        """What each adds to the path of the servo."""
+        inside = [_profile(joint, stay) for stay in joint.stays]
+        return lambda path: [column for here in inside for column in (path * here, here)]
+
+    def fitted(
+        self, joint: Followed, worth: Callable[[_Change, Follower], bool]
+    ) -> tuple[Span, Follower]:
+        """The servo of the other times."""
+        servos = (joint.fit, *sorted(joint.screen, key=_cost)[:_SERVOS])
+        return None, fitted(joint, servos, (3, 8), self.columns(joint, None))
+
+
+_STAYS = _Stays("stays", 0)
 CHANGES = (
-    *(_Change(number, moments) for number in ("zero", "gain", "lag") for moments in (0, 1)),
-    _Change("gain", 2), _Levels("levels", 0),
+    *(_Change(number, moments) for number in ("zero", "gain", "torque", "lag")
+      for moments in (0, 1)),
+    _Change("gain", 2), _Levels("levels", 0), _STAYS,
 )  # fmt: skip
 """What may change, and how: a new one is a row here and its words in `_finding`."""
 
@@ -742,10 +832,11 @@ def comparisons(joint: Followed) -> list[Compared]:
     """
     loaded = any(t.load is not None for t in joint.trials)
     changes = [c for c in CHANGES if c.number == "lag" or not loaded]
+    changes = [c for c in changes if c.number != "stays" or joint.stays_often]
 
     def nats(change: _Change, plain: float, fit: Follower, count: float) -> float:
         more = (plain + joint.unsure) / (fit.cost + joint.unsure)
-        return count * float(np.log(more)) - 0.5 * change.values * np.log(len(joint.time_s))
+        return count * float(np.log(more)) - 0.5 * change.values(joint) * np.log(len(joint.time_s))
 
     plain = joint.fit.cost
 
@@ -792,6 +883,20 @@ def _finding(joint: Followed, number: str, span: Span, fit: Follower) -> Finding
         verdict = REFUSE if fit.terms[_LAG] + min(later, 0.0) < -_EARLY_S else CARE
         values = {"drift_ms": 1e3 * later / seconds, "percent": 100 * later / seconds}
         return Finding("lag_drifts", verdict, values)
+    if number == "torque":
+        grown = float(np.exp(fit.terms[_FADE]))
+        before_hz = float(np.exp(fit.terms[_NATURAL])) / (2 * np.pi)
+        values = {"percent": 100 * (grown - 1), "before_hz": before_hz,
+                  "after_hz": before_hz * np.sqrt(grown)}  # fmt: skip
+        if span is None:
+            return Finding("torque_fades", CARE, values)
+        return Finding("torque_changed", CARE, values | {"time_s": since})
+    if number == "stays":
+        begins, lasts = zip(
+            *((time[a], time[b - 1] - time[a]) for a, b in joint.stays), strict=True
+        )
+        values = {"times": len(lasts), "longest_s": max(lasts), "time_s": begins[0]}
+        return Finding("left_path", CARE, values)
     if number == "levels":
         without = fit.terms.copy()
         without[_LOW:] = joint.fit.terms[_LOW:]
@@ -805,7 +910,8 @@ def _finding(joint: Followed, number: str, span: Span, fit: Follower) -> Finding
         return Finding("clipped", CARE, values)
     before, after = float(fit.values[0]), float(fit.values[:2].sum())
     if span is None:
-        return Finding("gain_drifts", CARE, {"percent": 100 * (after / before - 1)})
+        values = {"before": before, "after": after, "percent": 100 * (after / before - 1)}
+        return Finding("gain_drifts", CARE, values)
     values = {"time_s": since, "until_s": until, "before": before, "after": after}
     if after < -_NO_GAIN * before:
         return Finding("sign_changed", REFUSE, values)

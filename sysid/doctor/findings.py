@@ -136,9 +136,9 @@ WORDS: dict[str, str] = {
         "{doubt_ms:.1f} ms; stamp commands and readings with one monotonic clock."
     ),
     "gain_drifts": (
-        "the joint moves {percent:+.0f} % farther at the end than at the beginning, by the same "
-        "commands: a servo that heats, a supply that sinks, or a load that grows. Use a part, or "
-        "record again when it has cooled."
+        "the gain goes from {before:.2f} at the beginning to {after:.2f} at the end "
+        "({percent:+.0f} %): a servo that heats, a supply that sinks, or a load that grows. Use a "
+        "part, or record again when it has cooled."
     ),
     "gaps": (
         "{percent:.0f} % of the recorded time lies in gaps of up to {longest_s:.2g} s between "
@@ -330,6 +330,16 @@ WORDS: dict[str, str] = {
         "seconds and come from one session, or cut the recording."
     ),
     "too_short": ("no trial has {rows} rows: the recording was cut short. Record it again."),
+    "torque_changed": (
+        "from {time_s:.1f} s on the servo has {percent:+.0f} % torque for the same error (its "
+        "natural frequency goes from {before_hz:.1f} to {after_hz:.1f} Hz): settings, supply or "
+        "torque limit changed. Use the parts apart."
+    ),
+    "torque_fades": (
+        "at the end the servo has {percent:+.0f} % torque for the same error (its natural "
+        "frequency goes from {before_hz:.1f} to {after_hz:.1f} Hz): a motor that heats, or a "
+        "supply that sinks. Use a part, or record again when it has cooled."
+    ),
     "trials_differ": (
         "two trials of {frequency_hz:.3g} Hz differ: the joint moves {gain:.2f} and "
         "{other_gain:.2f} times as far as commanded, the latter from {time_s:.1f} s on. "
@@ -386,6 +396,8 @@ RIVALS = {
     "second_writer": "a second program",
     "sign_changed": "a sign that changes",
     "sign_inverted": "an inverted sign",
+    "torque_changed": "a torque that changes",
+    "torque_fades": "a torque that fades",
     "zero_drifts": "a zero that drifts",
     "zero_moves": "a zero that moves",
 }

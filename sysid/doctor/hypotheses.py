@@ -98,7 +98,7 @@ def relation_findings(joint: Followed) -> list[Finding]:
     if best.code and best.servo.nats > min(plain.servo.nats, base.nats(left)) - CLEAR_NATS:
         best = plain
     share = 1 - best.servo.unexplained
-    held = bool(held_findings(trials, joint.step) or changes)
+    held = bool(held_findings(trials, joint.step) or changes or joint.stays_often)
     rest = joint.fit.residuals_rad
     noisy = np.var(np.diff(rest)) > np.var(rest)  # an autocorrelation below one half
     if share < (_FOLLOWS if best.code else _HALF) and (best.code or not (held or sound or noisy)):
@@ -385,6 +385,8 @@ def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     loose = joint.base.explained < _LOOSE and not _sound(joint)
     disturbed = joint.fit.cost - joint.noise - joint.unsure > _DISTURBED
     if (loose or disturbed) and not (found or loaded or held_findings(trials, step)):
+        if joint.stays_often:
+            return [joint.stays_often]
         if loose:
             return [Finding("loosely_related", CARE, {"percent": 100 * joint.base.explained})]
         return [Finding("disturbed", CARE, {"percent": 100 * joint.unexplained})]

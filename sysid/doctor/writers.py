@@ -1,11 +1,14 @@
 """A second program that commands the same servo: `second_writer` and `scatter_findings`.
 
 A servo executes whichever command arrived last. What another program writes stands until the next
-command, so that the set-point is away for a row or so and the joint is pushed off its path, the
-more the farther its place is. What a servo with limits (`changes`) leaves is whitened by an
-autoregression, and the size of what remains is regressed on the speed and the acceleration of the
-path: dates in doubt and friction go with these. A second program's pushes go with the distance from
-one place as well, and the large ones towards it.
+command, a loop later at most, and pushes the joint as a pulse of that length on the set-point does:
+by the servo's own response, towards one goal, and no farther than from the command to that goal.
+
+What a servo with limits (`changes`) leaves of the readings is whitened by an autoregression, and
+so is the response to a pulse at each command, beside a constant for as long. The pulses that stand
+out of the noise are taken one after the other, the largest first (matching pursuit). Their sizes
+are compared with those of pulses of no direction: all may reach one goal, any part of the way to
+it, or go towards it as far as others do.
 
 Between polls a push leaves no such mark. There, tones whose readings differ from period to period
 by far more than poll and quantisation explain show that something else moves the joint.
@@ -14,10 +17,12 @@ by far more than poll and quantisation explain show that something else moves th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.stats import rankdata
 
 from pupper_sysid.common.tones import least_squares
 from pupper_sysid.sysid.doctor.changes import Followed
@@ -26,106 +31,264 @@ from pupper_sysid.sysid.doctor.signals import interpolation_findings
 from pupper_sysid.sysid.feedback.poll_lattice import PollLattice, quantum, readings
 from pupper_sysid.sysid.recordings.recording import Trial
 
-_ORDER, _FEWEST_ROWS = 4, 40  # of the autoregression; of a trial
-_PLACES = np.linspace(-0.5, 1.5, 15)  # of the path's range
-_JUMP, _STICKS = 0.3, 0.25  # of the command's range: in a row, to and fro
-_LARGEST = 20.0  # innovation that counts, of the median
-_FAR = 4.0  # innovation that shows its direction, of the usual size
-_PUSHED_NATS, _ONE_WAY_NATS = 13.0, 3.0  # of 48 sound recordings the most is 6
+_ORDER, _FEWEST_ROWS, _FINEST_S = 4, 40, 0.005  # of the autoregression; of a trial; of the rows
+_JUMP, _RESTS, _SETTLED_S = 0.3, 0.1, 0.15  # of the command's range; of the jump
+_STICKS = 0.25  # of the command's range, to and fro
+_RESPONSE_S, _TIME_CONSTANTS = 0.4, 6.0  # that a pulse is looked at, at most
+_LARGEST = 20.0  # innovation that counts in the noise, of the median
+_STANDS_OUT, _MOST_PULSES = 4.5, 150  # of its standard deviation; of a trial
+_SHAPE = 0.3  # error of a response, of its size
+_ECHO = 3.0  # a pulse beside another so much larger is an error of its response
+_SMALLEST, _EXACT, _FARTHEST = 0.06, 0.15, 1.35  # of the command's range; of the way to the goal
+_GOALS = np.linspace(-0.5, 1.5, 41)  # of the command's range
+_FEWEST, _PLACES = 3, 0.1  # pulses; range of their commands, of the whole
+_NATS = 1.3  # advantage, of 189 sound recordings 0.8 at most
+_ALIKE, _ELSEWHERE, _MOST_PLACES = 0.1, 0.2, 500  # of the ranks; share of pulses
+_BY_CHANCE, _MOST_NATS = (0.05, 0.3), 2.5  # share of pulses that another cause has; of a pulse
 
 _HIGHEST_HZ, _LEAST_AMPLITUDE_RAD, _LEAST_STEPS = 4.5, 0.1, 20.0
 _SCATTER, _SCATTER_S = 0.15, 0.012  # of the amplitude; as an error of the time
 _HARMONICS, _FEWEST_READINGS = 3, 25
 
 
+@dataclass(frozen=True)
+class Pulses:
+    """Pulses of the set-point, a loop long, that readings show beside the command."""
+
+    time_s: NDArray[np.float64]
+    """Of the command that they follow."""
+    command_rad: NDArray[np.float64]
+    size_rad: NDArray[np.float64]
+    """Beside the command, had they stood for the whole loop."""
+    doubt_rad: NDArray[np.float64]
+    """Standard deviation."""
+    place: NDArray[np.float64]
+    """Ranks, from 0 to 1, of the command, of the speed of the path and of the time since a step
+    among those of the trial, shape (pulses, 3)."""
+
+    def part(self, inside: NDArray) -> Pulses:
+        """Those that are `inside`, by mask or number."""
+        return Pulses(*(getattr(self, f.name)[inside] for f in fields(self)))
+
+    def least(self, joint: Followed) -> NDArray[np.float64]:
+        """Sizes from which they count [rad]."""
+        return np.maximum(_STANDS_OUT * self.doubt_rad, _SMALLEST * joint.reach)
+
+
+def _together(parts: Sequence[Pulses]) -> Pulses:
+    return Pulses(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Pulses)))
+
+
 def second_writer(joint: Followed) -> list[Finding]:
-    """Pushes towards one place while the command goes on."""
+    """Pulses towards one goal while the command goes on."""
     loaded = any(t.load is not None for t in joint.trials)  # its swings are not this servo's
     sticks = 2 * joint.friction_rad > _STICKS * joint.reach  # it jumps where friction lets go
     if loaded or sticks or interpolation_findings(joint.trials, joint.step):
         return []
-    nats, times = pushes(joint)
-    if nats < _PUSHED_NATS or not len(times):
-        return []
+    found, none = zip(*(pulses(joint, n) for n in range(len(joint.base.samples))), strict=True)
+    every, none = _together(found), _together(none)
+    every = every.part(np.abs(every.size_rad) > every.least(joint))
+    nats, towards = towards_one_goal(every, none, joint)
+    places = float(np.ptp(every.command_rad[towards])) if towards.any() else 0.0
+    if nats < _NATS or towards.sum() < _FEWEST or places < _PLACES * joint.reach:
+        return []  # at one place only, what a servo does there looks like a goal
+    times = every.time_s[towards]
     values = {"times": len(times), "time_s": float(times.min()) - joint.start_s}
     return [joint.rivalled(Finding("second_writer", CARE, values))]  # a bent path pushes as well
 
 
-def pushes(joint: Followed) -> tuple[float, NDArray[np.float64]]:
-    """Advantage of pushes towards one place over none [nats], and times of the largest."""
-    parts = []
-    for number, sample in enumerate(joint.base.samples):
-        time, rises = sample.time_s, np.diff(sample.time_s) > 0
-        jump = float(np.max(np.abs(np.diff(sample.command_rad)), initial=0.0))
-        if len(time) < _FEWEST_ROWS or not rises.all() or jump > _JUMP * joint.reach:
-            continue  # after a step friction stops a servo on its way, to a place between all
-        path = joint.path_of_trial(number)
-        rate = np.gradient(path, time)
-        rest = sample.position_rad - joint.fit.values[0] * path
-        parts.append(
-            (time[_ORDER:], path[_ORDER:], np.abs(rate[_ORDER:]),
-             np.abs(np.gradient(rate, time)[_ORDER:]), _innovations(rest - np.median(rest)))
-        )  # fmt: skip
-    if not parts:
-        return 0.0, np.zeros(0)
-    time, path, rate, bend, innovations = (np.concatenate(p) for p in zip(*parts, strict=True))
-    usual = float(np.median(np.abs(innovations))) + joint.step / 4 + 1e-9
-    size = np.minimum(np.abs(innovations), _LARGEST * usual)
-    plain, spread = _spread(size, usual, rate, bend)
-    scaled = size / spread
-    far = scaled > _FAR / 0.6745 * float(np.median(scaled))
-    far[1:] &= ~far[:-1]  # one push shows in the row after it, too
-    away = scaled - scaled.mean()
-    along = float(np.clip(away[1:] @ away[:-1] / max(away @ away, 1e-12), 0.0, 0.95))
-    best = 0.0
-    low, high = float(path.min()), float(path.max())
-    for place in low + (high - low) * _PLACES:
-        likelier = (_spread(size, usual, rate, bend, np.abs(path - place))[0] - plain) * (
-            (1 - along) / (1 + along)
-        )
-        towards = np.sign(place - path[far]) == np.sign(innovations[far])
-        one_way = _one_way(int(towards.sum()), len(towards))
-        if one_way > _ONE_WAY_NATS:  # size alone goes with a load or the place of friction, too
-            best = max(best, likelier + one_way)
-    return best, time[far]
+def towards_one_goal(
+    pulses: Pulses, none: Pulses, joint: Followed
+) -> tuple[float, NDArray[np.bool_]]:
+    """Advantage of one goal over pulses of no direction [nats], and which go towards it.
+
+    `none`: commands that no pulse follows.
+    """
+    size, far = pulses.size_rad, np.abs(pulses.size_rad)
+    if not len(size):
+        return 0.0, np.zeros(0, bool)
+    least = pulses.least(joint)
+    usual = max(float(np.mean(far - least)), 0.05 * joint.reach)
+    chance = 0.5 / usual * np.exp(-(far - least) / usual)
+    command = np.concatenate([s.command_rad for s in joint.base.samples])
+    low, high = float(command.min()), float(command.max())
+    best, at, which = -np.inf, low, np.zeros(len(size), bool)
+    for goal in low + (high - low) * _GOALS:
+        way = goal - pulses.command_rad
+        most = _FARTHEST * np.abs(way) + 2 * pulses.doubt_rad
+        within = (np.sign(size) == np.sign(way)) & (far < most)
+        spread = np.hypot(_EXACT * way, pulses.doubt_rad)
+        whole = np.exp(-0.5 * ((size - way) / spread) ** 2) / (np.sqrt(2 * np.pi) * spread)
+        any_part = within / np.maximum(most - least, 0.05 * joint.reach)
+        as_others = 2 * chance * within
+        for density in (0.95 * whole + 0.05 * as_others, any_part, as_others):
+            for share in _BY_CHANCE:
+                likely = (1 - share) * density + share * chance
+                nats = float(np.minimum(np.log(likely / chance), _MOST_NATS).sum())
+                if nats > best:
+                    best, at, which = nats, goal, within
+    seen = np.clip(1 - none.least(joint) / (np.abs(at - none.command_rad) + 1e-9), _ELSEWHERE, 1)
+    best -= 0.5 * float(np.log(len(_GOALS))) + _of_one_place(pulses, none.place, seen)
+    return best, which
 
 
-def _innovations(rest: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What residuals are not by those before them; pushes do not set the autoregression."""
+def _of_one_place(pulses: Pulses, others: NDArray, seen: NDArray[np.float64]) -> float:
+    """Advantage of pulses that repeat where the joint moves alike over those at any time [nats].
+
+    What a servo does beyond its model it does again there. `seen`: share of pulses at the `others`
+    that would be seen.
+    """
+    apart = np.abs(pulses.time_s[:, None] - pulses.time_s) > _RESPONSE_S
+
+    def near(ends: NDArray) -> NDArray[np.float64]:
+        return np.exp(-0.5 * (((pulses.place[:, None] - ends) / _ALIKE) ** 2).sum(axis=2))
+
+    usual = near(others) @ seen / np.maximum(seen.sum(), 1e-9)
+    again = (near(pulses.place) * apart).sum(axis=1) / np.maximum(apart.sum(axis=1), 1)
+    nats = np.log(_ELSEWHERE + (1 - _ELSEWHERE) * again / np.maximum(usual, 1e-9))
+    return max(float(nats.sum()), 0.0)
+
+
+def pulses(joint: Followed, number: int) -> tuple[Pulses, Pulses]:
+    """Pulses beside the command of a trial that stand out of the noise, and some of no size."""
+    nothing = np.zeros(0)
+    none = Pulses(nothing, nothing, nothing, nothing, np.zeros((0, 3)))
+    sample, gain = joint.base.samples[number], joint.fit.values[0]
+    trial = next(t for t in joint.trials if t.send_time_s[0] == sample.start_s)
+    time, position, path = sample.time_s, sample.position_rad, joint.path_of_trial(number)
+    if len(time) < _FEWEST_ROWS or not (np.diff(time) > 0).all():
+        return none, none
+    together = max(1, int(_FINEST_S / float(np.median(np.diff(time))) + 1e-9))
+    time, position, path = (_means(x, together) for x in (time, position, path))
+    if len(time) < _FEWEST_ROWS:
+        return none, none
+    rest = position - gain * path
+    weights, innovations = _autoregression(rest - np.median(rest))
+    rate = np.gradient(path, time)
+    noise = np.full(len(time), np.inf)
+    noise[_ORDER:] = np.maximum(
+        _noise(innovations, joint.step, np.abs(rate), np.abs(np.gradient(rate, time))),
+        max(joint.step, 1e-6) / np.sqrt(12),
+    )
+    left = np.zeros(len(time))
+    left[_ORDER:] = innovations / noise[_ORDER:]
+
+    natural, damping, lag = *np.exp(joint.fit.terms[:2]), float(joint.fit.terms[9])
+    slowest = min(damping, 1.0) * natural
+    loop, gap = (float(np.median(np.diff(t))) for t in (trial.send_time_s, time))
+    sent = trial.send_time_s[trial.send_time_s + lag < time[-1]]
+    cells = max(1, int(_FINEST_S / loop + 1e-9))
+    at, command = (_means(x, cells) for x in (sent, trial.command_rad[: len(sent)]))
+    lasts = min(_RESPONSE_S, max(_TIME_CONSTANTS / slowest, 3 * gap))
+    rows = np.searchsorted(time, at + lag)[:, None] + np.arange(int(np.ceil(lasts / gap)) + 2)
+    recorded = rows < len(time)
+    rows = np.minimum(rows, len(time) - 1)
+    steps = _steps(trial, joint.reach)
+    since_step = _since(steps, time)
+    recorded &= (since_step >= lag + max(_SETTLED_S, 4 / slowest))[rows]
+    since = time[rows] - at[:, None] - lag
+    response = gain * (_step(since, natural, damping) - _step(since - loop, natural, damping))
+    white = response.copy()
+    for k, weight in enumerate(weights, 1):
+        white[:, k:] -= weight * response[:, :-k]
+    white = np.where(recorded, white / noise[rows], 0.0)
+    constant = np.where(recorded, (1 - weights.sum()) / noise[rows], 0.0)
+    share = (white * constant).sum(1) / np.maximum((constant**2).sum(1), 1e-12)
+    shape = white - share[:, None] * constant
+    power = (shape**2).sum(1)
+    seen = power > 0.25 * np.median(power[power > 0]) if (power > 0).any() else power > 0
+    power = np.where(seen, power, np.inf)
+
+    doubt = power**-0.5
+    found, sizes = _pursuit(shape, white, power, rows, left)
+    place = np.column_stack(
+        [command, rate[rows[:, 0]], _since(steps, at) if len(steps) else np.zeros(len(at))]
+    )
+    place = (rankdata(place, axis=0) - 0.5) / len(place)
+    some = np.flatnonzero(seen)[:: 1 + int(seen.sum()) // _MOST_PLACES]
+    others = Pulses(at[some], command[some], np.zeros(len(some)), doubt[some], place[some])
+    every = Pulses(at[found], command[found], sizes, doubt[found], place[found])
+    beside = np.abs(every.time_s[:, None] - every.time_s) < lasts
+    larger = np.abs(every.size_rad) > _ECHO * np.abs(every.size_rad[:, None])
+    return every.part(np.asarray(~(beside & larger).any(axis=1))), others
+
+
+def _pursuit(
+    shape: NDArray, white: NDArray, power: NDArray, rows: NDArray, left: NDArray
+) -> tuple[list[int], NDArray[np.float64]]:
+    """Numbers and sizes of the pulses in what is `left`, the largest first.
+
+    `shape`: responses at their `rows`, of that `power`, beside a constant; `white`: with it.
+    """
+    found, sizes = [], []
+    product = (shape * left[rows]).sum(1)
+    for _ in range(_MOST_PULSES):
+        k = int(np.argmax(np.abs(product) / np.sqrt(power)))
+        size = product[k] / power[k]
+        if not abs(size) * np.sqrt(power[k]) > _STANDS_OUT:
+            break
+        found.append(k)
+        sizes.append(size)
+        of, explained = rows[k, white[k] != 0], size * white[k, white[k] != 0]
+        left[of] = (left[of] - explained) / np.hypot(1, _SHAPE * explained)
+        power[k] = np.inf
+        near = np.abs(rows[:, 0] - rows[k, 0]) <= rows.shape[1]
+        product[near] = (shape[near] * left[rows[near]]).sum(1)
+    return found, np.array(sizes)
+
+
+def _means(values: NDArray[np.float64], together: int) -> NDArray[np.float64]:
+    return values[: len(values) // together * together].reshape(-1, together).mean(axis=1)
+
+
+def _steps(trial: Trial, reach: float) -> NDArray[np.float64]:
+    """Times of steps of the command [s]: friction and limits stop a servo on its way."""
+    move = np.abs(np.diff(trial.command_rad))
+    beside = np.maximum(np.append(0.0, move[:-1]), np.append(move[1:], 0.0))
+    return trial.send_time_s[1:][(move > _JUMP * reach) & (beside < _RESTS * move)]
+
+
+def _since(steps: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Time since the last step [s]."""
+    return time - np.append(-np.inf, steps)[np.searchsorted(steps, time)]
+
+
+def _step(time: NDArray, natural: float, damping: float) -> NDArray[np.float64]:
+    """Response of a second-order servo to a step."""
+    time = np.maximum(time, 0.0)
+    root = np.sqrt(complex(damping**2 - 1)) or 1e-4
+    fast, slow = natural * (damping + root), natural * (damping - root)
+    decay = (fast * np.exp(-slow * time) - slow * np.exp(-fast * time)) / (fast - slow)
+    return 1 - decay.real
+
+
+def _autoregression(rest: NDArray[np.float64]) -> tuple[NDArray, NDArray[np.float64]]:
+    """Weights of the rows before each, and what is not by those; pulses do not set the weights."""
     design = np.column_stack([rest[_ORDER - k : len(rest) - k] for k in range(1, _ORDER + 1)])
     wanted, weight = rest[_ORDER:], np.ones(len(rest) - _ORDER)
-    left = wanted
+    weights, left = np.zeros(_ORDER), wanted
     for _ in range(4):
-        left = wanted - design @ least_squares(design * weight[:, None], wanted * weight)
+        weights = least_squares(design * weight[:, None], wanted * weight)
+        left = wanted - design @ weights
         usual = 1.4826 * float(np.median(np.abs(left))) + 1e-12
         weight = np.sqrt(1 / np.maximum(1, np.abs(left) / (2 * usual)))
-    return left
+    return weights, left
 
 
-def _spread(size: NDArray, usual: float, *causes: NDArray) -> tuple[float, NDArray[np.float64]]:
-    """Log-likelihood of sizes whose mean is a sum of positive shares of `causes`, and that mean."""
-    spread = likely_spread(size, usual, causes)
-    return -float(np.sum(np.log(spread) + size / spread)), spread
+def _noise(innovations: NDArray[np.float64], step: float, *causes: NDArray) -> NDArray[np.float64]:
+    """Standard deviation of each, which grows by positive shares of `causes`.
 
-
-def likely_spread(size: NDArray, usual: float, causes: Sequence[NDArray]) -> NDArray[np.float64]:
-    """Mean of exponential sizes as a sum of positive shares of 1 and `causes`, by some `rows`."""
-    design = np.column_stack([np.ones_like(size), *causes])
+    Dates in doubt go with the speed of the path, friction with its acceleration.
+    """
+    usual = float(np.median(np.abs(innovations))) + step / 4 + 1e-9
+    size = np.minimum(np.abs(innovations), _LARGEST * usual)
+    design = np.column_stack([np.ones_like(size), *(c[_ORDER:] for c in causes)])
     design = design / np.maximum(design.mean(axis=0), 1e-12)
     spread = np.full_like(size, usual)
     for _ in range(3):
         weighted = design / spread[:, None]
         spread = np.maximum(design @ nnls(weighted, size / spread)[0], 0.3 * usual)
-    return spread
-
-
-def _one_way(towards: int, of: int) -> float:
-    """Likelihood of a direction of its own over chance [nats]; 0 if most go away."""
-    share = towards / max(of, 1)
-    if share <= 0.5:
-        return 0.0
-    rest = of - towards
-    return towards * np.log(2 * share) + (rest * np.log(2 * (1 - share)) if rest else 0.0)
+    return spread * 1.4826 * float(np.median(np.abs(innovations) / spread))
 
 
 def scatter_findings(tones: Sequence[Trial], lattice: PollLattice) -> list[Finding]:

@@ -14,6 +14,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.reading.content import refuse_more
 from pupper_sysid.common.strict_yaml import printable
+from pupper_sysid.sysid.recordings.importers.columns import column as column_named
 from pupper_sysid.sysid.recordings.importers.log import MOST_TRIALS
 from pupper_sysid.sysid.recordings.importers.options import (
     LARGEST_RAD,
@@ -150,7 +151,9 @@ def _refuse_degrees(
     kind = "position" if column == "position_rad" else "command"
     source = (names.get(joint) or {}).get(kind) if isinstance(names, dict) else None
     place = f"{printable(str(source))[:60]} (the {kind} of {joint})" if source else column
-    if kind == "command" and _PULSES_US[0] < np.nanmin(known) <= largest < _PULSES_US[1] and stated:
+    by_name = _units_by_name(names.get(joint) if isinstance(names, dict) else None)
+    pulses = kind == "command" and _PULSES_US[0] < np.nanmin(known) <= largest < _PULSES_US[1]
+    if pulses and (stated or any(by_name)):
         raise InputError(
             f"{path}, column {place}: values of {np.nanmin(known):.4g} to {largest:.4g} beside "
             "angles look like pulse widths in µs. Write them as angles, about (µs - 1500) * "
@@ -165,6 +168,7 @@ def _refuse_degrees(
     units = likely_of_pair(*(values[np.isfinite(values)] for values in angles.T))
     if units == ["deg"] and str(source).endswith(".pos") and largest <= 100:
         units.append("percent:3.5")  # LeRobot's, of a range that it does not log
+    units = list(dict.fromkeys(_with_named(text, by_name) for text in units))
     word, _, of_position = units[0].partition(",")
     beside = ""
     if of_position:
@@ -184,6 +188,19 @@ def _refuse_degrees(
         f"{text}, or convert the log with {lines} (or turns, counts:4096, scale:…; rad if the "
         "joint turns so far)."
     )
+
+
+def _units_by_name(columns: Any) -> list[str]:
+    """Units that the names of the columns of a command and a position say."""
+    names = columns if isinstance(columns, Mapping) else {}
+    return [column_named(str(names.get(kind, ""))).unit for kind in ("command", "position")]
+
+
+def _with_named(units: str, by_name: list[str]) -> str:
+    """The units of an option, with those that the names of columns say in their place."""
+    command, _, position = units.partition(",")
+    pair = [own or text for own, text in zip(by_name, (command, position or command), strict=True)]
+    return ",".join(dict.fromkeys(pair)) if any(by_name) else units
 
 
 def _words(unit: str) -> str:

@@ -28,7 +28,7 @@ from pupper_sysid.sysid.recordings.importers.columns import column, has_time, ti
 from pupper_sysid.sysid.recordings.importers.log import Table
 from pupper_sysid.sysid.recordings.importers.options import LARGEST_RAD, LogOptions
 from pupper_sysid.sysid.recordings.importers.tables import LABELS, is_flag
-from pupper_sysid.sysid.recordings.importers.times import rate_in, tick_in, units_in
+from pupper_sysid.sysid.recordings.importers.times import drive_in, rate_in, tick_in, units_in
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
 
 SCHEMA_VERSION = 1
@@ -150,6 +150,7 @@ def parse(path: Path, text: str, options: LogOptions | None = None) -> Table:
         {name: numbers[name] for name in columns if name in numbers}, texts, csv_table.faults,
         numbered=opened.numbered, notes=warnings, metadata=metadata,
         rate=rate_in(head.split("\n")), tick_s=tick_in(head), units=units_in(head, columns),
+        drive=drive_in(head),
     )  # fmt: skip
     return table if keep.all() else table.taken(np.flatnonzero(keep))
 

@@ -46,8 +46,6 @@ class World:
     seed: int
     clamp_rad: tuple[float, float] = (-np.inf, np.inf)
     stop_rad: tuple[float, float] = (-np.inf, np.inf)
-    derated_at: float = np.inf
-    derated: float = 1.0
     writer_share: float = 0.0
     values: dict = field(default_factory=dict)
 
@@ -120,13 +118,19 @@ def commanded(world: World, time: NDArray[np.float64], rng: np.random.Generator)
 
 
 @njit(cache=True)
-def _moved(goal, natural, damping, friction, speed, low, high, change_at, change):
-    """Position at each step of a servo whose error is `goal` minus position."""
+def _moved(goal, natural, damping, friction, speed, low, high, torque):
+    """Position at each step of a servo whose error is `goal` minus position.
+
+    `torque`: of what it would be, at each step; at 0 the joint is held.
+    """
     position, velocity = goal[0], 0.0
     out = np.empty(len(goal))
     step = 5e-4
     for k in range(len(goal)):
-        strength = natural * natural * (change if k >= change_at else 1.0)
+        if torque[k] == 0.0:
+            velocity, out[k] = 0.0, position
+            continue
+        strength = natural * natural * torque[k]
         force = strength * (goal[k] - position) - 2 * damping * natural * velocity
         hold = natural * natural * friction
         if velocity == 0.0 and abs(force) <= hold:
@@ -159,12 +163,12 @@ def simulated(world: World) -> pd.DataFrame:
     gravity = world.gravity_rad * np.sin(goal / max(world.amplitude_rad, 1e-6))
     goal = world.gain * goal + gravity
     natural = 2 * np.pi * world.bandwidth_hz
-    if world.writer_share > 0:
-        position = _with_writer(world, goal, row, natural, rng)
+    if world.writer_share > 0 or "times_s" in world.values:
+        position = _with_writer(world, clock, send, goal, row, natural, rng)
     else:
         position = _moved(
             goal, natural, world.damping, world.friction_rad, world.speed_rad_s,
-            *world.stop_rad, int(min(world.derated_at, 1e6) / STEP_S), world.derated,
+            *world.stop_rad, np.interp(clock, *world.values.get("torque", ([0.0], [1.0]))),
         )  # fmt: skip
     read = send + min(0.002, 0.3 / world.rate_hz)
     measured = read
@@ -185,15 +189,19 @@ def simulated(world: World) -> pd.DataFrame:
     })  # fmt: skip
 
 
-def _with_writer(world: World, goal, row, natural, rng) -> NDArray:
-    """Some commands are replaced, until the next, by another program's old goal."""
-    rows = int(row.max()) + 2
-    hit = rng.random(rows) < world.writer_share
+def _with_writer(world: World, clock, send, goal, row, natural, rng) -> NDArray:
+    """Another program's goal stands from its writes until the next command."""
     home = world.values["home"]
-    taken = hit[np.maximum(row, 0)]
+    if "times_s" in world.values:
+        times = np.concatenate([[-1.0], world.values["times_s"]])
+        last = times[np.searchsorted(times, clock - world.dead_time_s, "right") - 1]
+        taken = (last > send[np.maximum(row, 0)]) & (row >= 0)
+    else:  # some commands are replaced
+        hit = rng.random(int(row.max()) + 2) < world.writer_share
+        taken = hit[np.maximum(row, 0)]
     return _moved(
         np.where(taken, home, goal), natural, world.damping, world.friction_rad, world.speed_rad_s,
-        *world.stop_rad, len(goal), 1.0,
+        *world.stop_rad, np.ones(len(goal)),
     )  # fmt: skip
 
 
@@ -280,16 +288,63 @@ def _second_writer(world: World, rng):
     return world, simulated(world)
 
 
+def _other_goal(world: World, rng) -> float:
+    return float(rng.choice([-1, 1]) * rng.uniform(0.0, 1.0) * world.amplitude_rad)
+
+
+def _now_and_then(world: World, rng):
+    """Another program writes its goal every 0.5 to 3 s, overwritten by the next command."""
+    times = 0.5 + np.cumsum(rng.uniform(0.5, 3.0, 40))
+    world = replace(world, values={"home": _other_goal(world, rng), "times_s": times})
+    return world, simulated(world)
+
+
+def _at_its_rate(world: World, rng):
+    """Another program writes its goal all the time, at a rate of its own."""
+    hz = np.exp(rng.uniform(np.log(2.0), np.log(min(20.0, 0.5 * world.rate_hz))))
+    times = rng.uniform(0.1, 0.6) + np.arange(0.0, world.duration_s, 1 / hz)
+    times = times + 0.03 / hz * rng.standard_normal(len(times))
+    world = replace(world, values={"home": _other_goal(world, rng), "times_s": np.sort(times)})
+    return world, simulated(world)
+
+
 def _derated(world: World, rng):
-    world = replace(world, derated_at=world.duration_s * rng.uniform(0.35, 0.65))
-    world = replace(world, derated=1.0)
-    at, factor = world.derated_at, rng.uniform(0.3, 0.6)
+    at, factor = world.duration_s * rng.uniform(0.35, 0.65), rng.uniform(0.3, 0.6)
     table = simulated(world)
     late = table.read_time_s > at
     about = world.offset_rad
     return replace(world, values={"at": at}), table.assign(
         position_rad=np.where(late, about + factor * (table.position_rad - about),
                               table.position_rad))  # fmt: skip
+
+
+def _torque_fades(world: World, rng):
+    """A motor that heats or a battery that sinks: torque falls smoothly, friction does not."""
+    torque = [0.0, world.duration_s], [1.0, 1 - rng.uniform(0.2, 0.5)]
+    world = replace(world, values={"torque": torque})
+    return world, simulated(world)
+
+
+def _held_at_times(world: World, rng):
+    """Something holds the joint for a while, several times."""
+    times = int(rng.integers(2, 5))
+    begins = np.linspace(1.5, world.duration_s - 1.5, times) + rng.uniform(-0.4, 0.4, times)
+    ends = begins + rng.uniform(0.7, 1.2, times)
+    clock = np.column_stack([begins - 1e-4, begins, ends, ends + 1e-4]).ravel()
+    torque = np.tile([1.0, 0.0, 0.0, 1.0], times)
+    world = replace(world, values={"torque": (clock, torque)})
+    return world, simulated(world)
+
+
+def _unplugged_at_times(t, world, rng):
+    """Readings stay for a while, several times, while the joint goes on."""
+    begins = np.cumsum(rng.uniform(1.8, 3.5, 3))
+    time = t.read_time_s.to_numpy()
+    row = np.arange(len(t))
+    for begin in begins:
+        out = (time > begin) & (time < begin + rng.uniform(0.7, 1.2))
+        row = np.where(out, max(int(np.argmax(out)) - 1, 0) if out.any() else 0, row)
+    return t.assign(position_rad=t.position_rad.to_numpy()[row])
 
 
 def _zeros(t, world, rng):
@@ -385,6 +440,11 @@ FAULTS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "loses power": (_rows(_loses_power), ("frozen",)),
     "speed": (_rows(_speed), ("speed_for_position", "fast_joint", "degrees", "unrelated",
                               "not_a_position_servo")),
+    "writer now and then": (_now_and_then, ("second_writer",)),
+    "writer at its rate": (_at_its_rate, ("second_writer",)),
+    "torque fades": (_torque_fades, ("torque_fades", "torque_changed", "gain_drifts")),
+    "held at times": (_held_at_times, ("frozen", "left_path")),
+    "unplugged at times": (_rows(_unplugged_at_times), ("frozen", "left_path")),
 }  # fmt: skip
 
 ACCUSING = sorted({code for _, codes in FAULTS.values() for code in codes})

@@ -36,7 +36,7 @@ from pupper_sysid.sysid.recordings.importers.log import (
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
 from pupper_sysid.sysid.recordings.importers.refusals import missing
 from pupper_sysid.sysid.recordings.importers.tables import read_numbered, read_table
-from pupper_sysid.sysid.recordings.importers.times import stated_rate, units_in
+from pupper_sysid.sysid.recordings.importers.times import drive_in, stated_rate, units_in
 
 ZIP, NPY, MAT = b"PK\x03\x04", b"\x93NUMPY", b"MATLAB 5.0"
 
@@ -104,8 +104,11 @@ def read_arrays(path: Path, data: bytes, options: LogOptions) -> Log:
     remarks = "\n".join(
         f"{k}: {v}" for k, v in arrays.items() if v.dtype.kind == "U" and v.size == 1
     )
-    units = units_in(remarks[:4000], table.names)
-    return read_table(path, replace(table, rate=stated_rate(scalars), units=units), options, layout)
+    table = replace(
+        table, rate=stated_rate(scalars), units=units_in(remarks[:4000], table.names),
+        drive=drive_in(remarks[:4000]),
+    )  # fmt: skip
+    return read_table(path, table, options, layout)
 
 
 def _with_names(

@@ -34,10 +34,13 @@ UNITS: dict[str, str] = {
         ("turns", "turn turns rev revs revolution revolutions rotation rotations "
                   "umdrehungen"),
         ("percent", "percent pct"),
+        ("share", "norm normalized normalised"),
+        ("length", "mm cm meter meters metre metres inch inches"),
         ("counts", "count counts tick ticks pulse pulses"),
         ("steps", "steps microsteps qc inc incs increments lsb"),
         ("scale:1e-06", "urad µrad"),
         (f"scale:{np.pi / 18e3!r}", "cdeg centideg centidegree centidegrees"),
+        (f"scale:{np.pi / 1800!r}", "ddeg decideg decidegree decidegrees"),
         (f"scale:{np.pi / 18e4!r}", "mdeg millideg millidegree millidegrees"),
         (f"scale:{np.pi / 200!r}", "gon gons gradian gradians"),
         (f"scale:{np.pi / 10800!r}", "arcmin"),
@@ -84,7 +87,7 @@ WORDS: dict[str, str] = {
                 "frame iteration iter step overrun moving force feedforward ff tff integral prev "
                 "previous last offset home initial init delta diff frequency freq hz cov "
                 "covariance enable enabled reached done warning fault trial episode loop "
-                "strom spannung dot iq uq ud trq torq rpm rps"),
+                "strom spannung dot iq uq ud trq torq rpm rps dps nm newton"),
         (TIME, "time times timestamp timestamps t ts stamp stamps clock elapsed seconds secs sec "
                "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
                "nanosec nanosecs nsecs usec usecs tout minutes days datenum zeit temps tiempo "
@@ -111,14 +114,18 @@ TIME_STEP = re.compile(r"(d_?t|delta_?t(ime)?|time_?(step|delta))([_ (\[].*)?", 
 """Names of times between rows."""
 
 _UNIT_RANK = {"rad": 0, "": 1, "mrad": 2, "deg": 3, "turns": 4, "counts": 5, "steps": 5,
-              "percent": 6}  # fmt: skip
+              "percent": 6, "share": 6, "length": 6}  # fmt: skip
 _SEPARATORS = re.compile(r"[\s_./:\\\[\](){}<>$%#*,;|='\"（）［］【】：，-]+")
 _CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?(?:[^\W\dA-Z_]|°)+|\d+|[^\w°]+")
 _IN_UNIT = re.compile(r"\s+(?:in|en)\s+(?=\S+$)", re.IGNORECASE)  # Winkel in Grad
 _SOLE_LETTERS = frozenset("ury")  # that mean something where no other word does
 _LETTERS = frozenset("qput")  # that begin a word such as qdes or tcmd
 _LONGEST = 200
-_PARTS_OF = re.compile(r"(?<![^\W_])(?<!\.)(\d*\.\d+)\s*\*?\s*(deg|rad|°)(?![a-z])")  # 0.1deg
+_PARTS_OF = re.compile(  # 0.1deg, 1e-3 rad, pi rad; deg/10, deg*100, deg_x10
+    r"(?<![^\W_])(?<!\.)(?P<part>\d*\.\d+|\d+e-\d+|pi|π)[\s*·_]*(?P<unit>deg|rad|°)(?![a-z])|"
+    r"(?<![a-z])(?P<whole>deg|rad|°)[\s_]*[/*×x][\s_]*(?P<times>10+)(?!\d)"
+)
+_SYMBOL = re.compile(r"\[(m|N|N[·.*]?m|A|mA|V|mV)\]\s*$")  # units of one letter, only in brackets
 _RAD = {"deg": np.pi / 180, "°": np.pi / 180, "rad": 1.0}
 
 
@@ -146,12 +153,27 @@ class Column:
 def column(name: str) -> Column:
     """What the name of a column says."""
     name = str(name)[:_LONGEST]
-    if not (part := _PARTS_OF.search(name)) or not float(part[1]) > 0:
+    if symbol := _SYMBOL.search(name):
+        plain = _column(name[: symbol.start()])
+        length = symbol[1] == "m"
+        return replace(
+            plain,
+            name=name,
+            template=f"{plain.template}{name[symbol.start() :]}",
+            kind=plain.kind if length else "",
+            unit="length" if length else "",
+        )
+    if not (part := _PARTS_OF.search(name)):
         return _column(name)
-    plain = _column(name.replace(part[0], part[2]))
-    return replace(
-        plain, name=name, template=name, unit=f"scale:{float(part[1]) * _RAD[part[2]]:.9g}"
-    )
+    word = part["unit"] or part["whole"]
+    if part["times"]:
+        factor = 1 / float(part["times"])
+    else:
+        factor = np.pi if part["part"] in ("pi", "π") else float(part["part"])
+    if not factor > 0:
+        return _column(name)
+    plain = _column(name.replace(part[0], word))
+    return replace(plain, name=name, template=name, unit=f"scale:{factor * _RAD[word]:.9g}")
 
 
 @lru_cache(4096)
@@ -176,6 +198,12 @@ def _column(name: str) -> Column:
     if "d" in lower and ANGLE in kinds and not kinds & {COMMAND, STATE, OTHER}:  # q_d, theta_d
         known[lower.index("d")] = COMMAND
         kinds.add(COMMAND)
+    if (
+        lower[-1:] in (["s"], ["s2"], ["sec"], ["min"])
+        and known[-2:-1] == [UNIT]
+        and (lower[-2] in UNITS)
+    ):  # rad/s
+        others(OTHER, lower[-1:])
     if parts[-1:] == ["A"] and lower[-2:-1] in (["q"], ["d"], ["i"]):  # q_A, a current; not q_a
         others(OTHER, ("q", "d", "i", "a"))
     if "mapper" in lower:  # pos_rel of ODrive's mapper is its estimate
@@ -244,6 +272,14 @@ def columns_of(names: Iterable[str]) -> list[Column]:
     if any(c.kind == "command" and c.name.lower().startswith("p_") for c in columns):  # p_des
         columns = [replace(c, kind="position", rank=(0, 0, 1, 1)) if c.name == "p" else c
                  for c in columns]  # fmt: skip
+    if any(c.kind == "command" and c.words != {"input"} for c in columns):
+        # of a controller that is told a set-point: what it reads, and what drives the motor
+        inputs = [c for c in columns if c.name.lower() == "input" and c.key == ""]
+        columns = [
+            replace(c, kind="position", rank=(0, 1, 1, 2)) if c in inputs
+            else replace(c, kind="") if inputs and c.name.lower() == "output" else c
+            for c in columns
+        ]  # fmt: skip
     placed = {c.key for c in columns if c.kind == "position"}
     return [
         replace(c, kind="position", template=_template(c.name, [c.name]))

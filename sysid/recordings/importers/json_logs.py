@@ -56,7 +56,12 @@ from pupper_sysid.sysid.recordings.importers.tables import (
     read_numbered,
     read_table,
 )
-from pupper_sysid.sysid.recordings.importers.times import doubt_of_a_turn, stated_rate, units_in
+from pupper_sysid.sysid.recordings.importers.times import (
+    doubt_of_a_turn,
+    drive_in,
+    stated_rate,
+    units_in,
+)
 
 BAM, KTUNE = "BAM JSON", "ktune JSON"
 
@@ -165,6 +170,10 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     lists: dict[str, list[Any]] = {}
     data = _of_pairs(_of_points(_of_frame(data)))
     records = _records(data)
+    head: Any = data
+    while records and len(records) > 2 and not any({*records[0]} & {*r} for r in records[1:4]):
+        head = {**(head if isinstance(head, Mapping) else {}), **records[0]}  # of JSON Lines
+        records = records[1:]
     if records is None and not isinstance(data, Mapping):
         values = _numbers(data)
         if values is None or values.ndim != 2:
@@ -203,12 +212,13 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     others = {n: v for n, v in lists.items() if v and n not in arrays}
     texts = {n: list(map(str, v)) for n, v in others.items()
              if has_time([n]) or (n in GROUPS and all(isinstance(t, str) for t in v))}  # fmt: skip
-    beside = _beside(data)
+    beside = _beside(head)
     scalars = {k: float(v) for k, v in beside if isinstance(v, int | float) and abs(v) < _FAR}
     remarks = "\n".join(f"{k}: {v}" for k, v in beside if isinstance(v, str))
     table = expanded(path, arrays, list(options.joints))
-    units = units_in(remarks[:_FEW_REMARKS], table.names)
-    table = replace(table, texts=texts, rate=stated_rate(scalars), units=units)
+    remarks = remarks[:_FEW_REMARKS]
+    units, drive = units_in(remarks, table.names), drive_in(remarks)
+    table = replace(table, texts=texts, rate=stated_rate(scalars), units=units, drive=drive)
     if not arrays or (missing(table.names) and not options.command):
         return None
     return read_table(path, table, options, "JSON table")

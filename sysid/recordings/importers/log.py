@@ -60,6 +60,9 @@ class Table:
     units: Mapping[str, str] = field(default_factory=dict)
     """Units of angles that the log states beside its columns; of the name "" those of all."""
 
+    drive: tuple[str, str] = ("", "")
+    """What the log says beside its columns that its drive is, and the unit which that counts."""
+
     @cached_property
     def names(self) -> list[str]:
         """Names of all columns."""

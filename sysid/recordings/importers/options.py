@@ -44,7 +44,9 @@ _OF_PART = {1024: "scale:0.005113", 1001: "scale:0.0041888"}
 """Of 1,024 counts in 300 degrees (AX-12 and SCS servos), of 1,000 in 240 (LX-16A)."""
 _MOST_DEGREES = 360.0  # of whole numbers that may be degrees
 _FARTHEST_DEGREES = 180.0  # from 0, of the same
-_ALIKE = 2.5  # factor by which a position may move more or less than its command
+MOVES_ALIKE = 2.5
+"""Factor by which a position may move more or less than its command."""
+_ASKEW = 0.3
 _ANGLE_SCALES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turns": 2 * np.pi}
 _NARROWEST_RAD, _WIDEST_RAD = 0.2, 2 * np.pi  # range of a joint
 
@@ -159,7 +161,7 @@ def likely_of_pair(command: NDArray[np.float64], position: NDArray[np.float64]) 
     """
     spread = float(np.ptp(command)), float(np.ptp(position))
     together = likely_units(np.concatenate([command, position]))
-    if not min(spread) > 0 or 1 / _ALIKE < spread[0] / spread[1] < _ALIKE:
+    if not min(spread) > 0 or 1 / MOVES_ALIKE < spread[0] / spread[1] < MOVES_ALIKE:
         return together
     ranked = []
     turns = [f"counts:{n}:0" for n in _COUNTS]  # also where they were averaged or scaled
@@ -172,8 +174,12 @@ def likely_of_pair(command: NDArray[np.float64], position: NDArray[np.float64]) 
         c, p = map(unit, texts)
         ratio = spread[0] * c.scale / (spread[1] * p.scale)
         apart = (np.mean(command) - c.zero) * c.scale - (np.mean(position) - p.zero) * p.scale
-        if 1 / _ALIKE < ratio < _ALIKE:
-            ranked.append((abs(np.log(ratio)) + abs(float(apart)), ",".join(texts)))
+        # a hobby servo's middle is 90°; few logs hold mrad, or counts that are no whole numbers
+        apart = min(abs(float(apart)), _ASKEW + abs(abs(float(apart)) - np.pi / 2))
+        odd = sum(t == "mrad" or (t in turns and (v % 1 != 0).any())
+                  for t, v in zip(texts, (command, position), strict=True))  # fmt: skip
+        if 1 / MOVES_ALIKE < ratio < MOVES_ALIKE:
+            ranked.append((abs(np.log(ratio)) + apart + odd, ",".join(texts)))
     return [text for _, text in sorted(ranked)][:2] or together
 
 

@@ -39,10 +39,14 @@ _DRIVES = {
     "ODrive": re.compile(r"odrv|axis\d\.(controller|encoder|motor|pos_vel_mapper)\.",
                          re.IGNORECASE),
     "moteus": re.compile(r"moteus|servo_stats|Register\.|(^|[_.])[qd]_current", re.IGNORECASE),
-    "": re.compile(r"axis\d|(^|[_.])iq(_|$)|input_pos|vel_(estimate|setpoint)", re.IGNORECASE),
+    "": re.compile(
+        r"axis\d|(^|[_.])iq(_|$)|input_pos|vel_(estimate|setpoint)|estimate_counts|shadow_count|"
+        r"count_in_cpr", re.IGNORECASE,
+    ),
 }  # fmt: skip
 """Names of columns by which the angles are turns without doubt; those under "" do not tell the
 program, and only beside marks of `_OF_TURNS`."""
+_ARRAY = re.compile(r"(data|values?)(_\d+)?", re.IGNORECASE)
 _MOST_TURNS = 100.0  # beyond which no angle is read, whatever its unit
 _COUNTS_OF_DRIVE = "counts:8192:0"
 """ODrive's default encoder; its firmware before 0.5 has counts where later ones have turns."""
@@ -90,20 +94,23 @@ def pairs(path: Path | str, table: Table, options: LogOptions) -> tuple[dict[str
 def _of_drive(
     path: Path | str, table: Table, options: LogOptions, pair: Pair, notes: list[str]
 ) -> Pair:
-    """The pair in turns where the log is of a program that counts them; `notes` get a sentence."""
+    """The pair in the unit of the drive that the log is of, if any; `notes` get a sentence."""
     sources = pair.command, pair.position
     given_away = {*table.names} | pair.command.words | pair.position.words
     named = [p for p, names in _DRIVES.items() if any(map(names.search, table.names))]
     program = next((p for p, marks in _OF_TURNS.items() if marks <= given_away), "")
-    program = program or (named[0] if named else "")
+    drive, counts = table.drive
+    program = program or next(iter(named), "") or drive
+    counts = counts or "turns"
     counted = [source for source in sources if source.unit == "counts"]
     if not program or options.unit or any(s.unit not in ("", "counts") for s in sources):
         return pair
-    if len(counted) == 2 or (counted and not named):
-        return pair
+    if (counted and counts != "turns") or table.units:
+        return pair  # beside it the log says its unit
+    named = [*named, *([drive] if drive else [])]
     known = [table.columns[s.name] for s in sources if s.unit == "" and s.name in table.columns]
     largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in known), default=0.0)
-    if counted or (named and largest > _MOST_TURNS):
+    if counted or (named and counts == "turns" and largest > _MOST_TURNS):
         units = [_COUNTS_OF_DRIVE if s in counted or largest > _MOST_TURNS else "turns"
                  for s in sources]  # fmt: skip
         templates = [s.template for s in sources]
@@ -113,20 +120,21 @@ def _of_drive(
             path, unit=",".join(dict.fromkeys(units)), command=templates[0], position=templates[1]
         )
         raise InputError(
-            f"{path}: {pair.command.name} and {pair.position.name} are names of {program}, which "
-            "counts turns, but these are an encoder's counts. Say how many a turn has; with "
+            f"{path}: {pair.command.name} and {pair.position.name} are of {program}, which counts "
+            "turns, but these are an encoder's counts. Say how many a turn has; with "
             f"ODrive's default: {line}."
         )
-    taken, other = ("turns", "rad") if named else ("rad", "turns")
+    taken, other = (counts, "rad") if named else ("rad", counts)
     if not any(program in note for note in notes):
+        whose = f"{pair.command.name} and {pair.position.name} are names of {program}"
+        whose = f"the log says that its drive is {program}" if drive else whose
         notes.append(
-            f"{pair.command.name} and {pair.position.name} are names of {program}, which counts "
-            f"turns; the values were taken as {taken}. If they are {other}, give `unit='{other}'`; "
-            "lag and dead time are the same."
+            f"{whose}, which counts {counts}; the values were taken as {taken}. If they are "
+            f"{other}, give `unit='{other}'`; lag and dead time are the same."
         )
     if not named:
         return pair
-    return Pair(*(replace(c, unit="turns") for c in sources))
+    return Pair(*(replace(c, unit=counts) for c in sources))
 
 
 def _by_words(path: Path | str, table: Table) -> tuple[dict[str, Pair], list[str]]:
@@ -188,7 +196,11 @@ def _decided(path: Path | str, table: Table, best: Sequence[Pair], used: Mapping
         twice = {getattr(pair, kind).name for pair in best
                  if pair.cost(used)[:4] == first.cost(used)[:4]
                  and getattr(pair, kind).words == chosen.words}  # fmt: skip
-        distinct(path, [bare_name(chosen.joint or SOLE)] * len(twice), "joints")
+        if chosen.joint:
+            distinct(path, [bare_name(chosen.joint)] * len(twice), "joints")
+        elif len(twice) > 1:
+            why = f"{len(twice)} columns may be the {kind} of {chosen.joint or 'the joint'}"
+            _refuse_choices(path, why, [p for p in best if getattr(p, kind).name in twice])
         values = [table.columns.get(n) for n in dict.fromkeys(getattr(p, kind).name for p in alike)]
         if any(v is None or values[0] is None or not np.array_equal(v, values[0], equal_nan=True)
                for v in values[1:]):  # fmt: skip
@@ -226,7 +238,10 @@ def _lone(
             choices = [Pair(*both)]
         _refuse_choices(path, "no joint has both a command and a position by its name", choices)
     (pair,) = choices
-    name = bare_name(pair.command.joint or pair.position.joint or SOLE)
+    word = pair.command.joint or pair.position.joint or SOLE
+    if _ARRAY.fullmatch(word):  # /commands/data[0] beside /joint_states/knee/position
+        word = pair.position.joint or word
+    name = bare_name(word)
     return {name: pair}, [
         f"{pair.command.name} and {pair.position.name} were taken for the command and the position "
         "of one joint."

@@ -44,6 +44,7 @@ _CAN = re.compile(  # candump's, PEAK's, Vector's
     rb"\A;\$FILEVERSION|^[ \t]*[\d.]+[ \t]+\d[ \t]+[0-9A-F]+x?[ \t]+[RT]x[ \t]+d[ \t]",
     re.MULTILINE | re.IGNORECASE,
 )
+_HEAD_OF_TABLE = 100_000  # bytes
 _HEAD = 2000  # bytes in which a kind of text is looked for
 _MARKUP = re.compile(rb"<[?!A-Za-z]")
 _ROW = re.compile(rb"\[[-+\d.eE, \t\[\]()]+\][ \t]*\r?\n")  # numbers, a whole line
@@ -55,32 +56,63 @@ def is_log_folder(folder: Path) -> bool:
         sage.is_sage(folder)
         or lerobot.is_lerobot(folder)
         or ros.is_bag(folder)
-        or _halves(folder) is not None
+        or bool(_halves(folder))
     )
 
 
-def _halves(folder: Path) -> tuple[Table, str] | None:
-    """Commands and states that a folder has in a table each, as one table, and their digest."""
+def _halves(folder: Path) -> list[Path]:
+    """The two tables of a folder that has commands in one and states in the other, by their heads.
+
+    Empty for other folders.
+    """
     logs = [p for p in sorted(folder.iterdir()) if p.suffix in _TABLES and _may_be_log(p)]
     if len(logs) != 2 or {column(p.stem).kind for p in logs} != {"command", "position"}:
-        return None
-    parts, times = [], []
+        return []
+    times = {_time_by_head(p) for p in logs}
+    return logs if len(times) == 1 and None not in times else []
+
+
+def _time_by_head(path: Path) -> str | None:
+    """The time of a table that has no pair of command and position, by its first rows."""
     try:
-        contents, digest = read_files(folder, logs)
-        for path in logs:
-            table = parse(path, decoded(path, contents[path]))
-            timed = [n for n in time_columns(table.names) if n in table.increasing]
-            if not timed or not missing(table.names):
-                return None
-            times.append(timed[0])
-            named = {n: n if n == timed[0] else f"{path.stem}.{n}" for n in table.columns}
-            parts.append(pd.DataFrame(table.columns).rename(columns=named))
-    except InputError:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_OF_TABLE)
+        whole = len(head) < _HEAD_OF_TABLE
+        table = parse(path, decoded(path, head if whole else head[: head.rfind(b"\n") + 1]))
+    except (InputError, OSError):
         return None
-    if times[0] != times[1]:
-        return None
-    whole = pd.concat(parts, ignore_index=True).sort_values(times[0], kind="stable")
-    return Table({str(n): whole[n].to_numpy(float) for n in whole}), digest
+    return _time_of(table) if missing(table.names) else None
+
+
+def _time_of(table: Table) -> str | None:
+    return next((n for n in time_columns(table.names) if n in table.increasing), None)
+
+
+def _joined(folder: Path, logs: list[Path]) -> tuple[Table, str]:
+    """Both tables as one, with the rows of each, and their digest."""
+    contents, digest = read_files(folder, logs)
+    tables = {path.stem: parse(path, decoded(path, contents[path])) for path in logs}
+    times = {stem: _time_of(table) for stem, table in tables.items()}
+    time = times[logs[0].stem]
+    if time is None or {*times.values()} != {time}:
+        listed = ", ".join(f"{name}: {time or 'none'}" for name, time in times.items())
+        raise InputError(
+            f"{folder}: the times of its two tables must be one column that increases ({listed})."
+        )
+    parts, units = [], {}
+    for stem, table in tables.items():
+        named = {n: n if n == time else f"{stem}.{n}" for n in table.columns}
+        parts.append(pd.DataFrame(table.columns).rename(columns=named))
+        for name in named:
+            if unit := table.units.get(name, table.units.get("", "")):
+                units[named[name]] = unit
+    whole = pd.concat(parts, ignore_index=True).sort_values(time, kind="stable")
+    first = tables[logs[0].stem]
+    return Table(
+        {str(n): whole[n].to_numpy(float) for n in whole}, units=units, tick_s=first.tick_s,
+        drive=max(table.drive for table in tables.values()),
+        notes=[note for table in tables.values() for note in table.notes],
+    ), digest  # fmt: skip
 
 
 def logs_in(path: Path) -> list[Path]:
@@ -122,7 +154,8 @@ def read_folder(folder: Path, options: LogOptions) -> Log:
     if ros.is_bag(folder):
         return ros.read_bag(folder, options)
     if halves := _halves(folder):
-        return replace(convert(folder, halves[0], options), sha256=halves[1])
+        table, digest = _joined(folder, halves)
+        return replace(convert(folder, table, options), sha256=digest)
     inside = [p.name for p in logs_in(folder)]
     raise InputError(
         f"{folder} holds {len(inside)} logs ({', '.join(inside[:3])} …). Give one of them; "

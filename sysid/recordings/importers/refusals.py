@@ -53,8 +53,14 @@ _CURRENT = re.compile(r"cur(r|rent)?(?![A-Za-z])", re.IGNORECASE)
 _WIDEST_ANGLE = 1e6  # of a joint, in any unit
 _COMPARED, _ALIKE = 12, 0.7  # columns; concordance of a command and its position
 _ORDERED = 100_000  # rows
-_NO_PLACE = re.compile(r"vel|speed|rpm|torque|effort|volt|temp|power|pwm|duty", re.IGNORECASE)
-_PULSES = re.compile(r"pwm|pulse|duty", re.IGNORECASE)  # what a hobby servo is commanded by
+_NO_PLACE = re.compile(
+    r"vel|speed|rpm|torque|effort|volt|temp|power|pwm|duty|(?:rad|deg|°)[_/ ]?s(?![a-z])|dps|"
+    r"(?<![a-z])nm(?![a-z])|\[[NAV]\]",
+    re.IGNORECASE,
+)
+_PULSES = re.compile(
+    r"pwm|pulse|duty|[_ (\[](us|µs)\b", re.IGNORECASE
+)  # what a hobby servo is commanded by
 _PULSES_US, _OF_PULSES = (400.0, 2700.0), "counts:4000:1500"  # 2,000 µs for half a turn
 _IS_RATE = 0.95  # correlation of a column with another one summed up
 
@@ -197,7 +203,9 @@ def lines_by_value(path: Path | str, table: Table) -> list[str]:
     for name, values in table.columns.items():
         known = table.known(name)
         same = (np.array_equal(values, table.columns[o], equal_nan=True) for o in others)
-        other = _NO_PLACE.search(re.split(r"[./]", name)[-1]) and not _are_pulses(table, name)
+        other = _NO_PLACE.search(re.split(r"[./](?!s\b)", name)[-1]) and not _are_pulses(
+            table, name
+        )
         if name == time or name in rates or other or np.ptp(known) == 0 or any(same):
             continue
         if np.ptp(known) < _WIDEST_ANGLE:
@@ -253,21 +261,27 @@ def _unit_of(table: Table, names: Iterable[str]) -> dict[str, str]:
 
     `names` may hold `{joint}`.
     """
-    pair, pulses = [], False
+    pair, named, pulses = [], [], False
     for name in names:
         pattern = re.escape(name).replace(re.escape("{joint}"), ".+")
         column_name = next(
             (n for n in table.columns if re.fullmatch(pattern, n)), name.split(",")[0]
         )
         pulses = pulses or _PULSES.search(column_name) is not None
-        if column(column_name).unit and not pulses:
-            return {}
+        named.append(column(column_name).unit)
         pair.append(table.known(column_name))
+    if all(named) and not pulses:
+        return {}
     largest = max(float(np.abs(values).max()) for values in pair)
     if _are_pulse_widths(pair[0]) and pulses:
-        of_position = likely_of_pair(pair[1], pair[1])[0].partition(",")[0]
+        of_position = named[1] or likely_of_pair(pair[1], pair[1])[0].partition(",")[0]
         return {"unit": f"{_OF_PULSES},{of_position}"}
-    return {"unit": likely_of_pair(*pair)[0]} if largest > LARGEST_RAD else {}
+    if not largest > LARGEST_RAD:
+        return {}
+    command, _, position = likely_of_pair(*pair)[0].partition(",")
+    units = [command if named[0] in ("", "counts") else named[0],
+             position or command if named[1] in ("", "counts") else named[1]]  # fmt: skip
+    return {"unit": ",".join(dict.fromkeys(units))}
 
 
 def _are_pulses(table: Table, name: str) -> bool:

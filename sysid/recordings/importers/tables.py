@@ -44,7 +44,7 @@ from pupper_sysid.sysid.recordings.importers.log import (
     joint_names,
     rows,
 )
-from pupper_sysid.sysid.recordings.importers.options import LogOptions, Unit, unit
+from pupper_sysid.sysid.recordings.importers.options import MOVES_ALIKE, LogOptions, Unit, unit
 from pupper_sysid.sysid.recordings.importers.pairs import SOLE, Pair, column_named, pairs
 
 LAYOUT = "table"
@@ -79,10 +79,15 @@ _MOSTLY_BLANK, _ONE_STAMP = 0.3, 0.9  # shares of positions without a command, w
 _LACKING = {
     "percent": ("percent of a range of motion that the log does not say. Give it, as of 3.5 rad",
                 "percent:3.5"),
+    "share": ("shares of a range that the log does not say. Give the rad that 1 is, as of ±90°",
+              "scale:1.5708"),
+    "length": ("lengths, and no angles. Give the rad of 1, as of mm of a wheel of 20 mm radius",
+               "scale:0.05"),
     "steps": ("the log does not say how many steps make a turn. Give them, as of 3200",
               "counts:3200:0"),
 }  # fmt: skip
 """Units that a name does not say whole, what to do, and an example."""
+_LASTING = re.compile(r"loop|exec|cycle|proc|comput|infer|sleep|duration|latency", re.IGNORECASE)
 _FLAG = re.compile(
     r"(.*?)[_. ]?(?:is|read|pos|rx)?[_. ]?"
     r"(?:(valid|ok|success|status|result)|invalid|timeout|timed_?out|lost|failed|"
@@ -145,6 +150,7 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
             )
     theirs = [*options.joints] or [*joints]
     names = joint_names(path, [options.joints.get(j) or j for j in theirs])
+    _refuse_some_without_unit(path, options, {j: joints[j][1] for j in theirs})
     metadata: dict[str, Any] = {"imported_from": layout, "joints": names, "bus": {}}
     if options.readings:
         metadata["readings"] = options.readings
@@ -155,6 +161,26 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
         parts.append(part)
         notes += [text for text in texts if text not in notes]
     return Log(pd.concat(parts, ignore_index=True), metadata, notes)
+
+
+def _refuse_some_without_unit(
+    path: Path | str, options: LogOptions, pair_of: Mapping[str, Pair]
+) -> None:
+    """Refuse joints whose unit does not say how far they turn beside others that it would spoil."""
+    lacking = {
+        joint: next(c for c in (pair.command, pair.position) if c.unit in _LACKING)
+        for joint, pair in pair_of.items()
+        if {pair.command.unit, pair.position.unit} & {*_LACKING} and not options.unit_of(joint)
+    }
+    others = [joint for joint in pair_of if joint not in lacking]
+    if lacking and others:
+        joint, source = next(iter(lacking.items()))
+        text, example = _LACKING[source.unit]
+        raise InputError(
+            f"{path}, column {printable(source.name)[:60]}: {text}, in a mapping file "
+            f"(`units: {{{joint}: '{example}'}}`), or leave {joint} out: "
+            f"{refusals.import_line(path, joints=','.join(others))}."
+        )
 
 
 def is_flag(name: str) -> tuple[str, bool] | None:
@@ -211,12 +237,14 @@ def _times(
     names = [name for name in names if name in table.columns or name in table.texts]
     rising = [n for n in names if n in table.columns and (np.diff(table.known(n)) > 0).all()]
     steps = next((n for n in names if TIME_STEP.fullmatch(n) and n not in rising), None)
-    candidates = [n for n in time_columns(names) if n != steps]
+    lasting = [n for n in names if _LASTING.search(n) and n in table.columns and n not in rising]
+    candidates = [n for n in time_columns(names) if n != steps and n not in lasting]
     candidates = candidates or [n for n in table.increasing if TIME_STEP.fullmatch(n)]
     if not candidates and table.tick_s is not None:
         candidates = [n for n in names if TIMER.search(n)]
     sent = [n for n in names if (c := column(n)).kind == "time" and c.words & _SENT]
-    read = [n for n in names if (c := column(n)).kind == "time" and c.words and n not in sent]
+    read = [n for n in names if (c := column(n)).kind == "time" and c.words
+            and n not in (*sent, *lasting)]  # fmt: skip
     time, command_time, notes = options.time, options.command_time, []
     if time is not None and time not in table.names and time.count(",") == 1:
         seconds, below = (column_named(path, table, "time", n.strip()) for n in time.split(","))
@@ -236,10 +264,11 @@ def _times(
     else:
         lines = [refusals.import_line(path, time=name) for name in rising[:1]]
         lines.append(refusals.import_line(path, rate="50"))
+        how_long = f"{lasting[0]} says how long something takes, not when; " if lasting else ""
         raise InputError(
-            f"{path}: no column is a time (time, timestamp, t …, also with _s, _ms, _us or _ns); "
-            f"it has {refusals.listed(table.names)}. Name it, or give your rows a second in place "
-            f"of 50: {'; or '.join(lines)}."
+            f"{path}: {how_long}no column is a time (time, timestamp, t …, also with _s, _ms, _us "
+            f"or _ns); it has {refusals.listed(table.names)}. Name it, or give your rows a second "
+            f"in place of 50: {'; or '.join(lines)}."
         )
     read_s, at, texts = _seconds(path, table, time)
     notes += texts
@@ -404,12 +433,17 @@ def _joint(
     commands = table.numbers(path, pair.command.name)[of_joint]
     positions = table.numbers(path, pair.position.name)[of_joint]
     stated, units = options.unit_of(*names), table.units
+    said: set[str] = set()
+    if stated is None and not units:
+        pair, texts = _one_unit(pair, commands if held is None else held, positions)
+        warnings += texts
     columns: dict[str, Any] = {}
     for kind, source, values in (
         ("command", pair.command, commands if held is None else held),
         ("position", pair.position, positions),
     ):
-        said = stated is not None or source.unit not in ("", "rad")
+        if stated is not None or source.unit not in ("", "rad"):
+            said.add(kind)
         if stated is not None:
             factor = stated[kind == "position"]
         else:
@@ -419,7 +453,8 @@ def _joint(
                 and not source.unit
                 and (word := units.get(source.name, units.get("")))
             ):
-                factor, said = unit(word), True
+                factor = unit(word)
+                said.add(kind)
                 warnings.append(f"{source.name} was taken as {word}, as the log says beside it.")
             factor = factor or Unit()
             if factor.counts:
@@ -431,9 +466,9 @@ def _joint(
         columns[f"{kind}_rad"] = factor.radians(values)
         if kind == "position" and factor.counts:
             columns["position_count"] = values
-        if said:
-            metadata["angle_unit"] = "stated"
     angles = columns.pop("command_rad"), columns.pop("position_rad")
+    if len(said) == 2:
+        metadata["angle_unit"] = "stated"
     columns |= {
         name: table.numbers(path, name)[of_joint] for name in _KEPT if name in table.columns
     }
@@ -443,6 +478,27 @@ def _joint(
         several = part.groupby("trial")["frequency_hz"].transform("nunique").to_numpy() > 1
         part.loc[several, "frequency_hz"] = np.nan  # a chirp is no tone
     return part, warnings
+
+
+def _one_unit(
+    pair: Pair, commands: NDArray[np.float64], positions: NDArray[np.float64]
+) -> tuple[Pair, list[str]]:
+    """The pair, one of which names a unit, with that for the other where both move as far by it."""
+    units = pair.command.unit, pair.position.unit
+    if bool(units[0]) == bool(units[1]) or set(units) & {"rad", *_LACKING}:
+        return pair, []
+    if "counts" in units and any((v[np.isfinite(v)] % 1 != 0).any() for v in (commands, positions)):
+        return pair, []
+    ranges = [float(np.ptp(np.nanquantile(v, (0.05, 0.95)))) for v in (commands, positions)]
+    if not min(ranges) > 0 or not 1 / MOVES_ALIKE < ranges[0] / ranges[1] < MOVES_ALIKE:
+        return pair, []
+    word = units[0] or units[1]
+    both = Pair(replace(pair.command, unit=word), replace(pair.position, unit=word))
+    silent, named = (pair.position, pair.command) if units[0] else (pair.command, pair.position)
+    return both, [
+        f"{silent.name} names no unit, and was taken as {word} like {named.name}, since it moves "
+        "as far. If that is wrong, give `unit`, such as deg,rad."
+    ]
 
 
 def _apart(
@@ -544,7 +600,7 @@ def _of_name(
         )
     if source.unit == "counts":
         known = positions[np.isfinite(positions)]
-        if (known % 1 != 0).any():  # a raw angle
+        if (known % 1 != 0).any() and source.name.lower().endswith("raw"):  # an angle
             return None
         if (commands < 0).any() and (commands[np.isfinite(commands)] % 1 == 0).all():
             return unit("counts:4096:0")

@@ -44,9 +44,12 @@ _OTHER_DATE = re.compile(r"^(?!\d{4}-\d)\d{1,4}([-/.])(?:\d{1,2}|[A-Z][a-z]{2})\
 _COMPACT = re.compile(r"^(\d{4})(\d\d)(\d\d)T(\d\d)(\d\d)(?=\d\d)")  # of ISO 8601
 _HALF_DAY = re.compile(r" ?([AP])M$")
 _PERIODS = ("dt", "ts", "timestep", "time_step", "sample_time", "sampling_time", "sample_period",
-            "sampling_period", "period", "delta_x", "delta_t", "wf_increment")  # fmt: skip
+            "sampling_period", "period", "control_dt", "loop_time", "cycle_time", "delta_x",
+            "delta_t", "wf_increment")  # fmt: skip
 _RATES = ("fs", "fps", "rate", "rate_hz", "hz", "frequency_hz", "sample_rate", "sample_rate_hz",
-          "sampling_rate", "sampling_rate_hz", "sampling_frequency")  # fmt: skip
+          "sampling_rate", "sampling_rate_hz", "sampling_frequency", "samplerate", "samplingrate",
+          "control_rate", "control_frequency", "control_hz", "loop_rate", "loop_frequency",
+          "loop_hz", "update_rate", "publish_rate", "sample_frequency")  # fmt: skip
 _EVERY = re.compile(
     r"(?<![\w.])(?:every|alle) +([\d.]+) *(ms|us|µs|s)\b|(?<![\w.])([\d.]+) *(fps|hz|khz)\b",
     re.IGNORECASE,
@@ -62,6 +65,10 @@ _ANGLES_IN = re.compile(
     rf"\b(?:angles?|positions|values|(?:angle[ _])?units?|winkel){_SAYS}{_UNIT_WORD}",
     re.IGNORECASE,
 )
+DRIVES = {"ODrive": "turns", "moteus": "turns", "VESC": "deg"}
+"""Drives that do not count radians, and what they count."""
+_DRIVE = re.compile(rf"(?<![\w.])({'|'.join(DRIVES)})(?![\w.])", re.IGNORECASE)
+_ANGLE = re.compile(r"(?<![^\W_])(rad|radians?|deg|degrees?|°)(?![a-z])", re.IGNORECASE)
 _TICK = re.compile(
     r"(?:(?<![\w-])(?:\w*ticks?|timer(?: clock)?|clock|time units?)\b *(?:=|:|is|are|of)|"
     r"\btime in (?:units of)?) *([\d.]+) *(ns|us|µs|ms|khz|mhz)\b", re.IGNORECASE,
@@ -219,6 +226,17 @@ def units_in(text: str, names: Iterable[str]) -> dict[str, str]:
             said = re.findall(pattern, text, re.IGNORECASE)
             units_of[name] = {UNITS[word.lower()] for word in said}
     return {name: units.pop() for name, units in units_of.items() if len(units) == 1}
+
+
+def drive_in(text: str) -> tuple[str, str]:
+    """The drive that remarks such as `moteus r4.11` name, and its unit of angles.
+
+    Empty where they name none, several, or a unit beside.
+    """
+    named = {match.lower() for match in _DRIVE.findall(text)}
+    if len(named) != 1 or _ANGLE.search(text):
+        return "", ""
+    return next((name, unit) for name, unit in DRIVES.items() if name.lower() in named)
 
 
 def tick_in(text: str) -> float | None:

@@ -16,7 +16,9 @@ from scipy.io import savemat
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.reading.content import reading_up_to
 from pupper_sysid.sysid.recordings.files import load
+from pupper_sysid.sysid.recordings.importers import recognise
 from pupper_sysid.sysid.recordings.importers.options import LogOptions
+from pupper_sysid.sysid.recordings.table import parse
 from support.real_recordings import case
 from support.refusals import assert_each_refused
 
@@ -418,6 +420,25 @@ def test_commands_and_states_in_two_tables_of_a_folder_are_one_log(tmp_path):
     (tmp_path / "joint_states.csv").write_text(joined(","))
     with pytest.raises(InputError, match="holds 2 logs"):
         load(tmp_path)
+
+
+def test_a_folder_s_tables_are_read_once_with_what_their_remarks_say(tmp_path, monkeypatch):
+    """Their heads tell that the folder is a log."""
+    time = np.round(0.002 * np.arange(9000), 6)
+    turns = np.round(0.05 * np.sin(8 * time), 9)
+    for name in ("joint_commands", "joint_states"):
+        table = pd.DataFrame({"timestamp": time, "knee": turns}).to_csv(index=False)
+        (tmp_path / f"{name}.csv").write_text(f"# moteus r4.11\n{table}")
+    sizes = []
+
+    def counted(path, text, *more):
+        sizes.append(len(text))
+        return parse(path, text, *more)
+
+    monkeypatch.setattr(recognise, "parse", counted)
+    (trial,) = load(tmp_path).trials("knee")
+    assert sum(size > 100_000 for size in sizes) == 2 and min(sizes) < 100_001
+    np.testing.assert_allclose(trial.command_rad, 2 * np.pi * turns, atol=1e-9)
 
 
 @pytest.mark.parametrize("under", [(), ("knee",)])

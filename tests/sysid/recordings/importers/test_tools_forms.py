@@ -68,6 +68,7 @@ INFLUX = "#group,false,false,false,true,true\n#datatype,string,long,dateTime:RFC
 TURNS = [(t, c / (2 * np.pi), p / (2 * np.pi)) for t, c, p in LOG]
 DEGREES = [(t, *np.degrees((c, p)).tolist()) for t, c, p in LOG]
 GERMAN = "".join(f"{t:.2f}\t{c!r}\t{t:.2f}\t{p!r}\n" for t, c, p in DEGREES).replace(".", ",")
+BOTH_DEGREES = [(t, *np.degrees(values).tolist()) for t, *values in BOTH]
 KEYED = [f"{t},{name},{c},{p}\n" for name, (commands, positions) in zip("ab", JOINTS, strict=True)
          for t, c, p in zip(TIME, commands, positions, strict=True)]  # fmt: skip
 SIGNED = [(t, *(round(652 * v) for v in (c, p))) for t, c, p in LOG]
@@ -235,8 +236,105 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
                         "axis_0_controller"),
     "ODrive's tree": ("t,axis0.controller.input_pos,axis0.encoder.pos_estimate\n"
                       + each("{t},{c!r},{p!r}", TURNS), "axis_0"),
+    "a drive in a remark": (each("{t},{c!r},{p!r}", TURNS, "# moteus r4.11\ntime,cmd,pos"),
+                            "joint"),
+    "a drive in JSON": (json.dumps({"metadata": {"drive": "ODrive v3.6"}, "data": [
+        {"t": t, "cmd": c, "pos": p} for t, c, p in TURNS]}), "joint"),
+    "a drive beside arrays": (saved(np.savez, time=TIME, cmd=COMMAND / (2 * np.pi),
+                                    pos=POSITION / (2 * np.pi), drive="moteus"), "joint"),
+    "a drive in prose": ("# compared with ODrive and moteus\n" + NAMED, "joint"),
+    "a drive with its unit behind": ("# VESC, values rad\n" + NAMED, "joint"),
+    "two headers in JSON Lines": ('{"drive": "ODrive"}\n{"unit": "rad"}\n' + each(
+        '{{"t": {t}, "cmd": {c!r}, "pos": {p!r}}}'), "joint"),
+    "a drive in degrees": (each("{t},{c!r},{p!r}", DEGREES, "# VESC 6 mk5\ntime,cmd,pos"), "joint"),
+    "a drive and its unit": ("# ODrive v3.6, angles in radians\n" + NAMED, "joint"),
+    "a drive's columns and their unit": (each("{t},{c},{p}", LOG, "# angles in rad\nt,"
+                            "axis0.controller.input_pos,axis0.encoder.pos_estimate"), "axis_0"),
+    "ODrive's counts beside its turns": (each("{t},{c!r},{p!r},{n}", TURNS, "t,pos_setpoint,"
+                                         "pos_estimate,pos_estimate_counts"), "joint"),
     "WPILib's rotations": (each("{t},{c!r},{p!r}", TURNS, "Timestamp,/arm/setpoint (rotations),"
                                 "/arm/position (rotations)"), "arm"),
+    "ODrive's liveplotter": (each("{t},{p!r},{c!r}", TURNS, "t,odrv0.axis0.pos_estimate,odrv0.axis0"
+                                  ".controller.input_pos"), "odrv0_axis_0"),
+    "SimpleFOC's studio": (each("{m},{c},{p},0.1,2", head="timestamp,target,shaft_angle,"
+                                "shaft_velocity,voltage_q"), "shaft"),
+    "CyberGear": (each("{t},{c},{p},0,1", head="time,loc_ref,mechPos,mechVel,iqf"), "loc"),
+    "CubeMars": (each("{m},{c!r},{p!r},1", DEGREES, "time_ms,pos_des_deg,pos_act_deg,spd"),
+                 "joint"),
+    "RobStride": (each("{t},11,{p},0.1,0,{c}", head="timestamp,motor_id,position_rad,"
+                       "velocity_rad_s,torque_nm,target_position_rad"), "motor_11"),
+    "K-Scale's table": (each("{m},{c!r},{p!r}", DEGREES, "timestamp_ms,actuator_11_command_deg,"
+                             "actuator_11_position_deg"), "actuator_11"),
+    "MyActuator": ("time,angle_cmd(0.01deg),angle_fb(0.01deg)\n" + "".join(
+        f"{t},{100 * c!r},{100 * p!r}\n" for t, c, p in DEGREES), "joint"),
+    "Arduino's PID": ("time,Setpoint,Input,Output\n" + "".join(
+        f"{1e3 * t},{c},{p},{200 * (c - p):.3f}\n" for t, c, p in LOG), "joint"),
+    "a process value and a drive": ("t,SP,PV,MV\n" + "".join(
+        f"{t},{c},{p},{2 * (c - p):.4f}\n" for t, c, p in LOG), "joint"),
+    # robots
+    "Unitree's messages": (each("{t},{c},{d},{p},{q},0", BOTH, "time,motor_cmd[0].q,motor_cmd[1].q,"
+                                "motor_state[0].q,motor_state[1].q,motor_state[0].dq"),
+                           "joint_0 joint_1"),
+    "Unitree's legs": (each("{t},{c},{d},{p},{q},1", BOTH, "t,FR_0_q_des,FR_1_q_des,FR_0_q,FR_1_q,"
+                            "FR_0_tau"), "FR_0 FR_1"),
+    "Spot": ("timestamp_sec,timestamp_nsec,fl.hx.position,fl.hx.command.position,fl.hx.load\n"
+             + "".join(f"1700000000,{round(1e9 * t)},{p},{c},0\n" for t, c, p in LOG), "fl_hx"),
+    "RTDE": (each("{t} {c} {d} 0.1 {p} {q} 0.2 1", BOTH, "timestamp target_q_0 target_q_1 "
+                  "target_qd_0 actual_q_0 actual_q_1 actual_qd_0 actual_current_0"),
+             "joint_0 joint_1"),
+    "Franka": (each("{t},{c},{d},{p},{q},0,1", BOTH, "time,q_d[0],q_d[1],q[0],q[1],dq[0],tau_J[0]"),
+               "joint_0 joint_1"),
+    "MuJoCo": (each("{t},{c},{d},{p},{q},0", BOTH, "time,ctrl[0],ctrl[1],qpos[0],qpos[1],qvel[0]"),
+               "joint_0 joint_1"),
+    "Drake": (each("{t},{c},{d},{p},{q}", BOTH, "t,desired_state[0],desired_state[1],state[0],"
+                   "state[1]"), "joint_0 joint_1"),
+    "Cheetah's LCM": (each("{m},{c},{p},0,0,0", head="lcm_timestamp,q_des[0],q[0],qd_des[0],qd[0],"
+                           "tau_est[0]"), "joint_0"),
+    # ROS as tables
+    "a bag's set-point": (each("{ns},{n},{c},{p},0", head="%time,field.header.seq,field.set_point,"
+                               "field.process_value,field.error"), "joint"),
+    "a controller's state in ROS 2": (each("{t},{c},{d},{p},{q},0", BOTH, "timestamp,reference."
+        "positions[0],reference.positions[1],feedback.positions[0],feedback.positions[1],"
+        "error.positions[0]"), "joint_0 joint_1"),
+    "a controller's state in ROS 1": (each("{t},{c},{d},{p},{q}", BOTH, "time,desired.positions.0,"
+        "desired.positions.1,actual.positions.0,actual.positions.1"), "joint_0 joint_1"),
+    "PlotJuggler's array": (each("{t},{p},0,{c}", head="__time,/joint_states/knee/position,"
+        "/joint_states/knee/velocity,/position_controller/commands/data[0]"), "knee"),
+    # monitors and desks
+    "Teleplot": (each(">cmd:{m}:{c}\n>pos:{m}:{p}"), "joint"),
+    "MATLAB's remark with units": (each("{t} {c!r} {p!r}", DEGREES, "% t [s]  q_ref [deg]  q_meas "
+                                        "[deg]"), "joint"),
+    "MATLAB's durations": (each("{t} sec,{c},{p}", head="Time,Ref,Meas"), "joint"),
+    "time deltas of pandas": (pd.DataFrame({"cmd": COMMAND, "pos": POSITION}, pd.to_timedelta(
+        TIME, unit="s")).to_csv(), "joint"),
+    "Excel's separator": ("sep=;\r\n" + each("{t};{c};{p}", head="time;cmd;pos").replace(
+        ".", ",").replace("\n", "\r\n"), "joint"),
+    "a header in JSON Lines": ('{"drive": "moteus", "rate": 100}\n' + each(
+        '{{"t": {t}, "cmd": {c!r}, "pos": {p!r}}}', TURNS), "joint"),
+    "a servo in JSON Lines": (each(
+        '{{"ts": {t}, "servo": {{"id": 3, "goal": {c}, "present": {p}}}}}'), "joint"),
+    "TOML above": (each("{t},{c!r},{p!r}", DEGREES, '[log]\nrate = 100\nunit = "deg"\n[data]\n'
+                        "time,cmd,pos"), "joint"),
+    "YAML above": (each("{t},{c!r},{p!r}", DEGREES, "---\nrobot: a\nangle_unit: deg\n---\n"
+                        "time,cmd,pos"), "joint"),
+    "INI above": (each("{n},{c!r},{p!r}", DEGREES, "[Header]\nSampleRate=100\nUnits=deg\n[Data]\n"
+                       "Index,Setpoint,Position"), "joint"),
+    "a control frequency": (each("{n},{c},{p}", head="# control_frequency: 100\nstep,cmd,pos"),
+                            "joint"),
+    "a simulation beside": ("t,cmd,sim_pos,real_pos\n" + "".join(
+        f"{t},{c},{0.5 * p},{p}\n" for t, c, p in LOG), "joint"),
+    # units of a pair
+    "a unit of the command": (each("{t},{c!r},{p!r}", DEGREES, "time,cmd_deg,pos"), "joint"),
+    "a unit of the position": (each("{t},{c!r},{p!r}", DEGREES, "time,cmd,pos_deg"), "joint"),
+    "a unit of each": (each("{t},{c},{p!r}", [(t, c, d) for (t, c, _), (*_, d) in
+                            zip(LOG, DEGREES, strict=True)], "time,cmd_rad,pos_deg"), "joint"),
+    "parts of pi": (each("{t},{c!r},{p!r}", [(t, c / np.pi, p / np.pi) for t, c, p in LOG],
+                         "t,cmd [pi rad],pos [pi rad]"), "joint"),
+    "thousandths of a radian": ("t,cmd [1e-3 rad],pos [1e-3 rad]\n" + "".join(
+        f"{t},{1000 * c!r},{1000 * p!r}\n" for t, c, p in LOG), "joint"),
+    **{f"tenths as {unit}": (f"t,cmd{unit},pos{unit}\n" + "".join(
+        f"{t},{10 * c!r},{10 * p!r}\n" for t, c, p in DEGREES), "joint")
+       for unit in ("_deg_x10", " (deg/10)", " [deg*10]", "_decideg")},
     # units: small angles, which a unit that is not understood would leave as they are
     "German degrees": (each("{t};{c!r};{p!r}", DEGREES, "Zeit;Sollwinkel in Grad;Istwinkel [Grad]"),
                        "joint"),
@@ -364,6 +462,37 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
     "ODrive's counts beside turns": ("t,axis0.controller.input_pos,axis0.encoder.shadow_count\n"
         + "".join(f"{t},{c!r},{8192 * p:.0f}\n" for t, c, p in TURNS),
         "--unit turns,counts:8192:0"),
+    "a set-point beside counts": ("t,pos_setpoint,pos_estimate_counts\n" + "".join(
+        f"{t},{c!r},{8192 * p:.1f}\n" for t, c, p in TURNS), "--unit turns,counts:8192:0"),
+    "Tinymovr": ("t,pos_setpoint_ticks,pos_estimate_ticks\n" + "".join(
+        f"{t},{8192 * c:.0f},{8192 * p:.0f}\n" for t, c, p in TURNS), "--unit counts:8192:0"),
+    "places of a motor and a joint": ("t,target_position,joint_position,motor_position\n" + "".join(
+        f"{t},{c},{p},{9 * p}\n" for t, c, p in LOG), "--position joint_position"),
+    "pulses beside degrees": ("t,servo_us,angle_deg\n" + "".join(
+        f"{t},{1500 + 636.6 * c:.1f},{np.degrees(p)}\n" for t, c, p in LOG),
+        "--unit counts:4000:1500,deg"),
+    "ticks beside degrees": ("ms,target,ticks\n" + "".join(
+        f"{1e3 * t},{np.degrees(c)},{2048 + 652 * p:.0f}\n" for t, c, p in LOG),
+        "--unit deg,counts:4096"),
+    "an encoder beside degrees": ("t,goal_deg,encoder\n" + "".join(
+        f"{t},{np.degrees(c)},{2048 + 652 * p:.0f}\n" for t, c, p in LOG),
+        "--unit deg,counts:4096"),
+    "a potentiometer beside degrees": ("ms\tgoal\tpot\n" + "".join(
+        f"{1e3 * t}\t{90 + np.degrees(c):.2f}\t{512 + 1024 / (2 * np.pi) * p:.0f}\n"
+        for t, c, p in LOG), "--unit deg,counts:1024"),
+    "VESC": (each("{m};24;{c!r};{p!r};10", DEGREES, "ms_today;input_voltage;pid_pos_set;"
+                  "pid_pos_now;rpm"), "--unit deg"),
+    "Feetech's FD": (each("{m},1,{c},{p},0,120,30", COUNTS, "Time,ID,GoalPosition,PresentPosition,"
+                          "Speed,Voltage,Temperature"), "--unit counts:4096"),
+    "Kinova": (each("{t},{c!r},{d!r},{p!r},{q!r}", BOTH_DEGREES, "time,commanded_position_0,"
+                    "commanded_position_1,actuator_position_0,actuator_position_1"), "--unit deg"),
+    "KUKA's RSI": (each("{t},{c!r},{d!r},{p!r},{q!r}", BOTH_DEGREES, "time,ASPos.A1,ASPos.A2,"
+                        "AIPos.A1,AIPos.A2"), "--unit deg --command ASPos.A1,ASPos.A2"),
+    "SimpleFOC's monitor": (each("{c}\t0.12\t0.1\t{p}"), "--command 0 --position 3"),
+    "how long a loop takes": ("exec_time_us,cmd,pos\n" + "".join(
+        f"{9800 + n % 7},{c},{p}\n" for n, (_, c, p) in enumerate(LOG)), "--rate 50"),
+    "lengths": (each("{t},{c},{p}", head="time_s,cmd_mm,pos_mm"), "--unit scale:0.05"),
+    "shares": (each("{t},{c},{p}", head="time_s,cmd_norm,pos_norm"), "--unit scale:1.5708"),
     "steps": (each("{t},{c},{p}", SIGNED, "t,target_steps,actual_steps"), "--unit counts:3200:0"),
     "whole seconds": ("time,cmd,pos\n" + "".join(
         f"12:30:{int(2.5 * t):02d},{c},{p}\n" for t, c, p in LOG), "--rate 40"),
@@ -378,6 +507,10 @@ WRONG: dict[str, tuple[str | bytes, str]] = {
     "candump": (each("(17000.{n:06d}) can0 001#8C2D7FF0333"), "raw frames of a CAN bus"),
     "candump on a screen": (each("  can0  141   [8]  A4 00 F4 01 1C 00 00 00"), "raw frames"),
     "columns named anew": (NAMED + "time,pos,cmd\n" + CSV, "named again, and differently"),
+    "speeds": (each("{t},{c},{p}", head="t,cmd_rad_s,meas_rad/s"), "no column is a command or"),
+    "torques": (each("{t},{c},{p}", head="t,cmd_Nm,meas [N]"), "no column is a command or"),
+    "a speed's set-point": (each("{t},{c},{p}", head="t,speed_setpoint,position"),
+                            "no column is a command"),
     "servo's answers alone": (each("ID 1 at {p}"), "no names"),
 }  # fmt: skip
 
@@ -417,8 +550,26 @@ def test_the_first_line_of_a_refusal_reads_the_log(tmp_path, form):
     (trial, *_) = recording.trials(recording.joints[0])
     for read, true in ((trial.command_rad, COMMAND), (trial.position_rad, POSITION)):
         assert np.corrcoef(read, true)[0, 1] > 0.9999
-        if form not in ("a percent sign", "steps"):  # of ranges that the log does not say
+        if form not in (
+            "a percent sign",
+            "steps",
+            "lengths",
+            "shares",
+        ):  # of ranges that the log does not say
             assert np.std(read) == pytest.approx(np.std(true), rel=0.01), line
+
+
+def test_a_length_of_one_joint_leaves_the_angles_of_others_alone(tmp_path):
+    head = "t,knee_cmd,knee_pos,gripper_cmd_mm,gripper_pos_mm"
+    path = written(tmp_path, each("{t},{c},{p},{d},{q}", BOTH, head))
+    with pytest.raises(
+        InputError, match=r"`units: \{gripper: 'scale:0.05'\}`.*--joints knee --out"
+    ):
+        load(path)
+    (trial,) = load(path, {"joints": ["knee"]}).trials("knee")
+    np.testing.assert_allclose(trial.position_rad, POSITION, atol=1e-9)
+    both = load(path, {"units": {"gripper": "scale:0.05"}})
+    np.testing.assert_allclose(both.trials("gripper")[0].position_rad, 0.05 * SECOND[1], atol=1e-9)
 
 
 FAILED = range(11, ROWS, 20)
