@@ -113,7 +113,8 @@ class Explanation:
     ----------
     words : str
     nats : float
-        By how much the log-likelihood is better, less one per number that is added.
+        By how much the log-likelihood is better, less the price of the numbers that are added
+        (Schwarz's criterion).
     dead_time_s : float
         Of the fit with it.
     weight : float
@@ -177,7 +178,7 @@ class _Tried:
     words: str
     problem: Problem
     fit: Fit
-    price: int
+    numbers: int
     shared: Sequence[int]
     of_readings: bool = False
     """Whether its weight is that of the readings alone."""
@@ -194,8 +195,9 @@ def _explanation(
         counted = (_unlikely(problem, best) - _unlikely(behind, fit)) / temperature
     if counted < _POSSIBLE_NATS:
         return None
+    price = 0.5 * tried.numbers * float(np.log(problem.samples / temperature))
     return Explanation(
-        tried.words, better - tried.price, float(behind.structure.decode(fit.point)[0]),
+        tried.words, better - price, float(behind.structure.decode(fit.point)[0]),
         float(np.exp(min(counted, 0.0))),
         fit.point[list(tried.shared)], (behind, fit), temperature,
     )  # fmt: skip
@@ -373,6 +375,10 @@ def _with_feature(
     likeliest = int(np.argmin([_tempered(behind, fit, temperature) for fit in fits]))
     gained = _tempered(problem, best, temperature)
     gained -= _tempered(behind, fits[likeliest], temperature)
+    size = float(wider.decode(fits[likeliest].point)[place])
+    box = wider.parameters[place]
+    # one that is as small or as large as it may be is another thing
+    sized = not (box.near(size, box.low) or box.near(size, box.high))
     if gained < _POSSIBLE_NATS:
         return []
     # by the readings alone: what they tell of friction is not its prior's to say
@@ -385,7 +391,7 @@ def _with_feature(
             of_readings=k > 0 and _unlikely(behind, fit) <= most,
         )
         for k, fit in enumerate(fits)
-        if k == likeliest or (k > 0 and _unlikely(behind, fit) <= most)
+        if (k == likeliest and sized) or (k > 0 and _unlikely(behind, fit) <= most)
     ]  # fmt: skip
 
 

@@ -236,7 +236,7 @@ SERVO_TERMS = {t.name: t for t in (
     Term("dead_zone_rad", "dead_zone_rad", "dead_zone_rad", "", 0.003, 1e-4, 0.05, 1.0),
     Term("start_duty", "start_duty", "start_duty", "", 0.01, 1e-4, 0.2, 1.5),
     Term("integral_per_s", "integral_per_s", "integral_per_s", "", 2.0, 0.02, 100.0, 1.5),
-    Term("link_share", "link_share", "link_share", "", 0.2, 0.01, 0.8, 1.0),
+    Term("link_share", "link_share", "link_share", "", 0.2, 0.05, 0.8, 1.0),
     Term("link_hz", "link_hz", "link_hz", "", 12.0, 2.0, 60.0, 1.0),
     Term("link_damping_ratio", "link_damping_ratio", "link_damping_ratio", "",
          0.05, 0.005, 1.0, 1.0),
