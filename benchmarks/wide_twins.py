@@ -297,9 +297,6 @@ def print_tables(records: list[dict[str, Any]]) -> None:
                 f"repeats, {repeats}: a difference is named in "
                 f"{share(sum(bool(r['named']) for r in of), len(of))}"
             )
-    fitted = [r for r in records if "misfit" in r]
-    for name, of in grouped(fitted, lambda r: r["kind"]).items():
-        print(f"misfit named, {name}: {share(sum(r['misfit'] for r in of), len(of))}")
     for title, in_class in (("in class", True), ("out of class", False)):
         part = grouped(
             (r for r in every if (r[3]["kind"] in wide.IN_CLASS) is in_class), lambda r: r[0]
@@ -310,17 +307,19 @@ def print_tables(records: list[dict[str, Any]]) -> None:
              "stretch"), (quantity_row(q, part[q]) for q in QUANTITIES if q in part),
         )  # fmt: skip
     both = [
-        (name, rows)
+        (name, rows, {id(r[3]): r[3] for r in rows}.values())
         for label, names in (("kind", wide.KINDS), ("motion", wide.MOTIONS))
         for name, rows in ((n, [r for r in every if r[3][label] == n]) for n in names)
         if rows
     ]
     print_rows(
-        ("kind or motion", "dead time: identified", "holds", "worst", "width",
-         "ratios: identified", "holds", "worst", "width", "lag holds"),
-        ((name, *cells([r for r in rows if r[0] == "dead_time_s"]),
-          *cells([r for r in rows if r[0] in RATIOS]), cells([r for r in rows if r[0] in LAGS])[1])
-         for name, rows in both),
+        ("kind or motion", "dead time: identified", "holds", "width", "ratios: identified",
+         "holds", "width", "lag holds", "misfit or another structure named"),
+        ((name, *(cells([r for r in rows if r[0] == "dead_time_s"])[k] for k in (0, 1, 3)),
+          *(cells([r for r in rows if r[0] in RATIOS])[k] for k in (0, 1, 3)),
+          cells([r for r in rows if r[0] in LAGS])[1],
+          share(sum(r["misfit"] for r in twins), len(twins)))
+         for name, rows, twins in both),
     )  # fmt: skip
 
 
