@@ -252,7 +252,7 @@ class Followed:
         """First reading and end of each time that it stays where it is while its path goes on."""
         usual = float(np.median(np.abs(np.diff(self.fit.residuals_rad))))
         alike = max(1.5 * self.step, 0.02 * self.scale) + 3 * usual
-        found = []
+        stays = []
         for first, end in pairwise(self.starts.tolist()):
             a = first
             while a < end:
@@ -260,10 +260,10 @@ class Followed:
                 b = a + int(np.argmax(away)) if away.any() else end
                 path = self.fit.path_rad[a:b]
                 if self.time_s[b - 1] - self.time_s[a] > _STAYS_S and np.ptp(path) > self.scale:
-                    found.append((a, b))
+                    stays.append((a, b))
                     a = b
                 a += 1
-        return found
+        return stays
 
     @cached_property
     def stays_often(self) -> Finding | None:

@@ -85,8 +85,8 @@ def second_writer(joint: Followed) -> list[Finding]:
     sticks = 2 * joint.friction_rad > _STICKS * joint.reach  # it jumps where friction lets go
     if loaded or sticks or interpolation_findings(joint.trials, joint.step):
         return []
-    found, none = zip(*(pulses(joint, n) for n in range(len(joint.base.samples))), strict=True)
-    every, none = _together(found), _together(none)
+    shown, none = zip(*(pulses(joint, n) for n in range(len(joint.base.samples))), strict=True)
+    every, none = _together(shown), _together(none)
     every = every.part(np.abs(every.size_rad) > every.least(joint))
     nats, towards = towards_one_goal(every, none, joint)
     places = float(np.ptp(every.command_rad[towards])) if towards.any() else 0.0
@@ -170,8 +170,8 @@ def pulses(joint: Followed, number: int) -> tuple[Pulses, Pulses]:
         _noise(innovations, joint.step, np.abs(rate), np.abs(np.gradient(rate, time))),
         max(joint.step, 1e-6) / np.sqrt(12),
     )
-    left = np.zeros(len(time))
-    left[_ORDER:] = innovations / noise[_ORDER:]
+    residuals = np.zeros(len(time))
+    residuals[_ORDER:] = innovations / noise[_ORDER:]
 
     natural, damping, lag = *np.exp(joint.fit.terms[:2]), float(joint.fit.terms[9])
     slowest = min(damping, 1.0) * natural
@@ -200,41 +200,41 @@ def pulses(joint: Followed, number: int) -> tuple[Pulses, Pulses]:
     power = np.where(seen, power, np.inf)
 
     doubt = power**-0.5
-    found, sizes = _pursuit(shape, white, power, rows, left)
+    numbers, sizes = _pursuit(shape, white, power, rows, residuals)
     place = np.column_stack(
         [command, rate[rows[:, 0]], _since(steps, at) if len(steps) else np.zeros(len(at))]
     )
     place = (rankdata(place, axis=0) - 0.5) / len(place)
     some = np.flatnonzero(seen)[:: 1 + int(seen.sum()) // _MOST_PLACES]
     others = Pulses(at[some], command[some], np.zeros(len(some)), doubt[some], place[some])
-    every = Pulses(at[found], command[found], sizes, doubt[found], place[found])
+    every = Pulses(at[numbers], command[numbers], sizes, doubt[numbers], place[numbers])
     beside = np.abs(every.time_s[:, None] - every.time_s) < lasts
     larger = np.abs(every.size_rad) > _ECHO * np.abs(every.size_rad[:, None])
     return every.part(np.asarray(~(beside & larger).any(axis=1))), others
 
 
 def _pursuit(
-    shape: NDArray, white: NDArray, power: NDArray, rows: NDArray, left: NDArray
+    shape: NDArray, white: NDArray, power: NDArray, rows: NDArray, residuals: NDArray
 ) -> tuple[list[int], NDArray[np.float64]]:
-    """Numbers and sizes of the pulses in what is `left`, the largest first.
+    """Numbers and sizes of the pulses in `residuals`, the largest first.
 
     `shape`: responses at their `rows`, of that `power`, beside a constant; `white`: with it.
     """
-    found, sizes = [], []
-    product = (shape * left[rows]).sum(1)
+    numbers, sizes = [], []
+    product = (shape * residuals[rows]).sum(1)
     for _ in range(_MOST_PULSES):
         k = int(np.argmax(np.abs(product) / np.sqrt(power)))
         size = product[k] / power[k]
         if not abs(size) * np.sqrt(power[k]) > _STANDS_OUT:
             break
-        found.append(k)
+        numbers.append(k)
         sizes.append(size)
         of, explained = rows[k, white[k] != 0], size * white[k, white[k] != 0]
-        left[of] = (left[of] - explained) / np.hypot(1, _SHAPE * explained)
+        residuals[of] = (residuals[of] - explained) / np.hypot(1, _SHAPE * explained)
         power[k] = np.inf
         near = np.abs(rows[:, 0] - rows[k, 0]) <= rows.shape[1]
-        product[near] = (shape[near] * left[rows[near]]).sum(1)
-    return found, np.array(sizes)
+        product[near] = (shape[near] * residuals[rows[near]]).sum(1)
+    return numbers, np.array(sizes)
 
 
 def _means(values: NDArray[np.float64], together: int) -> NDArray[np.float64]:
@@ -266,13 +266,13 @@ def _autoregression(rest: NDArray[np.float64]) -> tuple[NDArray, NDArray[np.floa
     """Weights of the rows before each, and what is not by those; pulses do not set the weights."""
     design = np.column_stack([rest[_ORDER - k : len(rest) - k] for k in range(1, _ORDER + 1)])
     wanted, weight = rest[_ORDER:], np.ones(len(rest) - _ORDER)
-    weights, left = np.zeros(_ORDER), wanted
+    weights, innovations = np.zeros(_ORDER), wanted
     for _ in range(4):
         weights = least_squares(design * weight[:, None], wanted * weight)
-        left = wanted - design @ weights
-        usual = 1.4826 * float(np.median(np.abs(left))) + 1e-12
-        weight = np.sqrt(1 / np.maximum(1, np.abs(left) / (2 * usual)))
-    return weights, left
+        innovations = wanted - design @ weights
+        usual = 1.4826 * float(np.median(np.abs(innovations))) + 1e-12
+        weight = np.sqrt(1 / np.maximum(1, np.abs(innovations) / (2 * usual)))
+    return weights, innovations
 
 
 def _noise(innovations: NDArray[np.float64], step: float, *causes: NDArray) -> NDArray[np.float64]:
@@ -309,12 +309,12 @@ def scatter_findings(tones: Sequence[Trial], lattice: PollLattice) -> list[Findi
         design = np.column_stack([np.ones_like(time), time, np.sin(angle), np.cos(angle)])
         solution = least_squares(design, position)
         amplitude = float(np.hypot(solution[2], solution[2 + _HARMONICS]))
-        left = np.sum((position - design @ solution) ** 2) / (len(time) - design.shape[1])
+        variance = np.sum((position - design @ solution) ** 2) / (len(time) - design.shape[1])
         speed = np.sqrt(2) * np.pi * tone.frequency_hz * amplitude
         if amplitude < max(_LEAST_AMPLITUDE_RAD, _LEAST_STEPS * step):
             continue
-        if np.sqrt(left) > max(_SCATTER * amplitude, _SCATTER_S * speed):
-            shares.append(float(np.sqrt(left)) / amplitude)
+        if np.sqrt(variance) > max(_SCATTER * amplitude, _SCATTER_S * speed):
+            shares.append(float(np.sqrt(variance)) / amplitude)
     if len(shares) < 2 or 2 * len(shares) < slow:
         return []
     return [Finding("unrepeatable", CARE, {"percent": 100 * float(np.median(shares))})]

@@ -273,7 +273,7 @@ def columns_of(names: Iterable[str]) -> list[Column]:
         columns = [replace(c, kind="position", rank=(0, 0, 1, 1)) if c.name == "p" else c
                  for c in columns]  # fmt: skip
     if any(c.kind == "command" and c.words != {"input"} for c in columns):
-        # of a controller that is told a set-point: what it reads, and what drives the motor
+        # of a controller with a set-point: what it reads, and what it sends to the motor
         inputs = [c for c in columns if c.name.lower() == "input" and c.key == ""]
         columns = [
             replace(c, kind="position", rank=(0, 1, 1, 2)) if c in inputs

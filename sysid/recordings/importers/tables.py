@@ -433,7 +433,7 @@ def _joint(
     commands = table.numbers(path, pair.command.name)[of_joint]
     positions = table.numbers(path, pair.position.name)[of_joint]
     stated, units = options.unit_of(*names), table.units
-    said: set[str] = set()
+    stated_kinds: set[str] = set()
     if stated is None and not units:
         pair, texts = _one_unit(pair, commands if held is None else held, positions)
         warnings += texts
@@ -443,7 +443,7 @@ def _joint(
         ("position", pair.position, positions),
     ):
         if stated is not None or source.unit not in ("", "rad"):
-            said.add(kind)
+            stated_kinds.add(kind)
         if stated is not None:
             factor = stated[kind == "position"]
         else:
@@ -454,7 +454,7 @@ def _joint(
                 and (word := units.get(source.name, units.get("")))
             ):
                 factor = unit(word)
-                said.add(kind)
+                stated_kinds.add(kind)
                 warnings.append(f"{source.name} was taken as {word}, as the log says beside it.")
             factor = factor or Unit()
             if factor.counts:
@@ -467,7 +467,7 @@ def _joint(
         if kind == "position" and factor.counts:
             columns["position_count"] = values
     angles = columns.pop("command_rad"), columns.pop("position_rad")
-    if len(said) == 2:
+    if len(stated_kinds) == 2:
         metadata["angle_unit"] = "stated"
     columns |= {
         name: table.numbers(path, name)[of_joint] for name in _KEPT if name in table.columns
