@@ -98,8 +98,9 @@ _SHARES_OF_LAG = (0.1, 0.3, 0.5, 0.7)
 _MOST_COMPARED = 3
 _PREFERENCE = 1.02
 """Error on unseen motion, over the smallest, up to which a simpler structure is exported."""
-_QUIETER = 0.7
-"""Noise after a profile over that before it, below which the profile is fitted anew."""
+_QUIETER, _QUIETER_ROUNDS = 0.7, 2
+"""Noise that a fit leaves over the noise that it was weighed with, below which structures are
+fitted anew; how often."""
 
 
 @dataclass(frozen=True)
@@ -493,9 +494,10 @@ def settled(
     A joint in free air is taken for any servo, with an unknown load, where a profile of the
     set-point describes it better, or DelayedPD does not and such a servo may.
     """
-    choice = choose(ready, every)
     if not ready.scales.free_air:
-        return ready, every, _explained(ready, choice)
+        return ready, every, _explained(ready, choose(ready, every))
+    ready, every = _with_their_noise(ready, every)
+    choice = choose(ready, every)
     goodness, plain = goodness_of(ready, choice.exported), _explained(ready, choice)
     profiled, gained = with_profile(ready, choice.exported)
     stated = bool(np.isfinite(ready.scales.acceleration_rad_s2))
@@ -528,6 +530,29 @@ def settled(
     if profiled is None and _error_rad(any_servo, wider.exported) > smaller:
         return ready, every, plain
     return any_servo, loaded, _explained(any_servo, wider)
+
+
+def _with_their_noise(
+    ready: PreparedJoint, every: list[Fitted]
+) -> tuple[PreparedJoint, list[Fitted]]:
+    """The joint and its fits, made anew where they leave far less noise than they were given.
+
+    Noise is what the first fits leave; one that missed a motion's limits hides that motion.
+    """
+    for _ in range(_QUIETER_ROUNDS):
+        best = min(every, key=lambda f: f.fit.cost)
+        quieter = ready.with_noise_of(best.structure, best.fit)
+        if min(map(operator.truediv, quieter.noise_rad, ready.noise_rad)) > _QUIETER:
+            break
+        first = {
+            f.structure.name: (
+                f.structure, refine(quieter.problem(f.structure), f.fit.point[None])
+            )
+            for f in every
+        }  # fmt: skip
+        ready = replace(quieter, first=first)
+        every = joined({stage: fit_structures(ready, stage) for stage in stages(ready)})
+    return ready, every
 
 
 def _explained(ready: PreparedJoint, choice: Choice, anew: bool = False) -> Choice:

@@ -231,3 +231,19 @@ def test_every_number_of_a_structure_is_a_row_of_the_table():
         assert (low < high).all()
         columns = structure.columns(np.array([[p.nominal for p in structure.parameters]]))
         assert np.isfinite(columns[:, :4]).all() and (columns[:, 0] > 0).all()
+
+
+@pytest.mark.slow
+def test_a_motion_at_its_torque_limit_is_described_though_the_first_fits_missed_it():
+    """Noise is what the first fits leave: here half as much again as the readings have."""
+    twin, path, *_ = wide_servo.draw_twin("no_limit", "chirp", 0, 4301)
+    rows = wide_servo.readings(twin, path)
+    log = Recording.from_arrays(
+        rows.sent_s, {JOINT: rows.command}, {JOINT: rows.position}, read_time_s=rows.read_s,
+        trial=rows.trial, name="chirp",
+    )  # fmt: skip
+    ratios = calibrate([log]).calibration.joints[JOINT].actuator.ratios_to_armature
+    for name in ("stiffness", "friction_loss", "effort_limit"):
+        quantity = getattr(ratios, name)
+        (low, high) = wide_servo.truths(twin, path)[name]
+        assert quantity.identified == "yes" and quantity.low <= high and low <= quantity.high
