@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.tones import least_squares
-from pupper_sysid.sysid.fit.run import Run, fresh_residuals
+from pupper_sysid.sysid.fit.run import Run, at_steps, free_run, fresh_residuals
 from pupper_sysid.sysid.fit.structure import Structure
 
 DESCRIBED = 1.6
@@ -48,17 +48,24 @@ _SETTLED_S = 0.5  # after which a tone's motion repeats, and not before its seco
 _MOST_HARMONICS = 7  # dry friction and a limited speed leave little beyond the seventh
 _LEAST_FREEDOM = 15  # readings more than coefficients: noise known to 18 %
 _OUTLIER_MAD = 4.0 * 1.4826
+_AT_REST = 0.1  # of the root mean square speed
 
 
-def reading_noise(runs: Sequence[Run], residuals: Sequence[NDArray[np.float64]]) -> float:
+def reading_noise(
+    runs: Sequence[Run],
+    residuals: Sequence[NDArray[np.float64]],
+    rows: Sequence[NDArray[np.bool_]] | None = None,
+) -> float:
     """Standard deviation of the noise of readings that count, an upper bound [rad].
 
     `runs`: of one kind of motion. `residuals` of shape (samples,) each: of the best model known
-    [rad]. Returns NaN where there are too few readings.
+    [rad]. `rows` of shape (samples,) each: of which readings; by default all. Returns NaN where
+    there are too few readings.
     """
     of_readings = [run.sample_rad for run in runs]
+    rows = rows or [np.ones(len(r), bool) for r in of_readings]
     bounds = [
-        _noise([_sums(run, values) for run, values in zip(runs, of_runs, strict=True)])
+        _noise([_sums(*each) for each in zip(runs, of_runs, rows, strict=True)])
         for of_runs in (of_readings, residuals)
     ]
     bounds += [_off_harmonics(runs, of_runs) for of_runs in (of_readings, residuals)]
@@ -88,8 +95,13 @@ def _off_harmonics(runs: Sequence[Run], of_runs: Sequence[NDArray[np.float64]]) 
     return float(np.sqrt(squares / freedom)) if freedom >= _LEAST_FREEDOM else float("nan")
 
 
-def _sums(run: Run, values: NDArray[np.float64]) -> tuple[NDArray, NDArray] | None:
-    """Consecutive values (rows, order + 1), and what is known of each row: commands before it."""
+def _sums(
+    run: Run, values: NDArray[np.float64], use: NDArray[np.bool_]
+) -> tuple[NDArray, NDArray] | None:
+    """Consecutive values (rows, order + 1), and what is known of each row: commands before it.
+
+    `use` of shape (samples,): of which readings there are rows.
+    """
     time, count = run.sample_step * run.step_s, len(values)
     if count < 10 * _ORDER:
         return None
@@ -104,6 +116,7 @@ def _sums(run: Run, values: NDArray[np.float64]) -> tuple[NDArray, NDArray] | No
     if not len(row):
         return None
     regular = (np.abs(-np.diff(time[back], axis=1) - interval) < _IRREGULAR * interval).all(axis=1)
+    regular &= use[row]
     # means of the held command over intervals before each reading
     clock = run.step_s * np.arange(run.steps + 1)
     area = np.concatenate([[0.0], np.cumsum(run.command * run.step_s)])
@@ -153,19 +166,40 @@ def goodness_of_fit(
 
     `values` of shape (parameters,). `quantum_rad`: quantisation step of readings: their noise is
     not below that of rounding, nor below `LEAST_NOISE_RAD`. Returns by tone, or label of the run;
-    NaN where the noise is not known.
+    NaN where the noise is not known. Of motions with rests it is the larger one of all readings and
+    of those in motion: a joint at rest is where its model is, whatever that is.
     """
     residuals = fresh_residuals(structure, values, runs)
+    moving = [
+        _moving(run, track)
+        for run, track in zip(runs, free_run(structure, values, runs), strict=True)
+    ]
     least = max(quantum_rad / np.sqrt(12.0), LEAST_NOISE_RAD)
     kinds = [f"{r.tone:g} Hz" if r.tone > 0 else r.label for r in runs]
     ratios = {}
     for kind in dict.fromkeys(kinds):
         members = [n for n, k in enumerate(kinds) if k == kind]
-        parts = [residuals[n] for n in members]
-        size = np.sqrt(_clipped_square(np.concatenate(parts)))
-        noise = reading_noise([runs[n] for n in members], parts)
-        ratios[kind] = float(size / max(noise, least)) if np.isfinite(noise) else np.nan
+        parts, of_kind = [residuals[n] for n in members], [runs[n] for n in members]
+        every = [np.ones(len(part), bool) for part in parts]
+        ratios[kind] = float("nan")
+        for rows in (every, [moving[n] for n in members]):
+            noise = reading_noise(of_kind, parts, rows)
+            if np.isfinite(noise):
+                used = np.concatenate([r[use] for r, use in zip(parts, rows, strict=True)])
+                ratio = float(np.sqrt(_clipped_square(used)) / max(noise, least))
+                ratios[kind] = float(np.fmax(ratios[kind], ratio))
+            if runs[members[0]].tone > 0:
+                break
     return ratios
+
+
+def _moving(run: Run, track: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """At which readings a motion is faster than a tenth of its root mean square, shape (samples,).
+
+    `track` of shape (steps + 1,): the motion [rad].
+    """
+    speed = np.abs(at_steps(np.gradient(track), run.sample_step))
+    return speed > _AT_REST * np.sqrt(np.mean(speed**2))
 
 
 def overall(ratios: Mapping[str, float]) -> float:

@@ -75,6 +75,26 @@ def test_exact_readings_have_no_noise_below_a_tenth_of_a_milliradian():
     assert 0.0 < ratio(1.0005) < DESCRIBED < ratio(1.02)
 
 
+def test_errors_in_the_transients_of_steps_count_the_same_however_long_the_rests_are():
+    """As outliers among readings at rest they would be clipped."""
+    rng, plain = np.random.default_rng(5), candidate(SIMULATED[0])
+    true = np.array([NUMBERS[n] for n in plain.names])
+    wrong = np.where(np.array(plain.names) == "damping_per_s", 1.05 * true, true)
+    levels = rng.uniform(-0.4, 0.4, 40)
+
+    def ratios(rest_s: float) -> list[float]:
+        run = stepped_run(np.repeat(levels, int(rest_s / STEP_S)))
+        track = free_run(plain, true, (run,))[0]
+        noise = NOISE_RAD * rng.standard_normal(len(run.sample_step))
+        read = np.interp(run.sample_step, np.arange(len(track)), track) + noise
+        run = replace(run, sample_rad=read)
+        return [overall(goodness_of_fit(plain, v, (run,), 0.0)) for v in (true, wrong)]
+
+    short, long = ratios(0.4), ratios(3.0)
+    assert [short[0], long[0]] == pytest.approx([1.0, 1.0], abs=0.1)
+    assert long[1] == pytest.approx(short[1], rel=0.3)
+
+
 def test_one_motion_that_is_not_described_is_a_misfit_among_others_that_are():
     others = {"1 Hz": 1.0, "2 Hz": 1.05, "3 Hz": 1.0, "4 Hz": float("nan")}
     assert undescribed(others | {"7 Hz": 2.0}) is None and undescribed({}) is None
