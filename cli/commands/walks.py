@@ -180,7 +180,7 @@ class Commanded(OfPolicies):
 
 def check_walk(command: tuple[float, float, float], robots: int, seconds: float) -> None:
     """Refuse walks that cannot be."""
-    from pupper_sysid.policies.deploy.commands import checked_command
+    from pupper_sysid.policies.deploy.deployment import checked_command
 
     if robots < 1:
         raise InputError(f"--robots is {robots}; it must be at least 1.")

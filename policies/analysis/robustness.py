@@ -24,19 +24,24 @@ from pupper_sysid.common.interval import UNKNOWN, Interval, mean_of
 from pupper_sysid.common.results import Result, internal
 from pupper_sysid.policies.analysis.gait import SETTLE_S, correlation, steady
 from pupper_sysid.policies.analysis.trial import (
+    JOINTS,
     NAN,
     Outcome,
     Trial,
+    applied,
+    delayed,
     gait_of_actions,
+    held,
+    jittered,
     mean,
+    noisy,
     outcome,
     walking,
+    zeroed,
 )
 from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.walks import perturbations
-from pupper_sysid.policies.walks.conditions import DIRECTIONS, Change
-from pupper_sysid.policies.walks.perturbations import JOINTS
 from pupper_sysid.policies.walks.rollouts import Rollout, replay
+from pupper_sysid.policies.walks.together import DIRECTIONS, Change
 from pupper_sysid.sim.robot.terrain import Terrain
 from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 
@@ -93,7 +98,7 @@ def delay_curve(
     step_ms = 1e3 * trial.task.control_step_s
     late = [extra for extra in extra_ms if extra]
     jitters = [
-        perturbations.jittered(JOINTS, round(extra / step_ms), rng)
+        jittered(JOINTS, round(extra / step_ms), rng)
         for extra, rng in zip(late, _generators(trial, len(late)), strict=True)
     ]
     plain, *walks = trial.walks(
@@ -106,9 +111,7 @@ def delay_curve(
     )
     altered = iter(zip(walks, walks[len(late) :], strict=False))
     walked = [next(altered) if extra else (plain, plain) for extra in extra_ms]
-    replays = _replayed(
-        policy, plain, [perturbations.delayed(JOINTS, round(e / step_ms)) for e in extra_ms]
-    )
+    replays = _replayed(policy, plain, [delayed(JOINTS, round(e / step_ms)) for e in extra_ms])
     points = []
     for extra, actions, (fixed, moving) in zip(extra_ms, replays, walked, strict=True):
         points += [
@@ -138,13 +141,13 @@ def ablation(
         sigma = float(spread.mean()) if name != "all joints" else NAN
         for share in NOISE_SHARES:
             rows.append({"kind": "noise", "level": share, "sigma": share * sigma})
-            changes.append(partial(perturbations.noisy, part, share * spread))
+            changes.append(partial(noisy, part, share * spread))
         rows.append({"kind": "zero", "level": 0.0, "sigma": NAN})
-        changes.append(lambda rng, part=part: perturbations.zeroed(part))
+        changes.append(lambda rng, part=part: zeroed(part))
         for ms in HOLD_MS:
             steps = max(round(ms / 1e3 / plain.step_s), 1)
             rows.append({"kind": "hold", "level": ms, "sigma": NAN})
-            changes.append(lambda rng, part=part, steps=steps: perturbations.held(part, steps))
+            changes.append(lambda rng, part=part, steps=steps: held(part, steps))
     channel = [name for name in channels for _ in range(len(rows) // len(channels))]
     known = [i for i, row in enumerate(rows) if row["kind"] != "noise" or steady(plain)]
     # a change keeps a memory: one for the walk, one for the replay
@@ -182,7 +185,7 @@ def _replayed(
     policy: Policy, plain: Rollout, changes: Sequence[Change]
 ) -> list[NDArray[np.float32]]:
     """Actions on the walk's observations, each changed in its way; all at once."""
-    seen = [perturbations.applied(change, plain.observation) for change in changes]
+    seen = [applied(change, plain.observation) for change in changes]
     actions, _ = replay(policy, np.concatenate(seen, axis=1))
     return np.split(actions, len(changes), axis=1)
 

@@ -31,9 +31,14 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result, internal
 from pupper_sysid.policies.analysis.gait import SETTLE_S
 from pupper_sysid.policies.analysis.trial import Trial
-from pupper_sysid.policies.walks.conditions import Actor, Condition, Moment, StepRecorder
 from pupper_sysid.policies.walks.rollouts import planar_velocity
-from pupper_sysid.policies.walks.together import walk_together
+from pupper_sysid.policies.walks.together import (
+    Actor,
+    Condition,
+    Moment,
+    StepRecorder,
+    walk_together,
+)
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges

@@ -35,16 +35,6 @@ from scipy.stats import beta
 from pupper_sysid.common.interval import LEVEL, Interval, mean_of
 from pupper_sysid.common.results import Result
 from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.walks.conditions import (
-    DIRECTIONS,
-    Condition,
-    Handicap,
-    Moment,
-    StepRecorder,
-    Walker,
-    evaluation_task,
-    within,
-)
 from pupper_sysid.policies.walks.rollouts import (
     ERRORS,
     STRIDE_ERRORS,
@@ -54,7 +44,17 @@ from pupper_sysid.policies.walks.rollouts import (
     stride_errors,
     tracking_errors,
 )
-from pupper_sysid.policies.walks.together import walk_together
+from pupper_sysid.policies.walks.together import (
+    DIRECTIONS,
+    Condition,
+    Handicap,
+    Moment,
+    StepRecorder,
+    Walker,
+    evaluation_task,
+    walk_together,
+    within,
+)
 from pupper_sysid.sim.robot.mini_pupper import MASS_KG
 from pupper_sysid.sim.robot.terrain import STAIRS_M, Terrain
 from pupper_sysid.sim.walking.config import Walking

@@ -17,8 +17,8 @@ from rsl_rl.utils import unpad_trajectories
 from tensordict import TensorDict
 from torch.distributions import Normal
 
-from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
 from pupper_sysid.policies.network.policy_network import CONTEXT, WIDTH, CausalAttention, step
+from pupper_sysid.policies.train.run_file import Architecture, Hyperparameters
 from pupper_sysid.sim.walking.observation import CLOCK_SEEN, OBSERVATION_PARTS
 
 

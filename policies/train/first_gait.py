@@ -29,10 +29,9 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result
-from pupper_sysid.policies.network.hyperparameters import OWN, TROT
-from pupper_sysid.policies.train.run_file import Run
+from pupper_sysid.policies.train.run_file import OWN, TROT, Run
 from pupper_sysid.policies.train.selection import COMMANDS, scored
-from pupper_sysid.policies.walks.conditions import evaluation_task, share_of_usual, within
+from pupper_sysid.policies.walks.together import evaluation_task, share_of_usual, within
 from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Walking

@@ -44,7 +44,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_bytes
 from pupper_sysid.common.reading.content import LARGEST_CHECKPOINT, refuse_bomb
 from pupper_sysid.policies.network.actor_critic import ActionNoise, build
-from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
+from pupper_sysid.policies.train.run_file import Architecture, Hyperparameters
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.robot.body import Body, mini_pupper
 from pupper_sysid.sim.robot.trot import stance

@@ -29,8 +29,7 @@ from torch.utils.hooks import RemovableHandle
 
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
-from pupper_sysid.policies.walks.conditions import Condition, Moment, StepRecorder
-from pupper_sysid.policies.walks.together import walk_together
+from pupper_sysid.policies.walks.together import Condition, Moment, StepRecorder, walk_together
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sim.walking.step import Step

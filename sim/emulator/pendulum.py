@@ -37,7 +37,13 @@ from pupper_sysid.common.data_sheet import no_load_speed, stall_torque
 from pupper_sysid.hardware.dynamixel import SERIES, profile
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-from pupper_sysid.sim.emulator.bench import AMBIENT_C, SUPPLY_V, ServosOnStand, held_over
+from pupper_sysid.sim.emulator.bench import (
+    AMBIENT_C,
+    PHYSICS_STEP_S,
+    SUPPLY_V,
+    ServosOnStand,
+    held_over,
+)
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, directly_read, draw_robot
 from pupper_sysid.sim.robot.servo_mjcf import (
     FRICTION_SOLIMP,
@@ -132,7 +138,6 @@ def dynamixel_registers(model: str) -> dict[str, int]:
     }  # fmt: skip
 
 
-PHYSICS_STEP_S = 0.001
 GRAVITY_M_S2 = 9.81
 
 _STILL_RAD_S, _STILL_RAD_S2, _STILL_STEPS = 1e-4, 1e-2, 50

@@ -40,8 +40,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pupper_sysid.hardware.serial_servos.series import Family, Series
-from pupper_sysid.sim.emulator.bench import AMBIENT_C, ServoBench
-from pupper_sysid.sim.emulator.faults import BusFaults
+from pupper_sysid.sim.emulator.bench import AMBIENT_C, BusFaults, ServoBench
 
 Pieces = list[tuple[float, bytes]]
 """Bytes that come back, each piece with the time at which it has arrived."""

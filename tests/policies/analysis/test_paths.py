@@ -15,8 +15,8 @@ from pupper_sysid.policies.analysis.autonomy import (
     rate_response,
 )
 from pupper_sysid.policies.analysis.robustness import DirectionWalk, compliance, terrain
-from pupper_sysid.policies.walks.conditions import DIRECTIONS
 from pupper_sysid.policies.walks.rollouts import Rollout
+from pupper_sysid.policies.walks.together import DIRECTIONS
 from reproduction.evidence import scales
 from support.walks import STEP, recorded, walked
 

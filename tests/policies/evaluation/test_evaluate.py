@@ -18,8 +18,13 @@ from pupper_sysid.policies.evaluation.evaluate import (
     usual_robots,
 )  # fmt: skip
 from pupper_sysid.policies.evaluation.evaluate import RANDOM as RANDOM_COMMANDS
-from pupper_sysid.policies.walks.conditions import DIRECTIONS, RANDOM, Condition, evaluation_task
-from pupper_sysid.policies.walks.together import walk_together
+from pupper_sysid.policies.walks.together import (
+    DIRECTIONS,
+    RANDOM,
+    Condition,
+    evaluation_task,
+    walk_together,
+)
 from pupper_sysid.sim.robot.mini_pupper import MASS_KG
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Curriculum, Walking, for_robot

@@ -23,13 +23,13 @@ from pupper_sysid.cli.policy_choice import (
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.network.policy_file import (
     CONTRACT,
     WEIGHTS,
     Policy,
     load_policy,
     refuse_bad,
+    write_policy,
 )
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
 from pupper_sysid.sim.walking.config import Commands

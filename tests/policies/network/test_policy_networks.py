@@ -10,9 +10,7 @@ from tensordict import TensorDict
 
 from pupper_sysid.common.errors import PupperError
 from pupper_sysid.policies.network.actor_critic import build, inputs
-from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
-from pupper_sysid.policies.network.policy_export import export_policy
-from pupper_sysid.policies.network.policy_file import Contract, load_policy
+from pupper_sysid.policies.network.policy_file import Contract, export_policy, load_policy
 from pupper_sysid.policies.network.policy_network import (
     CONTEXT,
     WIDTH,
@@ -20,6 +18,7 @@ from pupper_sysid.policies.network.policy_network import (
     PolicyNetwork,
     step,
 )
+from pupper_sysid.policies.train.run_file import Architecture, Hyperparameters
 from pupper_sysid.policies.train.training import action_history
 from pupper_sysid.sim.walking.observation import (
     OBSERVATION_PARTS,

@@ -9,8 +9,8 @@ import torch
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.network.actor_critic import ActionNoise
-from pupper_sysid.policies.network.hyperparameters import Exploration, Hyperparameters
 from pupper_sysid.policies.train.learner import Ranks
+from pupper_sysid.policies.train.run_file import Exploration, Hyperparameters
 from pupper_sysid.policies.train.selection import Judge
 from pupper_sysid.policies.train.training import make_learner
 from pupper_sysid.sim.walking.config import Walking

@@ -11,8 +11,16 @@ from typing import Any
 import yaml
 
 from pupper_sysid.common.results import plain
-from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters, Imitation
-from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run, preset, save_run
+from pupper_sysid.policies.train.run_file import (
+    RUN_FILE,
+    Architecture,
+    Hyperparameters,
+    Imitation,
+    Run,
+    load_run,
+    preset,
+    save_run,
+)
 from pupper_sysid.sim.walking.config import Curriculum
 from support.refusals import assert_each_refused
 from support.tiny_training import ALL_KINDS, CALIBRATION, tiny_run

@@ -9,11 +9,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters, Imitation
 from pupper_sysid.policies.train import imitation, training
 from pupper_sysid.policies.train.imitation import LearnedTeacher, TrotTeacher, imitate
 from pupper_sysid.policies.train.learner import Learner, Ranks, read_checkpoint
 from pupper_sysid.policies.train.run_file import (
+    Architecture,
+    Hyperparameters,
+    Imitation,
     check_teacher,
     load_run,
     preset,
