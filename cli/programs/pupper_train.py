@@ -44,7 +44,7 @@ from pupper_sysid.policies.train.run_file import (
     with_robot,
 )
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.rewards.weights import Rewards
+from pupper_sysid.sim.walking.config import Rewards
 from pupper_sysid.sim.walking.servo_ranges import check_actuator, servo_ranges
 
 if TYPE_CHECKING:

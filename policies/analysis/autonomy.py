@@ -44,7 +44,7 @@ from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.rollouts import Rollout, heading, replay
 from pupper_sysid.policies.walks.together import Disturb
 from pupper_sysid.sim.walking.env import PupperEnv
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
+from pupper_sysid.sim.walking.step import OBSERVATION_PARTS
 
 Array = NDArray[np.float64]
 

@@ -43,7 +43,7 @@ from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.rollouts import Rollout, replay
 from pupper_sysid.policies.walks.together import DIRECTIONS, Change
 from pupper_sysid.sim.robot.terrain import Terrain
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
+from pupper_sysid.sim.walking.step import OBSERVATION_PARTS as PARTS
 
 Array = NDArray[np.float64]
 

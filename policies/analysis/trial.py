@@ -20,8 +20,8 @@ from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.walks.rollouts import Rollout, collect, pooled_errors
 from pupper_sysid.policies.walks.together import Change, Condition, Disturb, evaluation_task
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+from pupper_sysid.sim.walking.step import OBSERVATION_PARTS as PARTS
 
 Array = NDArray[np.float64]
 NAN = float("nan")

@@ -40,7 +40,7 @@ from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy.controller import Controller, Decision, Rest, Senses, at_rest
 from pupper_sysid.policies.deploy.walk_log import WalkLog, start_header
 from pupper_sysid.policies.network.policy_file import CommandRanges
-from pupper_sysid.sim.walking.observation import FALLEN_TILT, OBSERVATION_PARTS
+from pupper_sysid.sim.walking.step import FALLEN_TILT, OBSERVATION_PARTS
 
 Commands = Callable[[float], NDArray[np.float64] | None]
 """Forward and sideways speed [m/s] and turn rate [rad/s] by time since the first tick [s]; None to

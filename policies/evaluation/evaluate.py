@@ -40,7 +40,6 @@ from pupper_sysid.policies.walks.rollouts import (
     STRIDE_ERRORS,
     counted,
     heading,
-    planar_velocity,
     stride_errors,
     tracking_errors,
 )
@@ -59,9 +58,9 @@ from pupper_sysid.sim.robot.mini_pupper import MASS_KG
 from pupper_sysid.sim.robot.terrain import STAIRS_M, Terrain
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.differences import TYPICAL, Differences
-from pupper_sysid.sim.walking.observation import FALLEN_TILT
-from pupper_sysid.sim.walking.rewards.strides import LOW_SWING_M, by_kind
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+from pupper_sysid.sim.walking.step import FALLEN_TILT
+from pupper_sysid.sim.walking.strides import LOW_SWING_M, by_kind
 
 Array = NDArray[np.float64]
 
@@ -180,7 +179,7 @@ class Figures(Result):
     """Mean speed of feet on the ground."""
     clearance_p10_m: float
     """Tenth percentile of the clearance over all swings: the largest height of the sole over the
-    ground in a swing (`sim.walking.rewards.strides`); NaN without a swing, as the next two."""
+    ground in a swing (`sim.walking.strides`); NaN without a swing, as the next two."""
     clearance_p50_m: float
     """Its median."""
     low_swing_share: float
@@ -213,7 +212,7 @@ class Recorder(StepRecorder[Walk]):
         # before the first step a foot may have been elsewhere: its speed is not known
         slip = facts.foot_speed_m_s * standing if self.steps else np.zeros(standing.shape)
         return {
-            "velocity": planar_velocity(facts), "contact": facts.contact, "alive": now.alive,
+            "velocity": facts.planar_velocity, "contact": facts.contact, "alive": now.alive,
             "gravity": facts.gravity.astype(np.float32),
             "heading": heading(self.env.robots.qpos), "slip_m_s": slip.sum(axis=1),
             "swing_s": (facts.last_air_s * ended).sum(axis=1), "swings": ended.sum(axis=1),

@@ -19,7 +19,7 @@ from torch.distributions import Normal
 
 from pupper_sysid.policies.network.policy_network import CONTEXT, WIDTH, CausalAttention, step
 from pupper_sysid.policies.train.run_file import Architecture, Hyperparameters
-from pupper_sysid.sim.walking.observation import CLOCK_SEEN, OBSERVATION_PARTS
+from pupper_sysid.sim.walking.step import CLOCK_SEEN, OBSERVATION_PARTS
 
 
 class ActionNoise(GaussianDistribution):

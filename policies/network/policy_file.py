@@ -38,7 +38,6 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import (
     as_path,
-    refuse_overwrite,
     sha256,
     versions,
     write_bytes,
@@ -54,8 +53,8 @@ from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS
 from pupper_sysid.servo_models.servo_file import WEIGHTS as SERVO_WEIGHTS
 from pupper_sysid.sim.walking.config import Commands, Walking
 from pupper_sysid.sim.walking.differences import OF_UNIT
-from pupper_sysid.sim.walking.observation import VELOCITY_STEPS, observation_of
 from pupper_sysid.sim.walking.servo_ranges import IDEAL, ServoRanges, is_servo_model
+from pupper_sysid.sim.walking.step import VELOCITY_STEPS, observation_of
 from pupper_sysid.sysid.export.network import Run, export_module
 
 SCHEMA, VERSION = "pupper-policy", 4
@@ -535,10 +534,9 @@ def write_policy(
     servos: ServoRanges,
     action_history: int,
     training: dict[str, Any],
-    force: bool = True,
     command_share: float = 1.0,
 ) -> None:
-    """Write the policy folder of an rsl_rl actor's weights.
+    """Write the policy folder of an rsl_rl actor's weights, over what is there.
 
     `command_share` is the share of the task's commands that the curriculum has come to.
     """
@@ -561,7 +559,6 @@ def write_policy(
             "config_sha256": body.hashes.get("robot_config"),
         }  # fmt: skip
     refuse_bad(network, "this policy")
-    refuse_overwrite(folder / CONTRACT, force)
     write_bytes(
         folder / WEIGHTS,
         save({name: value.contiguous() for name, value in network.state_dict().items()}),

@@ -40,7 +40,7 @@ from pupper_sysid.policies.train.run_file import Imitation, Run, check_teacher
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.policies.walks.together import share_of_usual
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.observation import CLOCK_SEEN, OBSERVATION_PARTS
+from pupper_sysid.sim.walking.step import CLOCK_SEEN, OBSERVATION_PARTS
 
 Array = NDArray[np.float64]
 

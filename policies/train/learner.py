@@ -48,7 +48,7 @@ from pupper_sysid.policies.train.run_file import Architecture, Hyperparameters
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.robot.body import Body, mini_pupper
 from pupper_sysid.sim.robot.trot import stance
-from pupper_sysid.sim.walking.observation import observation_of, privileged_parts
+from pupper_sysid.sim.walking.step import observation_of, privileged_parts
 
 _POLAR, _AXIAL = ([0, 1, 2], [1.0, -1.0, 1.0]), ([0, 1, 2], [-1.0, 1.0, -1.0])
 _COMMAND = [0, 1, 2], [1.0, -1.0, -1.0]

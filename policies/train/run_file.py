@@ -23,8 +23,15 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256, versions, write_text
 from pupper_sysid.common.results import plain
 from pupper_sysid.common.strict_yaml import Place
-from pupper_sysid.sim.walking.config import PRESETS, Curriculum, Observation, Walking, for_robot
-from pupper_sysid.sim.walking.rewards.weights import CLOCK, Rewards
+from pupper_sysid.sim.walking.config import (
+    CLOCK,
+    PRESETS,
+    Curriculum,
+    Observation,
+    Rewards,
+    Walking,
+    for_robot,
+)
 
 Kind = Literal["mlp", "lstm", "gru", "transformer", "mlp-actions"]
 
@@ -48,18 +55,6 @@ class Architecture:
     and the trunk's true speed alone: a teacher, which no robot can follow, for policies that can
     (`--start scratch`)."""
 
-    def __post_init__(self):
-        for name in ("hidden", "critic_hidden"):
-            if not getattr(self, name):
-                raise InputError(f"architecture.{name} is empty; give the units of each layer.")
-        if min(*self.hidden, *self.critic_hidden, self.memory) < 1:
-            raise InputError("A layer of the architecture has no units; each needs at least 1.")
-        if self.privileged_actor and self.kind != "mlp":
-            raise InputError(
-                f"A teacher is an MLP, not a policy of kind {self.kind}. What learns from it "
-                "can be of any kind."
-            )
-
 
 @dataclass(frozen=True)
 class Exploration:
@@ -74,10 +69,6 @@ class Exploration:
     """Whether joints of larger dead band (friction over stiffness) get more noise in proportion."""
     learned: bool = False
     """Whether the standard deviation is learned instead of scheduled, as published."""
-
-    def __post_init__(self):
-        if not min(self.std) > 0:
-            raise InputError("learner.exploration.std must be positive.")
 
     def std_at(self, samples: float) -> float:
         """Scheduled standard deviation after so many samples."""
@@ -134,11 +125,6 @@ class Hyperparameters:
     """Updates over which the weights of the policy that is judged and saved are averaged
     (exponentially), which smooths out the noise of single updates; 1 for the last ones."""
 
-    def __post_init__(self):
-        for name in ("steps_per_environment", "epochs", "minibatches", "averaging"):
-            if getattr(self, name) < 1:
-                raise InputError(f"learner.{name} is {getattr(self, name)}; it must be at least 1.")
-
 
 TROT, OWN = "trot", "own"
 
@@ -163,14 +149,6 @@ class Imitation:
     correction_rate: float = 0.3
     """Share of the policy's errors of speed by which the teacher's commands change per round, in
     the second half of the rounds."""
-
-    def __post_init__(self):
-        least = {"iterations": 0, "rollouts": 1, "epochs": 1, "minibatches": 1}
-        for name in least:
-            if getattr(self, name) < least[name]:
-                raise InputError(
-                    f"imitation.{name} is {getattr(self, name)}; it must be at least {least[name]}."
-                )
 
 
 Start = Literal["imitation", "scratch", "teacher"]
@@ -236,7 +214,7 @@ class Run:
     """Of everything that is drawn."""
 
     def __post_init__(self):
-        refuse_impossible(self)
+        _refuse_impossible(self)
 
 
 def preset(
@@ -486,6 +464,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "task.action_scale": (1e-3, 10),
     "learner.steps_per_environment": (1, 10_000),
     "learner.epochs": (1, 1000),
+    "learner.minibatches": (1, 1_000_000_000),
+    "learner.averaging": (1, 1_000_000),
     "learner.learning_rate": (1e-12, 10),
     "learner.learning_rates": (1e-12, 10),
     "learner.critic_learning_rate": (1e-12, 10),
@@ -494,18 +474,17 @@ _RANGES: dict[str, tuple[float, float]] = {
     "imitation.iterations": (0, 1_000_000),
     "imitation.rollouts": (1, 1_000),
     "imitation.epochs": (1, 10_000),
+    "imitation.minibatches": (1, 1_000_000_000),
     "imitation.learning_rate": (1e-12, 10),
 }
 """Smallest and largest value, by the dotted name of a setting."""
 
 
-def refuse_impossible(run: Run) -> None:
+def _refuse_impossible(run: Run) -> None:
     """Refuse settings outside their ranges: a misprint, or what fills the memory.
 
     They come from the command line and from a run's file, which may be damaged or anybody's. The
     ranges are far wider than anything that trains.
-
-    `seed` is any whole number from 0 on.
     """
     for name, value in _numbers(run, ""):
         low, high = _RANGES.get(name, (-_LARGEST, _LARGEST))
@@ -516,8 +495,18 @@ def refuse_impossible(run: Run) -> None:
         raise InputError(f"seed is {str(run.seed)[:24]}; it must be 0 or more, below 2^63.")
     for name in ("hidden", "critic_hidden"):
         layers = len(getattr(run.architecture, name))
-        if layers > _MOST_LAYERS:
-            raise InputError(f"architecture.{name} has {layers} layers; at most {_MOST_LAYERS}.")
+        if not 1 <= layers <= _MOST_LAYERS:
+            raise InputError(
+                f"architecture.{name} has {layers} layers; give the units of each, of 1 to "
+                f"{_MOST_LAYERS} layers."
+            )
+    if run.architecture.privileged_actor and run.architecture.kind != "mlp":
+        raise InputError(
+            f"A teacher is an MLP, not a policy of kind {run.architecture.kind}. What learns from "
+            "it can be of any kind."
+        )
+    if not min(run.learner.exploration.std) > 0:
+        raise InputError("learner.exploration.std must be positive.")
     samples = run.environments * run.learner.steps_per_environment
     if run.learner.minibatches > samples:
         raise InputError(

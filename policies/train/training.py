@@ -78,11 +78,11 @@ class Progress:
     left_s: float
 
 
-def make_env(run: Run, ranks: Ranks, servos: ServoRanges | None = None) -> PupperEnv:
+def make_env(run: Run, ranks: Ranks) -> PupperEnv:
     """The environment of a run (of this process)."""
     threads = threads_of(run, ranks)
     return PupperEnv(
-        run.task, servos or servo_ranges(run.actuator, run.feedback, run.task.body),
+        run.task, servo_ranges(run.actuator, run.feedback, run.task.body),
         run.environments, run.seed + 7919 * ranks.rank, threads,
         servo_model_of(run.actuator, run.task.control_step_s),
         device={"cpu": None, "warp-cpu": "cpu"}.get(run.device, _local(run.device, ranks)),

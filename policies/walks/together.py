@@ -36,11 +36,10 @@ from pupper_sysid.sim.robot.terrain import STAIRS_M
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import PRESETS, Commands, Curriculum, Walking
 from pupper_sysid.sim.walking.differences import OF_MOTOR
-from pupper_sysid.sim.walking.draws import Twins, at_rest
+from pupper_sysid.sim.walking.draws import Twins, at_rest, command_ends
 from pupper_sysid.sim.walking.env import PupperEnv
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of
-from pupper_sysid.sim.walking.step import Step
+from pupper_sysid.sim.walking.step import OBSERVATION_PARTS, Step
 
 Array = NDArray[np.float64]
 
@@ -297,7 +296,7 @@ def share_of_usual(task: Walking) -> Array:
 
     Of the Mini Pupper at most 1; those of another robot are its own, as large as they are.
     """
-    largest, usual = (np.abs(_ranges(c)).max(axis=1) for c in (task.commands, RANDOM))
+    largest, usual = (np.abs(command_ends(c)).max(axis=0) for c in (task.commands, RANDOM))
     share = largest / usual
     if not share.all():
         share = np.where(share > 0, share, task.body.command_scale)
@@ -309,12 +308,7 @@ def within(task: Walking, usual: Array) -> Array:
 
     Both have the shape (n, 3).
     """
-    return np.clip(share_of_usual(task) * usual, *_ranges(task.commands).T)
-
-
-def _ranges(commands: Commands) -> Array:
-    """Lowest and highest of each part, shape (3, 2)."""
-    return np.array([commands.forward_m_s, commands.sideways_m_s, commands.yaw_rad_s])
+    return np.clip(share_of_usual(task) * usual, *command_ends(task.commands))
 
 
 def random_commands(
@@ -322,8 +316,7 @@ def random_commands(
 ) -> Array:
     """Commands of `RANDOM`, or others, for each robot and step, shape (steps, robots, 3)."""
     rng = np.random.default_rng([seed, 3])
-    low, high = _ranges(commands).T
-    drawn = rng.uniform(low, high, (steps, robots, 3))
+    drawn = rng.uniform(*command_ends(commands), (steps, robots, 3))
     # of exponential intervals, memoryless: in each step a new one comes with this chance
     new = rng.random((steps, robots)) < 1 - np.exp(-step_s / commands.every_s)
     new[0] = True

@@ -24,12 +24,16 @@ Array = NDArray[np.float64]
 
 def draw_commands(commands: Commands, count: int, share: float, rng: np.random.Generator) -> Array:
     """Commanded motions [m/s, m/s, rad/s], shape (count, 3), from a `share` of the ranges."""
-    ranges = np.array([commands.forward_m_s, commands.sideways_m_s, commands.yaw_rad_s])
-    motions = rng.uniform(ranges[:, 0], ranges[:, 1], (count, 3)) * share
+    motions = rng.uniform(*command_ends(commands), (count, 3)) * share
     alone = rng.random(count) < commands.single
     motions[alone] *= np.eye(3)[rng.integers(0, 3, count)][alone]
     motions[rng.random(count) < commands.standing] = 0.0
     return at_rest(commands, motions)
+
+
+def command_ends(commands: Commands) -> Array:
+    """Lowest and highest of forward and sideways speed and of the turn rate, shape (2, 3)."""
+    return np.array([commands.forward_m_s, commands.sideways_m_s, commands.yaw_rad_s]).T
 
 
 def at_rest(commands: Commands, command: Array) -> Array:

@@ -27,22 +27,25 @@ from pupper_sysid.sim.robot.robot_batch import (
     trunk_velocity,
 )
 from pupper_sysid.sim.robot.terrain import make_ground
-from pupper_sysid.sim.walking.config import PRESETS, Walking, for_robot
+from pupper_sysid.sim.walking.config import PRESETS, Rewards, Walking, for_robot, narrowed
 from pupper_sysid.sim.walking.draws import Twins, at_rest, draw_commands, draw_pose, generator
-from pupper_sysid.sim.walking.observation import (
+from pupper_sysid.sim.walking.rewards import TERMS, weighted
+from pupper_sysid.sim.walking.senses import Rows, Senses
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
+from pupper_sysid.sim.walking.step import (
     FALLEN_TILT,
+    Step,
+    StepResult,
+    Unfinished,
+    empty_facts,
     noise_of,
     observation_of,
     observed,
     privileged_of,
     privileged_parts,
+    unforeseen_of,
 )
-from pupper_sysid.sim.walking.rewards.strides import EffortMeter, Strides
-from pupper_sysid.sim.walking.rewards.terms import TERMS, weighted
-from pupper_sysid.sim.walking.rewards.weights import Rewards, narrowed
-from pupper_sysid.sim.walking.senses import Rows, Senses
-from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
-from pupper_sysid.sim.walking.step import Step, StepResult, Unfinished, empty_facts, unforeseen_of
+from pupper_sysid.sim.walking.strides import EffortMeter, Strides
 
 Array = NDArray[np.float64]
 Term = Callable[[Step, Rewards], Array]
@@ -114,7 +117,7 @@ class PupperEnv:
     -----
     An action a, shape (n, 12), is the set-point default pose + `action_scale` · a [rad] in the
     order of `JOINT_NAMES`, within the joint limits, held for one control step (20 ms). The
-    observation, shape (n, 60), is laid out in `sim.walking.observation`.
+    observation, shape (n, 60), is laid out in `sim.walking.step`.
 
     Environments that end in a step are reset in it: `StepResult.observation` is the first of the
     new episode, `StepResult.terminal` holds the last one of those whose time was up, whose value a

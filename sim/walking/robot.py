@@ -78,16 +78,15 @@ class WalkingRobot:
         self,
         robot: EmulatedRobot,
         rng: np.random.Generator,
-        time_step_s: float = PHYSICS_STEP_S,
         body: Body | None = None,
     ):
         self.body = body = body or mini_pupper()
-        self._rng, self._dt, self._lock = rng, time_step_s, RLock()
+        self._rng, self._dt, self._lock = rng, PHYSICS_STEP_S, RLock()
         native = {
-            s.joint: for_commands_between_steps(s.actuator, time_step_s, s.joint)
+            s.joint: for_commands_between_steps(s.actuator, PHYSICS_STEP_S, s.joint)
             for s in robot.servos
         }
-        self._model = _model(body, native, time_step_s)
+        self._model = _model(body, native)
         self._data = mujoco.MjData(self._model)
         self._gains = self._model.actuator_biasprm.copy()
         self._effort = np.array([s.actuator.effort_limit for s in robot.servos], float)
@@ -99,7 +98,7 @@ class WalkingRobot:
         # servo coordinates of absolute angles: a calf's is that with its thigh at neutral
         self._shift = layout.per_servo().to_angles(layout.to_counts(np.zeros(joints)))
         delays = [float(np.asarray(s.actuator.dead_time_s)) for s in robot.servos]
-        self._settled_after = int(max(delays) / time_step_s) + 3
+        self._settled_after = int(max(delays) / PHYSICS_STEP_S) + 3
         self._linked = np.array(body.linked, int)
         self._goal = self._absolute(body.pose)
         self._queue: deque[tuple[float, int, float]] = deque()
@@ -305,12 +304,12 @@ def body_joint_map(body: Body) -> JointMap:
     return JointMap(file, body.joints)
 
 
-def _model(body: Body, servos: dict[str, DelayedPDParameters], step_s: float) -> Any:
+def _model(body: Body, servos: dict[str, DelayedPDParameters]) -> Any:
     """The robot on flat ground, compiled, with an IMU."""
     if body.is_mini_pupper:
-        return mujoco.MjModel.from_xml_string(robot_xml(servos, step_s))
+        return mujoco.MjModel.from_xml_string(robot_xml(servos, PHYSICS_STEP_S))
     ground = make_ground("flat", np.random.default_rng(0))
-    spec = mujoco.MjSpec.from_string(body.xml(servos, step_s, ground, "evaluation"))
+    spec = mujoco.MjSpec.from_string(body.xml(servos, PHYSICS_STEP_S, ground, "evaluation"))
     # mounted as the Mini Pupper's chip (`hardware.imu`): x and y exchanged, z down
     spec.body(body.trunk).add_site(name=_IMU, xyaxes=[0, 1, 0, 1, 0, 0])
     for name, kind in (

@@ -24,8 +24,8 @@ from pupper_sysid.sim.emulator.robot import RobotSpec
 from pupper_sysid.sim.robot.robot_batch import Moved, RobotBatch
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.differences import Differences
-from pupper_sysid.sim.walking.observation import VELOCITY_STEPS
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+from pupper_sysid.sim.walking.step import VELOCITY_STEPS
 
 Array = NDArray[np.float64]
 Rows = slice | NDArray[np.intp]

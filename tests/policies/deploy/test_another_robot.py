@@ -109,7 +109,7 @@ def test_the_emulated_hexapod_stands_where_its_calibration_says(policy):
 def test_the_imu_of_another_robot_measures_in_its_trunks_axes(policy):
     task = for_robot(tiny_run().task, policy.parent / "hexapod.xml", policy.parent / "hexapod.yaml")
     servos = servo_ranges(SERVO, body=task.body).in_steps_of(0.001).nominal()
-    model = _model(task.body, servos, 0.001)
+    model = _model(task.body, servos)
     model.opt.gravity[:] = 0.0
     data = mujoco.MjData(model)
     data.qpos[2], data.qpos[7:] = 5.0, task.body.pose

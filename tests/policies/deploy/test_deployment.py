@@ -22,8 +22,8 @@ from pupper_sysid.policies.deploy.walk_log import read_walk, replay
 from pupper_sysid.policies.network.policy_file import CommandRanges, Policy
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 from pupper_sysid.sim.walking.robot import WalkingBus
+from pupper_sysid.sim.walking.step import OBSERVATION_PARTS
 from support.refusals import assert_each_refused
 from support.saved_servo_models import linear_filter
 from support.tiny_training import CALIBRATION

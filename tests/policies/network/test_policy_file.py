@@ -38,11 +38,11 @@ from support.refusals import assert_each_refused
 from support.tiny_training import ALL_KINDS, CALIBRATION, HISTORY, networks, tiny_run
 
 
-def write(folder: Path, weights: dict[str, torch.Tensor], force: bool = True) -> None:
+def write(folder: Path, weights: dict[str, torch.Tensor]) -> None:
     """Write an MLP of `networks` with these weights."""
     run = tiny_run()
     run = replace(run, architecture=replace(run.architecture, hidden=(32, 16)))
-    write_policy(folder, weights, run, servo_ranges(CALIBRATION), 0, {"seed": 0}, force)
+    write_policy(folder, weights, run, servo_ranges(CALIBRATION), 0, {"seed": 0})
 
 
 def rewrite_contract(folder: Path, **changes) -> None:

@@ -24,9 +24,8 @@ from pupper_sysid.policies.train.run_file import (
 )
 from pupper_sysid.policies.train.training import BEST, LAST, make_env, make_learner, train
 from pupper_sysid.policies.train.vec_env import WalkingVecEnv
-from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.observation import PRIVILEGED_PARTS
-from pupper_sysid.sim.walking.rewards.weights import CLOCK, Rewards
+from pupper_sysid.sim.walking.config import CLOCK, Rewards, Walking
+from pupper_sysid.sim.walking.step import PRIVILEGED_PARTS
 from support.checkpoints import different, stop_after
 from support.refusals import assert_each_refused
 from support.tiny_training import tiny_run

@@ -23,8 +23,8 @@ from pupper_sysid.sim.robot.mini_pupper import robot_xml
 from pupper_sysid.sim.robot.terrain import STAIRS_M
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.env import PupperEnv
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from pupper_sysid.sim.walking.step import OBSERVATION_PARTS
 
 SERVOS = servo_ranges(SAMPLES / "calibrated.yaml")
 TASK = evaluation_task(Walking())

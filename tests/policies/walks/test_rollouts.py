@@ -17,8 +17,8 @@ from pupper_sysid.policies.walks.rollouts import (
 )
 from pupper_sysid.policies.walks.together import Condition, evaluation_task
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.observation import OBSERVATION
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from pupper_sysid.sim.walking.step import OBSERVATION
 from support.tiny_training import ALL_KINDS, CALIBRATION
 from support.walks import walk
 

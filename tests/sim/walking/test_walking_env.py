@@ -24,15 +24,14 @@ from pupper_sysid.sim.walking.config import (
     Level,
     Observation,
     Randomisation,
+    Rewards,
     Walking,
 )
 from pupper_sysid.sim.walking.env import PupperEnv, make_env
-from pupper_sysid.sim.walking.observation import OBSERVATION, OBSERVATION_SIZE
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
-from pupper_sysid.sim.walking.rewards.terms import TERMS, progress
-from pupper_sysid.sim.walking.rewards.weights import Rewards
+from pupper_sysid.sim.walking.rewards import TERMS, progress
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_ranges
-from pupper_sysid.sim.walking.step import StepResult
+from pupper_sysid.sim.walking.step import OBSERVATION, StepResult
+from pupper_sysid.sim.walking.step import OBSERVATION_PARTS as PARTS
 from support.refusals import assert_each_refused
 from support.robot_in_air import error_in_air, lags_in_air
 from support.walks import STILL
@@ -187,7 +186,6 @@ def test_an_observation_is_sixty_named_numbers_in_the_published_order():
         ("joint_position_relative", 12, 24, 0.01), ("joint_velocity", 24, 36, 1.5),
         ("joint_effort", 36, 48, 0.1), ("last_action", 48, 60, 0.0),
     ]  # fmt: skip
-    assert OBSERVATION_SIZE == 60
     env = make()
     observation, privileged = env.reset()
     assert observation.shape == (4, 60) and observation.dtype == np.float32
@@ -709,7 +707,7 @@ def test_rewards_and_observations_of_a_users_own_come_beside_the_usual_ones():
     np.testing.assert_allclose(
         result.terms["level"], -2.0 * env.config.control_step_s * result.facts.gravity[:, 2]
     )
-    assert result.observation.shape == (3, OBSERVATION_SIZE + 1)
+    assert result.observation.shape == (3, 61)
     np.testing.assert_allclose(result.observation[:, -1], env.robots.qpos[:, 2], rtol=1e-6)
     plain = make_env("paper", environments=3, seed=1, threads=1)
     usual = plain.step(plain.action)

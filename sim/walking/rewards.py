@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.sim.walking.rewards.weights import Rewards
+from pupper_sysid.sim.walking.config import Rewards
 from pupper_sysid.sim.walking.step import Step
 
 Array = NDArray[np.float64]

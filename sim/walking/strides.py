@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pupper_sysid.hardware.imu import GRAVITY_M_S2
 from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.robot_batch import Moved, RobotBatch
-from pupper_sysid.sim.walking.rewards.weights import Rewards
+from pupper_sysid.sim.walking.config import Rewards
 
 Array = NDArray[np.float64]
 
