@@ -58,9 +58,9 @@ from pupper_sysid.sim.robot.mini_pupper import MASS_KG
 from pupper_sysid.sim.robot.terrain import STAIRS_M, Terrain
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.differences import TYPICAL, Differences
+from pupper_sysid.sim.walking.rewards import LOW_SWING_M, by_kind
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sim.walking.step import FALLEN_TILT
-from pupper_sysid.sim.walking.strides import LOW_SWING_M, by_kind
 
 Array = NDArray[np.float64]
 
@@ -179,7 +179,7 @@ class Figures(Result):
     """Mean speed of feet on the ground."""
     clearance_p10_m: float
     """Tenth percentile of the clearance over all swings: the largest height of the sole over the
-    ground in a swing (`sim.walking.strides`); NaN without a swing, as the next two."""
+    ground in a swing (`sim.walking.rewards`); NaN without a swing, as the next two."""
     clearance_p50_m: float
     """Its median."""
     low_swing_share: float

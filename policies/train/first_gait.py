@@ -37,8 +37,8 @@ from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.draws import Twins
 from pupper_sysid.sim.walking.env import PupperEnv
+from pupper_sysid.sim.walking.rewards import LOW_SWING_M, by_kind
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
-from pupper_sysid.sim.walking.strides import LOW_SWING_M, by_kind
 
 Array = NDArray[np.float64]
 

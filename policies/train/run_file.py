@@ -495,11 +495,10 @@ def _refuse_impossible(run: Run) -> None:
         raise InputError(f"seed is {str(run.seed)[:24]}; it must be 0 or more, below 2^63.")
     for name in ("hidden", "critic_hidden"):
         layers = len(getattr(run.architecture, name))
-        if not 1 <= layers <= _MOST_LAYERS:
-            raise InputError(
-                f"architecture.{name} has {layers} layers; give the units of each, of 1 to "
-                f"{_MOST_LAYERS} layers."
-            )
+        if not layers:
+            raise InputError(f"architecture.{name} is empty; give the units of each layer.")
+        if layers > _MOST_LAYERS:
+            raise InputError(f"architecture.{name} has {layers} layers; at most {_MOST_LAYERS}.")
     if run.architecture.privileged_actor and run.architecture.kind != "mlp":
         raise InputError(
             f"A teacher is an MLP, not a policy of kind {run.architecture.kind}. What learns from "

@@ -40,7 +40,7 @@ from pupper_sysid.policies.train.imitation import (
     imitate,
     load_teacher,
 )
-from pupper_sysid.policies.train.learner import Learner, Ranks
+from pupper_sysid.policies.train.learner import Learner, Ranks, WalkingVecEnv
 from pupper_sysid.policies.train.run_file import (
     LARGEST_CURVES_BYTES,
     OWN,
@@ -54,7 +54,6 @@ from pupper_sysid.policies.train.run_file import (
     teacher_of,
 )
 from pupper_sysid.policies.train.selection import Judge
-from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 

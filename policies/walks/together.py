@@ -477,7 +477,9 @@ class _Group:
             np.flatnonzero(np.repeat([c.walker == w for c in conditions], np.diff(ends)))
             for w in ("policy", "trot")
         )
-        self.trot = _reference(task)
+        # beside a policy: the usual trot, or that which was fitted to its servos
+        usual = task.body.is_mini_pupper and task.trot in [p.trot for p in PRESETS.values()]
+        self.trot = Trot() if usual else task.trot
         self.last = np.zeros(len(conditions), int)  # steps until none of a condition was up
 
     def walk(self, advance: Callable[[float], bool]) -> bool:
@@ -541,12 +543,6 @@ class _Group:
         """What was kept, by condition."""
         groups = zip(self.conditions, self.robots, self.last.tolist(), strict=True)
         return [self.recorder.of(c, robots, n, self.commands[:, robots]) for c, robots, n in groups]
-
-
-def _reference(task: Walking) -> Trot:
-    """The trot beside a policy: the usual one, or that which was fitted to its servos."""
-    usual = [preset.trot for preset in PRESETS.values()]
-    return Trot() if task.trot in usual and task.body.is_mini_pupper else task.trot
 
 
 def _numbers(robots: slice) -> NDArray[np.intp]:

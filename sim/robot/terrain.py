@@ -164,7 +164,8 @@ def _tile(name: str, count: int, rng: np.random.Generator) -> NDArray[np.float64
     if name == "flat":
         return np.zeros((count, count))
     if name == "rough":
-        return rng.choice(_ROUGH_M, (count, count)) * _inside(count, 0.25)
+        inside = np.minimum(np.arange(count), np.arange(count)[::-1]) * SPACING_M >= 0.25
+        return rng.choice(_ROUGH_M, (count, count)) * np.outer(inside, inside)
     x = (np.arange(count) + 0.5) * SPACING_M - TILE_M / 2
     far = np.maximum(np.abs(x)[:, None], np.abs(x)[None, :])
     pyramid = TILE_M / 2 - np.maximum(far, _PLATFORM_M / 2)
@@ -172,8 +173,3 @@ def _tile(name: str, count: int, rng: np.random.Generator) -> NDArray[np.float64
         return np.floor(pyramid / _TREAD_M) * rng.uniform(*_RISER_M)
     slope = rng.uniform(0.3, 1.0) * _STEEPEST
     return pyramid * slope * (1 if name == "slope" else -1)
-
-
-def _inside(count: int, border_m: float) -> NDArray[np.bool_]:
-    near = np.minimum(np.arange(count), np.arange(count)[::-1]) * SPACING_M >= border_m
-    return near[:, None] & near[None, :]

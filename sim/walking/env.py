@@ -29,7 +29,7 @@ from pupper_sysid.sim.robot.robot_batch import (
 from pupper_sysid.sim.robot.terrain import make_ground
 from pupper_sysid.sim.walking.config import PRESETS, Rewards, Walking, for_robot, narrowed
 from pupper_sysid.sim.walking.draws import Twins, at_rest, draw_commands, draw_pose, generator
-from pupper_sysid.sim.walking.rewards import TERMS, weighted
+from pupper_sysid.sim.walking.rewards import TERMS, EffortMeter, Strides, weighted
 from pupper_sysid.sim.walking.senses import Rows, Senses
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 from pupper_sysid.sim.walking.step import (
@@ -45,7 +45,6 @@ from pupper_sysid.sim.walking.step import (
     privileged_parts,
     unforeseen_of,
 )
-from pupper_sysid.sim.walking.strides import EffortMeter, Strides
 
 Array = NDArray[np.float64]
 Term = Callable[[Step, Rewards], Array]

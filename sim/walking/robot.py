@@ -5,7 +5,9 @@ rest is not stepped until a command moves it. Commands come at any instant, not 
 steps: each actuator gets the mean of its held command over the step before
 (`sim.robot.servo_mjcf.for_commands_between_steps`). The last two seconds are kept, because servos
 are polled one after the other, each a little before the latest evaluated instant. `trunk` gives the
-true motion, for scoring.
+true motion, for scoring. `WalkingBus` puts it behind the same bus as a real one:
+
+    bus = GuardedBus(WalkingBus(draw_robot(rng), rng))
 """
 
 from __future__ import annotations
@@ -356,8 +358,11 @@ def calibrated_robot(
 class WalkingBus:
     """A `hardware.bus.ServoBus` with an IMU (`hardware.imu.Imu`) of an emulated robot that walks.
 
-    `truth` are its servos and their feedback; `rng` decides lost polls, noise and timing. Time is
-    virtual, or the host's. `robot` is the robot behind the bus.
+    Commands and readings are in joint coordinates (a calf relative to its thigh;
+    `hardware.joint_map`) and pass through `EmulatedBus`: quantisation, polls in turn, lost polls,
+    offset, noise. The calf's reading is that of two servos, polled at different times. `truth` are
+    the servos and their feedback; `rng` decides lost polls, noise and timing. Time is virtual, or
+    the host's. `robot` is the robot behind the bus.
     """
 
     name = "emulated"

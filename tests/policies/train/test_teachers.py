@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from pupper_sysid.policies.train import imitation, training
 from pupper_sysid.policies.train.imitation import LearnedTeacher, TrotTeacher, imitate
-from pupper_sysid.policies.train.learner import Learner, Ranks, read_checkpoint
+from pupper_sysid.policies.train.learner import Learner, Ranks, WalkingVecEnv, read_checkpoint
 from pupper_sysid.policies.train.run_file import (
     Architecture,
     Hyperparameters,
@@ -23,7 +23,6 @@ from pupper_sysid.policies.train.run_file import (
     teacher_of,
 )
 from pupper_sysid.policies.train.training import BEST, LAST, make_env, make_learner, train
-from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.walking.config import CLOCK, Rewards, Walking
 from pupper_sysid.sim.walking.step import PRIVILEGED_PARTS
 from support.checkpoints import different, stop_after

@@ -26,9 +26,8 @@ from pupper_sysid.sim.walking.config import (
     Rewards,
     narrowed,
 )
-from pupper_sysid.sim.walking.rewards import TERMS, weighted
+from pupper_sysid.sim.walking.rewards import TERMS, EffortMeter, Strides, by_kind, weighted
 from pupper_sysid.sim.walking.step import Step, empty_facts
-from pupper_sysid.sim.walking.strides import EffortMeter, Strides, by_kind
 
 SIZES = dict.fromkeys(
     ["command", "linear_velocity", "angular_velocity", "gravity", "stride_velocity", "clock"], 3
