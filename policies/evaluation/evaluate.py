@@ -14,7 +14,7 @@ are others than those of a training with the same seed.
 The battery holds conditions that make walking robots fall. Usual conditions separate nothing: an
 open-loop trot falls under none of them. These go on until it does: pushes, slopes, stairs, loads
 off centre, a weak leg, missed control ticks, late and jittered servos, slippery ground, and all
-that typically differs between a robot and its model (`sim.walking.differences.TYPICAL`). All are
+that typically differs between a robot and its model (`sim.walking.draws.TYPICAL`). All are
 walked under random commands.
 
 `Figures` are the numbers of a row: falls, errors, speed, drift of the heading, feet, and effort of
@@ -57,7 +57,7 @@ from pupper_sysid.policies.walks.together import (
 from pupper_sysid.sim.robot.mini_pupper import MASS_KG
 from pupper_sysid.sim.robot.terrain import STAIRS_M, Terrain
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.differences import TYPICAL, Differences
+from pupper_sysid.sim.walking.draws import TYPICAL, Differences
 from pupper_sysid.sim.walking.rewards import LOW_SWING_M, by_kind
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sim.walking.step import FALLEN_TILT

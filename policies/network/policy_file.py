@@ -52,7 +52,7 @@ from pupper_sysid.policies.train.run_file import Run as TrainingRun
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS
 from pupper_sysid.servo_models.servo_file import WEIGHTS as SERVO_WEIGHTS
 from pupper_sysid.sim.walking.config import Commands, Walking
-from pupper_sysid.sim.walking.differences import OF_UNIT
+from pupper_sysid.sim.walking.draws import OF_UNIT
 from pupper_sysid.sim.walking.servo_ranges import IDEAL, ServoRanges, is_servo_model
 from pupper_sysid.sim.walking.step import VELOCITY_STEPS, observation_of
 from pupper_sysid.sysid.export.network import Run, export_module

@@ -35,8 +35,7 @@ from pupper_sysid.sim.robot.robot_batch import RobotBatch, trunk_velocity
 from pupper_sysid.sim.robot.terrain import STAIRS_M
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import PRESETS, Commands, Curriculum, Walking
-from pupper_sysid.sim.walking.differences import OF_MOTOR
-from pupper_sysid.sim.walking.draws import Twins, at_rest, command_ends
+from pupper_sysid.sim.walking.draws import OF_MOTOR, Twins, at_rest, command_ends
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of
 from pupper_sysid.sim.walking.step import OBSERVATION_PARTS, Step

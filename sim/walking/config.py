@@ -21,7 +21,7 @@ from pupper_sysid.sim.robot.body import Body, body_of
 from pupper_sysid.sim.robot.mini_pupper import MASS_KG, Knee, Physics
 from pupper_sysid.sim.robot.terrain import Terrain
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.differences import TYPICAL, Differences, check_range
+from pupper_sysid.sim.walking.draws import TYPICAL, Differences, check_range
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.sim.emulator.robot import RobotSpec
 from pupper_sysid.sim.robot.robot_batch import Moved, RobotBatch
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.differences import Differences
+from pupper_sysid.sim.walking.draws import Differences
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 from pupper_sysid.sim.walking.step import VELOCITY_STEPS
 
