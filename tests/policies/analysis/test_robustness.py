@@ -13,10 +13,12 @@ from pupper_sysid.policies.analysis.autonomy import (
     orbits,
     push_response,
 )
-from pupper_sysid.policies.analysis.robustness import DelayPoint, ablation, delay_curve
 from pupper_sysid.policies.analysis.trial import (
     JOINTS,
+    DelayPoint,
+    ablation,
     applied,
+    delay_curve,
     delayed,
     held,
     jittered,
@@ -81,8 +83,8 @@ def test_a_delay_curve_has_its_three_modes_and_begins_with_the_plain_walk(walker
 @pytest.mark.slow
 def test_an_ablation_hurts_more_the_more_is_taken(walker, monkeypatch):
     policy, trial = walker
-    monkeypatch.setattr("pupper_sysid.policies.analysis.robustness.NOISE_SHARES", (0.05, 2.0))
-    monkeypatch.setattr("pupper_sysid.policies.analysis.robustness.HOLD_MS", (80,))
+    monkeypatch.setattr("pupper_sysid.policies.analysis.trial.NOISE_SHARES", (0.05, 2.0))
+    monkeypatch.setattr("pupper_sysid.policies.analysis.trial.HOLD_MS", (80,))
     rows = ablation(policy, trial, channels=("last_action",))
     noise = [r.correlation for r in rows if r.kind == "noise"]
     assert noise[0] > 0.9 and noise[-1] < noise[0] - 0.2
