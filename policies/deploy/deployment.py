@@ -42,7 +42,8 @@ from pupper_sysid.policies.deploy.walk_log import WalkLog, start_header
 from pupper_sysid.policies.network.policy_file import CommandRanges
 from pupper_sysid.sim.walking.step import FALLEN_TILT, OBSERVATION_PARTS
 
-Commands = Callable[[float], NDArray[np.float64] | None]
+Array = NDArray[np.float64]
+Commands = Callable[[float], Array | None]
 """Forward and sideways speed [m/s] and turn rate [rad/s] by time since the first tick [s]; None to
 stop."""
 
@@ -66,7 +67,7 @@ def constant(
     return lambda elapsed_s: value
 
 
-def checked_command(command: tuple[float, float, float]) -> NDArray[np.float64]:
+def checked_command(command: tuple[float, float, float]) -> Array:
     """The command as an array, shape (3,)."""
     value = np.array(command, float)
     if not np.isfinite(value).all() or np.abs(value).max() > _LARGEST:
@@ -104,14 +105,13 @@ def script(
         rows[:, 1:] = trained.clipped(rows[:, 1:], say)
     ends = np.cumsum(rows[:, 0])
 
-    def command(elapsed_s: float) -> NDArray[np.float64] | None:
+    def command(elapsed_s: float) -> Array | None:
         row = int(np.searchsorted(ends, elapsed_s, side="right"))
         return rows[row, 1:] if row < len(rows) else None
 
     return command
 
 
-Array = NDArray[np.float64]
 STAND_S = 3.0
 SETTLE_S = 0.5
 REST_SAMPLES = 50

@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.delayed_pd import FRICTION_IMPEDANCE, DelayedPDParameters
 
+Array = NDArray[np.float64]
+
 INTEGRATOR = "implicitfast"
 MASSLESS = '<inertial pos="0 0 0" mass="1e-9" diaginertia="1e-15 1e-15 1e-15"/>'
 """Of a body that moves by its joint's armature alone."""
@@ -154,17 +156,15 @@ def rest_at(model: Any, data: Any, position_rad: Sequence[float]) -> None:
         hold(model, data, i, position)
 
 
-def switch_torque(
-    model: Any, gains: NDArray[np.float64], on: bool, index: int | slice = slice(None)
-) -> None:
+def switch_torque(model: Any, gains: Array, on: bool, index: int | slice = slice(None)) -> None:
     """Switch servos on, with the `gains` that `actuator_biasprm` had, or limp, without any."""
     model.actuator_biasprm[index] = gains[index] if on else 0.0
 
 
 def write_servos(
-    fields: Mapping[str, NDArray[np.float64]],
+    fields: Mapping[str, Array],
     ids: NDArray[np.intp],
-    servos: Mapping[str, NDArray[np.float64]],
+    servos: Mapping[str, Array],
     dof_of: Mapping[int, int],
     tendon_of: Mapping[int, int],
 ) -> None:
@@ -188,7 +188,7 @@ def write_servos(
             fields[f"{kind}_damping"][ids[:, None], at] = servos["back_emf"][:, names]
 
 
-def empty_delay_lines(model: Any) -> NDArray[np.float64]:
+def empty_delay_lines(model: Any) -> Array:
     """Delay lines after a command of 0 held for long, shape (actuators, length)."""
     from pupper_sysid.sim.robot.engine import mujoco
 
@@ -198,9 +198,7 @@ def empty_delay_lines(model: Any) -> NDArray[np.float64]:
     return data.history.reshape(model.nu, -1).copy()
 
 
-def delay_lines(
-    empty: NDArray[np.float64], position_rad: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def delay_lines(empty: Array, position_rad: Array) -> Array:
     """Delay lines after commands held for long, shape (n, actuators · length), for `history`.
 
     `empty` is from `empty_delay_lines`; `position_rad` has the shape (n, actuators).
