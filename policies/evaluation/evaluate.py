@@ -24,7 +24,7 @@ servos.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from statistics import mode
 from typing import Any, Literal
 
@@ -139,12 +139,6 @@ class Walk:
         """Size of the change of heading over the episode; NaN of robots that did not finish it."""
         change = np.degrees(np.abs(self.heading[-1] - self.heading[0]))
         return np.where(self.alive[-1], change, np.nan)
-
-    def first(self, episodes: int) -> Walk:
-        """The same of the first episodes."""
-        arrays = {f.name: getattr(self, f.name) for f in fields(self)[3:]}
-        first = {name: array[:, :episodes] for name, array in arrays.items()}
-        return Walk(self.step_s, self.kinds, self.fell[:episodes], **first)
 
 
 @dataclass(frozen=True, kw_only=True)

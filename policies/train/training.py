@@ -406,7 +406,7 @@ class _Session:
             write_policy(
                 self.folder / name, self.learner.averaged.state_dict(), self.run, servos,
                 action_history(self.run, servos), about,
-                command_share=self.learner.env.env.level.commands,
+                command_share=self.learner.env.env.level["commands"],
             )  # fmt: skip
 
     def report(

@@ -301,27 +301,14 @@ class Curriculum:
     angular_sigma: Ramp = _FULL
     """On the widths of the turn rate's tracking terms."""
 
-    def at(self, samples: float) -> Level:
-        """All factors after so many samples."""
+    def at(self, samples: float) -> dict[str, float]:
+        """All factors, by field, after so many samples."""
         factors = {}
         for part in fields(self):
             first, last, begin, end = getattr(self, part.name)
             share = (1e-6 * samples - begin) / max(end - begin, 1e-9)
             factors[part.name] = first + (last - first) * min(max(share, 0.0), 1.0)
-        return Level(**factors)
-
-
-@dataclass(frozen=True)
-class Level:
-    """Factors of a `Curriculum` at one time."""
-
-    commands: float = 1.0
-    push: float = 1.0
-    penalties: float = 1.0
-    guides: float = 1.0
-    progress: float = 1.0
-    linear_sigma: float = 1.0
-    angular_sigma: float = 1.0
+        return factors
 
 
 @dataclass(frozen=True)

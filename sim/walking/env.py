@@ -102,7 +102,7 @@ class PupperEnv:
         Control steps since the start; simulations that became NaN, and were drawn anew.
     processes : int
         That train together: the curriculum counts the samples of all.
-    level : Level
+    level : dict of str to float
         Factors of the curriculum now.
 
     Raises
@@ -337,7 +337,8 @@ class PupperEnv:
             self._rewards = self._narrowed()
 
     def _narrowed(self) -> Rewards:
-        return narrowed(self.config.rewards, self.level.linear_sigma, self.level.angular_sigma)
+        level = self.level
+        return narrowed(self.config.rewards, level["linear_sigma"], level["angular_sigma"])
 
     # ------------------------------------------------------------------------- one step
 
@@ -354,7 +355,7 @@ class PupperEnv:
             self._draw_commands(due)
         self._until_push -= span
         pushed = np.flatnonzero(self._until_push <= 0)
-        most = self.level.push * config.randomisation.push_m_s
+        most = self.level["push"] * config.randomisation.push_m_s
         push = np.zeros((0, 2))
         if len(pushed):
             push = self.rng.uniform(-most, most, (len(pushed), 2))
@@ -389,7 +390,9 @@ class PupperEnv:
         facts["acceleration"] /= span
         step = Step(body=self.body, **facts)
         level = self.level
-        terms = weighted(step, self._rewards, level.penalties, level.guides, level.progress)
+        terms = weighted(
+            step, self._rewards, level["penalties"], level["guides"], level["progress"]
+        )
         for name, (weight, term) in self._user_terms.items():
             terms[name] = weight * term(step, self._rewards)
         for name, term in terms.items():
@@ -432,7 +435,7 @@ class PupperEnv:
 
     def _draw_commands(self, ids: NDArray[np.intp]) -> None:
         commands, n = self.config.commands, len(ids)
-        self.command[ids] = draw_commands(commands, n, self.level.commands, self.rng)
+        self.command[ids] = draw_commands(commands, n, self.level["commands"], self.rng)
         self._until_command[ids] = self.rng.exponential(commands.every_s, n)
 
     # ------------------------------------------------------------------------- what is seen
