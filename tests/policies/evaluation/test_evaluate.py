@@ -1,5 +1,7 @@
 """Evaluation: falls and tracking errors, by command, ground and added dead time."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 
