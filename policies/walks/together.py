@@ -315,7 +315,8 @@ def random_commands(
 ) -> Array:
     """Commands of `RANDOM`, or others, for each robot and step, shape (steps, robots, 3)."""
     rng = np.random.default_rng([seed, 3])
-    drawn = rng.uniform(*command_ends(commands), (steps, robots, 3))
+    low, high = command_ends(commands)
+    drawn = rng.uniform(low, high, (steps, robots, 3))
     # of exponential intervals, memoryless: in each step a new one comes with this chance
     new = rng.random((steps, robots)) < 1 - np.exp(-step_s / commands.every_s)
     new[0] = True

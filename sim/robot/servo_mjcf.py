@@ -48,11 +48,11 @@ def friction_solref(time_step_s: float) -> tuple[float, float]:
 def joint_attributes(parameters: DelayedPDParameters, time_step_s: float) -> dict[str, str]:
     """Attributes of the `<joint>` (or tendon) that one servo turns: inertia, friction, back-EMF."""
     return {
-        "armature": _number(parameters.armature),
-        "frictionloss": _number(parameters.friction_loss),
-        "solreffriction": " ".join(map(_number, friction_solref(time_step_s))),
-        "solimpfriction": " ".join(map(_number, FRICTION_SOLIMP)),
-    } | ({"damping": _number(parameters.back_emf)} if np.any(parameters.back_emf) else {})
+        "armature": numbers(parameters.armature),
+        "frictionloss": numbers(parameters.friction_loss),
+        "solreffriction": numbers(*friction_solref(time_step_s)),
+        "solimpfriction": numbers(*FRICTION_SOLIMP),
+    } | ({"damping": numbers(parameters.back_emf)} if np.any(parameters.back_emf) else {})
 
 
 def actuator_attributes(parameters: DelayedPDParameters, time_step_s: float) -> dict[str, str]:
@@ -68,18 +68,18 @@ def actuator_attributes(parameters: DelayedPDParameters, time_step_s: float) -> 
     effort = float(np.asarray(parameters.effort_limit))
     speed = float(np.asarray(parameters.velocity_limit))
     attributes_ = {
-        "kp": _number(parameters.stiffness),
-        "kv": _number(parameters.damping),
+        "kp": numbers(parameters.stiffness),
+        "kv": numbers(parameters.damping),
         "input": "pos",
         # two more than whole steps: MuJoCo silently truncates a delay beyond its buffer
         "nsample": str(int(delay / time_step_s) + 2),
-        "delay": _number(delay),
+        "delay": numbers(delay),
         "interp": "linear",
     }
     if np.isfinite(speed):
-        attributes_["slewmax"] = _number(speed)
+        attributes_["slewmax"] = numbers(speed)
     if np.isfinite(effort):
-        attributes_["forcerange"] = f"{_number(-effort)} {_number(effort)}"
+        attributes_["forcerange"] = numbers(-effort, effort)
     return attributes_
 
 
@@ -99,12 +99,17 @@ def free_air_xml(servos: Sequence[DelayedPDParameters], time_step_s: float) -> s
         bodies.append(f'<body><joint type="hinge" axis="0 1 0" {joint}/>{MASSLESS}</body>')
         actuators.append(pid_element({"joint": f"joint{i}"}, servo, time_step_s))
     option = (
-        f'<option timestep="{_number(time_step_s)}" integrator="{INTEGRATOR}" gravity="0 0 0"/>'
+        f'<option timestep="{numbers(time_step_s)}" integrator="{INTEGRATOR}" gravity="0 0 0"/>'
     )
     return (
         f"<mujoco>{option}<worldbody>{''.join(bodies)}</worldbody>"
         f"<actuator>{''.join(actuators)}</actuator></mujoco>"
     )
+
+
+def numbers(*values: Any) -> str:
+    """As they stand in an attribute, with all digits."""
+    return " ".join(repr(float(np.asarray(value))) for value in values)
 
 
 def attributes(values: Mapping[str, str]) -> str:
@@ -207,7 +212,3 @@ def delay_lines(empty: Array, position_rad: Array) -> Array:
     # a line is two numbers, the times and the values, as many of each
     lines[:, :, -((lines.shape[2] - 2) // 2) :] = position_rad[:, :, None]
     return lines.reshape(len(lines), -1)
-
-
-def _number(value: Any) -> str:
-    return repr(float(np.asarray(value)))

@@ -210,7 +210,8 @@ class Bodies:
 
 def draw_commands(commands: Commands, count: int, share: float, rng: np.random.Generator) -> Array:
     """Commanded motions [m/s, m/s, rad/s], shape (count, 3), from a `share` of the ranges."""
-    motions = rng.uniform(*command_ends(commands), (count, 3)) * share
+    low, high = command_ends(commands)
+    motions = rng.uniform(low, high, (count, 3)) * share
     alone = rng.random(count) < commands.single
     motions[alone] *= np.eye(3)[rng.integers(0, 3, count)][alone]
     motions[rng.random(count) < commands.standing] = 0.0
