@@ -18,7 +18,7 @@ import tyro
 
 from pupper_sysid.cli.policy_choice import policy_at
 from pupper_sysid.policies.evaluation.evaluate import BATTERY, evaluate, share_interval, table
-from pupper_sysid.policies.walks.conditions import Walker
+from pupper_sysid.policies.walks.together import Walker
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 

@@ -11,9 +11,8 @@ import numpy as np
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.step_size import delay_at_step
-from pupper_sysid.sim.emulator.bench import FreeAirServos
+from pupper_sysid.sim.emulator.bench import PHYSICS_STEP_S, FreeAirServo, FreeAirServos
 from pupper_sysid.sim.emulator.bus import EmulatedBus
-from pupper_sysid.sim.emulator.free_air import PHYSICS_STEP_S, FreeAirServo
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
 from pupper_sysid.sysid.recordings.files import load

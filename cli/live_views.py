@@ -212,7 +212,7 @@ class LiveViews:
 
     def walk_tick(self, to_servo: Callable[[Array], Array], tick: Tick) -> None:
         """Show one tick of a walk in servo angles, which `to_servo` makes of joint angles."""
-        from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
+        from pupper_sysid.sim.walking.step import OBSERVATION_PARTS
 
         reading = replace(tick.reading, position_rad=to_servo(tick.reading.position_rad))
         gravity = tick.decision.observation[OBSERVATION_PARTS["projected_gravity"]]

@@ -196,7 +196,7 @@ def trained_commands(policy: Policy, run: Run | None) -> CommandRanges:
         return contract.commands
     if run is not None:
         reached = run.task.curriculum.at(contract.training.get("samples", float("inf")))
-        return CommandRanges.of(run.task.commands, reached.commands)
+        return CommandRanges.of(run.task.commands, reached["commands"])
     # only the published presets let a policy see the trunk's speed
     of = "release" if contract.base_velocity == "true" else "fast"
     assumed = CommandRanges.of(WALKING[of].commands)

@@ -24,21 +24,21 @@ from pupper_sysid.common.reading.csv_table import read_table
 from pupper_sysid.common.results import Result
 from pupper_sysid.policies.analysis.autonomy import Autonomy, Orbits, autonomy, orbits
 from pupper_sysid.policies.analysis.gait import GaitReport, describe
-from pupper_sysid.policies.analysis.robustness import (
+from pupper_sysid.policies.analysis.trial import (
     AblationPoint,
     DelayPoint,
     DirectionWalk,
     GroundPoint,
+    Outcome,
+    Trial,
     ablation,
     compliance,
     delay_curve,
+    outcome,
     terrain,
 )
-from pupper_sysid.policies.analysis.trial import Outcome, Trial, outcome
-from pupper_sysid.policies.network.hyperparameters import TROT
 from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.train.curves import PROGRESS
-from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run
+from pupper_sysid.policies.train.run_file import PROGRESS, RUN_FILE, TROT, Run, load_run
 from pupper_sysid.policies.walks.rollouts import Rollout
 from pupper_sysid.sim.walking.config import Curriculum
 

@@ -372,7 +372,7 @@ def _summary(
 
 def _command(options: Options) -> str:
     """The command that makes the page, with files by their names."""
-    given: dict[str, Sequence[Any]] = {
+    flags: dict[str, Sequence[Any]] = {
         "": options.policies,
         "--from-nothing": options.from_nothing,
         "--recordings": [p.name for p in options.recordings],
@@ -385,7 +385,7 @@ def _command(options: Options) -> str:
         **{f"--{k}": [f"{getattr(options, k):g}"] for k in ("robots", "seconds", "seed")},
         "--out": [options.out],
     }
-    words = [str(word) for flag, values in given.items() if values for word in (flag, *values)]
+    words = [str(word) for flag, values in flags.items() if values for word in (flag, *values)]
     return " ".join(["python -m reproduction", *filter(None, words)])
 
 

@@ -120,7 +120,7 @@ def real_playback() -> Path:
 @pytest.fixture(scope="session")
 def walker():
     """The shipped LSTM, and two robots with calibrated servos to walk on."""
-    from pupper_sysid.policies.analysis.robustness import Trial
+    from pupper_sysid.policies.analysis.trial import Trial
     from pupper_sysid.policies.network.policy_file import load_policy
     from pupper_sysid.sim.walking.config import Walking
     from pupper_sysid.sim.walking.servo_ranges import servo_ranges

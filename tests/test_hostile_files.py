@@ -31,8 +31,8 @@ from scipy.io import savemat
 from pupper_sysid.common.errors import PupperError
 from pupper_sysid.data import SAMPLES
 from pupper_sysid.hardware.joint_map import load_joint_map
-from pupper_sysid.policies.deploy.commands import COLUMNS as SCRIPT_COLUMNS
-from pupper_sysid.policies.deploy.commands import script
+from pupper_sysid.policies.deploy.deployment import COLUMNS as SCRIPT_COLUMNS
+from pupper_sysid.policies.deploy.deployment import script
 from pupper_sysid.policies.deploy.walk_log import COLUMNS as WALK_COLUMNS
 from pupper_sysid.policies.deploy.walk_log import TITLE as WALK_TITLE
 from pupper_sysid.policies.deploy.walk_log import read_walk

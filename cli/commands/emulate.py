@@ -31,9 +31,8 @@ from pupper_sysid.hardware.lock import announced
 from pupper_sysid.hardware.loop import real_time_priority
 from pupper_sysid.hardware.serial_servos.series import Family, Series
 from pupper_sysid.sim.emulator import pendulum
-from pupper_sysid.sim.emulator.bench import ServoBench
+from pupper_sysid.sim.emulator.bench import BusFaults, ServoBench
 from pupper_sysid.sim.emulator.esp32 import ImuProxy, ProxyEmulator, ProxySocket
-from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sim.emulator.serial_line import LineEmulator, SerialPty

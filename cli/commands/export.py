@@ -121,7 +121,7 @@ class Export:
                 f"{folder} is a policy: export it with `--to onnx` or `--to torchscript`."
             )
         from pupper_sysid.cli.policy_choice import policy_at
-        from pupper_sysid.policies.network.policy_export import ENDINGS, export_policy
+        from pupper_sysid.policies.network.policy_file import ENDINGS, export_policy
 
         policy, _ = policy_at(folder)
         target = self.out or Path(f"{resolved(folder).name}{ENDINGS[self.to]}")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pupper_sysid.policies.analysis.trial import Trial
     from pupper_sysid.policies.twin.twin import Gyro
     from pupper_sysid.policies.twin.twin import Twin as Result
-    from pupper_sysid.policies.walks.conditions import Actor
+    from pupper_sysid.policies.walks.together import Actor
     from pupper_sysid.sim.robot.body import Body
     from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 

@@ -180,7 +180,7 @@ class Commanded(OfPolicies):
 
 def check_walk(command: tuple[float, float, float], robots: int, seconds: float) -> None:
     """Refuse walks that cannot be."""
-    from pupper_sysid.policies.deploy.commands import checked_command
+    from pupper_sysid.policies.deploy.deployment import checked_command
 
     if robots < 1:
         raise InputError(f"--robots is {robots}; it must be at least 1.")
@@ -328,7 +328,7 @@ class Delay(Commanded):
     def analyse(self) -> Results:
         """Delay curves of each policy."""
         from pupper_sysid.policies.analysis.figures import delay_figure
-        from pupper_sysid.policies.analysis.robustness import delay_curve
+        from pupper_sysid.policies.analysis.trial import delay_curve
 
         curves = self.per_policy(delay_curve, self.command)
         columns = (
@@ -348,7 +348,7 @@ class Ablation(Commanded):
     def analyse(self) -> Results:
         """Ablations of each policy."""
         from pupper_sysid.policies.analysis.figures import ablation_figure
-        from pupper_sysid.policies.analysis.robustness import ablation
+        from pupper_sysid.policies.analysis.trial import ablation
 
         points = self.per_policy(ablation, self.command)
         columns = ("channel", "kind", "level", "sigma", "correlation", "survival", "mae_vx_m_s")
@@ -402,7 +402,7 @@ class Terrain(Commanded):
     def analyse(self) -> Results:
         """Walks of each policy on each ground."""
         from pupper_sysid.policies.analysis.figures import terrain_figure
-        from pupper_sysid.policies.analysis.robustness import terrain
+        from pupper_sysid.policies.analysis.trial import terrain
 
         points = self.per_policy(terrain, self.command)
         columns = (
@@ -422,7 +422,7 @@ class Compliance(OfPolicies):
     def analyse(self) -> Results:
         """Walks of each policy in each direction."""
         from pupper_sysid.policies.analysis.figures import compliance_figure
-        from pupper_sysid.policies.analysis.robustness import compliance
+        from pupper_sysid.policies.analysis.trial import compliance
 
         walks = self.per_policy(compliance)
         table = terminal.table(

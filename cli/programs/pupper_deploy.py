@@ -49,8 +49,7 @@ from pupper_sysid.policies.deploy.stacks import STACKS, ObserverKind, Stack, Sta
 
 if TYPE_CHECKING:
     from pupper_sysid.policies.deploy.assembly import Assembly
-    from pupper_sysid.policies.deploy.commands import Commands
-    from pupper_sysid.policies.deploy.deployment import Tick
+    from pupper_sysid.policies.deploy.deployment import Commands, Tick
     from pupper_sysid.policies.network.policy_file import CommandRanges
     from pupper_sysid.sim.emulator.robot import EmulatedRobot
     from pupper_sysid.sim.robot.body import Body
@@ -183,7 +182,7 @@ def _run(options: Deploy) -> None:
 
     torch.set_num_threads(1)
     from pupper_sysid.policies.deploy.assembly import assemble
-    from pupper_sysid.policies.deploy.commands import constant, script
+    from pupper_sysid.policies.deploy.deployment import constant, script
 
     policy, run = policy_choice.policy_at(options.policy)
     body = policy_choice.body_at(options.policy, policy, run)
@@ -253,8 +252,7 @@ def _open(
 ) -> tuple[GuardedBus, Imu, JointMap, Any]:
     """Bus, IMU, joint map, and the emulated robot if it is one."""
     if options.bus == EMULATED:
-        from pupper_sysid.sim.walking.bus import WalkingBus
-        from pupper_sysid.sim.walking.robot import body_joint_map
+        from pupper_sysid.sim.walking.robot import WalkingBus, body_joint_map
 
         rng = np.random.default_rng(options.seed)
         truth = _emulated(options, rng, body, actuator)
@@ -310,7 +308,7 @@ def _emulated(options: Deploy, rng: np.random.Generator, body: Body, trained: st
     """
     from pupper_sysid.servo_models.cards.files import is_card
     from pupper_sysid.sim.emulator.robot import draw_robot
-    from pupper_sysid.sim.walking.bus import calibrated_robot
+    from pupper_sysid.sim.walking.robot import calibrated_robot
     from pupper_sysid.sim.walking.servo_ranges import check_actuator, is_servo_model, servo_ranges
 
     if not body.is_mini_pupper:
@@ -443,7 +441,7 @@ _SHOWN_EVERY_S = 0.2
 class Driver:
     """Commands from the keyboard, no further than those `trained`, and a live table of the ticks.
 
-    Use it as a context; it is a `policies.deploy.commands.Commands`.
+    Use it as a context; it is a `policies.deploy.deployment.Commands`.
     """
 
     def __init__(self, trained: CommandRanges) -> None:

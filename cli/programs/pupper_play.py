@@ -68,7 +68,7 @@ class Play:
 
 def _run(options: Play) -> None:
     need_positive("--seconds", options.seconds)
-    from pupper_sysid.policies.deploy.commands import checked_command
+    from pupper_sysid.policies.deploy.deployment import checked_command
 
     command = checked_command(options.command)
     if options.video:
@@ -78,7 +78,7 @@ def _run(options: Play) -> None:
     refuse_files(options.force, rerun=options.rerun, mcap=options.mcap)
     import torch
 
-    from pupper_sysid.policies.walks.conditions import evaluation_task
+    from pupper_sysid.policies.walks.together import evaluation_task
     from pupper_sysid.sim.walking.env import PupperEnv
     from pupper_sysid.sim.walking.servo_ranges import servo_model_of
 

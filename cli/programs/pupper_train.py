@@ -31,8 +31,10 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import hold_output, refuse_path
 from pupper_sysid.common.results import plain
-from pupper_sysid.policies.network.hyperparameters import OWN, TROT, Kind
 from pupper_sysid.policies.train.run_file import (
+    OWN,
+    TROT,
+    Kind,
     Run,
     Start,
     check_teacher,
@@ -42,7 +44,7 @@ from pupper_sysid.policies.train.run_file import (
     with_robot,
 )
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.rewards.weights import Rewards
+from pupper_sysid.sim.walking.config import Rewards
 from pupper_sysid.sim.walking.servo_ranges import check_actuator, servo_ranges
 
 if TYPE_CHECKING:

@@ -27,10 +27,13 @@ from pupper_sysid.common.interval import mean_of
 from pupper_sysid.common.results import Result, internal
 from pupper_sysid.policies.analysis.gait import SETTLE_S, sine_frequency
 from pupper_sysid.policies.analysis.trial import (
+    JOINTS,
     NAN,
     STILL_RAD,
     Outcome,
     Trial,
+    applied,
+    delayed,
     gait_of_actions,
     moving_frequency,
     outcome,
@@ -38,11 +41,10 @@ from pupper_sysid.policies.analysis.trial import (
     walking,
 )
 from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.walks import perturbations
-from pupper_sysid.policies.walks.conditions import Disturb
 from pupper_sysid.policies.walks.rollouts import Rollout, heading, replay
+from pupper_sysid.policies.walks.together import Disturb
 from pupper_sysid.sim.walking.env import PupperEnv
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
+from pupper_sysid.sim.walking.step import OBSERVATION_PARTS
 
 Array = NDArray[np.float64]
 
@@ -177,8 +179,8 @@ def orbits(
     robot, now = next(iter(moving.items()))
     acted, hidden_states = [], []
     for delay in delays_ms:
-        change = perturbations.delayed(perturbations.JOINTS, round(delay / 1e3 / plain.step_s))
-        actions, hidden = replay(policy, perturbations.applied(change, plain.observation))
+        change = delayed(JOINTS, round(delay / 1e3 / plain.step_s))
+        actions, hidden = replay(policy, applied(change, plain.observation))
         acted.append(plain.action_scale * actions[now, robot].astype(float))
         hidden_states.append(hidden[now, robot].astype(float))
     rate = moving_frequency(acted[0], plain.step_s)

@@ -20,13 +20,13 @@ from pupper_sysid.common.figure_style import (
 from pupper_sysid.common.joints import KINDS, LEGS
 from pupper_sysid.policies.analysis.autonomy import Autonomy
 from pupper_sysid.policies.analysis.gait import SETTLE_S, intervals
-from pupper_sysid.policies.analysis.robustness import (
+from pupper_sysid.policies.analysis.servo_demand import ServoDemand
+from pupper_sysid.policies.analysis.trial import (
     AblationPoint,
     DelayPoint,
     DirectionWalk,
     GroundPoint,
 )
-from pupper_sysid.policies.analysis.servo_demand import ServoDemand
 from pupper_sysid.policies.walks.rollouts import Rollout
 
 _MODES = {"fixed": "-", "jittered": "--", "replay": ":"}

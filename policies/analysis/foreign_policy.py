@@ -54,9 +54,9 @@ from pupper_sysid.sim.export.foreign import position_servos
 from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.robot_file import RobotFile
 from pupper_sysid.sim.walking.config import EVALUATION_STEP_S, Walking, for_robot
-from pupper_sysid.sim.walking.differences import Differences
-from pupper_sysid.sim.walking.observation import VELOCITY_STEPS, observation_of, places
+from pupper_sysid.sim.walking.draws import Differences
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+from pupper_sysid.sim.walking.step import VELOCITY_STEPS, observation_of, places
 
 Array = NDArray[np.float64]
 Row = NDArray[np.float32]

@@ -31,9 +31,13 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result, internal
 from pupper_sysid.policies.analysis.gait import SETTLE_S
 from pupper_sysid.policies.analysis.trial import Trial
-from pupper_sysid.policies.walks.conditions import Actor, Condition, Moment, StepRecorder
-from pupper_sysid.policies.walks.rollouts import planar_velocity
-from pupper_sysid.policies.walks.together import walk_together
+from pupper_sysid.policies.walks.together import (
+    Actor,
+    Condition,
+    Moment,
+    StepRecorder,
+    walk_together,
+)
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
@@ -314,7 +318,7 @@ class _Recorder(StepRecorder):
         to_servo, facts = self.env.robots.to_servo, now.facts
         command = now.command[:, :2]
         size = np.linalg.norm(command, axis=1)
-        along = (planar_velocity(facts)[:, :2] * command).sum(axis=1) / np.maximum(size, 1e-9)
+        along = (facts.planar_velocity[:, :2] * command).sum(axis=1) / np.maximum(size, 1e-9)
         return {
             "force": facts.torque.copy(), "speed": to_servo(facts.velocity).copy(),
             "acceleration": to_servo(facts.acceleration).copy(), "along": along,

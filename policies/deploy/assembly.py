@@ -28,9 +28,8 @@ from pupper_sysid.hardware.bus import ServoBus
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.hardware.safety.monitor import GuardLimits
-from pupper_sysid.policies.deploy.commands import constant
 from pupper_sysid.policies.deploy.controller import Controller
-from pupper_sysid.policies.deploy.deployment import Outcome, Rows, Tick, deploy
+from pupper_sysid.policies.deploy.deployment import Outcome, Rows, Tick, constant, deploy
 from pupper_sysid.policies.deploy.matches import Match, ServoMatch, compare, servo_match
 from pupper_sysid.policies.deploy.stacks import Observer, Stack, SyntheticPD, make_observer
 from pupper_sysid.policies.network.policy_file import Policy, trained_servo
@@ -39,9 +38,8 @@ from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.servo_models.servo_file import WEIGHTS
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.robot.body import Body
-from pupper_sysid.sim.walking.bus import WalkingBus
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.robot import WalkingRobot, body_joint_map
+from pupper_sysid.sim.walking.robot import WalkingBus, WalkingRobot, body_joint_map
 from pupper_sysid.sim.walking.servo_ranges import (
     ServoRanges,
     is_servo_model,

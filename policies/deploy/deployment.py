@@ -3,6 +3,10 @@
 However a walk ends, the robot is parked, or limp after a fault, within a second, and the log's last
 line gives the reason. The controller itself (`policies.deploy.controller`) is pure, and the guard
 (`hardware.safety.guard`) is before every servo.
+
+Velocity commands over time are constant, or from a script, within what a policy was trained for.
+Beyond that a policy does not walk faster: at twice the training's speed the shipped ones stop or
+walk backwards.
 """
 
 from __future__ import annotations
@@ -17,7 +21,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pupper_sysid.common.errors import BusError, PupperError, SafetyStop
+from pupper_sysid.common.border import read_text
+from pupper_sysid.common.errors import BusError, InputError, PupperError, SafetyStop
+from pupper_sysid.common.reading.csv_table import column_names, read_table
 from pupper_sysid.hardware.bus import BusSample, Sent
 from pupper_sysid.hardware.imu import Imu, ImuSample
 from pupper_sysid.hardware.loop import (
@@ -31,12 +37,81 @@ from pupper_sysid.hardware.loop import (
     glide,
 )
 from pupper_sysid.hardware.safety.guard import GuardedBus
-from pupper_sysid.policies.deploy.commands import Commands
 from pupper_sysid.policies.deploy.controller import Controller, Decision, Rest, Senses, at_rest
 from pupper_sysid.policies.deploy.walk_log import WalkLog, start_header
-from pupper_sysid.sim.walking.observation import FALLEN_TILT, OBSERVATION_PARTS
+from pupper_sysid.policies.network.policy_file import CommandRanges
+from pupper_sysid.sim.walking.step import FALLEN_TILT, OBSERVATION_PARTS
 
 Array = NDArray[np.float64]
+Commands = Callable[[float], Array | None]
+"""Forward and sideways speed [m/s] and turn rate [rad/s] by time since the first tick [s]; None to
+stop."""
+
+COLUMNS = ("seconds", "forward_m_s", "left_m_s", "turn_rad_s")
+_LARGEST = 5.0
+
+
+def constant(
+    command: tuple[float, float, float],
+    trained: CommandRanges | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Commands:
+    """A constant command.
+
+    It is clipped to the ranges of the training, where they are known; `say` is then called with a
+    sentence.
+    """
+    value = checked_command(command)
+    if trained is not None:
+        value = trained.clipped(value[None], say)[0]
+    return lambda elapsed_s: value
+
+
+def checked_command(command: tuple[float, float, float]) -> Array:
+    """The command as an array, shape (3,)."""
+    value = np.array(command, float)
+    if not np.isfinite(value).all() or np.abs(value).max() > _LARGEST:
+        raise InputError(
+            f"`command` is {' '.join(map(str, command))}; each must be within ±{_LARGEST:g} "
+            "(m/s, m/s, rad/s)."
+        )
+    return value
+
+
+def script(
+    path: Path, trained: CommandRanges | None = None, say: Callable[[str], None] = lambda text: None
+) -> Commands:
+    """Commands of a CSV file with `COLUMNS`, one row after another, then a stop.
+
+    `trained` and `say` as for `constant`.
+    """
+    text = read_text(path)
+    if tuple(column_names(path, text)) != COLUMNS:
+        raise InputError(f"{path}: it needs rows with the columns {','.join(COLUMNS)}.")
+    table = read_table(path, text)
+    if table.cut or not len(table):
+        raise InputError(f"{path} has no rows, or its last one is cut short.")
+    rows = np.stack([table.numbers[name] for name in COLUMNS], axis=-1)
+    bad = np.flatnonzero(
+        ~np.isfinite(rows).all(axis=1) | (np.abs(rows[:, 1:]) > _LARGEST).any(axis=1)
+        | ~(rows[:, 0] > 0)
+    )  # fmt: skip
+    if len(bad):
+        raise InputError(
+            f"{path}, line {table.line[bad[0]]}: seconds must be positive and speeds within "
+            f"±{_LARGEST:g}."
+        )
+    if trained is not None:
+        rows[:, 1:] = trained.clipped(rows[:, 1:], say)
+    ends = np.cumsum(rows[:, 0])
+
+    def command(elapsed_s: float) -> Array | None:
+        row = int(np.searchsorted(ends, elapsed_s, side="right"))
+        return rows[row, 1:] if row < len(rows) else None
+
+    return command
+
+
 STAND_S = 3.0
 SETTLE_S = 0.5
 REST_SAMPLES = 50

@@ -29,7 +29,7 @@ from pupper_sysid.common.reading.csv_table import (
     read_table,
 )
 from pupper_sysid.policies.deploy.controller import Controller, Decision, Rest, Senses
-from pupper_sysid.sim.walking.observation import observation_of
+from pupper_sysid.sim.walking.step import observation_of
 
 TITLE = "# pupper-sysid walk"
 SCHEMA_VERSION = 1

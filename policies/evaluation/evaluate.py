@@ -14,7 +14,7 @@ are others than those of a training with the same seed.
 The battery holds conditions that make walking robots fall. Usual conditions separate nothing: an
 open-loop trot falls under none of them. These go on until it does: pushes, slopes, stairs, loads
 off centre, a weak leg, missed control ticks, late and jittered servos, slippery ground, and all
-that typically differs between a robot and its model (`sim.walking.differences.TYPICAL`). All are
+that typically differs between a robot and its model (`sim.walking.draws.TYPICAL`). All are
 walked under random commands.
 
 `Figures` are the numbers of a row: falls, errors, speed, drift of the heading, feet, and effort of
@@ -24,7 +24,7 @@ servos.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from statistics import mode
 from typing import Any, Literal
 
@@ -35,7 +35,15 @@ from scipy.stats import beta
 from pupper_sysid.common.interval import LEVEL, Interval, mean_of
 from pupper_sysid.common.results import Result
 from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.walks.conditions import (
+from pupper_sysid.policies.walks.rollouts import (
+    ERRORS,
+    STRIDE_ERRORS,
+    counted,
+    heading,
+    stride_errors,
+    tracking_errors,
+)
+from pupper_sysid.policies.walks.together import (
     DIRECTIONS,
     Condition,
     Handicap,
@@ -43,25 +51,16 @@ from pupper_sysid.policies.walks.conditions import (
     StepRecorder,
     Walker,
     evaluation_task,
+    walk_together,
     within,
 )
-from pupper_sysid.policies.walks.rollouts import (
-    ERRORS,
-    STRIDE_ERRORS,
-    counted,
-    heading,
-    planar_velocity,
-    stride_errors,
-    tracking_errors,
-)
-from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.mini_pupper import MASS_KG
 from pupper_sysid.sim.robot.terrain import STAIRS_M, Terrain
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.differences import TYPICAL, Differences
-from pupper_sysid.sim.walking.observation import FALLEN_TILT
-from pupper_sysid.sim.walking.rewards.strides import LOW_SWING_M, by_kind
+from pupper_sysid.sim.walking.draws import TYPICAL, Differences
+from pupper_sysid.sim.walking.rewards import LOW_SWING_M, by_kind
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+from pupper_sysid.sim.walking.step import FALLEN_TILT
 
 Array = NDArray[np.float64]
 
@@ -141,12 +140,6 @@ class Walk:
         change = np.degrees(np.abs(self.heading[-1] - self.heading[0]))
         return np.where(self.alive[-1], change, np.nan)
 
-    def first(self, episodes: int) -> Walk:
-        """The same of the first episodes."""
-        arrays = {f.name: getattr(self, f.name) for f in fields(self)[3:]}
-        first = {name: array[:, :episodes] for name, array in arrays.items()}
-        return Walk(self.step_s, self.kinds, self.fell[:episodes], **first)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Figures(Result):
@@ -180,7 +173,7 @@ class Figures(Result):
     """Mean speed of feet on the ground."""
     clearance_p10_m: float
     """Tenth percentile of the clearance over all swings: the largest height of the sole over the
-    ground in a swing (`sim.walking.rewards.strides`); NaN without a swing, as the next two."""
+    ground in a swing (`sim.walking.rewards`); NaN without a swing, as the next two."""
     clearance_p50_m: float
     """Its median."""
     low_swing_share: float
@@ -213,7 +206,7 @@ class Recorder(StepRecorder[Walk]):
         # before the first step a foot may have been elsewhere: its speed is not known
         slip = facts.foot_speed_m_s * standing if self.steps else np.zeros(standing.shape)
         return {
-            "velocity": planar_velocity(facts), "contact": facts.contact, "alive": now.alive,
+            "velocity": facts.planar_velocity, "contact": facts.contact, "alive": now.alive,
             "gravity": facts.gravity.astype(np.float32),
             "heading": heading(self.env.robots.qpos), "slip_m_s": slip.sum(axis=1),
             "swing_s": (facts.last_air_s * ended).sum(axis=1), "swings": ended.sum(axis=1),

@@ -20,8 +20,7 @@ from pupper_sysid.common.results import plain
 from pupper_sysid.common.tables import Column, Table, ends, rounded
 from pupper_sysid.policies.evaluation.evaluate import WALKERS, Evaluation, Figures, in_short
 from pupper_sysid.policies.network.policy_file import Policy
-from pupper_sysid.policies.train.curves import LARGEST_BYTES, PROGRESS
-from pupper_sysid.policies.train.run_file import RUN_FILE, Run
+from pupper_sysid.policies.train.run_file import LARGEST_CURVES_BYTES, PROGRESS, RUN_FILE, Run
 from pupper_sysid.policies.walks.rollouts import ERRORS, STRIDE_ERRORS
 
 _WALK = Column("", "walk", kind="key")
@@ -254,7 +253,7 @@ def _findings(evaluation: Evaluation) -> list[tuple[str, str]]:
 def _curves(path: Path) -> dict[str, np.ndarray]:
     """Columns of `progress.csv`."""
     remedy = "Move it away for a page without the training."
-    columns = read_table(path, read_text(path, LARGEST_BYTES, remedy), strict=False).numbers
+    columns = read_table(path, read_text(path, LARGEST_CURVES_BYTES, remedy), strict=False).numbers
     lacking = [name for name in ("samples", *_CURVES) if name not in columns]
     if lacking:
         raise InputError(f"{path} has no numbers called {lacking[0]}. {remedy}")

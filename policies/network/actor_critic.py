@@ -17,9 +17,9 @@ from rsl_rl.utils import unpad_trajectories
 from tensordict import TensorDict
 from torch.distributions import Normal
 
-from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
 from pupper_sysid.policies.network.policy_network import CONTEXT, WIDTH, CausalAttention, step
-from pupper_sysid.sim.walking.observation import CLOCK_SEEN, OBSERVATION_PARTS
+from pupper_sysid.policies.train.run_file import Architecture, Hyperparameters
+from pupper_sysid.sim.walking.step import CLOCK_SEEN, OBSERVATION_PARTS
 
 
 class ActionNoise(GaussianDistribution):

@@ -19,6 +19,7 @@ have no slope at errors of several widths.
 from __future__ import annotations
 
 import os
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,16 +30,15 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.results import Result
-from pupper_sysid.policies.network.hyperparameters import OWN, TROT
-from pupper_sysid.policies.train.run_file import Run
+from pupper_sysid.policies.train.run_file import OWN, TROT, Run
 from pupper_sysid.policies.train.selection import COMMANDS, scored
-from pupper_sysid.policies.walks.conditions import evaluation_task, share_of_usual, within
+from pupper_sysid.policies.walks.together import evaluation_task, share_of_usual, within
 from pupper_sysid.sim.robot.body import Body
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.draws import Twins
 from pupper_sysid.sim.walking.env import PupperEnv
-from pupper_sysid.sim.walking.rewards.strides import LOW_SWING_M, by_kind
+from pupper_sysid.sim.walking.rewards import LOW_SWING_M, by_kind
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 
 Array = NDArray[np.float64]
@@ -244,17 +244,16 @@ def suited(run: Run, fitted: FirstGait) -> Run:
     if fitted.trot == run.task.trot and not fitted.after.poor:
         return run
     trot, score, rewards = fitted.trot, fitted.after, run.task.rewards
-
-    def wider(name: str, error: float) -> float:
+    errors = {
+        "linear_sigma": score.speed_error_m_s, "stride_linear_sigma": score.mean_speed_error_m_s,
+        "angular_sigma": score.turn_error_rad_s,
+        "stride_angular_sigma": score.mean_turn_error_rad_s,
+    }  # fmt: skip
+    changes: dict[str, float] = {}
+    for name, error in errors.items():
         usual = _USUAL[name] * run.task.body.command_scale[2 if "angular" in name else 0]
-        return getattr(rewards, name) * float(min(max(error / usual, 1.0), _WIDEST))
-
-    changes = {
-        "linear_sigma": wider("linear_sigma", score.speed_error_m_s),
-        "stride_linear_sigma": wider("stride_linear_sigma", score.mean_speed_error_m_s),
-        "angular_sigma": wider("angular_sigma", score.turn_error_rad_s),
-        "stride_angular_sigma": wider("stride_angular_sigma", score.mean_turn_error_rad_s),
-    }
+        wider = float(min(max(error / usual, 1.0), _WIDEST))
+        changes[name] = wider * getattr(rewards, name)
     if run.imitation.teacher == OWN:
         usual = Trot()  # to which the clock of the rewards belongs
         changes |= {
@@ -325,18 +324,13 @@ def fit_trot(
         progress((generation + 1) / (_GENERATIONS + 1))
     best = [trot for _, trot in sorted(tried, key=lambda pair: pair[0])[: _FINALISTS - 1]]
     trots = [task.trot, _trot(task.trot, box, mean), *best]
-    walked = _judged(trots, task, servos, seed, threads)
-    before = _score(walked[0])
-    # in the physics of evaluation the speeds differ a little
-    more = [_corrected(trot, walk) for trot, walk in zip(trots, walked, strict=True)]
-    walked += _judged(more, task, servos, seed, threads)
-    trots += more
-    chosen = int(np.argmin([_cost(walk) for walk in walked]))
-    again = _corrected(trots[chosen], walked[chosen])
-    trots, walked = [trots[chosen], again], [walked[chosen]]
-    walked += _judged([again], task, servos, seed, threads)
-    chosen = int(np.argmin([_cost(walk) for walk in walked]))
-    trot, walk = trots[chosen], walked[chosen]
+    finalists = list(zip(trots, _judged(trots, task, servos, seed, threads), strict=True))
+    before = _score(finalists[0][1])
+    for _ in range(2):  # in the physics of evaluation the speeds differ a little
+        corrected = [_corrected(trot, walk) for trot, walk in finalists]
+        finalists += zip(corrected, _judged(corrected, task, servos, seed, threads), strict=True)
+        finalists = [min(finalists, key=lambda finalist: _cost(finalist[1]))]
+    ((trot, walk),) = finalists
     after = _score(walk)
     poor = after.poor and not ends()
     limit = _limit(trot, walk, task, servos, seed, threads) if poor else None
@@ -433,10 +427,7 @@ def _walk(
     env.set_command(np.tile(command, (count, 1)))
     actions = _actions(trots, env, command, steps)
     alive = np.ones(n * count, bool)
-    records: dict[str, list[NDArray]] = {
-        name: []
-        for name in ("velocity", "stride", "up", "clearance", "saturated", "square", "sway")
-    }
+    records: dict[str, list[NDArray]] = defaultdict(list)
     for action in actions:
         if ends():
             return []

@@ -35,13 +35,16 @@ from tensordict import TensorDict
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.policies.network.actor_critic import build
-from pupper_sysid.policies.network.hyperparameters import Imitation
-from pupper_sysid.policies.train.learner import Learner, judged_weights, read_checkpoint
-from pupper_sysid.policies.train.run_file import Run, check_teacher
-from pupper_sysid.policies.train.vec_env import WalkingVecEnv
-from pupper_sysid.policies.walks.conditions import share_of_usual
+from pupper_sysid.policies.train.learner import (
+    Learner,
+    WalkingVecEnv,
+    judged_weights,
+    read_checkpoint,
+)
+from pupper_sysid.policies.train.run_file import Imitation, Run, check_teacher
+from pupper_sysid.policies.walks.together import share_of_usual
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.observation import CLOCK_SEEN, OBSERVATION_PARTS
+from pupper_sysid.sim.walking.step import CLOCK_SEEN, OBSERVATION_PARTS
 
 Array = NDArray[np.float64]
 

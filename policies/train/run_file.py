@@ -1,7 +1,8 @@
 """Settings of a training run, and the file in its folder that holds them.
 
-`Run` holds all settings; `preset` gives complete ones for a kind of policy. `save_run` writes
-`run.yaml` into a run's folder, with hashes and versions; `load_run` reads and checks it.
+`Run` holds all settings, one table for all architectures; `preset` gives complete ones for a kind
+of policy. `save_run` writes `run.yaml` into a run's folder, with hashes and versions; `load_run`
+reads and checks it. Nothing here imports torch.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast, get_origin, get_type_hints
 
+import tyro
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
@@ -21,16 +23,133 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256, versions, write_text
 from pupper_sysid.common.results import plain
 from pupper_sysid.common.strict_yaml import Place
-from pupper_sysid.policies.network.hyperparameters import (
-    OWN,
-    Architecture,
-    Exploration,
-    Hyperparameters,
-    Imitation,
-    Kind,
+from pupper_sysid.sim.walking.config import (
+    CLOCK,
+    PRESETS,
+    Curriculum,
+    Observation,
+    Rewards,
+    Walking,
+    for_robot,
 )
-from pupper_sysid.sim.walking.config import PRESETS, Curriculum, Observation, Walking, for_robot
-from pupper_sysid.sim.walking.rewards.weights import CLOCK, Rewards
+
+Kind = Literal["mlp", "lstm", "gru", "transformer", "mlp-actions"]
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Kind and size of a policy."""
+
+    kind: Annotated[Kind, tyro.conf.Suppress] = "mlp"
+    """Kind of network; `--policy` sets it."""
+    hidden: tuple[int, ...] = (256, 128, 64)
+    """Units of the layers of the head (of the MLP)."""
+    memory: int = 128
+    """Units of an LSTM or GRU."""
+    critic_hidden: tuple[int, ...] = (256, 128, 64)
+    """Units of the layers of the critic."""
+    privileged_critic: bool = True
+    """Whether the critic has the true state beside the observation."""
+    privileged_actor: bool = False
+    """Whether the policy acts by the clock of the reward and sees, besides, its command, the IMU
+    and the trunk's true speed alone: a teacher, which no robot can follow, for policies that can
+    (`--start scratch`)."""
+
+
+@dataclass(frozen=True)
+class Exploration:
+    """Noise of the actions while a policy learns."""
+
+    std: tuple[float, float] = (0.05, 0.04)
+    """Standard deviation at the start and at the end; 1 is `action_scale` radians. A learned one
+    starts at the first and never falls below the second."""
+    anneal_m_samples: tuple[float, float] = (0.0, 20.0)
+    """Millions of samples between which it falls, by equal factors."""
+    by_dead_band: bool = True
+    """Whether joints of larger dead band (friction over stiffness) get more noise in proportion."""
+    learned: bool = False
+    """Whether the standard deviation is learned instead of scheduled, as published."""
+
+    def std_at(self, samples: float) -> float:
+        """Scheduled standard deviation after so many samples."""
+        (first, last), (begin, end) = self.std, self.anneal_m_samples
+        share = (1e-6 * samples - begin) / max(end - begin, 1e-9)
+        return first * (last / first) ** min(max(share, 0.0), 1.0)
+
+
+@dataclass(frozen=True)
+class Hyperparameters:
+    """Of PPO; the same table for all architectures."""
+
+    steps_per_environment: int = 24
+    """Control steps between two updates."""
+    epochs: int = 4
+    """Passes over the data of an update."""
+    minibatches: int = 4
+    """Parts of the data per pass."""
+    learning_rate: float = 1e-6
+    """Of the policy, at the start; then adapted to the KL divergence."""
+    learning_rates: tuple[float, float] = (1e-7, 1e-3)
+    """Smallest and largest learning rate of the policy."""
+    critic_learning_rate: float = 1e-3
+    """Of the critic."""
+    desired_kl: float = 0.01
+    """KL divergence per update that the policy's learning rate aims at, of actions given the noise
+    before."""
+    critic_warmup: int = 0
+    """First updates in which only the critic learns."""
+    discount: float = 0.99
+    """γ."""
+    gae_lambda: float = 0.95
+    """λ of the generalised advantage estimate."""
+    clip: float = 0.2
+    """Of the probability ratio and of the change of the value."""
+    entropy: float = 0.0
+    """Weight of the entropy; without effect unless the standard deviation is learned."""
+    value_weight: float = 0.5
+    """Weight of the value's error."""
+    gradient_norm: float = 1.0
+    """Largest norm of a gradient."""
+    exploration: Exploration = field(default_factory=Exploration)
+    mirror: bool = False
+    """Whether every sample is also learned from as its mirror image, left for right; for policies
+    without a memory."""
+    normalise: bool = True
+    """Whether observations are normalised by their running mean and deviation."""
+    freeze_normaliser: bool = False
+    """Whether that mean and deviation stay what they were at the start of PPO."""
+    mixed_precision: bool = False
+    """Whether updates are computed in bfloat16; worth it where the processor has it (avx512_bf16,
+    amx)."""
+    averaging: int = 1
+    """Updates over which the weights of the policy that is judged and saved are averaged
+    (exponentially), which smooths out the noise of single updates; 1 for the last ones."""
+
+
+TROT, OWN = "trot", "own"
+
+
+@dataclass(frozen=True)
+class Imitation:
+    """Settings of the first gait's imitation."""
+
+    iterations: int = 12
+    """Rounds; 0 to start PPO from random weights."""
+    teacher: str = TROT
+    """`trot`: the open-loop trot; `own`: one that is trained from nothing first, in the run's
+    folder `teacher/`; or the folder of a run of `--start teacher`."""
+    rollouts: int = 5
+    """Rollouts per round, each of as many steps as one of PPO."""
+    epochs: int = 10
+    """Passes over the data of a round."""
+    minibatches: int = 16
+    """Parts of each rollout per pass."""
+    learning_rate: float = 1e-2
+    """Of Muon (matrices) and Adam (biases) at the start; it falls to 0 with the last step."""
+    correction_rate: float = 0.3
+    """Share of the policy's errors of speed by which the teacher's commands change per round, in
+    the second half of the rounds."""
+
 
 Start = Literal["imitation", "scratch", "teacher"]
 """How a policy comes to its first gait: by imitation of a trot, or of a teacher that was trained
@@ -42,6 +161,8 @@ LearnerDevice = Literal["as-device", "cpu", "cuda"]
 RUN_SCHEMA = "pupper-run"
 RUN_VERSION = 3
 RUN_FILE = "run.yaml"
+PROGRESS = "progress.csv"
+LARGEST_CURVES_BYTES = 100e6
 _OF_TEACHER = (*CLOCK, "clock_duty", "crouch", "spread")  # parameters of its rewards
 # settings that say what actions mean
 _OF_ACTIONS = ("action_scale", "control_step_s", "knee", "robot", "robot_config")
@@ -93,7 +214,7 @@ class Run:
     """Of everything that is drawn."""
 
     def __post_init__(self):
-        refuse_impossible(self)
+        _refuse_impossible(self)
 
 
 def preset(
@@ -343,6 +464,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "task.action_scale": (1e-3, 10),
     "learner.steps_per_environment": (1, 10_000),
     "learner.epochs": (1, 1000),
+    "learner.minibatches": (1, 1_000_000_000),
+    "learner.averaging": (1, 1_000_000),
     "learner.learning_rate": (1e-12, 10),
     "learner.learning_rates": (1e-12, 10),
     "learner.critic_learning_rate": (1e-12, 10),
@@ -351,18 +474,17 @@ _RANGES: dict[str, tuple[float, float]] = {
     "imitation.iterations": (0, 1_000_000),
     "imitation.rollouts": (1, 1_000),
     "imitation.epochs": (1, 10_000),
+    "imitation.minibatches": (1, 1_000_000_000),
     "imitation.learning_rate": (1e-12, 10),
 }
 """Smallest and largest value, by the dotted name of a setting."""
 
 
-def refuse_impossible(run: Run) -> None:
+def _refuse_impossible(run: Run) -> None:
     """Refuse settings outside their ranges: a misprint, or what fills the memory.
 
     They come from the command line and from a run's file, which may be damaged or anybody's. The
     ranges are far wider than anything that trains.
-
-    `seed` is any whole number from 0 on.
     """
     for name, value in _numbers(run, ""):
         low, high = _RANGES.get(name, (-_LARGEST, _LARGEST))
@@ -373,8 +495,17 @@ def refuse_impossible(run: Run) -> None:
         raise InputError(f"seed is {str(run.seed)[:24]}; it must be 0 or more, below 2^63.")
     for name in ("hidden", "critic_hidden"):
         layers = len(getattr(run.architecture, name))
+        if not layers:
+            raise InputError(f"architecture.{name} is empty; give the units of each layer.")
         if layers > _MOST_LAYERS:
             raise InputError(f"architecture.{name} has {layers} layers; at most {_MOST_LAYERS}.")
+    if run.architecture.privileged_actor and run.architecture.kind != "mlp":
+        raise InputError(
+            f"A teacher is an MLP, not a policy of kind {run.architecture.kind}. What learns from "
+            "it can be of any kind."
+        )
+    if not min(run.learner.exploration.std) > 0:
+        raise InputError("learner.exploration.std must be positive.")
     samples = run.environments * run.learner.steps_per_environment
     if run.learner.minibatches > samples:
         raise InputError(

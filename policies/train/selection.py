@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from rsl_rl.models import MLPModel
 
-from pupper_sysid.policies.train.vec_env import WalkingVecEnv
-from pupper_sysid.policies.walks.conditions import evaluation_task, share_of_usual, within
+from pupper_sysid.policies.train.learner import WalkingVecEnv
+from pupper_sysid.policies.walks.together import evaluation_task, share_of_usual, within
 from pupper_sysid.servo_models.networks import JointArrays
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.env import PupperEnv

@@ -12,9 +12,12 @@ no robot can.
 
 from __future__ import annotations
 
+import csv
+import math
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -22,12 +25,14 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from pupper_sysid.common.border import read_text
 from pupper_sysid.common.errors import InputError, PupperError
+from pupper_sysid.common.files import write_text
 from pupper_sysid.common.processes.stop import finishing
 from pupper_sysid.common.processes.workers import keep_freed_memory
-from pupper_sysid.policies.network.hyperparameters import OWN, TROT
-from pupper_sysid.policies.network.policy_export import write_policy
-from pupper_sysid.policies.train.curves import CurveWriter, EpisodeMeans
+from pupper_sysid.common.reading.content import refuse_more
+from pupper_sysid.common.reading.dialect import whole_number
+from pupper_sysid.policies.network.policy_file import write_policy
 from pupper_sysid.policies.train.imitation import (
     LearnedTeacher,
     Teacher,
@@ -35,9 +40,13 @@ from pupper_sysid.policies.train.imitation import (
     imitate,
     load_teacher,
 )
-from pupper_sysid.policies.train.learner import Learner, Ranks
+from pupper_sysid.policies.train.learner import Learner, Ranks, WalkingVecEnv
 from pupper_sysid.policies.train.run_file import (
+    LARGEST_CURVES_BYTES,
+    OWN,
+    PROGRESS,
     RUN_FILE,
+    TROT,
     Run,
     refuse_taken,
     resume_run,
@@ -45,7 +54,6 @@ from pupper_sysid.policies.train.run_file import (
     teacher_of,
 )
 from pupper_sysid.policies.train.selection import Judge
-from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
 
@@ -69,11 +77,11 @@ class Progress:
     left_s: float
 
 
-def make_env(run: Run, ranks: Ranks, servos: ServoRanges | None = None) -> PupperEnv:
+def make_env(run: Run, ranks: Ranks) -> PupperEnv:
     """The environment of a run (of this process)."""
     threads = threads_of(run, ranks)
     return PupperEnv(
-        run.task, servos or servo_ranges(run.actuator, run.feedback, run.task.body),
+        run.task, servo_ranges(run.actuator, run.feedback, run.task.body),
         run.environments, run.seed + 7919 * ranks.rank, threads,
         servo_model_of(run.actuator, run.task.control_step_s),
         device={"cpu": None, "warp-cpu": "cpu"}.get(run.device, _local(run.device, ranks)),
@@ -398,7 +406,7 @@ class _Session:
             write_policy(
                 self.folder / name, self.learner.averaged.state_dict(), self.run, servos,
                 action_history(self.run, servos), about,
-                command_share=self.learner.env.env.level.commands,
+                command_share=self.learner.env.env.level["commands"],
             )  # fmt: skip
 
     def report(
@@ -440,3 +448,101 @@ class _Session:
 def _rank_file(name: str, ranks: Ranks) -> str:
     """Name of a rank's checkpoint; each rank has its own environments."""
     return name if ranks.rank == 0 else name.replace(".pt", f".rank{ranks.rank}.pt")
+
+
+_NUMBER = 40  # characters of a row that may hold its number
+MOST_ROWS = 1_000_000
+
+
+class EpisodeMeans:
+    """Means over the steps of an update: reward and its terms, falls, lengths of episodes."""
+
+    def __init__(self, environments: int):
+        self._length = np.zeros(environments)
+        self._terms: list[dict[str, float]] = []
+        self._ended: list[float] = []
+        self._falls = self._steps = 0
+
+    def __call__(self, rewards: torch.Tensor, dones: torch.Tensor, extras: dict) -> None:
+        done = dones.cpu().numpy().astype(bool)
+        self._length += 1
+        self._ended += self._length[done].tolist()
+        self._length[done] = 0
+        self._falls += int(done.sum()) - len(extras["terminal_ids"])
+        self._steps += len(done)
+        self._terms.append({k: float(v.mean()) for k, v in extras["terms"].items()})
+
+    def row(self) -> dict[str, float]:
+        """Means since the last call."""
+        names = self._terms[0]
+        terms = {k: float(np.mean([t[k] for t in self._terms])) for k in names}
+        row = {
+            "reward": sum(terms.values()),
+            "falls_per_1000_steps": 1000 * self._falls / self._steps,
+            "episode_steps": float(np.mean(self._ended)) if self._ended else float("nan"),
+            **{f"reward.{k}": v for k, v in terms.items()},
+        }
+        self._terms, self._ended, self._falls, self._steps = [], [], 0, 0
+        return row
+
+
+class CurveWriter:
+    """`progress.csv`, `imitation.csv` and TensorBoard, appended to.
+
+    Rows beyond `done` (by phase) are from after the checkpoint that is resumed, and are dropped.
+    """
+
+    def __init__(self, folder: Path, done: dict[str, int]):
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._paths = {"ppo": folder / PROGRESS, "imitation": folder / "imitation.csv"}
+        for phase, path in self._paths.items():
+            with _writing(path):
+                _drop_rows(path, done[phase])
+        with _writing(folder / "tensorboard"):
+            self._board = SummaryWriter(str(folder / "tensorboard"))
+
+    def write(self, phase: str, step: int, row: dict[str, float]) -> None:
+        """One row."""
+        path = self._paths[phase]
+        with _writing(path):
+            new = not path.exists()
+            with path.open("a", newline="") as file:
+                writer = csv.writer(file)
+                if new:
+                    writer.writerow(["update", *row])
+                writer.writerow([step, *(f"{v:.6g}" for v in row.values())])
+            for name, value in row.items():
+                self._board.add_scalar(f"{phase}/{name}", value, step)
+
+    def close(self) -> None:
+        """Finish writing."""
+        self._board.close()
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Turn a failed write (full disk, no permission) into an `InputError`."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
+
+
+def _drop_rows(path: Path, last: int) -> None:
+    """Keep a table's header and its rows up to update `last`."""
+    if not path.exists():
+        return
+    text = read_text(path, LARGEST_CURVES_BYTES)
+    refuse_more(path, text.count("\n"), MOST_ROWS, "rows")
+    header, *rows = text.splitlines(keepends=True) or [""]
+    rows_before = [row for row in rows if _update(row[:_NUMBER]) <= last]
+    if rows_before != rows:
+        write_text(path, "".join([header, *rows_before]), force=True)
+
+
+def _update(row: str) -> float:
+    """Number of a row's update; infinite where there is none."""
+    with suppress(ValueError):
+        return whole_number(row.split(",")[0])
+    return math.inf

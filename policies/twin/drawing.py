@@ -21,7 +21,13 @@ from pupper_sysid.servo_models.calibration.calibration import Calibration, load_
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, JointCalibration
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.robot.engine import mujoco
-from pupper_sysid.sim.robot.replay import ServoRobot, compiled, mini_pupper_robot, robot_of
+from pupper_sysid.sim.robot.replay import (
+    ServoRobot,
+    compiled,
+    mini_pupper_robot,
+    robot_of,
+    servo_angles,
+)
 from pupper_sysid.sim.walking.servo_ranges import (
     IDEAL,
     check_actuator,
@@ -162,11 +168,11 @@ class HungRobot:
         The direction of gravity in the trunk's frame, shape (n, 3), gives roll and pitch; the
         heading stays forward. By default, and where it is NaN, the trunk is level.
         """
-        model, joints = self._model, self.robot.joints
-        data = mujoco.MjData(model)
-        qpos = np.tile(data.qpos, (len(servo_rad), 1))
-        at = [int(model.joint(name).qposadr[0]) for name in joints]
-        qpos[:, at] = _joint_angles(model, data, joints, servo_rad + self.robot.shift_rad)
+        model = self._model
+        qpos = np.tile(model.qpos0, (len(servo_rad), 1))
+        at = [int(model.joint(name).qposadr[0]) for name in self.robot.joints]
+        # a servo that turns a tendon turns several joints
+        qpos[:, at] = (servo_rad + self.robot.shift_rad) @ np.linalg.inv(servo_angles(model)[at])
         bodies = bodies_over_time(model, qpos, self._surfaces)
         return bodies if gravity is None else _tilted(bodies, gravity)
 
@@ -209,20 +215,6 @@ def _tilted(bodies: list[Body], gravity: Array) -> list[Body]:
         )
         for body in bodies
     ]  # fmt: skip
-
-
-def _joint_angles(model: Any, data: Any, joints: tuple[str, ...], servo: Array) -> Array:
-    """Joint angles of servo angles: a servo that turns a tendon turns several joints."""
-    at = [int(model.joint(name).qposadr[0]) for name in joints]
-
-    def lengths(angles: Array) -> Array:
-        data.qpos[at] = angles
-        mujoco.mj_fwdPosition(model, data)
-        return data.actuator_length.copy()
-
-    zero = lengths(np.zeros(len(at)))
-    moment = np.stack([lengths(row) - zero for row in np.eye(len(at))], axis=1)
-    return np.linalg.solve(moment, (servo - zero).T).T.astype(np.float64)
 
 
 def _surfaces(model: Any) -> dict[int, Surface]:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pupper_sysid.common.errors import InputError
+from pupper_sysid.sim.robot.engine import mujoco
 
 SIZE = (720, 1280)
 """Height and width [pixels]."""
@@ -40,11 +41,10 @@ class Film:
         self, path: Path, model: Any, step_s: float, lines: Sequence[str], command: Sequence[float],
         scale: float = 1.0,
     ):  # fmt: skip
-        self._mujoco: Any = importlib.import_module("mujoco")
         frame = model.vis.global_  # of a user's model it may be smaller
         frame.offheight, frame.offwidth = np.maximum((frame.offheight, frame.offwidth), SIZE)
         try:
-            self._renderer = self._mujoco.Renderer(model, *SIZE)
+            self._renderer = mujoco.Renderer(model, *SIZE)
         except Exception as error:  # EGL, OSMesa and GLFW raise different errors
             raise InputError(
                 f"No frames can be drawn here ({type(error).__name__}: {error}), so there is no "
@@ -63,11 +63,11 @@ class Film:
         self._model, self._step_s = model, step_s
         self._lines, self._command = tuple(lines), tuple(command)
         self._velocity: deque[NDArray[np.float64]] = deque(maxlen=max(1, round(_MEAN_S / step_s)))
-        self._camera = self._mujoco.MjvCamera()
+        self._camera = mujoco.MjvCamera()
         self._camera.azimuth, self._camera.elevation = _AZIMUTH_DEG, _ELEVATION_DEG
         self._camera.distance = _DISTANCE_M * scale
         self._height_m = _HEIGHT_M * scale
-        self._shown = self._mujoco.MjvOption()
+        self._shown = mujoco.MjvOption()
         if not (model.geom_group[model.geom_bodyid > 0] < _HIDDEN_GROUP).any():
             self._shown.geomgroup[:] = 1  # a robot without meshes is drawn as what collides
         self._pictures = 0

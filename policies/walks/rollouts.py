@@ -29,11 +29,9 @@ from torch.utils.hooks import RemovableHandle
 
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.network.policy_network import ACTIONS, PolicyNetwork
-from pupper_sysid.policies.walks.conditions import Condition, Moment, StepRecorder
-from pupper_sysid.policies.walks.together import walk_together
+from pupper_sysid.policies.walks.together import Condition, Moment, StepRecorder, walk_together
 from pupper_sysid.sim.walking.env import PupperEnv
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
-from pupper_sysid.sim.walking.step import Step
 
 Array = NDArray[np.float64]
 
@@ -47,11 +45,6 @@ STRIDE_ERRORS = tuple(f"stride_{name}" for name in ERRORS)
 
 _STRIDE_S = (0.2, 1.0)  # strides that are averaged over
 _USUAL_STRIDE_S = 0.3  # of robots that take no steps
-
-
-def planar_velocity(facts: Step) -> Array:
-    """Forward and sideways speed [m/s] and turn rate [rad/s] of each robot, shape (n, 3)."""
-    return np.column_stack([facts.linear_velocity[:, :2], facts.angular_velocity[:, 2]])
 
 
 def counted(velocity: Array, alive: Bools, fell: Bools) -> tuple[Array, Bools]:
@@ -204,7 +197,7 @@ class _Recorder(StepRecorder[Rollout]):
         return {
             "action": now.action, "contact": now.facts.contact, "alive": now.alive,
             "joint_position": now.facts.position_relative + self.env.default,
-            "velocity": planar_velocity(now.facts),
+            "velocity": now.facts.planar_velocity,
             "position": np.column_stack([qpos[:, :2], heading(qpos)]),
         }  # fmt: skip
 

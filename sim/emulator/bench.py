@@ -6,7 +6,8 @@ are counted in the order of `JOINT_NAMES`, their angles are in servo coordinates
 
 The emulators of all protocols use the same servos as `EmulatedBus`, with the same truth. A bench
 adds the encoder's counts, the duty, the supply, and a hand that moves limp joints (`move_by_hand`),
-so that a calibration of the joints can be rehearsed without a robot.
+so that a calibration of the joints can be rehearsed without a robot. `BusFaults` are faults of real
+buses, injected at chosen rates, repeatably.
 
 Polls are those of the robot's firmware (`servo_models.held_feedback`): its servo task polls one
 servo after the other: servo `i` of `n` a share `i / n` of a round after the first. The length of a
@@ -18,15 +19,25 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from threading import RLock
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pupper_sysid.common.errors import InputError
+from pupper_sysid.common.reading.dialect import decimal
 from pupper_sysid.hardware.imu import GRAVITY_M_S2, ImuSample
 from pupper_sysid.hardware.joint_map import JointMap
+from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.emulator.robot import EmulatedRobot
+from pupper_sysid.sim.robot.servo_mjcf import (
+    for_commands_between_steps,
+    free_air_xml,
+    rest_at,
+    switch_torque,
+)
 
 _CHUNK = 256
 _DRIFT_MEMORY_S = 5.0  # recordings of 3 s see different mean periods, so it wanders over seconds
@@ -171,8 +182,6 @@ class FreeAirServos(ServosOnStand):
     """A `ServoPlant` on a stand, legs in free air."""
 
     def __init__(self, robot: EmulatedRobot):
-        from pupper_sysid.sim.emulator.free_air import FreeAirServo  # imports MuJoCo
-
         pose = robot.joint_map.rest_pose().tolist()
         super().__init__(
             [FreeAirServo(s.actuator, x) for s, x in zip(robot.servos, pose, strict=True)]
@@ -280,3 +289,201 @@ class ServoBench:
     def truth(self, **transport: Any) -> dict[str, Any]:
         """True parameters, and how the protocol delays commands (`transport`)."""
         return self.robot.truth() | {"transport": transport}
+
+
+ANSWER_KINDS = (
+    "lost", "late", "truncated", "corrupted", "duplicated", "foreign", "wrong-length",
+)  # fmt: skip
+STATE_KINDS = ("error-bits", "frozen", "reboot", "brown-out", "unplugged", "second-writer")
+KINDS = (*ANSWER_KINDS, *STATE_KINDS)
+
+_LATE_S = (0.004, 0.06)
+
+
+@dataclass
+class BusFaults:
+    """Faults drawn at given rates."""
+
+    rates: dict[str, float]
+    """Probability per answer, for each of `KINDS`."""
+    rng: np.random.Generator
+    lasts_s: float = 0.2
+    """How long faults of servos and lines last."""
+    counts: dict[str, int] = field(default_factory=dict)
+    """How many were injected."""
+    ended: list[tuple[str, float]] = field(default_factory=list)
+    """Kind and end of faults that last, on the emulator's clock."""
+
+    def __post_init__(self):
+        for kind, rate in self.rates.items():
+            if kind not in KINDS:
+                raise InputError(f"fault '{kind}' is not known; known are {', '.join(KINDS)}.")
+            if not 0 <= rate <= 1:
+                raise InputError(f"fault {kind}: {rate} is not a probability; choose 0 to 1.")
+        if sum(self.rates.values()) > 1:
+            raise InputError("faults: the probabilities add up to more than 1.")
+        self._kinds = [k for k, r in self.rates.items() if r > 0]
+        self._edges = np.cumsum([self.rates[k] for k in self._kinds])
+
+    @classmethod
+    def parse(cls, text: str, rng: np.random.Generator) -> BusFaults:
+        """Faults from `kind=rate,kind=rate`; an empty text is none."""
+        rates = {}
+        for part in filter(None, (piece.strip() for piece in text.split(","))):
+            kind, _, rate = part.partition("=")
+            try:
+                rates[kind] = decimal(rate)
+            except ValueError:
+                raise InputError(
+                    f"`faults`: '{part}' is not kind=probability, such as lost=0.02."
+                ) from None
+        return cls(rates, rng)
+
+    def draw(self) -> str | None:
+        """The fault of the next answer, if any; counted."""
+        if not self._kinds:
+            return None
+        k = int(np.searchsorted(self._edges, self.rng.random(), side="right"))
+        if k >= len(self._kinds):
+            return None
+        self.counts[self._kinds[k]] = self.counts.get(self._kinds[k], 0) + 1
+        return self._kinds[k]
+
+    def apply(self, kind: str | None, answer: bytes, foreign: bytes) -> list[tuple[float, bytes]]:
+        """What arrives instead of `answer`: pieces, each with its delay [s].
+
+        `foreign` is the answer to another request.
+        """
+        match kind:
+            case "lost" | "reboot":
+                return []
+            case "late":
+                return [(float(self.rng.uniform(*_LATE_S)), answer)]
+            case "truncated":
+                return [(0.0, answer[: int(self.rng.integers(1, len(answer)))])]
+            case "corrupted":
+                return [(0.0, corrupted(answer, self.rng))]
+            case "duplicated":
+                return [(0.0, answer), (0.0, answer)]
+        return [(0.0, foreign if kind == "foreign" else answer)]
+
+
+def corrupted(answer: bytes, rng: np.random.Generator) -> bytes:
+    """One burst of noise on a line: some bits of one byte, or of two neighbours, flipped."""
+    damaged = bytearray(answer)
+    at = int(rng.integers(len(damaged)))
+    damaged[at] ^= int(rng.integers(1, 256))
+    if rng.random() < 0.3 and at + 1 < len(damaged):
+        damaged[at + 1] ^= int(rng.integers(1, 256))
+    return bytes(damaged)
+
+
+PHYSICS_STEP_S = 0.001
+"""Half the step of fitting, so that the truth is not made by the model that is fitted."""
+
+_STILL_RAD_S = 1e-4  # MuJoCo's dry friction creeps at up to 3e-5 rad/s: invisible
+_STILL_RAD_S2 = 1e-4
+_STEPS_BETWEEN_LOOKS = 50
+
+
+class FreeAirServo:
+    """A servo in free air; time starts at 0 and must not go backwards.
+
+    MuJoCo steps it only as far, and as often, as its position is needed. Commands come at any
+    instant, not only on physics steps: the actuator gets the mean of the held command over the step
+    before (`sim.robot.servo_mjcf.for_commands_between_steps`). A servo at rest is not stepped until
+    a command moves it.
+
+    Parameters are scalars, the dead time at least two physics steps. It rests at `position_rad` at
+    the start, commanded there for long.
+    """
+
+    def __init__(
+        self,
+        parameters: DelayedPDParameters,
+        position_rad: float,
+        time_step_s: float = PHYSICS_STEP_S,
+    ):
+        from pupper_sysid.sim.robot.engine import mujoco
+
+        self._engine = mujoco
+        native = for_commands_between_steps(parameters, time_step_s, "servo")
+        self._model = mujoco.MjModel.from_xml_string(free_air_xml([native], time_step_s))
+        self._data = mujoco.MjData(self._model)
+        rest_at(self._model, self._data, [position_rad])
+        self._gains = self._model.actuator_biasprm.copy()
+        self._effort = float(np.asarray(parameters.effort_limit))
+        self._dt = time_step_s
+        self._settled_after = int(float(np.asarray(parameters.dead_time_s)) / time_step_s) + 3
+        self._step = 0
+        self._changed = -self._settled_after - 1
+        self._goal = float(position_rad)
+        self._queue: deque[tuple[float, float]] = deque()
+        self._limp = self._asleep = False
+
+    def command(self, time_s: float, position_rad: float) -> None:
+        """Set the command from `time_s` on; times must not go backwards."""
+        latest = self._queue[-1][1] if self._queue else self._goal
+        if not self._limp and position_rad != latest:
+            self._queue.append((time_s, float(position_rad)))
+            self._asleep = False
+
+    def position_at(self, time_s: float) -> float:
+        """True position [rad] at `time_s`, at most one physics step before the latest call."""
+        if time_s <= 0 or self._asleep:
+            return float(self._data.qpos[0])
+        self._advance(int(np.ceil(time_s / self._dt - 1e-9)))
+        # exact inside a step: MuJoCo moves the joint with the velocity at the step's end
+        ahead = self._step * self._dt - time_s
+        self._asleep = not self._queue and self._resting()
+        return float(self._data.qpos[0]) - float(self._data.qvel[0]) * ahead
+
+    @property
+    def load(self) -> float:
+        """Signed share of the effort limit in use at the time of the last call."""
+        if self._limp or self._asleep:
+            return 0.0
+        return float(self._data.actuator_force[0]) / self._effort
+
+    def torque(self, time_s: float, on: bool) -> None:
+        """Hold the present position, or go limp, from `time_s` on."""
+        position = self.position_at(time_s)
+        self._limp = not on
+        switch_torque(self._model, self._gains, on)
+        velocity = float(self._data.qvel[0])
+        rest_at(self._model, self._data, [position])
+        self._data.qvel[0] = velocity
+        self._goal = position
+        self._queue.clear()
+        self._changed = self._step
+        self._asleep = False
+
+    def _advance(self, last: int) -> None:
+        """Take physics steps until the state is that of the start of step `last`."""
+        while self._step < last:
+            # step k sees the commands of step k - 1
+            event = int(self._queue[0][0] / self._dt) + 1 if self._queue else last
+            if event > self._step:
+                steps = min(event, last) - self._step
+                if not self._resting():
+                    steps = min(steps, _STEPS_BETWEEN_LOOKS)
+                    self._data.ctrl[0] = self._goal
+                    self._engine.mj_step(self._model, self._data, nstep=steps)
+                self._step += steps
+            else:
+                since, stop = (self._step - 1) * self._dt, self._step * self._dt
+                integral, self._goal = held_over(since, stop, self._goal, self._queue)
+                self._data.ctrl[0] = integral / self._dt
+                self._engine.mj_step(self._model, self._data)
+                self._changed = self._step
+                self._step += 1
+
+    def _resting(self) -> bool:
+        """Whether another step would change nothing."""
+        data = self._data
+        return (
+            self._step - self._changed > self._settled_after
+            and abs(data.qvel[0]) < _STILL_RAD_S
+            and abs(data.qacc[0]) < _STILL_RAD_S2
+            and (self._limp or not len(data.act) or abs(data.act[0] - self._goal) < 1e-12)
+        )

@@ -25,8 +25,7 @@ import numpy as np
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.imu import to_chip
-from pupper_sysid.sim.emulator.bench import PollSchedule, ServoBench
-from pupper_sysid.sim.emulator.faults import BusFaults
+from pupper_sysid.sim.emulator.bench import BusFaults, PollSchedule, ServoBench
 
 TICK_S = 0.002
 """Period of the firmware's servo task [s], which writes goal positions."""

@@ -37,7 +37,13 @@ from pupper_sysid.common.data_sheet import no_load_speed, stall_torque
 from pupper_sysid.hardware.dynamixel import SERIES, profile
 from pupper_sysid.hardware.joint_map import JointMap, load_joint_map
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-from pupper_sysid.sim.emulator.bench import AMBIENT_C, SUPPLY_V, ServosOnStand, held_over
+from pupper_sysid.sim.emulator.bench import (
+    AMBIENT_C,
+    PHYSICS_STEP_S,
+    SUPPLY_V,
+    ServosOnStand,
+    held_over,
+)
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, directly_read, draw_robot
 from pupper_sysid.sim.robot.servo_mjcf import (
     FRICTION_SOLIMP,
@@ -45,6 +51,7 @@ from pupper_sysid.sim.robot.servo_mjcf import (
     MASSLESS,
     attributes,
     friction_solref,
+    numbers,
 )
 
 FEETECH_REGISTERS = {
@@ -132,7 +139,6 @@ def dynamixel_registers(model: str) -> dict[str, int]:
     }  # fmt: skip
 
 
-PHYSICS_STEP_S = 0.001
 GRAVITY_M_S2 = 9.81
 
 _STILL_RAD_S, _STILL_RAD_S2, _STILL_STEPS = 1e-4, 1e-2, 50
@@ -352,21 +358,21 @@ class PendulumServo:
 def _xml(p: PendulumServoParameters, time_step_s: float) -> str:
     """MJCF: a motor on a hinge about y, and its load, directly or through gears with play."""
     solver = {
-        "solreffriction": " ".join(map(_number, friction_solref(time_step_s))),
-        "solimpfriction": " ".join(map(_number, FRICTION_SOLIMP)),
+        "solreffriction": numbers(*friction_solref(time_step_s)),
+        "solimpfriction": numbers(*FRICTION_SOLIMP),
     }
     motor: dict[str, Any] = solver | {
-        "name": "motor", "type": "hinge", "axis": "0 1 0", "ref": _number(p.hanging_rad),
-        "armature": _number(p.armature_kg_m2), "damping": _number(p.back_emf_nm_s_rad),
-        "frictionloss": _number(p.friction_nm),
+        "name": "motor", "type": "hinge", "axis": "0 1 0", "ref": numbers(p.hanging_rad),
+        "armature": numbers(p.armature_kg_m2), "damping": numbers(p.back_emf_nm_s_rad),
+        "frictionloss": numbers(p.friction_nm),
     }  # fmt: skip
     total = p.mass_kg + p.arm_mass_kg
     load = MASSLESS
     if total > 0 and p.length_m > 0:
         below = (p.mass_kg + p.arm_mass_kg / 2) * p.length_m / total
-        inertia = _number(max(p.load_inertia_kg_m2 - total * below**2, 1e-12))
+        inertia = numbers(max(p.load_inertia_kg_m2 - total * below**2, 1e-12))
         load = (
-            f'<inertial pos="0 0 {_number(-below)}" mass="{_number(total)}" '
+            f'<inertial pos="0 0 {numbers(-below)}" mass="{numbers(total)}" '
             f'diaginertia="{inertia} {inertia} {inertia}"/>'
         )
     if p.backlash_rad:
@@ -375,9 +381,9 @@ def _xml(p: PendulumServoParameters, time_step_s: float) -> str:
             solver
             | {
                 "name": "play", "type": "hinge", "axis": "0 1 0", "armature": repr(_HORN_KG_M2),
-                "limited": "true", "range": f"{_number(-half)} {_number(half)}",
+                "limited": "true", "range": numbers(-half, half),
                 "solreflimit": "0.002 1", "solimplimit": "0.99 0.9999 0.0001",
-                "frictionloss": _number(p.output_friction_nm),
+                "frictionloss": numbers(p.output_friction_nm),
             }
         )  # fmt: skip
         load = f"{MASSLESS}<body><joint {play}/>{load}</body>"
@@ -385,12 +391,8 @@ def _xml(p: PendulumServoParameters, time_step_s: float) -> str:
         f'<mujoco><compiler angle="radian"/><option timestep="{time_step_s}" '
         f'integrator="{INTEGRATOR}" gravity="0 0 {-GRAVITY_M_S2}"/>'
         f"<worldbody><body><joint {attributes(motor)}/>{load}</body></worldbody>"
-        f'<actuator><motor joint="motor" gear="{_number(p.torque_nm)}"/></actuator></mujoco>'
+        f'<actuator><motor joint="motor" gear="{numbers(p.torque_nm)}"/></actuator></mujoco>'
     )
-
-
-def _number(value: float) -> str:
-    return repr(float(value))
 
 
 _SPREAD = ("torque_nm", "duty_per_rad", "back_emf_nm_s_rad", "friction_nm", "armature_kg_m2")

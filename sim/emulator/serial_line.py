@@ -27,7 +27,6 @@ import os
 import pty
 import select
 import struct
-import termios
 import threading
 import time
 import tty
@@ -40,8 +39,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from pupper_sysid.hardware.serial_servos.series import Family, Series
-from pupper_sysid.sim.emulator.bench import AMBIENT_C, ServoBench
-from pupper_sysid.sim.emulator.faults import BusFaults
+from pupper_sysid.sim.emulator.bench import AMBIENT_C, BusFaults, ServoBench
 
 Pieces = list[tuple[float, bytes]]
 """Bytes that come back, each piece with the time at which it has arrived."""
@@ -219,7 +217,7 @@ class LineEmulator(ABC):
         self._renamed.clear()
 
     def _byte_s(self, baud: int | None) -> float:
-        return 10.0 / (self.baud if baud is None or baud <= 0 else baud)  # 0: without a name
+        return 10.0 / (self.baud if baud is None or baud <= 0 else baud)
 
     def _holds_position(self, servo_id: int) -> bool:
         """Whether a servo goes to the positions that it is commanded, by its mode."""
@@ -410,13 +408,6 @@ class LineEmulator(ABC):
         return self.series.decode(name, bytes(self.servos[servo_id].memory))
 
 
-_SPEEDS = {
-    getattr(termios, f"B{rate}"): rate
-    for rate in (
-        9_600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800, 500_000, 921_600, 1_000_000,
-        2_000_000, 3_000_000, 4_000_000,
-    )
-}  # fmt: skip
 _IDLE_S = 0.05
 _TCGETS2, _TERMIOS2 = 0x802C542A, struct.Struct("=4IB19s2I")
 """Linux: request of a terminal's settings with its rates as numbers, and their layout."""
@@ -498,17 +489,7 @@ class SerialPty:
         self.emulator.faults.ended.append(("unplugged", self.now()))
 
     def _baud(self) -> int | None:
-        """Rate that the host has set; None if the terminal has none.
-
-        Linux has every rate as a number. Elsewhere those without a name are not distinguished: such
-        a one counts as the servos' if theirs has no name either, and else as 0, at which no servo
-        listens.
-        """
+        """Rate that the host has set, which Linux has as a number; None elsewhere."""
         with contextlib.suppress(OSError):
             return _TERMIOS2.unpack(fcntl.ioctl(self._host, _TCGETS2, bytes(_TERMIOS2.size)))[-1]
-        with contextlib.suppress(termios.error):
-            named = _SPEEDS.get(termios.tcgetattr(self._host)[4])
-            if named is not None:
-                return named
-            return 0 if self.emulator.baud in _SPEEDS.values() else self.emulator.baud
         return None

@@ -39,6 +39,8 @@ from pupper_sysid.sim.export.mjcf import to_mjcf
 from pupper_sysid.sim.export.shared import ExportedServos
 from pupper_sysid.sim.robot.servo_mjcf import hold
 
+Array = NDArray[np.float64]
+
 TONES_HZ, AMPLITUDE_RAD, TONE_S = (1.7, 2.7, 3.7), 0.25, 1.0
 WALK_S = 2.0
 _SETTLE_S = 0.5
@@ -139,9 +141,7 @@ def step_costs(servos: ExportedServos, commands: NDArray) -> dict[str, list[floa
     return costs
 
 
-def _fitted_motion(
-    joint: JointCalibration, commands: NDArray
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _fitted_motion(joint: JointCalibration, commands: NDArray) -> tuple[Array, Array]:
     """Times and positions of the calibration's model, in the steps of its fit."""
     actuator, loaded = joint.actuator, joint.under_load
     step_s, start = actuator.fitted_step_s, np.array(commands[0])
@@ -234,9 +234,7 @@ def compiled(servos: ExportedServos, defaults: str = _MODEL_DEFAULTS) -> Any:
     return mujoco.MjModel.from_xml_string(text, {"servos.xml": to_mjcf(servos).encode()})
 
 
-def moved_by(
-    model: Any, joints: tuple[str, ...], commands: NDArray, step_s: float
-) -> NDArray[np.float64]:
+def moved_by(model: Any, joints: tuple[str, ...], commands: NDArray, step_s: float) -> Array:
     """Positions of hinges after each step, (steps, joints), from rest at the first command."""
     from pupper_sysid.sim.robot.engine import mujoco
 
@@ -255,7 +253,7 @@ def moved_by(
     return np.array(positions)
 
 
-def held(commands: NDArray, step_s: float) -> NDArray[np.float64]:
+def held(commands: NDArray, step_s: float) -> Array:
     """Mean of the held commands of a loop over each physics step."""
     edges = CONTROL_S * np.arange(len(commands) + 1)
     area = np.append(0.0, np.cumsum(commands) * CONTROL_S)
@@ -263,7 +261,7 @@ def held(commands: NDArray, step_s: float) -> NDArray[np.float64]:
     return np.diff(np.interp(step_s * np.arange(steps + 1), edges, area)) / step_s
 
 
-def walk_commands() -> NDArray[np.float64]:
+def walk_commands() -> Array:
     """Commands of one thigh in the sample's walk, from where it begins [rad]."""
     file = resources.files("pupper_sysid.data") / "samples" / "walk_commands.csv"
     with resources.as_file(file) as path:
@@ -273,7 +271,7 @@ def walk_commands() -> NDArray[np.float64]:
     return (rows["LF_thigh_command_rad"] - rows["LF_thigh_command_rad"][0])[row]
 
 
-def unseen_tones() -> NDArray[np.float64]:
+def unseen_tones() -> Array:
     """Commands of the tones, one after the other [rad]."""
     time = np.arange(0.0, TONE_S, CONTROL_S)
     return AMPLITUDE_RAD * np.sin(2 * np.pi * np.outer(TONES_HZ, time)).ravel()

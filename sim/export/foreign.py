@@ -249,8 +249,8 @@ def _value(node: ast.expr | None, literals: Mapping[str, Any]) -> Any:
         return getattr(settings, node.attr, None) if isinstance(settings, SimpleNamespace) else None
     if isinstance(node, ast.Call):
         keywords = {k.arg: k.value for k in node.keywords if k.arg}
-        if isinstance(made := keywords.get("default_factory"), ast.Lambda):
-            return _value(made.body, literals)
+        if isinstance(factory := keywords.get("default_factory"), ast.Lambda):
+            return _value(factory.body, literals)
         if isinstance(node.func, ast.Name) and node.func.id == "reflected_inertia":  # mjlab's
             sides = [*node.args, *keywords.values()]
             numbers = [_value(side, literals) for side in sides]

@@ -20,7 +20,13 @@ from numpy.typing import NDArray
 
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES, LEGS
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
-from pupper_sysid.sim.robot.servo_mjcf import INTEGRATOR, attributes, joint_attributes, pid_element
+from pupper_sysid.sim.robot.servo_mjcf import (
+    INTEGRATOR,
+    attributes,
+    joint_attributes,
+    numbers,
+    pid_element,
+)
 
 if TYPE_CHECKING:
     from pupper_sysid.sim.robot.terrain import Ground
@@ -129,8 +135,8 @@ def robot_xml(
             # it goes with the robot, and so does the part of the ground that shadows are drawn on
             '<light mode="trackcom" pos="-0.3 -0.2 1.2" dir="0.25 0.17 -1" directional="true" '
             'diffuse="0.75 0.75 0.75" specular="0.1 0.1 0.1" castshadow="true"/>'
-            f'<geom name="trunk" type="box" size="{_numbers(TRUNK_BOX_M)}" '
-            f'pos="{_numbers(TRUNK_BOX_AT_M)}" rgba="0.2 0.35 0.6 1"/>'
+            f'<geom name="trunk" type="box" size="{numbers(*TRUNK_BOX_M)}" '
+            f'pos="{numbers(*TRUNK_BOX_AT_M)}" rgba="0.2 0.35 0.6 1"/>'
         )
     return f"""<mujoco model="mini_pupper_2">
   <compiler angle="radian" autolimits="true"/>
@@ -223,7 +229,7 @@ def _leg(
     side = SIDE[leg]
     joints = {
         kind: f'<joint name="{leg}_{kind}" type="hinge" axis="{axis}" '
-        f'range="{_numbers(LIMITS_RAD[f"{leg}_{kind}"])}" '
+        f'range="{numbers(*LIMITS_RAD[f"{leg}_{kind}"])}" '
         + (
             ""
             if kind == "calf" and knee == "linkage"
@@ -236,7 +242,7 @@ def _leg(
     hip = thigh = calf = ""
     if complete:
         hip = (
-            f'<geom name="{leg}_hip" type="box" size="{_numbers(HIP_BOX_M)}" '
+            f'<geom name="{leg}_hip" type="box" size="{numbers(*HIP_BOX_M)}" '
             f'pos="{x} {side * y} {z}" rgba="0.25 0.25 0.28 1"/>'
         )
         thigh = (
@@ -265,11 +271,7 @@ def _mirrored(body: tuple, side: int) -> str:
 
 
 def _inertial(mass: float, centre: tuple, inertia: tuple) -> str:
-    return f'<inertial mass="{mass!r}" pos="{_numbers(centre)}" fullinertia="{_numbers(inertia)}"/>'
-
-
-def _numbers(values) -> str:
-    return " ".join(repr(float(v)) for v in values)
+    return f'<inertial mass="{mass!r}" pos="{numbers(*centre)}" fullinertia="{numbers(*inertia)}"/>'
 
 
 _SIDE = np.array([SIDE[leg] for leg in LEGS])

@@ -213,7 +213,7 @@ def replay(
 
     model = compiled(robot, float(servos["dead_time_s"].max()), fixed)
     joints = np.array([int(model.joint(name).qposadr[0]) for name in robot.joints])
-    mix = _mixing(model)  # servo angles are qpos @ mix
+    mix = servo_angles(model)  # servo angles are qpos @ mix
     unmix = np.linalg.inv(mix[joints])
     reached = (reach + robot.shift_rad) @ unmix
     low, high = reached.min(axis=0) - _BEYOND_RAD, reached.max(axis=0) + _BEYOND_RAD
@@ -263,8 +263,8 @@ def replay(
     return Replayed(servo_rad, fell, gyro)
 
 
-def _mixing(model) -> Array:
-    """Angle of each servo by positions of joints, shape (nq, servos)."""
+def servo_angles(model: Any) -> Array:
+    """Matrix, shape (nq, servos), by which positions of joints give the angles of the servos."""
     mix = np.zeros((model.nq, model.nu))
     kinds = zip(model.actuator_trntype, model.actuator_trnid[:, 0], strict=True)
     for servo, (kind, target) in enumerate(kinds):

@@ -30,7 +30,7 @@ from pupper_sysid.sim.robot import servo_mjcf
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.terrain import Ground
 from pupper_sysid.sim.walking.config import Randomisation, Walking
-from pupper_sysid.sim.walking.differences import Bodies
+from pupper_sysid.sim.walking.draws import Bodies
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
 
 Array = NDArray[np.float64]

@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.delayed_pd import FRICTION_IMPEDANCE, DelayedPDParameters
 
+Array = NDArray[np.float64]
+
 INTEGRATOR = "implicitfast"
 MASSLESS = '<inertial pos="0 0 0" mass="1e-9" diaginertia="1e-15 1e-15 1e-15"/>'
 """Of a body that moves by its joint's armature alone."""
@@ -46,11 +48,11 @@ def friction_solref(time_step_s: float) -> tuple[float, float]:
 def joint_attributes(parameters: DelayedPDParameters, time_step_s: float) -> dict[str, str]:
     """Attributes of the `<joint>` (or tendon) that one servo turns: inertia, friction, back-EMF."""
     return {
-        "armature": _number(parameters.armature),
-        "frictionloss": _number(parameters.friction_loss),
-        "solreffriction": " ".join(map(_number, friction_solref(time_step_s))),
-        "solimpfriction": " ".join(map(_number, FRICTION_SOLIMP)),
-    } | ({"damping": _number(parameters.back_emf)} if np.any(parameters.back_emf) else {})
+        "armature": numbers(parameters.armature),
+        "frictionloss": numbers(parameters.friction_loss),
+        "solreffriction": numbers(*friction_solref(time_step_s)),
+        "solimpfriction": numbers(*FRICTION_SOLIMP),
+    } | ({"damping": numbers(parameters.back_emf)} if np.any(parameters.back_emf) else {})
 
 
 def actuator_attributes(parameters: DelayedPDParameters, time_step_s: float) -> dict[str, str]:
@@ -66,18 +68,18 @@ def actuator_attributes(parameters: DelayedPDParameters, time_step_s: float) -> 
     effort = float(np.asarray(parameters.effort_limit))
     speed = float(np.asarray(parameters.velocity_limit))
     attributes_ = {
-        "kp": _number(parameters.stiffness),
-        "kv": _number(parameters.damping),
+        "kp": numbers(parameters.stiffness),
+        "kv": numbers(parameters.damping),
         "input": "pos",
         # two more than whole steps: MuJoCo silently truncates a delay beyond its buffer
         "nsample": str(int(delay / time_step_s) + 2),
-        "delay": _number(delay),
+        "delay": numbers(delay),
         "interp": "linear",
     }
     if np.isfinite(speed):
-        attributes_["slewmax"] = _number(speed)
+        attributes_["slewmax"] = numbers(speed)
     if np.isfinite(effort):
-        attributes_["forcerange"] = f"{_number(-effort)} {_number(effort)}"
+        attributes_["forcerange"] = numbers(-effort, effort)
     return attributes_
 
 
@@ -97,12 +99,17 @@ def free_air_xml(servos: Sequence[DelayedPDParameters], time_step_s: float) -> s
         bodies.append(f'<body><joint type="hinge" axis="0 1 0" {joint}/>{MASSLESS}</body>')
         actuators.append(pid_element({"joint": f"joint{i}"}, servo, time_step_s))
     option = (
-        f'<option timestep="{_number(time_step_s)}" integrator="{INTEGRATOR}" gravity="0 0 0"/>'
+        f'<option timestep="{numbers(time_step_s)}" integrator="{INTEGRATOR}" gravity="0 0 0"/>'
     )
     return (
         f"<mujoco>{option}<worldbody>{''.join(bodies)}</worldbody>"
         f"<actuator>{''.join(actuators)}</actuator></mujoco>"
     )
+
+
+def numbers(*values: Any) -> str:
+    """As they stand in an attribute, with all digits."""
+    return " ".join(repr(float(np.asarray(value))) for value in values)
 
 
 def attributes(values: Mapping[str, str]) -> str:
@@ -154,17 +161,15 @@ def rest_at(model: Any, data: Any, position_rad: Sequence[float]) -> None:
         hold(model, data, i, position)
 
 
-def switch_torque(
-    model: Any, gains: NDArray[np.float64], on: bool, index: int | slice = slice(None)
-) -> None:
+def switch_torque(model: Any, gains: Array, on: bool, index: int | slice = slice(None)) -> None:
     """Switch servos on, with the `gains` that `actuator_biasprm` had, or limp, without any."""
     model.actuator_biasprm[index] = gains[index] if on else 0.0
 
 
 def write_servos(
-    fields: Mapping[str, NDArray[np.float64]],
+    fields: Mapping[str, Array],
     ids: NDArray[np.intp],
-    servos: Mapping[str, NDArray[np.float64]],
+    servos: Mapping[str, Array],
     dof_of: Mapping[int, int],
     tendon_of: Mapping[int, int],
 ) -> None:
@@ -188,7 +193,7 @@ def write_servos(
             fields[f"{kind}_damping"][ids[:, None], at] = servos["back_emf"][:, names]
 
 
-def empty_delay_lines(model: Any) -> NDArray[np.float64]:
+def empty_delay_lines(model: Any) -> Array:
     """Delay lines after a command of 0 held for long, shape (actuators, length)."""
     from pupper_sysid.sim.robot.engine import mujoco
 
@@ -198,9 +203,7 @@ def empty_delay_lines(model: Any) -> NDArray[np.float64]:
     return data.history.reshape(model.nu, -1).copy()
 
 
-def delay_lines(
-    empty: NDArray[np.float64], position_rad: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def delay_lines(empty: Array, position_rad: Array) -> Array:
     """Delay lines after commands held for long, shape (n, actuators · length), for `history`.
 
     `empty` is from `empty_delay_lines`; `position_rad` has the shape (n, actuators).
@@ -209,7 +212,3 @@ def delay_lines(
     # a line is two numbers, the times and the values, as many of each
     lines[:, :, -((lines.shape[2] - 2) // 2) :] = position_rad[:, :, None]
     return lines.reshape(len(lines), -1)
-
-
-def _number(value: Any) -> str:
-    return repr(float(np.asarray(value)))

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from pupper_sysid.sim.robot.mini_pupper import FLAT_GROUND
 
+Array = NDArray[np.float64]
+
 Terrain = Literal["flat", "rough", "slopes", "troughs", "steps", "stairs", "mixed"]
 
 TILE_M, SPACING_M = 8.0, 0.05
@@ -45,15 +47,15 @@ class Ground:
     xml: str
     assets: str
     """`xml` and `assets`: MJCF inside `<worldbody>` and `<asset>`."""
-    heights: NDArray[np.float64] | None
+    heights: Array | None
     """Heights [m] at `SPACING_M`, row along y; None for a plane; shape (rows, columns)."""
     half_size_m: float
     """Distance of its edge from the origin; infinite for a plane."""
-    boxes: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4)))
+    boxes: Array = field(default_factory=lambda: np.zeros((0, 4)))
     """Square boxes on a plane: x and y of the middle, half of the width, height of the top [m];
     shape (k, 4)."""
 
-    def height(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def height(self, x: Array, y: Array) -> Array:
         """Height [m] at positions [m], as MuJoCo sees it; at the edge beyond the edge.
 
         Each square between four heights is two triangles, which meet where x and y grow together.
@@ -71,9 +73,7 @@ class Ground:
         more, less = np.maximum(u, v), np.minimum(u, v)
         return near + more * (beside - near) + less * (far - beside)
 
-    def highest_near(
-        self, x: NDArray[np.float64], y: NDArray[np.float64]
-    ) -> NDArray[np.float64] | float:
+    def highest_near(self, x: Array, y: Array) -> Array | float:
         """An upper bound of the heights [m] within 15 cm of positions [m]."""
         highest = self._highest
         if highest is None:
@@ -84,9 +84,7 @@ class Ground:
         )
         return highest[row, column]
 
-    def _highest_box(
-        self, x: NDArray[np.float64], y: NDArray[np.float64], near_m: float
-    ) -> NDArray[np.float64]:
+    def _highest_box(self, x: Array, y: Array, near_m: float) -> Array:
         """Height of the highest box [m] at positions, or within `near_m` of them."""
         height = np.zeros(np.broadcast_shapes(x.shape, y.shape))
         for at_x, at_y, half, top in self.boxes:
@@ -95,7 +93,7 @@ class Ground:
         return height
 
     @cached_property
-    def _highest(self) -> NDArray[np.float64] | None:
+    def _highest(self) -> Array | None:
         """Highest of the heights around each, in all squares within `_NEAR_M`."""
         if self.heights is None:
             return None
@@ -155,16 +153,17 @@ def _stairs() -> Ground:
     return Ground(FLAT_GROUND + geoms, "", None, np.inf, boxes)
 
 
-def _depth(heights: NDArray[np.float64]) -> float:
+def _depth(heights: Array) -> float:
     return max(float(np.ptp(heights)), 1e-3)
 
 
-def _tile(name: str, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def _tile(name: str, count: int, rng: np.random.Generator) -> Array:
     """Heights of one tile, 0 at its edge."""
     if name == "flat":
         return np.zeros((count, count))
     if name == "rough":
-        return rng.choice(_ROUGH_M, (count, count)) * _inside(count, 0.25)
+        inside = np.minimum(np.arange(count), np.arange(count)[::-1]) * SPACING_M >= 0.25
+        return rng.choice(_ROUGH_M, (count, count)) * np.outer(inside, inside)
     x = (np.arange(count) + 0.5) * SPACING_M - TILE_M / 2
     far = np.maximum(np.abs(x)[:, None], np.abs(x)[None, :])
     pyramid = TILE_M / 2 - np.maximum(far, _PLATFORM_M / 2)
@@ -172,8 +171,3 @@ def _tile(name: str, count: int, rng: np.random.Generator) -> NDArray[np.float64
         return np.floor(pyramid / _TREAD_M) * rng.uniform(*_RISER_M)
     slope = rng.uniform(0.3, 1.0) * _STEEPEST
     return pyramid * slope * (1 if name == "slope" else -1)
-
-
-def _inside(count: int, border_m: float) -> NDArray[np.bool_]:
-    near = np.minimum(np.arange(count), np.arange(count)[::-1]) * SPACING_M >= border_m
-    return near[:, None] & near[None, :]

@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.sim.robot.body import Body, mini_pupper
 
+Array = NDArray[np.float64]
+
 _GRID = np.linspace(0.0, 2 * np.pi, 96, endpoint=False)
 
 
@@ -62,9 +64,7 @@ class Trot:
                 "is impossible: trot.frequency_hz must be positive, trot.duty between 0 and 1."
             )
 
-    def joints(
-        self, phase: NDArray[np.float64], command: NDArray[np.float64], body: Body | None = None
-    ) -> NDArray[np.float64]:
+    def joints(self, phase: Array, command: Array, body: Body | None = None) -> Array:
         """Joint set-points [rad], shape (n, 12).
 
         `phase`, shape (n,), is that of LF and RB [rad]: at 0 they touch down in front. `command`,
@@ -86,12 +86,12 @@ class Trot:
 
     def phase_of(
         self,
-        joints: NDArray[np.float64],
-        earlier: NDArray[np.float64],
+        joints: Array,
+        earlier: Array,
         between_s: float,
-        command: NDArray[np.float64],
+        command: Array,
         body: Body | None = None,
-    ) -> NDArray[np.float64]:
+    ) -> Array:
         """Phase [rad], shape (n,), of the point of the trot nearest to joint set-points.
 
         The set-points `between_s` before them distinguish feet that rise from feet that come down,
@@ -119,7 +119,7 @@ class Trot:
         bend = np.maximum(before - 2 * at + after, 1e-15)
         return _GRID[nearest] + _GRID[1] * np.clip(0.5 * (before - after) / bend, -0.5, 0.5)
 
-    def _cycle(self, phase: NDArray[np.float64], body: Body) -> tuple[NDArray, NDArray]:
+    def _cycle(self, phase: Array, body: Body) -> tuple[NDArray, NDArray]:
         """Where feet are in their strokes, 1 to -1, and how high [m], each shape (4, n)."""
         foot_phase = (phase / (2 * np.pi) + body.offsets[:, None]) % 1.0
         stands = foot_phase < self.duty
@@ -129,9 +129,7 @@ class Trot:
         along = np.where(stands, 1.0 - 2.0 * foot_phase / self.duty, back)
         return along, np.where(stands, 0.0, self.lift_m * np.sin(swing))
 
-    def _strokes(
-        self, command: NDArray[np.float64], centre: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _strokes(self, command: Array, centre: Array) -> Array:
         """Half of each foot's stroke along x and y [m], shape (n, 4, 2)."""
         x, y = centre[:, 0], centre[:, 1]
         ahead = self.gain * np.where(command[:, :1] < 0, self.back_gain, 1.0)
@@ -141,13 +139,13 @@ class Trot:
         # from +A to -A while it stands
         return speed * self.duty / (2 * self.frequency_hz)
 
-    def _turn(self, command: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _turn(self, command: Array) -> Array:
         """Turn rate of the feet [rad/s], shape (n,): a gain that depends on the command."""
         more = self.turn_dead_band_rad_s * self.turning_in_place(command)
         return self.turn_gain * command[:, 2] + more
 
     @staticmethod
-    def turning_in_place(command: NDArray[np.float64]) -> NDArray[np.float64]:
+    def turning_in_place(command: Array) -> Array:
         """Sign of the turn where feet do not step sideways, 0 where they do; smooth, shape (n,)."""
         sideways, turn = command[:, 1], command[:, 2]
         within = np.maximum(1.0 - (sideways / _BREAKS_LOOSE_M_S) ** 2, 0.0)
@@ -158,13 +156,13 @@ _BREAKS_LOOSE_M_S = 0.025  # speed sideways from which steps move the hips in an
 _SOFT = 0.05  # rad/s over which the dead band is added
 
 
-def feet_at(body: Body, crouch_m: float, spread_m: float) -> NDArray[np.float64]:
+def feet_at(body: Body, crouch_m: float, spread_m: float) -> Array:
     """Feet in the trunk's frame [m], shape (4, 3), of a trunk that is lower, and farther apart."""
     none = np.zeros(len(body.feet))
     return body.feet_at + np.column_stack([none, spread_m * body.sides, none + crouch_m])
 
 
-def stance(body: Body, crouch_m: float, spread_m: float) -> NDArray[np.float64]:
+def stance(body: Body, crouch_m: float, spread_m: float) -> Array:
     """Joint angles [rad], shape (12,), of a robot that stands so low and wide."""
     feet = feet_at(body, crouch_m, spread_m)[None]
     return body.joints_at(feet, np.zeros(feet.shape[:2]))[0]

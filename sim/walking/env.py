@@ -27,22 +27,24 @@ from pupper_sysid.sim.robot.robot_batch import (
     trunk_velocity,
 )
 from pupper_sysid.sim.robot.terrain import make_ground
-from pupper_sysid.sim.walking.config import PRESETS, Walking, for_robot
+from pupper_sysid.sim.walking.config import PRESETS, Rewards, Walking, for_robot, narrowed
 from pupper_sysid.sim.walking.draws import Twins, at_rest, draw_commands, draw_pose, generator
-from pupper_sysid.sim.walking.observation import (
+from pupper_sysid.sim.walking.rewards import TERMS, EffortMeter, Strides, weighted
+from pupper_sysid.sim.walking.senses import Rows, Senses
+from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
+from pupper_sysid.sim.walking.step import (
     FALLEN_TILT,
+    Step,
+    StepResult,
+    Unfinished,
+    empty_facts,
     noise_of,
     observation_of,
     observed,
     privileged_of,
     privileged_parts,
+    unforeseen_of,
 )
-from pupper_sysid.sim.walking.rewards.strides import EffortMeter, Strides
-from pupper_sysid.sim.walking.rewards.terms import TERMS, weighted
-from pupper_sysid.sim.walking.rewards.weights import Rewards, narrowed
-from pupper_sysid.sim.walking.senses import Rows, Senses
-from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_model_of, servo_ranges
-from pupper_sysid.sim.walking.step import Step, StepResult, Unfinished, empty_facts, unforeseen_of
 
 Array = NDArray[np.float64]
 Term = Callable[[Step, Rewards], Array]
@@ -100,7 +102,7 @@ class PupperEnv:
         Control steps since the start; simulations that became NaN, and were drawn anew.
     processes : int
         That train together: the curriculum counts the samples of all.
-    level : Level
+    level : dict of str to float
         Factors of the curriculum now.
 
     Raises
@@ -114,7 +116,7 @@ class PupperEnv:
     -----
     An action a, shape (n, 12), is the set-point default pose + `action_scale` · a [rad] in the
     order of `JOINT_NAMES`, within the joint limits, held for one control step (20 ms). The
-    observation, shape (n, 60), is laid out in `sim.walking.observation`.
+    observation, shape (n, 60), is laid out in `sim.walking.step`.
 
     Environments that end in a step are reset in it: `StepResult.observation` is the first of the
     new episode, `StepResult.terminal` holds the last one of those whose time was up, whose value a
@@ -335,7 +337,8 @@ class PupperEnv:
             self._rewards = self._narrowed()
 
     def _narrowed(self) -> Rewards:
-        return narrowed(self.config.rewards, self.level.linear_sigma, self.level.angular_sigma)
+        level = self.level
+        return narrowed(self.config.rewards, level["linear_sigma"], level["angular_sigma"])
 
     # ------------------------------------------------------------------------- one step
 
@@ -352,7 +355,7 @@ class PupperEnv:
             self._draw_commands(due)
         self._until_push -= span
         pushed = np.flatnonzero(self._until_push <= 0)
-        most = self.level.push * config.randomisation.push_m_s
+        most = self.level["push"] * config.randomisation.push_m_s
         push = np.zeros((0, 2))
         if len(pushed):
             push = self.rng.uniform(-most, most, (len(pushed), 2))
@@ -387,7 +390,9 @@ class PupperEnv:
         facts["acceleration"] /= span
         step = Step(body=self.body, **facts)
         level = self.level
-        terms = weighted(step, self._rewards, level.penalties, level.guides, level.progress)
+        terms = weighted(
+            step, self._rewards, level["penalties"], level["guides"], level["progress"]
+        )
         for name, (weight, term) in self._user_terms.items():
             terms[name] = weight * term(step, self._rewards)
         for name, term in terms.items():
@@ -430,7 +435,7 @@ class PupperEnv:
 
     def _draw_commands(self, ids: NDArray[np.intp]) -> None:
         commands, n = self.config.commands, len(ids)
-        self.command[ids] = draw_commands(commands, n, self.level.commands, self.rng)
+        self.command[ids] = draw_commands(commands, n, self.level["commands"], self.rng)
         self._until_command[ids] = self.rng.exponential(commands.every_s, n)
 
     # ------------------------------------------------------------------------- what is seen

@@ -23,9 +23,9 @@ from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.sim.emulator.robot import RobotSpec
 from pupper_sysid.sim.robot.robot_batch import Moved, RobotBatch
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.differences import Differences
-from pupper_sysid.sim.walking.observation import VELOCITY_STEPS
+from pupper_sysid.sim.walking.draws import Differences
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
+from pupper_sysid.sim.walking.step import VELOCITY_STEPS
 
 Array = NDArray[np.float64]
 Rows = slice | NDArray[np.intp]
@@ -71,7 +71,7 @@ class HeldReadings:
         self.age_s = np.zeros(shape)
 
     @property
-    def state(self) -> dict[str, NDArray[np.float64]]:
+    def state(self) -> dict[str, Array]:
         """Everything that changes, for an exact copy."""
         return {
             "lattice": self._lattice, "next": self._next, "position": self.position,
@@ -81,8 +81,8 @@ class HeldReadings:
     def reset(
         self,
         ids: NDArray[np.intp],
-        position: NDArray[np.float64],
-        period: NDArray[np.float64] | float = 1.0,
+        position: Array,
+        period: Array | float = 1.0,
     ) -> None:
         """Start robots `ids` at rest.
 
@@ -99,7 +99,7 @@ class HeldReadings:
         self.load[ids] = 0.0
         self.age_s[ids] = self._lattice[ids] - self._next[ids]
 
-    def chances(self, steps: int) -> NDArray[np.float64]:
+    def chances(self, steps: int) -> Array:
         """Draw what decides losses and jitters of a control step of so many physics steps.
 
         Shape (environments, rounds, 2, servos): for all robots at once and for all servos, due or
@@ -114,10 +114,10 @@ class HeldReadings:
 
     def advance(
         self,
-        start: NDArray[np.float64],
-        position: NDArray[np.float64],
-        load: NDArray[np.float64],
-        chances: NDArray[np.float64],
+        start: Array,
+        position: Array,
+        load: Array,
+        chances: Array,
         rows: slice = slice(None),
     ) -> None:
         """Let one control step pass for the robots `rows`, n of them.
@@ -163,7 +163,7 @@ class HeldReadings:
             np.add(next_, lattice, out=next_, where=due)
         next_ -= span
 
-    def _reported(self, angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _reported(self, angle: Array) -> Array:
         """`angle` as the encoder reports it: with its offset, in whole quantisation steps."""
         shifted = angle + self._offset
         quantised = np.rint(shifted / self._quantum) * self._quantum
@@ -171,13 +171,13 @@ class HeldReadings:
 
 
 def _between(
-    flat: NDArray[np.float64],
+    flat: Array,
     at: NDArray[np.intp],
     width: int,
-    start: NDArray[np.float64],
+    start: Array,
     before: NDArray[np.intp],
-    share: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    share: Array,
+) -> Array:
     """Values a `share` of a step after step `before`, which end at `at`; `start` is before all."""
     ends = flat.take(at)
     begins = np.where(before > 0, flat.take(at - width, mode="clip"), start)

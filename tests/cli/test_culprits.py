@@ -22,11 +22,11 @@ from pupper_sysid.hardware.loop import BUS, GUARD, IMU, LOG, POLICY, VIEWS, Fixe
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy import deployment
 from pupper_sysid.policies.deploy.assembly import assemble
-from pupper_sysid.policies.deploy.commands import constant
+from pupper_sysid.policies.deploy.deployment import constant
 from pupper_sysid.policies.deploy.stacks import STACKS, suited
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.sim.emulator.robot import draw_robot
-from pupper_sysid.sim.walking.bus import WalkingBus
+from pupper_sysid.sim.walking.robot import WalkingBus
 from support.command_line import refused
 from support.following_bus import FollowingBus
 

@@ -30,7 +30,7 @@ from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy.walk_log import read_walk
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
+from pupper_sysid.sim.walking.step import OBSERVATION_PARTS
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.view import channels
 from support.command_line import ran, refused

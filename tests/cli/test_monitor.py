@@ -10,8 +10,8 @@ from pupper_sysid.hardware import esp32
 from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.feetech import PING, SYNC_READ, FrameReader
 from pupper_sysid.hardware.serial_servos import line as serial_line
+from pupper_sysid.sim.emulator.bench import BusFaults
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator
-from pupper_sysid.sim.emulator.faults import BusFaults
 from support.command_line import json_of, ran, run
 from support.servo_servers import StillBench, bench_of, on_a_port, on_a_socket, still_servos
 

@@ -23,7 +23,7 @@ from pupper_sysid.common.errors import refuse_outside
 from pupper_sysid.common.joints import STALL_TORQUES_NM
 from pupper_sysid.data import SAMPLES
 from pupper_sysid.hardware.address import parse_address
-from pupper_sysid.policies.deploy.commands import checked_command
+from pupper_sysid.policies.deploy.deployment import checked_command
 from pupper_sysid.policies.deploy.stacks import Stack
 from pupper_sysid.policies.train.run_file import Run, preset, resume_run, save_run
 from pupper_sysid.servo_models.calibration.parts import Actuator

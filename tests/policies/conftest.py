@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pupper_sysid.policies.network.policy_export import write_policy
-from pupper_sysid.policies.network.policy_file import Policy, load_policy
+from pupper_sysid.policies.network.policy_file import Policy, load_policy, write_policy
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.tiny_training import ALL_KINDS, CALIBRATION, HISTORY, networks, tiny_run
 

@@ -29,7 +29,7 @@ from pupper_sysid.policies.analysis.autonomy import (
     RatePoint,
     rate_exponent,
 )
-from pupper_sysid.policies.analysis.robustness import (
+from pupper_sysid.policies.analysis.trial import (
     AblationPoint,
     DelayPoint,
     DirectionWalk,

@@ -17,10 +17,9 @@ from pupper_sysid.hardware.feetech import SCS0009, STS3215, Frame, FrameReader, 
 from pupper_sysid.hardware.joint_map import JointMap, joint_map_from, load_joint_map
 from pupper_sysid.hardware.safety import watchdog
 from pupper_sysid.hardware.safety.guard import GuardedBus, open_guarded
-from pupper_sysid.sim.emulator.bench import ServoBench
+from pupper_sysid.sim.emulator.bench import BusFaults, ServoBench
 from pupper_sysid.sim.emulator.dynamixel import DynamixelEmulator
 from pupper_sysid.sim.emulator.esp32 import ProxyEmulator, ProxySocket
-from pupper_sysid.sim.emulator.faults import BusFaults
 from pupper_sysid.sim.emulator.feetech import FeetechEmulator
 from pupper_sysid.sim.emulator.pendulum import (
     BENCH_MAP,

@@ -8,9 +8,8 @@ from tensordict import TensorDict
 
 from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.network.actor_critic import build
-from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters, Imitation
 from pupper_sysid.policies.train.learner import TerminalPPO
-from pupper_sysid.policies.train.run_file import Run
+from pupper_sysid.policies.train.run_file import Architecture, Hyperparameters, Imitation, Run
 from pupper_sysid.sim.walking.config import Walking
 
 CALIBRATION = str(SAMPLES / "calibrated.yaml")

@@ -4,9 +4,8 @@ import numpy as np
 
 from pupper_sysid.policies.analysis.trial import Trial
 from pupper_sysid.policies.evaluation.evaluate import Recorder, Walk
-from pupper_sysid.policies.walks.conditions import Condition
 from pupper_sysid.policies.walks.rollouts import Rollout
-from pupper_sysid.policies.walks.together import walk_together
+from pupper_sysid.policies.walks.together import Condition, walk_together
 from pupper_sysid.sim.walking.config import Randomisation, Walking
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 

@@ -16,8 +16,7 @@ from pupper_sysid.policies.analysis.foreign_policy import (
 from pupper_sysid.policies.analysis.servo_demand import servo_demand
 from pupper_sysid.policies.analysis.trial import Trial
 from pupper_sysid.policies.network.onnx_network import OnnxNetwork
-from pupper_sysid.policies.network.policy_export import export_policy
-from pupper_sysid.policies.network.policy_file import load_policy
+from pupper_sysid.policies.network.policy_file import export_policy, load_policy
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.real_recordings import FOLDER
 from support.refusals import assert_each_refused

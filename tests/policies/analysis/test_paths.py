@@ -14,9 +14,9 @@ from pupper_sysid.policies.analysis.autonomy import (
     rate_exponent,
     rate_response,
 )
-from pupper_sysid.policies.analysis.robustness import DirectionWalk, compliance, terrain
-from pupper_sysid.policies.walks.conditions import DIRECTIONS
+from pupper_sysid.policies.analysis.trial import DirectionWalk, compliance, terrain
 from pupper_sysid.policies.walks.rollouts import Rollout
+from pupper_sysid.policies.walks.together import DIRECTIONS
 from reproduction.evidence import scales
 from support.walks import STEP, recorded, walked
 
@@ -105,7 +105,7 @@ def test_a_policy_walks_at_other_rates_with_other_scales_and_on_other_ground(wal
 def test_a_policy_goes_where_it_is_commanded(walker, monkeypatch):
     policy, trial = walker
     some = {k: DIRECTIONS[k] for k in ("forward", "turn left", "stand")}
-    monkeypatch.setattr("pupper_sysid.policies.analysis.robustness.DIRECTIONS", some)
+    monkeypatch.setattr("pupper_sysid.policies.analysis.trial.DIRECTIONS", some)
     forward, turn = compliance(policy, replace(trial, seconds=3.5))
     assert forward.direction == "forward" and forward.share.value > 0.7
     assert turn.share.value > 0.3 and np.isnan(turn.drift.value)

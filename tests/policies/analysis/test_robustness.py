@@ -13,9 +13,18 @@ from pupper_sysid.policies.analysis.autonomy import (
     orbits,
     push_response,
 )
-from pupper_sysid.policies.analysis.robustness import DelayPoint, ablation, delay_curve
-from pupper_sysid.policies.walks import perturbations
-from pupper_sysid.policies.walks.perturbations import JOINTS
+from pupper_sysid.policies.analysis.trial import (
+    JOINTS,
+    DelayPoint,
+    ablation,
+    applied,
+    delay_curve,
+    delayed,
+    held,
+    jittered,
+    noisy,
+    zeroed,
+)
 from pupper_sysid.policies.walks.rollouts import Rollout
 from support.walks import recorded
 
@@ -30,21 +39,21 @@ def counting() -> np.ndarray:
 
 def test_each_change_alters_the_joints_in_its_way_and_leaves_the_rest_alone():
     steps = np.arange(STEPS)
-    late = perturbations.applied(perturbations.delayed(JOINTS, 8), counting())
+    late = applied(delayed(JOINTS, 8), counting())
     for robot, number in ((0, 12), (1, 47)):
         np.testing.assert_array_equal(late[:, robot, number], np.maximum(steps - 8, 0))
-    held = perturbations.applied(perturbations.held(JOINTS, 5), counting())
-    np.testing.assert_array_equal(held[:, 0, 20], 5 * (steps // 5))
-    zeroed = perturbations.applied(perturbations.zeroed(JOINTS), counting())
-    assert not zeroed[..., JOINTS].any()
-    for changed in (late, held, zeroed):
+    stale = applied(held(JOINTS, 5), counting())
+    np.testing.assert_array_equal(stale[:, 0, 20], 5 * (steps // 5))
+    nothing = applied(zeroed(JOINTS), counting())
+    assert not nothing[..., JOINTS].any()
+    for changed in (late, stale, nothing):
         np.testing.assert_array_equal(changed[:, 0, 11], steps)
         np.testing.assert_array_equal(changed[:, 0, 48], steps)
 
 
 def test_a_jittered_delay_never_goes_back_in_time_and_keeps_its_bounds():
     rng = np.random.default_rng(0)
-    seen = perturbations.applied(perturbations.jittered(JOINTS, 4, rng), counting())[:, :, 12]
+    seen = applied(jittered(JOINTS, 4, rng), counting())[:, :, 12]
     lag = np.arange(STEPS)[:, None] - seen
     assert (np.diff(seen, axis=0) >= 0).all()
     assert lag.min() >= 0 and lag.max() <= 8
@@ -53,8 +62,8 @@ def test_a_jittered_delay_never_goes_back_in_time_and_keeps_its_bounds():
 
 def test_noise_has_the_size_that_was_asked_for_per_number():
     sigma = np.linspace(0.1, 2.0, 36)
-    change = perturbations.noisy(JOINTS, sigma, np.random.default_rng(0))
-    added = perturbations.applied(change, np.zeros((4000, 1, 60), np.float32))
+    change = noisy(JOINTS, sigma, np.random.default_rng(0))
+    added = applied(change, np.zeros((4000, 1, 60), np.float32))
     np.testing.assert_allclose(added[:, 0, JOINTS].std(axis=0), sigma, rtol=0.06)
     assert not added[..., :12].any() and not added[..., 48:].any()
 
@@ -74,8 +83,8 @@ def test_a_delay_curve_has_its_three_modes_and_begins_with_the_plain_walk(walker
 @pytest.mark.slow
 def test_an_ablation_hurts_more_the_more_is_taken(walker, monkeypatch):
     policy, trial = walker
-    monkeypatch.setattr("pupper_sysid.policies.analysis.robustness.NOISE_SHARES", (0.05, 2.0))
-    monkeypatch.setattr("pupper_sysid.policies.analysis.robustness.HOLD_MS", (80,))
+    monkeypatch.setattr("pupper_sysid.policies.analysis.trial.NOISE_SHARES", (0.05, 2.0))
+    monkeypatch.setattr("pupper_sysid.policies.analysis.trial.HOLD_MS", (80,))
     rows = ablation(policy, trial, channels=("last_action",))
     noise = [r.correlation for r in rows if r.kind == "noise"]
     assert noise[0] > 0.9 and noise[-1] < noise[0] - 0.2

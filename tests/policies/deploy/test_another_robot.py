@@ -12,11 +12,10 @@ import torch
 from pupper_sysid.cli.programs import pupper_deploy
 from pupper_sysid.hardware.imu import GRAVITY_M_S2, from_chip
 from pupper_sysid.policies.deploy.walk_log import read_walk
-from pupper_sysid.policies.network.policy_export import write_policy
+from pupper_sysid.policies.network.policy_file import write_policy
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
-from pupper_sysid.sim.walking.bus import WalkingBus, calibrated_robot
 from pupper_sysid.sim.walking.config import for_robot
-from pupper_sysid.sim.walking.robot import _model
+from pupper_sysid.sim.walking.robot import WalkingBus, _model, calibrated_robot
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.command_line import run_program
 from support.legged import legged
@@ -110,7 +109,7 @@ def test_the_emulated_hexapod_stands_where_its_calibration_says(policy):
 def test_the_imu_of_another_robot_measures_in_its_trunks_axes(policy):
     task = for_robot(tiny_run().task, policy.parent / "hexapod.xml", policy.parent / "hexapod.yaml")
     servos = servo_ranges(SERVO, body=task.body).in_steps_of(0.001).nominal()
-    model = _model(task.body, servos, 0.001)
+    model = _model(task.body, servos)
     model.opt.gravity[:] = 0.0
     data = mujoco.MjData(model)
     data.qpos[2], data.qpos[7:] = 5.0, task.body.pose

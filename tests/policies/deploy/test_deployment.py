@@ -15,16 +15,15 @@ from pupper_sysid.common.files import SyncedText
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy.assembly import WalkScore, assemble, reassemble
-from pupper_sysid.policies.deploy.commands import constant, script
 from pupper_sysid.policies.deploy.controller import Controller, Rest, Senses
-from pupper_sysid.policies.deploy.deployment import IMU_SILENT_S, Outcome, deploy
+from pupper_sysid.policies.deploy.deployment import IMU_SILENT_S, Outcome, constant, deploy, script
 from pupper_sysid.policies.deploy.stacks import STACKS, ServoModelObserver, Stack, suited
 from pupper_sysid.policies.deploy.walk_log import read_walk, replay
 from pupper_sysid.policies.network.policy_file import CommandRanges, Policy
 from pupper_sysid.sim.emulator.robot import draw_robot
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.bus import WalkingBus
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
+from pupper_sysid.sim.walking.robot import WalkingBus
+from pupper_sysid.sim.walking.step import OBSERVATION_PARTS
 from support.refusals import assert_each_refused
 from support.saved_servo_models import linear_filter
 from support.tiny_training import CALIBRATION

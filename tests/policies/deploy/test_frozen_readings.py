@@ -14,14 +14,13 @@ from pupper_sysid.hardware.bus import BusSample
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.policies.deploy.assembly import WINDOW_S, FrozenReadings, assemble
-from pupper_sysid.policies.deploy.commands import constant
 from pupper_sysid.policies.deploy.controller import Decision, Senses
-from pupper_sysid.policies.deploy.deployment import Outcome, Tick, deploy
+from pupper_sysid.policies.deploy.deployment import Outcome, Tick, constant, deploy
 from pupper_sysid.policies.deploy.stacks import STACKS, SyntheticPD, suited
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.servo_models.delayed_pd import DelayedPDParameters
 from pupper_sysid.sim.emulator.robot import draw_robot
-from pupper_sysid.sim.walking.bus import WalkingBus
+from pupper_sysid.sim.walking.robot import WalkingBus
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.tiny_training import CALIBRATION
 

@@ -9,7 +9,7 @@ from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.policies.deploy.matches import servo_match
 from pupper_sysid.policies.network.policy_file import trained_servo
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.differences import Differences
+from pupper_sysid.sim.walking.draws import Differences
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_ranges
 from support.tiny_training import CALIBRATION
 

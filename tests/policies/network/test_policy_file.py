@@ -23,13 +23,13 @@ from pupper_sysid.cli.policy_choice import (
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.policies.network.policy_export import write_policy
 from pupper_sysid.policies.network.policy_file import (
     CONTRACT,
     WEIGHTS,
     Policy,
     load_policy,
     refuse_bad,
+    write_policy,
 )
 from pupper_sysid.policies.network.policy_network import PolicyNetwork
 from pupper_sysid.sim.walking.config import Commands
@@ -38,11 +38,11 @@ from support.refusals import assert_each_refused
 from support.tiny_training import ALL_KINDS, CALIBRATION, HISTORY, networks, tiny_run
 
 
-def write(folder: Path, weights: dict[str, torch.Tensor], force: bool = True) -> None:
+def write(folder: Path, weights: dict[str, torch.Tensor]) -> None:
     """Write an MLP of `networks` with these weights."""
     run = tiny_run()
     run = replace(run, architecture=replace(run.architecture, hidden=(32, 16)))
-    write_policy(folder, weights, run, servo_ranges(CALIBRATION), 0, {"seed": 0}, force)
+    write_policy(folder, weights, run, servo_ranges(CALIBRATION), 0, {"seed": 0})
 
 
 def rewrite_contract(folder: Path, **changes) -> None:

@@ -10,9 +10,7 @@ from tensordict import TensorDict
 
 from pupper_sysid.common.errors import PupperError
 from pupper_sysid.policies.network.actor_critic import build, inputs
-from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters
-from pupper_sysid.policies.network.policy_export import export_policy
-from pupper_sysid.policies.network.policy_file import Contract, load_policy
+from pupper_sysid.policies.network.policy_file import Contract, export_policy, load_policy
 from pupper_sysid.policies.network.policy_network import (
     CONTEXT,
     WIDTH,
@@ -20,14 +18,13 @@ from pupper_sysid.policies.network.policy_network import (
     PolicyNetwork,
     step,
 )
+from pupper_sysid.policies.train.run_file import Architecture, Hyperparameters
 from pupper_sysid.policies.train.training import action_history
-from pupper_sysid.sim.walking.observation import (
-    OBSERVATION_PARTS,
-    OBSERVATION_SIZE,
-    PRIVILEGED_PARTS,
-    PRIVILEGED_SIZE,
-)
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from pupper_sysid.sim.walking.step import (
+    OBSERVATION_PARTS,
+    PRIVILEGED_PARTS,
+)
 from pupper_sysid.sysid.export import network as network_export
 from support.command_line import fresh_python
 from support.tiny_training import (
@@ -243,7 +240,7 @@ def test_past_actions_cover_the_longest_delay_and_one_step_more():
 def test_a_teacher_sees_command_imu_and_the_clock_with_its_harmonics_and_nothing_else():
     turns = 0.1
     generator = torch.Generator().manual_seed(0)
-    sizes = {"policy": OBSERVATION_SIZE, "privileged": PRIVILEGED_SIZE, "noise": 12}
+    sizes = {"policy": 60, "privileged": 106, "noise": 12}
     seen = TensorDict(
         {k: torch.randn(5, n, generator=generator) for k, n in sizes.items()}, batch_size=[5]
     )

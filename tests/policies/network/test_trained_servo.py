@@ -13,7 +13,7 @@ from pupper_sysid.common.files import sha256
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.policies.network.policy_file import CONTRACT, VERSION, load_policy, trained_servo
 from pupper_sysid.sim.walking.config import Randomisation, Walking
-from pupper_sysid.sim.walking.differences import Differences
+from pupper_sysid.sim.walking.draws import Differences
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.refusals import assert_each_refused
 from support.tiny_training import CALIBRATION

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pupper_sysid.policies.network.hyperparameters import OWN, TROT, Imitation
 from pupper_sysid.policies.train import first_gait
 from pupper_sysid.policies.train.first_gait import (
     FirstGait,
@@ -16,9 +15,9 @@ from pupper_sysid.policies.train.first_gait import (
     suited,
     with_first_gait,
 )
-from pupper_sysid.policies.train.run_file import preset, teacher_of
+from pupper_sysid.policies.train.run_file import OWN, TROT, Imitation, preset, teacher_of
 from pupper_sysid.policies.train.selection import COMMANDS
-from pupper_sysid.policies.walks.conditions import share_of_usual, within
+from pupper_sysid.policies.walks.together import share_of_usual, within
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Commands, Walking
 from pupper_sysid.sim.walking.env import PupperEnv

@@ -17,15 +17,14 @@ from pupper_sysid.policies.train.learner import (
     CHECKPOINT_VERSION,
     Learner,
     Ranks,
+    WalkingVecEnv,
     judged_weights,
     read_checkpoint,
 )
 from pupper_sysid.policies.train.training import make_env, make_learner
-from pupper_sysid.policies.train.vec_env import WalkingVecEnv
 from pupper_sysid.sim.robot.body import mini_pupper
 from pupper_sysid.sim.robot.mini_pupper import SIDE, foot_position
-from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.rewards.weights import Rewards
+from pupper_sysid.sim.walking.config import Rewards, Walking
 from support.refusals import assert_each_refused
 from support.tiny_training import observations, ppo, tiny_run
 

@@ -8,9 +8,8 @@ import torch
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import LEGS
-from pupper_sysid.policies.network.hyperparameters import Hyperparameters
-from pupper_sysid.policies.train.learner import Learner, mirrored
-from pupper_sysid.policies.train.vec_env import WalkingVecEnv
+from pupper_sysid.policies.train.learner import Learner, WalkingVecEnv, mirrored
+from pupper_sysid.policies.train.run_file import Hyperparameters
 from pupper_sysid.sim.robot.mini_pupper import foot_position
 from pupper_sysid.sim.walking.config import Observation, Walking
 from pupper_sysid.sim.walking.env import PupperEnv

@@ -9,11 +9,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from pupper_sysid.policies.network.hyperparameters import Architecture, Hyperparameters, Imitation
 from pupper_sysid.policies.train import imitation, training
 from pupper_sysid.policies.train.imitation import LearnedTeacher, TrotTeacher, imitate
-from pupper_sysid.policies.train.learner import Learner, Ranks, read_checkpoint
+from pupper_sysid.policies.train.learner import Learner, Ranks, WalkingVecEnv, read_checkpoint
 from pupper_sysid.policies.train.run_file import (
+    Architecture,
+    Hyperparameters,
+    Imitation,
     check_teacher,
     load_run,
     preset,
@@ -21,10 +23,8 @@ from pupper_sysid.policies.train.run_file import (
     teacher_of,
 )
 from pupper_sysid.policies.train.training import BEST, LAST, make_env, make_learner, train
-from pupper_sysid.policies.train.vec_env import WalkingVecEnv
-from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.observation import PRIVILEGED_PARTS
-from pupper_sysid.sim.walking.rewards.weights import CLOCK, Rewards
+from pupper_sysid.sim.walking.config import CLOCK, Rewards, Walking
+from pupper_sysid.sim.walking.step import PRIVILEGED_PARTS
 from support.checkpoints import different, stop_after
 from support.refusals import assert_each_refused
 from support.tiny_training import tiny_run

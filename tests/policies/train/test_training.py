@@ -22,14 +22,12 @@ import torch
 
 from pupper_sysid.cli.policy_choice import policy_at
 from pupper_sysid.common.errors import InputError, PupperError
-from pupper_sysid.policies.network.hyperparameters import Imitation
 from pupper_sysid.policies.network.policy_file import load_policy
 from pupper_sysid.policies.train import training
-from pupper_sysid.policies.train.curves import PROGRESS
 from pupper_sysid.policies.train.imitation import imitate
 from pupper_sysid.policies.train.learner import Learner, Ranks, read_checkpoint
-from pupper_sysid.policies.train.run_file import load_run
-from pupper_sysid.policies.train.training import LAST, learner_device, train
+from pupper_sysid.policies.train.run_file import Imitation, load_run
+from pupper_sysid.policies.train.training import LAST, PROGRESS, learner_device, train
 from pupper_sysid.sim.gpu.warp_robots import WarpRobots
 from support.checkpoints import different, stop_after
 from support.tiny_training import CALIBRATION, tiny_run

@@ -9,15 +9,15 @@ import pytest
 from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.evaluation.evaluate import Recorder
 from pupper_sysid.policies.walks import together as module
-from pupper_sysid.policies.walks.conditions import (
+from pupper_sysid.policies.walks.together import (
     RANDOM,
     Condition,
     evaluation_task,
     random_commands,
     share_of_usual,
+    walk_together,
     within,
 )
-from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.trot import Trot
 from pupper_sysid.sim.walking.config import Commands, Walking

@@ -9,22 +9,22 @@ import pytest
 from pupper_sysid.data import SAMPLES
 from pupper_sysid.policies.evaluation.evaluate import Recorder
 from pupper_sysid.policies.walks import together
-from pupper_sysid.policies.walks.conditions import (
+from pupper_sysid.policies.walks.together import (
     Condition,
     Handicap,
     evaluation_task,
     impose,
     missed_ticks,
     push_directions,
+    walk_together,
 )
-from pupper_sysid.policies.walks.together import walk_together
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import robot_xml
 from pupper_sysid.sim.robot.terrain import STAIRS_M
 from pupper_sysid.sim.walking.config import Walking
 from pupper_sysid.sim.walking.env import PupperEnv
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from pupper_sysid.sim.walking.step import OBSERVATION_PARTS
 
 SERVOS = servo_ranges(SAMPLES / "calibrated.yaml")
 TASK = evaluation_task(Walking())

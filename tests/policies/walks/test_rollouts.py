@@ -6,7 +6,6 @@ import torch
 
 from pupper_sysid.policies.network.policy_file import Policy
 from pupper_sysid.policies.network.policy_network import WIDTH
-from pupper_sysid.policies.walks.conditions import Condition, evaluation_task
 from pupper_sysid.policies.walks.rollouts import (
     Rollout,
     collect,
@@ -16,9 +15,10 @@ from pupper_sysid.policies.walks.rollouts import (
     stride_errors,
     tracking_errors,
 )
+from pupper_sysid.policies.walks.together import Condition, evaluation_task
 from pupper_sysid.sim.walking.config import Walking
-from pupper_sysid.sim.walking.observation import OBSERVATION
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from pupper_sysid.sim.walking.step import OBSERVATION
 from support.tiny_training import ALL_KINDS, CALIBRATION
 from support.walks import walk
 

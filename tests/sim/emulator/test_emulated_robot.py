@@ -15,9 +15,8 @@ from pupper_sysid.common.errors import FileExistsRefusal, InputError
 from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.servo_models.delayed_pd import DelayedPD
-from pupper_sysid.sim.emulator.bench import PollSchedule, ServoBench
+from pupper_sysid.sim.emulator.bench import FreeAirServo, PollSchedule, ServoBench
 from pupper_sysid.sim.emulator.bus import TRUTH_COLUMNS, EmulatedBus
-from pupper_sysid.sim.emulator.free_air import FreeAirServo
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from support.servo_parameters import MEASURED
 

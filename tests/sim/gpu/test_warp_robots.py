@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.sim.gpu import worlds
+from pupper_sysid.sim.gpu import warp_robots
 from pupper_sysid.sim.gpu.warp_robots import WarpRobots
 from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.robot_batch import RobotBatch
@@ -90,8 +90,8 @@ def test_without_the_extra_the_command_that_installs_it_is_given(monkeypatch):
     def missing(name: str):
         raise ImportError(f"No module named {name!r}")
 
-    monkeypatch.setattr(worlds, "import_module", missing)
-    worlds._engine.cache_clear()
+    monkeypatch.setattr(warp_robots, "import_module", missing)
+    warp_robots._engine.cache_clear()
     with pytest.raises(InputError, match=r'pip install "pupper-sysid\[gpu\]"'):
         PupperEnv(Walking(), SERVOS, 1, device="cpu")
-    worlds._engine.cache_clear()
+    warp_robots._engine.cache_clear()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.policies.walks.conditions import evaluation_task
+from pupper_sysid.policies.walks.together import evaluation_task
 from pupper_sysid.sim.robot.body import Body, body_of, mini_pupper
 from pupper_sysid.sim.robot.engine import mujoco
 from pupper_sysid.sim.robot.mini_pupper import robot_xml

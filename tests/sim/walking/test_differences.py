@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from pupper_sysid.sim.walking.config import Commands, Curriculum, Observation, Walking
-from pupper_sysid.sim.walking.differences import TYPICAL, Differences
-from pupper_sysid.sim.walking.draws import Twins, at_rest, generator
+from pupper_sysid.sim.walking.draws import TYPICAL, Differences, Twins, at_rest, generator
 from pupper_sysid.sim.walking.env import PupperEnv
-from pupper_sysid.sim.walking.observation import OBSERVATION_PARTS as PARTS
 from pupper_sysid.sim.walking.senses import HeldReadings, Imu
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
+from pupper_sysid.sim.walking.step import OBSERVATION_PARTS as PARTS
 from support.refusals import assert_each_refused
 from support.walks import STILL
 

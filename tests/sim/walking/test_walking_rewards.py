@@ -17,11 +17,16 @@ from pupper_sysid.sim.robot.mini_pupper import (
     joint_angles,
 )
 from pupper_sysid.sim.robot.robot_batch import Moved
-from pupper_sysid.sim.walking.config import PRESETS
-from pupper_sysid.sim.walking.rewards import terms as wr
-from pupper_sysid.sim.walking.rewards.strides import EffortMeter, Strides, by_kind
-from pupper_sysid.sim.walking.rewards.terms import TERMS, weighted
-from pupper_sysid.sim.walking.rewards.weights import DEFAULT, PAPER, RELEASE, Rewards, narrowed
+from pupper_sysid.sim.walking import rewards as wr
+from pupper_sysid.sim.walking.config import (
+    DEFAULT_REWARDS,
+    PAPER_REWARDS,
+    PRESETS,
+    RELEASE_REWARDS,
+    Rewards,
+    narrowed,
+)
+from pupper_sysid.sim.walking.rewards import TERMS, EffortMeter, Strides, by_kind, weighted
 from pupper_sysid.sim.walking.step import Step, empty_facts
 
 SIZES = dict.fromkeys(
@@ -294,7 +299,9 @@ def test_every_robot_is_judged_by_its_own_numbers():
     )
     for name, term in TERMS.items():
         np.testing.assert_allclose(
-            term(both, RELEASE), [term(one, RELEASE)[0], term(other, RELEASE)[0]], err_msg=name
+            term(both, RELEASE_REWARDS),
+            [term(one, RELEASE_REWARDS)[0], term(other, RELEASE_REWARDS)[0]],
+            err_msg=name,
         )
 
 
@@ -307,10 +314,12 @@ def only(**given: Any) -> Rewards:
 
 
 def test_a_term_counts_with_its_weight_penalties_with_their_factor_and_none_without():
-    assert set(TERMS) <= {field.name for field in fields(DEFAULT)}
+    assert set(TERMS) <= {field.name for field in fields(DEFAULT_REWARDS)}
     assert weighted(step(), only()) == {}
     assert list(weighted(step(), only(alive=0.5))) == ["alive"]
-    assert set(weighted(step(), RELEASE)) == {k for k, v in weights(RELEASE).items() if v}
+    assert set(weighted(step(), RELEASE_REWARDS)) == {
+        k for k, v in weights(RELEASE_REWARDS).items() if v
+    }
     s = step(action=joints(j0=2.0))
     found = weighted(s, only(alive=0.5, action_rate=-0.1), penalties=0.25)
     assert found["alive"][0] == 0.5
@@ -341,12 +350,15 @@ PAPERS_OWN = {"action_smoothness": -1.0, "joint_position": -0.7}
 
 
 def test_presets_have_the_released_weights_but_those_of_the_paper_where_it_states_any():
-    for rewards, published in ((RELEASE, PUBLISHED), (PAPER, PUBLISHED | PAPERS_OWN)):
+    for rewards, published in (
+        (RELEASE_REWARDS, PUBLISHED),
+        (PAPER_REWARDS, PUBLISHED | PAPERS_OWN),
+    ):
         assert {k: v for k, v in weights(rewards).items() if v} == published
         assert {k: getattr(rewards, k) for k in PARAMETERS} == PARAMETERS
-    assert PRESETS["paper"].rewards == PAPER
-    assert PRESETS["release"].rewards == RELEASE
-    assert PRESETS["fast"].rewards == DEFAULT
+    assert PRESETS["paper"].rewards == PAPER_REWARDS
+    assert PRESETS["release"].rewards == RELEASE_REWARDS
+    assert PRESETS["fast"].rewards == DEFAULT_REWARDS
 
 
 # ----- clearance of swings and effort of servos, from made-up motion whose answer is known

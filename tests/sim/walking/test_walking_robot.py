@@ -12,8 +12,7 @@ from pupper_sysid.hardware.safety.guard import GuardedBus
 from pupper_sysid.sim.emulator.robot import RobotSpec, draw_robot
 from pupper_sysid.sim.robot.mini_pupper import default_pose
 from pupper_sysid.sim.robot.trot import Trot
-from pupper_sysid.sim.walking.bus import WalkingBus, calibrated_robot
-from pupper_sysid.sim.walking.robot import WalkingRobot
+from pupper_sysid.sim.walking.robot import WalkingBus, WalkingRobot, calibrated_robot
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
 from support.servo_servers import exact_spec
 from support.tiny_training import CALIBRATION
