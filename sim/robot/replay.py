@@ -135,6 +135,7 @@ def _with_servos(spec: Any, joints: Sequence[str]) -> Any:
     for elements in (spec.actuators, spec.sensors, spec.keys):
         for element in list(elements):
             spec.delete(element)
+    servo_mjcf.forget_actuator_defaults(spec)
     for name in joints:
         servo = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         servo.set_to_pid(1.0, 0.1, slewmax=1.0, ctrlspec=1)  # commands are positions

@@ -34,7 +34,11 @@ from pupper_sysid.sim.robot.body import Body, fixed_offsets
 from pupper_sysid.sim.robot.engine import in_a_line, mujoco
 from pupper_sysid.sim.robot.hinges import driven_joints, leaders
 from pupper_sysid.sim.robot.mini_pupper import EVALUATION_SOLVER, Physics
-from pupper_sysid.sim.robot.servo_mjcf import FRICTION_SOLIMP, friction_solref
+from pupper_sysid.sim.robot.servo_mjcf import (
+    FRICTION_SOLIMP,
+    forget_actuator_defaults,
+    friction_solref,
+)
 from pupper_sysid.sim.robot.terrain import Ground
 
 Array = NDArray[np.float64]
@@ -317,6 +321,7 @@ class _Reader:
                          spec.excludes, spec.pairs):  # fmt: skip
             for element in list(elements):
                 spec.delete(element)
+        forget_actuator_defaults(spec)
         plane, field = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD
         for geom in list(spec.geoms):
             if geom.type in (plane, field):

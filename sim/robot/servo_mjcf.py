@@ -37,6 +37,30 @@ BATCH_FIELDS = (
 TENDON_FIELDS = ("tendon_armature", "tendon_frictionloss", "tendon_damping")
 
 
+_ACTUATOR = (
+    "gear", "ctrllimited", "ctrlrange", "forcelimited", "forcerange", "actlimited", "actrange",
+    "actearly", "actdim", "dyntype", "dynprm", "gaintype", "gainprm", "biastype", "biasprm",
+    "armature", "damping", "cranklength", "lengthrange", "inheritrange", "delay", "nsample",
+    "interp", "group",
+)  # fmt: skip
+"""What a file's default class can say of all actuators."""
+
+
+def forget_actuator_defaults(spec: Any) -> None:
+    """Actuators added to a robot's file from here on have nothing of its default class.
+
+    `<motor gear="150"/>` there would be a servo of 150 times the torque.
+
+    `spec`: a `mujoco.MjSpec`.
+    """
+    from pupper_sysid.sim.robot.engine import mujoco
+
+    fresh = mujoco.MjSpec()
+    of_file, of_none = spec.default.actuator, fresh.default.actuator
+    for name in _ACTUATOR:
+        setattr(of_file, name, getattr(of_none, name))
+
+
 def friction_solref(time_step_s: float) -> tuple[float, float]:
     """MuJoCo `solreffriction` in its direct form: stop within one time step, no spring.
 

@@ -398,6 +398,17 @@ def test_a_ball_and_stairs_beside_the_robot_are_taken_out(tmp_path):
     assert compiled(own).ngeom == compiled(alone).ngeom
 
 
+def test_actuators_in_a_files_default_class_are_not_the_servos(tmp_path):
+    default = """<default><general gear="150" ctrllimited="true" ctrlrange="-0.4 0.4" actdim="1"
+        forcelimited="true" forcerange="-1 1" dyntype="filter" dynprm="0.1"/></default>"""
+    plain = compiled(body(tmp_path))
+    model = compiled(body(tmp_path, legged(PLACES).replace("<worldbody>", default + "<worldbody>")))
+    for name in ("gear", "ctrllimited", "forcelimited", "forcerange", "dyntype", "dynprm",
+                 "gainprm", "biasprm", "delay"):  # fmt: skip
+        field = f"actuator_{name}"
+        np.testing.assert_array_equal(getattr(model, field), getattr(plain, field), name)
+
+
 @pytest.mark.parametrize(
     ("xml", "config", "words"),
     [
