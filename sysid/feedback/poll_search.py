@@ -181,13 +181,16 @@ class Stretch:
     same_end: NDArray[np.float64]
     """`same_begin` and `same_end`: the same of each row whose value did not change although the
     servo must have moved [s], shape (same,)."""
+    moving: NDArray[np.bool_]
+    """By which changed rows the servo must have moved, so that without a change they would be among
+    those that stayed the same, shape (changed,)."""
 
     def between(self, start_s: float, stop_s: float) -> Stretch:
         """Rows read within a part of the stretch."""
         new, same = ((e > start_s) & (e <= stop_s) for e in (self.end, self.same_end))
         return Stretch(
             self.trial, start_s, stop_s, self.begin[new], self.end[new],
-            self.same_begin[same], self.same_end[same],
+            self.same_begin[same], self.same_end[same], self.moving[new],
         )  # fmt: skip
 
 

@@ -140,12 +140,14 @@ def evidence(stretch: Stretch, period_s: float, blur_s: float, loss: float) -> f
     """Log-likelihood of when rows changed, for the best segments of a period.
 
     Unlike the score of one period's phases it compares periods: a shorter one explains more changes
-    by more polls, of which more must have failed.
+    by more polls, of which more must have failed. Where the servo need not have moved, rows that
+    stayed the same say nothing, and a shorter one only meets more rows by chance.
     """
     score = _scored(stretch, np.zeros(len(stretch.end)), period_s, blur_s, loss, None, 1.0).score
     one = float(np.max(score[0] + score[:, -1]))
     best = max(float(score[0, -1]), one - NATS)
-    return best + len(stretch.end) * float(np.log(1.0 - loss))
+    by_chance = np.minimum((stretch.end - stretch.begin) / period_s, 1.0)
+    return best + float(np.sum(np.where(stretch.moving, np.log(1.0 - loss), -np.log(by_chance))))
 
 
 @dataclass(frozen=True)

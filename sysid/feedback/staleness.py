@@ -50,9 +50,9 @@ def read_before(trial: Trial) -> NDArray[np.float64]:
 def stretches_of(trial: Trial, step: float) -> list[Stretch]:
     """Cut a trial into stretches short enough for one strict lattice each."""
     read, rows, before = trial.read_time_s, fresh_rows(trial), read_before(trial)
-    moving = np.flatnonzero(moving_rows(trial, step))
+    moving = moving_rows(trial, step)
     known = np.isfinite(trial.position_rad) & np.isfinite(before)
-    same = np.setdiff1d(moving[known[moving]], rows)
+    same = np.setdiff1d(np.flatnonzero(moving & known), rows)
     parts = max(1, int(np.ceil((read[-1] - read[0]) / STRETCH_S)))
     edges = np.linspace(read[0], read[-1], parts + 1)
     stretches = []
@@ -60,8 +60,11 @@ def stretches_of(trial: Trial, step: float) -> list[Stretch]:
         new, held = (r[(read[r] > start) & (read[r] <= stop)] for r in (rows, same))
         if len(new) >= 8:
             stretches.append(
-                Stretch(trial.number, start, stop, before[new], read[new], before[held], read[held])
-            )
+                Stretch(
+                    trial.number, start, stop, before[new], read[new], before[held], read[held],
+                    moving[new],
+                )
+            )  # fmt: skip
     return stretches
 
 

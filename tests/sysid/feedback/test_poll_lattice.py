@@ -46,6 +46,26 @@ def test_a_servo_that_sticks_is_not_mistaken_for_a_bus_that_holds():
     assert np.allclose(readings(asked, lattice).time_s, asked.read_time_s[rows])
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_the_poll_behind_steps_is_not_taken_for_an_alias_of_it(seed):
+    """Most rows are at rest, where a repeat says nothing of failed polls."""
+    rng, poll_s, count_rad = np.random.default_rng(seed), 0.02685, 0.0057
+    read = LOOP_S * np.arange(450) + 0.001
+    levels = np.repeat(rng.uniform(-0.4, 0.4, 15), 30)
+    polls = poll_s * np.arange(-4, 330) + rng.uniform(0.0, poll_s)
+    polls = polls[rng.random(len(polls)) > 0.42]
+    held = levels[np.clip((polls / LOOP_S).astype(int), 0, 449)]
+    angle, moved = 0.0, []
+    for gap, level in zip(np.diff(polls, prepend=polls[0]), held, strict=True):
+        angle += (level - angle) * -np.expm1(-gap / 0.06)
+        moved.append(angle + 0.003 * rng.standard_normal())
+    counted = count_rad * np.round(np.array(moved) / count_rad)
+    position = counted[np.searchsorted(polls, read, "right") - 1]
+    trial = Trial("LF_hip", 0, 0.0, read - 0.001, read, levels, position, None, 0.0, "polled")
+    lattice = find_poll_lattice([trial], rng)
+    assert lattice.poll_period_s == pytest.approx(poll_s, abs=2e-4)
+
+
 def test_a_header_that_says_polled_outweighs_motion_that_looks_live_or_cannot_be_told():
     rng = np.random.default_rng(1)
     trials = tone_trials(0.04, rng, period_s=0.0)
@@ -186,7 +206,7 @@ def test_a_period_that_explains_as_much_is_inside_the_interval():
 
 def test_the_error_of_the_period_is_scatter_shrunk_towards_the_usual_drift():
     none = np.zeros(0)
-    part = Stretch(0, 0.0, 3.0, np.zeros(50), np.zeros(50), none, none)
+    part = Stretch(0, 0.0, 3.0, np.zeros(50), np.zeros(50), none, none, np.ones(50, bool))
     periods = (0.0201, 0.0199, 0.0200, 0.0200)
     phases = [Phase(n, 0.0, 3.0, p, 0.0, 1e-4) for n, p in enumerate(periods)]
     period, error = common_period([part] * 4, phases, range(4))
@@ -194,7 +214,7 @@ def test_the_error_of_the_period_is_scatter_shrunk_towards_the_usual_drift():
     variance = (2e-8 + 3 * 1.6e-9) / 6
     assert period == pytest.approx(0.02) and error == pytest.approx(math.sqrt(3 * variance / 4))
     # segments of one stretch are one measurement
-    half = replace(part, begin=np.zeros(25), end=np.zeros(25))
+    half = replace(part, begin=np.zeros(25), end=np.zeros(25), moving=np.ones(25, bool))
     split = common_period([half] * 2 + [part] * 3, [phases[0], *phases], (0, 0, 1, 2, 3))
     assert split == pytest.approx((period, error))
 

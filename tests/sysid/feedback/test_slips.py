@@ -109,7 +109,7 @@ def stretch(jump=0.0):
     keep = np.concatenate([[True], np.diff(end) > 0])
     end = end[keep]
     none = np.zeros(0)
-    return Stretch(0, 0.0, 3.0, end - 0.02, end, none, none)
+    return Stretch(0, 0.0, 3.0, end - 0.02, end, none, none, np.ones(len(end), bool))
 
 
 def test_residuals_that_a_slip_has_widened_do_not_hide_it():
