@@ -33,7 +33,7 @@ from pupper_sysid.policies.network.policy_network import PolicyNetwork
 from pupper_sysid.policies.train.run_file import Run as TrainingRun
 from pupper_sysid.sim.walking.observation import VELOCITY_STEPS, observation_of
 from pupper_sysid.sim.walking.servo_ranges import ServoRanges
-from pupper_sysid.sysid.export.network import Run, export_module
+from pupper_sysid.sysid.export import Run, export_module
 
 ENDINGS = {"onnx": ".onnx", "torchscript": ".pt"}
 _STEPS = 6

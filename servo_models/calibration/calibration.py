@@ -144,13 +144,7 @@ class Calibration(Part):
         return tuple(self.joints)
 
     def joint(self, name: str) -> JointCalibration:
-        """Calibration of the joint `name`.
-
-        Raises
-        ------
-        InputError
-            If this calibration lacks that joint.
-        """
+        """Calibration of the joint `name`; refused if this one lacks it."""
         if name not in self.joints:
             raise InputError(
                 f"The calibration of {self.robot} has no joint {name}. "
@@ -170,17 +164,9 @@ class Calibration(Part):
         return joints
 
     def at_p_gain(self, p_gain: float) -> Calibration:
-        """The calibration of the same servos at another P gain of their position loops.
+        """The calibration of the same servos at another P gain, the register's value.
 
-        Parameters
-        ----------
-        p_gain : float
-            The register's value.
-
-        Raises
-        ------
-        InputError
-            If a joint was recorded at one gain without a known load: it has no `under_load`.
+        Refused if a joint was recorded at one gain without a known load: it has no `under_load`.
         """
         joints = {name: joint.at_p_gain(p_gain) for name, joint in self.joints.items()}
         return self.model_copy(update={"joints": joints})
@@ -234,25 +220,10 @@ class Calibration(Part):
         )
 
     def export(self, to: str, out: Path | str = ".", **options: Any) -> Path:
-        """Write these servos for another simulator; see `sim.export.export.export`.
+        """Write these servos for another simulator, and return the file.
 
-        Parameters
-        ----------
-        to : {"mjcf", "isaaclab", "isaaclab-bam", "mjlab", "newton", "json"}
-        out : Path or str
-            File, or a folder, in which the file is called `servos` with the target's ending.
-        **options
-            `physics_step_s`, `gain`, `link_inertia`, `model`, `force`.
-
-        Returns
-        -------
-        Path
-            The file that was written.
-
-        Raises
-        ------
-        InputError
-            If the target cannot take these servos so, or the file exists.
+        `to`, `out` and the options (`physics_step_s`, `gain`, `link_inertia`, `model`, `force`) are
+        those of `ps.export`.
         """
         # a room above this one: files import no simulator
         return import_module("pupper_sysid.sim.export.export").export(self, to, out, **options)
@@ -262,13 +233,7 @@ class Calibration(Part):
         return f"{_HEADER}\n{dump(self.model_dump(mode='json', by_alias=True))}"
 
     def save(self, path: Path | str, force: bool = False) -> None:
-        """Write this calibration to `path` as YAML, in one atomic step.
-
-        Raises
-        ------
-        InputError
-            If `path` exists and `force` is not set, or if it cannot be written.
-        """
+        """Write this calibration to `path` as YAML, in one atomic step."""
         write_text(Path(path), self.to_yaml(), force)
 
 

@@ -331,11 +331,8 @@ def motor_of(servo: UnderLoad) -> tuple[dict[str, Any], tuple[str, ...]]:
 def bam_card(calibration: Calibration) -> ServoCard:
     """The servo of a calibration under load as a card whose numbers are those of BAM's models.
 
-    Raises
-    ------
-    InputError
-        If it is of several joints, was not fitted under a known load, states no supply voltage, or
-        is not of a servo that BAM knows.
+    Refused if it is of several joints, was not fitted under a known load, states no supply voltage,
+    or is not of a servo that BAM knows.
     """
     (name, joint), *others = calibration.joints.items()
     block = joint.under_load

@@ -120,7 +120,7 @@ class Comparison(Result):
 
     def plot(self, joints: Sequence[str] | None = None) -> Figure:
         """Figure of the models in free run beside commands and readings, a panel per joint."""
-        from pupper_sysid.sysid.servo_fit.figures import free_run_figure
+        from pupper_sysid.sysid.report.figures import free_run_figure
 
         every = [r for runs in self.runs.values() for r in runs]
         gains, loads = {r.run.p_gain for r in every}, [r.trial.load for r in every]

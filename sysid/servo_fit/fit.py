@@ -170,7 +170,7 @@ class ServoFit(Result):
 
     def plot(self, joints: Sequence[str] | None = None) -> Figure:
         """Figure of the model in free run beside commands and readings, a panel per joint."""
-        from pupper_sysid.sysid.servo_fit.figures import free_run_figure
+        from pupper_sysid.sysid.report.figures import free_run_figure
 
         bands = {j: (s.band_noise_rad, s.band_timing_s) for j, s in self.joints.items()}
         return free_run_figure(

@@ -28,7 +28,7 @@ from pupper_sysid.sim.walking.observation import (
     PRIVILEGED_SIZE,
 )
 from pupper_sysid.sim.walking.servo_ranges import servo_ranges
-from pupper_sysid.sysid.export import network as network_export
+from pupper_sysid.sysid import export as network_export
 from support.command_line import fresh_python
 from support.tiny_training import (
     ALL_KINDS,
