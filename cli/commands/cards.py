@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.common import Json
+from pupper_sysid.cli.terminal import Json
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.servo_models.calibration.parts import ARMATURES, P_GAINS
 from pupper_sysid.servo_models.calibration.quantity import Quantity, words_of

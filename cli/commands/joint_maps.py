@@ -16,8 +16,7 @@ from rich.text import Text
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE, joints_on, say_remarks
-from pupper_sysid.cli.commands.common import Json, Replace
-from pupper_sysid.cli.terminal import Keyboard
+from pupper_sysid.cli.terminal import Json, Keyboard, Replace
 from pupper_sysid.common.errors import BusError, InputError
 from pupper_sysid.common.files import refuse_overwrite
 from pupper_sysid.common.reading.dialect import whole_number

@@ -12,8 +12,7 @@ import tyro
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.common import Joints, Json, OfRecordings
-from pupper_sysid.cli.terminal import ms, number
+from pupper_sysid.cli.terminal import Joints, Json, OfRecordings, ms, number
 from pupper_sysid.common.errors import InputError, PupperError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, resolved
 from pupper_sysid.common.joints import (

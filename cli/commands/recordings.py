@@ -12,8 +12,8 @@ import tyro
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.common import Json, OfRecordings, Replace
 from pupper_sysid.cli.live_views import refuse_files
+from pupper_sysid.cli.terminal import Json, OfRecordings, Replace
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, resolved, write_bytes
 from pupper_sysid.common.joints import JOINT_NAMES, share_sentences
