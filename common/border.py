@@ -3,6 +3,8 @@
 `read_yaml`, `read_json` and `read_text` turn a file into plain data; `refuse_other_version` checks
 its schema version; `validated` turns the data into a pydantic model. Whatever is wrong becomes an
 `InputError` of a sentence or two: the file, the line, the place, what stands there, what to do.
+
+`refuse_other_kind` names what is another kind of file of this project, and what reads it.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import math
 import re
 import textwrap
 from collections.abc import Mapping
+from contextlib import suppress
 from copy import copy
 from functools import cache
 from itertools import pairwise
@@ -27,7 +30,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.content import allowed, content, refuse_more
+from pupper_sysid.common.reading.content import allowed, content, open_regular, refuse_more
 from pupper_sysid.common.strict_yaml import MAX_DEPTH, Place, load, place_text, printable
 
 LARGEST_BYTES = 2_000_000
@@ -155,6 +158,64 @@ def refuse_other_schema(
     if not isinstance(data, dict) or data.get("schema") != schema:
         raise InputError(f"{name} {what}: it does not say `schema: {schema}` at the top. {remedy}")
     refuse_other_version(name, data.get("schema_version"), version)
+
+
+RECORDING = "pupper-sysid recording"
+_TRUTH = "truth"
+_KINDS = {
+    RECORDING: ("a recording", "`pupper-sysid doctor`, `delay` and `calibrate` read it"),
+    _TRUTH: ("the truth of an emulated recording", "`pupper-sysid compare-truth` reads it"),
+    "pupper-calibration": (
+        "a calibration", "`pupper-sysid export` reads it, `compare` takes it as one of `models`"),
+    "pupper-servo-card": ("a servo card", "`pupper-sysid servo show` and `servo diff` read it"),
+    "pupper-servo-model": (
+        "a fitted servo model", "`pupper-sysid compare` takes its folder as one of `models`"),
+    "pupper-sysid plan": ("a plan", "`pupper-sysid sweep` takes it as `plan`"),
+    "pupper-policy": ("a policy", "`pupper-eval`, `pupper-play` and `pupper-deploy` read it"),
+    "pupper-run": ("a training run", "`pupper-eval` reads its folder, `pupper-train` resumes it"),
+}  # fmt: skip
+"""By the schema that a file states: what it is, and what reads it."""
+_INSIDE = ("contract.json", "run.yaml")  # of a folder
+_HEAD = 8192
+_SCHEMA = re.compile(r"^[ \t{]*\"?schema\"?: *\"?(pupper-[\w -]*\w)", re.MULTILINE)
+_OURS = re.compile(rf"# {RECORDING}|[\w,]*\b(send_time_s|motor_idx)\b")
+_EMULATED = re.compile(r"spec:\s+dead_time_s:")
+
+
+def refuse_other_kind(path: Path, expected: str) -> None:
+    """Refuse what is another kind of file, or folder, of this project, and name what reads it.
+
+    What is no file of this project, or cannot be read, is left to its reader. `expected` is
+    `RECORDING`, or the schema that the expected kind states.
+    """
+    kind = _kind_of(path)
+    if kind not in (None, expected):
+        what, readers = _KINDS[kind]
+        raise InputError(f"{path} is {what}, not {_KINDS[expected][0]}: {readers}.")
+
+
+def _kind_of(path: Path) -> str | None:
+    with suppress(InputError, OSError):
+        if path.is_dir():
+            inside = (path / name for name in _INSIDE)
+            return next((kind for p in inside if p.is_file() and (kind := _kind_of(p))), None)
+        with open_regular(path) as file:
+            head = file.read(_HEAD).decode(errors="replace")
+        if _OURS.match(head):
+            return RECORDING
+        if _EMULATED.match(head):
+            return _TRUTH
+        stated = _SCHEMA.search(head)
+        return stated[1] if stated and stated[1] in _KINDS else None
+    return None
+
+
+def read_own(path: Path, schema: str, version: int, remedy: str) -> tuple[Any, dict[Place, int]]:
+    """Data and lines of a YAML file of this project that states `schema`; others are refused."""
+    refuse_other_kind(path, schema)
+    data, lines = read_yaml(path)
+    refuse_other_schema(path, data, f"is not {_KINDS[schema][0]}", schema, version, remedy)
+    return data, lines
 
 
 def validated(

@@ -23,15 +23,24 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from pupper_sysid.common.border import read_bytes, read_json, refuse_other_version, validated
+from pupper_sysid.common.border import (
+    read_bytes,
+    read_json,
+    refuse_other_kind,
+    refuse_other_version,
+    validated,
+)
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import as_path, refuse_overwrite, write_bytes, write_text
 from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.processes.stop import held
 from pupper_sysid.common.reading.content import refuse_large_header
-from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
-from pupper_sysid.servo_models.interface import AtControlRate, substeps
+from pupper_sysid.servo_models.delayed_pd import (
+    AtControlRate,
+    DelayedPD,
+    DelayedPDParameters,
+    substeps,
+)
 from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork, same_rate
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS, SparseEquation
 

@@ -27,9 +27,14 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, model_validator
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 
-from pupper_sysid.common.border import read_bytes, read_json, refuse_other_version, validated
+from pupper_sysid.common.border import (
+    read_bytes,
+    read_json,
+    refuse_other_kind,
+    refuse_other_version,
+    validated,
+)
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import as_path, sha256
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import JOINT_NAMES

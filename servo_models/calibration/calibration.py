@@ -23,9 +23,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator
 
-from pupper_sysid.common.border import read_yaml, refuse_other_schema, validated
+from pupper_sysid.common.border import read_own, validated
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import as_path, write_text
 from pupper_sysid.common.joints import in_order, strange_joint
 from pupper_sysid.common.strict_yaml import dump
@@ -313,10 +312,8 @@ def load_calibration(path_or_preset: Path | str) -> Calibration:
 
 
 def _load(path: Path) -> Calibration:
-    refuse_other_kind(path, SCHEMA)
-    data, lines = read_yaml(path)
     remedy = "Give a file that `pupper-sysid calibrate` wrote."
-    refuse_other_schema(path, data, "is not a calibration", SCHEMA, SCHEMA_VERSION, remedy)
+    data, lines = read_own(path, SCHEMA, SCHEMA_VERSION, remedy)
     version = data["schema_version"]
     if version == SCHEMA_VERSION:
         return validated(Calibration, data, path, lines)

@@ -30,15 +30,8 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import ConfigDict
 
-from pupper_sysid.common.border import (
-    read_json,
-    read_text,
-    read_yaml,
-    refuse_other_schema,
-    validated,
-)
+from pupper_sysid.common.border import read_json, read_own, read_text, read_yaml, validated
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import LOADED_KEYS, UnderLoad
@@ -476,8 +469,6 @@ def load_card(path_or_name: Path | str) -> ServoCard:
 def _load(path: Path) -> ServoCard:
     if path.suffix.lower() == ".json":
         return load_bam(path)
-    refuse_other_kind(path, SCHEMA)
-    data, lines = read_yaml(path)
     example = "`pupper-sysid servo show sts3215-bam-m1 --yaml` prints one as an example."
-    refuse_other_schema(path, data, "is not a servo card", SCHEMA, SCHEMA_VERSION, example)
+    data, lines = read_own(path, SCHEMA, SCHEMA_VERSION, example)
     return validated(ServoCard, data, path, lines)

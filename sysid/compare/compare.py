@@ -21,8 +21,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from pupper_sysid.common.border import refuse_other_kind
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import as_path
 from pupper_sysid.common.results import Result, internal
 from pupper_sysid.servo_models.calibration.calibration import (
@@ -34,7 +34,7 @@ from pupper_sysid.servo_models.calibration.calibration import (
 )
 from pupper_sysid.servo_models.cards.card import CardCalibration
 from pupper_sysid.servo_models.cards.files import card_names
-from pupper_sysid.servo_models.interface import ServoModel
+from pupper_sysid.servo_models.delayed_pd import ServoModel
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.doctor import checks
 from pupper_sysid.sysid.doctor.checks import Joints, Recordings

@@ -26,8 +26,7 @@ from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.common.results import Result, internal, plain
 from pupper_sysid.servo_models.calibration.calibration import utc_now
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
-from pupper_sysid.servo_models.interface import ServoModel
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, ServoModel
 from pupper_sysid.servo_models.networks import RecurrentNetwork
 from pupper_sysid.servo_models.servo_file import (
     ARCHITECTURES,

@@ -26,8 +26,7 @@ from scipy.optimize import nnls
 
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.common.results import internal
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.servo_models.interface import AtControlRate, ServoModel
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, AtControlRate, ServoModel
 from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
 from pupper_sysid.sysid.fit.predict import ReadingRule, ages
 from pupper_sysid.sysid.servo_fit.data import Run, ServoData, look_up

@@ -280,8 +280,7 @@ def test_servos_that_do_not_say_that_they_are_limp_are_asked_until_they_do(monke
 
     rng = np.random.default_rng(0)
     servos = draw_robot(rng)
-    for module in (watchdog_process, watchdog_process):
-        monkeypatch.setattr(module, "open_bus", lambda *of, **how: Deaf(servos, rng))
+    monkeypatch.setattr(watchdog_process, "open_bus", lambda *of, **how: Deaf(servos, rng))
     orders = orders_for()
     watchdog_process.park(orders)
     assert len(asked) > 45 and not asked[-1]
