@@ -98,9 +98,9 @@ def read_yaml(path: Path) -> tuple[Any, dict[Place, int]]:
     return load(read_text(path), str(path))
 
 
-def read_json(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> Any:
+def read_json(path: Path, remedy: str = "") -> Any:
     """Data of a JSON file of limited size."""
-    return parse_json(read_text(path, largest_bytes, remedy), str(path), remedy)
+    return parse_json(read_text(path, remedy=remedy), str(path), remedy)
 
 
 def parse_json(text: str, name: str, remedy: str = "") -> Any:
@@ -133,14 +133,14 @@ def _levels(text: str) -> int:
     return int(np.cumsum(steps).max(initial=0))
 
 
-def refuse_other_version(path: Path | str, version: Any, known: int, oldest: int = 1) -> None:
-    """Refuse a file whose `schema_version` is none that this code reads, `oldest` to `known`."""
+def refuse_other_version(path: Path | str, version: Any, known: int) -> None:
+    """Refuse a file whose `schema_version` is none that this code reads, 1 to `known`."""
     if type(version) is int and version > known:
         raise InputError(
             f"{path} was written by a newer version of pupper-sysid (schema_version {version}; "
             f"this one reads {known}). Upgrade pupper-sysid."
         )
-    if type(version) is not int or version < oldest:
+    if type(version) is not int or version < 1:
         raise InputError(
             f"{path}: schema_version is {_short(version)}; this version reads {known}. Put the "
             "file back as it was written."

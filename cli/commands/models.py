@@ -441,7 +441,7 @@ class CompareTruth:
 
     def run(self) -> None:
         """Calibrate if need be, compare, print."""
-        from pupper_sysid.sysid.compare.truth import compared_with_truth, read_truth
+        from pupper_sysid.sysid.compare.truth import read_truth, truth_table
         from pupper_sysid.sysid.fit.calibrate import calibrate
 
         truth = read_truth(self.recording, self.truth)  # before the work, not after it
@@ -454,7 +454,7 @@ class CompareTruth:
                 fitted = calibrate(
                     recording, joints, self.seed, workers=2, progress=advance
                 ).calibration
-        rows = compared_with_truth(recording, truth, fitted, joints)
+        rows = truth_table(fitted, truth, recording, joints)
         if self.json:
             return terminal.print_json(rows)
         cells = []
@@ -462,12 +462,12 @@ class CompareTruth:
             end = next((end for end in _UNITS if row.quantity.endswith(end)), "")
             places = 3 if abs(row.truth) < 1 else max(0, 3 - len(f"{abs(row.truth):.0f}"))
             unit, factor, digits = _UNITS.get(end, (unit_of(row.quantity), 1.0, places))
-            found, low, high, true = (
+            value, low, high, true = (
                 number(factor * x, digits)
                 for x in (row.found.value, row.found.low, row.found.high, row.truth)
             )
             cells.append((
-                row.joint, f"{words_of(row.quantity)}, {unit}".removesuffix(", 1"), found,
+                row.joint, f"{words_of(row.quantity)}, {unit}".removesuffix(", 1"), value,
                 f"{low}…{high}", true, row.identified,
                 {True: "yes", False: "no", None: "–"}[row.held],
             ))  # fmt: skip

@@ -304,6 +304,17 @@ class Actuator(Part):
         return DelayedPDParameters(**values)
 
     @property
+    def per_inertia(self) -> dict[str, Quantity]:
+        """What positions in free air identify, by the names of the fitted parameters."""
+        ratios = self.ratios_to_armature
+        return {
+            "dead_time_s": self.dead_time_s, "stiffness_per_s2": ratios.stiffness,
+            "damping_per_s": ratios.damping, "friction_rad_s2": ratios.friction_loss,
+            "effort_rad_s2": ratios.effort_limit,
+            "velocity_limit_rad_s": self.velocity_limit_rad_s, "back_emf_per_s": ratios.back_emf,
+        }  # fmt: skip
+
+    @property
     def fitted_step_s(self) -> float:
         """Step in which the numbers hold [s]; `CONTINUOUS_S` for the servo's own."""
         return CONTINUOUS_S if self.numbers_in == "continuous time" else self.physics_step_s

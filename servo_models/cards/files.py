@@ -193,11 +193,9 @@ def from_bam(
     )
 
 
-def to_bam(card: ServoCard, specimen: str | None = None) -> dict[str, Any]:
-    """Content of a BAM parameter file with a card's numbers; by default the default specimen's."""
-    numbers = card.specimens.get(specimen or card.default)
-    if numbers is None:
-        raise InputError(f"{card.name} has no specimen {specimen}: {', '.join(card.specimens)}.")
+def to_bam(card: ServoCard) -> dict[str, Any]:
+    """Content of a BAM parameter file with the numbers of a card's default specimen."""
+    numbers = card.numbers
     if not isinstance(numbers, PositionLoop) or card.supply_v is None:
         raise InputError(
             f"{card.name} states torques of a simulator, not position loop and motor, which BAM "

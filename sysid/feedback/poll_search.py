@@ -278,7 +278,8 @@ def refine(
 def contains(stretch: Stretch, phase: Phase) -> NDArray[np.bool_]:
     """Which changed rows have a lattice instant in their interval, shape (changed,)."""
     middle = 0.5 * (stretch.begin + stretch.end)
-    return np.abs(phase.nearest(middle) - middle) <= 0.5 * (stretch.end - stretch.begin) + 0.5 * BLUR_S
+    reach = 0.5 * (stretch.end - stretch.begin) + 0.5 * BLUR_S
+    return np.abs(phase.nearest(middle) - middle) <= reach
 
 
 def _score(begin: NDArray, end: NDArray, periods: NDArray) -> NDArray[np.float64]:
