@@ -103,9 +103,9 @@ def load_all(paths: Sequence[Path]) -> list[Recording]:
         if not path.exists() and any(str(path) in recording.joints for recording in recordings):
             raise InputError(f"{path} is a joint, no file: choose it with `--joints {path}`.")
         recordings += [load(log) for log in logs_in(path)]
-    by_name: dict[str, tuple[str, ...]] = {}
+    by_name: dict[str, list[str]] = {}
     for recording in recordings:
-        by_name[recording.name] = (*by_name.get(recording.name, ()), *recording.warnings)
+        by_name.setdefault(recording.name, []).extend(recording.warnings)
     for names, text in share_sentences(by_name):
         warn(f"{'all logs' if names == 'All joints' else names}: {text}")
     if len(recordings) > 1 and all(recording.joints == ["joint"] for recording in recordings):
