@@ -366,7 +366,7 @@ def _with_segments(
             phase = poll_search.refine(part, lattice.poll_period_s, lattice.blur_s, loss, near)
             if n:
                 # from one phase to the next, at the border between the two
-                at, period = segment.start_s, phase.period_s
+                at, period = np.array(segment.start_s), phase.period_s
                 here, there = phases[-1].nearest(at), phase.nearest(at)
                 jump_s = float((there - here + period / 2) % period - period / 2)
                 # less is drift: the segments follow it, but nothing slipped
