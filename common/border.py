@@ -25,7 +25,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
@@ -72,6 +72,12 @@ _NOT_A_MAPPING = ("model_type", "model_attributes_type")
 _FIRST = ("extra_forbidden", *_NOT_A_MAPPING)
 
 _Model = TypeVar("_Model", bound=BaseModel)
+
+
+class Part(BaseModel):
+    """Strict, frozen part of a file: no unknown key, no conversion, no NaN, no infinity."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
 def read_bytes(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> bytes:

@@ -28,9 +28,9 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from pupper_sysid.common.border import read_json, validated
+from pupper_sysid.common.border import Part, read_json, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.hardware.joint_map import JointMap, JointMapFile, joint_map_from
@@ -297,10 +297,8 @@ _FARTHEST_OFFSET = 1_044_479  # of a Dynamixel's register; Feetech's goes to 204
 _FARTHEST_COUNT = 1_048_575
 
 
-class LeRobotJoint(BaseModel):
+class LeRobotJoint(Part):
     """One joint of LeRobot's file."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     id: int = Field(ge=0, le=253)
     """Servo id on its bus."""

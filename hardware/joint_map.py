@@ -29,9 +29,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from pupper_sysid.common.border import read_yaml, refuse_other_schema, validated
+from pupper_sysid.common.border import Part, read_yaml, refuse_other_schema, validated
 from pupper_sysid.common.data_sheet import counts_of
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
@@ -50,18 +50,13 @@ PRESETS = (
 Frame = Literal["proxy", "raw"]
 Linkage = Literal["parallel knee", "none"]
 
-_FILE = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-
-
 _SCALE_FACTOR, _KNOWN_FACTOR = 2.5, 1.3
 """By how much a scale may differ from one turn per whole range (1,024 counts may be 300°, and
 reports of the Mini Pupper's servos go up to twice that), and from a known servo's data sheet."""
 
 
-class JointEntry(BaseModel):
+class JointEntry(Part):
     """One joint of the file."""
-
-    model_config = _FILE
 
     id: int = Field(ge=0, le=253)
     """Servo id on its bus."""
@@ -97,10 +92,8 @@ class JointEntry(BaseModel):
         return self
 
 
-class JointMapFile(BaseModel):
+class JointMapFile(Part):
     """The whole file."""
-
-    model_config = _FILE
 
     schema_: Literal["pupper-sysid joint map"] = Field(alias="schema")
     schema_version: Literal[1]

@@ -18,12 +18,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from pupper_sysid.common.border import (
+    Part,
     read_bytes,
     read_json,
     refuse_other_kind,
@@ -35,6 +36,7 @@ from pupper_sysid.common.files import as_path, refuse_overwrite, write_bytes, wr
 from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.processes.stop import held
 from pupper_sysid.common.reading.content import refuse_large_header
+from pupper_sysid.servo_models.calibration.calibration import InputFile
 from pupper_sysid.servo_models.delayed_pd import (
     AtControlRate,
     DelayedPD,
@@ -61,11 +63,7 @@ _RECURRENT = frozenset(("weight_input", "weight_hidden", "bias", "weight_out", "
 Model = CommandNetwork | RecurrentNetwork | AtControlRate
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-
-class JointContract(_Strict):
+class JointContract(Part):
     """Scores and error of one joint's model."""
 
     scores: dict[str, float | None]
@@ -78,14 +76,7 @@ class JointContract(_Strict):
     """Number of readings it was fitted to."""
 
 
-class InputRecording(_Strict):
-    """Recording the model was fitted to."""
-
-    name: str
-    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-
-
-class Contract(_Strict):
+class Contract(Part):
     """What a saved servo model is, and what it needs."""
 
     schema_name: Annotated[Literal["pupper-servo-model"], Field(alias="schema")] = SCHEMA
@@ -112,7 +103,7 @@ class Contract(_Strict):
     """"fresh" (each at its own time) or "all" rows, per joint."""
     split: str
     choices: dict[str, float]
-    recordings: Annotated[tuple[InputRecording, ...], Field(strict=False)]
+    recordings: Annotated[tuple[InputFile, ...], Field(strict=False)]
     seed: int
     versions: dict[str, str]
     notes: Annotated[tuple[str, ...], Field(strict=False)] = ()

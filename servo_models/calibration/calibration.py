@@ -23,13 +23,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator
 
-from pupper_sysid.common.border import read_own, validated
+from pupper_sysid.common.border import Part, read_own, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import as_path, write_text
 from pupper_sysid.common.joints import in_order, strange_joint
 from pupper_sysid.common.strict_yaml import dump
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, JointCalibration
-from pupper_sysid.servo_models.calibration.quantity import Part, Whole
+from pupper_sysid.servo_models.calibration.quantity import Whole
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.step_size import at_step

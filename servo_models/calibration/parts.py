@@ -20,6 +20,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from pupper_sysid.common.border import Part
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.servo_models.calibration.quantity import (
     AGE,
@@ -37,7 +38,6 @@ from pupper_sysid.servo_models.calibration.quantity import (
     TORQUE,
     NotNegative,
     Number,
-    Part,
     PlausibleRange,
     Quantity,
     Whole,

@@ -30,12 +30,12 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import ConfigDict
 
-from pupper_sysid.common.border import read_json, read_own, read_text, read_yaml, validated
+from pupper_sysid.common.border import Part, read_json, read_own, read_text, read_yaml, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import LOADED_KEYS, UnderLoad
-from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number, Part
+from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number
 from pupper_sysid.servo_models.cards.card import SCHEMA, SCHEMA_VERSION, Gains, ServoCard, Source
 from pupper_sysid.servo_models.cards.numbers import PositionLoop, stated
 

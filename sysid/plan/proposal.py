@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from pupper_sysid.common.border import Part
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.servo_models.calibration.calibration import Calibration, InputFile
 from pupper_sysid.servo_models.calibration.parts import Actuator, JointCalibration
-from pupper_sysid.servo_models.calibration.quantity import Number, Part, Whole
+from pupper_sysid.servo_models.calibration.quantity import Number, Whole
 from pupper_sysid.sysid.doctor.checks import each_joint, joint_trials
 from pupper_sysid.sysid.fit.goodness import LEAST_NOISE_RAD
 from pupper_sysid.sysid.fit.joint_fit import fit_joint

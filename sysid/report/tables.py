@@ -22,8 +22,6 @@ from pupper_sysid.common.tables import Column, Row, Table, ends, rounded
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of, words_of
-from pupper_sysid.sysid.recordings.recording import Recording
-from pupper_sysid.sysid.recordings.table import comments
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.compare.compare import Comparison
@@ -31,6 +29,7 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.fit.results import JointCalibrationResult
     from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
     from pupper_sysid.sysid.lag.lag_budget import LagBudget
+    from pupper_sysid.sysid.recordings.recording import Recording
     from pupper_sysid.sysid.servo_fit.scores import ModelScores
 
 MODEL_NAMES = {
@@ -383,6 +382,8 @@ def tidy_table(
 
 
 def _calibration_table(calibration: Calibration) -> str:
+    from pupper_sysid.sysid.recordings.table import comments  # brings pandas
+
     header = calibration.model_dump(mode="json", by_alias=True, exclude={"joints"})
     header["operating_points"] = {
         name: joint.holds_at.model_dump(mode="json") for name, joint in calibration.joints.items()
