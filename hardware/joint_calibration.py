@@ -24,7 +24,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ from pydantic import Field, model_validator
 from pupper_sysid.common.border import Part, read_json, validated
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.hardware.joint_map import JointMap, JointMapFile, joint_map_from
+from pupper_sysid.hardware.joint_map import FARTHEST_OFFSET, JointMap, JointMapFile, joint_map_from
 
 MARGIN = 0.02
 """Distance of the limits from each end, as a fraction of the travel."""
@@ -293,7 +293,6 @@ def _place(entry: dict, joint: str, start: JointMapFile, measured: Measured) -> 
     return ["offset measured", f"limits of {start.name}, moved by the offset"]
 
 
-_FARTHEST_OFFSET = 1_044_479  # of a Dynamixel's register; Feetech's goes to 2047
 _FARTHEST_COUNT = 1_048_575
 
 
@@ -304,7 +303,7 @@ class LeRobotJoint(Part):
     """Servo id on its bus."""
     drive_mode: Literal[0, 1]
     """1: the joint turns against the counts."""
-    homing_offset: int = Field(ge=-_FARTHEST_OFFSET, le=_FARTHEST_OFFSET)
+    homing_offset: Annotated[int, FARTHEST_OFFSET]
     """Value of the servo's register [counts]."""
     range_min: int = Field(ge=-_FARTHEST_COUNT, le=_FARTHEST_COUNT)
     """Lowest count of the joint's range."""
