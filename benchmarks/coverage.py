@@ -43,7 +43,7 @@ def swept(seed: int) -> Iterator[Row]:
     loss, noise = float(rng.uniform(0.0, 0.5)), float(rng.uniform(0.002, 0.008))
     robot = sweep_random_robot(rng, "1,2,4,8", loss=loss, reading_noise_rad=noise)
     result = calibrate(robot.recording, [robot.joint])
-    for q in truth_table(result, robot.bus.truth(), robot.recording).quantities:
+    for q in truth_table(result.calibration, robot.bus.truth(), robot.recording).quantities:
         if q.found is not None and np.isfinite([q.found.low, q.found.high]).all():
             yield q.quantity, q.found, q.truth, q.identified != "no"
 

@@ -22,7 +22,7 @@ import pandas as pd
 import tyro
 
 from pupper_sysid.common.joints import DEFAULT_POSE
-from pupper_sysid.servo_models.interface import ServoModel
+from pupper_sysid.servo_models.delayed_pd import ServoModel
 from pupper_sysid.servo_models.servo_file import physical_model
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot

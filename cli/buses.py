@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from pupper_sysid.hardware.serial_servos.series import Series
 
 JOINTS_FILE = Path("joints.yaml")
 _LARGEST_REGISTER = 1 << 20  # of a Dynamixel in its extended position mode
+_REGISTER = re.compile(r"\s*(?:([0-9]+):)?(\S+?)\s*=\s*(-?[0-9]+)\s*")
 
 
 def chosen_map(text: str | None) -> JointMap | None:
@@ -81,24 +83,17 @@ def parse_servo_registers(text: str, series: Series) -> dict[int | None, dict[st
 
 def _registers(text: str, known: Iterable[str], example: str) -> dict[int | None, dict[str, int]]:
     by_id: dict[int | None, dict[str, int]] = {None: {}}
+    of_one_servo = ":" in example
+    least = -_LARGEST_REGISTER if of_one_servo else 0
     for part in filter(None, text.split(",")):
-        name, _, value = (piece.strip() for piece in part.partition("="))
-        servo, colon, of_servo = name.partition(":")
-        name = of_servo if colon else name
-        digits = value.removeprefix("-")
-        number = whole_number(value) if digits.isascii() and digits.isdecimal() else None
-        servo_id = whole_number(servo) if colon and servo.isascii() and servo.isdecimal() else None
-        addressed = bool(colon) == (servo_id is not None) and (":" in example or not colon)
-        least = -_LARGEST_REGISTER if ":" in example else 0
-        if (
-            name not in known
-            or not addressed
-            or number is None
-            or not least <= number <= _LARGEST_REGISTER
-        ):
+        match = _REGISTER.fullmatch(part)
+        servo, name, value = match.groups() if match else (None, "", "0")
+        in_range = least <= whole_number(value) <= _LARGEST_REGISTER
+        if name not in known or not in_range or (servo and not of_one_servo):
             raise InputError(
                 f"--registers: '{part}' sets no register that acts here; write {example}, and of "
                 f"these: {', '.join(known)}."
             )
-        by_id.setdefault(servo_id, {})[name] = number
+        servo_id = whole_number(servo) if servo else None
+        by_id.setdefault(servo_id, {})[name] = whole_number(value)
     return by_id

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pupper_sysid.cli.terminal import cell, err, table, warn
-from pupper_sysid.common.border import read_json
+from pupper_sysid.common.border import read_json, refuse_other_kind
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import resolved, sha256
 from pupper_sysid.policies.train.run_file import RUN_FILE, Run, load_run
 from pupper_sysid.servo_models.calibration.calibration import PRESETS, is_shipped

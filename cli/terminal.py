@@ -1,4 +1,4 @@
-"""Output of all commands: streams, tables, numbers, JSON, progress bars; questions at the keyboard.
+"""What commands share: options, recordings, output on the terminal, questions at the keyboard.
 
 Results go to stdout, everything else (progress, warnings, what to run next) to stderr: with
 `--json`, stdout is one JSON object.
@@ -30,10 +30,11 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import tyro
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -102,9 +103,9 @@ def load_all(paths: Sequence[Path]) -> list[Recording]:
         if not path.exists() and any(str(path) in recording.joints for recording in recordings):
             raise InputError(f"{path} is a joint, no file: choose it with `--joints {path}`.")
         recordings += [load(log) for log in logs_in(path)]
-    by_name: dict[str, tuple[str, ...]] = {}
+    by_name: dict[str, list[str]] = {}
     for recording in recordings:
-        by_name[recording.name] = (*by_name.get(recording.name, ()), *recording.warnings)
+        by_name.setdefault(recording.name, []).extend(recording.warnings)
     for names, text in share_sentences(by_name):
         warn(f"{'all logs' if names == 'All joints' else names}: {text}")
     if len(recordings) > 1 and all(recording.joints == ["joint"] for recording in recordings):
@@ -116,6 +117,30 @@ def load_all(paths: Sequence[Path]) -> list[Recording]:
 def pick_joints(recordings: Sequence[Recording], text: str) -> list[str]:
     """Recorded joints that `text` names."""
     return select_joints(text, list(dict.fromkeys(j for r in recordings for j in r.joints)))
+
+
+Joints = Annotated[
+    str, tyro.conf.arg(help="Names (LF_hip), legs (LF), kinds (hip), several with commas, or all.")
+]
+Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object and nothing else.")]
+Replace = Annotated[bool, tyro.conf.arg(help="Replace files that exist.")]
+
+
+@dataclass(frozen=True)
+class OfRecordings:
+    """Options of a command that reads recordings."""
+
+    recordings: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Recordings, pooled per joint; by default the newest in recordings/."""
+    joints: Joints = "all"
+    json: Json = False
+    seed: int = 0
+    """Seed of the bootstrap and of the models' global starts."""
+
+    def load(self) -> tuple[list[Recording], list[str]]:
+        """The recordings, and the joints of them that were chosen."""
+        recordings = load_all(self.recordings)
+        return recordings, pick_joints(recordings, self.joints)
 
 
 def print_json(value: Any) -> None:

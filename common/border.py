@@ -3,6 +3,8 @@
 `read_yaml`, `read_json` and `read_text` turn a file into plain data; `refuse_other_version` checks
 its schema version; `validated` turns the data into a pydantic model. Whatever is wrong becomes an
 `InputError` of a sentence or two: the file, the line, the place, what stands there, what to do.
+
+`refuse_other_kind` names what is another kind of file of this project, and what reads it.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import math
 import re
 import textwrap
 from collections.abc import Mapping
+from contextlib import suppress
 from copy import copy
 from functools import cache
 from itertools import pairwise
@@ -22,12 +25,12 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.reading.content import allowed, content, refuse_more
+from pupper_sysid.common.reading.content import allowed, content, open_regular, refuse_more
 from pupper_sysid.common.strict_yaml import MAX_DEPTH, Place, load, place_text, printable
 
 LARGEST_BYTES = 2_000_000
@@ -71,6 +74,12 @@ _FIRST = ("extra_forbidden", *_NOT_A_MAPPING)
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
+class Part(BaseModel):
+    """Strict, frozen part of a file: no unknown key, no conversion, no NaN, no infinity."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
 def read_bytes(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> bytes:
     """Content of a regular file of limited size; a larger one is refused without being read.
 
@@ -95,9 +104,9 @@ def read_yaml(path: Path) -> tuple[Any, dict[Place, int]]:
     return load(read_text(path), str(path))
 
 
-def read_json(path: Path, largest_bytes: float = LARGEST_BYTES, remedy: str = "") -> Any:
+def read_json(path: Path, remedy: str = "") -> Any:
     """Data of a JSON file of limited size."""
-    return parse_json(read_text(path, largest_bytes, remedy), str(path), remedy)
+    return parse_json(read_text(path, remedy=remedy), str(path), remedy)
 
 
 def parse_json(text: str, name: str, remedy: str = "") -> Any:
@@ -130,14 +139,14 @@ def _levels(text: str) -> int:
     return int(np.cumsum(steps).max(initial=0))
 
 
-def refuse_other_version(path: Path | str, version: Any, known: int, oldest: int = 1) -> None:
-    """Refuse a file whose `schema_version` is none that this code reads, `oldest` to `known`."""
+def refuse_other_version(path: Path | str, version: Any, known: int) -> None:
+    """Refuse a file whose `schema_version` is none that this code reads, 1 to `known`."""
     if type(version) is int and version > known:
         raise InputError(
             f"{path} was written by a newer version of pupper-sysid (schema_version {version}; "
             f"this one reads {known}). Upgrade pupper-sysid."
         )
-    if type(version) is not int or version < oldest:
+    if type(version) is not int or version < 1:
         raise InputError(
             f"{path}: schema_version is {_short(version)}; this version reads {known}. Put the "
             "file back as it was written."
@@ -155,6 +164,64 @@ def refuse_other_schema(
     if not isinstance(data, dict) or data.get("schema") != schema:
         raise InputError(f"{name} {what}: it does not say `schema: {schema}` at the top. {remedy}")
     refuse_other_version(name, data.get("schema_version"), version)
+
+
+RECORDING = "pupper-sysid recording"
+_TRUTH = "truth"
+_KINDS = {
+    RECORDING: ("a recording", "`pupper-sysid doctor`, `delay` and `calibrate` read it"),
+    _TRUTH: ("the truth of an emulated recording", "`pupper-sysid compare-truth` reads it"),
+    "pupper-calibration": (
+        "a calibration", "`pupper-sysid export` reads it, `compare` takes it as one of `models`"),
+    "pupper-servo-card": ("a servo card", "`pupper-sysid servo show` and `servo diff` read it"),
+    "pupper-servo-model": (
+        "a fitted servo model", "`pupper-sysid compare` takes its folder as one of `models`"),
+    "pupper-sysid plan": ("a plan", "`pupper-sysid sweep` takes it as `plan`"),
+    "pupper-policy": ("a policy", "`pupper-eval`, `pupper-play` and `pupper-deploy` read it"),
+    "pupper-run": ("a training run", "`pupper-eval` reads its folder, `pupper-train` resumes it"),
+}  # fmt: skip
+"""By the schema that a file states: what it is, and what reads it."""
+_INSIDE = ("contract.json", "run.yaml")  # of a folder
+_HEAD = 8192
+_SCHEMA = re.compile(r"^[ \t{]*\"?schema\"?: *\"?(pupper-[\w -]*\w)", re.MULTILINE)
+_OURS = re.compile(rf"# {RECORDING}|[\w,]*\b(send_time_s|motor_idx)\b")
+_EMULATED = re.compile(r"spec:\s+dead_time_s:")
+
+
+def refuse_other_kind(path: Path, expected: str) -> None:
+    """Refuse what is another kind of file, or folder, of this project, and name what reads it.
+
+    What is no file of this project, or cannot be read, is left to its reader. `expected` is
+    `RECORDING`, or the schema that the expected kind states.
+    """
+    kind = _kind_of(path)
+    if kind not in (None, expected):
+        what, readers = _KINDS[kind]
+        raise InputError(f"{path} is {what}, not {_KINDS[expected][0]}: {readers}.")
+
+
+def _kind_of(path: Path) -> str | None:
+    with suppress(InputError, OSError):
+        if path.is_dir():
+            inside = (path / name for name in _INSIDE)
+            return next((kind for p in inside if p.is_file() and (kind := _kind_of(p))), None)
+        with open_regular(path) as file:
+            head = file.read(_HEAD).decode(errors="replace")
+        if _OURS.match(head):
+            return RECORDING
+        if _EMULATED.match(head):
+            return _TRUTH
+        stated = _SCHEMA.search(head)
+        return stated[1] if stated and stated[1] in _KINDS else None
+    return None
+
+
+def read_own(path: Path, schema: str, version: int, remedy: str) -> tuple[Any, dict[Place, int]]:
+    """Data and lines of a YAML file of this project that states `schema`; others are refused."""
+    refuse_other_kind(path, schema)
+    data, lines = read_yaml(path)
+    refuse_other_schema(path, data, f"is not {_KINDS[schema][0]}", schema, version, remedy)
+    return data, lines
 
 
 def validated(

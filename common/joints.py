@@ -103,6 +103,12 @@ def share_sentences(by_joint: Mapping[str, Iterable[str]]) -> list[tuple[str, st
     return [("All joints" if names == every_joint else names, text) for names, text in rows]
 
 
+def with_joints(by_joint: Mapping[str, Iterable[str]]) -> list[str]:
+    """Sentences on joints, each once, behind the names of all joints that it is about."""
+    bare = {j: [text.removeprefix(f"{j}: ") for text in texts] for j, texts in by_joint.items()}
+    return [f"{names}: {text}" for names, text in share_sentences(bare)]
+
+
 def _ranged(sentences: Iterable[str]) -> str:
     """One sentence for some that differ in their numbers alone."""
     listed = list(sentences)

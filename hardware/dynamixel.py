@@ -135,15 +135,14 @@ MODELS = {
 """Names by model number; MX are those with the firmware for protocol 2.0."""
 
 
-def _series(name: str, model: int) -> Series:
-    return Series(
+SERIES = {
+    model: Series(
         name, model, big_endian=False, counts=4096, has_sync_read=True, lock_address=None,
         registers=_TABLE, aliases=_ALIASES, eeprom_end=64,
         offset_sign=-1,  # present = encoder + homing offset
-    )  # fmt: skip
-
-
-SERIES = {model: _series(name, model) for model, name in MODELS.items()}
+    )
+    for model, name in MODELS.items()
+}  # fmt: skip
 
 FAST_SINCE = {"X330": 46, "X430": 45, "X540": 45}
 """First firmware with fast sync read, by the models' size: Robotis e-Manual, protocol 2.0, section
@@ -413,11 +412,6 @@ class DynamixelLine(SerialLine):
         self.fast: frozenset[int] = frozenset()
         """Ids of servos that answer fast sync reads."""
         self._was_fast = self._incomplete = False
-
-    def ping(self, servo: int) -> LineFrame | None:
-        """Status frame of `servo`, or None if it does not answer."""
-        reply = self._exchange(lambda: self.ask_model(servo), [servo], self.model_bytes).get(servo)
-        return reply.frame if reply else None
 
     def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
         """The same bytes of several servos with one request; fast, if all of them can."""

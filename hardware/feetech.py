@@ -352,12 +352,10 @@ class FeetechLine(SerialLine):
         super().__init__(device, baud, exclusive)
         self._packets = self._sdk().protocol_packet_handler()
 
-    def ping(self, servo: int) -> LineFrame | None:
-        """Status frame of `servo`, or None if it does not answer."""
-        reply = self._exchange(
-            lambda: self._packets.txPacket(self._port, [0, 0, servo, 2, PING, 0]), [servo], 0
-        ).get(servo)
-        return reply.frame if reply else None
+    def answers_ping(self, servo: int) -> bool:
+        """See `SerialLine`; the model number is another request."""
+        request = [0, 0, servo, 2, PING, 0]
+        return bool(self._exchange(lambda: self._packets.txPacket(self._port, request), [servo], 0))
 
     def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
         """The same bytes of several servos with one request (not on the SCS series)."""

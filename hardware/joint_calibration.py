@@ -21,21 +21,19 @@ Dynamixel the servo does, by its own register, so that counts keep their directi
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from pupper_sysid.common.border import read_json, validated
+from pupper_sysid.common.border import Part, read_json, validated
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.files import write_text
 from pupper_sysid.common.joints import JOINT_NAMES
-from pupper_sysid.hardware.joint_map import JointMap, JointMapFile, joint_map_from
+from pupper_sysid.hardware.joint_map import FARTHEST_OFFSET, JointMap, JointMapFile, joint_map_from
 
 MARGIN = 0.02
 """Distance of the limits from each end, as a fraction of the travel."""
@@ -115,6 +113,12 @@ class Travel:
         self.low[joint] = self.high[joint] = self._before[joint] = -1
         self.wrapped[joint] = False
 
+    def limits(self, joint: int) -> tuple[int, int]:
+        """Limits of one joint that keep `MARGIN` of its travel to both of its ends."""
+        low, high = int(self.low[joint]), int(self.high[joint])
+        margin = MARGIN * (high - low)
+        return int(np.ceil(low + margin)), int(np.floor(high - margin))
+
     def refusals(self, names: tuple[str, ...]) -> dict[str, str]:
         """Reasons by joint why its travel does not show its limits."""
         least = SMALLEST_TRAVEL * self.counts
@@ -178,22 +182,6 @@ def mean_counts(readings: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArr
     mean[read] = np.nanmean(known[:, read], axis=0)
     strayed[read] = np.nanmax(known[:, read], axis=0) - np.nanmin(known[:, read], axis=0)
     return mean, strayed
-
-
-def offset_counts(mean_count: float, counts: int) -> int:
-    """Offset of a horn: count of the middle pose less the encoder's centre."""
-    return round(mean_count - counts / 2)
-
-
-def limits_within(low: int, high: int) -> tuple[int, int]:
-    """Limits that keep `MARGIN` of the travel to both of its ends."""
-    margin = MARGIN * (high - low)
-    return int(np.ceil(low + margin)), int(np.floor(high - margin))
-
-
-def counts_per_rad(from_count: float, to_count: float, angle_deg: float) -> float:
-    """Scale of a servo that was turned through a known angle, in either direction."""
-    return float(abs(to_count - from_count) / np.radians(angle_deg))
 
 
 def scales_agree(measured: float, stated: float) -> bool:
@@ -305,20 +293,17 @@ def _place(entry: dict, joint: str, start: JointMapFile, measured: Measured) -> 
     return ["offset measured", f"limits of {start.name}, moved by the offset"]
 
 
-_FARTHEST_OFFSET = 1_044_479  # of a Dynamixel's register; Feetech's goes to 2047
 _FARTHEST_COUNT = 1_048_575
 
 
-class LeRobotJoint(BaseModel):
+class LeRobotJoint(Part):
     """One joint of LeRobot's file."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     id: int = Field(ge=0, le=253)
     """Servo id on its bus."""
     drive_mode: Literal[0, 1]
     """1: the joint turns against the counts."""
-    homing_offset: int = Field(ge=-_FARTHEST_OFFSET, le=_FARTHEST_OFFSET)
+    homing_offset: Annotated[int, FARTHEST_OFFSET]
     """Value of the servo's register [counts]."""
     range_min: int = Field(ge=-_FARTHEST_COUNT, le=_FARTHEST_COUNT)
     """Lowest count of the joint's range."""
@@ -412,11 +397,3 @@ def lerobot_calibration(
             "range_max": entry.limits_counts[1],
         }
     return entries
-
-
-def write_lerobot(
-    path: Path, joint_map: JointMap, homing_offsets: Mapping[str, int], force: bool = False
-) -> None:
-    """Write LeRobot's calibration of a joint map."""
-    entries = lerobot_calibration(joint_map, homing_offsets)
-    write_text(path, json.dumps(entries, indent=4) + "\n", force)

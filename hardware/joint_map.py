@@ -25,13 +25,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from pupper_sysid.common.border import read_yaml, refuse_other_schema, validated
+from pupper_sysid.common.border import Part, read_yaml, refuse_other_schema, validated
 from pupper_sysid.common.data_sheet import counts_of
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import write_text
@@ -50,18 +50,19 @@ PRESETS = (
 Frame = Literal["proxy", "raw"]
 Linkage = Literal["parallel knee", "none"]
 
-_FILE = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+_Number = TypeVar("_Number", int, float)
+_Ends = Annotated[tuple[_Number, _Number], Field(strict=False)]  # a file has lists
 
+FARTHEST_OFFSET = Field(ge=-1_044_479, le=1_044_479)
+"""Range of a Dynamixel's register of the homing offset; Feetech's goes to 2047."""
 
 _SCALE_FACTOR, _KNOWN_FACTOR = 2.5, 1.3
 """By how much a scale may differ from one turn per whole range (1,024 counts may be 300°, and
 reports of the Mini Pupper's servos go up to twice that), and from a known servo's data sheet."""
 
 
-class JointEntry(BaseModel):
+class JointEntry(Part):
     """One joint of the file."""
-
-    model_config = _FILE
 
     id: int = Field(ge=0, le=253)
     """Servo id on its bus."""
@@ -72,21 +73,14 @@ class JointEntry(BaseModel):
     counts_per_rad: float = Field(gt=1, lt=100_000)
     offset_counts: int = Field(ge=-4096, le=4096)
     """Offset of the servo's horn."""
-    limits_counts: tuple[int, int]
+    limits_counts: _Ends[int]
     """Lowest and highest count that may be commanded."""
-    limits_rad: tuple[float, float]
+    limits_rad: _Ends[float]
     """Lowest and highest angle of the simulator's joint."""
-    homing_offset: int | None = Field(default=None, ge=-1_044_479, le=1_044_479)
+    homing_offset: Annotated[int, FARTHEST_OFFSET] | None = None
     """Of the servo's own register, where the map holds only with that value."""
     source: str
     """Origin of these values: a preset's source, or the calibration that measured them."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _lists_are_pairs(cls, data: Any) -> Any:
-        if isinstance(data, dict):
-            data = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
-        return data
 
     @model_validator(mode="after")
     def _limits_are_ordered(self) -> JointEntry:
@@ -97,10 +91,8 @@ class JointEntry(BaseModel):
         return self
 
 
-class JointMapFile(BaseModel):
+class JointMapFile(Part):
     """The whole file."""
-
-    model_config = _FILE
 
     schema_: Literal["pupper-sysid joint map"] = Field(alias="schema")
     schema_version: Literal[1]

@@ -85,11 +85,6 @@ class HeldFeedback:
             Draws the phases and lost polls; by default one without a seed.
         until_poll_s : array_like, optional
             Time until the first poll [s]; by default drawn.
-
-        Raises
-        ------
-        InputError
-            If the time step is not positive.
         """
         if not (np.isfinite(time_step_s) and time_step_s > 0):
             raise InputError(f"HeldFeedback: time_step_s is {time_step_s}; it must be positive.")
@@ -106,11 +101,6 @@ class HeldFeedback:
         """Readings [rad] after one time step that ended at `position` [rad], of the same shape.
 
         A poll falls anywhere in a step and reads the position of that instant.
-
-        Raises
-        ------
-        InputError
-            If `reset` was not called before, or with another shape.
 
         Examples
         --------
@@ -141,13 +131,7 @@ class HeldFeedback:
 
     @property
     def age_s(self) -> NDArray[np.float64]:
-        """Ages of the readings after the last step [s].
-
-        Raises
-        ------
-        InputError
-            If `reset` was not called before.
-        """
+        """Ages of the readings after the last step [s]."""
         if not self._state:
             raise InputError("HeldFeedback: call `reset` first.")
         return self._state["age"].copy()

@@ -18,20 +18,31 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from pupper_sysid.common.border import read_bytes, read_json, refuse_other_version, validated
+from pupper_sysid.common.border import (
+    Part,
+    read_bytes,
+    read_json,
+    refuse_other_kind,
+    refuse_other_version,
+    validated,
+)
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import as_path, refuse_overwrite, write_bytes, write_text
 from pupper_sysid.common.joints import strange_joint
 from pupper_sysid.common.processes.stop import held
 from pupper_sysid.common.reading.content import refuse_large_header
-from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
-from pupper_sysid.servo_models.interface import AtControlRate, substeps
+from pupper_sysid.servo_models.calibration.calibration import InputFile
+from pupper_sysid.servo_models.delayed_pd import (
+    AtControlRate,
+    DelayedPD,
+    DelayedPDParameters,
+    substeps,
+)
 from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork, same_rate
 from pupper_sysid.servo_models.sparse_equation import COEFFICIENTS, SparseEquation
 
@@ -52,11 +63,7 @@ _RECURRENT = frozenset(("weight_input", "weight_hidden", "bias", "weight_out", "
 Model = CommandNetwork | RecurrentNetwork | AtControlRate
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-
-class JointContract(_Strict):
+class JointContract(Part):
     """Scores and error of one joint's model."""
 
     scores: dict[str, float | None]
@@ -69,14 +76,7 @@ class JointContract(_Strict):
     """Number of readings it was fitted to."""
 
 
-class InputRecording(_Strict):
-    """Recording the model was fitted to."""
-
-    name: str
-    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-
-
-class Contract(_Strict):
+class Contract(Part):
     """What a saved servo model is, and what it needs."""
 
     schema_name: Annotated[Literal["pupper-servo-model"], Field(alias="schema")] = SCHEMA
@@ -103,7 +103,7 @@ class Contract(_Strict):
     """"fresh" (each at its own time) or "all" rows, per joint."""
     split: str
     choices: dict[str, float]
-    recordings: Annotated[tuple[InputRecording, ...], Field(strict=False)]
+    recordings: Annotated[tuple[InputFile, ...], Field(strict=False)]
     seed: int
     versions: dict[str, str]
     notes: Annotated[tuple[str, ...], Field(strict=False)] = ()

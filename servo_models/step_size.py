@@ -251,34 +251,26 @@ def _mean_exp(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.abs(x) > 1e-9, np.expm1(safe) / safe, 1.0)
 
 
-def delay_at_step(
-    parameters: DelayedPDParameters,
-    time_step_s: float,
-    fitted_step_s: float = TIME_STEP_S,
-) -> NDArray[np.float64]:
-    """Dead time [s] with which servos in steps of `time_step_s` lag as in `fitted_step_s`.
+def delay_at_step(parameters: DelayedPDParameters, time_step_s: float) -> NDArray[np.float64]:
+    """Dead time [s] with which servos in steps of `time_step_s` lag as in those of `TIME_STEP_S`.
 
     Shape (servos,). It may be negative, where the step alone is more than the whole lag.
     """
     delay = np.atleast_1d(parameters.dead_time_s)
-    if time_step_s == fitted_step_s:
+    if time_step_s == TIME_STEP_S:
         return delay
-    change = lag_of_steps(parameters, time_step_s, fitted_step_s)
+    change = lag_of_steps(parameters, time_step_s)
     if not np.isfinite(change).all():
         raise InputError(_UNSTABLE_STEP.format(1e3 * time_step_s))
     return delay - change
 
 
-def lag_of_steps(
-    parameters: DelayedPDParameters,
-    time_step_s: float,
-    fitted_step_s: float = TIME_STEP_S,
-) -> NDArray[np.float64]:
-    """Lag that steps of `time_step_s` have more than those of `fitted_step_s` [s], shape (servos,).
+def lag_of_steps(parameters: DelayedPDParameters, time_step_s: float) -> NDArray[np.float64]:
+    """Lag that steps of `time_step_s` have more than those of `TIME_STEP_S` [s], shape (servos,).
 
     NaN where the motion in those steps is not the tones': the servo is not stable, or hardly moves
     at their frequencies.
     """
-    fitted, usual = tones_in_steps_of(parameters, fitted_step_s)
+    fitted, usual = tones_in_steps_of(parameters, TIME_STEP_S)
     in_steps, residue = tones_in_steps_of(parameters, time_step_s)
     return np.where(residue - usual < _UNSTABLE, in_steps - fitted, np.nan)

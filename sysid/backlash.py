@@ -1,7 +1,7 @@
 """Hysteresis, dead zone and backlash of a servo from slow strokes up and down.
 
     pupper-sysid sweep --load pendulum:0.1kg@0.10m --gains 4,8,16 --kind reversal
-    found = backlash(load("recordings/reversal_….csv"))
+    measured = backlash(load("recordings/reversal_….csv"))
 
 At low speed and P gain `P` a servo whose encoder sits on its output trails its command by
 
@@ -152,8 +152,8 @@ def backlash(recordings: Recordings, joints: Joints = None, seed: int = 0) -> Ba
     Examples
     --------
     >>> from pupper_sysid.sysid.recordings.files import load
-    >>> found = backlash(load("recordings/reversal.csv"))  # doctest: +SKIP
-    >>> print(found)  # doctest: +SKIP
+    >>> measured = backlash(load("recordings/reversal.csv"))  # doctest: +SKIP
+    >>> print(measured)  # doctest: +SKIP
     bench: hysteresis 1.50° [1.48, 1.51] at P 8, …, backlash 1.92° [1.83, 2.00]
     """
     inputs = checks.as_sequence(recordings)

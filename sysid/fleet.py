@@ -1,9 +1,9 @@
 """Calibrate the recordings of many robots at once, on some cores or on a Dask cluster.
 
-    fleet = calibrate_fleet(Path("robots"), Path("fleet"), Settings(seed=0), jobs=2)
+    fleet = run_fleet(Path("robots"), Path("fleet"), Calibrations(seed=0), jobs=2)
     fleet.table                   # one row per robot and joint
 
-`fit_servo_fleet` fits servo models instead; both are `run_fleet` with another product.
+`ServoModels` fits servo models instead.
 
 One recording is one robot. Each gets its own calibration file, written when it is done, so that an
 interrupted run continues: a file made from the same bytes with the same settings is kept. A
@@ -19,12 +19,11 @@ from __future__ import annotations
 
 import re
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -51,32 +50,6 @@ FEWEST = 5  # robots needed to mark outliers
 
 _CONNECT_S = 10
 _ADDRESS = re.compile(r"(tls|tcp)://[A-Za-z0-9_.:\[\]-]+:[0-9]{1,5}")
-
-QUANTITIES = {
-    "lag_ms": lambda joint: _ms(joint.lag.lag_s),
-    "dead_time_ms": lambda joint: _ms(joint.actuator.dead_time_s),
-    "stiffness_per_s2": lambda joint: joint.actuator.ratios_to_armature.stiffness.value,
-    "damping_per_s": lambda joint: joint.actuator.ratios_to_armature.damping.value,
-    "friction_rad_s2": lambda joint: joint.actuator.ratios_to_armature.friction_loss.value,
-    "speed_rad_s": lambda joint: joint.actuator.top_speed_rad_s,
-    "poll_period_ms": lambda joint: _ms(joint.feedback.poll_period_s),
-    "loss": lambda joint: joint.feedback.loss.value,
-    "offset_rad": lambda joint: joint.feedback.offset_rad.value,
-    "fit_percent": lambda joint: joint.scores.fit_percent,
-}
-"""Columns of the table, from each joint's calibration."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How every recording is calibrated."""
-
-    seed: int = 0
-    stall_torque_nm: float | None = None
-
-    def __post_init__(self):
-        if self.stall_torque_nm is not None:
-            refuse_outside("`stall_torque_nm`", self.stall_torque_nm, *STALL_TORQUES_NM, "N·m")
 
 
 @dataclass
@@ -119,49 +92,23 @@ def robots_in(root: Path) -> dict[Path, str]:
     return dict(zip(recordings, names, strict=True))
 
 
-def calibrate_fleet(
+def run_fleet(
     root: Path,
     out: Path,
-    settings: Settings,
+    product: Product,
     jobs: int = 1,
     cluster: str | None = None,
     force: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Fleet:
-    """Calibrate every recording in `root`; a `<robot>.yaml` each in `out`, and the table.
+    """Make the product of every recording in `root`; one per robot in `out`, and the table.
 
     Joints of one robot run one after the other, robots in `jobs` processes here, or on the workers
     of a Dask scheduler (`cluster`, `tls://HOST:PORT` or `tcp://HOST:PORT`, see `trust`) that see
-    the same folders. `force` makes calibrations anew that another recording or other settings made.
-    `progress` is called with each robot that is done.
+    the same folders. `force` makes anew what another recording or other settings made. `progress`
+    is called with each robot that is done. Problems of single robots are listed, not raised.
     """
-    targets = {path: out / f"{name}.yaml" for path, name in robots_in(root).items()}
-    return run_fleet(
-        targets, lambda target, path: _is_of(target, path, settings),
-        partial(_calibrated, settings=settings), _numbers, tuple(QUANTITIES), out,
-        jobs, cluster, force, progress,
-    )  # fmt: skip
-
-
-def run_fleet(
-    targets: Mapping[Path, Path],
-    is_of: Callable[[Path, Path], bool],
-    make: Callable[[Path, Path], None],
-    numbers: Callable[[Path], Mapping[str, dict[str, float]]],
-    quantities: Sequence[str],
-    out: Path,
-    jobs: int,
-    cluster: str | None,
-    force: bool,
-    progress: Callable[[str], None] | None,
-) -> Fleet:
-    """Make what is missing of `targets`, here or on a cluster, and the table of all.
-
-    Problems of single robots are listed in it, not raised. `targets` has by recording what is made
-    of it, called as its robot is. `is_of(target, path)` says whether an existing target was made so
-    from this recording; `make(path, target)` makes it, and must be picklable; `numbers(target)` has
-    by joint what the table shows, by `quantities`. `out` is the table's folder.
-    """
+    targets = {path: product.target(out, name) for path, name in robots_in(root).items()}
     if jobs < 1:
         raise InputError(f"`jobs` is {jobs}; it must be at least 1.")
     if cluster is not None:
@@ -172,7 +119,7 @@ def run_fleet(
         same = False
         if target.exists():
             with suppress(PupperError):  # one that cannot be read is left to `make`
-                same = is_of(target, path)
+                same = product.is_of(target, path)
         if same:
             fleet.kept.append(_called(target))
         elif target.exists() and not force:
@@ -182,7 +129,7 @@ def run_fleet(
             )
         else:
             todo.append((path, target))
-    tasks = [(make, path, target, read_limit()) for path, target in todo]
+    tasks = [(product, path, target, read_limit()) for path, target in todo]
     for name, problem in _here(tasks, jobs) if cluster is None else _on(cluster, tasks):
         (fleet.failed if problem else fleet.made).append(name)
         if problem:
@@ -194,10 +141,10 @@ def run_fleet(
     rows = [
         {"robot": _called(target), "joint": joint} | row
         for target in usable
-        for joint, row in numbers(target).items()
+        for joint, row in product.numbers(target).items()
     ]
-    table = pd.DataFrame(rows, columns=["robot", "joint", *quantities])
-    table["outliers"] = _outliers(table, quantities)
+    table = pd.DataFrame(rows, columns=["robot", "joint", *product.quantities])
+    table["outliers"] = _outliers(table, product.quantities)
     table["problem"] = ""
     lost = pd.DataFrame([{"robot": n, "problem": p} for n, p in sorted(fleet.problems.items())])
     fleet.table = pd.concat([table, lost], ignore_index=True) if len(lost) else table
@@ -212,36 +159,11 @@ def _called(target: Path) -> str:
     return target.stem if target.suffix == ".yaml" else target.name
 
 
-def _is_of(target: Path, path: Path, settings: Settings) -> bool:
-    """Whether a calibration was made from these bytes with these settings."""
-    calibration = load_calibration(target)
-    scales = [j.actuator.scale for j in calibration.joints.values()]
-    torques = {s.value_nm if s.source == GIVEN_TORQUE else None for s in scales}
-    return (
-        [i.sha256 for i in calibration.inputs] == [sha256(path)]
-        and calibration.seed == settings.seed
-        and torques == {settings.stall_torque_nm}
-    )
-
-
-def _numbers(target: Path) -> dict[str, dict[str, float]]:
-    """What the table has of each joint of a calibration."""
-    joints = load_calibration(target).joints
-    return {j: {k: value(joint) for k, value in QUANTITIES.items()} for j, joint in joints.items()}
-
-
-def _calibrated(path: Path, target: Path, settings: Settings) -> None:
-    calibration = calibrate(load(path), None, settings.seed, settings.stall_torque_nm, workers=1)
-    calibration.save(target, force=True)
-
-
-def _one(
-    make: Callable[[Path, Path], None], path: Path, target: Path, limit: float
-) -> tuple[str, str]:
+def _one(product: Product, path: Path, target: Path, limit: float) -> tuple[str, str]:
     """Make one robot's; its name, and what went wrong or nothing."""
     try:
         with reading_up_to(limit):
-            make(path, target)
+            product.make(path, target)
     except PupperError as error:
         return _called(target), str(error)
     except Exception as error:  # a defect that one robot's log brings out must not cost the others
@@ -272,8 +194,7 @@ def trust(cluster: str) -> str:
 
 def _here(tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[tuple[str, str]]:
     """Do tasks of `_one` on processes of this computer."""
-    modules = {getattr(make, "func", make).__module__ for make, *_ in tasks}
-    with Workers(jobs, *modules, option="jobs") as workers:
+    with Workers(jobs, option="jobs") as workers:
         for task in tasks:
             workers.submit(None, _one, *task)
         for _, result in workers.results():
@@ -321,73 +242,107 @@ def _outliers(table: pd.DataFrame, quantities: Sequence[str]) -> list[str]:
     return [";".join(names) for names in outlying]
 
 
+QUANTITIES = {
+    "lag_ms": lambda joint: _ms(joint.lag.lag_s),
+    "dead_time_ms": lambda joint: _ms(joint.actuator.dead_time_s),
+    "stiffness_per_s2": lambda joint: joint.actuator.ratios_to_armature.stiffness.value,
+    "damping_per_s": lambda joint: joint.actuator.ratios_to_armature.damping.value,
+    "friction_rad_s2": lambda joint: joint.actuator.ratios_to_armature.friction_loss.value,
+    "speed_rad_s": lambda joint: joint.actuator.top_speed_rad_s,
+    "poll_period_ms": lambda joint: _ms(joint.feedback.poll_period_s),
+    "loss": lambda joint: joint.feedback.loss.value,
+    "offset_rad": lambda joint: joint.feedback.offset_rad.value,
+    "fit_percent": lambda joint: joint.scores.fit_percent,
+}
+"""Columns of the table, from each joint's calibration."""
+
+
+@dataclass(frozen=True)
+class Calibrations:
+    """A calibration file per robot: what `run_fleet` makes of each recording."""
+
+    seed: int = 0
+    stall_torque_nm: float | None = None
+    quantities: ClassVar = tuple(QUANTITIES)
+
+    def __post_init__(self):
+        refuse_outside("`stall_torque_nm`", self.stall_torque_nm, *STALL_TORQUES_NM, "N·m")
+
+    def target(self, out: Path, robot: str) -> Path:
+        """File or folder of what is made, called as the robot is."""
+        return out / f"{robot}.yaml"
+
+    def is_of(self, target: Path, path: Path) -> bool:
+        """Whether an existing target was made with these settings from this recording."""
+        calibration = load_calibration(target)
+        scales = [j.actuator.scale for j in calibration.joints.values()]
+        torques = {s.value_nm if s.source == GIVEN_TORQUE else None for s in scales}
+        return (
+            [i.sha256 for i in calibration.inputs] == [sha256(path)]
+            and calibration.seed == self.seed
+            and torques == {self.stall_torque_nm}
+        )
+
+    def make(self, path: Path, target: Path) -> None:
+        """Make it; in other processes."""
+        result = calibrate(load(path), None, self.seed, self.stall_torque_nm, workers=1)
+        result.save(target, force=True)
+
+    def numbers(self, target: Path) -> dict[str, dict[str, float]]:
+        """What the table shows, by joint and quantity."""
+        joints = load_calibration(target).joints
+        return {n: {k: value(j) for k, value in QUANTITIES.items()} for n, j in joints.items()}
+
+
 def _ms(quantity) -> float:
     return float("nan") if quantity is None else 1e3 * quantity.value
 
 
 SERVO_QUANTITIES = {
-    "free_run_mrad": "rmse_free_run_rad",
-    "held_mrad": "rmse_held_rad",
-    "linear_mrad": "linear_rmse_rad",
-    "delayed_pd_mrad": "delayed_pd_rmse_rad",
+    "free_run_mrad": "rmse_free_run_rad", "held_mrad": "rmse_held_rad",
+    "linear_mrad": "linear_rmse_rad", "delayed_pd_mrad": "delayed_pd_rmse_rad",
     "persistence_mrad": "persistence_rmse_rad",
-}
+}  # fmt: skip
 """Columns of the table and the scores of the model's contract that they show: unseen data."""
 
 
 @dataclass(frozen=True)
-class ServoSettings:
-    """Settings of every fit: parameters of `servo_fit.fit.fit_servo`."""
+class ServoModels:
+    """A folder of a servo model per robot; the settings are parameters of `fit_servo`."""
 
     arch: str = "mlp"
     preset: str = "default"
     split: Split = EACH_GROUP_IN_TURN
     readings: str = "auto"
     seed: int = 0
+    quantities: ClassVar = tuple(SERVO_QUANTITIES)
+
+    def target(self, out: Path, robot: str) -> Path:
+        """See `Calibrations`."""
+        return out / robot
+
+    def is_of(self, target: Path, path: Path) -> bool:
+        """See `Calibrations`."""
+        contract = load_servo_model(target).contract
+        data = servo_data([load(path)], list(contract.joints), self.readings, self.seed)
+        return (
+            [r.sha256 for r in contract.recordings] == [sha256(path)]
+            and (contract.arch, contract.preset, contract.seed, contract.split)
+            == (self.arch, self.preset, self.seed, self.split.name)
+            and contract.readings_counted == data.modes
+        )
+
+    def make(self, path: Path, target: Path) -> None:
+        """See `Calibrations`."""
+        fit_servo(load(path), **vars(self), keep_unfinished=False).save(target, force=True)
+
+    def numbers(self, target: Path) -> dict[str, dict[str, float]]:
+        """See `Calibrations`; NaN where a model has no such score."""
+        numbers = {}
+        for joint, known in load_servo_model(target).contract.joints.items():
+            errors = {name: known.scores.get(key) for name, key in SERVO_QUANTITIES.items()}
+            numbers[joint] = {k: float("nan") if e is None else 1e3 * e for k, e in errors.items()}
+        return numbers
 
 
-def fit_servo_fleet(
-    root: Path,
-    out: Path,
-    settings: ServoSettings,
-    jobs: int = 1,
-    cluster: str | None = None,
-    force: bool = False,
-    progress: Callable[[str], None] | None = None,
-) -> Fleet:
-    """Fit a servo model to every recording in `root`; a folder per robot in `out`, and the table.
-
-    Parameters and errors as for `sysid.fleet.calibrate_fleet`.
-    """
-    targets = {path: out / name for path, name in robots_in(root).items()}
-    return run_fleet(
-        targets, lambda target, path: _is_servo_of(target, path, settings),
-        partial(_fitted, settings=settings), _servo_numbers, tuple(SERVO_QUANTITIES), out,
-        jobs, cluster, force, progress,
-    )  # fmt: skip
-
-
-def _servo_numbers(target: Path) -> dict[str, dict[str, float]]:
-    """Scores of each joint of a model; NaN where it has no such score."""
-    numbers = {}
-    for joint, known in load_servo_model(target).contract.joints.items():
-        errors = {name: known.scores.get(key) for name, key in SERVO_QUANTITIES.items()}
-        numbers[joint] = {k: float("nan") if e is None else 1e3 * e for k, e in errors.items()}
-    return numbers
-
-
-def _is_servo_of(target: Path, path: Path, settings: ServoSettings) -> bool:
-    """Whether a model was fitted to this file with these settings."""
-    contract = load_servo_model(target).contract
-    return (
-        [r.sha256 for r in contract.recordings] == [sha256(path)]
-        and (contract.arch, contract.preset, contract.seed)
-        == (settings.arch, settings.preset, settings.seed)
-        and contract.split == settings.split.name
-        and contract.readings_counted
-        == servo_data([load(path)], list(contract.joints), settings.readings, settings.seed).modes
-    )
-
-
-def _fitted(path: Path, target: Path, settings: ServoSettings) -> None:
-    fit_servo(load(path), **vars(settings), keep_unfinished=False).save(target, force=True)
+Product = Calibrations | ServoModels

@@ -16,9 +16,8 @@ from rich.text import Text
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import chosen_map, say_remarks
-from pupper_sysid.cli.commands.common import Json, Replace
 from pupper_sysid.cli.live_views import LiveViews, ViewTargets
-from pupper_sysid.cli.terminal import number
+from pupper_sysid.cli.terminal import Json, Replace, number
 from pupper_sysid.common.errors import BusError, InputError, PupperError, refuse_outside
 from pupper_sysid.hardware.address import (
     EMULATED,
@@ -31,12 +30,16 @@ from pupper_sysid.hardware.address import (
 from pupper_sysid.hardware.bus import BusSample, Sent, ServoBus, error_words
 from pupper_sysid.hardware.esp32 import Esp32Bus
 from pupper_sysid.hardware.joint_map import JointMap
-from pupper_sysid.hardware.lock import announced_devices
+from pupper_sysid.hardware.lock import Note, announced_devices, notes
 from pupper_sysid.hardware.safety.guard import open_bus
-from pupper_sysid.hardware.safety.limp import can_come_back, is_there, may_be_on, switch_off
-from pupper_sysid.hardware.safety.notes import Note, notes
 from pupper_sysid.hardware.safety.watchdog import HANG_S
-from pupper_sysid.hardware.safety.watchdog_process import restore
+from pupper_sysid.hardware.safety.watchdog_process import (
+    can_come_back,
+    is_there,
+    may_be_on,
+    restore,
+    switch_off,
+)
 from pupper_sysid.hardware.serial_servos.scan import LineReport
 from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import draw_robot

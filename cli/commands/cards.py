@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.common import Json
+from pupper_sysid.cli.terminal import Json
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.servo_models.calibration.parts import ARMATURES, P_GAINS
 from pupper_sysid.servo_models.calibration.quantity import Quantity, words_of
@@ -117,22 +117,22 @@ class Diff:
     def run(self) -> None:
         """Read both and print a table."""
         refuse_outside("--gain", self.gain, *P_GAINS)
-        found = compare.compared(self.first, self.second, self.joint, self.gain, _servo)
+        comparison = compare.compared(self.first, self.second, self.joint, self.gain, _servo)
         if self.json:
-            return terminal.print_json(found)
+            return terminal.print_json(comparison)
         columns = (
             servo.title + ("" if servo.p_gain is None else f", P {servo.p_gain:g}")
-            for servo in (found.first, found.second)
+            for servo in (comparison.first, comparison.second)
         )
         terminal.print_table(
             "", "", *columns, "ratio",
             rows=(
                 (f"{row.quantity} [{row.unit}]", _with_interval(row.first),
                  _with_interval(row.second), terminal.number(row.ratio, 2))
-                for row in found.differences
+                for row in comparison.differences
             ),
         )  # fmt: skip
-        for sentence in (*found.notes, *_verdict(found)):
+        for sentence in (*comparison.notes, *_verdict(comparison)):
             for line in wrap(sentence, _WIDTH):
                 terminal.out.print(line)
 
@@ -234,12 +234,12 @@ def _starts_as_xml(path: Path) -> bool:
         return file.read(100).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
 
 
-def _verdict(found: compare.Comparison) -> Iterator[str]:
+def _verdict(comparison: compare.Comparison) -> Iterator[str]:
     """The largest difference, then lags and distance of the two motions, in words."""
-    known = [row for row in found.differences if row.ratio is not None]
+    known = [row for row in comparison.differences if row.ratio is not None]
     if not known:
         raise InputError("The two have no number in common.")
-    most, motion = max(known, key=lambda row: row.distance), found.motion
+    most, motion = max(known, key=lambda row: row.distance), comparison.motion
     if most.distance < 0.02:
         yield "They agree within 2 % in every number that both state."
     else:

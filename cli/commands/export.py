@@ -131,7 +131,7 @@ class Export:
 
     def _servo_model(self, folder: Path) -> Path:
         from pupper_sysid.servo_models.servo_file import load_servo_model
-        from pupper_sysid.sysid.export.network import ENDINGS, export_servo_model
+        from pupper_sysid.sysid.export import ENDINGS, export_servo_model
 
         if self.to not in ("csv", "onnx", "torchscript"):
             raise InputError(
@@ -146,8 +146,8 @@ class Export:
         return target
 
     def _table(self, path: Path, links: dict[str, float]) -> Path | None:
-        from pupper_sysid.sysid.export.tidy_table import to_csv
         from pupper_sysid.sysid.recordings.files import load
+        from pupper_sysid.sysid.report.tables import tidy_table
 
         if path.name in ("contract.json", "weights.safetensors"):
             raise InputError(f"{self.source} is part of a servo model; give its folder.")
@@ -183,7 +183,7 @@ class Export:
             calibration = load(path)
             terminal.warn(*calibration.warnings)
         target = self.out or Path(path.name).with_suffix(".tidy.csv" if kind == ".csv" else ".csv")
-        to_csv(calibration, target, self.force)
+        tidy_table(calibration, target, self.force)
         return target
 
     @staticmethod

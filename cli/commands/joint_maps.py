@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from contextlib import closing, nullcontext
 from dataclasses import dataclass
@@ -16,10 +17,9 @@ from rich.text import Text
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE, joints_on, say_remarks
-from pupper_sysid.cli.commands.common import Json, Replace
-from pupper_sysid.cli.terminal import Keyboard
+from pupper_sysid.cli.terminal import Json, Keyboard, Replace
 from pupper_sysid.common.errors import BusError, InputError
-from pupper_sysid.common.files import refuse_overwrite
+from pupper_sysid.common.files import refuse_overwrite, write_text
 from pupper_sysid.common.reading.dialect import whole_number
 from pupper_sysid.hardware import joint_calibration as jc
 from pupper_sysid.hardware.address import EMULATED, bus_name, parse_address
@@ -116,7 +116,8 @@ class CalibrateJoints:
                 name: setup.get("registers", {}).get("homing_offset", 0)
                 for name, setup in setups.items()
             }
-            jc.write_lerobot(self.lerobot_calibration, new, offsets_there, self.force)
+            lerobot = json.dumps(jc.lerobot_calibration(new, offsets_there), indent=4)
+            write_text(self.lerobot_calibration, f"{lerobot}\n", self.force)
         entries = {name: new.file.joints[name] for name in offsets}
         terminal.print_table(
             f"{self.out}: {new.file.name}", "joint", "id", "offset", "limits", "counts/rad",
@@ -192,7 +193,7 @@ class Guide:
             ):
                 break
         return {
-            name: jc.offset_counts(float(count), self._counts)
+            name: round(float(count) - self._counts / 2)
             for name, count in zip(self.joints, mean, strict=True)
         }
 
@@ -223,11 +224,7 @@ class Guide:
             terminal.warn(
                 f"{_list(cut)}: the travel runs into the end of the encoder; an end is not seen."
             )
-        return {
-            name: jc.limits_within(int(travel.low[k]), int(travel.high[k]))
-            for k, name in enumerate(self.joints)
-            if name not in refused
-        }
+        return {name: travel.limits(k) for k, name in enumerate(self.joints) if name not in refused}
 
     def scale(self, joint: str, angle_deg: float) -> tuple[float | None, bool]:
         """Step 3: the measured scale (None if skipped), and whether to use it."""
@@ -249,7 +246,7 @@ class Guide:
                 f"Now move {joint} by {angle_deg:g} degrees, hold it and press Enter."
             )
             after = self._mean()[0][which]
-            measured = jc.counts_per_rad(before, after, angle_deg)
+            measured = float(abs(after - before) / np.radians(angle_deg))
             words = f"{abs(after - before):.0f} counts: {measured:.1f} counts per radian"
             if abs(after - before) < jc.SMALLEST_TRAVEL * self._counts:
                 terminal.err.print(f"{words}. That is too little motion; try again.")

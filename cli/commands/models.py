@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -12,8 +12,7 @@ import tyro
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.common import Joints, Json, OfRecordings
-from pupper_sysid.cli.terminal import ms, number
+from pupper_sysid.cli.terminal import Joints, Json, OfRecordings, ms, number
 from pupper_sysid.common.errors import InputError, PupperError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, resolved
 from pupper_sysid.common.joints import (
@@ -29,7 +28,7 @@ from pupper_sysid.sysid.sweep.excitation import TRIAL_S
 
 if TYPE_CHECKING:
     from pupper_sysid.sysid.fit.calibrate import CalibrationResult
-    from pupper_sysid.sysid.fleet import Fleet
+    from pupper_sysid.sysid.fleet import Product
     from pupper_sysid.sysid.servo_fit.fit import ServoFit, Split
 
 Readings = Annotated[
@@ -120,18 +119,15 @@ class Calibrate(OfRecordings):
 
     def _fleet(self, root: Path) -> None:
         """Many robots, one after the other or side by side."""
-        from pupper_sysid.sysid.fleet import Settings, calibrate_fleet
+        from pupper_sysid.sysid.fleet import Calibrations
 
         if self.prior is not None:
             raise InputError("--from: a fleet is calibrated without a prior; leave it out.")
         if self.joints != "all":
             raise InputError("--joints: a fleet is calibrated with all its joints; leave it out.")
-        settings = Settings(self.seed, self.stall_torque)
         each_robot(
             self, root, "calibrating", "calibrated", "a calibration", _OF_CALIBRATIONS,
-            lambda out, advance: calibrate_fleet(
-                root, out, settings, self.jobs, self.cluster, self.force, advance
-            ),
+            Calibrations(self.seed, self.stall_torque),
         )  # fmt: skip
 
     def _print(self, result: CalibrationResult) -> None:
@@ -280,16 +276,13 @@ class FitServo(OfRecordings):
 
     def _fleet(self, root: Path, split: Split) -> None:
         """Many robots, one after the other or side by side."""
-        from pupper_sysid.sysid.fleet import ServoSettings, fit_servo_fleet
+        from pupper_sysid.sysid.fleet import ServoModels
 
         if self.joints != "all":
             raise InputError("--joints: a fleet is fitted with all its joints; leave it out.")
-        settings = ServoSettings(self.arch, self.preset, split, self.readings, self.seed)
         each_robot(
             self, root, f"fitting {self.arch}", "servos", "a servo model", _OF_SERVO_MODELS,
-            lambda out, advance: fit_servo_fleet(
-                root, out, settings, self.jobs, self.cluster, self.force, advance
-            ),
+            ServoModels(self.arch, self.preset, split, self.readings, self.seed),
         )  # fmt: skip
 
     def _split(self) -> Split:
@@ -448,7 +441,7 @@ class CompareTruth:
 
     def run(self) -> None:
         """Calibrate if need be, compare, print."""
-        from pupper_sysid.sysid.compare.truth import compared_with_truth, read_truth
+        from pupper_sysid.sysid.compare.truth import read_truth, truth_table
         from pupper_sysid.sysid.fit.calibrate import calibrate
 
         truth = read_truth(self.recording, self.truth)  # before the work, not after it
@@ -461,7 +454,7 @@ class CompareTruth:
                 fitted = calibrate(
                     recording, joints, self.seed, workers=2, progress=advance
                 ).calibration
-        rows = compared_with_truth(recording, truth, fitted, joints)
+        rows = truth_table(fitted, truth, recording, joints)
         if self.json:
             return terminal.print_json(rows)
         cells = []
@@ -469,12 +462,12 @@ class CompareTruth:
             end = next((end for end in _UNITS if row.quantity.endswith(end)), "")
             places = 3 if abs(row.truth) < 1 else max(0, 3 - len(f"{abs(row.truth):.0f}"))
             unit, factor, digits = _UNITS.get(end, (unit_of(row.quantity), 1.0, places))
-            found, low, high, true = (
+            value, low, high, true = (
                 number(factor * x, digits)
                 for x in (row.found.value, row.found.low, row.found.high, row.truth)
             )
             cells.append((
-                row.joint, f"{words_of(row.quantity)}, {unit}".removesuffix(", 1"), found,
+                row.joint, f"{words_of(row.quantity)}, {unit}".removesuffix(", 1"), value,
                 f"{low}…{high}", true, row.identified,
                 {True: "yes", False: "no", None: "–"}[row.held],
             ))  # fmt: skip
@@ -513,7 +506,7 @@ def each_robot(
     ending: str,
     what: str,
     columns: Mapping[str, tuple[str, int]],
-    make: Callable[[Path, Any], Fleet],
+    product: Product,
 ) -> None:
     """Have a fleet's results made, and print its joints, outliers and failed recordings.
 
@@ -521,14 +514,16 @@ def each_robot(
     robot; `columns` gives title and digits by column of the table. A recording that could not be
     used is a `PupperError` at the end: the exit code says so, too.
     """
-    from pupper_sysid.sysid.fleet import TABLE, robots_in, trust
+    from pupper_sysid.sysid.fleet import TABLE, robots_in, run_fleet, trust
 
     started = time.perf_counter()
     folder = options.out or resolved(root).with_name(f"{resolved(root).name}_{ending}")
     if options.cluster is not None:
         terminal.warn(trust(options.cluster))
     with terminal.progress(doing, len(robots_in(root))) as advance:
-        fleet = make(folder, advance)
+        fleet = run_fleet(
+            root, folder, product, options.jobs, options.cluster, options.force, advance
+        )
     elapsed_s = time.perf_counter() - started
     if options.json:
         terminal.print_json(fleet.summary(folder, elapsed_s))

@@ -14,8 +14,7 @@ import tyro
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE
-from pupper_sysid.cli.commands.common import Joints, Json
-from pupper_sysid.cli.terminal import number
+from pupper_sysid.cli.terminal import Joints, Json, number
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import select_joints

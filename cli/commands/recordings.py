@@ -12,11 +12,11 @@ import tyro
 from rich.text import Text
 
 from pupper_sysid.cli import terminal
-from pupper_sysid.cli.commands.common import Json, OfRecordings, Replace
 from pupper_sysid.cli.live_views import refuse_files
+from pupper_sysid.cli.terminal import Json, OfRecordings, Replace
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import refuse_overwrite, resolved, write_bytes
-from pupper_sysid.common.joints import JOINT_NAMES, share_sentences
+from pupper_sysid.common.joints import JOINT_NAMES, with_joints
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.sysid.report import tables
 
@@ -79,13 +79,12 @@ class Delay(OfRecordings):
         ranges = {name: [f"servo lag is the {b.lag_range}; its table by frequency has the lag of "
                          "a motion at each."] for name, b in budgets.items()
                   if b.lag_range.startswith("mean")}  # fmt: skip
-        for names, text in share_sentences(ranges):
-            terminal.out.print(f"{names}: {text}")
+        for text in with_joints(ranges):
+            terminal.out.print(text)
         terminal.out.print()
         first = dict([next(iter(budgets.items()))])  # all joints are too wide
         terminal.print_tables(tables.frequency_table(budgets), tables.estimator_table(first))
-        by_joint = {n: [w.removeprefix(f"{n}: ") for w in b.warnings] for n, b in budgets.items()}
-        terminal.warn(*(f"{names}: {text}" for names, text in share_sentences(by_joint)))
+        terminal.warn(*with_joints({name: b.warnings for name, b in budgets.items()}))
 
 
 @dataclass(frozen=True)

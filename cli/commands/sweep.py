@@ -17,9 +17,9 @@ import numpy as np
 
 from pupper_sysid.cli import terminal
 from pupper_sysid.cli.buses import JOINTS_FILE, connect, joints_on, parse_registers
-from pupper_sysid.cli.commands.common import Json, Replace
 from pupper_sysid.cli.commands.plan import run_rounds, say_how_to_resume
 from pupper_sysid.cli.live_views import LiveViews, ViewTargets
+from pupper_sysid.cli.terminal import Json, Replace
 from pupper_sysid.common.errors import BusError, InputError, refuse_outside
 from pupper_sysid.common.files import refuse_overwrite, sha256
 from pupper_sysid.common.joints import select_joints

@@ -27,8 +27,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from pupper_sysid.cli.policy_choice import warn_of_fallbacks
 from pupper_sysid.cli.program import begin_work, parse, user_errors
 from pupper_sysid.cli.terminal import err, out, print_json, remember, share_progress, spell, warn
+from pupper_sysid.common.border import refuse_other_kind
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import hold_output, refuse_path
 from pupper_sysid.common.results import plain
 from pupper_sysid.policies.train.run_file import (

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.hardware.address import BusAddress
 from pupper_sysid.hardware.joint_map import JointMap
+from pupper_sysid.hardware.lock import remove_note, write_note
 from pupper_sysid.hardware.loop import lasting_s
-from pupper_sysid.hardware.safety.notes import remove_note, write_note
 
 HANG_S = 1.0
 """Without a beat for so long, the driver counts as hung."""

@@ -159,7 +159,7 @@ class SerialBus(HostClock):
         for joint, servo in zip(self.joint_names, self._servos, strict=True):
             if servo.registers is None:
                 self._remember(servo)
-            if servo.registers is None and self.line.ping(servo.id) is not None:
+            if servo.registers is None and self.line.answers_ping(servo.id):
                 level = servo.series.name_of("response_level")
                 raise BusError(
                     f"{joint}: it answers pings, but no read: its register {level} (address "

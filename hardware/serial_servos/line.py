@@ -155,10 +155,6 @@ class SerialLine(ABC):
         """Send the request whose reply holds the model number; 0 if sent."""
 
     @abstractmethod
-    def ping(self, servo: int) -> LineFrame | None:
-        """Status frame of `servo`, or None if it does not answer."""
-
-    @abstractmethod
     def sync_read(self, servos: Sequence[int], address: int, size: int) -> dict[int, Reply]:
         """The same bytes of several servos with one request."""
 
@@ -284,6 +280,10 @@ class SerialLine(ABC):
         """Model number of `servo`, its bytes as little endian; None if it does not answer."""
         reply = self._exchange(lambda: self.ask_model(servo), [servo], self.model_bytes)
         return int.from_bytes(reply[servo].frame.data[:2], "little") if servo in reply else None
+
+    def answers_ping(self, servo: int) -> bool:
+        """Whether `servo` answers a ping, which no register can forbid."""
+        return self.model(servo) is not None
 
     def doubled(self, servos: Sequence[int], address: int, size: int) -> list[int]:
         """Ids whose replies are garbled while those of the other ids are clean.

@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike, NDArray
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.joints import JOINT_NAMES
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
-from pupper_sysid.servo_models.interface import substeps as physics_substeps
+from pupper_sysid.servo_models.delayed_pd import substeps as physics_substeps
 from pupper_sysid.servo_models.networks import JointArrays
 
 if TYPE_CHECKING:

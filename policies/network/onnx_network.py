@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pupper_sysid.common.border import read_bytes
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
-from pupper_sysid.sysid.export.network import onnx_library
+from pupper_sysid.sysid.export import onnx_library
 
 _LARGEST_BYTES = 200_000_000
 _MOST_NODES = 20_000

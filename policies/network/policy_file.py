@@ -33,9 +33,14 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save
 
-from pupper_sysid.common.border import read_bytes, read_json, refuse_other_version, validated
+from pupper_sysid.common.border import (
+    read_bytes,
+    read_json,
+    refuse_other_kind,
+    refuse_other_version,
+    validated,
+)
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import (
     as_path,
     sha256,
@@ -55,7 +60,7 @@ from pupper_sysid.sim.walking.config import Commands, Walking
 from pupper_sysid.sim.walking.draws import OF_UNIT
 from pupper_sysid.sim.walking.servo_ranges import IDEAL, ServoRanges, is_servo_model
 from pupper_sysid.sim.walking.step import VELOCITY_STEPS, observation_of
-from pupper_sysid.sysid.export.network import Run, export_module
+from pupper_sysid.sysid.export import Run, export_module
 
 SCHEMA, VERSION = "pupper-policy", 4
 SERVO_SCHEMA, SERVO_VERSION = "pupper-policy-servo", 1

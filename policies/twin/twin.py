@@ -51,9 +51,9 @@ from pupper_sysid.sim.robot.replay import ServoRobot
 from pupper_sysid.sysid.doctor.checks import chosen_joints
 from pupper_sysid.sysid.fit.predict import ReadingRule, in_words, rule_of
 from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.report.figures import busiest
 from pupper_sysid.sysid.servo_fit import scores
 from pupper_sysid.sysid.servo_fit.data import ServoData, servo_data
-from pupper_sysid.sysid.servo_fit.figures import busiest
 from pupper_sysid.sysid.servo_fit.scores import (
     mean_known,
     offsets,

@@ -23,14 +23,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator
 
-from pupper_sysid.common.border import read_yaml, refuse_other_schema, validated
+from pupper_sysid.common.border import Part, read_own, validated
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import as_path, write_text
 from pupper_sysid.common.joints import in_order, strange_joint
 from pupper_sysid.common.strict_yaml import dump
 from pupper_sysid.servo_models.calibration.parts import PARAMETER_KEYS, JointCalibration
-from pupper_sysid.servo_models.calibration.quantity import Part, Whole
+from pupper_sysid.servo_models.calibration.quantity import Whole
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.step_size import at_step
@@ -144,13 +143,7 @@ class Calibration(Part):
         return tuple(self.joints)
 
     def joint(self, name: str) -> JointCalibration:
-        """Calibration of the joint `name`.
-
-        Raises
-        ------
-        InputError
-            If this calibration lacks that joint.
-        """
+        """Calibration of the joint `name`; refused if this one lacks it."""
         if name not in self.joints:
             raise InputError(
                 f"The calibration of {self.robot} has no joint {name}. "
@@ -170,17 +163,9 @@ class Calibration(Part):
         return joints
 
     def at_p_gain(self, p_gain: float) -> Calibration:
-        """The calibration of the same servos at another P gain of their position loops.
+        """The calibration of the same servos at another P gain, the register's value.
 
-        Parameters
-        ----------
-        p_gain : float
-            The register's value.
-
-        Raises
-        ------
-        InputError
-            If a joint was recorded at one gain without a known load: it has no `under_load`.
+        Refused if a joint was recorded at one gain without a known load: it has no `under_load`.
         """
         joints = {name: joint.at_p_gain(p_gain) for name, joint in self.joints.items()}
         return self.model_copy(update={"joints": joints})
@@ -234,25 +219,10 @@ class Calibration(Part):
         )
 
     def export(self, to: str, out: Path | str = ".", **options: Any) -> Path:
-        """Write these servos for another simulator; see `sim.export.export.export`.
+        """Write these servos for another simulator, and return the file.
 
-        Parameters
-        ----------
-        to : {"mjcf", "isaaclab", "isaaclab-bam", "mjlab", "newton", "json"}
-        out : Path or str
-            File, or a folder, in which the file is called `servos` with the target's ending.
-        **options
-            `physics_step_s`, `gain`, `link_inertia`, `model`, `force`.
-
-        Returns
-        -------
-        Path
-            The file that was written.
-
-        Raises
-        ------
-        InputError
-            If the target cannot take these servos so, or the file exists.
+        `to`, `out` and the options (`physics_step_s`, `gain`, `link_inertia`, `model`, `force`) are
+        those of `ps.export`.
         """
         # a room above this one: files import no simulator
         return import_module("pupper_sysid.sim.export.export").export(self, to, out, **options)
@@ -262,13 +232,7 @@ class Calibration(Part):
         return f"{_HEADER}\n{dump(self.model_dump(mode='json', by_alias=True))}"
 
     def save(self, path: Path | str, force: bool = False) -> None:
-        """Write this calibration to `path` as YAML, in one atomic step.
-
-        Raises
-        ------
-        InputError
-            If `path` exists and `force` is not set, or if it cannot be written.
-        """
+        """Write this calibration to `path` as YAML, in one atomic step."""
         write_text(Path(path), self.to_yaml(), force)
 
 
@@ -348,10 +312,8 @@ def load_calibration(path_or_preset: Path | str) -> Calibration:
 
 
 def _load(path: Path) -> Calibration:
-    refuse_other_kind(path, SCHEMA)
-    data, lines = read_yaml(path)
     remedy = "Give a file that `pupper-sysid calibrate` wrote."
-    refuse_other_schema(path, data, "is not a calibration", SCHEMA, SCHEMA_VERSION, remedy)
+    data, lines = read_own(path, SCHEMA, SCHEMA_VERSION, remedy)
     version = data["schema_version"]
     if version == SCHEMA_VERSION:
         return validated(Calibration, data, path, lines)

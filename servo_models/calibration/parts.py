@@ -20,6 +20,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from pupper_sysid.common.border import Part
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.servo_models.calibration.quantity import (
     AGE,
@@ -37,7 +38,6 @@ from pupper_sysid.servo_models.calibration.quantity import (
     TORQUE,
     NotNegative,
     Number,
-    Part,
     PlausibleRange,
     Quantity,
     Whole,
@@ -302,6 +302,17 @@ class Actuator(Part):
         """The numbers themselves, without intervals."""
         values = {field: getattr(self, key).value for field, key in PARAMETER_KEYS.items()}
         return DelayedPDParameters(**values)
+
+    @property
+    def per_inertia(self) -> dict[str, Quantity]:
+        """What positions in free air identify, by the names of the fitted parameters."""
+        ratios = self.ratios_to_armature
+        return {
+            "dead_time_s": self.dead_time_s, "stiffness_per_s2": ratios.stiffness,
+            "damping_per_s": ratios.damping, "friction_rad_s2": ratios.friction_loss,
+            "effort_rad_s2": ratios.effort_limit,
+            "velocity_limit_rad_s": self.velocity_limit_rad_s, "back_emf_per_s": ratios.back_emf,
+        }  # fmt: skip
 
     @property
     def fitted_step_s(self) -> float:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from pupper_sysid.common import border
+from pupper_sysid.common.border import Part
 from pupper_sysid.common.interval import Interval
 
 UNIT_OF_NAME = {
@@ -71,12 +72,6 @@ def _python_number(value: Any) -> Any:
 Number = Annotated[float, BeforeValidator(_python_number)]
 Whole = Annotated[int, BeforeValidator(_python_number)]
 NotNegative = Annotated[Number, Field(ge=0)]
-
-
-class Part(BaseModel):
-    """Strict, frozen part of a file: no unknown key, no conversion, no NaN, no infinity."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
 _Part = TypeVar("_Part", bound=Part)

@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from pupper_sysid.common.border import Part
 from pupper_sysid.common.data_sheet import counts_of
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.files import write_text
@@ -38,7 +39,7 @@ from pupper_sysid.servo_models.calibration.parts import (
     Selection,
     UnderLoad,
 )
-from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number, Part, Quantity
+from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number, Quantity
 from pupper_sysid.servo_models.cards.numbers import (
     LOADED_KEYS,
     LoadedLoop,

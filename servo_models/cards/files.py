@@ -30,19 +30,12 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import ConfigDict
 
-from pupper_sysid.common.border import (
-    read_json,
-    read_text,
-    read_yaml,
-    refuse_other_schema,
-    validated,
-)
+from pupper_sysid.common.border import Part, read_json, read_own, read_text, read_yaml, validated
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.servo_models.calibration.calibration import Calibration
 from pupper_sysid.servo_models.calibration.parts import LOADED_KEYS, UnderLoad
-from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number, Part
+from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number
 from pupper_sysid.servo_models.cards.card import SCHEMA, SCHEMA_VERSION, Gains, ServoCard, Source
 from pupper_sysid.servo_models.cards.numbers import PositionLoop, stated
 
@@ -200,11 +193,9 @@ def from_bam(
     )
 
 
-def to_bam(card: ServoCard, specimen: str | None = None) -> dict[str, Any]:
-    """Content of a BAM parameter file with a card's numbers; by default the default specimen's."""
-    numbers = card.specimens.get(specimen or card.default)
-    if numbers is None:
-        raise InputError(f"{card.name} has no specimen {specimen}: {', '.join(card.specimens)}.")
+def to_bam(card: ServoCard) -> dict[str, Any]:
+    """Content of a BAM parameter file with the numbers of a card's default specimen."""
+    numbers = card.numbers
     if not isinstance(numbers, PositionLoop) or card.supply_v is None:
         raise InputError(
             f"{card.name} states torques of a simulator, not position loop and motor, which BAM "
@@ -331,11 +322,8 @@ def motor_of(servo: UnderLoad) -> tuple[dict[str, Any], tuple[str, ...]]:
 def bam_card(calibration: Calibration) -> ServoCard:
     """The servo of a calibration under load as a card whose numbers are those of BAM's models.
 
-    Raises
-    ------
-    InputError
-        If it is of several joints, was not fitted under a known load, states no supply voltage, or
-        is not of a servo that BAM knows.
+    Refused if it is of several joints, was not fitted under a known load, states no supply voltage,
+    or is not of a servo that BAM knows.
     """
     (name, joint), *others = calibration.joints.items()
     block = joint.under_load
@@ -479,8 +467,6 @@ def load_card(path_or_name: Path | str) -> ServoCard:
 def _load(path: Path) -> ServoCard:
     if path.suffix.lower() == ".json":
         return load_bam(path)
-    refuse_other_kind(path, SCHEMA)
-    data, lines = read_yaml(path)
     example = "`pupper-sysid servo show sts3215-bam-m1 --yaml` prints one as an example."
-    refuse_other_schema(path, data, "is not a servo card", SCHEMA, SCHEMA_VERSION, example)
+    data, lines = read_own(path, SCHEMA, SCHEMA_VERSION, example)
     return validated(ServoCard, data, path, lines)

@@ -28,6 +28,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer
 
+from pupper_sysid.common.border import Part
 from pupper_sysid.servo_models.calibration import parts
 from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
 from pupper_sysid.servo_models.calibration.quantity import (
@@ -38,7 +39,6 @@ from pupper_sysid.servo_models.calibration.quantity import (
     STIFFNESS,
     TIME,
     TORQUE,
-    Part,
     PlausibleRange,
     Quantity,
     unit_of,

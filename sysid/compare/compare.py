@@ -21,8 +21,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from pupper_sysid.common.border import refuse_other_kind
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import as_path
 from pupper_sysid.common.results import Result, internal
 from pupper_sysid.servo_models.calibration.calibration import (
@@ -34,7 +34,7 @@ from pupper_sysid.servo_models.calibration.calibration import (
 )
 from pupper_sysid.servo_models.cards.card import CardCalibration
 from pupper_sysid.servo_models.cards.files import card_names
-from pupper_sysid.servo_models.interface import ServoModel
+from pupper_sysid.servo_models.delayed_pd import ServoModel
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid.doctor import checks
 from pupper_sysid.sysid.doctor.checks import Joints, Recordings
@@ -58,60 +58,10 @@ OFFSET_RULE = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class ComparedScores(scores.Scores):
-    """Root mean square and mean absolute errors of one model on one joint, or their means [rad]."""
-
-    mae_held_rad: float
-    mae_raw_rad: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class ComparedModel(scores.ModelScores):
-    """Scores of one model on readings that it predicts."""
-
-    # as for the errors, with more numbers
-    joints: dict[str, ComparedScores]  # pyright: ignore[reportIncompatibleVariableOverride]
-    mean: ComparedScores
-    """Over joints."""
-    offset_rad: dict[str, float] = field(default_factory=dict)
-    """By joint, reading minus prediction of these recordings; empty for a model fitted here."""
-    age_spread_rad: dict[str, float] = field(default_factory=dict)
-    """By joint, the part of the raw error that the unknown age of readings makes: a perfect model
-    would have it. 0 where readings are dated."""
-    readings: dict[str, predict.ReadingRule] = field(default_factory=dict)
-    """By joint, when a calibration says that readings were measured."""
-
-    @classmethod
-    def scored(
-        cls,
-        model_scores: scores.ModelScores,
-        offset_rad: dict[str, float],
-        age_spread_rad: dict[str, float],
-        readings: dict[str, predict.ReadingRule] | None = None,
-    ) -> ComparedModel:
-        """The scores with the offset, the spread and the rules that belong to them."""
-        joints = {
-            joint: ComparedScores(
-                **vars(joint_scores),
-                mae_held_rad=_mean_absolute(model_scores.errors[joint].held),
-                mae_raw_rad=_mean_absolute(model_scores.errors[joint].raw),
-            )
-            for joint, joint_scores in model_scores.joints.items()
-        }
-        more = {"joints": joints, "mean": scores.mean(joints)}
-        return cls(
-            **vars(model_scores) | more,  # pyright: ignore[reportArgumentType]
-            offset_rad=offset_rad,
-            age_spread_rad=age_spread_rad,
-            readings=readings or {},
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
 class Comparison(Result):
     """Servo models on the same readings."""
 
-    models: dict[str, ComparedModel]
+    models: dict[str, scores.ModelScores]
     readings: dict[str, predict.ReadingRule]
     """By joint, when its readings were measured."""
     persistence_rmse_rad: dict[str, float]
@@ -170,7 +120,7 @@ class Comparison(Result):
 
     def plot(self, joints: Sequence[str] | None = None) -> Figure:
         """Figure of the models in free run beside commands and readings, a panel per joint."""
-        from pupper_sysid.sysid.servo_fit.figures import free_run_figure
+        from pupper_sysid.sysid.report.figures import free_run_figure
 
         every = [r for runs in self.runs.values() for r in runs]
         gains, loads = {r.run.p_gain for r in every}, [r.trial.load for r in every]
@@ -179,10 +129,6 @@ class Comparison(Result):
         errors = {name: model.errors for name, model in self.models.items()}
         drawn = {name: track for name, track in self.tracks.items() if name != scores.LINEAR}
         return free_run_figure(self.data, drawn, errors, self.bands, joints)
-
-
-def _mean_absolute(errors: NDArray[np.float64]) -> float:
-    return float(np.mean(np.abs(errors))) if len(errors) else float("nan")
 
 
 Model = str | Path | Calibration | CalibrationResult | ServoFit
@@ -265,11 +211,11 @@ def compare(
             rows = scores.as_rows(data, servo.of_rows)
             track, offset = scores.run_with_offset(scores.learned_run(servo.model, rows), rows)
             errors = scores.errors(servo.model, track, rows, everything)
-            scored[name] = ComparedModel.scored(scores.ModelScores.of(errors, seed), offset, {})
+            scored[name] = scores.ModelScores.of(errors, seed, offset_rad=offset)
             tracks[name] = track
         bands = {name: servo.band for name, servo in opened.items() if servo.band}
         tracks[scores.LINEAR], errors = _linear(data, seed)
-        scored[scores.LINEAR] = ComparedModel.scored(scores.ModelScores.of(errors, seed), {}, {})
+        scored[scores.LINEAR] = scores.ModelScores.of(errors, seed)
         for name, predicted in predictions.items():
             tracks[name] = {j: _on_ticks(data, j, runs[j], p.tracks) for j, p in predicted.items()}
     except InputError as error:
@@ -316,7 +262,7 @@ def compare(
     )  # fmt: skip
 
 
-def _scored(predictions: Mapping[str, predict.Prediction], seed: int) -> ComparedModel:
+def _scored(predictions: Mapping[str, predict.Prediction], seed: int) -> scores.ModelScores:
     """Scores of a calibration's predictions by joint."""
     errors = {}
     for joint, p in predictions.items():
@@ -325,12 +271,12 @@ def _scored(predictions: Mapping[str, predict.Prediction], seed: int) -> Compare
         errors[joint] = scores.Errors(
             e["counted"], p.one_step(), nothing, p.blocks(), e["held"], e["raw"]
         )
-    return ComparedModel.scored(
-        scores.ModelScores.of(errors, seed),
-        {joint: p.offset_rad for joint, p in predictions.items()},
-        {joint: p.age_spread_rad() for joint, p in predictions.items()},
-        {joint: p.rule for joint, p in predictions.items()},
-    )
+    return scores.ModelScores.of(
+        errors, seed,
+        offset_rad={joint: p.offset_rad for joint, p in predictions.items()},
+        age_spread_rad={joint: p.age_spread_rad() for joint, p in predictions.items()},
+        readings={joint: p.rule for joint, p in predictions.items()},
+    )  # fmt: skip
 
 
 def _fitted_here(name: str, hashes: Sequence[str], recordings: Sequence[Recording]) -> list[str]:
@@ -521,12 +467,11 @@ def four_way(
     run = calibrated_run(load_calibration("paper"), data)
     track, offset = scores.run_with_offset(run, data, split.train)
     errors = scores.errors(None, track, data, split.test)
-    published = scores.ModelScores.of(errors, seed)
+    published = scores.ModelScores.of(errors, seed, offset_rad=offset)
     fitted = {FITTED: mlp.scored["delayed-pd"], scores.LINEAR: mlp.scored["linear"]}
     fitted |= {arch.upper(): fit.scored[arch] for arch, fit in fits.items()}
     return Comparison(
-        models={PUBLISHED: ComparedModel.scored(published, offset, {})}
-        | {name: ComparedModel.scored(of_model, {}, {}) for name, of_model in fitted.items()},
+        models={PUBLISHED: published} | fitted,
         readings=rules,
         persistence_rmse_rad={j: s.persistence_rmse_rad for j, s in mlp.joints.items()},
         repeatability_rad={j: s.repeatability_rad for j, s in mlp.joints.items()},

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -35,7 +35,6 @@ from pupper_sysid.servo_models.step_size import at_step
 from pupper_sysid.sysid.doctor import checks
 from pupper_sysid.sysid.doctor.checks import Recordings
 from pupper_sysid.sysid.feedback.poll_lattice import Readings, find_poll_lattice, readings
-from pupper_sysid.sysid.fit.calibrate import CalibrationResult
 from pupper_sysid.sysid.fit.run import whole_counts
 from pupper_sysid.sysid.lag.lag_budget import lag_budget
 from pupper_sysid.sysid.lag.tone import tone_lags, tone_response, tone_weights
@@ -133,20 +132,25 @@ def _pairs(
 
 
 def truth_table(
-    calibration: Calibration | CalibrationResult,
+    calibration: Calibration,
     truth: Mapping[str, Any],
     recordings: Recordings | None = None,
-    seed: int = 0,
     joints: Sequence[str] | None = None,
 ) -> TruthTable:
     """Each quantity of a calibration beside the true one, of all joints that both have, or some.
 
-    `truth` is as `EmulatedRobot.truth()` gives it and `read_truth` reads it. With the `recordings`
-    that the calibration was made from the lag is compared, too, because it depends on the commands;
-    `seed` is the calibration's, for the search for the poll.
+    `truth` is as `EmulatedRobot.truth()` gives it and `read_truth` reads it. The lag depends on the
+    commands: it is compared if the `recordings` are those that the calibration was made from.
     """
-    if isinstance(calibration, CalibrationResult):
-        calibration = calibration.calibration
+    notes: tuple[str, ...] = ()
+    made_from = {i.sha256 for i in calibration.inputs}
+    if recordings is not None and {r.sha256 for r in checks.as_sequence(recordings)} != made_from:
+        recordings = None
+        names = ", ".join(i.name for i in calibration.inputs) or "no recording"
+        notes = (
+            f"The calibration was made from {names}, so its lag, which depends on the commands, is "
+            "not compared.",
+        )
     both = [j for j in calibration.joint_names if j in truth["joints"]]
     if joints is not None:
         both = [j for j in both if j in joints]
@@ -167,12 +171,13 @@ def truth_table(
         if recordings is not None and fitted.lag.lag_s is not None:
             trials = checks.joint_trials(recordings, joint)
             moved = true | {"actuator": _at_gain(true, trials[0].p_gain)}
-            rows.append(_row(joint, "lag_s", fitted.lag.lag_s, true_lag_s(trials, moved, seed)))
+            lag_s = true_lag_s(trials, moved, calibration.seed or 0)
+            rows.append(_row(joint, "lag_s", fitted.lag.lag_s, lag_s))
         for name, (quantity, known) in _pairs(fitted, stepped, feedback).items():
             # a part that neither servo has, and a limit that is infinite, are nothing to find
             if np.isfinite(known) and (known or quantity.value):
                 rows.append(_row(joint, name, quantity, known))
-    return TruthTable(quantities=tuple(rows), definitions=tuple(definitions))
+    return TruthTable(quantities=tuple(rows), definitions=tuple(definitions), notes=notes)
 
 
 def read_truth(recording: Path, truth: Path | None = None) -> dict[str, Any]:
@@ -288,23 +293,3 @@ def _row(joint: str, name: str, fitted: Quantity, truth: float) -> TruthRow:
         identified=fitted.identified, truth=float(truth),
         held=bool(low - rounding <= truth <= high + rounding) if known else None,
     )  # fmt: skip
-
-
-def compared_with_truth(
-    recordings: Recordings,
-    truth: Mapping[str, Any],
-    calibration: Calibration,
-    joints: Sequence[str] | None = None,
-) -> TruthTable:
-    """`truth_table` with the lag where the recordings are the calibration's own, else a note."""
-    seed = calibration.seed or 0
-    made_from = {i.sha256 for i in calibration.inputs}
-    if {r.sha256 for r in checks.as_sequence(recordings)} == made_from:
-        return truth_table(calibration, truth, recordings, seed, joints)
-    table = truth_table(calibration, truth, None, seed, joints)
-    names = ", ".join(i.name for i in calibration.inputs) or "no recording"
-    note = (
-        f"The calibration was made from {names}, so its lag, which depends on the commands, is "
-        "not compared."
-    )
-    return replace(table, notes=(note,))

@@ -82,8 +82,7 @@ def likeliest_periods(
         phases = tuple(poll_search.refine(s, period, poll_search.BLUR_S, None) for s in stretches)
         if more_changes_than_polls(trials, phases, sure):
             continue
-        loss = count_loss(trials, phases, sure)[0]
-        loss = float(np.clip(loss, 0.02, 0.98)) if np.isfinite(loss) else 0.5
+        loss = _possible(count_loss(trials, phases, sure)[0]) or _UNKNOWN_LOSS
         # a period may not win by the width of its instants
         scores[period] = max(
             sum(evidence(s, period, blur, loss) for s in stretches) for blur in poll_search.BLURS_S
@@ -266,8 +265,7 @@ def find_poll_lattice(trials: Sequence[Trial], rng: np.random.Generator) -> Poll
     )  # fmt: skip
     if liveness == "live":  # a new value at each read: the poll is faster than the loop
         return nothing
-    step = max(quantum(trials), 1e-6)
-    stretches = [s for t in trials if len(t.read_time_s) > 3 for s in stretches_of(t, step)]
+    stretches = stretches_of(trials)
     if not stretches or not np.isfinite(loop):
         return nothing
 
@@ -321,9 +319,10 @@ def redate(trials: Sequence[Trial], lattice: PollLattice, motions: Sequence[Moti
         return lattice
     polled = [(t, m) for t, m in zip(trials, motions, strict=True) if t.readings != "live"]
     polled_trials = [t for t, _ in polled]
-    step = max(quantum(polled_trials), 1e-6)
-    stretches = [s for t in polled_trials if len(t.read_time_s) > 3 for s in stretches_of(t, step)]
-    return _with_segments(polled_trials, stretches, lattice, {t.number: m for t, m in polled}, None)
+    motions_by_number = {t.number: m for t, m in polled}
+    return _with_segments(
+        polled_trials, stretches_of(polled_trials), lattice, motions_by_number, None
+    )
 
 
 def _with_segments(
@@ -367,11 +366,8 @@ def _with_segments(
             phase = poll_search.refine(part, lattice.poll_period_s, lattice.blur_s, loss, near)
             if n:
                 # from one phase to the next, at the border between the two
-                at, period = segment.start_s, phase.period_s
-                here, there = (
-                    p.phase_s + p.period_s * np.round((at - p.phase_s) / p.period_s)
-                    for p in (phases[-1], phase)
-                )
+                at, period = np.array(segment.start_s), phase.period_s
+                here, there = phases[-1].nearest(at), phase.nearest(at)
                 jump_s = float((there - here + period / 2) % period - period / 2)
                 # less is drift: the segments follow it, but nothing slipped
                 if abs(jump_s) > max(SMALLEST_JUMP * period, lattice.blur_s):
@@ -408,9 +404,8 @@ def _instants(stretch: Stretch, phases: Sequence[Phase]) -> NDArray[np.float64]:
     middle = 0.5 * (stretch.begin + stretch.end)
     time = middle
     for p in phases:
-        near = p.phase_s + p.period_s * np.round((middle - p.phase_s) / p.period_s)
         inside = (stretch.end >= p.start_s) & (stretch.end <= p.stop_s)
-        time = np.where(inside, np.clip(near, stretch.begin, stretch.end), time)
+        time = np.where(inside, np.clip(p.nearest(middle), stretch.begin, stretch.end), time)
     return time
 
 
@@ -431,8 +426,7 @@ def readings(trial: Trial, lattice: PollLattice) -> Readings:
     phases = [p for p in lattice.phases if p.trial == trial.number]
     for phase in phases:
         inside = (read[rows] >= phase.start_s) & (read[rows] <= phase.stop_s)
-        count = np.round((time - phase.phase_s) / phase.period_s)
-        instant = phase.phase_s + count * phase.period_s
+        instant = phase.nearest(time)
         slack = 0.5 * poll_search.BLURS_S[-1]
         hit = inside & (instant >= before - slack) & (instant <= read[rows] + slack)
         time = np.where(hit, np.minimum(instant, read[rows]), time)

@@ -209,6 +209,10 @@ class Phase:
     """`period_s`, `phase_s` and `phase_sd_s`: period, an instant near the stretch's middle, and the
     standard error of that."""
 
+    def nearest(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The instant nearest to each time [s]."""
+        return self.phase_s + self.period_s * np.round((time_s - self.phase_s) / self.period_s)
+
 
 def best_periods(
     stretches: Sequence[Stretch], grid: NDArray[np.float64]
@@ -277,8 +281,8 @@ def refine(
 def contains(stretch: Stretch, phase: Phase) -> NDArray[np.bool_]:
     """Which changed rows have a lattice instant in their interval, shape (changed,)."""
     middle = 0.5 * (stretch.begin + stretch.end)
-    instant = phase.phase_s + phase.period_s * np.round((middle - phase.phase_s) / phase.period_s)
-    return np.abs(instant - middle) <= 0.5 * (stretch.end - stretch.begin) + 0.5 * BLUR_S
+    reach = 0.5 * (stretch.end - stretch.begin) + 0.5 * BLUR_S
+    return np.abs(phase.nearest(middle) - middle) <= reach
 
 
 def _score(begin: NDArray, end: NDArray, periods: NDArray) -> NDArray[np.float64]:

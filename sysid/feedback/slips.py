@@ -330,9 +330,8 @@ def _count(
             )
             instants = p.phase_s + p.period_s * np.arange(first, last + 1)
             inside = (read[rows] > p.start_s) & (read[rows] <= p.stop_s)
-            dated = p.phase_s + p.period_s * np.round((middle[inside] - p.phase_s) / p.period_s)
             polls += int(np.sum(counts(instants, p.period_s)))
-            successes += int(np.sum(counts(dated, p.period_s)))
+            successes += int(np.sum(counts(p.nearest(middle[inside]), p.period_s)))
     return successes, polls
 
 

@@ -47,24 +47,21 @@ def read_before(trial: Trial) -> NDArray[np.float64]:
     return np.where(last >= 0, trial.read_time_s[last], np.nan)
 
 
-def stretches_of(trial: Trial, step: float) -> list[Stretch]:
-    """Cut a trial into stretches short enough for one strict lattice each."""
-    read, rows, before = trial.read_time_s, fresh_rows(trial), read_before(trial)
-    moving = moving_rows(trial, step)
-    known = np.isfinite(trial.position_rad) & np.isfinite(before)
-    same = np.setdiff1d(np.flatnonzero(moving & known), rows)
-    parts = max(1, int(np.ceil((read[-1] - read[0]) / STRETCH_S)))
-    edges = np.linspace(read[0], read[-1], parts + 1)
+def stretches_of(trials: Sequence[Trial]) -> list[Stretch]:
+    """Cut trials into stretches short enough for one strict lattice each."""
+    step = max(quantum(trials), 1e-6)
     stretches = []
-    for start, stop in pairwise(edges):
-        new, held = (r[(read[r] > start) & (read[r] <= stop)] for r in (rows, same))
-        if len(new) >= 8:
-            stretches.append(
-                Stretch(
-                    trial.number, start, stop, before[new], read[new], before[held], read[held],
-                    moving[new],
-                )
-            )  # fmt: skip
+    for trial in (t for t in trials if len(t.read_time_s) > 3):
+        read, rows, before = trial.read_time_s, fresh_rows(trial), read_before(trial)
+        moving = moving_rows(trial, step)
+        known = np.isfinite(trial.position_rad) & np.isfinite(before)
+        same = np.setdiff1d(np.flatnonzero(moving & known), rows)
+        parts = max(1, int(np.ceil((read[-1] - read[0]) / STRETCH_S)))
+        for start, stop in pairwise(np.linspace(read[0], read[-1], parts + 1)):
+            new, held = (r[(read[r] > start) & (read[r] <= stop)] for r in (rows, same))
+            if len(new) >= 8:
+                times = before[new], read[new], before[held], read[held]
+                stretches.append(Stretch(trial.number, start, stop, *times, moving[new]))
     return stretches
 
 

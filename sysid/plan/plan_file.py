@@ -25,9 +25,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from pupper_sysid.common.border import read_yaml, refuse_other_schema, validated
+from pupper_sysid.common.border import read_own, validated
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import refuse_other_kind
 from pupper_sysid.common.files import sha256, versions, write_text
 from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import strange_joint
@@ -90,10 +89,8 @@ def save_plan(proposal: SweepPlan, path: Path, force: bool = False) -> None:
 
 def load_plan(path: Path) -> SweepPlan:
     """Read a plan file."""
-    refuse_other_kind(path, SCHEMA)
-    data, lines = read_yaml(path)
     remedy = "Give a file that `pupper-sysid plan` wrote."
-    refuse_other_schema(path, data, "is not a plan", SCHEMA, SCHEMA_VERSION, remedy)
+    data, lines = read_own(path, SCHEMA, SCHEMA_VERSION, remedy)
     file = validated(PlanFile, data, path, lines)
     return SweepPlan(**{name: getattr(file, name) for name in SweepPlan.model_fields})
 

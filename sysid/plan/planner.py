@@ -33,10 +33,11 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from scipy.optimize import nnls
 
+from pupper_sysid.common.border import Part
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.common.results import Result
 from pupper_sysid.hardware.safety.monitor import GuardLimits
-from pupper_sysid.servo_models.calibration.quantity import Number, Part
+from pupper_sysid.servo_models.calibration.quantity import Number
 from pupper_sysid.sysid.feedback.poll_lattice import Readings
 from pupper_sysid.sysid.fit.posterior import PHASE_SD_S, STEPPING_SD_S
 from pupper_sysid.sysid.fit.run import Run, at_steps, free_run, prepare, residuals

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from pupper_sysid.common.border import Part
 from pupper_sysid.common.errors import InputError, refuse_outside
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.servo_models.calibration.calibration import Calibration, InputFile
 from pupper_sysid.servo_models.calibration.parts import Actuator, JointCalibration
-from pupper_sysid.servo_models.calibration.quantity import Number, Part, Quantity, Whole
+from pupper_sysid.servo_models.calibration.quantity import Number, Whole
 from pupper_sysid.sysid.doctor.checks import each_joint, joint_trials
 from pupper_sysid.sysid.fit.goodness import LEAST_NOISE_RAD
 from pupper_sysid.sysid.fit.joint_fit import fit_joint
@@ -358,22 +359,11 @@ def _preset(actuator: Actuator) -> dict[str, float]:
     }
 
 
-_QUANTITIES = {
-    "dead_time_s": lambda a: a.dead_time_s,
-    "stiffness_per_s2": lambda a: a.ratios_to_armature.stiffness,
-    "damping_per_s": lambda a: a.ratios_to_armature.damping,
-    "friction_rad_s2": lambda a: a.ratios_to_armature.friction_loss,
-    "effort_rad_s2": lambda a: a.ratios_to_armature.effort_limit,
-    "velocity_limit_rad_s": lambda a: a.velocity_limit_rad_s,
-}
-
-
 def _interval_information(model: Structure, actuator: Actuator) -> NDArray[np.float64]:
     """What a calibration's intervals say about each parameter on its own."""
-    precision = np.zeros(len(model.parameters))
+    precision, quantities = np.zeros(len(model.parameters)), actuator.per_inertia
     for k, p in enumerate(model.parameters):
-        if p.name in _QUANTITIES:
-            quantity: Quantity = _QUANTITIES[p.name](actuator)
+        if quantity := quantities.get(p.name):
             low, high = quantity.low, quantity.high
             if quantity.identified != "no" and low and high and high > low > 0:
                 precision[k] = _sd(p, Interval(quantity.value, low, high)) ** -2

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from pupper_sysid.common import border
+from pupper_sysid.common.border import RECORDING, refuse_other_kind
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import RECORDING, refuse_other_kind
 from pupper_sysid.common.files import SyncedText, versions
 from pupper_sysid.common.reading.content import unpacked
 from pupper_sysid.common.reading.dialect import decoded

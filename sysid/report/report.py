@@ -258,13 +258,8 @@ def _fit(
     """One candidate model; `exported` is the joint if simulators run this one."""
     model, quantities = structure(candidate.model), dict[str, Quantity]()
     if exported is not None:
-        a, ratios = exported.actuator, exported.actuator.ratios_to_armature
-        quantities = {
-            "dead_time_s": a.dead_time_s, "stiffness_per_s2": ratios.stiffness,
-            "damping_per_s": ratios.damping, "friction_rad_s2": ratios.friction_loss,
-            "effort_rad_s2": ratios.effort_limit, "velocity_limit_rad_s": a.velocity_limit_rad_s,
-            "back_emf_per_s": ratios.back_emf, "offset_rad": exported.feedback.offset_rad,
-        }  # fmt: skip
+        offset = {"offset_rad": exported.feedback.offset_rad}
+        quantities = exported.actuator.per_inertia | offset
     parameters = {
         name: quantities[name].model_copy(update={"value": value}).interval
         if name in quantities

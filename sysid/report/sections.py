@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 from pupper_sysid.common.figure_style import BLUE, FAINT, GREEN, INK, RED, axes_column, styled
 from pupper_sysid.common.files import versions
-from pupper_sysid.common.joints import JOINT_NAMES, share_sentences
+from pupper_sysid.common.joints import JOINT_NAMES, share_sentences, with_joints
 from pupper_sysid.common.page import Fold, Picture, Section
 from pupper_sysid.common.tables import Column, Table
 from pupper_sysid.servo_models.calibration.calibration import Calibration
@@ -101,7 +101,7 @@ def _lag(results: Mapping[str, JointCalibrationResult]) -> Section:
         "line across each bar is the raw lag, which is the sum.",
         figures.lag_budget_figure(budgets),
     )
-    notes = shared({joint: r.lag.warnings for joint, r in results.items()})
+    notes = with_joints({joint: r.lag.warnings for joint, r in results.items()})
     if any(r.lag.stale_lag_s < _NEGATIVE_S for r in results.values()):
         notes.append(
             "Stale readings with a negative lag: these positions were read after the time stamp of "
@@ -115,12 +115,6 @@ def _lag(results: Mapping[str, JointCalibrationResult]) -> Section:
 
 
 _NEGATIVE_S = -5e-5
-
-
-def shared(by_joint: Mapping[str, Sequence[str]]) -> list[str]:
-    """Sentences of joints, each once, behind the names of all joints that it holds for."""
-    bare = {j: [t.removeprefix(f"{j}: ") for t in texts] for j, texts in by_joint.items()}
-    return [f"{names}: {text}" for names, text in share_sentences(bare)]
 
 
 def _doctor(report: Findings) -> Section:
@@ -276,7 +270,7 @@ def _parameters(report: Findings, parameters: Table) -> Section:
             "the reason stands under each joint."
         ],
         tables=[tables.parameter_matrix(parameters)],
-        notes=shared(
+        notes=with_joints(
             {
                 joint: [w for w in r.warnings if w not in (*r.lag.warnings, *r.differences)]
                 for joint, r in report.results.items()
@@ -341,7 +335,7 @@ def advice(
     gaps = {
         joint: _gaps(result, calibration.joint(joint).actuator) for joint, result in results.items()
     }
-    texts = [f"{j}: {text}" for part in (again, gaps) for j, text in share_sentences(part)]
+    texts = with_joints(again) + with_joints(gaps)
     if any(calibration.joint(j).actuator.scale.anchor == "stall torque" for j in results):
         texts.append(
             "Torques rest on an assumed stall torque, because a joint that swings in free air "

@@ -1,20 +1,26 @@
 """Tables of what recordings show and of what was fitted to them (`common.tables`).
 
-Each function turns results into the `Table` that commands print and the report shows and writes.
+Each function turns results into the `Table` that commands print and the report shows and writes;
+`tidy_table` is what `export --to csv` writes.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import math
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
+from pydantic import BaseModel
 
+from pupper_sysid.common.files import write_text
 from pupper_sysid.common.results import flat, plain
 from pupper_sysid.common.tables import Column, Row, Table, ends, rounded
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S
+from pupper_sysid.servo_models.calibration.parts import NO_SPEED_LIMIT_RAD_S, JointCalibration
 from pupper_sysid.servo_models.calibration.quantity import Quantity, unit_of, words_of
 
 if TYPE_CHECKING:
@@ -23,6 +29,7 @@ if TYPE_CHECKING:
     from pupper_sysid.sysid.fit.results import JointCalibrationResult
     from pupper_sysid.sysid.lag.frequency_response import FrequencyResponse
     from pupper_sysid.sysid.lag.lag_budget import LagBudget
+    from pupper_sysid.sysid.recordings.recording import Recording
     from pupper_sysid.sysid.servo_fit.scores import ModelScores
 
 MODEL_NAMES = {
@@ -348,3 +355,63 @@ def _significant(value: float) -> str:
         digits = 2 - math.floor(math.log10(abs(value))) if value else 0
         return rounded(value, max(digits, 0))
     return f"{value:.2e}".replace("-", "−")
+
+
+CALIBRATION_COLUMNS = (
+    "joint", "part", "quantity", "unit", "value", "low", "high", "identified", "why",
+)  # fmt: skip
+
+
+def tidy_table(
+    source: Calibration | Recording, path: Path | None = None, force: bool = False
+) -> str:
+    """A calibration or recording as tidy CSV text, written to `path` if one is given.
+
+    Comment lines (`# key: JSON value`) say where the numbers come from;
+    `pandas.read_csv(path, comment="#")` skips them.
+    A calibration gives the columns `CALIBRATION_COLUMNS`: `part` is where the quantity stands in
+    the calibration file (`actuator`, `feedback`, `lag`, `scores`, …), `low` and `high` are the ends
+    of its 90 % interval, and a number that is not a measured quantity (a score, a count of steps)
+    leaves the last four empty. What the calibration does not hold has no row. A recording gives its
+    rows with the columns of `sysid.recordings.recording`.
+    """
+    text = _calibration_table(source) if isinstance(source, Calibration) else source.to_csv()
+    if path is not None:
+        write_text(path, text, force)
+    return text
+
+
+def _calibration_table(calibration: Calibration) -> str:
+    from pupper_sysid.sysid.recordings.table import comments  # brings pandas
+
+    header = calibration.model_dump(mode="json", by_alias=True, exclude={"joints"})
+    header["operating_points"] = {
+        name: joint.holds_at.model_dump(mode="json") for name, joint in calibration.joints.items()
+    }
+    buffer = io.StringIO()
+    buffer.write(comments("pupper-sysid calibration table", header))
+    # text is quoted: a '#' in a sentence must not begin a comment
+    table = csv.writer(buffer, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n")
+    buffer.write(",".join(CALIBRATION_COLUMNS) + "\n")
+    for name, joint in calibration.joints.items():
+        table.writerows([name, *row] for row in _numbers(joint))
+    return buffer.getvalue()
+
+
+def _numbers(joint: JointCalibration) -> Iterator[list[Any]]:
+    """Part, quantity, unit, value, low, high, identified, why of all numbers of one joint."""
+    parts: dict[str, BaseModel] = {
+        "actuator": joint.actuator,
+        "ratios_to_armature": joint.actuator.ratios_to_armature,
+        "scale": joint.actuator.scale,
+        "feedback": joint.feedback,
+        "lag": joint.lag,
+        "scores": joint.scores,
+    }
+    for part, model in parts.items():
+        for name, entry in model:
+            if isinstance(entry, Quantity):
+                numbers = [entry.value, entry.low, entry.high]
+                yield [part, name, unit_of(name), *numbers, entry.identified, entry.why]
+            elif isinstance(entry, int | float):
+                yield [part, name, unit_of(name), entry, "", "", "", ""]

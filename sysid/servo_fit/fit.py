@@ -12,7 +12,7 @@ first reading to the part's readings at their own times (`sysid.fit.search`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,8 +26,7 @@ from pupper_sysid.common.interval import Interval
 from pupper_sysid.common.joints import DEFAULT_POSE
 from pupper_sysid.common.results import Result, internal, plain
 from pupper_sysid.servo_models.calibration.calibration import utc_now
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters
-from pupper_sysid.servo_models.interface import ServoModel
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, ServoModel
 from pupper_sysid.servo_models.networks import RecurrentNetwork
 from pupper_sysid.servo_models.servo_file import (
     ARCHITECTURES,
@@ -170,7 +169,7 @@ class ServoFit(Result):
 
     def plot(self, joints: Sequence[str] | None = None) -> Figure:
         """Figure of the model in free run beside commands and readings, a panel per joint."""
-        from pupper_sysid.sysid.servo_fit.figures import free_run_figure
+        from pupper_sysid.sysid.report.figures import free_run_figure
 
         bands = {j: (s.band_noise_rad, s.band_timing_s) for j, s in self.joints.items()}
         return free_run_figure(
@@ -274,7 +273,7 @@ def fit_servo(
     notes += [note] if note else []
     data = windows.merged_groups(data)
     if split.test is None:
-        data = _with_two_groups(data, training)
+        data = windows.with_two_groups(data, training)
         folds = [(windows.without(g), windows.only(g)) for g in range(len(data.groups))]
     else:
         folds = [(training, split.test)]
@@ -367,31 +366,6 @@ def verdict(
             f"{1e3 * above:.1f} mrad above it."
         )
     return text
-
-
-def _with_two_groups(data: ServoData, part: windows.Part) -> ServoData:
-    """The data without groups that have no readings, such as a tone cut short."""
-    present = {
-        j: {int(g) for r in data.runs[j] for g in r.group[r.readings.rows][windows.chosen(r, part)]}
-        - {-1}
-        for j in data.joints
-    }
-    for joint, groups in present.items():
-        if len(groups) < 2:
-            seen = ", ".join(data.groups[g] for g in groups) or "nothing"
-            raise InputError(
-                f"{joint} has readings of {seen} only, others of more, so it cannot be tested on "
-                "what it has not seen. Leave it out of `joints`, record it again, or split by time "
-                "(`train_before_s`, `test_after_s`)."
-            )
-    used = sorted(set().union(*present.values()))
-    place = np.full(len(data.groups) + 1, -1)
-    place[used] = np.arange(len(used))
-    runs = {
-        j: tuple(replace(r, group=place[r.group]) for r in groups)
-        for j, groups in data.runs.items()
-    }
-    return replace(data, runs=runs, groups=tuple(data.groups[g] for g in used))
 
 
 @dataclass(frozen=True)

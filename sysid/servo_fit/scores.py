@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,8 +26,7 @@ from scipy.optimize import nnls
 
 from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.common.results import internal
-from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S
-from pupper_sysid.servo_models.interface import AtControlRate, ServoModel
+from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, AtControlRate, ServoModel
 from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
 from pupper_sysid.sysid.fit.predict import ReadingRule, ages
 from pupper_sysid.sysid.servo_fit.data import Run, ServoData, look_up
@@ -57,12 +56,14 @@ class Errors:
 
 @dataclass(frozen=True, kw_only=True)
 class Scores:
-    """Root mean square errors of one model on one joint, or their means over joints [rad]."""
+    """Root mean square and mean absolute errors on one joint, or means over joints [rad]."""
 
     rmse_one_step_rad: float
     rmse_free_run_rad: float
     rmse_held_rad: float
     rmse_raw_rad: float
+    mae_held_rad: float
+    mae_raw_rad: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,19 +76,27 @@ class ModelScores:
     rmse_free_run_rad: Interval
     """Of the mean."""
     errors: dict[str, Errors] = internal()
+    offset_rad: dict[str, float] = field(default_factory=dict)
+    """By joint, reading minus prediction of these recordings; empty for a model fitted here."""
+    age_spread_rad: dict[str, float] = field(default_factory=dict)
+    """By joint, the part of the raw error that the unknown age of readings makes: a perfect model
+    would have it. 0 where readings are dated."""
+    readings: dict[str, ReadingRule] = field(default_factory=dict)
+    """By joint, when a calibration says that readings were measured."""
 
     @classmethod
-    def of(cls, errors_of: dict[str, Errors], seed: int) -> ModelScores:
-        """Scores of errors; `seed` is that of the bootstrap."""
+    def of(cls, errors_of: dict[str, Errors], seed: int, **more: Any) -> ModelScores:
+        """Scores of errors; `seed` is that of the bootstrap, `more` the fields with a default."""
         joints = {
             joint: Scores(
                 rmse_one_step_rad=rms(e.one_step), rmse_free_run_rad=rms(e.free_run),
                 rmse_held_rad=rms(e.held), rmse_raw_rad=rms(e.raw),
+                mae_held_rad=mean_known(np.abs(e.held)), mae_raw_rad=mean_known(np.abs(e.raw)),
             )
             for joint, e in errors_of.items()
         }  # fmt: skip
         return cls(joints=joints, mean=mean(joints), rmse_free_run_rad=interval(errors_of, seed),
-                   errors=errors_of)  # fmt: skip
+                   errors=errors_of, **more)  # fmt: skip
 
 
 _S = TypeVar("_S", bound=Scores)

@@ -111,27 +111,21 @@ def grouped(data: ServoData, part: Part) -> tuple[ServoData, str | None]:
     A part of one group is cut into stretches. The first rows after a boundary belong to no stretch,
     because the servo's motion there depends on the stretch before.
     """
-    present = {
-        int(g)
-        for joint_runs in data.runs.values()
-        for run in joint_runs
-        for g in run.group[run.readings.rows][chosen(run, part)]
-    }
+    present = set().union(*(_groups_in(data, joint, part) for joint in data.joints))
     if len(present) > 1:
         return data, None
 
-    def cut(run: Run) -> Run:
+    def cut(run: Run) -> NDArray[np.int64]:
         inside = np.flatnonzero(chosen_rows(run, part))
         memory = int(np.ceil(_MEMORY_S / data.period_s))
         group = np.full(len(run.number), -1)
         for n, rows in enumerate(np.array_split(inside, _STRETCHES)):
             group[rows[min(memory, len(rows) // 2) if n else 0 :]] = n
-        return replace(run, group=group)
+        return group
 
-    runs = {j: tuple(cut(run) for run in joint_runs) for j, joint_runs in data.runs.items()}
-    names = tuple(f"stretch {n + 1}" for n in range(_STRETCHES))
+    names = [f"stretch {n + 1}" for n in range(_STRETCHES)]
     group = data.groups[next(iter(present))] if present else "nothing"
-    return replace(data, runs=runs, groups=names), (
+    return _regrouped(data, names, cut), (
         f"There is one group to learn from ({group}), so models are chosen by holding out "
         "stretches of it. Record more loops or tones to test how they generalise."
     )
@@ -153,10 +147,36 @@ def merged_groups(data: ServoData, most: int = 5) -> ServoData:
     for place, g in enumerate(order):
         fold[g] = place % most
     names = [", ".join(data.groups[g] for g in order[n::most]) for n in range(most)]
-    runs = {
-        j: tuple(replace(r, group=fold[r.group]) for r in joint_runs)
-        for j, joint_runs in data.runs.items()
-    }
+    return _regrouped(data, names, lambda run: fold[run.group])
+
+
+def with_two_groups(data: ServoData, part: Part) -> ServoData:
+    """The data without groups that have no readings, such as a tone cut short."""
+    present = {joint: _groups_in(data, joint, part) - {-1} for joint in data.joints}
+    for joint, groups in present.items():
+        if len(groups) < 2:
+            seen = ", ".join(data.groups[g] for g in groups) or "nothing"
+            raise InputError(
+                f"{joint} has readings of {seen} only, others of more, so it cannot be tested on "
+                "what it has not seen. Leave it out of `joints`, record it again, or split by time "
+                "(`train_before_s`, `test_after_s`)."
+            )
+    used = sorted(set().union(*present.values()))
+    place = np.full(len(data.groups) + 1, -1)
+    place[used] = np.arange(len(used))
+    return _regrouped(data, [data.groups[g] for g in used], lambda run: place[run.group])
+
+
+def _groups_in(data: ServoData, joint: str, part: Part) -> set[int]:
+    """Groups of a joint's counted readings in a part."""
+    return {int(g) for r in data.runs[joint] for g in r.group[r.readings.rows][chosen(r, part)]}
+
+
+def _regrouped(
+    data: ServoData, names: Sequence[str], group: Callable[[Run], NDArray[np.int64]]
+) -> ServoData:
+    """The same data with other groups, called `names`."""
+    runs = {j: tuple(replace(r, group=group(r)) for r in data.runs[j]) for j in data.runs}
     return replace(data, runs=runs, groups=tuple(names))
 
 

@@ -336,7 +336,7 @@ def check_amplitude(amplitude_rad: float) -> None:
         )
 
 
-def parse_frequencies(text: str, highest_hz: float = HIGHEST_HZ) -> list[float]:
+def parse_frequencies(text: str) -> list[float]:
     """Frequencies [Hz] that `text` names: `1-10`, `1-10:0.5`, `1,2,4,6.5`, or a mix.
 
     Examples
@@ -357,7 +357,7 @@ def parse_frequencies(text: str, highest_hz: float = HIGHEST_HZ) -> list[float]:
                 f"`frequencies`: '{part}' is not a frequency in Hz. Write 1-10, 1-10:0.5 or 1,2,4."
             ) from None
         for value in (low, high):
-            _checked_frequency(value, highest_hz)
+            _checked_frequency(value, HIGHEST_HZ)
         if high < low:
             raise InputError(f"`frequencies`: '{part}' runs backwards; write {high:g}-{low:g}.")
         if not (np.isfinite(step) and step > 0) or (step_text and not dash):

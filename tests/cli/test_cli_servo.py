@@ -133,25 +133,19 @@ class Reached(Exception):
 
 
 @pytest.mark.parametrize(
-    ("command", "worker", "ending"),
-    [
-        ("calibrate", "pupper_sysid.sysid.fleet.calibrate_fleet", "calibrated"),
-        ("fit-servo", "pupper_sysid.sysid.fleet.fit_servo_fleet", "servos"),
-    ],
+    ("command", "ending"), [("calibrate", "calibrated"), ("fit-servo", "servos")]
 )
 @pytest.mark.parametrize(
     ("here", "given"), [("robots", "."), ("robots/one", ".."), (".", "robots")]
 )
-def test_results_are_beside_the_folder(
-    capsys, tmp_path, monkeypatch, command, worker, ending, here, given
-):
+def test_results_are_beside_the_folder(capsys, tmp_path, monkeypatch, command, ending, here, given):
     (tmp_path / "robots/one").mkdir(parents=True)
     (tmp_path / "robots/one/sweep.csv").touch()
 
     def reach(root, out, *_):
         raise Reached(out)
 
-    monkeypatch.setattr(worker, reach)
+    monkeypatch.setattr("pupper_sysid.sysid.fleet.run_fleet", reach)
     monkeypatch.chdir(tmp_path / here)
     with pytest.raises(Reached) as reached:
         run(capsys, command, given, "--debug")

@@ -15,9 +15,8 @@ from pupper_sysid.cli.commands.bus import Park
 from pupper_sysid.cli.programs.pupper_sysid import COMMANDS
 from pupper_sysid.common.errors import SafetyStop
 from pupper_sysid.hardware import loop as clock
-from pupper_sysid.hardware.lock import runtime_folder
+from pupper_sysid.hardware.lock import notes, remove_note, runtime_folder, write_note
 from pupper_sysid.hardware.safety import watchdog
-from pupper_sysid.hardware.safety.notes import notes, remove_note, write_note
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from support.package import ROOT
 from support.served_driver import PATIENT, drive

@@ -30,7 +30,7 @@ from pupper_sysid.servo_models.calibration.parts import Actuator
 from pupper_sysid.servo_models.calibration.quantity import PlausibleRange
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.sysid.fit.calibrate import calibrate
-from pupper_sysid.sysid.fleet import Settings
+from pupper_sysid.sysid.fleet import Calibrations
 from pupper_sysid.sysid.plan.plan_file import save_plan
 from pupper_sysid.sysid.plan.proposal import plan_from_recordings
 from pupper_sysid.sysid.recordings.files import load
@@ -357,7 +357,7 @@ def test_numbers_that_cannot_be_are_refused_in_python_before_they_are_used(tmp_p
         *((lambda k=k: on_a_bench(k, duration_s=0.0), "duration_s is 0") for k in [*KINDS, BENCH]),
         *((lambda t=t: calibrate(nothing, stall_torque_nm=t), "stall_torque_nm")
           for t in (0.0, 1e308, nan, 101.0)),
-        *((lambda t=t: Settings(stall_torque_nm=t), "stall_torque_nm") for t in (0.0, 101.0)),
+        *((lambda t=t: Calibrations(stall_torque_nm=t), "stall_torque_nm") for t in (0.0, 101.0)),
         (lambda: plan_from_recordings([nothing], ["knee"], seconds=1e9), "seconds"),
         *((lambda g=g: load_card("sts3215-bam-m1").pd(p_gain=g), "p_gain")
           for g in (0.0, -1.0, nan, inf, 1e308)),

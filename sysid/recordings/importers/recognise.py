@@ -12,8 +12,8 @@ from typing import Any
 import pandas as pd
 
 from pupper_sysid.common import border
+from pupper_sysid.common.border import RECORDING, refuse_other_kind
 from pupper_sysid.common.errors import InputError
-from pupper_sysid.common.file_kinds import RECORDING, refuse_other_kind
 from pupper_sysid.common.reading.dialect import decoded, without_numpy
 from pupper_sysid.common.strict_yaml import load
 from pupper_sysid.sysid.recordings.importers import (

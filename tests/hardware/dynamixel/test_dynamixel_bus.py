@@ -11,8 +11,8 @@ import pytest
 from pupper_sysid.common.errors import BusError, SafetyStop
 from pupper_sysid.hardware import dynamixel
 from pupper_sysid.hardware.dynamixel import TRIGGERED, WATCHDOG_UNITS, DynamixelBus
+from pupper_sysid.hardware.lock import notes, write_note
 from pupper_sysid.hardware.safety.guard import GuardedBus, GuardLimits
-from pupper_sysid.hardware.safety.notes import notes, write_note
 from pupper_sysid.hardware.serial_servos import line as serial_line
 from pupper_sysid.sim.emulator.dynamixel import DynamixelEmulator
 from pupper_sysid.sim.emulator.serial_line import SerialPty

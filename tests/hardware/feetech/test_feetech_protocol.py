@@ -203,7 +203,7 @@ def test_our_line_sends_the_golden_bytes(series, end):
         line = FeetechLine(server.device, 1_000_000)
         line.patience_s = 0.4  # the servos share this process and a busy machine
         asked = {
-            "ping 1": lambda: line.ping(1),
+            "ping 1": lambda: line.answers_ping(1),
             "read model 1": lambda: line.model(1),
             "read position 1": lambda: line.read(1, 56, 2),
             "firmware read 3": lambda: line.read(3, 56, 6),

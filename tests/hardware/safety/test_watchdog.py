@@ -18,7 +18,6 @@ from pupper_sysid.common.joints import DEFAULT_POSE, JOINT_NAMES
 from pupper_sysid.hardware.address import BusAddress
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.hardware.lock import LOG
-from pupper_sysid.hardware.safety import limp as limp_module
 from pupper_sysid.hardware.safety import watchdog_process
 from pupper_sysid.hardware.safety.watchdog import Watchdog
 from pupper_sysid.hardware.serial_servos import line as serial_line
@@ -281,8 +280,7 @@ def test_servos_that_do_not_say_that_they_are_limp_are_asked_until_they_do(monke
 
     rng = np.random.default_rng(0)
     servos = draw_robot(rng)
-    for module in (limp_module, watchdog_process):
-        monkeypatch.setattr(module, "open_bus", lambda *of, **how: Deaf(servos, rng))
+    monkeypatch.setattr(watchdog_process, "open_bus", lambda *of, **how: Deaf(servos, rng))
     orders = orders_for()
     watchdog_process.park(orders)
     assert len(asked) > 45 and not asked[-1]
@@ -297,7 +295,7 @@ def test_half_a_message_is_no_reason_to_leave_a_robot():
 
 def test_only_a_line_that_cannot_come_back_is_given_up():
     for where, comes in (("/dev/ttyUSB0", True), ("/dev/pts/7", False), ("/nowhere/at/all", False)):
-        assert limp_module.can_come_back(BusAddress("feetech", where)) is comes
+        assert watchdog_process.can_come_back(BusAddress("feetech", where)) is comes
 
 
 def test_a_driver_without_its_watchdog_does_not_go_on(here):

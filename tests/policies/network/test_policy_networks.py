@@ -25,7 +25,7 @@ from pupper_sysid.sim.walking.step import (
     OBSERVATION_PARTS,
     PRIVILEGED_PARTS,
 )
-from pupper_sysid.sysid.export import network as network_export
+from pupper_sysid.sysid import export as network_export
 from support.command_line import fresh_python
 from support.tiny_training import (
     ALL_KINDS,

@@ -15,7 +15,6 @@ from pupper_sysid.sim.emulator.bus import EmulatedBus
 from pupper_sysid.sim.emulator.robot import EmulatedRobot, RobotSpec, draw_robot
 from pupper_sysid.sysid.compare import truth as module
 from pupper_sysid.sysid.compare.truth import (
-    compared_with_truth,
     read_truth,
     true_lag_s,
     truth_table,
@@ -142,11 +141,14 @@ def test_the_true_lag_is_the_dead_time_and_the_dynamics(swept):
 
 def test_the_lag_is_compared_on_the_calibrations_own_recording_only(swept):
     robot, _, recording = swept
-    found = compared_with_truth(recording, robot.truth(), load_calibration(SAMPLE))
-    assert not any(row.quantity == "lag_s" for row in found)
-    assert "was made from" in found.notes[0]
-    rows = truth_table(load_calibration(SAMPLE), robot.truth(), recording, joints=[JOINT])
-    assert next(iter(rows)).quantity == "lag_s"
+    sample = load_calibration(SAMPLE)
+    compared = truth_table(sample, robot.truth(), recording)
+    assert not any(row.quantity == "lag_s" for row in compared)
+    assert "was made from" in compared.notes[0]
+    own = sample.inputs[0].model_copy(update={"sha256": recording.sha256})
+    made_from_it = sample.model_copy(update={"inputs": (own,)})
+    rows = truth_table(made_from_it, robot.truth(), recording, joints=[JOINT])
+    assert next(iter(rows)).quantity == "lag_s" and not rows.notes
 
 
 def test_the_truth_is_read_beside_its_recording_and_refused_in_a_sentence(swept, tmp_path):

@@ -19,11 +19,11 @@ from pupper_sysid.servo_models.cards.card import Source
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.servo_models.cards.numbers import LoadedLoop, TorquePD
 from pupper_sysid.servo_models.loaded_servo import LoadedServoParameters
-from pupper_sysid.sysid.export.tidy_table import CALIBRATION_COLUMNS, to_csv
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
 from pupper_sysid.sysid.fit.results import LoadedFit, StructureFit
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.recording import Recording
+from pupper_sysid.sysid.report.tables import CALIBRATION_COLUMNS, tidy_table
 from support.refusals import assert_each_refused
 
 SOURCE = Source(title="a bench", url="https://example.org/bench", licence="MIT")
@@ -130,7 +130,7 @@ def with_one_measurement() -> Calibration:
 
 
 def test_a_number_keeps_its_value_interval_and_reason_exactly():
-    table = table_of(to_csv(with_one_measurement()))
+    table = table_of(tidy_table(with_one_measurement()))
     row = table[(table.joint == "LF_hip") & (table.quantity == "dead_time_s")].iloc[0].to_dict()
     assert row == {
         "joint": "LF_hip", "part": "actuator", "quantity": "dead_time_s", "unit": "s",
@@ -147,7 +147,7 @@ def test_a_number_keeps_its_value_interval_and_reason_exactly():
 
 def test_a_calibration_becomes_one_row_per_joint_and_quantity_with_its_unit_and_source():
     paper = load_calibration("paper")
-    table = table_of(to_csv(paper))
+    table = table_of(tidy_table(paper))
     assert tuple(table.columns) == CALIBRATION_COLUMNS
     assert not table.duplicated(["joint", "part", "quantity"]).any()
     quantities = table[table.identified.notna()]
@@ -155,14 +155,16 @@ def test_a_calibration_becomes_one_row_per_joint_and_quantity_with_its_unit_and_
         JOINT_NAMES, QUANTITIES_PER_JOINT
     )
     assert set(table[table.identified.isna()].quantity) == PLAIN_NUMBERS
-    lines = [line[2:] for line in to_csv(paper).splitlines() if line.startswith("# ")]
+    lines = [line[2:] for line in tidy_table(paper).splitlines() if line.startswith("# ")]
     assert lines[0] == "pupper-sysid calibration table"
     said = {key: json.loads(value) for key, _, value in (s.partition(": ") for s in lines[1:])}
     assert said["schema"] == "pupper-calibration" and said["schema_version"] == 4
     assert said["created"] == paper.created and said["units"] == paper.units
     assert said["notes"] == list(paper.notes)
     # the same quantity over and not over the armature are kept apart
-    table = table_of(to_csv(load_calibration("release"))).set_index(["joint", "part", "quantity"])
+    table = table_of(tidy_table(load_calibration("release"))).set_index(
+        ["joint", "part", "quantity"]
+    )
     assert table.loc[("RB_calf", "actuator", "stiffness_nm_per_rad"), "unit"] == "N·m/rad"
     ratio = table.loc[("RB_calf", "ratios_to_armature", "stiffness")]
     assert (ratio["value"], ratio["unit"]) == (80.0 / 0.005, "1/s²")
@@ -186,13 +188,13 @@ def sweep_file(folder: Path) -> Path:
 def test_an_exported_recording_reads_back_as_the_same_recording(tmp_path: Path):
     source = sweep_file(tmp_path)
     imported, before = load(source), source.read_bytes()
-    table = table_of(to_csv(imported))
+    table = table_of(tidy_table(imported))
     assert set(table.joint) == {"LF_thigh"} and set(table.frequency_hz) == {1.0, 2.0}
     assert len(table) == 240 and (np.diff(table.send_time_s) > 0).all()
     path = tmp_path / "exported.csv"
-    to_csv(imported, path)
+    tidy_table(imported, path)
     with pytest.raises(FileExistsRefusal):
-        to_csv(imported, source)
+        tidy_table(imported, source)
     assert source.read_bytes() == before
     again = load(path)
     # whole numbers may come back as floats; their values must not change
@@ -204,11 +206,11 @@ def test_an_exported_recording_reads_back_as_the_same_recording(tmp_path: Path):
 
 def test_a_recording_that_was_cut_short_still_says_so_after_its_export(tmp_path: Path):
     cut = tmp_path / "cut.csv"
-    to_csv(load(sweep_file(tmp_path)), cut)
+    tidy_table(load(sweep_file(tmp_path)), cut)
     text = cut.read_text().replace('# imported_from: "single-joint sweep"\n', "")
     cut.write_text(text[: text.index("# completed")].rstrip("\n")[:-4])
     exported = tmp_path / "exported.csv"
-    to_csv(load(cut), exported)
+    tidy_table(load(cut), exported)
     again = load(exported)
     assert len(again.table) == 239
     assert any("not recorded to its end" in warning for warning in again.warnings)

@@ -24,7 +24,7 @@ from pupper_sysid.cli.programs import pupper_sysid
 from pupper_sysid.common.errors import FileExistsRefusal, PupperError
 from pupper_sysid.servo_models.networks import RecurrentNetwork
 from pupper_sysid.servo_models.servo_file import SavedModel, load_servo_model, save_servo_model
-from pupper_sysid.sysid.export.network import ENDINGS, export_servo_model, parameter_table
+from pupper_sysid.sysid.export import ENDINGS, export_servo_model, parameter_table
 from support.command_line import ran, refused
 from support.refusals import assert_each_refused
 from support.saved_servo_models import JOINTS, KINDS, P, arrays, commands, contract, saved

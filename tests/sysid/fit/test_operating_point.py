@@ -10,13 +10,13 @@ from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.cards.files import load_card
 from pupper_sysid.sim.export.export import exported_text
 from pupper_sysid.sim.export.targets import TARGETS
-from pupper_sysid.sysid.export.tidy_table import to_csv
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
 from pupper_sysid.sysid.fit.operating_point import reference_gain, with_operating_points
 from pupper_sysid.sysid.fit.preparation import scales_of
 from pupper_sysid.sysid.fit.run import prepare
 from pupper_sysid.sysid.recordings.recording import Trial
 from pupper_sysid.sysid.recordings.servo_setup import PendulumLoad, ServoSetup
+from pupper_sysid.sysid.report.tables import tidy_table
 
 NAN = float("nan")
 POINT = "P gain 32 (the servo's own by the recording's header)"
@@ -75,7 +75,7 @@ def test_every_export_states_gain_armature_and_load(target):
 
 def test_the_table_the_file_and_a_card_state_them_too(tmp_path):
     made = calibration()
-    assert "0.1 kg at 0.12 m" in to_csv(made)
+    assert "0.1 kg at 0.12 m" in tidy_table(made)
     made.save(tmp_path / "a.yaml")
     point = load_calibration(tmp_path / "a.yaml").joint("knee").holds_at
     assert (point.p_gain, point.armature, point.load) == (32.0, "servo", "0.1 kg at 0.12 m")

@@ -13,7 +13,7 @@ from pupper_sysid.common.reading.content import reading_up_to
 from pupper_sysid.servo_models.calibration.calibration import load_calibration
 from pupper_sysid.servo_models.servo_file import load_servo_model
 from pupper_sysid.sysid import fleet
-from pupper_sysid.sysid.fleet import OUTLIER, QUANTITIES, ServoSettings, _outliers, fit_servo_fleet
+from pupper_sysid.sysid.fleet import OUTLIER, QUANTITIES, ServoModels, _outliers
 from pupper_sysid.sysid.recordings.files import load
 from support.command_line import ran, refused, run
 from support.refusals import assert_each_refused
@@ -36,7 +36,7 @@ def sweeps(tmp_path_factory) -> Path:
 def calibrated(sweeps, tmp_path_factory) -> tuple[fleet.Fleet, Path]:
     """The fleet of calibrations of these robots, made by two workers, and its folder."""
     out = tmp_path_factory.mktemp("fleet") / "out"
-    return fleet.calibrate_fleet(sweeps, out, fleet.Settings(), jobs=2), out
+    return fleet.run_fleet(sweeps, out, fleet.Calibrations(), jobs=2), out
 
 
 def two_made_and_one_failed(found: dict, out: Path) -> pd.DataFrame:
@@ -97,7 +97,7 @@ def test_a_robot_that_fails_now_is_not_shown_with_what_it_was_before(sweeps, cal
     root.mkdir(), out.mkdir()
     (root / "r1.csv").write_text("time,what\n1,2\n")
     shutil.copy(calibrated[1] / "r1.yaml", out)
-    again = fleet.calibrate_fleet(root, out, fleet.Settings(), force=True)
+    again = fleet.run_fleet(root, out, fleet.Calibrations(), force=True)
     assert again.failed == ["r1"] and again.table["robot"].to_list() == ["r1"]
     assert again.table["problem"].iloc[0]
 
@@ -108,7 +108,7 @@ def test_an_interrupted_training_is_not_kept_for_a_finished_one(sweeps, tmp_path
 
     monkeypatch.setattr("pupper_sysid.sysid.servo_fit.training._Adam.descend", stop)
     with pytest.raises(KeyboardInterrupt):
-        fit_servo_fleet(sweeps, tmp_path / "out", ServoSettings())
+        fleet.run_fleet(sweeps, tmp_path / "out", ServoModels())
     assert not (tmp_path / "out" / "r1").exists()
 
 
@@ -118,8 +118,8 @@ def test_a_dask_cluster_gives_what_one_process_gives(sweeps, calibrated, tmp_pat
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None
     ) as cluster:
-        there = fleet.calibrate_fleet(
-            sweeps, tmp_path / "there", fleet.Settings(), cluster=cluster.scheduler_address
+        there = fleet.run_fleet(
+            sweeps, tmp_path / "there", fleet.Calibrations(), cluster=cluster.scheduler_address
         )
     pd.testing.assert_frame_equal(there.table, calibrated[0].table)
 
@@ -134,12 +134,26 @@ def test_a_cluster_is_an_address_that_is_written_out_and_what_it_is_trusted_with
     )  # fmt: skip
     assert_each_refused(
         [(a, "write out the scheduler's address") for a in addresses],
-        lambda a: fleet.calibrate_fleet(sweeps, tmp_path, fleet.Settings(), cluster=a),
+        lambda a: fleet.run_fleet(sweeps, tmp_path, fleet.Calibrations(), cluster=a),
     )
     for address in ("tls://host:8786", "tcp://[::1]:8786"):
         said = fleet.trust(address)
         assert "is enough to run programs on this computer" in said
         assert ("within a network of your own" in said) == address.startswith("tcp")
+
+
+class Names(fleet.Calibrations):
+    """A product that is made at once."""
+
+    quantities = ()
+
+    def make(self, path: Path, target: Path) -> None:
+        """The recording's name, once it has been read."""
+        target.write_text(load(path).name)
+
+    def numbers(self, target: Path) -> dict[str, dict[str, float]]:
+        """None."""
+        return {"LF_hip": {}}
 
 
 def test_of_30_recordings_10_are_broken_and_20_are_done(sweeps, tmp_path, capsys):
@@ -158,15 +172,7 @@ def test_of_30_recordings_10_are_broken_and_20_are_done(sweeps, tmp_path, capsys
         (root / f"{name}.csv").write_bytes(data)
     os.mkfifo(root / "pipe.csv")
     (root / "device.csv").symlink_to("/dev/zero")
-    targets = {path: out / f"{name}.yaml" for path, name in fleet.robots_in(root).items()}
-
-    def make(path: Path, target: Path) -> None:
-        target.write_text(load(path).name)
-
-    made = fleet.run_fleet(
-        targets, lambda target, path: False, make,
-        lambda target: {"LF_hip": {}}, (), out, 1, None, True, None,
-    )  # fmt: skip
+    made = fleet.run_fleet(root, out, Names(), force=True)
     assert len(made.made) == 20
     assert sorted(made.failed) == sorted([*broken, "pipe", "device"])
     assert all(problem.endswith(".") for problem in made.problems.values())
@@ -178,10 +184,10 @@ def test_the_limit_of_reading_holds_for_every_worker(sweeps, tmp_path):
     shutil.copy(sweeps / "r1.csv", root / "r1.csv")
     with (root / "r1.csv").open("a") as file:
         file.write("# note: " + '"' + "x" * 1_500_000 + '"\n')
-    first = fit_servo_fleet(root, tmp_path / "a", ServoSettings(arch="fir"), jobs=2)
+    first = fleet.run_fleet(root, tmp_path / "a", ServoModels(arch="fir"), jobs=2)
     assert "read_limit=2" in first.problems["r1"]
     with reading_up_to(2):
-        again = fit_servo_fleet(root, tmp_path / "b", ServoSettings(arch="fir"), jobs=2)
+        again = fleet.run_fleet(root, tmp_path / "b", ServoModels(arch="fir"), jobs=2)
     assert again.made == ["r1"]
 
 

@@ -7,8 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
-from pupper_sysid.servo_models.interface import AtControlRate, substeps
+from pupper_sysid.servo_models.delayed_pd import (
+    AtControlRate,
+    DelayedPD,
+    DelayedPDParameters,
+    substeps,
+)
 from pupper_sysid.servo_models.networks import CommandNetwork, RecurrentNetwork
 from pupper_sysid.sysid.servo_fit import networks as network_fit
 from pupper_sysid.sysid.servo_fit.data import ServoData, look_up, servo_data

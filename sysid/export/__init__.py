@@ -1,1 +1,0 @@
-"""Recordings and servo models as tables, ONNX and TorchScript."""
