@@ -173,7 +173,7 @@ def answered(joint: dict[str, Any]) -> dict[str, dict[str, Any]]:
         "damping_sum": ratios["damping_and_back_emf"],
         "dead_time_s": actuator["dead_time_s"],
         "speed_limit": actuator["velocity_limit_rad_s"],
-        "acceleration_limit": (joint["under_load"] or {}).get("acceleration_limit_rad_s2"),
+        "acceleration_limit": (joint["servo"] or {}).get("acceleration_limit_rad_s2"),
         "offset_rad": joint["feedback"]["offset_rad"],
     }
     parts = numbers["damping"], numbers["back_emf"]

@@ -190,9 +190,9 @@ class Export:
     def _at_gain(calibration: Calibration, gain: float) -> Calibration:
         """The calibration at another P gain; says how far that was tested."""
         sentences = {
-            joint.under_load.how_far_tested(gain)
+            joint.servo.how_far_tested(gain)
             for joint in calibration.joints.values()
-            if joint.under_load is not None
+            if joint.servo is not None
         }
         at_gain = calibration.at_p_gain(gain)
         for sentence in sorted(sentences):

@@ -79,7 +79,7 @@ def of_calibration(calibration: Calibration, robot: ServoRobot, recording: Recor
     gains = {t.p_gain for joint in recording.joints for t in recording.trials(joint)}
     if len(gains) == 1 and np.isfinite(gain := gains.pop()):
         joints = {
-            joint: fitted.at_p_gain(gain) if fitted.under_load else fitted
+            joint: fitted.at_p_gain(gain) if fitted.servo else fitted
             for joint, fitted in calibration.joints.items()
         }
         calibration = calibration.model_copy(update={"joints": joints})

@@ -14,6 +14,7 @@ it, `release` the one in the training configuration its authors released. Neithe
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from importlib import import_module, resources
@@ -35,17 +36,20 @@ from pupper_sysid.servo_models.held_feedback import HeldFeedback
 from pupper_sysid.servo_models.step_size import at_step
 
 SCHEMA = "pupper-calibration"
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 PRESETS = ("paper", "release")
 
 _RENAMED = {
-    "delay_s": "dead_time_s",
-    "ladder": "candidate_models",
-    "naive_lag_s": "raw_lag_s",
-    "rmse_free_run_naive_rad": "rmse_free_run_raw_rad",
-    "rmse_naive_rad": "rmse_raw_rad",
+    1: {
+        "delay_s": "dead_time_s",
+        "ladder": "candidate_models",
+        "naive_lag_s": "raw_lag_s",
+        "rmse_free_run_naive_rad": "rmse_free_run_raw_rad",
+        "rmse_naive_rad": "rmse_raw_rad",
+    },
+    4: {"under_load": "servo"},
 }
-"""Names of version 1 files, and what replaced them."""
+"""Names in files up to a version, and what replaced them."""
 
 UNITS = (
     "SI: radians of the simulator frame, seconds, N·m, kg·m²; every name ends in its unit; "
@@ -100,7 +104,7 @@ class Calibration(Part):
 
     schema_name: Annotated[Literal["pupper-calibration"], Field(alias="schema")] = SCHEMA
     """Kind of the file."""
-    schema_version: Literal[4] = SCHEMA_VERSION
+    schema_version: Literal[5] = SCHEMA_VERSION
     """Version of the file's format."""
     robot: str
     """The robot that was measured."""
@@ -165,7 +169,7 @@ class Calibration(Part):
     def at_p_gain(self, p_gain: float) -> Calibration:
         """The calibration of the same servos at another P gain, the register's value.
 
-        Refused if a joint was recorded at one gain without a known load: it has no `under_load`.
+        Refused if a joint was recorded at one gain without a known load: it has no `servo`.
         """
         joints = {name: joint.at_p_gain(p_gain) for name, joint in self.joints.items()}
         return self.model_copy(update={"joints": joints})
@@ -317,18 +321,17 @@ def _load(path: Path) -> Calibration:
     version = data["schema_version"]
     if version == SCHEMA_VERSION:
         return validated(Calibration, data, path, lines)
-    if version in (2, 3):  # 2 is the same without `under_load`
-        if version == 3:
-            data = data | {"joints": _with_unseen_runs(data.get("joints"))}
-        return validated(Calibration, data | {"schema_version": SCHEMA_VERSION}, path, lines)
-    data = _renamed(data, _RENAMED) | {"schema_version": SCHEMA_VERSION}
-    lines = {tuple(_RENAMED.get(str(p), p) for p in place): n for place, n in lines.items()}
+    names = {k: v for last, names in _RENAMED.items() if version <= last for k, v in names.items()}
+    data = _renamed(data, names) | {"schema_version": SCHEMA_VERSION}
+    if version == 3:
+        data |= {"joints": _with_unseen_runs(data.get("joints"))}
+    lines = {tuple(names.get(str(p), p) for p in place): n for place, n in lines.items()}
     try:
         return validated(Calibration, data, path, lines)
     except InputError as error:
         message = str(error)
-        for old, new in _RENAMED.items():
-            message = message.replace(new, old)  # the words of the file that is being read
+        for old, new in names.items():  # as the file that is read has them
+            message = re.sub(rf"(?<=\.){new}\b", old, message)
         raise InputError(message) from error
 
 
@@ -338,7 +341,7 @@ def _with_unseen_runs(joints: Any) -> Any:
         return joints
     renamed, old = dict(joints), "rmse_leave_one_frequency_out_rad"
     for name, joint in joints.items():
-        if isinstance(joint, dict) and joint.get("under_load") is not None:
+        if isinstance(joint, dict) and joint.get("servo") is not None:
             # root mean square errors of the model, mean absolute ones of the candidates
             new = {"scores": "rmse_unseen_runs_rad", "selection": "mae_unseen_runs_rad"}
             blocks = {p: _renamed(joint[p], {old: new[p]}) for p in new.keys() & joint.keys()}

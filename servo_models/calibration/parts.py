@@ -9,8 +9,8 @@ range.
 `OperatingPoint` is the P gain, the armature and the load that the numbers are for. Stiffness is in
 proportion to the P gain of the servo's position loop, and an armature is that of motor and gears
 alone or holds what the joint moved, too. Two sets of numbers can be compared only where both are
-known, so every file that is written from a calibration states them. `UnderLoad` is the servo at any
-P gain and load.
+known, so every file that is written from a calibration states them. `FittedServo` is the servo at
+any P gain and load.
 """
 
 from __future__ import annotations
@@ -56,8 +56,10 @@ class RecordedLoad(Part):
     """Largest torque of gravity [N·m]."""
 
 
-class UnderLoad(Part):
-    """Position loop, motor and friction of a servo recorded under load or at several P gains.
+class FittedServo(Part):
+    """Position loop, motor and friction of a servo that was fitted with more than DelayedPD has.
+
+    That is a servo under load, at several P gains, or with a profile of its set-point.
 
     See `servo_models.loaded_servo` for the equations; a term that is null was not needed.
     """
@@ -115,7 +117,7 @@ class UnderLoad(Part):
     hanging_rad: Annotated[Quantity | None, OFFSET] = None
     """Position at which the load hangs [rad], less that of the recording's header."""
 
-    def servo(self, dead_time_s: float) -> LoadedServoParameters:
+    def parameters(self, dead_time_s: float) -> LoadedServoParameters:
         """The numbers themselves, without intervals."""
         values = {
             name: value.value
@@ -129,7 +131,7 @@ class UnderLoad(Part):
 
         Examples
         --------
-        >>> part = UnderLoad.model_construct(p_gains_tested=(8.0, 16.0, 32.0))
+        >>> part = FittedServo.model_construct(p_gains_tested=(8.0, 16.0, 32.0))
         >>> part.how_far_tested(16), part.how_far_tested(20)
         ('P 16 was recorded.', 'P 20 lies between recorded gains, 16 and 32.')
         >>> part.how_far_tested(64)
@@ -150,10 +152,10 @@ class UnderLoad(Part):
 
 _ENDINGS = ("", "_nm", "_nm_s_per_rad", "_kg_m2", "_rad_s", "_rad_s2", "_per_nm")
 LOADED_KEYS = {
-    name: next(name + end for end in _ENDINGS if name + end in UnderLoad.model_fields)
+    name: next(name + end for end in _ENDINGS if name + end in FittedServo.model_fields)
     for name in (f.name for f in fields(LoadedServoParameters) if f.name != "dead_time_s")
 }
-"""Fields of `LoadedServoParameters` and their names in `UnderLoad`."""
+"""Fields of `LoadedServoParameters` and their names in `FittedServo`."""
 
 
 Armature = Literal["servo", "servo and load"]
@@ -434,8 +436,8 @@ class JointCalibration(Part):
     """What the numbers of `actuator` hold for; null in older files, see `holds_at`."""
     actuator: Actuator
     """From command to motion."""
-    under_load: UnderLoad | None = None
-    """The servo at any P gain and load; null where it was recorded at one gain in free air."""
+    servo: FittedServo | None = None
+    """The servo as it was fitted, at any P gain and load; null where `actuator` is all of it."""
     feedback: Feedback
     """From motion to reading."""
     lag: Lag = Lag()
@@ -468,7 +470,7 @@ class JointCalibration(Part):
         """What the numbers of `actuator` hold for; of an older file, as far as it says."""
         if self.operating_point is not None:
             return self.operating_point
-        block = self.under_load
+        block = self.servo
         if block is None:
             return OperatingPoint(armature="servo and load")
         return OperatingPoint(
@@ -477,13 +479,13 @@ class JointCalibration(Part):
 
     def at_p_gain(self, p_gain: float) -> JointCalibration:
         """The same servo at another P gain, the register's value, with stiffness in proportion."""
-        if self.under_load is None:
+        if self.servo is None:
             raise InputError(
                 "This calibration holds at the P gain that it was recorded with. Record several "
                 "gains, or a known load, to predict others."
             )
         refuse_outside("`p_gain`", p_gain, *P_GAINS)
-        share = p_gain / self.under_load.p_gain
+        share = p_gain / self.servo.p_gain
         actuator = self.actuator
         ratios = actuator.ratios_to_armature
         ratio = {"stiffness": ratios.stiffness.scaled(share)}
@@ -494,7 +496,7 @@ class JointCalibration(Part):
         return self.model_copy(
             update={
                 "actuator": actuator.model_copy(update=stiffness),
-                "under_load": self.under_load.model_copy(update={"p_gain": float(p_gain)}),
+                "servo": self.servo.model_copy(update={"p_gain": float(p_gain)}),
                 "operating_point": self.holds_at.at_p_gain(p_gain),
             }
         )

@@ -32,12 +32,12 @@ from pupper_sysid.servo_models.calibration.parts import (
     Actuator,
     Armature,
     Feedback,
+    FittedServo,
     JointCalibration,
     OperatingPoint,
     RatiosToArmature,
     Scale,
     Selection,
-    UnderLoad,
 )
 from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number, Quantity
 from pupper_sysid.servo_models.cards.numbers import (
@@ -267,7 +267,7 @@ class ServoCard(Part):
                     source=f"servo card {self.name} ({self.source.title})",
                 ),
             ),
-            under_load=self._under_load(name),
+            servo=self._under_load(name),
             feedback=Feedback(
                 poll_period_s=_ideal(), loss=_ideal(), offset_rad=_ideal(), mean_age_s=_ideal(),
                 quantum_rad=_ideal(2 * float(np.pi) / counts if counts else 0.0),
@@ -275,7 +275,7 @@ class ServoCard(Part):
             selection=Selection(model=f"card {self.name}"),
         )  # fmt: skip
 
-    def _under_load(self, name: str) -> UnderLoad | None:
+    def _under_load(self, name: str) -> FittedServo | None:
         """The servo at any P gain and load; None where the card states torques at one gain."""
         numbers, gain = self.specimens[name], self.gains.p
         if isinstance(numbers, TorquePD) or gain is None:
@@ -288,7 +288,7 @@ class ServoCard(Part):
             values.setdefault("friction_loss_nm", stated(0.0))
         values["duty_s_per_rad"] = values.get("duty_s_per_rad") or stated(0.0)
         values.pop("dead_time_s", None)
-        return UnderLoad(
+        return FittedServo(
             structure=f"card {self.name}", known_load=True, p_gain=gain, p_gains_tested=(gain,),
             reference_voltage_v=self.supply_v, **values,
         )  # fmt: skip

@@ -137,7 +137,7 @@ def servo_of(path_or_name: str, part: str | None = None, p_gain: float | None = 
     part = part or calibration.joint_names[0]
     joint = calibration.joint(part)
     if p_gain is not None and p_gain != joint.holds_at.p_gain:
-        if joint.under_load is None:
+        if joint.servo is None:
             raise InputError(
                 f"`p_gain`: {path_or_name} holds at {joint.holds_at.gain_text} only, so there are "
                 "no numbers for another. Leave `p_gain` out."
@@ -149,7 +149,7 @@ def servo_of(path_or_name: str, part: str | None = None, p_gain: float | None = 
     if numbers["velocity_limit_rad_s"].value >= NO_SPEED_LIMIT_RAD_S:
         numbers["velocity_limit_rad_s"] = None
     pd = TorquePD(model="delayed_pd", **numbers)
-    any_gain = joint.under_load is not None and point.p_gain is not None
+    any_gain = joint.servo is not None and point.p_gain is not None
     return Servo(name, part, point.p_gain, any_gain, point.armature, None, pd)
 
 

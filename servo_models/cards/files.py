@@ -34,7 +34,7 @@ from pupper_sysid.common.border import Part, read_json, read_own, read_text, rea
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.servo_models.calibration.calibration import Calibration
-from pupper_sysid.servo_models.calibration.parts import LOADED_KEYS, UnderLoad
+from pupper_sysid.servo_models.calibration.parts import LOADED_KEYS, FittedServo
 from pupper_sysid.servo_models.calibration.quantity import NotNegative, Number
 from pupper_sysid.servo_models.cards.card import SCHEMA, SCHEMA_VERSION, Gains, ServoCard, Source
 from pupper_sysid.servo_models.cards.numbers import PositionLoop, stated
@@ -278,7 +278,7 @@ _NOT_IN_BAM = {
 }
 
 
-def motor_of(servo: UnderLoad) -> tuple[dict[str, Any], tuple[str, ...]]:
+def motor_of(servo: FittedServo) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Motor and friction of a servo fitted under load, by the names of Isaac Lab's `BamMotorCfg`.
 
     BAM's friction at standstill decays as exp(-(v / v0)^a), ours as 1 / (1 + (v / v1)^2); v0 is
@@ -326,7 +326,7 @@ def bam_card(calibration: Calibration) -> ServoCard:
     or is not of a servo that BAM knows.
     """
     (name, joint), *others = calibration.joints.items()
-    block = joint.under_load
+    block = joint.servo
     if block is None or not block.known_load:
         raise InputError(
             f"{name} was fitted without a known load: its torques are known only relative to the "
@@ -374,8 +374,8 @@ def bam_card(calibration: Calibration) -> ServoCard:
 def lost_in_bam(calibration: Calibration) -> list[str]:
     """What BAM's models do not have of a servo under load, in sentences."""
     (joint,) = calibration.joints.values()
-    assert joint.under_load is not None
-    return [f"Not represented: {words}." for words in motor_of(joint.under_load)[1]]
+    assert joint.servo is not None
+    return [f"Not represented: {words}." for words in motor_of(joint.servo)[1]]
 
 
 def _frictions(numbers: PositionLoop) -> tuple[str, dict[str, Any]]:

@@ -143,13 +143,13 @@ def step_costs(servos: ExportedServos, commands: NDArray) -> dict[str, list[floa
 
 def _fitted_motion(joint: JointCalibration, commands: NDArray) -> tuple[Array, Array]:
     """Times and positions of the calibration's model, in the steps of its fit."""
-    actuator, loaded = joint.actuator, joint.under_load
+    actuator, loaded = joint.actuator, joint.servo
     step_s, start = actuator.fitted_step_s, np.array(commands[0])
     servo: DelayedPD | LoadedServo = DelayedPD(actuator.parameters, step_s)
     arriving = held(commands, step_s)
     if loaded is not None:
         # this model has no limit on the set-point's speed, which a card states
-        servo = LoadedServo(loaded.servo(0.0), loaded.p_gain, time_step_s=step_s)
+        servo = LoadedServo(loaded.parameters(0.0), loaded.p_gain, time_step_s=step_s)
         line = DelayLine(np.array(actuator.dead_time_s.value), step_s)
         line.reset(start)
         most = actuator.velocity_limit_rad_s.value * step_s
@@ -204,7 +204,7 @@ def _notes(servos: ExportedServos, joints: Mapping[str, JointCheck]) -> Iterator
     costs = {
         name: 1e3 * row.not_carried_rad
         for name, row in joints.items()
-        if servos.calibration.joint(name).under_load is not None
+        if servos.calibration.joint(name).servo is not None
     }
     # without frictions of the load such a servo moves like its actuator, up to rounding
     if loaded := [name for name, cost in costs.items() if cost >= _SEEN_MRAD]:

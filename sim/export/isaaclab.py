@@ -164,12 +164,12 @@ def to_isaaclab_bam(servos: ExportedServos) -> str:
     step_s, stepped, groups = servos.physics_step_s, servos.actuators(), []
     lost: dict[str, list[str]] = {}
     for name, joint in servos.calibration.joints.items():
-        if joint.under_load is None:
+        if joint.servo is None:
             raise InputError(
                 f"{name} was not fitted under load, so its motor's kt and R are unknown; export it "
                 "to isaaclab, or record it with a known load."
             )
-        loaded = joint.under_load
+        loaded = joint.servo
         motor, beyond = motor_of(loaded)
         for words in beyond:
             lost.setdefault(words, []).append(name)

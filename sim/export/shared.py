@@ -198,14 +198,14 @@ class ExportedServos:
         """What of servos that were fitted under load no PD carries."""
         joints: dict[tuple[str, ...], list[str]] = {}
         for name, joint in self.calibration.joints.items():
-            if joint.under_load is not None:
-                servo = joint.under_load.servo(joint.actuator.dead_time_s.value)
+            if joint.servo is not None:
+                servo = joint.servo.parameters(joint.actuator.dead_time_s.value)
                 if lost := servo.beyond_delayed_pd():
                     joints.setdefault(lost, []).append(name)
         for lost, names in joints.items():
             yield (
                 f"Fitted under load, but not represented: {', '.join(lost)} ({', '.join(names)}). "
-                "The friction here is that of one motor torque; `under_load` of the calibration "
+                "The friction here is that of one motor torque; `servo` of the calibration "
                 "has the whole servo."
             )
 

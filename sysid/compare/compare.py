@@ -377,7 +377,7 @@ def _calibrations(
             )
         else:
             calibration, called = load_calibration(model), Path(model).name
-        loaded = any(j.under_load for j in calibration.joints.values())
+        loaded = any(j.servo for j in calibration.joints.values())
         kind = "servo under load" if loaded else "DelayedPD"
         label = f"{kind} ({called})" if called else kind
         if label in calibrations:

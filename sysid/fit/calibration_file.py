@@ -3,7 +3,7 @@
 Free-air positions give ratios to the armature. One torque sets the scale: the stall torque, which
 is the effort limit; so armature = stall torque / (effort limit per inertia), and the rest follows.
 A known load sets the scale itself. A servo recorded under load or at several gains has a block
-`under_load` besides: the servo at any gain and load.
+`servo` besides: the servo at any gain and load.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from pupper_sysid.servo_models.calibration.parts import (
     Actuator,
     CandidateModel,
     Feedback,
+    FittedServo,
     JointCalibration,
     Lag,
     RatiosToArmature,
@@ -41,7 +42,6 @@ from pupper_sysid.servo_models.calibration.parts import (
     Scale,
     Scores,
     Selection,
-    UnderLoad,
 )
 from pupper_sysid.servo_models.calibration.quantity import Quantity, measured, quantity_of
 from pupper_sysid.servo_models.delayed_pd import TIME_STEP_S, DelayedPDParameters, whole_steps
@@ -153,7 +153,7 @@ def _joint(result: JointCalibrationResult, stall: float, source: str) -> JointCa
         block, numbers, undecided = _block(loaded, torque), loaded.numbers, loaded.undecided
     return JointCalibration(
         actuator=actuator,
-        under_load=block,
+        servo=block,
         feedback=_feedback(
             lag, quantity_of(numbers["offset_rad"], why=undecided.get("offset_rad"))
         ),
@@ -308,7 +308,7 @@ def _delay_steps(servo: DelayedPDParameters, dead_time_s: Interval) -> tuple[int
     return whole_steps(low, high, TIME_STEP_S)
 
 
-def _block(loaded: LoadedFit, torque: float) -> UnderLoad:
+def _block(loaded: LoadedFit, torque: float) -> FittedServo:
     """The servo at any gain and load; `torque` makes torques of the fit N·m."""
     factor = dict.fromkeys(
         ("stall_torque", "back_emf", "armature", "friction_loss", "stribeck_friction",
@@ -331,7 +331,7 @@ def _block(loaded: LoadedFit, torque: float) -> UnderLoad:
         )
     volts = loaded.reference_voltage_v
     return measured(
-        UnderLoad,
+        FittedServo,
         structure=loaded.structure,
         known_load=known,
         p_gain=loaded.p_gain,

@@ -847,7 +847,7 @@ def _load_warnings(joint: str, loaded: LoadedFit) -> Iterator[str]:
         yield (
             f"{joint}: simulators' actuators do not carry {', '.join(lost)}; DelayedPD has the "
             f"friction of a motor torque of {loaded.motor_torque_nm:.2g}"
-            f"{' N·m' if loaded.known_load else ' rad/s²'}. `under_load` has the whole servo."
+            f"{' N·m' if loaded.known_load else ' rad/s²'}. `servo` has the whole servo."
         )
     if not loaded.folds:
         yield f"{joint}: one run only, so no structure was tested on unseen motion."

@@ -81,7 +81,7 @@ def with_operating_points(
     joints, notes = {}, list(calibration.notes)
     for name, joint in calibration.joints.items():
         # in free air the stiffness is that of the runs themselves
-        gain = (reference_gain if joint.under_load else gain_of_runs)(trials[name])
+        gain = (reference_gain if joint.servo else gain_of_runs)(trials[name])
         joints[name] = joint.model_copy(
             update={"operating_point": _operating_point(joint, trials[name], gain)}
         )
@@ -98,7 +98,7 @@ def with_operating_points(
 def _operating_point(
     joint: JointCalibration, trials: Sequence[Trial], gain: ReferenceGain
 ) -> OperatingPoint:
-    block = joint.under_load
+    block = joint.servo
     return OperatingPoint(
         p_gain=gain.value,
         p_gain_source=gain.source,

@@ -344,7 +344,7 @@ def notes(
         for joint, joint_runs in runs.items():
             sentences += _torque_off_notes(name, calibration, joint, joint_runs)
             gains = sorted({b.run.p_gain for b in joint_runs if np.isfinite(b.trial.p_gain)})
-            block = calibration.joint(joint).under_load
+            block = calibration.joint(joint).servo
             if block is not None:
                 sentences += [
                     f"{name}, {joint}: {tested}"
@@ -366,7 +366,7 @@ def _torque_off_notes(
     off_s = sum(
         np.count_nonzero(compared.run.torque_on < 0.5) * compared.run.step_s for compared in runs
     )
-    block = calibration.joint(joint).under_load
+    block = calibration.joint(joint).servo
     if not off_s or (block is not None and block.off_brake is not None):
         return []
     return [
@@ -397,13 +397,13 @@ class _Servo:
         dead_time = pd["dead_time_s"]
         slowest = fitted.actuator.velocity_limit_rad_s.value
         limit = slowest if slowest < NO_SPEED_LIMIT_RAD_S else np.inf
-        block = fitted.under_load
+        block = fitted.servo
         if block is not None:
             gravity = block.gravity_nm.value if block.gravity_nm else 0.0
             hanging = block.hanging_rad.value if block.hanging_rad else 0.0
             volts = block.reference_voltage_v or math.nan
             stated = fitted.actuator.dead_time_s.value  # the numbers of a block are the servo's own
-            return cls(block.servo(stated), None, (gravity, hanging), limit, volts)
+            return cls(block.parameters(stated), None, (gravity, hanging), limit, volts)
         stall = min(pd["effort_limit"], _NO_LIMIT_NM)
         parameters = LoadedServoParameters(
             duty_per_rad=pd["stiffness"] / stall,

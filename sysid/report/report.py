@@ -167,7 +167,7 @@ def write_findings(findings: Findings, folder: Path, force: bool = False) -> Wri
 
 def can_recall(joint: JointCalibration) -> bool:
     """Whether the file holds all of a joint's fits: those of servos under load it does not."""
-    return joint.under_load is None and _carried(joint) in {
+    return joint.servo is None and _carried(joint) in {
         candidate.model for candidate in joint.selection.candidate_models
     }
 

@@ -102,6 +102,6 @@ def test_a_servo_calibrated_under_load_goes_to_bam_and_one_in_free_air_is_told_w
     for name in ("kt", "R", "armature", "friction_base", "command_delay", "load_friction_motor"):
         assert of_fit[name] == pytest.approx(of_card[name], rel=1e-6), name
     (name, joint), *_ = calibration.joints.items()
-    free = joint.model_copy(update={"under_load": None})
+    free = joint.model_copy(update={"servo": None})
     with pytest.raises(InputError, match="without a known load"):
         bam_card(calibration.model_copy(update={"joints": {name: free}}))

@@ -136,7 +136,7 @@ def test_every_quantity_of_a_calibration_has_a_unit_and_a_description():
 
 def version_1(path: Path) -> Path:
     """The file at `path` with the keys that it had in version 1."""
-    text = path.read_text().replace("schema_version: 4", "schema_version: 1")
+    text = path.read_text().replace("schema_version: 5", "schema_version: 1")
     for new, old in (
         ("dead_time_s:", "delay_s:"), ("candidate_models:", "ladder:"),
         ("raw_lag_s", "naive_lag_s"), ("rmse_raw_rad", "rmse_naive_rad"),
@@ -151,7 +151,7 @@ def test_a_file_of_version_1_is_read_saved_in_the_present_one_and_its_faults_are
     file, tmp_path
 ):
     loaded = load_calibration(version_1(file))
-    assert loaded.joints == calibration().joints and loaded.schema_version == 4
+    assert loaded.joints == calibration().joints and loaded.schema_version == 5
     loaded.save(tmp_path / "again.yaml")
     assert " delay_s:" not in (tmp_path / "again.yaml").read_text()
     text = file.read_text().replace("delay_s: {value: 0.025,", "delay_s: {value: 25.0,")
@@ -161,16 +161,27 @@ def test_a_file_of_version_1_is_read_saved_in_the_present_one_and_its_faults_are
         load_calibration(file)
 
 
+def test_a_servo_in_a_file_of_version_4_is_read_and_its_faults_are_named_as_in_it(file):
+    card = load_calibration("sts3215-bam-m6")
+    card.save(file, force=True)
+    text = file.read_text().replace("schema_version: 5", "schema_version: 4")
+    file.write_text(text.replace("    servo:", "    under_load:"))
+    assert load_calibration(file).joints == card.joints
+    file.write_text(file.read_text().replace("known_load: true", "known_load: perhaps"))
+    with pytest.raises(InputError, match=r"joints\.\w+\.under_load\.known_load"):
+        load_calibration(file)
+
+
 def test_errors_on_unseen_runs_of_a_version_3_file_have_their_own_names(file, tmp_path):
     """Version 3 had a mean absolute error over left-out runs among the RMS over frequencies."""
     card = load_calibration("sts3215-bam-m6")
-    block = next(iter(card.joints.values())).under_load
+    block = next(iter(card.joints.values())).servo
     assert block is not None
     calibration(LF_hip=joint_calibration(), LF_thigh=joint_calibration()).save(file, force=True)
     data = yaml.safe_load(file.read_text()) | {"schema_version": 3}
     loaded, free = data["joints"].values()
-    for joint, under_load in ((loaded, block.model_dump(mode="json")), (free, None)):
-        joint["under_load"] = under_load
+    for joint, servo in ((loaded, block.model_dump(mode="json")), (free, None)):
+        joint["under_load"], _ = servo, joint.pop("servo")
         for own in (joint["scores"], *joint["selection"]["candidate_models"]):
             own.pop("rmse_unseen_runs_rad", own.pop("mae_unseen_runs_rad", None))
             own["rmse_leave_one_frequency_out_rad"] = 0.012
@@ -188,7 +199,7 @@ def test_errors_on_unseen_runs_of_a_version_3_file_have_their_own_names(file, tm
 
 
 def test_a_damaged_version_3_file_is_refused_like_any_other(file):
-    text = file.read_text().replace("schema_version: 4", "schema_version: 3")
+    text = file.read_text().replace("schema_version: 5", "schema_version: 3")
     head = text[: text.index("\njoints:") + 1]
 
     def read(damage):
@@ -260,9 +271,9 @@ def test_what_is_no_calibration_is_refused_with_what_is_wrong(file, tmp_path):
         (b"a:\n  b: 1\n  b: 2\n", "line 3, a.b stands in the file twice"),
         (b"[" * 1_000_000, "more than 20 levels of nesting"), (head, "schema_version is null"),
         (head + b"schema_version: true\n", "schema_version is True"),
-        (head + b"schema_version: 0\n", "schema_version is 0; this version reads 4"),
-        (head + b"schema_version: 5\nnew: 1\n", "newer version"),
-        (head + b"schema_version: 5\nnew: 1\n", "Upgrade"),
+        (head + b"schema_version: 0\n", "schema_version is 0; this version reads 5"),
+        (head + b"schema_version: 6\nnew: 1\n", "newer version"),
+        (head + b"schema_version: 6\nnew: 1\n", "Upgrade"),
     ]  # fmt: skip
     assert_refused(file, [(content(data), says) for data, says in contents])
     names = [

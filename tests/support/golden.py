@@ -295,10 +295,10 @@ def _calibrate(recordings: Recordings, joint: str) -> Figures:
             "fit_percent": s.fit_percent,
         },
     }  # fmt: skip
-    if own.under_load is not None:
-        found["under_load"] = {
+    if own.servo is not None:
+        found["servo"] = {
             name: _quantity(value) if hasattr(value, "identified") else plain(value)
-            for name, value in own.under_load
+            for name, value in own.servo
             if value is not None and name != "loads_tested"
         }
     found["compare"] = _compare(recordings, joint, result.calibration)

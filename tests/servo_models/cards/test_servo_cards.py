@@ -245,17 +245,17 @@ def test_a_fit_under_load_is_a_card_with_the_parameters_of_the_loaded_servo(tmp_
 def test_a_card_of_a_position_loop_is_a_calibration_at_any_gain_and_load(name):
     card = load_card(name)
     joint = card.calibration().joint("any")
-    assert joint.under_load is not None
+    assert joint.servo is not None
     own, gain = card.loaded()
-    made = joint.under_load.servo(float(own.dead_time_s)).arrays()
+    made = joint.servo.parameters(float(own.dead_time_s)).arrays()
     for field, value in own.arrays().items():
         if field != "stribeck_speed" or made["stribeck_friction"] > 0:
             assert made[field] == pytest.approx(value), field
-    assert joint.under_load.p_gain == gain
+    assert joint.servo.p_gain == gain
     twice = joint.at_p_gain(2 * gain)
     stiffness = twice.actuator.stiffness_nm_per_rad.value
     assert stiffness == pytest.approx(card.pd(p_gain=2 * gain).parameters.stiffness)
-    assert load_card("sts3215-open-duck").calibration().joint("any").under_load is None
+    assert load_card("sts3215-open-duck").calibration().joint("any").servo is None
 
 
 # ----- two servos are compared at one P gain and by one definition of the armature

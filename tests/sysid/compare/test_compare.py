@@ -213,10 +213,10 @@ def model(off_brake: bool):
     """A calibration under load that knows how the servo brakes with the torque off, or not."""
     made = load_card("xl330-m288").calibration()
     joint = made.joint("knee")
-    assert joint.under_load is not None and joint.under_load.off_brake is not None
+    assert joint.servo is not None and joint.servo.off_brake is not None
     if not off_brake:
-        block = joint.under_load.model_copy(update={"off_brake": None})
-        joint = joint.model_copy(update={"under_load": block})
+        block = joint.servo.model_copy(update={"off_brake": None})
+        joint = joint.model_copy(update={"servo": block})
     return made.model_copy(update={"joints": {"knee": joint}})
 
 

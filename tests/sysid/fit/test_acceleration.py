@@ -61,7 +61,7 @@ def recording(
 @pytest.mark.slow
 def test_a_limit_of_the_servo_is_found_in_fast_motion():
     fit = calibrate([recording(CHIRP, LIMIT_RAD_S2, 2), recording(JUMPS, LIMIT_RAD_S2, 2)])
-    limit = fit.calibration.joint("j").under_load.acceleration_limit_rad_s2
+    limit = fit.calibration.joint("j").servo.acceleration_limit_rad_s2
     assert limit.identified == "yes" and limit.value == pytest.approx(LIMIT_RAD_S2, rel=0.05)
     assert limit.low <= LIMIT_RAD_S2 <= limit.high
 
@@ -69,7 +69,7 @@ def test_a_limit_of_the_servo_is_found_in_fast_motion():
 @pytest.mark.slow
 def test_no_limit_is_found_where_there_is_none():
     block = calibrate([recording(CHIRP, np.inf, 3), recording(JUMPS, np.inf, 3)])
-    block = block.calibration.joint("j").under_load
+    block = block.calibration.joint("j").servo
     assert block is None or block.acceleration_limit_rad_s2 is None
 
 

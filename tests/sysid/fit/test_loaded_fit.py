@@ -9,7 +9,7 @@ import pytest
 
 from pupper_sysid.common.errors import InputError
 from pupper_sysid.servo_models.calibration.calibration import Calibration, load_calibration
-from pupper_sysid.servo_models.calibration.parts import RecordedLoad, UnderLoad
+from pupper_sysid.servo_models.calibration.parts import FittedServo, RecordedLoad
 from pupper_sysid.servo_models.calibration.quantity import Quantity
 from pupper_sysid.servo_models.loaded_servo import Load, LoadedServo, LoadedServoParameters
 from pupper_sysid.sysid.compare.compare import compare
@@ -81,13 +81,13 @@ def calibration(gains: tuple[float, ...] = (8.0, 32.0)) -> Calibration:
             "numbers_in": "continuous time",
         }
     )
-    block = UnderLoad(
+    block = FittedServo(
         structure="base", known_load=True, p_gain=16.0, p_gains_tested=gains,
         loads_tested=(RecordedLoad(inertia_kg_m2=0.006, gravity_nm=0.47),),
         duty_per_rad=known(0.06), stall_torque_nm=known(2.0), back_emf_nm_s_per_rad=known(0.28),
         armature_kg_m2=known(0.012), friction_loss_nm=known(0.08), off_brake=known(0.3),
     )  # fmt: skip
-    own = joint.model_copy(update={"actuator": actuator, "under_load": block})
+    own = joint.model_copy(update={"actuator": actuator, "servo": block})
     return preset.model_copy(update={"joints": {"knee": own}})
 
 
@@ -100,7 +100,7 @@ def test_a_known_load_gives_numbers_in_newton_metres_and_left_out_runs_have_erro
     recordings = [short(recording(8.0)), short(recording(32.0, 3))]
     fit = calibrate(recordings)
     result, joint = fit["knee"], fit.calibration.joint("knee")
-    block = joint.under_load
+    block = joint.servo
     assert block is not None
     for quantity, truth in (
         (block.stall_torque_nm, TRUE.stall_torque), (block.armature_kg_m2, TRUE.armature),
@@ -135,7 +135,7 @@ def test_a_calibration_predicts_a_gain_it_has_not_seen_and_one_of_a_single_gain_
 ):
     known = calibration()
     alone = known.model_copy(
-        update={"joints": {"knee": known.joint("knee").model_copy(update={"under_load": None})}}
+        update={"joints": {"knee": known.joint("knee").model_copy(update={"servo": None})}}
     )
     known.save(tmp_path / "any.yaml")
     alone.save(tmp_path / "one.yaml")
@@ -184,13 +184,13 @@ def test_runs_of_several_rates_have_no_linear_filter_and_a_note_says_why(tmp_pat
 def test_the_file_keeps_the_servo_under_load(tmp_path: Path):
     calibration().save(tmp_path / "knee.yaml")
     read = load_calibration(tmp_path / "knee.yaml").joint("knee")
-    assert read.under_load is not None
-    assert read.under_load.servo(0.014) == TRUE
+    assert read.servo is not None
+    assert read.servo.parameters(0.014) == TRUE
     at_32 = read.at_p_gain(32.0)
     assert at_32.actuator.stiffness_nm_per_rad.value == pytest.approx(0.06 * 32 * 2.0)
-    assert at_32.under_load is not None and at_32.under_load.p_gain == 32.0
+    assert at_32.servo is not None and at_32.servo.p_gain == 32.0
     low, high = read.actuator.stiffness_nm_per_rad.low, at_32.actuator.stiffness_nm_per_rad.low
-    assert high / low == pytest.approx(32.0 / read.under_load.p_gain)
+    assert high / low == pytest.approx(32.0 / read.servo.p_gain)
     with pytest.raises(InputError, match="p_gain"):
         read.at_p_gain(0.0)
 

@@ -85,7 +85,7 @@ def test_the_table_the_file_and_a_card_state_them_too(tmp_path):
 
 def test_in_free_air_the_gain_is_that_of_the_runs_and_the_armature_holds_the_link():
     made = calibration()
-    joint = made.joint("knee").model_copy(update={"under_load": None})
+    joint = made.joint("knee").model_copy(update={"servo": None})
     made = made.model_copy(update={"joints": {"knee": joint}})
     made = with_operating_points(made, {"knee": [trial(16.0, p_gain=32)]})
     point = made.joint("knee").holds_at
