@@ -71,6 +71,7 @@ MOST_CELLS = 40_000_000
 MOST_COMMENTS = 10_000
 LONGEST_CELL = 100_000
 LONGEST_COMMENT = 1_000_000
+LONGEST_NAME = 1_000
 
 # from 3.1 on, pandas rounds as Python does and deprecates the argument
 _OLD_PANDAS = tuple(map(int, pd.__version__.split(".")[:2])) < (3, 1)
@@ -204,6 +205,8 @@ def _opening(
     refuse_more(path, line.count(",") + 1, MOST_COLUMNS, "columns", _SPLIT)
     names = [name.strip() for name in (_cells(path, n, line) if columns is None else columns)]
     refuse_more(path, len(names), MOST_COLUMNS, "columns", _SPLIT)
+    longest = max(map(len, names), default=0)
+    refuse_more(f"{path}: the name of a column", longest, LONGEST_NAME, "characters")
     distinct(f"{path}, line {n}" if columns is None else f"{path}, its columns", names)
     if columns is not None:
         return CsvTable(names, comments=comments), n, at

@@ -86,7 +86,7 @@ _MARKS = (  # around numbers, what to put in their place, and where they must be
     (re.compile("[│┃]"), "|", _IN_TEXT),
     (re.compile("[\u2500-\u257f]"), "-", _IN_TEXT),  # lines around cells
     (re.compile(r"^[ \t|+:]*[-=]{3}[-=+ |:\t]*$", re.MULTILINE), "", _IN_TEXT),  # below names
-    (re.compile(r"^[ \t]*\|[ \t]*|[ \t]*\|[ \t]*$", re.MULTILINE), "", _IN_EACH),  # around rows
+    (re.compile(r"^[ \t]*\|[ \t]*|(?<![ \t])[ \t]*\|[ \t]*$", re.MULTILINE), "", _IN_EACH),
     (re.compile(r"\x1b\[[\d;]*m"), "", _IN_TEXT),  # colours of a terminal
     (_NUMPY := re.compile(r"\bnp\.\w+\(([-+.\w]+)\)"), r"\1", _IN_ROWS),
     (re.compile(r"\b(?:tensor|array)\((?:'\w', ?)?(\[[^\]\n]*\])[^()\n]{0,80}\)"), r"\1", _IN_ROWS),
@@ -107,11 +107,11 @@ _UNIT = re.compile(rf"[(\[<{{]?\s*({_UNITS}|raw|-|1|none)\s*[)\]>}}]?", re.IGNOR
 _ANGLE_UNIT = re.compile(r"rad(ians?)?|deg(rees?)?|°|turns?|rev|counts?|ticks?", re.IGNORECASE)
 _WITH_UNIT = re.compile(rf"([-+]?[\d.,]+(?:[eE][-+]?\d+)?) ?({_UNITS})", re.IGNORECASE)
 _NAMED_LIST = re.compile(
-    r"([A-Za-z_][\w./]*)(?:\s*[:=]\s*[\[(]|(?<=\w\w) +\[)\s*([-+.\deE,; \t]+?)\s*[\])]"
+    r"(?<![\w./])[./]*([A-Za-z_][\w./]*)(?:\s*[:=]\s*[\[(]|(?<=\w\w) +\[)([-+.\deE,; \t]+)[\])]"
 )
 _PAIR, _LONG_PAIR = (  # with names of a word, or of two
     re.compile(
-        rf"(?<![\w\"'])[\"']?([A-Za-z_][\w./]*{more})[\"']?\s*[:=]\s*"
+        rf"(?<![\w\"'./])[\"']?[./]*([A-Za-z_][\w./]*{more})[\"']?\s*[:=]\s*"
         rf"([-+]?[\d.]+(?:[eE][-+]?\d+)?)(?: ?({_UNITS})(?!\s*[:=]))?(?![\w:])",
         re.IGNORECASE,
     )
@@ -134,11 +134,11 @@ _BRACKETED = re.compile(
     re.MULTILINE,
 )
 _LONG_LIST = re.compile(  # NumPy ends lines within long ones
-    r'((?:"\[[^"\]]*\]"[^"\n]*)*"\[[^"\]]*\n[^"\]]*\]"(?:[^"\n]*"\[[^"\]]*\]")*)([^\n]*)'
+    r'^((?:[^"\n]++|"(?!\[)|"\[[^"\]]*+\]")*"\[[^"\]\n]*+\n[^"\]]*+\]")([^\n]*)', re.MULTILINE
 )
 _BRACKETS = re.compile(r"[\[\]()]")
 _HEX_CELL = re.compile(r"([0-9a-f]{2,8})(h?)", re.IGNORECASE)
-_DOUBLED = re.compile(r"([+-]?\d+),(\d+)(,|$)", re.MULTILINE)  # 0,1,0,2 of decimal commas
+_DOUBLED = re.compile(r"(?<!\d)([+-]?\d+),(\d+)(,|$)", re.MULTILINE)  # 0,1,0,2 of decimal commas
 _CELL = r"(?:^|(?<=[;\t])) ?{} ?(?=[;\t]|$)"  # of a table that commas do not separate
 _MARKED = re.compile(_CELL.format(r"([+-]?\d+)([.,])(\d+(?:[eE][+-]?\d+)?)"), re.MULTILINE)
 _NEGATIVE = re.compile(_CELL.format(r"\((\d+(?:[.,]\d+)?)\)"), re.MULTILINE)
@@ -147,7 +147,7 @@ _TELEPLOT = re.compile(
     re.IGNORECASE | re.MULTILINE,
 )
 _INFLUX = re.compile(
-    r"^[\w.-]+((?:,[\w.-]+=[\w.-]+)*) ([^ \n]+=[^ \n]+) (\d{10,19})$", re.MULTILINE
+    r"^[\w.-]+((?:,[\w.-]+=[\w.-]+)*) ([^ =\n]+=[^ \n]+) (\d{10,19})$", re.MULTILINE
 )
 _LIST = re.compile(r'"?[\[(]\s*([-+.\d][-+.\deE,;\s]*?)\s*[\])]"?')
 
@@ -418,7 +418,10 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
         if columns is not None:
             notes.append("the names of its columns were taken from a comment")
     spaced = shape.separator == " "
-    while columns and not spaced and len(before) > 1 and len({*columns, ""}) <= len(columns):
+    whole = columns is not None and len(columns) == shape.columns
+    while (
+        columns and whole and not spaced and len(before) > 1 and len({*columns, ""}) <= len(columns)
+    ):
         above = _names(lines[before[-2]], shape)  # names in several lines, as of groups
         if above is None or len(above) != shape.columns:
             break
@@ -426,7 +429,7 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
             above[k] = above[k] or above[k - 1]
         columns = [f"{a}.{b}".strip(".") for a, b in zip(above, columns, strict=True)]
         lines[before.pop(-2)] = ""
-    if columns and len(columns) == shape.columns:
+    if columns and whole:
         above = (_units_above(line, shape) for line in lines[:first])
         units = units or next(filter(None, above), [])
         columns = _once(columns, [_split(row, shape.separator) for row in lines[first:]])

@@ -206,7 +206,8 @@ def _with_named(units: str, by_name: list[str]) -> str:
 def _words(unit: str) -> str:
     name, _, turn = unit.partition(":")
     if name != "counts":
-        return {"deg": "degrees", "rad": "radians"}.get(name, name)
+        words = {"deg": "degrees", "rad": "radians", "scale": "values in parts of a degree"}
+        return words.get(name, name)
     counts, _, zero = turn.partition(":")
     return f"counts of an encoder with {counts} a turn" + (", 0 rad at count 0" if zero else "")
 

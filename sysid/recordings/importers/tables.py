@@ -54,7 +54,7 @@ _TONES = ("frequency_hz", "freq_hz", "frequency", "freq")
 SERIES = ("name", "signal", "event", "type", "kind", "variable", "topic", "field", "series",
            "metric", "key", "channel", "_field", "_measurement", "op", "operation", "direction",
            "dir", "param", "parameter", "quantity", "label", "source", "item",
-           "register")  # fmt: skip
+           "register", "what", "tag", "var", "msg_type")  # fmt: skip
 _VALUES = ("value", "values", "val", "_value", "data")
 GROUPS = ("leg", "limb", "arm", "side", "joint", "joint_name", "motor", "motor_name", "servo",
            "servo_name", "actuator", "name", "axis", "dof", "motor_idx", "motor_id", "motor_index",
@@ -309,8 +309,9 @@ def _of_two(
 ) -> tuple[NDArray[np.float64], float]:
     """Times in seconds and what is below one in a column of its own, as stamps of ROS have them."""
     values, below = table.numbers(path, name), table.numbers(path, rest)
-    zero = float(np.nanmin(values))
-    part = 1e-3 if rest.lower().endswith("ms") else 1e-6 if np.nanmax(below) < 1e6 else 1e-9
+    zero = float(table.known(name).min())
+    small = table.known(rest).max() < 1e6
+    part = 1e-3 if rest.lower().endswith("ms") else 1e-6 if small else 1e-9
     return values - zero + part * below, zero
 
 
@@ -411,8 +412,8 @@ def _joint(
     number, shifted = times.one_after_another(stamp, trial)
     if trial is None and number.max(initial=0) > 0:
         warnings.append(
-            f"its times start again ({number.max():g} ×): each run of rows was taken for a trial "
-            "of the same joint."
+            f"its times start again or jump on by more than an hour ({number.max():g} ×): each run "
+            "of rows was taken for a trial of the same joint."
         )
     if sent is not None:
         send, read, doubt = times.sent_at(sent, stamp) + (shifted - stamp), shifted, 0.0
@@ -426,8 +427,8 @@ def _joint(
             "that rate, and are in doubt by half a turn."
         )
     metadata["bus"]["read_time_doubt_s"] = max(doubt, metadata["bus"].get("read_time_doubt_s", 0.0))
-    apart = float(np.clip(np.nanmedian(read - send), -1, 1)) if len(send) else 0.0
-    metadata["read_after_send_s"] = apart
+    apart = (read - send)[np.isfinite(read - send)]
+    metadata["read_after_send_s"] = float(np.clip(np.median(apart), -1, 1)) if len(apart) else 0.0
     used = {"command": pair.command.name, "position": pair.position.name}
     metadata.setdefault("columns", {})[names[1]] = used
     commands = table.numbers(path, pair.command.name)[of_joint]

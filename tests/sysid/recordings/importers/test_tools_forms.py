@@ -340,6 +340,7 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
                        "joint"),
     "French degrees": (each("{t};{c!r};{p!r}", DEGREES, "temps;consigne (degrés);mesure (degrés)"),
                        "joint"),
+    "Russian": ("время,задание,положение\n" + CSV, "joint"),
     "Spanish degrees": (each("{t};{c!r};{p!r}", DEGREES, "Tiempo (s);Ángulo deseado (°);Ángulo "
                              "medido (°)").encode("cp1252"), "joint"),
     "Dutch degrees": (each("{t};{c!r};{p!r}", DEGREES, "tijd;gewenste hoek (graden);gemeten hoek "
@@ -424,7 +425,6 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
     "JSON without names": (json.dumps(LOG), "--time 0 --command 1 --position 2"),
     "names that say nothing": ("Var1,Var2,Var3\n" + CSV, "--time Var1 --command Var2"),
     "two angles": ("t,angle_in,angle_out\n" + CSV, "--command angle_in --position angle_out"),
-    "Russian": ("время,задание,положение\n" + CSV, "--time 'время' --command 'задание'"),
     "a clock without names": (each("2026-05-04 12:30:{t:06.3f}\t{c}\t{p}"), "--time time_of_day"),
     "Dynamixel's example": (each("[ID:001] GoalPos:{c:03d}  PresPos:{p:03d}", COUNTS),
                             "--rate 50 --unit counts:4096 --command GoalPos"),
