@@ -83,6 +83,7 @@ _NOTHING = re.compile(
     r"[\W_]*(\d\.#([qs]?nan|ind)\d*|nan(\(\w+\))?|none|null|nil|n\.?/?a|div/0|num|value|ref|missing|"
     r"invalid|lost|failed|err|error|timeout)?[\W_]*"
 )
+_REMARKS = ("comment", "comments", "remark", "remarks", "note", "notes", "message")
 _LONGEST_WORD = 30
 """Words for a reading that failed."""
 _COMMENT = re.compile(r"^#.*$", re.MULTILINE)
@@ -287,6 +288,10 @@ class _Blocks:
             remarks = [n for n, row in rows.items()
                        if not any(is_decimal(cell) or is_clock(cell) for cell in row)]  # fmt: skip
             rows = self._without(rows, remarks, len(rows) - 1)
+            most = len(table.columns)
+            if table.columns[-1].lower() in _REMARKS:  # with commas in them
+                rows = {n: [*row[: most - 1], ",".join(row[most - 1 :])] if len(row) > most else row
+                        for n, row in rows.items()}  # fmt: skip
         if last and rows and len(rows[max(rows)]) < len(table.columns):
             table.cut = True
             rows.popitem()

@@ -33,6 +33,7 @@ _MANY_REPEATED = 0.1  # of the rows
 _SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
 _LATEST_S = 1e11
 _FASTEST_HZ = 20_000.0  # loop of a servo
+_SMALL_RAD = 0.1
 _MANY_ROWS = 5  # that lie apart from the others
 _FEW_TRIALS = 10  # that are named one by one
 
@@ -164,6 +165,8 @@ def _refuse_degrees(
             f"{path}, column {place}: values reach {largest:.4g} rad, more than a hundred turns. "
             "Say the unit (such as deg, turns or counts:8192:0), or take the start's angle off."
         )
+    reach = table[column].abs().groupby(table["joint"]).max()
+    others = [str(j) for j, most in reach.items() if _SMALL_RAD < most <= LARGEST_RAD]
     angles = table.loc[table["joint"] == joint, ["command_rad", "position_rad"]].to_numpy(float)
     units = likely_of_pair(*(values[np.isfinite(values)] for values in angles.T))
     if units == ["deg"] and str(source).endswith(".pos") and largest <= 100:
@@ -187,6 +190,12 @@ def _refuse_degrees(
     raise InputError(
         f"{text}, or convert the log with {lines} (or turns, counts:4096, scale:…; rad if the "
         "joint turns so far)."
+        + (
+            f" If {', '.join(others)[:200]} are in radians as they are, give `units: {{{joint}: "
+            f"'{units[0]}'}}` in a mapping file instead."
+            if others
+            else ""
+        )
     )
 
 
@@ -199,7 +208,8 @@ def _units_by_name(columns: Any) -> list[str]:
 def _with_named(units: str, by_name: list[str]) -> str:
     """The units of an option, with those that the names of columns say in their place."""
     command, _, position = units.partition(",")
-    pair = [own or text for own, text in zip(by_name, (command, position or command), strict=True)]
+    pair = [text if named in ("", "rad") else named
+            for named, text in zip(by_name, (command, position or command), strict=True)]  # fmt: skip
     return ",".join(dict.fromkeys(pair)) if any(by_name) else units
 
 

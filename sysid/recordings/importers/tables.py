@@ -13,7 +13,7 @@ may hold one value.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -44,7 +44,13 @@ from pupper_sysid.sysid.recordings.importers.log import (
     joint_names,
     rows,
 )
-from pupper_sysid.sysid.recordings.importers.options import MOVES_ALIKE, LogOptions, Unit, unit
+from pupper_sysid.sysid.recordings.importers.options import (
+    MOVES_ALIKE,
+    LogOptions,
+    Unit,
+    smallest_step,
+    unit,
+)
 from pupper_sysid.sysid.recordings.importers.pairs import SOLE, Pair, column_named, pairs
 
 LAYOUT = "table"
@@ -69,6 +75,10 @@ _SENT = frozenset(
     "command commands commanded cmd cmds goal target send sent tx action write written".split()
 )
 """Words of a time at which a command was sent."""
+_ACTIONS = frozenset(("action", "actions"))
+_ACTS_ALIKE = 1.7  # factor by which a joint may move more or less than its action
+_ACTION_SCALES = (0.1, 0.2, 0.25, 0.3, 0.5, 2.0, 3.0)
+_COUNTS_DEG, _SAME_STEP = (360 / 1024, 300 / 1024, 360 / 4096, 360 / 16384), 3e-3
 _MOST_GROUPS = 1000
 _TOGETHER = 0.2  # share of the rows with a command or position that have both
 _FEWEST_ROWS = 3  # of a joint in a table with a row per joint
@@ -160,6 +170,10 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
                              joints[joint][0], (joint, name), metadata)  # fmt: skip
         parts.append(part)
         notes += [text for text in texts if text not in notes]
+    if options.unit is None and all(
+        joints[j][1].command.words <= _ACTIONS and not joints[j][1].command.unit for j in theirs
+    ):
+        _refuse_raw_actions(path, options, parts)
     return Log(pd.concat(parts, ignore_index=True), metadata, notes)
 
 
@@ -181,6 +195,36 @@ def _refuse_some_without_unit(
             f"(`units: {{{joint}: '{example}'}}`), or leave {joint} out: "
             f"{refusals.import_line(path, joints=','.join(others))}."
         )
+
+
+def _refuse_raw_actions(
+    path: Path | str, options: LogOptions, parts: Sequence[pd.DataFrame]
+) -> None:
+    """Refuse a policy's actions from which set-points are still to be made.
+
+    A joint's set-point is its default angle and a share, the same for all, of its action.
+    """
+    factors = []
+    for part in parts:
+        ranges = [_spread(part[f"{kind}_rad"].to_numpy(float)) for kind in ("position", "command")]
+        factors += [ranges[0] / ranges[1]] if min(ranges) > 0 else []
+    factor = float(np.median(factors)) if factors else 1.0
+    if not 1 / _ACTS_ALIKE < factor < _ACTS_ALIKE:
+        usual = min(_ACTION_SCALES, key=lambda scale: abs(np.log(scale / factor)))
+        raw, angles = (refusals.import_line(path, **(options.words | {"unit": text}))
+                       for text in (f"scale:{usual:g},rad", "rad"))  # fmt: skip
+        raise InputError(
+            f"{path}: its joints move {factor:.2g} times as far as its actions, so these seem to be "
+            "a policy's own, which a default angle and a scale turn into set-points. Log the "
+            f"set-points, or give your action_scale in place of {usual:g}: {raw}; or, if they are "
+            f"set-points: {angles}."
+        )
+
+
+def _spread(values: NDArray[np.float64]) -> float:
+    """Range of all but the outermost values; 0 without any."""
+    known = values[np.isfinite(values)]
+    return float(np.ptp(np.quantile(known, (0.05, 0.95)))) if len(known) else 0.0
 
 
 def is_flag(name: str) -> tuple[str, bool] | None:
@@ -298,6 +342,10 @@ def _seconds(
     lower = {n.lower(): n for n in table.columns}
     match = re.fullmatch(r"(.*?)(?:secs?|seconds?)", name.lower())
     rest = [lower[n] for end in _SUBSECONDS if match and (n := match[1] + end) in lower]
+    below = table.first(_MILLISECONDS)
+    whole = below not in (None, name) and not (values % 1).any() and not np.diff(values).all()
+    if below and whole and 0 <= table.known(below).min() <= table.known(below).max() < 1000:
+        rest = rest or [below]
     if rest:
         return *_of_two(path, table, name, rest[0]), []
     clock = times.clock(name, values, table.tick_s)
@@ -311,7 +359,7 @@ def _of_two(
     values, below = table.numbers(path, name), table.numbers(path, rest)
     zero = float(table.known(name).min())
     small = table.known(rest).max() < 1e6
-    part = 1e-3 if rest.lower().endswith("ms") else 1e-6 if small else 1e-9
+    part = 1e-3 if rest.lower() in _MILLISECONDS or rest.lower().endswith("ms") else 1e-6 if small else 1e-9
     return values - zero + part * below, zero
 
 
@@ -484,14 +532,26 @@ def _joint(
 def _one_unit(
     pair: Pair, commands: NDArray[np.float64], positions: NDArray[np.float64]
 ) -> tuple[Pair, list[str]]:
-    """The pair, one of which names a unit, with that for the other where both move as far by it."""
+    """The pair, one of which names a unit, with that for the other where both move as far by it.
+
+    Where none does, the step of the readings may be a count of an encoder in degrees.
+    """
     units = pair.command.unit, pair.position.unit
+    ranges = _spread(commands), _spread(positions)
+    alike = min(ranges) > 0 and 1 / MOVES_ALIKE < ranges[0] / ranges[1] < MOVES_ALIKE
+    step = smallest_step(positions) if alike and not any(units) else 0.0
+    if any(abs(step / count - 1) < _SAME_STEP for count in _COUNTS_DEG):
+        both = Pair(replace(pair.command, unit="deg"), replace(pair.position, unit="deg"))
+        return both, [
+            f"{pair.position.name} names no unit, and was taken as deg, since its readings are "
+            f"{step:.3g} apart: a count of an encoder in degrees. If that is wrong, give "
+            "`unit='rad'`."
+        ]
     if bool(units[0]) == bool(units[1]) or set(units) & {"rad", *_LACKING}:
         return pair, []
     if "counts" in units and any((v[np.isfinite(v)] % 1 != 0).any() for v in (commands, positions)):
         return pair, []
-    ranges = [float(np.ptp(np.nanquantile(v, (0.05, 0.95)))) for v in (commands, positions)]
-    if not min(ranges) > 0 or not 1 / MOVES_ALIKE < ranges[0] / ranges[1] < MOVES_ALIKE:
+    if not alike:
         return pair, []
     word = units[0] or units[1]
     both = Pair(replace(pair.command, unit=word), replace(pair.position, unit=word))
