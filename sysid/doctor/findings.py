@@ -42,7 +42,7 @@ def rivalled(finding: Finding, rival: str) -> Finding:
 
 WORDS: dict[str, str] = {
     "angle_wrapped": (
-        "readings jump by about a turn {times} times within a row, the first time at "
+        "angles jump by about a turn {times} times within a row, the first time at "
         "{time_s:.2f} s: an angle wrapped at ±π or at the encoder's end. Unwrap it "
         "(numpy.unwrap), or mount the horn so that the range is not crossed."
     ),
@@ -141,7 +141,7 @@ WORDS: dict[str, str] = {
         "part, or record again when it has cooled."
     ),
     "gaps": (
-        "{percent:.0f} % of the recorded time lies in gaps of up to {longest_s:.2g} s between "
+        "{percent:.0f} % of the recorded time lies in gaps of up to {longest_s:,.1f} s between "
         "rows, where the motion is unknown. Give each stretch its own trial number, or record "
         "again."
     ),
@@ -305,6 +305,11 @@ WORDS: dict[str, str] = {
     "some_missing": (
         "{percent:.0f} % of the readings are missing; the rest is used. Check the plugs before "
         "the next recording."
+    ),
+    "speed_for_command": (
+        "the position moves as the sum of the commands ({percent:.0f} %), and not as they do: they "
+        "are speeds, duty cycles or changes of the goal. A position servo's log needs its goals; of "
+        "changes they are the sum (numpy.cumsum)."
     ),
     "speed_for_position": (
         "the position moves as the joint's speed does: its integral follows the command "

@@ -45,6 +45,7 @@ _FASTEST_RAD_S, _WRAP_RAD, _UNUSUAL = 20.0, 0.5, 8.0  # a good servo of this siz
 _HELD = 0.4  # of the command's range, to and fro
 _SAME_TONE_HZ = 0.02
 _DIFFERENT = 0.35  # of the gain
+_NEAR_TURN = 0.5  # of a command's jump
 _SPEED_LEFT, _SPEED_BETTER, _SPEED_GAIN = 0.12, 0.35, 0.55  # the last of the logarithm
 
 
@@ -260,6 +261,11 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
 
     The readings beyond the jump are put back, shifted or mirrored, whichever the command explains.
     """
+    for t in trials:
+        turned = np.flatnonzero(np.abs(np.abs(np.diff(t.command_rad)) - 2 * np.pi) < _NEAR_TURN)
+        if len(turned):
+            when = float(t.send_time_s[turned[0] + 1] - trials[0].send_time_s[0])
+            return [Finding("angle_wrapped", REFUSE, {"times": len(turned), "time_s": when})]
     jumps = [_jumps(t, step) for t in trials]
     sizes = np.concatenate([np.abs(size) for size, _ in jumps])
     if not len(sizes):
@@ -335,29 +341,52 @@ def _unexplained(trials: Sequence[Trial], step: float) -> float:
 
 
 def speed_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
-    """A column that holds the joint's speed: its integral follows the command, and it does not."""
+    """A column that holds a speed: its integral goes with the other column, and it does not.
+
+    A position may hold the joint's speed; a command may be one, a duty cycle, or a change of the
+    goal.
+    """
     plain = _unexplained(trials, step)
-    summed = [_summed(t) for t in trials if np.isfinite(t.position_rad).sum() > 8]
-    other = explain(summed, 0.0) if plain > _SPEED_LEFT and summed else None
-    if other is None:
+    read = [t for t in trials if np.isfinite(t.position_rad).sum() > 8]
+    if plain <= _SPEED_LEFT or not read:
         return []
-    servo = other.best(1.0, other.causal())
-    if servo.unexplained > min(_SPEED_LEFT, _SPEED_BETTER * plain):
-        return []
-    if abs(np.log(max(servo.gain, 1e-9))) > _SPEED_GAIN:
-        return []
-    return [Finding("speed_for_position", REFUSE, {"percent": 100 * (1 - servo.unexplained)})]
+    for code, summed in (("speed_for_position", _position_summed),
+                         ("speed_for_command", _command_summed)):  # fmt: skip
+        other = explain([summed(t) for t in read], 0.0)
+        servo = other.best(1.0, other.causal()) if other else None
+        if servo is None or servo.unexplained > min(_SPEED_LEFT, _SPEED_BETTER * plain):
+            continue
+        # of commands the factor is the drive's
+        if code == "speed_for_command" or abs(np.log(max(servo.gain, 1e-9))) <= _SPEED_GAIN:
+            return [Finding(code, REFUSE, {"percent": 100 * (1 - servo.unexplained)})]
+    return []
 
 
-def _summed(trial: Trial) -> Trial:
+def _position_summed(trial: Trial) -> Trial:
     """The trial with the integral of its position, without the line that a constant leaves."""
     seen = np.isfinite(trial.position_rad)
     time, value = trial.read_time_s[seen], trial.position_rad[seen]
-    total = np.concatenate([[0.0], np.cumsum(np.diff(time) * 0.5 * (value[1:] + value[:-1]))])
-    line = np.column_stack([np.ones_like(time), time - time[0]])
     position = np.full(len(seen), np.nan)
-    position[seen] = total - line @ least_squares(line, total)
+    position[seen] = _level(time, np.cumsum(np.gradient(time) * value))
     return replace(trial, position_rad=position, position_count=None)
+
+
+def _command_summed(trial: Trial) -> Trial:
+    """The trial with the integral of its command; both without the line that a constant leaves."""
+    seen, sent = np.isfinite(trial.position_rad), trial.send_time_s
+    total = np.concatenate([[0.0], np.cumsum(np.diff(sent) * trial.command_rad[:-1])])
+    command, position = _level(sent, total), trial.position_rad.copy()
+    position[seen] = _level(trial.read_time_s[seen], position[seen])
+    return replace(
+        trial, command_rad=command, position_rad=position, position_count=None,
+        initial_command_rad=float(command[0]),
+    )  # fmt: skip
+
+
+def _level(time: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values without their straight line."""
+    line = np.column_stack([np.ones_like(time), time - time[0]])
+    return values - line @ least_squares(line, values)
 
 
 # ----- what comes on top of a servo that follows

@@ -66,12 +66,15 @@ _PULSES = re.compile(
 )  # what a hobby servo is commanded by
 _PULSES_US, _OF_PULSES = (400.0, 2700.0), "counts:4000:1500"  # 2,000 µs for half a turn
 _QUANTITIES = {  # words of a command that is no place, and what to do
-    "changes of the goal: add them up (numpy.cumsum) to a column of goals":
-        re.compile(r"delta|diff|incr|relative|(?<![a-z])rel(?![a-z])", re.IGNORECASE),
-    "a speed, so that this is no log of a position servo":
-        re.compile(r"vel|speed|rpm|omega|dq|qd|(?:rad|deg|°)[_/ ]?s(?![a-z])|dps", re.IGNORECASE),
-    "a torque or current, so that this is no log of a position servo":
-        re.compile(r"torque|effort|current|(?<![a-z])(?:nm|iq|tau)(?![a-z])", re.IGNORECASE),
+    "changes of the goal: add them up (numpy.cumsum) to a column of goals": re.compile(
+        r"delta|diff|incr|relative|(?<![a-z])rel(?![a-z])", re.IGNORECASE
+    ),
+    "a speed, so that this is no log of a position servo": re.compile(
+        r"vel|speed|rpm|omega|dq|qd|(?:rad|deg|°)[_/ ]?s(?![a-z])|dps", re.IGNORECASE
+    ),
+    "a torque or current, so that this is no log of a position servo": re.compile(
+        r"torque|effort|current|(?<![a-z])(?:nm|iq|tau)(?![a-z])", re.IGNORECASE
+    ),
 }
 _ERROR = re.compile(r"(.*[_. ])?(err|error|deviation)([_. ].*)?", re.IGNORECASE)
 _IS_RATE = 0.95  # correlation of a column with another one summed up

@@ -44,13 +44,7 @@ from pupper_sysid.sysid.recordings.importers.log import (
     joint_names,
     rows,
 )
-from pupper_sysid.sysid.recordings.importers.options import (
-    MOVES_ALIKE,
-    LogOptions,
-    Unit,
-    smallest_step,
-    unit,
-)
+from pupper_sysid.sysid.recordings.importers.options import MOVES_ALIKE, LogOptions, Unit, unit
 from pupper_sysid.sysid.recordings.importers.pairs import SOLE, Pair, column_named, pairs
 
 LAYOUT = "table"
@@ -78,7 +72,6 @@ _SENT = frozenset(
 _ACTIONS = frozenset(("action", "actions"))
 _ACTS_ALIKE = 1.7  # factor by which a joint may move more or less than its action
 _ACTION_SCALES = (0.1, 0.2, 0.25, 0.3, 0.5, 2.0, 3.0)
-_COUNTS_DEG, _SAME_STEP = (360 / 1024, 300 / 1024, 360 / 4096, 360 / 16384), 3e-3
 _MOST_GROUPS = 1000
 _TOGETHER = 0.2  # share of the rows with a command or position that have both
 _FEWEST_ROWS = 3  # of a joint in a table with a row per joint
@@ -359,7 +352,13 @@ def _of_two(
     values, below = table.numbers(path, name), table.numbers(path, rest)
     zero = float(table.known(name).min())
     small = table.known(rest).max() < 1e6
-    part = 1e-3 if rest.lower() in _MILLISECONDS or rest.lower().endswith("ms") else 1e-6 if small else 1e-9
+    part = (
+        1e-3
+        if rest.lower() in _MILLISECONDS or rest.lower().endswith("ms")
+        else 1e-6
+        if small
+        else 1e-9
+    )
     return values - zero + part * below, zero
 
 
@@ -532,26 +531,14 @@ def _joint(
 def _one_unit(
     pair: Pair, commands: NDArray[np.float64], positions: NDArray[np.float64]
 ) -> tuple[Pair, list[str]]:
-    """The pair, one of which names a unit, with that for the other where both move as far by it.
-
-    Where none does, the step of the readings may be a count of an encoder in degrees.
-    """
+    """The pair, one of which names a unit, with that for the other where both move as far by it."""
     units = pair.command.unit, pair.position.unit
-    ranges = _spread(commands), _spread(positions)
-    alike = min(ranges) > 0 and 1 / MOVES_ALIKE < ranges[0] / ranges[1] < MOVES_ALIKE
-    step = smallest_step(positions) if alike and not any(units) else 0.0
-    if any(abs(step / count - 1) < _SAME_STEP for count in _COUNTS_DEG):
-        both = Pair(replace(pair.command, unit="deg"), replace(pair.position, unit="deg"))
-        return both, [
-            f"{pair.position.name} names no unit, and was taken as deg, since its readings are "
-            f"{step:.3g} apart: a count of an encoder in degrees. If that is wrong, give "
-            "`unit='rad'`."
-        ]
     if bool(units[0]) == bool(units[1]) or set(units) & {"rad", *_LACKING}:
         return pair, []
     if "counts" in units and any((v[np.isfinite(v)] % 1 != 0).any() for v in (commands, positions)):
         return pair, []
-    if not alike:
+    ranges = _spread(commands), _spread(positions)
+    if not min(ranges) > 0 or not 1 / MOVES_ALIKE < ranges[0] / ranges[1] < MOVES_ALIKE:
         return pair, []
     word = units[0] or units[1]
     both = Pair(replace(pair.command, unit=word), replace(pair.position, unit=word))
