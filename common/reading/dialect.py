@@ -86,7 +86,7 @@ _MARKS = (  # around numbers, what to put in their place, and where they must be
     (re.compile("[│┃]"), "|", _IN_TEXT),
     (re.compile("[\u2500-\u257f]"), "-", _IN_TEXT),  # lines around cells
     (re.compile(r"^[ \t|+:]*[-=]{3}[-=+ |:\t]*$", re.MULTILINE), "", _IN_TEXT),  # below names
-    (re.compile(r"^[ \t]*\|[ \t]*|(?<![ \t])[ \t]*\|[ \t]*$", re.MULTILINE), "", _IN_EACH),
+    (re.compile(r"^[ \t]*\|[ \t|]*|(?<![ \t|])[ \t]*\|[ \t|]*$", re.MULTILINE), "", _IN_EACH),
     (re.compile(r"\x1b\[[\d;]*m"), "", _IN_TEXT),  # colours of a terminal
     (_NUMPY := re.compile(r"\bnp\.\w+\(([-+.\w]+)\)"), r"\1", _IN_ROWS),
     (re.compile(r"\b(?:tensor|array)\((?:'\w', ?)?(\[[^\]\n]*\])[^()\n]{0,80}\)"), r"\1", _IN_ROWS),
@@ -671,7 +671,7 @@ def _is_row(line: str, shape: _Shape, complete: bool = False) -> bool:
 
 def _names(line: str, shape: _Shape) -> list[str] | None:
     """Names of the columns in a line, whose separators may differ from those of the rows."""
-    tied = re.sub(r"\s+(?=[(\[])", "_", line.strip())  # time (s): a name and its unit
+    tied = re.sub(r"(?<!\s)\s+(?=[(\[])", "_", line.strip())  # time (s): a name and its unit
     ways = [_split(line, shape.separator), _split(tied, shape.separator)]
     if not _REMARK.match(line.split(maxsplit=1)[0]) or shape.separator == " ":
         spaced = re.split(r"\s{2,}|\t", line.strip())
@@ -714,8 +714,9 @@ def _units_above(line: str, shape: _Shape) -> list[str]:
 
     Without an angle's among them there are none: volts are LabVIEW's own, whatever was measured.
     """
+    bare = line[mark.end() :] if (mark := _COMMENT.match(line)) else line
     for separator in (shape.separator, ","):
-        head, *cells = _split(_COMMENT.sub("", line), separator) or [""]
+        head, *cells = _split(bare, separator) or [""]
         if "unit" in head.lower():
             head = head.partition(":")[2].strip()
         cells = [head, *cells, *[""] * shape.columns][: shape.columns]

@@ -307,9 +307,9 @@ WORDS: dict[str, str] = {
         "the next recording."
     ),
     "speed_for_command": (
-        "the position moves as the sum of the commands ({percent:.0f} %), and not as they do: they "
-        "are speeds, duty cycles or changes of the goal. A position servo's log needs its goals; of "
-        "changes they are the sum (numpy.cumsum)."
+        "the position moves as the sum of the commands ({percent:.0f} %), and not as they do: "
+        "they are speeds, duty cycles or changes of the goal. A position servo's log needs its "
+        "goals; of changes they are the sum (numpy.cumsum)."
     ),
     "speed_for_position": (
         "the position moves as the joint's speed does: its integral follows the command "

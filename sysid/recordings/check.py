@@ -166,7 +166,8 @@ def _refuse_degrees(
             "Say the unit (such as deg, turns or counts:8192:0), or take the start's angle off."
         )
     reach = table[column].abs().groupby(table["joint"]).max()
-    others = [str(j) for j, most in reach.items() if _SMALL_RAD < most <= LARGEST_RAD]
+    near = (reach.to_numpy() > _SMALL_RAD) & (reach.to_numpy() <= LARGEST_RAD)
+    others = [str(j) for j in reach.index[near]]
     angles = table.loc[table["joint"] == joint, ["command_rad", "position_rad"]].to_numpy(float)
     units = likely_of_pair(*(values[np.isfinite(values)] for values in angles.T))
     if units == ["deg"] and str(source).endswith(".pos") and largest <= 100:
@@ -208,8 +209,9 @@ def _units_by_name(columns: Any) -> list[str]:
 def _with_named(units: str, by_name: list[str]) -> str:
     """The units of an option, with those that the names of columns say in their place."""
     command, _, position = units.partition(",")
+    texts = (command, position or command)
     pair = [text if named in ("", "rad") else named
-            for named, text in zip(by_name, (command, position or command), strict=True)]  # fmt: skip
+            for named, text in zip(by_name, texts, strict=True)]  # fmt: skip
     return ",".join(dict.fromkeys(pair)) if any(by_name) else units
 
 

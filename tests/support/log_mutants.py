@@ -61,9 +61,9 @@ def _separated(rng: np.random.Generator, data: bytes) -> bytes:
 
 
 def _spelled(rng: np.random.Generator, data: bytes) -> bytes:
-    old, new = [(b".", b","), (b"\n", b"\r\n"), (b"\n", b"\r"), (b"-", b"\xe2\x88\x92"),
-                (b"e", b"E"), (b'"', b""), (b"\n", b"\n\n"), (b"_", b" ")][rng.integers(8)]  # fmt: skip
-    return data.replace(old, new)
+    spellings = [(b".", b","), (b"\n", b"\r\n"), (b"\n", b"\r"), (b"-", b"\xe2\x88\x92"),
+                 (b"e", b"E"), (b'"', b""), (b"\n", b"\n\n"), (b"_", b" ")]  # fmt: skip
+    return data.replace(*spellings[rng.integers(len(spellings))])
 
 
 def _coded(rng: np.random.Generator, data: bytes) -> bytes:
@@ -132,21 +132,21 @@ def _zipped(data: bytes) -> bytes:
 
 PACKERS: Sequence[Callable[[bytes], bytes]] = (
     gzip.compress, bz2.compress, lzma.compress, _zipped, lambda data: b"\x28\xb5\x2f\xfd" + data,
-    lambda data: gzip.compress(_zipped(data)), lambda data: gzip.compress(data) + gzip.compress(data),
+    lambda data: gzip.compress(_zipped(data)), lambda data: 2 * gzip.compress(data),
 )  # fmt: skip
 
 
 def mutant(rng: np.random.Generator, seeds: Mapping[str, bytes]) -> tuple[str, bytes]:
     """Name of a seed, and its damaged content."""
-    name = [*seeds][rng.integers(len(seeds))]
+    name = [*seeds][int(rng.integers(len(seeds)))]
     data = seeds[name]
     for _ in range(1 + rng.binomial(2, 0.25)):
         if data:
-            data = CHANGES[rng.integers(len(CHANGES))](rng, data)
+            data = CHANGES[int(rng.integers(len(CHANGES)))](rng, data)
     if rng.random() < 0.1:
-        data = PACKERS[rng.integers(len(PACKERS))](data)
+        data = PACKERS[int(rng.integers(len(PACKERS)))](data)
         if rng.random() < 0.5:
-            data = (_flip, _pieces)[rng.integers(2)](rng, data)
+            data = (_flip, _pieces)[int(rng.integers(2))](rng, data)
     return name, data
 
 
@@ -157,7 +157,8 @@ def stated(rng: np.random.Generator) -> dict[str, Any]:
         "command": ["1", "cmd", "goal", "{joint}_cmd", "1,2", "q_des[{joint}]", "{joint}"],
         "position": ["2", "pos", "present", "{joint}_pos", "3,4", "q[{joint}]", "{joint}"],
         "trial": ["0", "phase", "trial", "3"],
-        "unit": ["deg", "turns", "counts:4096", "counts:8192:0", "percent:3", "scale:1e-9", "deg,rad"],
+        "unit": ["deg", "turns", "counts:4096", "counts:8192:0", "percent:3", "scale:1e-9",
+                 "deg,rad"],
         "rate": [30.0, 1000.0, 1e5, 0.1], "send_after": ["3ms", "-250us", "0s", "1s"],
         "command_time": ["0", "t_cmd", "time"], "readings": ["live", "polled"],
         "read_before_send": [True, False], "stamp": ["start", "middle", "end"],

@@ -30,7 +30,8 @@ UNITS: dict[str, str] = {
         ("rad", "rad rads radian radians 弧度 рад 라디안"),
         ("mrad", "mrad"),
         ("deg", "deg degs degree degrees ° grad grados gradi graus graden degré degrés degres "
-                "stopnie stopni derece grader fok grade astetta stupňů stupeň stupne 度 도 град градусы градусов"),
+                "stopnie stopni derece grader fok grade astetta stupňů stupeň "
+                "stupne 度 도 град градусы градусов"),
         ("turns", "turn turns rev revs revolution revolutions rotation rotations "
                   "umdrehungen"),
         ("percent", "percent pct"),
@@ -74,7 +75,8 @@ WORDS: dict[str, str] = {
                 "potentiometer pot resolver pv ist istwert ärvärde mesure misura medida "
                 "实际 当前 実測 反馈 現在 測定 测量 현재 측정 "
                 "zmierzona zmierzony medido gemeten atual mesuré mesurée misurato измеренный "
-                "mittaus mitattu skutečná skutečný měřená mért olculen ölçülen uppmätt 計測値 測定値 "
+                "mittaus mitattu skutečná skutečný měřená mért olculen ölçülen uppmätt "
+                "計測値 測定値 "
                 "измеренное gerçek gercek"),
         (MAYBE_STATE, "y output outputs read rx follower receive received recv rcv process"),
         (ANGLE, "position positions pos posn angle angles ang qpos q p theta θ winkel "

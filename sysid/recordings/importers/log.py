@@ -99,7 +99,7 @@ class Table:
     def _lower(self) -> dict[str, str]:
         return {n.lower(): n for n in self.columns}
 
-    @property
+    @cached_property
     def increasing(self) -> list[str]:
         """Columns whose numbers never decrease, and are not all the same, nor count named rows."""
         steps = {n: np.diff(v[np.isfinite(v)]) for n, v in self.columns.items()}

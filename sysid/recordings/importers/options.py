@@ -47,6 +47,7 @@ _FARTHEST_DEGREES = 180.0  # from 0, of the same
 MOVES_ALIKE = 2.5
 """Factor by which a position may move more or less than its command."""
 _ASKEW = 0.3
+_STILL = 1e-100
 _ANGLE_SCALES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turns": 2 * np.pi}
 _NARROWEST_RAD, _WIDEST_RAD = 0.2, 2 * np.pi  # range of a joint
 
@@ -158,12 +159,12 @@ def likely_of_pair(
 ) -> list[str]:
     """What a command and its position, one of them beyond a turn, may be in.
 
-    `named`: units that they name. Where one moves many times as far as the other they are in different units, which are those by
-    which they move as far.
+    `named`: units that they name. Where one moves many times as far as the other they are in
+    different units, which are those by which they move as far.
     """
     spread = float(np.ptp(command)), float(np.ptp(position))
     together = likely_units(np.concatenate([command, position]))
-    alike = not min(spread) > 0 or 1 / MOVES_ALIKE < spread[0] / spread[1] < MOVES_ALIKE
+    alike = not min(spread) > _STILL or 1 / MOVES_ALIKE < spread[0] / spread[1] < MOVES_ALIKE
     if alike and not any(named):
         return together
     ranked = []

@@ -57,7 +57,8 @@ _WIDEST_ANGLE = 1e6  # of a joint, in any unit
 _COMPARED, _ALIKE = 12, 0.7  # columns; concordance of a command and its position
 _ORDERED = 100_000  # rows
 _NO_PLACE = re.compile(
-    r"delta|diff|incr|err(?:or)?(?![a-z])|vel|speed|rpm|torque|effort|volt|temp|power|pwm|duty|(?:rad|deg|°)[_/ ]?s(?![a-z])|dps|"
+    r"delta|diff|incr|err(?:or)?(?![a-z])|"
+    r"vel|speed|rpm|torque|effort|volt|temp|power|pwm|duty|(?:rad|deg|°)[_/ ]?s(?![a-z])|dps|"
     r"(?<![a-z])nm(?![a-z])|\[[NAV]\]",
     re.IGNORECASE,
 )
@@ -212,7 +213,7 @@ def _lines_by_name(path: Path | str, table: Table, timed: bool) -> str:
                 for c in columns
                 if c.kind == others and c.name not in times[:1] and c.name not in rates
             ]  # fmt: skip
-        by_kind.append(chosen)
+        by_kind.append(chosen[:_COMPARED])
     lines = []
     for (command, *name), (position, *other) in product(*by_kind):
         if ("{joint}" in command) != ("{joint}" in position):  # of one of them a lone word
@@ -311,7 +312,7 @@ def _unit_of(table: Table, names: Iterable[str]) -> dict[str, str]:
     if not largest > LARGEST_RAD:
         return {}
     named = ["" if name == "counts" else name for name in named]
-    command, _, position = likely_of_pair(*pair, named)[0].partition(",")
+    command, _, position = likely_of_pair(pair[0], pair[1], named)[0].partition(",")
     units = [named[0] or command, named[1] or position or command]
     return {"unit": ",".join(dict.fromkeys(units))}
 

@@ -207,8 +207,8 @@ def _refuse_raw_actions(
         raw, angles = (refusals.import_line(path, **(options.words | {"unit": text}))
                        for text in (f"scale:{usual:g},rad", "rad"))  # fmt: skip
         raise InputError(
-            f"{path}: its joints move {factor:.2g} times as far as its actions, so these seem to be "
-            "a policy's own, which a default angle and a scale turn into set-points. Log the "
+            f"{path}: its joints move {factor:.2g} times as far as its actions, so these seem to "
+            "be a policy's own, which a default angle and a scale turn into set-points. Log the "
             f"set-points, or give your action_scale in place of {usual:g}: {raw}; or, if they are "
             f"set-points: {angles}."
         )

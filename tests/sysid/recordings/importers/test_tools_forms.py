@@ -421,6 +421,7 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
             STACKED["q_des"]), "dt": 0.01}, f)), "joint_0 joint_1"),
     "one environment first": (saved(np.savez, time=TIME, dof_pos=STACKED["q"][None],
                                     des_dof_pos=STACKED["q_des"][None]), "joint_0 joint_1"),
+    "MATLAB's rate": (matlab(cmd=COMMAND, pos=POSITION, fs=100.0), "joint"),
     "Simulink's time": (matlab(tout=TIME[:, None], **STACKED), "joint_0 joint_1"),
 }  # fmt: skip
 
