@@ -165,9 +165,9 @@ def _refuse_degrees(
             f"{path}, column {place}: values reach {largest:.4g} rad, more than a hundred turns. "
             "Say the unit (such as deg, turns or counts:8192:0), or take the start's angle off."
         )
-    reach = table[column].abs().groupby(table["joint"]).max()
-    near = (reach.to_numpy() > _SMALL_RAD) & (reach.to_numpy() <= LARGEST_RAD)
-    others = [str(j) for j in reach.index[near]]
+    of_row = table["joint"].to_numpy()
+    others = [j for j in map(str, table["joint"].unique())
+              if _SMALL_RAD < values[of_row == j].max() <= LARGEST_RAD]  # fmt: skip
     angles = table.loc[table["joint"] == joint, ["command_rad", "position_rad"]].to_numpy(float)
     units = likely_of_pair(*(values[np.isfinite(values)] for values in angles.T))
     if units == ["deg"] and str(source).endswith(".pos") and largest <= 100:

@@ -30,7 +30,7 @@ MOST_TRIALS = 50_000
 """Of all joints together."""
 MOST_JOINTS = 200
 
-_LARGEST = 1e100  # whose squares are numbers, too
+_LEAST, _LARGEST = 1e-100, 1e100  # whose squares are numbers, too
 _ENDINGS = re.compile(r"[._/](pos|position)$", re.IGNORECASE)
 
 
@@ -83,7 +83,7 @@ class Table:
     def known(self, name: str) -> NDArray[np.float64]:
         """The numbers of a column that are not missing; two zeros if it has none."""
         values = self.columns.get(name, np.zeros(0))
-        values = values[np.abs(values) <= _LARGEST]
+        values = np.where(np.abs(values) < _LEAST, 0.0, values)[np.abs(values) <= _LARGEST]
         return values if len(values) else np.zeros(2)
 
     @cached_property
