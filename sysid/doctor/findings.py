@@ -436,11 +436,11 @@ def shared(by_joint: Mapping[str, Sequence[Finding]]) -> list[tuple[str, str]]:
         kinds = [_kind(f) for f in findings]
         for finding, kind in zip(findings, kinds, strict=True):
             # two of a kind about one joint, e.g. on two of its trials, stay apart
-            own = kind if kinds.count(kind) == 1 else (*kind, str(finding.values))
-            groups.setdefault(own, {})[joint] = finding
+            group = kind if kinds.count(kind) == 1 else (*kind, str(finding.values))
+            groups.setdefault(group, {})[joint] = finding
     return [
-        ("All joints" if len(own) == len(by_joint) > 2 else ", ".join(own), _ranged(own))
-        for own in groups.values()
+        ("All joints" if len(group) == len(by_joint) > 2 else ", ".join(group), _ranged(group))
+        for group in groups.values()
     ]
 
 

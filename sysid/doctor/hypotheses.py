@@ -62,10 +62,10 @@ def relations(joint: Followed) -> list[Relation]:
     """All relations of one joint's command and position, the likeliest first."""
     base = joint.base
     causal = base.causal(_LONGEST_LAG_S)
-    found = [Relation("", joint.servo), Relation("sign_inverted", base.best(-1.0, causal))]
+    candidates = [Relation("", joint.servo), Relation("sign_inverted", base.best(-1.0, causal))]
     if _turns(joint.trials) >= _TURNS:
         ahead = base.best(1.0, base.total_s < -0.5 * base.grid_s)
-        found.append(Relation("position_early", ahead))
+        candidates.append(Relation("position_early", ahead))
         other = explain(joint.trials, joint.step, True)
         if other is not None:
             other = replace(other, rows=base.rows)
@@ -73,8 +73,8 @@ def relations(joint: Followed) -> list[Relation]:
             swapped = other.best(1.0, late)
             # a filter takes the noise out of any position, but only ahead of time if it is one
             if swapped.nats < other.best(1.0, other.total_s < -0.5 * other.grid_s).nats:
-                found.append(Relation("columns_swapped", swapped))
-    return sorted(found, key=lambda r: r.servo.nats)
+                candidates.append(Relation("columns_swapped", swapped))
+    return sorted(candidates, key=lambda r: r.servo.nats)
 
 
 def _sound(joint: Followed) -> bool:
@@ -95,8 +95,8 @@ def relation_findings(joint: Followed) -> list[Finding]:
     best, second = ranked[:2]
     plain = next(r for r in ranked if not r.code)
     # the servo as it is has limits and may change, which the other relations are not fitted with
-    left = change.fit.unexplained(joint) if change else joint.unexplained
-    if best.code and best.servo.nats > min(plain.servo.nats, base.nats(left)) - CLEAR_NATS:
+    unexplained = change.fit.unexplained(joint) if change else joint.unexplained
+    if best.code and best.servo.nats > min(plain.servo.nats, base.nats(unexplained)) - CLEAR_NATS:
         best = plain
     share = 1 - best.servo.unexplained
     held = bool(held_findings(trials, joint.step) or changes or joint.stays_often)
@@ -171,12 +171,14 @@ def _usual_gain(joint: Followed, best: Relation) -> bool:
     base = joint.base
     inside = base.causal(_LONGEST_LAG_S) & usual(np.tensordot(base.weight, base.gains, axes=1))
     sign = float(np.sign(best.servo.gain))
-    left = base.best(sign, inside).unexplained if inside.any() else 1.0
+    unexplained = base.best(sign, inside).unexplained if inside.any() else 1.0
     least = best.servo.unexplained
     if not best.code:
-        left = min(left, joint.unexplained if usual(float(joint.fit.values[0])) else 1.0)
+        unexplained = min(
+            unexplained, joint.unexplained if usual(float(joint.fit.values[0])) else 1.0
+        )
         least = min(least, joint.unexplained)
-    return base.nats(left) < base.nats(least) + CLEAR_NATS
+    return base.nats(unexplained) < base.nats(least) + CLEAR_NATS
 
 
 def _scale(joint: Followed, best: Relation, excused: bool) -> Finding | None:
@@ -283,13 +285,13 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     sign = np.log2(max(edge - bottom, 1e-6) / step) if step > 0 else 0.0
     signed = _is_bit(sign) if step > 0 else near > 0.1 * turn
     others = {"shifted": shifted} | ({"mirrored": mirrored} if signed else {})
-    left = {name: _unexplained(t, step) for name, t in {"": list(trials), **others}.items()}
-    if left[""] < _FITS:
+    unexplained = {name: _unexplained(t, step) for name, t in {"": list(trials), **others}.items()}
+    if unexplained[""] < _FITS:
         return []  # a fast joint, or one in another unit
-    best = min(left, key=lambda name: left[name])
-    if near > 0.1 * turn and (not best or left[best] > max(_FITS, 0.5 * left[""])):
+    best = min(unexplained, key=lambda name: unexplained[name])
+    if near > 0.1 * turn and (not best or unexplained[best] > max(_FITS, 0.5 * unexplained[""])):
         return []  # it is no turn that jumps, and put back no servo explains it
-    if not best or left[best] > 0.7 * left[""]:
+    if not best or unexplained[best] > 0.7 * unexplained[""]:
         best = "shifted"
     values = {"times": len(sizes), "time_s": when}
     bits = np.log2(jump / step) if step > 0 else 0.0
@@ -403,23 +405,23 @@ def held_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
 
 def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     """What explains the pair of columns, and what comes on top of it."""
-    if found := echo(trials, step):
-        return [found]
+    if findings := echo(trials, step):
+        return [findings]
     joint = followed(trials, step)
-    found = relation_findings(joint) if joint else []
-    if joint is None or any(f.verdict == REFUSE for f in found):
-        return found
-    found += _trials_differ(joint) or joint.changes or second_writer(joint)
+    findings = relation_findings(joint) if joint else []
+    if joint is None or any(f.verdict == REFUSE for f in findings):
+        return findings
+    findings += _trials_differ(joint) or joint.changes or second_writer(joint)
     loaded = any(t.load is not None for t in trials)
     loose = joint.base.explained < _LOOSE and not _sound(joint)
     disturbed = joint.fit.cost - joint.noise - joint.unsure > _DISTURBED
-    if (loose or disturbed) and not (found or loaded or held_findings(trials, step)):
+    if (loose or disturbed) and not (findings or loaded or held_findings(trials, step)):
         if joint.stays_often:
             return [joint.stays_often]
         if loose:
             return [Finding("loosely_related", CARE, {"percent": 100 * joint.base.explained})]
         return [Finding("disturbed", CARE, {"percent": 100 * joint.unexplained})]
-    return found
+    return findings
 
 
 def _trials_differ(joint: Followed) -> list[Finding]:
