@@ -462,20 +462,13 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
     start = sum(len(line) + 1 for line in text[:_SAMPLE].split("\n")[:first])
     head = "\n".join(line if line[:1] == "#" else "" for line in lines[:first])
     body = text[start:]
-    if before:
-        body = _unnamed(body, lines[before[-1]])
+    if before and (names := lines[before[-1]]) in body:  # as appended passes have them
+        body = re.sub(rf"^{re.escape(names)}$", "", body, flags=re.MULTILINE)
     body = _cells(body, shape)
     while len(columns) > 2 and not columns[-1]:  # each row ends with a separator
         columns = columns[:-1]
         body = re.sub(r",[ \t]*$", "", body, flags=re.MULTILINE)
     return Plain(f"{head}\n{body}" if first else body, columns, numbered, _sentence(notes))
-
-
-def _unnamed(body: str, names: str) -> str:
-    """Rows without further lines of names, as appended passes have them."""
-    if names not in body:  # one search of the text is cheaper than one per line
-        return body
-    return re.sub(rf"^{re.escape(names)}$", "", body, flags=re.MULTILINE)
 
 
 def _cells(body: str, shape: _Shape) -> str:

@@ -280,7 +280,7 @@ def recorded_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
     Raises InputError where two recordings hold the same trial, whose readings would count twice.
     """
     several = as_sequence(recordings)
-    names = _told_apart([recording.name for recording in several])
+    names = _distinct_names([recording.name for recording in several])
     trials: list[Trial] = []
     for name, recording in zip(names, several, strict=True):
         for trial in recording.trials(joint):
@@ -299,7 +299,7 @@ def _same(one: Trial, other: Trial) -> bool:
     )
 
 
-def _told_apart(names: Sequence[str]) -> list[str]:
+def _distinct_names(names: Sequence[str]) -> list[str]:
     """Names of recordings, those that are alike with a number."""
     places = [names[: k + 1].count(name) for k, name in enumerate(names)]
     several = [names.count(name) > 1 for name in names]

@@ -433,7 +433,10 @@ def shared(by_joint: Mapping[str, Sequence[Finding]]) -> list[tuple[str, str]]:
     """Joints and sentences: findings that differ in nothing but their numbers become one."""
     groups: dict[tuple, dict[str, Finding]] = {}
     for joint, findings in by_joint.items():
-        kinds = [_kind(f) for f in findings]
+        kinds = [
+            (f.code, f.verdict, *(v for v in f.values.values() if isinstance(v, str)))
+            for f in findings
+        ]
         for finding, kind in zip(findings, kinds, strict=True):
             # two of a kind about one joint, e.g. on two of its trials, stay apart
             group = kind if kinds.count(kind) == 1 else (*kind, str(finding.values))
@@ -442,11 +445,6 @@ def shared(by_joint: Mapping[str, Sequence[Finding]]) -> list[tuple[str, str]]:
         ("All joints" if len(group) == len(by_joint) > 2 else ", ".join(group), _ranged(group))
         for group in groups.values()
     ]
-
-
-def _kind(finding: Finding) -> tuple:
-    words = tuple(v for v in finding.values.values() if isinstance(v, str))
-    return finding.code, finding.verdict, words
 
 
 def _ranged(findings: Mapping[str, Finding]) -> str:

@@ -273,7 +273,10 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     if not len(sizes):
         return []
     jump = float(np.median(sizes))
-    middle = _gap(np.concatenate([t.position_rad for t in trials]), jump)
+    ordered = np.concatenate([t.position_rad for t in trials])
+    ordered = np.sort(ordered[np.isfinite(ordered)])
+    widest = int(np.argmax(np.diff(ordered)))
+    middle = float(0.5 * (ordered[widest] + ordered[widest + 1]))
     shifted = [_beyond(t, middle, lambda v: v - jump) for t in trials]
     edge = min(float(np.nanmin(np.where(t.position_rad > middle, t.position_rad, np.inf)))
                for t in trials)  # fmt: skip
@@ -323,13 +326,6 @@ def _jumps(trial: Trial, step: float) -> tuple[NDArray[np.float64], NDArray[np.f
     far = np.abs(move) > np.maximum(_FASTEST_RAD_S * taken, max(5 * step + 0.2, usual))
     far &= np.abs(move) > _WRAP_RAD
     return move[far], time[new][1:][far]
-
-
-def _gap(position: NDArray[np.float64], jump: float) -> float:
-    """Middle of the widest gap between readings."""
-    ordered = np.sort(position[np.isfinite(position)])
-    at = int(np.argmax(np.diff(ordered)))
-    return float(0.5 * (ordered[at] + ordered[at + 1]))
 
 
 def _beyond(trial: Trial, middle: float, put_back: Callable[[NDArray], NDArray]) -> Trial:

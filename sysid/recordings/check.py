@@ -22,11 +22,10 @@ from pupper_sysid.sysid.recordings.importers.options import (
     likely_of_pair,
     unit,
 )
-from pupper_sysid.sysid.recordings.importers.refusals import import_line
+from pupper_sysid.sysid.recordings.importers.refusals import PULSES_US, import_line
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT
 
 _LEAST_ROWS = 20
-_PULSES_US = (400.0, 2700.0)
 _FARTHEST_RAD = 200 * np.pi  # of angles whose unit was stated
 _IDENTITY = ["joint", "trial", "send_time_s", "read_time_s", "command_rad", "position_rad"]
 _MANY_REPEATED = 0.1  # of the rows
@@ -150,10 +149,12 @@ def _refuse_degrees(
     joint = str(table["joint"].iloc[farthest])
     names = metadata.get("columns") or {}
     kind = "position" if column == "position_rad" else "command"
-    source = (names.get(joint) or {}).get(kind) if isinstance(names, dict) else None
+    of_joint = names.get(joint) if isinstance(names, dict) else None
+    of_joint = of_joint if isinstance(of_joint, Mapping) else {}
+    source = of_joint.get(kind)
     place = f"{printable(str(source))[:60]} (the {kind} of {joint})" if source else column
-    by_name = _units_by_name(names.get(joint) if isinstance(names, dict) else None)
-    pulses = kind == "command" and _PULSES_US[0] < np.nanmin(known) <= largest < _PULSES_US[1]
+    by_name = [column_named(str(of_joint.get(k, ""))).unit for k in ("command", "position")]
+    pulses = kind == "command" and PULSES_US[0] < np.nanmin(known) <= largest < PULSES_US[1]
     if pulses and (stated or any(by_name)):
         raise InputError(
             f"{path}, column {place}: values of {np.nanmin(known):.4g} to {largest:.4g} beside "
@@ -198,12 +199,6 @@ def _refuse_degrees(
             else ""
         )
     )
-
-
-def _units_by_name(columns: Any) -> list[str]:
-    """Units that the names of the columns of a command and a position say."""
-    names = columns if isinstance(columns, Mapping) else {}
-    return [column_named(str(names.get(kind, ""))).unit for kind in ("command", "position")]
 
 
 def _with_named(units: str, by_name: list[str]) -> str:

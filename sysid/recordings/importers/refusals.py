@@ -65,7 +65,7 @@ _NO_PLACE = re.compile(
 _PULSES = re.compile(
     r"pwm|pulse|duty|(^|[_ (\[])(us|µs)\b", re.IGNORECASE
 )  # what a hobby servo is commanded by
-_PULSES_US, _OF_PULSES = (400.0, 2700.0), "counts:4000:1500"  # 2,000 µs for half a turn
+PULSES_US, _OF_PULSES = (400.0, 2700.0), "counts:4000:1500"  # 2,000 µs for half a turn
 _QUANTITIES = {  # words of a command that is no place, and what to do
     "changes of the goal: add them up (numpy.cumsum) to a column of goals": re.compile(
         r"delta|diff|incr|relative|(?<![a-z])rel(?![a-z])", re.IGNORECASE
@@ -327,7 +327,7 @@ def _are_pulses(table: Table, name: str) -> bool:
 
 
 def _are_pulse_widths(values: NDArray[np.float64]) -> bool:
-    return bool(_PULSES_US[0] < values.min() <= values.max() < _PULSES_US[1])
+    return bool(PULSES_US[0] < values.min() <= values.max() < PULSES_US[1])
 
 
 def rate_note(line: str | Mapping[str, str], table: Table) -> str:
