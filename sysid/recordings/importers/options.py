@@ -164,8 +164,8 @@ def likely_of_pair(
     """
     spread = float(np.ptp(command)), float(np.ptp(position))
     together = likely_units(np.concatenate([command, position]))
-    alike = not min(spread) > _STILL or 1 / MOVES_ALIKE < spread[0] / spread[1] < MOVES_ALIKE
-    if alike and not any(named):
+    still = not min(spread) > _STILL
+    if still or (not any(named) and 1 / MOVES_ALIKE < spread[0] / spread[1] < MOVES_ALIKE):
         return together
     ranked = []
     turns = [f"counts:{n}:0" for n in _COUNTS]  # also where they were averaged or scaled

@@ -342,9 +342,9 @@ def _likeness(table: Table, pair: Sequence[str]) -> tuple[float, list[str]]:
     Lin's coefficient of concordance at the best lag: 1 for equal columns; an offset counts, another
     scale, too.
     """
-    values = [table.columns[name][:_ORDERED] for name in pair]
-    if not all(np.isfinite(table.columns[name]).all() for name in pair):
+    if any(len(table.known(name)) < len(table.columns[name]) for name in pair):
         return 0.0, [*pair]
+    values = [table.known(name)[:_ORDERED] for name in pair]
     first, second = (v - np.mean(v) for v in values)
     product_at = np.fft.irfft(np.fft.rfft(second, 2 * len(second)).conj()
                               * np.fft.rfft(first, 2 * len(first)))  # fmt: skip
