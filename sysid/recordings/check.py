@@ -53,7 +53,8 @@ def check(
     warnings: list[str] = []
     options = options or LogOptions()
     if strange := strange_joint(table["joint"].unique().tolist(), "columns" in metadata):
-        raise InputError(f"{path}, column joint: '{strange[0]}' is no joint; {strange[1]}")
+        called = printable(strange[0])[:60]
+        raise InputError(f"{path}, column joint: '{called}' is no joint; {strange[1]}")
     needed = ["send_time_s", "read_time_s", "trial", "command_rad"]
     lost = np.isnan(table[needed].to_numpy(float)).any(axis=1)
     if lost.any():
