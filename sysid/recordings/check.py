@@ -162,6 +162,14 @@ def _refuse_degrees(
             "angles look like pulse widths in µs. Write them as angles, about (µs - 1500) * "
             "0.0016 rad, and give that column."
         )
+    for turn in (2**16, 2**32):
+        apart = (known < turn / 4) | (known > 0.75 * turn)
+        if 0.75 * turn < largest < turn and apart.all() and not (known % 1).any():
+            raise InputError(
+                f"{path}, column {place}: values are near 0 and near {turn:,}, which looks like "
+                f"negative numbers read without their sign. Take {turn:,} off those above "
+                f"{turn // 2 - 1:,} in the log, and say what the rest counts."
+            )
     if stated:
         raise InputError(
             f"{path}, column {place}: values reach {largest:.4g} rad, more than a hundred turns. "

@@ -222,7 +222,8 @@ def _lines_by_name(path: Path | str, table: Table, timed: bool) -> str:
             unit = _unit_of(table, (command, position))
             lines.append(import_line(path, **when, **unit, command=command, position=position))
     text = "; or ".join(list(dict.fromkeys(lines or lines_by_value(path, table)))[:3])
-    return f"{text}{rate_note(when, table)}" if text else ""
+    guess = ", where the counts of a turn are a guess by the values" if "counts:" in text else ""
+    return f"{text}{guess}{rate_note(when, table)}" if text else ""
 
 
 def lines_by_value(path: Path | str, table: Table) -> list[str]:

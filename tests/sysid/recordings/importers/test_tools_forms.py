@@ -534,6 +534,8 @@ WRONG: dict[str, tuple[str | bytes, str]] = {
     "changes of the goal": (each("{t},{c},{p}", head="t,delta_cmd,pos"), "is changes of the goal"),
     "speeds to go at": (each("{t},{c},{p}", head="t,cmd_vel,pos"), "cmd_vel is a speed"),
     "torques to give": (each("{t},{c},{p}", head="t,target_torque,pos"), "is a torque or current"),
+    "numbers without their sign": (each("{t},{c},{p}", [
+        (t, c % 65536, p % 65536) for t, c, p in SIGNED], "t,goal,pos"), "Take 65,536 off those"),
     "errors": (each("{t},{c},{p}", head="t,setpoint,error"), "Add a column setpoint - error"),
     "errors and a drive": (each("{t},{c},{p},{p}", head="t,setpoint,error,output"),
                            "Add a column setpoint - error"),
