@@ -122,7 +122,7 @@ def _of_drive(
             path, unit=",".join(dict.fromkeys(units)), command=templates[0], position=templates[1]
         )
         raise InputError(
-            f"{path}: {pair.command.name} and {pair.position.name} are of {program}, which counts "
+            f"{path}: {refusals.listed(s.name for s in sources)} are of {program}, which counts "
             "turns, but these are an encoder's counts. Say how many a turn has; with "
             f"ODrive's default: {line}."
         )

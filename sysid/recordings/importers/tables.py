@@ -167,7 +167,7 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
         joints[j][1].command.words <= _ACTIONS and not joints[j][1].command.unit for j in theirs
     ):
         _refuse_raw_actions(path, options, parts)
-    return Log(pd.concat(parts, ignore_index=True), metadata, notes)
+    return Log(pd.concat(parts, ignore_index=True), metadata, [*map(printable, notes)])
 
 
 def _refuse_some_without_unit(
