@@ -11,11 +11,9 @@ import gzip
 import json
 import lzma
 import re
-import resource
 import shutil
 import sqlite3
 import struct
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,7 +26,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
-from pupper_sysid.common.errors import PupperError
 from pupper_sysid.data import SAMPLES
 from pupper_sysid.hardware.joint_map import load_joint_map
 from pupper_sysid.policies.deploy.deployment import COLUMNS as SCRIPT_COLUMNS
@@ -45,16 +42,12 @@ from pupper_sysid.sysid.plan.plan_file import load_plan, save_plan
 from pupper_sysid.sysid.recordings.files import load
 from pupper_sysid.sysid.recordings.importers.options import LogOptions, read_mapping
 from pupper_sysid.sysid.sweep.recorder import playback
+from support.limited import limited
 from support.planned_servos import small_plan
 from support.saved_servo_models import saved
 
 CARDS = Path(__file__).parents[1] / "servo_models" / "cards" / "data"
 EXAMPLES = max(settings.default.max_examples // 12, 1)
-CPU_S = 5.0
-"""Processor time of one reading; the slowest refusal takes a few milliseconds."""
-MEMORY_BYTES = 2 << 30
-"""Address space beyond what the process has: a reader that needs more raises MemoryError."""
-
 SOME = settings(
     max_examples=EXAMPLES,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
@@ -354,23 +347,6 @@ def damages(draw: st.DrawFn) -> Callable[[bytes], bytes]:
         return data
 
     return apply
-
-
-def limited(call: Callable[[], Any]) -> str:
-    """The refusal of a call, empty if there is none; fails beyond the limits of time and memory."""
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    before = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY_BYTES, before[1]))
-    started, refusal = time.thread_time(), ""
-    try:
-        call()
-    except PupperError as error:
-        refusal = str(error)
-        assert refusal.isprintable() and refusal.endswith((".", "?", ".)")), refusal
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, before)
-    assert time.thread_time() - started < CPU_S
-    return refusal
 
 
 @pytest.fixture(scope="module")

@@ -71,6 +71,7 @@ MOST_CELLS = 40_000_000
 MOST_COMMENTS = 10_000
 LONGEST_CELL = 100_000
 LONGEST_COMMENT = 1_000_000
+LONGEST_NAME = 1_000
 
 # from 3.1 on, pandas rounds as Python does and deprecates the argument
 _OLD_PANDAS = tuple(map(int, pd.__version__.split(".")[:2])) < (3, 1)
@@ -82,6 +83,7 @@ _NOTHING = re.compile(
     r"[\W_]*(\d\.#([qs]?nan|ind)\d*|nan(\(\w+\))?|none|null|nil|n\.?/?a|div/0|num|value|ref|missing|"
     r"invalid|lost|failed|err|error|timeout)?[\W_]*"
 )
+_REMARKS = ("comment", "comments", "remark", "remarks", "note", "notes", "message")
 _LONGEST_WORD = 30
 """Words for a reading that failed."""
 _COMMENT = re.compile(r"^#.*$", re.MULTILINE)
@@ -204,6 +206,8 @@ def _opening(
     refuse_more(path, line.count(",") + 1, MOST_COLUMNS, "columns", _SPLIT)
     names = [name.strip() for name in (_cells(path, n, line) if columns is None else columns)]
     refuse_more(path, len(names), MOST_COLUMNS, "columns", _SPLIT)
+    longest = max(map(len, names), default=0)
+    refuse_more(f"{path}: the name of a column", longest, LONGEST_NAME, "characters")
     distinct(f"{path}, line {n}" if columns is None else f"{path}, its columns", names)
     if columns is not None:
         return CsvTable(names, comments=comments), n, at
@@ -284,6 +288,10 @@ class _Blocks:
             remarks = [n for n, row in rows.items()
                        if not any(is_decimal(cell) or is_clock(cell) for cell in row)]  # fmt: skip
             rows = self._without(rows, remarks, len(rows) - 1)
+            most = len(table.columns)
+            if table.columns[-1].lower() in _REMARKS:  # with commas in them
+                rows = {n: [*row[: most - 1], ",".join(row[most - 1 :])] if len(row) > most else row
+                        for n, row in rows.items()}  # fmt: skip
         if last and rows and len(rows[max(rows)]) < len(table.columns):
             table.cut = True
             rows.popitem()

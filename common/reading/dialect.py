@@ -86,7 +86,7 @@ _MARKS = (  # around numbers, what to put in their place, and where they must be
     (re.compile("[│┃]"), "|", _IN_TEXT),
     (re.compile("[\u2500-\u257f]"), "-", _IN_TEXT),  # lines around cells
     (re.compile(r"^[ \t|+:]*[-=]{3}[-=+ |:\t]*$", re.MULTILINE), "", _IN_TEXT),  # below names
-    (re.compile(r"^[ \t]*\|[ \t]*|[ \t]*\|[ \t]*$", re.MULTILINE), "", _IN_EACH),  # around rows
+    (re.compile(r"^[ \t]*\|[ \t|]*|(?<![ \t|])[ \t]*\|[ \t|]*$", re.MULTILINE), "", _IN_EACH),
     (re.compile(r"\x1b\[[\d;]*m"), "", _IN_TEXT),  # colours of a terminal
     (_NUMPY := re.compile(r"\bnp\.\w+\(([-+.\w]+)\)"), r"\1", _IN_ROWS),
     (re.compile(r"\b(?:tensor|array)\((?:'\w', ?)?(\[[^\]\n]*\])[^()\n]{0,80}\)"), r"\1", _IN_ROWS),
@@ -107,11 +107,11 @@ _UNIT = re.compile(rf"[(\[<{{]?\s*({_UNITS}|raw|-|1|none)\s*[)\]>}}]?", re.IGNOR
 _ANGLE_UNIT = re.compile(r"rad(ians?)?|deg(rees?)?|°|turns?|rev|counts?|ticks?", re.IGNORECASE)
 _WITH_UNIT = re.compile(rf"([-+]?[\d.,]+(?:[eE][-+]?\d+)?) ?({_UNITS})", re.IGNORECASE)
 _NAMED_LIST = re.compile(
-    r"([A-Za-z_][\w./]*)(?:\s*[:=]\s*[\[(]|(?<=\w\w) +\[)\s*([-+.\deE,; \t]+?)\s*[\])]"
+    r"(?<![\w./])[./]*([A-Za-z_][\w./]*)(?:\s*[:=]\s*[\[(]|(?<=\w\w) +\[)([-+.\deE,; \t]+)[\])]"
 )
 _PAIR, _LONG_PAIR = (  # with names of a word, or of two
     re.compile(
-        rf"(?<![\w\"'])[\"']?([A-Za-z_][\w./]*{more})[\"']?\s*[:=]\s*"
+        rf"(?<![\w\"'./])[\"']?[./]*([A-Za-z_][\w./]*{more})[\"']?\s*[:=]\s*"
         rf"([-+]?[\d.]+(?:[eE][-+]?\d+)?)(?: ?({_UNITS})(?!\s*[:=]))?(?![\w:])",
         re.IGNORECASE,
     )
@@ -134,11 +134,11 @@ _BRACKETED = re.compile(
     re.MULTILINE,
 )
 _LONG_LIST = re.compile(  # NumPy ends lines within long ones
-    r'((?:"\[[^"\]]*\]"[^"\n]*)*"\[[^"\]]*\n[^"\]]*\]"(?:[^"\n]*"\[[^"\]]*\]")*)([^\n]*)'
+    r'^((?:[^"\n]++|"(?!\[)|"\[[^"\]]*+\]")*"\[[^"\]\n]*+\n[^"\]]*+\]")([^\n]*)', re.MULTILINE
 )
 _BRACKETS = re.compile(r"[\[\]()]")
 _HEX_CELL = re.compile(r"([0-9a-f]{2,8})(h?)", re.IGNORECASE)
-_DOUBLED = re.compile(r"([+-]?\d+),(\d+)(,|$)", re.MULTILINE)  # 0,1,0,2 of decimal commas
+_DOUBLED = re.compile(r"(?<!\d)([+-]?\d+),(\d+)(,|$)", re.MULTILINE)  # 0,1,0,2 of decimal commas
 _CELL = r"(?:^|(?<=[;\t])) ?{} ?(?=[;\t]|$)"  # of a table that commas do not separate
 _MARKED = re.compile(_CELL.format(r"([+-]?\d+)([.,])(\d+(?:[eE][+-]?\d+)?)"), re.MULTILINE)
 _NEGATIVE = re.compile(_CELL.format(r"\((\d+(?:[.,]\d+)?)\)"), re.MULTILINE)
@@ -147,7 +147,7 @@ _TELEPLOT = re.compile(
     re.IGNORECASE | re.MULTILINE,
 )
 _INFLUX = re.compile(
-    r"^[\w.-]+((?:,[\w.-]+=[\w.-]+)*) ([^ \n]+=[^ \n]+) (\d{10,19})$", re.MULTILINE
+    r"^[\w.-]+((?:,[\w.-]+=[\w.-]+)*) ([^ =\n]+=[^ \n]+) (\d{10,19})$", re.MULTILINE
 )
 _LIST = re.compile(r'"?[\[(]\s*([-+.\d][-+.\deE,;\s]*?)\s*[\])]"?')
 
@@ -418,7 +418,10 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
         if columns is not None:
             notes.append("the names of its columns were taken from a comment")
     spaced = shape.separator == " "
-    while columns and not spaced and len(before) > 1 and len({*columns, ""}) <= len(columns):
+    whole = columns is not None and len(columns) == shape.columns
+    while (
+        columns and whole and not spaced and len(before) > 1 and len({*columns, ""}) <= len(columns)
+    ):
         above = _names(lines[before[-2]], shape)  # names in several lines, as of groups
         if above is None or len(above) != shape.columns:
             break
@@ -426,7 +429,7 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
             above[k] = above[k] or above[k - 1]
         columns = [f"{a}.{b}".strip(".") for a, b in zip(above, columns, strict=True)]
         lines[before.pop(-2)] = ""
-    if columns and len(columns) == shape.columns:
+    if columns and whole:
         above = (_units_above(line, shape) for line in lines[:first])
         units = units or next(filter(None, above), [])
         columns = _once(columns, [_split(row, shape.separator) for row in lines[first:]])
@@ -459,20 +462,13 @@ def _rewritten(text: str, lines: list[str], bare: list[int], shape: _Shape) -> P
     start = sum(len(line) + 1 for line in text[:_SAMPLE].split("\n")[:first])
     head = "\n".join(line if line[:1] == "#" else "" for line in lines[:first])
     body = text[start:]
-    if before:
-        body = _unnamed(body, lines[before[-1]])
+    if before and (names := lines[before[-1]]) in body:  # as appended passes have them
+        body = re.sub(rf"^{re.escape(names)}$", "", body, flags=re.MULTILINE)
     body = _cells(body, shape)
     while len(columns) > 2 and not columns[-1]:  # each row ends with a separator
         columns = columns[:-1]
         body = re.sub(r",[ \t]*$", "", body, flags=re.MULTILINE)
     return Plain(f"{head}\n{body}" if first else body, columns, numbered, _sentence(notes))
-
-
-def _unnamed(body: str, names: str) -> str:
-    """Rows without further lines of names, as appended passes have them."""
-    if names not in body:  # one search of the text is cheaper than one per line
-        return body
-    return re.sub(rf"^{re.escape(names)}$", "", body, flags=re.MULTILINE)
 
 
 def _cells(body: str, shape: _Shape) -> str:
@@ -668,7 +664,7 @@ def _is_row(line: str, shape: _Shape, complete: bool = False) -> bool:
 
 def _names(line: str, shape: _Shape) -> list[str] | None:
     """Names of the columns in a line, whose separators may differ from those of the rows."""
-    tied = re.sub(r"\s+(?=[(\[])", "_", line.strip())  # time (s): a name and its unit
+    tied = re.sub(r"(?<!\s)\s+(?=[(\[])", "_", line.strip())  # time (s): a name and its unit
     ways = [_split(line, shape.separator), _split(tied, shape.separator)]
     if not _REMARK.match(line.split(maxsplit=1)[0]) or shape.separator == " ":
         spaced = re.split(r"\s{2,}|\t", line.strip())
@@ -711,8 +707,9 @@ def _units_above(line: str, shape: _Shape) -> list[str]:
 
     Without an angle's among them there are none: volts are LabVIEW's own, whatever was measured.
     """
+    bare = line[mark.end() :] if (mark := _COMMENT.match(line)) else line
     for separator in (shape.separator, ","):
-        head, *cells = _split(_COMMENT.sub("", line), separator) or [""]
+        head, *cells = _split(bare, separator) or [""]
         if "unit" in head.lower():
             head = head.partition(":")[2].strip()
         cells = [head, *cells, *[""] * shape.columns][: shape.columns]

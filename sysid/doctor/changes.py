@@ -125,8 +125,8 @@ class Follower:
         """Share of the variance of the readings."""
         parts = np.split(joint.position_rad, joint.starts[1:-1])
         about = np.concatenate([p - p.mean() for p in parts])
-        left = self.residuals_rad - self.residuals_rad.mean()
-        return float(np.mean(left**2) / max(np.mean(about**2), 1e-18))
+        residuals = self.residuals_rad - self.residuals_rad.mean()
+        return float(np.mean(residuals**2) / max(np.mean(about**2), 1e-18))
 
 
 @dataclass(frozen=True)

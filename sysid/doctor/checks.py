@@ -73,22 +73,22 @@ def setup_findings(setup: ServoSetup, speed_rad_s: float = _SERVO_RAD_S) -> list
 
     `speed_rad_s`: speed of the fast parts of the motion [rad/s].
     """
-    found, registers = [], setup.registers
+    shaping, registers = [], setup.registers
     dynamixel = "profile_velocity" in registers
     limit = setup.set_point_acceleration_rad_s2
     if limit is not None and (lag_s := speed_rad_s / (2 * limit)) > _LEAST_LAG_S:
         said = f"{limit:.1f} rad/s², a lag of up to {1e3 * lag_s:.0f} ms at {speed_rad_s:.1f} rad/s"
         name = "profile_acceleration" if dynamixel else "acceleration"
-        found.append(_shaped(name, registers.get(name, 0), said, "0"))
+        shaping.append(_shaped(name, registers.get(name, 0), said, "0"))
     speed = setup.set_point_speed_rad_s
     if speed is not None and speed < _SERVO_RAD_S:
         name = "profile_velocity" if dynamixel else "goal_speed"
-        found.append(_shaped(name, registers.get(name, 0), f"{speed:.2f} rad/s", "0"))
+        shaping.append(_shaped(name, registers.get(name, 0), f"{speed:.2f} rad/s", "0"))
     if duration_s := setup.set_point_duration_s:
         name = "profile_velocity" if dynamixel else "goal_time"
         said = f"{1e3 * duration_s:.0f} ms for each command"
-        found.append(_shaped(name, registers.get(name, 0), said, "0"))
-    return found
+        shaping.append(_shaped(name, registers.get(name, 0), said, "0"))
+    return shaping
 
 
 def register_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
@@ -139,13 +139,13 @@ def findings(recorded: Sequence[Trial]) -> list[Finding]:
     trials = long_enough(cleaned)
     if not trials:
         return [Finding("too_short", REFUSE, {"rows": LEAST_ROWS})]
-    found = [*_missing(recorded, len(recorded) - len(trials)), *clock_findings(trials)]
-    found += _bad_readings(recorded, cleaned)
+    faults = [*_missing(recorded, len(recorded) - len(trials)), *clock_findings(trials)]
+    faults += _bad_readings(recorded, cleaned)
     step = -1.0
     for check in (stepwise_findings, *_CHECKS[:1], _few_fresh, *_CHECKS[1:]):
-        if any(f.verdict == REFUSE for f in found):
+        if any(f.verdict == REFUSE for f in faults):
             break
-        if check in _SERVOS_ALONE and any(f.code == "held_by_friction" for f in found):
+        if check in _SERVOS_ALONE and any(f.code == "held_by_friction" for f in faults):
             continue
         step = quantum(trials) if step < 0 else step
         if check in _OF_ONE_SERVO:
@@ -153,10 +153,10 @@ def findings(recorded: Sequence[Trial]) -> list[Finding]:
             for point in _operating_points(trials):
                 for finding in check(point, step):
                     by_code.setdefault(finding.code, finding)
-            found += by_code.values()
+            faults += by_code.values()
         else:
-            found += check(trials, step)
-    return found
+            faults += check(trials, step)
+    return faults
 
 
 def _operating_points(trials: Sequence[Trial]) -> list[list[Trial]]:
@@ -203,14 +203,14 @@ def _few_fresh(trials: Sequence[Trial], step: float) -> list[Finding]:
 def _missing(recorded: Sequence[Trial], short: int) -> list[Finding]:
     position = np.concatenate([t.position_rad for t in recorded])
     share = float(np.mean(~np.isfinite(position))) if len(position) else 1.0
-    found = []
+    losses = []
     if not len(position) or share > _MANY_MISSING:
-        found.append(Finding("most_missing", REFUSE, {"percent": 100 * share}))
+        losses.append(Finding("most_missing", REFUSE, {"percent": 100 * share}))
     elif share > _FEW_MISSING:
-        found.append(Finding("some_missing", CARE, {"percent": 100 * share}))
+        losses.append(Finding("some_missing", CARE, {"percent": 100 * share}))
     if short:
-        found.append(Finding("short_trials", CARE, {"trials": short, "rows": LEAST_ROWS}))
-    return found
+        losses.append(Finding("short_trials", CARE, {"trials": short, "rows": LEAST_ROWS}))
+    return losses
 
 
 def _bad_readings(recorded: Sequence[Trial], cleaned: Sequence[Trial]) -> list[Finding]:
@@ -280,7 +280,7 @@ def recorded_trials(recordings: Recordings, joint: str) -> tuple[Trial, ...]:
     Raises InputError where two recordings hold the same trial, whose readings would count twice.
     """
     several = as_sequence(recordings)
-    names = _told_apart([recording.name for recording in several])
+    names = _distinct_names([recording.name for recording in several])
     trials: list[Trial] = []
     for name, recording in zip(names, several, strict=True):
         for trial in recording.trials(joint):
@@ -299,7 +299,7 @@ def _same(one: Trial, other: Trial) -> bool:
     )
 
 
-def _told_apart(names: Sequence[str]) -> list[str]:
+def _distinct_names(names: Sequence[str]) -> list[str]:
     """Names of recordings, those that are alike with a number."""
     places = [names[: k + 1].count(name) for k, name in enumerate(names)]
     several = [names.count(name) > 1 for name in names]

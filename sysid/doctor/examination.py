@@ -159,22 +159,24 @@ def examine(
     InputError
         If a joint is not recorded.
     """
-    given = as_sequence(recordings)
+    sequence = as_sequence(recordings)
     rng = np.random.default_rng(seed)
-    limits = [(r.metadata.get("bus") or {}).get("speed_limit_rad_s") for r in given]
+    limits = [(r.metadata.get("bus") or {}).get("speed_limit_rad_s") for r in sequence]
     known = [float(limit) for limit in limits if limit]
-    recorded = {joint: recorded_trials(given, joint) for joint in chosen_joints(given, joints)}
+    recorded = {
+        joint: recorded_trials(sequence, joint) for joint in chosen_joints(sequence, joints)
+    }
     mixed = crossed({joint: long_enough(trials) for joint, trials in recorded.items()})
-    found = {
+    examinations = {
         joint: _examine_joint(joint, trials, mixed.get(joint), known, rng, (lags or {}).get(joint))
         for joint, trials in recorded.items()
     }
-    held = any(j.feedback and j.feedback.kind == "lattice" for j in found.values())
+    held = any(j.feedback and j.feedback.kind == "lattice" for j in examinations.values())
     return Examination(
-        recording=", ".join(r.name for r in given),
-        warnings=tuple(w for r in given for w in r.warnings),
+        recording=", ".join(r.name for r in sequence),
+        warnings=tuple(w for r in sequence for w in r.warnings),
         advice=(_HELD,) if held else (),
-        joints=found,
+        joints=examinations,
     )
 
 
@@ -200,17 +202,19 @@ def _examine_joint(
 ) -> JointExamination:
     unstated = NO_LOAD_SPEED_RAD_S if joint in JOINT_NAMES else math.nan
     limit_rad_s = max(stated_rad_s, default=unstated)
-    found = [*findings(recorded), *([mixed] if mixed else [])]
+    joint_findings = [*findings(recorded), *([mixed] if mixed else [])]
     recorded = [without_bad_readings(t) for t in recorded]
     trials = long_enough(recorded)
     if not trials:
         return JointExamination(
-            verdict=REFUSE, reasons=tuple(f.text for f in found), findings=tuple(found)
+            verdict=REFUSE,
+            reasons=tuple(f.text for f in joint_findings),
+            findings=tuple(joint_findings),
         )
     gaps = np.concatenate([np.diff(t.send_time_s) for t in trials])
     seen = np.concatenate([np.isfinite(t.position_rad) for t in trials])
     fresh = sum(len(fresh_rows(t)) for t in trials)
-    usable = all(f.verdict != REFUSE for f in found)
+    usable = all(f.verdict != REFUSE for f in joint_findings)
     tones = [replace(t, number=n) for n, t in enumerate(named_tones(recorded))]
     tones = long_enough(tones)
     lattice = PollLattice(kind="unresolved", fresh_fraction=fresh / len(seen))
@@ -219,15 +223,15 @@ def _examine_joint(
     if usable:
         lattice = lag.feedback if lag else find_poll_lattice(tones, rng)
         hold_share = _hold_share(joint, tones, lattice, rng, lag)
-        found += [*_held(lattice, hold_share), *_slips(tones, lattice)]
-        found += scatter_findings(tones, lattice)
-        found += [*_excitation(trials), *_coverage(tones, speed, limit_rad_s)]
-    found = [replace(f, joint=joint) for f in found]
-    found.sort(key=lambda f: VERDICTS.index(f.verdict))
+        joint_findings += [*_held(lattice, hold_share), *_slips(tones, lattice)]
+        joint_findings += scatter_findings(tones, lattice)
+        joint_findings += [*_excitation(trials), *_coverage(tones, speed, limit_rad_s)]
+    joint_findings = [replace(f, joint=joint) for f in joint_findings]
+    joint_findings.sort(key=lambda f: VERDICTS.index(f.verdict))
     return JointExamination(
-        verdict=found[0].verdict if found else USE,
-        reasons=tuple(f.text for f in found) or (Finding("nothing_wrong", USE).text,),
-        findings=tuple(found),
+        verdict=joint_findings[0].verdict if joint_findings else USE,
+        reasons=tuple(f.text for f in joint_findings) or (Finding("nothing_wrong", USE).text,),
+        findings=tuple(joint_findings),
         loop_period_s=float(np.median(gaps)),
         jitter_s=float(np.std(gaps)),
         fresh_fraction=lattice.fresh_fraction,
@@ -286,14 +290,14 @@ def _held(lattice: PollLattice, hold_share: float) -> list[Finding]:
 
 def _slips(trials: Sequence[Trial], lattice: PollLattice) -> list[Finding]:
     """Jumps of the poll's phase, which ask for no care: both sides are dated."""
-    found = []
+    slips = []
     for slip in lattice.slips:
         tone = next(t.frequency_hz for t in trials if t.number == slip.trial)
         where = f"at {tone:g} Hz" if tone > 0 else f"in trial {slip.trial}"
         values = {"where": where, "jump_ms": 1e3 * slip.jump_s, "time_s": slip.time_s,
                   "nats": slip.nats}  # fmt: skip
-        found.append(Finding("poll_slipped", USE, values))
-    return found
+        slips.append(Finding("poll_slipped", USE, values))
+    return slips
 
 
 def _excitation(trials: Sequence[Trial]) -> list[Finding]:
@@ -307,15 +311,15 @@ def _excitation(trials: Sequence[Trial]) -> list[Finding]:
 
 
 def _coverage(trials: Sequence[Trial], speed: float, limit: float) -> list[Finding]:
-    found = []
+    shortcomings = []
     tones = [t for t in trials if t.frequency_hz > 0]
     frequencies = sorted({round(t.frequency_hz, 2) for t in tones})
     if len(frequencies) == 1 and len(tones) == len(trials):
-        found.append(Finding("one_frequency", CARE, {"frequency_hz": frequencies[0]}))
+        shortcomings.append(Finding("one_frequency", CARE, {"frequency_hz": frequencies[0]}))
     short = [t for t in tones if (t.send_time_s[-1] - t.send_time_s[0]) * t.frequency_hz < 2]
     if short:
-        found.append(Finding("short_tones", CARE, {"tones": len(short), "of": len(tones)}))
+        shortcomings.append(Finding("short_tones", CARE, {"tones": len(short), "of": len(tones)}))
     if speed < 0.9 * limit:
         values = {"speed_rad_s": speed, "limit_rad_s": limit, "percent": 100 * speed / limit}
-        found.append(Finding("slow_commands", USE, values))
-    return found
+        shortcomings.append(Finding("slow_commands", USE, values))
+    return shortcomings

@@ -156,10 +156,10 @@ def explain(trials: Sequence[Trial], step: float, exchanged: bool = False) -> Ex
     samples, maps, spread = [], [], []
     for t in trials:
         sample = _samples(t, live, grid)
-        found = _maps(sample, grid, len(lags))
-        if found is not None:
+        trial_maps = _maps(sample, grid, len(lags))
+        if trial_maps is not None:
             samples.append(sample)
-            maps.append(found)
+            maps.append(trial_maps)
             spread.append(float(np.var(sample.position_rad)))
     if not maps:
         return None
@@ -273,10 +273,10 @@ def _maps(
     n, sy, syy = (correlate(a, of_there) for a in (of_mask, of_y, of_square))
     n = np.maximum(n, 1e-9)
     rho, gain = np.zeros((2, len(FILTERS), count))
-    own = np.concatenate([np.full(before, samples.rest_rad), command])
+    held = np.concatenate([np.full(before, samples.rest_rad), command])
     enough = n >= _OVERLAP * mask.sum()
     for k, (hz, damping) in enumerate(FILTERS):
-        u = _low_pass(own, hz, damping, grid) - command.mean()
+        u = _low_pass(held, hz, damping, grid) - command.mean()
         of_u = transform(u)
         su, suy = correlate(of_mask, of_u), correlate(of_y, of_u)
         suu = correlate(of_mask, transform(u * u))
@@ -302,7 +302,7 @@ _MUCH_BETTER = 0.5
 
 def crossed(trials_by_joint: Mapping[str, Sequence[Trial]]) -> dict[str, Finding]:
     """Joints whose position follows the command of another one, recorded at the same time."""
-    found = {}
+    crossed_joints = {}
     for joint, trials in trials_by_joint.items():
         others = {
             name: theirs
@@ -312,8 +312,8 @@ def crossed(trials_by_joint: Mapping[str, Sequence[Trial]]) -> dict[str, Finding
         if not others or any(f.verdict == REFUSE for f in clock_findings(trials)):
             continue
         step = quantum(trials)
-        own = _servo(trials, step)
-        if own is None or own.unexplained < _MUCH_BETTER / 4:
+        servo = _servo(trials, step)
+        if servo is None or servo.unexplained < _MUCH_BETTER / 4:
             continue
         for other, theirs in others.items():
             instead = [
@@ -321,10 +321,10 @@ def crossed(trials_by_joint: Mapping[str, Sequence[Trial]]) -> dict[str, Finding
                 for t, o in zip(trials, theirs, strict=True)
             ]
             theirs_instead = _servo(instead, step)
-            if theirs_instead and theirs_instead.unexplained < _MUCH_BETTER * own.unexplained:
-                found[joint] = Finding("other_joint", REFUSE, {"other": other}, joint)
+            if theirs_instead and theirs_instead.unexplained < _MUCH_BETTER * servo.unexplained:
+                crossed_joints[joint] = Finding("other_joint", REFUSE, {"other": other}, joint)
                 break
-    return found
+    return crossed_joints
 
 
 def _servo(trials: Sequence[Trial], step: float) -> Servo | None:
@@ -367,12 +367,12 @@ def echo(trials: Sequence[Trial], step: float) -> Finding | None:
             sent = row[moves]
             # where each row has another command, those that a poll has yet to see may be left out
             steady = (np.diff(travel, prepend=-1.0) > 0) & (np.diff(travel, append=np.inf) > 0)
-            left = t.position_rad[sent + shift] - t.command_rad[sent]
-            parts.append(np.array([left, fresh[sent + shift] & steady[sent]]))
-        left, seen = np.concatenate([np.zeros((2, 0)), *parts], axis=1)
-        if np.isfinite(left).sum() < _ECHO_ROWS:
+            away = t.position_rad[sent + shift] - t.command_rad[sent]
+            parts.append(np.array([away, fresh[sent + shift] & steady[sent]]))
+        away, seen = np.concatenate([np.zeros((2, 0)), *parts], axis=1)
+        if np.isfinite(away).sum() < _ECHO_ROWS:
             break
-        for each in (left[np.isfinite(left)], left[np.isfinite(left) & (seen > 0)]):
+        for each in (away[np.isfinite(away)], away[np.isfinite(away) & (seen > 0)]):
             if len(each) < _ECHO_ROWS:
                 continue
             middle = 0.5 * float(np.sum(np.quantile(each, (0.01, 0.99))))
@@ -394,8 +394,8 @@ def _servo_would_show(trials: Sequence[Trial], near: float) -> bool:
         path = _low_pass(held, _FASTEST_HZ, 1.0, _SERVO_GRID_S)
         within = t.send_time_s + lag_s <= time[-1]
         away.append(np.interp(t.send_time_s + lag_s, time, path)[within] - t.command_rad[within])
-    shown = np.concatenate(away)
-    return bool(np.mean(np.abs(shown - np.median(shown)) > near) > 2 * (1 - _ECHO_SHARE))
+    distance = np.concatenate(away)
+    return bool(np.mean(np.abs(distance - np.median(distance)) > near) > 2 * (1 - _ECHO_SHARE))
 
 
 def _delayed(trials: Sequence[Trial], near: float, loop: float) -> Finding | None:
@@ -406,7 +406,7 @@ def _delayed(trials: Sequence[Trial], near: float, loop: float) -> Finding | Non
     if sum(map(len, rows)) < _ECHO_ROWS:
         return None
 
-    def left(lag: float) -> NDArray[np.float64]:
+    def residuals(lag: float) -> NDArray[np.float64]:
         parts = [
             t.position_rad[r] - np.interp(t.read_time_s[r] - lag, t.send_time_s, t.command_rad)
             for t, r in zip(trials, rows, strict=True)
@@ -415,13 +415,13 @@ def _delayed(trials: Sequence[Trial], near: float, loop: float) -> Finding | Non
         return away - 0.5 * float(np.sum(np.quantile(away, (0.01, 0.99))))
 
     def spread(lag: float) -> float:
-        return float(np.mean(left(lag) ** 2))
+        return float(np.mean(residuals(lag) ** 2))
 
     coarse = min(np.arange(-loop, _LONGEST_ECHO_S / 2, loop / 2), key=spread)
     around = (coarse - loop / 2, coarse + loop / 2)
     fine: Any = minimize_scalar(spread, bounds=around, method="bounded")
     late = float(fine.x)
-    if np.mean(np.abs(left(late)) <= near) < _ECHO_SHARE:
+    if np.mean(np.abs(residuals(late)) <= near) < _ECHO_SHARE:
         return None
     return Finding("echo_between_rows", REFUSE, {"late_ms": 1e3 * late})
 

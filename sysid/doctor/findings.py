@@ -42,7 +42,7 @@ def rivalled(finding: Finding, rival: str) -> Finding:
 
 WORDS: dict[str, str] = {
     "angle_wrapped": (
-        "readings jump by about a turn {times} times within a row, the first time at "
+        "angles jump by about a turn {times} times within a row, the first time at "
         "{time_s:.2f} s: an angle wrapped at ±π or at the encoder's end. Unwrap it "
         "(numpy.unwrap), or mount the horn so that the range is not crossed."
     ),
@@ -141,7 +141,7 @@ WORDS: dict[str, str] = {
         "part, or record again when it has cooled."
     ),
     "gaps": (
-        "{percent:.0f} % of the recorded time lies in gaps of up to {longest_s:.2g} s between "
+        "{percent:.0f} % of the recorded time lies in gaps of up to {longest_s:,.1f} s between "
         "rows, where the motion is unknown. Give each stretch its own trial number, or record "
         "again."
     ),
@@ -306,6 +306,11 @@ WORDS: dict[str, str] = {
         "{percent:.0f} % of the readings are missing; the rest is used. Check the plugs before "
         "the next recording."
     ),
+    "speed_for_command": (
+        "the position moves as the sum of the commands ({percent:.0f} %), and not as they do: "
+        "they are speeds, duty cycles or changes of the goal. A position servo's log needs its "
+        "goals; of changes they are the sum (numpy.cumsum)."
+    ),
     "speed_for_position": (
         "the position moves as the joint's speed does: its integral follows the command "
         "({percent:.0f} %), and it does not. The column holds a velocity; take that of the angle."
@@ -428,20 +433,18 @@ def shared(by_joint: Mapping[str, Sequence[Finding]]) -> list[tuple[str, str]]:
     """Joints and sentences: findings that differ in nothing but their numbers become one."""
     groups: dict[tuple, dict[str, Finding]] = {}
     for joint, findings in by_joint.items():
-        kinds = [_kind(f) for f in findings]
+        kinds = [
+            (f.code, f.verdict, *(v for v in f.values.values() if isinstance(v, str)))
+            for f in findings
+        ]
         for finding, kind in zip(findings, kinds, strict=True):
             # two of a kind about one joint, e.g. on two of its trials, stay apart
-            own = kind if kinds.count(kind) == 1 else (*kind, str(finding.values))
-            groups.setdefault(own, {})[joint] = finding
+            group = kind if kinds.count(kind) == 1 else (*kind, str(finding.values))
+            groups.setdefault(group, {})[joint] = finding
     return [
-        ("All joints" if len(own) == len(by_joint) > 2 else ", ".join(own), _ranged(own))
-        for own in groups.values()
+        ("All joints" if len(group) == len(by_joint) > 2 else ", ".join(group), _ranged(group))
+        for group in groups.values()
     ]
-
-
-def _kind(finding: Finding) -> tuple:
-    words = tuple(v for v in finding.values.values() if isinstance(v, str))
-    return finding.code, finding.verdict, words
 
 
 def _ranged(findings: Mapping[str, Finding]) -> str:

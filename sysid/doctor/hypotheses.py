@@ -45,6 +45,7 @@ _FASTEST_RAD_S, _WRAP_RAD, _UNUSUAL = 20.0, 0.5, 8.0  # a good servo of this siz
 _HELD = 0.4  # of the command's range, to and fro
 _SAME_TONE_HZ = 0.02
 _DIFFERENT = 0.35  # of the gain
+_NEAR_TURN = 0.5  # of a command's jump
 _SPEED_LEFT, _SPEED_BETTER, _SPEED_GAIN = 0.12, 0.35, 0.55  # the last of the logarithm
 
 
@@ -61,10 +62,10 @@ def relations(joint: Followed) -> list[Relation]:
     """All relations of one joint's command and position, the likeliest first."""
     base = joint.base
     causal = base.causal(_LONGEST_LAG_S)
-    found = [Relation("", joint.servo), Relation("sign_inverted", base.best(-1.0, causal))]
+    candidates = [Relation("", joint.servo), Relation("sign_inverted", base.best(-1.0, causal))]
     if _turns(joint.trials) >= _TURNS:
         ahead = base.best(1.0, base.total_s < -0.5 * base.grid_s)
-        found.append(Relation("position_early", ahead))
+        candidates.append(Relation("position_early", ahead))
         other = explain(joint.trials, joint.step, True)
         if other is not None:
             other = replace(other, rows=base.rows)
@@ -72,8 +73,8 @@ def relations(joint: Followed) -> list[Relation]:
             swapped = other.best(1.0, late)
             # a filter takes the noise out of any position, but only ahead of time if it is one
             if swapped.nats < other.best(1.0, other.total_s < -0.5 * other.grid_s).nats:
-                found.append(Relation("columns_swapped", swapped))
-    return sorted(found, key=lambda r: r.servo.nats)
+                candidates.append(Relation("columns_swapped", swapped))
+    return sorted(candidates, key=lambda r: r.servo.nats)
 
 
 def _sound(joint: Followed) -> bool:
@@ -94,8 +95,8 @@ def relation_findings(joint: Followed) -> list[Finding]:
     best, second = ranked[:2]
     plain = next(r for r in ranked if not r.code)
     # the servo as it is has limits and may change, which the other relations are not fitted with
-    left = change.fit.unexplained(joint) if change else joint.unexplained
-    if best.code and best.servo.nats > min(plain.servo.nats, base.nats(left)) - CLEAR_NATS:
+    unexplained = change.fit.unexplained(joint) if change else joint.unexplained
+    if best.code and best.servo.nats > min(plain.servo.nats, base.nats(unexplained)) - CLEAR_NATS:
         best = plain
     share = 1 - best.servo.unexplained
     held = bool(held_findings(trials, joint.step) or changes or joint.stays_often)
@@ -170,12 +171,14 @@ def _usual_gain(joint: Followed, best: Relation) -> bool:
     base = joint.base
     inside = base.causal(_LONGEST_LAG_S) & usual(np.tensordot(base.weight, base.gains, axes=1))
     sign = float(np.sign(best.servo.gain))
-    left = base.best(sign, inside).unexplained if inside.any() else 1.0
+    unexplained = base.best(sign, inside).unexplained if inside.any() else 1.0
     least = best.servo.unexplained
     if not best.code:
-        left = min(left, joint.unexplained if usual(float(joint.fit.values[0])) else 1.0)
+        unexplained = min(
+            unexplained, joint.unexplained if usual(float(joint.fit.values[0])) else 1.0
+        )
         least = min(least, joint.unexplained)
-    return base.nats(left) < base.nats(least) + CLEAR_NATS
+    return base.nats(unexplained) < base.nats(least) + CLEAR_NATS
 
 
 def _scale(joint: Followed, best: Relation, excused: bool) -> Finding | None:
@@ -260,12 +263,20 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
 
     The readings beyond the jump are put back, shifted or mirrored, whichever the command explains.
     """
+    for t in trials:
+        turned = np.flatnonzero(np.abs(np.abs(np.diff(t.command_rad)) - 2 * np.pi) < _NEAR_TURN)
+        if len(turned):
+            when = float(t.send_time_s[turned[0] + 1] - trials[0].send_time_s[0])
+            return [Finding("angle_wrapped", REFUSE, {"times": len(turned), "time_s": when})]
     jumps = [_jumps(t, step) for t in trials]
     sizes = np.concatenate([np.abs(size) for size, _ in jumps])
     if not len(sizes):
         return []
     jump = float(np.median(sizes))
-    middle = _gap(np.concatenate([t.position_rad for t in trials]), jump)
+    ordered = np.concatenate([t.position_rad for t in trials])
+    ordered = np.sort(ordered[np.isfinite(ordered)])
+    widest = int(np.argmax(np.diff(ordered)))
+    middle = float(0.5 * (ordered[widest] + ordered[widest + 1]))
     shifted = [_beyond(t, middle, lambda v: v - jump) for t in trials]
     edge = min(float(np.nanmin(np.where(t.position_rad > middle, t.position_rad, np.inf)))
                for t in trials)  # fmt: skip
@@ -277,13 +288,13 @@ def encoder_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     sign = np.log2(max(edge - bottom, 1e-6) / step) if step > 0 else 0.0
     signed = _is_bit(sign) if step > 0 else near > 0.1 * turn
     others = {"shifted": shifted} | ({"mirrored": mirrored} if signed else {})
-    left = {name: _unexplained(t, step) for name, t in {"": list(trials), **others}.items()}
-    if left[""] < _FITS:
+    unexplained = {name: _unexplained(t, step) for name, t in {"": list(trials), **others}.items()}
+    if unexplained[""] < _FITS:
         return []  # a fast joint, or one in another unit
-    best = min(left, key=lambda name: left[name])
-    if near > 0.1 * turn and (not best or left[best] > max(_FITS, 0.5 * left[""])):
+    best = min(unexplained, key=lambda name: unexplained[name])
+    if near > 0.1 * turn and (not best or unexplained[best] > max(_FITS, 0.5 * unexplained[""])):
         return []  # it is no turn that jumps, and put back no servo explains it
-    if not best or left[best] > 0.7 * left[""]:
+    if not best or unexplained[best] > 0.7 * unexplained[""]:
         best = "shifted"
     values = {"times": len(sizes), "time_s": when}
     bits = np.log2(jump / step) if step > 0 else 0.0
@@ -317,13 +328,6 @@ def _jumps(trial: Trial, step: float) -> tuple[NDArray[np.float64], NDArray[np.f
     return move[far], time[new][1:][far]
 
 
-def _gap(position: NDArray[np.float64], jump: float) -> float:
-    """Middle of the widest gap between readings."""
-    ordered = np.sort(position[np.isfinite(position)])
-    at = int(np.argmax(np.diff(ordered)))
-    return float(0.5 * (ordered[at] + ordered[at + 1]))
-
-
 def _beyond(trial: Trial, middle: float, put_back: Callable[[NDArray], NDArray]) -> Trial:
     position = trial.position_rad
     return replace(trial, position_rad=np.where(position > middle, put_back(position), position))
@@ -335,29 +339,52 @@ def _unexplained(trials: Sequence[Trial], step: float) -> float:
 
 
 def speed_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
-    """A column that holds the joint's speed: its integral follows the command, and it does not."""
+    """A column that holds a speed: its integral goes with the other column, and it does not.
+
+    A position may hold the joint's speed; a command may be one, a duty cycle, or a change of the
+    goal.
+    """
     plain = _unexplained(trials, step)
-    summed = [_summed(t) for t in trials if np.isfinite(t.position_rad).sum() > 8]
-    other = explain(summed, 0.0) if plain > _SPEED_LEFT and summed else None
-    if other is None:
+    read = [t for t in trials if np.isfinite(t.position_rad).sum() > 8]
+    if plain <= _SPEED_LEFT or not read:
         return []
-    servo = other.best(1.0, other.causal())
-    if servo.unexplained > min(_SPEED_LEFT, _SPEED_BETTER * plain):
-        return []
-    if abs(np.log(max(servo.gain, 1e-9))) > _SPEED_GAIN:
-        return []
-    return [Finding("speed_for_position", REFUSE, {"percent": 100 * (1 - servo.unexplained)})]
+    for code, summed in (("speed_for_position", _position_summed),
+                         ("speed_for_command", _command_summed)):  # fmt: skip
+        other = explain([summed(t) for t in read], 0.0)
+        servo = other.best(1.0, other.causal()) if other else None
+        if servo is None or servo.unexplained > min(_SPEED_LEFT, _SPEED_BETTER * plain):
+            continue
+        # of commands the factor is the drive's
+        if code == "speed_for_command" or abs(np.log(max(servo.gain, 1e-9))) <= _SPEED_GAIN:
+            return [Finding(code, REFUSE, {"percent": 100 * (1 - servo.unexplained)})]
+    return []
 
 
-def _summed(trial: Trial) -> Trial:
+def _position_summed(trial: Trial) -> Trial:
     """The trial with the integral of its position, without the line that a constant leaves."""
     seen = np.isfinite(trial.position_rad)
     time, value = trial.read_time_s[seen], trial.position_rad[seen]
-    total = np.concatenate([[0.0], np.cumsum(np.diff(time) * 0.5 * (value[1:] + value[:-1]))])
-    line = np.column_stack([np.ones_like(time), time - time[0]])
     position = np.full(len(seen), np.nan)
-    position[seen] = total - line @ least_squares(line, total)
+    position[seen] = _level(time, np.cumsum(np.gradient(time) * value))
     return replace(trial, position_rad=position, position_count=None)
+
+
+def _command_summed(trial: Trial) -> Trial:
+    """The trial with the integral of its command; both without the line that a constant leaves."""
+    seen, sent = np.isfinite(trial.position_rad), trial.send_time_s
+    total = np.concatenate([[0.0], np.cumsum(np.diff(sent) * trial.command_rad[:-1])])
+    command, position = _level(sent, total), trial.position_rad.copy()
+    position[seen] = _level(trial.read_time_s[seen], position[seen])
+    return replace(
+        trial, command_rad=command, position_rad=position, position_count=None,
+        initial_command_rad=float(command[0]),
+    )  # fmt: skip
+
+
+def _level(time: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values without their straight line."""
+    line = np.column_stack([np.ones_like(time), time - time[0]])
+    return values - line @ least_squares(line, values)
 
 
 # ----- what comes on top of a servo that follows
@@ -374,23 +401,23 @@ def held_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
 
 def hypothesis_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     """What explains the pair of columns, and what comes on top of it."""
-    if found := echo(trials, step):
-        return [found]
+    if findings := echo(trials, step):
+        return [findings]
     joint = followed(trials, step)
-    found = relation_findings(joint) if joint else []
-    if joint is None or any(f.verdict == REFUSE for f in found):
-        return found
-    found += _trials_differ(joint) or joint.changes or second_writer(joint)
+    findings = relation_findings(joint) if joint else []
+    if joint is None or any(f.verdict == REFUSE for f in findings):
+        return findings
+    findings += _trials_differ(joint) or joint.changes or second_writer(joint)
     loaded = any(t.load is not None for t in trials)
     loose = joint.base.explained < _LOOSE and not _sound(joint)
     disturbed = joint.fit.cost - joint.noise - joint.unsure > _DISTURBED
-    if (loose or disturbed) and not (found or loaded or held_findings(trials, step)):
+    if (loose or disturbed) and not (findings or loaded or held_findings(trials, step)):
         if joint.stays_often:
             return [joint.stays_often]
         if loose:
             return [Finding("loosely_related", CARE, {"percent": 100 * joint.base.explained})]
         return [Finding("disturbed", CARE, {"percent": 100 * joint.unexplained})]
-    return found
+    return findings
 
 
 def _trials_differ(joint: Followed) -> list[Finding]:

@@ -72,15 +72,15 @@ def unit_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
 def frozen_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     """Readings that stop changing while the command goes on, or do not change in some trials."""
     longest = [_frozen_s(t) for t in trials]
-    found, frozen = [], sum(s > 0 for s in longest)
+    findings, frozen = [], sum(s > 0 for s in longest)
     if frozen:
         values = {"trials": frozen, "of": len(trials), "longest_s": max(longest)}
-        found.append(Finding("frozen", REFUSE if 2 * frozen > len(trials) else CARE, values))
+        findings.append(Finding("frozen", REFUSE if 2 * frozen > len(trials) else CARE, values))
     if still := _still(trials, step):
         verdict = REFUSE if 2 * len(still) > len(trials) else CARE
         values = {"plural": "s" if still[1:] else "", "trials": ", ".join(map(str, still[:5]))}
-        found.append(Finding("still_trials", verdict, values))
-    return found
+        findings.append(Finding("still_trials", verdict, values))
+    return findings
 
 
 def interpolation_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
@@ -277,10 +277,10 @@ def clock_findings(trials: Sequence[Trial]) -> list[Finding]:
     gaps = np.concatenate([np.diff(t.send_time_s) for t in trials])
     loop = float(np.median(gaps))
     spans = np.array([t.send_time_s[-1] - t.send_time_s[0] for t in trials])
-    found = [*_unit(loop), *_budget(spans), *_order(trials, gaps)]
-    if any(f.verdict == REFUSE for f in found):
-        return found
-    return [*found, *_two_clocks(trials, loop), *_gaps(gaps, loop)]
+    findings = [*_unit(loop), *_budget(spans), *_order(trials, gaps)]
+    if any(f.verdict == REFUSE for f in findings):
+        return findings
+    return [*findings, *_two_clocks(trials, loop), *_gaps(gaps, loop)]
 
 
 def _unit(loop: float) -> list[Finding]:
@@ -334,18 +334,18 @@ def _two_clocks(trials: Sequence[Trial], loop: float) -> list[Finding]:
 
 
 def _gaps(gaps: NDArray[np.float64], loop: float) -> list[Finding]:
-    found = []
+    findings = []
     late = gaps[gaps > _LONG_GAP * loop]
     lost = float(late.sum() / max(gaps.sum(), 1e-12))
     if lost > _LOST_TIME:
         return [Finding("gaps", REFUSE, {"percent": 100 * lost, "longest_s": late.max()})]
     if np.std(gaps) > _UNEVEN * loop:
         values = {"jitter_ms": 1e3 * np.std(gaps), "loop_ms": 1e3 * loop}
-        found.append(Finding("uneven_loop", CARE, values))
+        findings.append(Finding("uneven_loop", CARE, values))
     if len(late):
         values = {"times": len(late), "longest_s": late.max()}
-        found.append(Finding("loop_stood_still", CARE, values))
-    return found
+        findings.append(Finding("loop_stood_still", CARE, values))
+    return findings
 
 
 def tone_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
@@ -354,18 +354,22 @@ def tone_findings(trials: Sequence[Trial], step: float) -> list[Finding]:
     tones = [t for t in trials if t.frequency_hz > 0]
     fast = [t for t in tones if t.frequency_hz * loop * _ROWS_PER_PERIOD > 1]
     wrong = [t for t in tones if all(t is not f for f in fast) and _tone_share(t) < _IS_TONE]
-    found = []
+    findings = []
     if wrong:
-        first, own = wrong[0], _strongest_hz(wrong[0])
+        first, strongest_hz = wrong[0], _strongest_hz(wrong[0])
         verdict = REFUSE if 2 * (len(wrong) + len(fast)) > len(tones) else CARE
-        values = {"trial": first.number, "called_hz": first.frequency_hz, "strongest_hz": own}
-        found.append(Finding("not_its_tone", verdict, values))
+        values = {
+            "trial": first.number,
+            "called_hz": first.frequency_hz,
+            "strongest_hz": strongest_hz,
+        }
+        findings.append(Finding("not_its_tone", verdict, values))
     if fast:
         highest = max(t.frequency_hz for t in fast)
         verdict = REFUSE if len(fast) == len(tones) else CARE
         values = {"frequency_hz": highest, "rows": 1 / max(highest * loop, 1e-300)}
-        found.append(Finding("too_few_rows_a_period", verdict, values))
-    return found
+        findings.append(Finding("too_few_rows_a_period", verdict, values))
+    return findings
 
 
 def _tone_share(trial: Trial) -> float:
@@ -383,8 +387,8 @@ def _tone_share(trial: Trial) -> float:
         if total < 1e-12:
             continue
         design = sine_design(2 * np.pi * trial.frequency_hz * (time[part] - time[first]))
-        left = value[part] - design @ least_squares(design, value[part])
-        best = max(best, 1 - float(np.var(left)) / total)
+        residuals = value[part] - design @ least_squares(design, value[part])
+        best = max(best, 1 - float(np.var(residuals)) / total)
     return best
 
 

@@ -85,8 +85,8 @@ def second_writer(joint: Followed) -> list[Finding]:
     sticks = 2 * joint.friction_rad > _STICKS * joint.reach  # it jumps where friction lets go
     if loaded or sticks or interpolation_findings(joint.trials, joint.step):
         return []
-    shown, none = zip(*(pulses(joint, n) for n in range(len(joint.base.samples))), strict=True)
-    every, none = _together(shown), _together(none)
+    stays, none = zip(*(pulses(joint, n) for n in range(len(joint.base.samples))), strict=True)
+    every, none = _together(stays), _together(none)
     every = every.part(np.abs(every.size_rad) > every.least(joint))
     nats, towards = towards_one_goal(every, none, joint)
     places = float(np.ptp(every.command_rad[towards])) if towards.any() else 0.0

@@ -22,17 +22,17 @@ from pupper_sysid.sysid.recordings.importers.options import (
     likely_of_pair,
     unit,
 )
-from pupper_sysid.sysid.recordings.importers.refusals import import_line
+from pupper_sysid.sysid.recordings.importers.refusals import PULSES_US, import_line
 from pupper_sysid.sysid.recordings.table import LARGEST_COUNT
 
 _LEAST_ROWS = 20
-_PULSES_US = (400.0, 2700.0)
 _FARTHEST_RAD = 200 * np.pi  # of angles whose unit was stated
 _IDENTITY = ["joint", "trial", "send_time_s", "read_time_s", "command_rad", "position_rad"]
 _MANY_REPEATED = 0.1  # of the rows
 _SHORTEST_TRIAL = 3  # rows; a rate of the command takes as many
 _LATEST_S = 1e11
 _FASTEST_HZ = 20_000.0  # loop of a servo
+_SMALL_RAD = 0.1
 _MANY_ROWS = 5  # that lie apart from the others
 _FEW_TRIALS = 10  # that are named one by one
 
@@ -53,7 +53,8 @@ def check(
     warnings: list[str] = []
     options = options or LogOptions()
     if strange := strange_joint(table["joint"].unique().tolist(), "columns" in metadata):
-        raise InputError(f"{path}, column joint: '{strange[0]}' is no joint; {strange[1]}")
+        called = printable(strange[0])[:60]
+        raise InputError(f"{path}, column joint: '{called}' is no joint; {strange[1]}")
     needed = ["send_time_s", "read_time_s", "trial", "command_rad"]
     lost = np.isnan(table[needed].to_numpy(float)).any(axis=1)
     if lost.any():
@@ -149,21 +150,34 @@ def _refuse_degrees(
     joint = str(table["joint"].iloc[farthest])
     names = metadata.get("columns") or {}
     kind = "position" if column == "position_rad" else "command"
-    source = (names.get(joint) or {}).get(kind) if isinstance(names, dict) else None
+    of_joint = names.get(joint) if isinstance(names, dict) else None
+    of_joint = of_joint if isinstance(of_joint, Mapping) else {}
+    source = of_joint.get(kind)
     place = f"{printable(str(source))[:60]} (the {kind} of {joint})" if source else column
-    by_name = _units_by_name(names.get(joint) if isinstance(names, dict) else None)
-    pulses = kind == "command" and _PULSES_US[0] < np.nanmin(known) <= largest < _PULSES_US[1]
+    by_name = [column_named(str(of_joint.get(k, ""))).unit for k in ("command", "position")]
+    pulses = kind == "command" and PULSES_US[0] < np.nanmin(known) <= largest < PULSES_US[1]
     if pulses and (stated or any(by_name)):
         raise InputError(
             f"{path}, column {place}: values of {np.nanmin(known):.4g} to {largest:.4g} beside "
             "angles look like pulse widths in µs. Write them as angles, about (µs - 1500) * "
             "0.0016 rad, and give that column."
         )
+    for turn in (2**16, 2**32):
+        apart = (known < turn / 4) | (known > 0.75 * turn)
+        if 0.75 * turn < largest < turn and apart.all() and not (known % 1).any():
+            raise InputError(
+                f"{path}, column {place}: values are near 0 and near {turn:,}, which looks like "
+                f"negative numbers read without their sign. Take {turn:,} off those above "
+                f"{turn // 2 - 1:,} in the log, and say what the rest counts."
+            )
     if stated:
         raise InputError(
             f"{path}, column {place}: values reach {largest:.4g} rad, more than a hundred turns. "
             "Say the unit (such as deg, turns or counts:8192:0), or take the start's angle off."
         )
+    of_row = table["joint"].to_numpy()
+    others = [j for j in map(str, table["joint"].unique())
+              if _SMALL_RAD < values[of_row == j].max() <= LARGEST_RAD]  # fmt: skip
     angles = table.loc[table["joint"] == joint, ["command_rad", "position_rad"]].to_numpy(float)
     units = likely_of_pair(*(values[np.isfinite(values)] for values in angles.T))
     if units == ["deg"] and str(source).endswith(".pos") and largest <= 100:
@@ -187,26 +201,29 @@ def _refuse_degrees(
     raise InputError(
         f"{text}, or convert the log with {lines} (or turns, counts:4096, scale:…; rad if the "
         "joint turns so far)."
+        + (
+            f" If {', '.join(others)[:200]} are in radians as they are, give `units: {{{joint}: "
+            f"'{units[0]}'}}` in a mapping file instead."
+            if others
+            else ""
+        )
     )
-
-
-def _units_by_name(columns: Any) -> list[str]:
-    """Units that the names of the columns of a command and a position say."""
-    names = columns if isinstance(columns, Mapping) else {}
-    return [column_named(str(names.get(kind, ""))).unit for kind in ("command", "position")]
 
 
 def _with_named(units: str, by_name: list[str]) -> str:
     """The units of an option, with those that the names of columns say in their place."""
     command, _, position = units.partition(",")
-    pair = [own or text for own, text in zip(by_name, (command, position or command), strict=True)]
+    texts = (command, position or command)
+    pair = [text if named in ("", "rad") else named
+            for named, text in zip(by_name, texts, strict=True)]  # fmt: skip
     return ",".join(dict.fromkeys(pair)) if any(by_name) else units
 
 
 def _words(unit: str) -> str:
     name, _, turn = unit.partition(":")
     if name != "counts":
-        return {"deg": "degrees", "rad": "radians"}.get(name, name)
+        words = {"deg": "degrees", "rad": "radians", "scale": "values in parts of a degree"}
+        return words.get(name, name)
     counts, _, zero = turn.partition(":")
     return f"counts of an encoder with {counts} a turn" + (", 0 rad at count 0" if zero else "")
 

@@ -28,6 +28,7 @@ from pupper_sysid.common.errors import InputError
 from pupper_sysid.common.files import versions, write_text
 from pupper_sysid.common.joints import DEFAULT_POSE, in_order
 from pupper_sysid.common.reading.csv_table import distinct
+from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.hardware.joint_map import PRESETS, load_joint_map
 from pupper_sysid.sysid.recordings.check import check
 from pupper_sysid.sysid.recordings.importers.columns import has_time
@@ -248,14 +249,15 @@ class Recording:
         shared |= {} if read_time_s is None else {"read_time_s": read_time_s}
         parts = []
         for joint, command in command_rad.items():
+            place = f"{name}, {printable(str(joint))[:60]}"
             arrays = shared | {"command_rad": command, "position_rad": position_rad[joint]}
             columns: dict[str, Any] = {"send_time_s": time_s, "joint": str(joint)}
             for key, values in arrays.items():
-                columns[key] = _numbers(f"{name}, {joint}", key, values)
+                columns[key] = _numbers(place, key, values)
                 free = key in ("trial", "frequency_hz") and columns[key].ndim == 0
                 if not free and columns[key].shape != time_s.shape:
                     raise InputError(
-                        f"{name}, {joint}: {key} has shape {columns[key].shape}, send_time_s "
+                        f"{place}: {key} has shape {columns[key].shape}, send_time_s "
                         f"{time_s.shape}; they must have the same number of values."
                     )
             parts.append(pd.DataFrame(columns, index=range(len(time_s))))
@@ -305,6 +307,8 @@ class Recording:
             try:
                 if column in TEXT_COLUMNS and not pd.api.types.is_numeric_dtype(cells):
                     raise ValueError
+                if np.iscomplexobj(cells.to_numpy()):  # whose imaginary part would be lost
+                    raise TypeError
                 values = cells.astype(float).to_numpy(float)
             except (TypeError, ValueError):
                 if column not in TEXT_COLUMNS:

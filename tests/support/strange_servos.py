@@ -417,6 +417,17 @@ def _speed(t, world, rng):
     return t.assign(position_rad=np.gradient(t.position_rad.to_numpy(), time))
 
 
+def _rates(t, world, rng):
+    """Commands of a drive that takes speeds or duty cycles, which it follows."""
+    goal, time = t.command_rad.to_numpy(), t.send_time_s.to_numpy()
+    return t.assign(command_rad=rng.uniform(0.2, 1.0) * np.gradient(goal, time))
+
+
+def _changes(t, world, rng):
+    """A policy's commands of this row less that of the row before."""
+    return t.assign(command_rad=np.diff(t.command_rad.to_numpy(), prepend=t.command_rad.iloc[0]))
+
+
 FAULTS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "healthy": (healthy, ()),
     "sign": (_rows(_inverted), ("sign_inverted",)),
@@ -445,6 +456,11 @@ FAULTS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "torque fades": (_torque_fades, ("torque_fades", "torque_changed", "gain_drifts")),
     "held at times": (_held_at_times, ("frozen", "left_path")),
     "unplugged at times": (_rows(_unplugged_at_times), ("frozen", "left_path")),
+    # of one tone they are another scale
+    "commands of speed": (_rows(_rates), ("speed_for_command", "hardly_moves", "scale_asks_care",
+                                          "scale_too_large")),
+    "changes of the goal": (_rows(_changes), ("speed_for_command", "scale_asks_care",
+                                              "scale_too_large")),
 }  # fmt: skip
 
 ACCUSING = sorted({code for _, codes in FAULTS.values() for code in codes})

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import io
 import struct
+import subprocess
+import sys
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -41,7 +43,7 @@ from pupper_sysid.sysid.recordings.importers.times import drive_in, stated_rate,
 ZIP, NPY, MAT = b"PK\x03\x04", b"\x93NUMPY", b"MATLAB 5.0"
 
 _NAMES = ("joint_names", "joints", "names", "motor_names", "dof_names")
-_DEEPEST = 3  # of dictionaries in a torch file, of structures in MATLAB's
+_DEEPEST = 3  # of dictionaries in a torch file
 
 
 def read_arrays(path: Path, data: bytes, options: LogOptions) -> Log:
@@ -145,12 +147,33 @@ def _loaded(path: Path, data: bytes) -> Any:
 _MAT_HEADER, _MAT_COMPRESSED, _PIECE = 128, 15, 1 << 20  # of MATLAB 5 MAT-files
 
 
+_LOAD_MAT = """
+import io, sys
+import numpy
+from scipy.io import loadmat
+
+def flat(name, value, depth):
+    if isinstance(value, dict) and depth:
+        for key, inside in value.items():
+            yield from flat(f"{name}.{key}"[:200], inside, depth - 1)
+    elif numpy.asarray(value).dtype.kind in "biufUS":
+        yield name, numpy.asarray(value)
+
+loaded = loadmat(io.BytesIO(sys.stdin.buffer.read()), simplify_cells=True)
+named = {f"/{name}": value for name, value in loaded.items() if name[:2] != "__"}
+out = io.BytesIO()
+numpy.savez(out, **dict(pair for name in named for pair in flat(name, named[name], 4)))
+sys.stdout.buffer.write(out.getvalue())
+"""
+"""Program that writes the arrays of a MATLAB 5 file as those of an archive, `/name` for `name`."""
+
+
 def _mat_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
     """The arrays of a MATLAB 5 file, those in structures as `structure.field`."""
     order, at, total = ">" if data[126:128] == b"MI" else "<", _MAT_HEADER, 0
-    remedy = "Save it again with save(name, '-v7'), or writematrix."
-    from scipy.io import loadmat
-
+    damaged = (
+        f"{path} is a damaged MATLAB file. Save it again with save(name, '-v7'), or writematrix."
+    )
     try:
         while at + 8 <= len(data):
             kind, size = struct.unpack_from(f"{order}II", data, at)
@@ -160,18 +183,19 @@ def _mat_arrays(path: Path, data: bytes) -> dict[str, NDArray[Any]]:
                 rest = unpacker.unconsumed_tail
                 refuse_more(f"{path}, unpacked,", total, LARGEST_BYTES, "bytes", exact=False)
             at += 8 + size
-        loaded = loadmat(io.BytesIO(data), simplify_cells=True)
-    except InputError:
-        raise
-    except Exception as error:  # damaged ones raise whatever zlib and scipy do
-        raise InputError(f"{path} is a damaged MATLAB file. {remedy}") from error
-    named = {name: value for name, value in loaded.items() if name[:2] != "__"}
-    return {name: value for name, value in _flat(path, named)
-            if isinstance(value, np.ndarray) and value.dtype.kind in "biufUS"}  # fmt: skip
+    except zlib.error as error:
+        raise InputError(damaged) from error
+    # damage can end the process that reads it
+    program = [sys.executable, "-I", "-c", _LOAD_MAT]
+    reader = subprocess.run(program, input=data, capture_output=True)
+    if reader.returncode:
+        raise InputError(damaged)
+    arrays = _loaded(path, reader.stdout)
+    return {name.removeprefix("/"): values for name, values in arrays.items()}
 
 
 def _flat(path: Path, loaded: Mapping[Any, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the values in structures or dictionaries as `structure.field`."""
+    """Yield the values in dictionaries as `name.key`."""
     count, pending = 0, [(str(name)[:200], value, 0) for name, value in loaded.items()]
     while pending:
         refuse_more(path, count + len(pending), MOST_COLUMNS, "arrays", exact=False)

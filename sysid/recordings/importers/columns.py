@@ -30,7 +30,8 @@ UNITS: dict[str, str] = {
         ("rad", "rad rads radian radians 弧度 рад 라디안"),
         ("mrad", "mrad"),
         ("deg", "deg degs degree degrees ° grad grados gradi graus graden degré degrés degres "
-                "stopnie stopni 度 도 град градусы градусов"),
+                "stopnie stopni derece grader fok grade astetta stupňů stupeň "
+                "stupne 度 도 град градусы градусов"),
         ("turns", "turn turns rev revs revolution revolutions rotation rotations "
                   "umdrehungen"),
         ("percent", "percent pct"),
@@ -63,6 +64,7 @@ WORDS: dict[str, str] = {
                   "setpoint setpoints set sp reference references ref refs demand demanded "
                   "requested action actions soll sollwert sv consigne consigna riferimento "
                   "referencia börvärde 目标 目標 指令 给定 设定 목표 명령 "
+                  "ohjearvo tavoite žádaná žádaný zadaná alapjel cél mål 指令値 目標値 "
                   "zadana zadany referência deseado deseada desejado desejada desiderato gewenst "
                   "gewenste voulu voulue заданный заданное задание hedef 目標"),
         (MAYBE_COMMAND, "u r ctrl control input inputs send sent tx request planned plan "
@@ -73,11 +75,14 @@ WORDS: dict[str, str] = {
                 "potentiometer pot resolver pv ist istwert ärvärde mesure misura medida "
                 "实际 当前 実測 反馈 現在 測定 测量 현재 측정 "
                 "zmierzona zmierzony medido gemeten atual mesuré mesurée misurato измеренный "
+                "mittaus mitattu skutečná skutečný měřená mért olculen ölçülen uppmätt "
+                "計測値 測定値 "
                 "измеренное gerçek gercek"),
         (MAYBE_STATE, "y output outputs read rx follower receive received recv rcv process"),
         (ANGLE, "position positions pos posn angle angles ang qpos q p theta θ winkel "
                 "角度 位置 각도 위치 ángulo posición posicion ângulo posição kąt hoek угол "
-                "angolo posizione açı aci"),
+                "angolo posizione açı aci poloha úhel szög pozíció asento kulma vinkel läge "
+                "положение позиция kot"),
         (OTHER, "v w velocity velocities vel vels speed speeds omega qd dq qdot qvel rate accel "
                 "acceleration accelerations acc qdd ddq torque torques tau effort efforts load "
                 "current currents curr cur amps ampere voltage volt volts temperature temperatures "
@@ -92,7 +97,7 @@ WORDS: dict[str, str] = {
                "millis micros nanos nsec ns us µs ms date datetime utc epoch at "
                "nanosec nanosecs nsecs usec usecs tout minutes days datenum zeit temps tiempo "
                "tempo tid datum fecha uhrzeit hora heure 时间 時間 "
-               "時刻 시간 秒 毫秒 초 czas tijd время zaman"),
+               "時刻 시간 秒 毫秒 초 czas tijd время zaman aika čas idő cas"),
         (UNIT, " ".join(UNITS)),
         (JOINT, "joint joints dof dofs motor motors servo servos actuator actuators axis axes dxl "
                 "group controller controllers data value values val field name names msg body "
@@ -125,6 +130,7 @@ _PARTS_OF = re.compile(  # 0.1deg, 1e-3 rad, pi rad; deg/10, deg*100, deg_x10
     r"(?<![^\W_])(?<!\.)(?P<part>\d*\.\d+|\d+e-\d+|pi|π)[\s*·_]*(?P<unit>deg|rad|°)(?![a-z])|"
     r"(?<![a-z])(?P<whole>deg|rad|°)[\s_]*[/*×x][\s_]*(?P<times>10+)(?!\d)"
 )
+_PERCENT = re.compile(r"(?<=.)[%％]")  # %time is ROS's
 _SYMBOL = re.compile(r"\[(m|N|N[·.*]?m|A|mA|V|mV)\]\s*$")  # units of one letter, only in brackets
 _RAD = {"deg": np.pi / 180, "°": np.pi / 180, "rad": 1.0}
 
@@ -179,6 +185,7 @@ def column(name: str) -> Column:
 @lru_cache(4096)
 def _column(name: str) -> Column:
     bare_name = _IN_UNIT.sub(" ", name.strip()).replace("μ", "µ")  # the Greek letter
+    bare_name = _PERCENT.sub(" percent ", bare_name)
     parts = [part for word in _SEPARATORS.split(bare_name) if word for part in _parts(word)]
     known = [WORDS.get(p.lower(), "") for p in parts]
     lower = [p.lower() for p in parts]
@@ -275,9 +282,10 @@ def columns_of(names: Iterable[str]) -> list[Column]:
     if any(c.kind == "command" and c.words != {"input"} for c in columns):
         # of a controller with a set-point: what it reads, and what it sends to the motor
         inputs = [c for c in columns if c.name.lower() == "input" and c.key == ""]
+        driven = inputs or any(c.name.lower() in ("error", "err", "e") for c in columns)
         columns = [
             replace(c, kind="position", rank=(0, 1, 1, 2)) if c in inputs
-            else replace(c, kind="") if inputs and c.name.lower() == "output" else c
+            else replace(c, kind="") if driven and c.name.lower() == "output" else c
             for c in columns
         ]  # fmt: skip
     placed = {c.key for c in columns if c.kind == "position"}

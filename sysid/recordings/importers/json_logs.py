@@ -212,7 +212,8 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     others = {n: v for n, v in lists.items() if v and n not in arrays}
     texts = {n: list(map(str, v)) for n, v in others.items()
              if has_time([n]) or (n in GROUPS and all(isinstance(t, str) for t in v))}  # fmt: skip
-    beside = _beside(head)
+    levels = [head, *head.values()] if isinstance(head, Mapping) else []
+    beside = [pair for level in levels if isinstance(level, Mapping) for pair in level.items()]
     scalars = {k: float(v) for k, v in beside if isinstance(v, int | float) and abs(v) < _FAR}
     remarks = "\n".join(f"{k}: {v}" for k, v in beside if isinstance(v, str))
     table = expanded(path, arrays, list(options.joints))
@@ -222,12 +223,6 @@ def read_json_table(path: Path, data: Any, options: LogOptions) -> Log | None:
     if not arrays or (missing(table.names) and not options.command):
         return None
     return read_table(path, table, options, "JSON table")
-
-
-def _beside(data: Any) -> list[tuple[str, Any]]:
-    """Names and values beside the lists of JSON, also those a level below."""
-    levels = [data, *data.values()] if isinstance(data, Mapping) else []
-    return [pair for level in levels if isinstance(level, Mapping) for pair in level.items()]
 
 
 def _of_frame(data: Any) -> Any:

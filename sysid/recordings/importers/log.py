@@ -30,6 +30,7 @@ MOST_TRIALS = 50_000
 """Of all joints together."""
 MOST_JOINTS = 200
 
+_LEAST, _LARGEST = 1e-100, 1e100  # whose squares are numbers, too
 _ENDINGS = re.compile(r"[._/](pos|position)$", re.IGNORECASE)
 
 
@@ -75,14 +76,14 @@ class Table:
             fault = f"{path}, column {printed}: its values are not numbers."
             raise InputError(self.faults.get(name, fault))
         values = np.asarray(self.columns[name], float)
-        if np.isinf(values).any():
-            raise InputError(f"{path}, column {printed}: a value is infinite.")
+        if (np.abs(values) > _LARGEST).any():
+            raise InputError(f"{path}, column {printed}: a value is infinite, or beyond 1e100.")
         return values
 
     def known(self, name: str) -> NDArray[np.float64]:
         """The numbers of a column that are not missing; two zeros if it has none."""
         values = self.columns.get(name, np.zeros(0))
-        values = values[np.isfinite(values)]
+        values = np.where(np.abs(values) < _LEAST, 0.0, values)[np.abs(values) <= _LARGEST]
         return values if len(values) else np.zeros(2)
 
     @cached_property
@@ -98,7 +99,7 @@ class Table:
     def _lower(self) -> dict[str, str]:
         return {n.lower(): n for n in self.columns}
 
-    @property
+    @cached_property
     def increasing(self) -> list[str]:
         """Columns whose numbers never decrease, and are not all the same, nor count named rows."""
         steps = {n: np.diff(v[np.isfinite(v)]) for n, v in self.columns.items()}

@@ -18,7 +18,7 @@ apart, and hobby servos with a magnetic encoder have 4,096 a turn.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from itertools import product
 from pathlib import Path
@@ -47,6 +47,7 @@ _FARTHEST_DEGREES = 180.0  # from 0, of the same
 MOVES_ALIKE = 2.5
 """Factor by which a position may move more or less than its command."""
 _ASKEW = 0.3
+_STILL = 1e-100
 _ANGLE_SCALES = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "turns": 2 * np.pi}
 _NARROWEST_RAD, _WIDEST_RAD = 0.2, 2 * np.pi  # range of a joint
 
@@ -153,22 +154,26 @@ def likely_units(values: NDArray[np.float64]) -> list[str]:
     return [*units, *(scale for most, scale in _OF_PART.items() if largest < most)]
 
 
-def likely_of_pair(command: NDArray[np.float64], position: NDArray[np.float64]) -> list[str]:
+def likely_of_pair(
+    command: NDArray[np.float64], position: NDArray[np.float64], named: Sequence[str] = ("", "")
+) -> list[str]:
     """What a command and its position, one of them beyond a turn, may be in.
 
-    Where one moves many times as far as the other they are in different units, which are those by
-    which they move as far.
+    `named`: units that they name. Where one moves many times as far as the other they are in
+    different units, which are those by which they move as far.
     """
     spread = float(np.ptp(command)), float(np.ptp(position))
     together = likely_units(np.concatenate([command, position]))
-    if not min(spread) > 0 or 1 / MOVES_ALIKE < spread[0] / spread[1] < MOVES_ALIKE:
+    still = not min(spread) > _STILL
+    if still or (not any(named) and 1 / MOVES_ALIKE < spread[0] / spread[1] < MOVES_ALIKE):
         return together
     ranked = []
     turns = [f"counts:{n}:0" for n in _COUNTS]  # also where they were averaged or scaled
+    parts = ["scale:0.00174533", "scale:0.000174533"]  # of degrees: 365 for 36.5
     choices = (
-        ["rad"] if np.abs(values).max() <= LARGEST_RAD else
-        [*likely_units(values), "mrad", *(turns if (values % 1 != 0).any() else [])]
-        for values in (command, position)
+        [text] if text else ["rad"] if np.abs(values).max() <= LARGEST_RAD else
+        [*likely_units(values), "mrad", *(turns if (values % 1 != 0).any() else parts)]
+        for values, text in zip((command, position), named, strict=True)
     )  # fmt: skip
     for texts in product(*choices):
         c, p = map(unit, texts)
@@ -176,7 +181,7 @@ def likely_of_pair(command: NDArray[np.float64], position: NDArray[np.float64]) 
         apart = (np.mean(command) - c.zero) * c.scale - (np.mean(position) - p.zero) * p.scale
         # a hobby servo's middle is 90°; few logs hold mrad, or counts that are no whole numbers
         apart = min(abs(float(apart)), _ASKEW + abs(abs(float(apart)) - np.pi / 2))
-        odd = sum(t == "mrad" or (t in turns and (v % 1 != 0).any())
+        odd = sum(0.05 if t in parts else t == "mrad" or (t in turns and (v % 1 != 0).any())
                   for t, v in zip(texts, (command, position), strict=True))  # fmt: skip
         if 1 / MOVES_ALIKE < ratio < MOVES_ALIKE:
             ranked.append((abs(np.log(ratio)) + apart + odd, ",".join(texts)))

@@ -32,6 +32,7 @@ _OF_TURNS = {
     "ODrive's API": {"input", "estimate"},
     "moteus's decoder": {"command_position", "q_current"},
     "moteus's telemetry": {"control_position", "q_current"},
+    "moteus's registers": {"command_position", "position", "velocity", "torque"},
 }
 """Programs that count turns and do not say so, and what their logs may be known by: columns, or
 words of the command's and the position's."""
@@ -47,6 +48,7 @@ _DRIVES = {
 """Names of columns by which the angles are turns without doubt; those under "" do not tell the
 program, and only beside marks of `_OF_TURNS`."""
 _ARRAY = re.compile(r"(data|values?)(_\d+)?", re.IGNORECASE)
+_BRACKETED = re.compile(r"[(\[（]\s*([^\W\d]+)\s*[)\]）]\s*$")
 _MOST_TURNS = 100.0  # beyond which no angle is read, whatever its unit
 _COUNTS_OF_DRIVE = "counts:8192:0"
 """ODrive's default encoder; its firmware before 0.5 has counts where later ones have turns."""
@@ -96,7 +98,7 @@ def _of_drive(
 ) -> Pair:
     """The pair in the unit of the drive that the log is of, if any; `notes` get a sentence."""
     sources = pair.command, pair.position
-    given_away = {*table.names} | pair.command.words | pair.position.words
+    given_away = {n.lower() for n in table.names} | pair.command.words | pair.position.words
     named = [p for p, names in _DRIVES.items() if any(map(names.search, table.names))]
     program = next((p for p, marks in _OF_TURNS.items() if marks <= given_away), "")
     drive, counts = table.drive
@@ -120,7 +122,7 @@ def _of_drive(
             path, unit=",".join(dict.fromkeys(units)), command=templates[0], position=templates[1]
         )
         raise InputError(
-            f"{path}: {pair.command.name} and {pair.position.name} are of {program}, which counts "
+            f"{path}: {refusals.listed(s.name for s in sources)} are of {program}, which counts "
             "turns, but these are an encoder's counts. Say how many a turn has; with "
             f"ODrive's default: {line}."
         )
@@ -174,9 +176,13 @@ def _by_words(path: Path | str, table: Table) -> tuple[dict[str, Pair], list[str
     joints = [min(pair.command.joint, pair.position.joint, key=len) for pair in chosen]
     names = [bare_name(j or p.command.key) or SOLE for j, p in zip(joints, chosen, strict=True)]
     distinct(path, names, "joints")
-    if names == ["d"]:  # ref_d, meas_d
-        both = f"{chosen[0].command.name} and {chosen[0].position.name}"
-        notes["d"] = f"{both} were taken for radians of a joint d; for degrees give `unit='deg'`."
+    bracketed = _BRACKETED.search(chosen[0].command.name)
+    if len(names) == 1 and names[0] in ("d", bracketed and bracketed[1]):
+        both = f"{chosen[0].command.name} and {chosen[0].position.name}"  # ref_d; Ziel (graadid)
+        notes["joint"] = (
+            f"{both} were taken for radians of a joint {names[0]}; if that is a unit, give it: for "
+            "degrees give `unit='deg'`."
+        )
     return dict(zip(names, chosen, strict=True)), [*notes.values()]
 
 

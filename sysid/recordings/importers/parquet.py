@@ -68,11 +68,16 @@ def read_columns(path: Path, data: bytes, names: Sequence[str]) -> dict[str, NDA
         )
     meta = file.metadata
     try:
-        chunks = (meta.row_group(g).column(c) for g in range(meta.num_row_groups)
-                  for c in range(meta.num_columns))  # fmt: skip
-        wanted = [c for c in chunks if c.path_in_schema.split(".list.")[0] in names]
-        values = sum(c.num_values for c in wanted)
-        unpacked = sum(c.total_uncompressed_size for c in wanted)
+        groups = [*map(meta.row_group, range(meta.num_row_groups))]
+        for g, group in enumerate(groups):
+            if group.total_byte_size <= LARGEST_BYTES:
+                # a row: damage that raises there ends the process in `column`
+                next(file.iter_batches(1, [g], list(names), use_threads=False), None)
+        wanted = [c for c in range(meta.num_columns)
+                  if file.schema.column(c).path.split(".list.")[0] in names]  # fmt: skip
+        chunks = [group.column(c) for group in groups for c in wanted]
+        values = sum(c.num_values for c in chunks)
+        unpacked = sum(c.total_uncompressed_size for c in chunks)
         refuse_more(path, values, MOST_CELLS, "values", "Split the log.")
         refuse_more(f"{path}, unpacked,", unpacked, LARGEST_BYTES, "bytes", "Split the log.")
         table = file.read(columns=list(names), use_threads=False)

@@ -20,7 +20,10 @@ from numpy.typing import NDArray
 from pupper_sysid.common.reading.dialect import is_clock
 from pupper_sysid.common.strict_yaml import printable
 from pupper_sysid.sysid.recordings.importers.columns import (
+    COMMAND,
     TIMER,
+    WORDS,
+    Column,
     column,
     columns_of,
     has_time,
@@ -54,14 +57,27 @@ _WIDEST_ANGLE = 1e6  # of a joint, in any unit
 _COMPARED, _ALIKE = 12, 0.7  # columns; concordance of a command and its position
 _ORDERED = 100_000  # rows
 _NO_PLACE = re.compile(
+    r"delta|diff|incr|err(?:or)?(?![a-z])|"
     r"vel|speed|rpm|torque|effort|volt|temp|power|pwm|duty|(?:rad|deg|°)[_/ ]?s(?![a-z])|dps|"
     r"(?<![a-z])nm(?![a-z])|\[[NAV]\]",
     re.IGNORECASE,
 )
 _PULSES = re.compile(
-    r"pwm|pulse|duty|[_ (\[](us|µs)\b", re.IGNORECASE
+    r"pwm|pulse|duty|(^|[_ (\[])(us|µs)\b", re.IGNORECASE
 )  # what a hobby servo is commanded by
-_PULSES_US, _OF_PULSES = (400.0, 2700.0), "counts:4000:1500"  # 2,000 µs for half a turn
+PULSES_US, _OF_PULSES = (400.0, 2700.0), "counts:4000:1500"  # 2,000 µs for half a turn
+_QUANTITIES = {  # words of a command that is no place, and what to do
+    "changes of the goal: add them up (numpy.cumsum) to a column of goals": re.compile(
+        r"delta|diff|incr|relative|(?<![a-z])rel(?![a-z])", re.IGNORECASE
+    ),
+    "a speed, so that this is no log of a position servo": re.compile(
+        r"vel|speed|rpm|omega|dq|qd|(?:rad|deg|°)[_/ ]?s(?![a-z])|dps", re.IGNORECASE
+    ),
+    "a torque or current, so that this is no log of a position servo": re.compile(
+        r"torque|effort|current|(?<![a-z])(?:nm|iq|tau)(?![a-z])", re.IGNORECASE
+    ),
+}
+_ERROR = re.compile(r"(.*[_. ])?(err|error|deviation)([_. ].*)?", re.IGNORECASE)
 _IS_RATE = 0.95  # correlation of a column with another one summed up
 
 
@@ -145,10 +161,27 @@ def unknown_columns(path: Path | str, table: Table, timed: bool = False) -> str:
             f"{printable(duty)[:40]} drives the motor and says not where it is to go: a log of a "
             "position servo needs its goals. "
         )
+    if lacks and (text := _other_quantity(columns_of(names))):
+        return f"of its columns ({listed(names)}) {lacks[0]}: {text}"
     return (
         f"its columns ({listed(names)}) belong to no known layout. {'; '.join(parts)}. "
         f"{hint}Name the columns{cure}"
     )
+
+
+def _other_quantity(columns: Sequence[Column]) -> str:
+    """What a column is that stands where a command or a position is lacking; empty for none."""
+    goal = next((printable(c.name)[:40] for c in columns if c.kind == "command"), "")
+    others = [c for c in columns if not c.kind]
+    commands = [c for c in others if any(WORDS[word] == COMMAND for word in c.words)]
+    for c, (meaning, pattern) in product(commands, _QUANTITIES.items()):
+        if not goal and pattern.search(c.name):
+            return f"{printable(c.name)[:40]} is {meaning}."
+    for c in others:
+        if goal and _ERROR.fullmatch(c.name):
+            error = printable(c.name)[:40]
+            return f"{error} says how far it is from its goal. Add a column {goal} - {error}."
+    return ""
 
 
 def _lines_by_name(path: Path | str, table: Table, timed: bool) -> str:
@@ -180,7 +213,7 @@ def _lines_by_name(path: Path | str, table: Table, timed: bool) -> str:
                 for c in columns
                 if c.kind == others and c.name not in times[:1] and c.name not in rates
             ]  # fmt: skip
-        by_kind.append(chosen)
+        by_kind.append(chosen[:_COMPARED])
     lines = []
     for (command, *name), (position, *other) in product(*by_kind):
         if ("{joint}" in command) != ("{joint}" in position):  # of one of them a lone word
@@ -189,7 +222,8 @@ def _lines_by_name(path: Path | str, table: Table, timed: bool) -> str:
             unit = _unit_of(table, (command, position))
             lines.append(import_line(path, **when, **unit, command=command, position=position))
     text = "; or ".join(list(dict.fromkeys(lines or lines_by_value(path, table)))[:3])
-    return f"{text}{rate_note(when, table)}" if text else ""
+    guess = ", where the counts of a turn are a guess by the values" if "counts:" in text else ""
+    return f"{text}{guess}{rate_note(when, table)}" if text else ""
 
 
 def lines_by_value(path: Path | str, table: Table) -> list[str]:
@@ -278,9 +312,9 @@ def _unit_of(table: Table, names: Iterable[str]) -> dict[str, str]:
         return {"unit": f"{_OF_PULSES},{of_position}"}
     if not largest > LARGEST_RAD:
         return {}
-    command, _, position = likely_of_pair(*pair)[0].partition(",")
-    units = [command if named[0] in ("", "counts") else named[0],
-             position or command if named[1] in ("", "counts") else named[1]]  # fmt: skip
+    named = ["" if name == "counts" else name for name in named]
+    command, _, position = likely_of_pair(pair[0], pair[1], named)[0].partition(",")
+    units = [named[0] or command, named[1] or position or command]
     return {"unit": ",".join(dict.fromkeys(units))}
 
 
@@ -294,7 +328,7 @@ def _are_pulses(table: Table, name: str) -> bool:
 
 
 def _are_pulse_widths(values: NDArray[np.float64]) -> bool:
-    return bool(_PULSES_US[0] < values.min() <= values.max() < _PULSES_US[1])
+    return bool(PULSES_US[0] < values.min() <= values.max() < PULSES_US[1])
 
 
 def rate_note(line: str | Mapping[str, str], table: Table) -> str:
@@ -309,9 +343,9 @@ def _likeness(table: Table, pair: Sequence[str]) -> tuple[float, list[str]]:
     Lin's coefficient of concordance at the best lag: 1 for equal columns; an offset counts, another
     scale, too.
     """
-    values = [table.columns[name][:_ORDERED] for name in pair]
-    if not all(np.isfinite(table.columns[name]).all() for name in pair):
+    if any(len(table.known(name)) < len(table.columns[name]) for name in pair):
         return 0.0, [*pair]
+    values = [table.known(name)[:_ORDERED] for name in pair]
     first, second = (v - np.mean(v) for v in values)
     product_at = np.fft.irfft(np.fft.rfft(second, 2 * len(second)).conj()
                               * np.fft.rfft(first, 2 * len(first)))  # fmt: skip

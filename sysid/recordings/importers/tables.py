@@ -13,7 +13,7 @@ may hold one value.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -54,7 +54,7 @@ _TONES = ("frequency_hz", "freq_hz", "frequency", "freq")
 SERIES = ("name", "signal", "event", "type", "kind", "variable", "topic", "field", "series",
            "metric", "key", "channel", "_field", "_measurement", "op", "operation", "direction",
            "dir", "param", "parameter", "quantity", "label", "source", "item",
-           "register")  # fmt: skip
+           "register", "what", "tag", "var", "msg_type")  # fmt: skip
 _VALUES = ("value", "values", "val", "_value", "data")
 GROUPS = ("leg", "limb", "arm", "side", "joint", "joint_name", "motor", "motor_name", "servo",
            "servo_name", "actuator", "name", "axis", "dof", "motor_idx", "motor_id", "motor_index",
@@ -69,6 +69,9 @@ _SENT = frozenset(
     "command commands commanded cmd cmds goal target send sent tx action write written".split()
 )
 """Words of a time at which a command was sent."""
+_ACTIONS = frozenset(("action", "actions"))
+_ACTS_ALIKE = 1.7  # factor by which a joint may move more or less than its action
+_ACTION_SCALES = (0.1, 0.2, 0.25, 0.3, 0.5, 2.0, 3.0)
 _MOST_GROUPS = 1000
 _TOGETHER = 0.2  # share of the rows with a command or position that have both
 _FEWEST_ROWS = 3  # of a joint in a table with a row per joint
@@ -160,7 +163,11 @@ def read_table(path: Path | str, table: Table, options: LogOptions, layout: str 
                              joints[joint][0], (joint, name), metadata)  # fmt: skip
         parts.append(part)
         notes += [text for text in texts if text not in notes]
-    return Log(pd.concat(parts, ignore_index=True), metadata, notes)
+    if options.unit is None and all(
+        joints[j][1].command.words <= _ACTIONS and not joints[j][1].command.unit for j in theirs
+    ):
+        _refuse_raw_actions(path, options, parts)
+    return Log(pd.concat(parts, ignore_index=True), metadata, [*map(printable, notes)])
 
 
 def _refuse_some_without_unit(
@@ -181,6 +188,36 @@ def _refuse_some_without_unit(
             f"(`units: {{{joint}: '{example}'}}`), or leave {joint} out: "
             f"{refusals.import_line(path, joints=','.join(others))}."
         )
+
+
+def _refuse_raw_actions(
+    path: Path | str, options: LogOptions, parts: Sequence[pd.DataFrame]
+) -> None:
+    """Refuse a policy's actions from which set-points are still to be made.
+
+    A joint's set-point is its default angle and a share, the same for all, of its action.
+    """
+    factors = []
+    for part in parts:
+        ranges = [_spread(part[f"{kind}_rad"].to_numpy(float)) for kind in ("position", "command")]
+        factors += [ranges[0] / ranges[1]] if min(ranges) > 0 else []
+    factor = float(np.median(factors)) if factors else 1.0
+    if not 1 / _ACTS_ALIKE < factor < _ACTS_ALIKE:
+        usual = min(_ACTION_SCALES, key=lambda scale: abs(np.log(scale / factor)))
+        raw, angles = (refusals.import_line(path, **(options.words | {"unit": text}))
+                       for text in (f"scale:{usual:g},rad", "rad"))  # fmt: skip
+        raise InputError(
+            f"{path}: its joints move {factor:.2g} times as far as its actions, so these seem to "
+            "be a policy's own, which a default angle and a scale turn into set-points. Log the "
+            f"set-points, or give your action_scale in place of {usual:g}: {raw}; or, if they are "
+            f"set-points: {angles}."
+        )
+
+
+def _spread(values: NDArray[np.float64]) -> float:
+    """Range of all but the outermost values; 0 without any."""
+    known = values[np.isfinite(values)]
+    return float(np.ptp(np.quantile(known, (0.05, 0.95)))) if len(known) else 0.0
 
 
 def is_flag(name: str) -> tuple[str, bool] | None:
@@ -298,6 +335,10 @@ def _seconds(
     lower = {n.lower(): n for n in table.columns}
     match = re.fullmatch(r"(.*?)(?:secs?|seconds?)", name.lower())
     rest = [lower[n] for end in _SUBSECONDS if match and (n := match[1] + end) in lower]
+    below = table.first(_MILLISECONDS)
+    whole = below not in (None, name) and not (values % 1).any() and not np.diff(values).all()
+    if below and whole and 0 <= table.known(below).min() <= table.known(below).max() < 1000:
+        rest = rest or [below]
     if rest:
         return *_of_two(path, table, name, rest[0]), []
     clock = times.clock(name, values, table.tick_s)
@@ -309,8 +350,15 @@ def _of_two(
 ) -> tuple[NDArray[np.float64], float]:
     """Times in seconds and what is below one in a column of its own, as stamps of ROS have them."""
     values, below = table.numbers(path, name), table.numbers(path, rest)
-    zero = float(np.nanmin(values))
-    part = 1e-3 if rest.lower().endswith("ms") else 1e-6 if np.nanmax(below) < 1e6 else 1e-9
+    zero = float(table.known(name).min())
+    small = table.known(rest).max() < 1e6
+    part = (
+        1e-3
+        if rest.lower() in _MILLISECONDS or rest.lower().endswith("ms")
+        else 1e-6
+        if small
+        else 1e-9
+    )
     return values - zero + part * below, zero
 
 
@@ -411,8 +459,8 @@ def _joint(
     number, shifted = times.one_after_another(stamp, trial)
     if trial is None and number.max(initial=0) > 0:
         warnings.append(
-            f"its times start again ({number.max():g} ×): each run of rows was taken for a trial "
-            "of the same joint."
+            f"its times start again or jump on by more than an hour ({number.max():g} ×): each run "
+            "of rows was taken for a trial of the same joint."
         )
     if sent is not None:
         send, read, doubt = times.sent_at(sent, stamp) + (shifted - stamp), shifted, 0.0
@@ -426,8 +474,8 @@ def _joint(
             "that rate, and are in doubt by half a turn."
         )
     metadata["bus"]["read_time_doubt_s"] = max(doubt, metadata["bus"].get("read_time_doubt_s", 0.0))
-    apart = float(np.clip(np.nanmedian(read - send), -1, 1)) if len(send) else 0.0
-    metadata["read_after_send_s"] = apart
+    apart = (read - send)[np.isfinite(read - send)]
+    metadata["read_after_send_s"] = float(np.clip(np.median(apart), -1, 1)) if len(apart) else 0.0
     used = {"command": pair.command.name, "position": pair.position.name}
     metadata.setdefault("columns", {})[names[1]] = used
     commands = table.numbers(path, pair.command.name)[of_joint]
@@ -489,7 +537,7 @@ def _one_unit(
         return pair, []
     if "counts" in units and any((v[np.isfinite(v)] % 1 != 0).any() for v in (commands, positions)):
         return pair, []
-    ranges = [float(np.ptp(np.nanquantile(v, (0.05, 0.95)))) for v in (commands, positions)]
+    ranges = _spread(commands), _spread(positions)
     if not min(ranges) > 0 or not 1 / MOVES_ALIKE < ranges[0] / ranges[1] < MOVES_ALIKE:
         return pair, []
     word = units[0] or units[1]

@@ -157,6 +157,7 @@ def healthy_codes() -> frozenset[str]:
     [
         pytest.param("heats", "gain_drifts", marks=pytest.mark.slow),
         ("zero jumps", "zero_moves"), ("loses power", "frozen"), ("speed", "speed_for_position"),
+        ("commands of speed", "speed_for_command"), ("changes of the goal", "speed_for_command"),
     ],
 )  # fmt: skip
 def test_free_motion_shows_what_happened_within_a_trial(fault, code):

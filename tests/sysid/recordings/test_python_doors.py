@@ -45,6 +45,9 @@ def test_arrays_and_paths_of_other_types_are_refused_in_a_sentence():
         (lambda: arrays(TIME, COMMAND, POSITION, metadata=[1]), "metadata is a list"),
         (lambda: ps.Recording.from_frame({"time": TIME}), "pandas.DataFrame"),
         (lambda: arrays(TIME, {"knee": COMMAND["knee"] + 0j}, POSITION), "are not numbers"),
+        (lambda: ps.Recording.from_frame(TABLE.assign(knee_pos=C + 0j)), "are not numbers"),
+        (lambda: arrays(TIME, {"\x1b": C}, {"\x1b": P}), r"column joint: '.' is no joint"),
+        (lambda: arrays(TIME, {"\x1b": C[1:]}, {"\x1b": P}), r"^[ -~\ufffd]*has shape"),
         (lambda: arrays([], {"knee": []}, {"knee": []}), "has no rows"),
         (lambda: ps.Recording.from_frame(TABLE.head(0)), "has no rows"),
     ):  # fmt: skip

@@ -54,6 +54,13 @@ def test_joints_with_strange_names_are_called_by_letters_and_digits(tmp_path):
     assert load(tmp_path / "log.csv").joints == ["b_Knie_b"]
 
 
+def test_control_characters_of_names_are_in_no_warning(tmp_path):
+    names = {"knee_command": "\x1b[2J_command", "knee_position": "position"}
+    table().rename(columns=names).to_csv(tmp_path / "log.csv", index=False)
+    recording = load(tmp_path / "log.csv")
+    assert recording.warnings and all(map(str.isprintable, recording.warnings))
+
+
 def test_a_parquet_file_without_the_library_names_the_extra(tmp_path, monkeypatch):
     parquet(tmp_path)
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)

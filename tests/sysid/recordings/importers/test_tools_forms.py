@@ -340,6 +340,7 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
                        "joint"),
     "French degrees": (each("{t};{c!r};{p!r}", DEGREES, "temps;consigne (degrés);mesure (degrés)"),
                        "joint"),
+    "Russian": ("время,задание,положение\n" + CSV, "joint"),
     "Spanish degrees": (each("{t};{c!r};{p!r}", DEGREES, "Tiempo (s);Ángulo deseado (°);Ángulo "
                              "medido (°)").encode("cp1252"), "joint"),
     "Dutch degrees": (each("{t};{c!r};{p!r}", DEGREES, "tijd;gewenste hoek (graden);gemeten hoek "
@@ -350,6 +351,10 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
                         "joint"),
     "Korean degrees": (each("{m},{c!r},{p!r}", DEGREES, "시간(ms),목표각도(도),현재각도(도)"),
                        "joint"),
+    **{f"degrees of {names}": (each("{t},{c!r},{p!r}", DEGREES, names), "joint") for names in (
+        "zaman,hedef_aci_derece,olculen_aci_derece", "tid,börvärde (grader),ärvärde (grader)",
+        "aika,ohjearvo (deg),mittaus (deg)", "čas,žádaná poloha [°],skutečná poloha [°]",
+        "idő,alapjel [fok],szög [fok]", "時刻[s],指令値[deg],計測値[deg]")},
     "a unit by column above": (each("{t},{c!r},{p}", [(t, d[1], p) for (t, _, p), d in
                                zip(LOG, DEGREES, strict=True)], "# cmd in deg, pos in rad\n"
                                "time,cmd,pos"), "joint"),
@@ -372,7 +377,13 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
     "seconds and milliseconds": ("sec,ms,cmd,pos\n" + "".join(
         f"{int(100 * t + 50) // 100},{10 * (round(100 * t + 50) % 100)},{c},{p}\n"
         for t, c, p in LOG), "joint"),
+    "an epoch and milliseconds": ("epoch,msec,cmd,pos\n" + each("1760000000,{m},{c},{p}"), "joint"),
+    "changes alone, by what they are": ("time,what,value\n" + "".join(
+        f"{t},cmd,{c}\n{t},pos,{p}\n" for t, c, p in LOG), "joint"),
     # cells
+    "remarks with commas": ("time,cmd,pos,comment\n" + "".join(
+        f"{t},{c},{p},{'warm, so far' if n % 9 == 5 else ''}\n" for n, (t, c, p) in
+        enumerate(LOG)), "joint"),
     "remarks behind rows": (NAMED.split("\n", 1)[0] + "\n" + each("{t},{c},{p}  # ok"), "joint"),
     "decimal commas between commas": ("time,cmd,pos\n" + each("{t:.3f},{c:.6f},{p:.6f}").replace(
         ",", ";").replace(".", ",").replace(";", ","), "joint"),
@@ -410,6 +421,7 @@ READ: dict[str, tuple[str | bytes, str]] = {  # and the joints
             STACKED["q_des"]), "dt": 0.01}, f)), "joint_0 joint_1"),
     "one environment first": (saved(np.savez, time=TIME, dof_pos=STACKED["q"][None],
                                     des_dof_pos=STACKED["q_des"][None]), "joint_0 joint_1"),
+    "MATLAB's rate": (matlab(cmd=COMMAND, pos=POSITION, fs=100.0), "joint"),
     "Simulink's time": (matlab(tout=TIME[:, None], **STACKED), "joint_0 joint_1"),
 }  # fmt: skip
 
@@ -424,7 +436,6 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
     "JSON without names": (json.dumps(LOG), "--time 0 --command 1 --position 2"),
     "names that say nothing": ("Var1,Var2,Var3\n" + CSV, "--time Var1 --command Var2"),
     "two angles": ("t,angle_in,angle_out\n" + CSV, "--command angle_in --position angle_out"),
-    "Russian": ("время,задание,положение\n" + CSV, "--time 'время' --command 'задание'"),
     "a clock without names": (each("2026-05-04 12:30:{t:06.3f}\t{c}\t{p}"), "--time time_of_day"),
     "Dynamixel's example": (each("[ID:001] GoalPos:{c:03d}  PresPos:{p:03d}", COUNTS),
                             "--rate 50 --unit counts:4096 --command GoalPos"),
@@ -494,6 +505,15 @@ LINES: dict[str, tuple[str | bytes, str]] = {  # and options of the line
     "lengths": (each("{t},{c},{p}", head="time_s,cmd_mm,pos_mm"), "--unit scale:0.05"),
     "shares": (each("{t},{c},{p}", head="time_s,cmd_norm,pos_norm"), "--unit scale:1.5708"),
     "steps": (each("{t},{c},{p}", SIGNED, "t,target_steps,actual_steps"), "--unit counts:3200:0"),
+    "percent in brackets": (each("{t},{c!r},{p!r}", DEGREES, "time,set-point [%],actual [%]"),
+                            "--unit percent:3.5"),
+    "readings of a converter beside degrees": ("t_ms,servo_deg,analog\n" + "".join(
+        f"{1e3 * t:.0f},{90 + np.degrees(c)!r},{512 + 1024 / (2 * np.pi) * p:.0f}\n"
+        for t, c, p in LOG), "--unit deg,counts:1024"),
+    "degrees that are called radians": (each("{t},{c!r},{p!r}", DEGREES, "t,cmd_rad,pos_rad"),
+                                        "--unit deg"),
+    "a policy's actions": ("time,actions_0,dof_pos_0\n" + "".join(
+        f"{t},{4 * c - 0.8},{p}\n" for t, c, p in LOG), "--unit scale:0.25,rad"),
     "whole seconds": ("time,cmd,pos\n" + "".join(
         f"12:30:{int(2.5 * t):02d},{c},{p}\n" for t, c, p in LOG), "--rate 40"),
 }  # fmt: skip
@@ -511,6 +531,14 @@ WRONG: dict[str, tuple[str | bytes, str]] = {
     "torques": (each("{t},{c},{p}", head="t,cmd_Nm,meas [N]"), "no column is a command or"),
     "a speed's set-point": (each("{t},{c},{p}", head="t,speed_setpoint,position"),
                             "no column is a command"),
+    "changes of the goal": (each("{t},{c},{p}", head="t,delta_cmd,pos"), "is changes of the goal"),
+    "speeds to go at": (each("{t},{c},{p}", head="t,cmd_vel,pos"), "cmd_vel is a speed"),
+    "torques to give": (each("{t},{c},{p}", head="t,target_torque,pos"), "is a torque or current"),
+    "numbers without their sign": (each("{t},{c},{p}", [
+        (t, c % 65536, p % 65536) for t, c, p in SIGNED], "t,goal,pos"), "Take 65,536 off those"),
+    "errors": (each("{t},{c},{p}", head="t,setpoint,error"), "Add a column setpoint - error"),
+    "errors and a drive": (each("{t},{c},{p},{p}", head="t,setpoint,error,output"),
+                           "Add a column setpoint - error"),
     "servo's answers alone": (each("ID 1 at {p}"), "no names"),
 }  # fmt: skip
 
@@ -611,6 +639,29 @@ def test_what_may_be_several_joints_is_said_to_be_taken_as_trials(tmp_path):
     blocks = f"# t cmd pos\n{each('{t} {c} {p}')}\n\n# knee\n{each('{t} {c} {p}')}"
     recording = load(written(tmp_path, blocks))
     assert any("start again" in text for text in recording.warnings)
+
+
+def test_what_may_be_turns_is_said_to_be_taken_for_radians(tmp_path):
+    head = "time,command_position,position,velocity,torque"  # moteus's, and others'
+    recording = load(written(tmp_path, each("{t},{c},{p},0,0", head=head)))
+    assert any("counts turns; the values were taken as rad" in w for w in recording.warnings)
+
+
+def test_tenths_of_degrees_are_offered_beside_degrees(tmp_path):
+    rows = [(t, round(10 * c), c) for t, c, _ in DEGREES]
+    with pytest.raises(InputError, match="--unit scale:0.00174533,deg --out"):
+        load(written(tmp_path, each("{t},{c},{p}", rows, "t,cmd_x10,pos")))
+
+
+def test_a_unit_of_one_joint_s_angles_leaves_another_s_alone(tmp_path):
+    rows = [(t, *np.degrees((c, p)), d, q) for t, c, p, d, q in BOTH]
+    path = written(
+        tmp_path, each("{t},{c},{p},{d},{q}", rows, "t,hip_cmd,hip_pos,knee_cmd,knee_pos")
+    )
+    with pytest.raises(InputError, match=r"If knee are in radians .* `units: \{hip: 'deg'\}`"):
+        load(path)
+    (trial,) = load(path, {"units": {"hip": "deg"}}).trials("knee")
+    np.testing.assert_allclose(trial.position_rad, SECOND[1], atol=1e-9)
 
 
 def test_a_suffix_that_may_mean_degrees_is_said_to_be_taken_for_a_joint(tmp_path):
