@@ -158,7 +158,7 @@ def test_a_calibration_becomes_one_row_per_joint_and_quantity_with_its_unit_and_
     lines = [line[2:] for line in tidy_table(paper).splitlines() if line.startswith("# ")]
     assert lines[0] == "pupper-sysid calibration table"
     said = {key: json.loads(value) for key, _, value in (s.partition(": ") for s in lines[1:])}
-    assert said["schema"] == "pupper-calibration" and said["schema_version"] == 4
+    assert said["schema"] == "pupper-calibration" and said["schema_version"] == 5
     assert said["created"] == paper.created and said["units"] == paper.units
     assert said["notes"] == list(paper.notes)
     # the same quantity over and not over the armature are kept apart
