@@ -267,7 +267,7 @@ class ServoCard(Part):
                     source=f"servo card {self.name} ({self.source.title})",
                 ),
             ),
-            servo=self._under_load(name),
+            servo=self._fitted_servo(name),
             feedback=Feedback(
                 poll_period_s=_ideal(), loss=_ideal(), offset_rad=_ideal(), mean_age_s=_ideal(),
                 quantum_rad=_ideal(2 * float(np.pi) / counts if counts else 0.0),
@@ -275,7 +275,7 @@ class ServoCard(Part):
             selection=Selection(model=f"card {self.name}"),
         )  # fmt: skip
 
-    def _under_load(self, name: str) -> FittedServo | None:
+    def _fitted_servo(self, name: str) -> FittedServo | None:
         """The servo at any P gain and load; None where the card states torques at one gain."""
         numbers, gain = self.specimens[name], self.gains.p
         if isinstance(numbers, TorquePD) or gain is None:
