@@ -441,7 +441,8 @@ def _slopes(problem: Problem, points: NDArray, difference: float) -> tuple[NDArr
     for first in range(0, len(points), together):
         at = slice(first, first + together)
         residuals, jacobian = jacobians(problem, points[at], difference)
-        root = np.sqrt(1.0 + residuals**2)
+        with np.errstate(over="ignore"):  # an unstable candidate costs infinitely much
+            root = np.sqrt(1.0 + residuals**2)
         weighted = jacobian / root[:, None]
         cost[at] += np.sum(root - 1.0, axis=-1)
         gradient[at] = (weighted @ residuals[:, :, None])[..., 0] + pull[at]

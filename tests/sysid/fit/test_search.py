@@ -1,5 +1,7 @@
 """Search: local fits leave the dents of a ridge, and find limits that have no slope."""
 
+import warnings
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +13,7 @@ from pupper_sysid.sysid.fit.joint_fit import _slight_limits
 from pupper_sysid.sysid.fit.search import (
     Fit,
     Problem,
+    curvature,
     from_about,
     refine,
     search_widely,
@@ -50,6 +53,16 @@ def test_local_fits_from_points_about_a_fit_find_the_way_along_a_ridge():
         stuck.append(near.cost > best + 100)
         assert from_about(problem, near, rng).cost < best + 1
     assert any(stuck), "the ridge has no dent, so this proves nothing"
+
+
+def test_residuals_that_are_too_large_to_square_print_no_warning():
+    structure = candidate("delayed_pd_back_emf")
+    point = structure.encode(np.array([NUMBERS[name] for name in structure.names]))
+    run = fine_run(np.repeat([0.0, 0.3], 500), 0.005)
+    run = replace(run, sample_rad=np.full(len(run.sample_step), 1e200))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        curvature(Problem(structure, (run,), (NOISE_RAD,)), point, 0.01)
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2))])
