@@ -83,9 +83,9 @@ _NOTHING = re.compile(
     r"[\W_]*(\d\.#([qs]?nan|ind)\d*|nan(\(\w+\))?|none|null|nil|n\.?/?a|div/0|num|value|ref|missing|"
     r"invalid|lost|failed|err|error|timeout)?[\W_]*"
 )
-_REMARKS = ("comment", "comments", "remark", "remarks", "note", "notes", "message")
-_LONGEST_WORD = 30
 """Words for a reading that failed."""
+_LONGEST_WORD = 30  # of them
+_REMARKS = ("comment", "comments", "remark", "remarks", "note", "notes", "message")
 _COMMENT = re.compile(r"^#.*$", re.MULTILINE)
 _QUOTED = re.compile(r'(?:^|(?<=[,\n]))"([^",\n]*)"(?=[,\n]|$)')
 

@@ -28,12 +28,13 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import torch
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AliasChoices, ConfigDict, Field, model_validator
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save
 
 from pupper_sysid.common.border import (
+    Part,
     read_bytes,
     read_json,
     refuse_other_kind,
@@ -75,11 +76,7 @@ _Sha = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 _Path = Annotated[str, Field(max_length=4096)]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-
-class Range(_Part):
+class Range(Part):
     """Plausible range of a number."""
 
     low: _Number
@@ -105,7 +102,7 @@ class DeadTimeRange(Range):
     high: _Seconds
 
 
-class ServoFeedback(_Part):
+class ServoFeedback(Part):
     """Readings of one servo, see `servo_models.held_feedback`."""
 
     poll_period_s: _Seconds
@@ -114,7 +111,7 @@ class ServoFeedback(_Part):
     offset_rad: _Angle
 
 
-class ServoNumbers(_Part):
+class ServoNumbers(Part):
     """One servo: the numbers of `servo_models.delayed_pd`, and its readings.
 
     A term that older policies lack is a range besides.
@@ -147,7 +144,7 @@ class ServoNumbers(_Part):
         return self
 
 
-class TrainedServo(_Part):
+class TrainedServo(Part):
     """Servos of a training."""
 
     schema_name: Annotated[Literal["pupper-policy-servo"], Field(alias="schema")]
@@ -236,7 +233,7 @@ def _scaled(value: float, ends: tuple[float, float]) -> dict[str, float]:
     return {"low": low, "value": float(min(max(value, low), high)), "high": high}
 
 
-class ObservationPart(_Part):
+class ObservationPart(Part):
     """One part of the observation, in order."""
 
     name: str
@@ -247,7 +244,7 @@ class ObservationPart(_Part):
 _Ends = Annotated[list[Annotated[float, Field(ge=-100, le=100)]], Field(min_length=2, max_length=2)]
 
 
-class CommandRanges(_Part):
+class CommandRanges(Part):
     """Commands of a training: lowest and highest of each part."""
 
     forward_m_s: _Ends
@@ -299,7 +296,7 @@ class CommandRanges(_Part):
         )
 
 
-class RobotReference(_Part):
+class RobotReference(Part):
     """The robot of a training that is not the Mini Pupper 2: its files and their hashes."""
 
     name: _Path
@@ -309,7 +306,7 @@ class RobotReference(_Part):
     config_sha256: _Sha | None
 
 
-class Contract(_Part):
+class Contract(Part):
     """Inputs, outputs and training of a policy."""
 
     schema_name: Annotated[Literal["pupper-policy"], Field(alias="schema")]

@@ -170,26 +170,22 @@ def goodness_of_fit(
     of those in motion: a joint at rest is where its model is, whatever that is.
     """
     residuals = fresh_residuals(structure, values, runs)
-    moving = [
-        _moving(run, track)
-        for run, track in zip(runs, free_run(structure, values, runs), strict=True)
-    ]
     least = max(quantum_rad / np.sqrt(12.0), LEAST_NOISE_RAD)
     kinds = [f"{r.tone:g} Hz" if r.tone > 0 else r.label for r in runs]
     ratios = {}
     for kind in dict.fromkeys(kinds):
         members = [n for n, k in enumerate(kinds) if k == kind]
         parts, of_kind = [residuals[n] for n in members], [runs[n] for n in members]
-        every = [np.ones(len(part), bool) for part in parts]
+        used_rows = [[np.ones(len(part), bool) for part in parts]]
+        if not of_kind[0].tone > 0:
+            used_rows.append(list(map(_moving, of_kind, free_run(structure, values, of_kind))))
         ratios[kind] = float("nan")
-        for rows in (every, [moving[n] for n in members]):
+        for rows in used_rows:
             noise = reading_noise(of_kind, parts, rows)
             if np.isfinite(noise):
                 used = np.concatenate([r[use] for r, use in zip(parts, rows, strict=True)])
                 ratio = float(np.sqrt(_clipped_square(used)) / max(noise, least))
                 ratios[kind] = float(np.fmax(ratios[kind], ratio))
-            if runs[members[0]].tone > 0:
-                break
     return ratios
 
 

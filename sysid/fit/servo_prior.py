@@ -99,11 +99,7 @@ def _logarithms(
 ) -> Iterator[tuple[str, tuple[float, float]]]:
     """Logarithm of each known number of one joint, and its standard deviation."""
     actuator, ratios, point = unit.actuator, unit.actuator.ratios_to_armature, unit.operating_point
-    numbers = {
-        "dead_time_s": actuator.dead_time_s,
-        "velocity_limit_rad_s": actuator.velocity_limit_rad_s,
-        "stiffness_per_s2": ratios.stiffness, "damping_per_s": ratios.damping,
-        "friction_rad_s2": ratios.friction_loss, "effort_rad_s2": ratios.effort_limit,
+    numbers = {n: q for n, q in actuator.per_inertia.items() if n != "back_emf_per_s"} | {
         "stiffness": actuator.stiffness_nm_per_rad, "damping": actuator.damping_nm_s_per_rad,
         "friction_loss": actuator.friction_loss_nm,
     }  # fmt: skip
