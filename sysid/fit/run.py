@@ -27,6 +27,14 @@ SHORTEST_STEP_S = TIME_STEP_S / 4
 fits where longer ones would move a number."""
 _LEAST_AT_REST, _SETTLES, _FAR = 8, 3.0, 5.0
 """Readings whose halves can be compared, and the difference [standard errors] of a moving joint."""
+_DENSE_S = 0.005
+"""Readings of a search that is twice as dense are thinned to one in this time [s]."""
+_EXCERPT_PERIODS, _EXCERPT_S, _EXCERPT_READINGS = 2.0, 1.0, 40
+"""Of a tone, what a search sees: so many periods, at least so long [s] and so many readings."""
+_PART_S, _SETTLED_S, _LONG, _STILL = 3.0, 0.6, 1.5, 0.1
+"""Of another motion: length of a part, and of the motion before it in which a servo forgets where
+it began [s]; how much longer than its parts it is at least, and the share of a mean part's path
+below which the command is still."""
 _VOLTAGE_WINDOW_S = 0.1
 """Length of the mean of logged voltages: single ones catch the ripple of the pulse width."""
 
@@ -129,6 +137,53 @@ class Run:
             self, held=held, edges=kernel.edges_of(held[0], self.edges[0, use][1::2]), pad=pad,
             sample_step=np.minimum(self.sample_step, even) / 2, row_step=self.row_step / 2,
             held_step=self.held_step / 2, step_s=2 * self.step_s,
+        )  # fmt: skip
+
+    def excerpts(self, seconds: float) -> tuple[Run, ...]:
+        """The readings that a search needs: a few periods of a tone, parts of another motion.
+
+        A servo does not move within `_DENSE_S`, and a tone repeats itself. `seconds`: how much of a
+        longer motion without a tone, in parts from all of it in which the command moves.
+        """
+        run = self._thinned()
+        if not len(run.sample_step):
+            return (run,)
+        time_s = (run.sample_step - run.sample_step[0]) * self.step_s
+        if self.tone > 0:
+            long_s = max(_EXCERPT_PERIODS / self.tone, _EXCERPT_S)
+            count = max(np.count_nonzero(time_s <= long_s), _EXCERPT_READINGS)
+            return (run,) if count >= len(time_s) else (run._part(0, slice(count)),)
+        parts = max(int(seconds / _PART_S), 1)
+        blocks = [np.flatnonzero(time_s // _PART_S == k) for k in range(int(time_s[-1] // _PART_S))]
+        blocks = [block for block in blocks if len(block)]
+        if len(blocks) < _LONG * parts:
+            return (run,)
+        command = self.command[np.minimum(run.sample_step.astype(int), self.steps - 1)]
+        paths = np.array([np.abs(np.diff(command[block])).sum() for block in blocks])
+        moving = np.flatnonzero(paths >= _STILL * paths.mean())
+        chosen = moving[((np.arange(parts) + 0.5) / parts * len(moving)).astype(int)]
+        settled = round(_SETTLED_S / self.step_s)
+        return tuple(
+            run._part(max(int(run.sample_step[blocks[k][0]]) - settled, 0), blocks[k])
+            for k in dict.fromkeys(chosen)
+        )
+
+    def _thinned(self) -> Run:
+        """The run without the most of readings that are closer than a servo moves."""
+        apart = np.floor(self.sample_step * (self.step_s / _DENSE_S))
+        use = np.unique(apart, return_index=True)[1]
+        return self if len(use) > len(apart) // 2 else self._part(0, use)
+
+    def _part(self, first: int, use: slice | NDArray[np.intp]) -> Run:
+        """The run from a step on, with some of its readings; the joint rests there before."""
+        step, reading = self.sample_step[use], self.sample_rad[use]
+        if not first:
+            return replace(self, sample_step=step, sample_rad=reading)
+        end = self.pad + int(np.ceil(step[-1])) + 2
+        return replace(
+            self, held=self.held[:, first:end], edges=self.edges[:, first:end],
+            start_rad=float(np.interp(first, self.sample_step, self.sample_rad)),
+            sample_step=step - first, sample_rad=reading,
         )  # fmt: skip
 
     def until(self, share: float) -> Run:

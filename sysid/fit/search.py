@@ -13,6 +13,7 @@ starts from its fit, too, so that it never costs more.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -44,6 +45,8 @@ _FAR_ABOVE = 10.0  # from a limit to one that no motion reaches
 _NEAR_SD, _NEAR_STEP = (0.02, 0.5), 0.02
 """Of the local fits about the best one: how many in a round, rounds at most, iterations, standard
 deviation of their starts and step of the Jacobian in fitted coordinates."""
+_SEARCHED_S = 30.0
+"""Of motions without tones, what a search sees of all of them [s]."""
 _LARGEST_BATCH = 4_000_000  # residuals at once
 _LEAST_GAIN = 0.05  # of log-likelihood: far below anything that an interval would notice
 _DELAY_GRID = 2.0  # steps between the delays tried for a start
@@ -64,11 +67,14 @@ class Problem:
     runs : tuple of Run
     noise_rad : tuple of float
         Of each run: the soft-L1 loss bends here, the prior is weighed against it.
+    whole : bool
+        Whether the runs have all of their readings.
     """
 
     structure: Structure
     runs: tuple[Run, ...]
     noise_rad: tuple[float, ...]
+    whole: bool = True
 
     @cached_property
     def samples(self) -> int:
@@ -114,9 +120,26 @@ class Problem:
         ])  # fmt: skip
 
     @cached_property
+    def excerpt(self) -> Problem:
+        """The same fit to the readings that a search needs (`Run.excerpts`)."""
+        if not self.whole:
+            return self
+        seconds = _SEARCHED_S / max(len(self.runs), 1)
+        parts = [run.excerpts(seconds) for run in self.runs]
+        if all(part[0] is run for part, run in zip(parts, self.runs, strict=True)):
+            return self
+        noise = [(s,) * len(part) for s, part in zip(self.noise_rad, parts, strict=True)]
+        return replace(
+            self, runs=tuple(itertools.chain(*parts)), noise_rad=tuple(itertools.chain(*noise)),
+            whole=False,
+        )  # fmt: skip
+
+    @cached_property
     def coarse(self) -> Problem:
-        """The same fit in longer steps (`Run.coarser`): twice the length, no shorter than usual."""
-        return replace(self, runs=tuple(_coarse(run) for run in self.runs))
+        """The excerpt in longer steps (`Run.coarser`): twice the length, no shorter than usual."""
+        return replace(
+            self.excerpt, runs=tuple(_coarse(run) for run in self.excerpt.runs), whole=False
+        )
 
     def only(self, use: Sequence[bool] | NDArray[np.bool_]) -> Problem:
         """The same fit to some of the runs."""
@@ -173,7 +196,7 @@ def search(
     `more` of shape (starts, parameters): further starts, in fitted coordinates. `keep`: how many of
     the starts are improved a little. `final`: how many of those are fitted to the end.
     """
-    starts = Starts(problem.coarse, rng).best(np.ones(len(problem.runs), bool), keep)
+    starts = Starts(problem.coarse, rng).best(keep)
     if more is not None and len(more):
         starts = np.concatenate([starts, more])
     rough = refined(problem.coarse, starts, final)[:_REFINED]
@@ -192,7 +215,7 @@ def search_widely(
     `more` of shape (starts, parameters): further starts, in fitted coordinates. `short`: fewer
     generations.
     """
-    crowd = Starts(problem.coarse, rng).best(np.ones(len(problem.runs), bool), _POPULATION)
+    crowd = Starts(problem.coarse, rng).best(_POPULATION)
     starts = crowd[:_KEEP]
     if more is not None and len(more):
         starts = np.concatenate([starts, more])
@@ -218,7 +241,8 @@ def evolved(
         if temperature_at(problem, best) <= LEAVES_MOTION:
             break
         # a stiff servo at its limits moves otherwise in coarse steps
-        best = evolve(problem, [best], rng, short, near)
+        evolved_fit = evolve(problem.excerpt, [best], rng, short, near)
+        best = min(best, refine(problem, evolved_fit.point[None]), key=lambda f: f.cost)
     return from_about(problem, with_limits(problem, best), rng)
 
 
@@ -230,6 +254,10 @@ def from_about(problem: Problem, best: Fit, rng: np.random.Generator) -> Fit:
     """
     if not problem.structure.scales.free_air:
         return best
+    excerpt = problem.excerpt
+    if excerpt is not problem:
+        about = from_about(excerpt, refine(excerpt, best.point[None]), rng)
+        return min(best, refine(problem, about.point[None]), key=lambda f: f.cost)
     low, high = problem.structure.box
     shape, (least, most) = (_NEAR, len(best.point)), np.log(_NEAR_SD)
     for _ in range(_NEAR_ROUNDS):
@@ -287,7 +315,15 @@ def refined(problem: Problem, starts: NDArray[np.float64], final: int = _FINAL) 
 
 
 def refine(problem: Problem, points: NDArray[np.float64]) -> Fit:
-    """The best local fit from some points (starts, parameters)."""
+    """The best local fit from some points (starts, parameters).
+
+    Where a search needs not all readings, the fit to all of them begins at the best of the fits to
+    those, and of the points.
+    """
+    if problem.excerpt is not problem:
+        ends = [f.point for f in local(problem.excerpt, points, _LONG, _STEP)]
+        points = np.concatenate([points, ends])
+        points = points[[int(np.argmin(problem.costs(points)))]]
     return min(local(problem, points, _LONG, _STEP), key=lambda f: f.cost)
 
 
@@ -321,10 +357,11 @@ class Starts:
             for run in problem.runs
         ])  # fmt: skip
 
-    def best(self, use: NDArray[np.bool_], keep: int) -> NDArray[np.float64]:
-        """The `keep` of the lowest cost on some of the runs, in fitted coordinates."""
-        problem = self._problem.only(use)
-        total, square = self._moments[np.asarray(use, bool)].sum(axis=0) / max(problem.samples, 1)
+    def best(self, keep: int, use: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+        """The `keep` of the lowest cost on the runs, or some of them, in fitted coordinates."""
+        problem = self._problem if use is None else self._problem.only(use)
+        moments = self._moments if use is None else self._moments[use]
+        total, square = moments.sum(axis=0) / max(problem.samples, 1)
         delay = np.argmin(square - total**2, axis=0)
         values = self._values.copy()
         values[:, 0] += self._later_s[delay]
@@ -584,7 +621,7 @@ def fit_folds(
     for n, out in enumerate(folds.values()):
         part = problem.only(~out)
         if starts is not None:
-            crowd = [starts.best(~out, _KEEP)]
+            crowd = [starts.best(_KEEP, ~out)]
         else:
             assert draws is not None and by_run is not None
             cost_without = by_run[~out].sum(axis=0) + problem.prior(draws)
