@@ -27,10 +27,10 @@ SHORTEST_STEP_S = TIME_STEP_S / 4
 fits where longer ones would move a number."""
 _LEAST_AT_REST, _SETTLES, _FAR = 8, 3.0, 5.0
 """Readings whose halves can be compared, and the difference [standard errors] of a moving joint."""
-_DENSE_S = 0.005
+_DENSE_S = 0.008
 """Readings of a search that is twice as dense are thinned to one in this time [s]."""
-_EXCERPT_PERIODS, _EXCERPT_S, _EXCERPT_READINGS = 2.0, 1.0, 40
-"""Of a tone, what a search sees: so many periods, at least so long [s] and so many readings."""
+_PERIODS = 2.0
+"""Of a tone that a search sees at least: those after the first are alike."""
 _PART_S, _SETTLED_S, _LONG, _STILL = 3.0, 0.6, 1.5, 0.1
 """Of another motion: length of a part, and of the motion before it in which a servo forgets where
 it began [s]; how much longer than its parts it is at least, and the share of a mean part's path
@@ -140,19 +140,19 @@ class Run:
         )  # fmt: skip
 
     def excerpts(self, seconds: float) -> tuple[Run, ...]:
-        """The readings that a search needs: a few periods of a tone, parts of another motion.
+        """The readings that a search needs, as runs: of a long motion some parts, none too dense.
 
-        A servo does not move within `_DENSE_S`, and a tone repeats itself. `seconds`: how much of a
-        longer motion without a tone, in parts from all of it in which the command moves.
+        A servo does not move within `_DENSE_S`, and a tone repeats itself. `seconds`: how much of
+        the motion, if it is that long: the beginning of a tone, and of another motion parts from
+        all of it in which the command moves.
         """
         run = self._thinned()
         if not len(run.sample_step):
             return (run,)
         time_s = (run.sample_step - run.sample_step[0]) * self.step_s
         if self.tone > 0:
-            long_s = max(_EXCERPT_PERIODS / self.tone, _EXCERPT_S)
-            count = max(np.count_nonzero(time_s <= long_s), _EXCERPT_READINGS)
-            return (run,) if count >= len(time_s) else (run._part(0, slice(count)),)
+            count = np.count_nonzero(time_s <= max(seconds, _PERIODS / self.tone))
+            return (run,) if count == len(time_s) else (run._part(0, slice(count)),)
         parts = max(int(seconds / _PART_S), 1)
         blocks = [np.flatnonzero(time_s // _PART_S == k) for k in range(int(time_s[-1] // _PART_S))]
         blocks = [block for block in blocks if len(block)]
