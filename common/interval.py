@@ -53,9 +53,9 @@ UNKNOWN = Interval(float("nan"), float("nan"), float("nan"))
 
 def t_quantile(freedom: int) -> float:
     """Half width of a 90 % interval in standard errors, by Student's t."""
-    from scipy.stats import t as student_t  # slow to import
+    from scipy.special import stdtrit  # slow to import
 
-    return float(student_t.ppf((1 + LEVEL) / 2, freedom))
+    return float(stdtrit(freedom, (1 + LEVEL) / 2))
 
 
 def mean_of(values: NDArray[np.float64]) -> Interval:

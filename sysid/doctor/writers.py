@@ -22,7 +22,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
-from scipy.stats import rankdata
 
 from pupper_sysid.common.tones import least_squares
 from pupper_sysid.sysid.doctor.changes import Followed
@@ -204,13 +203,19 @@ def pulses(joint: Followed, number: int) -> tuple[Pulses, Pulses]:
     place = np.column_stack(
         [command, rate[rows[:, 0]], _since(steps, at) if len(steps) else np.zeros(len(at))]
     )
-    place = (rankdata(place, axis=0) - 0.5) / len(place)
+    place = np.apply_along_axis(_shares_below, 0, place)
     some = np.flatnonzero(seen)[:: 1 + int(seen.sum()) // _MOST_PLACES]
     others = Pulses(at[some], command[some], np.zeros(len(some)), doubt[some], place[some])
     every = Pulses(at[numbers], command[numbers], sizes, doubt[numbers], place[numbers])
     beside = np.abs(every.time_s[:, None] - every.time_s) < lasts
     larger = np.abs(every.size_rad) > _ECHO * np.abs(every.size_rad[:, None])
     return every.part(np.asarray(~(beside & larger).any(axis=1))), others
+
+
+def _shares_below(values: NDArray) -> NDArray[np.float64]:
+    """Ranks from 0 to 1, those of equal values alike."""
+    _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return (np.cumsum(counts) - 0.5 * counts)[places] / len(values)
 
 
 def _pursuit(
