@@ -45,7 +45,7 @@ _FAR_ABOVE = 10.0  # from a limit to one that no motion reaches
 _NEAR_SD, _NEAR_STEP = (0.02, 0.5), 0.02
 """Of the local fits about the best one: how many in a round, rounds at most, iterations, standard
 deviation of their starts and step of the Jacobian in fitted coordinates."""
-_SEARCHED_S = 20.0
+_SEARCHED_S = 30.0
 """What a search sees of all runs together [s], if there is more: as much as recordings of which
 servos are found well (`benchmarks/wide_twins.py`)."""
 _LARGEST_BATCH = 4_000_000  # residuals at once
