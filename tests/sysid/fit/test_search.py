@@ -10,6 +10,8 @@ import pytest
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.fit.choice import Fitted
 from pupper_sysid.sysid.fit.joint_fit import _slight_limits
+from pupper_sysid.sysid.fit.run import Run, fresh_residuals
+from pupper_sysid.sysid.fit.scores import rms
 from pupper_sysid.sysid.fit.search import (
     Fit,
     Problem,
@@ -109,3 +111,45 @@ def test_a_limit_is_known_where_it_explains_more_than_noise_and_what_the_model_l
         ready = SimpleNamespace(problem=lambda structure, problem=problem: problem)
         slight = _slight_limits(ready, Fitted(problem.structure, fit), {"chirp": undescribed})
         assert ("effort_rad_s2" not in slight) is known, (effort_rad_s2, undescribed)
+
+
+def steps_of(seconds: float, rng: np.random.Generator) -> Run:
+    """Random steps every 0.5 s, read 200 times per second."""
+    levels = np.repeat(rng.uniform(-0.3, 0.3, int(2 * seconds)), round(0.5 / CONTINUOUS_S))
+    return fine_run(levels, 0.005).coarser().coarser()
+
+
+def test_a_search_sees_parts_of_a_long_motion_in_which_the_servo_moves_as_in_the_whole():
+    structure = candidate("delayed_pd_back_emf")
+    truth = np.array([NUMBERS[name] for name in structure.names])
+    rng = np.random.default_rng(0)
+    long = problem_of(structure, truth, steps_of(90.0, rng), NOISE_RAD, rng)
+    excerpt = long.excerpt
+    assert len(excerpt.runs) > 3 and excerpt.excerpt is excerpt
+    parts_s = [r.step_s * float(np.ptp(r.sample_step)) for r in excerpt.runs]
+    assert 20.0 < sum(parts_s) < 40.0 and max(parts_s) < 4.0
+    for residuals in fresh_residuals(structure, truth, excerpt.runs):
+        assert rms([residuals]) < 1.2 * NOISE_RAD
+    for whole in (steps_of(30.0, rng), replace(steps_of(2.0, rng), frequency_hz=1.0)):
+        short = problem_of(structure, truth, whole, NOISE_RAD, rng)
+        assert short.excerpt is short
+
+
+def test_a_search_skips_where_no_command_changes_and_most_of_dense_readings():
+    rng = np.random.default_rng(1)
+    moves = rng.uniform(-0.3, 0.3, 60)
+    levels = np.repeat(np.concatenate([np.zeros(120), moves]), round(0.5 / CONTINUOUS_S))
+    run = fine_run(levels, 0.001)
+    parts = run.excerpts(9.0)
+    assert len(parts) == 3
+    for part in parts:
+        inside = part.sample_step.astype(int)
+        assert len(np.unique(part.command[inside])) > 3
+        assert np.median(np.diff(part.sample_step)) * part.step_s > 0.006
+
+
+def test_a_search_sees_two_periods_of_a_long_slow_tone():
+    time_s = CONTINUOUS_S * np.arange(round(12.0 / CONTINUOUS_S))
+    tone = replace(fine_run(0.3 * np.sin(np.pi * time_s), 0.02), frequency_hz=0.5)
+    (part,) = tone.excerpts(1.0)
+    assert np.ptp(part.sample_step) * part.step_s == pytest.approx(4.0, abs=0.02)
