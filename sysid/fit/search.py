@@ -45,9 +45,9 @@ _FAR_ABOVE = 10.0  # from a limit to one that no motion reaches
 _NEAR_SD, _NEAR_STEP = (0.02, 0.5), 0.02
 """Of the local fits about the best one: how many in a round, rounds at most, iterations, standard
 deviation of their starts and step of the Jacobian in fitted coordinates."""
-_SEARCHED_S = 30.0
-"""What a search sees of all runs together [s], if there is more: as much as recordings of which
-servos are found well (`benchmarks/wide_twins.py`)."""
+_SEARCHED_STEPS = 15_000
+"""What a search simulates of all runs together, if there is more: 30 s in steps of 2 ms, as of a
+sweep of ten tones."""
 _LARGEST_BATCH = 4_000_000  # residuals at once
 _LEAST_GAIN = 0.05  # of log-likelihood: far below anything that an interval would notice
 _DELAY_GRID = 2.0  # steps between the delays tried for a start
@@ -125,8 +125,8 @@ class Problem:
         """The same fit to the readings that a search needs (`Run.excerpts`)."""
         if not self.whole:
             return self
-        seconds = _SEARCHED_S / max(len(self.runs), 1)
-        parts = [run.excerpts(seconds) for run in self.runs]
+        steps = _SEARCHED_STEPS / max(len(self.runs), 1)
+        parts = [run.excerpts(steps * run.step_s) for run in self.runs]
         if all(part[0] is run for part, run in zip(parts, self.runs, strict=True)):
             return self
         noise = [(s,) * len(part) for s, part in zip(self.noise_rad, parts, strict=True)]
