@@ -388,18 +388,12 @@ def choose(ready: PreparedJoint, fitted: Sequence[Fitted]) -> Choice:
     if not ready.scales.free_air:  # the noise of the first structure was that of a worse one
         for _ in range(2):
             structure, values = exported.structure, exported.values
-            parts = fresh_residuals(structure, values, ready.runs)
+            parts = fresh_residuals(structure, values, ready.alike)
             noise = noise_by_run(parts, ready.runs, ready.least_rad)
             problem = replace(ready.problem(structure), noise_rad=noise)
             exported = replace(exported, fit=refine(problem, exported.fit.point[None]))
     likely = [exported if f.structure.name == exported.structure.name else f for f in likely]
-    repeats = None
-    if not ready.scales.known_load and len({r.p_gain for r in ready.runs}) == 1:
-        quantum_rad = ready.lag.quantum_rad
-        repeats = compare_repeats(
-            ready.problem(exported.structure), exported.fit, ready.least_rad,
-            quantum_rad if np.isfinite(quantum_rad) else 0.0,
-        )  # fmt: skip
+    repeats = compare_repeats(ready.apart(exported.structure, exported.fit))
     if repeats is not None:
         likely = [_as_repeats(f, repeats, ready.fit_rng()) for f in likely]
         exported = next(f for f in likely if f.structure.name == exported.structure.name)
@@ -438,7 +432,7 @@ def simplest(
 
 def _unseen(ready: PreparedJoint, fitted: Fitted) -> float:
     """RMS error on what was left out [rad]; NaN without folds."""
-    runs = ready.runs
+    runs = ready.alike
     folds = folds_of(runs)
     left_out = held_out_residuals(fitted.structure, fitted.folds or [], folds, runs)
     return rms(list(left_out.values()))
@@ -705,16 +699,12 @@ def braking(fitted: Fitted) -> Interval:
 
 def goodness_of(ready: PreparedJoint, fitted: Fitted) -> dict[str, float]:
     """Residual over noise by tone, or label of the run, as `goodness_of_fit` has it."""
-    quantum_rad = ready.lag.quantum_rad
-    return goodness_of_fit(
-        fitted.structure, fitted.values, ready.runs,
-        quantum_rad if np.isfinite(quantum_rad) else 0.0,
-    )  # fmt: skip
+    return goodness_of_fit(fitted.structure, fitted.values, ready.alike, ready.quantum_rad)
 
 
 def _error_rad(ready: PreparedJoint, fitted: Fitted) -> float:
     """RMS error on fresh readings [rad]."""
-    return rms(fresh_residuals(fitted.structure, fitted.values, ready.runs))
+    return rms(fresh_residuals(fitted.structure, fitted.values, ready.alike))
 
 
 def undescribed(goodness: Mapping[str, float]) -> str | None:
