@@ -41,7 +41,7 @@ from pupper_sysid.sysid.fit.results import (
     TELLING_NATS,
     plausible,
 )
-from pupper_sysid.sysid.fit.run import fresh_residuals
+from pupper_sysid.sysid.fit.run import Run, fresh_residuals
 from pupper_sysid.sysid.fit.scores import held_out_residuals, rms
 from pupper_sysid.sysid.fit.search import (
     LEAVES_MOTION,
@@ -698,8 +698,25 @@ def braking(fitted: Fitted) -> Interval:
 
 
 def goodness_of(ready: PreparedJoint, fitted: Fitted) -> dict[str, float]:
-    """Residual over noise by tone, or label of the run, as `goodness_of_fit` has it."""
-    return goodness_of_fit(fitted.structure, fitted.values, ready.alike, ready.quantum_rad)
+    """Residual over noise by tone, or label of the run, as `goodness_of_fit` has it.
+
+    Of several recordings that are `alike` it is that of the one which is described least.
+    """
+
+    def of_runs(runs: Sequence[Run]) -> dict[str, float]:
+        return goodness_of_fit(fitted.structure, fitted.values, runs, ready.quantum_rad)
+
+    of_all, by_recording = of_runs(ready.alike), []
+    for source in dict.fromkeys(r.source for r in ready.runs) if ready.between_rad else ():
+        ratios = of_runs([r for r in ready.alike if r.source == source])
+        by_recording.append({f"{motion} of {source}": r for motion, r in ratios.items()})
+    return max([of_all, *by_recording], key=_misfit)
+
+
+def _misfit(goodness: Mapping[str, float]) -> float:
+    """Above 1 where a servo is not described; 0 where that is not known."""
+    ratios = [overall(goodness) / DESCRIBED, *(r / DESCRIBED_ONE for r in goodness.values())]
+    return float(np.fmax.reduce([0.0, *ratios]))
 
 
 def _error_rad(ready: PreparedJoint, fitted: Fitted) -> float:
@@ -712,9 +729,9 @@ def undescribed(goodness: Mapping[str, float]) -> str | None:
     ratio = overall(goodness)
     if ratio > DESCRIBED:
         return f"the model does not describe this servo: its errors are {ratio:.1f} times the noise"
-    motion = max(goodness, key=lambda name: np.nan_to_num(goodness[name]), default=None)
-    if motion is None or not goodness[motion] > DESCRIBED_ONE:
+    if not _misfit(goodness) > 1.0:
         return None
+    motion = max(goodness, key=lambda name: np.nan_to_num(goodness[name]))
     return (
         f"the model does not describe this servo in the motion {motion}: its errors are "
         f"{goodness[motion]:.1f} times the noise there"

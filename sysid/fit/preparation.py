@@ -36,7 +36,12 @@ from pupper_sysid.sysid.fit.goodness import DESCRIBED, LEAST_NOISE_RAD, goodness
 from pupper_sysid.sysid.fit.noise import noise_by_run
 from pupper_sysid.sysid.fit.operating_point import loaded_joints, reference_gain
 from pupper_sysid.sysid.fit.posterior import STEPPING_SD_S, STEPPING_SHARE
-from pupper_sysid.sysid.fit.repeats import Apart, between_recordings, fit_apart
+from pupper_sysid.sysid.fit.repeats import (
+    Apart,
+    between_recordings,
+    fit_apart,
+    mean_point,
+)
 from pupper_sysid.sysid.fit.run import (
     SHORTEST_STEP_S,
     Run,
@@ -137,18 +142,30 @@ class PreparedJoint:
         problem = Problem(structure, self.runs, self.noise_rad)
         return fit_apart(problem, fit.point, self.least_rad, self.quantum_rad)
 
-    def without_differences(self) -> PreparedJoint:
-        """The joint with its recordings as `alike` as the first fits say, which are made anew."""
-        structure, best = min(self.first.values(), key=lambda pair: pair[1].cost)
-        apart = self.apart(structure, best)
+    def alike_by(self, structure: Structure, fit: Fit) -> tuple[PreparedJoint, Fit]:
+        """The joint with its recordings as `alike` as fits to each say, and that of their mean.
+
+        The joint itself and `fit`, to all recordings, where there is one.
+        """
+        apart = self.apart(structure, fit)
         if not apart:
-            return self
-        between_rad = between_recordings(structure, best.point, apart, self.runs)
+            return self, fit
+        point = mean_point(apart)
+        between_rad = between_recordings(structure, point, apart, self.runs)
         ready = replace(self, between_rad=between_rad)
-        residuals = fresh_residuals(structure, structure.decode(best.point), ready.alike)
+        return ready, Fit(point, float(ready.problem(structure).costs(point[None])[0]))
+
+    def without_differences(self) -> PreparedJoint:
+        """The joint with its recordings `alike`, and first fits to them."""
+        every = [(s, *self.alike_by(s, fit)) for s, fit in self.first.values()]
+        structure, ready, mean = min(every, key=lambda one: one[2].cost)
+        if not ready.between_rad:
+            return self
+        residuals = fresh_residuals(structure, structure.decode(mean.point), ready.alike)
         ready = replace(ready, noise_rad=noise_by_run(residuals, ready.runs, ready.least_rad))
         first = {
-            name: (s, refine(ready.problem(s), f.point[None])) for name, (s, f) in self.first.items()
+            s.name: (s, refine(ready.problem(s), np.array([fit.point, of_s.point])))
+            for (s, _, of_s), (_, fit) in zip(every, self.first.values(), strict=True)
         }
         return replace(ready, first=first)
 
@@ -172,20 +189,22 @@ class PreparedJoint:
         A noise that is many times too large leaves a fit to its prior, and hides what a physics
         step moves.
         """
-        residuals = fresh_residuals(structure, structure.decode(fit.point), self.alike)
+        ready, fit = self.alike_by(structure, fit)
+        residuals = fresh_residuals(structure, structure.decode(fit.point), ready.alike)
         noise = noise_by_run(residuals, self.runs, self.least_rad)
         smaller = tuple(map(min, noise, self.noise_rad))
-        problem = replace(self.problem(structure), noise_rad=smaller)
+        problem = replace(ready.problem(structure), noise_rad=smaller)
         dated = self.recorded, self.lag.feedback, self.reference_voltage_v
         step_s = _step_for(problem, fit, *dated)
         runs = self.runs
         if step_s < runs[0].step_s:
             _, runs = _dated(*dated, True, step_s, self.lost_commands)
-        return replace(self, runs=runs, noise_rad=smaller)
+        return replace(ready, runs=runs, noise_rad=smaller)
 
     def problem(self, structure: Structure) -> Problem:
         """The fit of a structure to all runs."""
-        return Problem(structure, self.alike, self.noise_rad)
+        recordings = len({r.source for r in self.runs}) if self.between_rad else 1
+        return Problem(structure, self.alike, self.noise_rad, recordings)
 
     def searched(self, structure: Structure) -> Problem:
         """The same with fewer readings at the ends of long runs, as much as a search needs."""

@@ -20,6 +20,7 @@ from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.servo_models.calibration.quantity import words_of
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.noise import noise_by_run, temperature_of
+from pupper_sysid.sysid.fit.posterior import Straight
 from pupper_sysid.sysid.fit.run import Run, fresh_residuals
 from pupper_sysid.sysid.fit.search import Problem, curvature, local, refine
 from pupper_sysid.sysid.fit.servo_prior import PER_INERTIA, UNIT_SD
@@ -121,10 +122,14 @@ def compare_repeats(apart: Mapping[str, Apart]) -> Repeats | None:
         difference = _difference(source, apart[source], others)
         named += [difference] if difference is not None else []
     named.sort(key=lambda d: -d.nats)
+    return _repeats(apart, tuple(named))
+
+
+def _repeats(apart: Mapping[str, Apart], differences: tuple[Difference, ...] = ()) -> Repeats:
     every = [*apart.values()]
     points = np.array([one.point for one in every])
     variances = np.array([np.diag(np.linalg.inv(one.precision)) for one in every], float)
-    return repeats_of(points, variances, every[0].part.structure, tuple(named))
+    return repeats_of(points, variances, every[0].part.structure, differences)
 
 
 def fit_apart(
@@ -144,6 +149,24 @@ def fit_apart(
     return {s: _apart(part, point, least_rad, quantum_rad) for s, part in parts.items()}
 
 
+def mean_point(apart: Mapping[str, Apart]) -> NDArray[np.float64]:
+    """Numbers of the mean servo of recordings that were fitted apart, shape (parameters,).
+
+    A number of a recording weighs as much as its error and the spread between recordings leave it.
+    The fit to all readings is another point: motions of servos that differ have a mean that is no
+    servo's, which moves the fit along its ridge by more than the servos are apart.
+    """
+    every, spread = [*apart.values()], np.diag(_repeats(apart).between ** 2)
+    structure = every[0].part.structure
+    straight = Straight(structure)
+    points = straight.of(np.array([one.point for one in every]))
+    slope = np.linalg.inv(straight.slope(points))
+    errors = np.linalg.inv([one.precision for one in every])
+    weights = np.linalg.inv(slope @ (errors + spread) @ slope.mT)
+    mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, points))
+    return np.clip(straight.fitted(mean), *structure.box)
+
+
 def between_recordings(
     structure: Structure,
     point: NDArray[np.float64],
@@ -155,7 +178,7 @@ def between_recordings(
     It is the motion with the numbers of the reading's recording less that with those of all. Zero
     in a recording that was not fitted apart.
 
-    `point` of shape (parameters,): of the fit to all recordings. `apart`: from `fit_apart`.
+    `point` of shape (parameters,): of that servo. `apart`: from `fit_apart`.
     """
     of_all = fresh_residuals(structure, structure.decode(point), runs)
     return tuple(
