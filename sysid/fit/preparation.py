@@ -150,7 +150,10 @@ class PreparedJoint:
         apart = self.apart(structure, fit)
         if not apart:
             return self, fit
-        point = mean_point(apart)
+        points = np.array([mean_point(apart), *(one.point for one in apart.values())])
+        costs = Problem(structure, self.runs, self.noise_rad).costs(points)
+        # of points in one valley the mean is in it, too
+        point = points[0] if costs[0] <= costs[1:].max() else fit.point
         between_rad = between_recordings(structure, point, apart, self.runs)
         ready = replace(self, between_rad=between_rad)
         return ready, Fit(point, float(ready.problem(structure).costs(point[None])[0]))
