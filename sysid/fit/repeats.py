@@ -154,7 +154,7 @@ def mean_point(apart: Mapping[str, Apart]) -> NDArray[np.float64]:
 
     A number of a recording weighs as much as its error and the spread between recordings leave it.
     The fit to all readings is another point: motions of servos that differ have a mean that is no
-    servo's, which moves the fit along its ridge by more than the servos are apart.
+    servo's, which can move the fit along its ridge by more than the servos are apart.
     """
     every, spread = [*apart.values()], np.diag(_repeats(apart).between ** 2)
     structure = every[0].part.structure
