@@ -150,7 +150,7 @@ class PreparedJoint:
         apart = self.apart(structure, fit)
         if not apart:
             return self, fit
-        points = np.array([mean_point(apart), *(one.point for one in apart.values())])
+        points = np.array([mean_point(apart, fit.point), *(one.point for one in apart.values())])
         costs = Problem(structure, self.runs, self.noise_rad).costs(points)
         # of points in one valley the mean is in it, too
         point = points[0] if costs[0] <= costs[1:].max() else fit.point

@@ -149,20 +149,24 @@ def fit_apart(
     return {s: _apart(part, point, least_rad, quantum_rad) for s, part in parts.items()}
 
 
-def mean_point(apart: Mapping[str, Apart]) -> NDArray[np.float64]:
+def mean_point(apart: Mapping[str, Apart], point: NDArray[np.float64]) -> NDArray[np.float64]:
     """Numbers of the mean servo of recordings that were fitted apart, shape (parameters,).
 
     A number of a recording weighs as much as its error and the spread between recordings leave it.
     The fit to all readings is another point: motions of servos that differ have a mean that is no
-    servo's, which can move the fit along its ridge by more than the servos are apart.
+    servo's, which can move the fit along its ridge by more than the servos are apart. It is off by
+    no more than units of a servo differ by: numbers that no recording tells are those of that fit.
+
+    `point` of shape (parameters,): of the fit to all recordings.
     """
     every, spread = [*apart.values()], np.diag(_repeats(apart).between ** 2)
     structure = every[0].part.structure
     straight = Straight(structure)
-    points = straight.of(np.array([one.point for one in every]))
+    points = straight.of(np.array([*(one.point for one in every), point]))
     slope = np.linalg.inv(straight.slope(points))
-    errors = np.linalg.inv([one.precision for one in every])
-    weights = np.linalg.inv(slope @ (errors + spread) @ slope.mT)
+    errors = [np.linalg.inv(one.precision) + spread for one in every]
+    errors.append(np.diag(_between_units(structure) ** 2))
+    weights = np.linalg.inv(slope @ errors @ slope.mT)
     mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, points))
     return np.clip(straight.fitted(mean), *structure.box)
 
@@ -292,12 +296,7 @@ def repeats_of(
     Gelman, A. (2006). Prior distributions for variance parameters in hierarchical models. Bayesian
     Analysis 1: 515–534, section 2.
     """
-    units = [
-        UNIT_SD if p.logarithmic
-        else p.marginal_sd if np.isfinite(p.marginal_sd) else SERVO_TERMS[p.name].prior_sd
-        for p in structure.parameters
-    ]  # fmt: skip
-    spreads = np.array(units)[:, None] * _SPREADS
+    spreads = _between_units(structure)[:, None] * _SPREADS
     weight = 1.0 / (variances[:, :, None] + spreads**2)
     mean = (weight * points[:, :, None]).sum(axis=0) / weight.sum(axis=0)
     cost = np.log(weight.sum(axis=0)) - np.log(weight).sum(axis=0)
@@ -305,6 +304,15 @@ def repeats_of(
     likelihood = np.exp(0.5 * (cost.min(axis=1, keepdims=True) - cost))
     probabilities = likelihood / likelihood.sum(axis=1, keepdims=True)
     return Repeats(structure.names, spreads, probabilities, len(points), differences)
+
+
+def _between_units(structure: Structure) -> NDArray[np.float64]:
+    """Standard deviations of numbers between units of a servo, shape (parameters,)."""
+    return np.array([
+        UNIT_SD if p.logarithmic
+        else p.marginal_sd if np.isfinite(p.marginal_sd) else SERVO_TERMS[p.name].prior_sd
+        for p in structure.parameters
+    ])  # fmt: skip
 
 
 def by_number(repeats: Repeats | None) -> dict[str, float]:
