@@ -700,15 +700,15 @@ def braking(fitted: Fitted) -> Interval:
 def goodness_of(ready: PreparedJoint, fitted: Fitted) -> dict[str, float]:
     """Residual over noise by tone, or label of the run, as `goodness_of_fit` has it.
 
-    Of several recordings that are `alike` it is that of the one which is described least; of all
-    together if each has too few readings.
+    Of several recordings it is that of the one which is described least; of all together if each
+    has too few readings.
     """
 
     def of_runs(runs: Sequence[Run]) -> dict[str, float]:
         return goodness_of_fit(fitted.structure, fitted.values, runs, ready.quantum_rad)
 
     least: dict[str, float] = {}
-    for source in dict.fromkeys(r.source for r in ready.runs) if ready.between_rad else ():
+    for source in ready.recordings if len(ready.recordings) > 1 else ():
         ratios = of_runs([r for r in ready.alike if r.source == source])
         ratios = {f"{motion} of {source}": r for motion, r in ratios.items()}
         least = max(least, ratios, key=_misfit)

@@ -135,9 +135,15 @@ class PreparedJoint:
         """Quantisation step of the readings [rad]; 0 where there is none."""
         return self.lag.quantum_rad if np.isfinite(self.lag.quantum_rad) else 0.0
 
+    @property
+    def recordings(self) -> tuple[str, ...]:
+        """Names of the recordings, if all are of one setup."""
+        one_setup = not self.scales.known_load and len({r.p_gain for r in self.runs}) == 1
+        return tuple(dict.fromkeys(r.source for r in self.runs)) if one_setup else ()
+
     def apart(self, structure: Structure, fit: Fit) -> dict[str, Apart]:
         """Fits to the recordings of one setup alone, by name; `fit`: to all of them."""
-        if self.scales.known_load or len({r.p_gain for r in self.runs}) > 1:
+        if not self.recordings:
             return {}
         problem = Problem(structure, self.runs, self.noise_rad)
         return fit_apart(problem, fit.point, self.least_rad, self.quantum_rad)
@@ -145,10 +151,11 @@ class PreparedJoint:
     def alike_by(self, structure: Structure, fit: Fit) -> tuple[PreparedJoint, Fit]:
         """The joint with its recordings as `alike` as fits to each say, and that of their mean.
 
-        The joint itself and `fit`, to all recordings, where there is one.
+        The joint itself and `fit`, to all recordings, where there is one, and where the structure
+        does not describe each: numbers of their own would make up for what it lacks.
         """
         apart = self.apart(structure, fit)
-        if not apart:
+        if not apart or any(one.misfit > DESCRIBED for one in apart.values()):
             return self, fit
         points = np.array([mean_point(apart, fit.point), *(one.point for one in apart.values())])
         costs = Problem(structure, self.runs, self.noise_rad).costs(points)
@@ -206,7 +213,7 @@ class PreparedJoint:
 
     def problem(self, structure: Structure) -> Problem:
         """The fit of a structure to all runs."""
-        recordings = len({r.source for r in self.runs}) if self.between_rad else 1
+        recordings = len(self.recordings) if self.between_rad else 1
         return Problem(structure, self.alike, self.noise_rad, recordings)
 
     def searched(self, structure: Structure) -> Problem:

@@ -202,14 +202,14 @@ class Apart:
         With the noise that is left without the other recordings.
     point : ndarray, shape (parameters,)
     precision : ndarray, shape (parameters, parameters)
-    temperature : float
-        How many readings count as one.
+    misfit : float
+        Residual over noise, of all motions; NaN where that is not known.
     """
 
     part: Problem
     point: NDArray[np.float64]
     precision: NDArray[np.float64]
-    temperature: float
+    misfit: float
 
 
 def _apart(part: Problem, point: NDArray, least_rad: float, quantum_rad: float) -> Apart:
@@ -227,7 +227,7 @@ def _apart(part: Problem, point: NDArray, least_rad: float, quantum_rad: float) 
         temperature *= misfit**2
     prior = structure.prior_precision
     bent = (curvature(part, point, _STEP) - prior) / temperature
-    return Apart(part, point, bent + prior + 1e-9 * np.eye(len(bent)), temperature)
+    return Apart(part, point, bent + prior + 1e-9 * np.eye(len(bent)), misfit)
 
 
 def _directions(names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
