@@ -91,7 +91,7 @@ def repeated(twin: wide.Twin, repeats: Repeats) -> list[wide.Twin]:
     """The twin as it is recorded: once, or twice and the next time."""
     if repeats == "none":
         return [twin]
-    rng = np.random.default_rng([twin.seed, twin.number, 77])
+    rng = wide.sender(twin, "between recordings")
     vary = BETWEEN if repeats == "alike" else 0.0
     twins = []
     for n in range(3):

@@ -166,7 +166,7 @@ def sparse_equations(
         If a joint has too little motion.
     """
     ready = checks.each_joint(partial(prepare_joint, seed=seed), recordings, joints, workers)
-    runs = {joint: r.runs for joint, r in ready.items()}
+    runs = {joint: r.alike for joint, r in ready.items()}
     noise_rad = {joint: r.noise_rad for joint, r in ready.items()}
     equations = fit_equations(runs, noise_rad, seed, workers, progress)
     equations = {

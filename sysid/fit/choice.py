@@ -41,7 +41,7 @@ from pupper_sysid.sysid.fit.results import (
     TELLING_NATS,
     plausible,
 )
-from pupper_sysid.sysid.fit.run import fresh_residuals
+from pupper_sysid.sysid.fit.run import Run, fresh_residuals
 from pupper_sysid.sysid.fit.scores import held_out_residuals, rms
 from pupper_sysid.sysid.fit.search import (
     LEAVES_MOTION,
@@ -388,18 +388,12 @@ def choose(ready: PreparedJoint, fitted: Sequence[Fitted]) -> Choice:
     if not ready.scales.free_air:  # the noise of the first structure was that of a worse one
         for _ in range(2):
             structure, values = exported.structure, exported.values
-            parts = fresh_residuals(structure, values, ready.runs)
+            parts = fresh_residuals(structure, values, ready.alike)
             noise = noise_by_run(parts, ready.runs, ready.least_rad)
             problem = replace(ready.problem(structure), noise_rad=noise)
             exported = replace(exported, fit=refine(problem, exported.fit.point[None]))
     likely = [exported if f.structure.name == exported.structure.name else f for f in likely]
-    repeats = None
-    if not ready.scales.known_load and len({r.p_gain for r in ready.runs}) == 1:
-        quantum_rad = ready.lag.quantum_rad
-        repeats = compare_repeats(
-            ready.problem(exported.structure), exported.fit, ready.least_rad,
-            quantum_rad if np.isfinite(quantum_rad) else 0.0,
-        )  # fmt: skip
+    repeats = compare_repeats(ready.apart(exported.structure, exported.fit))
     if repeats is not None:
         likely = [_as_repeats(f, repeats, ready.fit_rng()) for f in likely]
         exported = next(f for f in likely if f.structure.name == exported.structure.name)
@@ -438,7 +432,7 @@ def simplest(
 
 def _unseen(ready: PreparedJoint, fitted: Fitted) -> float:
     """RMS error on what was left out [rad]; NaN without folds."""
-    runs = ready.runs
+    runs = ready.alike
     folds = folds_of(runs)
     left_out = held_out_residuals(fitted.structure, fitted.folds or [], folds, runs)
     return rms(list(left_out.values()))
@@ -704,17 +698,32 @@ def braking(fitted: Fitted) -> Interval:
 
 
 def goodness_of(ready: PreparedJoint, fitted: Fitted) -> dict[str, float]:
-    """Residual over noise by tone, or label of the run, as `goodness_of_fit` has it."""
-    quantum_rad = ready.lag.quantum_rad
-    return goodness_of_fit(
-        fitted.structure, fitted.values, ready.runs,
-        quantum_rad if np.isfinite(quantum_rad) else 0.0,
-    )  # fmt: skip
+    """Residual over noise by tone, or label of the run, as `goodness_of_fit` has it.
+
+    Of several recordings it is that of the one which is described least; of all together if each
+    has too few readings.
+    """
+
+    def of_runs(runs: Sequence[Run]) -> dict[str, float]:
+        return goodness_of_fit(fitted.structure, fitted.values, runs, ready.quantum_rad)
+
+    least: dict[str, float] = {}
+    for source in ready.recordings if len(ready.recordings) > 1 else ():
+        ratios = of_runs([r for r in ready.alike if r.source == source])
+        ratios = {f"{motion} of {source}": r for motion, r in ratios.items()}
+        least = max(least, ratios, key=_misfit)
+    return least if np.isfinite(overall(least)) else of_runs(ready.alike)
+
+
+def _misfit(goodness: Mapping[str, float]) -> float:
+    """Above 1 where a servo is not described; 0 where that is not known."""
+    ratios = [overall(goodness) / DESCRIBED, *(r / DESCRIBED_ONE for r in goodness.values())]
+    return float(np.fmax.reduce([0.0, *ratios]))
 
 
 def _error_rad(ready: PreparedJoint, fitted: Fitted) -> float:
     """RMS error on fresh readings [rad]."""
-    return rms(fresh_residuals(fitted.structure, fitted.values, ready.runs))
+    return rms(fresh_residuals(fitted.structure, fitted.values, ready.alike))
 
 
 def undescribed(goodness: Mapping[str, float]) -> str | None:
@@ -722,9 +731,9 @@ def undescribed(goodness: Mapping[str, float]) -> str | None:
     ratio = overall(goodness)
     if ratio > DESCRIBED:
         return f"the model does not describe this servo: its errors are {ratio:.1f} times the noise"
-    motion = max(goodness, key=lambda name: np.nan_to_num(goodness[name]), default=None)
-    if motion is None or not goodness[motion] > DESCRIBED_ONE:
+    if not _misfit(goodness) > 1.0:
         return None
+    motion = max(goodness, key=lambda name: np.nan_to_num(goodness[name]))
     return (
         f"the model does not describe this servo in the motion {motion}: its errors are "
         f"{goodness[motion]:.1f} times the noise there"

@@ -295,7 +295,7 @@ def _hidden_rad(ready: PreparedJoint, choice: Choice, goodness: Mapping[str, flo
     """RMS error that is not noise [rad]: a motion in a wrong shape can hide as much."""
     if not undescribed(goodness):
         return 0.0
-    error = rms(fresh_residuals(choice.exported.structure, choice.exported.values, ready.runs))
+    error = rms(fresh_residuals(choice.exported.structure, choice.exported.values, ready.alike))
     return float(error * np.sqrt(1.0 - overall(goodness) ** -2))
 
 

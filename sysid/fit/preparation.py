@@ -2,7 +2,8 @@
 
 A first fit, to readings dated by the poll lattice, gives the expected motion. With it the lattice
 is searched for slips and the readings are dated anew, readings behind commands that never arrived
-are left out, and each motion gets the noise that its residuals show.
+are left out, and each motion gets the noise that its residuals show. Of several recordings the
+readings are those of one servo then, without what the recordings differ by (`PreparedJoint.alike`).
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,12 @@ from pupper_sysid.sysid.fit.goodness import DESCRIBED, LEAST_NOISE_RAD, goodness
 from pupper_sysid.sysid.fit.noise import noise_by_run
 from pupper_sysid.sysid.fit.operating_point import loaded_joints, reference_gain
 from pupper_sysid.sysid.fit.posterior import STEPPING_SD_S, STEPPING_SHARE
+from pupper_sysid.sysid.fit.repeats import (
+    Apart,
+    between_recordings,
+    fit_apart,
+    mean_point,
+)
 from pupper_sysid.sysid.fit.run import (
     SHORTEST_STEP_S,
     Run,
@@ -93,6 +101,9 @@ class PreparedJoint:
         Commands that never arrived; the readings that they touch are not in `runs`.
     load_notes : tuple of str
         What the recordings say against the claimed load, in sentences.
+    between_rad : tuple of ndarray
+        Of several recordings, by how far the readings of each run differ for it (see
+        `between_recordings`); empty of one.
     """
 
     joint: str
@@ -107,6 +118,66 @@ class PreparedJoint:
     first: dict[str, tuple[Structure, Fit]]
     lost_commands: tuple[LostCommands, ...]
     load_notes: tuple[str, ...] = ()
+    between_rad: tuple[NDArray[np.float64], ...] = ()
+
+    @cached_property
+    def alike(self) -> tuple[Run, ...]:
+        """The runs with readings as if no recording differed, for every fit and its goodness."""
+        if not self.between_rad:
+            return self.runs
+        return tuple(
+            replace(run, sample_rad=run.sample_rad - between)
+            for run, between in zip(self.runs, self.between_rad, strict=True)
+        )
+
+    @property
+    def quantum_rad(self) -> float:
+        """Quantisation step of the readings [rad]; 0 where there is none."""
+        return self.lag.quantum_rad if np.isfinite(self.lag.quantum_rad) else 0.0
+
+    @property
+    def recordings(self) -> tuple[str, ...]:
+        """Names of the recordings, if all are of one setup."""
+        one_setup = not self.scales.known_load and len({r.p_gain for r in self.runs}) == 1
+        return tuple(dict.fromkeys(r.source for r in self.runs)) if one_setup else ()
+
+    def apart(self, structure: Structure, fit: Fit) -> dict[str, Apart]:
+        """Fits to the recordings of one setup alone, by name; `fit`: to all of them."""
+        if not self.recordings:
+            return {}
+        problem = Problem(structure, self.runs, self.noise_rad)
+        return fit_apart(problem, fit.point, self.least_rad, self.quantum_rad)
+
+    def alike_by(self, structure: Structure, fit: Fit) -> tuple[PreparedJoint, Fit]:
+        """The joint with its recordings as `alike` as fits to each say, and that of their mean.
+
+        The joint itself and `fit`, to all recordings, where there is one, and where the structure
+        does not describe each: numbers of their own would make up for what it lacks.
+        """
+        apart = self.apart(structure, fit)
+        if not apart or any(one.misfit > DESCRIBED for one in apart.values()):
+            return self, fit
+        points = np.array([mean_point(apart, fit.point), *(one.point for one in apart.values())])
+        costs = Problem(structure, self.runs, self.noise_rad).costs(points)
+        # of points in one valley the mean is in it, too
+        point = points[0] if costs[0] <= costs[1:].max() else fit.point
+        between_rad = between_recordings(structure, point, apart, self.runs)
+        ready = replace(self, between_rad=between_rad)
+        return ready, Fit(point, float(ready.problem(structure).costs(point[None])[0]))
+
+    def without_differences(self) -> PreparedJoint:
+        """The joint with its recordings `alike`, and first fits to them."""
+        every = [(s, *self.alike_by(s, fit)) for s, fit in self.first.values()]
+        structure, ready, mean = min(every, key=lambda one: one[2].cost)
+        if not ready.between_rad:
+            return self
+        residuals = fresh_residuals(structure, structure.decode(mean.point), ready.alike)
+        ready = replace(ready, noise_rad=noise_by_run(residuals, ready.runs, ready.least_rad))
+        first = {
+            s.name: (s, refine(ready.problem(s), np.array([fit.point, of_s.point])))
+            for (s, _, of_s), (_, fit) in zip(every, self.first.values(), strict=True)
+        }
+        return replace(ready, first=first)
 
     def fit_rng(self) -> np.random.Generator:
         """The same generator for every fit, so that a fit does not depend on those before it."""
@@ -119,7 +190,7 @@ class PreparedJoint:
         """
         scales = scales_of(self.recorded, self.runs)
         scales = replace(scales, known_load=False, p_gain=1.0, prior=self.scales.prior)
-        first = _first_fits(scales, self.runs, self.noise_rad, self.fit_rng())
+        first = _first_fits(scales, self.alike, self.noise_rad, self.fit_rng())
         return replace(self, scales=scales, first=first, reference_voltage_v=float("nan"))
 
     def with_noise_of(self, structure: Structure, fit: Fit) -> PreparedJoint:
@@ -128,26 +199,28 @@ class PreparedJoint:
         A noise that is many times too large leaves a fit to its prior, and hides what a physics
         step moves.
         """
-        residuals = fresh_residuals(structure, structure.decode(fit.point), self.runs)
+        ready, fit = self.alike_by(structure, fit)
+        residuals = fresh_residuals(structure, structure.decode(fit.point), ready.alike)
         noise = noise_by_run(residuals, self.runs, self.least_rad)
         smaller = tuple(map(min, noise, self.noise_rad))
-        problem = replace(self.problem(structure), noise_rad=smaller)
+        problem = replace(ready.problem(structure), noise_rad=smaller)
         dated = self.recorded, self.lag.feedback, self.reference_voltage_v
         step_s = _step_for(problem, fit, *dated)
         runs = self.runs
         if step_s < runs[0].step_s:
             _, runs = _dated(*dated, True, step_s, self.lost_commands)
-        return replace(self, runs=runs, noise_rad=smaller)
+        return replace(ready, runs=runs, noise_rad=smaller)
 
     def problem(self, structure: Structure) -> Problem:
         """The fit of a structure to all runs."""
-        return Problem(structure, self.runs, self.noise_rad)
+        recordings = len(self.recordings) if self.between_rad else 1
+        return Problem(structure, self.alike, self.noise_rad, recordings)
 
     def searched(self, structure: Structure) -> Problem:
         """The same with fewer readings at the ends of long runs, as much as a search needs."""
         total = sum(r.steps * r.step_s for r in self.runs)
         share = min(_SEARCHED_S / max(total, 1e-9), 1.0)
-        return replace(self.problem(structure), runs=tuple(r.until(share) for r in self.runs))
+        return replace(self.problem(structure), runs=tuple(r.until(share) for r in self.alike))
 
     def warnings(self) -> Iterator[str]:
         """What went wrong while the joint was recorded, in sentences."""
@@ -243,10 +316,11 @@ def prepare_joint(
         load_notes = check_claimed_load(
             joint, recorded, structure, runs, noise, best, least, deepcopy(rng)
         )
-    return PreparedJoint(
+    ready = PreparedJoint(
         joint, rng, lag, scales, volts, recorded, runs, noise, least, first, lost_commands,
         load_notes,
     )  # fmt: skip
+    return ready.without_differences() if known is None else ready
 
 
 def reference_voltage(trials: Sequence[Trial]) -> float:

@@ -1,15 +1,16 @@
 """Repeats: do the recordings of a joint agree, which one differs in what, and how widely they vary.
 
 A servo is not the same on two days: its battery, temperature and grease are not, nor may be its
-gain. Each recording is fitted apart, from the fit to all of them, and compared with the others by
-normal approximations of their likelihoods. Where one differs, the one number that explains most of
-it is named, with the factor between it and the others. What each number may vary by between
-recordings widens its interval, which then is for the next recording, too.
+gain. Each recording is fitted apart, from the fit to all of them (`fit_apart`), and compared with
+the others by normal approximations of their likelihoods (`compare_repeats`). Where one differs, the
+one number that explains most of it is named, with the factor between it and the others. What each
+number may vary by between recordings widens its interval, which then is for the next recording,
+too. It is no error of the model: `between_recordings` is by how far readings differ for that.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,8 +20,9 @@ from pupper_sysid.common.interval import HALF_WIDTH_SD, Interval
 from pupper_sysid.servo_models.calibration.quantity import words_of
 from pupper_sysid.sysid.fit.goodness import DESCRIBED, goodness_of_fit, overall
 from pupper_sysid.sysid.fit.noise import noise_by_run, temperature_of
-from pupper_sysid.sysid.fit.run import fresh_residuals
-from pupper_sysid.sysid.fit.search import Fit, Problem, curvature, local, refine
+from pupper_sysid.sysid.fit.posterior import Straight
+from pupper_sysid.sysid.fit.run import Run, fresh_residuals
+from pupper_sysid.sysid.fit.search import Problem, curvature, local, refine
 from pupper_sysid.sysid.fit.servo_prior import PER_INERTIA, UNIT_SD
 from pupper_sysid.sysid.fit.structure import SERVO_TERMS, Structure
 
@@ -109,37 +111,89 @@ class Repeats:
         return spread * np.sqrt(1.0 + 1.0 / self.recordings) * rng.standard_normal(drawn.shape)
 
 
-def compare_repeats(
-    problem: Problem, best: Fit, least_rad: float, quantum_rad: float
-) -> Repeats | None:
-    """Compare the recordings that a fit is of; None of one recording.
-
-    `problem`: all runs. `best`: to all of them. `least_rad`: least noise that a run may have [rad].
-    `quantum_rad`: step of the readings [rad]; 0 if there is none.
-    """
-    structure, runs = problem.structure, problem.runs
-    sources = list(dict.fromkeys(r.source for r in runs))
-    parts = [problem.only([r.source == source for r in runs]) for source in sources]
-    rich = [len(sources) <= _MOST and part.samples >= _LEAST_READINGS for part in parts]
-    if sum(rich) < 2:
+def compare_repeats(apart: Mapping[str, Apart]) -> Repeats | None:
+    """Compare the recordings that were fitted apart; None without any."""
+    if not apart:
         return None
-    sources = [s for s, enough in zip(sources, rich, strict=True) if enough]
-    rich_parts = [part for part, enough in zip(parts, rich, strict=True) if enough]
-    apart = [_apart(part, best.point, least_rad, quantum_rad) for part in rich_parts]
     named = []
     # of two, either differs from the other
-    for k in range(1 if len(rich_parts) == 2 else 0, len(rich_parts)):
-        others = [one for n, one in enumerate(apart) if n != k]
-        difference = _difference(sources[k], apart[k], others)
+    for source in [*apart][1 if len(apart) == 2 else 0 :]:
+        others = [one for name, one in apart.items() if name != source]
+        difference = _difference(source, apart[source], others)
         named += [difference] if difference is not None else []
     named.sort(key=lambda d: -d.nats)
-    points = np.array([one.point for one in apart])
-    variances = np.array([np.diag(np.linalg.inv(one.precision)) for one in apart], float)
-    return repeats_of(points, variances, structure, tuple(named))
+    return _repeats(apart, tuple(named))
+
+
+def _repeats(apart: Mapping[str, Apart], differences: tuple[Difference, ...] = ()) -> Repeats:
+    every = [*apart.values()]
+    points = np.array([one.point for one in every])
+    variances = np.array([np.diag(np.linalg.inv(one.precision)) for one in every], float)
+    return repeats_of(points, variances, every[0].part.structure, differences)
+
+
+def fit_apart(
+    problem: Problem, point: NDArray[np.float64], least_rad: float, quantum_rad: float
+) -> dict[str, Apart]:
+    """The fit to each recording alone, by its name; empty of one recording.
+
+    `problem`: all runs. `point` of shape (parameters,): of the fit to all of them. `least_rad`:
+    least noise that a run may have [rad]. `quantum_rad`: step of the readings [rad]; 0 if there is
+    none.
+    """
+    sources = dict.fromkeys(r.source for r in problem.runs)
+    parts = {s: problem.only([r.source == s for r in problem.runs]) for s in sources}
+    parts = {s: part for s, part in parts.items() if part.samples >= _LEAST_READINGS}
+    if not 1 < len(parts) <= len(sources) <= _MOST:
+        return {}
+    return {s: _apart(part, point, least_rad, quantum_rad) for s, part in parts.items()}
+
+
+def mean_point(apart: Mapping[str, Apart], point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Numbers of the mean servo of recordings that were fitted apart, shape (parameters,).
+
+    A number of a recording weighs as much as its error and the spread between recordings leave it.
+    The fit to all readings is another point: motions of servos that differ have a mean that is no
+    servo's, which can move the fit along its ridge by more than the servos are apart. It is off by
+    no more than units of a servo differ by: numbers that no recording tells are those of that fit.
+
+    `point` of shape (parameters,): of the fit to all recordings.
+    """
+    every, spread = [*apart.values()], np.diag(_repeats(apart).between ** 2)
+    structure = every[0].part.structure
+    straight = Straight(structure)
+    points = straight.of(np.array([*(one.point for one in every), point]))
+    slope = np.linalg.inv(straight.slope(points))
+    errors = [np.linalg.inv(one.precision) + spread for one in every]
+    errors.append(np.diag(_between_units(structure) ** 2))
+    weights = np.linalg.inv(slope @ errors @ slope.mT)
+    mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, points))
+    return np.clip(straight.fitted(mean), *structure.box)
+
+
+def between_recordings(
+    structure: Structure,
+    point: NDArray[np.float64],
+    apart: Mapping[str, Apart],
+    runs: Sequence[Run],
+) -> tuple[NDArray[np.float64], ...]:
+    """By how far readings differ from those of one servo, shape (samples,) for each run [rad].
+
+    It is the motion with the numbers of the reading's recording less that with those of all. Zero
+    in a recording that was not fitted apart.
+
+    `point` of shape (parameters,): of that servo. `apart`: from `fit_apart`.
+    """
+    of_all = fresh_residuals(structure, structure.decode(point), runs)
+    return tuple(
+        fresh_residuals(structure, structure.decode(apart[run.source].point), [run])[0] - common
+        if run.source in apart else np.zeros_like(common)
+        for run, common in zip(runs, of_all, strict=True)
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class _Apart:
+class Apart:
     """Fit to one recording alone.
 
     Attributes
@@ -148,17 +202,17 @@ class _Apart:
         With the noise that is left without the other recordings.
     point : ndarray, shape (parameters,)
     precision : ndarray, shape (parameters, parameters)
-    temperature : float
-        How many readings count as one.
+    misfit : float
+        Residual over noise, of all motions; NaN where that is not known.
     """
 
     part: Problem
     point: NDArray[np.float64]
     precision: NDArray[np.float64]
-    temperature: float
+    misfit: float
 
 
-def _apart(part: Problem, point: NDArray, least_rad: float, quantum_rad: float) -> _Apart:
+def _apart(part: Problem, point: NDArray, least_rad: float, quantum_rad: float) -> Apart:
     """Fit to one recording, from the fit to all of them."""
     structure, runs = part.structure, part.runs
     residuals: list[NDArray[np.float64]] = []
@@ -173,7 +227,7 @@ def _apart(part: Problem, point: NDArray, least_rad: float, quantum_rad: float) 
         temperature *= misfit**2
     prior = structure.prior_precision
     bent = (curvature(part, point, _STEP) - prior) / temperature
-    return _Apart(part, point, bent + prior + 1e-9 * np.eye(len(bent)), temperature)
+    return Apart(part, point, bent + prior + 1e-9 * np.eye(len(bent)), misfit)
 
 
 def _directions(names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
@@ -187,7 +241,7 @@ def _directions(names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
     return at
 
 
-def _difference(source: str, one: _Apart, others: Sequence[_Apart]) -> Difference | None:
+def _difference(source: str, one: Apart, others: Sequence[Apart]) -> Difference | None:
     """In what a recording differs from all others; None if it does not.
 
     Whether it does is asked of the difference of the two fits, in which direction of the run's own
@@ -242,12 +296,7 @@ def repeats_of(
     Gelman, A. (2006). Prior distributions for variance parameters in hierarchical models. Bayesian
     Analysis 1: 515–534, section 2.
     """
-    units = [
-        UNIT_SD if p.logarithmic
-        else p.marginal_sd if np.isfinite(p.marginal_sd) else SERVO_TERMS[p.name].prior_sd
-        for p in structure.parameters
-    ]  # fmt: skip
-    spreads = np.array(units)[:, None] * _SPREADS
+    spreads = _between_units(structure)[:, None] * _SPREADS
     weight = 1.0 / (variances[:, :, None] + spreads**2)
     mean = (weight * points[:, :, None]).sum(axis=0) / weight.sum(axis=0)
     cost = np.log(weight.sum(axis=0)) - np.log(weight).sum(axis=0)
@@ -255,6 +304,15 @@ def repeats_of(
     likelihood = np.exp(0.5 * (cost.min(axis=1, keepdims=True) - cost))
     probabilities = likelihood / likelihood.sum(axis=1, keepdims=True)
     return Repeats(structure.names, spreads, probabilities, len(points), differences)
+
+
+def _between_units(structure: Structure) -> NDArray[np.float64]:
+    """Standard deviations of numbers between units of a servo, shape (parameters,)."""
+    return np.array([
+        UNIT_SD if p.logarithmic
+        else p.marginal_sd if np.isfinite(p.marginal_sd) else SERVO_TERMS[p.name].prior_sd
+        for p in structure.parameters
+    ])  # fmt: skip
 
 
 def by_number(repeats: Repeats | None) -> dict[str, float]:

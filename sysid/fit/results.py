@@ -168,6 +168,7 @@ class JointCalibrationResult(Result):
     warnings : tuple of str
     goodness : dict of str to float
         Residual of the model over the noise of readings, by motion: 1 where it explains the servo.
+        Of several recordings, that of the one which is described least.
     r_hat, effective_draws : float
         R̂ of the draws behind the intervals, and how many independent ones they are worth.
     between_recordings : dict of str to float

@@ -68,6 +68,8 @@ class Problem:
     runs : tuple of Run
     noise_rad : tuple of float
         Of each run: the soft-L1 loss bends here, the prior is weighed against it.
+    recordings : int
+        Which had numbers of their own taken from their readings, those of all included.
     whole : bool
         Whether the runs have all of their readings.
     """
@@ -75,6 +77,7 @@ class Problem:
     structure: Structure
     runs: tuple[Run, ...]
     noise_rad: tuple[float, ...]
+    recordings: int = 1
     whole: bool = True
 
     @cached_property
@@ -177,7 +180,7 @@ def temperature_at(problem: Problem, fit: Fit) -> float:
     values = problem.structure.decode(fit.point)
     residuals = fresh_residuals(problem.structure, values, problem.runs)
     scaled = [r / noise for r, noise in zip(residuals, problem.noise_rad, strict=True)]
-    return temperature_of(scaled, problem.runs, len(values))
+    return temperature_of(scaled, problem.runs, problem.recordings * len(values))
 
 
 def price_of_a_number(problem: Problem, fit: Fit) -> float:

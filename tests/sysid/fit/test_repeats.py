@@ -8,10 +8,13 @@ import pytest
 from pupper_sysid.servo_models.delayed_pd import DelayedPD, DelayedPDParameters
 from pupper_sysid.servo_models.step_size import CONTINUOUS_S
 from pupper_sysid.sysid.feedback.poll_lattice import find_poll_lattice
-from pupper_sysid.sysid.fit.repeats import Repeats, compare_repeats, repeats_of
-from pupper_sysid.sysid.fit.run import prepare
+from pupper_sysid.sysid.fit.choice import Fitted, goodness_of, undescribed
+from pupper_sysid.sysid.fit.preparation import PreparedJoint, prepare_joint
+from pupper_sysid.sysid.fit.repeats import Repeats, compare_repeats, fit_apart, repeats_of
+from pupper_sysid.sysid.fit.run import Run, prepare
 from pupper_sysid.sysid.fit.search import Problem, refine
 from pupper_sysid.sysid.fit.structure import SIMULATED, candidate
+from pupper_sysid.sysid.recordings.recording import Trial
 from support.synthetic import tone_trials
 
 SERVO = DelayedPDParameters(
@@ -21,22 +24,35 @@ SERVO = DelayedPDParameters(
 NOISE_RAD = 1e-3
 
 
-def recorded(name: str, seed: int, **changes: float) -> list:
-    """Live, noisy tones of the servo, or of one that differs by factors."""
-    rng, runs = np.random.default_rng(seed), []
-    own = replace(SERVO, **{n: factor * getattr(SERVO, n) for n, factor in changes.items()})
-    tones = tone_trials(0.03, rng, (2.0, 4.0), duration_s=2.0, period_s=0.0)
-    lattice = find_poll_lattice([replace(t, readings="live") for t in tones], rng)
-    for trial in tones:
+def trials(name: str, seed: int, bend_rad: float = 0.0, **changes: float) -> list[Trial]:
+    """Live, noisy tones of the servo, or of one that differs by factors; a bent potentiometer."""
+    rng, made = np.random.default_rng(seed), []
+    servo = replace(SERVO, **{n: factor * getattr(SERVO, n) for n, factor in changes.items()})
+    for trial in tone_trials(0.03, rng, (2.0, 4.0), duration_s=2.0, period_s=0.0):
         start = trial.send_time_s[0]
         steps = np.arange(0.0, 2.1, CONTINUOUS_S)
         row = np.clip(np.searchsorted(trial.send_time_s - start, steps, "right") - 1, 0, None)
-        motion = DelayedPD(own, CONTINUOUS_S).rollout(trial.command_rad[row])
+        motion = DelayedPD(servo, CONTINUOUS_S).rollout(trial.command_rad[row])
+        motion = motion + bend_rad * np.sin(20.0 * motion)
         seen = np.interp(trial.read_time_s - start, steps + CONTINUOUS_S, motion)
         seen += NOISE_RAD * rng.standard_normal(len(seen))
-        made = replace(trial, position_rad=seen, readings="live", source=name)
-        runs.append(prepare(made, lattice).in_free_air())
-    return runs
+        made.append(replace(trial, position_rad=seen, readings="live", source=name))
+    return made
+
+
+def recorded(name: str, seed: int, **changes: float) -> list[Run]:
+    """The same on the physics clock."""
+    tones = trials(name, seed, **changes)
+    lattice = find_poll_lattice(tones, np.random.default_rng(seed))
+    return [prepare(trial, lattice).in_free_air() for trial in tones]
+
+
+def pooled(*recordings: list[Trial]) -> tuple[PreparedJoint, Fitted]:
+    """The recordings made ready, and the first fit."""
+    every = [t for recording in recordings for t in recording]
+    every = [replace(t, number=n) for n, t in enumerate(every)]
+    ready = prepare_joint("knee", every, 0, free_air=True)
+    return ready, Fitted(*ready.first[SIMULATED[0]])
 
 
 def compared(*recordings: list) -> Repeats | None:
@@ -49,7 +65,8 @@ def compared(*recordings: list) -> Repeats | None:
         "offset_rad": 0.0,
     }  # fmt: skip
     point = structure.encode(np.array([by_name[n] for n in structure.names]))
-    return compare_repeats(problem, refine(problem, point[None]), 3e-4, 0.0)
+    best = refine(problem, point[None])
+    return compare_repeats(fit_apart(problem, best.point, 3e-4, 0.0))
 
 
 def test_one_recording_has_nothing_to_be_compared_with():
@@ -60,6 +77,31 @@ def test_recordings_of_one_servo_agree():
     repeats = compared(recorded("monday", 0), recorded("tuesday", 1), recorded("walk", 2))
     assert repeats is not None and repeats.differences == ()
     assert repeats.between[:-1].max() < 0.05  # a tenth would be seen
+
+
+def test_what_recordings_vary_by_is_no_misfit_and_the_fit_is_their_mean():
+    changes = {"stiffness": 1.06, "damping": 0.97, "velocity_limit": 0.96}
+    ready, fitted = pooled(trials("monday", 0), trials("tuesday", 1, **changes))
+    as_read = replace(ready, between_rad=())
+    assert undescribed(goodness_of(as_read, fitted)) is not None
+    assert undescribed(goodness_of(ready, fitted)) is None
+    values = dict(zip(fitted.structure.names, fitted.values, strict=True))
+    assert values["stiffness_per_s2"] == pytest.approx(3000.0 * 1.03, rel=0.02)
+    assert values["damping_per_s"] == pytest.approx(60.0 * 0.985, rel=0.02)
+    assert values["velocity_limit_rad_s"] == pytest.approx(6.0 * 0.98, rel=0.02)
+
+
+def test_a_recording_that_is_not_described_by_its_own_fit_is_named_among_others_that_are():
+    recordings = [trials("monday", 0), trials("tuesday", 1), trials("walk", 2, bend_rad=5e-3)]
+    ready, fitted = pooled(*recordings)
+    goodness = goodness_of(ready, fitted)
+    assert undescribed(goodness) is not None
+    assert all(motion.endswith(" of walk") for motion in goodness)
+
+
+def test_readings_of_one_recording_are_left_as_they_are():
+    ready, _ = pooled(trials("monday", 0))
+    assert ready.alike is ready.runs
 
 
 @pytest.mark.parametrize("recordings", [2, 3, 5])
