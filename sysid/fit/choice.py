@@ -161,7 +161,7 @@ def _fitted(
     short: bool = False,
 ) -> Fitted:
     """The best fit to all runs; structures that this one contains are among its starts."""
-    problem = ready.searched(structure)
+    problem = ready.bounded(structure)
     near = [f for f in tried.values() if structure.contains(f.structure)] or [*tried.values()]
     more = [structure.adopt(f.structure, f.fit.point) for f in near]
     if first is not None:
@@ -250,7 +250,7 @@ def _under_load(
         features = [f for f in profiled.structure.features if f != "back-EMF"]
         structure = servo_structure(("back-EMF", *features), scales)
         near = structure.adopt(profiled.structure, profiled.fit.point)
-        fit = refine(ready.searched(structure), near[None])
+        fit = refine(ready.bounded(structure), near[None])
         tried[structure.features] = Fitted(structure, fit)
         stated = tuple(dict.fromkeys((*stated, "acceleration")))
     elif "acceleration" not in stated:
@@ -286,7 +286,7 @@ def _compared(
     rng: np.random.Generator,
 ) -> Fitted:
     """The fit with draws from its posterior, and with the fits to what is left of each fold."""
-    structure, problem = fitted.structure, ready.searched(fitted.structure)
+    structure, problem = fitted.structure, ready.bounded(fitted.structure)
     best = refine(problem, fitted.fit.point[None])
     temperature = temperature_at(problem, best)
     misfit = overall(goodness_of(ready, replace(fitted, fit=best)))
@@ -323,7 +323,7 @@ def _nats(ready: PreparedJoint, fitted: Iterable[Fitted]) -> dict[str, float]:
     """
     fitted = [*fitted]
     best = min(fitted, key=lambda f: f.fit.cost)
-    temperature = temperature_at(ready.searched(best.structure), best.fit)
+    temperature = temperature_at(ready.bounded(best.structure), best.fit)
     count = {f.structure.name: len(f.structure.parameters) for f in fitted}
     least = {f.structure.name: f.fit.cost / temperature + count[f.structure.name] for f in fitted}
     lowest = min(least.values())
@@ -578,7 +578,7 @@ def _alternatives(
     ready: PreparedJoint, fitted: Fitted, exported: Fitted, nats: Mapping[str, float], anew: bool
 ) -> list[Explanation]:
     """What explains the servo beside a likely structure, in the exported one's numbers."""
-    problem = ready.searched(fitted.structure)
+    problem = ready.bounded(fitted.structure)
     best = replace(fitted.fit, cost=float(problem.costs(fitted.fit.point[None])[0]))
     tried = explanations(problem, best, exported.temperature, anew, ready.fit_rng())
     if fitted is exported:
@@ -645,12 +645,12 @@ def with_profile(ready: PreparedJoint, exported: Fitted) -> tuple[Fitted, float]
         # the noise was the motion that the exported one cannot make
         tried[structure.features] = fitted
         fitted = _fitted(quieter, structure, tried, ready.fit_rng(), short=True)
-    problem, rng = quieter.searched(structure), ready.fit_rng()
+    problem, rng = quieter.bounded(structure), ready.fit_rng()
     best = refine(problem, fitted.fit.point[None])
     for start in _as_late(structure, best.point):
         fit = from_about(problem, refine(problem, start[None]), rng)
         best = min(best, fit, key=lambda f: f.cost)
-    cost = float(ready.searched(structure).costs(best.point[None])[0])
+    cost = float(ready.bounded(structure).costs(best.point[None])[0])
     fitted = replace(fitted, fit=Fit(best.point, cost))
     return fitted, _gained(ready, exported, fitted)
 

@@ -71,8 +71,8 @@ _STEPS_S = (TIME_STEP_S, 2 * SHORTEST_STEP_S, SHORTEST_STEP_S)
 _MOST_SHIFT = 0.5
 """Of a number's standard deviation: what an error of the step may be; it adds an eighth to it."""
 _JACOBIAN_STEP = 0.01
-_SEARCHED_S = 250.0
-"""Duration of all runs together that a search uses; the final fit uses all."""
+_FITTED_S = 250.0
+"""Duration of all runs together that is fitted; scores and the lag are of all."""
 
 
 @dataclass(frozen=True)
@@ -216,10 +216,10 @@ class PreparedJoint:
         recordings = len(self.recordings) if self.between_rad else 1
         return Problem(structure, self.alike, self.noise_rad, recordings)
 
-    def searched(self, structure: Structure) -> Problem:
-        """The same with fewer readings at the ends of long runs, as much as a search needs."""
+    def bounded(self, structure: Structure) -> Problem:
+        """The same without the ends of runs that are very long together."""
         total = sum(r.steps * r.step_s for r in self.runs)
-        share = min(_SEARCHED_S / max(total, 1e-9), 1.0)
+        share = min(_FITTED_S / max(total, 1e-9), 1.0)
         return replace(self.problem(structure), runs=tuple(r.until(share) for r in self.alike))
 
     def warnings(self) -> Iterator[str]:
