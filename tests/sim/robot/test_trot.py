@@ -12,7 +12,7 @@ from support.refusals import assert_each_refused
 
 TROT = Trot(
     frequency_hz=2.5, lift_m=0.020, duty=0.6, crouch_m=0.0, spread_m=0.0, even_swing=0.0, gain=1.0,
-    turn_gain=1.0, turn_dead_band_rad_s=0.0,
+    back_gain=1.0, side_gain=1.0, turn_gain=1.0, turn_dead_band_rad_s=0.0,
 )  # fmt: skip
 STEP_S = 0.02
 COMMANDS = ((0.2, 0.0, 0.0), (-0.2, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.5), (0.15, -0.05, 0.3))
