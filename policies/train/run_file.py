@@ -258,11 +258,12 @@ def _first_gait_imitated(kind: Kind) -> Run:
             steps_per_environment=steps, epochs=3, critic_warmup=40, freeze_normaliser=True,
             desired_kl=0.02 if without_memory else 0.01, learning_rate=1e-5, discount=0.97,
             gae_lambda=0.9,
-            exploration=Exploration((0.02, 0.01), (0.0, 2.5)),
+            exploration=Exploration((0.025, 0.008), (0.0, 4.0)),
             mirror=without_memory, averaging=50,
         ),
-        imitation=Imitation(rollouts=240 // steps, minibatches=4 if without_memory else 16),
-        environments=512, iterations=8000 // steps,
+        # after 8 rounds a policy walks as well as after 12
+        imitation=Imitation(8, rollouts=240 // steps, minibatches=4 if without_memory else 16),
+        environments=512, iterations=16_000 // steps,
     )  # fmt: skip
 
 
