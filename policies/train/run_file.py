@@ -175,6 +175,7 @@ _DROPPED: dict[type, set[str]] = {
     Rewards: {"clock", "flight", "progress_in_time"},
 }
 """Settings of older files that say nothing of how a policy walks."""
+_OLD_TROT = {"back_gain": 1.0, "side_gain": 1.0, "even_lift": 0.0}  # before these were settings
 _OLD_RAMP = {"first": 1.0, "last": 1.0, "begin": 0.0, "end": 0.0}  # four settings before version 3
 
 
@@ -386,6 +387,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[Place, int]]:
     if not isinstance(content, dict) or content.get("schema") != RUN_SCHEMA:
         raise InputError(f"{path} is not the settings of a training run.")
     refuse_other_version(path, content.get("schema_version"), RUN_VERSION)
+    with suppress(KeyError, TypeError):  # refused later
+        task = content["settings"]["task"]
+        task["trot"] = {**_OLD_TROT, **task["trot"]}
     if content["schema_version"] < 3:
         with suppress(KeyError, TypeError, AttributeError):  # refused later
             ramps = content["settings"]["task"]["curriculum"]

@@ -20,7 +20,6 @@ from pupper_sysid.policies.evaluation.evaluate import (
     usual_robots,
 )  # fmt: skip
 from pupper_sysid.policies.evaluation.evaluate import RANDOM as RANDOM_COMMANDS
-from pupper_sysid.policies.train.first_gait import LEAST_CLEARANCE_M
 from pupper_sysid.policies.walks.together import (
     DIRECTIONS,
     RANDOM,
@@ -135,9 +134,9 @@ def test_the_open_loop_trot_keeps_its_clock_and_follows_its_commands():
     assert own.fall_rate == 0 and rhythm_hz == pytest.approx(Trot().frequency_hz, rel=0.02)
     # a foot that bounces as it comes down makes two swings
     assert 1.0 < own.stride_hz / rhythm_hz < 1.15
-    # its feet clear the ground once it walks, which those of a trot of small errors alone do not
+    # its feet clear the ground once it walks; those of a trot of small errors alone by 2.8 mm here
     walking = found.clearance_m[round(1.0 / found.step_s) :]
-    assert np.nanquantile(walking, 0.1) > LEAST_CLEARANCE_M
+    assert np.nanquantile(walking, 0.1) > 0.004
     assert own.speed_share == pytest.approx(1.0, abs=0.15)
     assert own.speed_share == pytest.approx(own.mean_velocity[0] / 0.15)
     assert 0.5 < np.mean(own.duty) < 0.75

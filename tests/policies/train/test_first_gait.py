@@ -25,11 +25,11 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_ranges
 from support.tiny_training import CALIBRATION, tiny_run
 
 GOOD = GaitScore(
-    score=0.8, falls=0.0, forward_share=1.0, turn_share=1.0, speed_error_m_s=0.016,
-    mean_speed_error_m_s=0.0035, turn_error_rad_s=0.062, mean_turn_error_rad_s=0.022,
+    score=0.8, falls=0.0, forward_share=1.0, turn_share=1.0, speed_error_m_s=0.017,
+    mean_speed_error_m_s=0.0035, turn_error_rad_s=0.061, mean_turn_error_rad_s=0.021,
     clearance_p10_m=0.009, low_swing_share=0.02, saturated_share=0.3,
 )  # fmt: skip
-BAD = replace(GOOD, score=0.3, forward_share=0.4, speed_error_m_s=0.032, turn_error_rad_s=1.0)
+BAD = replace(GOOD, score=0.3, forward_share=0.4, speed_error_m_s=0.034, turn_error_rad_s=1.0)
 FITTED = Trot(frequency_hz=2.5, duty=0.7, lift_m=0.02, crouch_m=0.01, spread_m=0.002)
 
 
@@ -123,11 +123,11 @@ def test_a_trot_is_fitted_to_servos_of_two_thirds_of_the_stiffness_and_torque(mo
     shares = []
     found = fit_trot(preset("fast", "mlp").task, weak, 0, progress=shares.append)
     before, after = found.before, found.after
-    # 7 of 100 % of the speed before. Their friction is more than half of their torque, so that feet
+    # 45 % of the speed before. Their friction is more than half of their torque, so that feet
     # that keep up with the speed are not lifted as high as on other servos: the limit is named
     low, high = first_gait.FORWARD
     assert before.poor and low <= after.forward_share <= high
-    assert after.score > before.score + 0.15
+    assert before.forward_share < 0.6 and after.score > before.score + 0.05
     assert after.poor and found.limit in ("torque", "friction")
     assert shares == sorted(shares) and shares[-1] == 1.0
 

@@ -11,8 +11,8 @@ from pupper_sysid.sim.robot.trot import Trot
 from support.refusals import assert_each_refused
 
 TROT = Trot(
-    frequency_hz=2.5, lift_m=0.020, duty=0.6, crouch_m=0.0, spread_m=0.0, even_swing=0.0, gain=1.0,
-    back_gain=1.0, side_gain=1.0, turn_gain=1.0, turn_dead_band_rad_s=0.0,
+    frequency_hz=2.5, lift_m=0.020, duty=0.6, crouch_m=0.0, spread_m=0.0, even_lift=0.0,
+    even_swing=0.0, gain=1.0, back_gain=1.0, side_gain=1.0, turn_gain=1.0, turn_dead_band_rad_s=0.0,
 )  # fmt: skip
 STEP_S = 0.02
 COMMANDS = ((0.2, 0.0, 0.0), (-0.2, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.5), (0.15, -0.05, 0.3))
@@ -108,11 +108,19 @@ def test_crouch_spread_gain_and_an_even_swing_shape_the_path():
     np.testing.assert_allclose(np.diff(x), np.ptp(x) / 8, atol=1e-9)
     assert half[[0, -1]] == pytest.approx(x[[0, -1]])
     assert np.diff(half).max() > 1.4 * np.diff(half).mean()
+    # and an even lift holds it at its height, from arcsin(1 - even_lift) on
+    lift, even = (
+        (feet(trot.joints(swing, ahead)) - NEUTRAL)[:, 0, 2]
+        for trot in (TROT, replace(TROT, even_lift=0.3))
+    )
+    np.testing.assert_allclose(even, np.minimum(lift / 0.7, TROT.lift_m), atol=1e-9)
 
 
-def test_a_duty_that_cannot_be_is_refused():
+def test_a_duty_or_an_even_lift_that_cannot_be_is_refused():
     refused = [(duty, "trot.duty") for duty in (0.0, 1.0, 1.2, -0.1)]
     assert_each_refused(refused, lambda duty: Trot(duty=duty))
+    refused = [(even, "trot.even_lift") for even in (-0.1, 1.0)]
+    assert_each_refused(refused, lambda even: Trot(even_lift=even))
 
 
 def test_a_turn_gets_the_dead_band_on_top_unless_feet_step_sideways():
