@@ -87,7 +87,7 @@ _SWAY_RAD_S = 1.0
 
 _LEAST_MINUTES = 5.0
 _USUAL = {
-    "linear_sigma": 0.017, "stride_linear_sigma": 0.0035, "angular_sigma": 0.061,
+    "linear_sigma": 0.0155, "stride_linear_sigma": 0.0032, "angular_sigma": 0.056,
     "stride_angular_sigma": 0.021,
 }  # fmt: skip
 """Errors of the trot on the shipped calibration, which the widths of the rewards suit [m/s, rad/s];

@@ -175,7 +175,7 @@ _DROPPED: dict[type, set[str]] = {
     Rewards: {"clock", "flight", "progress_in_time"},
 }
 """Settings of older files that say nothing of how a policy walks."""
-_OLD_TROT = {"back_gain": 1.0, "side_gain": 1.0, "even_lift": 0.0}  # before these were settings
+_OLD_TROT = {"back_gain": 1.0, "side_gain": 1.0}  # before these were settings
 _OLD_RAMP = {"first": 1.0, "last": 1.0, "begin": 0.0, "end": 0.0}  # four settings before version 3
 
 

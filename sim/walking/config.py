@@ -162,7 +162,7 @@ CLOCK = ("clock_hz", "clock_pull_hz", "clock_height")
 DEFAULT_REWARDS = Rewards(
     base_linear_velocity=3.0, tracking_shape="gaussian", linear_sigma=0.035,
     stride_linear_sigma=0.015, angular_sigma=0.16, stride_angular_sigma=0.06,
-    low_swing=-8.0, torque_saturation=-4.0, torque_share=-3.0, mechanical_power=-1.0,
+    low_swing=-8.0, torque_saturation=-8.0, torque_share=-3.0, mechanical_power=-1.0,
 )  # fmt: skip
 """With widths of about an imitated trot's errors, where the slope of a Gaussian is largest. Each of
 the last four costs a trot that clears three quarters of `least_clearance`, with servos at their

@@ -25,11 +25,11 @@ from pupper_sysid.sim.walking.servo_ranges import ServoRanges, servo_ranges
 from support.tiny_training import CALIBRATION, tiny_run
 
 GOOD = GaitScore(
-    score=0.8, falls=0.0, forward_share=1.0, turn_share=1.0, speed_error_m_s=0.017,
-    mean_speed_error_m_s=0.0035, turn_error_rad_s=0.061, mean_turn_error_rad_s=0.021,
+    score=0.8, falls=0.0, forward_share=1.0, turn_share=1.0, speed_error_m_s=0.0155,
+    mean_speed_error_m_s=0.0032, turn_error_rad_s=0.056, mean_turn_error_rad_s=0.021,
     clearance_p10_m=0.009, low_swing_share=0.02, saturated_share=0.3,
 )  # fmt: skip
-BAD = replace(GOOD, score=0.3, forward_share=0.4, speed_error_m_s=0.034, turn_error_rad_s=1.0)
+BAD = replace(GOOD, score=0.3, forward_share=0.4, speed_error_m_s=0.031, turn_error_rad_s=1.0)
 FITTED = Trot(frequency_hz=2.5, duty=0.7, lift_m=0.02, crouch_m=0.01, spread_m=0.002)
 
 
